@@ -1,8 +1,12 @@
-"""From the cloud of one view to ranked grasps: what the camera saw goes in, joints and poses come out."""
+"""From the cloud of one view to ranked grasps: what the camera saw goes in, joints and poses come
+out.
+"""
 
 from torchgrasp import ContactSpec, Status, fit_shape, load_hand, load_object, plan_grasps
 
-cloud = load_object("rabbit").view  # your own: read_cloud("cloud.ply", viewpoint=(x, y, z)), in metres with z up
+cloud = load_object(
+    "rabbit"
+).view  # your own: read_cloud("cloud.ply", viewpoint=(x, y, z)), in metres with z up
 hand = load_hand("allegro")
 spec = ContactSpec(friction=0.8, table=0.0)  # the object stands on the plane z = 0
 
@@ -13,6 +17,13 @@ print(f"the surface that the camera saw is known to {std:.1f} mm")
 grasps = plan_grasps(cloud, hand, spec, starts=100, shape=shape)
 executable = grasps[grasps.status == Status.OK]
 for grasp in executable[:3]:
-    print(f"success {float(grasp.success):.0%}, clearance {1e3 * float(grasp.clearance):.1f} mm, palm at")
+    print(
+        f"success {float(grasp.success):.0%}, clearance {1e3 * float(grasp.clearance):.1f} mm, palm at"
+    )
     print(grasp.obj_from_hand[0].numpy().round(3))
-    print({name: round(float(q), 3) for name, q in zip(hand.joint_names, grasp.joints[0], strict=True)})
+    print(
+        {
+            name: round(float(q), 3)
+            for name, q in zip(hand.joint_names, grasp.joints[0], strict=True)
+        }
+    )

@@ -1,4 +1,6 @@
-"""A hand of one's own from its URDF: a first hand.toml is drafted, the hand is checked, and it grasps."""
+"""A hand of one's own from its URDF: a first hand.toml is drafted, the hand is checked, and it
+grasps.
+"""
 
 import shutil
 import tempfile
@@ -12,9 +14,13 @@ from torchgrasp.testing import check_hand
 
 folder = Path(tempfile.mkdtemp()) / "mine"
 folder.mkdir()
-shutil.copy(load_hand("barrett").urdf_path, folder / "hand.urdf")  # stands for the URDF of your own hand
+shutil.copy(
+    load_hand("barrett").urdf_path, folder / "hand.urdf"
+)  # stands for the URDF of your own hand
 
-write_file(folder / "hand.toml", draft_hand(folder / "hand.urdf"))  # as `torchgrasp hand new`; read it and mend it
+write_file(
+    folder / "hand.toml", draft_hand(folder / "hand.urdf")
+)  # as `torchgrasp hand new`; read it and mend it
 hand = check_hand(folder)  # as `torchgrasp hand check`: raises with the rule that a file breaks
 print(f"{hand.name}: {hand.dof} actuated joints, fingers {', '.join(hand.tips.names)}")
 

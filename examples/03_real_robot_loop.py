@@ -1,13 +1,22 @@
-"""The loop of a real robot, without a simulator: joints and fingertip forces go in, targets come out.
+"""The loop of a real robot, without a simulator: joints and fingertip forces go in, targets come
+out.
 
-`FakeRobot` stands for the driver of your own hand. Replace its three methods; the loop below stays as it is.
+`FakeRobot` stands for the driver of your own hand. Replace its three methods; the loop below stays
+as it is.
 """
 
 import gc
 
 import torch
 
-from torchgrasp import ClosingReference, ContactSpec, GraspController, load_hand, load_object, plan_grasps
+from torchgrasp import (
+    ClosingReference,
+    ContactSpec,
+    GraspController,
+    load_hand,
+    load_object,
+    plan_grasps,
+)
 from torchgrasp.control import TipContact, measure, no_contact, observe
 
 PERIOD = 1 / 200  # seconds between two control ticks
@@ -17,14 +26,17 @@ class FakeRobot:
     """A compliant hand around an object that yields by 1 mm for 2 N."""
 
     def __init__(self, reference):
-        self.reference, self.joints = reference, reference.pregrasp
+        self.reference = reference
+        self.joints = reference.pregrasp
 
     def read_joints(self):
         """Return the encoders of the actuated joints, in the order of `hand.joint_names` [rad]."""
         return self.joints
 
     def read_fingertips(self):
-        """Return the contact of each fingertip in the hand's frame; NaN points and normals mean none."""
+        """Return the contact of each fingertip in the hand's frame; NaN points and normals mean
+        none.
+        """
         points = self.reference.contact_points(self.reference.hand.tip_centres(self.joints))
         normals = self.reference.normals
         force = 2e3 * ((self.reference.gains.target - points) * normals).sum(-1).clamp_min(0.0)
@@ -37,24 +49,37 @@ class FakeRobot:
 
         `targets.palm` [m] is for the arm; this one does not yield.
         """
-        forces = self.read_fingertips().forces  # the drives yield to them: kp (target - joint) = J^T f at rest
+        forces = (
+            self.read_fingertips().forces
+        )  # the drives yield to them: kp (target - joint) = J^T f at rest
         torques = torch.einsum("cih,ci->h", self.reference.hand.jacobian(self.joints), forces)
-        rest = self.reference.pick(targets.joints) - torques / self.reference.pick(self.reference.kp)
+        rest = self.reference.pick(targets.joints) - torques / self.reference.pick(
+            self.reference.kp
+        )
         self.joints = self.joints + 0.05 * (rest - self.joints)
 
 
 hand = load_hand("allegro")
 grasp = plan_grasps(load_object("cylinder").view, hand, ContactSpec(table=0.0), starts=50)[0]
-print("palm to", grasp.obj_from_hand[0].numpy().round(3).tolist(), "with the joints at the pre-grasp")
+print(
+    "palm to", grasp.obj_from_hand[0].numpy().round(3).tolist(), "with the joints at the pre-grasp"
+)
 
 reference = ClosingReference.from_grasp(hand, grasp, force=4.0)
-controller, robot, tactile = GraspController(reference), FakeRobot(reference), no_contact()
+controller = GraspController(reference)
+robot = FakeRobot(reference)
+tactile = no_contact()
 gc.collect()
 gc.freeze()  # else Python looks through all that was imported in some tick, for 0.1 s
 ticks = 0
 while not controller.closed:  # then lift the arm, and go on stepping
-    # `measure` filters the forces and flags contacts; a sensor that does so itself fills a `TactileState`
-    tactile = measure(tactile, robot.read_fingertips(), reference.normals, hand.tips.radius.double(), PERIOD)
+    # `measure` filters the forces and flags contacts; a sensor that does so itself fills a
+    # `TactileState`
+    tactile = measure(
+        tactile, robot.read_fingertips(), reference.normals, hand.tips.radius.double(), PERIOD
+    )
     robot.send(controller.step(observe(hand, robot.read_joints(), tactile), PERIOD))
     ticks += 1
-print(f"closed after {ticks * PERIOD:.2f} s, the fingers press with {tactile.reading.numpy().round(1)} N")
+print(
+    f"closed after {ticks * PERIOD:.2f} s, the fingers press with {tactile.reading.numpy().round(1)} N"
+)

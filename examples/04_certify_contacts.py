@@ -1,4 +1,6 @@
-"""Contacts of another planner: do they hold, how far from not holding are they, and can a hand take them?"""
+"""Contacts of another planner: do they hold, how far from not holding are they, and can a hand take
+them?
+"""
 
 import math
 
@@ -6,15 +8,24 @@ import torch
 
 from torchgrasp import Contacts, ContactSpec, certify, load_hand, load_mixture, solve_ik
 
-# Three contacts around a can of radius 33 mm, the third one opposite the first two, and three on one side of it.
-angles = torch.tensor([[20.0, -20.0, 180.0], [40.0, 0.0, -40.0]], dtype=torch.float64) * math.pi / 180
+# Three contacts around a can of radius 33 mm, the third one opposite the first two, and three on
+# one side of it.
+angles = (
+    torch.tensor([[20.0, -20.0, 180.0], [40.0, 0.0, -40.0]], dtype=torch.float64) * math.pi / 180
+)
 normals = torch.stack([angles.cos(), angles.sin(), torch.zeros_like(angles)], -1)
-contacts = Contacts(points=0.033 * normals + torch.tensor([0.0, 0.0, 0.05], dtype=torch.float64), normals=normals)
+contacts = Contacts(
+    points=0.033 * normals + torch.tensor([0.0, 0.0, 0.05], dtype=torch.float64), normals=normals
+)
 
 certificate = certify(contacts, ContactSpec(friction=0.6, friction_margin=1.0))
-for closed, margin, witness in zip(certificate.closed, certificate.margin, certificate.witness, strict=True):
+for closed, margin, witness in zip(
+    certificate.closed, certificate.margin, certificate.witness, strict=True
+):
     told = (
-        f"closed, margin {float(margin):.4f}" if closed else f"not closed: nothing opposes {witness.numpy().round(2)}"
+        f"closed, margin {float(margin):.4f}"
+        if closed
+        else f"not closed: nothing opposes {witness.numpy().round(2)}"
     )
     print(told)
 

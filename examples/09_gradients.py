@@ -1,4 +1,6 @@
-"""Gradients: fit the posture model by descent instead of EM, and move fingertips onto an uncertain shape by descent."""
+"""Gradients: fit the posture model by descent instead of EM, and move fingertips onto an uncertain
+shape by descent.
+"""
 
 import torch
 
@@ -19,34 +21,54 @@ hand = load_hand("barrett")
 
 # 1. The leaves are the parameters of four Gaussians in units of the samples' deviations.
 samples = sample_configurations(hand, 3000)
-rows, em = samples.rows(), fit_mixture(samples, components=4)
-centre, unit = rows.mean(0), rows.std(0)
-logits, means, factors = torch.zeros(4), torch.randn(4, 10, generator=torch.Generator().manual_seed(0)), torch.eye(10)
+rows = samples.rows()
+em = fit_mixture(samples, components=4)
+centre = rows.mean(0)
+unit = rows.std(0)
+logits = torch.zeros(4)
+means = torch.randn(4, 10, generator=torch.Generator().manual_seed(0))
+factors = torch.eye(10)
 leaves = [x.double().requires_grad_() for x in (logits, means, factors.repeat(4, 1, 1))]
 optimiser = torch.optim.Adam(leaves, lr=0.05)
 for _ in range(300):
     logits, means, factors = leaves
     root = unit[:, None] * factors.tril()
     covariances = root @ root.mT + torch.diag(1e-4 * unit**2)
-    loss = -GraspMixture(logits.softmax(0), centre + unit * means, covariances, em.names).log_prob(rows).mean()
+    loss = (
+        -GraspMixture(logits.softmax(0), centre + unit * means, covariances, em.names)
+        .log_prob(rows)
+        .mean()
+    )
     optimiser.zero_grad()
     loss.backward()
     optimiser.step()
-print(f"mean log-likelihood: {float(-loss.detach()):.2f} by descent, {float(em.log_prob(rows).mean()):.2f} by EM")
+print(
+    f"mean log-likelihood: {float(-loss.detach()):.2f} by descent, {float(em.log_prob(rows).mean()):.2f} by EM"
+)
 
-# 2. Forward kinematics, the shape's posterior and the posture model form one loss of the joints [rad].
+# 2. Forward kinematics, the shape's posterior and the posture model form one loss of the joints
+# [rad].
 view = load_object("cylinder").view
-shape, model, grasp = fit_shape(view), load_mixture("barrett"), plan_grasps(view, hand, starts=30)[0]
-pose, joints = grasp.obj_from_hand.double(), (grasp.joints + 0.05).double()  # spoiled, so that there is something to do
+shape = fit_shape(view)
+model = load_mixture("barrett")
+grasp = plan_grasps(view, hand, starts=30)[0]
+# spoiled, so that there is something to do
+pose = grasp.obj_from_hand.double()
+joints = (grasp.joints + 0.05).double()
 
 
 def loss_of(joints: torch.Tensor) -> torch.Tensor:
-    """Return squared distances and deviations [mm2] of the surface at the fingertips, plus the energy, Eq. (21)."""
+    """Return squared distances and deviations [mm2] of the surface at the fingertips, plus the
+    energy, Eq. (21).
+    """
     points, normals = hand.fingertips(joints)
-    points, normals = apply(pose, points), rotate(pose, normals)
+    points = apply(pose, points)
+    normals = rotate(pose, normals)
     surface = shape.predict(points)
     off = 1e3 * shape.scale * surface.distance  # [mm]
-    return (off**2 + (1e3 * surface.std_m) ** 2).sum() + model.energy(encode((points, normals))).amin()
+    return (off**2 + (1e3 * surface.std_m) ** 2).sum() + model.energy(
+        encode((points, normals))
+    ).amin()
 
 
 print(f"loss {float(loss_of(joints)):.1f} of the spoiled grasp,", end=" ")
@@ -65,4 +87,6 @@ def evaluate() -> torch.Tensor:
 optimiser.step(evaluate)
 joints = joints.detach()
 curvature = torch.func.hessian(loss_of)(joints)[0, :, 0]
-print(f"{float(loss_of(joints)):.1f} after descent, with curvatures {torch.linalg.eigvalsh(curvature).numpy().round()}")
+print(
+    f"{float(loss_of(joints)):.1f} after descent, with curvatures {torch.linalg.eigvalsh(curvature).numpy().round()}"
+)

@@ -1,10 +1,11 @@
 """A real arm: grasps that a UR5e with an Allegro hand reaches, and the joint trajectory of both.
 
-Here the URDF is made from the published Denavit-Hartenberg parameters, with a cylinder around each link. A maker's URDF
-has meshes: `torchgrasp.app.author.clean_arm` replaces them. With the network and `pip install robot_descriptions`:
+Here the URDF is made from the published Denavit-Hartenberg parameters, with a cylinder around each
+link. A maker's URDF has meshes: `torchgrasp.app.author.clean_arm` replaces them. With the network
+and `pip install robot_descriptions`:
 
-    from robot_descriptions import panda_description as found  # or ur5e_description, iiwa14_description
-    file.write_text(clean_arm(found.URDF_PATH, meshes=found.REPOSITORY_PATH))
+    from robot_descriptions import panda_description as found  # or ur5e_description,
+    iiwa14_description file.write_text(clean_arm(found.URDF_PATH, meshes=found.REPOSITORY_PATH))
 """
 
 import math
@@ -26,21 +27,25 @@ LINKS = [
     ("wrist_2", 0.0, 0.0997, -math.pi / 2, 0.04, 0.1, "0 0 0.09", 0.0),
     ("wrist_3", 0.0, 0.0996, 0.0, 0.04, 0.045, "0 0 0.077", 0.0),
 ]
-urdf, parent, origin = '<robot name="ur5e"><link name="base"/>', "base", 'xyz="0 0 0"'
+urdf = '<robot name="ur5e"><link name="base"/>'
+parent = "base"
+origin = 'xyz="0 0 0"'
 for name, a, d, alpha, radius, length, centre, pitch in LINKS:
     limit = math.pi if name == "elbow" else 2 * math.pi
     urdf += f"""<link name="{name}_link"><collision><origin xyz="{centre}" rpy="0 {pitch} 0"/><geometry>
     <cylinder radius="{radius}" length="{length}"/></geometry></collision></link>
   <joint name="{name}_joint" type="revolute"><parent link="{parent}"/><child link="{name}_link"/><origin {origin}/>
     <axis xyz="0 0 1"/><limit lower="{-limit}" upper="{limit}" effort="150" velocity="3.14"/></joint>"""
-    parent, origin = f"{name}_link", f'xyz="{a} 0 {d}" rpy="{alpha} 0 0"'
+    parent = f"{name}_link"
+    origin = f'xyz="{a} 0 {d}" rpy="{alpha} 0 0"'
 urdf += f"""<link name="tool0"/><joint name="flange" type="fixed"><parent link="{parent}"/><child link="tool0"/>
   <origin {origin}/></joint></robot>"""
 file = Path(tempfile.mkdtemp()) / "ur5e.urdf"
 file.write_text(urdf)
 
 hand = load_hand("allegro")
-base, mount = torch.eye(4), torch.eye(4)
+base = torch.eye(4)
+mount = torch.eye(4)
 base[:3, 3] = torch.tensor([-0.55, 0.0, 0.0])  # the arm stands beside the object, on the same table
 mount[2, 3] = 0.095  # from the flange to the root of the hand, as your adapter is
 arm = load_arm(file, hand, "tool0", obj_from_base=base, tip_from_hand=mount)
@@ -49,9 +54,13 @@ grasps = plan_grasps(load_object("cylinder").view, hand, ContactSpec(table=0.0),
 best = grasps[0].raise_for_status()
 room, manipulability = best.ease[0].tolist()
 print(dict(zip(arm.joint_names, best.arm[0].tolist(), strict=True)))
-print(f"{best.success[0]:.0%} likely, joints keep {room:.0%} of half their range, manipulability {manipulability:.3f}")
+print(
+    f"{best.success[0]:.0%} likely, joints keep {room:.0%} of half their range, manipulability {manipulability:.3f}"
+)
 
 motion = plan_motion(arm, hand, best)
 for phase, k in motion.phases.items():
-    print(f"{motion.times[k]:.1f} s {phase}: arm at {[round(q, 2) for q in motion.positions[0, k, :6].tolist()]}")
+    print(
+        f"{motion.times[k]:.1f} s {phase}: arm at {[round(q, 2) for q in motion.positions[0, k, :6].tolist()]}"
+    )
 print(len(format_motion(hand, motion).splitlines()), "lines of a trajectory_msgs/JointTrajectory")

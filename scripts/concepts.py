@@ -1,5 +1,6 @@
 #!/usr/bin/env python
-"""Draw the pictures of docs/concepts.md: a slice through a band of uncertainty, and contacts with and without closure.
+"""Draw the pictures of docs/concepts.md: a slice through a band of uncertainty, and contacts with
+and without closure.
 
 python scripts/concepts.py [--out docs]
 """
@@ -20,12 +21,17 @@ from matplotlib.axes import Axes
 
 HEIGHT = 0.07
 """Height [m] of the slice through the jug: its belly and its handle."""
-INK, GREY, SEEN, TRUE = "#1f2933", "#9aa5b1", "#d64545", "#147d64"
+INK = "#1f2933"
+GREY = "#9aa5b1"
+SEEN = "#d64545"
+TRUE = "#147d64"
 """Colours of lines, of what stands back, of what the camera saw and of the true outline."""
 
 
 def draw_band(path: Path) -> None:
-    """Draw the surface that is estimated at one height, its bands, the true outline and what was seen there."""
+    """Draw the surface that is estimated at one height, its bands, the true outline and what was
+    seen there.
+    """
     jug = load_object("jug")
     shape = fit_shape(jug.view, table=0.0)
     x, y = np.meshgrid(np.linspace(-0.1, 0.06, 161), np.linspace(-0.06, 0.06, 121))
@@ -60,8 +66,11 @@ def draw_band(path: Path) -> None:
 
 
 def draw_contacts(axes: Axes, degrees: tuple[float, ...]) -> None:
-    """Draw three contacts on a tin from above with their friction cones, and what the certificate says of them."""
-    radius, spec = 0.033, ContactSpec(friction=0.8)
+    """Draw three contacts on a tin from above with their friction cones, and what the certificate
+    says of them.
+    """
+    radius = 0.033
+    spec = ContactSpec(friction=0.8)
     angle = torch.deg2rad(torch.tensor(degrees, dtype=torch.float64))
     normals = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], -1)[None]
     proof = certify(Contacts(radius * normals, normals), spec)
@@ -69,12 +78,27 @@ def draw_contacts(axes: Axes, degrees: tuple[float, ...]) -> None:
     for friction, color in ((spec.friction, "#fff3c4"), (spec.planned_friction, "#f7c948")):
         half = math.degrees(math.atan(friction))
         for turn in degrees:
-            at = 1e3 * radius * np.array([math.cos(math.radians(turn)), math.sin(math.radians(turn))])
-            axes.add_patch(matplotlib.patches.Wedge(at, 24, turn + 180 - half, turn + 180 + half, color=color))
+            at = (
+                1e3
+                * radius
+                * np.array([math.cos(math.radians(turn)), math.sin(math.radians(turn))])
+            )
+            axes.add_patch(
+                matplotlib.patches.Wedge(at, 24, turn + 180 - half, turn + 180 + half, color=color)
+            )
     for turn in degrees:
         at = 1e3 * radius * np.array([math.cos(math.radians(turn)), math.sin(math.radians(turn))])
-        axes.annotate("", at * 0.55, at * 1.45, arrowprops={"arrowstyle": "-|>", "color": SEEN, "linewidth": 1.6})
-    said = "closed: any push is resisted" if bool(proof.closed) else "not closed: it is pushed out downwards"
+        axes.annotate(
+            "",
+            at * 0.55,
+            at * 1.45,
+            arrowprops={"arrowstyle": "-|>", "color": SEEN, "linewidth": 1.6},
+        )
+    said = (
+        "closed: any push is resisted"
+        if bool(proof.closed)
+        else "not closed: it is pushed out downwards"
+    )
     axes.set_title(f"{said}\nmargin {float(proof.margin):+.3f}", fontsize=9)
     axes.set(aspect="equal", xlim=(-55, 55), ylim=(-55, 55), xticks=[], yticks=[])
     axes.set_frame_on(False)

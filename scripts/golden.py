@@ -1,10 +1,12 @@
 #!/usr/bin/env python3
-"""Hashes of what the library computes, to show that a change of the code leaves every bit as it was.
+"""Hashes of what the library computes, to show that a change of the code leaves every bit as it
+was.
 
-    .venv/bin/python scripts/golden.py --save before.json     # at the old commit
-    .venv/bin/python scripts/golden.py --against before.json  # after the change: exit code 1 where a hash differs
+    .venv/bin/python scripts/golden.py --save before.json     # at the old commit .venv/bin/python
+    scripts/golden.py --against before.json  # after the change: exit code 1 where a hash differs
 
-Hashes depend on the processor and on the versions of the packages. Compare files of one machine only.
+Hashes depend on the processor and on the versions of the packages. Compare files of one machine
+only.
 """
 
 import argparse
@@ -80,7 +82,8 @@ def digest(*parts: Any) -> str:
 
 def hash_grasps(grasps: Any) -> str:
     """Return the hash of the rows of grasps."""
-    contacts, certificate = grasps.contacts, grasps.certificate
+    contacts = grasps.contacts
+    certificate = grasps.certificate
     return digest(
         *(getattr(grasps, name) for name in GRASP_FIELDS),
         *(contacts.points, contacts.normals, contacts.variance, contacts.std_m),
@@ -99,7 +102,9 @@ def see(name: str, k: int) -> Any:
     if k == 0:
         return shipped.view
     pose = look_at(60.0 * k, 35.0, target=shipped.mesh)
-    depth, labels = render_depth([trimesh.Trimesh(shipped.mesh.vertices, shipped.mesh.faces)], pose, seed=k)
+    depth, labels = render_depth(
+        [trimesh.Trimesh(shipped.mesh.vertices, shipped.mesh.faces)], pose, seed=k
+    )
     return cloud_from_depth(depth, INTRINSICS, mask=labels == 1, camera_pose=pose)
 
 
@@ -123,11 +128,22 @@ def close(name: str, hand: str, how: str) -> str:
     if "sensor" in options:
         options["sensor"] = SensorModel(options["sensor"])
     thing = load_object(name)
-    surface = surface_field(fit_shape(thing.view, table=0.0)) if options.pop("seen", False) else None
+    surface = (
+        surface_field(fit_shape(thing.view, table=0.0)) if options.pop("seen", False) else None
+    )
     spec = TrialSpec(lift_height=0.02, hold_time=0.1, **options)
     grasp = load_shipped_grasp(name, hand)
-    found = close_hand(grasp, load_hand(hand), thing.mesh, spec, error=error, parts=thing.parts, surface=surface)
-    return digest(found.status.name, found.time, found.forces, found.object_pose, found.hand_pose, found.joints)
+    found = close_hand(
+        grasp, load_hand(hand), thing.mesh, spec, error=error, parts=thing.parts, surface=surface
+    )
+    return digest(
+        found.status.name,
+        found.time,
+        found.forces,
+        found.object_pose,
+        found.hand_pose,
+        found.joints,
+    )
 
 
 def lift(k: int) -> str:
@@ -144,9 +160,12 @@ def export(name: str, hand: str) -> str:
     from torchgrasp.data.shipped import load_shipped_grasp
     from torchgrasp.export import format_graspgen, format_grasps, format_keyframes
 
-    grasps, the_hand = load_shipped_grasp(name, hand), load_hand(hand)
+    grasps = load_shipped_grasp(name, hand)
+    the_hand = load_hand(hand)
     return digest(
-        format_grasps(the_hand, grasps), format_keyframes(the_hand, grasps), format_graspgen(grasps, "object.obj")
+        format_grasps(the_hand, grasps),
+        format_keyframes(the_hand, grasps),
+        format_graspgen(grasps, "object.obj"),
     )
 
 
@@ -171,7 +190,10 @@ def run_command(words: str) -> str:
 
 JOBS: dict[str, tuple[Callable[..., str], list[tuple[Any, ...]]]] = {
     "plan": (plan, [(*view, hand, mode) for view in VIEWS for hand in HANDS for mode in MODES]),
-    "close": (close, [(name, hand, how) for how in CLOSINGS for name in OBJECTS[:2] for hand in HANDS]),
+    "close": (
+        close,
+        [(name, hand, how) for how in CLOSINGS for name in OBJECTS[:2] for hand in HANDS],
+    ),
     "lift": (lift, [(k,) for k in range(8)]),
     "export": (export, [(name, hand) for name in OBJECTS[:2] for hand in HANDS]),
     "command": (run_command, [(words,) for words in COMMANDS]),
@@ -205,8 +227,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--save", type=Path, help="file that the hashes are written to")
     parser.add_argument("--against", type=Path, help="file of hashes to compare with")
-    parser.add_argument("--only", nargs="+", choices=JOBS, default=list(JOBS), help="parts; by default all")
-    parser.add_argument("--every", type=int, default=1, help="compute only each so many-th hash of a part")
+    parser.add_argument(
+        "--only", nargs="+", choices=JOBS, default=list(JOBS), help="parts; by default all"
+    )
+    parser.add_argument(
+        "--every", type=int, default=1, help="compute only each so many-th hash of a part"
+    )
     parser.add_argument("--workers", type=int, default=2, help="processes")
     given = parser.parse_args()
     found = compute_all(given.only, given.every, given.workers)

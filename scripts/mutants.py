@@ -1,11 +1,12 @@
 #!/usr/bin/env python3
 """Mutation tests: change one operator or number of the library, and see whether a test notices.
 
-    .venv/bin/python -m pip install cosmic-ray==8.7.0
-    .venv/bin/python scripts/mutants.py --folders shape plan control posture_model --each 50 --out mutants.json
+    .venv/bin/python -m pip install cosmic-ray==8.7.0 .venv/bin/python scripts/mutants.py --folders
+    shape plan control posture_model --each 50 --out mutants.json
 
-Cosmic Ray makes the mutants. Each runs in a copy of the repository: first the test file of the mutated module, then the
-other tests of its folder. A mutant that no test notices has survived. It needs a test, or it changes no behaviour.
+Cosmic Ray makes the mutants. Each runs in a copy of the repository: first the test file of the
+mutated module, then the other tests of its folder. A mutant that no test notices has survived. It
+needs a test, or it changes no behaviour.
 """
 
 import argparse
@@ -49,7 +50,8 @@ def all_mutants(folder: str) -> list[Mutant]:
 
     found = []
     for path in sorted((ROOT / "torchgrasp" / folder).rglob("*.py")):
-        tree, module = get_ast(path.read_text()), path.relative_to(ROOT).as_posix()
+        tree = get_ast(path.read_text())
+        module = path.relative_to(ROOT).as_posix()
         for name in NAMES if path.name != "__init__.py" else ():
             operator = get_operator(name)()
             count = sum(len(list(operator.mutation_positions(node))) for node in ast_nodes(tree))
@@ -68,7 +70,9 @@ def try_mutant(copy: Path, mutant: Mutant, limit: float) -> dict[str, object]:
     assert after is not None
     lines = [
         (k, old.strip(), new.strip())
-        for k, (old, new) in enumerate(zip(before.split("\n"), after.split("\n"), strict=False), start=1)
+        for k, (old, new) in enumerate(
+            zip(before.split("\n"), after.split("\n"), strict=False), start=1
+        )
         if old != new
     ]
     path.write_text(after)
@@ -88,7 +92,9 @@ def run_tests(copy: Path, module: str, limit: float) -> bool:
     words = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-m", "not slow"]
     for tests in [own] * own.is_file() + [folder]:
         try:
-            done = subprocess.run([*words, str(tests)], cwd=copy, env=environment, capture_output=True, timeout=limit)
+            done = subprocess.run(
+                [*words, str(tests)], cwd=copy, env=environment, capture_output=True, timeout=limit
+            )
         except subprocess.TimeoutExpired:
             return True
         if done.returncode:
@@ -99,12 +105,23 @@ def run_tests(copy: Path, module: str, limit: float) -> bool:
 def main() -> int:
     """Try a sample of the mutants of each folder; print the survivors."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--folders", nargs="+", default=["shape", "plan", "control", "posture_model"])
-    parser.add_argument("--each", type=int, default=50, help="mutants of each folder, drawn at random")
+    parser.add_argument(
+        "--folders", nargs="+", default=["shape", "plan", "control", "posture_model"]
+    )
+    parser.add_argument(
+        "--each", type=int, default=50, help="mutants of each folder, drawn at random"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--limit", type=float, default=600.0, help="seconds for the tests of one mutant")
-    parser.add_argument("--out", type=Path, required=True, help="JSON file; mutants that it holds are not tried again")
+    parser.add_argument(
+        "--limit", type=float, default=600.0, help="seconds for the tests of one mutant"
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        help="JSON file; mutants that it holds are not tried again",
+    )
     given = parser.parse_args()
     chosen = []
     for folder in given.folders:
@@ -129,7 +146,12 @@ def main() -> int:
             for result in pool.map(work, [mutant for mutant in chosen if mutant not in tried]):
                 done.append(result)
                 given.out.write_text(json.dumps(done, indent=1))
-                print("killed  " if result["killed"] else "SURVIVED", result["module"], result["line"], flush=True)
+                print(
+                    "killed  " if result["killed"] else "SURVIVED",
+                    result["module"],
+                    result["line"],
+                    flush=True,
+                )
     survivors = [one for one in done if not one["killed"]]
     print(f"{len(survivors)} of {len(done)} mutants survived")
     return 0

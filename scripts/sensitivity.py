@@ -1,10 +1,12 @@
 #!/usr/bin/env python3
-"""Which tuned numbers matter: each number at module level is moved by 20 %, and plans and closings are compared.
+"""Which tuned numbers matter: each number at module level is moved by 20 %, and plans and closings
+are compared.
 
     .venv/bin/python scripts/sensitivity.py --objects DIR --out sensitivity.json
 
-A number whose change alters no plan and no closing has no effect on these objects. It is removed, or its reason is a
-case that these objects do not have. The first case that differs ends the search, so the order of cases is that of cost.
+A number whose change alters no plan and no closing has no effect on these objects. It is removed,
+or its reason is a case that these objects do not have. The first case that differs ends the search,
+so the order of cases is that of cost.
 """
 
 import argparse
@@ -68,10 +70,16 @@ class Moved(importlib.machinery.SourceFileLoader):
         """Compile the source with the number moved."""
         tree = ast.parse(data)
         for node in ast.walk(tree):
-            here = isinstance(node, ast.Constant) and (node.lineno, node.col_offset) == self.number[2:]
+            here = (
+                isinstance(node, ast.Constant) and (node.lineno, node.col_offset) == self.number[2:]
+            )
             if here and isinstance(node, ast.Constant) and isinstance(node.value, int | float):
                 value = node.value * self.factor
-                node.value = type(node.value)(value) if isinstance(node.value, float) else _whole(node.value, value)
+                node.value = (
+                    type(node.value)(value)
+                    if isinstance(node.value, float)
+                    else _whole(node.value, value)
+                )
         return compile(tree, path, "exec")
 
     def get_code(self, fullname: str) -> Any:
@@ -88,7 +96,8 @@ class Finder(importlib.abc.MetaPathFinder):
     """Finds the module of the number that is moved."""
 
     def __init__(self, number: Number, factor: float) -> None:
-        self.number, self.factor = number, factor
+        self.number = number
+        self.factor = factor
 
     def find_spec(self, fullname: str, path: Any, target: ModuleType | None = None) -> Any:
         """Return a spec with the loader that moves the number."""
@@ -97,11 +106,14 @@ class Finder(importlib.abc.MetaPathFinder):
         spec = importlib.machinery.PathFinder.find_spec(fullname, path)
         assert spec is not None and spec.origin is not None
         loader = Moved(fullname, spec.origin)
-        loader.number, loader.factor = self.number, self.factor
+        loader.number = self.number
+        loader.factor = self.factor
         return importlib.util.spec_from_file_location(fullname, spec.origin, loader=loader)
 
 
-def cases(number: Number | None, objects: Path | None, names: list[str]) -> Iterator[tuple[str, Callable[[], str]]]:
+def cases(
+    number: Number | None, objects: Path | None, names: list[str]
+) -> Iterator[tuple[str, Callable[[], str]]]:
     """Yield the cases on which a number is tried; None: all."""
     import golden
 
@@ -146,11 +158,17 @@ def plan_object(objects: Any, name: str) -> str:
     from torchgrasp.data import read_view
 
     view = read_view(objects, name, "view0")
-    return golden.hash_grasps(plan_grasps(view, load_hand("allegro"), ContactSpec(table=0.0), 80, 0))
+    return golden.hash_grasps(
+        plan_grasps(view, load_hand("allegro"), ContactSpec(table=0.0), 80, 0)
+    )
 
 
 def compute(
-    number: Number | None, factor: float, objects: Path | None, names: list[str], before: dict[str, str]
+    number: Number | None,
+    factor: float,
+    objects: Path | None,
+    names: list[str],
+    before: dict[str, str],
 ) -> Any:
     """Return the first case that a moved number changes; without a number, the hash of every case."""
     import torch
@@ -194,11 +212,24 @@ def in_child(*job: Any) -> Any:
 def main() -> int:
     """Move each number up, and down where that changes nothing; write what changed."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--objects", type=Path, help="folder of objects with views, in which further plans are made")
-    parser.add_argument("--names", nargs="*", default=[], help="objects of the folder that are planned on")
-    parser.add_argument("--folders", nargs="*", default=[*PLANNED, *CLOSED], help="folders whose numbers are moved")
-    parser.add_argument("--out", type=Path, required=True, help="JSON file; numbers that it holds are not tried again")
-    parser.add_argument("--publish", action="store_true", help="write docs/results/sensitivity.md, too")
+    parser.add_argument(
+        "--objects", type=Path, help="folder of objects with views, in which further plans are made"
+    )
+    parser.add_argument(
+        "--names", nargs="*", default=[], help="objects of the folder that are planned on"
+    )
+    parser.add_argument(
+        "--folders", nargs="*", default=[*PLANNED, *CLOSED], help="folders whose numbers are moved"
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        help="JSON file; numbers that it holds are not tried again",
+    )
+    parser.add_argument(
+        "--publish", action="store_true", help="write docs/results/sensitivity.md, too"
+    )
     given = parser.parse_args()
     import lxml.etree  # noqa: F401
     import mujoco  # noqa: F401
@@ -211,7 +242,11 @@ def main() -> int:
 
     before = in_child(None, 1.0, given.objects, given.names, {})
     done = json.loads(given.out.read_text()) if given.out.is_file() else {}
-    paths = [path for folder in given.folders for path in sorted((ROOT / "torchgrasp" / folder).rglob("*.py"))]
+    paths = [
+        path
+        for folder in given.folders
+        for path in sorted((ROOT / "torchgrasp" / folder).rglob("*.py"))
+    ]
     for number in [number for path in paths for number in numbers_of(path)]:
         key = f"{number.module}:{number.line} {number.name} [{number.column}]"
         if key not in done:
@@ -220,19 +255,29 @@ def main() -> int:
             done[key] = up or down or "no effect"
             print(f"{done[key]:28} {key}", flush=True)
             given.out.write_text(json.dumps(done, indent=1))
-    print(f"{sum(value == 'no effect' for value in done.values())} of {len(done)} numbers have no effect")
+    print(
+        f"{sum(value == 'no effect' for value in done.values())} of {len(done)} numbers have no effect"
+    )
     if given.publish:
         write_page(done)
     return 0
 
 
 def write_page(done: dict[str, str]) -> None:
-    """Write docs/results/sensitivity.md: how many numbers have an effect, and the others with their reason."""
+    """Write docs/results/sensitivity.md: how many numbers have an effect, and the others with their
+    reason.
+    """
     from benchmarks.common import describe_run
 
-    found = [(*re.fullmatch(r"torchgrasp\.(\S+):(\d+) (.+) \[\d+\]", key).groups(), done[key]) for key in done]  # pyright: ignore
-    silent = [(module, int(line), name) for module, line, name, effect in found if effect == "no effect"]
-    every, without = Counter(x[0].split(".")[0] for x in found), Counter(x[0].split(".")[0] for x in silent)
+    found = [
+        (*re.fullmatch(r"torchgrasp\.(\S+):(\d+) (.+) \[\d+\]", key).groups(), done[key])
+        for key in done
+    ]  # pyright: ignore
+    silent = [
+        (module, int(line), name) for module, line, name, effect in found if effect == "no effect"
+    ]
+    every = Counter(x[0].split(".")[0] for x in found)
+    without = Counter(x[0].split(".")[0] for x in silent)
     lines = ["# Numbers", "", "`scripts/sensitivity.py`", "", describe_run(1), "", SENSITIVITY, ""]
     lines += ["| folder | numbers | without effect |", "| --- | --- | --- |"]
     lines += [f"| {folder} | {n} | {without[folder]} |" for folder, n in sorted(every.items())]
@@ -244,7 +289,9 @@ def write_page(done: dict[str, str]) -> None:
 def reason_of(module: str, line: int) -> str:
     """Return the comment behind the number at a line, or the docstring below it."""
     path = ROOT / "torchgrasp" / Path(*module.split("."))
-    source = (path / "__init__.py" if path.is_dir() else path.with_suffix(".py")).read_text().split("\n")
+    source = (
+        (path / "__init__.py" if path.is_dir() else path.with_suffix(".py")).read_text().split("\n")
+    )
     _, mark, comment = source[line - 1].partition("  # ")
     return (comment if mark else source[line].strip('"')).replace("|", "/")
 

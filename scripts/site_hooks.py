@@ -65,11 +65,15 @@ def on_post_template(output_content: str, **_: Any) -> str:
 def _notebook(text: str) -> str:
     """Return the cells of a notebook as Markdown, without their outputs."""
     cells = [(cell["cell_type"], "".join(cell["source"])) for cell in json.loads(text)["cells"]]
-    return "\n\n".join(source if kind == "markdown" else f"```python\n{source}\n```" for kind, source in cells)
+    return "\n\n".join(
+        source if kind == "markdown" else f"```python\n{source}\n```" for kind, source in cells
+    )
 
 
 def _relink(text: str, folder: Path, up: str = "") -> str:
-    """Replace links from a file in a folder of the project by links of the site; `up` leads to the site's root."""
+    """Replace links from a file in a folder of the project by links of the site; `up` leads to the
+    site's root.
+    """
 
     def replace(match: re.Match[str]) -> str:
         target = (ROOT / folder / match[1]).resolve()
@@ -96,4 +100,6 @@ class FenceExamples(griffe.Extension):
 def fence(text: str) -> str:
     """Return a docstring whose examples are fenced."""
     blocks = re.split(r"\n{2,}", text)
-    return "\n\n".join(f"```pycon\n{b}\n```" if b.lstrip().startswith(">>> ") else b for b in blocks)
+    return "\n\n".join(
+        f"```pycon\n{b}\n```" if b.lstrip().startswith(">>> ") else b for b in blocks
+    )

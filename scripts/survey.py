@@ -1,5 +1,6 @@
 #!/usr/bin/env python
-"""Count what a reader of the library meets, folder by folder: lines, files, numbers at module level, public names.
+"""Count what a reader of the library meets, folder by folder: lines, files, numbers at module
+level, public names.
 
 python scripts/survey.py            the counts, and sentences of docstrings that are long
 """
@@ -19,16 +20,22 @@ MOST_WORDS = 30
 
 def main() -> int:
     """Print the counts and the long sentences."""
-    counts, public = defaultdict(lambda: [0, 0, 0, 0]), set[str]()
+    counts = defaultdict(lambda: [0, 0, 0, 0])
+    public = set[str]()
     long: list[str] = []
     for path in sorted((ROOT / "torchgrasp").rglob("*.py")):
-        text, inner = path.read_text(), path.relative_to(ROOT / "torchgrasp")
-        tree, count = ast.parse(text), counts["/".join(inner.parts[:-1]) or "torchgrasp"]
+        text = path.read_text()
+        inner = path.relative_to(ROOT / "torchgrasp")
+        tree = ast.parse(text)
+        count = counts["/".join(inner.parts[:-1]) or "torchgrasp"]
         names = exported(tree)
         for k, n in enumerate((len(text.splitlines()), 1, sum(numbers(tree)), len(names))):
             count[k] += n
         public |= names
-        long += [f"{path.relative_to(ROOT)}:{line}: {sentence}" for line, sentence in long_sentences(tree)]
+        long += [
+            f"{path.relative_to(ROOT)}:{line}: {sentence}"
+            for line, sentence in long_sentences(tree)
+        ]
     total = [sum(count[k] for count in counts.values()) for k in range(3)]
     print(f"{'folder':24}{'lines':>8}{'files':>8}{'numbers':>8}{'public':>8}")
     for name, count in [*sorted(counts.items()), ("all, names once", [*total, len(public)])]:
@@ -39,14 +46,22 @@ def main() -> int:
 
 def exported(tree: ast.Module) -> set[str]:
     """Return the names in `__all__`."""
-    lists = [n.value for n in tree.body if isinstance(n, ast.Assign) and ast.unparse(n.targets[0]) == "__all__"]
+    lists = [
+        n.value
+        for n in tree.body
+        if isinstance(n, ast.Assign) and ast.unparse(n.targets[0]) == "__all__"
+    ]
     return {name for names in lists for name in ast.literal_eval(names)}
 
 
 def numbers(tree: ast.Module) -> Iterator[int]:
     """Yield how many names each assignment of numbers at module level has."""
     for node in tree.body:
-        if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None and is_number(node.value):
+        if (
+            isinstance(node, ast.Assign | ast.AnnAssign)
+            and node.value is not None
+            and is_number(node.value)
+        ):
             target = node.targets[0] if isinstance(node, ast.Assign) else node.target
             yield len(target.elts) if isinstance(target, ast.Tuple) else 1
 
@@ -77,5 +92,7 @@ def long_sentences(tree: ast.Module) -> Iterator[tuple[int, str]]:
 
 
 if __name__ == "__main__":
-    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
+    argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    ).parse_args()
     sys.exit(main())

@@ -1,7 +1,8 @@
-"""Annotations of the first calls in each test are checked as jaxtyping does, but without binding of arguments.
+"""Annotations of the first calls in each test are checked as jaxtyping does, but without binding of
+arguments.
 
-Binding takes most of jaxtyping's time. The later steps of a solver have the shapes of the first ones. A function gets
-its check at its first call, and nested functions share one check.
+Binding takes most of jaxtyping's time. The later steps of a solver have the shapes of the first
+ones. A function gets its check at its first call, and nested functions share one check.
 """
 
 import dataclasses
@@ -21,7 +22,9 @@ CHECKS: dict[CodeType, FunctionType] = {}
 """A function with a check, by the code of the function."""
 CALLS = 10  # of a function that are checked in each test
 LEFT: dict[CodeType, int] = {}
-"""Number of calls that are still to be checked in this test, by the code of the function, if not `CALLS`."""
+"""Number of calls that are still to be checked in this test, by the code of the function, if not
+`CALLS`.
+"""
 
 
 def jaxtyped(thing: Any = None, **options: Any) -> Any:
@@ -31,15 +34,21 @@ def jaxtyped(thing: Any = None, **options: Any) -> Any:
     if thing is None:
         return functools.partial(jaxtyped, **options)
     if isinstance(thing, type):
-        if dataclasses.is_dataclass(thing) and getattr(thing.__init__, "__globals__", None) is not globals():
+        if (
+            dataclasses.is_dataclass(thing)
+            and getattr(thing.__init__, "__globals__", None) is not globals()
+        ):
             setattr(thing, "__init__", jaxtyped(thing.__init__, **options))  # noqa: B010
         return thing
     return with_check(thing) if thing.__annotations__ else thing
 
 
 def with_check(thing: FunctionType) -> Callable[..., Any]:
-    """Return a function whose first calls are checked; each call binds the letters of its shapes anew."""
-    checked, code = None, thing.__code__
+    """Return a function whose first calls are checked; each call binds the letters of its shapes
+    anew.
+    """
+    checked = None
+    code = thing.__code__
 
     @functools.wraps(thing)
     def call(*args: Any, **kwargs: Any) -> Any:
@@ -60,26 +69,38 @@ def with_check(thing: FunctionType) -> Callable[..., Any]:
 def bound(thing: FunctionType) -> FunctionType:
     """Return a function with its check, which is made once for all functions of the same code."""
     if thing.__code__ not in CHECKS:
-        hints = {name: resolved(hint, thing.__globals__) for name, hint in thing.__annotations__.items()}
-        CHECKS[thing.__code__] = beartype(conf=BeartypeConf(violation_type=TypeError))(copied(thing, thing, hints))
+        hints = {
+            name: resolved(hint, thing.__globals__) for name, hint in thing.__annotations__.items()
+        }
+        CHECKS[thing.__code__] = beartype(conf=BeartypeConf(violation_type=TypeError))(
+            copied(thing, thing, hints)
+        )
     check = CHECKS[thing.__code__]
     if "__beartype_func" not in (check.__kwdefaults__ or {}):  # nothing of it can be checked
         return thing
     return copied(check, check, check.__annotations__, __beartype_func=thing)
 
 
-def copied(code: FunctionType, names: FunctionType, hints: dict[str, Any], **defaults: Any) -> FunctionType:
+def copied(
+    code: FunctionType, names: FunctionType, hints: dict[str, Any], **defaults: Any
+) -> FunctionType:
     """Return a copy of a function with other annotations and with other defaults of keywords."""
-    copy = FunctionType(code.__code__, code.__globals__, names.__name__, code.__defaults__, code.__closure__)
+    copy = FunctionType(
+        code.__code__, code.__globals__, names.__name__, code.__defaults__, code.__closure__
+    )
     copy.__kwdefaults__ = {**(code.__kwdefaults__ or {}), **defaults}
-    copy.__qualname__, copy.__module__, copy.__annotations__ = names.__qualname__, names.__module__, hints
+    copy.__qualname__ = names.__qualname__
+    copy.__module__ = names.__module__
+    copy.__annotations__ = hints
     return copy
 
 
 def resolved(hint: Any, names: dict[str, Any]) -> Any:
     """Return an annotation without texts; `Any` where a text names what is not defined."""
     try:
-        return typing.get_type_hints(SimpleNamespace(__annotations__={"it": hint}), names, include_extras=True)["it"]
+        return typing.get_type_hints(
+            SimpleNamespace(__annotations__={"it": hint}), names, include_extras=True
+        )["it"]
     except NameError:
         return Any
 

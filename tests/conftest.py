@@ -17,20 +17,30 @@ from tests import annotations
 if TYPE_CHECKING:
     from torchgrasp.values.planning import PointCloud
 
-os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # each of many processes would compile the library and the tests anew
+os.environ.pop(
+    "PYTHONDONTWRITEBYTECODE", None
+)  # each of many processes would compile the library and the tests anew
 sys.dont_write_bytecode = False
 
 annotations.install()
 
-collect_ignore = ["export/play_usd.py"]  # its packages are in an environment beside; test_play.py runs it there
+collect_ignore = [
+    "export/play_usd.py"
+]  # its packages are in an environment beside; test_play.py runs it there
 
 SLOW = [HealthCheck.too_slow, HealthCheck.function_scoped_fixture]
-settings.register_profile("short", max_examples=100, derandomize=True, deadline=None, suppress_health_check=SLOW)
-settings.register_profile("long", max_examples=100_000, deadline=None, database=None, suppress_health_check=SLOW)
+settings.register_profile(
+    "short", max_examples=100, derandomize=True, deadline=None, suppress_health_check=SLOW
+)
+settings.register_profile(
+    "long", max_examples=100_000, deadline=None, database=None, suppress_health_check=SLOW
+)
 settings.load_profile("short")  # `--hypothesis-profile=long` chooses the other
 
 
-SIMULATED = re.compile(r"(close_hand|evaluate|drop|lift_grasp|open_scene|pull_grasp|run_protocol|open)\(")
+SIMULATED = re.compile(
+    r"(close_hand|evaluate|drop|lift_grasp|open_scene|pull_grasp|run_protocol|open)\("
+)
 """What an example calls that opens a simulator."""
 
 
@@ -63,7 +73,9 @@ def motion(generator: torch.Generator) -> Tensor:
 
 @pytest.fixture(scope="session")
 def seen_cylinder() -> "PointCloud":
-    """One side of a standing cylinder, r 30 mm and h 120 mm, seen from a camera 0.5 m away, with exact normals."""
+    """One side of a standing cylinder, r 30 mm and h 120 mm, seen from a camera 0.5 m away, with
+    exact normals.
+    """
     from torchgrasp.values.planning import PointCloud
 
     rng = torch.Generator().manual_seed(1)
@@ -76,7 +88,8 @@ def seen_cylinder() -> "PointCloud":
     turn = torch.rand(200, generator=rng, dtype=torch.float64) * 2 * math.pi
     top = torch.stack([radius * turn.cos(), radius * turn.sin(), torch.full_like(turn, 0.12)], -1)
     top_normals = torch.tensor([0.0, 0, 1], dtype=torch.float64).expand(200, 3)
-    points, normals = torch.cat([side, top]), torch.cat([side_normals, top_normals])
+    points = torch.cat([side, top])
+    normals = torch.cat([side_normals, top_normals])
     seen = ((camera - points) * normals).sum(-1) > 0
     return PointCloud(points[seen], normals[seen], camera)
 
@@ -104,7 +117,8 @@ def toy_hand(tmp_path: Path) -> Path:
     (folder / "hand.urdf").write_text(f'<robot name="toy">{links}{joints}</robot>')
     (folder / "hand.toml").write_text(
         'name = "toy"\nurdf = "hand.urdf"\nbase_link = "palm"\napproach = [0, 0, 1]\nlimit_margin = 0.0\n'
-        '[actuators]\nkp = 1.0\nkd = 0.1\n[options.default]\nfingers = ["f1", "f2", "f3"]\n' + fingers
+        '[actuators]\nkp = 1.0\nkd = 0.1\n[options.default]\nfingers = ["f1", "f2", "f3"]\n'
+        + fingers
     )
     return folder
 
@@ -119,7 +133,9 @@ def body(mass: float, inertia: float, com: str, shapes: str) -> str:
 
 
 def claw_urdf() -> str:
-    """Three fingers, two against one: each swivels and bends, and its last joint follows by -0.7 times plus 0.1."""
+    """Three fingers, two against one: each swivels and bends, and its last joint follows by -0.7
+    times plus 0.1.
+    """
     parts = [f'<link name="base">{body(0.3, 3e-4, "0 0 0", box("0.11 0.1 0.03", "0 0 0"))}</link>']
     for name, x, y, yaw in (
         ("left", -0.045, -0.03, 0.0),
@@ -135,10 +151,19 @@ def claw_urdf() -> str:
         }
         parts += [f'<link name="{name}_{k}">{v}</link>' for k, v in links.items()]
         limit = '<limit lower="{}" upper="{}" effort="1.5" velocity="3"/>'
-        swivel, bend, follow = limit.format(-0.5, 0.5), limit.format(-0.5, 1.3), limit.format(-0.9, 0.5)
+        swivel = limit.format(-0.5, 0.5)
+        bend = limit.format(-0.5, 1.3)
+        follow = limit.format(-0.9, 0.5)
         mimic = f'<mimic joint="{name}_bend" multiplier="-0.7" offset="0.1"/>'
         for joint, parent, child, origin, axis, rest in (
-            ("swivel", "base", f"{name}_root", f'xyz="{x} {y} 0.015" rpy="0 0 {yaw}"', "0 0 1", swivel),
+            (
+                "swivel",
+                "base",
+                f"{name}_root",
+                f'xyz="{x} {y} 0.015" rpy="0 0 {yaw}"',
+                "0 0 1",
+                swivel,
+            ),
             ("bend", f"{name}_root", f"{name}_near", 'xyz="0 0 0.018"', "0 1 0", bend),
             ("follow", f"{name}_near", f"{name}_far", 'xyz="0 0 0.06"', "0 -1 0", follow + mimic),
         ):
@@ -155,7 +180,9 @@ def claw_urdf() -> str:
 
 @pytest.fixture
 def claw(tmp_path: Path) -> Path:
-    """The URDF of a hand with three fingers and a coupling unlike the shipped hands', in a folder of its own."""
+    """The URDF of a hand with three fingers and a coupling unlike the shipped hands', in a folder
+    of its own.
+    """
     folder = tmp_path / "claw"
     folder.mkdir()
     (folder / "claw.urdf").write_text(claw_urdf())

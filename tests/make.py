@@ -38,7 +38,9 @@ load_hand = functools.cache(load.load_hand)
 
 
 def start_process(command: list[str], **options: Any) -> subprocess.Popen[str]:
-    """Start a process that SIGINT reaches: children inherit that a shell's background processes ignore it."""
+    """Start a process that SIGINT reaches: children inherit that a shell's background processes
+    ignore it.
+    """
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, **options)
@@ -52,7 +54,9 @@ def real(values) -> Tensor:
 
 def directions(n: int, seed: int = 0) -> Tensor:
     """Random unit vectors (n, 3) in float64."""
-    return unit(torch.randn(n, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64))
+    return unit(
+        torch.randn(n, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    )
 
 
 def random_motion(seed: int) -> Tensor:
@@ -74,13 +78,17 @@ def spokes(*angles: float) -> Tensor:
     return torch.stack([turn.cos(), turn.sin(), torch.zeros_like(turn)], -1)[None]
 
 
-def ball(n: int = 300, radius: float = 0.04, centre=(0.0, 0.0, 0.0), seed: int = 0, viewpoint=None) -> PointCloud:
+def ball(
+    n: int = 300, radius: float = 0.04, centre=(0.0, 0.0, 0.0), seed: int = 0, viewpoint=None
+) -> PointCloud:
     """Points all around a ball, with outward normals."""
     normals = directions(n, seed)
     return PointCloud(radius * normals + real(centre), normals, viewpoint)
 
 
-def ball_contacts(n: int, generator: torch.Generator, fingertips: int = 3, radius: float = 0.04) -> Contacts:
+def ball_contacts(
+    n: int, generator: torch.Generator, fingertips: int = 3, radius: float = 0.04
+) -> Contacts:
     """Random contacts on a ball, some closed, some not."""
     normals = unit(torch.randn(n, fingertips, 3, generator=generator, dtype=torch.float64))
     return Contacts(radius * normals, normals)
@@ -91,14 +99,22 @@ def box(size, place=(0.0, 0.0)) -> trimesh.Trimesh:
     return trimesh.creation.box(size).apply_translation([*place, size[2] / 2][:3])
 
 
-CUP_RADIUS, CUP_HEIGHT = 0.037, 0.075
+CUP_RADIUS = 0.037
+CUP_HEIGHT = 0.075
 
 
 @functools.cache
 def cup(wall: float, radius: float = CUP_RADIUS, floor: float = 0.003) -> trimesh.Trimesh:
     """A straight cup that stands at z = 0, open at the top."""
     inside = radius - wall
-    profile = [[0, 0], [radius, 0], [radius, CUP_HEIGHT], [inside, CUP_HEIGHT], [inside, floor], [0, floor]]
+    profile = [
+        [0, 0],
+        [radius, 0],
+        [radius, CUP_HEIGHT],
+        [inside, CUP_HEIGHT],
+        [inside, floor],
+        [0, floor],
+    ]
     return trimesh.creation.revolve(np.array(profile), sections=96)
 
 
@@ -137,7 +153,8 @@ def write_objects(folder: Path) -> Path:
 
 def field_of_mesh(mesh: trimesh.Trimesh, margin: float = 0.08) -> SignedDistanceField:
     """The signed distance field of a mesh [m]."""
-    vertices, faces = torch.tensor(np.asarray(mesh.vertices)), torch.tensor(np.asarray(mesh.faces))
+    vertices = torch.tensor(np.asarray(mesh.vertices))
+    faces = torch.tensor(np.asarray(mesh.faces))
     return field_from_surface(vertices, faces, margin=margin)
 
 
@@ -151,23 +168,36 @@ def half_ball(seen_from: float, std_factor: float, noise: float = 0.02) -> Shape
     n = n[n[:, 2] > seen_from]
     outside = 1.2 * unit(torch.randn(40, 3, generator=generator)).double()
     x = torch.cat([n, torch.zeros(1, 3, dtype=torch.float64), outside])
-    distance = torch.cat([torch.zeros(len(n)), torch.tensor([-1.0]), torch.full((40,), 0.2)]).double()
+    distance = torch.cat(
+        [torch.zeros(len(n)), torch.tensor([-1.0]), torch.full((40,), 0.2)]
+    ).double()
     oriented = torch.arange(len(x)) < len(n)
     sigma = torch.full_like(distance, noise)
-    observations = Observations(x, distance, torch.cat([n, torch.zeros_like(x[len(n) :])]), oriented, sigma, sigma)
+    observations = Observations(
+        x, distance, torch.cat([n, torch.zeros_like(x[len(n) :])]), oriented, sigma, sigma
+    )
     normalisation = Normalisation(torch.zeros(3, dtype=torch.float64), HALF_BALL_RADIUS)
-    return condition(observations, normalisation, PointCloud(HALF_BALL_RADIUS * n, n), std_factor=std_factor)
+    return condition(
+        observations, normalisation, PointCloud(HALF_BALL_RADIUS * n, n), std_factor=std_factor
+    )
 
 
-def contacts_on(shape: ShapeGP, generator: torch.Generator, count: int, fingertips: int = 3) -> Contacts:
+def contacts_on(
+    shape: ShapeGP, generator: torch.Generator, count: int, fingertips: int = 3
+) -> Contacts:
     """Random contacts on the mean surface with its normals, closed at friction 0.8."""
     x = unit(torch.randn(20 * count, fingertips, 3, generator=generator, dtype=torch.float64))
     for _ in range(8):
-        distance, slope = (t.unflatten(0, (len(x), -1)) for t in shape.mean_and_gradient(x.flatten(0, 1)))
+        distance, slope = (
+            t.unflatten(0, (len(x), -1)) for t in shape.mean_and_gradient(x.flatten(0, 1))
+        )
         x = x - (distance / (slope * slope).sum(-1))[..., None] * slope
     normals = unit(shape.mean_and_gradient(x.flatten(0, 1))[1]).unflatten(0, (len(x), -1))
-    good = closed_exact(x, normals, 0.8) & (torch.linalg.vector_norm(x - x.roll(1, 1), dim=-1).amin(-1) > 0.3)
-    x, normals = x[good][:count], normals[good][:count]
+    good = closed_exact(x, normals, 0.8) & (
+        torch.linalg.vector_norm(x - x.roll(1, 1), dim=-1).amin(-1) > 0.3
+    )
+    x = x[good][:count]
+    normals = normals[good][:count]
     return Contacts(shape.metres(x), normals)
 
 
@@ -175,7 +205,8 @@ def touched_contacts(hand: Hand, joints: Tensor, obj_from_hand: Tensor | None = 
     """Contacts at the middle of the fingertips' pads, in the hand's frame or at poses of the hand."""
     points, normals = hand.fingertips(joints)
     if obj_from_hand is not None:
-        points, normals = apply(obj_from_hand, points), rotate(obj_from_hand, normals)
+        points = apply(obj_from_hand, points)
+        normals = rotate(obj_from_hand, normals)
     return Contacts(points, -normals)
 
 
@@ -185,30 +216,53 @@ def ring_samples(n: int = 3000) -> HandSamples:
     angle = rng.uniform(0, 6, size=n)
     lengths = 0.05 + 0.01 * np.stack([np.sin(angle), np.cos(angle), np.sin(2 * angle)], -1)
     cosines = np.stack([np.cos(angle), np.sin(angle), np.cos(3 * angle)], -1)
-    q = np.concatenate([lengths, cosines], -1) + rng.normal(size=(n, 6)) * np.repeat([1e-3, 0.05], 3)
+    q = np.concatenate([lengths, cosines], -1) + rng.normal(size=(n, 6)) * np.repeat(
+        [1e-3, 0.05], 3
+    )
     return HandSamples(torch.from_numpy(angle[:, None]), torch.from_numpy(q), ("turn",))
 
 
-def covariance(x: Tensor, other: Tensor, has_normal: Tensor, other_has_normal: Tensor, profile: Profile) -> Tensor:
-    """The covariance of observations by autograd, Eqs. (2)-(5): all d, then w1, w2, w3 of points with normals."""
+def covariance(
+    x: Tensor, other: Tensor, has_normal: Tensor, other_has_normal: Tensor, profile: Profile
+) -> Tensor:
+    """The covariance of observations by autograd, Eqs. (2)-(5): all d, then w1, w2, w3 of points
+    with normals.
+    """
     blocks = cross_covariance(Kernel(profile), x.detach(), other.detach(), len(other)).flatten(0, 1)
-    rows, columns = (torch.cat([torch.ones_like(mask), mask.repeat(3)]) for mask in (has_normal, other_has_normal))
+    rows, columns = (
+        torch.cat([torch.ones_like(mask), mask.repeat(3)])
+        for mask in (has_normal, other_has_normal)
+    )
     return blocks[rows][:, columns]
 
 
 def dense_posterior(
-    known: Observations, profile: Profile, x: Tensor, normals: bool = True, extra: Tensor | None = None
+    known: Observations,
+    profile: Profile,
+    x: Tensor,
+    normals: bool = True,
+    extra: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Mean and covariance of (d, w), or of d alone, at points by one dense solve; `extra` is added to the noise."""
+    """Mean and covariance of (d, w), or of d alone, at points by one dense solve; `extra` is added
+    to the noise.
+    """
     y, noise = known.rows()
-    has, asked = known.has_normal, torch.full((len(x),), normals)
-    k = covariance(known.x, known.x, has, has, profile) + torch.diag(noise) + (0.0 if extra is None else extra)
-    star, own = covariance(x, known.x, asked, has, profile), covariance(x, x, asked, asked, profile)
+    has = known.has_normal
+    asked = torch.full((len(x),), normals)
+    k = (
+        covariance(known.x, known.x, has, has, profile)
+        + torch.diag(noise)
+        + (0.0 if extra is None else extra)
+    )
+    star = covariance(x, known.x, asked, has, profile)
+    own = covariance(x, x, asked, asked, profile)
     return star @ torch.linalg.solve(k, y), own - star @ torch.linalg.solve(k, star.T)
 
 
 def half_sphere(n: int = 40, extra: int = 0) -> Observations:
-    """Points of the unit sphere's right half with normals, mixed with points off it without; then `extra` on it."""
+    """Points of the unit sphere's right half with normals, mixed with points off it without; then
+    `extra` on it.
+    """
     generator = torch.Generator().manual_seed(3)
     on = unit(torch.randn(n + extra, 3, dtype=torch.float64, generator=generator))
     on = torch.cat([on[:, :1].abs(), on[:, 1:]], 1)
@@ -216,7 +270,8 @@ def half_sphere(n: int = 40, extra: int = 0) -> Observations:
     last = len(x) - extra
     x = torch.cat([x[torch.randperm(last, generator=generator)], x[last:]])
     distance = torch.linalg.vector_norm(x, dim=-1) - 1.0
-    on_sphere, noise = distance.abs() < 1e-9, torch.full_like(distance, 0.02)
+    on_sphere = distance.abs() < 1e-9
+    noise = torch.full_like(distance, 0.02)
     return Observations(x, torch.where(on_sphere, 0.0, distance), x, on_sphere, noise, 2.5 * noise)
 
 
@@ -233,7 +288,9 @@ def queries(shape: ShapeGP, n: int) -> Tensor:
     """Points [m] all over a shape's domain."""
     generator = torch.Generator().manual_seed(7)
     x = unit(torch.randn(n, 3, dtype=torch.float64, generator=generator))
-    return shape.metres(x * torch.rand(n, 1, dtype=torch.float64, generator=generator) * shape.domain_radius * 0.99)
+    return shape.metres(
+        x * torch.rand(n, 1, dtype=torch.float64, generator=generator) * shape.domain_radius * 0.99
+    )
 
 
 def near(found: Tensor, wanted: Tensor, atol: float) -> None:
@@ -243,24 +300,36 @@ def near(found: Tensor, wanted: Tensor, atol: float) -> None:
 
 def same_bits(first: Any, second: Any) -> bool:
     """Tell whether two values hold the same tensors to the last bit."""
-    a, b = named_tensors(first), named_tensors(second)
+    a = named_tensors(first)
+    b = named_tensors(second)
     return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
 
 
 def largest_share(wrenches: np.ndarray) -> float:
-    """The largest s of Eq. (13) by SciPy: phi >= s, sum phi = 1, and phi balances the wrenches (6, m)."""
+    """The largest s of Eq. (13) by SciPy: phi >= s, sum phi = 1, and phi balances the wrenches (6,
+    m).
+    """
     m = wrenches.shape[1]
-    equal = np.r_[np.c_[wrenches, wrenches.sum(1)], [np.r_[np.ones(m), m]]]  # phi = s + psi with psi >= 0
+    equal = np.r_[
+        np.c_[wrenches, wrenches.sum(1)], [np.r_[np.ones(m), m]]
+    ]  # phi = s + psi with psi >= 0
     bounds = [(0, None)] * m + [(None, None)]
     found = linprog(np.r_[np.zeros(m), -1.0], A_eq=equal, b_eq=np.eye(7)[6], bounds=bounds)
     return float(found.x[m]) if found.status == 0 else -np.inf
 
 
-def closure_margin(points: Tensor, normals: Tensor, friction: float, edges: int = 24) -> tuple[float, int]:
-    """The margin of Eq. (13) for contacts (f, 3) by NumPy and SciPy alone, and the rank of their wrenches."""
-    arms, columns = (points - points.mean(0)).numpy(), []
+def closure_margin(
+    points: Tensor, normals: Tensor, friction: float, edges: int = 24
+) -> tuple[float, int]:
+    """The margin of Eq. (13) for contacts (f, 3) by NumPy and SciPy alone, and the rank of their
+    wrenches.
+    """
+    arms = (points - points.mean(0)).numpy()
+    columns = []
     turn = 2 * np.pi * np.arange(edges)[:, None] / edges
-    for arm, inward in zip(arms / np.linalg.norm(arms, axis=1).max(), -normals.numpy(), strict=True):
+    for arm, inward in zip(
+        arms / np.linalg.norm(arms, axis=1).max(), -normals.numpy(), strict=True
+    ):
         one, other = np.linalg.svd(inward[None])[2][1:]
         force = inward + friction * (np.cos(turn) * one + np.sin(turn) * other)
         columns.append(np.c_[force, np.cross(arm, force)])
@@ -269,11 +338,17 @@ def closure_margin(points: Tensor, normals: Tensor, friction: float, edges: int 
 
 
 def run_python(*arguments: str, given: str = "") -> subprocess.CompletedProcess[str]:
-    """Run Python in a process of its own that can import the library and the helpers of the tests, `given` a text."""
-    path = os.pathsep.join(filter(None, [str(ROOT), str(ROOT / "scripts"), os.environ.get("PYTHONPATH")]))
+    """Run Python in a process of its own that can import the library and the helpers of the tests,
+    `given` a text.
+    """
+    path = os.pathsep.join(
+        filter(None, [str(ROOT), str(ROOT / "scripts"), os.environ.get("PYTHONPATH")])
+    )
     environment = os.environ | {"PYTHONPATH": path}
     command = [sys.executable, *arguments]
-    return subprocess.run(command, input=given, capture_output=True, text=True, timeout=600, env=environment)
+    return subprocess.run(
+        command, input=given, capture_output=True, text=True, timeout=600, env=environment
+    )
 
 
 def see(*boxes: tuple[float, ...], pose: Tensor | None = None) -> Scene:
@@ -285,4 +360,6 @@ def see(*boxes: tuple[float, ...], pose: Tensor | None = None) -> Scene:
         meshes.append(mesh)
     camera = look_at(20.0, 45.0, 0.7)
     depth, labels = render_depth(meshes, camera)
-    return Scene.from_depth(depth, INTRINSICS, camera if pose is None else pose @ camera, labels=labels)
+    return Scene.from_depth(
+        depth, INTRINSICS, camera if pose is None else pose @ camera, labels=labels
+    )

@@ -1,4 +1,6 @@
-"""A standing cylinder and a pinch of it by each hand, solved once: what tests of trials and simulators start from."""
+"""A standing cylinder and a pinch of it by each hand, solved once: what tests of trials and
+simulators start from.
+"""
 
 import dataclasses
 import functools
@@ -16,13 +18,40 @@ from torchgrasp.hand.load import load_hand
 from torchgrasp.values.planning import Certificate, Contacts, Grasps
 from torchgrasp.values.specs import TrialSpec
 
-RADIUS, HEIGHT = 0.03, 0.18
+RADIUS = 0.03
+HEIGHT = 0.18
 POSES = {  # rotation vector, translation, joints, opened joints
     "allegro": (
         [0.24253, -1.75703, -2.50589],
         [0.1042, 0.014, 0.0964],
-        [-0.0667, 0.6228, 0.6892, 0.557, 0.0044, 0.7411, 0.7659, 0.5881, 1.1233, 0.4317, 0.4032, 0.6257],
-        [-0.1367, 0.6075, 0.5415, 0.4525, -0.0493, 0.6581, 0.6872, 0.5489, 1.0773, 0.5813, 0.1806, 0.8404],
+        [
+            -0.0667,
+            0.6228,
+            0.6892,
+            0.557,
+            0.0044,
+            0.7411,
+            0.7659,
+            0.5881,
+            1.1233,
+            0.4317,
+            0.4032,
+            0.6257,
+        ],
+        [
+            -0.1367,
+            0.6075,
+            0.5415,
+            0.4525,
+            -0.0493,
+            0.6581,
+            0.6872,
+            0.5489,
+            1.0773,
+            0.5813,
+            0.1806,
+            0.8404,
+        ],
     ),
     "barrett": (
         [-3.12917, -0.02668, 0.00548],
@@ -52,8 +81,10 @@ def pinch(name):
     normals, heights = (torch.tensor(v, **real) for v in CONTACTS[name])
     normals = normals / normals.norm(dim=-1, keepdim=True)
     points = RADIUS * normals + heights[:, None] * torch.tensor([0.0, 0.0, 1.0], **real)
-    one, three = torch.ones(1, **real), torch.ones(1, 3, **real)
-    hand, pose = load_hand(name), rigid(rotation_from_vector(vector), translation)
+    one = torch.ones(1, **real)
+    three = torch.ones(1, 3, **real)
+    hand = load_hand(name)
+    pose = rigid(rotation_from_vector(vector), translation)
     return hand, Grasps(
         joints=joints,
         pregrasp=opened,
@@ -87,7 +118,9 @@ def digest(result):
     """Every number of a trial but its wall time."""
     tensors = (getattr(result, f.name) for f in dataclasses.fields(result))
     data = b"".join(t.numpy().tobytes() for t in tensors if isinstance(t, torch.Tensor))
-    return hashlib.sha256(data + repr((result.status, result.object_motion, result.contact_order)).encode()).hexdigest()
+    return hashlib.sha256(
+        data + repr((result.status, result.object_motion, result.contact_order)).encode()
+    ).hexdigest()
 
 
 def digest_elsewhere(name, simulator, seed):

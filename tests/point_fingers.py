@@ -1,4 +1,6 @@
-"""Three point fingers that slide along x, y and z around a pinched block: what tests of the controllers start from."""
+"""Three point fingers that slide along x, y and z around a pinched block: what tests of the
+controllers start from.
+"""
 
 import dataclasses
 from collections.abc import Iterator
@@ -15,7 +17,8 @@ from torchgrasp.hand.load import load_hand
 from torchgrasp.values.closing import ClosingGains
 
 PERIOD = 0.01
-FREE, TOUCHING = torch.zeros(3, dtype=torch.bool), torch.ones(3, dtype=torch.bool)
+FREE = torch.zeros(3, dtype=torch.bool)
+TOUCHING = torch.ones(3, dtype=torch.bool)
 
 
 NORMALS = real([[1, 0, 0], [1, 0, 0], [-1, 0, 0]])
@@ -30,10 +33,14 @@ GAINS = ClosingGains(
 
 
 def reference(coupling: torch.Tensor | None = None) -> ClosingReference:
-    """Joint 3 i + k moves finger i along axis k; a shipped hand lends what the controllers do not read."""
+    """Joint 3 i + k moves finger i along axis k; a shipped hand lends what the controllers do not
+    read.
+    """
     coupling = torch.eye(9).double() if coupling is None else coupling
     h = coupling.shape[1]
-    ones, zero, names = torch.ones(h).double(), torch.zeros(h).double(), tuple(f"slide_{k}" for k in range(9))
+    ones = torch.ones(h).double()
+    zero = torch.zeros(h).double()
+    names = tuple(f"slide_{k}" for k in range(9))
     hand = load_hand("barrett")
     spheres = hand.collision_spheres
     hand = dataclasses.replace(
@@ -65,21 +72,35 @@ def on_table(**changes) -> ClosingReference:
 def close_on_block(
     controller: GraspController, seconds: float, off: float = 0.01, away: float = 0.0
 ) -> Iterator[tuple[Observation, Targets]]:
-    """Close on a stiff block `away` [m] along x of its place; the joints follow and slide the tips from `off` [m]."""
-    joints, palm, tactile, shift = torch.zeros(9).double(), torch.zeros(3).double(), no_contact(), real([away, 0, 0])
+    """Close on a stiff block `away` [m] along x of its place; the joints follow and slide the tips
+    from `off` [m].
+    """
+    joints = torch.zeros(9).double()
+    palm = torch.zeros(3).double()
+    tactile = no_contact()
+    shift = real([away, 0, 0])
     for _ in range(round(seconds / PERIOD)):
         points = TARGET + off * NORMALS + joints.reshape(3, 3)
-        push = 2e3 * -((points + palm - TARGET - shift) * NORMALS).sum(-1).clamp_max(0.0)  # of 2 kN/m
+        push = 2e3 * -((points + palm - TARGET - shift) * NORMALS).sum(-1).clamp_max(
+            0.0
+        )  # of 2 kN/m
         contact = TipContact(push, -push[:, None] * NORMALS, points, NORMALS)
         tactile = measure(tactile, contact, NORMALS, real([0.01] * 3), PERIOD)
-        seen = dataclasses.replace(observation(joints=joints), tips=points + 0.01 * NORMALS, tactile=tactile)
+        seen = dataclasses.replace(
+            observation(joints=joints), tips=points + 0.01 * NORMALS, tactile=tactile
+        )
         targets = controller.step(seen, PERIOD)
-        joints, palm = targets.joints, targets.palm
+        joints = targets.joints
+        palm = targets.palm
         yield seen, targets
 
 
-def observation(off: float = 0.02, reading=(0.0, 0.0, 0.0), contact=FREE, joints=None) -> Observation:
-    """Tips `off` metres away from their contacts along the normals; sensed contacts are the planned ones."""
+def observation(
+    off: float = 0.02, reading=(0.0, 0.0, 0.0), contact=FREE, joints=None
+) -> Observation:
+    """Tips `off` metres away from their contacts along the normals; sensed contacts are the planned
+    ones.
+    """
     touched = contact[:, None]
     tactile = dataclasses.replace(
         no_contact(),
@@ -90,4 +111,6 @@ def observation(off: float = 0.02, reading=(0.0, 0.0, 0.0), contact=FREE, joints
         normals=torch.where(touched, NORMALS, torch.nan),
     )
     joints = torch.zeros(9).double() if joints is None else joints
-    return Observation(joints, TARGET + (0.01 + off) * NORMALS, torch.eye(9).double().reshape(3, 3, 9), tactile)
+    return Observation(
+        joints, TARGET + (0.01 + off) * NORMALS, torch.eye(9).double().reshape(3, 3, 9), tactile
+    )

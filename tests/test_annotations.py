@@ -14,14 +14,20 @@ def test_each_call_of_a_nested_function_is_checked():
 
     def make(step):
         @checked
-        def add(x: 'Float[Tensor, "n"]', y: "Later" = None, *, z: 'Float[Tensor, "n"] | None' = None) -> Tensor:
+        def add(
+            x: 'Float[Tensor, "n"]', y: "Later" = None, *, z: 'Float[Tensor, "n"] | None' = None
+        ) -> Tensor:
             return x + step if step else 0
 
         return add
 
-    one, two, none = make(1), make(2), make(0)
+    one = make(1)
+    two = make(2)
+    none = make(0)
     for n in (2, 3):
-        assert one(torch.zeros(n)).sum() == n and two(torch.zeros(n), z=torch.ones(n)).sum() == 2 * n
+        assert (
+            one(torch.zeros(n)).sum() == n and two(torch.zeros(n), z=torch.ones(n)).sum() == 2 * n
+        )
     for call in (
         lambda: one(torch.zeros(2, 2)),
         lambda: two(torch.zeros(2), z=torch.zeros(3)),

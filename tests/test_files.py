@@ -11,7 +11,16 @@ import torch
 from safetensors.torch import save_file
 
 from torchgrasp import load_grasps
-from torchgrasp.files import LOCK, hold_file, hold_folder, load_tensors, read_bytes, save_tensors, sha256, write_file
+from torchgrasp.files import (
+    LOCK,
+    hold_file,
+    hold_folder,
+    load_tensors,
+    read_bytes,
+    save_tensors,
+    sha256,
+    write_file,
+)
 from torchgrasp.foundation.base import named_tensors
 from torchgrasp.foundation.errors import ModelFileError, OutputError
 from torchgrasp.foundation.limits import TENSOR_FILE_BYTES
@@ -21,7 +30,9 @@ from torchgrasp.values.planning import Certificate, Contacts, Grasps
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_a_file_is_read_as_far_as_it_says_it_is(tmp_path):
-    """The system's own files say that they are empty; /proc/kmsg is one, and a reader of it waits for ever."""
+    """The system's own files say that they are empty; /proc/kmsg is one, and a reader of it waits
+    for ever.
+    """
     (tmp_path / "a").write_bytes(b"12\n3")
     (tmp_path / "link").symlink_to("/proc/self/maps")
     assert read_bytes(tmp_path / "a") == b"12\n3"
@@ -42,7 +53,9 @@ def some_grasps(g: int = 2, h: int = 4, f: int = 3) -> Grasps:
         tip_error=rand(g, f),
         clearance=rand(g),
         normal_angle=rand(g, f),
-        certificate=Certificate(rand(g), rand(g), rand(g), torch.ones(g, dtype=torch.bool), rand(g, 6)),
+        certificate=Certificate(
+            rand(g), rand(g), rand(g), torch.ones(g, dtype=torch.bool), rand(g, 6)
+        ),
         score=rand(g),
         status=torch.zeros(g, dtype=torch.int64),
         meta={"hand": "toy", "unit": "metre"},
@@ -58,7 +71,8 @@ def test_grasps_survive_the_round_trip(tmp_path, fingertips, known):
     before.save(tmp_path / "deep" / "grasps.safetensors")
     after = load_grasps(tmp_path / "deep" / "grasps.safetensors")
     assert after.meta == before.meta
-    one, other = named_tensors(after), named_tensors(before)
+    one = named_tensors(after)
+    other = named_tensors(before)
     assert one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
     assert (after.contacts.variance is not None) == (after.contacts.std_m is not None) == known
 
@@ -72,8 +86,13 @@ def test_optional_tensors_may_be_absent_and_others_may_not(tmp_path):
 
 
 def test_grasps_of_other_numbers_of_fingertips_or_of_several_are_refused(tmp_path):
-    four, three = some_grasps(f=4), some_grasps(f=3)
-    for wrong in (some_grasps(f=2), some_grasps(f=6), dataclasses.replace(four, contacts=three.contacts)):
+    four = some_grasps(f=4)
+    three = some_grasps(f=3)
+    for wrong in (
+        some_grasps(f=2),
+        some_grasps(f=6),
+        dataclasses.replace(four, contacts=three.contacts),
+    ):
         save_tensors(tmp_path / "grasps", "grasps", named_tensors(wrong), {})
         with pytest.raises(ModelFileError, match=r"three to five|one size for each letter"):
             load_grasps(tmp_path / "grasps")
@@ -136,7 +155,11 @@ def test_a_file_may_be_written_by_a_function(tmp_path):
 
 
 def test_a_held_folder_or_file_loses_what_a_killed_run_left_half_written(tmp_path):
-    parts = [tmp_path / ".f.dead.part", tmp_path / ".g.dead.part", tmp_path / "deep" / ".h.dead.part"]
+    parts = [
+        tmp_path / ".f.dead.part",
+        tmp_path / ".g.dead.part",
+        tmp_path / "deep" / ".h.dead.part",
+    ]
     (tmp_path / "deep").mkdir()
     for path in parts:
         path.write_bytes(b"half")
@@ -156,7 +179,12 @@ def test_many_writers_of_one_file_leave_one_of_theirs_whole(tmp_path):
 def test_a_file_is_held_by_one_run_and_its_folder_left_as_it_was(tmp_path):
     path = tmp_path / "new" / "model.safetensors"
     with hold_file(path), hold_file(path.with_name("other")):
-        with pytest.raises(OutputError, match=r"path: expected .*got .*model\.safetensors, in use by"), hold_file(path):
+        with (
+            pytest.raises(
+                OutputError, match=r"path: expected .*got .*model\.safetensors, in use by"
+            ),
+            hold_file(path),
+        ):
             pytest.fail("held twice")
     assert os.listdir(tmp_path) == []
 
@@ -187,5 +215,8 @@ def test_a_folder_is_held_by_one_run_and_left_as_it_was(tmp_path):
     with hold_folder(tmp_path / "new"):
         assert sorted(os.listdir(tmp_path / "new")) == [LOCK, "result"]
     (tmp_path / "file").write_text("x")
-    with pytest.raises(OutputError, match="folder that can be written"), hold_folder(tmp_path / "file" / "x"):
+    with (
+        pytest.raises(OutputError, match="folder that can be written"),
+        hold_folder(tmp_path / "file" / "x"),
+    ):
         pytest.fail("no folder")

@@ -46,13 +46,19 @@ def die_once(path: str) -> str:
 @pytest.mark.promise("F4", "F5")
 def test_a_failure_costs_its_own_task_alone_and_the_order_stays():
     bad = {2: "KILL", 4: "hang", 5: "exit"}
-    found = list(run_tasks(act, [(bad.get(i, "square"), i) for i in range(12)], workers=2, limit=3.0))
-    expected = {i: Status.TIMED_OUT if what == "hang" else Status.WORKER_DIED for i, what in bad.items()}
+    found = list(
+        run_tasks(act, [(bad.get(i, "square"), i) for i in range(12)], workers=2, limit=3.0)
+    )
+    expected = {
+        i: Status.TIMED_OUT if what == "hang" else Status.WORKER_DIED for i, what in bad.items()
+    }
     assert found == [expected.get(i, i * i) for i in range(12)]
 
 
 @pytest.mark.promise("F4")
-def test_a_death_that_is_not_the_tasks_own_is_forgiven_and_the_task_goes_before_those_that_wait(tmp_path):
+def test_a_death_that_is_not_the_tasks_own_is_forgiven_and_the_task_goes_before_those_that_wait(
+    tmp_path,
+):
     tasks = [(str(tmp_path / "mark"),), *((str(tmp_path),) for _ in range(7))]
     found = list(run_as_they_end(die_once, tasks, 1, 60.0))
     numbers = [number for number, result in found if result == "survived"]
@@ -60,7 +66,9 @@ def test_a_death_that_is_not_the_tasks_own_is_forgiven_and_the_task_goes_before_
 
 
 def test_a_task_that_ends_early_waits_for_its_turn_as_an_error_does_and_workers_have_one_thread():
-    results = run_tasks(act, [("slow", 5), ("square", 3), ("threads",), ("raise", 5), ("square", 2)], workers=2)
+    results = run_tasks(
+        act, [("slow", 5), ("square", 3), ("threads",), ("raise", 5), ("square", 2)], workers=2
+    )
     assert [next(results) for _ in range(3)] == [25, 9, 1]
     with pytest.raises(BadArgument, match=r"value: expected .*got 5"):
         next(results)
@@ -84,7 +92,8 @@ class Heavy:
     """A task whose workers die while they begin, as many times as the folder has no mark."""
 
     def __init__(self, folder: str, deaths: int) -> None:
-        self.folder, self.deaths = folder, deaths
+        self.folder = folder
+        self.deaths = deaths
 
     def __call__(self, value: int) -> int:
         return value * value
@@ -104,7 +113,9 @@ def test_workers_that_die_before_they_take_a_task_are_replaced(tmp_path):
 
 
 @pytest.mark.promise("F4")
-def test_workers_that_always_die_before_they_take_a_task_are_one_error_however_many_the_tasks(tmp_path):
+def test_workers_that_always_die_before_they_take_a_task_are_one_error_however_many_the_tasks(
+    tmp_path,
+):
     with pytest.raises(NoWorkers, match=r"no worker process can start.*__main__"):
         list(run_tasks(Heavy(str(tmp_path), 1000), [(2,)] * 50, workers=1))
 
@@ -143,9 +154,18 @@ def test_a_packed_value_holds_no_tensor_and_unpacks_to_the_same_value_with_its_c
     assert sent["clouds"][0] is sent["clouds"][1]  # what is held twice is sent once
     packed = pickle.dumps(sent)
     assert b"torch.Tensor" not in packed and b"_rebuild_tensor" not in packed
-    found = unpack(pickle.loads(packed))  # noqa: S301 packed here
-    assert torch.equal(found["clouds"][1].points, cloud.points) and found["clouds"][0].normals is None
-    assert torch.equal(found["clouds"][0].cached, torch.arange(3)) and type(found["clouds"][0]) is PointCloud
+    found = unpack(pickle.loads(packed))  # noqa: S301
+    assert (
+        torch.equal(found["clouds"][1].points, cloud.points) and found["clouds"][0].normals is None
+    )
+    assert (
+        torch.equal(found["clouds"][0].cached, torch.arange(3))
+        and type(found["clouds"][0]) is PointCloud
+    )
     assert found["batch"] == BatchSize(4, 2) and isinstance(found["batch"], BatchSize)
-    assert found["pair"][0].shape == () and float(found["pair"][0]) == 2.5 and found["pair"][1] == "text"
+    assert (
+        found["pair"][0].shape == ()
+        and float(found["pair"][0]) == 2.5
+        and found["pair"][1] == "text"
+    )
     assert found["class"] is PointCloud

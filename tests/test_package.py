@@ -15,12 +15,24 @@ from tests.make import run_python
 
 ROOT = Path(__file__).parents[1]
 SOURCES = sorted((ROOT / "torchgrasp").rglob("*.py"))
-PACKAGES = [found.name for found in pkgutil.walk_packages(torchgrasp.__path__, "torchgrasp.") if found.ispkg]
+PACKAGES = [
+    found.name for found in pkgutil.walk_packages(torchgrasp.__path__, "torchgrasp.") if found.ispkg
+]
 
 
 SIMULATORS = {"sapien", "mujoco", "coacd", "pebble"}
 DRAWERS = {"pyvista", "vtk", "vtkmodules", "matplotlib", "PIL"}
-SLOW = {"scipy", "trimesh", "yourdfpy", "pytorch_kinematics", "networkx", "lxml", "skimage", "sklearn", "embreex"}
+SLOW = {
+    "scipy",
+    "trimesh",
+    "yourdfpy",
+    "pytorch_kinematics",
+    "networkx",
+    "lxml",
+    "skimage",
+    "sklearn",
+    "embreex",
+}
 OF_URDF = SLOW - {"skimage", "sklearn"} | {"matplotlib", "PIL", "mujoco"}
 """What yourdfpy and pytorch-kinematics import."""
 
@@ -30,8 +42,14 @@ OF_URDF = SLOW - {"skimage", "sklearn"} | {"matplotlib", "PIL", "mujoco"}
     ("code", "needed"),
     [
         ("import torchgrasp", set()),
-        ("import torchgrasp; [torchgrasp.load_hand(name) for name in ('allegro', 'barrett', 'shadow')]", OF_URDF),
-        ("import torchgrasp.app.cli as cli\ntry: cli.main(['--help'])\nexcept SystemExit: pass", set()),
+        (
+            "import torchgrasp; [torchgrasp.load_hand(name) for name in ('allegro', 'barrett', 'shadow')]",
+            OF_URDF,
+        ),
+        (
+            "import torchgrasp.app.cli as cli\ntry: cli.main(['--help'])\nexcept SystemExit: pass",
+            set(),
+        ),
     ],
     ids=["import", "load_hand", "help"],
 )
@@ -80,7 +98,11 @@ def test_source_has_no_neural_network_pickle_or_global_random_state(path):
 
 def public_names():
     packages = [torchgrasp, *map(importlib.import_module, PACKAGES)]
-    return {f"{p.__name__}.{name}": getattr(p, name) for p in packages for name in getattr(p, "__all__", ())}
+    return {
+        f"{p.__name__}.{name}": getattr(p, name)
+        for p in packages
+        for name in getattr(p, "__all__", ())
+    }
 
 
 def types_of(annotation):
@@ -96,7 +118,11 @@ def hints(function):
     try:
         found = typing.get_type_hints(function)
     except NameError:  # a type that is imported for type checkers alone, such as trimesh.Trimesh
-        found = {k: x for k, x in getattr(function, "__annotations__", {}).items() if not isinstance(x, str)}
+        found = {
+            k: x
+            for k, x in getattr(function, "__annotations__", {}).items()
+            if not isinstance(x, str)
+        }
     return [hint for name, hint in found.items() if name != "return"]
 
 
@@ -108,9 +134,17 @@ def test_what_public_functions_take_is_public():
     for name, thing in names.items():
         parts = [thing] if inspect.isfunction(thing) else []
         if isinstance(thing, type):
-            parts = [m for key, m in vars(thing).items() if not key.startswith("_") and inspect.isfunction(m)]
+            parts = [
+                m
+                for key, m in vars(thing).items()
+                if not key.startswith("_") and inspect.isfunction(m)
+            ]
         for kind in (kind for part in parts for hint in hints(part) for kind in types_of(hint)):
-            if id(kind) not in public and not kind.__name__.startswith("_") and not kind.__module__.startswith(apart):
+            if (
+                id(kind) not in public
+                and not kind.__name__.startswith("_")
+                and not kind.__module__.startswith(apart)
+            ):
                 hidden.add(f"{kind.__module__}.{kind.__qualname__} in {name}")
     assert hidden == set()
 
@@ -153,5 +187,9 @@ def test_every_id_is_promised_or_has_its_reason():
     most = {"I": 13, "H": 6, "F": 9, "L": 7, "N": 16}
     known = {f"{letter}{k}" for letter in most for k in range(1, most[letter] + 1)}
     reasons = re.findall(r"^\| ([A-Z])(\d+)(?: to [A-Z](\d+))? \|", NOT_PROMISED, re.MULTILINE)
-    told = {f"{letter}{k}" for letter, first, last in reasons for k in range(int(first), int(last or first) + 1)}
+    told = {
+        f"{letter}{k}"
+        for letter, first, last in reasons
+        for k in range(int(first), int(last or first) + 1)
+    }
     assert PROMISED | told == known and not PROMISED & told

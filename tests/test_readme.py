@@ -22,7 +22,9 @@ def fenced(language, text=README):
     return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
 
 
-@pytest.mark.parametrize("code", [code for text in (README, *GUIDES) for code in fenced("python", text)])
+@pytest.mark.parametrize(
+    "code", [code for text in (README, *GUIDES) for code in fenced("python", text)]
+)
 def test_python_of_the_readme_and_the_guides_runs(code, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     exec(compile(code, "README.md", "exec"), {})
@@ -35,7 +37,9 @@ def test_the_guide_to_hands_runs_as_it_stands(tmp_path, monkeypatch, capsys):
     from torchgrasp.app import cli
 
     def in_shell(line):
-        done = subprocess.run(["bash", "-euo", "pipefail", "-c", line], capture_output=True, text=True)
+        done = subprocess.run(
+            ["bash", "-euo", "pipefail", "-c", line], capture_output=True, text=True
+        )
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout.strip()
 
@@ -44,10 +48,15 @@ def test_the_guide_to_hands_runs_as_it_stands(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}:{os.environ['PATH']}")
     monkeypatch.setattr("torchgrasp.app.cli.hands.TRIAL_STARTS", 12)
-    guide = "".join(fenced("bash", (ROOT / "docs" / "hands.md").read_text())).replace("--starts 200", "--starts 60")
+    guide = "".join(fenced("bash", (ROOT / "docs" / "hands.md").read_text())).replace(
+        "--starts 200", "--starts 60"
+    )
     for line in guide.splitlines():
         if line.startswith("torchgrasp "):
-            assert cli.main(shlex.split(os.path.expandvars(line))[1:]) == 0, (line, capsys.readouterr())
+            assert cli.main(shlex.split(os.path.expandvars(line))[1:]) == 0, (
+                line,
+                capsys.readouterr(),
+            )
         elif assigned := re.fullmatch(r"(\w+)=(.*)", line):
             monkeypatch.setenv(assigned[1], in_shell(f"echo {assigned[2]}"))
         else:
@@ -56,7 +65,11 @@ def test_the_guide_to_hands_runs_as_it_stands(tmp_path, monkeypatch, capsys):
     assert said.count("the hand can grasp") == 2 and "The leap hand held the cylinder" in said
     assert "wrong:" not in said and "warning:" not in said
     grasps = json.loads((tmp_path / "grasps.json").read_text())["grasps"]
-    assert grasps and {contact["finger"] for contact in grasps[0]["contacts"]} == {"index", "ring", "thumb"}
+    assert grasps and {contact["finger"] for contact in grasps[0]["contacts"]} == {
+        "index",
+        "ring",
+        "thumb",
+    }
 
 
 def test_the_guide_to_a_real_camera_runs_as_it_stands(tmp_path, monkeypatch, capsys):
@@ -64,17 +77,28 @@ def test_the_guide_to_a_real_camera_runs_as_it_stands(tmp_path, monkeypatch, cap
     from torchgrasp import read_scene
     from torchgrasp.app import cli
 
-    guide, found = (ROOT / "docs" / "real_camera.md").read_text(), []
+    guide = (ROOT / "docs" / "real_camera.md").read_text()
+    found = []
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(cli.grasp.Grasp, "_grasp_scene", lambda self, path, *_: found.append(read_scene(path)) or 0)
+    monkeypatch.setattr(
+        cli.grasp.Grasp, "_grasp_scene", lambda self, path, *_: found.append(read_scene(path)) or 0
+    )
     exec(compile(fenced("python", guide)[0], "real_camera.md", "exec"), {})
     for line in "".join(fenced("bash", guide)).splitlines():
         assert cli.main(shlex.split(line)[1:]) == 0, (line, capsys.readouterr())
     assert [len(scene.things) for scene in found] == [3, 3, 3] and found[-1].target is not None
-    assert {path.stem for path in tmp_path.glob("*.png")} == {"scene", "masked", "quiet", "up", "known"}
+    assert {path.stem for path in tmp_path.glob("*.png")} == {
+        "scene",
+        "masked",
+        "quiet",
+        "up",
+        "known",
+    }
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "examples").glob("*.py")), ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "examples").glob("*.py")), ids=lambda path: path.stem
+)
 def test_example_runs(path, capsys):
     runpy.run_path(str(path), run_name="__main__")
     assert capsys.readouterr().out
@@ -87,7 +111,9 @@ def test_every_example_is_short_and_numbered():
     assert max(len(path.read_text().splitlines()) for path in paths) <= 60
 
 
-@pytest.mark.parametrize("line", [line for block in fenced("bash") for line in block.splitlines() if line.strip()])
+@pytest.mark.parametrize(
+    "line", [line for block in fenced("bash") for line in block.splitlines() if line.strip()]
+)
 def test_commands_of_the_readme_exist_and_take_their_flags(line, capsys):
     from torchgrasp.app.cli import COMMANDS, main
 

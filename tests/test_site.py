@@ -1,4 +1,6 @@
-"""The documentation as a site: it builds without a warning, and every public name of a listed package is in it."""
+"""The documentation as a site: it builds without a warning, and every public name of a listed
+package is in it.
+"""
 
 import importlib
 import re
@@ -25,13 +27,21 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_every_public_name_has_its_entry(site: Path):
     pages = sorted((site / "api").glob("*.html"))
-    entries = {last for page in pages for last in re.findall(r'id="torchgrasp[\w.]*\.(\w+)"', page.read_text())}
+    entries = {
+        last
+        for page in pages
+        for last in re.findall(r'id="torchgrasp[\w.]*\.(\w+)"', page.read_text())
+    }
     for page in pages:
         package = importlib.import_module(
-            "torchgrasp" if page.stem == "torchgrasp" else f"torchgrasp.{APART.get(page.stem, page.stem)}"
+            "torchgrasp"
+            if page.stem == "torchgrasp"
+            else f"torchgrasp.{APART.get(page.stem, page.stem)}"
         )
         # constants and aliases of types have no docstring that Python keeps
-        named = {name for name in package.__all__ if getattr(getattr(package, name), "__doc__", None)}
+        named = {
+            name for name in package.__all__ if getattr(getattr(package, name), "__doc__", None)
+        }
         assert named <= entries, (page.stem, named - entries)
 
 
@@ -42,4 +52,6 @@ def test_examples_of_docstrings_are_code_and_no_quotes(site: Path):
 
 def test_nothing_is_fetched_from_elsewhere(site: Path):
     for page in site.rglob("*.html"):
-        assert not re.search(r'<(script|img|link rel="stylesheet")[^>]*(src|href)="https?://', page.read_text()), page
+        assert not re.search(
+            r'<(script|img|link rel="stylesheet")[^>]*(src|href)="https?://', page.read_text()
+        ), page

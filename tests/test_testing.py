@@ -1,4 +1,6 @@
-"""The public laws: shipped hands, kernels and simulators obey them, broken ones are told which they break."""
+"""The public laws: shipped hands, kernels and simulators obey them, broken ones are told which they
+break.
+"""
 
 from pathlib import Path
 
@@ -18,7 +20,8 @@ from torchgrasp.testing import check_hand
 
 @pytest.mark.promise("N13")
 @pytest.mark.parametrize(
-    ("name", "fingers"), [("allegro", "default"), ("allegro", "paper_literal"), ("barrett", "default")]
+    ("name", "fingers"),
+    [("allegro", "default"), ("allegro", "paper_literal"), ("barrett", "default")],
 )
 def test_shipped_hands_obey_the_law(name, fingers):
     assert check_hand(name, fingers).name == name
@@ -43,9 +46,27 @@ def copy_of(name: str, tmp_path: Path, file: str, old: str, new: str) -> Path:
         ("allegro", "hand.urdf", 'effort="0.7"', 'effort="0"', "effort"),
         ("allegro", "hand.toml", "joint_9 = -0.196", "joint_9 = -1.0", "joint_9"),
         ("barrett", "hand.toml", "ratio = 0.3333333333333333", "ratio = 0.3443", "coupling"),
-        ("allegro", "hand.toml", "[0.01039230485, 0, 0.006]", "[-0.01039230485, 0, -0.006]", "center"),
-        ("barrett", "hand.toml", '["f3_flex", "f3_distal"]', '["f3_distal", "f3_flex"]', "in order"),
-        ("leap", "hand.toml", '"10" = -0.2', '"10" = -0.5', r"meet in all .* as ring_\w+ and ring_"),
+        (
+            "allegro",
+            "hand.toml",
+            "[0.01039230485, 0, 0.006]",
+            "[-0.01039230485, 0, -0.006]",
+            "center",
+        ),
+        (
+            "barrett",
+            "hand.toml",
+            '["f3_flex", "f3_distal"]',
+            '["f3_distal", "f3_flex"]',
+            "in order",
+        ),
+        (
+            "leap",
+            "hand.toml",
+            '"10" = -0.2',
+            '"10" = -0.5',
+            r"meet in all .* as ring_\w+ and ring_",
+        ),
     ],
 )
 def test_broken_hands_are_told_why(tmp_path, name, file, old, new, match):
@@ -54,15 +75,20 @@ def test_broken_hands_are_told_why(tmp_path, name, file, old, new, match):
 
 
 @pytest.mark.parametrize(
-    ("shape", "depth"), [('<box size="0.04 0.02 0.02"/>', 0.02), ('<cylinder radius="0.01" length="0.04"/>', 0.02)]
+    ("shape", "depth"),
+    [('<box size="0.04 0.02 0.02"/>', 0.02), ('<cylinder radius="0.01" length="0.04"/>', 0.02)],
 )
 def test_a_contact_inside_its_tip_is_told(tmp_path, shape, depth):
     """A tip 40 mm long, turned by 90 degrees so that it reaches along z; its end is the pad."""
     turn = "0 1.5707963267948966 0" if "box" in shape else "0 0 0"
     text = (hands_folder() / "allegro" / "hand.urdf").read_text()
     start = text.index("<collision>", text.index('<link name="index_tip">'))
-    collision = f'<collision><origin xyz="0 0 0" rpy="{turn}"/><geometry>{shape}</geometry></collision>'
-    (tmp_path / "hand.urdf").write_text(text[:start] + collision + text[text.index("</link>", start) :])
+    collision = (
+        f'<collision><origin xyz="0 0 0" rpy="{turn}"/><geometry>{shape}</geometry></collision>'
+    )
+    (tmp_path / "hand.urdf").write_text(
+        text[:start] + collision + text[text.index("</link>", start) :]
+    )
     toml = (hands_folder() / "allegro" / "hand.toml").read_text()
     pad = 'contact = [0.01039230485, 0, 0.006]\nnormal = [0.8660254037844387, 0.0, 0.5]\ntip = "sphere"\n'
     pad += "center = [0, 0, 0]\nradius = 0.012"
@@ -109,7 +135,9 @@ BROKEN = {
     "variance": Kernel(lambda r: -torch.exp(-r * r)),
     "variance of normals": Kernel(torch.ones_like),
     "smooth": Kernel(lambda r: torch.exp(-r)),
-    "derivatives of another": Kernel(rbf_kernel(1.0).profile, closed_form=matern52_kernel(1.0).derivatives),
+    "derivatives of another": Kernel(
+        rbf_kernel(1.0).profile, closed_form=matern52_kernel(1.0).derivatives
+    ),
     "derivatives that end at a kink": Kernel(lambda r: torch.clamp(1 - r * r, min=0.0) ** 2),
     "covariance": Kernel(torch.cos),
     "covariance beyond the ball": Kernel(PLATE.profile, closed_form=PLATE.closed_form),
@@ -134,7 +162,11 @@ def test_a_kernel_is_told_which_law_it_breaks(name):
         ("jacobian", lambda scene, x: 2 * x, "kinematics"),
         ("penetration", lambda scene, x: 0.0, "overlap"),
         ("object_pose", lambda scene, x: x + 0.01, "rest"),
-        ("hand_pose", lambda scene, x: x + 0.001 * scene.data.time * (scene.data.time > 0.5), "lift"),
+        (
+            "hand_pose",
+            lambda scene, x: x + 0.001 * scene.data.time * (scene.data.time > 0.5),
+            "lift",
+        ),
         ("object_pose", lambda scene, x: x + 1e-9 * np.random.default_rng().random(), "repeat"),
     ],
 )

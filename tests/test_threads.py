@@ -29,13 +29,17 @@ def test_a_fit_uses_one_thread_and_restores_the_threads():
 
 def test_a_plan_uses_one_thread_in_what_its_observer_sees():
     seen = set()
-    view, hand = torchgrasp.load_object("cylinder").view, torchgrasp.load_hand("barrett")
-    torchgrasp.plan_grasps(view, hand, starts=20, observer=lambda *_: seen.add(torch.get_num_threads()))
+    view = torchgrasp.load_object("cylinder").view
+    hand = torchgrasp.load_hand("barrett")
+    torchgrasp.plan_grasps(
+        view, hand, starts=20, observer=lambda *_: seen.add(torch.get_num_threads())
+    )
     assert seen == {1} and torch.get_num_threads() == 2
 
 
 def test_threads_are_restored_by_a_stream_between_its_items_and_when_it_is_abandoned():
-    view, hand = torchgrasp.load_object("cylinder").view, torchgrasp.load_hand("barrett")
+    view = torchgrasp.load_object("cylinder").view
+    hand = torchgrasp.load_hand("barrett")
     stream = torchgrasp.stream_grasps(view, hand, starts=20)
     assert len(next(stream)) and torch.get_num_threads() == 2
     del stream

@@ -24,7 +24,9 @@ from torchgrasp.values.specs import ContactSpec, TrialSpec
 
 def plan(status: list[int]) -> ContactPlan:
     b = len(status)
-    contacts = Contacts(torch.rand(b, 3, 3), torch.rand(b, 3, 3), torch.rand(b, 3), torch.rand(b, 3))
+    contacts = Contacts(
+        torch.rand(b, 3, 3), torch.rand(b, 3, 3), torch.rand(b, 3), torch.rand(b, 3)
+    )
     return ContactPlan(contacts, torch.rand(b, 3, 8), torch.arange(b) * 1.0, torch.tensor(status))
 
 
@@ -35,14 +37,19 @@ def test_statuses_are_sentences_with_distinct_codes():
 
 def test_raise_for_status_counts_the_failures():
     assert plan([0, 0]).raise_for_status() is not None
-    with pytest.raises(FailedRows, match=f"2 of 3 rows: {Status.TOO_CLOSE.sentence}".replace("(", r"\(")):
+    with pytest.raises(
+        FailedRows, match=f"2 of 3 rows: {Status.TOO_CLOSE.sentence}".replace("(", r"\(")
+    ):
         plan([0, 14, 14]).raise_for_status()
 
 
 def test_contacts_of_two_precisions_are_refused():
-    single, double = torch.rand(2, 3, 3), torch.rand(2, 3, 3, dtype=torch.float64)
+    single = torch.rand(2, 3, 3)
+    double = torch.rand(2, 3, 3, dtype=torch.float64)
     for wrong in ((single, double), (double, single), (double, double, None, single[..., 0])):
-        with pytest.raises(BadArgument, match=r"contacts: expected .*got torch\.float32 beside torch\.float64"):
+        with pytest.raises(
+            BadArgument, match=r"contacts: expected .*got torch\.float32 beside torch\.float64"
+        ):
             Contacts(*wrong)
 
 
@@ -83,7 +90,9 @@ def test_contacts_of_unknown_variance_are_batches_like_others():
     assert len(both) == 4 and both.variance is None
     mixed = pick(torch.tensor([True, False, True]), contacts, contacts[[1, 1, 1]])
     assert torch.equal(mixed.points, contacts.points[[0, 1, 2]]) and mixed.std_m is None
-    assert torch.equal(put(contacts, torch.tensor([2]), contacts[0]).points, contacts.points[[0, 1, 0]])
+    assert torch.equal(
+        put(contacts, torch.tensor([2]), contacts[0]).points, contacts.points[[0, 1, 0]]
+    )
     with pytest.raises(BadArgument, match=r"std_m: expected .*got None"):
         contacts.require_std()
 
@@ -108,7 +117,10 @@ def test_iteration_yields_batches_of_one_and_ends():
 def test_to_returns_a_new_value_and_keeps_integers():
     before = plan([0])
     after = before.to(torch.float64)
-    assert after.contacts.points.dtype == torch.float64 and before.contacts.points.dtype == torch.float32
+    assert (
+        after.contacts.points.dtype == torch.float64
+        and before.contacts.points.dtype == torch.float32
+    )
     assert after.status.dtype == torch.int64
     certificate = Certificate(*torch.rand(3, 2), torch.tensor([True, False]), torch.rand(2, 6))
     assert certificate.to(torch.float64).closed.dtype == torch.bool
@@ -141,7 +153,11 @@ def test_the_first_bad_index_is_named():
 def test_fingertips_come_from_the_hand_unless_they_are_given():
     spec = ContactSpec()
     assert (spec.fingertip_radius, spec.least_separation) == (0.012, 0.026)
-    assert spec.for_fingertips(0.012) == spec.for_fingertips(0.0) == dataclasses.replace(spec, tip_radius=0.012)
+    assert (
+        spec.for_fingertips(0.012)
+        == spec.for_fingertips(0.0)
+        == dataclasses.replace(spec, tip_radius=0.012)
+    )
     wide = spec.for_fingertips(0.02)
     assert wide.fingertip_radius == 0.02 and wide.least_separation == pytest.approx(0.042)
     given = ContactSpec(tip_radius=0.005, separation=0.01)
@@ -153,7 +169,12 @@ def test_fingertips_come_from_the_hand_unless_they_are_given():
 def test_paper_spec_has_no_margins():
     spec = ContactSpec.paper()
     assert spec.planned_friction == spec.friction == 0.8
-    assert spec.max_variance == 0.03 and spec.separation == 0 and spec.flatness is None and spec.table is None
+    assert (
+        spec.max_variance == 0.03
+        and spec.separation == 0
+        and spec.flatness is None
+        and spec.table is None
+    )
     assert TrialSpec(kp=None).kp is None
 
 
@@ -177,7 +198,9 @@ def test_few_numbers_are_shown_themselves():
 
 def test_a_value_of_too_many_fields_is_cut():
     names = [f"a_field_of_a_long_name_{k}" for k in range(60)]
-    Wide = dataclasses.make_dataclass("Wide", [(name, torch.Tensor) for name in names], bases=(Value,), frozen=True)
+    Wide = dataclasses.make_dataclass(
+        "Wide", [(name, torch.Tensor) for name in names], bases=(Value,), frozen=True
+    )
     text = repr(Wide(*(torch.zeros(9) for _ in names)))
     assert len(text.splitlines()) == 12 and text.endswith("...)")
 
@@ -195,7 +218,11 @@ VALUES = {
 @pytest.mark.parametrize("name", VALUES)
 def test_copies_and_pickled_values_are_equal_and_have_one_hash(name):
     value = VALUES[name]()
-    for again in (copy.deepcopy(value), pickle.loads(pickle.dumps(value)), dataclasses.replace(value)):  # noqa: S301
+    for again in (
+        copy.deepcopy(value),
+        pickle.loads(pickle.dumps(value)),  # noqa: S301
+        dataclasses.replace(value),
+    ):
         assert again == value and hash(again) == hash(value) and {value: 1}[again] == 1
     assert value != name and value is not again
 
@@ -211,7 +238,8 @@ def test_values_differ_by_one_number_a_dtype_or_a_text_and_missing_numbers_are_e
     assert grasp != dataclasses.replace(grasp, meta=grasp.meta | {"seed": "another"})
     assert len({grasp, grasp[[0]], grasp[[0, 0]]}) == 2
     Odds = dataclasses.make_dataclass("Odds", [("share", float)], bases=(Value,), frozen=True)
-    unknown, other = Odds(float("nan")), Odds(float("nan"))
+    unknown = Odds(float("nan"))
+    other = Odds(float("nan"))
     assert unknown == other != Odds(0.5) and hash(unknown) == hash(other)
 
 
@@ -231,7 +259,9 @@ def test_what_is_no_value_of_numbers_is_equal_to_itself_alone():
 def test_the_best_grasp_is_the_first_executable_one_or_the_reasons():
     grasp = pinch("allegro")[1]
     three = dataclasses.replace(
-        grasp[[0, 0, 0]], status=torch.tensor([13, 0, 0]), score=torch.tensor([9.0, 2.0, 1.0]).double()
+        grasp[[0, 0, 0]],
+        status=torch.tensor([13, 0, 0]),
+        score=torch.tensor([9.0, 2.0, 1.0]).double(),
     )
     assert three.best == three[1] and float(three.best.score) == 2.0
     with pytest.raises(FailedRows, match=Status.NOT_CLOSED.sentence[:30]):
@@ -244,7 +274,9 @@ def test_the_best_grasp_is_the_first_executable_one_or_the_reasons():
 
 def test_the_text_of_grasps_begins_with_what_a_user_asks_first():
     grasps = load_shipped_grasp("jug", "barrett")[[0, 0]]
-    assert repr(grasps).startswith("Grasps(2 of 2 executable, best predicted success 94%, hand barrett, joints=")
+    assert repr(grasps).startswith(
+        "Grasps(2 of 2 executable, best predicted success 94%, hand barrett, joints="
+    )
     assert repr(grasps[:0]).startswith("Grasps(0 of 0 executable, hand barrett, ")
 
 
@@ -254,5 +286,7 @@ def test_the_joints_of_a_hand_are_all_joints_of_its_urdf_and_the_finger_that_res
     hand = hand_of(grasp)
     robot = yourdfpy.URDF.load(hand.urdf_path, load_meshes=False, build_scene_graph=False)
     joints = hand.expand(grasp.joints[0])
-    assert len(joints) == 16 and set(joints) == set(robot.actuated_joint_names) > set(hand.joint_names)
+    assert len(joints) == 16 and set(joints) == set(robot.actuated_joint_names) > set(
+        hand.joint_names
+    )
     assert [float(joints[name]) for name in hand.joint_names] == grasp.joints[0].tolist()

@@ -1,6 +1,7 @@
 """Dexterous grasps from a partial point cloud, robust to the uncertainty of the unseen surface.
 
-The names below are the core of the library, in the order of the data flow. Each subpackage has more public names.
+The names below are the core of the library, in the order of the data flow. Each subpackage has more
+public names.
 """
 
 from torchgrasp.foundation.errors import GraspError, Status
@@ -47,15 +48,56 @@ from torchgrasp.evaluation.lift import close_hand
 __version__ = "0.1.0"
 
 __all__ = [
-    "plan_grasps", "GraspError", "Status", "Plane", "ContactSpec", "SensorModel", "TrialSpec",
-    "Certificate", "ClosureResult", "ContactCode", "ContactPlan", "Contacts", "Grasps", "PointCloud", "ShapeEstimate",
-    "load_grasps", "cloud_from_array", "cloud_from_depth", "merge_clouds", "read_cloud", "Scene", "read_scene",
-    "save_scene", "list_objects", "load_object", "load_scene", "ShapeGP", "fit_shape",
-    "Region", "certify", "closure_probability", "plan_contacts", "Hand", "load_hand",
-    "GraspMixture", "encode", "fit_mixture", "load_mixture", "sample_configurations",
-    "solve_ik", "GraspTask", "explain_success", "stream_grasps", "explain_empty", "plan_scene",
-    "ClosingReference", "GraspController", "closing_gains", "close_hand",
-]  # fmt: skip
+    "plan_grasps",
+    "GraspError",
+    "Status",
+    "Plane",
+    "ContactSpec",
+    "SensorModel",
+    "TrialSpec",
+    "Certificate",
+    "ClosureResult",
+    "ContactCode",
+    "ContactPlan",
+    "Contacts",
+    "Grasps",
+    "PointCloud",
+    "ShapeEstimate",
+    "load_grasps",
+    "cloud_from_array",
+    "cloud_from_depth",
+    "merge_clouds",
+    "read_cloud",
+    "Scene",
+    "read_scene",
+    "save_scene",
+    "list_objects",
+    "load_object",
+    "load_scene",
+    "ShapeGP",
+    "fit_shape",
+    "Region",
+    "certify",
+    "closure_probability",
+    "plan_contacts",
+    "Hand",
+    "load_hand",
+    "GraspMixture",
+    "encode",
+    "fit_mixture",
+    "load_mixture",
+    "sample_configurations",
+    "solve_ik",
+    "GraspTask",
+    "explain_success",
+    "stream_grasps",
+    "explain_empty",
+    "plan_scene",
+    "ClosingReference",
+    "GraspController",
+    "closing_gains",
+    "close_hand",
+]
 
 
 def __dir__() -> list[str]:

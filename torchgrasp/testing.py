@@ -1,4 +1,6 @@
-"""Checks of a user's own hand: rules for its files, and laws of its kinematics, on which planning relies."""
+"""Checks of a user's own hand: rules for its files, and laws of its kinematics, on which planning
+relies.
+"""
 
 import io
 from collections.abc import Iterator
@@ -28,15 +30,15 @@ FK_TOLERANCE = 1e-8  # largest difference [m, and entries of rotations] from the
 def check_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
     """Check a hand, shipped or in a folder, with a choice of grasping fingers, and return it.
 
-    The rules for the files concern coupling, limits, drives, masses, pads, parked joints and self-collision. The
-    kinematics of the loaded hand must obey these laws, which errors name:
+    The rules for the files concern coupling, limits, drives, masses, pads, parked joints and
+    self-collision. The kinematics of the loaded hand must obey these laws, which errors name:
 
     * `kinematics`: the poses of all links are those of yourdfpy.
     * `jacobian`: the Jacobian of the fingertips equals central differences.
     * `batch`: the rows of a batch equal single postures, and an empty batch is empty.
 
-    Raises `BrokenLaw` for the first law that the kinematics break, `HandFileError` for a file that breaks a rule, and
-    `BadArgument` if the hand has no such fingers.
+    Raises `BrokenLaw` for the first law that the kinematics break, `HandFileError` for a file that
+    breaks a rule, and `BadArgument` if the hand has no such fingers.
 
     >>> check_hand("barrett").name
     'barrett'
@@ -48,36 +50,56 @@ def check_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
     if not bool((hand.self_clearance(joints) > 0).any()):
         met = " and ".join(most_met(hand, joints))
         found = f"{find_hand(name_or_path)}: links that meet in all of {FK_POSTURES} random postures, as {met}"
-        raise HandFileError("hand.toml", found, "parked joints, shapes or pairs of self_collision by which they part")
+        raise HandFileError(
+            "hand.toml",
+            found,
+            "parked joints, shapes or pairs of self_collision by which they part",
+        )
     worst, link = largest_fk_error(hand, joints)
     if not worst < FK_TOLERANCE:
-        raise BrokenLaw("kinematics", f"link {link} of {hand.name} off by {worst:.3g}", "the pose of yourdfpy")
+        raise BrokenLaw(
+            "kinematics", f"link {link} of {hand.name} off by {worst:.3g}", "the pose of yourdfpy"
+        )
     _check_jacobian(hand, joints)
     return hand
 
 
 def _check_jacobian(hand: Hand, joints: Float[Tensor, "n h"]) -> None:
-    """Raise `BrokenLaw` if the Jacobian differs from central differences, or a row of a batch from a single posture."""
+    """Raise `BrokenLaw` if the Jacobian differs from central differences, or a row of a batch from
+    a single posture.
+    """
     # Step [rad] of central differences, and their largest difference [m/rad] from the Jacobian
-    step, allowed = 1e-6, 1e-6
+    step = 1e-6
+    allowed = 1e-6
     steps = step * torch.eye(hand.dof, dtype=torch.float64, device="cpu")
     after, before = (hand.fingertips(joints[:, None] + sign * steps)[0] for sign in (1, -1))
-    error = ((after - before) / (2 * step) - hand.jacobian(joints).movedim(-1, 1)).abs().amax((0, 2, 3))
+    error = (
+        ((after - before) / (2 * step) - hand.jacobian(joints).movedim(-1, 1)).abs().amax((0, 2, 3))
+    )
     if not float(error.max()) < allowed:
-        found = f"the column of {hand.joint_names[int(error.argmax())]} off by {float(error.max()):.3g}"
+        found = (
+            f"the column of {hand.joint_names[int(error.argmax())]} off by {float(error.max()):.3g}"
+        )
         raise BrokenLaw("jacobian", found, "that of central differences")
     points, _ = hand.fingertips(joints)
     for row in (0, len(joints) - 1):
-        if not torch.allclose(hand.fingertips(joints[row])[0], points[row], rtol=0, atol=FK_TOLERANCE):
-            raise BrokenLaw("batch", f"row {row} of {len(joints)} elsewhere than alone", "the same fingertips")
+        if not torch.allclose(
+            hand.fingertips(joints[row])[0], points[row], rtol=0, atol=FK_TOLERANCE
+        ):
+            raise BrokenLaw(
+                "batch", f"row {row} of {len(joints)} elsewhere than alone", "the same fingertips"
+            )
     if hand.fingertips(joints[:0])[0].shape != (0, *points.shape[1:]):
         raise BrokenLaw("batch", "fingertips of no postures", "an empty batch")
 
 
 def find_faults(name_or_path: str | Path, fingers: Fingers = "default") -> Iterator[HandFileError]:
-    """Yield an error for each rule that a hand's files break; raise the error of `load_hand` if it cannot load them."""
+    """Yield an error for each rule that a hand's files break; raise the error of `load_hand` if it
+    cannot load them.
+    """
     spec = read_hand_toml(find_hand(name_or_path) / "hand.toml", fingers)
-    urdf, hand = read_urdf(spec.urdf), load_hand(name_or_path, fingers)
+    urdf = read_urdf(spec.urdf)
+    hand = load_hand(name_or_path, fingers)
     yield from _wrong_bodies(urdf)
     yield from _wrong_joints(urdf, spec, hand)
     yield from _wrong_pads(urdf, spec)
@@ -85,13 +107,21 @@ def find_faults(name_or_path: str | Path, fingers: Fingers = "default") -> Itera
 
 def random_joints(hand: Hand, n: int, seed: int = 0) -> Float[Tensor, "n h"]:
     """Return n random postures, uniform within the joint limits [rad]."""
-    share = torch.rand(n, hand.dof, generator=torch.Generator().manual_seed(seed), dtype=torch.float64, device="cpu")
+    share = torch.rand(
+        n,
+        hand.dof,
+        generator=torch.Generator().manual_seed(seed),
+        dtype=torch.float64,
+        device="cpu",
+    )
     return hand.lower + (hand.upper - hand.lower) * share
 
 
 def most_met(hand: Hand, joints: Float[Tensor, "n h"]) -> tuple[str, str]:
     """Return the names of the two links of a hand that overlap in the most of n postures."""
-    apart = hand.self_collision.separations(hand.tree.frames(hand.expand_joints(joints).T.contiguous()), 0.0)
+    apart = hand.self_collision.separations(
+        hand.tree.frames(hand.expand_joints(joints).T.contiguous()), 0.0
+    )
     links = hand.self_collision.link[hand.self_collision.pairs[int((apart < 0).sum(1).argmax())]]
     one, two = (hand.tree.link_names[int(k)] for k in links)
     return one, two
@@ -105,11 +135,16 @@ def _wrong_bodies(urdf: Urdf) -> Iterator[HandFileError]:
         xx, xy, xz, yy, yz, zz = link.inertia
         principal = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         if principal[0] <= 0 or principal[0] + principal[1] < principal[2] * (1 - 1e-6):
-            yield urdf.wrong(f"link {link.name} of principal inertias {principal}", "positive, any two >= the third")
+            yield urdf.wrong(
+                f"link {link.name} of principal inertias {principal}",
+                "positive, any two >= the third",
+            )
 
 
 def _wrong_joints(urdf: Urdf, spec: HandSpec, hand: Hand) -> Iterator[HandFileError]:
-    """Yield errors for drives without effort or velocity, and for fixed or coupled joints beyond their limits."""
+    """Yield errors for drives without effort or velocity, and for fixed or coupled joints beyond
+    their limits.
+    """
     for joint in urdf.movable:
         if not (joint.effort > 0 and joint.velocity > 0):
             found = f"joint {joint.name} of effort {joint.effort}, velocity {joint.velocity}"
@@ -122,7 +157,9 @@ def _wrong_joints(urdf: Urdf, spec: HandSpec, hand: Hand) -> Iterator[HandFileEr
 
 
 def _wrong_pads(urdf: Urdf, spec: HandSpec) -> Iterator[HandFileError]:
-    """Yield errors for fingers with wrong joints, and for contact points inside the tip's own shapes."""
+    """Yield errors for fingers with wrong joints, and for contact points inside the tip's own
+    shapes.
+    """
     shapes = {x.name: x.shapes for x in urdf.links}
     for finger in spec.all_fingers:
         movers = [j.name for j in reversed(urdf.movers(finger.tip_link))]
@@ -146,12 +183,15 @@ def _inside(point: np.ndarray, shape: LinkShape) -> bool:
 
 def largest_fk_error(hand: Hand, joints: Float[Tensor, "n h"]) -> tuple[float, str]:
     """Return the largest difference of a pose entry from yourdfpy's, and the link's name."""
-    urdf, poses = read_urdf(hand.urdf_path), hand.link_poses(joints).double()
+    urdf = read_urdf(hand.urdf_path)
+    poses = hand.link_poses(joints).double()
     robot = yourdfpy.URDF.load(io.BytesIO(urdf.xml), load_meshes=False)
     others = torch.zeros_like(poses)
     for row in range(len(joints)):
         values = {name: float(value) for name, value in hand.expand(joints[row]).items()}
         robot.update_cfg([values[name] for name in robot.actuated_joint_names])
-        others[row] = torch.from_numpy(np.stack([robot.get_transform(link) for link in hand.tree.link_names]))
+        others[row] = torch.from_numpy(
+            np.stack([robot.get_transform(link) for link in hand.tree.link_names])
+        )
     error = (others - poses).abs().amax((0, 2, 3))
     return float(error.max()), hand.tree.link_names[int(error.argmax())]

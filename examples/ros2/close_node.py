@@ -1,8 +1,10 @@
 #!/usr/bin/env python3
-"""Close an Allegro or a LEAP hand on a planned grasp, and hold: joint states come in, joint commands go out.
+"""Close an Allegro or a LEAP hand on a planned grasp, and hold: joint states come in, joint
+commands go out.
 
-`HandLoop` holds what the node does with messages; it needs no ROS. Neither hand feels with its fingertips: the loop
-takes what a drive exerts beyond the free motion, stiffness times lag, as the torque of a contact.
+`HandLoop` holds what the node does with messages; it needs no ROS. Neither hand feels with its
+fingertips: the loop takes what a drive exerts beyond the free motion, stiffness times lag, as the
+torque of a contact.
 """
 
 import contextlib
@@ -23,7 +25,8 @@ from torchgrasp.hand import hand_of
 from torchgrasp.values.closing import SensorModel
 
 OPENING = 0.5  # greatest speed [rad/s] of a joint on its way to the pre-grasp
-SILENCE = 0.1  # time [s] without joint states after which nothing is sent: the driver then keeps its last targets
+# time [s] without joint states after which nothing is sent: the driver then keeps its last targets
+SILENCE = 0.1
 
 
 class Driver(NamedTuple):
@@ -52,29 +55,48 @@ class Settings(NamedTuple):
 
 
 class HandLoop:
-    """The loop of one hand: it opens to the pre-grasp; it closes and holds between `close` and `open`."""
+    """The loop of one hand: it opens to the pre-grasp; it closes and holds between `close` and
+    `open`.
+    """
 
     def __init__(self, settings: Settings) -> None:
-        grasp, self.period = load_grasps(settings.grasps)[settings.row], 1 / settings.rate
-        reference = ClosingReference.from_grasp(hand_of(grasp), grasp, settings.force, kp=settings.kp or None)
-        self.reference, self.hand = dataclasses.replace(reference, sensor=SensorModel("torque")), reference.hand
+        grasp = load_grasps(settings.grasps)[settings.row]
+        self.period = 1 / settings.rate
+        reference = ClosingReference.from_grasp(
+            hand_of(grasp), grasp, settings.force, kp=settings.kp or None
+        )
+        self.reference = dataclasses.replace(reference, sensor=SensorModel("torque"))
+        self.hand = reference.hand
         self.feel = settings.feel
-        kind, joints = self.hand.name.removesuffix("_left"), self.hand.tree.joint_names
-        names: dict[str, str] = json.loads((Path(__file__).parent / "drivers" / f"{kind}.json").read_text())
-        self.driver, self.names = DRIVERS[kind], list(names.values())
+        kind = self.hand.name.removesuffix("_left")
+        joints = self.hand.tree.joint_names
+        names: dict[str, str] = json.loads(
+            (Path(__file__).parent / "drivers" / f"{kind}.json").read_text()
+        )
+        self.driver = DRIVERS[kind]
+        self.names = list(names.values())
         self.order = [joints.index(name) for name in names]  # of the driver, in the URDF's
         self.back = [list(names).index(name) for name in joints]
-        self.damping = torch.tensor([self.hand.actuators[joint].kd for joint in joints], dtype=torch.float64)
+        self.damping = torch.tensor(
+            [self.hand.actuators[joint].kd for joint in joints], dtype=torch.float64
+        )
         self.pregrasp = self.reference.expand(self.reference.pregrasp)
         self.controller: GraspController | None = None
         self.measured: torch.Tensor | None = None
-        self.sent, self.before, self.silent = self.pregrasp, self.pregrasp, 0
+        self.sent = self.pregrasp
+        self.before = self.pregrasp
+        self.silent = 0
 
     def hear(self, positions: Any) -> None:
-        """Take the driver's joint positions [rad], in its order: of a JointState, or of the LEAP's service."""
+        """Take the driver's joint positions [rad], in its order: of a JointState, or of the LEAP's
+        service.
+        """
         if len(positions) == len(self.names) and all(map(math.isfinite, positions)):
-            first, self.silent = self.measured is None, 0
-            self.measured = torch.tensor(list(positions), dtype=torch.float64)[self.back] - self.driver.zero
+            first = self.measured is None
+            self.silent = 0
+            self.measured = (
+                torch.tensor(list(positions), dtype=torch.float64)[self.back] - self.driver.zero
+            )
             self.sent = self.measured if first else self.sent  # the hand opens from where it is
 
     def close(self) -> bool:
@@ -86,7 +108,8 @@ class HandLoop:
             self.controller = GraspController(self.reference, options=options)
         else:
             self.controller = GraspController(self.reference, "open_loop")
-        self.tactile, self.before = no_contact(fingers=len(self.hand.tips)), self.measured
+        self.tactile = no_contact(fingers=len(self.hand.tips))
+        self.before = self.measured
         return True
 
     def open(self) -> None:
@@ -94,7 +117,9 @@ class HandLoop:
         self.controller = None
 
     def tick(self) -> torch.Tensor | None:
-        """Return the targets of the next period, in the URDF's order [rad]; None while the driver is silent."""
+        """Return the targets of the next period, in the URDF's order [rad]; None while the driver
+        is silent.
+        """
         self.silent += 1
         if (measured := self.measured) is None or self.silent > round(SILENCE / self.period):
             return None
@@ -107,10 +132,17 @@ class HandLoop:
         return self.sent
 
     def _step(self, controller: GraspController, measured: torch.Tensor) -> torch.Tensor:
-        """Return the controller's targets; the fingertips' forces are estimated from the lag of the drives."""
+        """Return the controller's targets; the fingertips' forces are estimated from the lag of the
+        drives.
+        """
         seen = observe(self.hand, self.reference.pick(measured), self.tactile)
-        torques = self.reference.kp * (self.sent - measured) - self.damping * (measured - self.before) / self.period
-        self.tactile = feel_torques(self.tactile, self.reference, seen.jacobian, torques, self.period)
+        torques = (
+            self.reference.kp * (self.sent - measured)
+            - self.damping * (measured - self.before) / self.period
+        )
+        self.tactile = feel_torques(
+            self.tactile, self.reference, seen.jacobian, torques, self.period
+        )
         self.before = measured
         return controller.step(dataclasses.replace(seen, tactile=self.tactile), self.period).joints
 
@@ -134,8 +166,11 @@ def main() -> None:
     from std_srvs.srv import SetBool  # pyright: ignore[reportMissingImports]
 
     rclpy.init()
-    node, types = rclpy.create_node("close_hand"), messages.ros_types()
-    settings = Settings(**{name: node.declare_parameter(name, x).value for name, x in Settings()._asdict().items()})
+    node = rclpy.create_node("close_hand")
+    types = messages.ros_types()
+    settings = Settings(
+        **{name: node.declare_parameter(name, x).value for name, x in Settings()._asdict().items()}
+    )
     loop = HandLoop(settings)
     commands = node.create_publisher(JointState, loop.driver.commands, 1)
     closed = node.create_publisher(Bool, "~/closed", 1)
@@ -163,11 +198,15 @@ def main() -> None:
 
 
 def listen(node: Any, loop: HandLoop) -> Callable[[], None]:
-    """Let the loop hear the driver; the function that is returned asks a LEAP's service again when it has answered."""
+    """Let the loop hear the driver; the function that is returned asks a LEAP's service again when
+    it has answered.
+    """
     if loop.driver.states != "leap_position":
         from sensor_msgs.msg import JointState  # pyright: ignore[reportMissingImports]
 
-        node.create_subscription(JointState, loop.driver.states, lambda message: loop.hear(message.position), 1)
+        node.create_subscription(
+            JointState, loop.driver.states, lambda message: loop.hear(message.position), 1
+        )
         return lambda: None
     from leap_hand.srv import LeapPosition  # pyright: ignore[reportMissingImports]
 

@@ -1,6 +1,7 @@
 """ROS 2 messages to clouds and poses, and grasps to messages.
 
-The classes of messages are given as `types`: those of ROS (`ros_types`), or those of rosbags, as in the tests.
+The classes of messages are given as `types`: those of ROS (`ros_types`), or those of rosbags, as in
+    the tests.
 """
 
 import array
@@ -16,7 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from torchgrasp import PointCloud
 
-if TYPE_CHECKING:  # rosbags has the definitions with types, which pyright compares with the code below
+if (
+    TYPE_CHECKING
+):  # rosbags has the definitions with types, which pyright compares with the code below
     from rosbags.typesys.stores import ros2_humble as ros
 
 PACKAGES = {
@@ -72,13 +75,20 @@ class _Ros:
 
 
 def read_points(message: "ros.sensor_msgs__msg__PointCloud2") -> np.ndarray:
-    """Return the finite points (n, 3) of a cloud of any layout: padding, colours, rows, float32 or float64."""
-    order, kinds = ">" if message.is_bigendian else "<", {7: "f4", 8: "f8"}
+    """Return the finite points (n, 3) of a cloud of any layout: padding, colours, rows, float32 or
+    float64.
+    """
+    order = ">" if message.is_bigendian else "<"
+    kinds = {7: "f4", 8: "f8"}
     at = {field.name: field for field in message.fields if field.name in ("x", "y", "z")}
     if len(at) < 3 or any(field.datatype not in kinds for field in at.values()):
-        raise ValueError(f"a cloud with fields {[field.name for field in message.fields]}, not x, y and z as floats")
+        raise ValueError(
+            f"a cloud with fields {[field.name for field in message.fields]}, not x, y and z as floats"
+        )
     if len(message.data) < message.height * message.row_step:
-        raise ValueError(f"{len(message.data)} bytes of points, less than {message.height} rows have")
+        raise ValueError(
+            f"{len(message.data)} bytes of points, less than {message.height} rows have"
+        )
     layout = np.dtype(
         {
             "names": list(at),
@@ -87,30 +97,39 @@ def read_points(message: "ros.sensor_msgs__msg__PointCloud2") -> np.ndarray:
             "itemsize": message.point_step,
         }
     )
-    shape, strides = (message.height, message.width), (message.row_step, message.point_step)
+    shape = (message.height, message.width)
+    strides = (message.row_step, message.point_step)
     rows = np.ndarray(shape, layout, np.asarray(message.data, np.uint8).tobytes(), strides=strides)
     points = np.stack([rows[axis].astype(float).ravel() for axis in "xyz"], axis=1)
     return points[np.isfinite(points).all(axis=1)]
 
 
 def read_cloud(
-    message: "ros.sensor_msgs__msg__PointCloud2", frame_from_cloud: np.ndarray, camera: np.ndarray | None
+    message: "ros.sensor_msgs__msg__PointCloud2",
+    frame_from_cloud: np.ndarray,
+    camera: np.ndarray | None,
 ) -> PointCloud:
-    """Return the cloud in another frame; `camera` (3,) is the camera's position [m] there, None if it is unknown."""
+    """Return the cloud in another frame; `camera` (3,) is the camera's position [m] there, None if
+    it is unknown.
+    """
     points = read_points(message) @ frame_from_cloud[:3, :3].T + frame_from_cloud[:3, 3]
-    return PointCloud(torch.from_numpy(points), viewpoint=None if camera is None else torch.from_numpy(camera))
+    return PointCloud(
+        torch.from_numpy(points), viewpoint=None if camera is None else torch.from_numpy(camera)
+    )
 
 
 def read_pose(position: Iterable[float], quaternion_xyzw: Iterable[float]) -> np.ndarray:
     """Return the pose matrix (4, 4) of a position [m] and a quaternion."""
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = Rotation.from_quat(list(quaternion_xyzw)).as_matrix(), list(position)
+    pose[:3, :3] = Rotation.from_quat(list(quaternion_xyzw)).as_matrix()
+    pose[:3, 3] = list(position)
     return pose
 
 
 def read_transform(transform: "ros.geometry_msgs__msg__Transform") -> np.ndarray:
     """Return the pose matrix (4, 4) of a transform of tf."""
-    place, turn = transform.translation, transform.rotation
+    place = transform.translation
+    turn = transform.rotation
     return read_pose((place.x, place.y, place.z), (turn.x, turn.y, turn.z, turn.w))
 
 
@@ -129,7 +148,9 @@ def write_grasps(types: Types, text: str, frame: str, stamp: Any) -> list[Any]:
                     orientation=types.Quaternion(**content["grasp_pose"]["pose"]["orientation"]),
                 ),
             ),
-            grasp_quality=max(0.0, content["grasp_quality"]),  # MoveIt sorts by it, which NaN would break
+            grasp_quality=max(
+                0.0, content["grasp_quality"]
+            ),  # MoveIt sorts by it, which NaN would break
             pre_grasp_approach=_translation(types, content["pre_grasp_approach"], header),
             post_grasp_retreat=_translation(types, content["post_grasp_retreat"], header),
             post_place_retreat=_translation(types, content["post_place_retreat"], header),
@@ -144,11 +165,17 @@ def _translation(types: Types, content: dict[str, Any], header: Any) -> Any:
     """Return a moveit_msgs/GripperTranslation."""
     vector = types.Vector3(**content["direction"]["vector"])
     distances = {name: content[name] for name in ("desired_distance", "min_distance")}
-    return types.GripperTranslation(direction=types.Vector3Stamped(header=header, vector=vector), **distances)
+    return types.GripperTranslation(
+        direction=types.Vector3Stamped(header=header, vector=vector), **distances
+    )
 
 
-def write_trajectory(types: Types, content: dict[str, Any], stamp: Any) -> "ros.trajectory_msgs__msg__JointTrajectory":
-    """Return a trajectory_msgs/JointTrajectory of a text of `format_moveit` or `format_trajectories`."""
+def write_trajectory(
+    types: Types, content: dict[str, Any], stamp: Any
+) -> "ros.trajectory_msgs__msg__JointTrajectory":
+    """Return a trajectory_msgs/JointTrajectory of a text of `format_moveit` or
+    `format_trajectories`.
+    """
     points = [
         types.JointTrajectoryPoint(
             positions=types.floats(point["positions"]),

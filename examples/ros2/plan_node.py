@@ -1,7 +1,9 @@
 #!/usr/bin/env python3
-"""The action `plan_grasp`: a PointCloud2 goes in, moveit_msgs/Grasp come out, with the stages as feedback.
+"""The action `plan_grasp`: a PointCloud2 goes in, moveit_msgs/Grasp come out, with the stages as
+feedback.
 
-`plan` holds what the node does with messages; it needs no ROS. `torchgrasp_ros/action/PlanGrasp.action` has the fields.
+`plan` holds what the node does with messages; it needs no ROS.
+`torchgrasp_ros/action/PlanGrasp.action` has the fields.
 """
 
 import contextlib
@@ -33,7 +35,15 @@ class Settings(NamedTuple):
     folder: str = ""  # where the grasps are written; by default a new folder
     camera_frame: str = ""  # frame at the camera's centre; by default that of the cloud
     names: str = ""  # JSON file of the driver's names of joints, in its order
-    flange: Sequence[float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)  # x y z qx qy qz qw, in the hand's frame
+    flange: Sequence[float] = (
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+        1.0,
+    )  # x y z qx qy qz qw, in the hand's frame
 
 
 class Planned(NamedTuple):
@@ -54,8 +64,8 @@ def plan(
 ) -> Planned:
     """Plan the grasps of a goal; `tell` gets each stage and a line about it.
 
-    `frame_from_cloud` (4, 4) leads from the cloud's frame to the goal's, whose z is up. `camera` (3,) is the camera's
-    position [m] there, or None.
+    `frame_from_cloud` (4, 4) leads from the cloud's frame to the goal's, whose z is up. `camera`
+    (3,) is the camera's position [m] there, or None.
     """
     frame = goal.gravity_frame or goal.cloud.header.frame_id
     try:
@@ -65,22 +75,36 @@ def plan(
         cloud = messages.read_cloud(goal.cloud, frame_from_cloud, camera)
         table = None if math.isnan(goal.table) else goal.table
         if goal.cut:
-            near = None if math.isnan(goal.near.x) else torch.tensor([goal.near.x, goal.near.y, goal.near.z])
+            near = (
+                None
+                if math.isnan(goal.near.x)
+                else torch.tensor([goal.near.x, goal.near.y, goal.near.z])
+            )
             cloud, table = cut_object(cloud, torch.tensor([0.0, 0.0, 1.0]), near, gap=0.02)
         cloud = remove_outliers(voxel_downsample(cloud, 0.002))
         tell("cloud", f"{len(cloud)} points")
         observer = lambda stage, message, _: tell(stage, message)  # noqa: E731
-        grasps = plan_grasps(cloud, hand, ContactSpec(table=table), settings.starts, observer=observer)
+        grasps = plan_grasps(
+            cloud, hand, ContactSpec(table=table), settings.starts, observer=observer
+        )
     except (GraspError, OSError, ValueError) as error:
         return Planned([], message=str(error))
-    stays = opened_pose(hand, grasps.pregrasp, grasps.obj_from_hand, grasps.table) == grasps.obj_from_hand
+    stays = (
+        opened_pose(hand, grasps.pregrasp, grasps.obj_from_hand, grasps.table)
+        == grasps.obj_from_hand
+    )
     best = grasps[(grasps.status == Status.OK) & stays.all(2).all(1)][: goal.most or None]
     if not len(best):
-        return Planned([], message="no executable grasp: torchgrasp cloud check and grasp tell more about the cloud")
+        return Planned(
+            [],
+            message="no executable grasp: torchgrasp cloud check and grasp tell more about the cloud",
+        )
     name = re.sub(r"[^\w-]", "_", goal.object_id) or "object"  # no id leads out of the folder
     file = Path(settings.folder or tempfile.mkdtemp(), f"{name}.safetensors")
     best.save(file)
-    text = format_moveit(hand, best, rename=rename, flange=flange, object_id=goal.object_id or "object")
+    text = format_moveit(
+        hand, best, rename=rename, flange=flange, object_id=goal.object_id or "object"
+    )
     return Planned(messages.write_grasps(types, text, frame, goal.cloud.header.stamp), str(file))
 
 
@@ -95,14 +119,20 @@ def main() -> None:
     from torchgrasp_ros.action import PlanGrasp  # pyright: ignore[reportMissingImports]
 
     rclpy.init()
-    node, types = rclpy.create_node("plan_grasp"), messages.ros_types()
+    node = rclpy.create_node("plan_grasp")
+    types = messages.ros_types()
     defaults = Settings()._asdict() | {"flange": list(Settings().flange)}
-    settings = Settings(**{name: node.declare_parameter(name, value).value for name, value in defaults.items()})
-    frames, wait = tf2_ros.Buffer(), Duration(seconds=1.0)
+    settings = Settings(
+        **{name: node.declare_parameter(name, value).value for name, value in defaults.items()}
+    )
+    frames = tf2_ros.Buffer()
+    wait = Duration(seconds=1.0)
     tf2_ros.TransformListener(frames, node)
 
     def pose(frame: str, header: Any) -> np.ndarray:
-        """Return the pose of the cloud's or the camera's frame in another frame, when the cloud was seen."""
+        """Return the pose of the cloud's or the camera's frame in another frame, when the cloud was
+        seen.
+        """
         found = frames.lookup_transform(frame, header.frame_id, header.stamp, wait)
         return messages.read_transform(found.transform)
 
@@ -114,7 +144,8 @@ def main() -> None:
                 raise GraspError("canceled")
             handle.publish_feedback(PlanGrasp.Feedback(stage=stage, message=message))
 
-        goal, header = handle.request, handle.request.cloud.header
+        goal = handle.request
+        header = handle.request.cloud.header
         frame = goal.gravity_frame or header.frame_id
         seen = types.Header(stamp=header.stamp, frame_id=settings.camera_frame or header.frame_id)
         try:
@@ -131,9 +162,13 @@ def main() -> None:
         return PlanGrasp.Result(**planned._asdict())
 
     ActionServer(
-        node, PlanGrasp, "plan_grasp", execute,
-        callback_group=ReentrantCallbackGroup(), cancel_callback=lambda _: CancelResponse.ACCEPT,
-    )  # fmt: skip
+        node,
+        PlanGrasp,
+        "plan_grasp",
+        execute,
+        callback_group=ReentrantCallbackGroup(),
+        cancel_callback=lambda _: CancelResponse.ACCEPT,
+    )
     with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
         rclpy.spin(node, MultiThreadedExecutor())
 

@@ -1,4 +1,6 @@
-"""What every benchmark needs: options, a registry, rows with a target, results as files, a clock and random views."""
+"""What every benchmark needs: options, a registry, rows with a target, results as files, a clock
+and random views.
+"""
 
 import dataclasses
 import importlib
@@ -26,7 +28,9 @@ Result = TypeVar("Result")
 
 
 def mean_over(values: Iterable[tuple[str, float]]) -> Share:
-    """Return the mean, with its 95 % interval, of values given as pairs of unit name and value; NaN is left out."""
+    """Return the mean, with its 95 % interval, of values given as pairs of unit name and value; NaN
+    is left out.
+    """
     sums: dict[str, tuple[float, int]] = {}
     for name, value in values:
         if not math.isnan(value):
@@ -39,29 +43,22 @@ def mean_over(values: Iterable[tuple[str, float]]) -> Share:
 class Options:
     """Options of all benches; a bench uses those that it needs.
 
-    Args:
-        only: benches of the subject; by default all.
-        objects: folders with manifest.json and a folder for each object. Benches that need objects are left out
-            without one.
-        names: objects to keep; by default all.
-        views: names of the views that are measured, as view0; by default all.
-        hands: names of hands.
-        conditions: of close/misplaced and close/sensors, or perturbations of close/perturb; by default all.
-        laws: controllers of close/misplaced; by default all.
-        grasps: grasps of each view, the best or spread over all ranks.
-        starts: random starts of the contact planner.
-        batches: numbers of clouds of gpu/clouds and gpu/launches.
-        gpu_rate: clouds that one GPU plans in a second, for load/campaign; gpu/clouds measures it. By default unknown.
-        scale: factor of the numbers of random samples, scenes, frames, plans and trials.
-        draws: trials of each grasp of close/table-lift, with other displacements, pushes and noise.
-        tries: largest number of grasps that a trial of close/table-lift tries; by default as the protocol says.
-        planned: folder OBJECT/VIEW.safetensors with grasps for close/table-lift; by default they are planned and kept.
-        simulator: of load/trials, load/campaign and close/table-lift.
-        workers: processes that share the trials.
-        threads: of torch.
-        seed: of every random number.
-        out: folder of the results as JSON, of kept plans and trials, and of the tables.
-        publish: write the tables to docs/results instead.
+    Args: only: benches of the subject; by default all. objects: folders with manifest.json and a
+        folder for each object. Benches that need objects are left out without one. names: objects
+        to keep; by default all. views: names of the views that are measured, as view0; by default
+        all. hands: names of hands. conditions: of close/misplaced and close/sensors, or
+        perturbations of close/perturb; by default all. laws: controllers of close/misplaced; by
+        default all. grasps: grasps of each view, the best or spread over all ranks. starts: random
+        starts of the contact planner. batches: numbers of clouds of gpu/clouds and gpu/launches.
+        gpu_rate: clouds that one GPU plans in a second, for load/campaign; gpu/clouds measures it.
+        By default unknown. scale: factor of the numbers of random samples, scenes, frames, plans
+        and trials. draws: trials of each grasp of close/table-lift, with other displacements,
+        pushes and noise. tries: largest number of grasps that a trial of close/table-lift tries; by
+        default as the protocol says. planned: folder OBJECT/VIEW.safetensors with grasps for
+        close/table-lift; by default they are planned and kept. simulator: of load/trials,
+        load/campaign and close/table-lift. workers: processes that share the trials. threads: of
+        torch. seed: of every random number. out: folder of the results as JSON, of kept plans and
+        trials, and of the tables. publish: write the tables to docs/results instead.
     """
 
     only: tuple[str, ...] = ()
@@ -139,7 +136,9 @@ def measure(subject: str, options: Options) -> list[Row]:
     """Run the benches that are asked for, print their rows, and write them as JSON and as Markdown."""
     known = benches_of(subject)
     if unknown := sorted(set(options.only) - set(known)):
-        raise SystemExit(f"only: {unknown} unknown; the benches of {subject} are {', '.join(known)}")
+        raise SystemExit(
+            f"only: {unknown} unknown; the benches of {subject} are {', '.join(known)}"
+        )
     torch.set_num_threads(options.threads)
     found: list[Row] = []
     for name in options.only or known:
@@ -148,11 +147,20 @@ def measure(subject: str, options: Options) -> list[Row]:
             continue
         rows = known[name].run(options)
         print(*rows, sep="\n", flush=True)
-        write_table(ROOT / "docs" / "results" if options.publish else options.out, f"{subject}-{name}", rows, options)
+        write_table(
+            ROOT / "docs" / "results" if options.publish else options.out,
+            f"{subject}-{name}",
+            rows,
+            options,
+        )
         found += rows
     met, missed = (sum(row.met is verdict for row in found) for verdict in (True, False))
     print(f"{met} targets met, {missed} missed, {len(found) - met - missed} rows without a target")
-    content = {"bench": subject, "settings": dataclasses.asdict(options), "rows": list(map(dataclasses.asdict, found))}
+    content = {
+        "bench": subject,
+        "settings": dataclasses.asdict(options),
+        "rows": list(map(dataclasses.asdict, found)),
+    }
     write_file(options.out / f"bench_{subject}.json", json.dumps(content, indent=1, default=str))
     return found
 
@@ -172,9 +180,13 @@ def describe_run(threads: int) -> str:
     """Return commit, processor, threads and version of torch in one line."""
 
     def git(*words: str) -> str:
-        return subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=False).stdout.strip()
+        return subprocess.run(
+            ["git", *words], cwd=ROOT, capture_output=True, text=True, check=False
+        ).stdout.strip()
 
-    commit = (git("rev-parse", "--short", "HEAD") or "unknown") + (" with changes" if git("status", "--short") else "")
+    commit = (git("rev-parse", "--short", "HEAD") or "unknown") + (
+        " with changes" if git("status", "--short") else ""
+    )
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.is_file() else []
     names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
@@ -183,10 +195,11 @@ def describe_run(threads: int) -> str:
 
 
 def least_seconds(action: Callable[[], object], repeats: int = 5, limit: float = 5.0) -> float:
-    """Return the least time of an action [s], after one call that is not counted: more is the load of others.
+    """Return the least time of an action [s], after one call that is not counted: more is the load
+    of others.
 
-    The time is the processor's on one thread, which waiting does not lengthen, and the wall's on several. The first
-    call alone counts when it takes more than `limit` seconds.
+    The time is the processor's on one thread, which waiting does not lengthen, and the wall's on
+    several. The first call alone counts when it takes more than `limit` seconds.
     """
     clock = time.process_time if torch.get_num_threads() == 1 else time.perf_counter
     times: list[float] = []
@@ -217,10 +230,13 @@ def peak_mib() -> float | None:
 BODIES = ("ellipsoid", "box", "cylinder", "torus")
 
 
-def random_view(n: int, generator: torch.Generator, body: str | None = None) -> tuple[Tensor, Tensor]:
+def random_view(
+    n: int, generator: torch.Generator, body: str | None = None
+) -> tuple[Tensor, Tensor]:
     """Return n points and outward normals of the side of a random body that faces a random camera.
 
-    The points lie within the unit ball about the origin, the largest norm being 1, with a noise of 0.002.
+    The points lie within the unit ball about the origin, the largest norm being 1, with a noise of
+    0.002.
 
     Args:
         n: number of points.
@@ -235,7 +251,8 @@ def random_view(n: int, generator: torch.Generator, body: str | None = None) -> 
     while len(points) < n:
         more, outward = _surface(body, 4 * n, axes, generator)
         facing = outward @ view > 0.05
-        points, normals = torch.cat([points, more[facing]])[:n], torch.cat([normals, outward[facing]])[:n]
+        points = torch.cat([points, more[facing]])[:n]
+        normals = torch.cat([normals, outward[facing]])[:n]
     points = points + 0.002 * torch.randn(points.shape, generator=generator, dtype=torch.float64)
     points = points - (points.amin(0) + points.amax(0)) / 2
     return points / torch.linalg.vector_norm(points, dim=-1).max(), normals
@@ -267,5 +284,7 @@ def _surface(body: str, m: int, axes: Tensor, generator: torch.Generator) -> tup
         return torch.where(on_side, side, cap), torch.where(on_side, around, lid)
     around = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], -1)
     turn = 2 * torch.pi * torch.rand(m, generator=generator, dtype=torch.float64)
-    normals = turn.cos()[:, None] * around + turn.sin()[:, None] * torch.eye(3, dtype=torch.float64)[2]
+    normals = (
+        turn.cos()[:, None] * around + turn.sin()[:, None] * torch.eye(3, dtype=torch.float64)[2]
+    )
     return around + 0.35 * axes[0] * normals, normals

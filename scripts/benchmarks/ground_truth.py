@@ -16,16 +16,23 @@ from torchgrasp.values.planning import PointCloud
 if TYPE_CHECKING:
     import trimesh
 
-SEARCH_SAMPLES, SEARCH_TRIANGLES = 20_000, 8
-"""Samples of a surface, and how many of them give the triangles among which its nearest point is sought."""
+SEARCH_SAMPLES = 20_000
+SEARCH_TRIANGLES = 8
+"""Samples of a surface, and how many of them give the triangles among which its nearest point is
+sought.
+"""
 FACING_SAMPLES = 48
-"""Samples among which those of one side of a wall are sought: they reach 6 mm around on a thing of a hand's size."""
+"""Samples among which those of one side of a wall are sought: they reach 6 mm around on a thing of
+a hand's size.
+"""
 
 
 def read_views(
     objects: Path, camera: bool = True, views: Sequence[str] = ()
 ) -> Iterator[tuple[str, str, PointCloud, "trimesh.Trimesh"]]:
-    """Yield object, view, noisy cloud and true mesh of every view, or of those with a name in `views`."""
+    """Yield object, view, noisy cloud and true mesh of every view, or of those with a name in
+    `views`.
+    """
     for name, view in list_views(objects):
         if views and view not in views:
             continue
@@ -41,17 +48,17 @@ def sample_mesh(
 
 
 def nearest_on_mesh(
-    mesh: "trimesh.Trimesh", points: Float[Tensor, "n 3"], facing: Float[Tensor, "n 3"] | None = None
+    mesh: "trimesh.Trimesh",
+    points: Float[Tensor, "n 3"],
+    facing: Float[Tensor, "n 3"] | None = None,
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
     """Return the nearest point of a mesh to each point, with its normal.
 
     Only the triangles of the nearest samples are tried, for speed.
 
-    Args:
-        mesh: the surface.
-        points: [m].
-        facing: outward directions. The nearest point whose normal is less than 90 degrees from it is returned: a finger
-            outside of a wall does not touch its inside. NaN where no sample nearby is turned so.
+    Args: mesh: the surface. points: [m]. facing: outward directions. The nearest point whose normal
+        is less than 90 degrees from it is returned: a finger outside of a wall does not touch its
+        inside. NaN where no sample nearby is turned so.
     """
     from scipy.spatial import KDTree
 
@@ -59,7 +66,9 @@ def nearest_on_mesh(
         return points, points
     samples, faces, _ = _sample(mesh, SEARCH_SAMPLES, np.random.default_rng(0))
     queries = points.numpy()
-    _, index = KDTree(samples).query(queries, k=SEARCH_TRIANGLES if facing is None else FACING_SAMPLES)
+    _, index = KDTree(samples).query(
+        queries, k=SEARCH_TRIANGLES if facing is None else FACING_SAMPLES
+    )
     candidates = faces[index]  # (n, samples)
     turned = np.ones(candidates.shape, dtype=bool)
     if facing is not None:
@@ -68,11 +77,15 @@ def nearest_on_mesh(
         first = np.argsort(~turned, axis=1, kind="stable")[:, :SEARCH_TRIANGLES]
         candidates, turned = (np.take_along_axis(part, first, 1) for part in (candidates, turned))
     corners = np.asarray(mesh.triangles)[candidates.reshape(-1)]
-    feet = closest_on_triangles(np.repeat(queries, SEARCH_TRIANGLES, 0), corners)[0].reshape(*candidates.shape, 3)
+    feet = closest_on_triangles(np.repeat(queries, SEARCH_TRIANGLES, 0), corners)[0].reshape(
+        *candidates.shape, 3
+    )
     distance = np.where(turned, np.linalg.norm(feet - queries[:, None], axis=-1), np.inf)
-    rows, best = np.arange(len(queries)), distance.argmin(1)
+    rows = np.arange(len(queries))
+    best = distance.argmin(1)
     missed = ~turned.any(1)[:, None]
-    found, normals = feet[rows, best], _face_normals(mesh, candidates[rows, best])
+    found = feet[rows, best]
+    normals = _face_normals(mesh, candidates[rows, best])
     return tuple(torch.from_numpy(np.where(missed, np.nan, part)) for part in (found, normals))  # pyright: ignore[reportReturnType]
 
 
@@ -81,7 +94,11 @@ def _sample(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return n random points evenly by area, their faces and the faces' normals."""
     corners = np.asarray(mesh.triangles)
-    area = np.cumsum(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1))
+    area = np.cumsum(
+        np.linalg.norm(
+            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1
+        )
+    )
     face = np.minimum(np.searchsorted(area, generator.random(n) * area[-1]), len(area) - 1)
     u, v = generator.random((2, n))
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)

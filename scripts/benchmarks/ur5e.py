@@ -1,6 +1,8 @@
-"""The UR5e with cylinders as collision shapes, written from the numbers that Universal Robots publishes.
+"""The UR5e with cylinders as collision shapes, written from the numbers that Universal Robots
+publishes.
 
-These are the Denavit-Hartenberg parameters, masses, centres of mass and joint limits. The cylinders follow its drawing.
+These are the Denavit-Hartenberg parameters, masses, centres of mass and joint limits. The cylinders
+follow its drawing.
 """
 
 import math
@@ -27,13 +29,23 @@ CENTRE = (
     (0, 0, -0.001159),
 )
 NAMES = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
-EFFORT, TURN = (150, 150, 150, 28, 28, 28), (2, 2, 1, 2, 2, 2)  # [N m], halves of a turn either way
+# [N m], halves of a turn either way
+EFFORT = (150, 150, 150, 28, 28, 28)
+TURN = (2, 2, 1, 2, 2, 2)
 QUARTER = math.pi / 2
 CYLINDERS: tuple[tuple[tuple[float, ...], ...], ...] = (  # radius, length, centre, pitch
     ((0.075, 0.09, 0, 0, 0.045, 0),),
     ((0.06, 0.13, 0, 0, 0.165, 0),),
-    ((0.06, 0.13, 0, 0, 0.125, 0), (0.055, 0.425, -0.2125, 0, 0.138, QUARTER), (0.055, 0.12, -0.425, 0, 0.13, 0)),
-    ((0.055, 0.1, 0, 0, 0.02, 0), (0.045, 0.3922, -0.1961, 0, 0.007, QUARTER), (0.04, 0.1, -0.3922, 0, 0.015, 0)),
+    (
+        (0.06, 0.13, 0, 0, 0.125, 0),
+        (0.055, 0.425, -0.2125, 0, 0.138, QUARTER),
+        (0.055, 0.12, -0.425, 0, 0.13, 0),
+    ),
+    (
+        (0.055, 0.1, 0, 0, 0.02, 0),
+        (0.045, 0.3922, -0.1961, 0, 0.007, QUARTER),
+        (0.04, 0.1, -0.3922, 0, 0.015, 0),
+    ),
     ((0.038, 0.11, 0, 0, 0.125, 0),),
     ((0.038, 0.1, 0, 0, 0.09, 0),),
     ((0.038, 0.045, 0, 0, 0.077, 0),),
@@ -42,7 +54,8 @@ CYLINDERS: tuple[tuple[tuple[float, ...], ...], ...] = (  # radius, length, cent
 
 def ur5e_urdf() -> str:
     """Return the URDF from `base_link` to the flange `tool0`."""
-    parts, names = ['<robot name="ur5e">'], ("base_link", *(f"{name}_link" for name in NAMES))
+    parts = ['<robot name="ur5e">']
+    names = ("base_link", *(f"{name}_link" for name in NAMES))
     for k, (name, cylinders) in enumerate(zip(names, CYLINDERS, strict=True)):
         mass, centre = (4.0, (0, 0, 0.04)) if k == 0 else (MASS[k - 1], _centre(k - 1))
         shapes = "".join(
@@ -51,7 +64,8 @@ def ur5e_urdf() -> str:
             for r, h, x, y, z, pitch in cylinders
         )
         r, h, *_ = cylinders[len(cylinders) > 1]
-        across, along = mass * (3 * r * r + h * h) / 12, mass * r * r / 2
+        across = mass * (3 * r * r + h * h) / 12
+        along = mass * r * r / 2
         xx, zz = (along, across) if len(cylinders) > 1 else (across, along)
         at = " ".join(map(str, centre))
         body = (
@@ -77,7 +91,9 @@ def ur5e_urdf() -> str:
 
 
 def _centre(k: int) -> tuple[float, ...]:
-    """Return a centre of mass in the frame of its joint, whose published one is in the next joint's frame."""
+    """Return a centre of mass in the frame of its joint, whose published one is in the next joint's
+    frame.
+    """
     turned = rotation_from_rpy((ALPHA[k], 0.0, 0.0)).numpy() @ np.array(CENTRE[k])
     return tuple((turned + np.array([A[k], 0.0, D[k]])).tolist())
 
@@ -88,17 +104,30 @@ def by_products(joints: np.ndarray) -> np.ndarray:
     for q, a, d, alpha in zip(joints, A, D, ALPHA, strict=True):
         (cq, sq), (ca, sa) = (math.cos(q), math.sin(q)), (math.cos(alpha), math.sin(alpha))
         pose = pose @ np.array(
-            [[cq, -sq * ca, sq * sa, a * cq], [sq, cq * ca, -cq * sa, a * sq], [0, sa, ca, d], [0, 0, 0, 1]]
+            [
+                [cq, -sq * ca, sq * sa, a * cq],
+                [sq, cq * ca, -cq * sa, a * sq],
+                [0, sa, ca, d],
+                [0, 0, 0, 1],
+            ]
         )
     return pose
 
 
 def ur5e(
-    hand: HandLike, place: tuple[float, float, float] = (-0.55, 0.0, 0.0), seed: int = 0, *, urdf: str | None = None
+    hand: HandLike,
+    place: tuple[float, float, float] = (-0.55, 0.0, 0.0),
+    seed: int = 0,
+    *,
+    urdf: str | None = None,
 ) -> Arm:
-    """Return the arm with a hand on its flange, whose root is 95 mm away; its base stands at a place [m]."""
-    base, mount = torch.eye(4, dtype=torch.float64), torch.eye(4, dtype=torch.float64)
-    base[:3, 3], mount[2, 3] = torch.tensor(place, dtype=torch.float64), 0.095
+    """Return the arm with a hand on its flange, whose root is 95 mm away; its base stands at a
+    place [m].
+    """
+    base = torch.eye(4, dtype=torch.float64)
+    mount = torch.eye(4, dtype=torch.float64)
+    base[:3, 3] = torch.tensor(place, dtype=torch.float64)
+    mount[2, 3] = 0.095
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder, "ur5e.urdf")
         file.write_text(urdf or ur5e_urdf())

@@ -20,9 +20,11 @@ def bic_curve(
     observer: Callable[[int, GraspMixture], object] = lambda m, mixture: None,
     **fit: Any,
 ) -> BicCurve:
-    """Fit a mixture for each number of components, and return the BIC of each (Fig. 6 b, d); raises as `fit_mixture`.
+    """Fit a mixture for each number of components, and return the BIC of each (Fig. 6 b, d); raises
+    as `fit_mixture`.
 
-    `checkpoints` is a folder from which an interrupted call continues. `fit` holds more arguments of `fit_mixture`.
+    `checkpoints` is a folder from which an interrupted call continues. `fit` holds more arguments
+    of `fit_mixture`.
     """
     if not components:
         raise BadArgument("components", "none", "at least one number")

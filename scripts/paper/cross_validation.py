@@ -17,7 +17,9 @@ from torchgrasp.posture_model.score import evaluate_mixture
 
 @dataclasses.dataclass(frozen=True)
 class CrossValidation(Value):
-    """Held-out mean log-likelihood [nats] and mean absolute error [rad] for each number of components and fold."""
+    """Held-out mean log-likelihood [nats] and mean absolute error [rad] for each number of
+    components and fold.
+    """
 
     components: Int[Tensor, "k"]
     log_likelihood: Float[Tensor, "k f"]
@@ -44,7 +46,8 @@ def cross_validate(
     observer: Callable[[int, int], None] = lambda m, fold: None,
     **fit: Any,
 ) -> CrossValidation:
-    """Fit on all folds but one and evaluate on that one, for each number of components (footnote 4 of the paper).
+    """Fit on all folds but one and evaluate on that one, for each number of components (footnote 4
+    of the paper).
 
     Args:
         samples: postures to divide.
@@ -54,21 +57,25 @@ def cross_validate(
         observer: called after each fit with its number of components and its fold.
         fit: iterations, tolerance and regularisation of `fit_mixture`.
 
-    Raises:
-        BadArgument: no number to try, folds outside [2, half the samples], or what `fit_mixture` refuses.
-        IndefiniteCovariance: as `fit_mixture`.
+    Raises: BadArgument: no number to try, folds outside [2, half the samples], or what
+        `fit_mixture` refuses. IndefiniteCovariance: as `fit_mixture`.
     """
     if not components:
         raise BadArgument("components", "none", "at least one number")
     if not 2 <= folds <= len(samples) // 2:
         raise BadArgument("folds", folds, f"2 to {len(samples) // 2}")
-    order = torch.randperm(len(samples), generator=torch.Generator().manual_seed(seed)).to(samples.q.device)
+    order = torch.randperm(len(samples), generator=torch.Generator().manual_seed(seed)).to(
+        samples.q.device
+    )
     parts = order.tensor_split(folds)
     error, log_likelihood = torch.empty(2, len(components), folds, dtype=torch.float64)
     for k, m in enumerate(components):
         for fold, held_out in enumerate(parts):
             rest = torch.cat([part for part in parts if part is not held_out])
-            score = evaluate_mixture(fit_mixture(samples[rest], m, seed=seed, **fit), samples[held_out])
-            error[k, fold], log_likelihood[k, fold] = score.mean_error, score.log_likelihood
+            score = evaluate_mixture(
+                fit_mixture(samples[rest], m, seed=seed, **fit), samples[held_out]
+            )
+            error[k, fold] = score.mean_error
+            log_likelihood[k, fold] = score.log_likelihood
             observer(m, fold)
     return CrossValidation(torch.tensor(list(components)), log_likelihood, error)

@@ -1,4 +1,6 @@
-"""Fig. 4 of the paper with the objects of torchgrasp: clouds, whole and partial, and the shapes that follow."""
+"""Fig. 4 of the paper with the objects of torchgrasp: clouds, whole and partial, and the shapes
+that follow.
+"""
 
 from pathlib import Path
 
@@ -16,7 +18,13 @@ TILE = (340, 360)
 """Width and height of one picture of a figure [pixels]."""
 BUDGET = 200
 """Observations of a whole cloud; a partial one has some 160, with those that complete it."""
-ROWS = ("whole cloud", "shape from the whole cloud", "partial cloud", "the paper's shape from it", "the default shape")
+ROWS = (
+    "whole cloud",
+    "shape from the whole cloud",
+    "partial cloud",
+    "the paper's shape from it",
+    "the default shape",
+)
 ARROW = 0.07
 """Length of the observed normals over the object's diagonal."""
 TURN = 70.0
@@ -24,10 +32,12 @@ TURN = 70.0
 
 
 def fig4(out: Path, seed: int = 0) -> None:
-    """Draw Fig. 4: four objects as whole and partial clouds, and their shapes coloured by standard deviation.
+    """Draw Fig. 4: four objects as whole and partial clouds, and their shapes coloured by standard
+    deviation.
 
-    Two shapes are of the partial cloud: with the paper's observations, and with torchgrasp's own. Arrows are the points
-    that a shape observes on the surface, of the cloud and of its completion, with its normals.
+    Two shapes are of the partial cloud: with the paper's observations, and with torchgrasp's own.
+    Arrows are the points that a shape observes on the surface, of the cloud and of its completion,
+    with its normals.
 
     Args:
         out: folder of fig4.png; it is made where it does not exist.
@@ -37,21 +47,29 @@ def fig4(out: Path, seed: int = 0) -> None:
     for name in list_objects():
         thing = load_object(name)
         clouds = (sample_whole(thing.mesh, seed), thing.view)
-        # Exact normals are observed as they are: new ones would mix the two sides of thin walls, 6 mm between points.
+        # Exact normals are observed as they are: new ones would mix the two sides of thin walls, 6
+        # mm between points.
         whole = fit_shape(clouds[0], budget=BUDGET, support="paper", seed=seed)
-        paper, default = fit_shape(clouds[1], support="paper", seed=seed), fit_shape(clouds[1], seed=seed, table=0.0)
+        paper = fit_shape(clouds[1], support="paper", seed=seed)
+        default = fit_shape(clouds[1], seed=seed, table=0.0)
         shapes = [whole, paper, default]
         surfaces = [extract_surface(shape, 64) for shape in shapes]
         arrows = [observed_normals(shape) for shape in shapes]
         for kind, surface in zip(("whole", "paper", "default"), surfaces, strict=True):
             std = 1e3 * surface.std_m
-            print(f"{name:10}{kind:9} std [mm]: median {std.median():.1f}, 99 % {std.quantile(0.99):.1f}")
+            print(
+                f"{name:10}{kind:9} std [mm]: median {std.median():.1f}, 99 % {std.quantile(0.99):.1f}"
+            )
         scenes.append((thing, clouds, surfaces, arrows))
-    # One scale for all, the most certain 80 % of each: the least certain bulges would leave all else in one colour.
-    most = 1e3 * max(float(surface.std_m.quantile(0.8)) for _, _, surfaces, _ in scenes for surface in surfaces)
+    # One scale for all, the most certain 80 % of each: the least certain bulges would leave all
+    # else in one colour.
+    most = 1e3 * max(
+        float(surface.std_m.quantile(0.8)) for _, _, surfaces, _ in scenes for surface in surfaces
+    )
     columns = []
     for thing, clouds, surfaces, arrows in scenes:
-        eye, corners = rotated(view_of(thing.view), TURN), np.asarray(thing.mesh.vertices)
+        eye = rotated(view_of(thing.view), TURN)
+        corners = np.asarray(thing.mesh.vertices)
         drawn = list(zip(surfaces, arrows, strict=True))
         column = ((clouds[0], None), drawn[0], (clouds[1], None), *drawn[1:])
         columns.append([draw(what, normals, most, corners, eye) for what, normals in column])
@@ -72,15 +90,21 @@ def draw(
     corners: np.ndarray,
     eye: tuple[float, float, float],
 ) -> Image.Image:
-    """Draw points by height, or a surface by its standard deviation up to `most` [mm] with arrows on it."""
+    """Draw points by height, or a surface by its standard deviation up to `most` [mm] with arrows
+    on it.
+    """
     canvas = Canvas()
     if isinstance(what, PointCloud):
         points = what.points.numpy()
         height = points[:, 2] - points[:, 2].min()
         canvas.add_points(points, map_colors(height / max(float(height.max()), 1e-12), "cividis"))
     else:
-        vertices, faces, normals = what.vertices.numpy(), what.faces.numpy(), what.normals.numpy()
-        canvas.add_mesh(vertices, faces, map_colors(1e3 * what.std_m.numpy() / most, "viridis"), normals)
+        vertices = what.vertices.numpy()
+        faces = what.faces.numpy()
+        normals = what.normals.numpy()
+        canvas.add_mesh(
+            vertices, faces, map_colors(1e3 * what.std_m.numpy() / most, "viridis"), normals
+        )
         corners = np.concatenate([corners, vertices])
     if arrows:
         length = ARROW * float(np.linalg.norm(np.ptp(corners, axis=0)))

@@ -1,4 +1,6 @@
-"""Fig. 6 (b, d): the number of Gaussians by the Bayesian information criterion and by cross-validation."""
+"""Fig. 6 (b, d): the number of Gaussians by the Bayesian information criterion and by cross-
+validation.
+"""
 
 import json
 from pathlib import Path
@@ -19,11 +21,13 @@ PUBLISHED = {"allegro": 41, "barrett": 36}
 SWEEP = tuple(range(5, 61, 5))
 """Numbers of Gaussians; the paper's figure shows 5 to 60."""
 FIT = {"tolerance": 1e-3, "iterations": 100}
-"""Of every fit: as `fit_mixture`, but with a third of the steps, since there are hundreds of fits."""
+"""Of every fit: as `fit_mixture`, but with a third of the steps, since there are hundreds of fits.
+"""
 
 
 def fig6(out: Path, n: int = 40_000, apart: int = 20_000, folds: int = 10, seed: int = 1) -> None:
-    """Draw Fig. 6 (b, d): the criterion on n postures and cross-validation on others, for both hands.
+    """Draw Fig. 6 (b, d): the criterion on n postures and cross-validation on others, for both
+    hands.
 
     The shipped models have the number of least criterion in this range.
 
@@ -40,8 +44,12 @@ def fig6(out: Path, n: int = 40_000, apart: int = 20_000, folds: int = 10, seed:
         samples = sample_configurations(hand, n, seed, sampling="grasping")
         others = sample_configurations(hand, apart, seed + 1, sampling="grasping")
         with tqdm(total=len(SWEEP) * (folds + 1), desc=name, disable=None, leave=False) as bar:
-            curve = bic_curve(samples, SWEEP, observer=lambda m, mixture: bar.update() and None, **FIT)
-            crossed = cross_validate(others, SWEEP, folds, observer=lambda m, fold: bar.update() and None, **FIT)
+            curve = bic_curve(
+                samples, SWEEP, observer=lambda m, mixture: bar.update() and None, **FIT
+            )
+            crossed = cross_validate(
+                others, SWEEP, folds, observer=lambda m, fold: bar.update() and None, **FIT
+            )
         print(name, curve, crossed, f"the paper: {PUBLISHED[name]}", sep="\n")
         curves[name] = curve, crossed
     draw_selection(curves, out / "fig6.png")
@@ -73,8 +81,15 @@ def draw_selection(curves: dict[str, tuple[BicCurve, CrossValidation]], out: Pat
             axis.errorbar(crossed.components, values.mean(1), error, fmt="o-", ms=3, capsize=2)
             axis.set_ylabel(label)
         for axis in row:
-            axis.axvline(PUBLISHED[name], color="grey", lw=0.8, ls="--", label=f"paper: {PUBLISHED[name]}")
-            axis.axvline(int(curve.components[curve.bic.argmin()]), color="#d62728", lw=0.8, label="least BIC")
+            axis.axvline(
+                PUBLISHED[name], color="grey", lw=0.8, ls="--", label=f"paper: {PUBLISHED[name]}"
+            )
+            axis.axvline(
+                int(curve.components[curve.bic.argmin()]),
+                color="#d62728",
+                lw=0.8,
+                label="least BIC",
+            )
             axis.set_xlabel("Gaussians")
             axis.set_title(name)
             axis.grid(alpha=0.3)

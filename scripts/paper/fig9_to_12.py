@@ -1,4 +1,6 @@
-"""Figs. 9 to 12 of the paper: contacts that hands take, in more than one way and with more than one hand."""
+"""Figs. 9 to 12 of the paper: contacts that hands take, in more than one way and with more than one
+hand.
+"""
 
 import dataclasses
 from pathlib import Path
@@ -9,7 +11,17 @@ import torch
 from PIL import Image
 
 from paper.sheet import render_tile, save_sheet
-from torchgrasp import Contacts, ContactSpec, Grasps, Hand, Status, list_objects, load_hand, load_object, plan_grasps
+from torchgrasp import (
+    Contacts,
+    ContactSpec,
+    Grasps,
+    Hand,
+    Status,
+    list_objects,
+    load_hand,
+    load_object,
+    plan_grasps,
+)
 from torchgrasp.app.report.canvas import AXES, FINGERS, OBJECT, Canvas, Direction
 from torchgrasp.app.report.solids import solids_from_hand
 from torchgrasp.app.report.stills import facing
@@ -29,13 +41,16 @@ SHOWN = 3
 """Grasps of each object in Figs. 11 and 12."""
 APART = 0.1
 """Hands whose bases are nearer [m] are seen from the side of the first one's fingers."""
-NORMAL, FRAME = 0.035, 0.03
+NORMAL = 0.035
+FRAME = 0.03
 """Lengths of the contacts' normals and of the virtual frame [m]."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Taken:
-    """Grasps of one hand on one object that passed every check of the paper's chain, and the estimated surface."""
+    """Grasps of one hand on one object that passed every check of the paper's chain, and the
+    estimated surface.
+    """
 
     hand: Hand
     surface: Surface
@@ -43,11 +58,13 @@ class Taken:
 
 
 def grasps(out: Path, starts: int = 1000, seed: int = 0, only: tuple[str, ...] = ()) -> None:
-    """Draw Figs. 9 to 12 with the project's objects: the hands on the shapes that one side of each object gives.
+    """Draw Figs. 9 to 12 with the project's objects: the hands on the shapes that one side of each
+    object gives.
 
-    fig9.png: one contact triple by two postures of the same hand. fig10.png: one triple by both hands. fig11.png and
-    fig12.png: grasps of the Barrett and of the Allegro hand. All are planned by `plan_grasps(mode="paper")`, and have
-    passed every check.
+    fig9.png: one contact triple by two postures of the same hand. fig10.png: one triple by both
+    hands. fig11.png and
+    fig12.png: grasps of the Barrett and of the Allegro hand. All are planned by
+    `plan_grasps(mode="paper")`, and have passed every check.
 
     Args:
         out: folder of the pictures; it is made where it does not exist.
@@ -64,23 +81,34 @@ def grasps(out: Path, starts: int = 1000, seed: int = 0, only: tuple[str, ...] =
     widest = sorted(pairs, key=lambda pair: -pair[3])[:2]
     save([[(t, one), (t, two)] for t, one, two, _ in widest], out / "fig9.png")
     save(
-        [found for allegro, barrett in taken if (found := shared_triple(allegro, barrett.hand))][:2], out / "fig10.png"
+        [found for allegro, barrett in taken if (found := shared_triple(allegro, barrett.hand))][
+            :2
+        ],
+        out / "fig10.png",
     )
     for k, number in ((1, 11), (0, 12)):
-        shown = [(both[k], index) for both in taken for index in range(min(SHOWN, len(both[k].grasps)))]
+        shown = [
+            (both[k], index) for both in taken for index in range(min(SHOWN, len(both[k].grasps)))
+        ]
         save([[one] for one in shown], out / f"fig{number}.png")
 
 
 def take(name: str, hand: Hand, starts: int, seed: int) -> Taken:
-    """Return the executable grasps of the paper's chain on one object, those of least variance first."""
+    """Return the executable grasps of the paper's chain on one object, those of least variance
+    first.
+    """
     stages = dict[str, Any]()
     note = lambda stage, text, value: stages.update({stage: value})  # noqa: E731
-    planned = plan_grasps(load_object(name).view, hand, SPEC, starts, seed, mode="paper", observer=note)
+    planned = plan_grasps(
+        load_object(name).view, hand, SPEC, starts, seed, mode="paper", observer=note
+    )
     return Taken(hand, extract_surface(stages["shape"]), planned[planned.status == Status.OK])
 
 
 def unlike_pair(taken: Taken) -> tuple[Taken, int, int, float] | None:
-    """Return the two grasps of one triple whose hands point apart the most, and the angle between them [rad]."""
+    """Return the two grasps of one triple whose hands point apart the most, and the angle between
+    them [rad].
+    """
     center = taken.grasps.contacts.points.mean(1)
     same = (torch.linalg.vector_norm(center[:, None] - center, dim=-1) < 1e-6).triu(1)
     if not bool(same.any()):
@@ -92,24 +120,34 @@ def unlike_pair(taken: Taken) -> tuple[Taken, int, int, float] | None:
 
 
 def shared_triple(first: Taken, other: Hand) -> list[tuple[Taken, int]]:
-    """Return a grasp of each hand on one triple: on those that the first hand takes, the other hand is tried, too."""
-    surface, contacts = first.surface, first.grasps.contacts
+    """Return a grasp of each hand on one triple: on those that the first hand takes, the other hand
+    is tried, too.
+    """
+    surface = first.surface
+    contacts = first.grasps.contacts
     if not len(contacts):
         return []
     world = CollisionWorld(field_from_surface(surface.vertices, surface.faces), SPEC.plane)
-    problem = GraspProblem(other, contacts, first.grasps.certificate, world, surface.vertices.mean(0))
+    problem = GraspProblem(
+        other, contacts, first.grasps.certificate, world, surface.vertices.mean(0)
+    )
     mixture = load_mixture(other.urdf_path.parent / "paper.safetensors")
-    tried = solve_as_paper(problem, query_mixture(other, contacts, mixture, n_seeds=1, max_energy=PAPER_ENERGY))
+    tried = solve_as_paper(
+        problem, query_mixture(other, contacts, mixture, n_seeds=1, max_energy=PAPER_ENERGY)
+    )
     good = tried[tried.status == Status.OK]
     if not len(good):
         return []
-    gap = torch.linalg.vector_norm(contacts.points.mean(1) - good.contacts.points[0].mean(0), dim=-1)
+    gap = torch.linalg.vector_norm(
+        contacts.points.mean(1) - good.contacts.points[0].mean(0), dim=-1
+    )
     return [(first, int(gap.argmin())), (Taken(other, surface, good), 0)]
 
 
 def save(rows: list[list[tuple[Taken, int]]], path: Path) -> None:
     """Draw grasps, those of one contact triple in a row and from one eye, else two in a row."""
-    shown, captions = [(*one, eye_of(row)) for row in rows for one in row], {}
+    shown = [(*one, eye_of(row)) for row in rows for one in row]
+    captions = {}
     for k, (taken, index, _) in enumerate(shown):
         worst = 1e3 * float(taken.grasps.tip_error[index].max())
         captions[divmod(k, 2)] = f"{taken.hand.name}, tips within {worst:.1f} mm"
@@ -118,7 +156,9 @@ def save(rows: list[list[tuple[Taken, int]]], path: Path) -> None:
 
 
 def eye_of(row: list[tuple[Taken, int]]) -> Direction:
-    """Return the direction from which a grasp is seen well, or two whose hands are apart: square to their distance."""
+    """Return the direction from which a grasp is seen well, or two whose hands are apart: square to
+    their distance.
+    """
     poses = [taken.grasps.obj_from_hand[index, :2, 3] for taken, index in row]
     x, y = (poses[0] - poses[-1]).tolist()
     if np.hypot(x, y) < APART:
@@ -127,11 +167,18 @@ def eye_of(row: list[tuple[Taken, int]]) -> Direction:
 
 
 def draw(taken: Taken, index: int, eye: Direction) -> Image.Image:
-    """Draw one grasp with its contacts, their normals and their virtual frame on the estimated surface."""
-    hand, grasp, surface = taken.hand, taken.grasps[index], taken.surface
-    canvas, contacts = Canvas(), grasp.contacts
+    """Draw one grasp with its contacts, their normals and their virtual frame on the estimated
+    surface.
+    """
+    hand = taken.hand
+    grasp = taken.grasps[index]
+    surface = taken.surface
+    canvas = Canvas()
+    contacts = grasp.contacts
     vertices = surface.vertices.numpy()
-    canvas.add_mesh(vertices, surface.faces.numpy(), OBJECT, surface.normals.numpy(), transparent=True)
+    canvas.add_mesh(
+        vertices, surface.faces.numpy(), OBJECT, surface.normals.numpy(), transparent=True
+    )
     joints = hand.expand_joints(grasp.joints[0])
     solids = solids_from_hand(hand, joints, hand.tree.joint_names, grasp.obj_from_hand[0])
     for solid in solids:

@@ -1,4 +1,6 @@
-"""From the paper's chain to the library's, one stage exchanged at a time: what each is worth, on the same views."""
+"""From the paper's chain to the library's, one stage exchanged at a time: what each is worth, on
+the same views.
+"""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -9,7 +11,8 @@ from paper.trials import run_cells
 from torchgrasp.evaluation.intervals import contrast_over, count_by, format_share, share_over
 from torchgrasp.files import format_columns
 
-PAPER_CHAIN, SUPPORT = Plan("paper", "paper", margins=False), Plan("paper", margins=False)
+PAPER_CHAIN = Plan("paper", "paper", margins=False)
+SUPPORT = Plan("paper", margins=False)
 RUNGS = (
     Row("paper", PAPER_CHAIN, "certain", "paper", "impedance"),
     Row("+ support", SUPPORT, "certain", "paper", "impedance"),
@@ -22,14 +25,17 @@ RUNGS = (
 )
 """Each rung exchanges one stage of the rung above it:
 
-* support: where the shape is observed; + margins: the contact problem; + refinement: seeds on fixed contacts;
-* + postures: seeds near each triple, contacts that slide; + ranking: by predicted success instead of variance;
+* support: where the shape is observed; + margins: the contact problem; + refinement: seeds on fixed
+    contacts;
+* + postures: seeds near each triple, contacts that slide; + ranking: by predicted success instead
+  of variance;
 * + closing and + holding: what the hand does.
 """
 
 
 def ladder(spec: Asked) -> None:
-    """Print what each stage is worth: the best grasp of each rung, lifted under the same errors of the object's pose.
+    """Print what each stage is worth: the best grasp of each rung, lifted under the same errors of
+    the object's pose.
 
     An object without an executable grasp fails, as often as it would have been lifted.
 
@@ -45,13 +51,17 @@ def judge_ladder(spec: TableSpec, cells: Iterator[tuple[Cell, ...]]) -> None:
     numbers: dict[str, Any] = {}
     hands = dict.fromkeys(cell.hand for cell in rows[0])
     for hand in ("all", *hands) if len(hands) > 1 else hands:
-        numbers[hand] = judge(spec, [[cell for cell in row if hand in ("all", cell.hand)] for row in rows])
+        numbers[hand] = judge(
+            spec, [[cell for cell in row if hand in ("all", cell.hand)] for row in rows]
+        )
         print_ladder(hand, numbers[hand])
     write(spec.out / "ladder.json", spec, rows, {"ladder": numbers})
 
 
 def judge(spec: TableSpec, rows: Sequence[Sequence[Cell]]) -> dict[str, dict[str, Any]]:
-    """Return the numbers of each rung: shares over families, and paired differences to the rung above."""
+    """Return the numbers of each rung: shares over families, and paired differences to the rung
+    above.
+    """
     found: dict[str, dict[str, Any]] = {}
     above = None
     for row in rows:
@@ -68,16 +78,31 @@ def judge(spec: TableSpec, rows: Sequence[Sequence[Cell]]) -> dict[str, dict[str
 
 
 def count_all(row: Sequence[Cell], lifts: int) -> dict[str, tuple[int, int]]:
-    """Return the lifts that held, and all, of each family; a view without a grasp fails in as many `lifts`."""
+    """Return the lifts that held, and all, of each family; a view without a grasp fails in as many
+    `lifts`.
+    """
     outcomes = [(cell.family, lift.held) for cell in row for lift in cell.lifts]
-    return count_by(outcomes + [(cell.family, False) for cell in row for _ in range(cell.refused * lifts)])
+    return count_by(
+        outcomes + [(cell.family, False) for cell in row for _ in range(cell.refused * lifts)]
+    )
 
 
 def print_ladder(hand: str, found: dict[str, dict[str, Any]]) -> None:
     """Print the rungs of a hand."""
     keys = ("graspable", "held_of_all", "held_of_lifted")
-    lines = [(f"{hand}: rung", "with a grasp", "held of all", "held of those with a grasp", "worth", "plan CPU")]
+    lines = [
+        (
+            f"{hand}: rung",
+            "with a grasp",
+            "held of all",
+            "held of those with a grasp",
+            "worth",
+            "plan CPU",
+        )
+    ]
     for name, rung in found.items():
         worth = "-" if rung["worth"] is None else format_points(rung["worth"])
-        lines.append((name, *(format_share(rung[key]) for key in keys), worth, f"{rung['plan_cpu_s']:.1f} s"))
+        lines.append(
+            (name, *(format_share(rung[key]) for key in keys), worth, f"{rung['plan_cpu_s']:.1f} s")
+        )
     print(f"\n{format_columns(lines, left={0, 1, 2, 3, 4})}")

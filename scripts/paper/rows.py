@@ -1,4 +1,6 @@
-"""The values of the tables: what is planned and lifted in a row, what a campaign is made of, and what came of it."""
+"""The values of the tables: what is planned and lifted in a row, what a campaign is made of, and
+what came of it.
+"""
 
 import dataclasses
 import math
@@ -12,15 +14,18 @@ from torchgrasp.values.specs import ClosingMode, ContactSpec, HoldingMode, Mode
 
 Support = Literal["camera", "paper"]
 Order = Literal["success", "certain", "risky"]
-"""Which executable grasp comes first: the likeliest success, or the least or greatest sum of variances (Sec. 6.5)."""
+"""Which executable grasp comes first: the likeliest success, or the least or greatest sum of
+variances (Sec. 6.5).
+"""
 
 
 @dataclasses.dataclass(frozen=True)
 class Plan(Value):
-    """How grasps are planned: `mode` of `plan_grasps`, support of the shape, and the problem of the contacts.
+    """How grasps are planned: `mode` of `plan_grasps`, support of the shape, and the problem of the
+    contacts.
 
-    `margins` are the library's (`ContactSpec`); without them the problem is the paper's. `variance` is S_thresh; None:
-    that of the problem.
+    `margins` are the library's (`ContactSpec`); without them the problem is the paper's. `variance`
+    is S_thresh; None: that of the problem.
     """
 
     mode: Mode = "joint"
@@ -30,13 +35,19 @@ class Plan(Value):
 
     def contacts(self) -> ContactSpec:
         """Return the problem, for an object that stands on a table at z = 0."""
-        spec = dataclasses.replace(ContactSpec() if self.margins else ContactSpec.paper(), table=0.0)
-        return spec if self.variance is None else dataclasses.replace(spec, max_variance=self.variance)
+        spec = dataclasses.replace(
+            ContactSpec() if self.margins else ContactSpec.paper(), table=0.0
+        )
+        return (
+            spec if self.variance is None else dataclasses.replace(spec, max_variance=self.variance)
+        )
 
 
 @dataclasses.dataclass(frozen=True)
 class Row(Value):
-    """A row of a table: its name, how grasps are planned, which come first, and how the hand closes and holds."""
+    """A row of a table: its name, how grasps are planned, which come first, and how the hand closes
+    and holds.
+    """
 
     name: str
     plan: Plan
@@ -47,22 +58,17 @@ class Row(Value):
 
 @dataclasses.dataclass(frozen=True)
 class TableSpec(Value):
-    """What a table is made of. A campaign that is stopped goes on where it was, if it is called again alike.
+    """What a table is made of. A campaign that is stopped goes on where it was, if it is called
+    again alike.
 
-    Args:
-        out: folder of the results, and of the plans and cells that are kept. After a change of the code, take another.
-        objects: folders of objects with noisy views, besides the library's own.
-        hands: by name.
-        only: names of objects to keep; by default all.
-        own: whether the library's own objects take part.
-        representatives: take one object of each family, the first by name.
-        finished: make the table of the objects that an earlier call has finished, and run nothing.
-        views: views of each object.
-        grasps: grasps of each view.
-        draws: lifts of each grasp, with an error of the pose each.
-        starts: of the contact planner.
-        workers: processes; the results do not depend on their number.
-        seed: of every random draw.
+    Args: out: folder of the results, and of the plans and cells that are kept. After a change of
+        the code, take another. objects: folders of objects with noisy views, besides the library's
+        own. hands: by name. only: names of objects to keep; by default all. own: whether the
+        library's own objects take part. representatives: take one object of each family, the first
+        by name. finished: make the table of the objects that an earlier call has finished, and run
+        nothing. views: views of each object. grasps: grasps of each view. draws: lifts of each
+        grasp, with an error of the pose each. starts: of the contact planner. workers: processes;
+        the results do not depend on their number. seed: of every random draw.
     """
 
     out: Path
@@ -107,8 +113,9 @@ class Subject(NamedTuple):
 class Lift(Value):
     """One lift, of the grasp at a `rank`, under one `draw` of the object's pose.
 
-    `pushed` [m] is how far the object moved until all fingers touched, `slip` [m] in the hand from then on. `certain`
-    tells whether the finger on the most certain contact touched first. NaN, None: never measured.
+    `pushed` [m] is how far the object moved until all fingers touched, `slip` [m] in the hand from
+    then on. `certain` tells whether the finger on the most certain contact touched first. NaN,
+    None: never measured.
     """
 
     view: str
@@ -129,8 +136,9 @@ class Lift(Value):
 class Cell(Value):
     """The lifts of one object with one hand in one row.
 
-    `refused` views had no executable grasp; `note` may say why. `std_m` [m] is that of a grasp's least certain contact,
-    a mean over the grasps. `seconds` is the mean CPU time of planning on a view.
+    `refused` views had no executable grasp; `note` may say why. `std_m` [m] is that of a grasp's
+    least certain contact, a mean over the grasps. `seconds` is the mean CPU time of planning on a
+    view.
     """
 
     object: str

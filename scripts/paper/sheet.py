@@ -19,7 +19,9 @@ def render_tile(canvas: Canvas, corners: np.ndarray, eye: Direction, tile: Tile)
     picture = Image.open(io.BytesIO(canvas.render_png(corners, eye)))
     width = round(picture.width * tile[1] / picture.height)
     left = (width - tile[0]) // 2
-    return picture.resize((width, tile[1]), Image.Resampling.LANCZOS).crop((left, 0, left + tile[0], tile[1]))
+    return picture.resize((width, tile[1]), Image.Resampling.LANCZOS).crop(
+        (left, 0, left + tile[0], tile[1])
+    )
 
 
 def save_sheet(
@@ -34,11 +36,16 @@ def save_sheet(
     """
     wide, high = rows[0][0].size if rows else (1, 1)
     top, bottom = (30, 80) if most_std_mm else (0, 0)
-    sheet = Image.new("RGB", (wide * max(map(len, rows), default=1), max(high * len(rows), 1) + top + bottom), PAPER)
+    sheet = Image.new(
+        "RGB",
+        (wide * max(map(len, rows), default=1), max(high * len(rows), 1) + top + bottom),
+        PAPER,
+    )
     for row, pictures in enumerate(rows):
         for column, picture in enumerate(pictures):
             sheet.paste(picture, (column * wide, row * high + top))
-    pen, font = ImageDraw.Draw(sheet), ImageFont.load_default(20)
+    pen = ImageDraw.Draw(sheet)
+    font = ImageFont.load_default(20)
     for (row, column), text in captions.items():
         pen.text((column * wide + 12, row * high + 10), text, INK, font)
     if most_std_mm:

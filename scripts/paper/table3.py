@@ -1,4 +1,6 @@
-"""Table 3 of the paper with the objects of torchgrasp: how many points the filter keeps, and how long shapes take."""
+"""Table 3 of the paper with the objects of torchgrasp: how many points the filter keeps, and how
+long shapes take.
+"""
 
 import json
 from collections.abc import Callable
@@ -31,25 +33,38 @@ PUBLISHED = {
 
 
 def table3(out: Path, seed: int = 0) -> None:
-    """Print Table 3: points that the filter keeps of a cloud, seconds of the filter and of the shape given its points.
+    """Print Table 3: points that the filter keeps of a cloud, seconds of the filter and of the
+    shape given its points.
 
-    "paper" is the filter of Sec. 3.1 on 1000 points of the whole surface and on the partial cloud: the most uncertain
-    point is observed until none has a variance above the noise. "default" is what torchgrasp does with the partial
-    cloud: a fixed number of points, the outline and the mirrored cloud.
+    "paper" is the filter of Sec. 3.1 on 1000 points of the whole surface and on the partial cloud:
+    the most uncertain point is observed until none has a variance above the noise. "default" is
+    what torchgrasp does with the partial cloud: a fixed number of points, the outline and the
+    mirrored cloud.
 
     Args:
         out: folder of table3.json; it is made where it does not exist.
         seed: of every draw.
     """
     torch.set_num_threads(1)
-    print(f"{'':10}{'setting':9}{'cloud':9}{'points':>7}{'filter s':>10}{'shape s':>9}   the paper's")
+    print(
+        f"{'':10}{'setting':9}{'cloud':9}{'points':>7}{'filter s':>10}{'shape s':>9}   the paper's"
+    )
     rows: list[dict[str, Any]] = []
     for name in list_objects():
         thing = load_object(name)
-        whole, part = sample_whole(thing.mesh, seed), thing.view
+        whole = sample_whole(thing.mesh, seed)
+        part = thing.view
         settings: tuple[tuple[str, str, Callable[[], ShapeGP]], ...] = (
-            ("paper", "whole", partial(fit_shape, whole, budget="sure", support="paper", seed=seed)),
-            ("paper", "partial", partial(fit_shape, part, budget="sure", support="paper", seed=seed)),
+            (
+                "paper",
+                "whole",
+                partial(fit_shape, whole, budget="sure", support="paper", seed=seed),
+            ),
+            (
+                "paper",
+                "partial",
+                partial(fit_shape, part, budget="sure", support="paper", seed=seed),
+            ),
             ("default", "partial", partial(fit_shape, part, seed=seed, table=0.0)),
         )
         for setting, cloud, fit in settings:
@@ -59,19 +74,28 @@ def table3(out: Path, seed: int = 0) -> None:
             rows.append(row | {"filter_s": filtering, "shape_s": modelling})
             label, points, first, second = PUBLISHED[name]
             beside = f"   {label} {points}, {first} s, {second} s" if cloud == "whole" else ""
-            print(f"{name:10}{setting:9}{cloud:9}{len(shape.x):7}{filtering:10.2f}{modelling:9.3f}{beside}", flush=True)
-    write_file(out / "table3.json", json.dumps({"seed": seed, "rows": rows, "published": PUBLISHED}, indent=1))
+            print(
+                f"{name:10}{setting:9}{cloud:9}{len(shape.x):7}{filtering:10.2f}{modelling:9.3f}{beside}",
+                flush=True,
+            )
+    write_file(
+        out / "table3.json",
+        json.dumps({"seed": seed, "rows": rows, "published": PUBLISHED}, indent=1),
+    )
 
 
 def sample_whole(mesh: trimesh.Trimesh, seed: int) -> PointCloud:
     """Return points of the whole surface [m] with outward normals."""
     points, faces = trimesh.sample.sample_surface(mesh, POINTS, seed=seed)[:2]
-    return PointCloud(torch.from_numpy(np.array(points)), torch.from_numpy(np.array(mesh.face_normals[faces])))
+    return PointCloud(
+        torch.from_numpy(np.array(points)), torch.from_numpy(np.array(mesh.face_normals[faces]))
+    )
 
 
 def condition_again(shape: ShapeGP) -> object:
     """Return the posterior of as many observations at the same places, made at once."""
-    on, normals = shape.x[shape.has_normal], shape.predict(shape.metres(shape.x[shape.has_normal])).normal
+    on = shape.x[shape.has_normal]
+    normals = shape.predict(shape.metres(shape.x[shape.has_normal])).normal
     off = shape.x[~shape.has_normal]
     known = on_surface(on, normals, torch.full_like(on[:, 0], NOISE), NOISE)
     beside = off_surface(off, shape.predict(shape.metres(off)).distance, NOISE)

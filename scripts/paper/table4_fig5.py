@@ -49,10 +49,12 @@ ARROW = 0.034
 
 
 def table4(out: Path, starts: int = 1000, seed: int = 0) -> None:
-    """Print Table 4: grasps out of 1000 starts, time and quality, with the paper's numbers beside ours.
+    """Print Table 4: grasps out of 1000 starts, time and quality, with the paper's numbers beside
+    ours.
 
-    "paper" plans the paper's problem (Eqs. 10-14, starts on a sphere of 0.1) on the paper's observations of the partial
-    cloud; "default" is what torchgrasp does by itself. Only certified grasps count.
+    "paper" plans the paper's problem (Eqs. 10-14, starts on a sphere of 0.1) on the paper's
+    observations of the partial cloud; "default" is what torchgrasp does by itself. Only certified
+    grasps count.
 
     Args:
         out: folder of table4.json; it is made where it does not exist.
@@ -60,7 +62,9 @@ def table4(out: Path, starts: int = 1000, seed: int = 0) -> None:
         seed: of the draw of starts.
     """
     torch.set_num_threads(1)
-    print(f"{'':10}{'setting':9}{'S':>5}{'grasps':>8}{'ms a start':>12}{'Q [cm]':>16}{'probability':>13}   the paper's")
+    print(
+        f"{'':10}{'setting':9}{'S':>5}{'grasps':>8}{'ms a start':>12}{'Q [cm]':>16}{'probability':>13}   the paper's"
+    )
     rows: list[dict[str, Any]] = []
     for name in list_objects():
         view = load_object(name).view
@@ -73,7 +77,9 @@ def table4(out: Path, starts: int = 1000, seed: int = 0) -> None:
                 spec = ContactSpec.paper(max_variance=threshold, table=0.0)
                 if setting == "default":
                     spec = ContactSpec(max_variance=threshold, table=0.0)
-                row = {"object": name, "setting": setting, "threshold": threshold} | count(shape, spec, starts, seed)
+                row = {"object": name, "setting": setting, "threshold": threshold} | count(
+                    shape, spec, starts, seed
+                )
                 rows.append(row)
                 print(line(row), flush=True)
     content = {"starts": starts, "seed": seed, "rows": rows, "published": PUBLISHED}
@@ -81,7 +87,9 @@ def table4(out: Path, starts: int = 1000, seed: int = 0) -> None:
 
 
 def count(shape: ShapeGP, spec: ContactSpec, starts: int, seed: int) -> dict[str, float]:
-    """Plan and return how many certified grasps came of it, the time of a start [ms], and their quality [cm]."""
+    """Plan and return how many certified grasps came of it, the time of a start [ms], and their
+    quality [cm].
+    """
     began = time.process_time()
     plan = plan_contacts(shape, spec, starts, seed)
     milliseconds = 1e3 * (time.process_time() - began) / starts
@@ -110,11 +118,12 @@ def line(row: dict[str, Any]) -> str:
 
 
 def fig5(out: Path, starts: int = 300, seed: int = 0) -> None:
-    """Draw Fig. 5: four planned grasps on each object, on the surface coloured by its standard deviation.
+    """Draw Fig. 5: four planned grasps on each object, on the surface coloured by its standard
+    deviation.
 
-    Each object has a column of the paper's problem on the paper's shape, and one of torchgrasp's own. Of the certified
-    grasps the better half counts: of the paper's the more certain ones, of the others the more probable ones. Drawn are
-    those unlike each other.
+    Each object has a column of the paper's problem on the paper's shape, and one of torchgrasp's
+    own. Of the certified grasps the better half counts: of the paper's the more certain ones, of
+    the others the more probable ones. Drawn are those unlike each other.
 
     Args:
         out: folder of fig5.png; it is made where it does not exist.
@@ -123,9 +132,14 @@ def fig5(out: Path, starts: int = 300, seed: int = 0) -> None:
     """
     scenes: list[tuple[str, Surface, Contacts]] = []
     for name, chain in itertools.product(list_objects(), ("paper", "default")):
-        as_paper, view = chain == "paper", load_object(name).view
+        as_paper = chain == "paper"
+        view = load_object(name).view
         spec = ContactSpec.paper(table=0.0) if as_paper else ContactSpec(table=0.0)
-        shape = fit_shape(view, seed=seed, support="paper") if as_paper else fit_shape(view, seed=seed, table=0.0)
+        shape = (
+            fit_shape(view, seed=seed, support="paper")
+            if as_paper
+            else fit_shape(view, seed=seed, table=0.0)
+        )
         plan = plan_contacts(shape, spec, starts, seed)
         contacts = plan.contacts[plan.status == Status.OK]
         contacts = contacts[certify(contacts, spec).closed]
@@ -140,7 +154,12 @@ def fig5(out: Path, starts: int = 300, seed: int = 0) -> None:
         )
     most = 1e3 * max(float(surface.std_m.quantile(0.9)) for _, surface, _ in scenes)
     rows = [[draw(surface, shown[k], most) for _, surface, shown in scenes] for k in range(SHOWN)]
-    save_sheet(out / "fig5.png", rows, {(0, column): name for column, (name, *_) in enumerate(scenes)}, most)
+    save_sheet(
+        out / "fig5.png",
+        rows,
+        {(0, column): name for column, (name, *_) in enumerate(scenes)},
+        most,
+    )
 
 
 def unlike(contacts: Contacts, count: int) -> Contacts:
@@ -155,8 +174,10 @@ def unlike(contacts: Contacts, count: int) -> Contacts:
 
 def draw(surface: Surface, contacts: Contacts, most: float) -> Image.Image:
     """Draw a grasp on the surface, from where most of its contacts face the eye."""
-    vertices, normals = surface.vertices.numpy(), surface.normals.numpy()
-    points, outward = contacts.points[0].numpy(), contacts.normals[0].numpy()
+    vertices = surface.vertices.numpy()
+    normals = surface.normals.numpy()
+    points = contacts.points[0].numpy()
+    outward = contacts.normals[0].numpy()
     canvas = Canvas()
     colors = map_colors(1e3 * surface.std_m.numpy() / most, "viridis")
     canvas.add_mesh(vertices, surface.faces.numpy(), colors, normals)

@@ -1,7 +1,8 @@
-"""Table 5, Fig. 7 and Fig. 8 of the paper: errors of the joints that `query_mixture` starts from (Eq. 23).
+"""Table 5, Fig. 7 and Fig. 8 of the paper: errors of the joints that `query_mixture` starts from
+(Eq. 23).
 
-Test postures can hold something and touch where their tips have rolled to. Beside them stand the same postures that
-touch with the middles of their pads, and uniform postures, as the paper tested.
+Test postures can hold something and touch where their tips have rolled to. Beside them stand the
+same postures that touch with the middles of their pads, and uniform postures, as the paper tested.
 """
 
 import dataclasses
@@ -25,15 +26,23 @@ from torchgrasp.posture_model.mixture import encode_fingertips
 from torchgrasp.posture_model.sample import sample_configurations
 
 PUBLISHED = {
-    "cases": [[0.03, 0.06, 0.27, 0.26], [0.17, 0.01, 0.27, 0.002], [0.04, 0.07, 0.25, 0.08], [0.03, 0.2, 0.06, 0.56]],
+    "cases": [
+        [0.03, 0.06, 0.27, 0.26],
+        [0.17, 0.01, 0.27, 0.002],
+        [0.04, 0.07, 0.25, 0.08],
+        [0.03, 0.2, 0.06, 0.56],
+    ],
     "overall": [(0.16, 0.01), (0.17, 0.01), (0.21, 0.007), (0.36, 0.02)],
 }
 """The paper's Table 5 by joint: four cases, and mean and deviation over all test postures [rad]."""
 PUBLISHED_ALLEGRO = 0.2
 """Average error in the paper's text on Fig. 8 [rad]."""
 CASES = (0.1, 0.4, 0.7, 0.95)
-"""Quantiles of the error at which the four cases are taken; the paper does not explain its own choice."""
-NEIGHBOURS, QUERIES = 64, 20_000
+"""Quantiles of the error at which the four cases are taken; the paper does not explain its own
+choice.
+"""
+NEIGHBOURS = 64
+QUERIES = 20_000
 """Nearest codes whose median posture is compared: of 8 to 128 the best; codes that are asked."""
 TILE = (520, 416)
 """Width and height of one picture of Fig. 7 [pixels]."""
@@ -61,17 +70,26 @@ class Errors:
 
 def measure_errors(name: str, n: int, seed: int, touching: Touching = "rolled") -> Errors:
     """Predict the joints of n test postures as a query does; the seed must differ from the model's."""
-    hand, mixture = load_hand(name), load_mixture(name)
+    hand = load_hand(name)
+    mixture = load_mixture(name)
     if str(seed) == mixture.meta["seed"]:
-        raise SystemExit(f"--seed {seed}: the model was fitted to these postures; choose another seed")
-    samples = sample_configurations(hand, n, seed, sampling="uniform" if touching == "uniform" else "grasping")
-    codes = encode_fingertips(*hand.fingertips(samples.joints)) if touching == "middle" else samples.q
+        raise SystemExit(
+            f"--seed {seed}: the model was fitted to these postures; choose another seed"
+        )
+    samples = sample_configurations(
+        hand, n, seed, sampling="uniform" if touching == "uniform" else "grasping"
+    )
+    codes = (
+        encode_fingertips(*hand.fingertips(samples.joints)) if touching == "middle" else samples.q
+    )
     predicted = mixture.joints(codes).clamp(hand.lower, hand.upper)
     return Errors(hand, samples.joints, predicted, (predicted - samples.joints).abs())
 
 
 def nearest_code_error(name: str, n: int, seed: int) -> float:
-    """Return the mean absolute error [rad] of the median posture of the nearest codes: what a code leaves open."""
+    """Return the mean absolute error [rad] of the median posture of the nearest codes: what a code
+    leaves open.
+    """
     hand = load_hand(name)
     known = sample_configurations(hand, n, seed + 1, sampling="grasping")
     asked = sample_configurations(hand, min(n, QUERIES), seed, sampling="grasping")
@@ -82,7 +100,8 @@ def nearest_code_error(name: str, n: int, seed: int) -> float:
 
 
 def table5(out: Path, n: int = 100_000, seed: int = 1) -> None:
-    """Print Table 5: the Barrett model's mean absolute error by joint, with the paper's numbers beside ours.
+    """Print Table 5: the Barrett model's mean absolute error by joint, with the paper's numbers
+    beside ours.
 
     Args:
         out: folder of table5.json.
@@ -90,20 +109,31 @@ def table5(out: Path, n: int = 100_000, seed: int = 1) -> None:
         seed: of their draw.
     """
     errors = measure_errors("barrett", n, seed)
-    others = {kind: measure_errors("barrett", n, seed, kind).error.mean(0) for kind in ("middle", "uniform")}
-    cases, mean, spread = errors.error[errors.cases()].T, errors.error.mean(0), errors.error.std(0)
+    others = {
+        kind: measure_errors("barrett", n, seed, kind).error.mean(0)
+        for kind in ("middle", "uniform")
+    }
+    cases = errors.error[errors.cases()].T
+    mean = errors.error.mean(0)
+    spread = errors.error.std(0)
     head = "".join(f"{f'case {k + 1}':>8}" for k in range(len(CASES)))
     print(f"{'joint':12}{head}{'overall':>17}   the paper's{head}{'overall':>17}")
     for k, joint in enumerate(errors.hand.joint_names):
-        ours = "".join(f"{float(x):8.3f}" for x in cases[k]) + f"{f'{mean[k]:.3f} +- {spread[k]:.3f}':>17}"
-        paper, (theirs, deviation) = PUBLISHED["cases"][k], PUBLISHED["overall"][k]
+        ours = (
+            "".join(f"{float(x):8.3f}" for x in cases[k])
+            + f"{f'{mean[k]:.3f} +- {spread[k]:.3f}':>17}"
+        )
+        paper = PUBLISHED["cases"][k]
+        (theirs, deviation) = PUBLISHED["overall"][k]
         print(
             f"{joint:12}{ours}   {f'J{k + 1}':11}"
             + "".join(f"{x:8.3g}" for x in paper)
             + f"{f'{theirs} +- {deviation}':>17}"
         )
     for kind, error in others.items():
-        print(f"{kind:12}{', '.join(f'{x:.3f}' for x in error.tolist())}; mean {float(error.mean()):.3f}")
+        print(
+            f"{kind:12}{', '.join(f'{x:.3f}' for x in error.tolist())}; mean {float(error.mean()):.3f}"
+        )
     theirs = np.mean([m for m, _ in PUBLISHED["overall"]])
     print(f"mean over joints {float(errors.error.mean()):.3f}; the paper's {theirs:.3f}")
     print(f"cases: the postures at {', '.join(f'{c:.0%}' for c in CASES)} of all, ordered by error")
@@ -113,7 +143,8 @@ def table5(out: Path, n: int = 100_000, seed: int = 1) -> None:
 
 
 def fig7(out: Path, n: int = 100_000, seed: int = 1) -> None:
-    """Draw Fig. 7: true (solid) and predicted (transparent) joints of the Barrett hand in the four cases of Table 5.
+    """Draw Fig. 7: true (solid) and predicted (transparent) joints of the Barrett hand in the four
+    cases of Table 5.
 
     Args:
         out: folder of fig7.png.
@@ -121,7 +152,8 @@ def fig7(out: Path, n: int = 100_000, seed: int = 1) -> None:
         seed: of their draw.
     """
     errors = measure_errors("barrett", n, seed)
-    pictures, captions = [], {}
+    pictures = []
+    captions = {}
     for k, row in enumerate(errors.cases()):
         pictures.append(draw_both(errors.hand, errors.joints[row], errors.predicted[row]))
         numbers = ", ".join(f"{x:.2f}" for x in errors.error[row].tolist())
@@ -130,7 +162,8 @@ def fig7(out: Path, n: int = 100_000, seed: int = 1) -> None:
 
 
 def fig8(out: Path, n: int = 100_000, seed: int = 1) -> None:
-    """Draw Fig. 8: the Allegro model's mean absolute error of each of the 12 joints, with its deviation.
+    """Draw Fig. 8: the Allegro model's mean absolute error of each of the 12 joints, with its
+    deviation.
 
     Args:
         out: folder of fig8.png and fig8.json.
@@ -141,14 +174,38 @@ def fig8(out: Path, n: int = 100_000, seed: int = 1) -> None:
 
     errors = measure_errors("allegro", n, seed)
     floor = nearest_code_error("allegro", n, seed)
-    mean, spread = errors.error.mean(0).numpy(), errors.error.std(0).numpy()
+    mean = errors.error.mean(0).numpy()
+    spread = errors.error.std(0).numpy()
     figure = Figure(figsize=(8.4, 4.2), dpi=140, facecolor=PAPER, layout="constrained")
     axes = figure.add_subplot(facecolor=PAPER)
-    place, fingers = np.arange(len(mean)), np.repeat(FINGERS[:3], 4)
-    axes.bar(place, mean, 0.65, yerr=[np.minimum(mean, spread), spread], color=fingers, ecolor=INK, capsize=3)
-    axes.axhline(PUBLISHED_ALLEGRO, color="#d62728", linestyle="--", linewidth=1.3, label="the paper: around 0.2 rad")
-    axes.axhline(float(mean.mean()), color=INK, linewidth=1.3, label=f"our mean {mean.mean():.3f} rad")
-    axes.axhline(floor, color=INK, linestyle=":", linewidth=1.3, label=f"median of nearest codes {floor:.3f} rad")
+    place = np.arange(len(mean))
+    fingers = np.repeat(FINGERS[:3], 4)
+    axes.bar(
+        place,
+        mean,
+        0.65,
+        yerr=[np.minimum(mean, spread), spread],
+        color=fingers,
+        ecolor=INK,
+        capsize=3,
+    )
+    axes.axhline(
+        PUBLISHED_ALLEGRO,
+        color="#d62728",
+        linestyle="--",
+        linewidth=1.3,
+        label="the paper: around 0.2 rad",
+    )
+    axes.axhline(
+        float(mean.mean()), color=INK, linewidth=1.3, label=f"our mean {mean.mean():.3f} rad"
+    )
+    axes.axhline(
+        floor,
+        color=INK,
+        linestyle=":",
+        linewidth=1.3,
+        label=f"median of nearest codes {floor:.3f} rad",
+    )
     axes.set_xticks(place, [name.removeprefix("joint_") for name in errors.hand.joint_names])
     axes.set_xlabel(f"joint ({', '.join(errors.hand.tips.names)})", color=INK)
     axes.set_ylabel("mean absolute error [rad]", color=INK)
@@ -159,16 +216,25 @@ def fig8(out: Path, n: int = 100_000, seed: int = 1) -> None:
     write_file(out / "fig8.png", lambda file: figure.savefig(file, format="png"))
     for name, error, deviation in zip(errors.hand.joint_names, mean, spread, strict=True):
         print(f"{name:10}{error:8.3f} +- {deviation:.3f}")
-    print(f"mean {mean.mean():.3f} rad; the median of nearest codes {floor:.3f}; the paper: about {PUBLISHED_ALLEGRO}")
-    _write(out, "fig8", {"n": n, "seed": seed, "mean": mean.tolist(), "spread": spread.tolist(), "floor": floor})
+    print(
+        f"mean {mean.mean():.3f} rad; the median of nearest codes {floor:.3f}; the paper: about {PUBLISHED_ALLEGRO}"
+    )
+    _write(
+        out,
+        "fig8",
+        {"n": n, "seed": seed, "mean": mean.tolist(), "spread": spread.tolist(), "floor": floor},
+    )
     print(out / "fig8.png")
 
 
 def draw_both(hand: Hand, true: Float[Tensor, "h"], predicted: Float[Tensor, "h"]) -> Image.Image:
     """Draw a hand at its true joints and, transparent, at the predicted ones."""
-    canvas, corners = Canvas(), []
+    canvas = Canvas()
+    corners = []
     for joints, transparent in ((true, False), (predicted, True)):
-        for solid in solids_from_hand(hand, hand.expand_joints(joints), hand.tree.joint_names, torch.eye(4).double()):
+        for solid in solids_from_hand(
+            hand, hand.expand_joints(joints), hand.tree.joint_names, torch.eye(4).double()
+        ):
             canvas.add_mesh(solid.vertices, solid.faces, solid.color, transparent=transparent)
             corners.append(solid.vertices)
     return render_tile(canvas, np.concatenate(corners), EYE, TILE)

@@ -1,4 +1,6 @@
-"""Tables 6 and 7 of the paper: riskier contacts hold less often, and the closing law holds more often."""
+"""Tables 6 and 7 of the paper: riskier contacts hold less often, and the closing law holds more
+often.
+"""
 
 import dataclasses
 import math
@@ -44,10 +46,14 @@ OWN: dict[ClosingMode, HoldingMode] = {
 """The closings of Table 7, and how each holds where each holds in its own way."""
 
 
-ROWS6 = tuple(Row(f"{t:.2f}", Plan(support="paper", variance=t), "risky", "uncertainty", "force") for t in THRESHOLDS)
+ROWS6 = tuple(
+    Row(f"{t:.2f}", Plan(support="paper", variance=t), "risky", "uncertainty", "force")
+    for t in THRESHOLDS
+)
 """Rows of Table 6.
 
-The thresholds are variances of the paper's shape: on the completed one hardly any contact reaches the first of them.
+The thresholds are variances of the paper's shape: on the completed one hardly any contact reaches
+the first of them.
 """
 ROWS7 = tuple(
     Row(f"{closing}, {holding}", Plan(variance=THRESHOLDS[0]), "risky", closing, holding)
@@ -58,7 +64,8 @@ ROWS7 = tuple(
 
 
 def table6(spec: Asked) -> None:
-    """Print Table 6: how often grasps hold whose contacts are less and less certain, on the paper's shape.
+    """Print Table 6: how often grasps hold whose contacts are less and less certain, on the paper's
+    shape.
 
     The riskiest grasps of each view are lifted under the library's closing.
 
@@ -74,12 +81,15 @@ def judge_table6(spec: TableSpec, cells: Iterator[tuple[Cell, ...]]) -> None:
     numbers = report(rows)
     fall = contrast_over([count_held(row) for row in rows], line_weights(THRESHOLDS))
     found = "excludes zero" if fall.low > 0 or fall.high < 0 else "does not exclude zero"
-    print(f"fall of the line from the first to the last: {format_points(fall)}; the interval {found}")
+    print(
+        f"fall of the line from the first to the last: {format_points(fall)}; the interval {found}"
+    )
     write(spec.out / "table6.json", spec, rows, {"rows": numbers, "fall": fall})
 
 
 def table7(spec: Asked) -> None:
-    """Print Table 7: how often the same grasps hold, closed in five ways, held alike and as each closing does itself.
+    """Print Table 7: how often the same grasps hold, closed in five ways, held alike and as each
+    closing does itself.
 
     The riskiest grasps below the first threshold are lifted.
 
@@ -92,11 +102,14 @@ def table7(spec: Asked) -> None:
 def judge_table7(spec: TableSpec, cells: Iterator[tuple[Cell, ...]]) -> None:
     """Print and write Table 7 of the cells of its rows."""
     rows = gather(cells)
-    numbers, held = report(rows), {row[0].row: count_held(row) for row in rows}
+    numbers = report(rows)
+    held = {row[0].row: count_held(row) for row in rows}
     alike = [f"{closing}, {FORCE}" for closing in OWN]
     own = [f"{closing}, {holding}" for closing, holding in OWN.items()]
     pairs = [(names[0], name) for names in (alike, own) for name in names[1:]]
-    pairs += [(names[2], name) for names in (alike, own) for name in names[3:]]  # the paper's law over the baselines
+    pairs += [
+        (names[2], name) for names in (alike, own) for name in names[3:]
+    ]  # the paper's law over the baselines
     gains = {f"{a} over {b}": contrast_over([held[a], held[b]], [1.0, -1.0]) for a, b in pairs}
     for name, gain in gains.items():
         print(f"{name}: {format_points(gain)}")
@@ -108,11 +121,16 @@ def gather(cells: Iterator[tuple[Cell, ...]]) -> list[list[Cell]]:
     rows: list[list[Cell]] = []
     for found in cells:
         if not rows:
-            shift, turn = 1e3 * PAPER.noise.translation, math.degrees(PAPER.noise.rotation)
-            print(f"the object stands within {shift:.0f} mm and {turn:.0f} deg of where it was seen; held of lifts:")
+            shift = 1e3 * PAPER.noise.translation
+            turn = math.degrees(PAPER.noise.rotation)
+            print(
+                f"the object stands within {shift:.0f} mm and {turn:.0f} deg of where it was seen; held of lifts:"
+            )
             print("; ".join(cell.row for cell in found))
             rows = [[] for _ in found]
-        counts = " ".join(f"{cell.held}/{len(cell.lifts)}" if cell.lifts else "none" for cell in found)
+        counts = " ".join(
+            f"{cell.held}/{len(cell.lifts)}" if cell.lifts else "none" for cell in found
+        )
         note = next((cell.note for cell in found if cell.note), "")
         print(f"{found[0].object:28}{found[0].hand:9}{counts} {note}".rstrip(), flush=True)
         for row, cell in zip(rows, found, strict=True):
@@ -126,30 +144,53 @@ def report(rows: Sequence[Sequence[Cell]]) -> dict[str, Any]:
     """Print what is to be said of each row, of all hands and of each, and return it."""
     numbers = {row[0].row: _numbers(row) for row in rows}
     lines = [
-        ("row", "hand", "held of the lifts", "objects with a grasp", "pushed", "slip", "most certain first", "paper")
+        (
+            "row",
+            "hand",
+            "held of the lifts",
+            "objects with a grasp",
+            "pushed",
+            "slip",
+            "most certain first",
+            "paper",
+        )
     ]
     for row in rows:
-        name, hands = row[0].row, dict.fromkeys(cell.hand for cell in row)
-        parts = {"all": numbers[name]} | {hand: _numbers([c for c in row if c.hand == hand]) for hand in hands}
-        for hand, found in parts.items() if len(hands) > 1 else [(next(iter(hands)), numbers[name])]:
+        name = row[0].row
+        hands = dict.fromkeys(cell.hand for cell in row)
+        parts = {"all": numbers[name]} | {
+            hand: _numbers([c for c in row if c.hand == hand]) for hand in hands
+        }
+        for hand, found in (
+            parts.items() if len(hands) > 1 else [(next(iter(hands)), numbers[name])]
+        ):
             held, certain = (format_share(found[key]) for key in ("held", "certain_first"))
-            moved = ["-" if math.isnan(x) else f"{x:.1f} mm" for x in (found["pushed_mm"], found["slip_mm"])]
+            moved = [
+                "-" if math.isnan(x) else f"{x:.1f} mm"
+                for x in (found["pushed_mm"], found["slip_mm"])
+            ]
             graspable = f"{found['graspable']} of {found['objects']}"
             lines.append((name, hand, held, graspable, *moved, certain, PUBLISHED.get(name, "-")))
     print(f"\n{format_columns(lines, left={0, 1, 2, 6})}")
     for name, found in numbers.items():
-        print(f"{name}: {', '.join(f'{n} {reason.lower()}' for reason, n in found['lost'].items()) or 'none lost'}")
+        print(
+            f"{name}: {', '.join(f'{n} {reason.lower()}' for reason, n in found['lost'].items()) or 'none lost'}"
+        )
     return numbers
 
 
 def _numbers(row: Sequence[Cell]) -> dict[str, Any]:
-    """Return the numbers of a row: shares with intervals over families, medians of the lifts that held."""
+    """Return the numbers of a row: shares with intervals over families, medians of the lifts that
+    held.
+    """
     lifts = [(cell.family, lift) for cell in row for lift in cell.lifts]
     objects = {cell.object: False for cell in row}
     objects |= {cell.object: True for cell in row if cell.lifts}
     return {
         "held": share_over(count_held(row)),
-        "certain_first": share_over(count_by((family, x.certain) for family, x in lifts if x.certain is not None)),
+        "certain_first": share_over(
+            count_by((family, x.certain) for family, x in lifts if x.certain is not None)
+        ),
         "pushed_mm": median(1e3 * x.pushed for _, x in lifts),
         "slip_mm": median(1e3 * x.slip for _, x in lifts if x.held),
         "std_mm": median(1e3 * cell.std_m for cell in row),
@@ -196,7 +237,9 @@ def format_points(difference: Share) -> str:
     return f"{100 * difference.value:+.1f} points {ends} over {difference.units} families"
 
 
-def write(path: Path, spec: TableSpec, rows: Sequence[Sequence[Cell]], found: dict[str, Any]) -> None:
+def write(
+    path: Path, spec: TableSpec, rows: Sequence[Sequence[Cell]], found: dict[str, Any]
+) -> None:
     """Write what was asked, found and measured as JSON."""
     asked = dataclasses.asdict(spec) | {"out": None, "objects": len(spec.objects)}
     cells = [dataclasses.asdict(cell) for row in rows for cell in row]

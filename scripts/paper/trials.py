@@ -1,8 +1,10 @@
-"""Campaigns of lifts behind Tables 6 and 7 and the ladder: planned once, kept as files, resumed where they stopped.
+"""Campaigns of lifts behind Tables 6 and 7 and the ladder: planned once, kept as files, resumed
+where they stopped.
 
-A row says how grasps are planned, which of them come first, and how the hand closes and holds. Rows share plans where
-they are the same. Every lift draws the object's pose on its table, unknown to the hand. The draw depends on object,
-view, rank and repetition only, so that rows are compared under the same errors.
+A row says how grasps are planned, which of them come first, and how the hand closes and holds. Rows
+share plans where they are the same. Every lift draws the object's pose on its table, unknown to the
+hand. The draw depends on object, view, rank and repetition only, so that rows are compared under
+the same errors.
 """
 
 import dataclasses
@@ -54,13 +56,28 @@ def run_cells(spec: TableSpec, rows: Sequence[Row]) -> Iterator[tuple[Cell, ...]
     """
     for hand in spec.hands:
         load_hand(hand)
-    tasks = [(spec, tuple(rows), subject, hand) for hand in spec.hands for subject in subjects(spec)]
+    tasks = [
+        (spec, tuple(rows), subject, hand) for hand in spec.hands for subject in subjects(spec)
+    ]
     if spec.finished:
-        tasks = [task for task in tasks if all(cell_path(spec, row, *task[2:]).is_file() for row in rows)]
-    for (_, _, subject, hand), cells in zip(tasks, run_tasks(fill, tasks, spec.workers, CELL_SECONDS), strict=True):
+        tasks = [
+            task for task in tasks if all(cell_path(spec, row, *task[2:]).is_file() for row in rows)
+        ]
+    for (_, _, subject, hand), cells in zip(
+        tasks, run_tasks(fill, tasks, spec.workers, CELL_SECONDS), strict=True
+    ):
         if isinstance(cells, Status):
             lost = Cell(
-                subject.label, subject.family, subject.group, hand, "", (), 1, math.nan, math.nan, cells.sentence
+                subject.label,
+                subject.family,
+                subject.group,
+                hand,
+                "",
+                (),
+                1,
+                math.nan,
+                math.nan,
+                cells.sentence,
             )
             cells = tuple(dataclasses.replace(lost, row=row.name) for row in rows)
         yield cells
@@ -75,9 +92,13 @@ def subjects(spec: TableSpec) -> list[Subject]:
     for folder in spec.objects:
         names = dict.fromkeys(name for name, _ in list_views(folder))
         entries = {name: read_entry(folder, name) for name in names}
-        found += [Subject(folder, name, entry.family, entry.group) for name, entry in entries.items()]
+        found += [
+            Subject(folder, name, entry.family, entry.group) for name, entry in entries.items()
+        ]
     families: dict[str, list[Subject]] = {}
-    for subject in sorted((s for s in found if not spec.only or s.name in spec.only), key=lambda s: s.label):
+    for subject in sorted(
+        (s for s in found if not spec.only or s.name in spec.only), key=lambda s: s.label
+    ):
         families.setdefault(subject.family, []).append(subject)
     ranked = [(k, subject) for some in families.values() for k, subject in enumerate(some)]
     ranked.sort(key=lambda x: (x[0], seed_of(spec.seed, x[1].label)))
@@ -90,9 +111,12 @@ def cell_path(spec: TableSpec, row: Row, subject: Subject, hand: str) -> Path:
     return spec.kept("cells", f"{hand}_{subject.label}", *asked).with_suffix(".json")
 
 
-def fill(spec: TableSpec, rows: tuple[Row, ...], subject: Subject, hand_name: str) -> tuple[Cell, ...]:
+def fill(
+    spec: TableSpec, rows: tuple[Row, ...], subject: Subject, hand_name: str
+) -> tuple[Cell, ...]:
     """Return the cells of one object and hand; each is kept as soon as it is there."""
-    bench, cells = _Bench(spec, subject, hand_name), []
+    bench = _Bench(spec, subject, hand_name)
+    cells = []
     for row in rows:
         path = cell_path(spec, row, subject, hand_name)
         if not path.is_file():
@@ -105,7 +129,9 @@ def _read_cell(path: Path) -> Cell:
     """Read a kept cell."""
     kept = _with_nan(json.loads(path.read_text("utf-8")), ("std_m", "seconds"))
     lifts = (_with_nan(lift, ("pushed", "slip")) for lift in kept.pop("lifts"))
-    return Cell(**kept, lifts=tuple(Lift(**lift | {"status": Status[lift["status"]]}) for lift in lifts))
+    return Cell(
+        **kept, lifts=tuple(Lift(**lift | {"status": Status[lift["status"]]}) for lift in lifts)
+    )
 
 
 def _with_nan(kept: dict[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
@@ -114,10 +140,14 @@ def _with_nan(kept: dict[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
 
 
 class _Bench:
-    """One object and one hand. What a row needs is loaded or planned when the first row asks for it."""
+    """One object and one hand. What a row needs is loaded or planned when the first row asks for
+    it.
+    """
 
     def __init__(self, spec: TableSpec, subject: Subject, hand_name: str) -> None:
-        self.spec, self.subject, self.hand = spec, subject, _load_hand(hand_name)
+        self.spec = spec
+        self.subject = subject
+        self.hand = _load_hand(hand_name)
         self.shapes: dict[tuple[str, Support], ShapeGP] = {}
 
     @functools.cached_property
@@ -132,7 +162,8 @@ class _Bench:
     @functools.cached_property
     def views(self) -> dict[str, PointCloud]:
         """Return the noisy views by name."""
-        folder, name = self.subject.folder, self.subject.name
+        folder = self.subject.folder
+        name = self.subject.name
         if folder is None:
             return {"view": load_object(name).view}
         views = [view for _, view in list_views(folder, only=[name])][: self.spec.views]
@@ -160,45 +191,74 @@ class _Bench:
                 for draw in range(self.spec.draws)
             ]
         mean = [sum(x) / len(x) if x else math.nan for x in (stds, seconds)]
-        label, family, group = self.subject.label, self.subject.family, self.subject.group
-        return Cell(label, family, group, self.hand.name, row.name, tuple(lifts), refused, *mean, "; ".join(notes))
+        label = self.subject.label
+        family = self.subject.family
+        group = self.subject.group
+        return Cell(
+            label,
+            family,
+            group,
+            self.hand.name,
+            row.name,
+            tuple(lifts),
+            refused,
+            *mean,
+            "; ".join(notes),
+        )
 
     def plan(self, view: str, plan: Plan) -> tuple[Grasps | None, dict[str, Any]]:
-        """Return the executable grasps of a view, kept or planned, and what is known of the planning."""
+        """Return the executable grasps of a view, kept or planned, and what is known of the
+        planning.
+        """
         path = self.spec.kept("plans", f"{self.hand.name}_{self.subject.label}_{view}", plan)
-        file, record = path.with_suffix(".safetensors"), path.with_suffix(".json")
+        file = path.with_suffix(".safetensors")
+        record = path.with_suffix(".json")
         if not record.is_file():
-            started, note = time.process_time(), ""
+            started = time.process_time()
+            note = ""
             try:
                 self._plan(view, plan).save(file)
             except GraspError as error:
                 note = " ".join(str(error).split())
-            write_file(record, format_json({"seconds": time.process_time() - started, "note": note}))
+            write_file(
+                record, format_json({"seconds": time.process_time() - started, "note": note})
+            )
         return load_grasps(file) if file.is_file() else None, json.loads(record.read_text("utf-8"))
 
     def _plan(self, view: str, plan: Plan) -> Grasps:
         """Plan on a view."""
-        cloud, seed = self.views[view], self.spec.seed
+        cloud = self.views[view]
+        seed = self.spec.seed
         if (view, plan.support) not in self.shapes:
-            self.shapes[view, plan.support] = fit_shape(cloud, support=plan.support, seed=seed, table=0.0)
+            self.shapes[view, plan.support] = fit_shape(
+                cloud, support=plan.support, seed=seed, table=0.0
+            )
         shape = self.shapes[view, plan.support]
-        grasps = plan_grasps(cloud, self.hand, plan.contacts(), self.spec.starts, seed, mode=plan.mode, shape=shape)
+        grasps = plan_grasps(
+            cloud, self.hand, plan.contacts(), self.spec.starts, seed, mode=plan.mode, shape=shape
+        )
         return grasps[grasps.status == Status.OK]
 
     def lift(self, row: Row, grasp: Grasps, view: str, rank: int, draw: int) -> Lift:
         """Close the hand on the true object, somewhere beside where it was seen, and lift it."""
         mesh, parts, mass = self.solid
         seed = seed_of(self.spec.seed, self.subject.label, view, rank, draw)
-        trial = dataclasses.replace(PAPER.trial, closing=row.closing, holding=row.holding, mass=mass)
+        trial = dataclasses.replace(
+            PAPER.trial, closing=row.closing, holding=row.holding, mass=mass
+        )
         error = draw_error(PAPER, grasp, mesh, seed)
         touch = seed_of(seed, "touch")
         found = close_hand(grasp, self.hand, mesh, trial, touch, parts=parts, error=error)
         certain = most_certain_first(found.contact_order, grasp) if found.contact_order else None
-        return Lift(view, rank, draw, found.status, found.pushed.distance, found.slip.distance, certain)
+        return Lift(
+            view, rank, draw, found.status, found.pushed.distance, found.slip.distance, certain
+        )
 
 
 def most_certain_first(contact_order: Sequence[int], grasp: Grasps) -> bool:
-    """Return whether the finger with the most certain contact touched first, as the paper expects (Sec. 5, Eq. 27)."""
+    """Return whether the finger with the most certain contact touched first, as the paper expects
+    (Sec. 5, Eq. 27).
+    """
     check_single(grasp)
     std_m = grasp.contacts.require_std()[0]
     return len(contact_order) > 0 and bool(std_m[contact_order[0]] == std_m.min())

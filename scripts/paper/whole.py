@@ -1,4 +1,6 @@
-"""All tables and figures of the paper in one resumable run, on one page with the paper's numbers beside ours."""
+"""All tables and figures of the paper in one resumable run, on one page with the paper's numbers
+beside ours.
+"""
 
 import base64
 import contextlib
@@ -70,14 +72,17 @@ class Sizes:
 
 
 FULL = Sizes()
-"""Every trial: three grasps and ten lifts of each, as in the paper, of one object of every family."""
+"""Every trial: three grasps and ten lifts of each, as in the paper, of one object of every family.
+"""
 QUICK = dataclasses.replace(FULL, postures=20_000, folds=3, families=8, grasps=2, draws=1)
 """The default: fewer lifts, families, test postures and folds."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Figure:
-    """A table or pictures that one command makes; `sizes` are its options and the fields of `Sizes` for them."""
+    """A table or pictures that one command makes; `sizes` are its options and the fields of `Sizes`
+    for them.
+    """
 
     name: str
     title: str
@@ -100,31 +105,83 @@ class Trials:
         """Return the campaign of the table."""
         spec = TableSpec(out, objects, representatives=True, starts=sizes.starts, workers=workers)
         found = subjects(spec)
-        few = [x.name for x in found if x.folder is None] + [x.name for x in found if x.folder][: sizes.families]
-        many = {"grasps": sizes.grasps, "draws": sizes.draws} if self.repeated else {"grasps": 1, "draws": 1}
+        few = [x.name for x in found if x.folder is None] + [x.name for x in found if x.folder][
+            : sizes.families
+        ]
+        many = (
+            {"grasps": sizes.grasps, "draws": sizes.draws}
+            if self.repeated
+            else {"grasps": 1, "draws": 1}
+        )
         return dataclasses.replace(spec, only=tuple(few), **many)
 
 
 PARTS = (
-    Figure("table3", "Table 3: points that the filter keeps of 1000, seconds of filter and shape", table3),
-    Figure("fig4", "Fig. 4: whole and partial clouds, and their shapes", fig4, pictures=("fig4",)),
-    Figure("table4", "Table 4: certified contact triples, time, distance of centres", table4, {"starts": "starts"}),
-    Figure("fig5", "Fig. 5: planned contacts, the paper's problem and ours", fig5, {"starts": "drawn"}, ("fig5",)),
     Figure(
-        "fig6", "Fig. 6: the number of Gaussians by BIC and by cross-validation", fig6,
-        {"n": "fitted", "apart": "apart", "folds": "folds"}, ("fig6",),
+        "table3",
+        "Table 3: points that the filter keeps of 1000, seconds of filter and shape",
+        table3,
     ),
-    Figure("table5", "Table 5: mean absolute error [rad] of the Barrett hand's joints", table5, {"n": "postures"}),
-    Figure("fig7", "Fig. 7: the four cases of Table 5, true and predicted", fig7, {"n": "postures"}, ("fig7",)),
-    Figure("fig8", "Fig. 8: mean error [rad] of the Allegro hand's joints", fig8, {"n": "postures"}, ("fig8",)),
+    Figure("fig4", "Fig. 4: whole and partial clouds, and their shapes", fig4, pictures=("fig4",)),
     Figure(
-        "grasps", "Figs. 9 to 12: a contact triple by two postures and by two hands; grasps of both hands", grasps,
-        {"starts": "drawn"}, ("fig9", "fig10", "fig11", "fig12"),
+        "table4",
+        "Table 4: certified contact triples, time, distance of centres",
+        table4,
+        {"starts": "starts"},
+    ),
+    Figure(
+        "fig5",
+        "Fig. 5: planned contacts, the paper's problem and ours",
+        fig5,
+        {"starts": "drawn"},
+        ("fig5",),
+    ),
+    Figure(
+        "fig6",
+        "Fig. 6: the number of Gaussians by BIC and by cross-validation",
+        fig6,
+        {"n": "fitted", "apart": "apart", "folds": "folds"},
+        ("fig6",),
+    ),
+    Figure(
+        "table5",
+        "Table 5: mean absolute error [rad] of the Barrett hand's joints",
+        table5,
+        {"n": "postures"},
+    ),
+    Figure(
+        "fig7",
+        "Fig. 7: the four cases of Table 5, true and predicted",
+        fig7,
+        {"n": "postures"},
+        ("fig7",),
+    ),
+    Figure(
+        "fig8",
+        "Fig. 8: mean error [rad] of the Allegro hand's joints",
+        fig8,
+        {"n": "postures"},
+        ("fig8",),
+    ),
+    Figure(
+        "grasps",
+        "Figs. 9 to 12: a contact triple by two postures and by two hands; grasps of both hands",
+        grasps,
+        {"starts": "drawn"},
+        ("fig9", "fig10", "fig11", "fig12"),
     ),
     Trials("table6", "Table 6: how often ever riskier grasps hold", ROWS6, judge_table6),
-    Trials("table7", "Table 7: how often the same grasps hold under five closings", ROWS7, judge_table7),
-    Trials("ladder", "From the paper's chain to the default, one stage at a time", RUNGS, judge_ladder, repeated=False),
-)  # fmt: skip
+    Trials(
+        "table7", "Table 7: how often the same grasps hold under five closings", ROWS7, judge_table7
+    ),
+    Trials(
+        "ladder",
+        "From the paper's chain to the default, one stage at a time",
+        RUNGS,
+        judge_ladder,
+        repeated=False,
+    ),
+)
 """All parts, in the order of the page."""
 
 
@@ -132,12 +189,10 @@ PARTS = (
 class Whole:
     """A reproduction. After a change of the code, take another folder.
 
-    Args:
-        out: folder of index.html, results.json, times.json and of all kept files.
-        objects: folders of objects with noisy views, beside the library's own four; see docs/data.md.
-        parts: names of the parts to make, as table3; by default all.
-        full: every trial instead of fewer trials.
-        workers: processes; the results do not depend on their number.
+    Args: out: folder of index.html, results.json, times.json and of all kept files. objects:
+        folders of objects with noisy views, beside the library's own four; see docs/data.md. parts:
+        names of the parts to make, as table3; by default all. full: every trial instead of fewer
+        trials. workers: processes; the results do not depend on their number.
     """
 
     out: Path
@@ -148,7 +203,8 @@ class Whole:
 
 
 def reproduce_all(spec: Annotated[Whole, tyro.conf.arg(name="")]) -> None:
-    """Make Tables 3 to 7, Figs. 4 to 12 and the ladder, on one page with the paper's numbers beside ours.
+    """Make Tables 3 to 7, Figs. 4 to 12 and the ladder, on one page with the paper's numbers beside
+    ours.
 
     A run that was stopped continues, to a results.json of the same bytes. Times are in times.json.
 
@@ -161,25 +217,44 @@ def reproduce_all(spec: Annotated[Whole, tyro.conf.arg(name="")]) -> None:
 def reproduce(spec: Whole, sizes: Sizes) -> None:
     """Make the missing parts in given sizes, and write the page after each."""
     if unknown := sorted({*spec.parts} - {part.name for part in PARTS}):
-        raise SystemExit(f"parts: {unknown} unknown; the parts are {', '.join(part.name for part in PARTS)}")
+        raise SystemExit(
+            f"parts: {unknown} unknown; the parts are {', '.join(part.name for part in PARTS)}"
+        )
     parts = [part for part in PARTS if not spec.parts or part.name in spec.parts]
-    tables = {x.name: x.spec(spec.out, spec.objects, sizes, spec.workers) for x in parts if isinstance(x, Trials)}
-    asked = {x.name: _plain(tables[x.name]) if isinstance(x, Trials) else options_of(x, sizes) for x in parts}
+    tables = {
+        x.name: x.spec(spec.out, spec.objects, sizes, spec.workers)
+        for x in parts
+        if isinstance(x, Trials)
+    }
+    asked = {
+        x.name: _plain(tables[x.name]) if isinstance(x, Trials) else options_of(x, sizes)
+        for x in parts
+    }
     left = [part for part in parts if _kept(spec.out, part.name, asked) is None]
     figures = [(part.name, spec.out, sizes) for part in left if isinstance(part, Figure)]
     lost = []
     with hold_folder(spec.out):
-        for (name, *_), found in zip(figures, run_tasks(make_figure, figures, spec.workers, LIMIT), strict=True):
+        for (name, *_), found in zip(
+            figures, run_tasks(make_figure, figures, spec.workers, LIMIT), strict=True
+        ):
             reason = found.sentence if isinstance(found, Status) else found
             lost += [name] if reason else []
             print(f"{name}: {reason or 'done'}", flush=True)
         write_pages(spec.out, sizes, parts, asked)
         for part in left:
             if isinstance(part, Trials):
-                table, began, said = tables[part.name], time.process_time(), io.StringIO()
+                table = tables[part.name]
+                began = time.process_time()
+                said = io.StringIO()
                 with contextlib.redirect_stdout(said):
                     part.judge(table, run_cells(table, part.rows))
-                _finish(spec.out, part.name, asked[part.name], said.getvalue(), time.process_time() - began)
+                _finish(
+                    spec.out,
+                    part.name,
+                    asked[part.name],
+                    said.getvalue(),
+                    time.process_time() - began,
+                )
                 write_pages(spec.out, sizes, parts, asked)
                 print(f"{part.name}: done", flush=True)
     print(spec.out / "index.html")
@@ -196,7 +271,8 @@ def make_figure(name: str, out: Path, sizes: Sizes) -> str:
     """Make one figure and keep its output; return the reason of a failure, or nothing."""
     part = next(part for part in PARTS if part.name == name)
     assert isinstance(part, Figure)
-    began, said = time.process_time(), io.StringIO()
+    began = time.process_time()
+    said = io.StringIO()
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(io.StringIO()):
         try:
             part.make(out, **options_of(part, sizes))
@@ -214,34 +290,55 @@ def _finish(out: Path, name: str, asked: dict[str, Any], said: str, seconds: flo
 
 
 def _kept(out: Path, name: str, asked: dict[str, dict[str, Any]]) -> dict[str, Any] | None:
-    """Return what is kept of a finished part with the same options, with its numbers; None if it is missing."""
-    record, numbers = out / "parts" / f"{name}.json", out / f"{name}.json"
+    """Return what is kept of a finished part with the same options, with its numbers; None if it is
+    missing.
+    """
+    record = out / "parts" / f"{name}.json"
+    numbers = out / f"{name}.json"
     content = json.loads(record.read_text("utf-8")) if record.is_file() else {"asked": None}
     if content["asked"] != asked[name]:
         return None
-    return content | {"numbers": json.loads(numbers.read_text("utf-8")) if numbers.is_file() else {}}
+    return content | {
+        "numbers": json.loads(numbers.read_text("utf-8")) if numbers.is_file() else {}
+    }
 
 
 def _plain(table: TableSpec) -> dict[str, Any]:
     """Return the fields of a table on which its numbers depend."""
     left_out = {"out", "objects", "workers", "finished"}
-    return {k: list(v) if isinstance(v, tuple) else v for k, v in vars(table).items() if k not in left_out}
+    return {
+        k: list(v) if isinstance(v, tuple) else v
+        for k, v in vars(table).items()
+        if k not in left_out
+    }
 
 
-def write_pages(out: Path, sizes: Sizes, parts: list[Figure | Trials], asked: dict[str, dict[str, Any]]) -> None:
+def write_pages(
+    out: Path, sizes: Sizes, parts: list[Figure | Trials], asked: dict[str, dict[str, Any]]
+) -> None:
     """Write index.html, results.json without times, and times.json, of the finished parts."""
     kept = [(part, _kept(out, part.name, asked)) for part in parts]
-    results, times = {}, {}
+    results = {}
+    times = {}
     for part, content in kept:
         if content is not None:
             numbers = {k: x for k, x in content["numbers"].items() if k not in ("cells", "asked")}
             said = {} if numbers else {"said": content["said"]}
-            results[part.name] = {"title": part.title, "asked": content["asked"], **said, "numbers": _round(numbers)}
+            results[part.name] = {
+                "title": part.title,
+                "asked": content["asked"],
+                **said,
+                "numbers": _round(numbers),
+            }
             times[part.name] = {"seconds": content["seconds"], **only_times(numbers)}
     about = {"torchgrasp": __version__, "sizes": dataclasses.asdict(sizes)}
     write_file(out / "results.json", format_json({**about, "parts": results}))
     write_file(out / "times.json", format_json(times))
-    few = [f"{k} {x} of {y}" for (k, x), y in zip(vars(sizes).items(), vars(FULL).values(), strict=True) if x < y]
+    few = [
+        f"{k} {x} of {y}"
+        for (k, x), y in zip(vars(sizes).items(), vars(FULL).values(), strict=True)
+        if x < y
+    ]
     trials = f"fewer trials than --full: {', '.join(few)}" if few else "every trial (--full)"
     body = [f'<p class="source">torchgrasp {__version__}; {escape(trials)}</p>', f"<p>{NOTE}</p>"]
     body += [_section(out, part, content) for part, content in kept]
@@ -261,7 +358,9 @@ def _section(out: Path, part: Figure | Trials, content: dict[str, Any] | None) -
             picture.convert("RGB").save(packed, format="JPEG", quality=88)
         data = base64.b64encode(packed.getvalue()).decode("ascii")
         lines.append(f'<figure><img alt="{name}" src="data:image/jpeg;base64,{data}"></figure>')
-    options = "".join(f" --{key} {value}" for key, value in content["asked"].items() if type(value) is int)
+    options = "".join(
+        f" --{key} {value}" for key, value in content["asked"].items() if type(value) is int
+    )
     command = f"scripts/reproduce.py {part.name}{options}"
     return "\n".join([*lines, f'<p class="source"><code>{escape(command)}</code></p>'])
 
@@ -277,7 +376,13 @@ def _round(value: Any) -> Any:
 
 def only_times(value: Any, name: str = "") -> dict[str, Any]:
     """Return the times below a value by their place."""
-    pairs = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    pairs = (
+        value.items()
+        if isinstance(value, dict)
+        else enumerate(value)
+        if isinstance(value, list)
+        else ()
+    )
     found: dict[str, Any] = {}
     for key, x in pairs:
         place = f"{name}/{key}".lstrip("/")

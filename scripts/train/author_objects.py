@@ -1,6 +1,8 @@
-"""Write the files of torchgrasp's own objects into torchgrasp/data/assets, the same bytes every time.
+"""Write the files of torchgrasp's own objects into torchgrasp/data/assets, the same bytes every
+time.
 
-Run `objects` after a change of `train/object_shapes.py` or of the virtual camera; it needs the extra `dev`.
+Run `objects` after a change of `train/object_shapes.py` or of the virtual camera; it needs the
+extra `dev`.
 """
 
 import dataclasses
@@ -17,7 +19,12 @@ from torchgrasp.files import write_file
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.values.specs import Simulator
 
-VIEWS = {"cylinder": (20.0, 30.0), "jug": (60.0, 35.0), "rabbit": (55.0, 30.0), "spray": (50.0, 25.0)}
+VIEWS = {
+    "cylinder": (20.0, 30.0),
+    "jug": (60.0, 35.0),
+    "rabbit": (55.0, 30.0),
+    "spray": (50.0, 25.0),
+}
 """Azimuth and elevation [deg] of the camera for each object."""
 SCENE_SEED = 1
 """Of the scene: its things stand apart, one of them in front of another."""
@@ -66,7 +73,9 @@ def write_object(name: str) -> None:
     write_file(DATA / name / "parts.npz", lambda file: np.savez_compressed(file, **columns))
     azimuth, elevation = VIEWS[name]
     cloud = partial_view(mesh, look_at(azimuth, elevation, target=mesh))
-    save_cloud(dataclasses.replace(cloud, frustum=None), DATA / name / "view.ply")  # the whole object is in view
+    save_cloud(
+        dataclasses.replace(cloud, frustum=None), DATA / name / "view.ply"
+    )  # the whole object is in view
     print(f"{name}: {len(mesh.faces)} faces, {mesh.volume * 1e6:.0f} cm3, {len(parts)} parts")
 
 
@@ -78,11 +87,17 @@ def golden(seed: int = 0) -> None:
     """
     for name, hand_name in sorted({(case.object, case.hand) for case in GOLDEN}):
         hand = load_hand(hand_name)
-        grasps = plan_grasps(load_object(name).view, hand, ContactSpec(table=0.0), starts=300, seed=seed)
+        grasps = plan_grasps(
+            load_object(name).view, hand, ContactSpec(table=0.0), starts=300, seed=seed
+        )
         grasps[grasps.status == Status.OK][0].save(DATA / name / f"{hand_name}.safetensors")
     simulators: tuple[Simulator, ...] = ("sapien", "mujoco")
     for simulator in simulators:
         for result in run_golden(simulator):
             print(simulator, result)
             if not result.right:
-                raise BadArgument("seed", f"{seed}: {result.case} is wrong in {simulator}", "one with right verdicts")
+                raise BadArgument(
+                    "seed",
+                    f"{seed}: {result.case} is wrong in {simulator}",
+                    "one with right verdicts",
+                )

@@ -1,7 +1,8 @@
 """Fit the factors of `std_m`, and try them on families of objects left out.
 
-The posterior's own deviations are too wide where much is known, and too narrow where a wrong plane looks right. The
-factor of a kind is the one with which 1, 2 and 3 `std_m` hold what they say, in the mean over views.
+The posterior's own deviations are too wide where much is known, and too narrow where a wrong plane
+looks right. The factor of a kind is the one with which 1, 2 and 3 `std_m` hold what they say, in
+the mean over views.
 """
 
 from collections.abc import Sequence
@@ -25,15 +26,24 @@ TOLERANCES = (0.05, 0.03, 0.015)
 """Misses of these shares that weigh the same."""
 FACTORS = np.arange(0.2, 1.5, 0.01)
 """Factors that are tried."""
-HIDDEN, TABLE_FACE, SAMPLES = 0.006, 0.002, 1500
-"""Distance [m] of hidden surface from the cloud; height [m] of the face on the table, which is left out; points."""
+HIDDEN = 0.006
+TABLE_FACE = 0.002
+SAMPLES = 1500
+"""Distance [m] of hidden surface from the cloud; height [m] of the face on the table, which is left
+out; points.
+"""
 
 Row = dict[str, Any]
-"""Family, group, the kind of hidden side with whether there was a table, errors over the posterior's deviations."""
+"""Family, group, the kind of hidden side with whether there was a table, errors over the
+posterior's deviations.
+"""
 
 
-def bands(objects: tyro.conf.Positional[Path], beside: Path | None = None, views: tuple[str, ...] = ()) -> None:
-    """Print the factors for `torchgrasp/shape/extra_observations.py`, and what bands hold on families left out.
+def bands(
+    objects: tyro.conf.Positional[Path], beside: Path | None = None, views: tuple[str, ...] = ()
+) -> None:
+    """Print the factors for `torchgrasp/shape/extra_observations.py`, and what bands hold on
+    families left out.
 
     Args:
         objects: a folder of objects as `torchgrasp.data` reads it.
@@ -42,9 +52,13 @@ def bands(objects: tyro.conf.Positional[Path], beside: Path | None = None, views
     """
     rows = measure_ratios(objects, views)
     kinds = sorted({row["kind"] for row in rows}, key=str)
-    factors = {kind: fit_factor([row["ratio"] for row in rows if row["kind"] == kind]) for kind in kinds}
+    factors = {
+        kind: fit_factor([row["ratio"] for row in rows if row["kind"] == kind]) for kind in kinds
+    }
     for row in rows:
-        others = [r["ratio"] for r in rows if r["kind"] == row["kind"] and r["family"] != row["family"]]
+        others = [
+            r["ratio"] for r in rows if r["kind"] == row["kind"] and r["family"] != row["family"]
+        ]
         row["factor"] = fit_factor(others) if others else STD_FACTORS[row["kind"]]
     print(f"STD_FACTORS = {factors}\nfamilies left out\n{format_shares(rows)}")
     if beside is not None:
@@ -55,12 +69,16 @@ def bands(objects: tyro.conf.Positional[Path], beside: Path | None = None, views
 
 
 def fit_factor(ratios: list[np.ndarray]) -> float:
-    """Return the factor with which the shares within 1, 2 and 3 deviations miss least, in the mean over views.
+    """Return the factor with which the shares within 1, 2 and 3 deviations miss least, in the mean
+    over views.
 
     `ratios` are errors over the posterior's own deviations, view by view.
     """
     misses = [
-        sum(abs(h - s) / t for h, s, t in zip(_held(ratios, f), NORMAL_SHARES, TOLERANCES, strict=True))
+        sum(
+            abs(h - s) / t
+            for h, s, t in zip(_held(ratios, f), NORMAL_SHARES, TOLERANCES, strict=True)
+        )
         for f in FACTORS
     ]
     return round(float(FACTORS[int(np.argmin(misses))]), 2)
@@ -72,20 +90,45 @@ def _held(ratios: list[np.ndarray], factor: float) -> list[float]:
 
 
 def format_shares(rows: Sequence[Row]) -> str:
-    """Return what bands hold with each row's factor, by kind and group, with intervals over families, as a table."""
+    """Return what bands hold with each row's factor, by kind and group, with intervals over
+    families, as a table.
+    """
     table: list[tuple[str, ...]] = [
-        ("kind, group", "table", "views", "factor", "1 std_m %", "2 std_m %", "3 std_m %", "80 % in 2")
+        (
+            "kind, group",
+            "table",
+            "views",
+            "factor",
+            "1 std_m %",
+            "2 std_m %",
+            "3 std_m %",
+            "80 % in 2",
+        )
     ]
-    labels = [[row["kind"], (row["group"], row["kind"][1]), ("all", row["kind"][1])] for row in rows]
+    labels = [
+        [row["kind"], (row["group"], row["kind"][1]), ("all", row["kind"][1])] for row in rows
+    ]
     for name in (name for column in zip(*labels, strict=True) for name in sorted(set(column))):
         mine = [row for row, own in zip(rows, labels, strict=True) if name in own]
         cells = []
         for k in (1, 2, 3):
-            found = mean_over((row["family"], 100 * float((row["ratio"] <= k * row["factor"]).mean())) for row in mine)
+            found = mean_over(
+                (row["family"], 100 * float((row["ratio"] <= k * row["factor"]).mean()))
+                for row in mine
+            )
             cells.append(f"{found.value:.1f} [{found.low:.1f}, {found.high:.1f}]")
         most = np.mean([(row["ratio"] <= 2 * row["factor"]).mean() >= 0.8 for row in mine])
         factor = f"{np.mean([row['factor'] for row in mine]):.2f}"
-        table.append((name[0], "yes" if name[1] else "no", str(len(mine)), factor, *cells, f"{most:.0%} of views"))
+        table.append(
+            (
+                name[0],
+                "yes" if name[1] else "no",
+                str(len(mine)),
+                factor,
+                *cells,
+                f"{most:.0%} of views",
+            )
+        )
     return format_columns(table, left=(0, 1))
 
 
@@ -98,7 +141,8 @@ def measure_ratios(objects: Path, views: Sequence[str] = ()) -> list[Row]:
         points, normals = sample_mesh(mesh, SAMPLES, np.random.default_rng(0))
         face = (points[:, 2] < float(mesh.bounds[0, 2]) + TABLE_FACE) & (normals[:, 2] < -0.7)
         far = torch.from_numpy(KDTree(cloud.points.numpy()).query(points.numpy())[0]) > HIDDEN
-        hidden, entry = points[far & ~face], read_entry(objects, name)
+        hidden = points[far & ~face]
+        entry = read_entry(objects, name)
         told = {"family": entry.family, "group": entry.group}
         for table in (0.0, None):
             if not len(hidden):

@@ -1,4 +1,5 @@
-"""Simple forms and toys of a household: blocks, prisms, extrusions, forms that run into each other. Lengths are in mm.
+"""Simple forms and toys of a household: blocks, prisms, extrusions, forms that run into each other.
+Lengths are in mm.
 
 Each function makes one body of its family; `draw` draws its sizes.
 """
@@ -7,7 +8,23 @@ import math
 
 import numpy as np
 
-from train.solids import Draw, Thing, around, ball, box, disc, join, lump, move, pebble, prism, rod, slab, stack, turn
+from train.solids import (
+    Draw,
+    Thing,
+    around,
+    ball,
+    box,
+    disc,
+    join,
+    lump,
+    move,
+    pebble,
+    prism,
+    rod,
+    slab,
+    stack,
+    turn,
+)
 
 
 def cube(draw: Draw) -> Thing:
@@ -19,31 +36,54 @@ def cube(draw: Draw) -> Thing:
 
 def column(draw: Draw) -> Thing:
     """A prism of three to eight sides, some with a narrower top."""
-    count, r = int(draw(3, 9)), draw(16, 60)
+    count = int(draw(3, 9))
+    r = draw(16, 60)
     outline = disc(r, r * draw(0.6, 1.0), 0, count)[:, :2]
     return turn(prism(outline, draw(20, 170), draw(0.6, 1.0)), "x", 90 if draw(0, 1) < 0.4 else 0)
 
 
 def pyramid(draw: Draw) -> Thing:
     """A pyramid or a cone with a blunt tip."""
-    count, r, h = (3, 4, 4, 6, 24, 24)[int(draw(0, 6))], draw(25, 75), draw(30, 130)
+    count = (3, 4, 4, 6, 24, 24)[int(draw(0, 6))]
+    r = draw(25, 75)
+    h = draw(30, 130)
     return stack([(r, 0), (r * draw(0.05, 0.4), h)], draw(0.7, 1.0), count)
 
 
 def wedge(draw: Draw) -> Thing:
     """A ramp with a blunt edge."""
-    x, y, low, high = draw(50, 160), draw(25, 80), draw(3, 10), draw(20, 75)
+    x = draw(50, 160)
+    y = draw(25, 80)
+    low = draw(3, 10)
+    high = draw(20, 75)
     return lump(
-        np.array([(s * x / 2, t * y / 2, z) for s, top in ((-1, low), (1, high)) for t in (-1, 1) for z in (0, top)])
+        np.array(
+            [
+                (s * x / 2, t * y / 2, z)
+                for s, top in ((-1, low), (1, high))
+                for t in (-1, 1)
+                for z in (0, top)
+            ]
+        )
     )
 
 
 def profile(draw: Draw) -> Thing:
     """A piece of an extruded L, T, U, Z or H, on its foot or on its end."""
-    x, z, depth, wall, kind = draw(30, 95), draw(25, 95), draw(12, 110), draw(3, 14), int(draw(0, 5))
-    left, right, centre = -(x - wall) / 2, (x - wall) / 2, 0.0
+    x = draw(30, 95)
+    z = draw(25, 95)
+    depth = draw(12, 110)
+    wall = draw(3, 14)
+    kind = int(draw(0, 5))
+    left = -(x - wall) / 2
+    right = (x - wall) / 2
+    centre = 0.0
     upright = ((left,), (centre,), (left, right), (left,), (left, right))[kind]
-    foot = [box(x, depth, wall), box(x, depth, wall, (0, 0, z - wall)), box(x, depth, wall, (0, 0, 0.5 * z))]
+    foot = [
+        box(x, depth, wall),
+        box(x, depth, wall, (0, 0, z - wall)),
+        box(x, depth, wall, (0, 0, 0.5 * z)),
+    ]
     top = box(x, depth, wall, (wall - x, 0, z - wall))
     webs = [solid for at in upright for solid in box(wall, depth, z, (at, 0, 0))]
     bars = (foot[0], foot[1], foot[0], foot[0] + top, foot[2])[kind]
@@ -52,9 +92,14 @@ def profile(draw: Draw) -> Thing:
 
 def cross(draw: Draw) -> Thing:
     """A plus or a star of three to six arms, lying or standing."""
-    count, reach, wide, h = int(draw(3, 7)), draw(25, 90), draw(8, 24), draw(8, 45)
+    count = int(draw(3, 7))
+    reach = draw(25, 90)
+    wide = draw(8, 24)
+    h = draw(8, 45)
     arms = around(box(reach, wide, h, (reach / 2, 0, 0)), count)
-    return turn(arms + stack([(wide, 0), (wide, h + draw(0, 6) + 0.5)]), "x", 90 if draw(0, 1) < 0.4 else 0)
+    return turn(
+        arms + stack([(wide, 0), (wide, h + draw(0, 6) + 0.5)]), "x", 90 if draw(0, 1) < 0.4 else 0
+    )
 
 
 def stone(draw: Draw) -> Thing:
@@ -70,8 +115,14 @@ def blocks(draw: Draw) -> Thing:
     thing = box(*first)
     for _ in range(int(draw(1, 4))):
         x, y, z = (draw(0.25, 1.1) * edge for edge in first)
-        side, turned = (draw(-0.5, 0.5) * first[0], draw(-0.5, 0.5) * first[1], draw(0.1, 0.9) * first[2]), draw(0, 90)
-        thing += move(turn(box(x, y, z) if draw(0, 1) < 0.6 else stack([(x / 2, 0), (x / 2, z)]), "z", turned), *side)
+        side = (draw(-0.5, 0.5) * first[0], draw(-0.5, 0.5) * first[1], draw(0.1, 0.9) * first[2])
+        turned = draw(0, 90)
+        thing += move(
+            turn(
+                box(x, y, z) if draw(0, 1) < 0.6 else stack([(x / 2, 0), (x / 2, z)]), "z", turned
+            ),
+            *side,
+        )
     return thing
 
 
@@ -80,58 +131,109 @@ def bubbles(draw: Draw) -> Thing:
     r = draw(15, 38)
     thing = ball(r, r * draw(0.7, 1.3), r * draw(0.7, 1.2), 6)
     for _ in range(int(draw(1, 4))):
-        a, angle, tilt = draw(0.4, 0.9) * r, draw(0, 6.28), draw(-0.6, 1.2)
-        at = np.array([math.cos(angle) * math.cos(tilt), math.sin(angle) * math.cos(tilt), math.sin(tilt)]) * r * 0.9
+        a = draw(0.4, 0.9) * r
+        angle = draw(0, 6.28)
+        tilt = draw(-0.6, 1.2)
+        at = (
+            np.array(
+                [math.cos(angle) * math.cos(tilt), math.sin(angle) * math.cos(tilt), math.sin(tilt)]
+            )
+            * r
+            * 0.9
+        )
         thing += move(ball(a, a * draw(0.7, 1.3), a * draw(0.7, 1.3), 6), *at.tolist())
     return thing
 
 
 def duck(draw: Draw) -> Thing:
     """An animal of rubber: a body, a head, a beak, ears or a tail."""
-    r, head = draw(20, 42), draw(0.5, 0.75)
-    thing = ball(r * draw(1.0, 1.5), r, 0.85 * r) + move(ball(head * r, head * r, head * r), 0.6 * r, 0, 1.2 * r)
+    r = draw(20, 42)
+    head = draw(0.5, 0.75)
+    thing = ball(r * draw(1.0, 1.5), r, 0.85 * r) + move(
+        ball(head * r, head * r, head * r), 0.6 * r, 0, 1.2 * r
+    )
     thing += pebble(0.35 * r, 0.25 * r, 0.15 * r, ((0.6 + head) * r, 0, 1.15 * r))
     thing += pebble(0.45 * r, 0.3 * r, 0.25 * r, (-1.1 * r, 0, 0.35 * r))
     tall = draw(0.2, 0.7) * r
-    ears = [pebble(0.18 * r, 0.2 * r, tall, (0.5 * r, s * 0.5 * head * r, (1.1 + head) * r)) for s in (-1, 1)]
+    ears = [
+        pebble(0.18 * r, 0.2 * r, tall, (0.5 * r, s * 0.5 * head * r, (1.1 + head) * r))
+        for s in (-1, 1)
+    ]
     return thing + (ears[0] + ears[1] if draw(0, 1) < 0.5 else [])
 
 
 def car(draw: Draw) -> Thing:
     """A toy car: a body, a cabin and four wheels."""
-    x, y, z, wheel = draw(50, 120), draw(24, 50), draw(12, 28), draw(7, 14)
+    x = draw(50, 120)
+    y = draw(24, 50)
+    z = draw(12, 28)
+    wheel = draw(7, 14)
     body = box(x, y, z, (0, 0, 0.6 * wheel)) + move(
         slab(0.5 * x, 0.85 * y, z, 4, 3), draw(-0.15, 0.1) * x, 0, 0.5 * wheel + z
     )
-    rims = [turn(stack([(wheel, -y / 2 - 3), (wheel, y / 2 + 3)], sides=16), "x", 90) for _ in (0, 1)]
+    rims = [
+        turn(stack([(wheel, -y / 2 - 3), (wheel, y / 2 + 3)], sides=16), "x", 90) for _ in (0, 1)
+    ]
     return body + move(rims[0], -0.32 * x, 0, wheel) + move(rims[1], 0.32 * x, 0, wheel)
 
 
 def stool(draw: Draw) -> Thing:
     """A small table of three or four legs, some upside down."""
-    r, h, top, leg, count = draw(25, 75), draw(30, 120), draw(5, 14), draw(4, 8), int(draw(3, 5))
+    r = draw(25, 75)
+    h = draw(30, 120)
+    top = draw(5, 14)
+    leg = draw(4, 8)
+    count = int(draw(3, 5))
     legs = around(rod((1.0 * r - 8, 0, 0), (0.7 * r - 8, 0, h), leg, 0.9 * leg), count)
-    return turn(legs + move(stack([(r, 0), (r, top)]), z=h - 2), "x", 180 if draw(0, 1) < 0.3 else 0)
+    return turn(
+        legs + move(stack([(r, 0), (r, top)]), z=h - 2), "x", 180 if draw(0, 1) < 0.3 else 0
+    )
 
 
 def pegs(draw: Draw) -> Thing:
     """A board with a row or a field of pegs."""
-    nx, ny, gap, base = int(draw(2, 6)), int(draw(1, 4)), draw(18, 36), draw(6, 16)
-    r, h = draw(0.18, 0.35) * gap, draw(12, 60)
-    places = [((i - (nx - 1) / 2) * gap, (j - (ny - 1) / 2) * gap) for i in range(nx) for j in range(ny)]
-    rods = join(move(stack([(r, 0), (r * draw(0.6, 1.0), h)], sides=12), x, y, base - 1) for x, y in places)
+    nx = int(draw(2, 6))
+    ny = int(draw(1, 4))
+    gap = draw(18, 36)
+    base = draw(6, 16)
+    r = draw(0.18, 0.35) * gap
+    h = draw(12, 60)
+    places = [
+        ((i - (nx - 1) / 2) * gap, (j - (ny - 1) / 2) * gap) for i in range(nx) for j in range(ny)
+    ]
+    rods = join(
+        move(stack([(r, 0), (r * draw(0.6, 1.0), h)], sides=12), x, y, base - 1) for x, y in places
+    )
     return box(nx * gap, max(ny * gap, 24), base) + rods
 
 
 def gear(draw: Draw) -> Thing:
     """A wheel with teeth or spokes, lying or standing on its rim."""
-    r, h, count = draw(20, 70), draw(8, 30), int(draw(5, 13))
-    tooth = prism([(0.9 * r, -0.15 * r), (1.2 * r, -0.1 * r), (1.2 * r, 0.1 * r), (0.9 * r, 0.15 * r)], 0.9 * h)
+    r = draw(20, 70)
+    h = draw(8, 30)
+    count = int(draw(5, 13))
+    tooth = prism(
+        [(0.9 * r, -0.15 * r), (1.2 * r, -0.1 * r), (1.2 * r, 0.1 * r), (0.9 * r, 0.15 * r)],
+        0.9 * h,
+    )
     wheel = prism(disc(r, r, 0)[:, :2], h) + stack([(0.4 * r, 0), (0.35 * r, h + draw(1, 20))])
     return turn(wheel + around(tooth, count), "x", 90 if draw(0, 1) < 0.3 else 0)
 
 
 FORMS = (
-    cube, column, pyramid, wedge, profile, cross, stone, blocks, bubbles, duck, car, stool, pegs, gear,
-)  # fmt: skip
+    cube,
+    column,
+    pyramid,
+    wedge,
+    profile,
+    cross,
+    stone,
+    blocks,
+    bubbles,
+    duck,
+    car,
+    stool,
+    pegs,
+    gear,
+)
 """Families of this file. New ones come last."""

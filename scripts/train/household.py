@@ -1,7 +1,9 @@
-"""Bodies as diverse as a household, any number of them, each with its convex parts: for fits that need many shapes.
+"""Bodies as diverse as a household, any number of them, each with its convex parts: for fits that
+need many shapes.
 
-The families cycle. Sizes are drawn anew for each body, 15 to 250 mm in all. No body is decomposed: its parts are known
-by construction, and its mesh is their union. Nothing fitted on them has seen a scanned object.
+The families cycle. Sizes are drawn anew for each body, 15 to 250 mm in all. No body is decomposed:
+its parts are known by construction, and its mesh is their union. Nothing fitted on them has seen a
+scanned object.
 """
 
 import dataclasses
@@ -28,10 +30,25 @@ FAMILIES = {
 }
 """Makers by family. A new one changes all bodies: the family of a body depends on their number."""
 CALIBRATING = frozenset(name for k, name in enumerate(sorted(FAMILIES)) if k % 6 in (0, 1, 3))
-"""Families that calibrate the model of success and support promises: no tree is fitted to their trials."""
+"""Families that calibrate the model of success and support promises: no tree is fitted to their
+trials.
+"""
 SEED = 46
 """Of all draws, beside the number of the body."""
-TOPPLED = {"can", "bottle", "flask", "jar", "turned", "cup", "mug", "goblet", "vase", "pitcher", "gable", "spray"}
+TOPPLED = {
+    "can",
+    "bottle",
+    "flask",
+    "jar",
+    "turned",
+    "cup",
+    "mug",
+    "goblet",
+    "vase",
+    "pitcher",
+    "gable",
+    "spray",
+}
 """Families that stand, but of which some bodies lie on their side."""
 LYING = 0.2
 """Share of the bodies of these families that lie."""
@@ -39,7 +56,9 @@ LYING = 0.2
 
 @dataclasses.dataclass(frozen=True)
 class HouseholdBody:
-    """A body [m] that rests on z = 0 above the origin: its closed mesh, and the convex parts that fill it."""
+    """A body [m] that rests on z = 0 above the origin: its closed mesh, and the convex parts that
+    fill it.
+    """
 
     name: str
     family: str
@@ -71,13 +90,17 @@ def family_of(k: int) -> str:
 
 def draw_thing(k: int) -> tuple[str, Thing]:
     """Return the family of the k-th body, and its solids [mm] before it comes to rest."""
-    family, draw = family_of(k), np.random.default_rng([SEED, k]).uniform
+    family = family_of(k)
+    draw = np.random.default_rng([SEED, k]).uniform
     thing = FAMILIES[family](draw)
     return family, turn(thing, "x", 90 if family in TOPPLED and draw() < LYING else 0)
 
 
 def household(
-    folder: tyro.conf.Positional[Path], count: int = len(FAMILIES), first: int = 0, highest: float = math.inf
+    folder: tyro.conf.Positional[Path],
+    count: int = len(FAMILIES),
+    first: int = 0,
+    highest: float = math.inf,
 ) -> None:
     """Write bodies as a folder of objects (`torchgrasp.data`) with one noisy view each.
 
@@ -87,5 +110,7 @@ def household(
         first: number of the first body.
         highest: height [m] above which a body is left out.
     """
-    bodies = filter(lambda body: body.mesh.extents[2] <= highest, map(author_household, itertools.count(first)))
+    bodies = filter(
+        lambda body: body.mesh.extents[2] <= highest, map(author_household, itertools.count(first))
+    )
     write_bodies(folder, {body.name: body.mesh for body in itertools.islice(bodies, count)})

@@ -30,8 +30,8 @@ LIMIT = 7200.0
 class Trials(NamedTuple):
     """Trials: `features` (n, k), whether each `passed`, its family, rank and hand.
 
-    `beside` (n, m, k) holds the features of all grasps that were tried on the body, for the task of the trial, with NaN
-    where there are fewer than m. `place` says which of them the trial tried.
+    `beside` (n, m, k) holds the features of all grasps that were tried on the body, for the task of
+    the trial, with NaN where there are fewer than m. `place` says which of them the trial tried.
     """
 
     features: Array
@@ -47,19 +47,24 @@ class Trials(NamedTuple):
         return Trials(*(column[rows] for column in self))
 
     def is_best(self, model: SuccessModel) -> Array:
-        """Return a mask of the trials whose grasp has the greatest prediction of those that were tried on its body."""
+        """Return a mask of the trials whose grasp has the greatest prediction of those that were
+        tried on its body.
+        """
         odds = model.log_odds(torch.from_numpy(self.beside.reshape(-1, len(FEATURES)))).numpy()
         odds = np.where(np.isnan(self.beside[..., 0]), -np.inf, odds.reshape(self.beside.shape[:2]))
         return odds.argmax(1) == self.place
 
 
 def read_trials(folders: Sequence[Path], workers: int = 1) -> Trials:
-    """Return the trials of data sets of `train.trials`, one for each hand; features of an earlier call are read.
+    """Return the trials of data sets of `train.trials`, one for each hand; features of an earlier
+    call are read.
 
     Of a data set that is not finished, its jobs so far are read.
     """
     missing = [(folder,) for folder in folders if not kept_features(folder).exists()]
-    for _ in tqdm(run_tasks(measure_folder, missing, workers, LIMIT), total=len(missing), disable=None):
+    for _ in tqdm(
+        run_tasks(measure_folder, missing, workers, LIMIT), total=len(missing), disable=None
+    ):
         pass
     parts = [np.load(kept_features(folder)) for folder in folders]
     return Trials(*(np.concatenate([part[name] for part in parts]) for name in Trials._fields))
@@ -77,14 +82,18 @@ def list_shards(folder: Path) -> list[Path]:
 
 
 def measure_folder(folder: Path) -> None:
-    """Measure the grasps of a data set for the tasks of its trials, and keep the result in its folder."""
+    """Measure the grasps of a data set for the tasks of its trials, and keep the result in its
+    folder.
+    """
     asked = json.loads((folder / ASKED).read_text("utf-8"))["hand"]
     shards = [load_shard(path, {}) for path in list_shards(folder)]
     found = measure_jobs(load_hand(asked["name"], asked["option"]), read_rows(shards))
     np.savez_compressed(kept_features(folder), **found._asdict())
 
 
-def measure_jobs(hand: Hand, jobs: Iterable[tuple[JobRow, PointCloud, Grasps, list[Trial]]]) -> Trials:
+def measure_jobs(
+    hand: Hand, jobs: Iterable[tuple[JobRow, PointCloud, Grasps, list[Trial]]]
+) -> Trials:
     """Return the trials of jobs of one hand with their features."""
     columns = [measure_job(hand, cloud, grasps, trials) for _, cloud, grasps, trials in jobs]
     return Trials(*(np.concatenate(column) for column in zip(*columns, strict=True)))
@@ -92,10 +101,13 @@ def measure_jobs(hand: Hand, jobs: Iterable[tuple[JobRow, PointCloud, Grasps, li
 
 def measure_job(hand: Hand, cloud: PointCloud, grasps: Grasps, trials: list[Trial]) -> Trials:
     """Return the trials of one view of a body with their features."""
-    body, n = EstimatedBody.of(fit_shape(cloud, table=0.0)), len(trials)
+    body = EstimatedBody.of(fit_shape(cloud, table=0.0))
+    n = len(trials)
     beside = np.full((n, BEST + SPREAD, len(FEATURES)), np.nan)
     for k, trial in enumerate(trials):
-        task, friction, lifted = trial.task.known, trial.task.friction, trial.task.lift
+        task = trial.task.known
+        friction = trial.task.friction
+        lifted = trial.task.lift
         beside[k, :n] = measure_grasps(hand, body, grasps, friction, task, lifted).numpy()
     place = np.arange(n)
     return Trials(

@@ -1,8 +1,9 @@
 """The shapes of torchgrasp's own objects from exact geometry; `author_objects.py` writes them.
 
-Every object is a union of convex solids, so its convex parts need no decomposition. A physics engine takes at most 255
-corners and 255 faces, so curved parts are coarser than the mesh; they have the same volume. The module needs
-manifold3d, a dependency of development only. Metres, z up, resting at z = 0.
+Every object is a union of convex solids, so its convex parts need no decomposition. A physics
+engine takes at most 255 corners and 255 faces, so curved parts are coarser than the mesh; they have
+the same volume. The module needs manifold3d, a dependency of development only. Metres, z up,
+resting at z = 0.
 """
 
 import math
@@ -14,7 +15,8 @@ import numpy as np
 
 SEGMENTS = 96
 """Sides of a solid of revolution: at a radius of 33 mm the facets lie 0.02 mm inside the circle."""
-FINE_SIDES, COARSE_SIDES = 48, 20
+FINE_SIDES = 48
+COARSE_SIDES = 20
 """Sides of the equator of an ellipsoid in the mesh and in the parts (102 corners, 200 faces)."""
 
 Vector = Sequence[float | int] | np.ndarray
@@ -60,7 +62,9 @@ def _rabbit() -> tuple[m3.Manifold, list[m3.Manifold]]:
     ]
     for side in (-1, 1):
         solids += [
-            _ellipsoid((0.020, 0.012 * side, 0.125), (0.008, 0.011, 0.032), pitch=-18.0, roll=-12.0 * side),  # ear
+            _ellipsoid(
+                (0.020, 0.012 * side, 0.125), (0.008, 0.011, 0.032), pitch=-18.0, roll=-12.0 * side
+            ),  # ear
             _ellipsoid((-0.018, 0.024 * side, 0.024), (0.028, 0.012, 0.026)),  # haunch
             _ellipsoid((0.008, 0.026 * side, 0.006), (0.028, 0.010, 0.010)),  # hind foot
             _ellipsoid((0.036, 0.013 * side, 0.022), (0.010, 0.009, 0.030), pitch=-14.0),  # foreleg
@@ -71,8 +75,17 @@ def _rabbit() -> tuple[m3.Manifold, list[m3.Manifold]]:
 
 
 def _spray() -> tuple[m3.Manifold, list[m3.Manifold]]:
-    """A spray bottle: an oval body of 70 x 54 mm, a neck, and a trigger head that sprays along x; 232 mm high."""
-    profile = [(0.029, 0), (0.033, 0.004), (0.035, 0.020), (0.035, 0.090), (0.0335, 0.110), (0.029, 0.130)]
+    """A spray bottle: an oval body of 70 x 54 mm, a neck, and a trigger head that sprays along x;
+    232 mm high.
+    """
+    profile = [
+        (0.029, 0),
+        (0.033, 0.004),
+        (0.035, 0.020),
+        (0.035, 0.090),
+        (0.0335, 0.110),
+        (0.029, 0.130),
+    ]
     profile += [(0.0225, 0.146), (0.0165, 0.158), (0.0145, 0.166)]
     body = [_frusta(profile[i : i + 3], flatten=0.77) for i in range(0, len(profile) - 2, 2)]
     neck = [
@@ -80,10 +93,18 @@ def _spray() -> tuple[m3.Manifold, list[m3.Manifold]]:
         _frusta([(0.0165, 0.172), (0.0165, 0.186), (0.0145, 0.190)]),  # the screw cap
     ]
     head = [
-        _prism([(-0.026, 0.206), (-0.022, 0.189), (0.016, 0.189), (0.016, 0.214), (-0.018, 0.214)], 0.022),
-        _prism([(-0.026, 0.205), (0.036, 0.205), (0.036, 0.224), (-0.004, 0.232), (-0.024, 0.226)], 0.022),
+        _prism(
+            [(-0.026, 0.206), (-0.022, 0.189), (0.016, 0.189), (0.016, 0.214), (-0.018, 0.214)],
+            0.022,
+        ),
+        _prism(
+            [(-0.026, 0.205), (0.036, 0.205), (0.036, 0.224), (-0.004, 0.232), (-0.024, 0.226)],
+            0.022,
+        ),
         _tube((0.030, 0, 0.215), (0.052, 0, 0.215), 0.0075),  # the nozzle
-        _prism([(0.018, 0.208), (0.030, 0.208), (0.036, 0.186), (0.029, 0.184)], 0.012),  # the trigger
+        _prism(
+            [(0.018, 0.208), (0.030, 0.208), (0.036, 0.186), (0.029, 0.184)], 0.012
+        ),  # the trigger
         _prism([(0.036, 0.187), (0.029, 0.186), (0.033, 0.164), (0.040, 0.163)], 0.012),
         _prism([(0.040, 0.165), (0.033, 0.166), (0.041, 0.150), (0.047, 0.153)], 0.012),
     ]
@@ -91,12 +112,25 @@ def _spray() -> tuple[m3.Manifold, list[m3.Manifold]]:
 
 
 def _jug() -> tuple[m3.Manifold, list[m3.Manifold]]:
-    """A full jug: 152 mm high, 78 mm wide, filled to 14 mm below the rim, a spout along x, a handle behind."""
-    outline = [(0.030, 0), (0.034, 0.004), (0.037, 0.025), (0.039, 0.050), (0.0385, 0.070), (0.036, 0.090)]
+    """A full jug: 152 mm high, 78 mm wide, filled to 14 mm below the rim, a spout along x, a handle
+    behind.
+    """
+    outline = [
+        (0.030, 0),
+        (0.034, 0.004),
+        (0.037, 0.025),
+        (0.039, 0.050),
+        (0.0385, 0.070),
+        (0.036, 0.090),
+    ]
     outline += [(0.0325, 0.108), (0.0305, 0.120), (0.0305, 0.126), (0.0315, 0.138)]
     body = [_frusta(outline[i : i + 3]) for i in (0, 2, 4)]
-    body += [_frusta(outline[i : i + 2]) for i in (6, 7, 8)]  # the outline is hollow at the neck: one frustum each
-    rim, staves = _ring([(0.0315, 0.138), (0.0340, 0.152)], [(0.0275, 0.138), (0.0305, 0.152)], pieces=24)
+    body += [
+        _frusta(outline[i : i + 2]) for i in (6, 7, 8)
+    ]  # the outline is hollow at the neck: one frustum each
+    rim, staves = _ring(
+        [(0.0315, 0.138), (0.0340, 0.152)], [(0.0275, 0.138), (0.0305, 0.152)], pieces=24
+    )
     spout = m3.Manifold.hull_points(
         np.array(
             [(0.029, s * 0.013, z) for s in (-1, 1) for z in (0.135, 0.152)]
@@ -115,7 +149,9 @@ def _jug() -> tuple[m3.Manifold, list[m3.Manifold]]:
 
 
 def _ellipsoid(centre: Vector, axes: Vector, pitch: float = 0.0, roll: float = 0.0) -> Solid:
-    """An ellipsoid with semi-axes `axes` [m], its top tipped forward by `pitch` and sideways by `roll` [deg]."""
+    """An ellipsoid with semi-axes `axes` [m], its top tipped forward by `pitch` and sideways by
+    `roll` [deg].
+    """
 
     def place(ball: m3.Manifold) -> m3.Manifold:
         return (
@@ -124,18 +160,28 @@ def _ellipsoid(centre: Vector, axes: Vector, pitch: float = 0.0, roll: float = 0
             .translate((centre[0], centre[1], centre[2]))
         )
 
-    fine, coarse = m3.Manifold.sphere(1.0, FINE_SIDES), m3.Manifold.sphere(1.0, COARSE_SIDES)
+    fine = m3.Manifold.sphere(1.0, FINE_SIDES)
+    coarse = m3.Manifold.sphere(1.0, COARSE_SIDES)
     grow = (4 / 3 * math.pi / coarse.volume()) ** (1 / 3)
     return Solid(place(fine), place(coarse.scale((grow, grow, grow))))
 
 
 def _frusta(profile: Sequence[Vector], flatten: float = 1.0) -> Solid:
-    """A solid of revolution of (radius, height) [m], convex as a whole; `flatten` scales it along y."""
+    """A solid of revolution of (radius, height) [m], convex as a whole; `flatten` scales it along
+    y.
+    """
 
     def revolve(segments: int, grow: float) -> m3.Manifold:
         angle = np.arange(segments) * 2 * np.pi / segments
         rings = [
-            np.stack([r * grow * np.cos(angle), r * grow * flatten * np.sin(angle), np.full(segments, z)], -1)
+            np.stack(
+                [
+                    r * grow * np.cos(angle),
+                    r * grow * flatten * np.sin(angle),
+                    np.full(segments, z),
+                ],
+                -1,
+            )
             for r, z in profile
         ]
         return m3.Manifold.hull_points(np.concatenate(rings))
@@ -145,12 +191,18 @@ def _frusta(profile: Sequence[Vector], flatten: float = 1.0) -> Solid:
     return Solid(revolve(SEGMENTS, 1.0), revolve(sides, math.sqrt(area)))
 
 
-def _ring(outer: Sequence[Vector], inner: Sequence[Vector], pieces: int) -> tuple[m3.Manifold, list[m3.Manifold]]:
-    """A ring between two convex profiles of (radius, height) [m], and the nearly convex pieces it is cut into."""
+def _ring(
+    outer: Sequence[Vector], inner: Sequence[Vector], pieces: int
+) -> tuple[m3.Manifold, list[m3.Manifold]]:
+    """A ring between two convex profiles of (radius, height) [m], and the nearly convex pieces it
+    is cut into.
+    """
     parts = []
     for i in range(pieces):
         angle = (np.arange(SEGMENTS // pieces + 1) + i * SEGMENTS // pieces) * 2 * np.pi / SEGMENTS
-        corners = [(r * math.cos(a), r * math.sin(a), z) for r, z in [*outer, *inner] for a in angle]
+        corners = [
+            (r * math.cos(a), r * math.sin(a), z) for r, z in [*outer, *inner] for a in angle
+        ]
         parts.append(m3.Manifold.hull_points(np.array(corners)))
     return _frusta(outer).fine - _frusta(inner).fine, parts
 
@@ -169,7 +221,9 @@ def _tube(start: Vector, end: Vector, radius: float) -> Solid:
 
 
 def _bar(ends: Sequence[tuple[Vector, Vector]], thick: float, wide: float) -> Solid:
-    """The hull of two elliptic discs in the plane y = 0: (centre, direction), semi-axes in the plane and along y."""
+    """The hull of two elliptic discs in the plane y = 0: (centre, direction), semi-axes in the
+    plane and along y.
+    """
 
     def hull(sides: int) -> m3.Manifold:
         angle = np.arange(sides) * 2 * np.pi / sides
@@ -186,4 +240,6 @@ def _bar(ends: Sequence[tuple[Vector, Vector]], thick: float, wide: float) -> So
 
 def _unite(solids: Sequence[Solid]) -> tuple[m3.Manifold, list[m3.Manifold]]:
     """Return the union of the solids, and their convex parts."""
-    return m3.Manifold.batch_boolean([s.fine for s in solids], m3.OpType.Add), [s.part for s in solids]
+    return m3.Manifold.batch_boolean([s.fine for s in solids], m3.OpType.Add), [
+        s.part for s in solids
+    ]

@@ -1,7 +1,8 @@
 """Fit how likely hidden places are full, and show the reliability on families of objects left out.
 
-Upright objects are scattered on a table and rendered. Of every other family are the objects that the model is fitted
-to; the others judge it. Places are drawn where the camera cannot see, and the meshes tell which are full.
+Upright objects are scattered on a table and rendered. Of every other family are the objects that
+the model is fitted to; the others judge it. Places are drawn where the camera cannot see, and the
+meshes tell which are full.
 """
 
 import json
@@ -44,19 +45,28 @@ KNOTS = {
     "target": ((0.0, 0.02, 0.05, 0.1, 0.2), (0.0, 0.03, 0.06, 0.1, 0.15)),
     "unseen": ((0.0, 0.03, 0.06, 0.1, 0.15),),
 }
-"""Knots of the piecewise linear functions of each kind's features: lengths in metres, depths over sizes."""
-PLACES, KEPT = 60_000, 1500
+"""Knots of the piecewise linear functions of each kind's features: lengths in metres, depths over
+sizes.
+"""
+PLACES = 60_000
+KEPT = 1500
 """Places drawn around a target, and hidden ones of each kind that are kept."""
 BINS = (0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.95, 1.0)
 """Bins of the reliability."""
 
 
-def make_scene(meshes: dict[str, trimesh.Trimesh], seed: int) -> tuple[Scene, list[trimesh.Trimesh], list[str]]:
-    """Return a rendered scene of 5 to 8 objects in its upright frame, the one nearest the middle its target."""
-    rng, generator = np.random.default_rng(seed), torch.Generator().manual_seed(seed)
+def make_scene(
+    meshes: dict[str, trimesh.Trimesh], seed: int
+) -> tuple[Scene, list[trimesh.Trimesh], list[str]]:
+    """Return a rendered scene of 5 to 8 objects in its upright frame, the one nearest the middle
+    its target.
+    """
+    rng = np.random.default_rng(seed)
+    generator = torch.Generator().manual_seed(seed)
     names = list(rng.choice(sorted(meshes), int(rng.integers(5, 9)), replace=False))
     things = [meshes[name].copy() for name in names]
-    radius, gap = float(rng.uniform(0.18, 0.26)), float(rng.uniform(0.005, 0.03))
+    radius = float(rng.uniform(0.18, 0.26))
+    gap = float(rng.uniform(0.005, 0.03))
     poses = None
     while poses is None:
         try:
@@ -65,14 +75,18 @@ def make_scene(meshes: dict[str, trimesh.Trimesh], seed: int) -> tuple[Scene, li
             radius += 0.02
     for mesh, pose in zip(things, poses, strict=True):
         mesh.apply_transform(pose.numpy())
-    camera = look_at(float(rng.uniform(0, 360)), float(rng.uniform(30, 60)), float(rng.uniform(0.45, 0.8)))
+    camera = look_at(
+        float(rng.uniform(0, 360)), float(rng.uniform(30, 60)), float(rng.uniform(0.45, 0.8))
+    )
     depth, labels = render_depth(things, camera, seed=seed)
     pixels = torch.nonzero(depth > 0)
     seen = labels[pixels[:, 0], pixels[:, 1]]
     points = cloud_from_depth(depth, INTRINSICS, camera_pose=camera).points
     order = np.argsort([np.linalg.norm(mesh.bounds.mean(0)[:2]) for mesh in things])
     target = next(int(i) + 1 for i in order if int((seen == i + 1).sum()) > 400)
-    scene = Scene(points, seen, DepthImage(depth, INTRINSICS, camera), pixels, Plane.horizontal(0.0), target)
+    scene = Scene(
+        points, seen, DepthImage(depth, INTRINSICS, camera), pixels, Plane.horizontal(0.0), target
+    )
     cloud = scene.cloud()
     frame = upright_frame(cloud.points, cloud.viewpoint, scene.table)
     for mesh in things:
@@ -80,15 +94,21 @@ def make_scene(meshes: dict[str, trimesh.Trimesh], seed: int) -> tuple[Scene, li
     return scene.to_upright(frame), things, names
 
 
-def collect(meshes: dict[str, trimesh.Trimesh], seeds: range) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def collect(
+    meshes: dict[str, trimesh.Trimesh], seeds: range
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Return features of hidden places and whether they are full, by kind."""
     found: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {kind: [] for kind in KNOTS}
     for seed in seeds:
         scene, things, _ = make_scene(meshes, seed)
-        shadows, rng = cast_shadows(scene, scene.target), np.random.default_rng(seed)
-        own, tops = scene.points[scene.rows_of()], scene.points[scene.labels > 0][:, 2]
-        low, high = own.amin(0).numpy() - SIDEWAYS, own.amax(0).numpy() + SIDEWAYS
-        low[2], high[2] = 0.0, float(tops.max()) + ABOVE
+        shadows = cast_shadows(scene, scene.target)
+        rng = np.random.default_rng(seed)
+        own = scene.points[scene.rows_of()]
+        tops = scene.points[scene.labels > 0][:, 2]
+        low = own.amin(0).numpy() - SIDEWAYS
+        high = own.amax(0).numpy() + SIDEWAYS
+        low[2] = 0.0
+        high[2] = float(tops.max()) + ABOVE
         places = torch.from_numpy(rng.uniform(low, high, (PLACES, 3)))
         behind, owner = shadows.look(places)
         hidden = (owner == -1) | ((owner != 0) & (behind > -NOISE))
@@ -109,27 +129,48 @@ def collect(meshes: dict[str, trimesh.Trimesh], seeds: range) -> dict[str, tuple
                     if k + 1 != scene.target:
                         full |= mesh.contains(places[some].numpy())
                 found[kind].append((features.numpy(), full))
-    return {kind: tuple(np.concatenate(x) for x in zip(*parts, strict=True)) for kind, parts in found.items()}
+    return {
+        kind: tuple(np.concatenate(x) for x in zip(*parts, strict=True))
+        for kind, parts in found.items()
+    }
 
 
-def fit(features: np.ndarray, full: np.ndarray, knots: tuple[tuple[float, ...], ...]) -> dict[str, object]:
-    """Return knots, values there and bias of a logistic regression (Newton's method, slightly damped)."""
-    hats = [np.stack([np.interp(x, k, e) for e in np.eye(len(k))], 1) for x, k in zip(features.T, knots, strict=True)]
+def fit(
+    features: np.ndarray, full: np.ndarray, knots: tuple[tuple[float, ...], ...]
+) -> dict[str, object]:
+    """Return knots, values there and bias of a logistic regression (Newton's method, slightly
+    damped).
+    """
+    hats = [
+        np.stack([np.interp(x, k, e) for e in np.eye(len(k))], 1)
+        for x, k in zip(features.T, knots, strict=True)
+    ]
     design = np.concatenate([*hats, np.ones((len(full), 1))], 1)
-    weights, damping = np.zeros(design.shape[1]), np.r_[np.full(design.shape[1] - 1, 3.0), 0.0]
+    weights = np.zeros(design.shape[1])
+    damping = np.r_[np.full(design.shape[1] - 1, 3.0), 0.0]
     for _ in range(30):
         p = 1 / (1 + np.exp(-design @ weights))
         gradient = design.T @ (p - full) + damping * weights
-        weights -= np.linalg.solve((design * (p * (1 - p))[:, None]).T @ design + np.diag(damping + 1e-6), gradient)
+        weights -= np.linalg.solve(
+            (design * (p * (1 - p))[:, None]).T @ design + np.diag(damping + 1e-6), gradient
+        )
     values = np.split(np.round(weights[:-1], 3), np.cumsum([len(k) for k in knots])[:-1])
-    return {"bias": round(float(weights[-1]), 3), "knots": knots, "values": [v.tolist() for v in values]}
+    return {
+        "bias": round(float(weights[-1]), 3),
+        "knots": knots,
+        "values": [v.tolist() for v in values],
+    }
 
 
 def reliability(p: np.ndarray, full: np.ndarray) -> list[str]:
     """Return a line for each bin: how many, mean probability, observed share."""
     which = np.digitize(p, BINS[1:-1])
     rows = [(BINS[i], BINS[i + 1], which == i) for i in range(len(BINS) - 1)]
-    return [f"{a:.2f}-{b:.2f} {r.sum():7d} {p[r].mean():.3f} {full[r].mean():.3f}" for a, b, r in rows if r.any()]
+    return [
+        f"{a:.2f}-{b:.2f} {r.sum():7d} {p[r].mean():.3f} {full[r].mean():.3f}"
+        for a, b, r in rows
+        if r.any()
+    ]
 
 
 def occupancy(objects: tyro.conf.Positional[Path], scenes: int = 30, model: Path = MODEL) -> None:
@@ -144,15 +185,23 @@ def occupancy(objects: tyro.conf.Positional[Path], scenes: int = 30, model: Path
     manifest = json.loads((objects / "manifest.json").read_text("utf-8"))["objects"]
     families = sorted({entry["family"] for entry in manifest.values()})
     halves = [
-        {n: trimesh.load(objects / n / "mesh.ply") for n, e in manifest.items() if families.index(e["family"]) % 2 == k}
+        {
+            n: trimesh.load(objects / n / "mesh.ply")
+            for n, e in manifest.items()
+            if families.index(e["family"]) % 2 == k
+        }
         for k in (0, 1)
     ]
-    seen, unseen = (collect(half, range(k * 1000, k * 1000 + scenes)) for k, half in enumerate(halves))
+    seen, unseen = (
+        collect(half, range(k * 1000, k * 1000 + scenes)) for k, half in enumerate(halves)
+    )
     content = {kind: fit(*seen[kind], KNOTS[kind]) for kind in KNOTS}
     note = f"{scenes} rendered scenes of 5 to 8 objects of {len(families) // 2} families"
     write_file(model, format_json({**content, "fitted_on": note}) + "\n")
     load_occupancy_model.cache_clear()
     for kind, (features, full) in unseen.items():
         p = probability(kind, torch.from_numpy(features)).numpy()
-        print(f"{kind}: {full.mean():.3f} full, Brier {np.mean((p - full) ** 2):.4f} of {full.var():.4f}")
+        print(
+            f"{kind}: {full.mean():.3f} full, Brier {np.mean((p - full) ** 2):.4f} of {full.var():.4f}"
+        )
         print(*reliability(p, full), sep="\n", flush=True)

@@ -1,4 +1,5 @@
-"""The posture model of mode "paper": the hand's postures that can hold something, of all sizes alike.
+"""The posture model of mode "paper": the hand's postures that can hold something, of all sizes
+alike.
 
 python scripts/train.py paper_model allegro
 """
@@ -15,16 +16,24 @@ from torchgrasp.posture_model import HandSamples
 from torchgrasp.posture_model.sample import sample_configurations
 
 COMPONENTS = {"allegro": 41, "barrett": 60}
-"""Numbers of Gaussians: the paper's for the Allegro hand; for the Barrett hand that of `mixture.safetensors`."""
-STEP, SIZES = 0.005, (0.01, 0.07)
-"""Width [m] of the classes of size that are made equally likely, and the range of sizes that is taken."""
+"""Numbers of Gaussians: the paper's for the Allegro hand; for the Barrett hand that of
+`mixture.safetensors`.
+"""
+STEP = 0.005
+SIZES = (0.01, 0.07)
+"""Width [m] of the classes of size that are made equally likely, and the range of sizes that is
+taken.
+"""
 
 
-def paper_model(hand: Annotated[str, tyro.conf.Positional], out: Path | None = None, drawn: int = 200_000) -> None:
+def paper_model(
+    hand: Annotated[str, tyro.conf.Positional], out: Path | None = None, drawn: int = 200_000
+) -> None:
     """Learn the posture model that `plan_grasps(mode="paper")` asks by Eq. (21).
 
-    Most random postures are wide open, so a model of all of them knows few triples of the size of an object. Here every
-    size, the mean distance of the fingertips from their centre, is equally likely.
+    Most random postures are wide open, so a model of all of them knows few triples of the size of
+    an object. Here every size, the mean distance of the fingertips from their centre, is equally
+    likely.
 
     Args:
         hand: by name.
@@ -35,7 +44,11 @@ def paper_model(hand: Annotated[str, tyro.conf.Positional], out: Path | None = N
     samples = even_sizes(sample_configurations(one, drawn, sampling="grasping"), drawn // 5)
     model = fit_mixture(samples, COMPONENTS[hand])
     meta = model.meta | {"sizes": f"evenly from {SIZES[0]:g} to {SIZES[1]:g} m"}
-    print(dataclasses.replace(model, meta=meta).save(out or one.urdf_path.parent / "paper.safetensors"))
+    print(
+        dataclasses.replace(model, meta=meta).save(
+            out or one.urdf_path.parent / "paper.safetensors"
+        )
+    )
 
 
 def even_sizes(samples: HandSamples, count: int) -> HandSamples:

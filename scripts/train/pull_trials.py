@@ -1,4 +1,6 @@
-"""A closed hand is pulled at harder and harder: what its fingertips felt, and when it lost the object."""
+"""A closed hand is pulled at harder and harder: what its fingertips felt, and when it lost the
+object.
+"""
 
 import dataclasses
 from collections.abc import Callable
@@ -23,8 +25,11 @@ Step = Callable[[Observation, float], Float[Tensor, " j"]]
 Holding = Callable[[ClosingReference, Observation, Float[Tensor, " j"]], Step]
 """Makes what holds a grasped object, from the last observation and targets of the closing."""
 
-CLOSING_TIME, PRESSING_TIME = 2.5, 0.5
-"""Longest time [s] of the closing: fingers that touch are done by then. Time [s] in which the forces build up."""
+CLOSING_TIME = 2.5
+PRESSING_TIME = 0.5
+"""Longest time [s] of the closing: fingers that touch are done by then. Time [s] in which the
+forces build up.
+"""
 
 MASS = 0.1
 """Mass of the object [kg]: nothing pulls at it but the disturbance."""
@@ -38,7 +43,9 @@ SAMPLE_TIME = 0.1
 
 @dataclasses.dataclass(frozen=True)
 class RisingPull(Value):
-    """A force on the object in a direction of the world: it rises by `rate` [N/s] to `most` [N], for `seconds`."""
+    """A force on the object in a direction of the world: it rises by `rate` [N/s] to `most` [N],
+    for `seconds`.
+    """
 
     direction: Float[Tensor, "3"]
     rate: float
@@ -52,7 +59,8 @@ class RisingPull(Value):
 
 @dataclasses.dataclass(frozen=True)
 class PullRecord(Value):
-    """One row every `SAMPLE_TIME` seconds since the end of the closing; the last row is that of the loss.
+    """One row every `SAMPLE_TIME` seconds since the end of the closing; the last row is that of the
+    loss.
 
     Args:
         tips: centres of the fingertips in the hand's frame [m].
@@ -79,9 +87,14 @@ class PullRecord(Value):
 
 
 def pull_until_lost(
-    trial: GraspTrial, reference: ClosingReference, holding: Holding, pull: RisingPull, friction: float = 0.8
+    trial: GraspTrial,
+    reference: ClosingReference,
+    holding: Holding,
+    pull: RisingPull,
+    friction: float = 0.8,
 ) -> PullRecord:
-    """Close a hand on a floating object, hold the object and pull at it, in a fresh simulation without gravity.
+    """Close a hand on a floating object, hold the object and pull at it, in a fresh simulation
+    without gravity.
 
     Args:
         trial: what is tried.
@@ -90,17 +103,26 @@ def pull_until_lost(
         pull: at the object.
         friction: of every contact.
     """
-    spec = TrialSpec(mass=MASS, friction=friction, gravity=0.0, approach=0.0, lift_height=0.0, table=False)
+    spec = TrialSpec(
+        mass=MASS, friction=friction, gravity=0.0, approach=0.0, lift_height=0.0, table=False
+    )
     run = TrialDriver(trial, spec, reference).open()
     return _record(_pull(run, holding, pull) if run.starts else [], overlap=not run.starts)
 
 
-def _pull(run: TrialRun, holding: Holding, pull: RisingPull) -> list[tuple[Tensor, Tensor, Tensor, list[float]]]:
+def _pull(
+    run: TrialRun, holding: Holding, pull: RisingPull
+) -> list[tuple[Tensor, Tensor, Tensor, list[float]]]:
     """Return tips, readings, springs, and pull, motion and rotation of every sample."""
-    robot, scene, rows = run.robot, run.scene, []
+    robot = run.robot
+    scene = run.scene
+    rows = []
     observation, hold = _close(run, holding)
-    readings, every, start = torch.zeros(3, dtype=torch.float64), robot.ticks(SAMPLE_TIME), scene.object_pose()
-    centre, pressing = np.append(scene.centre, 1.0), robot.ticks(PRESSING_TIME)
+    readings = torch.zeros(3, dtype=torch.float64)
+    every = robot.ticks(SAMPLE_TIME)
+    start = scene.object_pose()
+    centre = np.append(scene.centre, 1.0)
+    pressing = robot.ticks(PRESSING_TIME)
     for k in range(pressing + robot.ticks(pull.seconds)):
         if k == pressing:
             start = scene.object_pose()
@@ -124,8 +146,10 @@ def _pull(run: TrialRun, holding: Holding, pull: RisingPull) -> list[tuple[Tenso
 
 def _close(run: TrialRun, holding: Holding) -> tuple[Observation, Step]:
     """Close under the law, and return the last observation and what holds from then on."""
-    robot, targets = run.robot, run.controller.targets.joints
-    observation, closing = robot.tick(Targets(targets)), UncertaintyClosing(robot.reference, ClosingOptions())
+    robot = run.robot
+    targets = run.controller.targets.joints
+    observation = robot.tick(Targets(targets))
+    closing = UncertaintyClosing(robot.reference, ClosingOptions())
     for _ in range(robot.ticks(CLOSING_TIME)):
         targets = closing(observation, robot.period)
         observation = robot.tick(Targets(targets))
@@ -138,7 +162,9 @@ def _record(rows: list[tuple[Tensor, Tensor, Tensor, list[float]]], overlap: boo
     """Return the samples as a value."""
     if not rows:
         none = torch.zeros(0, 3, dtype=torch.float64)
-        return PullRecord(none[..., None].expand(0, 3, 3), none, none, none[:, 0], none[:, 0], none[:, 0], overlap)
+        return PullRecord(
+            none[..., None].expand(0, 3, 3), none, none, none[:, 0], none[:, 0], none[:, 0], overlap
+        )
     tips, forces, springs = (torch.stack(column) for column in list(zip(*rows, strict=True))[:3])
     pulled, moved, turned = torch.tensor([row[3] for row in rows], dtype=torch.float64).unbind(1)
     return PullRecord(tips, forces, springs, pulled, moved, turned, overlap)

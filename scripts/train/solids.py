@@ -1,7 +1,9 @@
-"""Solids of household bodies: each is one body, and the convex pieces that it consists of, known by construction.
+"""Solids of household bodies: each is one body, and the convex pieces that it consists of, known by
+construction.
 
-A thing is a list of solids [mm] that overlap or share a plane, its mesh is their union. A piece has at most 48 corners:
-a physics engine takes 64. The module needs manifold3d, a dependency of development only.
+A thing is a list of solids [mm] that overlap or share a plane, its mesh is their union. A piece has
+at most 48 corners: a physics engine takes 64. The module needs manifold3d, a dependency of
+development only.
 """
 
 import itertools
@@ -23,16 +25,20 @@ Profile = Sequence[tuple[float, float]]
 SIDES = 24
 """Of a solid of revolution: a frustum then has 48 corners."""
 SECTORS = 16
-"""Of a wall. Each has two facets outside and one inside, so that it is convex and few make a smooth vessel."""
+"""Of a wall. Each has two facets outside and one inside, so that it is convex and few make a smooth
+vessel.
+"""
 ROUND = 12
 """Sides of a rod or a handle."""
 
 MERGED = 1e-3
-"""Corners of a union this near to each other [mm] become one, as a file in single precision needs."""
+"""Corners of a union this near to each other [mm] become one, as a file in single precision needs.
+"""
 ROCKING = 1.0
 """Between two faces on which a body lies alike [deg]: it rocks, but does not tip over."""
 STEADY = 4.0
-"""A body tips over when it is tilted by more than this [deg]; a lying rod of 24 sides rolls at 7.5."""
+"""A body tips over when it is tilted by more than this [deg]; a lying rod of 24 sides rolls at 7.5.
+"""
 
 
 class Solid(NamedTuple):
@@ -46,28 +52,44 @@ Thing = list[Solid]
 
 
 def stack(profile: Profile, oval: float = 1.0, sides: int = SIDES) -> Thing:
-    """Return a solid of revolution about z, one frustum between two neighbouring points; `oval` scales it along y."""
+    """Return a solid of revolution about z, one frustum between two neighbouring points; `oval`
+    scales it along y.
+    """
     rings = [disc(r, r * oval, z, sides) for r, z in profile]
-    pieces = [np.concatenate(pair) for pair in itertools.pairwise(rings) if pair[0][0, 2] < pair[1][0, 2]]
+    pieces = [
+        np.concatenate(pair) for pair in itertools.pairwise(rings) if pair[0][0, 2] < pair[1][0, 2]
+    ]
     return [Solid(_sew(np.stack(rings)), pieces)]
 
 
 def disc(a: float, b: float, z: float, sides: int = SIDES) -> np.ndarray:
-    """Return the corners (sides, 3) of an ellipse at height z, with half axes a along x and b along y."""
-    angle = 2 * math.pi * (np.arange(sides) + 0.5) / sides  # a side, not a corner, is lowest in a lying solid
+    """Return the corners (sides, 3) of an ellipse at height z, with half axes a along x and b along
+    y.
+    """
+    angle = (
+        2 * math.pi * (np.arange(sides) + 0.5) / sides
+    )  # a side, not a corner, is lowest in a lying solid
     return np.stack([a * np.cos(angle), b * np.sin(angle), np.full(sides, z)], -1)
 
 
 def shell(levels: Sequence[tuple[float, float, float]], oval: float = 1.0) -> Thing:
-    """Return the wall between two profiles about z, of (outer radius, inner radius, height), cut into sectors."""
+    """Return the wall between two profiles about z, of (outer radius, inner radius, height), cut
+    into sectors.
+    """
     outer = np.stack([disc(r, r * oval, z, 2 * SECTORS) for r, _, z in levels])
     inner = np.stack([disc(r, r * oval, z, 2 * SECTORS) for _, r, z in levels])
     pieces = []
     for level, k in itertools.product(range(len(levels) - 1), range(0, 2 * SECTORS, 2)):
         seen = np.arange(k, k + 3) % (2 * SECTORS)
-        pieces.append(np.concatenate([*outer[level : level + 2, seen], *inner[level : level + 2, seen[::2]]]))
+        pieces.append(
+            np.concatenate([*outer[level : level + 2, seen], *inner[level : level + 2, seen[::2]]])
+        )
     hole = inner[:, ::2]
-    beyond = [hole[:1] - np.array([0, 0, 1]), hole, hole[-1:] + np.array([0, 0, 1])]  # the hole opens both ends
+    beyond = [
+        hole[:1] - np.array([0, 0, 1]),
+        hole,
+        hole[-1:] + np.array([0, 0, 1]),
+    ]  # the hole opens both ends
     return [Solid(_sew(outer) - _sew(np.concatenate(beyond)), pieces)]
 
 
@@ -82,9 +104,16 @@ def vessel(outline: Profile, wall: float, floor: float, oval: float = 1.0) -> Th
     inner = outer - wall * np.hypot(1.0, np.gradient(outer, levels))
     inner = np.maximum(inner, 0.1 * outer)  # a thick wall leaves a narrow hole
     (around,) = shell(list(zip(outer, inner, levels, strict=True)), oval)
-    base = np.stack([disc(r, r * oval, z, 2 * SECTORS) for r, z in ((radius[0], 0.0), (outer[0], floor))])
+    base = np.stack(
+        [disc(r, r * oval, z, 2 * SECTORS) for r, z in ((radius[0], 0.0), (outer[0], floor))]
+    )
     halves = [np.arange(first, first + SECTORS + 1) % (2 * SECTORS) for first in (0, SECTORS)]
-    return [Solid(_sew(base) + around.body, [base[:, half].reshape(-1, 3) for half in halves] + around.pieces)]
+    return [
+        Solid(
+            _sew(base) + around.body,
+            [base[:, half].reshape(-1, 3) for half in halves] + around.pieces,
+        )
+    ]
 
 
 def box(x: float, y: float, z: float, at: Sequence[float] = (0.0, 0.0, 0.0)) -> Thing:
@@ -95,24 +124,38 @@ def box(x: float, y: float, z: float, at: Sequence[float] = (0.0, 0.0, 0.0)) -> 
 
 def crate(x: float, y: float, z: float, wall: float, floor: float) -> Thing:
     """Return a box that is open above, with these edges and thicknesses."""
-    sides = [box(x, wall, z, (0, s * (y - wall) / 2, 0)) + box(wall, y, z, (s * (x - wall) / 2, 0, 0)) for s in (-1, 1)]
+    sides = [
+        box(x, wall, z, (0, s * (y - wall) / 2, 0)) + box(wall, y, z, (s * (x - wall) / 2, 0, 0))
+        for s in (-1, 1)
+    ]
     hole = box(x - 2 * wall, y - 2 * wall, z, (0, 0, floor))[0].body
     pieces = [solid.pieces[0] for solid in [*box(x, y, floor), *sides[0], *sides[1]]]
     return [Solid(box(x, y, z)[0].body - hole, pieces)]
 
 
-def prism(outline: Sequence[tuple[float, float]] | np.ndarray, height: float, top: float = 1.0) -> Thing:
+def prism(
+    outline: Sequence[tuple[float, float]] | np.ndarray, height: float, top: float = 1.0
+) -> Thing:
     """Return a convex outline of (x, y), extruded along z to a top that is scaled by this factor."""
     flat = np.array(outline)
-    return lump(np.concatenate([np.c_[flat, np.zeros(len(flat))], np.c_[top * flat, np.full(len(flat), height)]]))
+    return lump(
+        np.concatenate(
+            [np.c_[flat, np.zeros(len(flat))], np.c_[top * flat, np.full(len(flat), height)]]
+        )
+    )
 
 
 def slab(x: float, y: float, z: float, corner: float, edge: float) -> Thing:
-    """Return a lying plate with corners of this radius, seen from above, and with edges that are cut by `edge`."""
+    """Return a lying plate with corners of this radius, seen from above, and with edges that are
+    cut by `edge`.
+    """
     quarter = np.repeat([0, 90, 180, 270], 3)
-    rounded, middle = np.radians(quarter + np.tile([0, 45, 90], 4)), np.radians(quarter + 45)
+    rounded = np.radians(quarter + np.tile([0, 45, 90], 4))
+    middle = np.radians(quarter + 45)
     sign = np.sign(np.stack([np.cos(middle), np.sin(middle)], -1))
-    flat = sign * (x / 2 - corner, y / 2 - corner) + corner * np.stack([np.cos(rounded), np.sin(rounded)], -1)
+    flat = sign * (x / 2 - corner, y / 2 - corner) + corner * np.stack(
+        [np.cos(rounded), np.sin(rounded)], -1
+    )
     inset = flat * (1 - 2 * edge / x, 1 - 2 * edge / y)
     levels = ((inset, 0.0), (flat, edge), (flat, z - edge), (inset, z))
     return lump(np.concatenate([np.c_[ring, np.full(12, height)] for ring, height in levels]))
@@ -124,7 +167,9 @@ def lump(corners: np.ndarray) -> Thing:
 
 
 def ball(a: float, b: float, c: float, slices: int = 8) -> Thing:
-    """Return an ellipsoid about the origin with three half axes; its poles are cut flat, so that it rests."""
+    """Return an ellipsoid about the origin with three half axes; its poles are cut flat, so that it
+    rests.
+    """
     cap = 0.18  # angle of the cut [rad]
     angle = np.linspace(math.pi - cap, cap, slices + 1)
     return stack(list(zip(a * np.sin(angle), c * np.cos(angle), strict=True)), b / a)
@@ -133,10 +178,17 @@ def ball(a: float, b: float, c: float, slices: int = 8) -> Thing:
 def pebble(a: float, b: float, c: float, at: Sequence[float] = (0.0, 0.0, 0.0)) -> Thing:
     """Return a coarse ellipsoid about `at` in one piece, for a detail."""
     angle = np.linspace(0.35, math.pi - 0.35, 4)
-    return lump(np.concatenate([disc(a * math.sin(t), b * math.sin(t), c * math.cos(t), ROUND) for t in angle]) + at)
+    return lump(
+        np.concatenate(
+            [disc(a * math.sin(t), b * math.sin(t), c * math.cos(t), ROUND) for t in angle]
+        )
+        + at
+    )
 
 
-def rod(start: Sequence[float], end: Sequence[float], r: float, r_end: float | None = None) -> Thing:
+def rod(
+    start: Sequence[float], end: Sequence[float], r: float, r_end: float | None = None
+) -> Thing:
     """Return a round bar or a frustum between two points."""
     along = np.subtract(end, start)
     side = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
@@ -151,7 +203,8 @@ def path(
     closed: bool = False,
     sides: int = ROUND,
 ) -> Thing:
-    """Return a bent bar through points (n, 3) of a plane with this normal, one piece between two of them.
+    """Return a bent bar through points (n, 3) of a plane with this normal, one piece between two of
+    them.
 
     Args:
         points: the middle line.
@@ -166,14 +219,23 @@ def path(
     up = np.asarray(normal, float) / np.linalg.norm(normal)
     out = np.cross(along / np.linalg.norm(along, axis=1, keepdims=True), up)
     section = disc(1.0, 1.0, 0.0, sides) * (math.sqrt(2) if sides == 4 else 1.0)
-    half = [np.broadcast_to(x, len(points))[:, None, None] for x in (thick, thick if wide is None else wide)]
-    rings = points[:, None] + half[0] * section[:, :1] * out[:, None] - half[1] * section[:, 1:2] * up
+    half = [
+        np.broadcast_to(x, len(points))[:, None, None]
+        for x in (thick, thick if wide is None else wide)
+    ]
+    rings = (
+        points[:, None] + half[0] * section[:, :1] * out[:, None] - half[1] * section[:, 1:2] * up
+    )
     pairs = itertools.pairwise([*rings, rings[0]] if closed else rings)
     return [Solid(_sew(rings, closed), [np.concatenate(pair) for pair in pairs])]
 
 
-def arc(radius: float | tuple[float, float], start: float, end: float, count: int, at: Sequence[float]) -> np.ndarray:
-    """Return points (count, 3) of a circle or ellipse in the plane of x and z, between two angles [deg] from x to z."""
+def arc(
+    radius: float | tuple[float, float], start: float, end: float, count: int, at: Sequence[float]
+) -> np.ndarray:
+    """Return points (count, 3) of a circle or ellipse in the plane of x and z, between two angles
+    [deg] from x to z.
+    """
     x, z = radius if isinstance(radius, tuple) else (radius, radius)
     angle = np.radians(np.linspace(start, end, count))
     return np.stack([x * np.cos(angle), np.zeros(count), z * np.sin(angle)], -1) + at
@@ -182,15 +244,22 @@ def arc(radius: float | tuple[float, float], start: float, end: float, count: in
 def move(thing: Thing, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Thing:
     """Return the thing, moved."""
     by = np.array([x, y, z])
-    return [Solid(body.translate((x, y, z)), [piece + by for piece in pieces]) for body, pieces in thing]
+    return [
+        Solid(body.translate((x, y, z)), [piece + by for piece in pieces]) for body, pieces in thing
+    ]
 
 
 def turn(thing: Thing, axis: str, degrees: float) -> Thing:
-    """Return the thing, turned about an axis through the origin; quarters are exact, so planes stay planes."""
+    """Return the thing, turned about an axis through the origin; quarters are exact, so planes stay
+    planes.
+    """
     matrix = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
     matrix = np.round(matrix) if degrees % 90 == 0 else matrix
     pose = np.c_[matrix, np.zeros(3)]
-    return [Solid(body.transform(pose), [piece @ matrix.T for piece in pieces]) for body, pieces in thing]
+    return [
+        Solid(body.transform(pose), [piece @ matrix.T for piece in pieces])
+        for body, pieces in thing
+    ]
 
 
 def around(thing: Thing, count: int, whole: float = 360.0) -> Thing:
@@ -210,12 +279,17 @@ def unite(thing: Thing) -> tuple[trimesh.Trimesh, list[trimesh.Trimesh]]:
     >>> round(mesh.volume * 1e9), mesh.is_volume, len(parts)
     (25000, True, 2)
     """
-    union = m3.Manifold.batch_boolean([solid.body for solid in thing], m3.OpType.Add).simplify(MERGED)
-    return _in_metres(union), [_in_metres(m3.Manifold.hull_points(piece)) for s in thing for piece in s.pieces]
+    union = m3.Manifold.batch_boolean([solid.body for solid in thing], m3.OpType.Add).simplify(
+        MERGED
+    )
+    return _in_metres(union), [
+        _in_metres(m3.Manifold.hull_points(piece)) for s in thing for piece in s.pieces
+    ]
 
 
 def find_rest(mesh: trimesh.Trimesh) -> np.ndarray:
-    """Return the least turn (4 x 4) that lays a body steadily on a face of its hull, or on its steadiest face.
+    """Return the least turn (4 x 4) that lays a body steadily on a face of its hull, or on its
+    steadiest face.
 
     >>> find_rest(trimesh.creation.box((1, 1, 1))).tolist() == np.eye(4).tolist()
     True
@@ -225,12 +299,17 @@ def find_rest(mesh: trimesh.Trimesh) -> np.ndarray:
     height = -planes[:, 3] - normals @ mesh.center_mass  # of the mass centre above each face
     cosine = normals @ normals.T
     sine = np.sqrt(np.maximum(1 - cosine**2, 0))
-    reach = (height - height[:, None] * cosine) / np.maximum(sine, 1e-9)  # from below the mass centre to each edge
+    reach = (height - height[:, None] * cosine) / np.maximum(
+        sine, 1e-9
+    )  # from below the mass centre to each edge
     within = np.where(sine > 1e-6, reach, np.inf).min(1) >= 0  # a face has no edge with itself
-    steady = np.where(sine > math.sin(math.radians(ROCKING)), reach, np.inf).min(1) / height * within
+    steady = (
+        np.where(sine > math.sin(math.radians(ROCKING)), reach, np.inf).min(1) / height * within
+    )
     good = steady >= min(math.tan(math.radians(STEADY)), steady.max())
     down = normals[np.argmax(np.where(good, -normals[:, 2], -np.inf))]
-    pose, sine = np.eye(4), math.hypot(down[0], down[1])
+    pose = np.eye(4)
+    sine = math.hypot(down[0], down[1])
     if sine > 1e-6:  # else it rests already
         axis = np.array([-down[1], down[0], 0.0]) / sine
         pose[:3, :3] = Rotation.from_rotvec(math.atan2(sine, -down[2]) * axis).as_matrix()
@@ -240,22 +319,31 @@ def find_rest(mesh: trimesh.Trimesh) -> np.ndarray:
 def _in_metres(solid: m3.Manifold) -> trimesh.Trimesh:
     """Return a solid as a mesh in metres."""
     arrays = solid.to_mesh64()
-    return trimesh.Trimesh(np.asarray(arrays.vert_properties)[:, :3] / 1000.0, np.asarray(arrays.tri_verts))
+    return trimesh.Trimesh(
+        np.asarray(arrays.vert_properties)[:, :3] / 1000.0, np.asarray(arrays.tri_verts)
+    )
 
 
 def _sew(rings: np.ndarray, closed: bool = False) -> m3.Manifold:
-    """Return the solid between rings (n, k, 3) of corners, counterclockwise as seen from the last one.
+    """Return the solid between rings (n, k, 3) of corners, counterclockwise as seen from the last
+    one.
 
     A facet of four corners that are not in a plane is bent outwards, as in the hull.
     """
     n, k, _ = rings.shape
     corners = rings.reshape(-1, 3)
     row, column = np.meshgrid(np.arange(n if closed else n - 1), np.arange(k), indexing="ij")
-    right, up = (column + 1) % k, (row + 1) % n
-    a, b, c, d = (x.ravel() for x in (row * k + column, row * k + right, up * k + right, up * k + column))
+    right = (column + 1) % k
+    up = (row + 1) % n
+    a, b, c, d = (
+        x.ravel() for x in (row * k + column, row * k + right, up * k + right, up * k + column)
+    )
     p, q, r, s = (corners[x] for x in (a, b, c, d))
     bulge = (np.cross(q - p, r - p) * (s - p)).sum(-1)[:, None] <= 0
-    faces = [np.where(bulge, np.c_[a, b, c], np.c_[a, b, d]), np.where(bulge, np.c_[a, c, d], np.c_[b, c, d])]
+    faces = [
+        np.where(bulge, np.c_[a, b, c], np.c_[a, b, d]),
+        np.where(bulge, np.c_[a, c, d], np.c_[b, c, d]),
+    ]
     if not closed:
         fan = np.c_[np.zeros(k - 2, int), np.arange(1, k - 1), np.arange(2, k)]
         faces += [fan[:, ::-1], fan + (n - 1) * k]

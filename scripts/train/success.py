@@ -1,8 +1,9 @@
-"""Fit the model of predicted success to trials, calibrate it on families left out, and judge it there.
+"""Fit the model of predicted success to trials, calibrate it on families left out, and judge it
+there.
 
-`scripts/train.py trials` makes the trials. Two of three families fit boosted trees; more friction, more force and less
-load never lower their prediction. The other families calibrate it: they scale the log-odds, and give intervals. Their
-trials with `--best` choose the bounds of promises.
+`scripts/train.py trials` makes the trials. Two of three families fit boosted trees; more friction,
+more force and less load never lower their prediction. The other families calibrate it: they scale
+the log-odds, and give intervals. Their trials with `--best` choose the bounds of promises.
 """
 
 import dataclasses
@@ -26,9 +27,15 @@ from train.measured import Trials, read_trials
 from train.trials import HANDS
 
 TREES = {
-    "max_iter": 100, "learning_rate": 0.05, "max_leaf_nodes": 16, "min_samples_leaf": 60, "l2_regularization": 5.0,
-    "max_features": 0.3, "random_state": 0, "early_stopping": False,
-}  # fmt: skip
+    "max_iter": 100,
+    "learning_rate": 0.05,
+    "max_leaf_nodes": 16,
+    "min_samples_leaf": 60,
+    "l2_regularization": 5.0,
+    "max_features": 0.3,
+    "random_state": 0,
+    "early_stopping": False,
+}
 """Parameters of the boosted trees; families left out of the fit chose them."""
 
 RISES = ("force to spare", *CAUSES["moved"], "friction")
@@ -36,29 +43,38 @@ FALLS = ("force needed", "mass", "displaced", "deviation", "tilt")
 """Features that never lower the prediction when they rise, or never raise it."""
 
 UNLIMITED = 1e9  # a bound that no feature reaches: files hold no infinity
-KNOTS, DRAWS = 12, 1000  # knots of the intervals, and how often their families are drawn anew
+# knots of the intervals, and how often their families are drawn anew
+KNOTS = 12
+DRAWS = 1000
 
 
 def success(
-    folders: tyro.conf.Positional[tuple[Path, ...]], best: tuple[Path, ...] = (), workers: int = 1, model: Path = MODEL
+    folders: tyro.conf.Positional[tuple[Path, ...]],
+    best: tuple[Path, ...] = (),
+    workers: int = 1,
+    model: Path = MODEL,
 ) -> None:
-    """Fit the model of predicted success to data sets of trials, judge it on families left out, and write it.
+    """Fit the model of predicted success to data sets of trials, judge it on families left out, and
+    write it.
 
-    Args:
-        folders: of `scripts/train.py trials`.
-        best: of the same with `--best`, after a fit to the same folders; without one the model makes no promise.
-        workers: processes that measure the grasps; the features are kept in the folders.
-        model: file of the model.
+    Args: folders: of `scripts/train.py trials`. best: of the same with `--best`, after a fit to the
+        same folders; without one the model makes no promise. workers: processes that measure the
+        grasps; the features are kept in the folders. model: file of the model.
     """
     torch.set_num_threads(1)
     trials = read_trials(list_hands(folders), workers)
     left = np.isin(trials.family, list(CALIBRATING))
     fitted = fit_model(trials, left)
     print(*judge(fitted, trials.select(left)), sep="\n")
-    about = {"fitted_on": f"{(~left).sum()} trials", "calibrated_on": f"{left.sum()} trials of other families"}
+    about = {
+        "fitted_on": f"{(~left).sum()} trials",
+        "calibrated_on": f"{left.sum()} trials of other families",
+    }
     if best:
         tried = read_trials(list_hands(best), workers)
-        tried = tried.select(tried.features[:, FEATURES.index("displaced")] == 0)  # no promise is made of others
+        tried = tried.select(
+            tried.features[:, FEATURES.index("displaced")] == 0
+        )  # no promise is made of others
         fitted = dataclasses.replace(fitted, kept=keep_trials(fitted, tried))
         print("best grasps:", *judge(fitted, tried), sep="\n")
         about["promised_on"] = f"{len(tried.passed)} trials of best grasps"
@@ -71,21 +87,32 @@ def list_hands(folders: Iterable[Path]) -> list[Path]:
 
 
 def fit_model(trials: Trials, left: Array) -> SuccessModel:
-    """Return the model, without promises; the mask `left` tells which trials calibrate it and fit no tree."""
-    trees = HistGradientBoostingClassifier(**TREES, monotonic_cst=[directions().get(name, 0) for name in FEATURES])
+    """Return the model, without promises; the mask `left` tells which trials calibrate it and fit
+    no tree.
+    """
+    trees = HistGradientBoostingClassifier(
+        **TREES, monotonic_cst=[directions().get(name, 0) for name in FEATURES]
+    )
     trees.fit(trials.features[~left], trials.passed[~left])
-    others, fitted = trials.select(left), read_trees(trees)
+    others = trials.select(left)
+    fitted = read_trees(trees)
     raw = fitted.log_odds(torch.from_numpy(others.features)).numpy()
     platt = LogisticRegression(C=np.inf).fit(raw[:, None], others.passed)
-    slope, shift = float(platt.coef_[0, 0]), float(platt.intercept_[0])
+    slope = float(platt.coef_[0, 0])
+    shift = float(platt.intercept_[0])
     bands = find_bands(slope * raw + shift, others.passed, others.family)
     held = trials.features[trials.passed]
     return SuccessModel(
-        fitted.feature, fitted.threshold, fitted.children, slope * fitted.value, slope * fitted.start + shift,
+        fitted.feature,
+        fitted.threshold,
+        fitted.children,
+        slope * fitted.value,
+        slope * fitted.start + shift,
         torch.from_numpy(find_range(trials.features)),
         torch.from_numpy(np.median(held, 0)),
-        torch.from_numpy(bands), torch.zeros(0, 3, dtype=torch.float64),
-    )  # fmt: skip
+        torch.from_numpy(bands),
+        torch.zeros(0, 3, dtype=torch.float64),
+    )
 
 
 def keep_trials(model: SuccessModel, tried: Trials) -> torch.Tensor:
@@ -96,7 +123,9 @@ def keep_trials(model: SuccessModel, tried: Trials) -> torch.Tensor:
 
 
 def find_range(features: Array) -> Array:
-    """Return least and greatest value of each feature; on the side on which grasps hold better there is no limit."""
+    """Return least and greatest value of each feature; on the side on which grasps hold better
+    there is no limit.
+    """
     found = np.stack([features.min(0), features.max(0)], -1)
     for name, direction in directions().items():
         found[FEATURES.index(name), (direction + 1) // 2] = direction * UNLIMITED
@@ -112,10 +141,14 @@ def read_trees(trees: HistGradientBoostingClassifier) -> SuccessModel:
     """Return the trees of scikit-learn as tensors, without calibration."""
     nodes = [predictor[0].nodes for predictor in trees._predictors]  # pyright: ignore
     shape = len(nodes), max(map(len, nodes))
-    feature, own = np.zeros(shape, dtype=np.int64), np.tile(np.arange(shape[1]), (shape[0], 1))
-    threshold, children, value = np.zeros(shape), np.stack([own, own], -1), np.zeros(shape)
+    feature = np.zeros(shape, dtype=np.int64)
+    own = np.tile(np.arange(shape[1]), (shape[0], 1))
+    threshold = np.zeros(shape)
+    children = np.stack([own, own], -1)
+    value = np.zeros(shape)
     for k, tree in enumerate(nodes):
-        leaf, n = tree["is_leaf"].astype(bool), len(tree)
+        leaf = tree["is_leaf"].astype(bool)
+        n = len(tree)
         feature[k, :n] = np.where(leaf, 0, tree["feature_idx"])
         threshold[k, :n] = np.where(leaf, 0.0, tree["num_threshold"])
         for side, name in enumerate(("left", "right")):
@@ -128,12 +161,15 @@ def read_trees(trees: HistGradientBoostingClassifier) -> SuccessModel:
 
 
 def find_bands(odds: Array, passed: Array, family: Array, seed: int = 0) -> Array:
-    """Return rows of log-odds, and the 95 % interval of the share that held there, from families drawn anew."""
+    """Return rows of log-odds, and the 95 % interval of the share that held there, from families
+    drawn anew.
+    """
     edges = np.quantile(odds, np.linspace(0, 1, KNOTS + 1))
     bins = np.clip(np.searchsorted(edges, odds, side="right") - 1, 0, KNOTS - 1)
     middle = np.array([odds[bins == b].mean() for b in range(KNOTS)])
     members = [np.flatnonzero(family == name) for name in np.unique(family)]
-    draw, shares = np.random.default_rng(seed), np.full((DRAWS, KNOTS), np.nan)
+    draw = np.random.default_rng(seed)
+    shares = np.full((DRAWS, KNOTS), np.nan)
     for k in range(DRAWS):
         rows = np.concatenate([members[i] for i in draw.integers(len(members), size=len(members))])
         total = np.bincount(bins[rows], minlength=KNOTS)
@@ -147,20 +183,29 @@ def judge(model: SuccessModel, trials: Trials) -> list[str]:
     p = torch.sigmoid(model.log_odds(torch.from_numpy(trials.features)))
     columns = dict(zip(FEATURES, trials.features.T, strict=True))
     groups = {
-        "all": np.ones(len(p), dtype=bool), "20 best": trials.rank < 20, "lifts": columns["lifted"] > 0,
-        "pulls": columns["lifted"] == 0, "best of its body": trials.is_best(model),
+        "all": np.ones(len(p), dtype=bool),
+        "20 best": trials.rank < 20,
+        "lifts": columns["lifted"] > 0,
+        "pulls": columns["lifted"] == 0,
+        "best of its body": trials.is_best(model),
         **{hand: trials.hand == hand for hand in HANDS},
-        **{f"friction {a:g} to {b:g}": (columns["friction"] >= a) & (columns["friction"] < b)
-           for a, b in ((0.2, 0.4), (0.4, 0.6), (0.6, 0.8), (0.8, 1.01))},
-        **{f"{a:g} to {b:g} kg": (columns["mass"] >= a) & (columns["mass"] < b)
-           for a, b in ((0.02, 0.05), (0.05, 0.1), (0.1, 0.25), (0.25, 0.5), (0.5, 1.01))},
-    }  # fmt: skip
+        **{
+            f"friction {a:g} to {b:g}": (columns["friction"] >= a) & (columns["friction"] < b)
+            for a, b in ((0.2, 0.4), (0.4, 0.6), (0.6, 0.8), (0.8, 1.01))
+        },
+        **{
+            f"{a:g} to {b:g} kg": (columns["mass"] >= a) & (columns["mass"] < b)
+            for a, b in ((0.02, 0.05), (0.05, 0.1), (0.1, 0.25), (0.25, 0.5), (0.5, 1.01))
+        },
+    }
     lines = []
     for name, rows in groups.items():
         if rows.sum() < 2 or len(np.unique(trials.passed[rows])) < 2:
             continue
         said = score.judge(
-            p[torch.from_numpy(rows)], torch.from_numpy(trials.passed[rows]), trials.family[rows].tolist()
+            p[torch.from_numpy(rows)],
+            torch.from_numpy(trials.passed[rows]),
+            trials.family[rows].tolist(),
         )
         lines.append(
             f"{name}: predicted {said['predicted']:.2f}, passed {said['passed']:.2f} of {rows.sum()}; "

@@ -1,4 +1,6 @@
-"""What a grasp is asked to do in a trial: pulls or a lift, and the numbers that decide whether it holds."""
+"""What a grasp is asked to do in a trial: pulls or a lift, and the numbers that decide whether it
+holds.
+"""
 
 import dataclasses
 import math
@@ -12,29 +14,36 @@ from torchgrasp.foundation.base import Value
 from torchgrasp.success.task import GraspTask
 from torchgrasp.values.specs import ClosingMode
 
-FRICTION, MASS, FORCE = (0.2, 1.0), (0.02, 1.0), (2.0, 10.0)
-"""Least and greatest friction, mass [kg] (even in its logarithm) and force [N] of the strongest finger."""
+FRICTION = (0.2, 1.0)
+MASS = (0.02, 1.0)
+FORCE = (2.0, 10.0)
+"""Least and greatest friction, mass [kg] (even in its logarithm) and force [N] of the strongest
+finger.
+"""
 
-ORDINARY_FRICTION, ORDINARY_MASS, ORDINARY_FORCE = (0.3, 1.0), (0.02, 0.25), (4.0, 10.0)
+ORDINARY_FRICTION = (0.3, 1.0)
+ORDINARY_MASS = (0.02, 0.25)
+ORDINARY_FORCE = (4.0, 10.0)
 """The same of the tasks for which a promise is made."""
 
-PULL, LIFT = PROTOCOLS["dexgraspbench"], PROTOCOLS["table-lift"]
+PULL = PROTOCOLS["dexgraspbench"]
+LIFT = PROTOCOLS["table-lift"]
 
 ASIDE = PoseNoise(0.03)
-"""Greatest error of the place of a lifted object; a floating one errs as in protocol "pose-noise"."""
+"""Greatest error of the place of a lifted object; a floating one errs as in protocol "pose-noise".
+"""
 
 
 @dataclasses.dataclass(frozen=True)
 class Task(Value):
     """One trial's task.
 
-    Args:
-        lift: whether the object is lifted off a table and held without slip; otherwise it floats and is pulled at.
-        closing: "uncertainty" or "open_loop".
-        friction: at the fingertips; that of the table is in the same proportion to it as in protocol "table-lift".
-        mass: of the object [kg]; the pulls press with 10 m/s^2 times the mass.
-        force: of the strongest finger [N]; None: the hand grips as the felt load asks for.
-        errs: whether the object is not where the planner saw it.
+    Args: lift: whether the object is lifted off a table and held without slip; otherwise it floats
+        and is pulled at. closing: "uncertainty" or "open_loop". friction: at the fingertips; that
+        of the table is in the same proportion to it as in protocol "table-lift". mass: of the
+        object [kg]; the pulls press with 10 m/s^2 times the mass. force: of the strongest finger
+        [N]; None: the hand grips as the felt load asks for. errs: whether the object is not where
+        the planner saw it.
     """
 
     lift: bool
@@ -62,35 +71,58 @@ class Task(Value):
         0.2
         """
         base = LIFT if self.lift else PULL
-        error, trial = ASIDE if self.lift else POSE_NOISE, base.trial
-        changes: dict[str, Any] = {"closing": self.closing, "friction": self.friction, "mass": self.mass}
+        error = ASIDE if self.lift else POSE_NOISE
+        trial = base.trial
+        changes: dict[str, Any] = {
+            "closing": self.closing,
+            "friction": self.friction,
+            "mass": self.mass,
+        }
         if trial.table_friction is not None:
             changes["table_friction"] = trial.table_friction / trial.friction * self.friction
-        changes["patch"] = trial.patch * trial.friction / self.friction  # friction times patch resists torsion
+        changes["patch"] = (
+            trial.patch * trial.friction / self.friction
+        )  # friction times patch resists torsion
         noise = error if self.errs else PoseNoise()
         found = dataclasses.replace(base, noise=noise, tries=1, criterion="held")
         return found.with_trial(**changes, force=self.force, simulator="mujoco")
 
 
 def draw_ordinary(draw: np.random.Generator, planned: float) -> Task:
-    """Draw the task of a grasp for which a promise is made: at the planned friction, where the planner saw the object.
+    """Draw the task of a grasp for which a promise is made: at the planned friction, where the
+    planner saw the object.
 
     >>> draw_ordinary(np.random.default_rng(0), 0.6).mass <= ORDINARY_MASS[1]
     True
     """
     mass = round(math.exp(draw.uniform(*np.log(ORDINARY_MASS))), 4)
     force = round(float(draw.uniform(*ORDINARY_FORCE)), 3)
-    return dataclasses.replace(draw_task(draw, planned), friction=planned, mass=mass, errs=False).pressing(force)
+    return dataclasses.replace(
+        draw_task(draw, planned), friction=planned, mass=mass, errs=False
+    ).pressing(force)
 
 
 def draw_task(draw: np.random.Generator, planned: float) -> Task:
-    """Draw the task of one trial of a grasp that was planned for the friction `planned`; half keep this friction.
+    """Draw the task of one trial of a grasp that was planned for the friction `planned`; half keep
+    this friction.
 
     >>> draw_task(np.random.default_rng(0), 0.6) == draw_task(np.random.default_rng(0), 0.6)
     True
     """
-    lift, kept, errs, grips = draw.random(4) < (0.25, 0.5, 0.5, 0.75)  # a lift takes three times as long as pulls
+    lift, kept, errs, grips = draw.random(4) < (
+        0.25,
+        0.5,
+        0.5,
+        0.75,
+    )  # a lift takes three times as long as pulls
     friction, force = (round(float(draw.uniform(*bounds)), 3) for bounds in (FRICTION, FORCE))
     mass = round(math.exp(draw.uniform(*np.log(MASS))), 4)
     closing = "uncertainty" if lift or draw.random() < 0.5 else "open_loop"
-    return Task(bool(lift), closing, planned if kept else friction, mass, None if lift and grips else force, bool(errs))
+    return Task(
+        bool(lift),
+        closing,
+        planned if kept else friction,
+        mass,
+        None if lift and grips else force,
+        bool(errs),
+    )

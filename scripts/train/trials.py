@@ -1,9 +1,12 @@
-"""Trials of the predicted success: grasps of all ranks on authored household bodies, each tried with a task of its own.
+"""Trials of the predicted success: grasps of all ranks on authored household bodies, each tried
+with a task of its own.
 
-One job is one body and one hand. It is planned on from a noisy view and its grasps are tried in MuJoCo. The jobs of a
-hand are a campaign (`torchgrasp.campaign`): the same call continues an interrupted run. Tasks are kept as metadata.
+One job is one body and one hand. It is planned on from a noisy view and its grasps are tried in
+MuJoCo. The jobs of a hand are a campaign (`torchgrasp.campaign`): the same call continues an
+interrupted run. Tasks are kept as metadata.
 
-For promises, the best grasp for each of a few ordinary tasks is tried instead, on families that fit no model.
+For promises, the best grasp for each of a few ordinary tasks is tried instead, on families that fit
+no model.
 """
 
 import dataclasses
@@ -51,7 +54,9 @@ HANDS = ("allegro", "barrett", "leap", "shadow")
 SENSORS: tuple[bool | SensorName, ...] = (True, "realsense", "kinect_v1", "azure", "zivid")
 """Noise of the views."""
 
-STARTS, BEST, SPREAD = 400, 6, 6
+STARTS = 400
+BEST = 6
+SPREAD = 6
 """Random starts of the planner; grasps tried of the twenty best ones, and of those that follow."""
 
 TASKS = 3
@@ -96,36 +101,59 @@ def trials(
 ) -> None:
     """Try grasps of all hands on household bodies; what is in the folder is not run again.
 
-    Args:
-        folder: of the data sets, one for each hand.
-        bodies: number of bodies; they are shared among the hands.
-        workers: number of processes, or the address of a Dask scheduler.
-        hands: whose share is tried.
-        first: number of the first body, so that more bodies can follow in a folder of their own.
-        best: try the best grasp for ordinary tasks, on bodies of the families that calibrate the model.
+    Args: folder: of the data sets, one for each hand. bodies: number of bodies; they are shared
+        among the hands. workers: number of processes, or the address of a Dask scheduler. hands:
+        whose share is tried. first: number of the first body, so that more bodies can follow in a
+        folder of their own. best: try the best grasp for ordinary tasks, on bodies of the families
+        that calibrate the model.
     """
     for hand in hands:
         counts = run_trials(hand, bodies, folder, workers, first=first, best=best).card["counts"]
-        print(f"{hand}: {counts['tries']} trials on {counts['objects']} bodies, {counts['passed']} passed")
+        print(
+            f"{hand}: {counts['tries']} trials on {counts['objects']} bodies, {counts['passed']} passed"
+        )
 
 
 def run_trials(
-    hand: str, bodies: int, folder: Path, workers: int | str = 1, seed: int = 0, first: int = 0, best: bool = False
+    hand: str,
+    bodies: int,
+    folder: Path,
+    workers: int | str = 1,
+    seed: int = 0,
+    first: int = 0,
+    best: bool = False,
 ) -> GraspShards:
-    """Try grasps of one hand on its share of some bodies from the `first` on, and return the data set."""
+    """Try grasps of one hand on its share of some bodies from the `first` on, and return the data
+    set.
+    """
     among = range(first, first + bodies)
-    numbers = [k for k in among if k % len(HANDS) == HANDS.index(hand) and (not best or family_of(k) in CALIBRATING)]
+    numbers = [
+        k
+        for k in among
+        if k % len(HANDS) == HANDS.index(hand) and (not best or family_of(k) in CALIBRATING)
+    ]
     model = load_hand(hand)
     of_hand = {"name": hand, "option": model.source.option, "sha256": model.source.sha256}
-    of_hand |= {"joint_names": ", ".join(model.joint_names), "finger_names": ", ".join(model.finger_names)}
+    of_hand |= {
+        "joint_names": ", ".join(model.joint_names),
+        "finger_names": ", ".join(model.finger_names),
+    }
     trials = {"grasps": BEST + SPREAD, "ranks": "best and spread", "starts": STARTS, "seed": seed}
     if best:
         trials |= {"grasps": TASKS, "ranks": "best", "model_sha256": sha256(MODEL)}
     asked = {
-        "torchgrasp": "campaign", "version": 1, "licence": "MIT", "hand": of_hand, "trials": trials,
-        "protocol": dataclasses.asdict(PULL), "tasks": "drawn for each trial: train/tasks.py", "bodies": len(numbers),
-        "jobs_in_shard": 32, "versions": versions(), "device": "cpu",
-    }  # fmt: skip
+        "torchgrasp": "campaign",
+        "version": 1,
+        "licence": "MIT",
+        "hand": of_hand,
+        "trials": trials,
+        "protocol": dataclasses.asdict(PULL),
+        "tasks": "drawn for each trial: train/tasks.py",
+        "bodies": len(numbers),
+        "jobs_in_shard": 32,
+        "versions": versions(),
+        "device": "cpu",
+    }
     rows = tuple(JobRow(f"body{k:05d}", "view0") for k in numbers)
     campaign = Campaign(asked, rows, lambda row: empty_shard(row, model, 1))
 
@@ -139,15 +167,20 @@ def run_trials(
     counts = data.card["counts"]
     spread = f"{BEST} of its twenty best grasps and {SPREAD} others"
     which = f"the best grasps for {TASKS} ordinary tasks" if best else spread
-    about = ABOUT.format(hand=hand, counts=counts, versions=json.dumps(versions()), starts=STARTS, which=which)
+    about = ABOUT.format(
+        hand=hand, counts=counts, versions=json.dumps(versions()), starts=STARTS, which=which
+    )
     write_file(folder / hand / README, about)
     return data
 
 
 def try_body(hand: str, k: int, seed: int, meta: dict[str, str], best: bool = False) -> bytes:
-    """Plan on one view of a body, try its grasps, and return the bytes of a shard with this job alone."""
+    """Plan on one view of a body, try its grasps, and return the bytes of a shard with this job
+    alone.
+    """
     check_versions(meta)
-    model, body = load_hand(hand), author_household(k)
+    model = load_hand(hand)
+    body = author_household(k)
     draw = np.random.default_rng([seed, k])
     row = JobRow(f"body{k:05d}", "view0", family=body.family)
     try:
@@ -158,20 +191,28 @@ def try_body(hand: str, k: int, seed: int, meta: dict[str, str], best: bool = Fa
     return pack_shard(shard, meta)
 
 
-def _try_body(hand: Hand, body: HouseholdBody, draw: np.random.Generator, row: JobRow, seed: int, best: bool) -> Shard:
-    azimuth, elevation = draw.uniform(0.0, 360.0), draw.uniform(15.0, 60.0)
+def _try_body(
+    hand: Hand, body: HouseholdBody, draw: np.random.Generator, row: JobRow, seed: int, best: bool
+) -> Shard:
+    azimuth = draw.uniform(0.0, 360.0)
+    elevation = draw.uniform(15.0, 60.0)
     sensor = SENSORS[draw.integers(len(SENSORS))]
     friction = round(float(draw.uniform(*(ORDINARY_FRICTION if best else FRICTION))), 3)
     camera = look_at(azimuth, elevation, target=body.mesh)
-    cloud, table = partial_view(body.mesh, camera, noise=sensor, seed=seed), Plane.horizontal(0.0)
+    cloud = partial_view(body.mesh, camera, noise=sensor, seed=seed)
+    table = Plane.horizontal(0.0)
     eye = cloud.viewpoint.double()[None]  # pyright: ignore[reportOptionalMemberAccess]
     found = plan_grasps(cloud, hand, ContactSpec(friction=friction, table=table), STARTS)
     executable = found[found.status == Status.OK]
     row = row._replace(executable=len(executable), points=len(cloud), meta={"sensor": str(sensor)})
     if not len(executable):
-        row = row._replace(status=Status(int(found.status.mode().values)) if len(found) else Status.OUT_OF_REACH)
+        row = row._replace(
+            status=Status(int(found.status.mode().values)) if len(found) else Status.OUT_OF_REACH
+        )
         empty = empty_shard(row, hand, 1).records
-        return Shard((row,), dataclasses.replace(empty, points=cloud.points.double(), viewpoints=eye))
+        return Shard(
+            (row,), dataclasses.replace(empty, points=cloud.points.double(), viewpoints=eye)
+        )
     shape = fit_shape(cloud, table=table)
     if best:
         tasks = [draw_ordinary(draw, friction) for _ in range(TASKS)]
@@ -179,37 +220,55 @@ def _try_body(hand: Hand, body: HouseholdBody, draw: np.random.Generator, row: J
     else:
         ranks = choose_ranks(len(executable), draw)
         tasks = [draw_task(draw, friction) for _ in ranks]
-    surface, results = surface_field(shape), []
+    surface = surface_field(shape)
+    results = []
     for number, (rank, task) in enumerate(zip(ranks, tasks, strict=True)):
-        grasp, own = executable[rank], seed_of(seed, number if best else rank)
+        grasp = executable[rank]
+        own = seed_of(seed, number if best else rank)
         error = draw_error(task.protocol, grasp, body.mesh, own)
         truth = Truth(body.mesh, body.parts, error)
-        trial = GraspTrial(hand, grasp, truth, seed_of(own, "touch"), surface=surface if task.lift else None)
+        trial = GraspTrial(
+            hand, grasp, truth, seed_of(own, "touch"), surface=surface if task.lift else None
+        )
         results.append(run_protocol(trial, task.protocol, rank))
     passed = torch.tensor([[x.passed] for x in results])
     outcome = torch.tensor([[int(x.status)] for x in results])
     said = json.dumps([dataclasses.asdict(task) for task in tasks])
-    meta = executable.meta | row.meta | {"tasks": said, "ranks": json.dumps(ranks), "friction": str(friction)}
+    meta = (
+        executable.meta
+        | row.meta
+        | {"tasks": said, "ranks": json.dumps(ranks), "friction": str(friction)}
+    )
     row = row._replace(grasps=len(ranks), passed=int(passed.sum()), meta=meta)
     return Shard((row,), Records(cloud.points.double(), eye, executable[ranks], passed, outcome))
 
 
 def best_for(tasks: Sequence[Task], hand: Hand, shape: ShapeGP, grasps: Grasps) -> list[int]:
     """Return for each task the index of the grasp that most likely holds it."""
-    body, best = EstimatedBody.of(shape), list[int]()
+    body = EstimatedBody.of(shape)
+    best = list[int]()
     for task in tasks:
         features = measure_grasps(hand, body, grasps, task.friction, task.known, task.lift)
-        best.append(int(load_success_model().log_odds(features).where(is_covered(features), -torch.inf).argmax()))
+        best.append(
+            int(
+                load_success_model()
+                .log_odds(features)
+                .where(is_covered(features), -torch.inf)
+                .argmax()
+            )
+        )
     return best
 
 
 def choose_ranks(executable: int, draw: np.random.Generator) -> list[int]:
-    """Return the ranks that are tried: some of the twenty best, and some of the others; at most all.
+    """Return the ranks that are tried: some of the twenty best, and some of the others; at most
+    all.
 
     >>> choose_ranks(3, np.random.default_rng(0))
     [0, 1, 2]
     """
-    best, others = np.arange(min(20, executable)), np.arange(20, executable)
+    best = np.arange(min(20, executable))
+    others = np.arange(20, executable)
     few = [draw.permutation(rows)[:most] for rows, most in ((best, BEST), (others, SPREAD))]
     return sorted(int(x) for x in np.concatenate(few))
 
@@ -222,10 +281,16 @@ def read_rows(shards: Iterable[Shard]) -> Iterator[tuple[JobRow, PointCloud, Gra
                 continue
             records = shard.take(k).records
             said: list[dict[str, Any]] = json.loads(row.meta["tasks"])
-            ranks, tasks = json.loads(row.meta["ranks"]), [Task(**fields) for fields in said]
+            ranks = json.loads(row.meta["ranks"])
+            tasks = [Task(**fields) for fields in said]
             outcomes = zip(ranks, tasks, records.passed[:, 0], records.outcome[:, 0], strict=True)
             trials = [
                 Trial(row.object, row.family, rank, task, bool(passed), Status(int(status)))
                 for rank, task, passed, status in outcomes
             ]
-            yield row, PointCloud(records.points, viewpoint=records.viewpoints[0]), records.grasps, trials
+            yield (
+                row,
+                PointCloud(records.points, viewpoint=records.viewpoints[0]),
+                records.grasps,
+                trials,
+            )

@@ -9,7 +9,9 @@ from torchgrasp.app import cli
 
 @pytest.fixture
 def run_command(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
-    """Return a function that runs a command, and returns its exit code and what it printed on stdout and stderr."""
+    """Return a function that runs a command, and returns its exit code and what it printed on
+    stdout and stderr.
+    """
 
     def run(*words: object) -> tuple[int, str, str]:
         capsys.readouterr()
@@ -21,12 +23,19 @@ def run_command(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, 
 
 @pytest.fixture
 def refusal(run_command: Callable[..., tuple[int, str, str]]) -> Callable[..., str]:
-    """Return a function that runs a command that must be refused in one sentence, and returns the sentence."""
+    """Return a function that runs a command that must be refused in one sentence, and returns the
+    sentence.
+    """
 
     def run(*words: object) -> str:
         code, out, err = run_command(*words)
         assert (code, out) == (2, "") and "Traceback" not in err
-        assert err.startswith("torchgrasp: ") and err.count("\n") == 1 and "expected" in err and ", got " in err
+        assert (
+            err.startswith("torchgrasp: ")
+            and err.count("\n") == 1
+            and "expected" in err
+            and ", got " in err
+        )
         return err.removeprefix("torchgrasp: ")
 
     return run

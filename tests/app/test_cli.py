@@ -59,10 +59,19 @@ def bad_inputs(folder):
         "millimetres": ([folder / "mm.npy", *hand], ["CLOUD", "m"]),
         "nan": ([folder / "nan.npy", *hand], ["CLOUD", "NaN", "198 of 200", "at least 4"]),
         "unknown hand": ([VIEW, "--hand", "fist"], ["--hand", "'fist'", "allegro", "barrett"]),
-        "open mesh": ([VIEW, *hand, "--mesh", folder / "open.ply", "--close"], ["--mesh", "open", "watertight"]),
-        "missing mesh": ([VIEW, *hand, "--mesh", folder / "no.stl", "--close"], ["--mesh", "no file"]),
+        "open mesh": (
+            [VIEW, *hand, "--mesh", folder / "open.ply", "--close"],
+            ["--mesh", "open", "watertight"],
+        ),
+        "missing mesh": (
+            [VIEW, *hand, "--mesh", folder / "no.stl", "--close"],
+            ["--mesh", "no file"],
+        ),
         "close without mesh": ([VIEW, *hand, "--close"], ["--close", "--mesh"]),
-        "open region": ([VIEW, *hand, "--keep", folder / "open.ply"], ["--keep", "open", "watertight"]),
+        "open region": (
+            [VIEW, *hand, "--keep", folder / "open.ply"],
+            ["--keep", "open", "watertight"],
+        ),
         "half a box": ([VIEW, *hand, "--avoid", "-1 0 0"], ["--avoid", "six numbers", "-1 0 0"]),
         "turned box": ([VIEW, *hand, "--keep", "1 0 0 -1 1 1"], ["--keep", "less than high"]),
         "two tables": ([VIEW, *hand, "--table", "0", "--no-table"], ["--table", "--no-table"]),
@@ -91,7 +100,12 @@ def test_regions_of_the_command_line_reach_the_planner(monkeypatch, run_command,
 
     monkeypatch.setattr(grasps, "plan_grasps", see)
     words = "--hand", "barrett", "--keep", "-1 -1 0.05 1 1 1", "--avoid", MESH
-    assert "seen" in run_command("grasp", VIEW, *words, "--resist", "lift", "pour", "--out", tmp_path / "out")[2]
+    assert (
+        "seen"
+        in run_command(
+            "grasp", VIEW, *words, "--resist", "lift", "pour", "--out", tmp_path / "out"
+        )[2]
+    )
 
 
 @pytest.mark.parametrize("name", ["a" * 300, "a/" * 3000, "a\0b", "\ud800"])
@@ -101,7 +115,10 @@ def test_regions_of_the_command_line_reach_the_planner(monkeypatch, run_command,
         ("CLOUD", ["grasp", "NAME", "--hand", "barrett", "--out", "out"]),
         ("--out", ["grasp", VIEW, "--hand", "barrett", "--out", "NAME"]),
         ("--out", ["hand", "sample", "--hand", "barrett", "--n", "10", "--out", "NAME"]),
-        ("--checkpoint", ["hand", "train", "barrett", "--n", "100", "--checkpoint", "NAME", "--out", "out"]),
+        (
+            "--checkpoint",
+            ["hand", "train", "barrett", "--n", "100", "--checkpoint", "NAME", "--out", "out"],
+        ),
         ("--objects", ["evaluate", "--objects", "NAME", "--hand", "barrett", "--out", "out"]),
     ],
 )
@@ -114,7 +131,9 @@ def test_a_path_that_no_file_can_have_is_refused_by_its_option(
 
 
 @pytest.mark.parametrize("out", ["file", "file/deeper", "/proc/nothing/here"])
-def test_a_folder_that_cannot_be_written_is_refused_before_the_work(out, tmp_path, refusal, refuse_work):
+def test_a_folder_that_cannot_be_written_is_refused_before_the_work(
+    out, tmp_path, refusal, refuse_work
+):
     (tmp_path / "file").write_text("x")
     assert refusal("grasp", VIEW, "--out", tmp_path / out).startswith("--out: ")
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
@@ -131,8 +150,11 @@ def test_check_folder_leaves_a_folder_as_it_was(tmp_path):
 
 @pytest.mark.promise("F9")
 @pytest.mark.parametrize("missing", ["sapien", "libX11.so.6: cannot open shared object file"])
-def test_a_missing_simulator_is_named_before_the_work(missing, tmp_path, run_command, monkeypatch, refuse_work):
-    find, load = inputs.importlib.util.find_spec, inputs.importlib.import_module
+def test_a_missing_simulator_is_named_before_the_work(
+    missing, tmp_path, run_command, monkeypatch, refuse_work
+):
+    find = inputs.importlib.util.find_spec
+    load = inputs.importlib.import_module
 
     def fail(name, *package):
         """Other packages may be imported here for the first time."""
@@ -145,14 +167,25 @@ def test_a_missing_simulator_is_named_before_the_work(missing, tmp_path, run_com
 
     monkeypatch.setattr(inputs.importlib.util, "find_spec", look)
     monkeypatch.setattr(inputs.importlib, "import_module", fail)
-    code, _, error = run_command("grasp", VIEW, "--mesh", MESH, "--close", "--out", tmp_path / "out")
-    assert code == 2 and missing in error and error.count("\n") == 1 and not (tmp_path / "out").exists()
+    code, _, error = run_command(
+        "grasp", VIEW, "--mesh", MESH, "--close", "--out", tmp_path / "out"
+    )
+    assert (
+        code == 2
+        and missing in error
+        and error.count("\n") == 1
+        and not (tmp_path / "out").exists()
+    )
 
 
 @pytest.mark.parametrize(
     ("error", "code", "said"),
     [
-        (MissingExtra("a package\nwith two lines", "sim"), 2, "torchgrasp: a package with two lines is not installed"),
+        (
+            MissingExtra("a package\nwith two lines", "sim"),
+            2,
+            "torchgrasp: a package with two lines is not installed",
+        ),
         (KeyboardInterrupt(), 130, "torchgrasp: interrupted\n"),
     ],
 )
@@ -164,7 +197,12 @@ def test_an_error_during_the_work_is_one_sentence_and_leaves_nothing(
 
     monkeypatch.setattr(grasps, "plan_grasps", fail)
     found, _, err = run_command("grasp", VIEW, "--hand", "allegro", "--out", tmp_path / "out")
-    assert found == code and err.startswith(said) and err.count("\n") == 1 and not (tmp_path / "out").exists()
+    assert (
+        found == code
+        and err.startswith(said)
+        and err.count("\n") == 1
+        and not (tmp_path / "out").exists()
+    )
 
 
 def test_objects_lists_files_that_exist(capsys):
@@ -175,21 +213,44 @@ def test_objects_lists_files_that_exist(capsys):
     assert run_python("-m", "torchgrasp", "objects").stdout.splitlines() == lines
 
 
-def test_the_table_is_at_the_lowest_point_that_is_no_outlier_unless_it_is_given(tmp_path, monkeypatch):
-    """Those are outliers whose eight nearest points are 2.5 times as far as half of the points have theirs."""
+def test_the_table_is_at_the_lowest_point_that_is_no_outlier_unless_it_is_given(
+    tmp_path, monkeypatch
+):
+    """Those are outliers whose eight nearest points are 2.5 times as far as half of the points have
+    theirs.
+    """
     seen = []
 
-    def note(cloud, hand, spec, starts, seed, fingers, mode, observer, time_budget, task, promise, **where):
+    def note(
+        cloud,
+        hand,
+        spec,
+        starts,
+        seed,
+        fingers,
+        mode,
+        observer,
+        time_budget,
+        task,
+        promise,
+        **where,
+    ):
         assert mode == "joint" and fingers is None and time_budget is None and promise is None
         assert where == {"keep": None, "avoid": None, "resist": None}
         assert task == GraspTask()
-        apart = torch.cdist(cloud.points.double(), cloud.points.double()).sort(1).values[:, 1:9].mean(1)
+        apart = (
+            torch.cdist(cloud.points.double(), cloud.points.double()).sort(1).values[:, 1:9].mean(1)
+        )
         lowest = float(cloud.points[apart <= 2.5 * apart.median(), 2].min())
         seen.append((spec.table, spec.friction, starts, seed, lowest))
         raise KeyboardInterrupt
 
     monkeypatch.setattr(grasps, "plan_grasps", note)
-    for extra in ([], ["--table", "-0.01"], ["--no-table", "--starts", "5", "--seed", "3", "--friction", "0.5"]):
+    for extra in (
+        [],
+        ["--table", "-0.01"],
+        ["--no-table", "--starts", "5", "--seed", "3", "--friction", "0.5"],
+    ):
         cli.main(["grasp", VIEW, "--hand", "barrett", "--out", str(tmp_path / "out"), *extra])
     assert seen[0][0] == seen[0][4] and seen[0][1:4] == (0.8, 1000, 0)
     assert seen[1][0] == -0.01
@@ -206,7 +267,9 @@ def test_a_shipped_mesh_comes_with_its_parts_wherever_it_lies(tmp_path):
     assert grasps.read_true_mesh(tmp_path / "box.stl")[1] is None
 
 
-def test_grasp_writes_grasps_and_pages_for_a_shipped_object_by_name(tmp_path, run_command, monkeypatch):
+def test_grasp_writes_grasps_and_pages_for_a_shipped_object_by_name(
+    tmp_path, run_command, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     code, out, err = run_command("grasp", "cylinder", "--hand", "barrett", "--starts", "20")
     assert err == ""  # no bar where there is no terminal
@@ -217,16 +280,28 @@ def test_grasp_writes_grasps_and_pages_for_a_shipped_object_by_name(tmp_path, ru
     assert sorted(p.name for p in folder.iterdir()) == names
     assert 'href="view.html"' in (folder / "report.html").read_text()
     found = load_grasps(folder / "grasps.safetensors")
-    assert found.meta["hand"] == "barrett" and found.meta["seed"] == "0" and "metre" in found.meta["units"]
-    assert code == (0 if bool((found.status == 0).any()) else 1) and torch.isfinite(found.joints).all()
+    assert (
+        found.meta["hand"] == "barrett"
+        and found.meta["seed"] == "0"
+        and "metre" in found.meta["units"]
+    )
+    assert (
+        code == (0 if bool((found.status == 0).any()) else 1) and torch.isfinite(found.joints).all()
+    )
     assert out.splitlines()[-1].startswith("The barrett hand has")
 
 
 @pytest.mark.parametrize(
     ("words", "near"),
-    [(["gras", "x"], "grasp"), (["grasp", "jgu"], "jug"), (["grasp", "jug", "--hand", "alegro"], "allegro")],
+    [
+        (["gras", "x"], "grasp"),
+        (["grasp", "jgu"], "jug"),
+        (["grasp", "jug", "--hand", "alegro"], "allegro"),
+    ],
 )
-def test_a_misspelt_name_is_answered_with_the_nearest_one(words, near, tmp_path, monkeypatch, refusal, refuse_work):
+def test_a_misspelt_name_is_answered_with_the_nearest_one(
+    words, near, tmp_path, monkeypatch, refusal, refuse_work
+):
     monkeypatch.chdir(tmp_path)
     assert refusal(*words).endswith(f"; did you mean {near}?\n")
 
@@ -241,7 +316,9 @@ def test_an_empty_result_names_what_would_help(tmp_path, run_command):
     assert "if the friction were 0.4 instead of 0" in last
 
 
-@pytest.mark.parametrize("words", [["cloud"], ["cloud", "--help"], ["shape", "-h"], ["cloud", "check", "--help"]])
+@pytest.mark.parametrize(
+    "words", [["cloud"], ["cloud", "--help"], ["shape", "-h"], ["cloud", "check", "--help"]]
+)
 def test_groups_of_commands_have_help(words, capsys):
     with pytest.raises(SystemExit) as end:
         cli.main(words)
@@ -251,7 +328,9 @@ def test_groups_of_commands_have_help(words, capsys):
 
 
 @pytest.mark.parametrize("command", list(cli.COMMANDS))
-def test_help_says_no_default_that_says_nothing_and_breaks_lines_by_their_width(command, capsys, monkeypatch):
+def test_help_says_no_default_that_says_nothing_and_breaks_lines_by_their_width(
+    command, capsys, monkeypatch
+):
     monkeypatch.setenv("COLUMNS", "100")
     with pytest.raises(SystemExit):
         cli.main([*command.split(), "--help"])
@@ -282,15 +361,21 @@ def test_view_opens_the_page_of_a_folder_or_names_what_is_missing(tmp_path, caps
     opened = []
     monkeypatch.setattr("webbrowser.open", opened.append)
     assert cli.main(["view", str(tmp_path)]) == 2 and "FOLDER: expected" in capsys.readouterr().err
-    assert cli.main(["view", "jug"]) == 2 and "torchgrasp grasp CLOUD --out jug" in capsys.readouterr().err
+    assert (
+        cli.main(["view", "jug"]) == 2
+        and "torchgrasp grasp CLOUD --out jug" in capsys.readouterr().err
+    )
     (tmp_path / "view.html").write_text("")
     assert cli.main(["view", str(tmp_path), "--no-browser"]) == 0 and opened == []
     assert cli.main(["view", str(tmp_path)]) == 0 and opened == [(tmp_path / "view.html").as_uri()]
-    assert "No browser was found" in capsys.readouterr().out  # `append` returns None, as a machine without a browser
+    assert (
+        "No browser was found" in capsys.readouterr().out
+    )  # `append` returns None, as a machine without a browser
     (tmp_path / "grasps.safetensors").write_text("")
     assert cli.main(["view", str(tmp_path / "grasps.safetensors")]) == 0 and opened[1] == opened[0]
     (tmp_path / "out" / "jug").mkdir(parents=True)
-    mine, jug = tmp_path / "mine.html", tmp_path / "out" / "jug" / "view.html"
+    mine = tmp_path / "mine.html"
+    jug = tmp_path / "out" / "jug" / "view.html"
     monkeypatch.chdir(tmp_path)
     for asked, page in (("mine.html", mine), ("jug", jug)):
         page.write_text("")
@@ -305,7 +390,9 @@ def test_the_bare_command_shows_where_to_begin_and_help_lists_every_command_in_a
     said = capsys.readouterr().out
     shown = [line.strip() for line in said.splitlines() if line.startswith("  torchgrasp")]
     named = {line.removeprefix("torchgrasp ") for line in shown}
-    assert len(named) == 4 and all(any(words.startswith(name) for name in cli.COMMANDS) for words in named)
+    assert len(named) == 4 and all(
+        any(words.startswith(name) for name in cli.COMMANDS) for words in named
+    )
 
 
 @pytest.mark.parametrize(
@@ -325,14 +412,24 @@ def test_the_shell_completes_commands_of_a_group(typed, offered, tmp_path, capsy
     (tmp_path / "completion").write_text(capsys.readouterr().out)
     words = " ".join(f"'{word}'" for word in ["torchgrasp", *typed])
     ask = f"source completion; COMP_WORDS=({words}); COMP_CWORD={len(typed)}; _tyro_torchgrasp; echo ${{COMPREPLY[@]}}"
-    done = subprocess.run(["bash", "-c", ask], cwd=tmp_path, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        ["bash", "-c", ask], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
     assert set(done.stdout.split()) - {"--help", "-h"} == offered
 
 
 def test_cloud_check_reports_a_view(run_command):
     code, out, _ = run_command("cloud", "check", VIEW)
     assert code == 0
-    for word in ("points      1000", "mm", "spacing", "noise", "outliers", "normals", "viewpoint   given"):
+    for word in (
+        "points      1000",
+        "mm",
+        "spacing",
+        "noise",
+        "outliers",
+        "normals",
+        "viewpoint   given",
+    ):
         assert word in out
 
 
@@ -341,7 +438,9 @@ def test_cloud_check_names_fixes(tmp_path, run_command):
     points[:3] += 0.3
     np.save(tmp_path / "ball.npy", np.concatenate([points, points[:5]]))
     code, out, _ = run_command("cloud", "check", tmp_path / "ball.npy")
-    assert code == 1 and "6005 (5 of them copies)" in out and "torchgrasp cloud thin" in out  # no camera sees all sides
+    assert (
+        code == 1 and "6005 (5 of them copies)" in out and "torchgrasp cloud thin" in out
+    )  # no camera sees all sides
     assert next(line for line in out.splitlines() if line.startswith("outliers")).split()[1] == "3"
 
 
@@ -353,7 +452,19 @@ def test_cloud_check_refuses_by_name(tmp_path, refusal):
 
 def test_cloud_render_writes_a_cloud_that_cloud_check_and_shape_surface_read(tmp_path, run_command):
     out = tmp_path / "made" / "view.ply"
-    words = ["cloud", "render", MESH, "--out", out, "--azimuth", "200", "--elevation", "20", "--points", "300"]
+    words = [
+        "cloud",
+        "render",
+        MESH,
+        "--out",
+        out,
+        "--azimuth",
+        "200",
+        "--elevation",
+        "20",
+        "--points",
+        "300",
+    ]
     assert run_command(*words)[0] == 0
     first = out.read_bytes()
     assert run_command(*words)[0] == 0 and out.read_bytes() == first
@@ -373,15 +484,30 @@ def test_cloud_render_writes_a_cloud_that_cloud_check_and_shape_surface_read(tmp
     [
         (["cloud", "render", MESH, "--out", "a.pcd"], "--out: expected .*got a.pcd"),
         (["cloud", "render", "none.stl", "--out", "a.ply"], "MESH: expected .*got none.stl"),
-        (["cloud", "render", MESH, "--out", "a.ply", "--elevation", "95"], "--elevation: expected .*got 95"),
-        (["cloud", "render", MESH, "--out", "a.ply", "--azimuth", "nan"], "--azimuth: expected .*got nan"),
-        (["cloud", "render", MESH, "--out", "a.ply", "--distance", "0"], "--distance: expected .*got 0"),
-        (["cloud", "render", MESH, "--out", "a.ply", "--points", "2"], "--points: expected .*got 2"),
+        (
+            ["cloud", "render", MESH, "--out", "a.ply", "--elevation", "95"],
+            "--elevation: expected .*got 95",
+        ),
+        (
+            ["cloud", "render", MESH, "--out", "a.ply", "--azimuth", "nan"],
+            "--azimuth: expected .*got nan",
+        ),
+        (
+            ["cloud", "render", MESH, "--out", "a.ply", "--distance", "0"],
+            "--distance: expected .*got 0",
+        ),
+        (
+            ["cloud", "render", MESH, "--out", "a.ply", "--points", "2"],
+            "--points: expected .*got 2",
+        ),
         (["cloud", "render", MESH, "--out", "a.ply", "--seed", "-1"], "--seed: expected .*got -1"),
         (["shape", "surface", VIEW, "--out", "a.obj"], "--out: expected .*got a.obj"),
         (["shape", "surface", VIEW, "--out", "a.ply", "--table", "0", "--no-table"], "--table"),
         (["shape", "surface", "no.ply", "--out", "a.ply"], "CLOUD: expected .*got no.ply"),
-        (["shape", "surface", VIEW, "--out", "a.ply", "--resolution", "4"], "--resolution: expected .*got 4"),
+        (
+            ["shape", "surface", VIEW, "--out", "a.ply", "--resolution", "4"],
+            "--resolution: expected .*got 4",
+        ),
     ],
 )
 def test_bad_options_are_named_and_nothing_is_left(words, start, tmp_path, refusal, monkeypatch):

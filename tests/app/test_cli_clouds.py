@@ -16,7 +16,14 @@ from torchgrasp import Scene, read_cloud, read_scene
 from torchgrasp.app import cli
 from torchgrasp.app.cli import grasp as grasps
 from torchgrasp.app.cli.inputs import CloudOptions, ViewOptions
-from torchgrasp.cloud import diagnose_cloud, estimate_normals, look_at, partial_view, read_cloud_file, save_cloud
+from torchgrasp.cloud import (
+    diagnose_cloud,
+    estimate_normals,
+    look_at,
+    partial_view,
+    read_cloud_file,
+    save_cloud,
+)
 from torchgrasp.cloud.camera import INTRINSICS, render_depth
 from torchgrasp.cloud.check import remove_outliers
 from torchgrasp.cloud.safe_files import read_image_file
@@ -61,7 +68,9 @@ def with_table(side=0.24):
 
 def in_camera(cloud, pose=POSE):
     """Return a cloud in the frame of its camera."""
-    return PointCloud((cloud.points - pose[:3, 3]) @ pose[:3, :3], None, torch.zeros(3, dtype=torch.float64))
+    return PointCloud(
+        (cloud.points - pose[:3, 3]) @ pose[:3, :3], None, torch.zeros(3, dtype=torch.float64)
+    )
 
 
 def mirrored():
@@ -111,20 +120,55 @@ def towards_inside():
 
 REFUSED = {  # file, cloud, words of what was found, words of what mends it
     "camera frame": ("a.npz", lambda: in_camera(jug()), "camera's frame", "--up 0 -1 0"),
-    "camera frame, camera not given": ("a.npz", lambda: unknown(in_camera(jug())), "camera's frame", "--camera-pose"),
-    "camera frame of a default PCD": ("a.pcd", lambda: pcd(in_camera(jug())), "camera's frame", "--up"),
-    "camera frame with a table": ("a.npz", lambda: in_camera(with_table()), "camera's frame", "normal of the plane"),
+    "camera frame, camera not given": (
+        "a.npz",
+        lambda: unknown(in_camera(jug())),
+        "camera's frame",
+        "--camera-pose",
+    ),
+    "camera frame of a default PCD": (
+        "a.pcd",
+        lambda: pcd(in_camera(jug())),
+        "camera's frame",
+        "--up",
+    ),
+    "camera frame with a table": (
+        "a.npz",
+        lambda: in_camera(with_table()),
+        "camera's frame",
+        "normal of the plane",
+    ),
     "upside down": ("a.npz", lambda: turned(jug(), *DOWN), "m below", "--up 0 0 -1"),
     "camera below": ("a.npz", mirrored, "m below", "--viewpoint"),
-    "camera in the robot's base": ("a.npz", lambda: seen_from(0.0, 0.0, 0.1), "points contradict", "--no-viewpoint"),
-    "camera in the cloud": ("a.npz", lambda: seen_from(0.5, 0.0, 0.07), "points contradict", "--viewpoint"),
+    "camera in the robot's base": (
+        "a.npz",
+        lambda: seen_from(0.0, 0.0, 0.1),
+        "points contradict",
+        "--no-viewpoint",
+    ),
+    "camera in the cloud": (
+        "a.npz",
+        lambda: seen_from(0.5, 0.0, 0.07),
+        "points contradict",
+        "--viewpoint",
+    ),
     "normals away": ("a.npz", towards_inside, "point away", "--no-normals"),
     "table": ("a.npz", with_table, "a table left in", "torchgrasp cloud cut"),
-    "table, no camera": ("a.npz", lambda: unknown(with_table()), "a table left in", "torchgrasp cloud cut"),
+    "table, no camera": (
+        "a.npz",
+        lambda: unknown(with_table()),
+        "a table left in",
+        "torchgrasp cloud cut",
+    ),
     "two bodies": ("a.npz", neighbours, "two bodies", "cloud cut CLOUD --point"),
     "millimetres": ("a.npy", lambda: 1000 * jug().points.numpy(), "extent of", "--unit mm"),
     "centimetres": ("a.npy", lambda: 100 * jug().points.numpy(), "extent of", "--unit cm"),
-    "whole scene": ("a.npy", lambda: 20 * jug().points.numpy(), "extent of", "torchgrasp cloud cut"),
+    "whole scene": (
+        "a.npy",
+        lambda: 20 * jug().points.numpy(),
+        "extent of",
+        "torchgrasp cloud cut",
+    ),
 }
 
 
@@ -142,7 +186,9 @@ def planned(monkeypatch):
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_a_contradictory_cloud_is_refused_with_its_fix(name, tmp_path, run_command, refusal, planned):
+def test_a_contradictory_cloud_is_refused_with_its_fix(
+    name, tmp_path, run_command, refusal, planned
+):
     file, make, found, fix = REFUSED[name]
     path = write(tmp_path / file, make())
     error = refusal("grasp", path, "--hand", "barrett", "--out", tmp_path / "out")
@@ -157,20 +203,34 @@ def test_a_contradictory_cloud_is_refused_with_its_fix(name, tmp_path, run_comma
 SAID = {  # file, cloud, options, words of note or advice
     "as it is": ("a.npz", jug, [], ""),
     "no camera": ("a.npz", lambda: unknown(jug()), [], "--viewpoint X Y Z"),
-    "a default PCD": ("a.pcd", lambda: pcd(unknown(PointCloud(moved(0.5)))), [], "the default viewpoint (0, 0, 0)"),
+    "a default PCD": (
+        "a.pcd",
+        lambda: pcd(unknown(PointCloud(moved(0.5)))),
+        [],
+        "the default viewpoint (0, 0, 0)",
+    ),
     "NaN rows": ("a.pcd", lambda: pcd(jug()), [], "7 of 1007 rows with NaN"),
     "colours": ("a.npy", lambda: np.tile(jug().points.numpy(), 2), [], "colours?"),
     "upright by --up": ("a.npz", lambda: turned(jug(), *DOWN), ["--up", "0", "0", "-3"], ""),
     "no table": ("a.npz", mirrored, ["--no-table"], ""),
-    "a part of many points": ("a.npy", lambda: np.repeat(jug().points.numpy(), 101, 0), [], "100000 of 101000 points"),
+    "a part of many points": (
+        "a.npy",
+        lambda: np.repeat(jug().points.numpy(), 101, 0),
+        [],
+        "100000 of 101000 points",
+    ),
 }
 
 
 @pytest.mark.parametrize("name", SAID)
-def test_notes_and_advice_are_printed_and_the_cloud_is_planned(name, tmp_path, run_command, planned):
+def test_notes_and_advice_are_printed_and_the_cloud_is_planned(
+    name, tmp_path, run_command, planned
+):
     file, make, options, words = SAID[name]
     path = write(tmp_path / file, make())
-    code, out, err = run_command("grasp", path, "--hand", "barrett", "--out", tmp_path / "out", *options)
+    code, out, err = run_command(
+        "grasp", path, "--hand", "barrett", "--out", tmp_path / "out", *options
+    )
     assert (code, err) == (130, "torchgrasp: interrupted\n") and len(planned) == 1
     lines = [s for s in out.splitlines() if s.startswith(("note", "advice"))]
     assert any(words in s for s in lines) if words else lines == []
@@ -181,7 +241,10 @@ def test_a_surface_from_all_sides_is_refused_by_the_check_as_by_the_fit(tmp_path
     np.save(tmp_path / "merged.npy", np.asarray(points))
     assert cli.main(["cloud", "check", str(tmp_path / "merged.npy")]) == 1
     (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("refused")]
-    assert "which no camera sees at once: a single view, the viewpoint of each point, or outward normals" in line
+    assert (
+        "which no camera sees at once: a single view, the viewpoint of each point, or outward normals"
+        in line
+    )
     with pytest.raises(BadArgument, match="which no camera sees at once"):
         fit_shape(read_cloud(tmp_path / "merged.npy"))
 
@@ -196,7 +259,17 @@ def test_the_camera_pose_moves_a_cloud_out_of_its_camera_s_frame(tmp_path, plann
     for file in ("pose.txt", "pose.npy"):
         (np.savetxt if file.endswith("txt") else np.save)(tmp_path / file, POSE.numpy())
         options = ["--camera-pose", str(tmp_path / file)]
-        cli.main(["grasp", str(tmp_path / "a.npz"), "--hand", "barrett", "--out", str(tmp_path / "out"), *options])
+        cli.main(
+            [
+                "grasp",
+                str(tmp_path / "a.npz"),
+                "--hand",
+                "barrett",
+                "--out",
+                str(tmp_path / "out"),
+                *options,
+            ]
+        )
         torch.testing.assert_close(planned[-1][0].points, jug().points)
         torch.testing.assert_close(planned[-1][0].viewpoint, POSE[:3, 3])
     assert cli.main(["cloud", "check", str(VIEW), *options]) == 2  # it is not in its camera's frame
@@ -205,10 +278,21 @@ def test_the_camera_pose_moves_a_cloud_out_of_its_camera_s_frame(tmp_path, plann
 
 def test_the_vertical_and_the_table_become_a_plane(tmp_path, planned):
     write(tmp_path / "a.npz", turned(jug(), [1, 0, 0], [0, 0, 1], [0, -1, 0]))  # y up
-    up, lowest = ["--up", "0", "2", "0"], float(remove_outliers(jug()).points[:, 2].min())
+    up = ["--up", "0", "2", "0"]
+    lowest = float(remove_outliers(jug()).points[:, 2].min())
     moved = [*up, "--table", "-0.01"], ["--table", "0", "2", "0", "-0.02"]
     for options, height in zip((up, *moved), (lowest, -0.01, -0.01), strict=True):
-        cli.main(["grasp", str(tmp_path / "a.npz"), "--hand", "barrett", "--out", str(tmp_path / "out"), *options])
+        cli.main(
+            [
+                "grasp",
+                str(tmp_path / "a.npz"),
+                "--hand",
+                "barrett",
+                "--out",
+                str(tmp_path / "out"),
+                *options,
+            ]
+        )
         table = planned[-1][1].table
         assert isinstance(table, Plane) and table.normal.tolist() == [0, 1, 0]
         assert table.offset == pytest.approx(height, abs=1e-12)
@@ -223,18 +307,27 @@ def test_bad_options_are_refused_in_one_sentence(options, refusal):
 
 
 def test_cut_leaves_the_thing_at_the_point_without_the_table(tmp_path, capsys):
-    mesh, box = load_object("jug").mesh, trimesh.creation.box((0.5, 0.4, 0.01))
+    mesh = load_object("jug").mesh
+    box = trimesh.creation.box((0.5, 0.4, 0.01))
     box.apply_translation((0.1, 0, -0.005))
     ball = trimesh.creation.icosphere(radius=0.03)
     ball.apply_translation((0.2, 0.05, 0.03))
     scene = partial_view(trimesh.Trimesh(*stack(mesh, box, ball)), POSE, 20000)
     for name, cloud in (("z", scene), ("y", turned(scene, [1, 0, 0], [0, 0, 1], [0, -1, 0]))):
-        path, up = str(write(tmp_path / f"{name}.npz", cloud)), ["--up", "0", "1", "0"] * (name == "y")
+        path = str(write(tmp_path / f"{name}.npz", cloud))
+        up = ["--up", "0", "1", "0"] * (name == "y")
         at = ["0.2", "0.05", "0.03"] if name == "z" else ["0.2", "0.03", "-0.05"]
         for options, wanted in (([], "jug"), (["--point", *at], "ball")):
-            assert cli.main(["cloud", "cut", path, "--out", str(tmp_path / "b.npz"), *up, *options]) == 0
+            assert (
+                cli.main(["cloud", "cut", path, "--out", str(tmp_path / "b.npz"), *up, *options])
+                == 0
+            )
             thing = read_cloud(tmp_path / "b.npz").points
-            back = ([1, 0, 0], [0, 1, 0], [0, 0, 1]) if name == "z" else ([1, 0, 0], [0, 0, -1], [0, 1, 0])
+            back = (
+                ([1, 0, 0], [0, 1, 0], [0, 0, 1])
+                if name == "z"
+                else ([1, 0, 0], [0, 0, -1], [0, 1, 0])
+            )
             points = turned(PointCloud(thing, None, thing[0]), *back).points
             of_ball = (points - torch.tensor([0.2, 0.05, 0.03]).double()).norm(dim=1) < 0.04
             assert float((of_ball == (wanted == "ball")).double().mean()) > 0.99
@@ -242,7 +335,9 @@ def test_cut_leaves_the_thing_at_the_point_without_the_table(tmp_path, capsys):
             assert cli.main(["cloud", "check", str(tmp_path / "b.npz"), *up]) == 0
     plane = capsys.readouterr().out.split("table   --table ")[-1].split()[:4]
     assert np.allclose(np.array(plane, dtype=float), [0, 1, 0, 0], atol=0.003)
-    assert cli.main(["cloud", "cut", path, "--out", str(tmp_path / "c.npz"), "--box", *"778899"]) == 2
+    assert (
+        cli.main(["cloud", "cut", path, "--out", str(tmp_path / "c.npz"), "--box", *"778899"]) == 2
+    )
     assert "0 points in the box" in capsys.readouterr().err and not (tmp_path / "c.npz").exists()
 
 
@@ -252,19 +347,49 @@ def test_scene_is_that_of_the_depth_image(tmp_path, capsys):
     np.savetxt(tmp_path / "pose.txt", image.obj_from_camera.numpy())
     k = image.intrinsics
     numbers = [str(float(x)) for x in (k[0, 0], k[1, 1], k[0, 2], k[1, 2])]
-    words = ["cloud", "scene", str(tmp_path / "depth.npy"), "--intrinsics", *numbers, "--out", str(tmp_path / "s.npz")]
+    words = [
+        "cloud",
+        "scene",
+        str(tmp_path / "depth.npy"),
+        "--intrinsics",
+        *numbers,
+        "--out",
+        str(tmp_path / "s.npz"),
+    ]
     assert cli.main([*words, "--camera-pose", str(tmp_path / "pose.txt")]) == 0
-    found, said = read_scene(tmp_path / "s.npz"), capsys.readouterr().out
-    assert len(found.things) == len(load_scene().things) == len(re.findall(r"^object ", said, re.MULTILINE))
+    found = read_scene(tmp_path / "s.npz")
+    said = capsys.readouterr().out
+    assert (
+        len(found.things)
+        == len(load_scene().things)
+        == len(re.findall(r"^object ", said, re.MULTILINE))
+    )
     assert found.target is None
-    assert found.table is not None and abs(found.table.offset) < 0.002  # the shipped scene stands at z = 0
-    shipped, on_target = load_scene(), np.zeros(tuple(image.depth.shape), dtype=bool)
+    assert (
+        found.table is not None and abs(found.table.offset) < 0.002
+    )  # the shipped scene stands at z = 0
+    shipped = load_scene()
+    on_target = np.zeros(tuple(image.depth.shape), dtype=bool)
     on_target[tuple(shipped.pixels[shipped.rows_of(2)].T.numpy())] = True
     np.save(tmp_path / "mask.npy", on_target)
-    assert cli.main([*words, "--camera-pose", str(tmp_path / "pose.txt"), "--mask", str(tmp_path / "mask.npy")]) == 0
+    assert (
+        cli.main(
+            [
+                *words,
+                "--camera-pose",
+                str(tmp_path / "pose.txt"),
+                "--mask",
+                str(tmp_path / "mask.npy"),
+            ]
+        )
+        == 0
+    )
     chosen = read_scene(tmp_path / "s.npz")  # the object that was announced is still the target
     assert f"object {chosen.target}:" in capsys.readouterr().out.split("(the target)")[0]
-    assert float(torch.cdist(chosen.cloud().points, shipped.cloud(2).points).amin(1).quantile(0.9)) < 0.002
+    assert (
+        float(torch.cdist(chosen.cloud().points, shipped.cloud(2).points).amin(1).quantile(0.9))
+        < 0.002
+    )
     np.save(tmp_path / "mask.npy", shipped.image.depth.numpy() < 0)
     assert cli.main([*words, "--mask", str(tmp_path / "mask.npy")]) == 2
     assert "--mask" in capsys.readouterr().err
@@ -287,7 +412,10 @@ def test_scene_takes_the_median_of_frames_of_a_still_camera(tmp_path, capsys):
         noise.append(float(found.noise.sigma(torch.tensor(0.7))))
     assert noise[1] < 0.9 * noise[0]
     assert cli.main([*words, str(tmp_path / "moved.npz"), "--frames", *paths[1:]]) == 2
-    assert "--frames: expected frames of a camera and a scene that stand still" in capsys.readouterr().err
+    assert (
+        "--frames: expected frames of a camera and a scene that stand still"
+        in capsys.readouterr().err
+    )
     assert not (tmp_path / "moved.npz").exists()
     assert cli.main([*words, str(tmp_path / "1.npz"), "--frames", paths[1]]) == 2
     assert "replace" in capsys.readouterr().err
@@ -299,20 +427,40 @@ def square(tmp_path):
     depth = np.full((120, 160), 0.8)
     depth[40:80, 60:100] = 0.7
     Image.fromarray(np.uint16(np.round(1e3 * depth))).save(tmp_path / "depth.png")
-    return ["cloud", "scene", tmp_path / "depth.png", "--intrinsics", "140", "140", "79.5", "59.5", "--out"]
+    return [
+        "cloud",
+        "scene",
+        tmp_path / "depth.png",
+        "--intrinsics",
+        "140",
+        "140",
+        "79.5",
+        "59.5",
+        "--out",
+    ]
 
 
-def test_scene_draws_a_picture_beside_it_that_replaces_no_input(square, tmp_path, run_command, refusal):
-    assert "replace" in refusal(*square, tmp_path / "depth.npz") and not (tmp_path / "depth.npz").exists()
+def test_scene_draws_a_picture_beside_it_that_replaces_no_input(
+    square, tmp_path, run_command, refusal
+):
+    assert (
+        "replace" in refusal(*square, tmp_path / "depth.npz")
+        and not (tmp_path / "depth.npz").exists()
+    )
     code, said, _ = run_command(*square, tmp_path / "scene.npz")
     assert code == 0 and str(tmp_path / "scene.png") in said
     with Image.open(tmp_path / "scene.png") as picture:
         assert picture.width == 1200
 
 
-def test_scene_takes_the_table_the_vertical_and_a_pixel_of_the_target(square, tmp_path, run_command, refusal):
+def test_scene_takes_the_table_the_vertical_and_a_pixel_of_the_target(
+    square, tmp_path, run_command, refusal
+):
     words = [*square, tmp_path / "scene.npz"]
-    for options in (["--table", "0", "0", "-2", "-1.6"], ["--up", "0", "0.1", "-1", "--point", "80", "60"]):
+    for options in (
+        ["--table", "0", "0", "-2", "-1.6"],
+        ["--up", "0", "0.1", "-1", "--point", "80", "60"],
+    ):
         assert run_command(*words, *options)[0] == 0
         seen = read_scene(tmp_path / "scene.npz")
         assert seen.table is not None and abs(seen.table.offset + 0.8) < 0.001
@@ -321,31 +469,48 @@ def test_scene_takes_the_table_the_vertical_and_a_pixel_of_the_target(square, tm
         assert refusal(*words, *bad.split()).startswith(f"{bad.split()[0]}: expected ")
 
 
-def test_a_mesh_or_a_table_that_contradicts_the_cloud_is_told_before_the_work(tmp_path, refusal, monkeypatch):
-    monkeypatch.setattr(grasps, "plan_grasps", lambda *_, **__: pytest.fail("work was done before the refusal"))
+def test_a_mesh_or_a_table_that_contradicts_the_cloud_is_told_before_the_work(
+    tmp_path, refusal, monkeypatch
+):
+    monkeypatch.setattr(
+        grasps, "plan_grasps", lambda *_, **__: pytest.fail("work was done before the refusal")
+    )
     mesh = load_object("jug").mesh.copy()
     mesh.apply_translation((0.13, 0.0, 0.0))
     mesh.export(tmp_path / "moved.ply")
     words = ["grasp", VIEW, "--out", tmp_path / "out", "--hand", "barrett"]
-    assert "--mesh: expected the cloud's points within" in refusal(*words, "--mesh", tmp_path / "moved.ply")
+    assert "--mesh: expected the cloud's points within" in refusal(
+        *words, "--mesh", tmp_path / "moved.ply"
+    )
     said = refusal(*words, "--table", "0.054")
-    assert "above the object's foot" in said and "--table, a table under the object's points" in said
-    assert "foot is 54 mm above the table" in refusal(*words, "--table", "-0.054", "--mesh", DATA / "jug" / "mesh.ply")
+    assert (
+        "above the object's foot" in said and "--table, a table under the object's points" in said
+    )
+    assert "foot is 54 mm above the table" in refusal(
+        *words, "--table", "-0.054", "--mesh", DATA / "jug" / "mesh.ply"
+    )
 
 
 def test_thin_leaves_one_point_a_voxel_and_no_outliers(tmp_path, capsys):
     rng = np.random.default_rng(0).normal(size=(60000, 3))
-    points = np.concatenate([0.04 * rng / np.linalg.norm(rng, axis=1, keepdims=True), [[0.3, 0, 0]]])
+    points = np.concatenate(
+        [0.04 * rng / np.linalg.norm(rng, axis=1, keepdims=True), [[0.3, 0, 0]]]
+    )
     path = str(write(tmp_path / "a.npy", points))
-    assert cli.main(["cloud", "thin", path, "--voxel", "0.004", "--out", str(tmp_path / "b.ply")]) == 0
+    assert (
+        cli.main(["cloud", "thin", path, "--voxel", "0.004", "--out", str(tmp_path / "b.ply")]) == 0
+    )
     thin = read_cloud(tmp_path / "b.ply").points
     assert 1000 < len(thin) < 4000 and float(thin.norm(dim=1).max()) < 0.041
     assert "1 outliers removed" in capsys.readouterr().out
 
 
 def depth_image():
-    """Return the depth [m] of a plane 0.5 m away with a square of pixels 0.4 m away, and the square's mask."""
-    depth, mask = np.full((480, 640), 0.5), np.zeros((480, 640), dtype=np.uint8)
+    """Return the depth [m] of a plane 0.5 m away with a square of pixels 0.4 m away, and the
+    square's mask.
+    """
+    depth = np.full((480, 640), 0.5)
+    mask = np.zeros((480, 640), dtype=np.uint8)
     mask[200:280, 300:380] = 255
     depth[mask > 0] = 0.4
     depth[::50] = np.nan
@@ -372,7 +537,12 @@ def test_depth_makes_a_cloud_of_the_mask(suffix, tmp_path, capsys):
     assert cli.main(["cloud", "depth", str(path), *options]) == 0
     still = read_cloud(tmp_path / "c.npz")
     assert len(still) == 78 * 80 and bool((still.points[:, 2] - 0.4).abs().max() < 1e-6)
-    assert cli.main(["cloud", "depth", str(path), *options, "--camera-pose", str(tmp_path / "pose.txt")]) == 0
+    assert (
+        cli.main(
+            ["cloud", "depth", str(path), *options, "--camera-pose", str(tmp_path / "pose.txt")]
+        )
+        == 0
+    )
     moved = read_cloud(tmp_path / "c.npz")
     torch.testing.assert_close(moved.points, still.points @ POSE[:3, :3].T + POSE[:3, 3])
     torch.testing.assert_close(moved.viewpoint, POSE[:3, 3])
@@ -381,10 +551,20 @@ def test_depth_makes_a_cloud_of_the_mask(suffix, tmp_path, capsys):
 BAD_DEPTH = {  # depth, mask, options, words
     "mask of another size": (lambda d, m: d, lambda d, m: m[::2], [], ["--mask", "(480, 640)"]),
     "empty mask": (lambda d, m: d, lambda d, m: 0 * m, [], ["--mask", "no pixel"]),
-    "intrinsics of another resolution": (lambda d, m: d[:240, :320], None, [], ["--intrinsics", "same resolution"]),
+    "intrinsics of another resolution": (
+        lambda d, m: d[:240, :320],
+        None,
+        [],
+        ["--intrinsics", "same resolution"],
+    ),
     "millimetres as floats": (lambda d, m: 1000 * d, None, [], ["DEPTH", "mm"]),
     "negative": (lambda d, m: -d, None, [], ["DEPTH", "depths >= 0"]),
-    "nothing measured": (lambda d, m: 0 * m.astype(np.uint16), None, [], ["DEPTH", "0 measured pixels"]),
+    "nothing measured": (
+        lambda d, m: 0 * m.astype(np.uint16),
+        None,
+        [],
+        ["DEPTH", "0 measured pixels"],
+    ),
     "a picture": (lambda d, m: np.stack([d, d, d], -1), None, [], ["DEPTH", "uint16"]),
     "not a file": (None, None, [], ["DEPTH", "no file"]),
     "no pose": (lambda d, m: d, None, ["--camera-pose", "none.txt"], ["--camera-pose", "no file"]),
@@ -402,14 +582,20 @@ def test_bad_depth_is_refused_in_one_sentence(name, tmp_path, refusal):
         options = [*options, "--mask", tmp_path / "m.npy"]
     options = options if "--out" in options else [*options, "--out", tmp_path / "c.npz"]
     error = refusal("cloud", "depth", tmp_path / "d.npy", *K, *options)
-    assert error.startswith(f"{words[0]}: ") and words[1] in error and not (tmp_path / "c.npz").exists()
+    assert (
+        error.startswith(f"{words[0]}: ")
+        and words[1] in error
+        and not (tmp_path / "c.npz").exists()
+    )
 
 
 @pytest.mark.parametrize("content", [b"", b"\x89PNG\r\n\x1a\n", b"\x93NUMPY", b"x" * 99])
 @pytest.mark.parametrize("suffix", [".png", ".npy", ".npz"])
 def test_malformed_depth_files_are_refused_by_name(suffix, content, tmp_path, refusal):
     (tmp_path / f"d{suffix}").write_bytes(content)
-    assert refusal("cloud", "depth", tmp_path / f"d{suffix}", *K, "--out", tmp_path / "c.npz").startswith("DEPTH: ")
+    assert refusal(
+        "cloud", "depth", tmp_path / f"d{suffix}", *K, "--out", tmp_path / "c.npz"
+    ).startswith("DEPTH: ")
 
 
 CAMERAS = {  # files that ROS, BOP and others write
@@ -424,7 +610,9 @@ def test_intrinsics_are_read_from_a_file(name, tmp_path, run_command):
     depth, mask = depth_image()
     Image.fromarray(np.nan_to_num(1000 * depth).astype(np.uint16)).save(tmp_path / "000007.png")
     np.save(tmp_path / "m.npy", mask)
-    (tmp_path / name).write_text(CAMERAS[name].replace("MATRIX", str([616, 0, 319.5, 0, 616, 239.5, 0, 0, 1])))
+    (tmp_path / name).write_text(
+        CAMERAS[name].replace("MATRIX", str([616, 0, 319.5, 0, 616, 239.5, 0, 0, 1]))
+    )
     words = ["cloud", "depth", tmp_path / "000007.png", "--mask", tmp_path / "m.npy"]
     for k, out in ((K[1:], "a.npz"), ([tmp_path / name], "b.npz")):
         assert run_command(*words, "--intrinsics", *k, "--out", tmp_path / out)[0] == 0
@@ -437,7 +625,10 @@ BAD_CAMERAS = {
     "c.yaml": (b"!!python/object/apply:os.getcwd []", "well-formed .yaml"),
     "d.yaml": (b"k: &k {k: *k}", "matrix K"),
     "e.yaml": (b"a: &a [1, 1, 1, 1]\nb: &b [*a, *a, *a, *a]\nk: [*b, *b, *b]", "matrix K"),
-    "f.json": (b'{"K": [1232, 0, 639, 0, 1232, 479, 0, 0, 1], "width": 1280, "height": 960}', "all four times 0.5"),
+    "f.json": (
+        b'{"K": [1232, 0, 639, 0, 1232, 479, 0, 0, 1], "width": 1280, "height": 960}',
+        "all four times 0.5",
+    ),
     "g.toml": (b"k = 1", ".json"),
     "word": (None, "no file"),
 }
@@ -458,12 +649,15 @@ def test_a_bad_file_of_intrinsics_is_refused_in_one_sentence(name, tmp_path, ref
 def test_a_tiff_and_its_unit_are_read(unit, tmp_path, run_command):
     depth, mask = depth_image()
     counts = np.nan_to_num(depth) / float(unit or 1)
-    Image.fromarray(counts.astype(np.uint16) if unit == "0.00025" else counts.astype(np.float32)).save(
-        tmp_path / "d.tiff"
-    )
+    Image.fromarray(
+        counts.astype(np.uint16) if unit == "0.00025" else counts.astype(np.float32)
+    ).save(tmp_path / "d.tiff")
     np.save(tmp_path / "m.npy", mask)
     options = ["--mask", tmp_path / "m.npy", *K, *([] if unit is None else ["--depth-unit", unit])]
-    assert run_command("cloud", "depth", tmp_path / "d.tiff", *options, "--out", tmp_path / "c.npz")[0] == 0
+    assert (
+        run_command("cloud", "depth", tmp_path / "d.tiff", *options, "--out", tmp_path / "c.npz")[0]
+        == 0
+    )
     assert np.allclose(read_cloud(tmp_path / "c.npz").points[:, 2], 0.4, atol=1e-6)
 
 
@@ -477,7 +671,10 @@ def test_exr_needs_a_package_and_a_unit_is_small(tmp_path, refusal, monkeypatch)
 
 def test_exr_gives_its_channel_of_depth(tmp_path, monkeypatch):
     depth = np.full((4, 6), 0.5, dtype=np.float32)
-    channels = {"RGB": SimpleNamespace(pixels=np.zeros((4, 6, 3))), "View.Depth.Z": SimpleNamespace(pixels=depth)}
+    channels = {
+        "RGB": SimpleNamespace(pixels=np.zeros((4, 6, 3))),
+        "View.Depth.Z": SimpleNamespace(pixels=depth),
+    }
     package = SimpleNamespace(File=lambda path: SimpleNamespace(channels=lambda: channels))
     monkeypatch.setitem(sys.modules, "OpenEXR", package)
     (tmp_path / "d.exr").write_bytes(b"v/1\x01")
@@ -490,7 +687,9 @@ def test_exr_gives_its_channel_of_depth(tmp_path, monkeypatch):
 @pytest.mark.parametrize("up", [None, (0.0, 0.0, 1.0)])
 def test_a_flying_pixel_below_the_table_is_not_where_the_table_is(up):
     seen = load_object("cylinder").view
-    flying = PointCloud(torch.cat([seen.points, torch.tensor([[0.0, 0.05, -0.03]])]), viewpoint=seen.viewpoint)
+    flying = PointCloud(
+        torch.cat([seen.points, torch.tensor([[0.0, 0.05, -0.03]])]), viewpoint=seen.viewpoint
+    )
     view = CloudOptions(up=up)
     found = [as_plane(view.plane(cloud)) for cloud in (seen, flying)]
     assert found[0].offset == found[1].offset and abs(found[0].offset) < 0.01
@@ -498,28 +697,44 @@ def test_a_flying_pixel_below_the_table_is_not_where_the_table_is(up):
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".ply"])
-def test_the_table_that_cut_names_is_that_of_the_next_commands(suffix, tmp_path, run_command, monkeypatch):
-    scene, cut, thin = str(write(tmp_path / "scene.npz", with_table(0.5))), tmp_path / f"a{suffix}", tmp_path / "b.npz"
+def test_the_table_that_cut_names_is_that_of_the_next_commands(
+    suffix, tmp_path, run_command, monkeypatch
+):
+    scene = str(write(tmp_path / "scene.npz", with_table(0.5)))
+    cut = tmp_path / f"a{suffix}"
+    thin = tmp_path / "b.npz"
     words = run_command("cloud", "cut", scene, "--out", cut)[1].split("table   --table ")[1].split()
     named = [float(word) for word in words[:4]]
     assert str(cut) in " ".join(words)
     assert run_command("cloud", "thin", cut, "--out", thin)[0] == 0
     planned = []
     monkeypatch.setattr(
-        grasps, "plan_grasps", lambda cloud, hand, spec, *_, **__: planned.append(spec.table) or exit(9)
+        grasps,
+        "plan_grasps",
+        lambda cloud, hand, spec, *_, **__: planned.append(spec.table) or exit(9),
     )
-    for path, options, offset in ((cut, [], named[3]), (thin, [], named[3]), (cut, ["--table", "-0.02"], -0.02)):
+    for path, options, offset in (
+        (cut, [], named[3]),
+        (thin, [], named[3]),
+        (cut, ["--table", "-0.02"], -0.02),
+    ):
         planned.clear()
         assert "the file holds a table" in run_command("cloud", "check", path)[1]
         with pytest.raises(SystemExit):
             run_command("grasp", path, "--out", tmp_path / "out", "--hand", "barrett", *options)
         assert abs(as_plane(planned[0]).offset - offset) < 1e-4
     file = read_cloud_file(cut)
-    assert file.table is not None and np.allclose([*file.table.normal.tolist(), file.table.offset], named, atol=1e-4)
+    assert file.table is not None and np.allclose(
+        [*file.table.normal.tolist(), file.table.offset], named, atol=1e-4
+    )
     np.savetxt(tmp_path / "pose.txt", np.diag([1.0, -1.0, -1.0, 1.0]))
     moved = ViewOptions(camera_pose=tmp_path / "pose.txt", unit="mm").read(
         "CLOUD",
-        save_cloud(PointCloud(100 * torch.rand(50, 3) + torch.tensor([0, 0, 900.0])), thin, Plane.horizontal(7.0)),
+        save_cloud(
+            PointCloud(100 * torch.rand(50, 3) + torch.tensor([0, 0, 900.0])),
+            thin,
+            Plane.horizontal(7.0),
+        ),
     )
     assert moved.table is not None and np.allclose(
         [*moved.table.normal.tolist(), moved.table.offset], [0, 0, -1, 0.007]
@@ -527,13 +742,14 @@ def test_the_table_that_cut_names_is_that_of_the_next_commands(suffix, tmp_path,
 
 
 def test_a_cloud_gives_a_scene_as_its_depth_image_does(tmp_path, run_command):
-    meshes, pose = [box([0.06, 0.06, 0.1], (0.0, 0.0)), box([0.05, 0.08, 0.06], (0.1, 0.12))], look_at(40.0, 45.0, 0.7)
-    depth, k = (
-        render_depth(meshes, pose)[0][::2, ::2].clone(),
-        torch.diag(torch.tensor([0.5, 0.5, 1])).double() @ INTRINSICS,
-    )
+    meshes = [box([0.06, 0.06, 0.1], (0.0, 0.0)), box([0.05, 0.08, 0.06], (0.1, 0.12))]
+    pose = look_at(40.0, 45.0, 0.7)
+    depth = render_depth(meshes, pose)[0][::2, ::2].clone()
+    k = torch.diag(torch.tensor([0.5, 0.5, 1])).double() @ INTRINSICS
     camera = Scene.from_depth(depth, k)
-    rows = torch.where((depth > 0)[..., None], DepthImage(depth, k, torch.eye(4).double()).points(), torch.nan)
+    rows = torch.where(
+        (depth > 0)[..., None], DepthImage(depth, k, torch.eye(4).double()).points(), torch.nan
+    )
     head = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 320\nHEIGHT 240\nVIEWPOINT 0 0 0 1 0 0 0\nDATA binary\n"
     (tmp_path / "a.pcd").write_bytes(head.encode() + rows.numpy().astype("<f4").tobytes())
     seen = PointCloud(camera.points, None, torch.zeros(3).double())
@@ -548,10 +764,16 @@ def test_a_cloud_gives_a_scene_as_its_depth_image_does(tmp_path, run_command):
         ("c.npz", ["--unit", "mm", "--viewpoint", 0, 0, 0]),
         ("b.ply", ["--camera-pose", tmp_path / "pose.txt"]),
     ):
-        code, said, error = run_command("cloud", "scene", tmp_path / name, *options, "--out", tmp_path / "s.npz")
+        code, said, error = run_command(
+            "cloud", "scene", tmp_path / name, *options, "--out", tmp_path / "s.npz"
+        )
         found = read_scene(tmp_path / "s.npz")
         assert code == 0 and "object 2" in said, error
-        assert len(found.things) == len(camera.things) and not found.image.bounded and (tmp_path / "s.png").is_file()
+        assert (
+            len(found.things) == len(camera.things)
+            and not found.image.bounded
+            and (tmp_path / "s.png").is_file()
+        )
         assert (found.target is not None) == ("--point" in options)
         height = found.table.height(found.viewpoint) if found.table is not None else 0
         assert abs(float(height) - float(pose[2, 3])) < 0.004
@@ -560,12 +782,20 @@ def test_a_cloud_gives_a_scene_as_its_depth_image_does(tmp_path, run_command):
 NO_SCENE = {
     "an image without intrinsics": ("d.png", [], "--intrinsics: expected fx fy cx cy"),
     "a scene's file": ("e.npz", [], "--intrinsics: expected fx fy cx cy"),
-    "a cloud without a camera": ("f.npy", [], "--viewpoint: expected the position of the one camera"),
+    "a cloud without a camera": (
+        "f.npy",
+        [],
+        "--viewpoint: expected the position of the one camera",
+    ),
     "a mask": ("f.npy", ["--mask", "m.png"], "--mask: expected --point"),
     "a unit of depth": ("f.npy", ["--depth-unit", "0.001"], "--depth-unit: expected"),
     "a pixel": ("f.npy", ["--point", "3", "4"], "--point: expected x y z"),
     "no cloud": ("g.pcd", [], "DEPTH: expected a well-formed .pcd file"),
-    "a viewpoint of an image": ("d.png", [*K, "--viewpoint", "0", "0", "0"], "--intrinsics: expected --camera-pose"),
+    "a viewpoint of an image": (
+        "d.png",
+        [*K, "--viewpoint", "0", "0", "0"],
+        "--intrinsics: expected --camera-pose",
+    ),
 }
 
 
@@ -576,7 +806,9 @@ def test_a_cloud_that_gives_no_scene_is_refused_in_one_sentence(name, tmp_path, 
     np.savez(tmp_path / "e.npz", depth=np.ones((9, 9)), intrinsics=np.eye(3))
     np.save(tmp_path / "f.npy", np.random.default_rng(0).random((90, 3)))
     (tmp_path / "g.pcd").write_bytes(b"x")
-    assert refusal("cloud", "scene", tmp_path / file, *options, "--out", tmp_path / "s.npz").startswith(words)
+    assert refusal(
+        "cloud", "scene", tmp_path / file, *options, "--out", tmp_path / "s.npz"
+    ).startswith(words)
 
 
 def test_normals_without_a_camera_are_planned_and_the_check_says_so(tmp_path, capsys):
@@ -587,5 +819,7 @@ def test_normals_without_a_camera_are_planned_and_the_check_says_so(tmp_path, ca
     said = capsys.readouterr().out
     assert re.search(r"viewpoint +estimated, .*100% of the normals", said) and "refused" not in said
     assert fit_shape(read_cloud(path)).kind != "whole"
-    ball = torch.nn.functional.normalize(torch.randn(600, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
+    ball = torch.nn.functional.normalize(
+        torch.randn(600, 3, generator=torch.Generator().manual_seed(0)), dim=-1
+    )
     assert diagnose_cloud(PointCloud(0.04 * ball, ball)).viewpoint is None

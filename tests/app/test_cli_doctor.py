@@ -13,11 +13,16 @@ from torchgrasp.evaluation import golden
 def without(monkeypatch, *names):
     """Hide packages from the import system."""
     find = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *more: None if name in names else find(name, *more))
+    monkeypatch.setattr(
+        importlib.util,
+        "find_spec",
+        lambda name, *more: None if name in names else find(name, *more),
+    )
 
 
 def test_the_doctor_names_what_is_there(capsys):
-    code, told = cli.main(["doctor"]), capsys.readouterr().out
+    code = cli.main(["doctor"])
+    told = capsys.readouterr().out
     for name in ("torch", "numpy", "scipy", "safetensors"):
         assert importlib.metadata.version(name) in told
     assert "allegro" in told and "GPU" in told and code in (0, 1)
@@ -25,7 +30,8 @@ def test_the_doctor_names_what_is_there(capsys):
 
 
 def test_what_one_command_needs_is_told_and_is_no_fault(monkeypatch, capsys):
-    code, version = cli.main(["doctor"]), importlib.metadata.version
+    code = cli.main(["doctor"])
+    version = importlib.metadata.version
     capsys.readouterr()
 
     def without_distributed(name):
@@ -35,7 +41,10 @@ def test_what_one_command_needs_is_told_and_is_no_fault(monkeypatch, capsys):
 
     monkeypatch.setattr(importlib.metadata, "version", without_distributed)
     assert cli.main(["doctor"]) == code
-    assert "`torchgrasp campaign --scheduler` needs it: pip install 'torchgrasp[cluster]'" in capsys.readouterr().out
+    assert (
+        "`torchgrasp campaign --scheduler` needs it: pip install 'torchgrasp[cluster]'"
+        in capsys.readouterr().out
+    )
 
 
 def test_the_doctor_names_what_is_missing_and_what_installs_it(monkeypatch, capsys):
@@ -68,7 +77,10 @@ def test_every_simulator_finds_the_known_verdicts(capsys):
     pytest.importorskip("sapien"), pytest.importorskip("mujoco")
     assert cli.main(["selftest"]) == 0
     told = capsys.readouterr().out
-    assert told.count(f"{len(golden.GOLDEN)} of {len(golden.GOLDEN)} verdicts right") == 2 and "(wrong)" not in told
+    assert (
+        told.count(f"{len(golden.GOLDEN)} of {len(golden.GOLDEN)} verdicts right") == 2
+        and "(wrong)" not in told
+    )
 
 
 def test_the_selftest_fails_where_a_verdict_is_another(monkeypatch, capsys):

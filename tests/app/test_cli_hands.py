@@ -38,19 +38,35 @@ def test_new_writes_a_draft_that_check_takes_and_draws(barrett, capsys, monkeypa
     assert main(["hand", "check", str(barrett), "--out", str(picture)]) == 0
     said = capsys.readouterr().out
     assert re.search(r"sets of fingers:\ndefault +f1, f2, f3\n", said)
-    for words in ("mine, option default: 4 actuated of 8 joints", "spread", "f1_distal = 0.3333 f1_flex", "none"):
+    for words in (
+        "mine, option default: 4 actuated of 8 joints",
+        "spread",
+        "f1_distal = 0.3333 f1_flex",
+        "none",
+    ):
         assert words in said
     with Image.open(picture) as image:
-        assert image.width == 1350 and len(np.unique(np.asarray(image).reshape(-1, 3), axis=0)) > 100
-    assert main(["hand", "new", str(barrett / "hand.urdf")]) == 2  # what is there is not overwritten
+        assert (
+            image.width == 1350 and len(np.unique(np.asarray(image).reshape(-1, 3), axis=0)) > 100
+        )
+    assert (
+        main(["hand", "new", str(barrett / "hand.urdf")]) == 2
+    )  # what is there is not overwritten
     assert "exists" in capsys.readouterr().err
 
 
 def test_check_names_every_fault(barrett, capsys):
-    urdf, toml = barrett / "hand.urdf", barrett / "hand.toml"
+    urdf = barrett / "hand.urdf"
+    toml = barrett / "hand.toml"
     text = urdf.read_text()
-    urdf.write_text(text.replace('<mass value="0.6086"/>', '<mass value="0"/>').replace('effort="2"', 'effort="0"'))
-    toml.write_text(toml.read_text().replace('["f3_flex", "f3_distal"]', '["f3_distal", "f3_flex"]'))
+    urdf.write_text(
+        text.replace('<mass value="0.6086"/>', '<mass value="0"/>').replace(
+            'effort="2"', 'effort="0"'
+        )
+    )
+    toml.write_text(
+        toml.read_text().replace('["f3_flex", "f3_distal"]', '["f3_distal", "f3_flex"]')
+    )
     assert main(["hand", "check", str(barrett), "--out", str(barrett / "x.png")]) == 2
     lines = capsys.readouterr().out.splitlines()
     assert all(line.startswith("wrong: ") for line in lines)
@@ -88,7 +104,11 @@ def test_a_posture_is_drawn_with_every_finger(barrett):
     from torchgrasp.app.report.stills import draw_posture
 
     hand = load_hand(barrett)
-    image = Image.open(io.BytesIO(draw_posture(hand, torch.tensor([0.5, 0.8, 0.8, 0.8]).double(), (1.0, -0.8, 0.5))))
+    image = Image.open(
+        io.BytesIO(
+            draw_posture(hand, torch.tensor([0.5, 0.8, 0.8, 0.8]).double(), (1.0, -0.8, 0.5))
+        )
+    )
     pixels = np.asarray(image).reshape(-1, 3) / 255
     pixels = pixels[np.ptp(pixels, axis=1) > 0.15]
     hue = pixels / np.linalg.norm(pixels, axis=1, keepdims=True)
@@ -98,7 +118,9 @@ def test_a_posture_is_drawn_with_every_finger(barrett):
 
 
 def test_new_mends_a_published_urdf_and_leaves_it_as_it_is(claw, capsys, tmp_path):
-    """A mesh as a tip: the clean copy lies beside the URDF, under another name, or in a folder of its own."""
+    """A mesh as a tip: the clean copy lies beside the URDF, under another name, or in a folder of
+    its own.
+    """
     import trimesh
 
     trimesh.creation.icosphere(3, 0.011).export(claw.parent / "tip.stl")
@@ -108,9 +130,27 @@ def test_new_mends_a_published_urdf_and_leaves_it_as_it_is(claw, capsys, tmp_pat
     assert main(["hand", "new", str(published)]) == 0
     said = capsys.readouterr().out
     assert "repaired: 3 collision meshes" in said and "hand_clean.urdf" in said
-    assert published.read_text() == text and "mesh" not in (claw.parent / "hand_clean.urdf").read_text()
+    assert (
+        published.read_text() == text
+        and "mesh" not in (claw.parent / "hand_clean.urdf").read_text()
+    )
     out = tmp_path / "other"
-    assert main(["hand", "new", str(published), "--out", str(out), "--tips", "left_tip", "thumb_tip", "right_tip"]) == 0
+    assert (
+        main(
+            [
+                "hand",
+                "new",
+                str(published),
+                "--out",
+                str(out),
+                "--tips",
+                "left_tip",
+                "thumb_tip",
+                "right_tip",
+            ]
+        )
+        == 0
+    )
     assert sorted(file.name for file in out.iterdir()) == ["hand.toml", "hand.urdf"]
     assert main(["hand", "check", str(out), "--out", str(out / "hand.png")]) == 0
     assert "the hand can grasp" in capsys.readouterr().out
@@ -118,12 +158,16 @@ def test_new_mends_a_published_urdf_and_leaves_it_as_it_is(claw, capsys, tmp_pat
 
 def test_hand_check_prints_warnings_with_their_fixes(claw, capsys, monkeypatch):
     """A pad that faces away, and a link that is always in another's way."""
-    text = claw.read_text().replace('<box size="0.016 0.02 0.056"/>', '<box size="0.055 0.055 0.056"/>')
+    text = claw.read_text().replace(
+        '<box size="0.016 0.02 0.056"/>', '<box size="0.055 0.055 0.056"/>'
+    )
     claw.write_text(text)
     assert main(["hand", "new", str(claw)]) == 0
     toml = claw.parent / "hand.toml"
     pad = toml.read_text().split("[[finger]]")[1]
-    away = pad.replace("0.866025403784", "-0.866025403784").replace("0.009526279442", "-0.009526279442")
+    away = pad.replace("0.866025403784", "-0.866025403784").replace(
+        "0.009526279442", "-0.009526279442"
+    )
     assert away != pad
     toml.write_text(toml.read_text().replace(pad, away))
     monkeypatch.setattr("torchgrasp.app.cli.hands._try_objects", lambda hand, bar: False)
@@ -133,9 +177,24 @@ def test_hand_check_prints_warnings_with_their_fixes(claw, capsys, monkeypatch):
 
 
 def test_every_set_of_fingers_is_checked_and_tried(tmp_path, capsys, monkeypatch):
-    """A draft of the Allegro hand has two; a fault of a further one is named, and four fingers are described."""
-    assert main(["hand", "new", str(hands_folder() / "allegro" / "hand.urdf"), "--out", str(tmp_path / "mine")]) == 0
-    assert re.search(r"default +[\w, ]*thumb\nfour +index, middle, ring, thumb\n", capsys.readouterr().out)
+    """A draft of the Allegro hand has two; a fault of a further one is named, and four fingers are
+    described.
+    """
+    assert (
+        main(
+            [
+                "hand",
+                "new",
+                str(hands_folder() / "allegro" / "hand.urdf"),
+                "--out",
+                str(tmp_path / "mine"),
+            ]
+        )
+        == 0
+    )
+    assert re.search(
+        r"default +[\w, ]*thumb\nfour +index, middle, ring, thumb\n", capsys.readouterr().out
+    )
     words = ["hand", "check", str(tmp_path / "mine"), "--out", str(tmp_path / "hand.png")]
     assert main(words) == 0
     said = capsys.readouterr().out
@@ -157,7 +216,10 @@ def test_train_learns_a_mixture_that_the_paper_modes_take(claw, capsys):
 
     assert main(["hand", "new", str(claw)]) == 0
     folder = str(claw.parent)
-    assert main(["hand", "train", folder, "--n", "3000", "--components", "4", "--held-out", "500"]) == 0
+    assert (
+        main(["hand", "train", folder, "--n", "3000", "--components", "4", "--held-out", "500"])
+        == 0
+    )
     assert "4 components" in capsys.readouterr().out
     assert load_mixture(folder).joint_names == load_hand(folder).joint_names
     assert main(["hand", "train", folder, "--held-out", "1"]) == 2
@@ -192,7 +254,12 @@ def test_new_takes_the_name_of_a_description(described, capsys, name):
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("octopus", "allegro_hand"), ("scene", "without a URDF"), ("far", "no route to host.*"), ("none.urdf", "no file")],
+    [
+        ("octopus", "allegro_hand"),
+        ("scene", "without a URDF"),
+        ("far", "no route to host.*"),
+        ("none.urdf", "no file"),
+    ],
 )
 def test_new_names_what_is_wrong_with_a_description(described, capsys, name, words):
     assert main(["hand", "new", name]) == 2

@@ -42,7 +42,15 @@ def grasp(tmp_path, run_command):
 
     def run(arrays: dict[str, np.ndarray], *options: str) -> tuple[int, str]:
         np.savez(tmp_path / "scene.npz", **arrays)
-        words = ["grasp", tmp_path / "scene.npz", "--hand", "barrett", "--out", tmp_path / "out", *options]
+        words = [
+            "grasp",
+            tmp_path / "scene.npz",
+            "--hand",
+            "barrett",
+            "--out",
+            tmp_path / "out",
+            *options,
+        ]
         code, out, err = run_command(*words)
         return code, err if code == 2 else out
 
@@ -63,21 +71,26 @@ def no_report(monkeypatch):
 
 @pytest.mark.parametrize("click", [True, False])
 def test_a_thing_is_grasped_by_click_or_mask(seen, grasp, tmp_path, click):
-    arrays, options = dict(seen), ["--point", *middle(seen["labels"], 1)]
+    arrays = dict(seen)
+    options = ["--point", *middle(seen["labels"], 1)]
     if not click:  # and by metres with gaps
         depth = seen["depth"] / 1e3
-        depth[::7, ::5], depth[3::11, ::3] = np.nan, 0.0
+        depth[::7, ::5] = np.nan
+        depth[3::11, ::3] = 0.0
         arrays |= {"depth": depth, "mask": (arrays.pop("labels") == 1).astype(np.uint8)}
         options = []
     code, words = grasp(arrays, "--starts", "10", *options)
     assert code == 0 and "executable grasps" in words
     best = load_grasps(tmp_path / "out" / "grasps.safetensors")[0]
     assert int(best.status) == Status.OK
-    assert float(best.contacts.points[0, :, :2].abs().max()) < 0.05  # of the first box, not of the second
+    assert (
+        float(best.contacts.points[0, :, :2].abs().max()) < 0.05
+    )  # of the first box, not of the second
 
 
 def test_without_a_choice_the_easiest_thing_is_taken_and_all_are_listed(seen, grasp, monkeypatch):
-    thing, asked = ThingPlan(2, 0.5, reason="too heavy"), []
+    thing = ThingPlan(2, 0.5, reason="too heavy")
+    asked = []
 
     def note(scene, hand, *_, fingers, enough, task, promise, resist, **where):
         asked.append((hand.finger_names, fingers))
@@ -86,9 +99,16 @@ def test_without_a_choice_the_easiest_thing_is_taken_and_all_are_listed(seen, gr
 
     monkeypatch.setattr("torchgrasp.app.cli.grasp.plan_scene", note)
     for wanted, passed in (("default", None), ("f3,f1,f2", None), ("auto", "auto")):
-        code, words = grasp(seen, "--fingers", wanted, "--mass", "0.4", "--promise", "0.8", "--resist", "lift")
+        code, words = grasp(
+            seen, "--fingers", wanted, "--mass", "0.4", "--promise", "0.8", "--resist", "lift"
+        )
         assert asked.pop() == (("f3", "f1", "f2") if "," in wanted else ("f1", "f2", "f3"), passed)
-    assert code == 1 and "object 2" in words and "too heavy" in words and "no executable grasp of any object" in words
+    assert (
+        code == 1
+        and "object 2" in words
+        and "too heavy" in words
+        and "no executable grasp of any object" in words
+    )
 
 
 def write(path: Path, seen: dict[str, np.ndarray], table: float, **choice: object) -> Scene:
@@ -135,49 +155,77 @@ def grasp_on(tmp_path, run_command):
 
 
 @pytest.mark.parametrize("options", [("--table", "0.001"), ("--up", "0", "0.1", "1")])
-def test_objects_that_the_library_found_are_found_again_on_another_table(seen, tmp_path, planned, grasp_on, options):
+def test_objects_that_the_library_found_are_found_again_on_another_table(
+    seen, tmp_path, planned, grasp_on, options
+):
     scene = write(tmp_path / "s.npz", seen, 0.03, point=[int(x) for x in middle(seen["labels"], 2)])
     assert "objects found again: 1, 2\n" in grasp_on(*options)
     (again,) = planned
     assert again.given == () and again.target == scene.target
     assert set(again.things) == {1, 2} and abs(again.table.offset) < 0.005
-    before, after = image_of(scene) == scene.target, image_of(again) == scene.target
-    assert (before & after).sum() > 0.95 * before.sum() and after.sum() > 1.2 * before.sum()  # down to the table
+    before = image_of(scene) == scene.target
+    after = image_of(again) == scene.target
+    assert (
+        before & after
+    ).sum() > 0.95 * before.sum() and after.sum() > 1.2 * before.sum()  # down to the table
 
 
 def test_beside_a_mask_of_the_user_other_objects_are_found_again(seen, tmp_path, planned, grasp_on):
     scene = write(tmp_path / "s.npz", seen, 0.03, mask=seen["labels"] == 2)
     words = grasp_on("--table", "0.0")
-    assert "objects kept, but for pixels of the table: 1\n" in words and "objects found again: 2\n" in words
-    before, after = image_of(scene), image_of(planned[0])
+    assert (
+        "objects kept, but for pixels of the table: 1\n" in words
+        and "objects found again: 2\n" in words
+    )
+    before = image_of(scene)
+    after = image_of(planned[0])
     for label in (1, 2):  # down to the table
         assert (
-            not ((before == label) & (after != label)).any() and (after == label).sum() > 1.2 * (before == label).sum()
+            not ((before == label) & (after != label)).any()
+            and (after == label).sum() > 1.2 * (before == label).sum()
         )
 
 
 @pytest.mark.parametrize("form", ["mask", "labels"])
-def test_what_the_user_gave_only_loses_the_pixels_of_another_table(seen, tmp_path, planned, grasp_on, form):
+def test_what_the_user_gave_only_loses_the_pixels_of_another_table(
+    seen, tmp_path, planned, grasp_on, form
+):
     column = int(np.nonzero(seen["labels"] == 2)[1].mean())
-    box, own = seen["labels"] == 2, binary_dilation(seen["labels"] == 2, iterations=12)
-    box[:, :column], own[:, :column] = False, False  # half of a box: no segmentation finds it
+    box = seen["labels"] == 2
+    own = binary_dilation(seen["labels"] == 2, iterations=12)
+    # half of a box: no segmentation finds it
+    box[:, :column] = False
+    own[:, :column] = False
     scene = write(tmp_path / "s.npz", seen, -0.03, **{form: own if form == "mask" else 7 * own})
     label = 1 if form == "mask" else 7
-    assert scene.given == (label,) and (image_of(scene) == label).sum() > 1.2 * box.sum()  # with a strip of the table
+    assert (
+        scene.given == (label,) and (image_of(scene) == label).sum() > 1.2 * box.sum()
+    )  # with a strip of the table
     assert f"objects kept, but for pixels of the table: {label}\n" in grasp_on("--table", "0.0")
     (again,) = planned
     assert again.given == (label,) and again.target == (1 if form == "mask" else None)
     assert again.things == (label,)
-    before, kept = image_of(scene) == label, image_of(again) == label
+    before = image_of(scene) == label
+    kept = image_of(again) == label
     high = before & box & (again.table.height(again.image.points()).numpy() > 0.01)
-    assert (kept & high).sum() > 0.99 * high.sum() and kept[~binary_dilation(box, iterations=2)].sum() < 5
+    assert (kept & high).sum() > 0.99 * high.sum() and kept[
+        ~binary_dilation(box, iterations=2)
+    ].sum() < 5
 
 
 def test_a_target_that_is_lost_on_another_table_is_told(seen, tmp_path, planned, grasp_on):
-    around = binary_dilation(seen["labels"] > 0, iterations=40).astype(int)  # an older file with boxes and table as one
-    np.savez(tmp_path / "s.npz", **seen | {"labels": around, "table": [0, 0, 1, -0.03], "target": 1})
+    around = binary_dilation(seen["labels"] > 0, iterations=40).astype(
+        int
+    )  # an older file with boxes and table as one
+    np.savez(
+        tmp_path / "s.npz", **seen | {"labels": around, "table": [0, 0, 1, -0.03], "target": 1}
+    )
     error = grasp_on("--table", "0.0")
-    assert error.startswith("torchgrasp: --table: ") and "object 1, the target, is lost" in error and not planned
+    assert (
+        error.startswith("torchgrasp: --table: ")
+        and "object 1, the target, is lost" in error
+        and not planned
+    )
     grasp_on("--table", "0.0", "--point", *middle(seen["labels"], 1))
     assert [scene.target in (2, 3) for scene in planned] == [True]
     beside = 2 * (around - binary_dilation(seen["labels"] > 0, iterations=9))  # a part of the table
@@ -187,23 +235,46 @@ def test_a_target_that_is_lost_on_another_table_is_told(seen, tmp_path, planned,
     assert "objects lost: 2\n" in grasp_on("--table", "0.0")
 
 
-def test_what_the_picture_says_against_a_chosen_object_is_told_before_planning(seen, tmp_path, planned, grasp_on):
-    labels = np.where(np.cumsum(seen["labels"] == 2).reshape(seen["labels"].shape) <= 60, seen["labels"], 0)
+def test_what_the_picture_says_against_a_chosen_object_is_told_before_planning(
+    seen, tmp_path, planned, grasp_on
+):
+    labels = np.where(
+        np.cumsum(seen["labels"] == 2).reshape(seen["labels"].shape) <= 60, seen["labels"], 0
+    )
     np.savez(tmp_path / "s.npz", **seen | {"labels": labels})
-    assert f"advice  {Status.FEW_PIXELS.sentence}" in grasp_on("--label", "2") and planned[0].target == 2
+    assert (
+        f"advice  {Status.FEW_PIXELS.sentence}" in grasp_on("--label", "2")
+        and planned[0].target == 2
+    )
     assert "advice" not in grasp_on("--label", "1")
 
 
 BAD = {
     "no plane": (lambda a: {**a, "depth": a["depth"] * (a["labels"] == 1)}, [], "plane"),
     "empty mask": (lambda a: {**a, "labels": None, "mask": 0 * a["labels"]}, [], "mask"),
-    "mask of another size": (lambda a: {**a, "labels": None, "mask": a["labels"][::2, ::2] > 0}, [], "mask"),
+    "mask of another size": (
+        lambda a: {**a, "labels": None, "mask": a["labels"][::2, ::2] > 0},
+        [],
+        "mask",
+    ),
     "labels of another size": (lambda a: {**a, "labels": a["labels"][::2, ::2]}, [], "labels"),
-    "intrinsics of another resolution": (lambda a: {**a, "intrinsics": 2 * a["intrinsics"]}, [], "intrinsics"),
+    "intrinsics of another resolution": (
+        lambda a: {**a, "intrinsics": 2 * a["intrinsics"]},
+        [],
+        "intrinsics",
+    ),
     "depth in mm, floating": (lambda a: {**a, "depth": a["depth"].astype(np.float32)}, [], "mm"),
     "no depth": (lambda a: {**a, "depth": 0 * a["depth"]}, [], "depth"),
-    "a pose that is not rigid": (lambda a: {**a, "camera_pose": 2 * a["camera_pose"]}, [], "camera_pose"),
-    "a table above the camera": (lambda a: {**a, "table": np.array([0.0, 0.0, 1.0, 5.0])}, [], "table"),
+    "a pose that is not rigid": (
+        lambda a: {**a, "camera_pose": 2 * a["camera_pose"]},
+        [],
+        "camera_pose",
+    ),
+    "a table above the camera": (
+        lambda a: {**a, "table": np.array([0.0, 0.0, 1.0, 5.0])},
+        [],
+        "table",
+    ),
     "a target that is the table": (lambda a: a, ["--point", "320", "440"], "--point"),
     "a pixel outside the image": (lambda a: a, ["--point", "900", "20"], "--point"),
     "an unknown label": (lambda a: a, ["--label", "9"], "--label"),
@@ -237,13 +308,20 @@ def test_cloud_scene_tells_a_pose_of_opengl_and_a_wrong_unit(seen, tmp_path, ref
     k = [str(float(INTRINSICS[i, j])) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))]
     words = ["cloud", "scene", tmp_path / "d.npy", "--intrinsics", *k, "--out", tmp_path / "s.npz"]
     error = refusal(*words, "--camera-pose", tmp_path / "gl.txt")
-    assert error.startswith("--camera-pose: ") and "OpenGL" in error and not (tmp_path / "s.npz").exists()
+    assert (
+        error.startswith("--camera-pose: ")
+        and "OpenGL" in error
+        and not (tmp_path / "s.npz").exists()
+    )
     assert "--depth-unit" in refusal(*words, "--depth-unit", "0.01")
 
 
 def run_lengths(mask):
     edges = np.flatnonzero(np.diff(mask.T.ravel(), prepend=False, append=False))
-    return {"size": list(mask.shape), "counts": np.diff(edges, prepend=0, append=mask.size).tolist()}
+    return {
+        "size": list(mask.shape),
+        "counts": np.diff(edges, prepend=0, append=mask.size).tolist(),
+    }
 
 
 def save_as(path, labels, form):
@@ -259,13 +337,26 @@ def save_as(path, labels, form):
     elif form == "stack.npy":
         np.save(path, np.stack(several))
     elif form == "alpha.png":
-        Image.fromarray(np.concatenate([colours, np.full((*labels.shape, 1), 255, dtype=np.uint8)], -1)).save(path)
+        Image.fromarray(
+            np.concatenate([colours, np.full((*labels.shape, 1), 255, dtype=np.uint8)], -1)
+        ).save(path)
     else:
-        Image.fromarray(colours if form == "colours.png" else labels.astype(form.split(".")[0])).save(path)
+        Image.fromarray(
+            colours if form == "colours.png" else labels.astype(form.split(".")[0])
+        ).save(path)
     return path
 
 
-FORMS = ["rle.json", "list.npz", "stack.npy", "alpha.png", "colours.png", "uint8.png", "uint16.png", "int32.tiff"]
+FORMS = [
+    "rle.json",
+    "list.npz",
+    "stack.npy",
+    "alpha.png",
+    "colours.png",
+    "uint8.png",
+    "uint16.png",
+    "int32.tiff",
+]
 
 
 @pytest.fixture
@@ -278,24 +369,40 @@ def scene_words(seen, tmp_path):
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_masks_of_each_form_are_the_objects_and_a_point_chooses(seen, scene_words, tmp_path, run_command, form):
+def test_masks_of_each_form_are_the_objects_and_a_point_chooses(
+    seen, scene_words, tmp_path, run_command, form
+):
     path = save_as(tmp_path / form, seen["labels"], form)
     point = ["--point", *middle(seen["labels"], 2)]
     code, said, _ = run_command("cloud", "scene", *scene_words, "--mask", path, *point)
     found = read_scene(tmp_path / "s.npz")
-    assert code == 0 and found.things == (1, 2) and found.target == 2 and "object 2" in said and "note" not in said
+    assert (
+        code == 0
+        and found.things == (1, 2)
+        and found.target == 2
+        and "object 2" in said
+        and "note" not in said
+    )
     own = found.pixels[found.rows_of(2)]
     assert (seen["labels"][tuple(own.T.numpy())] == 2).mean() > 0.99
 
 
 @pytest.mark.parametrize("form", ["one.json", "colours.png", "uint16.png"])
-def test_a_mask_of_one_object_is_the_target_and_the_table_below_is_told(seen, scene_words, tmp_path, run_command, form):
+def test_a_mask_of_one_object_is_the_target_and_the_table_below_is_told(
+    seen, scene_words, tmp_path, run_command, form
+):
     mask = seen["labels"] == 1
     row, column = np.nonzero(mask)
-    mask[row.min() : row.max() + 20, column.min() : column.max() + 1] = True  # with a strip of the table
+    mask[row.min() : row.max() + 20, column.min() : column.max() + 1] = (
+        True  # with a strip of the table
+    )
     path = save_as(tmp_path / form, mask.astype(int), form)
     code, said, _ = run_command("cloud", "scene", *scene_words, "--mask", path)
-    assert code == 0 and "(the target)" in said and "pixels lie on the support and were removed" in said
+    assert (
+        code == 0
+        and "(the target)" in said
+        and "pixels lie on the support and were removed" in said
+    )
     found = read_scene(tmp_path / "s.npz")
     assert found.target == 1 and float(torch.quantile(found.cloud().points[:, 2], 0.02)) > 0.002
     assert run_command("cloud", "depth", *scene_words, "--mask", path)[0] == 0
@@ -315,7 +422,11 @@ BAD_MASKS = {
 def test_a_bad_file_of_masks_is_refused_in_one_sentence(scene_words, tmp_path, refusal, name):
     (tmp_path / name).write_bytes(BAD_MASKS[name][0])
     error = refusal("cloud", "scene", *scene_words, "--mask", tmp_path / name)
-    assert error.startswith("--mask: ") and BAD_MASKS[name][1] in error and not (tmp_path / "s.npz").exists()
+    assert (
+        error.startswith("--mask: ")
+        and BAD_MASKS[name][1] in error
+        and not (tmp_path / "s.npz").exists()
+    )
 
 
 def test_a_cloud_needs_a_mask_of_one_object(seen, scene_words, tmp_path, refusal):

@@ -1,4 +1,6 @@
-"""The UR5e with an Allegro hand, and grasps of the shipped cylinder that it reaches, each made once."""
+"""The UR5e with an Allegro hand, and grasps of the shipped cylinder that it reaches, each made
+once.
+"""
 
 import pytest
 from benchmarks.ur5e import ur5e
@@ -19,4 +21,6 @@ def arm(hand):
 
 @pytest.fixture(scope="session")
 def grasps(arm, hand):
-    return plan_grasps(load_object("cylinder").view, hand, ContactSpec(table=0.0), starts=24, arm=arm)
+    return plan_grasps(
+        load_object("cylinder").view, hand, ContactSpec(table=0.0), starts=24, arm=arm
+    )

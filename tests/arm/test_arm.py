@@ -1,4 +1,6 @@
-"""The arm's kinematics beside Denavit and Hartenberg's products and pinocchio; files that are refused."""
+"""The arm's kinematics beside Denavit and Hartenberg's products and pinocchio; files that are
+refused.
+"""
 
 import re
 
@@ -28,14 +30,18 @@ def test_poses_are_products_of_the_published_matrices(arm):
 def test_inverse_kinematics_and_manipulability_agree_with_pinocchio(arm):
     pin = pytest.importorskip("pinocchio")
     model = pin.buildModelFromXML(ur5e_urdf())
-    data, frame = model.createData(), model.getFrameId("tool0")
+    data = model.createData()
+    frame = model.getFrameId("tool0")
 
     def placed(q):
         pin.framesForwardKinematics(model, data, q)
         return data.oMf[frame].homogeneous
 
-    generator, moved = torch.Generator().manual_seed(3), arm.moved(random_motion(4))
-    joints = arm.lower + torch.rand(300, 6, generator=generator, dtype=torch.float64) * (arm.upper - arm.lower)
+    generator = torch.Generator().manual_seed(3)
+    moved = arm.moved(random_motion(4))
+    joints = arm.lower + torch.rand(300, 6, generator=generator, dtype=torch.float64) * (
+        arm.upper - arm.lower
+    )
     base_from_tip = torch.tensor(np.array([placed(q) for q in joints.numpy()]))
     poses = moved.obj_from_base @ base_from_tip @ moved.tip_from_hand
     assert reach_poses(moved, poses).double().mean() > 0.95  # all are reached by some posture
@@ -43,21 +49,28 @@ def test_inverse_kinematics_and_manipulability_agree_with_pinocchio(arm):
     for q, (room, measure) in zip(joints[:20].numpy(), ease.tolist(), strict=True):
         jacobian = pin.computeFrameJacobian(model, data, q, frame, pin.LOCAL_WORLD_ALIGNED)
         assert measure == pytest.approx(abs(np.linalg.det(jacobian)), abs=1e-9)
-        low, high = model.lowerPositionLimit, model.upperPositionLimit
-        assert room == pytest.approx(1 - (np.abs(q - (low + high) / 2) / ((high - low) / 2)).max(), abs=1e-9)
+        low = model.lowerPositionLimit
+        high = model.upperPositionLimit
+        assert room == pytest.approx(
+            1 - (np.abs(q - (low + high) / 2) / ((high - low) / 2)).max(), abs=1e-9
+        )
 
 
 def test_poses_out_of_reach_are_refused(arm):
     """The flange is at most 0.98 m from the shoulder, by the lengths of the links."""
     poses = arm.hand_poses(arm.library[:50])
     far = poses.clone()
-    far[:, :3, 3] += 2.2 * torch.nn.functional.normalize(poses[:, :3, 3] - arm.obj_from_base[:3, 3], dim=1)
+    far[:, :3, 3] += 2.2 * torch.nn.functional.normalize(
+        poses[:, :3, 3] - arm.obj_from_base[:3, 3], dim=1
+    )
     assert not reach_poses(arm, far).any() and reach_poses(arm, poses).double().mean() > 0.95
     assert reach_poses(arm, poses[:0]).shape == (0,)
 
 
 def test_same_seed_same_library(arm, hand):
-    assert torch.equal(arm.library, ur5e(hand).library) and not torch.equal(arm.library, ur5e(hand, seed=1).library)
+    assert torch.equal(arm.library, ur5e(hand).library) and not torch.equal(
+        arm.library, ur5e(hand, seed=1).library
+    )
 
 
 def test_an_arm_is_for_the_hand_that_is_named(arm, hand, monkeypatch):
@@ -69,7 +82,9 @@ def test_an_arm_is_for_the_hand_that_is_named(arm, hand, monkeypatch):
     with pytest.raises(BadArgument, match=r"^arm: expected .* barrett hand"):
         plan_grasps(load_object("cylinder"), "barrett", arm=arm)
     changes = list_changes(Request(load_object("cylinder").view, hand, arm=arm))
-    assert all(change.request.hand.name == hand.name for change in changes)  # another hand would need another arm
+    assert all(
+        change.request.hand.name == hand.name for change in changes
+    )  # another hand would need another arm
 
 
 def test_files_that_are_no_arm_are_refused(hand, tmp_path):
@@ -86,9 +101,15 @@ def test_files_that_are_no_arm_are_refused(hand, tmp_path):
     with pytest.raises(BadArgument, match=r"tip: .*'hand'"):
         load(good, "hand")
     with pytest.raises(HandFileError, match="elbow_link with a mesh"):
-        load(re.sub(r"(elbow_link.*?)<cylinder[^>]*>", r'\1<mesh filename="elbow.stl"/>', good, count=1))
+        load(
+            re.sub(
+                r"(elbow_link.*?)<cylinder[^>]*>", r'\1<mesh filename="elbow.stl"/>', good, count=1
+            )
+        )
     mimic = r'\1<mimic joint="elbow_joint"/></joint>'
-    follower = re.sub(r'(joint name="wrist_1_joint".*?)</joint>', mimic, good, count=1, flags=re.DOTALL)
+    follower = re.sub(
+        r'(joint name="wrist_1_joint".*?)</joint>', mimic, good, count=1, flags=re.DOTALL
+    )
     with pytest.raises(HandFileError, match="wrist_1_joint that follows another"):
         load(follower)
     with pytest.raises(HandFileError, match="urdf"):
@@ -96,17 +117,27 @@ def test_files_that_are_no_arm_are_refused(hand, tmp_path):
 
 
 def test_a_published_arm_with_meshes_is_cleaned_for_the_library(hand, tmp_path):
-    """The forearm becomes a mesh; the spheres of the arm that is read again cover its vertices to a centimetre."""
+    """The forearm becomes a mesh; the spheres of the arm that is read again cover its vertices to a
+    centimetre.
+    """
     turn = trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0])
-    body = trimesh.creation.capsule(0.35, 0.045).apply_transform(turn).apply_translation([-0.375, 0, 0.007])
+    body = (
+        trimesh.creation.capsule(0.35, 0.045)
+        .apply_transform(turn)
+        .apply_translation([-0.375, 0, 0.007])
+    )
     body.export(tmp_path / "forearm.stl")
     mesh = '<geometry><mesh filename="package://any/forearm.stl"/></geometry></collision></link>'
-    text = re.sub(r'(name="elbow_link".*?<collision>).*?</link>', rf"\1{mesh}", ur5e_urdf(), count=1)
+    text = re.sub(
+        r'(name="elbow_link".*?<collision>).*?</link>', rf"\1{mesh}", ur5e_urdf(), count=1
+    )
     (tmp_path / "published.urdf").write_text(text)
     with pytest.raises(HandFileError, match="clean_arm"):
         load_arm(tmp_path / "published.urdf", hand)
     (tmp_path / "arm.urdf").write_text(clean_arm(tmp_path / "published.urdf"))
     arm = load_arm(tmp_path / "arm.urdf", hand)
     mine = arm.link == arm.tree.link_names.index("elbow_link")
-    far = torch.cdist(torch.from_numpy(np.array(body.vertices)), arm.center[mine]) - arm.radius[mine]
+    far = (
+        torch.cdist(torch.from_numpy(np.array(body.vertices)), arm.center[mine]) - arm.radius[mine]
+    )
     assert mine.sum() > 4 and far.amin(1).max() < 0.002

@@ -1,4 +1,6 @@
-"""A campaign whose jobs cost nothing: their records are drawn by number. Workers import this module."""
+"""A campaign whose jobs cost nothing: their records are drawn by number. Workers import this
+module.
+"""
 
 import os
 import signal
@@ -14,14 +16,26 @@ from torchgrasp.foundation.errors import Status
 from torchgrasp.foundation.jobs import run_as_they_end
 from torchgrasp.values.planning import Certificate, Contacts, Grasps
 
-JOINTS, FINGERS, TRIES = 4, 3, 2
+JOINTS = 4
+FINGERS = 3
+TRIES = 2
 """Sizes of the records."""
 ASKED = {
     "torchgrasp": "campaign",
     "version": 1,
     "licence": "CC0-1.0",
-    "hand": {"name": "toy", "option": "default", "sha256": "0" * 64, "joint_names": "a, b, c, d", "finger_names": "f"},
-    "protocol": {"name": "toy", "noise": {"draws": TRIES}, "trial": {"simulator": "none", "friction": 0.5}},
+    "hand": {
+        "name": "toy",
+        "option": "default",
+        "sha256": "0" * 64,
+        "joint_names": "a, b, c, d",
+        "finger_names": "f",
+    },
+    "protocol": {
+        "name": "toy",
+        "noise": {"draws": TRIES},
+        "trial": {"simulator": "none", "friction": 0.5},
+    },
     "trials": {"grasps": 3, "ranks": "best", "starts": 1, "seed": 0},
     "versions": {"torchgrasp": "0", "mujoco": "none"},
     "device": "cpu",
@@ -46,21 +60,37 @@ def records(rng: torch.Generator, points: int, count: int, tries: int = TRIES) -
     def draw(*shape: int) -> torch.Tensor:
         return torch.rand(*shape, generator=rng, dtype=torch.float64)
 
-    f, n = FINGERS, count
+    f = FINGERS
+    n = count
     contacts = Contacts(draw(n, f, 3), draw(n, f, 3), draw(n, f), draw(n, f))
     certificate = Certificate(draw(n), draw(n), draw(n), draw(n) > 0.5, draw(n, 6))
-    pose, order = torch.eye(4, dtype=torch.float64).repeat(n, 1, 1), torch.arange(f).repeat(n, 1)
+    pose = torch.eye(4, dtype=torch.float64).repeat(n, 1, 1)
+    order = torch.arange(f).repeat(n, 1)
     status = torch.zeros(n, dtype=torch.int64)
     grasps = Grasps(
-        draw(n, JOINTS), draw(n, JOINTS), draw(n, 3), pose, contacts, order, draw(n, f), draw(n), draw(n, f),
-        certificate, draw(n), status, known=status == 0, interval=torch.zeros(n, 2, dtype=torch.float64),
-    )  # fmt: skip
+        draw(n, JOINTS),
+        draw(n, JOINTS),
+        draw(n, 3),
+        pose,
+        contacts,
+        order,
+        draw(n, f),
+        draw(n),
+        draw(n, f),
+        certificate,
+        draw(n),
+        status,
+        known=status == 0,
+        interval=torch.zeros(n, 2, dtype=torch.float64),
+    )
     passed = draw(n, tries) > 0.4
     outcome = torch.where(passed, int(Status.OK), int(Status.DROPPED))
     return Records(draw(points, 3), draw(1, 3), grasps, passed, outcome)
 
 
-def cheap_job(number: int, row: JobRow, meta: dict[str, str], pause: float = 0.0, marks: str = "") -> bytes:
+def cheap_job(
+    number: int, row: JobRow, meta: dict[str, str], pause: float = 0.0, marks: str = ""
+) -> bytes:
     """Return the file of a job; leave the process's number among the marks while at it."""
     mark = Path(marks) / str(os.getpid())
     if marks:
@@ -70,9 +100,13 @@ def cheap_job(number: int, row: JobRow, meta: dict[str, str], pause: float = 0.0
     count = number % 4
     drawn = records(rng, 5 + number % 3, count)
     row = row._replace(
-        status=Status.OK if count else Status.NOT_CLOSED, executable=count, points=5 + number % 3, grasps=count,
-        passed=int(drawn.passed.sum()), meta={"cloud_sha256": str(number)},
-    )  # fmt: skip
+        status=Status.OK if count else Status.NOT_CLOSED,
+        executable=count,
+        points=5 + number % 3,
+        grasps=count,
+        passed=int(drawn.passed.sum()),
+        meta={"cloud_sha256": str(number)},
+    )
     mark.unlink(missing_ok=True) if marks else None
     return pack_shard(Shard((row,), drawn), meta)
 
@@ -83,7 +117,9 @@ def die_at(number: int, row: JobRow, meta: dict[str, str], deadly: int) -> bytes
     return cheap_job(number, row, meta)
 
 
-def seen_job(number: int, row: JobRow, meta: dict[str, str], plans: list[int] | None = None) -> bytes:
+def seen_job(
+    number: int, row: JobRow, meta: dict[str, str], plans: list[int] | None = None
+) -> bytes:
     """Do a job on a worker in this process; with plans, it is the job that has the number's plan."""
     from benchmarks.load.swarm import begin  # not at the top: other workers need no Dask
 
@@ -117,4 +153,6 @@ def work_on(asked: Campaign, workers: int, function=cheap_job, *more):
 
 def contents(folder: Path) -> dict[str, bytes]:
     """Return every file below a folder, by its path there."""
-    return {str(x.relative_to(folder)): x.read_bytes() for x in sorted(folder.rglob("*")) if x.is_file()}
+    return {
+        str(x.relative_to(folder)): x.read_bytes() for x in sorted(folder.rglob("*")) if x.is_file()
+    }

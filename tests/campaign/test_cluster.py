@@ -1,4 +1,6 @@
-"""A real Dask cluster, of processes or of many workers in this one: workers die, plan for others, nobody answers."""
+"""A real Dask cluster, of processes or of many workers in this one: workers die, plan for others,
+nobody answers.
+"""
 
 import dataclasses
 import json
@@ -44,11 +46,18 @@ def address():
     """The address of a scheduler with two worker processes, which come back when they die."""
     import dask
 
-    quiet = {"distributed.logging.distributed": "critical", "distributed.scheduler.allowed-failures": 1}
+    quiet = {
+        "distributed.logging.distributed": "critical",
+        "distributed.scheduler.allowed-failures": 1,
+    }
     with (
         dask.config.set(quiet),
         distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=60
+            n_workers=2,
+            threads_per_worker=1,
+            processes=True,
+            dashboard_address=None,
+            silence_logs=60,
         ) as cluster,
     ):
         yield cluster.scheduler_address
@@ -56,8 +65,12 @@ def address():
 
 @pytest.mark.promise("F4")
 @pytest.mark.filterwarnings("ignore")
-def test_a_worker_killed_in_the_middle_changes_no_byte_and_a_deadly_job_is_named(address, tmp_path: Path):
-    asked, marks, killed = campaign(JOBS), tmp_path / "marks", []
+def test_a_worker_killed_in_the_middle_changes_no_byte_and_a_deadly_job_is_named(
+    address, tmp_path: Path
+):
+    asked = campaign(JOBS)
+    marks = tmp_path / "marks"
+    killed = []
     marks.mkdir()
     carry_out(asked, tmp_path / "whole", work_on(asked, 0))
 
@@ -78,7 +91,9 @@ def test_a_worker_killed_in_the_middle_changes_no_byte_and_a_deadly_job_is_named
 
     tasks = [(j, asked.rows[j], asked.meta, 3) for j in (1, 3, 4)]
     ended = dict(run_on_cluster(die_at, tasks, address, 60.0))
-    assert [type(ended[k]) for k in range(3)] == [bytes, Status, bytes] and ended[1] is Status.WORKER_DIED
+    assert [type(ended[k]) for k in range(3)] == [bytes, Status, bytes] and ended[
+        1
+    ] is Status.WORKER_DIED
 
 
 @pytest.mark.promise("F5")
@@ -86,7 +101,9 @@ def test_a_worker_killed_in_the_middle_changes_no_byte_and_a_deadly_job_is_named
 def test_a_late_job_is_named_and_costs_no_other(address, tmp_path: Path):
     asked = campaign(2)
     tasks = [(j, asked.rows[j], asked.meta, 1, str(tmp_path / "never")) for j in (0, 1)]
-    ended = dict(run_on_cluster(wait_at, tasks, address, 5.0))  # a busy worker may need seconds for the first
+    ended = dict(
+        run_on_cluster(wait_at, tasks, address, 5.0)
+    )  # a busy worker may need seconds for the first
     assert isinstance(ended[0], bytes) and ended[1] is Status.TIMED_OUT
 
 
@@ -99,7 +116,9 @@ def test_an_error_of_a_job_comes_when_it_ends(address):
 
 @pytest.mark.sim
 @pytest.mark.filterwarnings("ignore")
-def test_an_object_is_planned_on_and_lifted_by_workers_as_here(address, carton: Path, data: Path, tmp_path: Path):
+def test_an_object_is_planned_on_and_lifted_by_workers_as_here(
+    address, carton: Path, data: Path, tmp_path: Path
+):
     pytest.importorskip("sapien")
     assert len(run_campaign(carton, load_hand("barrett"), tmp_path / "there", QUICK, address)) == 2
     assert contents(tmp_path / "there") == contents(data)
@@ -124,11 +143,19 @@ def forty():
 
 @pytest.mark.promise("F4")
 @pytest.mark.filterwarnings("ignore")
-def test_four_of_forty_workers_die_and_every_job_is_written_once(forty, tmp_path: Path, monkeypatch):
+def test_four_of_forty_workers_die_and_every_job_is_written_once(
+    forty, tmp_path: Path, monkeypatch
+):
     """The scheduler, which holds no more jobs than it may, gives the jobs of the dead to others."""
-    jobs, most, held, written = 100, 45, list[int](), Counter[str]()
-    asked, write = campaign(jobs, 16), folder_module.write_file
-    monkeypatch.setattr(folder_module, "write_file", lambda path, x: written.update([path.name]) or write(path, x))
+    jobs = 100
+    most = 45
+    held = list[int]()
+    written = Counter[str]()
+    asked = campaign(jobs, 16)
+    write = folder_module.write_file
+    monkeypatch.setattr(
+        folder_module, "write_file", lambda path, x: written.update([path.name]) or write(path, x)
+    )
     monkeypatch.setattr(cluster_module, "OUTSTANDING", most)
     FATAL.update(dict.fromkeys((1, 30, 60, 99), forty))
 
@@ -151,7 +178,8 @@ def test_four_of_forty_workers_die_and_every_job_is_written_once(forty, tmp_path
 @pytest.mark.promise("F4")
 @pytest.mark.filterwarnings("ignore")
 def test_a_worker_with_a_gpu_plans_for_a_shard_and_another_one_if_it_dies(forty, tmp_path: Path):
-    asked, size = campaign(64, 16), 16
+    asked = campaign(64, 16)
+    size = 16
     with_gpu = list(forty.workers.values())[:3]
     for worker in with_gpu:
         forty.sync(worker.set_resources, GPU=1)
@@ -172,12 +200,20 @@ def test_a_worker_with_a_gpu_plans_for_a_shard_and_another_one_if_it_dies(forty,
 
 @pytest.mark.sim
 @pytest.mark.filterwarnings("ignore")
-def test_plans_of_a_batch_are_tried_and_say_their_device(forty, carton: Path, data: Path, tmp_path: Path, monkeypatch):
-    """The processor stands for the GPU: the records of the only sound view are those of its plan alone."""
-    objects, out, spec = tmp_path / "objects", tmp_path / "out", dataclasses.replace(QUICK, device="cuda")
+def test_plans_of_a_batch_are_tried_and_say_their_device(
+    forty, carton: Path, data: Path, tmp_path: Path, monkeypatch
+):
+    """The processor stands for the GPU: the records of the only sound view are those of its plan
+    alone.
+    """
+    objects = tmp_path / "objects"
+    out = tmp_path / "out"
+    spec = dataclasses.replace(QUICK, device="cuda")
     shutil.copytree(carton, objects)
     entries = json.loads((objects / "manifest.json").read_text())["objects"]
-    (objects / "manifest.json").write_text(json.dumps({"objects": entries | {"a gone one": entries["carton"]}}))
+    (objects / "manifest.json").write_text(
+        json.dumps({"objects": entries | {"a gone one": entries["carton"]}})
+    )
     forty.sync(next(iter(forty.workers.values())).set_resources, GPU=1)
     monkeypatch.setattr(run_module, "plan_jobs", lambda *task: plan_jobs(*task[:-1], "cpu"))
     run_campaign(objects, load_hand("barrett"), out, spec, forty.scheduler_address)
@@ -186,7 +222,10 @@ def test_plans_of_a_batch_are_tried_and_say_their_device(forty, carton: Path, da
     assert gone.row.status is Status.BAD_OBJECT and "no file" in gone.row.note
     assert same_bits(there.grasps, alone.grasps) and there.passed.equal(alone.passed)
     assert there.row._replace(meta=alone.row.meta) == alone.row
-    assert there.row.meta == alone.row.meta | {"device": "cpu"} and "planned on cuda" in (out / "README.md").read_text()
+    assert (
+        there.row.meta == alone.row.meta | {"device": "cpu"}
+        and "planned on cuda" in (out / "README.md").read_text()
+    )
     with pytest.raises(OutputError, match="other campaigns"):
         run_campaign(objects, load_hand("barrett"), out, QUICK)
     with pytest.raises(BadArgument, match="workers"):

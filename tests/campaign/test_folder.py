@@ -1,4 +1,6 @@
-"""The folder of a campaign: every job is accounted for, and the bytes are those of an undisturbed run."""
+"""The folder of a campaign: every job is accounted for, and the bytes are those of an undisturbed
+run.
+"""
 
 import hashlib
 import json
@@ -12,7 +14,16 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.campaign.cheap import ASKED, campaign, cheap_job, contents, die_at, records, wait_at, work_on
+from tests.campaign.cheap import (
+    ASKED,
+    campaign,
+    cheap_job,
+    contents,
+    die_at,
+    records,
+    wait_at,
+    work_on,
+)
 from torchgrasp.campaign.folder import carry_out
 from torchgrasp.data import read_shards
 from torchgrasp.files import hold_folder
@@ -33,29 +44,46 @@ def test_every_job_has_a_row_and_the_card_tells_the_truth(whole: Path):
     assert sorted(contents(whole)) == ["README.md", "campaign.json", "card.json"] + [
         f"shard-{k:06}.safetensors" for k in range(3)
     ]
-    data, card = read_shards(whole), json.loads((whole / "card.json").read_text())
-    assert [(row.object, row.view) for row in data.jobs] == [(r.object, r.view) for r in campaign(JOBS).rows]
+    data = read_shards(whole)
+    card = json.loads((whole / "card.json").read_text())
+    assert [(row.object, row.view) for row in data.jobs] == [
+        (r.object, r.view) for r in campaign(JOBS).rows
+    ]
     assert data.jobs[2].status is Status.BAD_OBJECT and data.jobs[2].note == "no mesh"
     expected = [j % 4 if j != 2 else 0 for j in range(JOBS)]
-    assert [row.grasps for row in data.jobs] == expected and len(data) == sum(expected) == card["counts"]["grasps"]
-    assert sum(card["counts"]["status"].values()) == JOBS and card["counts"]["status"]["BAD_OBJECT"] == 1
+    assert [row.grasps for row in data.jobs] == expected and len(data) == sum(expected) == card[
+        "counts"
+    ]["grasps"]
+    assert (
+        sum(card["counts"]["status"].values()) == JOBS
+        and card["counts"]["status"]["BAD_OBJECT"] == 1
+    )
     shards = sorted(whole.glob("shard-*"))
     assert card["shards_sha256"] == [hashlib.sha256(x.read_bytes()).hexdigest() for x in shards]
     assert card["campaign"] == hashlib.sha256((whole / "campaign.json").read_bytes()).hexdigest()
     passed = sum(int(data.job(j).passed.sum()) for j in range(JOBS))
     assert passed == card["counts"]["passed"] and card["counts"]["tries"] == 2 * len(data)
     text = (whole / "README.md").read_text()
-    assert text.startswith("---\nlicense: cc0-1.0\n") and f"{JOBS} jobs" in text and "| bad_object | 1 |" in text
+    assert (
+        text.startswith("---\nlicense: cc0-1.0\n")
+        and f"{JOBS} jobs" in text
+        and "| bad_object | 1 |" in text
+    )
 
 
 def test_a_job_is_read_as_it_was_written(whole: Path):
     data = read_shards(whole)
     for j in (0, 7, 11, JOBS - 1):  # of every shard; the second is its shard's last
         rng = torch.Generator().manual_seed(j)
-        truth, found = records(rng, 5 + j % 3, j % 4), data.job(j)
-        assert torch.equal(found.grasps.joints, truth.grasps.joints) and found.row.meta == {"cloud_sha256": str(j)}
+        truth = records(rng, 5 + j % 3, j % 4)
+        found = data.job(j)
+        assert torch.equal(found.grasps.joints, truth.grasps.joints) and found.row.meta == {
+            "cloud_sha256": str(j)
+        }
         assert found.cloud is not None and torch.equal(found.cloud.points, truth.points)
-        assert torch.equal(found.cloud.viewpoint, truth.viewpoints[0]) and torch.equal(found.passed, truth.passed)
+        assert torch.equal(found.cloud.viewpoint, truth.viewpoints[0]) and torch.equal(
+            found.passed, truth.passed
+        )
         assert torch.equal(found.grasps.certificate.witness, truth.grasps.certificate.witness)
     assert data.job(2).cloud is None and len(data.job(2).grasps) == 0
     with pytest.raises(IndexError):
@@ -91,7 +119,9 @@ def test_an_interruption_after_any_job_changes_no_byte(whole: Path, tmp_path: Pa
 def test_processes_killed_three_times_change_no_byte(whole: Path, tmp_path: Path):
     """Somebody kills workers while they are at work; every job is done all the same."""
     pytest.importorskip("pebble")
-    asked, marks, killed = campaign(JOBS), tmp_path / "marks", []
+    asked = campaign(JOBS)
+    marks = tmp_path / "marks"
+    killed = []
     marks.mkdir()
 
     def kill() -> None:
@@ -109,10 +139,15 @@ def test_processes_killed_three_times_change_no_byte(whole: Path, tmp_path: Path
     assert len(killed) == 3 and contents(tmp_path / "out") == contents(whole)
 
 
-def test_a_deadly_job_is_named_and_the_next_call_tries_it_again(whole: Path, tmp_path: Path, monkeypatch):
+def test_a_deadly_job_is_named_and_the_next_call_tries_it_again(
+    whole: Path, tmp_path: Path, monkeypatch
+):
     pytest.importorskip("pebble")
-    monkeypatch.setattr("torchgrasp.campaign.folder.ROUNDS", 1)  # a process takes two seconds to begin
-    asked, told = campaign(JOBS), []
+    monkeypatch.setattr(
+        "torchgrasp.campaign.folder.ROUNDS", 1
+    )  # a process takes two seconds to begin
+    asked = campaign(JOBS)
+    told = []
     data = carry_out(asked, tmp_path / "out", work_on(asked, 1, die_at, 9), told.append)
     assert [j for j, row in enumerate(data.jobs) if row.status is Status.WORKER_DIED] == [9]
     assert data.card["counts"]["status"]["WORKER_DIED"] == 1 and len(told) == JOBS
@@ -125,7 +160,8 @@ def test_a_deadly_job_is_named_and_the_next_call_tries_it_again(whole: Path, tmp
 def test_a_job_is_on_disk_as_soon_as_it_ended(whole: Path, tmp_path: Path):
     """The first job waits until another one is told, which is on disk by then."""
     pytest.importorskip("pebble")
-    asked, told = campaign(JOBS), []
+    asked = campaign(JOBS)
+    told = []
 
     def tell(row) -> None:
         told.append(row)
@@ -139,11 +175,18 @@ def test_a_job_is_on_disk_as_soon_as_it_ended(whole: Path, tmp_path: Path):
 
 
 def test_what_is_damaged_is_made_anew(whole: Path, tmp_path: Path):
-    asked, out = campaign(JOBS), tmp_path / "out"
+    asked = campaign(JOBS)
+    out = tmp_path / "out"
     carry_out(asked, out, work_on(asked, 0))
-    shard, rng = out / "shard-000001.safetensors", random.Random(0)
+    shard = out / "shard-000001.safetensors"
+    rng = random.Random(0)
     good = shard.read_bytes()
-    for bad in (good[:-8], b"", (out / "shard-000000.safetensors").read_bytes(), rng.randbytes(500)):
+    for bad in (
+        good[:-8],
+        b"",
+        (out / "shard-000000.safetensors").read_bytes(),
+        rng.randbytes(500),
+    ):
         shard.write_bytes(bad)
         data = read_shards(out)
         with pytest.raises(ModelFileError, match="shard-000001"):
@@ -159,7 +202,10 @@ def test_what_is_damaged_is_made_anew(whole: Path, tmp_path: Path):
 @pytest.mark.promise("F7")
 def test_other_campaigns_files_and_runs_are_refused(whole: Path, tmp_path: Path):
     asked = campaign(JOBS)
-    for other in (campaign(JOBS, 9), campaign(JOBS)._replace(asked=ASKED | {"jobs_in_shard": 8, "licence": "MIT"})):
+    for other in (
+        campaign(JOBS, 9),
+        campaign(JOBS)._replace(asked=ASKED | {"jobs_in_shard": 8, "licence": "MIT"}),
+    ):
         with pytest.raises(OutputError, match="other campaigns"):
             carry_out(other, whole, work_on(other, 0))
     (tmp_path / "thesis.tex").write_text("years of work")
@@ -171,7 +217,14 @@ def test_other_campaigns_files_and_runs_are_refused(whole: Path, tmp_path: Path)
 
 @pytest.mark.parametrize(
     "change",
-    [{"jobs": 5}, {"jobs": [1]}, {"jobs_in_shard": 0}, {"jobs_in_shard": "8"}, {"campaign": None}, {"campaign": "x"}],
+    [
+        {"jobs": 5},
+        {"jobs": [1]},
+        {"jobs_in_shard": 0},
+        {"jobs_in_shard": "8"},
+        {"campaign": None},
+        {"campaign": "x"},
+    ],
 )
 def test_a_damaged_card_is_refused(whole: Path, tmp_path: Path, change):
     for name, data in contents(whole).items():
@@ -181,11 +234,19 @@ def test_a_damaged_card_is_refused(whole: Path, tmp_path: Path, change):
     with pytest.raises(ModelFileError):
         read_shards(tmp_path).job(0)
     row = card["jobs"][0]
-    for key, value in (("status", "FINE"), ("grasps", -1), ("grasps", 10**9), ("object", 3), ("points", None)):
+    for key, value in (
+        ("status", "FINE"),
+        ("grasps", -1),
+        ("grasps", 10**9),
+        ("object", 3),
+        ("points", None),
+    ):
         bad = card | {"jobs": [row | {key: value}, *card["jobs"][1:]]}
         (tmp_path / "card.json").write_text(json.dumps(bad))
         with pytest.raises(ModelFileError, match=key):
             read_shards(tmp_path)
-    (tmp_path / "card.json").write_text(json.dumps(card | {"jobs": [row | {"note": "other"}, *card["jobs"][1:]]}))
+    (tmp_path / "card.json").write_text(
+        json.dumps(card | {"jobs": [row | {"note": "other"}, *card["jobs"][1:]]})
+    )
     with pytest.raises(ModelFileError, match="other jobs"):
         read_shards(tmp_path).job(0)

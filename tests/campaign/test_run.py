@@ -1,4 +1,6 @@
-"""A campaign on a real object: what is written is what `evaluate` finds, and what others compute of it."""
+"""A campaign on a real object: what is written is what `evaluate` finds, and what others compute of
+it.
+"""
 
 import dataclasses
 import json
@@ -29,7 +31,9 @@ def test_the_records_are_what_evaluate_finds(data: Path, carton: Path):
     assert job.passed[:, 0].tolist() == [a.passed for a in score.attempts]
     assert job.grasps.success.tolist() == [a.predicted for a in score.attempts]
     cloud = read_view(carton, "carton", "view0")
-    assert torch.equal(job.cloud.points, cloud.points.double()) and torch.equal(job.cloud.viewpoint, cloud.viewpoint)
+    assert torch.equal(job.cloud.points, cloud.points.double()) and torch.equal(
+        job.cloud.viewpoint, cloud.viewpoint
+    )
 
 
 @pytest.mark.sim
@@ -56,34 +60,62 @@ def test_a_loader_makes_batches_of_what_the_job_holds(data: Path):
 
 @pytest.mark.sim
 @pytest.mark.filterwarnings("ignore")
-def test_bad_objects_and_errors_of_the_library_have_rows(carton: Path, tmp_path: Path, monkeypatch, capsys):
+def test_bad_objects_and_errors_of_the_library_have_rows(
+    carton: Path, tmp_path: Path, monkeypatch, capsys
+):
     pytest.importorskip("sapien")
     objects = tmp_path / "objects"
     shutil.copytree(carton, objects)
     entries = json.loads((objects / "manifest.json").read_text())["objects"]
-    entries |= {"../up": entries["carton"], "gone": entries["carton"], "blind": {"views": {}}, "loose": 5}
+    entries |= {
+        "../up": entries["carton"],
+        "gone": entries["carton"],
+        "blind": {"views": {}},
+        "loose": 5,
+    }
     (objects / "manifest.json").write_text(json.dumps({"objects": entries}))
     monkeypatch.setitem(PROTOCOLS, "tabletop", LIFT)
-    words = ["campaign", str(objects), "--hand", "barrett", "--out", str(tmp_path / "out"), "--starts", "12"]
+    words = [
+        "campaign",
+        str(objects),
+        "--hand",
+        "barrett",
+        "--out",
+        str(tmp_path / "out"),
+        "--starts",
+        "12",
+    ]
     words += ["--grasps", "1", "--workers", "0"]
     with monkeypatch.context() as faulty:
         faulty.setattr(job_module, "try_grasp", lambda *_: 1 / 0)
         assert cli.main(words) == 1
     said = capsys.readouterr().out
-    assert said.endswith("\n1 job failed by no fault of the object (broken): the same command tries again\n")
+    assert said.endswith(
+        "\n1 job failed by no fault of the object (broken): the same command tries again\n"
+    )
     rows = {row.object: row for row in read_shards(tmp_path / "out").jobs}
     assert rows["carton"].status is Status.BROKEN and "ZeroDivisionError" in rows["carton"].note
-    bad = {"'../up'": "a printable name", "gone": "no file", "blind": "no view", "'loose'": "object"}
+    bad = {
+        "'../up'": "a printable name",
+        "gone": "no file",
+        "blind": "no view",
+        "'loose'": "object",
+    }
     assert {name: rows[name].status for name in bad} == dict.fromkeys(bad, Status.BAD_OBJECT)
     assert [name for name, words in bad.items() if words not in rows[name].note] == []
     assert "5 jobs: 4 bad_object, 1 broken" in said and "0 grasps" in said
-    assert not (tmp_path / "up").exists() and set(x.name for x in tmp_path.iterdir()) == {"objects", "out"}
+    assert not (tmp_path / "up").exists() and set(x.name for x in tmp_path.iterdir()) == {
+        "objects",
+        "out",
+    }
     assert cli.main(words) == 0
     assert "5 jobs: 4 bad_object, 1 ok" in capsys.readouterr().out
 
 
 def test_a_fault_of_the_machine_is_no_row_of_a_job(carton: Path, monkeypatch):
-    """What an object's own files do wrong is refused by name, so an OSError is of the installation or the disk."""
+    """What an object's own files do wrong is refused by name, so an OSError is of the installation
+    or the disk.
+    """
 
     def fail(*_: object) -> None:
         raise OSError("no space left")
@@ -96,7 +128,11 @@ def test_a_fault_of_the_machine_is_no_row_of_a_job(carton: Path, monkeypatch):
 
 
 def test_bad_arguments_are_named_before_any_work(carton: Path, tmp_path: Path, capsys):
-    for trials in (EvaluationSpec(planned=True), EvaluationSpec(complete=True), EvaluationSpec(fingers="auto")):
+    for trials in (
+        EvaluationSpec(planned=True),
+        EvaluationSpec(complete=True),
+        EvaluationSpec(fingers="auto"),
+    ):
         with pytest.raises(BadArgument, match=r"trials: expected .*got"):
             CampaignSpec(trials=trials)
     for licence in ("", "a\nb", "x" * 101):
@@ -106,10 +142,15 @@ def test_bad_arguments_are_named_before_any_work(carton: Path, tmp_path: Path, c
         run_campaign(tmp_path / "none", load_hand("barrett"), tmp_path / "out")
     words = ["campaign", str(carton), "--hand", "barrett", "--out", str(tmp_path / "out")]
     for more, named in (
-        (["--hand", "fist"], "--hand"), (["--fingers", "auto"], "--fingers"), (["--workers", "-1"], "--workers"),
-        (["--seed", "-1"], "--seed"), (["--grasps", "0"], "--grasps"), (["--jobs-in-shard", "0"], "--jobs-in-shard"),
-        (["--only", "jug"], "OBJECTS"), (["--licence", ""], "--licence"),
-    ):  # fmt: skip
+        (["--hand", "fist"], "--hand"),
+        (["--fingers", "auto"], "--fingers"),
+        (["--workers", "-1"], "--workers"),
+        (["--seed", "-1"], "--seed"),
+        (["--grasps", "0"], "--grasps"),
+        (["--jobs-in-shard", "0"], "--jobs-in-shard"),
+        (["--only", "jug"], "OBJECTS"),
+        (["--licence", ""], "--licence"),
+    ):
         assert cli.main([*words, *more]) == 2
         assert capsys.readouterr().err.startswith(f"torchgrasp: {named}: expected "), more
     assert list(tmp_path.iterdir()) == []
@@ -117,9 +158,12 @@ def test_bad_arguments_are_named_before_any_work(carton: Path, tmp_path: Path, c
 
 def test_other_versions_and_hands_on_a_machine_end_the_campaign(carton: Path):
     source = load_hand("barrett").source
-    view, spec = ObjectView(carton, "carton", "view0", source), EvaluationSpec()
+    view = ObjectView(carton, "carton", "view0", source)
+    spec = EvaluationSpec()
     with pytest.raises(BadArgument, match=r"workers: expected .*got one with"):
         job_module.run_job(view, LIFT, spec, {"campaign": "x", "versions": "{}"})
     other = dataclasses.replace(view, hand=source._replace(sha256="0"))
     with pytest.raises(BadArgument, match=r"hand: expected .*got"):
-        job_module.run_job(other, LIFT, spec, {"campaign": "x", "versions": json.dumps(job_module.versions())})
+        job_module.run_job(
+            other, LIFT, spec, {"campaign": "x", "versions": json.dumps(job_module.versions())}
+        )

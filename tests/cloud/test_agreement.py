@@ -42,7 +42,10 @@ def test_a_noisy_view_agrees_with_its_mesh_also_with_points_of_the_table(distanc
 
 @pytest.mark.parametrize("shift", [(0.13, 0.0, 0.0), (0.0, 0.0, -0.06), (0.0, 0.04, 0.03)])
 def test_a_mesh_in_another_frame_is_told(shift):
-    with pytest.raises(BadArgument, match=r"mesh: expected the cloud's points within \d\d mm .* got \d+ of 300 about"):
+    with pytest.raises(
+        BadArgument,
+        match=r"mesh: expected the cloud's points within \d\d mm .* got \d+ of 300 about",
+    ):
         check_mesh(view(), moved(BOX, *shift))
     check_mesh(PointCloud(view().points + torch.tensor(shift)), moved(BOX, *shift))
 

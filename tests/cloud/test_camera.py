@@ -27,18 +27,26 @@ def test_look_at_is_a_rigid_upright_camera():
         torch.testing.assert_close(pose @ inverse(pose), torch.eye(4, dtype=torch.float64))
         assert abs(torch.linalg.det(pose[:3, :3]).item() - 1) < 1e-12
         target = pose[:3, 3] + 0.7 * pose[:3, 2]
-        torch.testing.assert_close(target, torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64), atol=1e-7, rtol=0)
+        torch.testing.assert_close(
+            target, torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64), atol=1e-7, rtol=0
+        )
         assert pose[2, 1] < 0  # down in the image is down in the world
         assert abs(pose[2, 0]) < 1e-12  # and the horizon is level
 
 
 def test_depth_of_a_sphere_agrees_with_the_closed_form():
     ball = trimesh.creation.icosphere(subdivisions=6, radius=0.05)
-    z, u, v = pixels(partial_view(ball, look_at(30.0, 20.0, 0.5), n=10**6, noise=False), look_at(30.0, 20.0, 0.5))
+    z, u, v = pixels(
+        partial_view(ball, look_at(30.0, 20.0, 0.5), n=10**6, noise=False), look_at(30.0, 20.0, 0.5)
+    )
     k = INTRINSICS
-    ray = torch.stack([(u - k[0, 2]) / k[0, 0], (v - k[1, 2]) / k[1, 1], torch.ones(len(u)).double()], -1)
+    ray = torch.stack(
+        [(u - k[0, 2]) / k[0, 0], (v - k[1, 2]) / k[1, 1], torch.ones(len(u)).double()], -1
+    )
     # |z ray - (0, 0, d)| = r
-    a, b, c = (ray**2).sum(-1), -2 * 0.5, 0.5**2 - 0.05**2
+    a = (ray**2).sum(-1)
+    b = -2 * 0.5
+    c = 0.5**2 - 0.05**2
     root = b**2 - 4 * a * c
     inner = root > 0.001
     exact = (-b - root.clamp_min(0).sqrt()) / (2 * a)
@@ -67,7 +75,8 @@ def test_noise_has_the_documented_size_and_is_repeatable(box):
     distance = 1e3 * trimesh.proximity.closest_point(box, cloud.points.numpy())[1]
     assert 0.2 < np.median(distance) < 1.0
     assert 0.6 < np.percentile(distance, 90) < 2.5
-    # errors act along the rays: the direction from the camera stays that of a pixel that sees the box
+    # errors act along the rays: the direction from the camera stays that of a pixel that sees the
+    # box
     pose = look_at(35.0, 25.0, 0.5)
     _, u, v = pixels(cloud, pose)
     assert (u - u.round()).abs().max() < 1e-6
@@ -94,13 +103,16 @@ def test_grazing_surfaces_fade_out():
 def test_fewer_pixels_than_points_give_all_pixels(box):
     far = partial_view(box, look_at(0.0, 0.0, 8.0), noise=False)
     _, u, v = pixels(far, look_at(0.0, 0.0, 8.0))
-    assert len(far) == (u.max() - u.min() + 1).round() * (v.max() - v.min() + 1).round() < 1000  # a full rectangle
+    assert (
+        len(far) == (u.max() - u.min() + 1).round() * (v.max() - v.min() + 1).round() < 1000
+    )  # a full rectangle
     assert len(far) == pytest.approx(616**2 * 0.08 * 0.10 / 7.97**2, rel=0.3)
 
 
 @pytest.fixture(scope="module")
 def boxes():
-    near, far = trimesh.creation.box([0.06, 0.08, 0.10]), trimesh.creation.box([0.08, 0.08, 0.20])
+    near = trimesh.creation.box([0.06, 0.08, 0.10])
+    far = trimesh.creation.box([0.08, 0.08, 0.20])
     return [near.apply_translation([0.05, 0.0, 0.05]), far.apply_translation([-0.08, 0.0, 0.10])]
 
 
@@ -108,7 +120,9 @@ def test_render_depth_exact_depths_lie_on_the_labelled_mesh_or_the_table(boxes):
     pose = look_at(10.0, 40.0, 0.7)
     depth, labels = render_depth(boxes, pose, noise=False)
     for k in (0, 1, 2):
-        points = cloud_from_depth(torch.where(labels == k, depth, 0.0), INTRINSICS, camera_pose=pose).points
+        points = cloud_from_depth(
+            torch.where(labels == k, depth, 0.0), INTRINSICS, camera_pose=pose
+        ).points
         if k == 0:
             assert points[:, 2].abs().max() < 1e-9
             assert 0.4 < points[:, :2].norm(dim=-1).max() < 0.6
@@ -133,7 +147,9 @@ def test_the_noise_is_that_of_a_partial_view(boxes):
     assert torch.equal(depth, exact)
     cloud = partial_view(boxes[0], pose, n=10**6, seed=5)
     whole = cloud_from_depth(depth, INTRINSICS, camera_pose=pose)
-    np.testing.assert_array_equal(np.sort(cloud.points[:, 0].numpy()), np.sort(whole.points[:, 0].numpy()))
+    np.testing.assert_array_equal(
+        np.sort(cloud.points[:, 0].numpy()), np.sort(whole.points[:, 0].numpy())
+    )
     assert torch.equal(labels, render_depth(boxes[:1], pose, table=None, noise=False)[1])
 
 

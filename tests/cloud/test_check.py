@@ -9,7 +9,9 @@ from torchgrasp.values.planning import PointCloud
 
 
 def cloud(n=50, scale=0.1, seed=0):
-    return torch.rand(n, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * scale
+    return (
+        torch.rand(n, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * scale
+    )
 
 
 def test_check_cloud_returns_a_good_cloud_itself():
@@ -21,7 +23,12 @@ def test_check_cloud_returns_a_good_cloud_itself():
 @pytest.mark.parametrize(
     ("factor", "words"),
     [
-        *[(1e-6, "normalised"), (0.04, "normalised"), (25.0, "whole scene.*--unit cm"), (110.0, "--unit cm")],
+        *[
+            (1e-6, "normalised"),
+            (0.04, "normalised"),
+            (25.0, "whole scene.*--unit cm"),
+            (110.0, "--unit cm"),
+        ],
         *[(1e3, "--unit mm"), (1e6, "--unit mm")],
     ],
 )
@@ -41,7 +48,9 @@ def test_check_cloud_finds_few_distinct_points_among_many_copies():
 def test_check_cloud_refuses_zero_normals_other_values_gradients_and_later_changes():
     with pytest.raises(BadArgument, match="length zero"):
         check_cloud(PointCloud(cloud(), torch.zeros(50, 3)))
-    with pytest.raises((BadArgument, TypeError), match="cloud"):  # TypeError: the annotations are checked in tests
+    with pytest.raises(
+        (BadArgument, TypeError), match="cloud"
+    ):  # TypeError: the annotations are checked in tests
         check_cloud(cloud())  # pyright: ignore[reportArgumentType]
     for value, name in (
         (PointCloud(cloud().requires_grad_()), "points"),
@@ -56,9 +65,12 @@ def test_check_cloud_refuses_zero_normals_other_values_gradients_and_later_chang
 
 
 def test_remove_duplicates_keeps_the_first_in_order():
-    points, copies = cloud(40), torch.randint(0, 40, (200,), generator=torch.Generator().manual_seed(1))
+    points = cloud(40)
+    copies = torch.randint(0, 40, (200,), generator=torch.Generator().manual_seed(1))
     order = torch.cat([torch.arange(40).flip(0), copies])
-    jitter = 1e-12 * torch.randn(240, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    jitter = 1e-12 * torch.randn(
+        240, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2)
+    )
     kept = remove_duplicates(PointCloud((points[order] + jitter), points[order] + 1, points[0]))
     torch.testing.assert_close(kept.points, points.flip(0), rtol=0, atol=1e-11)
     torch.testing.assert_close(kept.normals, points.flip(0) + 1)
@@ -67,7 +79,9 @@ def test_remove_duplicates_keeps_the_first_in_order():
 def test_remove_duplicates_of_many_copies_keeps_points_a_little_apart():
     """A pair of points for every two copies would be 5e9 pairs here."""
     copies = cloud(1) + 1e-11 * cloud(100_000, 1.0, seed=3)
-    apart = cloud(1) + 3e-10 * torch.arange(1, 4, dtype=torch.float64)[:, None] * real([1.0, 0.0, 0.0])
+    apart = cloud(1) + 3e-10 * torch.arange(1, 4, dtype=torch.float64)[:, None] * real(
+        [1.0, 0.0, 0.0]
+    )
     kept = remove_duplicates(PointCloud(torch.cat([cloud(9), copies, apart])))
     assert torch.equal(kept.points, torch.cat([cloud(9), apart]))
 
@@ -87,7 +101,8 @@ def test_voxel_downsample_keeps_the_point_nearest_to_each_centre():
 
 
 def test_voxel_downsample_moves_and_scales_with_the_cloud_and_keeps_the_dtype():
-    points, shift = load_object("jug").view.points, real([3.0, -2.0, 5.0])
+    points = load_object("jug").view.points
+    shift = real([3.0, -2.0, 5.0])
     rows = voxel_downsample(PointCloud(points), 0.01).points
     moved = voxel_downsample(PointCloud(points + shift), 0.01).points
     torch.testing.assert_close(moved - shift, rows, atol=1e-12, rtol=0)
@@ -105,7 +120,9 @@ def test_voxel_downsample_refuses_a_voxel_out_of_range_or_too_large(voxel):
 def test_remove_outliers_removes_hardly_anything_else(name):
     view = load_object(name).view
     directions = torch.randn(10, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    far = view.points.mean(0) + 0.4 * directions / torch.linalg.vector_norm(directions, dim=-1, keepdim=True)
+    far = view.points.mean(0) + 0.4 * directions / torch.linalg.vector_norm(
+        directions, dim=-1, keepdim=True
+    )
     clean = remove_outliers(PointCloud(torch.cat([view.points, far]), None, view.viewpoint))
     assert not bool((torch.cdist(clean.points, far) == 0).any())
     assert len(clean) > 0.96 * len(view) and torch.equal(clean.viewpoint, view.viewpoint)

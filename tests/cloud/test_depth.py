@@ -13,7 +13,14 @@ K = torch.tensor([[600.0, 0, 30], [0, 550.0, 20], [0, 0, 1]], dtype=torch.float6
 
 def camera(width, height):
     """A camera of a resolution, as RealSense describes it."""
-    return {"fx": 600.0, "fy": 600.0, "ppx": width / 2, "ppy": height / 2, "width": width, "height": height}
+    return {
+        "fx": 600.0,
+        "fy": 600.0,
+        "ppx": width / 2,
+        "ppy": height / 2,
+        "width": width,
+        "height": height,
+    }
 
 
 def tilted_depth():
@@ -32,24 +39,36 @@ def test_points_lie_on_the_plane_that_the_depth_was_made_from():
 
 
 def test_the_pose_moves_points_and_viewpoint_alike():
-    pose = rigid(rotation_from_vector(torch.tensor([0.3, -1.0, 2.0]).double()), torch.tensor([0.1, 0.2, -0.3]).double())
-    still, moved = cloud_from_depth(tilted_depth(), K), cloud_from_depth(tilted_depth(), K, camera_pose=pose)
+    pose = rigid(
+        rotation_from_vector(torch.tensor([0.3, -1.0, 2.0]).double()),
+        torch.tensor([0.1, 0.2, -0.3]).double(),
+    )
+    still = cloud_from_depth(tilted_depth(), K)
+    moved = cloud_from_depth(tilted_depth(), K, camera_pose=pose)
     torch.testing.assert_close(moved.points, still.points @ pose[:3, :3].T + pose[:3, 3])
     torch.testing.assert_close(moved.viewpoint, pose[:3, 3])
 
 
 def test_the_frustum_goes_through_the_outermost_pixels():
-    pose = rigid(rotation_from_vector(torch.tensor([0.3, -1.0, 2.0]).double()), torch.tensor([0.1, 0.2, -0.3]).double())
+    pose = rigid(
+        rotation_from_vector(torch.tensor([0.3, -1.0, 2.0]).double()),
+        torch.tensor([0.1, 0.2, -0.3]).double(),
+    )
     cloud = cloud_from_depth(tilted_depth(), K, camera_pose=pose)
     height = ((cloud.points - cloud.viewpoint) @ cloud.frustum.T).reshape(48, 64, 4)
     assert float(height.min()) > -1e-12
     for border, side in ((height[:, 0], 0), (height[:, -1], 1), (height[0], 2), (height[-1], 3)):
-        torch.testing.assert_close(border[:, side], torch.zeros(len(border)).double(), atol=1e-12, rtol=0)
+        torch.testing.assert_close(
+            border[:, side], torch.zeros(len(border)).double(), atol=1e-12, rtol=0
+        )
 
 
 def test_pixels_without_depth_or_outside_the_mask_are_left_out():
-    depth, mask = tilted_depth(), torch.zeros(48, 64, dtype=torch.bool)
-    depth[0, 0], depth[0, 1], depth[0, 2] = 0.0, float("nan"), float("inf")
+    depth = tilted_depth()
+    mask = torch.zeros(48, 64, dtype=torch.bool)
+    depth[0, 0] = 0.0
+    depth[0, 1] = float("nan")
+    depth[0, 2] = float("inf")
     assert len(cloud_from_depth(depth, K)) == 48 * 64 - 3
     mask[10:20, 5:25] = True
     assert len(cloud_from_depth(depth, K, mask)) == 200
@@ -77,30 +96,78 @@ REFUSED = {
     "negative depth": (lambda d: (-d, K), "depth.*depths >= 0"),
     "a colour image": (lambda d: (d.expand(3, -1, -1), K), "depth.*of shape"),
     "8 bit depth": (lambda d: ((200 * d).to(torch.uint8), K), "depth.*uint16"),
-    "mask of another size": (lambda d: (d, K, torch.ones(24, 32, dtype=torch.bool)), r"mask.*\(48, 64\)"),
+    "mask of another size": (
+        lambda d: (d, K, torch.ones(24, 32, dtype=torch.bool)),
+        r"mask.*\(48, 64\)",
+    ),
     "empty mask": (lambda d: (d, K, np.zeros((48, 64), dtype=np.uint8)), "mask.*no pixel"),
     "floating mask": (lambda d: (d, K, d), "mask.*bool or uint8"),
-    "intrinsics of twice the size": (lambda d: (d, (1200.0, 1100.0, 64.0, 48.0)), r"intrinsics.*\(64.0, 48.0\) px"),
-    "intrinsics of half the size": (lambda d: (d, (300.0, 275.0, 16.0, 12.0)), "intrinsics.*same resolution"),
+    "intrinsics of twice the size": (
+        lambda d: (d, (1200.0, 1100.0, 64.0, 48.0)),
+        r"intrinsics.*\(64.0, 48.0\) px",
+    ),
+    "intrinsics of half the size": (
+        lambda d: (d, (300.0, 275.0, 16.0, 12.0)),
+        "intrinsics.*same resolution",
+    ),
     "depth in cm": (lambda d: (100 * d + 30, K), "depth.*are these cm.*depth_unit=0.01"),
     "depth in tens of metres": (lambda d: (d / 100, K), "depth.*depth_unit"),
     "a dict without a camera": (lambda d: (d, {"fps": 30}), "intrinsics.*a dict of fps"),
-    "a dict of words": (lambda d: (d, {"fx": "a", "fy": 1, "cx": 1, "cy": 1}), "intrinsics.*fx, fy, cx and cy"),
-    "BOP of many images": (lambda d: (d, {"0": {"cam_K": [1] * 9}, "1": {}}), "intrinsics.*the entry of this image"),
-    "a width that is no number": (lambda d: (d, {"K": K.numpy(), "width": "64", "height": 48}), "positive width"),
-    "normalised intrinsics": (lambda d: (d, (0.96, 0.96, 0.5, 0.5)), "intrinsics.*multiply normalised"),
-    "a focal length in mm": (lambda d: (d, (1.93, 1.93, 32.0, 24.0)), "intrinsics.*view of 1.. degrees"),
-    "fx cx fy cy": (lambda d: (d, (600.0, 31.0, 600.0, 24.0)), "intrinsics.*the order fx, fy, cx, cy"),
-    "cx cy fx fy": (lambda d: (d, (31.0, 24.0, 600.0, 600.0)), "intrinsics.*the order fx, fy, cx, cy"),
-    "the second camera's projection": (lambda d: (d, [600, 0, 31, -30, 0, 600, 24, 0, 0, 0, 1, 0]), "fourth column"),
-    "a camera of twice the size": (lambda d: (d, camera(128, 96)), r"an image of 128 x 96 px.*|times 0\.5"),
+    "a dict of words": (
+        lambda d: (d, {"fx": "a", "fy": 1, "cx": 1, "cy": 1}),
+        "intrinsics.*fx, fy, cx and cy",
+    ),
+    "BOP of many images": (
+        lambda d: (d, {"0": {"cam_K": [1] * 9}, "1": {}}),
+        "intrinsics.*the entry of this image",
+    ),
+    "a width that is no number": (
+        lambda d: (d, {"K": K.numpy(), "width": "64", "height": 48}),
+        "positive width",
+    ),
+    "normalised intrinsics": (
+        lambda d: (d, (0.96, 0.96, 0.5, 0.5)),
+        "intrinsics.*multiply normalised",
+    ),
+    "a focal length in mm": (
+        lambda d: (d, (1.93, 1.93, 32.0, 24.0)),
+        "intrinsics.*view of 1.. degrees",
+    ),
+    "fx cx fy cy": (
+        lambda d: (d, (600.0, 31.0, 600.0, 24.0)),
+        "intrinsics.*the order fx, fy, cx, cy",
+    ),
+    "cx cy fx fy": (
+        lambda d: (d, (31.0, 24.0, 600.0, 600.0)),
+        "intrinsics.*the order fx, fy, cx, cy",
+    ),
+    "the second camera's projection": (
+        lambda d: (d, [600, 0, 31, -30, 0, 600, 24, 0, 0, 0, 1, 0]),
+        "fourth column",
+    ),
+    "a camera of twice the size": (
+        lambda d: (d, camera(128, 96)),
+        r"an image of 128 x 96 px.*|times 0\.5",
+    ),
     "a camera of another ratio": (lambda d: (d, camera(85, 48)), "an image of 85 x 48 px"),
     "a region of another size": (
-        lambda d: (d, {"K": K.ravel().tolist(), "roi": {"x_offset": 0, "y_offset": 0, "width": 32, "height": 24}}),
+        lambda d: (
+            d,
+            {
+                "K": K.ravel().tolist(),
+                "roi": {"x_offset": 0, "y_offset": 0, "width": 32, "height": 24},
+            },
+        ),
         "an image of 32 x 24 px",
     ),
-    "a region of words": (lambda d: (d, {"K": K.ravel().tolist(), "roi": {"x_offset": "8"}}), "roi and binning"),
-    "a region that is a list": (lambda d: (d, camera(64, 48) | {"roi": [1], "binning_x": -1}), "roi and binning"),
+    "a region of words": (
+        lambda d: (d, {"K": K.ravel().tolist(), "roi": {"x_offset": "8"}}),
+        "roi and binning",
+    ),
+    "a region that is a list": (
+        lambda d: (d, camera(64, 48) | {"roi": [1], "binning_x": -1}),
+        "roi and binning",
+    ),
     "a camera that is turned": (lambda d: (d, camera(48, 64)), "the transposed image"),
     "transposed intrinsics": (lambda d: (d, K.T), "intrinsics.*fx, fy"),
     "three intrinsics": (lambda d: (d, (600.0, 30.0, 20.0)), "intrinsics.*fx, fy, cx, cy"),
@@ -112,23 +179,32 @@ REFUSED = {
 @pytest.mark.parametrize("name", REFUSED)
 def test_a_bad_image_is_refused_in_one_sentence(name):
     make, words = REFUSED[name]
-    with pytest.raises((BadArgument, TypeError), match=words):  # TypeError: the annotations are checked in tests
+    with pytest.raises(
+        (BadArgument, TypeError), match=words
+    ):  # TypeError: the annotations are checked in tests
         read_depth(*make(tilted_depth()))
 
 
 def test_refusals():
-    depth, eye = tilted_depth(), torch.eye(4, dtype=torch.float64)
+    depth = tilted_depth()
+    eye = torch.eye(4, dtype=torch.float64)
     with pytest.raises(SuspiciousScale, match="scene"):
         cloud_from_depth(depth * 80, K)
     with pytest.raises(TooFewPoints, match="3 measured"):
         cloud_from_depth(depth, K, torch.arange(48 * 64).reshape(48, 64) < 3)
-    for spoilt in (2 * eye, torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0])).double(), eye + torch.nan):
+    for spoilt in (
+        2 * eye,
+        torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0])).double(),
+        eye + torch.nan,
+    ):
         with pytest.raises(BadArgument, match="camera_pose"):
             cloud_from_depth(depth, K, camera_pose=spoilt)
 
 
 class Ros:  # a message, whose matrix is an array
-    k, width, height = K.numpy().ravel(), 64, 48
+    k = K.numpy().ravel()
+    width = 64
+    height = 48
 
 
 FORMS = {
@@ -169,10 +245,28 @@ FORMS = {
         "distortion_coefficients": {"rows": 1, "cols": 5, "data": [0.0] * 5},
     },
     "Open3D": {"width": 64, "height": 48, "intrinsic_matrix": K.T.ravel().tolist()},
-    "RealSense": {"fx": 600.0, "fy": 550.0, "ppx": 30.0, "ppy": 20.0, "width": 64, "height": 48, "coeffs": [0.0] * 5},
-    "Zivid": {"CameraIntrinsics": {"CameraMatrix": {"CX": 30.0, "CY": 20.0, "FX": 600.0, "FY": 550.0}}},
+    "RealSense": {
+        "fx": 600.0,
+        "fy": 550.0,
+        "ppx": 30.0,
+        "ppy": 20.0,
+        "width": 64,
+        "height": 48,
+        "coeffs": [0.0] * 5,
+    },
+    "Zivid": {
+        "CameraIntrinsics": {"CameraMatrix": {"CX": 30.0, "CY": 20.0, "FX": 600.0, "FY": 550.0}}
+    },
     "BOP": {"cam_K": K.ravel().tolist(), "depth_scale": 1.0},
-    "BOP of a camera": {"cx": 30, "cy": 20, "fx": 600, "fy": 550, "depth_scale": 1.0, "width": 64, "height": 48},
+    "BOP of a camera": {
+        "cx": 30,
+        "cy": 20,
+        "fx": 600,
+        "fy": 550,
+        "depth_scale": 1.0,
+        "width": 64,
+        "height": 48,
+    },
 }
 
 
@@ -195,7 +289,9 @@ def test_counts_of_a_stated_unit_are_metres(scale, camera):
     counts = (1000 / scale * tilted_depth()).round().numpy().astype(np.uint16)
     unit = scale / 1000 if scale == 0.25 else None
     assert np.allclose(read_depth(counts, camera, depth_unit=unit)[0], tilted_depth(), atol=2e-4)
-    floats = (1000 * tilted_depth()).float()[..., None]  # millimetres, as Zivid gives them, and one channel
+    floats = (1000 * tilted_depth()).float()[
+        ..., None
+    ]  # millimetres, as Zivid gives them, and one channel
     assert np.allclose(read_depth(floats, K, depth_unit=0.001)[0], tilted_depth(), atol=1e-6)
 
 
@@ -223,18 +319,26 @@ def test_intrinsics_of_a_mode_are_refused_for_another(size):
 
 
 def test_a_crop_with_its_own_principal_point_is_no_other_resolution():
-    rng, depth, refused = np.random.default_rng(0), np.full((480, 640), 500, dtype=np.uint16), 0
+    rng = np.random.default_rng(0)
+    depth = np.full((480, 640), 500, dtype=np.uint16)
+    refused = 0
     for _ in range(200):
-        (left, right), (top, bottom) = np.sort(rng.integers(0, 640, 2)), np.sort(rng.integers(0, 480, 2))
+        (left, right), (top, bottom) = (
+            np.sort(rng.integers(0, 640, 2)),
+            np.sort(rng.integers(0, 480, 2)),
+        )
         if min(right - left, bottom - top) < 40:
             continue
-        part, k = depth[top:bottom, left:right], (613.0, 613.0, 322.5 - left, 248.2 - top)
+        part = depth[top:bottom, left:right]
+        k = (613.0, 613.0, 322.5 - left, 248.2 - top)
         read_depth(part, (*k, right - left, bottom - top))  # stated
         try:
             read_depth(part, k)
         except BadArgument:  # as of a smaller camera, by chance
             refused += 1
-        if max(abs(left - (640 - right)), abs(top - (480 - bottom))) > 60:  # the sensor's size, with a shifted centre
+        if (
+            max(abs(left - (640 - right)), abs(top - (480 - bottom))) > 60
+        ):  # the sensor's size, with a shifted centre
             whole = {"fx": 613, "fy": 613, "cx": k[2], "cy": k[3], "width": 640, "height": 480}
             if max(abs(k[2] / 640 - 0.5), abs(k[3] / 480 - 0.5)) > 0.05:
                 read_depth(part, whole)

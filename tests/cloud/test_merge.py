@@ -20,7 +20,9 @@ EYE = torch.eye(4, dtype=torch.float64)
 @pytest.fixture(scope="module")
 def two_views():
     mesh = load_object("jug").mesh
-    return [partial_view(mesh, look_at(azimuth, 35.0, target=mesh), n=600) for azimuth in (60.0, 240.0)]
+    return [
+        partial_view(mesh, look_at(azimuth, 35.0, target=mesh), n=600) for azimuth in (60.0, 240.0)
+    ]
 
 
 def in_own_frames(views, motion):
@@ -50,7 +52,11 @@ def test_the_hidden_side_of_two_views_is_completed_too():
     """Each camera has an outline of its own; a cloud that does not say who saw what has none."""
     mesh = load_object("cylinder").mesh
     merged = merge_clouds(
-        [partial_view(mesh, look_at(azimuth, 35.0, target=mesh), n=600) for azimuth in (60.0, 180.0)], [EYE, EYE]
+        [
+            partial_view(mesh, look_at(azimuth, 35.0, target=mesh), n=600)
+            for azimuth in (60.0, 180.0)
+        ],
+        [EYE, EYE],
     )
     points, face = trimesh.sample.sample_surface(mesh, 3000, seed=0)
     side = torch.from_numpy(points[mesh.face_normals[face][:, 2] > -0.5].copy())
@@ -66,7 +72,9 @@ def test_the_hidden_side_of_two_views_is_completed_too():
 def test_the_cameras_of_a_merged_cloud_are_kept_in_files_and_by_every_filter(two_views, tmp_path):
     merged = merge_clouds(two_views, [EYE, EYE])
     back = read_cloud(save_cloud(merged, tmp_path / "merged.npz"))
-    assert torch.equal(back.viewpoint, merged.viewpoint) and torch.equal(back.normals, merged.normals)
+    assert torch.equal(back.viewpoint, merged.viewpoint) and torch.equal(
+        back.normals, merged.normals
+    )
     with pytest.raises(BadArgument, match=r"\.npz, for a cloud of several views"):
         save_cloud(merged, tmp_path / "merged.ply")
     for cloud in (voxel_downsample(merged, 0.004), clean_cloud(merged), remove_outliers(merged)):
@@ -87,7 +95,9 @@ def test_a_merged_cloud_without_a_view_worth_the_name_is_refused(two_views):
 
 
 def test_one_view_keeps_its_viewpoint_and_given_normals_turn_along(motion):
-    points = 0.1 * torch.rand(50, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    points = 0.1 * torch.rand(
+        50, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
     cloud = PointCloud(points, 2 * points + 1, points[0] + 1)
     alone = merge_clouds([cloud], [motion])
     torch.testing.assert_close(alone.viewpoint, apply(motion, cloud.viewpoint[None])[0])

@@ -15,7 +15,9 @@ from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import inverse, rigid, rotation_from_vector
 
 GL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])).double()
-OPTICAL = torch.tensor([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]]).double()  # link_from_optical
+OPTICAL = torch.tensor(
+    [[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]]
+).double()  # link_from_optical
 VIEWS = {"front": (20.0, 45.0), "low": (140.0, 28.0), "steep": (-70.0, 68.0)}
 
 
@@ -54,8 +56,14 @@ POSES = {  # a wrong pose of a right one, what is said
     "transposed": (lambda p: p.T.contiguous(), "give its transpose"),
     "millimetres": (lambda p: scaled(p, 1000), "divide camera_pose.* by 1000"),
     "centimetres": (lambda p: scaled(p, 100), "divide camera_pose.* by 100$|by 100, got"),
-    "scaled": (lambda p: torch.diag(torch.tensor([2.0, 2, 2, 1])).double() @ p, "a rotation times 2"),
-    "left-handed": (lambda p: p @ torch.diag(torch.tensor([-1.0, 1, 1, 1])).double(), "left-handed"),
+    "scaled": (
+        lambda p: torch.diag(torch.tensor([2.0, 2, 2, 1])).double() @ p,
+        "a rotation times 2",
+    ),
+    "left-handed": (
+        lambda p: p @ torch.diag(torch.tensor([-1.0, 1, 1, 1])).double(),
+        "left-handed",
+    ),
     "rounded": (lambda p: torch.round(p, decimals=1), "orthogonal"),
     "3 x 4": (lambda p: p[:3], "add the row 0 0 0 1"),
     "16 numbers": (lambda p: p.ravel(), "reshape"),
@@ -96,7 +104,11 @@ def test_an_inverse_pose_is_told_by_a_table_a_few_degrees_from_level(elevation):
     for wrong, said in (POSES[name] for name in ("inverse", "OpenGL's view matrix")):
         with pytest.raises(BadArgument, match=said):
             Scene.from_depth(depth, INTRINSICS, wrong(pose))
-    right_up = tuple(Scene.from_depth(depth, INTRINSICS, inverse(pose), table=None, up=_up(pose)).table.normal.tolist())
+    right_up = tuple(
+        Scene.from_depth(
+            depth, INTRINSICS, inverse(pose), table=None, up=_up(pose)
+        ).table.normal.tolist()
+    )
     assert right_up[2] > 0.9  # whose user says so is believed
 
 
@@ -111,7 +123,10 @@ INPUTS = {  # depth in metres and pose to the arguments; what is said
         lambda d, p: {"depth": np.uint16((1e4 * d).numpy()), "camera_pose": p},
         "depth_unit",
     ),
-    "a quarter of a millimetre": (lambda d, p: {"depth": np.uint16((4e3 * d).numpy())}, "depth_unit"),
+    "a quarter of a millimetre": (
+        lambda d, p: {"depth": np.uint16((4e3 * d).numpy())},
+        "depth_unit",
+    ),
     "a quarter of a millimetre, posed": (
         lambda d, p: {"depth": np.uint16((4e3 * d).numpy()), "camera_pose": p},
         "depth_unit",
@@ -128,15 +143,33 @@ INPUTS = {  # depth in metres and pose to the arguments; what is said
     "centimetres": (lambda d, p: {"depth": 100 * d}, "depth_unit=0.01"),
     "counts of centimetres": (lambda d, p: {"depth": np.uint16((10 * d).numpy())}, "depth_unit"),
     "counts of metres": (lambda d, p: {"depth": torch.round(d).long()}, "depth_unit"),
-    "a unit ten times too small": (lambda d, p: {"depth": 1e3 * d, "depth_unit": 5e-5}, "depth_unit"),
+    "a unit ten times too small": (
+        lambda d, p: {"depth": 1e3 * d, "depth_unit": 5e-5},
+        "depth_unit",
+    ),
     "counts per metre": (lambda d, p: {"depth": 1e3 * d, "depth_unit": 1000.0}, "depth_unit"),
     "upside down": (lambda d, p: {"depth": d.flip(0), "camera_pose": p}, r"depth\[::-1\]"),
-    "up against the table": (lambda d, p: {"depth": d, "camera_pose": p, "up": (0.0, 0.0, -1.0)}, "up"),
-    "OpenGL with up": (lambda d, p: {"depth": d, "camera_pose": p @ GL, "up": (0.0, 0.0, 1.0)}, "OpenGL"),
-    "OpenGL with a table": (lambda d, p: {"depth": d, "camera_pose": p @ GL, "table": 0.0}, "table"),
-    "transposed image": (lambda d, p: {"depth": d.T.contiguous(), "camera_pose": p}, "transposed image"),
+    "up against the table": (
+        lambda d, p: {"depth": d, "camera_pose": p, "up": (0.0, 0.0, -1.0)},
+        "up",
+    ),
+    "OpenGL with up": (
+        lambda d, p: {"depth": d, "camera_pose": p @ GL, "up": (0.0, 0.0, 1.0)},
+        "OpenGL",
+    ),
+    "OpenGL with a table": (
+        lambda d, p: {"depth": d, "camera_pose": p @ GL, "table": 0.0},
+        "table",
+    ),
+    "transposed image": (
+        lambda d, p: {"depth": d.T.contiguous(), "camera_pose": p},
+        "transposed image",
+    ),
     "half the image": (lambda d, p: {"depth": d[::2, ::2].contiguous()}, "times 0.5"),
-    "twice the image": (lambda d, p: {"depth": d.repeat_interleave(2, 0).repeat_interleave(2, 1)}, "times 2"),
+    "twice the image": (
+        lambda d, p: {"depth": d.repeat_interleave(2, 0).repeat_interleave(2, 1)},
+        "times 2",
+    ),
 }
 
 
@@ -156,7 +189,9 @@ def test_a_stated_unit_and_a_mended_pose_are_used(tmp_path):
         read_scene(save_scene(right(), tmp_path / "s.npz")),
     ):
         assert len(scene.things) == 2 and float(scene.table.normal[2]) > 0.999
-    down = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])).double() @ pose  # a robot that hangs from the ceiling
+    down = (
+        torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])).double() @ pose
+    )  # a robot that hangs from the ceiling
     with pytest.raises(BadArgument, match="up"):
         Scene.from_depth(depth, INTRINSICS, down)
     hanging = Scene.from_depth(depth, INTRINSICS, down, up=(0.0, 0.0, -1.0))
@@ -171,17 +206,32 @@ def test_right_poses_raise_no_alarm():
         placed = rigid(turn, torch.tensor(rng.uniform(-2, 2, 3))) @ pose
         assert len(Scene.from_depth(depth, INTRINSICS, placed).things) == 2
     for tilt in (0.3, math.pi / 4, 1.2):  # a base on a slope
-        tilted = rigid(rotation_from_vector(torch.tensor([tilt, 0.2, 0.0]).double()), torch.zeros(3).double()) @ pose
+        tilted = (
+            rigid(
+                rotation_from_vector(torch.tensor([tilt, 0.2, 0.0]).double()),
+                torch.zeros(3).double(),
+            )
+            @ pose
+        )
         assert len(Scene.from_depth(depth, INTRINSICS, tilted).things) == 2
     assert len(Scene.from_depth(depth, INTRINSICS).things) == 2  # the camera's own frame
-    beside = rigid(rotation_from_vector(torch.tensor([0.02, 0.0, 0.01]).double()), torch.tensor([0.015, 0, 0]).double())
-    assert len(Scene.from_depth(depth, INTRINSICS, beside).things) == 2  # the frame of the colour camera
+    beside = rigid(
+        rotation_from_vector(torch.tensor([0.02, 0.0, 0.01]).double()),
+        torch.tensor([0.015, 0, 0]).double(),
+    )
+    assert (
+        len(Scene.from_depth(depth, INTRINSICS, beside).things) == 2
+    )  # the frame of the colour camera
 
 
 def test_a_high_camera_is_noted_where_no_unit_is_given():
     depth, pose = seen()
     high = Scene.from_depth(2.2 * depth, INTRINSICS, scaled(pose, 2.2))  # objects of 11 to 22 cm
-    assert len(high.notes) == 1 and "1.09 m above the table" in high.notes[0] and "depth_unit" in high.notes[0]
+    assert (
+        len(high.notes) == 1
+        and "1.09 m above the table" in high.notes[0]
+        and "depth_unit" in high.notes[0]
+    )
     assert Scene.from_depth(2.2 * depth, INTRINSICS, scaled(pose, 2.2), depth_unit=1.0).notes == ()
     assert right().notes == ()
 

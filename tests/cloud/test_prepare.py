@@ -30,7 +30,9 @@ def truth(mesh, points):
 
 def surface(mesh, n, seed=0):
     points, face = trimesh.sample.sample_surface(mesh, n, seed=seed)
-    return PointCloud(torch.from_numpy(np.asarray(points)), torch.from_numpy(mesh.face_normals[face].copy()))
+    return PointCloud(
+        torch.from_numpy(np.asarray(points)), torch.from_numpy(mesh.face_normals[face].copy())
+    )
 
 
 def check_normals(cloud):
@@ -43,7 +45,10 @@ def estimate_viewpoint(cloud):
 
 def flip(cloud, share, seed=0):
     """Flip a share of the normals, and tell which."""
-    flipped = torch.rand(len(cloud), generator=torch.Generator().manual_seed(seed), dtype=torch.float64) < share
+    flipped = (
+        torch.rand(len(cloud), generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+        < share
+    )
     return PointCloud(
         cloud.points, torch.where(flipped[:, None], -cloud.normals, cloud.normals), cloud.viewpoint
     ), flipped
@@ -60,7 +65,9 @@ def test_normals_of_a_sphere_agree_with_the_closed_form(ball_view):
     cosine = (cloud.normals * unit(cloud.points)).sum(-1)
     assert torch.rad2deg(torch.arccos(cosine.clamp(-1, 1))).median() < 2.0
     assert (cosine > 0.9).all()
-    torch.testing.assert_close(torch.linalg.vector_norm(cloud.normals, dim=-1), torch.ones(1000).double())
+    torch.testing.assert_close(
+        torch.linalg.vector_norm(cloud.normals, dim=-1), torch.ones(1000).double()
+    )
 
 
 def test_an_exact_plane_has_its_exact_normal_and_stays_where_it_is():
@@ -145,7 +152,9 @@ def test_a_prepared_view_is_the_clean_cloud_and_its_points_in_float64(dtype):
     view = load_object("jug").view.to(dtype)
     prepared = prepare_cloud(view, rng())
     clean = clean_cloud(view)
-    assert torch.equal(prepared.cloud.points, clean.points) and torch.equal(prepared.cloud.normals, clean.normals)
+    assert torch.equal(prepared.cloud.points, clean.points) and torch.equal(
+        prepared.cloud.normals, clean.normals
+    )
     assert torch.equal(prepared.points, clean.points.double())
     assert torch.equal(prepared.normals, unit(clean.normals.double()))
     assert torch.equal(prepared.viewpoint, view.viewpoint.double()) and prepared.one_sided
@@ -166,7 +175,9 @@ def test_a_whole_surface_is_not_turned_towards_its_viewpoint():
 
 def test_without_cleaning_points_and_given_normals_stay_as_they_are():
     points = 0.04 * directions(600)
-    prepared = prepare_cloud(PointCloud(points.repeat(2, 1), 3 * directions(600).repeat(2, 1)), rng(), clean=False)
+    prepared = prepare_cloud(
+        PointCloud(points.repeat(2, 1), 3 * directions(600).repeat(2, 1)), rng(), clean=False
+    )
     assert torch.equal(prepared.points, points)
     torch.testing.assert_close(prepared.normals, directions(600))
     fitted = prepare_cloud(PointCloud(points), rng(), clean=False)
@@ -175,7 +186,9 @@ def test_without_cleaning_points_and_given_normals_stay_as_they_are():
 
 @pytest.mark.parametrize("copies", [1, 12])
 def test_normals_of_random_signs_are_ignored_however_often_a_point_was_given(copies):
-    """Copies of a point agree with each other: counted as neighbours they would hide that the signs are random."""
+    """Copies of a point agree with each other: counted as neighbours they would hide that the signs
+    are random.
+    """
     view = load_object("cylinder").view
     normals = flip(estimate_normals(view), 0.5)[0].normals
     spoilt = PointCloud(view.points.repeat(copies, 1), normals.repeat(copies, 1), view.viewpoint)
@@ -217,7 +230,9 @@ def test_the_guess_follows_a_rigid_motion_and_finds_the_camera(ball_view):
         moved = PointCloud(ball_view.points @ turn.T + 0.3)
         camera = ball_view.viewpoint @ turn.T
         guess = estimate_viewpoint(moved) - 0.3
-        angle = torch.arccos(guess @ camera / torch.linalg.vector_norm(guess) / torch.linalg.vector_norm(camera))
+        angle = torch.arccos(
+            guess @ camera / torch.linalg.vector_norm(guess) / torch.linalg.vector_norm(camera)
+        )
         assert torch.rad2deg(angle) < 25
 
 
@@ -225,7 +240,11 @@ def test_a_cloud_in_the_frame_of_its_camera_was_seen_from_the_origin():
     thing = load_object("jug")
     pose = look_at(60.0, 35.0, target=thing.mesh)
     torch.testing.assert_close(pose[:3, 3], thing.view.viewpoint, atol=1e-6, rtol=0)
-    assert estimate_viewpoint(PointCloud(apply(inverse(pose), thing.view.points))).tolist() == [0, 0, 0]
+    assert estimate_viewpoint(PointCloud(apply(inverse(pose), thing.view.points))).tolist() == [
+        0,
+        0,
+        0,
+    ]
 
 
 @pytest.mark.parametrize("name", list_objects())
@@ -235,4 +254,6 @@ def test_a_view_faces_its_camera_and_a_whole_surface_does_not(name):
     both = torch.cat([view.normals, -view.normals])
     assert share_facing(view.points.repeat(2, 1), both, view.viewpoint) == pytest.approx(0.5)
     each = view.viewpoint.expand(len(view), 3)
-    assert share_facing(view.points, view.normals, each) == share_facing(view.points, view.normals, view.viewpoint)
+    assert share_facing(view.points, view.normals, each) == share_facing(
+        view.points, view.normals, view.viewpoint
+    )

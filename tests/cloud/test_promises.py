@@ -8,7 +8,13 @@ import torch
 
 from tests.make import ball
 from torchgrasp.cloud import check, diagnose, prepare
-from torchgrasp.foundation.errors import BadArgument, Flat, GraspError, SuspiciousScale, TooFewPoints
+from torchgrasp.foundation.errors import (
+    BadArgument,
+    Flat,
+    GraspError,
+    SuspiciousScale,
+    TooFewPoints,
+)
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.values.planning import PointCloud
@@ -37,7 +43,9 @@ EYE = torch.tensor([0.3, 0.2, 0.5], dtype=torch.float64)
 
 
 def refused(function, value, kind, match):
-    """Check that a value is refused by name before any work: no neighbour is sought, nothing is factored."""
+    """Check that a value is refused by name before any work: no neighbour is sought, nothing is
+    factored.
+    """
 
     def work(*_args, **_kwargs):
         pytest.fail("work was done before the refusal")
@@ -69,7 +77,9 @@ def test_no_number_is_refused_where_the_value_is_made_and_where_it_is_used(name,
 def test_fewer_than_four_points_are_refused(name, n):
     cloud = ball(viewpoint=EYE.clone())
     refused(lambda c: PointCloud(c.points[:n]), cloud, TooFewPoints, f"{n} points")
-    copies = PointCloud(*(x.repeat(20, 1) for x in (cloud.points[: max(n, 1)], cloud.normals[: max(n, 1)])))
+    copies = PointCloud(
+        *(x.repeat(20, 1) for x in (cloud.points[: max(n, 1)], cloud.normals[: max(n, 1)]))
+    )
     refused(FUNCTIONS[name], copies, BadArgument, "coincide|distinct")
 
 
@@ -77,14 +87,22 @@ def test_fewer_than_four_points_are_refused(name, n):
 @pytest.mark.parametrize("distance", [0.0, 1e-12, 5e-10])
 def test_copies_change_nothing(distance):
     cloud = ball(121, viewpoint=EYE.clone())
-    jitter = 0.08 * distance * unit(torch.randn(5 * 121, 3, generator=torch.Generator().manual_seed(1)).double())
+    jitter = (
+        0.08
+        * distance
+        * unit(torch.randn(5 * 121, 3, generator=torch.Generator().manual_seed(1)).double())
+    )
     copies = PointCloud(
-        torch.cat([cloud.points, cloud.points.repeat(5, 1) + jitter]), cloud.normals.repeat(6, 1), cloud.viewpoint
+        torch.cat([cloud.points, cloud.points.repeat(5, 1) + jitter]),
+        cloud.normals.repeat(6, 1),
+        cloud.viewpoint,
     )
     assert len(check.remove_duplicates(copies)) == 121
     assert diagnose.diagnose_cloud(copies).copies == 5 * 121
     for support in ("camera", "paper"):
-        once, six = (fit_shape(c, support=support).predict(1.1 * cloud.points[:9]) for c in (cloud, copies))
+        once, six = (
+            fit_shape(c, support=support).predict(1.1 * cloud.points[:9]) for c in (cloud, copies)
+        )
         torch.testing.assert_close(six.distance, once.distance, atol=1e-6, rtol=0)
         torch.testing.assert_close(six.variance, once.variance, atol=1e-6, rtol=0)
 
@@ -92,7 +110,10 @@ def test_copies_change_nothing(distance):
 @pytest.mark.promise("I4")
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_a_point_and_a_line_are_refused(name):
-    along = torch.linspace(0, 0.1, 50, dtype=torch.float64)[:, None] * torch.tensor([1.0, 2.0, -1.0]).double()
+    along = (
+        torch.linspace(0, 0.1, 50, dtype=torch.float64)[:, None]
+        * torch.tensor([1.0, 2.0, -1.0]).double()
+    )
     refused(FUNCTIONS[name], PointCloud(0 * along, along + 1), BadArgument, "coincide")
     refused(FUNCTIONS[name], PointCloud(along, along + 1), BadArgument, "line")
 
@@ -124,27 +145,37 @@ def test_a_wrong_unit_is_refused_by_name(name, factor):
 def test_results_scale_with_the_cloud(factor):
     cloud = ball(viewpoint=EYE.clone())
     large = PointCloud(factor * cloud.points, cloud.normals, factor * EYE)
-    one, other = diagnose.diagnose_cloud(cloud), diagnose.diagnose_cloud(large)
+    one = diagnose.diagnose_cloud(cloud)
+    other = diagnose.diagnose_cloud(large)
     for name in ("spacing", "noise"):
         assert getattr(other, name) == pytest.approx(factor * getattr(one, name), rel=1e-9)
-    assert other.density == pytest.approx(one.density / factor**2, rel=1e-9) and other.outliers == one.outliers
-    a, b = prepare.clean_cloud(cloud), prepare.clean_cloud(large)
+    assert (
+        other.density == pytest.approx(one.density / factor**2, rel=1e-9)
+        and other.outliers == one.outliers
+    )
+    a = prepare.clean_cloud(cloud)
+    b = prepare.clean_cloud(large)
     torch.testing.assert_close(b.points, factor * a.points, rtol=1e-9, atol=1e-12)
-    small, big = check.voxel_downsample(cloud, 0.01), check.voxel_downsample(large, 0.01 * factor)
+    small = check.voxel_downsample(cloud, 0.01)
+    big = check.voxel_downsample(large, 0.01 * factor)
     torch.testing.assert_close(big.points, factor * small.points, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.promise("I6")
 def test_far_from_the_origin_nothing_changes():
-    cloud, shift = ball(viewpoint=EYE.clone()), torch.tensor([1e4, -1e4, 1e4], dtype=torch.float64)
+    cloud = ball(viewpoint=EYE.clone())
+    shift = torch.tensor([1e4, -1e4, 1e4], dtype=torch.float64)
     far = PointCloud(cloud.points + shift, cloud.normals, EYE + shift)
-    a, b = prepare.clean_cloud(cloud), prepare.clean_cloud(far)
+    a = prepare.clean_cloud(cloud)
+    b = prepare.clean_cloud(far)
     torch.testing.assert_close(b.points - shift, a.points, atol=1e-7, rtol=0)
     torch.testing.assert_close(b.normals, a.normals, atol=1e-7, rtol=0)
     at = 1.05 * cloud.points[:20]
     for support in ("camera", "paper"):
         one, other = (fit_shape(c, support=support) for c in (cloud, far))
-        torch.testing.assert_close(other.predict(at + shift).distance, one.predict(at).distance, atol=1e-7, rtol=0)
+        torch.testing.assert_close(
+            other.predict(at + shift).distance, one.predict(at).distance, atol=1e-7, rtol=0
+        )
 
 
 @pytest.mark.promise("I7")
@@ -158,14 +189,21 @@ def test_other_dtypes_and_shapes_are_refused(dtype):
 @pytest.mark.promise("I7")
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_gradients_are_refused_and_strides_do_not_matter(name):
-    cloud, function = ball(viewpoint=EYE.clone()), FUNCTIONS[name]
-    refused(function, PointCloud(cloud.points.clone().requires_grad_(), cloud.normals), BadArgument, "detach")
+    cloud = ball(viewpoint=EYE.clone())
+    function = FUNCTIONS[name]
+    refused(
+        function,
+        PointCloud(cloud.points.clone().requires_grad_(), cloud.normals),
+        BadArgument,
+        "detach",
+    )
     strided = PointCloud(
         cloud.points.T.contiguous().T,
         torch.stack([cloud.normals, cloud.normals], -1)[..., 0],
         EYE[None].expand(2, 3)[1],
     )
-    one, other = function(cloud), function(strided)
+    one = function(cloud)
+    other = function(strided)
     if isinstance(one, PointCloud):
         assert torch.equal(one.points, other.points)
     elif isinstance(one, torch.Tensor):
@@ -182,8 +220,12 @@ def test_outliers_go_lengths_do_not_matter_and_zero_is_refused():
     assert float(torch.linalg.vector_norm(clean.points, dim=-1).max()) < 0.06
     long = PointCloud(cloud.points, 7 * cloud.normals)
     assert diagnose.diagnose_cloud(long).normals.scaled == 400
-    one, other = (fit_shape(PointCloud(c.points, c.normals), support="paper") for c in (cloud, long))
-    torch.testing.assert_close(one.predict(cloud.points).distance, other.predict(cloud.points).distance)
+    one, other = (
+        fit_shape(PointCloud(c.points, c.normals), support="paper") for c in (cloud, long)
+    )
+    torch.testing.assert_close(
+        one.predict(cloud.points).distance, other.predict(cloud.points).distance
+    )
     zero = cloud.normals.clone()
     zero[3] = 0
     refused(check.check_cloud, PointCloud(cloud.points, zero), BadArgument, "length zero")

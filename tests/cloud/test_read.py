@@ -32,7 +32,9 @@ def unit_rows(n):
     return v / np.linalg.norm(v, axis=1, keepdims=True)
 
 
-@pytest.mark.parametrize("fields", ["points", "points normals", "points viewpoint", "points normals viewpoint frustum"])
+@pytest.mark.parametrize(
+    "fields", ["points", "points normals", "points viewpoint", "points normals viewpoint frustum"]
+)
 @pytest.mark.parametrize(("suffix", "tolerance"), [(".npz", 0.0), (".ply", 1e-8)])
 def test_a_saved_cloud_reads_back(tmp_path, points, fields, suffix, tolerance):
     arrays = {"points": points, "normals": unit_rows(60), "viewpoint": np.array([0.1, -0.2, 0.7])}
@@ -40,7 +42,8 @@ def test_a_saved_cloud_reads_back(tmp_path, points, fields, suffix, tolerance):
     cloud = PointCloud(**{name: torch.from_numpy(arrays[name]) for name in fields.split()})
     back = read_cloud(save_cloud(cloud, tmp_path / f"cloud{suffix}"))
     for name in arrays:
-        wanted, found = getattr(cloud, name), getattr(back, name)
+        wanted = getattr(cloud, name)
+        found = getattr(back, name)
         assert (wanted is None) == (found is None)
         if wanted is not None:
             assert found.dtype == torch.float64
@@ -58,9 +61,7 @@ def test_ply_of_another_writer(tmp_path, points, encoding):
 
 def test_ply_big_endian_with_other_properties(tmp_path, points):
     header = "ply\nformat binary_big_endian 1.0\nelement vertex 60\nproperty uchar red\nproperty double x\n"
-    header += (
-        "property double y\nproperty double z\nelement face 0\nproperty list uchar int vertex_indices\nend_header\n"
-    )
+    header += "property double y\nproperty double z\nelement face 0\nproperty list uchar int vertex_indices\nend_header\n"
     rows = b"".join(struct.pack(">Bddd", 7, *p) for p in points)
     (tmp_path / "a.ply").write_bytes(header.encode() + rows)
     np.testing.assert_array_equal(read_cloud(tmp_path / "a.ply").points.numpy(), points)
@@ -74,27 +75,34 @@ def test_the_surface_of_a_mesh_is_sampled(tmp_path):
     assert radius.min() > 0.0495
     assert radius.max() <= 0.05 + 1e-7
     assert ((cloud.normals * cloud.points).sum(-1) / radius > 0.99).all()
-    torch.testing.assert_close(read_cloud(tmp_path / "ball.ply").points, cloud.points, rtol=0, atol=0)
+    torch.testing.assert_close(
+        read_cloud(tmp_path / "ball.ply").points, cloud.points, rtol=0, atol=0
+    )
     ball.faces = ball.faces[:-5]
     ball.export(tmp_path / "open.ply")
     assert read_cloud(tmp_path / "open.ply").normals is None
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary"])
-@pytest.mark.parametrize(("view", "found"), [("0.1 0.2 0.9 1 0 0 0", [0.1, 0.2, 0.9]), ("0 0 0 1 0 0 0", None)])
+@pytest.mark.parametrize(
+    ("view", "found"), [("0.1 0.2 0.9 1 0 0 0", [0.1, 0.2, 0.9]), ("0 0 0 1 0 0 0", None)]
+)
 def test_pcd(tmp_path, points, encoding, view, found):
     normals = unit_rows(60)
-    header = "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z _ normal_x normal_y normal_z\nSIZE 8 8 8 1 4 4 4\n"
-    header += (
-        f"TYPE F F F U F F F\nCOUNT 1 1 1 4 1 1 1\nWIDTH 60\nHEIGHT 1\nVIEWPOINT {view}\nPOINTS 60\nDATA {encoding}\n"
+    header = (
+        "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z _ normal_x normal_y normal_z\nSIZE 8 8 8 1 4 4 4\n"
     )
+    header += f"TYPE F F F U F F F\nCOUNT 1 1 1 4 1 1 1\nWIDTH 60\nHEIGHT 1\nVIEWPOINT {view}\nPOINTS 60\nDATA {encoding}\n"
     if encoding == "ascii":
         body = "".join(
             " ".join(map(repr, [*map(float, p), 0, 0, 0, 0, *map(float, n)])) + "\n"
             for p, n in zip(points, normals, strict=True)
         ).encode()
     else:
-        body = b"".join(struct.pack("<ddd4Bfff", *p, 0, 0, 0, 0, *n) for p, n in zip(points, normals, strict=True))
+        body = b"".join(
+            struct.pack("<ddd4Bfff", *p, 0, 0, 0, 0, *n)
+            for p, n in zip(points, normals, strict=True)
+        )
     (tmp_path / "a.pcd").write_bytes(header.encode() + body)
     cloud = read_cloud(tmp_path / "a.pcd")
     np.testing.assert_array_equal(cloud.points.numpy(), points)
@@ -107,7 +115,8 @@ def cap(turn, centre):
     v = np.random.default_rng(1).uniform(-1, 1, (600, 2))
     v = v[np.linalg.norm(v, axis=1) < 0.98]
     v = np.column_stack([v, -np.sqrt(1 - (v**2).sum(1))])
-    c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
+    c = np.cos(np.radians(turn))
+    s = np.sin(np.radians(turn))
     return 0.04 * v @ np.array([[1, 0, 0], [0, c, s], [0, -s, c]]) + centre
 
 
@@ -125,7 +134,9 @@ def pcd(points, view="0 0 0 1 0 0 0", data="ascii"):
         (cap(90, [0.0, 0.0, 0.5]), False),  # seen from its side
     ],
 )
-def test_the_default_viewpoint_of_pcd_counts_only_where_a_camera_can_have_been_there(tmp_path, points, believed):
+def test_the_default_viewpoint_of_pcd_counts_only_where_a_camera_can_have_been_there(
+    tmp_path, points, believed
+):
     (tmp_path / "a.pcd").write_bytes(pcd(points))
     file = read_cloud_file(tmp_path / "a.pcd")
     assert (file.cloud.viewpoint is not None) == believed
@@ -135,7 +146,10 @@ def test_the_default_viewpoint_of_pcd_counts_only_where_a_camera_can_have_been_t
 
 def compress(data):
     """Pack bytes as LZF, greedily: copies of three bytes and more, literals between."""
-    out, literal, seen, i = bytearray(), bytearray(), {}, 0
+    out = bytearray()
+    literal = bytearray()
+    seen = {}
+    i = 0
 
     def flush():
         for k in range(0, len(literal), 32):
@@ -144,7 +158,8 @@ def compress(data):
         literal.clear()
 
     while i < len(data):
-        key, length = data[i : i + 3], 0
+        key = data[i : i + 3]
+        length = 0
         at = seen.get(key, -1)
         if len(key) == 3 and 0 <= at and i - at <= 8192:
             length = 3
@@ -203,20 +218,47 @@ def colours(n):
 
 
 LEFT_OUT = {
-    "NaN": (lambda p: np.concatenate([p, [[np.nan, 0, 0], [0, np.inf, 0]]]), 60, False, "2 of 62 rows with NaN"),
+    "NaN": (
+        lambda p: np.concatenate([p, [[np.nan, 0, 0], [0, np.inf, 0]]]),
+        60,
+        False,
+        "2 of 62 rows with NaN",
+    ),
     "organised": (
         lambda p: np.where(np.arange(180).reshape(6, 10, 3) < 30, np.nan, p.reshape(6, 10, 3)),
         50,
         False,
         "10 of 60 rows",
     ),
-    "zeros": (lambda p: np.concatenate([p, np.zeros((5, 3))]), 60, False, "5 of 65 rows at exactly"),
-    "colours": (lambda p: np.concatenate([p, colours(60)], 1), 60, False, "columns 4 to 6 are no unit vectors"),
-    "colours of 8 bit": (lambda p: np.concatenate([p, np.round(255 * colours(60))], 1), 60, False, "colours"),
+    "zeros": (
+        lambda p: np.concatenate([p, np.zeros((5, 3))]),
+        60,
+        False,
+        "5 of 65 rows at exactly",
+    ),
+    "colours": (
+        lambda p: np.concatenate([p, colours(60)], 1),
+        60,
+        False,
+        "columns 4 to 6 are no unit vectors",
+    ),
+    "colours of 8 bit": (
+        lambda p: np.concatenate([p, np.round(255 * colours(60))], 1),
+        60,
+        False,
+        "colours",
+    ),
     "normals": (lambda p: np.concatenate([p, unit_rows(60)], 1), 60, True, ""),
-    "organised normals": (lambda p: np.concatenate([p, unit_rows(60)], 1).reshape(6, 10, 6), 60, True, ""),
+    "organised normals": (
+        lambda p: np.concatenate([p, unit_rows(60)], 1).reshape(6, 10, 6),
+        60,
+        True,
+        "",
+    ),
     "some normals NaN": (
-        lambda p: np.concatenate([p, np.where(np.arange(60)[:, None] < 9, np.nan, unit_rows(60))], 1),
+        lambda p: np.concatenate(
+            [p, np.where(np.arange(60)[:, None] < 9, np.nan, unit_rows(60))], 1
+        ),
         51,
         True,
         "9 of 60 rows without a normal",
@@ -260,10 +302,19 @@ def test_arrays_and_text(tmp_path, points):
     np.savetxt(tmp_path / "d.xyz", table, delimiter=",")
     np.savetxt(tmp_path / "e.xyz", points, newline="\r\n")
     np.savetxt(tmp_path / "f.xyz", points, newline="\r")
-    (tmp_path / "g.csv").write_text('"x","y","z"\n' + "".join(f"{x};{y};{z}\n" for x, y, z in points))
+    (tmp_path / "g.csv").write_text(
+        '"x","y","z"\n' + "".join(f"{x};{y};{z}\n" for x, y, z in points)
+    )
     np.savetxt(tmp_path / "h.txt", points)
     kinds = [("g.csv", False), ("h.txt", False)]
-    kinds += [("a.npy", False), ("b.npy", True), ("c.xyz", False), ("d.xyz", True), ("e.xyz", False), ("f.xyz", False)]
+    kinds += [
+        ("a.npy", False),
+        ("b.npy", True),
+        ("c.xyz", False),
+        ("d.xyz", True),
+        ("e.xyz", False),
+        ("f.xyz", False),
+    ]
     for name, normals in kinds:
         cloud = read_cloud(tmp_path / name)
         np.testing.assert_allclose(cloud.points.numpy(), points, atol=1e-8)
@@ -272,7 +323,8 @@ def test_arrays_and_text(tmp_path, points):
 
 @pytest.mark.parametrize("suffix", [".ply", ".pcd", ".npz", ".npy", ".xyz"])
 @pytest.mark.parametrize(
-    "content", [b"", b"\x00\xff\xfe" * 50, b"ply\n", b"DATA ascii\n", b"PK\x03\x04", b"\x93NUMPY\x01\x00"]
+    "content",
+    [b"", b"\x00\xff\xfe" * 50, b"ply\n", b"DATA ascii\n", b"PK\x03\x04", b"\x93NUMPY\x01\x00"],
 )
 def test_malformed_content_is_refused_by_name(tmp_path, suffix, content):
     (tmp_path / f"a{suffix}").write_bytes(content)
@@ -292,7 +344,8 @@ def test_spoilt_or_truncated_bytes_are_refused_by_name_or_read(tmp_path, points,
     else:
         header = "FIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nWIDTH 60\nHEIGHT 1\nDATA ascii"
         np.savetxt(path, points, header=header if suffix == ".pcd" else "", comments="")
-    data, rng = path.read_bytes(), np.random.default_rng(0)
+    data = path.read_bytes()
+    rng = np.random.default_rng(0)
     for _ in range(60):
         spoilt = bytearray(data)
         for place in rng.integers(0, min(len(data), 300), 3):
@@ -302,21 +355,32 @@ def test_spoilt_or_truncated_bytes_are_refused_by_name_or_read(tmp_path, points,
             assert torch.isfinite(read_cloud(path).points).all()
     for stop in range(0, len(data) - 1, 37):
         path.write_bytes(data[:stop])
-        with pytest.raises(GraspError) if suffix in (".ply", ".npz", ".npy") else contextlib.suppress(GraspError):
+        with (
+            pytest.raises(GraspError)
+            if suffix in (".ply", ".npz", ".npy")
+            else contextlib.suppress(GraspError)
+        ):
             read_cloud(path)
 
 
 def test_headers_that_promise_too_much_are_refused_before_memory_is_taken(tmp_path):
-    header = "ply\nformat binary_little_endian 1.0\nelement vertex 99999999999999\nproperty float x\n"
+    header = (
+        "ply\nformat binary_little_endian 1.0\nelement vertex 99999999999999\nproperty float x\n"
+    )
     (tmp_path / "a.ply").write_text(header + "property float y\nproperty float z\nend_header\n")
     buffer = io.BytesIO()
-    np.lib.format.write_array_header_1_0(buffer, {"descr": "<f8", "fortran_order": False, "shape": (10**13, 3)})
+    np.lib.format.write_array_header_1_0(
+        buffer, {"descr": "<f8", "fortran_order": False, "shape": (10**13, 3)}
+    )
     (tmp_path / "b.npy").write_bytes(buffer.getvalue())
     with zipfile.ZipFile(tmp_path / "c.npz", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("points.npy", buffer.getvalue() + bytes(1000))
-    (tmp_path / "d.pcd").write_text("FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 99999999999999\nDATA binary\n")
+    (tmp_path / "d.pcd").write_text(
+        "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 99999999999999\nDATA binary\n"
+    )
     (tmp_path / "e.ply").write_text(
-        header.replace("binary_little_endian", "ascii") + "property float y\nproperty float z\nend_header\n1 2 3\n"
+        header.replace("binary_little_endian", "ascii")
+        + "property float y\nproperty float z\nend_header\n1 2 3\n"
     )
     for name in ("a.ply", "b.npy", "c.npz", "d.pcd", "e.ply"):
         with pytest.raises(CloudFileError):
@@ -327,34 +391,66 @@ def test_columns_whose_squares_overflow_are_no_normals(tmp_path, points):
     table = np.concatenate([points, np.tile([0.0, 0.0, 1.0], (len(points), 1))], 1)
     table[0, 3] = 1e200
     np.save(tmp_path / "table.npy", table)
-    assert read_cloud_file(tmp_path / "table.npy").cloud.normals is not None  # one of many: the others are normals
+    assert (
+        read_cloud_file(tmp_path / "table.npy").cloud.normals is not None
+    )  # one of many: the others are normals
     table[:, 3] = 1e200
     np.save(tmp_path / "table.npy", table)
     assert read_cloud_file(tmp_path / "table.npy").cloud.normals is None
 
 
-MESH = ["ply", "format binary_little_endian 1.0", "element vertex 3", *(f"property float {x}" for x in "xyz")]
+MESH = [
+    "ply",
+    "format binary_little_endian 1.0",
+    "element vertex 3",
+    *(f"property float {x}" for x in "xyz"),
+]
 FACES = [*MESH, "element face 500001", "property list uchar int vertex_indices", "end_header\n"]
-PROPERTIES = [*MESH, "element face 1", *(f"property list uchar int p{k}" for k in range(254)), "end_header\n"]
+PROPERTIES = [
+    *MESH,
+    "element face 1",
+    *(f"property list uchar int p{k}" for k in range(254)),
+    "end_header\n",
+]
 OBJECTS = np.array([{"code": 1}], dtype=object)
 REFUSED = {
     "millimetres": (lambda p: 1000 * p, SuspiciousScale, "mm"),
     "normalised": (lambda p: 1e-3 * p, SuspiciousScale, "normalised"),
-    "missing": (lambda p: np.where(np.arange(180).reshape(60, 3) < 170, np.nan, p), TooFewPoints, "57 of 60 rows with"),
+    "missing": (
+        lambda p: np.where(np.arange(180).reshape(60, 3) < 170, np.nan, p),
+        TooFewPoints,
+        "57 of 60 rows with",
+    ),
     "three points": (lambda p: p[:3], TooFewPoints, "3 points"),
     "two columns": (lambda p: p[:, :2], CloudFileError, "shape"),
     "complex": (lambda p: p + 1j, CloudFileError, "real numbers"),
     "pickled": (lambda p: OBJECTS, CloudFileError, "objects|object|pickle"),
     "pickled in .npz": (lambda p: {"points": OBJECTS}, CloudFileError, "object|pickle"),
-    "other names": (lambda p: {"xyz": p, "rgb": p}, CloudFileError, r"no array named 'points', but \['xyz', 'rgb'\]"),
+    "other names": (
+        lambda p: {"xyz": p, "rgb": p},
+        CloudFileError,
+        r"no array named 'points', but \['xyz', 'rgb'\]",
+    ),
     "NaN viewpoint": (
         lambda p: {"points": p, "viewpoint": np.array([0, np.nan, 1])},
         BadArgument,
         "viewpoint with NaN",
     ),
-    "frustum": (lambda p: {"points": p, "frustum": np.ones((3, 3))}, CloudFileError, r"a frustum of shape \(3, 3\)"),
-    "many faces": (lambda p: "\n".join(FACES).encode(), CloudFileError, "500001 faces"),  # before the body is read
-    "many properties": (lambda p: "\n".join(PROPERTIES).encode() + bytes(10_000), CloudFileError, "257 properties"),
+    "frustum": (
+        lambda p: {"points": p, "frustum": np.ones((3, 3))},
+        CloudFileError,
+        r"a frustum of shape \(3, 3\)",
+    ),
+    "many faces": (
+        lambda p: "\n".join(FACES).encode(),
+        CloudFileError,
+        "500001 faces",
+    ),  # before the body is read
+    "many properties": (
+        lambda p: "\n".join(PROPERTIES).encode() + bytes(10_000),
+        CloudFileError,
+        "257 properties",
+    ),
 }
 
 
@@ -362,7 +458,9 @@ REFUSED = {
 def test_read_cloud_names_what_is_wrong(tmp_path, points, name):
     make, error, words = REFUSED[name]
     content = make(points)
-    path = tmp_path / ("a.npz" if isinstance(content, dict) else "a.ply" if isinstance(content, bytes) else "a.npy")
+    path = tmp_path / (
+        "a.npz" if isinstance(content, dict) else "a.ply" if isinstance(content, bytes) else "a.npy"
+    )
     if isinstance(content, bytes):
         path.write_bytes(content)
     elif isinstance(content, dict):
@@ -379,7 +477,9 @@ def test_wrong_paths_and_viewpoints_are_refused_by_name(tmp_path, points):
         with pytest.raises(CloudFileError, match=words):
             read_cloud(tmp_path / name)
     for viewpoint in ([0.0, 1.0], ["x", 0.0, 1.0]):
-        with pytest.raises((BadArgument, TypeError), match="viewpoint"):  # TypeError: annotations are checked in tests
+        with pytest.raises(
+            (BadArgument, TypeError), match="viewpoint"
+        ):  # TypeError: annotations are checked in tests
             read_cloud(tmp_path / "a.npy", viewpoint=viewpoint)  # pyright: ignore[reportArgumentType]
     with pytest.raises(OutputError):
         save_cloud(PointCloud(torch.from_numpy(points)), tmp_path / "a.npy" / "b.npz")

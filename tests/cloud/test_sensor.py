@@ -7,7 +7,14 @@ import torch
 import trimesh
 
 from torchgrasp.cloud.camera import INTRINSICS, look_at, partial_view, render_depth
-from torchgrasp.cloud.sensor import ACTIVE_STEREO, SENSORS, SensorNoise, add_noise, estimate_noise, median_depth
+from torchgrasp.cloud.sensor import (
+    ACTIVE_STEREO,
+    SENSORS,
+    SensorNoise,
+    add_noise,
+    estimate_noise,
+    median_depth,
+)
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.plane import Plane
@@ -43,7 +50,9 @@ def test_the_noise_of_a_kinect_is_that_of_its_paper():
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_bias_is_smooth_and_of_its_size(name):
-    noise = dataclasses.replace(sensor(name), disparity=0.0, step=1e-6, floor=0.0, growth=0.0, lost=0.0)
+    noise = dataclasses.replace(
+        sensor(name), disparity=0.0, step=1e-6, floor=0.0, growth=0.0, lost=0.0
+    )
     errors = wall(0.8, noise).reshape(240, 320)
     assert float(errors.std()) == pytest.approx(noise.bias, rel=0.05)
     assert float((errors[:, 1:] - errors[:, :-1]).std()) < 0.15 * noise.bias
@@ -51,7 +60,9 @@ def test_the_bias_is_smooth_and_of_its_size(name):
 
 def test_neighbouring_pixels_of_a_grain_have_similar_noise():
     def likeness(grain):
-        errors = wall(1.0, SensorNoise(growth=0.002, bias=0.0, lost=0.0, grain=grain)).reshape(240, 320)
+        errors = wall(1.0, SensorNoise(growth=0.002, bias=0.0, lost=0.0, grain=grain)).reshape(
+            240, 320
+        )
         return float((errors[:, 1:] * errors[:, :-1]).mean() / errors.square().mean())
 
     assert abs(likeness(0.0)) < 0.05
@@ -61,16 +72,24 @@ def test_neighbouring_pixels_of_a_grain_have_similar_noise():
 def test_the_second_camera_misses_a_strip_beside_a_nearer_surface():
     depth = torch.full((40, 200), 1.0, dtype=torch.float64)
     depth[:, 100:150] = 0.5
-    exact = SensorNoise(base=30.0, step=1e-6, bias=0.0, flying=0.0, lost_rim=0.0, lost=0.0, shadow=True)
+    exact = SensorNoise(
+        base=30.0, step=1e-6, bias=0.0, flying=0.0, lost_rim=0.0, lost=0.0, shadow=True
+    )
     seen = add_noise(depth, torch.ones_like(depth), torch.Generator(), exact)
     missing = torch.nonzero(seen[20] == 0)[:, 0]
-    assert missing.tolist() == list(range(int(missing[0]), 100))  # up to the nearer surface's left rim
+    assert missing.tolist() == list(
+        range(int(missing[0]), 100)
+    )  # up to the nearer surface's left rim
     assert len(missing) == pytest.approx(30.0 * (1 / 0.5 - 1 / 1.0), abs=2)
 
 
 def test_a_camera_is_chosen_by_name_or_by_its_noise():
-    ball, pose = trimesh.creation.icosphere(radius=0.04), look_at(0.0, 30.0)
-    views = {name: partial_view(ball, pose, noise=noise).points for name, noise in [("True", True), *SENSORS.items()]}
+    ball = trimesh.creation.icosphere(radius=0.04)
+    pose = look_at(0.0, 30.0)
+    views = {
+        name: partial_view(ball, pose, noise=noise).points
+        for name, noise in [("True", True), *SENSORS.items()]
+    }
     assert torch.equal(views["True"], partial_view(ball, pose, noise=ACTIVE_STEREO).points)
     for name in SENSORS:
         assert torch.equal(views[name], partial_view(ball, pose, noise=name).points)
@@ -87,7 +106,8 @@ def test_an_unknown_camera_is_refused_by_name():
 
 @pytest.mark.parametrize("name", SENSORS)
 def test_the_noise_of_a_sensor_is_estimated_from_its_table(name):
-    pose, noise = look_at(20.0, 45.0, 0.7), SENSORS[name]
+    pose = look_at(20.0, 45.0, 0.7)
+    noise = SENSORS[name]
     table = Plane.horizontal(0.0).moved(inverse(pose))
     depth, labels = render_depth([BRICK], pose, noise=name)
     found = estimate_noise(depth, INTRINSICS, table, labels == 0)
@@ -106,14 +126,17 @@ def frames(count: int, pose):
 
 def test_the_median_of_frames_has_less_noise_and_fewer_holes():
     pose = look_at(20.0, 45.0, 0.7)
-    seen, exact = frames(5, pose), render_depth([BRICK], pose, noise=False)[0]
+    seen = frames(5, pose)
+    exact = render_depth([BRICK], pose, noise=False)[0]
     middle = median_depth(seen)
 
     def error(depth):
         return float((depth - exact)[(depth > 0) & (exact > 0)].abs().median())
 
     assert error(middle) < 0.6 * error(seen[0])
-    assert int(((middle == 0) & (exact > 0)).sum()) < 0.7 * int(((seen[0] == 0) & (exact > 0)).sum())
+    assert int(((middle == 0) & (exact > 0)).sum()) < 0.7 * int(
+        ((seen[0] == 0) & (exact > 0)).sum()
+    )
     assert not bool(middle[exact == 0].any())
 
 

@@ -21,12 +21,15 @@ ELEVATIONS = (20.0, 45.0, 70.0)
 
 @functools.cache
 def view(name, elevation, table=False):
-    """Return a noisy view of a shipped object, with or without the table about it, and the camera's pose."""
+    """Return a noisy view of a shipped object, with or without the table about it, and the camera's
+    pose.
+    """
     mesh = load_object(name).mesh
     pose = look_at(10.0 + 3 * elevation, elevation, 0.6, mesh)
     if not table:
         return partial_view(mesh, pose, 800, seed=int(elevation)), pose
-    bottom, middle = float(mesh.bounds[0, 2]), mesh.bounds.mean(0)
+    bottom = float(mesh.bounds[0, 2])
+    middle = mesh.bounds.mean(0)
     ground = box((0.3, 0.3, 0.01), (*middle[:2], bottom - 0.005))
     whole = trimesh.util.concatenate([mesh, ground])
     return partial_view(whole, pose, 2500, seed=int(elevation)), pose
@@ -38,17 +41,25 @@ def test_a_guessed_camera_is_above_the_support_in_any_frame(name, elevation):
     turn = rotation_from_vector(torch.tensor([1.0, 0.7, elevation]).double())
     for table in (True, False):  # the support is seen, or its normal is given
         points = view(name, elevation, table)[0].points.double() @ turn.T
-        guess, angle = guess_viewpoint(points, fit_local_planes(points)[0], None if table else turn[:, 2])
+        guess, angle = guess_viewpoint(
+            points, fit_local_planes(points)[0], None if table else turn[:, 2]
+        )
         assert float(guess @ turn[:, 2]) > float((points @ turn[:, 2]).min()) and 0 < angle <= 180
 
 
 @pytest.mark.parametrize(
     ("name", "elevation", "known"),
-    [(name, one, (k + i) % 2 == 0) for k, name in enumerate(list_objects()) for i, one in enumerate(ELEVATIONS)],
+    [
+        (name, one, (k + i) % 2 == 0)
+        for k, name in enumerate(list_objects())
+        for i, one in enumerate(ELEVATIONS)
+    ],
 )
 def test_a_cloud_in_the_frame_of_its_camera_is_told(name, elevation, known):
     cloud, pose = view(name, elevation)
-    own = PointCloud(apply(inverse(pose), cloud.points), None, torch.zeros(3).double() if known else None)
+    own = PointCloud(
+        apply(inverse(pose), cloud.points), None, torch.zeros(3).double() if known else None
+    )
     refused = [str(advice) for advice in diagnose_cloud(own).advice if advice.refused]
     assert any("camera's frame" in sentence and "--up" in sentence for sentence in refused)
 
@@ -57,7 +68,8 @@ def test_a_cloud_in_the_frame_of_its_camera_is_told(name, elevation, known):
 @pytest.mark.parametrize("name", list_objects())
 def test_a_possible_viewpoint_is_kept_and_one_below_is_not(name, elevation):
     points = view(name, elevation, table=True)[0].points.double()
-    normals, (_, pose) = fit_local_planes(points)[0], view(name, elevation)
+    normals = fit_local_planes(points)[0]
+    (_, pose) = view(name, elevation)
     assert can_see(points, normals, pose[:3, 3])
     if elevation < 60:  # from far below, a table hides few points of what stands on it
         assert not can_see(points, normals, 2 * points.mean(0) - pose[:3, 3])

@@ -1,4 +1,6 @@
-"""An analytic shape as a stand-in of the learned one: an ellipsoid whose uncertainty grows away from a camera."""
+"""An analytic shape as a stand-in of the learned one: an ellipsoid whose uncertainty grows away
+from a camera.
+"""
 
 import dataclasses
 
@@ -13,7 +15,9 @@ from torchgrasp.shape.estimate import SurfaceJet
 
 @dataclasses.dataclass(frozen=True)
 class Ellipsoid:
-    """q(x) = (|x / axes|^2 - 1) / 2 as distance, variance c (1 - x . view)^2, all in normalised units."""
+    """q(x) = (|x / axes|^2 - 1) / 2 as distance, variance c (1 - x . view)^2, all in normalised
+    units.
+    """
 
     axes: tuple[float, float, float] = (1.0, 0.6, 0.5)
     view: tuple[float, float, float] = (0.6, 0.8, 0.0)

@@ -1,4 +1,6 @@
-"""Certificates against a programme written from Eq. (13) alone, and the cases in which Eq. (13) is not enough."""
+"""Certificates against a programme written from Eq. (13) alone, and the cases in which Eq. (13) is
+not enough.
+"""
 
 import math
 import sys
@@ -29,7 +31,9 @@ def leaning(generator: torch.Generator, count: int) -> tuple[Tensor, Tensor]:
 
 def test_eq13_margins_agree_with_a_programme_written_from_the_equation_alone(generator):
     points, normals = leaning(generator, 60)
-    found = certify(Contacts(points, normals), ContactSpec(friction=0.6, friction_margin=1.0, edges=64))
+    found = certify(
+        Contacts(points, normals), ContactSpec(friction=0.6, friction_margin=1.0, edges=64)
+    )
     oracle = real([closure_margin(p, n, 0.6, 64)[0] for p, n in zip(points, normals, strict=True)])
     # With 64 edges the margin hardly depends on the tangent from which they are counted.
     torch.testing.assert_close(found.margin, oracle, atol=2e-4, rtol=0.05)
@@ -41,8 +45,11 @@ def test_eq13_margins_agree_with_a_programme_written_from_the_equation_alone(gen
 
 def exact_products(wrench: Tensor, witness: Tensor) -> list[Fraction]:
     """The products of a wrench with the edges in rational arithmetic: no rounding."""
-    rows, w = wrench.tolist(), [Fraction(x) for x in witness.tolist()]
-    return [sum((Fraction(x) * y for x, y in zip(row, w, strict=True)), Fraction(0)) for row in rows]
+    rows = wrench.tolist()
+    w = [Fraction(x) for x in witness.tolist()]
+    return [
+        sum((Fraction(x) * y for x, y in zip(row, w, strict=True)), Fraction(0)) for row in rows
+    ]
 
 
 @pytest.mark.promise("N2")
@@ -50,12 +57,15 @@ def test_open_rows_carry_a_wrench_that_no_contact_opposes(generator):
     points, normals = leaning(generator, 100)
     found = certify(Contacts(points, normals), SPEC)
     edges = wrenches(points, normals, 0.6, 8).flatten(1, 2)
-    torch.testing.assert_close(torch.linalg.vector_norm(found.witness, dim=-1), torch.ones(100, dtype=torch.float64))
+    torch.testing.assert_close(
+        torch.linalg.vector_norm(found.witness, dim=-1), torch.ones(100, dtype=torch.float64)
+    )
     open_rows = torch.nonzero(~found.closed)[:, 0].tolist()
     assert len(open_rows) > 20
     for row in open_rows:
         products = exact_products(edges[row], found.witness[row])
-        # A margin of 0 is no rarity: two contacts balance by themselves, and the third has nothing to push against.
+        # A margin of 0 is no rarity: two contacts balance by themselves, and the third has nothing
+        # to push against.
         assert min(products) > (0 if float(found.margin[row]) < -1e-12 else -1e-15)
         assert max(products) > 1e-3
     closed = exact_products(edges[found.closed][0], found.witness[found.closed][0])
@@ -72,7 +82,9 @@ def test_margin_and_witness_bound_each_other_so_that_neither_can_be_improved(gen
 
 
 @pytest.mark.parametrize("edges", [3, 8, 32])
-def test_highs_gives_the_same_certificates_where_the_batch_gives_none(generator, monkeypatch, edges):
+def test_highs_gives_the_same_certificates_where_the_batch_gives_none(
+    generator, monkeypatch, edges
+):
     points, normals = leaning(generator, 40)
     spec = ContactSpec(friction=0.6, friction_margin=1.0, edges=edges)
     batch = certify(Contacts(points, normals), spec)
@@ -127,7 +139,8 @@ def test_coincident_and_collinear_contacts_are_refused_though_eq13_holds_for_the
     found = certify(Contacts(points, spokes()), SPEC)
     assert float(found.margin) > 0 and float(found.rank_ratio) < 1e-9 and not bool(found.closed)
     assert float((wrenches(points, spokes(), 0.6) @ found.witness[0]).abs().max()) < 1e-9
-    line, normals = real([[[-1.0, 0, 0], [1, 0, 0], [0.4, 0, 0]]]), real([[[-1.0, 0, 0], [1, 0, 0], [1, 0, 0]]])
+    line = real([[[-1.0, 0, 0], [1, 0, 0], [0.4, 0, 0]]])
+    normals = real([[[-1.0, 0, 0], [1, 0, 0], [1, 0, 0]]])
     found = certify(Contacts(line, normals), SPEC)
     assert float(found.margin) > 0 and not bool(found.closed)
     # No contact on the x axis can turn the object about it.
@@ -136,8 +149,10 @@ def test_coincident_and_collinear_contacts_are_refused_though_eq13_holds_for_the
 
 @pytest.mark.promise("I7")
 def test_rows_that_are_not_finite_are_not_closed_and_harm_no_other_and_no_rows_give_none():
-    points, normals = spokes().repeat(3, 1, 1), spokes().repeat(3, 1, 1)
-    points[1, 0, 0], normals[2, 1] = torch.nan, torch.nan
+    points = spokes().repeat(3, 1, 1)
+    normals = spokes().repeat(3, 1, 1)
+    points[1, 0, 0] = torch.nan
+    normals[2, 1] = torch.nan
     found = certify(Contacts(points, normals), SPEC)
     assert found.closed.tolist() == [True, False, False]
     assert found.witness.isnan().all(-1).tolist() == [False, True, True]
@@ -152,5 +167,7 @@ def test_rows_that_are_not_finite_are_not_closed_and_harm_no_other_and_no_rows_g
 def test_certify_accepts_no_balance_with_a_residual(monkeypatch, residual, closed):
     module = sys.modules["torchgrasp.contacts.certify"]  # the package has a function of this name
     monkeypatch.setattr(module, "EXACT", -1.0)  # every row is given to HiGHS
-    monkeypatch.setattr(module, "solve_by_highs", lambda wrench: (0.01, residual, None, torch.zeros(len(wrench))))
+    monkeypatch.setattr(
+        module, "solve_by_highs", lambda wrench: (0.01, residual, None, torch.zeros(len(wrench)))
+    )
     assert bool(certify(Contacts(spokes(), spokes()), SPEC).closed) is closed

@@ -22,7 +22,9 @@ def test_a_sure_shape_is_sure_to_be_closed():
         assert float(none.probability) < 0.02
 
 
-def test_the_probability_is_a_share_with_a_bounded_error_and_bad_arguments_are_named(doubtful, generator):
+def test_the_probability_is_a_share_with_a_bounded_error_and_bad_arguments_are_named(
+    doubtful, generator
+):
     contacts = contacts_on(doubtful, generator, 100)
     for friction in (0.5, 1.0):
         found = closure_probability(doubtful, contacts, ContactSpec(friction=friction), n=1000)
@@ -54,9 +56,13 @@ def test_surfaces_drawn_anew_are_closed_as_often(doubtful, generator, fingertips
 
 
 @pytest.mark.parametrize("fingertips", [3, 5])
-def test_rows_do_not_depend_on_each_other_and_a_seed_fixes_every_bit(doubtful, generator, fingertips):
+def test_rows_do_not_depend_on_each_other_and_a_seed_fixes_every_bit(
+    doubtful, generator, fingertips
+):
     contacts = contacts_on(doubtful, generator, 20, fingertips)
-    every, again, other = (closure_probability(doubtful, contacts, n=300, seed=seed) for seed in (3, 3, 4))
+    every, again, other = (
+        closure_probability(doubtful, contacts, n=300, seed=seed) for seed in (3, 3, 4)
+    )
     assert torch.equal(every.probability, again.probability)
     assert not torch.equal(every.probability, other.probability)
     some = closure_probability(doubtful, contacts[[4, 11]], n=300, seed=3)

@@ -43,11 +43,17 @@ def tripods(count, seed, fingertips=3):
 def judged(fingertips):
     """Eight tripods, and the least friction that balances each."""
     points, normals = tripods(8, 2, fingertips)
-    return points, normals, [least_ratio(p.numpy(), n.numpy()) for p, n in zip(points, normals, strict=True)]
+    return (
+        points,
+        normals,
+        [least_ratio(p.numpy(), n.numpy()) for p, n in zip(points, normals, strict=True)],
+    )
 
 
 def least_ratio(points, normals):
-    """The least friction (tangent) that balances contacts: bisection over LPs with a fine polygonal cone."""
+    """The least friction (tangent) that balances contacts: bisection over LPs with a fine polygonal
+    cone.
+    """
     angles = np.linspace(0, 2 * np.pi, 64, endpoint=False)
 
     def balances(friction):
@@ -62,11 +68,17 @@ def least_ratio(points, normals):
         scaled = np.concatenate([matrix / 0.04, np.ones((1, 64 * f))])
         least = -ones  # each contact presses with at least 2 % of the sum
         answer = linprog(
-            np.zeros(64 * f), A_ub=least, b_ub=-0.02 * np.ones(f), A_eq=scaled, b_eq=np.eye(7)[6], method="highs"
+            np.zeros(64 * f),
+            A_ub=least,
+            b_ub=-0.02 * np.ones(f),
+            A_eq=scaled,
+            b_eq=np.eye(7)[6],
+            method="highs",
         )
         return answer.status == 0
 
-    low, high = 0.0, 8.0
+    low = 0.0
+    high = 8.0
     for _ in range(12):
         middle = (low + high) / 2
         low, high = (low, middle) if balances(middle) else (middle, high)
@@ -91,7 +103,9 @@ def test_least_friction_forces_balance_are_scaled_and_come_nearer_to_the_preferr
     forces = least_friction_forces(points, normals, 5.0)
     good = torch.isfinite(forces).all(-1).all(-1)
     assert good.float().mean() > 0.8
-    points, normals, forces = points[good], normals[good], forces[good]
+    points = points[good]
+    normals = normals[good]
+    forces = forces[good]
     assert forces.sum(-2).abs().max() < 1e-9
     assert torch.linalg.cross(points, forces).sum(-2).abs().max() < 1e-9
     push = -(forces * normals).sum(-1)
@@ -107,14 +121,20 @@ def test_least_friction_forces_balance_are_scaled_and_come_nearer_to_the_preferr
     assert off(wanted[None]) < 0.97 * off(None)
     nothing = torch.zeros(2, 0, fingertips, 3)
     assert least_friction_forces(nothing, nothing).shape == nothing.shape
-    assert least_friction_forces(nothing[0], nothing[0], 4.0, nothing[0, ..., 0]).shape == nothing.shape[1:]
+    assert (
+        least_friction_forces(nothing[0], nothing[0], 4.0, nothing[0, ..., 0]).shape
+        == nothing.shape[1:]
+    )
 
 
 @FINGERTIPS
 def test_least_friction_and_central_forces_agree_with_linear_programmes(fingertips):
     points, normals, oracles = judged(fingertips)
     central = central_forces(points, normals, points.new_ones(8, fingertips), 1e-3)
-    found = (tangential_ratio(x, normals).amax(-1) for x in (least_friction_forces(points, normals, 1.0), central))
+    found = (
+        tangential_ratio(x, normals).amax(-1)
+        for x in (least_friction_forces(points, normals, 1.0), central)
+    )
     compared = 0
     for oracle, searched, centred in zip(oracles, *found, strict=True):
         if not torch.isfinite(searched):
@@ -134,13 +154,17 @@ def test_least_friction_forces_of_a_pinch_are_even_turn_with_the_frame_and_need_
     assert tangential_ratio(forces, normals).max() < 1e-2
     there = least_friction_forces(points @ TURN.T, normals @ TURN.T, 6.0)
     assert (forces @ TURN.T - there).abs().max() < 0.15
-    assert torch.isnan(least_friction_forces(points, normals[:1].expand(3, 3).contiguous(), 4.0)).all()
+    assert torch.isnan(
+        least_friction_forces(points, normals[:1].expand(3, 3).contiguous(), 4.0)
+    ).all()
 
 
 def test_search_and_central_forces_agree():
     points, normals = tripods(40, 5)
     searched = tangential_ratio(least_friction_forces(points, normals), normals).amax(-1)
-    centred = tangential_ratio(central_forces(points, normals, points.new_ones(40, 3), 1e-3), normals).amax(-1)
+    centred = tangential_ratio(
+        central_forces(points, normals, points.new_ones(40, 3), 1e-3), normals
+    ).amax(-1)
     good = searched < 2.0
     assert int(good.sum()) > 25
     assert float((centred - searched)[good].max()) < 0.01  # the search also weighs evenness
@@ -154,12 +178,16 @@ def test_least_friction_forces_do_not_depend_on_the_batch(uneven):
     together = least_friction_forces(points, normals, 4.0, preferred)
     assert int(torch.isfinite(together).flatten(1).all(1).sum()) > 15
     for k in range(20):
-        alone = least_friction_forces(points[k], normals[k], 4.0, None if preferred is None else preferred[k])
+        alone = least_friction_forces(
+            points[k], normals[k], 4.0, None if preferred is None else preferred[k]
+        )
         torch.testing.assert_close(alone, together[k], rtol=0, atol=1e-9, equal_nan=True)
 
 
 def test_least_friction_forces_of_five_fingers_follow_the_preferred_ones():
-    points = real([*([0.03, y, z] for y in (-0.02, 0.02) for z in (-0.02, 0.02)), [-0.03, 0.0, 0.0]])
+    points = real(
+        [*([0.03, y, z] for y in (-0.02, 0.02) for z in (-0.02, 0.02)), [-0.03, 0.0, 0.0]]
+    )
     normals = real([[1.0, 0, 0]] * 4 + [[-1.0, 0, 0]])
     push = -(least_friction_forces(points, normals, 8.0) * normals).sum(-1)
     near(push, real([2.0, 2, 2, 2, 8]), 0.01)

@@ -7,17 +7,26 @@ import torch
 
 from tests.make import HALF_BALL_RADIUS as RADIUS
 from tests.make import contacts_on, near
-from torchgrasp.contacts.closure_probability import FOOTPRINT, NODES, first_contact, grid, line_posterior
+from torchgrasp.contacts.closure_probability import (
+    FOOTPRINT,
+    NODES,
+    first_contact,
+    grid,
+    line_posterior,
+)
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.posterior import combined_covariance
 
 
-def test_a_finger_stops_where_the_drawn_distance_turns_negative_nearest_to_its_contact(doubtful, generator):
+def test_a_finger_stops_where_the_drawn_distance_turns_negative_nearest_to_its_contact(
+    doubtful, generator
+):
     lines = line_posterior(doubtful, contacts_on(doubtful, generator, 5))
     drawn = 2 * torch.randn(5, 60, 60, generator=generator, dtype=torch.float64) @ lines.root
     points, normals = first_contact(lines, drawn)
     value = drawn.unflatten(-1, (3, len(NODES), 4))
-    t, nodes = grid().flip(0).numpy(), np.array(NODES[::-1])
+    t = grid().flip(0).numpy()
+    nodes = np.array(NODES[::-1])
     met = 0
     for b, n, i in itertools.product(range(5), range(60), range(3)):
         deviation = np.interp(t, nodes, value[b, n, i, :, 0].flip(0).numpy())
@@ -52,7 +61,9 @@ def test_the_posterior_on_the_lines_is_that_of_distance_and_normal(doubtful, gen
         near(lines.slope[b, i, k], mean[0, 1:], 1e-10)
         if float(torch.linalg.vector_norm(at)) <= edge:
             variance = doubtful.std_factor**2 * covariance[0, 0, 0]
-            torch.testing.assert_close(deviation[b, i, k, 0, i, k, 0], variance, rtol=1e-6, atol=1e-12)
+            torch.testing.assert_close(
+                deviation[b, i, k, 0, i, k, 0], variance, rtol=1e-6, atol=1e-12
+            )
             held += 1
     assert 20 < held < 45  # outside the domain deviations are those at its edge
 
@@ -62,7 +73,9 @@ def distance_covariance(posterior, x):
     return combined_covariance(posterior, x[:, :, None], x.new_ones(1, 1, 1, 1))
 
 
-def test_covariances_of_distances_and_their_sums_are_those_of_the_joint_posterior(doubtful, generator):
+def test_covariances_of_distances_and_their_sums_are_those_of_the_joint_posterior(
+    doubtful, generator
+):
     x = unit(torch.randn(3, 2, 4, 3, generator=generator, dtype=torch.float64))
     weights = torch.randn(3, 2, 2, 4, generator=generator, dtype=torch.float64)
     whole = torch.stack([torch.block_diag(*blocks) for blocks in weights])

@@ -1,4 +1,6 @@
-"""Regions: signed distances against sampled borders and another library's, masks against the pixels that they mark."""
+"""Regions: signed distances against sampled borders and another library's, masks against the pixels
+that they mark.
+"""
 
 import numpy as np
 import pytest
@@ -12,28 +14,38 @@ from torchgrasp.contacts.region import combine
 from torchgrasp.foundation.errors import BadArgument, MeshError
 from torchgrasp.geometry.frames import apply
 
-LOW, HIGH = real([-0.03, -0.02, 0.01]), real([0.05, 0.04, 0.06])
+LOW = real([-0.03, -0.02, 0.01])
+HIGH = real([0.05, 0.04, 0.06])
 
 
-def test_a_box_and_a_mesh_have_the_distance_of_a_sampled_border_and_the_sign_of_the_corners(generator):
+def test_a_box_and_a_mesh_have_the_distance_of_a_sampled_border_and_the_sign_of_the_corners(
+    generator,
+):
     pose = random_motion(3)
-    mesh = trimesh.creation.box(bounds=np.stack([LOW.numpy(), HIGH.numpy()])).apply_transform(pose.numpy())
+    mesh = trimesh.creation.box(bounds=np.stack([LOW.numpy(), HIGH.numpy()])).apply_transform(
+        pose.numpy()
+    )
     border = torch.from_numpy(trimesh.sample.sample_surface(mesh, 50_000, seed=0)[0])
-    local = LOW + (HIGH - LOW) * (2 * torch.rand(200, 3, generator=generator, dtype=torch.float64) - 0.5)
+    local = LOW + (HIGH - LOW) * (
+        2 * torch.rand(200, 3, generator=generator, dtype=torch.float64) - 0.5
+    )
     points = apply(pose, local)
     inside = ((local > LOW) & (local < HIGH)).all(1)
     for region in (Region.box(LOW, HIGH, pose), Region.mesh(mesh)):
         found = region(points)
         assert torch.equal(found < 0, inside)
         beyond = torch.cdist(points, border).amin(1) - found.abs()
-        assert -1e-9 < float(beyond.min()) and float(beyond.max()) < 1e-3  # samples lie farther than the border
+        assert (
+            -1e-9 < float(beyond.min()) and float(beyond.max()) < 1e-3
+        )  # samples lie farther than the border
     assert Region.box(LOW, HIGH)(torch.zeros(2, 5, 3)).shape == (2, 5)  # and keeps the dtype
     assert Region.box(LOW, HIGH)(torch.zeros(3)).dtype == torch.float32
 
 
 def test_a_mask_is_the_cone_of_its_pixels_with_the_unseen_side():
     scene = see((0.0, 0.0, 0.06, 0.12), (0.0, -0.1, 0.06, 0.14))
-    region, camera = Region.mask(scene, scene.pixel_labels == 1), scene.viewpoint.double()
+    region = Region.mask(scene, scene.pixel_labels == 1)
+    camera = scene.viewpoint.double()
     seen = scene.points.double()
     own = scene.labels == 1
     assert torch.equal(region(seen) < 0, own)
@@ -46,7 +58,8 @@ def test_a_mask_is_the_cone_of_its_pixels_with_the_unseen_side():
 
 
 def test_regions_combine_and_tell_what_is_no_region():
-    ball, box = Region(lambda x: x.norm(dim=-1) - 0.05), Region.box(LOW, HIGH)
+    ball = Region(lambda x: x.norm(dim=-1) - 0.05)
+    box = Region.box(LOW, HIGH)
     points = real([[0.0, 0, 0], [0.0, 0, 0.03], [0.0, 0, 0.09]])
     both = combine(ball, box)
     assert both is not None and (both(points) < 0).tolist() == [True, False, False]
@@ -79,12 +92,15 @@ def test_the_row_of_a_region_is_its_distance_with_its_gradient(ellipsoid, genera
 def test_planned_contacts_lie_in_the_region_or_say_so(spec):
     view = load_object("jug").view
     region = Region.rim(view, 0.0, 0.4)
-    shape, inside = fit_shape(view, table=0.0), ContactSpec(**vars(spec) | {"region": region})
+    shape = fit_shape(view, table=0.0)
+    inside = ContactSpec(**vars(spec) | {"region": region})
     free, kept = (plan_contacts(shape, one, 30) for one in (spec, inside))
     good = kept.status == Status.OK
     assert bool((region(kept.contacts.points[good]) < 0).all()) and int(good.sum()) > 10
     beyond = (region(free.contacts.points) > 0).any(1) & (free.status == Status.OK)
     assert int(beyond.sum()) > 10  # the region is no matter of course
-    missed = plan_contacts(shape, ContactSpec(**vars(spec) | {"region": lambda x: x[:, 2] + 1.0}), 20)
+    missed = plan_contacts(
+        shape, ContactSpec(**vars(spec) | {"region": lambda x: x[:, 2] + 1.0}), 20
+    )
     assert not bool((missed.status == Status.OK).any())
     assert int((missed.status == Status.OUTSIDE).sum()) > 10

@@ -1,4 +1,6 @@
-"""How much of a load contacts resist: against HiGHS, and by both proofs, checked in the frame of the caller."""
+"""How much of a load contacts resist: against HiGHS, and by both proofs, checked in the frame of
+the caller.
+"""
 
 import numpy as np
 import pytest
@@ -16,18 +18,28 @@ PLACE = real([1.0, 2.0, 0.5])
 
 
 def wrench_matrix(points, normals):
-    """Wrenches (6, f e) about the origin of the forces along the cones' edges, with normal parts of 1 N."""
-    edges = cone_edges(normals[None], tangents(points[None], normals[None]), SPEC.planned_friction, SPEC.edges)[0]
+    """Wrenches (6, f e) about the origin of the forces along the cones' edges, with normal parts of
+    1 N.
+    """
+    edges = cone_edges(
+        normals[None], tangents(points[None], normals[None]), SPEC.planned_friction, SPEC.edges
+    )[0]
     return np.concatenate([edges, np.cross(points[:, None], edges)], -1).reshape(-1, 6).T
 
 
 def by_highs(points, normals, strength, load) -> float:
-    matrix, f = wrench_matrix(points, normals), len(points)
+    matrix = wrench_matrix(points, normals)
+    f = len(points)
     most = np.zeros((f, matrix.shape[1] + 1))
     for contact in range(f):
         most[contact, contact * SPEC.edges : (contact + 1) * SPEC.edges] = 1
     found = linprog(
-        np.r_[np.zeros(matrix.shape[1]), -1], most, strength, np.c_[matrix, load], np.zeros(6), method="highs"
+        np.r_[np.zeros(matrix.shape[1]), -1],
+        most,
+        strength,
+        np.c_[matrix, load],
+        np.zeros(6),
+        method="highs",
     )
     return -found.fun
 
@@ -35,7 +47,8 @@ def by_highs(points, normals, strength, load) -> float:
 @pytest.fixture(params=[3, 4, 5])
 def case(request, generator) -> tuple[Resisted, tuple]:
     """Random contacts and loads on an object far from the origin, and what they resist."""
-    b, f = 40, request.param
+    b = 40
+    f = request.param
     arms, noise = (torch.randn(b, f, 3, generator=generator, dtype=torch.float64) for _ in range(2))
     normals = unit(unit(arms - arms.mean(1, keepdim=True)) + 0.3 * noise)
     points = 0.05 * arms + PLACE
@@ -50,7 +63,9 @@ def case(request, generator) -> tuple[Resisted, tuple]:
 def test_the_margin_is_the_least_of_highs_over_the_loads(case):
     found, (points, normals, strength, loads) = case
     for k, margin in enumerate(found.margin.tolist()):
-        margins = [by_highs(points[k], normals[k], strength[k].numpy(), load) for load in loads[k].numpy()]
+        margins = [
+            by_highs(points[k], normals[k], strength[k].numpy(), load) for load in loads[k].numpy()
+        ]
         assert margin == pytest.approx(min(margins), abs=1e-9)
     assert 5 < int((found.margin > 0.01).sum()) and bool((found.margin < 0.01).any())
 
@@ -60,13 +75,19 @@ def test_forces_prove_that_it_is_no_less_and_the_twist_that_it_is_no_more(case):
     arms = points - points.mean(1, keepdim=True)
     push = -(found.forces * normals).sum(-1)
     slide = torch.linalg.vector_norm(found.forces + push[..., None] * normals, dim=-1)
-    assert bool((slide <= SPEC.planned_friction * push + 1e-9).all())  # the cone with edges lies in the round one
+    assert bool(
+        (slide <= SPEC.planned_friction * push + 1e-9).all()
+    )  # the cone with edges lies in the round one
     assert bool((push <= strength + 1e-9).all())
     total = torch.cat([found.forces.sum(1), torch.linalg.cross(arms, found.forces).sum(1)], -1)
     torch.testing.assert_close(total, -found.margin[:, None] * found.load, atol=1e-8, rtol=0)
     work = (found.twist * found.load).sum(-1)
     assert bool((work < 0).all())
     for k in range(len(points)):
-        gain = (found.twist[k].numpy() @ wrench_matrix(arms[k], normals[k])).reshape(len(points[k]), -1).max(1)
+        gain = (
+            (found.twist[k].numpy() @ wrench_matrix(arms[k], normals[k]))
+            .reshape(len(points[k]), -1)
+            .max(1)
+        )
         bound = float((strength[k].numpy() * np.maximum(gain, 0)).sum() / -work[k])
         assert bound == pytest.approx(float(found.margin[k]), abs=1e-8)

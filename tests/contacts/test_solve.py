@@ -1,4 +1,6 @@
-"""Plans on an analytic shape: every constraint re-checked from outside, statuses, seeds, given starts."""
+"""Plans on an analytic shape: every constraint re-checked from outside, statuses, seeds, given
+starts.
+"""
 
 import dataclasses
 import itertools
@@ -13,12 +15,21 @@ from torchgrasp.contacts.form_closure import wrenches
 from torchgrasp.contacts.plan import TO_CENTRE, plan_chunk, plan_contacts
 from torchgrasp.contacts.problem import ContactProblem
 from torchgrasp.contacts.solver import project
-from torchgrasp.contacts.starts import STARTS_PER_CHUNK, draw_in, drawn_starts, settle_flatness, start_chunks
+from torchgrasp.contacts.starts import (
+    STARTS_PER_CHUNK,
+    draw_in,
+    drawn_starts,
+    settle_flatness,
+    start_chunks,
+)
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.geometry.frames import degenerate
 from torchgrasp.geometry.linalg import unit
 
-SPECS = {"paper": ContactSpec.paper(), "table": ContactSpec(table=0.472, flatness=0.6, flat_radius=0.008)}
+SPECS = {
+    "paper": ContactSpec.paper(),
+    "table": ContactSpec(table=0.472, flatness=0.6, flat_radius=0.008),
+}
 
 
 @pytest.mark.parametrize("fingertips", [3, 4, 5])
@@ -34,13 +45,17 @@ def test_eq10_to_eq13_hold_for_every_row_that_is_ok(ellipsoid, name, fingertips)
     gradient = x / real(ellipsoid.axes) ** 2
     torch.testing.assert_close(good.contacts.normals, unit(gradient))  # Eq. (11)
     torch.testing.assert_close(good.contacts.variance, ellipsoid.doubt_at(x))
-    torch.testing.assert_close(good.contacts.std_m, 0.65 * 0.06 * ellipsoid.doubt_at(x).sqrt() / gradient.norm(dim=-1))
+    torch.testing.assert_close(
+        good.contacts.std_m, 0.65 * 0.06 * ellipsoid.doubt_at(x).sqrt() / gradient.norm(dim=-1)
+    )
     assert float(good.contacts.variance.max()) < spec.max_variance  # Eq. (12)
     assert bool(certify(good.contacts, spec).closed.all())  # Eq. (13)
     w = wrenches(good.contacts.points, good.contacts.normals, spec.planned_friction, spec.edges)
     assert float((good.coefficients[..., None] * w).sum((1, 2)).abs().max()) <= 1e-8
     assert float(good.coefficients.min()) > 0
-    torch.testing.assert_close(good.coefficients.sum((1, 2)), torch.ones(len(good), dtype=torch.float64))
+    torch.testing.assert_close(
+        good.coefficients.sum((1, 2)), torch.ones(len(good), dtype=torch.float64)
+    )
     centres = good.contacts.points + spec.fingertip_radius * good.contacts.normals
     for one, other in itertools.combinations(centres.unbind(1), 2):
         assert float(torch.linalg.vector_norm(one - other, dim=-1).min()) >= spec.least_separation
@@ -51,7 +66,11 @@ def test_eq10_to_eq13_hold_for_every_row_that_is_ok(ellipsoid, name, fingertips)
         assert float(tip.min()) >= spec.table - 1e-12
     if spec.flatness is not None:
         assert (
-            float(normal_variation(ellipsoid, x, good.contacts.normals, spec.ring_radius / ellipsoid.scale).max())
+            float(
+                normal_variation(
+                    ellipsoid, x, good.contacts.normals, spec.ring_radius / ellipsoid.scale
+                ).max()
+            )
             <= spec.flatness
         )
 
@@ -68,10 +87,14 @@ def test_eq14_contacts_approach_the_centre_of_the_shape(ellipsoid):
     plan = plan_chunk(ellipsoid, problem, first, TO_CENTRE)
     begun = check_feasibility(ellipsoid, problem, first)
     good = (plan.status == Status.OK) & (begun.status == Status.OK)
-    assert int(good.sum()) > 5 and float(plan.quality[good].mean()) < 0.9 * float(begun.quality[good].mean())
+    assert int(good.sum()) > 5 and float(plan.quality[good].mean()) < 0.9 * float(
+        begun.quality[good].mean()
+    )
 
 
-def test_same_seed_gives_the_same_bits_another_seed_another_plan_and_no_feasible_start_is_lost(ellipsoid):
+def test_same_seed_gives_the_same_bits_another_seed_another_plan_and_no_feasible_start_is_lost(
+    ellipsoid,
+):
     spec = SPECS["table"]
     one, two, other = (plan_contacts(ellipsoid, spec, starts=20, seed=s) for s in (5, 5, 6))
     assert torch.equal(one.contacts.points, two.contacts.points)
@@ -84,7 +107,9 @@ def test_same_seed_gives_the_same_bits_another_seed_another_plan_and_no_feasible
 
 
 def test_given_starts_keep_their_order_and_their_frame(ellipsoid, generator):
-    starts = ellipsoid.metres(0.1 * unit(torch.randn(12, 3, 3, generator=generator, dtype=torch.float64)))
+    starts = ellipsoid.metres(
+        0.1 * unit(torch.randn(12, 3, 3, generator=generator, dtype=torch.float64))
+    )
     forward = plan_contacts(ellipsoid, ContactSpec.paper(), starts)
     backward = plan_contacts(ellipsoid, ContactSpec.paper(), starts.flip(0))
     near(forward.contacts.points, backward.contacts.points.flip(0), 1e-6)
@@ -97,12 +122,16 @@ def test_given_starts_keep_their_order_and_their_frame(ellipsoid, generator):
 def test_a_start_without_a_gradient_is_named_and_harms_no_other(ellipsoid, generator, spec):
     around = 0.3 * unit(torch.randn(4, 3, 3, generator=generator, dtype=torch.float64))
     around[1] = 0.0  # the gradient vanishes in the centre, so no step to the surface is defined
-    plan, alone = (plan_contacts(ellipsoid, spec, ellipsoid.metres(s)) for s in (around, around[[0, 2, 3]]))
+    plan, alone = (
+        plan_contacts(ellipsoid, spec, ellipsoid.metres(s)) for s in (around, around[[0, 2, 3]])
+    )
     assert plan.status[1] == Status.OUT_OF_DOMAIN
     torch.testing.assert_close(plan.contacts.points[[0, 2, 3]], alone.contacts.points)
 
 
-def test_a_time_budget_bounds_how_many_starts_are_planned_and_changes_no_row(ellipsoid, monkeypatch):
+def test_a_time_budget_bounds_how_many_starts_are_planned_and_changes_no_row(
+    ellipsoid, monkeypatch
+):
     now = [0.0]
     monkeypatch.setattr("torchgrasp.contacts.plan.time.monotonic", lambda: now[0])
     whole = plan_contacts(ellipsoid, ContactSpec.paper(), starts=120)
@@ -128,7 +157,9 @@ def test_more_starts_only_add_rows(ellipsoid, monkeypatch):
 
 
 def test_far_starts_are_drawn_in_others_stay_and_chunks_hold_all(ellipsoid, generator):
-    on = project(ellipsoid, 0.9 * unit(torch.randn(3, 3, 3, generator=generator, dtype=torch.float64)), 8)
+    on = project(
+        ellipsoid, 0.9 * unit(torch.randn(3, 3, 3, generator=generator, dtype=torch.float64)), 8
+    )
     torch.testing.assert_close(draw_in(ellipsoid, on), on)
     drawn = draw_in(ellipsoid, 2 * on)
     torch.testing.assert_close(drawn.mean(1), torch.zeros(3, 3, dtype=torch.float64))
@@ -139,13 +170,17 @@ def test_far_starts_are_drawn_in_others_stay_and_chunks_hold_all(ellipsoid, gene
 
 
 @pytest.mark.parametrize(
-    ("radius", "flat"), [(0.04, 0.008), (0.018, 0.006), (0.012, 0.004), (0.0085, 0.003), (0.004, 0.003)]
+    ("radius", "flat"),
+    [(0.04, 0.008), (0.018, 0.006), (0.012, 0.004), (0.0085, 0.003), (0.004, 0.003)],
 )
 def test_contacts_of_a_ball_are_flat_within_the_widest_ring_that_it_offers(ellipsoid, radius, flat):
     ball = dataclasses.replace(ellipsoid, axes=(1.0, 1.0, 1.0), scale=radius, doubt=0.0)
     spec = ContactSpec()
     assert settle_flatness(ball, spec, 0).spec.flat_radius == flat
-    plan, there = (plan_contacts(ball, s, starts=25) for s in (spec, dataclasses.replace(spec, flat_radius=flat)))
+    plan, there = (
+        plan_contacts(ball, s, starts=25)
+        for s in (spec, dataclasses.replace(spec, flat_radius=flat))
+    )
     assert torch.equal(plan.contacts.points, there.contacts.points)
     given = dataclasses.replace(spec, flat_radius=0.002)
     assert settle_flatness(ball, given, 0).spec == given
@@ -178,7 +213,9 @@ def test_statuses_name_the_first_violation_in_order(ellipsoid):
     seen = dataclasses.replace(ellipsoid, doubt=1e-4)
 
     def status(points: torch.Tensor, spec: ContactSpec = spec, shape=seen) -> Status:
-        return Status(int(check_feasibility(shape, ContactProblem.of(shape, spec), points[None]).status[0]))
+        return Status(
+            int(check_feasibility(shape, ContactProblem.of(shape, spec), points[None]).status[0])
+        )
 
     assert status(around) is Status.OK
     assert status(around * 1.4) is Status.OUT_OF_DOMAIN
@@ -192,20 +229,34 @@ def test_statuses_name_the_first_violation_in_order(ellipsoid):
     assert status(touching, dataclasses.replace(spec, separation=0.0)) is Status.DEGENERATE
     assert status(around, dataclasses.replace(spec, flatness=0.1)) is Status.NOT_FLAT
     close = project(seen, real([[[1.0, 0, 0], [0.8, 0.4, 0], [0.8, -0.4, 0]]]), 8)[0]
-    assert status(close, dataclasses.replace(spec, friction=0.3, separation=0.01)) is Status.NOT_CLOSED
+    assert (
+        status(close, dataclasses.replace(spec, friction=0.3, separation=0.01)) is Status.NOT_CLOSED
+    )
     good = {
         Status.OFF_SURFACE: torch.tensor([True, False, True, False]),
         Status.NOT_CLOSED: torch.tensor([True, True, False, False]),
     }
-    assert first_violation(good).tolist() == [Status.OK, Status.OFF_SURFACE, Status.NOT_CLOSED, Status.OFF_SURFACE]
+    assert first_violation(good).tolist() == [
+        Status.OK,
+        Status.OFF_SURFACE,
+        Status.NOT_CLOSED,
+        Status.OFF_SURFACE,
+    ]
 
 
 def test_bad_arguments_are_refused(ellipsoid):
     wrong = (BadArgument, TypeError)  # TypeError: the annotations are checked in tests
     for name, bad in (
-        ("shape", None), ("spec", 0.8), ("starts", 0), ("starts", -3), ("starts", True), ("time_budget", 0.0),
-        ("time_budget", float("nan")), ("seed", -1), ("seed", 1.5),
-    ):  # fmt: skip
+        ("shape", None),
+        ("spec", 0.8),
+        ("starts", 0),
+        ("starts", -3),
+        ("starts", True),
+        ("time_budget", 0.0),
+        ("time_budget", float("nan")),
+        ("seed", -1),
+        ("seed", 1.5),
+    ):
         with pytest.raises(wrong, match=name):
             plan_contacts(**{"shape": ellipsoid, "starts": 3, name: bad})
     far = torch.zeros(2, 3, 3, dtype=torch.float64)

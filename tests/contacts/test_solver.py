@@ -1,4 +1,6 @@
-"""Steps of a batch: onto the surface and along it, never uphill, each triple by itself; and what they reach."""
+"""Steps of a batch: onto the surface and along it, never uphill, each triple by itself; and what
+they reach.
+"""
 
 import dataclasses
 
@@ -27,7 +29,9 @@ STAGE = Stage(centre=1.0, cones=1.0, steps=6)
 
 
 def triples(ellipsoid, generator: torch.Generator, count: int = 40) -> Tensor:
-    return project(ellipsoid, 0.7 * unit(torch.randn(count, 3, 3, generator=generator, dtype=torch.float64)), 8)
+    return project(
+        ellipsoid, 0.7 * unit(torch.randn(count, 3, 3, generator=generator, dtype=torch.float64)), 8
+    )
 
 
 def cost(ellipsoid, state: State) -> Tensor:
@@ -42,13 +46,17 @@ def test_points_go_to_the_nearest_place_and_a_stage_leaves_no_triple_worse(ellip
     found = project(sphere, points, 8)
     torch.testing.assert_close(found, 0.8 * unit(points))
     torch.testing.assert_close(project(sphere, found, 3), found)
-    problem, first = ContactProblem.of(ellipsoid, SPEC), start_state(ellipsoid, triples(ellipsoid, generator))
+    problem = ContactProblem.of(ellipsoid, SPEC)
+    first = start_state(ellipsoid, triples(ellipsoid, generator))
     last = descend(ellipsoid, problem, first, STAGE)
-    before, after = cost(ellipsoid, first), cost(ellipsoid, last)
+    before = cost(ellipsoid, first)
+    after = cost(ellipsoid, last)
     assert bool((after <= before).all())
     assert float((after / before).median()) < 0.2
     assert float(ellipsoid.value(last.points).abs().max()) < 0.05
-    size = torch.linalg.vector_norm(forces_from_tensions(last.points, last.tension)[0], dim=-1).mean(-1)
+    size = torch.linalg.vector_norm(
+        forces_from_tensions(last.points, last.tension)[0], dim=-1
+    ).mean(-1)
     torch.testing.assert_close(size, torch.ones(40, dtype=torch.float64))
 
 
@@ -61,24 +69,31 @@ def test_steps_are_bounded_and_promise_what_the_linear_model_keeps(ellipsoid, ge
     assert float(moved.max()) <= LONGEST_STEP + 1e-12
     assert torch.equal(taken, moved > STAGE.settled)
     assert bool((promised_decrease(model, x) > 0).all())
-    # A hundredth of the step lowers the cost by what the linear model promises of it, to first order.
+    # A hundredth of the step lowers the cost by what the linear model promises of it, to first
+    # order.
     x = 0.01 * x
     points = state.points + x[:, :9].unflatten(1, (3, 3))
     small = State(points, state.tension + x[:, 9:], start_state(ellipsoid, points).jet)
     promised = promised_decrease(model, x)
-    assert bool(((cost(ellipsoid, state) - cost(ellipsoid, small) - promised).abs() < 0.1 * promised).all())
+    assert bool(
+        ((cost(ellipsoid, state) - cost(ellipsoid, small) - promised).abs() < 0.1 * promised).all()
+    )
 
 
 def test_each_triple_goes_its_own_way_and_settled_or_lost_ones_are_left_alone(ellipsoid, generator):
-    problem, points = ContactProblem.of(ellipsoid, SPEC), triples(ellipsoid, generator, 12)
+    problem = ContactProblem.of(ellipsoid, SPEC)
+    points = triples(ellipsoid, generator, 12)
     together = descend(ellipsoid, problem, start_state(ellipsoid, points), STAGE)
     for i in (0, 5, 11):
         alone = descend(ellipsoid, problem, start_state(ellipsoid, points[i : i + 1]), STAGE)
         torch.testing.assert_close(alone.points[0], together.points[i])
-    problem, points = ContactProblem.of(ellipsoid, SPEC), triples(ellipsoid, generator, 6)
+    problem = ContactProblem.of(ellipsoid, SPEC)
+    points = triples(ellipsoid, generator, 6)
     points[2, 1] = torch.nan
     state = start_state(ellipsoid, points)
-    still = descend(ellipsoid, problem, state, dataclasses.replace(STAGE, settled=1.0))  # no step is that long
+    still = descend(
+        ellipsoid, problem, state, dataclasses.replace(STAGE, settled=1.0)
+    )  # no step is that long
     torch.testing.assert_close(still.points, points, equal_nan=True, rtol=0, atol=0)
     moved = descend(ellipsoid, problem, state, STAGE)
     assert bool(torch.isnan(moved.points[2, 1]).all())
@@ -93,7 +108,9 @@ def test_nearly_every_single_try_solves_the_papers_problem(name, generator):
         plan = plan_contacts(shape, SPEC, shape.metres(starts))
         found = shape.predict(plan.contacts.points)
         x = shape.normalise(plan.contacts.points)
-        good = (found.distance.abs() <= 1e-5).all(-1) & (found.variance <= SPEC.max_variance).all(-1)
+        good = (found.distance.abs() <= 1e-5).all(-1) & (found.variance <= SPEC.max_variance).all(
+            -1
+        )
         w = wrenches(x, found.normal, SPEC.friction, SPEC.edges)
         good &= rank_ratio(w) > 1e-3
         closed = torch.tensor([largest_share(each.T.numpy()) > 1e-8 for each in w.flatten(1, 2)])

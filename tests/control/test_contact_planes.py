@@ -1,4 +1,6 @@
-"""Where the object is by touch: against a general optimiser, rigid motions, and a block that stands elsewhere."""
+"""Where the object is by touch: against a general optimiser, rigid motions, and a block that stands
+elsewhere.
+"""
 
 import dataclasses
 
@@ -32,33 +34,45 @@ def known(normals=AROUND, std_mm=(1.0, 3.0, 6.0), table=True):
 @pytest.mark.parametrize("touching", [(1, 0, 0), (0, 1, 1), (1, 1, 1), (0, 0, 0)])
 @pytest.mark.parametrize("off_mm", [(8.0, 2.0, 9.0), (-3.0, 5.0, -6.0), (4.0, -9.0, -8.0)])
 def test_displacement_is_the_likeliest(table, touching, off_mm):
-    """The posterior by SciPy: a touch measures a plane, a finger in the air costs only where the plane passes it."""
+    """The posterior by SciPy: a touch measures a plane, a finger in the air costs only where the
+    plane passes it.
+    """
     held = known(table=table)
-    normals, off, felt = AROUND.numpy(), 1e-3 * np.array(off_mm), np.array(touching, dtype=bool)
+    normals = AROUND.numpy()
+    off = 1e-3 * np.array(off_mm)
+    felt = np.array(touching, dtype=bool)
     target = held.gains.target.numpy()
     arms = target - target.mean(0)
     place = np.array([0.01, 0.01, 0.001 if table else 0.01])
     turn = np.array([0.01, 0.01, 0.09]) if table else np.full(3, 0.09)
-    variance = np.array([n @ c @ n for n, c in zip(normals, held.gains.covariance.numpy(), strict=True)])
+    variance = np.array(
+        [n @ c @ n for n, c in zip(normals, held.gains.covariance.numpy(), strict=True)]
+    )
 
     def cost(scaled):
-        shift, rotation = scaled[:3] * place, scaled[3:] * turn
+        shift = scaled[:3] * place
+        rotation = scaled[3:] * turn
         plane = ((shift + np.cross(rotation, arms)) * normals).sum(-1)
         miss = np.where(felt, plane - off, np.maximum(plane - off, 0.0))
         return 0.5 * (scaled**2).sum() + 0.5 * (miss**2 / variance).sum()
 
     best = minimize(cost, np.zeros(6), method="BFGS", options={"gtol": 1e-10}).x
-    found = ContactPlanes(held).displacement(held.gains.target + real(off)[:, None] * AROUND, torch.tensor(felt))
+    found = ContactPlanes(held).displacement(
+        held.gains.target + real(off)[:, None] * AROUND, torch.tensor(felt)
+    )
     assert np.allclose(found.numpy(), best * np.concatenate([place, turn]), atol=2e-6)
 
 
 def test_displacement_by_certain_contacts_stays_on_the_table():
     flat = unit(AROUND * real([1, 1, 0]))
-    held, shift = known(flat, std_mm=(0.0, 0.0, 0.0)), real([0.006, -0.004, 0.0])
+    held = known(flat, std_mm=(0.0, 0.0, 0.0))
+    shift = real([0.006, -0.004, 0.0])
     sure = dataclasses.replace(held.gains, covariance=held.gains.covariance / 1e4)
     planes = ContactPlanes(dataclasses.replace(held, gains=sure))
     off = (shift * flat).sum(-1)
-    found = planes.displacement(held.gains.target + off[:, None] * flat, torch.ones(3, dtype=torch.bool))
+    found = planes.displacement(
+        held.gains.target + off[:, None] * flat, torch.ones(3, dtype=torch.bool)
+    )
     moved = planes.moved(found) - held.gains.target
     assert torch.allclose((moved * flat).sum(-1), off, atol=5e-5)
     assert float(found[2].abs()) < 1e-6 and float(moved[:, 2].abs().max()) < 1e-4
@@ -71,8 +85,12 @@ def test_displacement_follows_the_more_certain_touch_and_is_bounded_in_the_air()
         held = known(opposed, std_mm)
         found = ContactPlanes(held).displacement(held.gains.target + 0.008 * opposed, felt)
         assert float(found[0]) * sign > 1e-3
-    held, touching = known(), torch.tensor([False, False, False])
-    near, far = (ContactPlanes(held).displacement(held.gains.target - off * AROUND, touching) for off in (0.025, 0.25))
+    held = known()
+    touching = torch.tensor([False, False, False])
+    near, far = (
+        ContactPlanes(held).displacement(held.gains.target - off * AROUND, touching)
+        for off in (0.025, 0.25)
+    )
     assert torch.allclose(near, far)
 
 
@@ -94,7 +112,9 @@ def test_palm_follows_a_displaced_block(closing):
     assert (palms[1:] - palms[:-1]).norm(dim=-1).max() <= PALM_SPEED * PERIOD + 1e-9
     posture = joints[-1] + 0.02 * NORMALS  # zero where each tip is at its planned contact
     assert (posture * NORMALS).sum(-1).abs().max() < 3e-3
-    still, moved = close(GraspController(reference(), closing, options=ClosingOptions(palm_reach=0.0, stops=0)), 0.01)
+    still, moved = close(
+        GraspController(reference(), closing, options=ClosingOptions(palm_reach=0.0, stops=0)), 0.01
+    )
     assert still.abs().max() == 0
     assert ((moved[-1] + 0.02 * NORMALS) * NORMALS).sum(-1).abs().max() > 8e-3
 

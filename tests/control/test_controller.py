@@ -1,11 +1,22 @@
-"""GraspController and its holdings without a simulator: phases, ends in time, balanced forces, refusals."""
+"""GraspController and its holdings without a simulator: phases, ends in time, balanced forces,
+refusals.
+"""
 
 import dataclasses
 
 import pytest
 import torch
 
-from tests.point_fingers import GAINS, NORMALS, PERIOD, TARGET, TOUCHING, observation, real, reference
+from tests.point_fingers import (
+    GAINS,
+    NORMALS,
+    PERIOD,
+    TARGET,
+    TOUCHING,
+    observation,
+    real,
+    reference,
+)
 from torchgrasp import TrialSpec
 from torchgrasp.control.controller import CLOSING_TIME, GraspController
 from torchgrasp.control.finger_forces import desired_forces
@@ -17,7 +28,9 @@ from torchgrasp.geometry.linalg import fibonacci_sphere
 from torchgrasp.values.closing import ClosingOptions
 
 PRESSED = (2.0, 2.0, 4.0)
-CLOSE = TARGET * real([1.0, 1.0, 0.2])  # two contacts side by side: unequal forces need little friction
+CLOSE = TARGET * real(
+    [1.0, 1.0, 0.2]
+)  # two contacts side by side: unequal forces need little friction
 
 
 def run(controller, seen, seconds):
@@ -31,7 +44,9 @@ def off(forces: torch.Tensor, proportions: torch.Tensor) -> float:
 
 
 def test_desired_and_held_forces_balance_or_press_along_the_normals():
-    torch.testing.assert_close(desired_forces(TARGET, NORMALS, 6.0).sum(0), torch.zeros(3, dtype=torch.float64))
+    torch.testing.assert_close(
+        desired_forces(TARGET, NORMALS, 6.0).sum(0), torch.zeros(3, dtype=torch.float64)
+    )
     alike = NORMALS[:1].expand(3, 3).contiguous()
     torch.testing.assert_close(desired_forces(TARGET, alike, 6.0), -6.0 * alike)
     forces, total = held_forces(reference(), observation(contact=TOUCHING))
@@ -39,7 +54,9 @@ def test_desired_and_held_forces_balance_or_press_along_the_normals():
     assert torch.linalg.cross(TARGET, forces).sum(0).abs().max() < 1e-9
     assert total == pytest.approx(8.0, rel=0.02)
     assert float((-(forces * NORMALS).sum(-1)).max()) == pytest.approx(4.0)
-    planned, total = held_forces(reference(), observation(contact=torch.tensor([True, True, False])))
+    planned, total = held_forces(
+        reference(), observation(contact=torch.tensor([True, True, False]))
+    )
     assert torch.equal(planned, GAINS.desired_force)
     assert total == pytest.approx(8.0)
 
@@ -49,11 +66,14 @@ def test_desired_forces_approach_preferred_proportions_and_held_ones_keep_those_
     even, led = (desired_forces(CLOSE, NORMALS, 4.0, x) for x in (None, preferred))
     assert led.sum(0).abs().max() < 1e-9
     assert off(led, preferred) < 0.5 * off(even, preferred)
-    planned, seen = real([3.2, 0.8, 4.0]), observation(contact=TOUCHING)
+    planned = real([3.2, 0.8, 4.0])
+    seen = observation(contact=TOUCHING)
     seen = dataclasses.replace(seen, tactile=dataclasses.replace(seen.tactile, points=CLOSE))
     gains = dataclasses.replace(GAINS, desired_force=-planned[:, None] * NORMALS)
     even, led = (
-        held_forces(dataclasses.replace(reference(), gains=dataclasses.replace(gains, force_source=x)), seen)[0]
+        held_forces(
+            dataclasses.replace(reference(), gains=dataclasses.replace(gains, force_source=x)), seen
+        )[0]
         for x in ("analytic", "stability")
     )
     assert led.sum(0).abs().max() < 1e-9
@@ -61,8 +81,11 @@ def test_desired_forces_approach_preferred_proportions_and_held_ones_keep_those_
 
 
 def test_forces_of_three_contacts_trade_friction_against_the_preferred_proportions():
-    """All directions in the null space are tried: the friction needed, and 0.2 of the distance from the proportions."""
-    preferred, sides = real([0.8, 0.2, 1.0]), TARGET.roll(-1, 0) - TARGET
+    """All directions in the null space are tried: the friction needed, and 0.2 of the distance from
+    the proportions.
+    """
+    preferred = real([0.8, 0.2, 1.0])
+    sides = TARGET.roll(-1, 0) - TARGET
     sides = sides / sides.norm(dim=1, keepdim=True)
     w = fibonacci_sphere(200_000).double()
     tried = w[:, :, None] * sides - (w[:, :, None] * sides).roll(1, 1)
@@ -84,7 +107,9 @@ def test_force_hold_exerts_the_forces_and_regulates_their_sum():
     assert (hold(seen, PERIOD) - start).abs().max() < 0.1
     last = [hold(seen, PERIOD) for _ in range(round(RAMP / PERIOD))][-1]
     forces, _ = held_forces(reference(), seen)
-    assert torch.allclose(2.0 * last.reshape(3, 3), forces, atol=0.02)  # kp times the lead of sliding joints is force
+    assert torch.allclose(
+        2.0 * last.reshape(3, 3), forces, atol=0.02
+    )  # kp times the lead of sliding joints is force
     more = [hold(weak, PERIOD) for _ in range(300)]
     assert more[49].norm() > 1.1 * last.norm()
     assert more[-1].norm() == pytest.approx(1.5 * float(forces.norm()) / 2.0, rel=1e-6)
@@ -95,14 +120,19 @@ def test_open_loop_passes_its_three_poses():
     controller = GraspController(opened, "open_loop")
     assert not controller.closed
     path = torch.stack(run(controller, observation(contact=TOUCHING), 2 * POSE_TIME + 0.2))
-    assert torch.allclose(path[39], real(0.0), atol=1e-12) and torch.allclose(path[19], real(-0.005))
+    assert torch.allclose(path[39], real(0.0), atol=1e-12) and torch.allclose(
+        path[19], real(-0.005)
+    )
     assert torch.allclose(path[79:], real(0.02)) and torch.allclose(path[59], real(0.01))
     assert controller.closed
 
 
-@pytest.mark.parametrize(("closing", "hold"), [("position", ForceHold), ("fixed", GripHold), ("uncertainty", GripHold)])
+@pytest.mark.parametrize(
+    ("closing", "hold"), [("position", ForceHold), ("fixed", GripHold), ("uncertainty", GripHold)]
+)
 def test_controller_ends_the_closing_in_time_and_holds(closing, hold):
-    controller, period = GraspController(reference(), closing), 0.02
+    controller = GraspController(reference(), closing)
+    period = 0.02
     for _ in range(round(CLOSING_TIME / period)):
         controller.step(observation(0.05), period)
     assert controller.hold is None
@@ -132,7 +162,8 @@ def test_controller_starts_with_the_opened_hand_refuses_unknown_names_and_passes
             GraspController(reference(), *names)
     with pytest.raises(BadArgument, match="law"):
         GraspController(reference(), "position", "law")
-    known, lost = reference(), torch.full((9,), torch.nan).double()
+    known = reference()
+    lost = torch.full((9,), torch.nan).double()
     assert torch.isnan(known.expand(lost)).all() and torch.isnan(known.pick(lost)).all()
     assert torch.isnan(known.hand.actuated.couple(lost)).all()
 

@@ -1,6 +1,8 @@
-"""Grip by the felt load: least forces beside SciPy, what is believed of friction, and a hand that carries a block.
+"""Grip by the felt load: least forces beside SciPy, what is believed of friction, and a hand that
+carries a block.
 
-The oracle `least_sum` is SciPy's general optimiser: every force stays in its cone under pushes from many sides.
+The oracle `least_sum` is SciPy's general optimiser: every force stays in its cone under pushes from
+many sides.
 """
 
 import dataclasses
@@ -11,31 +13,54 @@ import numpy as np
 import pytest
 import torch
 
-from tests.point_fingers import GAINS, NORMALS, PERIOD, TARGET, TOUCHING, observation, real, reference
+from tests.point_fingers import (
+    GAINS,
+    NORMALS,
+    PERIOD,
+    TARGET,
+    TOUCHING,
+    observation,
+    real,
+    reference,
+)
 from torchgrasp import Plane, Status
-from torchgrasp.control.holding import MIN_PUSH, PRIOR_STD, PUSH, FrictionEstimate, GripHold, likely_body, push_reserve
+from torchgrasp.control.holding import (
+    MIN_PUSH,
+    PRIOR_STD,
+    PUSH,
+    FrictionEstimate,
+    GripHold,
+    likely_body,
+    push_reserve,
+)
 from torchgrasp.control.least_forces import LeastForces, balance, friction_ratios
 from torchgrasp.control.tactile import Observation
 from torchgrasp.geometry.linalg import GOLDEN_ANGLE, fibonacci_sphere
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 
-POINTS, OUTWARD = TARGET.numpy(), NORMALS.numpy()
+POINTS = TARGET.numpy()
+OUTWARD = NORMALS.numpy()
 GRASP_MAP = balance(POINTS).wrench
 FREE = np.zeros((3, 3, 1))
 FLOOR = np.full(3, 0.1)
 HEAVIEST = likely_body(reference())[1]
 
 
-def solve(load: list[float], friction: float, floor=FLOOR, reserve: np.ndarray | float = 0.0) -> np.ndarray:
+def solve(
+    load: list[float], friction: float, floor=FLOOR, reserve: np.ndarray | float = 0.0
+) -> np.ndarray:
     """Least forces, by as many calls as ticks of a tenth of a second."""
     solver = LeastForces(GAINS.desired_force.numpy().copy(), np.ones(1), 100.0)
     for _ in range(10):
-        solver.solve(balance(POINTS), OUTWARD, FREE, np.array(load, float), friction, floor, reserve)
+        solver.solve(
+            balance(POINTS), OUTWARD, FREE, np.array(load, float), friction, floor, reserve
+        )
     return solver.forces
 
 
 def shares(arm: np.ndarray) -> np.ndarray:
-    """How much each finger's force changes by a push of 1 N along each axis at `arm` from the middle of the contacts.
+    """How much each finger's force changes by a push of 1 N along each axis at `arm` from the
+    middle of the contacts.
 
     Springs of equal stiffness share it, so that the sum of squares is least.
     """
@@ -51,7 +76,9 @@ def pushed_forces(forces: np.ndarray, push: float, arm: np.ndarray) -> np.ndarra
 
 @functools.cache
 def least_sum(load: tuple[float, ...], friction: float, push: float = 0.0) -> float:
-    """The least normal sum with which all forces stay in their cones under the push, by SciPy, from several starts."""
+    """The least normal sum with which all forces stay in their cones under the push, by SciPy, from
+    several starts.
+    """
     from scipy.optimize import minimize
 
     def normal(x: np.ndarray) -> np.ndarray:
@@ -66,12 +93,17 @@ def least_sum(load: tuple[float, ...], friction: float, push: float = 0.0) -> fl
     cones = {"type": "ineq", "fun": slack}
     floors = {"type": "ineq", "fun": lambda x: normal(x)[0] - FLOOR}
     starts = [k * GAINS.desired_force.numpy().ravel() for k in (1.0, 2.0, 4.0)]
-    found = [minimize(lambda x: normal(x).sum(), x, constraints=[held, cones, floors], tol=1e-9) for x in starts]
+    found = [
+        minimize(lambda x: normal(x).sum(), x, constraints=[held, cones, floors], tol=1e-9)
+        for x in starts
+    ]
     return min(float(x.fun) for x in found if x.success)
 
 
 @pytest.mark.parametrize("friction", [0.4, 0.8])
-@pytest.mark.parametrize("load", [[0, 1, 0, 0, 0, 0], [0.5, 2, 1, 0, 0, 0.02], [0, 3, 0, 0.01, 0, 0]])
+@pytest.mark.parametrize(
+    "load", [[0, 1, 0, 0, 0, 0], [0.5, 2, 1, 0, 0, 0.02], [0, 3, 0, 0.01, 0, 0]]
+)
 def test_least_forces_carry_the_load_within_the_cones_at_nearly_the_least_sum(load, friction):
     forces = solve(load, friction)
     assert np.allclose(GRASP_MAP @ forces.ravel(), load, atol=1e-9)
@@ -95,20 +127,27 @@ def test_forces_with_a_reserve_stay_in_their_cones_under_a_push_from_any_side(fr
 
 
 def test_the_likely_body_is_the_estimated_surface_or_a_ball_as_wide_as_the_contacts():
-    grid = torch.cartesian_prod(*[torch.linspace(-0.1, 0.1, 51).double()] * 3).reshape(51, 51, 51, 3)
+    grid = torch.cartesian_prod(*[torch.linspace(-0.1, 0.1, 51).double()] * 3).reshape(
+        51, 51, 51, 3
+    )
     ball = torch.linalg.vector_norm(grid - real([0.01, 0.02, 0.0]), dim=-1) - 0.06
-    turned, volume = torch.eye(4).double(), 4 / 3 * math.pi * 0.06**3
+    turned = torch.eye(4).double()
+    volume = 4 / 3 * math.pi * 0.06**3
     turned[:3, 3] = real([0.0, 0.0, 0.05])
     ball[:, :, -1] = -0.2  # a sign that is wrong far from the surface
     field = SignedDistanceField(real([-0.1, -0.1, -0.1]), 0.004, ball)
-    centre, weight = likely_body(dataclasses.replace(reference(), surface=field, obj_from_hand=turned))
+    centre, weight = likely_body(
+        dataclasses.replace(reference(), surface=field, obj_from_hand=turned)
+    )
     np.testing.assert_allclose(centre, [0.01, 0.02, -0.05], atol=1e-3)
     assert weight == pytest.approx(9810 * volume, rel=0.05)
     known = reference()
     centre, weight = likely_body(known)
     np.testing.assert_allclose(centre, POINTS.mean(0))
     assert weight == pytest.approx(9.81 * 0.4)  # a ball of 130 g, if it were water
-    wide = dataclasses.replace(known, gains=dataclasses.replace(known.gains, target=2 * known.gains.target))
+    wide = dataclasses.replace(
+        known, gains=dataclasses.replace(known.gains, target=2 * known.gains.target)
+    )
     assert likely_body(wide)[1] == pytest.approx(9810 * math.pi / 6 * (0.12**2 + 0.04**2) ** 1.5)
 
 
@@ -116,7 +155,8 @@ def test_the_likely_body_is_the_estimated_surface_or_a_ball_as_wide_as_the_conta
 def test_balance_gives_grasp_map_inverse_and_null_space(fingertips):
     generator = np.random.default_rng(fingertips)
     points, forces = generator.normal(size=(2, fingertips, 3))
-    found, arms = balance(points), points - points.mean(0)
+    found = balance(points)
+    arms = points - points.mean(0)
     total = np.concatenate([forces.sum(0), np.cross(arms, forces).sum(0)])
     np.testing.assert_allclose(found.wrench @ forces.ravel(), total, atol=1e-12)
     np.testing.assert_allclose(found.inverse, np.linalg.pinv(found.wrench), atol=1e-12)
@@ -128,17 +168,24 @@ def test_balance_gives_grasp_map_inverse_and_null_space(fingertips):
 
 
 def test_a_finger_in_the_air_bears_no_load_and_presses_as_little_as_allowed():
-    points, floor = np.array([[0.0, -0.03, 0], [0, 0.03, 0], [0.02, 0.03, 0]]), np.array([0.2, 0.2, 0.7])
+    points = np.array([[0.0, -0.03, 0], [0, 0.03, 0], [0.02, 0.03, 0]])
+    floor = np.array([0.2, 0.2, 0.7])
     normals = np.array([[0.0, -1, 0], [0, 1, 0], [0, 1, 0]])
-    contacts, load = balance(points, np.array([True, True, False])), np.array([1.0, 0, 2, 0, 0, 0])
-    load[3:] = np.cross(points[:2].mean(0) - points.mean(0), load[:3])  # it acts between the two fingers
-    solver, forces = LeastForces(-normals.copy(), np.ones(1), 100.0), -normals
+    contacts = balance(points, np.array([True, True, False]))
+    load = np.array([1.0, 0, 2, 0, 0, 0])
+    load[3:] = np.cross(
+        points[:2].mean(0) - points.mean(0), load[:3]
+    )  # it acts between the two fingers
+    solver = LeastForces(-normals.copy(), np.ones(1), 100.0)
+    forces = -normals
     for _ in range(10):
         forces = solver.solve(contacts, normals, FREE, load, 0.5, floor)
     np.testing.assert_allclose(forces[:2].sum(0), load[:3], atol=1e-9)
     push = -(forces * normals).sum(-1)
     least = math.sqrt(5) / 2 / 0.5  # [N] of each of the two, which share the load
-    assert push[:2] == pytest.approx([least] * 2, rel=0.05) and push[2] == pytest.approx(0.7, rel=0.1)
+    assert push[:2] == pytest.approx([least] * 2, rel=0.05) and push[2] == pytest.approx(
+        0.7, rel=0.1
+    )
 
 
 def test_least_forces_keep_the_floors():
@@ -174,15 +221,22 @@ def test_friction_is_at_least_the_ratio_of_a_finger_that_sticks():
 def carried(
     weight: float, friction: float, max_force: float | None = None, seconds: float = 4.0
 ) -> tuple[GripHold, Observation, list[float]]:
-    """Hold a block whose weight comes off its table in half a second, after another one, without noise.
+    """Hold a block whose weight comes off its table in half a second, after another one, without
+    noise.
 
-    The joints follow at once: what the hand wants is what is felt. A finger slides where that exceeds its cone.
+    The joints follow at once: what the hand wants is what is felt. A finger slides where that
+        exceeds its cone.
     """
-    strong = {name: drive._replace(effort=8.0) for name, drive in reference().hand.actuators.items()}
+    strong = {
+        name: drive._replace(effort=8.0) for name, drive in reference().hand.actuators.items()
+    }
     hand = dataclasses.replace(reference().hand, actuators=strong)
-    known = dataclasses.replace(reference(), hand=hand, table=Plane(real([0, 1, 0]), -0.1), max_force=max_force)
+    known = dataclasses.replace(
+        reference(), hand=hand, table=Plane(real([0, 1, 0]), -0.1), max_force=max_force
+    )
     seen = observation(0.0, (2.0, 2.0, 4.0), TOUCHING)
-    hold, sums = GripHold(known, seen, torch.zeros(9).double()), []
+    hold = GripHold(known, seen, torch.zeros(9).double())
+    sums = []
     for k in range(round(seconds / PERIOD)):
         hold(seen, PERIOD)
         lifted = min(max((k * PERIOD - 1.0) / 0.5, 0.0), 1.0) * weight
@@ -194,7 +248,11 @@ def carried(
         slides = friction_ratios(forces, OUTWARD) > friction
         across = forces + push[:, None] * OUTWARD
         length = np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-9)
-        forces = np.where(slides[:, None], across * friction * push[:, None] / length - push[:, None] * OUTWARD, forces)
+        forces = np.where(
+            slides[:, None],
+            across * friction * push[:, None] / length - push[:, None] * OUTWARD,
+            forces,
+        )
         tactile = dataclasses.replace(
             seen.tactile,
             reading=torch.from_numpy(push),
@@ -209,7 +267,9 @@ def carried(
 def test_grip_carries_heavy_and_slippery_blocks_harder_and_fragile_ones_within_their_force():
     for weight in (0.5, 1.5):
         hold, _, sums = carried(weight, 0.8)
-        needed, heaviest = (least_sum((0, x, 0, 0, 0, 0), 0.8, y) for x, y in ((weight, PUSH), (0, PUSH + HEAVIEST)))
+        needed, heaviest = (
+            least_sum((0, x, 0, 0, 0, 0), 0.8, y) for x, y in ((weight, PUSH), (0, PUSH + HEAVIEST))
+        )
         assert hold.status is Status.OK
         assert needed < sums[-1] < 1.2 * needed
         assert heaviest < sums[95] < 1.2 * heaviest  # on the table
@@ -227,8 +287,11 @@ def test_grip_carries_heavy_and_slippery_blocks_harder_and_fragile_ones_within_t
 def test_grip_reports_a_load_as_too_heavy_only_if_a_finger_slides():
     hold, _, _ = carried(40.0, 0.8)  # beyond the torques
     assert hold.status is Status.TOO_HEAVY and hold.weight > 5.0
-    weight, most = 5.0, 2.0
-    believed = FrictionEstimate().mean * 2 * most  # the thumb presses with 2 N, the others with the half
+    weight = 5.0
+    most = 2.0
+    believed = (
+        FrictionEstimate().mean * 2 * most
+    )  # the thumb presses with 2 N, the others with the half
     assert believed < weight
     assert carried(weight, 3.0, max_force=most)[0].status is Status.OK
     assert carried(weight, 0.8, max_force=most)[0].status is Status.TOO_HEAVY
@@ -238,12 +301,17 @@ def test_grip_reports_a_load_as_too_heavy_only_if_a_finger_slides():
 @pytest.mark.parametrize("sideways", [slice(0, 1), slice(0, 3)])
 @pytest.mark.parametrize("max_force", [None, 2.0])
 def test_grip_floors_stay_finite_for_a_planned_force_along_the_surface(sideways, max_force):
-    """A finger in the air keeps the planned forces; the sensed normals of the others may be across them."""
-    normals, points = NORMALS.clone(), TARGET.clone()
-    normals[sideways], points[2] = real([0, 1, 0]), torch.nan
+    """A finger in the air keeps the planned forces; the sensed normals of the others may be across
+    them.
+    """
+    normals = NORMALS.clone()
+    points = TARGET.clone()
+    normals[sideways] = real([0, 1, 0])
+    points[2] = torch.nan
     seen = observation(0.0, (2.0, 2.0, 4.0), TOUCHING)
     tactile = dataclasses.replace(seen.tactile, normals=normals, points=points)
-    known, seen = dataclasses.replace(reference(), max_force=max_force), dataclasses.replace(seen, tactile=tactile)
+    known = dataclasses.replace(reference(), max_force=max_force)
+    seen = dataclasses.replace(seen, tactile=tactile)
     hold = GripHold(known, seen, torch.zeros(9).double())
     floor = hold._bounded(np.maximum(hold.grip, MIN_PUSH))
     assert np.isfinite(floor).all() and (floor > 0).all()

@@ -17,7 +17,9 @@ from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.values.closing import ClosingOptions, SensorModel
 
 ALL = ClosingOptions()
-DOWN, LENGTH, TIP = real([0.0, -1.0, 0.0]), 0.08, 0.01
+DOWN = real([0.0, -1.0, 0.0])
+LENGTH = 0.08
+TIP = 0.01
 OPEN = real([[0.052, 0, 0.02], [0.052, 0, -0.02], [-0.036, 0, 0]])
 """Tips of the opened hand [m]: 6 mm beside the ball in its place."""
 
@@ -27,22 +29,28 @@ def above(**changes):
 
 
 def feel(hand, shift):
-    """What the open hand feels of a ball displaced by `shift`: each tip that overlaps it touches its nearest point."""
+    """What the open hand feels of a ball displaced by `shift`: each tip that overlaps it touches
+    its nearest point.
+    """
     tips = OPEN + hand.palm - hand.left * hand.direction
     out = tips - (CENTER + shift)
     normals = out / out.norm(dim=-1, keepdim=True)
     contact = out.norm(dim=-1) < RADIUS + TIP
-    seen, touched = observation(contact=contact), contact[:, None]
+    seen = observation(contact=contact)
+    touched = contact[:, None]
     points = OPEN - TIP * normals  # in the axes of the displaced hand
     tactile = dataclasses.replace(
-        seen.tactile, points=torch.where(touched, points, torch.nan), normals=torch.where(touched, normals, torch.nan)
+        seen.tactile,
+        points=torch.where(touched, points, torch.nan),
+        normals=torch.where(touched, normals, torch.nan),
     )
     return dataclasses.replace(seen, tips=OPEN, tactile=tactile)
 
 
 def come(hand, shift, ticks=3000):
     """Let the hand come; return `left` and `palm` of every tick."""
-    lefts, palms = [hand.left], [hand.palm]
+    lefts = [hand.left]
+    palms = [hand.palm]
     for _ in range(ticks):
         if hand.done:
             return real(lefts), torch.stack(palms)
@@ -80,7 +88,9 @@ def test_guarded_approach_draws_back_before_its_palm_moves_within_its_reach():
     stopped = int((lefts.diff() >= 0).int().argmax())
     first = int((palms.abs().sum(-1) > 0).int().argmax())
     feeling = 0.06 + (len(TURNS) + len(FINE_TURNS) + 2) * PERIOD
-    assert (lefts[stopped + 1 : stopped + 6].diff() >= SPEED * PERIOD * (1 - 1e-9)).all()  # it draws back at once
+    assert (
+        lefts[stopped + 1 : stopped + 6].diff() >= SPEED * PERIOD * (1 - 1e-9)
+    ).all()  # it draws back at once
     assert (first - stopped) * PERIOD >= feeling and (lefts[stopped : first + 1].diff() >= 0).all()
     assert lefts[first] >= float(lefts[stopped]) + 0.02 - 1e-9
     assert lefts.max() <= LENGTH
@@ -92,10 +102,13 @@ def test_guarded_approach_draws_back_before_its_palm_moves_within_its_reach():
 
 @pytest.mark.parametrize("placed", [True, False])
 def test_guarded_approach_arrives_though_every_finger_touches_all_the_way(placed):
-    hand, seen = GuardedApproach(above(), ALL, LENGTH, []), observation(contact=torch.ones(3, dtype=torch.bool))
+    hand = GuardedApproach(above(), ALL, LENGTH, [])
+    seen = observation(contact=torch.ones(3, dtype=torch.bool))
     if not placed:
         nowhere = torch.full((3, 3), torch.nan).double()
-        seen = dataclasses.replace(seen, tactile=dataclasses.replace(seen.tactile, points=nowhere, normals=nowhere))
+        seen = dataclasses.replace(
+            seen, tactile=dataclasses.replace(seen.tactile, points=nowhere, normals=nowhere)
+        )
     for _ in range(3000):
         if hand.done:
             break
@@ -105,9 +118,13 @@ def test_guarded_approach_arrives_though_every_finger_touches_all_the_way(placed
 
 
 def test_guarded_approach_feels_a_link_by_the_drives_of_its_joints():
-    hand, grasp = load_hand("allegro"), load_shipped_grasp("jug", "allegro")
-    plan = dataclasses.replace(ClosingReference.from_grasp(hand, grasp), table=above().table, surface=ball_field())
-    coming, joints = GuardedApproach(plan, ALL, LENGTH, []), plan.pregrasp
+    hand = load_hand("allegro")
+    grasp = load_shipped_grasp("jug", "allegro")
+    plan = dataclasses.replace(
+        ClosingReference.from_grasp(hand, grasp), table=above().table, surface=ball_field()
+    )
+    coming = GuardedApproach(plan, ALL, LENGTH, [])
+    joints = plan.pregrasp
     still = observe(hand, joints, no_contact())
     for _ in range(30):
         coming(still, PERIOD)
@@ -134,7 +151,8 @@ def approach(controller, shift):
 
 
 def test_controller_closes_where_the_approach_found_the_object():
-    shift, controller = real([0.016, 0, 0]), GraspController(above(), approach=LENGTH)
+    shift = real([0.016, 0, 0])
+    controller = GraspController(above(), approach=LENGTH)
     commanded = approach(controller, shift)
     assert commanded[0].left == LENGTH and commanded[-1].left == 0.0 and controller.stops >= 1
     opened = controller.reference.expand(controller.reference.pregrasp)
@@ -171,14 +189,18 @@ def test_controller_refuses_a_bad_length_of_approach():
 
 
 def test_controller_comes_down_once_more_after_it_closed_on_nothing():
-    options, nothing, lefts, palms = ClosingOptions(attempts=3), observation(0.02), [], []
+    options = ClosingOptions(attempts=3)
+    nothing = observation(0.02)
+    lefts = []
+    palms = []
     controller = GraspController(above(), options=options, approach=LENGTH)
     while not controller.closed:
         targets = controller.step(nothing, PERIOD)
         lefts.append(targets.left)
         palms.append(targets.palm)
     assert controller.attempts == 3
-    left, palm = real(lefts), torch.stack(palms)
+    left = real(lefts)
+    palm = torch.stack(palms)
     ups = ((left[1:] > 0) & (left[:-1] == 0)).nonzero()[:, 0]
     assert len(ups) == 2  # it draws back before its palm moves to another place
     assert (left.diff().abs() <= SPEED * PERIOD * (1 + 1e-9)).all()

@@ -1,4 +1,6 @@
-"""The closing law, Eqs. (25)-(28), against NumPy and closed forms; bounded and finite for any state."""
+"""The closing law, Eqs. (25)-(28), against NumPy and closed forms; bounded and finite for any
+state.
+"""
 
 import dataclasses
 import math
@@ -9,7 +11,12 @@ import torch
 
 from tests.make import directions
 from torchgrasp import ClosingReference, closing_gains, load_hand
-from torchgrasp.control.finger_forces import contacts_in_hand, desired_forces, joint_stiffness, tip_compliance
+from torchgrasp.control.finger_forces import (
+    contacts_in_hand,
+    desired_forces,
+    joint_stiffness,
+    tip_compliance,
+)
 from torchgrasp.control.law import (
     FORCE_BANDWIDTH,
     FORCE_FLOOR,
@@ -38,16 +45,21 @@ def draw(*shape, seed=0):
 
 def shipped(name):
     """A hand, its grasp of the jug, and the grasp's contacts in the hand's frame."""
-    hand, grasp = load_hand(name), load_shipped_grasp("jug", name)
+    hand = load_hand(name)
+    grasp = load_shipped_grasp("jug", name)
     points, normals = contacts_in_hand(grasp)
     return hand, grasp, points[0], normals[0]
 
 
 def test_eq26_blend_is_the_gaussian_of_the_error():
-    normals, std = directions(50), 0.02 * draw(50, seed=1).abs()
+    normals = directions(50)
+    std = 0.02 * draw(50, seed=1).abs()
     covariance = surface_covariance(normals, std)
     error = 0.01 * draw(50, 3, seed=2)
-    oracle = [math.exp(-0.5 * e @ np.linalg.inv(s) @ e) for e, s in zip(error.numpy(), covariance.numpy(), strict=True)]
+    oracle = [
+        math.exp(-0.5 * e @ np.linalg.inv(s) @ e)
+        for e, s in zip(error.numpy(), covariance.numpy(), strict=True)
+    ]
     share = blend(error, covariance)
     assert np.allclose(share.numpy(), oracle)
     assert ((share >= 0) & (share <= 1)).all()
@@ -66,11 +78,16 @@ def test_eq27_gain_is_inverse_to_the_variance_and_bounded_for_axis_normals():
     normals = torch.cat([torch.eye(3).double(), directions(20)])
     std = torch.linspace(0, 0.03, 23, dtype=torch.float64)
     gain = position_gain(surface_covariance(normals, std))
-    oracle = POSITION_RATE * POSITION_FLOOR**2 / (std[:, None] ** 2 * normals**2 + POSITION_FLOOR**2)
+    oracle = (
+        POSITION_RATE * POSITION_FLOOR**2 / (std[:, None] ** 2 * normals**2 + POSITION_FLOOR**2)
+    )
     assert torch.allclose(gain, oracle)
     assert torch.isfinite(gain).all()
     assert gain.max() <= POSITION_RATE + 1e-9
-    less, more = (position_gain(surface_covariance(normals, s * torch.ones(23).double())) for s in (0.002, 0.02))
+    less, more = (
+        position_gain(surface_covariance(normals, s * torch.ones(23).double()))
+        for s in (0.002, 0.02)
+    )
     assert (less >= more).all()
 
 
@@ -92,15 +109,23 @@ def test_eq25_is_the_papers_law_for_square_jacobians():
     """One finger of three joints a contact, small errors: J^-1 [(1-l) K (xd-xc) + l C (fd-fc)]."""
     jacobian = torch.zeros(3, 3, 9, dtype=torch.float64)
     for finger in range(3):
-        jacobian[finger, :, 3 * finger : 3 * finger + 3] = 0.05 * (torch.eye(3) + 0.2 * draw(3, 3, seed=finger))
-    error, force_error = 1e-4 * draw(3, 3, seed=7), 0.01 * draw(3, 3, seed=8)
-    share, k, c = torch.tensor([0.1, 0.5, 0.9]).double(), 3 * draw(3, 3).abs(), 0.02 * draw(3, 3, seed=9).abs()
+        jacobian[finger, :, 3 * finger : 3 * finger + 3] = 0.05 * (
+            torch.eye(3) + 0.2 * draw(3, 3, seed=finger)
+        )
+    error = 1e-4 * draw(3, 3, seed=7)
+    force_error = 0.01 * draw(3, 3, seed=8)
+    share = torch.tensor([0.1, 0.5, 0.9]).double()
+    k = 3 * draw(3, 3).abs()
+    c = 0.02 * draw(3, 3, seed=9).abs()
     velocity = tip_velocity(error, force_error, share, k, c)
     step = joint_step(jacobian, velocity, 0.01, damping=1e-12)
     for finger in range(3):
         columns = slice(3 * finger, 3 * finger + 3)
-        near, square = float(share[finger]), jacobian[finger, :, columns].numpy()
-        bracket = (1 - near) * (k * error)[finger].numpy() + near * (c * force_error)[finger].numpy()
+        near = float(share[finger])
+        square = jacobian[finger, :, columns].numpy()
+        bracket = (1 - near) * (k * error)[finger].numpy() + near * (c * force_error)[
+            finger
+        ].numpy()
         assert np.allclose(step[columns], np.linalg.solve(square, 0.01 * bracket), rtol=1e-6)
 
 
@@ -109,7 +134,9 @@ def test_eq25_damped_inverse_is_the_regularised_least_squares(h):
     jacobian = 0.05 * draw(6, 9, h)
     for j, found in zip(jacobian.numpy(), damped_inverse(jacobian).numpy(), strict=True):
         stacked = np.concatenate([j, math.sqrt(1e-5) * np.eye(h)])
-        oracle = np.linalg.lstsq(stacked, np.concatenate([np.eye(9), np.zeros((h, 9))]), rcond=None)[0]
+        oracle = np.linalg.lstsq(
+            stacked, np.concatenate([np.eye(9), np.zeros((h, 9))]), rcond=None
+        )[0]
         assert np.allclose(found, oracle, atol=1e-8)
 
 
@@ -122,10 +149,12 @@ def test_eq25_is_bounded_and_finite_for_any_state(scale):
     jacobian[: n // 4, 0] = 0
     jacobian[n // 4 : n // 2, 1] = jacobian[n // 4 : n // 2, 0]
     jacobian[n // 2 : 5 * n // 8, :, :, 1:] = 0
-    error, force_error = scale * draw(n, 3, 3, seed=2), 1e3 * scale * draw(n, 3, 3, seed=3)
+    error = scale * draw(n, 3, 3, seed=2)
+    force_error = 1e3 * scale * draw(n, 3, 3, seed=3)
     share = torch.rand(n, 3, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     gain = 10 * draw(n, 3, 3, seed=5).abs()
-    gain[::7], gain[1::7] = 0, 1e12
+    gain[::7] = 0
+    gain[1::7] = 1e12
     velocity = tip_velocity(error, force_error, share, gain, gain)
     assert velocity.norm(dim=-1).max() <= MAX_SPEED + 1e-12
     step = joint_step(jacobian, velocity, 0.01, posture_error=scale * draw(n, 12, seed=6))
@@ -137,7 +166,9 @@ def test_eq25_posture_moves_no_fingertip_and_compliance_is_the_motion_for_a_newt
     hand = load_hand("allegro")
     joints = 0.5 * (hand.lower + hand.upper)
     jacobian = hand.jacobian(joints)
-    step = joint_step(jacobian, torch.zeros(3, 3).double(), 0.01, posture_error=draw(12), damping=1e-9)
+    step = joint_step(
+        jacobian, torch.zeros(3, 3).double(), 0.01, posture_error=draw(12), damping=1e-9
+    )
     assert step.norm() > 1e-3
     assert (jacobian @ step).norm() < 1e-3 * step.norm() * jacobian.norm()
     _, pads = hand.fingertips(joints)
@@ -145,7 +176,9 @@ def test_eq25_posture_moves_no_fingertip_and_compliance_is_the_motion_for_a_newt
         torque = jacobian[finger].T @ pads[finger]
         bent = torque / torch.tensor([hand.actuators[n].kp for n in hand.joint_names])
         moved = (jacobian[finger] @ bent) @ pads[finger]
-        assert float(tip_compliance(jacobian, pads, joint_stiffness(hand))[finger]) == pytest.approx(float(moved))
+        assert float(
+            tip_compliance(jacobian, pads, joint_stiffness(hand))[finger]
+        ) == pytest.approx(float(moved))
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett"])
@@ -153,19 +186,27 @@ def test_closing_gains_are_in_the_hands_frame(name):
     hand, grasp, points, normals = shipped(name)
     gains = closing_gains(grasp, hand, 5.0)
     assert torch.allclose(gains.target, points)
-    assert torch.allclose(gains.covariance, surface_covariance(normals, grasp.contacts.std_m[0].double()))
+    assert torch.allclose(
+        gains.covariance, surface_covariance(normals, grasp.contacts.std_m[0].double())
+    )
     assert torch.allclose(gains.position_gain, position_gain(gains.covariance))
     assert ((gains.force_gain > 0) & (gains.force_gain < 0.1)).all()
     assert float(-(gains.desired_force * normals).sum(-1).min()) == pytest.approx(5.0)
-    assert torch.allclose(apply(grasp.obj_from_hand.double(), points[None]), grasp.contacts.points.double(), atol=1e-6)
+    assert torch.allclose(
+        apply(grasp.obj_from_hand.double(), points[None]), grasp.contacts.points.double(), atol=1e-6
+    )
 
 
 def test_closing_gains_press_unbalanced_contacts_along_their_normals_and_refuse_bad_arguments():
     hand, grasp, *_ = shipped("allegro")
     same = grasp.contacts.normals[:, :1].expand(1, 3, 3).contiguous()
     contacts = grasp.contacts
-    gains = closing_gains(dataclasses.replace(grasp, contacts=dataclasses.replace(contacts, normals=same)), hand, 5.0)
-    assert torch.allclose(gains.desired_force, -5.0 * rotate(inverse(grasp.obj_from_hand.double()), same.double())[0])
+    gains = closing_gains(
+        dataclasses.replace(grasp, contacts=dataclasses.replace(contacts, normals=same)), hand, 5.0
+    )
+    assert torch.allclose(
+        gains.desired_force, -5.0 * rotate(inverse(grasp.obj_from_hand.double()), same.double())[0]
+    )
     assert torch.isfinite(gains.force_gain).all()
     with pytest.raises(BadArgument, match=r"grasp: expected .*got 0 rows"):
         closing_gains(grasp[:0], hand)
@@ -173,7 +214,10 @@ def test_closing_gains_press_unbalanced_contacts_along_their_normals_and_refuse_
         closing_gains(dataclasses.replace(grasp, meta={}), load_hand("barrett"))
     for std_m, found in ((contacts.std_m * float("inf"), "inf"), (None, "None")):
         with pytest.raises(BadArgument, match=rf"std_m: expected .*got {found}"):
-            closing_gains(dataclasses.replace(grasp, contacts=dataclasses.replace(contacts, std_m=std_m)), hand)
+            closing_gains(
+                dataclasses.replace(grasp, contacts=dataclasses.replace(contacts, std_m=std_m)),
+                hand,
+            )
     for force in (0.0, -1.0, float("nan")):
         with pytest.raises(BadArgument, match="force"):
             closing_gains(grasp, hand, force)
@@ -181,11 +225,15 @@ def test_closing_gains_press_unbalanced_contacts_along_their_normals_and_refuse_
 
 @pytest.mark.parametrize("name", ["allegro", "barrett"])
 def test_eq28_force_gains_follow_the_learned_variance(name):
-    """Along its normal a loop has the bandwidth C_F over the compliance; no finger's force is known exactly."""
+    """Along its normal a loop has the bandwidth C_F over the compliance; no finger's force is known
+    exactly.
+    """
     (hand, grasp, points, normals), model = shipped(name), load_stability(load_hand(name))
     gains = ClosingReference.from_grasp(hand, grasp, 4.0, stability=model).gains
     hand = hand.to("cpu", torch.float64)
-    variance = model.preferred_forces(points + hand.tips.radius[:, None] * normals).covariance.diagonal()
+    variance = model.preferred_forces(
+        points + hand.tips.radius[:, None] * normals
+    ).covariance.diagonal()
     sigma = variance[:, None] * normals**2 + FORCE_FLOOR**2
     jacobian = hand.jacobian(grasp.joints.double(), points[None])
     compliance = tip_compliance(jacobian, normals[None], joint_stiffness(hand))[0]
@@ -197,7 +245,10 @@ def test_eq28_force_gains_follow_the_learned_variance(name):
 def test_reference_approaches_the_forces_that_the_stability_model_prefers():
     (hand, grasp, points, normals), model = shipped("barrett"), load_stability(load_hand("barrett"))
     wanted = model.preferred_forces(points + hand.tips.radius[:, None] * normals, 4.0).forces
-    even, led = (ClosingReference.from_grasp(hand, grasp, 4.0, stability=x).gains.desired_force for x in (None, model))
+    even, led = (
+        ClosingReference.from_grasp(hand, grasp, 4.0, stability=x).gains.desired_force
+        for x in (None, model)
+    )
     assert torch.allclose(led, desired_forces(points, normals, 4.0, wanted), atol=1e-9)
     even, led = (float((-(x * normals).sum(-1) - wanted).norm()) for x in (even, led))
     assert led < 0.9 * even

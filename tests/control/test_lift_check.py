@@ -1,4 +1,6 @@
-"""A lift that leaves the object behind is felt; a lift that holds it, be it light or carried by the palm, is not."""
+"""A lift that leaves the object behind is felt; a lift that holds it, be it light or carried by the
+palm, is not.
+"""
 
 import dataclasses
 
@@ -15,13 +17,17 @@ ONE = torch.tensor([True, False, False])
 def lift(contact, load=0.0, reference=None, noise=0.0, speed=0.1):
     """The check after each tick of a rise to 50 mm, in which the fingertips carry a load [N]."""
     reference = on_table() if reference is None else reference
-    check, generator = LiftCheck(reference), torch.Generator().manual_seed(1)
-    up, lost = reference.table.normal, []
+    check = LiftCheck(reference)
+    generator = torch.Generator().manual_seed(1)
+    up = reference.table.normal
+    lost = []
     for k in range(round(0.05 / speed / PERIOD)):
         drawn = noise * torch.randn(3, 3, generator=generator, dtype=torch.float64)
         seen = observation(0.0, (1.0, 1.0, 1.0), contact)
         tactile = dataclasses.replace(seen.tactile, forces=load / 3 * up + drawn)
-        lost.append(check(dataclasses.replace(seen, tactile=tactile), (k + 1) * PERIOD * speed, PERIOD))
+        lost.append(
+            check(dataclasses.replace(seen, tactile=tactile), (k + 1) * PERIOD * speed, PERIOD)
+        )
     return lost
 
 
@@ -39,22 +45,32 @@ def test_an_object_of_50_grams_in_noisy_fingertips_is_not_lost(seconds):
 
 
 def test_what_one_fingertip_and_the_palm_carry_is_not_lost_until_it_drops():
-    reference, check = on_table(), LiftCheck(on_table())
-    seen, forces = observation(0.0, contact=ONE), torch.zeros(3, 3, dtype=torch.float64)
+    reference = on_table()
+    check = LiftCheck(on_table())
+    seen = observation(0.0, contact=ONE)
+    forces = torch.zeros(3, 3, dtype=torch.float64)
     for load, lost in ((1.0, False), (-0.5, True)):
         forces[0] = load * reference.table.normal
-        there = dataclasses.replace(seen, tactile=dataclasses.replace(seen.tactile, forces=forces.clone()))
+        there = dataclasses.replace(
+            seen, tactile=dataclasses.replace(seen.tactile, forces=forces.clone())
+        )
         for k in range(60):
             found = check(there, 0.0 if load > 0 and k < 20 else 0.03, PERIOD)
         assert found is lost
 
 
 def slide(*speeds, height=0.02, noise=0.0):
-    """When [s] an object is lost that the hand carries, and along which its fingertips slide at some speeds [m/s]."""
-    check, generator = LiftCheck(on_table()), torch.Generator().manual_seed(2)
-    seen, up = observation(0.0, (1.0, 1.0, 1.0), TOUCHING), on_table().table.normal
+    """When [s] an object is lost that the hand carries, and along which its fingertips slide at
+    some speeds [m/s].
+    """
+    check = LiftCheck(on_table())
+    generator = torch.Generator().manual_seed(2)
+    seen = observation(0.0, (1.0, 1.0, 1.0), TOUCHING)
+    up = on_table().table.normal
     for k in range(round(1.0 / PERIOD)):
-        sliding = torch.tensor(speeds).double() + noise * torch.randn(3, generator=generator, dtype=torch.float64)
+        sliding = torch.tensor(speeds).double() + noise * torch.randn(
+            3, generator=generator, dtype=torch.float64
+        )
         tactile = dataclasses.replace(seen.tactile, forces=up.expand(3, 3).clone(), sliding=sliding)
         if check(dataclasses.replace(seen, tactile=tactile), height, PERIOD):
             return (k + 1) * PERIOD
@@ -74,6 +90,10 @@ def test_without_forces_or_table_the_touches_tell():
     for reference in (binary, dataclasses.replace(on_table(), table=None)):
         for contact in (TOUCHING, ONE, FREE):
             check = LiftCheck(reference)
-            assert check(observation(0.0, contact=contact), 0.03, PERIOD) is (int(contact.sum()) < 2)
-    dead = dataclasses.replace(on_table(), sensor=SensorModel("binary", dead=(on_table().hand.finger_names[2],)))
+            assert check(observation(0.0, contact=contact), 0.03, PERIOD) is (
+                int(contact.sum()) < 2
+            )
+    dead = dataclasses.replace(
+        on_table(), sensor=SensorModel("binary", dead=(on_table().hand.finger_names[2],))
+    )
     assert not LiftCheck(dead)(observation(0.0, contact=ONE), 0.03, PERIOD)

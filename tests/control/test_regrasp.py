@@ -1,4 +1,6 @@
-"""Closing once more: what is judged before a lift, how the hand opens, and when the controller does so."""
+"""Closing once more: what is judged before a lift, how the hand opens, and when the controller does
+so.
+"""
 
 import dataclasses
 import math
@@ -20,13 +22,20 @@ from tests.point_fingers import (
 )
 from torchgrasp import ClosingReference, ContactSpec, GraspController
 from torchgrasp.control.controller import CLOSING_TIME
-from torchgrasp.control.recovery import MISPLACED, OPENING_TIME, PRESSING_TIME, GraspCheck, Reopening
+from torchgrasp.control.recovery import (
+    MISPLACED,
+    OPENING_TIME,
+    PRESSING_TIME,
+    GraspCheck,
+    Reopening,
+)
 from torchgrasp.control.uncertainty_closing import PALM_SPEED
 from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.values.closing import NO_OPTIONS, ClosingOptions, SensorModel
 
-STILL, PLACE = torch.zeros(3).double(), torch.zeros(6).double()
+STILL = torch.zeros(3).double()
+PLACE = torch.zeros(6).double()
 
 
 def judge(seen, believed=PLACE, last=False, reference=None) -> GraspCheck:
@@ -47,9 +56,13 @@ def test_grasp_check_accepts_balanced_contacts_and_rejects_a_finger_in_the_air()
         assert check.judged and check.secure is (missing is None)
 
 
-@pytest.mark.parametrize(("degrees", "friction"), [(25.0, 0.6), (36.0, 0.6), (36.0, 0.8), (25.0, 0.4)])
+@pytest.mark.parametrize(
+    ("degrees", "friction"), [(25.0, 0.6), (36.0, 0.6), (36.0, 0.8), (25.0, 0.4)]
+)
 def test_grasp_check_rejects_forces_beyond_the_planned_friction(degrees, friction):
-    """All normals lean the same way across the line of the forces, by more or less than the angle of friction."""
+    """All normals lean the same way across the line of the forces, by more or less than the angle
+    of friction.
+    """
     angle = torch.deg2rad(real(degrees))
     leaning = torch.stack([NORMALS[:, 0] * angle.cos(), angle.sin().expand(3), NORMALS[:, 2]], -1)
     check = judge(pressing(normals=leaning), reference=on_table(friction=friction))
@@ -57,10 +70,15 @@ def test_grasp_check_rejects_forces_beyond_the_planned_friction(degrees, frictio
 
 
 def test_the_closing_plan_knows_the_friction_that_the_grasp_was_planned_for():
-    hand, grasp = load_hand("barrett"), load_shipped_grasp("jug", "barrett")
+    hand = load_hand("barrett")
+    grasp = load_shipped_grasp("jug", "barrett")
 
     def planned(friction):
-        meta = {name: text for name, text in (grasp.meta | {"friction": friction}).items() if text is not None}
+        meta = {
+            name: text
+            for name, text in (grasp.meta | {"friction": friction}).items()
+            if text is not None
+        }
         return ClosingReference.from_grasp(hand, dataclasses.replace(grasp, meta=meta)).friction
 
     assert list(map(planned, ("0.5", "1", None))) == [0.5, 1.0, ContactSpec().friction]
@@ -86,11 +104,16 @@ def test_grasp_check_without_places_judges_by_touch_and_accepts_the_last_attempt
 
 
 def test_reopening_opens_before_the_palm_moves():
-    start, shift = torch.full((9,), 0.1).double(), real([0.01, 0.005, -0.01])
+    start = torch.full((9,), 0.1).double()
+    shift = real([0.01, 0.005, -0.01])
     opening = Reopening(on_table(), torch.cat([shift, STILL]), start, STILL, STILL, 0.02)
-    goal, palms, ticks = shift * real([1, 0, 1]), [STILL], 0  # along the table
+    # along the table
+    goal = shift * real([1, 0, 1])
+    palms = [STILL]
+    ticks = 0
     while not opening.done:
-        joints, ticks = opening(PERIOD), ticks + 1
+        joints = opening(PERIOD)
+        ticks = ticks + 1
         palms.append(opening.palm)
         if not torch.equal(joints, opening.opened):
             assert torch.equal(opening.palm, STILL)
@@ -102,7 +125,8 @@ def test_reopening_opens_before_the_palm_moves():
 
 @pytest.mark.parametrize(("reach", "length"), [(0.02, 0.02), (0.0, 0.0)])
 def test_reopening_keeps_the_palm_within_its_reach(reach, length):
-    far, joints = torch.cat([real([0.03, 0, 0.04]), STILL]), torch.zeros(9).double()
+    far = torch.cat([real([0.03, 0, 0.04]), STILL])
+    joints = torch.zeros(9).double()
     opening = Reopening(on_table(), far, joints, STILL, STILL, reach)
     while not opening.done:
         opening(PERIOD)
@@ -110,19 +134,25 @@ def test_reopening_keeps_the_palm_within_its_reach(reach, length):
 
 
 def test_reopening_takes_fingers_and_palm_back_at_the_same_time():
-    start, begun, closed = torch.full((9,), 0.1).double(), real([0.02, 0, 0]), real([0.01, 0, 0.01])
+    start = torch.full((9,), 0.1).double()
+    begun = real([0.02, 0, 0])
+    closed = real([0.01, 0, 0.01])
     opening = Reopening(on_table(), PLACE, start, closed, begun, 0.0)
     while not opening.done:
         joints = opening(PERIOD)
         share = (joints - start) / (opening.opened - start)
-        assert torch.allclose(opening.palm, closed + share[:3] * (begun - closed), rtol=0, atol=1e-12)
+        assert torch.allclose(
+            opening.palm, closed + share[:3] * (begun - closed), rtol=0, atol=1e-12
+        )
     assert torch.equal(joints, opening.opened) and torch.equal(opening.palm, begun)
 
 
 def test_only_a_hand_whose_fingers_have_all_touched_presses_before_it_is_judged():
     for missing in (None, 1):
-        controller, contact = GraspController(on_table()), TOUCHING if missing is None else torch.arange(3) != missing
-        seen, targets = observation(0.0, (0.3 * contact.double()).tolist(), contact), []
+        controller = GraspController(on_table())
+        contact = TOUCHING if missing is None else torch.arange(3) != missing
+        seen = observation(0.0, (0.3 * contact.double()).tolist(), contact)
+        targets = []
         while controller.reopening is None and len(targets) < 1000:
             joints = controller.step(seen, PERIOD).joints
             targets += [joints] if controller.hold is not None else []
@@ -150,9 +180,14 @@ def test_controller_closes_again_after_meeting_nothing(closing):
 
 @pytest.mark.parametrize(
     ("closing", "options", "table"),
-    [("uncertainty", ClosingOptions(attempts=1), True), ("uncertainty", NO_OPTIONS, True), ("uncertainty", None, False),
-     ("position", None, True), ("paper", None, True)],
-)  # fmt: skip
+    [
+        ("uncertainty", ClosingOptions(attempts=1), True),
+        ("uncertainty", NO_OPTIONS, True),
+        ("uncertainty", None, False),
+        ("position", None, True),
+        ("paper", None, True),
+    ],
+)
 def test_controller_with_one_attempt_or_without_table_closes_once(closing, options, table):
     held = on_table() if table else reference()
     controller = GraspController(held, closing, options=options)

@@ -1,4 +1,6 @@
-"""A second look: motions of bodies whose distance field is known in closed form are found again, and followed."""
+"""A second look: motions of bodies whose distance field is known in closed form are found again,
+and followed.
+"""
 
 import dataclasses
 
@@ -20,7 +22,8 @@ from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_from_vect
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.signed_distance import field_from_surface
 
-TABLE, UP = Plane(real([0, 1, 0]), -0.1), real([0, 1, 0])
+TABLE = Plane(real([0, 1, 0]), -0.1)
+UP = real([0, 1, 0])
 
 
 def turned(shift, turn):
@@ -37,10 +40,15 @@ def seen_block(n=400, seed=0):
     return CENTER + HALF * torch.where(torch.arange(3) == face[:, None], 1.0, inside)
 
 
-@pytest.mark.parametrize("pose", [None, rigid(rotation_from_vector(real([0.4, -1.0, 2.0])), real([0.5, -0.2, 0.1]))])
-@pytest.mark.parametrize(("shift", "turn"), [((0, 0), 0), ((0.06, -0.03), 0.3), ((-0.02, 0.075), -0.4)])
+@pytest.mark.parametrize(
+    "pose", [None, rigid(rotation_from_vector(real([0.4, -1.0, 2.0])), real([0.5, -0.2, 0.1]))]
+)
+@pytest.mark.parametrize(
+    ("shift", "turn"), [((0, 0), 0), ((0.06, -0.03), 0.3), ((-0.02, 0.075), -0.4)]
+)
 def test_relocate_finds_the_motion_of_a_block_in_any_frame(shift, turn, pose):
-    pose, motion = torch.eye(4).double() if pose is None else pose, turned(shift, turn)
+    pose = torch.eye(4).double() if pose is None else pose
+    motion = turned(shift, turn)
     cloud = PointCloud(apply(pose @ motion, seen_block()))
     found = inverse(pose) @ relocate(field(block, pose), cloud, TABLE.moved(pose)) @ pose
     corners = CENTER + HALF * torch.cartesian_prod(*[real([-1, 1])] * 3)
@@ -49,7 +57,8 @@ def test_relocate_finds_the_motion_of_a_block_in_any_frame(shift, turn, pose):
 
 
 def test_relocate_is_robust_against_noise_and_outliers():
-    generator, motion = torch.Generator().manual_seed(0), turned((0.05, 0.03), 0.2)
+    generator = torch.Generator().manual_seed(0)
+    motion = turned((0.05, 0.03), 0.2)
     points = apply(motion, seen_block())
     points = points + 0.002 * torch.randn(points.shape, generator=generator, dtype=torch.float64)
     points[:40] += real([0.03, 0.02, 0.0])  # a tenth of the points is of something else
@@ -64,7 +73,8 @@ def seen_ball(shift):
 
 
 def test_controller_moves_the_path_of_its_palm_to_the_object_before_the_approach():
-    shift, controller = real([0.05, 0, 0.03]), GraspController(above(), approach=LENGTH)
+    shift = real([0.05, 0, 0.03])
+    controller = GraspController(above(), approach=LENGTH)
     controller.relook(seen_ball(shift))
     assert (controller.targets.palm - shift).norm() < 1e-3 and controller.targets.left == LENGTH
     while controller.approaching:
@@ -97,9 +107,18 @@ def test_the_camera_of_a_view_is_at_its_viewpoint_and_looks_at_its_points():
 @pytest.mark.filterwarnings("ignore")
 def test_a_camera_beside_the_hand_finds_an_object_six_centimetres_away():
     pytest.importorskip("sapien")
-    surface = field_from_surface(torch.tensor(cylinder().vertices), torch.tensor(cylinder().faces), 0.004)
+    surface = field_from_surface(
+        torch.tensor(cylinder().vertices), torch.tensor(cylinder().faces), 0.004
+    )
     hand, grasp = pinch("allegro")
-    camera, away = look_at(-120.0, 40.0, 0.5, cylinder()), (-0.045, 0.04)
+    camera = look_at(-120.0, 40.0, 0.5, cylinder())
+    away = (-0.045, 0.04)
     spec = dataclasses.replace(QUICK, noise=False)
-    found = lift_grasp(GraspTrial(hand, grasp, Truth(cylinder(away), camera=camera), surface=surface), spec)
-    assert (found.held, found.stops, found.attempts) == (True, 0, 1) and found.before_lift.distance < 0.005
+    found = lift_grasp(
+        GraspTrial(hand, grasp, Truth(cylinder(away), camera=camera), surface=surface), spec
+    )
+    assert (found.held, found.stops, found.attempts) == (
+        True,
+        0,
+        1,
+    ) and found.before_lift.distance < 0.005

@@ -1,4 +1,6 @@
-"""Poorer fingertips: what each kind tells, how late, and that the closing law relies on no more than that."""
+"""Poorer fingertips: what each kind tells, how late, and that the closing law relies on no more
+than that.
+"""
 
 import dataclasses
 import math
@@ -6,7 +8,16 @@ import math
 import pytest
 import torch
 
-from tests.point_fingers import GAINS, NORMALS, PERIOD, TARGET, TOUCHING, observation, real, reference
+from tests.point_fingers import (
+    GAINS,
+    NORMALS,
+    PERIOD,
+    TARGET,
+    TOUCHING,
+    observation,
+    real,
+    reference,
+)
 from torchgrasp import GraspController, TrialSpec
 from torchgrasp.control import FingertipSensor, TipContact, feel_flags, feel_torques, no_contact
 from torchgrasp.control.holding import MAX_FACTOR, ForceHold
@@ -43,11 +54,18 @@ def test_sensor_delay_repeats_earlier_readings_and_noise_scales():
             assert torch.equal(old[k].reading, fresh[k - late].reading)
             assert torch.equal(old[k].contact, fresh[k - late].contact)
     assert (old[0].reading == 0).all()
-    one, three = (torch.stack([t.reading for t in told(having(noise=n), (2.0, 2.0, 2.0), 100, 1)]) for n in (1.0, 3.0))
+    one, three = (
+        torch.stack([t.reading for t in told(having(noise=n), (2.0, 2.0, 2.0), 100, 1)])
+        for n in (1.0, 3.0)
+    )
     clean = torch.stack([t.reading for t in told(having(), (2.0, 2.0, 2.0), 100)])
     assert torch.allclose(three - clean, 3 * (one - clean), atol=1e-12)
-    readings = torch.stack([t.reading for t in told(having(kind="torque"), (2.0, 2.0, 2.0), 700, 1)[50:]])
-    passed = math.sqrt(1 - math.exp(-0.4 * math.pi)) / math.sqrt(1 + math.exp(-0.4 * math.pi))  # of an AR(1) low-pass
+    readings = torch.stack(
+        [t.reading for t in told(having(kind="torque"), (2.0, 2.0, 2.0), 700, 1)[50:]]
+    )
+    passed = math.sqrt(1 - math.exp(-0.4 * math.pi)) / math.sqrt(
+        1 + math.exp(-0.4 * math.pi)
+    )  # of an AR(1) low-pass
     assert float(readings.std()) == pytest.approx(TORQUE_NOISE * passed, rel=0.15)
 
 
@@ -57,14 +75,18 @@ def test_torque_sensor_measures_observable_forces_without_places_as_feel_torques
     assert torch.allclose(last.forces, -last.reading[:, None] * NORMALS, atol=1e-9)
     assert last.contact.tolist() == [True, True, False]
     assert not torch.isfinite(last.points).any() and not torch.isfinite(last.normals).any()
-    known, tactile = having(kind="torque"), no_contact()
+    known = having(kind="torque")
+    tactile = no_contact()
     torques = torch.einsum("fcj,fc->j", JACOBIAN, touch((1.0, 2.0, 0.5)).forces)
     for expected in told(known, (1.0, 2.0, 0.5), 20):
         tactile = feel_torques(tactile, known, JACOBIAN, torques, PERIOD)
-        assert torch.allclose(tactile.reading, expected.reading) and torch.equal(tactile.contact, expected.contact)
+        assert torch.allclose(tactile.reading, expected.reading) and torch.equal(
+            tactile.contact, expected.contact
+        )
     stretched = JACOBIAN.clone()
     stretched[0, 0] *= 1e-3  # the first finger is stretched out along its normal
-    torques, tactile = 0.01 * torch.ones(9).double(), no_contact()
+    torques = 0.01 * torch.ones(9).double()
+    tactile = no_contact()
     for _ in range(20):
         tactile = feel_torques(tactile, known, stretched, torques, PERIOD)
     assert abs(float(tactile.reading[0])) < 1.0  # by least squares it would be 10 N
@@ -73,7 +95,8 @@ def test_torque_sensor_measures_observable_forces_without_places_as_feel_torques
 
 
 def test_binary_sensor_reads_the_same_for_every_force():
-    weak, strong = told(having(kind="binary"), (1.0, 0.1, 0.0))[-1], told(having(kind="binary"), (9.0, 0.1, 0.0))[-1]
+    weak = told(having(kind="binary"), (1.0, 0.1, 0.0))[-1]
+    strong = told(having(kind="binary"), (9.0, 0.1, 0.0))[-1]
     assert weak.contact.tolist() == [True, False, False]
     for name in ("reading", "forces", "contact", "average", "sliding"):
         assert torch.equal(getattr(weak, name), getattr(strong, name))
@@ -81,28 +104,43 @@ def test_binary_sensor_reads_the_same_for_every_force():
 
 
 def test_dead_sensor_is_silent_and_others_are_unchanged():
-    quiet, all_of_them = (told(x, (2.0, 2.0, 2.0), seed=3)[-1] for x in (having(dead=FINGERS[1:2]), having()))
-    assert quiet.reading[1] == 0 and not quiet.contact[1] and not torch.isfinite(quiet.points[1]).any()
+    quiet, all_of_them = (
+        told(x, (2.0, 2.0, 2.0), seed=3)[-1] for x in (having(dead=FINGERS[1:2]), having())
+    )
+    assert (
+        quiet.reading[1] == 0 and not quiet.contact[1] and not torch.isfinite(quiet.points[1]).any()
+    )
     for k in (0, 2):
-        assert quiet.reading[k] == all_of_them.reading[k] and torch.equal(quiet.normals[k], all_of_them.normals[k])
+        assert quiet.reading[k] == all_of_them.reading[k] and torch.equal(
+            quiet.normals[k], all_of_them.normals[k]
+        )
     with pytest.raises(BadArgument, match="little_toe"):
         FingertipSensor(having(dead=("little_toe",)))
 
 
-def closes(sensor: SensorModel, contact, off: float, ticks=12) -> tuple[UncertaintyClosing, torch.Tensor]:
-    """How far the last finger's target comes on while the others touch as given, its tip off its contact [m]."""
+def closes(
+    sensor: SensorModel, contact, off: float, ticks=12
+) -> tuple[UncertaintyClosing, torch.Tensor]:
+    """How far the last finger's target comes on while the others touch as given, its tip off its
+    contact [m].
+    """
     law = UncertaintyClosing(dataclasses.replace(reference(), sensor=sensor), WAIT_ALONE)
     seen = observation(off, (0.3, 0.3, 0.0), contact)
     targets = torch.stack([law(seen, PERIOD).reshape(3, 3)[2] for _ in range(ticks)])
     return law, -((targets - targets[0]) * NORMALS[2]).sum(-1)
 
 
-DEAD, TWO = SensorModel(dead=FINGERS[2:]), torch.tensor([True, True, False])
+DEAD = SensorModel(dead=FINGERS[2:])
+TWO = torch.tensor([True, True, False])
 
 
 def test_dead_finger_rests_at_its_contact_then_searches_and_counts_as_touching_far_beyond():
     alone = torch.tensor([True, False, False])
-    for contact, off, comes_on in ((alone, 0.01, True), (alone, -0.001, False), (TWO, -0.001, True)):
+    for contact, off, comes_on in (
+        (alone, 0.01, True),
+        (alone, -0.001, False),
+        (TWO, -0.001, True),
+    ):
         law, steps = closes(DEAD, contact, off)
         assert (float(steps[-1]) > 1e-3) == comes_on and not law.done
         if not comes_on:
@@ -110,23 +148,32 @@ def test_dead_finger_rests_at_its_contact_then_searches_and_counts_as_touching_f
     deviation = float((NORMALS[2] @ GAINS.covariance[2] @ NORMALS[2]).sqrt())
     for off, done in ((-0.9 * 3.0 * deviation, False), (-1.1 * 3.0 * deviation, True)):
         assert closes(DEAD, TWO, off)[0].done == done
-    assert not closes(SensorModel(), TWO, -1.1 * 3.0 * deviation)[0].done  # one that could tell searches on
+    assert not closes(SensorModel(), TWO, -1.1 * 3.0 * deviation)[
+        0
+    ].done  # one that could tell searches on
 
 
 def test_dead_finger_stops_where_its_drives_push_which_measure_blocked_joints_but_not_motion():
     joints = torch.zeros(9).double()  # something keeps it where it is
     known = dataclasses.replace(reference(), kp=torch.full((9,), 100.0).double(), sensor=DEAD)
-    law, seen = UncertaintyClosing(known, WAIT_ALONE), observation(-0.001, (0.3, 0.3, 0.0), TWO, joints)
+    law = UncertaintyClosing(known, WAIT_ALONE)
+    seen = observation(-0.001, (0.3, 0.3, 0.0), TWO, joints)
     targets = torch.stack([law(seen, PERIOD).reshape(3, 3)[2] for _ in range(120)])
     ahead = -(targets * NORMALS[2]).sum(-1)
     assert law.done and bool(law.touched.all())
-    assert STALLED < 100.0 * float(ahead[-1]) < 3 * STALLED  # it stands, the lag of the average later
+    assert (
+        STALLED < 100.0 * float(ahead[-1]) < 3 * STALLED
+    )  # it stands, the lag of the average later
     assert torch.allclose(ahead[-20:], ahead[-1:], atol=1e-9)
-    known, still = reference(), torch.zeros(9).double()
+    known = reference()
+    still = torch.zeros(9).double()
     drive = next(iter(known.hand.actuators.values()))
-    pushed, moving = DriveFeel(known), DriveFeel(known)
+    pushed = DriveFeel(known)
+    moving = DriveFeel(known)
     for k in range(200):
-        felt = pushed(observation(joints=still), still - (0.5 * NORMALS / known.kp[0]).flatten(), PERIOD)
+        felt = pushed(
+            observation(joints=still), still - (0.5 * NORMALS / known.kp[0]).flatten(), PERIOD
+        )
         at = still + 0.2 * PERIOD * (k + 1)  # at 0.2 rad/s a drive lags by d/k of it
         free = moving(observation(joints=at), at + drive.kd / known.kp * 0.2, PERIOD)
     assert torch.allclose(felt, real([0.5, 0.5, 0.5]), rtol=1e-3)
@@ -137,14 +184,17 @@ def test_dead_finger_in_the_air_does_not_move_the_object_estimate():
     moved = {}
     for name, known in (("dead", having(dead=FINGERS[2:])), ("alive", reference())):
         law = UncertaintyClosing(known, ClosingOptions())
-        tips = TARGET + 0.01 * NORMALS - 0.01 * NORMALS * real([[0.0], [0.0], [1.0]])  # the last is beyond its contact
+        tips = (
+            TARGET + 0.01 * NORMALS - 0.01 * NORMALS * real([[0.0], [0.0], [1.0]])
+        )  # the last is beyond its contact
         law(dataclasses.replace(observation(), tips=tips), PERIOD)
         moved[name] = float(law.palm.norm())
     assert moved["dead"] == 0 and moved["alive"] > 0
 
 
 def test_force_hold_regulates_by_sensed_forces_alone():
-    start, silent = torch.zeros(9).double(), observation(0.0, (0.0, 0.0, 0.0), TOUCHING)
+    start = torch.zeros(9).double()
+    silent = observation(0.0, (0.0, 0.0, 0.0), TOUCHING)
     for known, factor in ((having(kind="binary"), 1.0), (reference(), MAX_FACTOR)):
         hold = ForceHold(known, silent, start)
         for _ in range(150):
@@ -158,7 +208,8 @@ def test_force_hold_regulates_by_sensed_forces_alone():
 
 
 def test_holdings_keep_the_largest_force():
-    fragile, seen = dataclasses.replace(reference(), max_force=2.0), observation(0.0, (0.0, 0.0, 0.0), TOUCHING)
+    fragile = dataclasses.replace(reference(), max_force=2.0)
+    seen = observation(0.0, (0.0, 0.0, 0.0), TOUCHING)
     for holding in ("force", "grip"):
         controller = GraspController(fragile, holding=holding)
         for _ in range(200):
@@ -170,7 +221,9 @@ def test_holdings_keep_the_largest_force():
         TrialSpec(force=4.0, max_force=2.0)
 
 
-@pytest.mark.parametrize(("closing", "holding"), [("paper", "force"), ("position", "force"), ("uncertainty", "grip")])
+@pytest.mark.parametrize(
+    ("closing", "holding"), [("paper", "force"), ("position", "force"), ("uncertainty", "grip")]
+)
 def test_closings_refuse_sensors_that_measure_too_little(closing, holding):
     for sensor in (SensorModel("binary"), SensorModel(dead=FINGERS[:1])):
         with pytest.raises(BadArgument, match="sensor"):
@@ -181,7 +234,8 @@ def test_closings_refuse_sensors_that_measure_too_little(closing, holding):
 
 
 @pytest.mark.parametrize(
-    "changes", [{"noise": 1.0}, {"noise": 3.0}, {"kind": "torque"}, {"kind": "torque", "noise": 3.0}]
+    "changes",
+    [{"noise": 1.0}, {"noise": 3.0}, {"kind": "torque"}, {"kind": "torque", "noise": 3.0}],
 )
 def test_sensor_noise_alone_is_no_touch(changes):
     levers = 0.05 * JACOBIAN  # a torque's noise is 0.2 N here, twice a tactile fingertip's

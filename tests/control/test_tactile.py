@@ -1,4 +1,6 @@
-"""The tactile fingertip: lag, noise, hysteresis, sampling rate, place of the contact, reproducibility."""
+"""The tactile fingertip: lag, noise, hysteresis, sampling rate, place of the contact,
+reproducibility.
+"""
 
 import itertools
 import math
@@ -6,27 +8,41 @@ import math
 import pytest
 import torch
 
-from torchgrasp.control.tactile import NOISE, SAMPLING_RATE, TipContact, low_pass, measure, no_contact
+from torchgrasp.control.tactile import (
+    NOISE,
+    SAMPLING_RATE,
+    TipContact,
+    low_pass,
+    measure,
+    no_contact,
+)
 from torchgrasp.geometry.linalg import unit
 
 NORMALS = torch.tensor([[1.0, 0, 0], [0, 0.6, 0.8], [0, 0, -1]], dtype=torch.float64)
 RADIUS = torch.tensor([0.012, 0.012, 0.0], dtype=torch.float64)
 POINTS = 0.1 * torch.eye(3, dtype=torch.float64) - RADIUS[:, None] * NORMALS
-SLANT = torch.linalg.cross(NORMALS, torch.ones(3, 3, dtype=torch.float64))  # friction, across the normals
+SLANT = torch.linalg.cross(
+    NORMALS, torch.ones(3, 3, dtype=torch.float64)
+)  # friction, across the normals
 
 
 def press(force, air=(), batch=()):
-    """Tips that press with a force along their normals and half of it across; tips in the air have no place."""
+    """Tips that press with a force along their normals and half of it across; tips in the air have
+    no place.
+    """
     push = torch.full((*batch, 3), float(force), dtype=torch.float64)
     nothing = torch.tensor([i in air for i in range(3)])[:, None]
-    points, normals = (torch.where(nothing, torch.nan, x).expand(*batch, 3, 3) for x in (POINTS, NORMALS))
+    points, normals = (
+        torch.where(nothing, torch.nan, x).expand(*batch, 3, 3) for x in (POINTS, NORMALS)
+    )
     return TipContact(push, push[..., None] * (0.5 * SLANT - NORMALS), points, normals)
 
 
 def run(forces, period=0.01, seed=None, air=(), batch=()):
     """Feed a sequence of forces to sensors."""
     generator = None if seed is None else torch.Generator().manual_seed(seed)
-    touch, trace = no_contact(*batch), []
+    touch = no_contact(*batch)
+    trace = []
     for force in forces:
         touch = measure(touch, press(force, air, batch), NORMALS, RADIUS, period, generator)
         trace.append(touch)
@@ -52,8 +68,11 @@ def test_measure_samples_at_the_sensors_rate_and_holds_the_samples():
 
 
 def test_measure_without_noise_reads_the_truth_and_no_place_of_a_tip_in_the_air():
-    touch, truth = run([3.0] * 50)[-1], press(3.0)
-    assert torch.allclose(touch.reading, truth.normal_force) and torch.allclose(touch.forces, truth.forces)
+    touch = run([3.0] * 50)[-1]
+    truth = press(3.0)
+    assert torch.allclose(touch.reading, truth.normal_force) and torch.allclose(
+        touch.forces, truth.forces
+    )
     assert torch.equal(touch.points, truth.points) and torch.equal(touch.normals, truth.normals)
     touch = run([0.0] * 50, seed=2, air=(1,))[-1]
     assert torch.isnan(touch.points[1]).all() and torch.isnan(touch.normals[1]).all()
@@ -66,7 +85,9 @@ def test_measure_noise_of_forces_has_the_papers_size_and_no_bias():
     assert abs(float(last.reading.mean()) - 2.0) < 0.01
     rest = last.forces - press(2.0).forces
     along = (rest * NORMALS).sum(-1)
-    assert torch.allclose(along, -(last.reading - 2.0), atol=1e-5)  # both readings have the same noise
+    assert torch.allclose(
+        along, -(last.reading - 2.0), atol=1e-5
+    )  # both readings have the same noise
     assert float(last.sliding.std()) == pytest.approx(2e-3, rel=0.03)  # [m/s]; nothing slides
     across = (rest - along[..., None] * NORMALS).norm(dim=-1)
     assert float(across.square().mean().sqrt()) == pytest.approx(2**0.5 * 0.3, rel=0.03)
@@ -75,19 +96,27 @@ def test_measure_noise_of_forces_has_the_papers_size_and_no_bias():
 def test_measure_noise_of_a_place_is_along_the_tip_and_turns_its_normal():
     last = run([2.0] * 2, seed=5, batch=(4000,))[-1]
     off = last.points - POINTS
-    assert float(off[:, 0].square().sum(-1).mean().sqrt()) == pytest.approx(2**0.5 * 1.5e-3, rel=0.03)
+    assert float(off[:, 0].square().sum(-1).mean().sqrt()) == pytest.approx(
+        2**0.5 * 1.5e-3, rel=0.03
+    )
     assert off.mean(0).norm(dim=-1).max() < 2e-4
     centres = POINTS + RADIUS[:, None] * NORMALS
     round_tips = centres[:2] - RADIUS[:2, None] * last.normals[:, :2]
-    assert torch.allclose(last.points[:, :2], round_tips)  # the sensed contact lies on the round tip
-    angle = torch.acos((unit(last.normals) * NORMALS).sum(-1).clamp(max=1.0)).square().mean(0).sqrt()
+    assert torch.allclose(
+        last.points[:, :2], round_tips
+    )  # the sensed contact lies on the round tip
+    angle = (
+        torch.acos((unit(last.normals) * NORMALS).sum(-1).clamp(max=1.0)).square().mean(0).sqrt()
+    )
     assert torch.allclose(angle, torch.full((3,), 2**0.5 * 1.5e-3 / 0.012).double(), rtol=0.05)
 
 
 def test_contact_flag_has_hysteresis_and_measure_repeats_itself_by_seed():
     flags = [bool(t.contact[0]) for t in run([0.15] * 60 + [0.3] * 60 + [0.15] * 60 + [0.05] * 60)]
     assert not any(flags[:60]) and all(flags[119:180]) and not flags[-1]
-    assert not any(bool(t.contact.any()) for t in run([0.0] * 60, seed=3, air=(0, 1, 2), batch=(50,)))
+    assert not any(
+        bool(t.contact.any()) for t in run([0.0] * 60, seed=3, air=(0, 1, 2), batch=(50,))
+    )
     before = torch.random.get_rng_state()
     first, second, other = (run([1.0] * 5, seed=s)[-1] for s in (7, 7, 8))
     assert torch.equal(first.reading, second.reading) and torch.equal(first.points, second.points)

@@ -1,4 +1,6 @@
-"""The closings: when fingers approach, wait, search, stop and press, and the paper's control law (Eqs. 25-28)."""
+"""The closings: when fingers approach, wait, search, stop and press, and the paper's control law
+(Eqs. 25-28).
+"""
 
 import dataclasses
 import math
@@ -20,7 +22,13 @@ from tests.point_fingers import (
     reference,
 )
 from torchgrasp import ClosingReference, GraspController, Plane
-from torchgrasp.control.law import MAX_SPEED, POSITION_FLOOR, POSITION_RATE, position_gain, surface_covariance
+from torchgrasp.control.law import (
+    MAX_SPEED,
+    POSITION_FLOOR,
+    POSITION_RATE,
+    position_gain,
+    surface_covariance,
+)
 from torchgrasp.control.paper.closings import SETTLED, STOP_FORCE, PaperClosing, PositionClosing
 from torchgrasp.control.reference import next_target
 from torchgrasp.control.sensing import WAITING_FORCE
@@ -34,16 +42,19 @@ from torchgrasp.control.uncertainty_closing import (
 )
 from torchgrasp.values.closing import NO_OPTIONS, ClosingOptions
 
-ONE, TWO = torch.tensor([True, False, False]), torch.tensor([True, True, False])
+ONE = torch.tensor([True, False, False])
+TWO = torch.tensor([True, True, False])
 RIGID_ARM = ClosingOptions(palm_reach=0.0, stops=0)
 
 
-def closing(options: ClosingOptions = ClosingOptions()) -> UncertaintyClosing:  # noqa: B008, it is frozen
+def closing(options: ClosingOptions = ClosingOptions()) -> UncertaintyClosing:  # noqa: B008
     return UncertaintyClosing(reference(), options)
 
 
 def uncertain(*std_mm: float, force: float = 1e-3) -> ClosingReference:
-    """The reference of contacts with these deviations, alike in all else; the force loop [m/(s N)] is slow."""
+    """The reference of contacts with these deviations, alike in all else; the force loop [m/(s N)]
+    is slow.
+    """
     covariance = surface_covariance(NORMALS, 1e-3 * real(std_mm))
     gains = dataclasses.replace(
         GAINS,
@@ -52,7 +63,9 @@ def uncertain(*std_mm: float, force: float = 1e-3) -> ClosingReference:
         force_gain=torch.full((3, 3), force).double(),
         desired_force=-3.0 * NORMALS,
     )
-    return dataclasses.replace(reference(), gains=gains, distance_variance=(1e-3 * real(std_mm)) ** 2)
+    return dataclasses.replace(
+        reference(), gains=gains, distance_variance=(1e-3 * real(std_mm)) ** 2
+    )
 
 
 def order(controller: GraspController) -> list[int]:
@@ -70,9 +83,13 @@ def test_eq25_free_fingers_approach_their_contacts_at_one_pace_and_fixed_gains_a
     assert ((step * NORMALS).sum(-1) < 0).all()
     assert step.norm(dim=-1).max() <= MAX_SPEED * PERIOD + 1e-12
     assert step[:, 1:].abs().max() < 1e-9
-    near = dataclasses.replace(observation(0.2), tips=TARGET + 0.01 * NORMALS + real([[0.2], [0.1], [0.2]]) * NORMALS)
+    near = dataclasses.replace(
+        observation(0.2), tips=TARGET + 0.01 * NORMALS + real([[0.2], [0.1], [0.2]]) * NORMALS
+    )
     speed = -(closing()(near, PERIOD).reshape(3, 3) * NORMALS).sum(-1)
-    assert float(speed[1] / speed[0]) == pytest.approx((0.1 + POSITION_FLOOR) / (0.2 + POSITION_FLOOR), rel=1e-3)
+    assert float(speed[1] / speed[0]) == pytest.approx(
+        (0.1 + POSITION_FLOOR) / (0.2 + POSITION_FLOOR), rel=1e-3
+    )
     assert float(speed[2]) == pytest.approx(float(speed[0]))
     gains = with_equal_gains(reference()).gains
     assert torch.allclose(gains.position_gain, real(POSITION_RATE))
@@ -83,11 +100,14 @@ def test_eq25_free_fingers_approach_their_contacts_at_one_pace_and_fixed_gains_a
 
 def test_paper_closing_touches_with_the_most_certain_finger_first():
     for std_mm, force in (((2.0, 5.0, 10.0), 1e-3), ((5.0, 10.0, 2.0), 0.02)):
-        assert order(GraspController(uncertain(*std_mm, force=force), "paper"))[0] == int(np.argmin(std_mm))
+        assert order(GraspController(uncertain(*std_mm, force=force), "paper"))[0] == int(
+            np.argmin(std_mm)
+        )
 
 
 def test_waiting_finger_rests_and_yields_to_more_than_the_waiting_force():
-    law, contact = closing(RIGID_ARM), ONE
+    law = closing(RIGID_ARM)
+    contact = ONE
     for reading in (WAITING_FORCE, 0.1, 0.0, -0.1):
         step = law(observation(0.02, (reading, 0, 0), contact), PERIOD).reshape(3, 3)
         assert step[0].abs().max() < 1e-12
@@ -95,19 +115,24 @@ def test_waiting_finger_rests_and_yields_to_more_than_the_waiting_force():
     step = law(observation(0.02, (1.0, 0, 0)), PERIOD).reshape(3, 3)
     assert float((step[0] * NORMALS[0]).sum()) > 0
     last = law(observation(0.02, (0.0, QUICK_TOUCH, QUICK_TOUCH)), PERIOD).reshape(3, 3)
-    assert float((last[0] * NORMALS[0]).sum()) < float((step[0] * NORMALS[0]).sum())  # all have touched: all press
+    assert float((last[0] * NORMALS[0]).sum()) < float(
+        (step[0] * NORMALS[0]).sum()
+    )  # all have touched: all press
 
 
 @pytest.mark.parametrize(("wait", "sign"), [(True, 1), (False, -1)])
 def test_finger_presses_at_once_without_waiting(wait, sign):
-    seen = observation(0.0, (1.0, 0.0, 0.0), ONE)  # more than the waiting force, less than the desired force
+    seen = observation(
+        0.0, (1.0, 0.0, 0.0), ONE
+    )  # more than the waiting force, less than the desired force
     step = closing(ClosingOptions(wait=wait))(seen, PERIOD).reshape(3, 3)
     assert float(step[0] @ NORMALS[0]) * sign > 0
 
 
 @pytest.mark.parametrize(("contact", "time"), [(TOUCHING, SETTLED), (ONE, PATIENCE)])
 def test_closing_ends_when_all_touch_or_patience_is_over(contact, time):
-    law, ticks = closing(), 0
+    law = closing()
+    ticks = 0
     while not law.done:
         law(observation(contact=contact), PERIOD)
         ticks += 1
@@ -119,14 +144,16 @@ def test_closing_ends_when_all_touch_or_patience_is_over(contact, time):
 
 
 def test_targets_stay_near_the_joints_but_late_fingers_search_and_press_harder():
-    law, stopping = closing(), PositionClosing(reference())
+    law = closing()
+    stopping = PositionClosing(reference())
     for _ in range(150):
         targets = law(observation(0.5), PERIOD)
     assert targets.abs().max() == pytest.approx(LEAD)
     for _ in range(60):
         targets = stopping(observation(0.5), 0.5)
     assert targets.abs().max() == pytest.approx(1.0)
-    seen, law = observation(-0.03, (0.3, 0.3, 0.0), TWO), closing()
+    seen = observation(-0.03, (0.3, 0.3, 0.0), TWO)
+    law = closing()
     first = law(seen, PERIOD).reshape(3, 3)
     assert float(first[2] @ NORMALS[2]) < -0.5 * MAX_SPEED * PERIOD
     last = [law(seen, PERIOD) for _ in range(240)][-1]
@@ -135,13 +162,16 @@ def test_targets_stay_near_the_joints_but_late_fingers_search_and_press_harder()
 
 @pytest.mark.parametrize("up", [1.0, -1.0])
 def test_searching_finger_stays_above_the_table(up):
-    """The fingers search along x, beyond their contacts; the table is across x, 5 mm behind the contacts above it."""
+    """The fingers search along x, beyond their contacts; the table is across x, 5 mm behind the
+    contacts above it.
+    """
     above = NORMALS[:, 0] == up
     table = Plane(real([up, 0, 0]), float(up * TARGET[above, 0].mean()) - 0.005)
     low, free = (dataclasses.replace(reference(), table=t) for t in (table, None))
     tips = {}
     for name, known in (("low", low), ("free", free)):
-        law, joints = UncertaintyClosing(known, RIGID_ARM), torch.zeros(9).double()
+        law = UncertaintyClosing(known, RIGID_ARM)
+        joints = torch.zeros(9).double()
         for _ in range(200):
             at = TARGET + 0.02 * NORMALS + joints.reshape(3, 3)
             joints = law(dataclasses.replace(observation(joints=joints), tips=at), PERIOD)
@@ -153,43 +183,77 @@ def test_searching_finger_stays_above_the_table(up):
 
 
 def test_fingers_slide_along_the_table_to_the_rim_of_a_low_object():
-    """Tips of 10 mm on the table touch a sharp rim 5 mm high with normals of slope 1/2; walls are met as before."""
+    """Tips of 10 mm on the table touch a sharp rim 5 mm high with normals of slope 1/2; walls are
+    met as before.
+    """
     slope = torch.tensor([0.5, 0.5, 0.5]).double()
     normals = torch.stack([(1 - slope**2).sqrt() * NORMALS[:, 0], 0 * slope, slope], -1)
     rim = TARGET * real([1.0, 1.0, 0.0]) + real([0.0, 0.0, 0.005])
-    gains = dataclasses.replace(GAINS, target=rim, covariance=surface_covariance(normals, real([0.004] * 3)))
-    low = dataclasses.replace(reference(), normals=normals, gains=gains, table=Plane(real([0, 0, 1]), 0.0))
-    law, joints, paths = UncertaintyClosing(low, RIGID_ARM), torch.zeros(9).double(), []
+    gains = dataclasses.replace(
+        GAINS, target=rim, covariance=surface_covariance(normals, real([0.004] * 3))
+    )
+    low = dataclasses.replace(
+        reference(), normals=normals, gains=gains, table=Plane(real([0, 0, 1]), 0.0)
+    )
+    law = UncertaintyClosing(low, RIGID_ARM)
+    joints = torch.zeros(9).double()
+    paths = []
     assert law.low.all() and not rim_contacts(dataclasses.replace(low, table=None)).any()
     assert not rim_contacts(dataclasses.replace(low, normals=NORMALS)).any()
     for _ in range(150):
-        paths.append(rim + 0.01 * normals + real([0, 0, 0.006]) + 0.012 * NORMALS + joints.reshape(3, 3))
+        paths.append(
+            rim + 0.01 * normals + real([0, 0, 0.006]) + 0.012 * NORMALS + joints.reshape(3, 3)
+        )
         joints = law(dataclasses.replace(observation(joints=joints), tips=paths[-1]), PERIOD)
-    height, left = torch.stack(paths)[..., 2] - 0.01, ((torch.stack(paths) - rim) * NORMALS).sum(-1)
-    touch = 0.01 * math.sqrt(0.75)  # horizontal distance [m] of a tip's centre from the rim that it touches
+    height = torch.stack(paths)[..., 2] - 0.01
+    left = ((torch.stack(paths) - rim) * NORMALS).sum(-1)
+    touch = 0.01 * math.sqrt(
+        0.75
+    )  # horizontal distance [m] of a tip's centre from the rim that it touches
     assert float(height.min()) > 0 and float(left.min()) < touch
-    assert float(height[left < touch + 0.003].max()) < 0.0005  # so low even where the rim is met 3 mm early
+    assert (
+        float(height[left < touch + 0.003].max()) < 0.0005
+    )  # so low even where the rim is met 3 mm early
 
 
 def test_a_raised_palm_goes_down_as_coupled_fingers_close_upwards():
-    """Each finger has one joint, with which its tip goes inwards and up by 0.6: only the palm keeps it at the table."""
-    slope, coupling = torch.tensor([0.5, 0.5, 0.5]).double(), torch.zeros(9, 3).double()
+    """Each finger has one joint, with which its tip goes inwards and up by 0.6: only the palm keeps
+    it at the table.
+    """
+    slope = torch.tensor([0.5, 0.5, 0.5]).double()
+    coupling = torch.zeros(9, 3).double()
     for i in range(3):
-        coupling[3 * i, i], coupling[3 * i + 2, i] = -NORMALS[i, 0], 0.6
+        coupling[3 * i, i] = -NORMALS[i, 0]
+        coupling[3 * i + 2, i] = 0.6
     normals = torch.stack([(1 - slope**2).sqrt() * NORMALS[:, 0], 0 * slope, slope], -1)
     rim = TARGET * real([1.0, 1.0, 0.0]) + real([0.0, 0.0, 0.005])
-    gains = dataclasses.replace(GAINS, target=rim, covariance=surface_covariance(normals, real([0.004] * 3)))
-    low = dataclasses.replace(reference(coupling), normals=normals, gains=gains, table=Plane(real([0, 0, 1]), 0.0))
-    rise, start = real([0, 0, 0.006]), rim + 0.01 * normals + 0.01 * NORMALS - real([0, 0, 0.006])
+    gains = dataclasses.replace(
+        GAINS, target=rim, covariance=surface_covariance(normals, real([0.004] * 3))
+    )
+    low = dataclasses.replace(
+        reference(coupling), normals=normals, gains=gains, table=Plane(real([0, 0, 1]), 0.0)
+    )
+    rise = real([0, 0, 0.006])
+    start = rim + 0.01 * normals + 0.01 * NORMALS - real([0, 0, 0.006])
     assert not low.rise.any()  # its links are far away
     raised = dataclasses.replace(low)
     vars(raised)["rise"] = rise
-    law, joints, paths = UncertaintyClosing(raised, RIGID_ARM), torch.zeros(9).double(), [start + rise]
-    while float(((paths[-1] - rim) * NORMALS).sum(-1).max()) > 0.01 * math.sqrt(0.75):  # until all tips touch
-        joints = law(dataclasses.replace(observation(joints=joints), tips=paths[-1] - law.palm), PERIOD)
+    law = UncertaintyClosing(raised, RIGID_ARM)
+    joints = torch.zeros(9).double()
+    paths = [start + rise]
+    while float(((paths[-1] - rim) * NORMALS).sum(-1).max()) > 0.01 * math.sqrt(
+        0.75
+    ):  # until all tips touch
+        joints = law(
+            dataclasses.replace(observation(joints=joints), tips=paths[-1] - law.palm), PERIOD
+        )
         paths.append(start + law.palm + joints.reshape(3, 3))
     height = torch.stack(paths)[..., 2] - 0.01
-    assert float(height.min()) > -1e-3 and float(height.amin(1).max()) < 1e-3 and float(height.max()) < 3e-3
+    assert (
+        float(height.min()) > -1e-3
+        and float(height.amin(1).max()) < 1e-3
+        and float(height.max()) < 3e-3
+    )
     assert float(law.palm[2]) < 0.003 and torch.equal(law.palm[:2], torch.zeros(2).double())
     law = UncertaintyClosing(raised, RIGID_ARM).press()
     law(dataclasses.replace(observation(), tips=start), PERIOD)
@@ -199,7 +263,9 @@ def test_a_raised_palm_goes_down_as_coupled_fingers_close_upwards():
 def test_joints_that_would_be_too_fast_slow_down_together():
     velocity = real([[2.0, 1.0, 0.0], [0.5, 0.0, 0.0], [0.0, 0.0, 0.0]])
     free, slow = (
-        next_target(reference(), torch.zeros(9).double(), velocity, observation(), 10.0, PERIOD, *fastest)
+        next_target(
+            reference(), torch.zeros(9).double(), velocity, observation(), 10.0, PERIOD, *fastest
+        )
         for fastest in ((), (0.8,))
     )
     assert float(slow.abs().max()) == pytest.approx(0.8 * PERIOD)
@@ -207,7 +273,9 @@ def test_joints_that_would_be_too_fast_slow_down_together():
 
 
 def test_touching_finger_is_force_controlled_and_held_with_the_desired_forces():
-    seen = observation(0.03, (2.0, 2.0, 4.0), TOUCHING)  # the forces are as desired, the contacts 30 mm early
+    seen = observation(
+        0.03, (2.0, 2.0, 4.0), TOUCHING
+    )  # the forces are as desired, the contacts 30 mm early
     assert UncertaintyClosing(reference(), NO_OPTIONS)(seen, PERIOD).abs().max() < 1e-9
     going = PaperClosing(reference())(seen, PERIOD).reshape(3, 3)
     assert ((going * NORMALS).sum(-1) < -1e-4).all()
@@ -233,7 +301,9 @@ def test_position_closing_stops_each_finger_for_good():
 
 def test_paper_position_closing_aims_at_the_contacts_and_stops_at_the_papers_force():
     law = PositionClosing(reference())
-    step = law(observation(0.02, (0.45, 0.55, 0.0)), PERIOD).reshape(3, 3).abs().amax(-1)  # Sec. 6.5: 0.5 N
+    step = (
+        law(observation(0.02, (0.45, 0.55, 0.0)), PERIOD).reshape(3, 3).abs().amax(-1)
+    )  # Sec. 6.5: 0.5 N
     assert (step > 0).tolist() == [True, False, True]
     controller = GraspController(reference(), "paper_position")
     assert isinstance(controller.closing, PositionClosing)

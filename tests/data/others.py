@@ -16,8 +16,17 @@ def read_foreign(kind: str, folder: Path, tmp_path: Path) -> dict[str, Any]:
     """Return what other libraries read in a folder, without a network and with an empty cache."""
     if not PYTHON.exists():
         pytest.skip("scripts/beside lerobot makes the environment of the readers")
-    out, cache = tmp_path / "read.json", {"HF_HOME": str(tmp_path / "cache"), "HF_HUB_OFFLINE": "1"}
-    command = [str(PYTHON), str(Path(__file__).with_name("foreign.py")), kind, str(folder), str(out)]
-    done = subprocess.run(command, env=os.environ | cache | {"PYTHONPATH": ""}, capture_output=True, text=True)
+    out = tmp_path / "read.json"
+    cache = {"HF_HOME": str(tmp_path / "cache"), "HF_HUB_OFFLINE": "1"}
+    command = [
+        str(PYTHON),
+        str(Path(__file__).with_name("foreign.py")),
+        kind,
+        str(folder),
+        str(out),
+    ]
+    done = subprocess.run(
+        command, env=os.environ | cache | {"PYTHONPATH": ""}, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr[-3000:]
     return json.loads(out.read_text())

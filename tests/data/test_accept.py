@@ -1,4 +1,6 @@
-"""What public functions take in place of clouds, scenes and hands: each gives the value that a careful caller makes."""
+"""What public functions take in place of clouds, scenes and hands: each gives the value that a
+careful caller makes.
+"""
 
 import types
 from pathlib import Path
@@ -54,7 +56,9 @@ def test_files_and_objects_are_read_with_their_camera(tmp_path):
     path = save_cloud(VIEW, tmp_path / "view.npz")
     for given in (path, str(path), load_object("cylinder"), VIEW):
         cloud = as_cloud(given, "cloud")
-        assert torch.equal(cloud.points, VIEW.points) and torch.equal(cloud.viewpoint, VIEW.viewpoint)
+        assert torch.equal(cloud.points, VIEW.points) and torch.equal(
+            cloud.viewpoint, VIEW.viewpoint
+        )
     scene = save_scene(see((0.0, 0.0, 0.06, 0.1)).select(1), tmp_path / "scene.npz")
     assert as_seen(scene, "cloud").target == 1
 
@@ -66,7 +70,12 @@ def test_planners_get_the_cloud_and_the_hand_of_an_array_and_a_name(monkeypatch)
         asked.append(request)
         raise KeyError
 
-    for name in ("grasps.plan_request", "many.plan_request", "grasps.stream_request", "explain.try_request"):
+    for name in (
+        "grasps.plan_request",
+        "many.plan_request",
+        "grasps.stream_request",
+        "explain.try_request",
+    ):
         monkeypatch.setattr(f"torchgrasp.planner.{name}", stop)
     for function in (torchgrasp.plan_grasps, torchgrasp.stream_grasps, torchgrasp.explain_empty):
         with pytest.raises(KeyError):
@@ -75,11 +84,16 @@ def test_planners_get_the_cloud_and_the_hand_of_an_array_and_a_name(monkeypatch)
         torchgrasp.plan_grasps([open3d(ARRAY), VIEW], "barrett")
     wanted = cloud_from_array(ARRAY)
     assert len(asked) == 4 and all(one.hand is as_hand("barrett", "hand") for one in asked)
-    assert all(torch.equal(one.cloud.points, wanted.points) and one.cloud.viewpoint is None for one in asked)
+    assert all(
+        torch.equal(one.cloud.points, wanted.points) and one.cloud.viewpoint is None
+        for one in asked
+    )
 
 
 def test_a_shape_of_an_array_is_that_of_its_cloud():
-    assert torch.equal(torchgrasp.fit_shape(cloud_from_array(ARRAY)).x, torchgrasp.fit_shape(ARRAY).x)
+    assert torch.equal(
+        torchgrasp.fit_shape(cloud_from_array(ARRAY)).x, torchgrasp.fit_shape(ARRAY).x
+    )
 
 
 def test_a_shipped_hand_is_loaded_once_and_a_folder_each_time():
@@ -89,14 +103,24 @@ def test_a_shipped_hand_is_loaded_once_and_a_folder_each_time():
 
 
 REFUSED = [x for x in HOSTILE if not isinstance(x, Path | str | list | tuple)] + [
-    [1], ARRAY[:3], ARRAY[:, :2], ARRAY[:, 0], ARRAY > 0, trimesh.creation.box(), torch.zeros(9, 2),
-    load_hand("barrett"), open3d(ARRAY[:, :2]), open3d(ARRAY, ARRAY[:5]), GRASP.contacts,
-]  # fmt: skip
+    [1],
+    ARRAY[:3],
+    ARRAY[:, :2],
+    ARRAY[:, 0],
+    ARRAY > 0,
+    trimesh.creation.box(),
+    torch.zeros(9, 2),
+    load_hand("barrett"),
+    open3d(ARRAY[:, :2]),
+    open3d(ARRAY, ARRAY[:5]),
+    GRASP.contacts,
+]
 
 
 @pytest.mark.parametrize("function", ["plan_grasps", "stream_grasps", "explain_empty", "fit_shape"])
 def test_what_is_no_cloud_is_refused_by_name(function):
-    call, hand = getattr(torchgrasp, function), [] if function == "fit_shape" else ["barrett"]
+    call = getattr(torchgrasp, function)
+    hand = [] if function == "fit_shape" else ["barrett"]
     for given in [*REFUSED, *NO_PATHS, "", "none.ply", Path("none.docx")]:
         with pytest.raises(BadArgument, match=r"^cloud") as caught:
             call(given, *hand)
@@ -122,7 +146,8 @@ def test_a_bad_item_of_a_list_is_named():
 def test_a_hand_closes_by_name_on_an_object():
     """Its fingers are those of the grasp, and the convex parts those of the object."""
     pytest.importorskip("sapien")
-    jug, grasp = load_object("jug"), load_shipped_grasp("jug", "allegro")
+    jug = load_object("jug")
+    grasp = load_shipped_grasp("jug", "allegro")
     spec = torchgrasp.TrialSpec(hold_time=0.1)
     careful = torchgrasp.close_hand(grasp, load_hand("allegro"), jug.mesh, spec, parts=jug.parts)
     plain = torchgrasp.close_hand(grasp, "allegro", jug, spec)

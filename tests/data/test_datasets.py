@@ -16,7 +16,9 @@ from torchgrasp.foundation.errors import BadArgument, MeshError
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A box of 0.2 m, to be halved, with two views and a whole cloud, and a torn mesh without views."""
+    """A box of 0.2 m, to be halved, with two views and a whole cloud, and a torn mesh without
+    views.
+    """
     box = trimesh.creation.box((0.2, 0.2, 0.2))
     for name in ("box", "torn"):
         (tmp_path / name).mkdir()
@@ -45,15 +47,23 @@ def test_views_are_listed_in_order(folder: Path):
 
 
 def test_an_object_without_family_is_one_of_its_own(folder: Path):
-    found = [(entry.family, entry.group) for entry in (read_entry(folder, name) for name in ("box", "torn"))]
+    found = [
+        (entry.family, entry.group)
+        for entry in (read_entry(folder, name) for name in ("box", "torn"))
+    ]
     assert found == [("cuboid", "solid"), ("torn", "")]
 
 
 def test_views_and_meshes_come_at_the_suggested_scale(folder: Path):
-    cloud, mesh = read_view(folder, "box", "view0"), read_object_mesh(folder, "box")
+    cloud = read_view(folder, "box", "view0")
+    mesh = read_object_mesh(folder, "box")
     assert cloud.normals is None
-    assert cloud.points.abs().max().item() == pytest.approx(0.05) and mesh.volume == pytest.approx(1e-3)
-    assert cloud.viewpoint is not None and cloud.viewpoint.tolist() == pytest.approx([0.0, 0.0, 1.0])
+    assert cloud.points.abs().max().item() == pytest.approx(0.05) and mesh.volume == pytest.approx(
+        1e-3
+    )
+    assert cloud.viewpoint is not None and cloud.viewpoint.tolist() == pytest.approx(
+        [0.0, 0.0, 1.0]
+    )
     assert read_view(folder, "box", "view0", camera=False).viewpoint is None
 
 
@@ -82,13 +92,18 @@ def test_a_folder_of_meshes_becomes_objects_with_views_that_see_them(tmp_path: P
     box.export(tmp_path / "meshes" / "carton.stl")
     trimesh.creation.icosphere(subdivisions=2, radius=0.04).export(tmp_path / "meshes" / "ball.obj")
     assert write_objects(tmp_path / "meshes", tmp_path / "out", views=2) == ["ball", "carton"]
-    assert list_views(tmp_path / "out") == [(name, f"view{k}") for name in ("ball", "carton") for k in (0, 1)]
+    assert list_views(tmp_path / "out") == [
+        (name, f"view{k}") for name in ("ball", "carton") for k in (0, 1)
+    ]
     mesh = read_object_mesh(tmp_path / "out", "carton")
     np.testing.assert_allclose(mesh.bounds, [[-0.03, -0.04, 0.0], [0.03, 0.04, 0.1]], atol=1e-6)
     cloud = read_view(tmp_path / "out", "carton", "view1")
     gap = np.abs(trimesh.proximity.signed_distance(mesh, cloud.points.numpy()))
     assert np.median(gap) < 0.002 and len(cloud) == 1000
-    assert cloud.viewpoint is not None and float((cloud.viewpoint - torch.tensor([0, 0, 0.05])).norm()) > 0.4
+    assert (
+        cloud.viewpoint is not None
+        and float((cloud.viewpoint - torch.tensor([0, 0, 0.05])).norm()) > 0.4
+    )
     again = tmp_path / "again"
     write_objects(tmp_path / "meshes", again, views=2)
     for file in sorted(path.relative_to(again) for path in again.rglob("*") if path.is_file()):

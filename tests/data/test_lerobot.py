@@ -31,9 +31,14 @@ def sent() -> list[np.ndarray]:
 def closing(sent: list[np.ndarray]) -> ClosureResult:
     """A grasp of the jug that lifts it."""
     scene = pytest.importorskip("torchgrasp.sim.mujoco_scene").MujocoScene
-    jug, drive = load_object("jug"), scene.drive
+    jug = load_object("jug")
+    drive = scene.drive
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene, "drive", lambda self, targets: (sent.append(targets.copy()), drive(self, targets)))
+        patch.setattr(
+            scene,
+            "drive",
+            lambda self, targets: (sent.append(targets.copy()), drive(self, targets)),
+        )
         grasp = load_shipped_grasp("jug", "allegro")
         return close_hand(grasp, load_hand("allegro"), jug.mesh, SPEC, parts=jug.parts)
 
@@ -44,7 +49,9 @@ def slipped(closing: ClosureResult) -> ClosureResult:
     half = len(closing.time) // 2
     turned = closing.object_pose[:half].clone()
     turns = torch.linspace(0, 2 * np.pi, half, dtype=torch.float64)
-    turned[:, :3, :3] = torch.from_numpy(Rotation.from_rotvec(turns[:, None].numpy() * [[1.0, 0.0, 0.0]]).as_matrix())
+    turned[:, :3, :3] = torch.from_numpy(
+        Rotation.from_rotvec(turns[:, None].numpy() * [[1.0, 0.0, 0.0]]).as_matrix()
+    )
     return part(closing, slice(0, half), held=False, object_pose=turned)
 
 
@@ -52,25 +59,33 @@ def part(closing: ClosureResult, ticks: slice, **changes: Any) -> ClosureResult:
     """Return some ticks of a closing."""
     names = ("time", "forces", "object_pose", "hand_pose", "joints", "targets")
     trace = {name: x[ticks] for name, x in vars(closing.trace).items()}
-    cut = {name: getattr(closing, name)[ticks] for name in names} | {"trace": type(closing.trace)(**trace)}
+    cut = {name: getattr(closing, name)[ticks] for name in names} | {
+        "trace": type(closing.trace)(**trace)
+    }
     return type(closing)(**{**vars(closing), **cut, **changes})
 
 
-def test_lerobot_reads_episodes_with_joints_by_name(closing: ClosureResult, slipped: ClosureResult, tmp_path: Path):
+def test_lerobot_reads_episodes_with_joints_by_name(
+    closing: ClosureResult, slipped: ClosureResult, tmp_path: Path
+):
     episodes = [("lift the jug", closing), ("let the jug fall", slipped), ("lift the jug", closing)]
     hand = load_hand("allegro")
     found = read_foreign("episodes", write_lerobot(tmp_path / "data", episodes, hand), tmp_path)
     assert (found["fps"], found["robot"], found["episodes"]) == (100, "allegro", 3)
     counts = [len(x.time) - 1 for _, x in episodes]
     assert found["rows"] == len(found["tasks"]) == sum(counts)
-    assert found["tasks"] == [task for (task, _), n in zip(episodes, counts, strict=True) for _ in range(n)]
+    assert found["tasks"] == [
+        task for (task, _), n in zip(episodes, counts, strict=True) for _ in range(n)
+    ]
     assert found["second"] == [counts[1], "let the jug fall", counts[0]]
     frames = {name: np.array(x) for name, x in found["frames"].items()}
     names = found["names"]
     first = frames["episode_index"] == 0
-    state, action = frames["observation.state"][first], frames["action"][first]
+    state = frames["observation.state"][first]
+    action = frames["action"][first]
     for joint in hand.tree.joint_names:
-        k, own = names["observation.state"].index(joint), closing.joint_names.index(joint)
+        k = names["observation.state"].index(joint)
+        own = closing.joint_names.index(joint)
         np.testing.assert_allclose(state[:, k], closing.joints[:-1, own], atol=1e-6)
         k = names["action"].index(joint)
         np.testing.assert_allclose(action[:, 0, k], closing.targets[1:, own], atol=1e-6)
@@ -80,34 +95,56 @@ def test_lerobot_reads_episodes_with_joints_by_name(closing: ClosureResult, slip
     turns = Rotation.from_quat(action[:, 0, at[3:]]).as_matrix()
     np.testing.assert_allclose(turns, closing.hand_pose[1:, :3, :3], atol=1e-5)
     assert names["observation.forces"][-1] == f"{hand.finger_names[-1]}.z"
-    np.testing.assert_allclose(frames["observation.forces"][first, -1], closing.trace.forces[:-1, -1, 2], atol=1e-5)
+    np.testing.assert_allclose(
+        frames["observation.forces"][first, -1], closing.trace.forces[:-1, -1, 2], atol=1e-5
+    )
     ends = np.cumsum(counts) - 1
     assert np.flatnonzero(frames["next.done"]).tolist() == ends.tolist()
     assert np.flatnonzero(frames["next.success"]).tolist() == [ends[0], ends[2]]
     np.testing.assert_allclose(frames["timestamp"][first], closing.time[:-1], atol=1e-6)
-    assert found["policy"]["action"] == ["ACTION", 23] and found["policy"]["observation.state"] == ["STATE", 23]
+    assert found["policy"]["action"] == ["ACTION", 23] and found["policy"]["observation.state"] == [
+        "STATE",
+        23,
+    ]
     assert found["policy"]["observation.environment_state"] == ["ENV", 7]
     of_second = frames["observation.environment_state"][frames["episode_index"] == 1]
-    assert np.abs(np.diff(of_second[:, 3:], axis=0)).max() < 0.1, "quaternions go on where their signs could jump"
+    assert np.abs(np.diff(of_second[:, 3:], axis=0)).max() < 0.1, (
+        "quaternions go on where their signs could jump"
+    )
     for name, theirs in found["theirs"].items():
         ours = found["stats"][name]
         assert set(ours) == set(theirs)
-        column = np.array(found["frames"][name], dtype=float).reshape(len(found["tasks"]), -1)[:, : len(ours["min"])]
+        column = np.array(found["frames"][name], dtype=float).reshape(len(found["tasks"]), -1)[
+            :, : len(ours["min"])
+        ]
         for key in ("min", "max", "mean", "std", "count"):
             np.testing.assert_allclose(ours[key], theirs[key], rtol=1e-5, atol=1e-5)
-        for q in (1, 10, 50, 90, 99):  # theirs are of a histogram: these are held to what a quantile is
+        for q in (
+            1,
+            10,
+            50,
+            90,
+            99,
+        ):  # theirs are of a histogram: these are held to what a quantile is
             at = np.array(ours[f"q{q:02}"])
             assert np.all((column < at - 1e-9).mean(0) <= q / 100 + 2 / len(column))
             assert np.all((column <= at + 1e-9).mean(0) >= q / 100 - 2 / len(column))
 
 
 def test_actions_are_what_the_drives_were_sent(closing: ClosureResult, sent: list[np.ndarray]):
-    np.testing.assert_array_equal(closing.targets[1:].numpy(), np.array(sent[1:]))  # the first is the start
-    assert closing.held and float((closing.targets - closing.joints)[-1].abs().max()) > 0.02, "fingers press [rad]"
+    np.testing.assert_array_equal(
+        closing.targets[1:].numpy(), np.array(sent[1:])
+    )  # the first is the start
+    assert closing.held and float((closing.targets - closing.joints)[-1].abs().max()) > 0.02, (
+        "fingers press [rad]"
+    )
 
 
-def test_what_is_no_episode_is_refused_and_the_same_call_changes_nothing(closing: ClosureResult, tmp_path: Path):
-    hand, good = load_hand("allegro"), ("lift the jug", closing)
+def test_what_is_no_episode_is_refused_and_the_same_call_changes_nothing(
+    closing: ClosureResult, tmp_path: Path
+):
+    hand = load_hand("allegro")
+    good = ("lift the jug", closing)
     late = part(closing, slice(0, None, 2))
     for bad in (part(closing, slice(0, 1)), late):
         with pytest.raises(BadArgument, match=r"episodes\[1\]"):

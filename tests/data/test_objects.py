@@ -23,7 +23,9 @@ def test_the_mesh_is_one_closed_body_at_rest_in_metres(thing):
     assert 0.1 < mesh.extents[2] < 0.25
     # it stands: its centre of mass is above the hull of what touches the table
     feet = mesh.vertices[mesh.vertices[:, 2] < 1e-4][:, :2]
-    hull = trimesh.convex.convex_hull(np.concatenate([np.c_[feet, 0 * feet[:, :1]], np.c_[feet, 0 * feet[:, :1] + 1]]))
+    hull = trimesh.convex.convex_hull(
+        np.concatenate([np.c_[feet, 0 * feet[:, :1]], np.c_[feet, 0 * feet[:, :1] + 1]])
+    )
     assert hull.contains([[*mesh.center_mass[:2], 0.5]]).all()
     assert 0.05 < thing.mass < 0.5
 
@@ -47,11 +49,19 @@ def test_the_view_is_the_noisy_side_that_the_camera_sees(thing):
     assert len(view) == 1000 and view.normals is None
     assert abs(np.linalg.norm(view.viewpoint.numpy() - thing.mesh.bounds.mean(0)) - 0.5) < 1e-6
     _, distance, face = trimesh.proximity.closest_point(thing.mesh, view.points.numpy())
-    assert np.median(distance) < 0.001 and np.percentile(distance, 90) < 0.002 and distance.max() < 0.05
+    assert (
+        np.median(distance) < 0.001
+        and np.percentile(distance, 90) < 0.002
+        and distance.max() < 0.05
+    )
     toward = ((view.viewpoint - view.points).numpy() * thing.mesh.face_normals[face]).sum(-1)
     assert (toward > 0).mean() > 0.95
     # a side is hidden: the mesh has surface that no point is near
-    nearest = torch.cdist(torch.from_numpy(np.array(thing.mesh.triangles_center)), view.points).amin(-1).numpy()
+    nearest = (
+        torch.cdist(torch.from_numpy(np.array(thing.mesh.triangles_center)), view.points)
+        .amin(-1)
+        .numpy()
+    )
     hidden = thing.mesh.area_faces[nearest > 0.015].sum() / thing.mesh.area
     assert 0.2 < hidden < 0.7
 

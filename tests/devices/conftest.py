@@ -9,7 +9,16 @@ import torch
 from torch import Tensor
 
 from tests.devices.elsewhere import DEVICE, Elsewhere, pretend
-from torchgrasp import ContactSpec, Grasps, Hand, ShapeGP, fit_shape, load_hand, load_object, plan_grasps
+from torchgrasp import (
+    ContactSpec,
+    Grasps,
+    Hand,
+    ShapeGP,
+    fit_shape,
+    load_hand,
+    load_object,
+    plan_grasps,
+)
 from torchgrasp.foundation.base import Value
 
 
@@ -37,12 +46,15 @@ def tensors_of(value: Any) -> list[Tensor]:
         return [value]
     if isinstance(value, Value):
         value = tuple(getattr(value, field.name) for field in dataclasses.fields(value))
-    return [x for part in value for x in tensors_of(part)] if isinstance(value, tuple | list) else []
+    return (
+        [x for part in value for x in tensors_of(part)] if isinstance(value, tuple | list) else []
+    )
 
 
 def same(there: Any, here: Any, device: torch.device = DEVICE) -> None:
     """Assert that a result is on a device, and has the numbers and types of the CPU's."""
-    one, other = tensors_of(there), tensors_of(here)
+    one = tensors_of(there)
+    other = tensors_of(here)
     assert len(one) == len(other) > 0
     for a, b in zip(one, other, strict=True):
         assert a.device == device and a.dtype == b.dtype

@@ -1,8 +1,10 @@
-"""A second device for tests: CPU tensors that say they are elsewhere, and break where a GPU's would.
+"""A second device for tests: CPU tensors that say they are elsewhere, and break where a GPU's
+would.
 
-`Elsewhere` behaves like a tensor of `DEVICE`. An operation on tensors of both devices is an error, as is
-`numpy()`, a draw there by a generator of the CPU, or an index from there into a tensor of the CPU. `pretend` makes
-`device=DEVICE` work. `TRAFFIC` says when a function runs there, and tells what crosses the border of the devices.
+`Elsewhere` behaves like a tensor of `DEVICE`. An operation on tensors of both devices is an error,
+as is `numpy()`, a draw there by a generator of the CPU, or an index from there into a tensor of the
+CPU. `pretend` makes `device=DEVICE` work. `TRAFFIC` says when a function runs there, and tells what
+crosses the border of the devices.
 """
 
 import contextlib
@@ -22,20 +24,42 @@ MAKERS = {
     for name in "tensor as_tensor zeros ones full empty eye arange linspace rand randn randint randperm".split()
 } | {torch.triu_indices, torch.tril_indices}
 """Functions that make tensors where they are told to."""
-DATA = {"item", "tolist", "__bool__", "__float__", "__int__", "__index__", "__repr__", "__format__", "__len__"}
-DATA |= {"dim", "size", "stride", "numel", "is_contiguous", "is_floating_point", "data_ptr", "backward"}
+DATA = {
+    "item",
+    "tolist",
+    "__bool__",
+    "__float__",
+    "__int__",
+    "__index__",
+    "__repr__",
+    "__format__",
+    "__len__",
+}
+DATA |= {
+    "dim",
+    "size",
+    "stride",
+    "numel",
+    "is_contiguous",
+    "is_floating_point",
+    "data_ptr",
+    "backward",
+}
 """Functions that return no tensor."""
 INTO = {"__getitem__", "__setitem__", "index_put", "index_put_"}
 """Functions that take indices of the CPU, too."""
 COPIES = {"tolist", "__repr__", "__format__"}
 """Functions that copy a whole tensor to the host."""
-DEVICE_OF, IS_CUDA = Tensor.device.__get__, Tensor.is_cuda.__get__
+DEVICE_OF = Tensor.device.__get__
+IS_CUDA = Tensor.is_cuda.__get__
 HOST_ONLY = Tensor.numpy, Tensor.__array__
 
 
 @dataclasses.dataclass
 class Traffic:
-    """How many nested functions run on the pretended device, and who is told of an "upload" or a "read"."""
+    """How many nested functions run on the pretended device, and who is told of an "upload" or a
+    "read".
+    """
 
     running: int = 0
     tell: Callable[[str], None] = lambda kind: None
@@ -126,7 +150,8 @@ class Elsewhere(Tensor):
             return DEVICE
         if func == IS_CUDA:
             return True
-        kwargs, name = kwargs or {}, getattr(func, "__name__", "")
+        kwargs = kwargs or {}
+        name = getattr(func, "__name__", "")
         with torch._C.DisableTorchFunctionSubclass():
             if func is Tensor.cpu:
                 TRAFFIC.tell("read")
@@ -165,10 +190,15 @@ def _running() -> Iterator[None]:
 
 
 def _tell_uploads(name: str, args: Any) -> None:
-    """Tell of each argument of the CPU that the device copies: indices, a copied tensor, numbers of a new tensor."""
+    """Tell of each argument of the CPU that the device copies: indices, a copied tensor, numbers of
+    a new tensor.
+    """
     if name in INTO:
         indices = args[1] if isinstance(args[1], tuple) else (args[1],)
-        uploads = sum(isinstance(x, list) or (isinstance(x, Tensor) and not isinstance(x, Elsewhere)) for x in indices)
+        uploads = sum(
+            isinstance(x, list) or (isinstance(x, Tensor) and not isinstance(x, Elsewhere))
+            for x in indices
+        )
     elif name == "copy_":
         if not isinstance(args[0], Elsewhere):
             TRAFFIC.tell("read")
@@ -196,7 +226,9 @@ def _to(args: Any, kwargs: dict[str, Any]) -> Tensor:
 def _convert(target: torch.device, args: Any, kwargs: dict[str, Any]) -> Tensor:
     """Return the tensor of `Tensor.to` on the device `target`."""
     rest = [_home(_plain(x)) for x in args[1:]]
-    result = Tensor.to(_plain(args[0]), *rest, **{key: _home(_plain(value)) for key, value in kwargs.items()})
+    result = Tensor.to(
+        _plain(args[0]), *rest, **{key: _home(_plain(value)) for key, value in kwargs.items()}
+    )
     if target.type != _device(args[0]).type:
         result = result.clone() if result is _plain(args[0]) else result
     elif args[0].dtype == result.dtype:
@@ -220,7 +252,9 @@ def _refuse_mixes(func: Any, name: str, args: Any, kwargs: dict[str, Any]) -> No
         if any(not isinstance(x, Elsewhere) and x.dim() > 0 for x in values):
             raise RuntimeError(f"{name}: expected all tensors to be on the same device")
     else:
-        raise RuntimeError(f"{name}: expected all tensors to be on the same device, but found {DEVICE} and cpu")
+        raise RuntimeError(
+            f"{name}: expected all tensors to be on the same device, but found {DEVICE} and cpu"
+        )
 
 
 class _Makers(TorchFunctionMode):
@@ -231,9 +265,15 @@ class _Makers(TorchFunctionMode):
         kwargs = kwargs or {}
         if func is not Tensor.to and func not in MAKERS:
             return func(*args, **kwargs)
-        if func in MAKERS and kwargs.get("device") is not None and torch.device(kwargs["device"]).type == DEVICE.type:
+        if (
+            func in MAKERS
+            and kwargs.get("device") is not None
+            and torch.device(kwargs["device"]).type == DEVICE.type
+        ):
             if kwargs.get("generator") is not None:
-                raise RuntimeError(f"Expected a '{DEVICE.type}' device type for generator but found 'cpu'")
+                raise RuntimeError(
+                    f"Expected a '{DEVICE.type}' device type for generator but found 'cpu'"
+                )
             if func in (torch.tensor, torch.as_tensor):
                 if not isinstance(args[0], Elsewhere):
                     TRAFFIC.tell("upload")

@@ -1,10 +1,14 @@
-"""A count of what a call on the pretended device would cost a GPU: kernel launches, waits of the host, and uploads.
+"""A count of what a call on the pretended device would cost a GPU: kernel launches, waits of the
+host, and uploads.
 
-`Launches` watches every operation of aten that runs while `TRAFFIC` says that the device works. The rules are:
+`Launches` watches every operation of aten that runs while `TRAFFIC` says that the device works. The
+rules are:
 
-- A launch is an operation that writes at least one number. Views and empty results launch nothing. An operation counts
-  once, even if it starts several kernels there: a factorisation, a sort, a choice by a mask.
-- A read is an operation after which the host waits, because it needs a number or the size of a result.
+- A launch is an operation that writes at least one number. Views and empty results launch nothing.
+  An operation counts once, even if it starts several kernels there: a factorisation, a sort, a
+  choice by a mask.
+- A read is an operation after which the host waits, because it needs a number or the size of a
+  result.
 - An upload is a copy from the host. The host may wait for the copy, too.
 """
 
@@ -24,9 +28,24 @@ from tests.devices.elsewhere import TRAFFIC
 LIBRARY = str(Path(__file__).resolve().parents[2] / "torchgrasp") + "/"
 HELPERS = ("base.py", "checks.py", "marks.py")
 """Files whose operations belong to the caller."""
-IDLE = {"empty", "empty_like", "empty_strided", "new_empty", "new_empty_strided", "_unsafe_view", "_local_scalar_dense"}
+IDLE = {
+    "empty",
+    "empty_like",
+    "empty_strided",
+    "new_empty",
+    "new_empty_strided",
+    "_unsafe_view",
+    "_local_scalar_dense",
+}
 """Operations without a kernel whose results are no views."""
-WAITS = {"_linalg_check_errors", "_linalg_eigh", "_linalg_svd", "linalg_eig", "linalg_lstsq", "multinomial"}
+WAITS = {
+    "_linalg_check_errors",
+    "_linalg_eigh",
+    "_linalg_svd",
+    "linalg_eig",
+    "linalg_lstsq",
+    "multinomial",
+}
 """Operations that wait on a GPU, which their tags do not say: they read whether they succeeded."""
 CHOICES = {"index", "index_put", "index_put_", "_index_put_impl_"}
 """Operations that wait for each index that is a mask."""
@@ -55,7 +74,8 @@ class Launches(TorchDispatchMode):
 
     def __init__(self, stages: dict[str, str] | None = None) -> None:
         super().__init__()
-        self.stages, self.found = stages or {}, Counter[tuple[str, Place]]()
+        self.stages = stages or {}
+        self.found = Counter[tuple[str, Place]]()
 
     def __enter__(self) -> "Launches":
         """Begin to count."""
@@ -104,14 +124,20 @@ class Launches(TorchDispatchMode):
 
 def place(frame: FrameType | None, stages: dict[str, str]) -> Place:
     """Return the innermost line of the library above a frame, and its stage."""
-    file, line, function, stage = "", 0, "", ""
+    file = ""
+    line = 0
+    function = ""
+    stage = ""
     while frame is not None and not (file and function and stage):
         code = frame.f_code
         if code.co_filename.startswith(LIBRARY):
             name = code.co_filename[len(LIBRARY) :]
             if not file and name not in HELPERS:
-                file, line = name, frame.f_lineno
-            if not function and name == file and not code.co_name.startswith("<"):  # a list is made in its function
+                file = name
+                line = frame.f_lineno
+            if (
+                not function and name == file and not code.co_name.startswith("<")
+            ):  # a list is made in its function
                 function = code.co_name
             stage = stage or stages.get(code.co_name, "")
         frame = frame.f_back

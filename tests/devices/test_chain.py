@@ -1,4 +1,6 @@
-"""The whole chain on another device: plans, reasons, scenes, fields, solvers, vessels, and the files that it writes."""
+"""The whole chain on another device: plans, reasons, scenes, fields, solvers, vessels, and the
+files that it writes.
+"""
 
 from collections.abc import Callable
 from typing import Any
@@ -43,7 +45,14 @@ from torchgrasp.export import (
     save_surface,
 )
 from torchgrasp.geometry.signed_distance import field_from_surface
-from torchgrasp.ik import CollisionWorld, GraspProblem, Obstacles, PostureLibrary, nearest_postures, solve_joint
+from torchgrasp.ik import (
+    CollisionWorld,
+    GraspProblem,
+    Obstacles,
+    PostureLibrary,
+    nearest_postures,
+    solve_joint,
+)
 from torchgrasp.ik.attempts import solve_contact_first
 from torchgrasp.ik.candidates import measure_errors
 from torchgrasp.ik.configuration import Configuration
@@ -56,16 +65,22 @@ from torchgrasp.shape.completion.complete import complete_cloud
 from torchgrasp.shape.completion.silhouette import silhouettes
 from torchgrasp.testing import random_joints
 
-SPEC, CPU = ContactSpec(table=0.0), torch.device("cpu")
-VIEW, UP = load_object("cylinder").view, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+SPEC = ContactSpec(table=0.0)
+CPU = torch.device("cpu")
+VIEW = load_object("cylinder").view
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
 
 PLANS = {
-    "task and promise": lambda cloud, hand: plan_grasps(cloud, hand, SPEC, 2, task=GraspTask(0.1), promise=0.8),
+    "task and promise": lambda cloud, hand: plan_grasps(
+        cloud, hand, SPEC, 2, task=GraspTask(0.1), promise=0.8
+    ),
     "stream": lambda cloud, hand: list(stream_grasps(cloud, hand, SPEC, 2)),
     "list": lambda cloud, hand: plan_grasps([cloud], hand, SPEC, 2),
     "any fingers": lambda cloud, hand: plan_grasps(cloud, hand, SPEC, 2, fingers="auto"),
     "four fingers": lambda cloud, hand: plan_grasps(cloud, load_hand("allegro", 4), SPEC, 1),
-    "contacts first": lambda cloud, hand: plan_grasps(cloud, hand, SPEC, 2, mode="contact_first", ranking="variance"),
+    "contacts first": lambda cloud, hand: plan_grasps(
+        cloud, hand, SPEC, 2, mode="contact_first", ranking="variance"
+    ),
     "paper": lambda cloud, hand: plan_grasps(cloud, hand, ContactSpec.paper(), 2, mode="paper"),
 }
 TEXTS = {
@@ -84,10 +99,13 @@ def test_grasps_of_every_kind_are_where_the_cloud_is(device, hand, name):
 
 
 def test_clouds_planned_together_have_the_grasps_of_each_alone(device, hand):
-    clouds, task = [VIEW, PointCloud(1e-4 * VIEW.points, None, VIEW.viewpoint), cup_view(0.004)], GraspTask(0.1)
+    clouds = [VIEW, PointCloud(1e-4 * VIEW.points, None, VIEW.viewpoint), cup_view(0.004)]
+    task = GraspTask(0.1)
     alone = at_home(lambda: plan_grasps(clouds, hand, SPEC, 6, task=task))
     together = plan_grasps(sent(clouds), hand, SPEC, 6, task=task)
-    assert "refused" in together[1].meta and all(grasps.joints.device == DEVICE for grasps in together)
+    assert "refused" in together[1].meta and all(
+        grasps.joints.device == DEVICE for grasps in together
+    )
     for there, here in zip(together[::2], alone[::2], strict=True):
         assert there.meta == here.meta
         assert share_found(here, there.to("cpu")) > 0.9  # rounding may move a few
@@ -99,7 +117,9 @@ def test_workers_estimate_shapes_for_plans_where_the_clouds_are(device, hand, mo
     monkeypatch.setattr("torchgrasp.planner.many.run_tasks", serial)
     expected = at_home(lambda: plan_grasps([VIEW], hand, SPEC, 2))
     same(plan_grasps([sent(VIEW)], hand, SPEC, 2, workers=1), expected)
-    refused = plan_grasps([sent(PointCloud(1e-4 * VIEW.points, None, VIEW.viewpoint))], hand, SPEC, 2)[0]
+    refused = plan_grasps(
+        [sent(PointCloud(1e-4 * VIEW.points, None, VIEW.viewpoint))], hand, SPEC, 2
+    )[0]
     assert "refused" in refused.meta and refused.joints.device == DEVICE
 
 
@@ -125,7 +145,9 @@ def test_completion_is_on_the_cpu(device):
 
 def test_words_about_a_cloud_are_the_same(device):
     seen = estimate_normals(VIEW)
-    assert format_report(diagnose_cloud(sent(seen), sent(UP))) == format_report(diagnose_cloud(seen, UP))
+    assert format_report(diagnose_cloud(sent(seen), sent(UP))) == format_report(
+        diagnose_cloud(seen, UP)
+    )
 
 
 def test_obstacles_are_asked_where_they_are(device, hand, shape, grasps):
@@ -134,7 +156,10 @@ def test_obstacles_are_asked_where_they_are(device, hand, shape, grasps):
     found = collision_probability(sent(hand), sent(grasps), sent(obstacles), SPEC.plane)
     same(found, collision_probability(hand, grasps, obstacles, SPEC.plane))
     assert lift_clearance(sent(vertices), sent(obstacles)) == lift_clearance(vertices, obstacles)
-    same(spread_rows(plan_contacts(sent(shape), SPEC, 6), 3), spread_rows(plan_contacts(shape, SPEC, 6), 3))
+    same(
+        spread_rows(plan_contacts(sent(shape), SPEC, 6), 3),
+        spread_rows(plan_contacts(shape, SPEC, 6), 3),
+    )
 
 
 @pytest.mark.parametrize("name", TEXTS)
@@ -149,13 +174,17 @@ def test_what_moves_success_is_the_same_wherever_its_parts_are(device, hand, sha
     parts = {"grasps": grasps, "hand": hand, "shape": shape}
     moved = {name: sent(part) if where in (name, "all") else part for name, part in parts.items()}
     found, expected = (explain_success(**x, task=GraspTask(mass=0.8)) for x in (moved, parts))
-    assert [(cost.cause, cost.sentence) for cost in found] == [(cost.cause, cost.sentence) for cost in expected]
+    assert [(cost.cause, cost.sentence) for cost in found] == [
+        (cost.cause, cost.sentence) for cost in expected
+    ]
 
 
 def test_files_are_the_same(device, shape, tmp_path):
-    surface, hand = extract_surface(shape, 24), load_hand("allegro")
+    surface = extract_surface(shape, 24)
+    hand = load_hand("allegro")
     there, here = (tmp_path / name for name in ("there", "here"))
-    joints, pose = random_joints(hand, 1, 0), torch.eye(4, dtype=torch.float64)[None]
+    joints = random_joints(hand, 1, 0)
+    pose = torch.eye(4, dtype=torch.float64)[None]
     grasps = grasps_from_joints(hand, joints, pose)
     same(grasps_from_joints(sent(hand), sent(joints), sent(pose)), grasps, CPU)
     for folder, to in ((there, sent), (here, lambda x: x)):
@@ -169,12 +198,15 @@ def test_files_are_the_same(device, shape, tmp_path):
 
 
 def test_trials_are_drawn_on_the_cpu(device):
-    noise, pivot = find_protocol("pose-noise").noise, torch.ones(3)
+    noise = find_protocol("pose-noise").noise
+    pivot = torch.ones(3)
     assert noise is not None
     same(draw_object_poses(noise, sent(pivot), 3, 0), draw_object_poses(noise, pivot, 3, 0), CPU)
 
 
-TURNED = torch.tensor([[0.0, -1, 0, 0.1], [1, 0, 0, 0.2], [0, 0, 1, 0.3], [0, 0, 0, 1]], dtype=torch.float64)
+TURNED = torch.tensor(
+    [[0.0, -1, 0, 0.1], [1, 0, 0, 0.2], [0, 0, 1, 0.3], [0, 0, 0, 1]], dtype=torch.float64
+)
 
 
 def here(value: Any) -> Any:
@@ -195,10 +227,14 @@ def test_grasps_are_solved_and_checked_where_their_contacts_are(device, hand, sh
     library = PostureLibrary.of(hand, 300)
 
     def solve(to: Callable[[Any], Any]) -> list[Any]:
-        there, contacts, its_hand = to(shape), to(grasps.contacts), to(hand)
+        there = to(shape)
+        contacts = to(grasps.contacts)
+        its_hand = to(hand)
         surface = extract_surface(there, 24)
         world = CollisionWorld(field_from_surface(surface.vertices, surface.faces, 0.01), 0.0)
-        problem = GraspProblem(its_hand, contacts, certify(contacts, SPEC), world, surface.vertices.mean(0))
+        problem = GraspProblem(
+            its_hand, contacts, certify(contacts, SPEC), world, surface.vertices.mean(0)
+        )
         seeds = nearest_postures(to(library), contacts, world, 2)
         configuration = Configuration(to(grasps.joints), to(grasps.obj_from_hand))
         return [
@@ -220,7 +256,12 @@ def test_both_walls_of_a_vessel_are_where_the_cloud_is(device):
         vessel = fit_shape(to(cup_view(0.004)), table=0.0)
         assert len(vessel.walls) == 2
         x = to(cup_view(0.004).points[:20].double())
-        return [vessel, vessel.predict(x), vessel.jet(vessel.normalise(x)), vessel.moved(to(TURNED))]
+        return [
+            vessel,
+            vessel.predict(x),
+            vessel.jet(vessel.normalise(x)),
+            vessel.moved(to(TURNED)),
+        ]
 
     same(fit(sent), fit(here))
 
@@ -232,7 +273,9 @@ def test_a_closing_is_the_same_wherever_hand_and_grasp_are(device):
     hand, grasp = pinch("allegro")
     there, near = (close_hand(to(grasp), to(hand), cylinder(), QUICK) for to in (sent, here))
     assert there.held and near.held
-    assert np.array_equal(there.forces, near.forces) and np.array_equal(there.object_pose, near.object_pose)
+    assert np.array_equal(there.forces, near.forces) and np.array_equal(
+        there.object_pose, near.object_pose
+    )
 
 
 @pytest.mark.parametrize("backend", ["torchgrasp", "pytorch_kinematics"])

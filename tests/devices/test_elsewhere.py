@@ -9,7 +9,11 @@ from tests.devices.elsewhere import DEVICE, elsewhere, pretend
 def test_it_says_where_it_is_and_results_stay_there():
     x = elsewhere(torch.arange(3.0))
     assert x.device == DEVICE and x.is_cuda
-    assert (2 * x).device == DEVICE and x[1:].sum().device == DEVICE and torch.zeros_like(x).device == DEVICE
+    assert (
+        (2 * x).device == DEVICE
+        and x[1:].sum().device == DEVICE
+        and torch.zeros_like(x).device == DEVICE
+    )
     assert x.cpu().device == torch.device("cpu") and not isinstance(x.cpu(), type(x))
 
 

@@ -1,4 +1,6 @@
-"""Counts of launches, waits and uploads on the pretended device; and a list of the places where a plan waits."""
+"""Counts of launches, waits and uploads on the pretended device; and a list of the places where a
+plan waits.
+"""
 
 from collections.abc import Callable
 
@@ -62,9 +64,13 @@ KNOWN = {
     "success/order.py": "grade",
     "values.py": "format_success select",
 }
-"""The functions in which a plan may wait for the device, by file. A function that waits no more is to be deleted."""
+"""The functions in which a plan may wait for the device, by file. A function that waits no more is
+to be deleted.
+"""
 MOST_READS = 1100
-"""Most waits of a small plan: a quarter more than at present, since rounding moves the numbers of steps."""
+"""Most waits of a small plan: a quarter more than at present, since rounding moves the numbers of
+steps.
+"""
 
 CALLS: dict[str, tuple[Callable[[Tensor], object], tuple[int, int, int]]] = {
     "arithmetic": (lambda x: (2 * x + 1).sum(), (3, 0, 0)),
@@ -88,7 +94,7 @@ CALLS: dict[str, tuple[Callable[[Tensor], object], tuple[int, int, int]]] = {
     "a tensor of the host": (lambda x: torch.ones(2).to(x), (0, 0, 1)),
     "a checked factor": (lambda x: torch.linalg.cholesky(torch.diag(x)), (2, 1, 0)),
     "work of the host": (lambda x: torch.ones(3) + 1, (0, 0, 0)),
-}  # fmt: skip
+}
 """Calls with their numbers of launches, reads and uploads."""
 
 
@@ -102,9 +108,12 @@ def test_calls_have_the_counts_of_a_gpu(device, name):
 
 
 def test_counts_have_the_line_of_the_library_and_its_stage(device):
-    cloud, rows = PointCloud(elsewhere(torch.ones(5, 3).cumsum(0))), elsewhere(torch.arange(4))
+    cloud = PointCloud(elsewhere(torch.ones(5, 3).cumsum(0)))
+    rows = elsewhere(torch.arange(4))
     with Launches({"select": "choice"}) as counted:
-        map_tensors(torch.neg, cloud.select(rows))  # a helper: its operations belong to the caller, which is this test
+        map_tensors(
+            torch.neg, cloud.select(rows)
+        )  # a helper: its operations belong to the caller, which is this test
     places = {(at.file, at.function, at.stage) for kind, at in counted.found if kind == "launch"}
     assert places == {("values.py", "select", "choice"), ("outside", "", "other")}
 
@@ -112,7 +121,15 @@ def test_counts_have_the_line_of_the_library_and_its_stage(device):
 def test_a_plan_waits_for_the_device_only_where_it_is_known(device, hand):
     with Launches() as counted:
         plan_grasps(sent(load_object("cylinder").view), hand, ContactSpec(table=0.0), 40)
-    known = {(file, function) for file, functions in KNOWN.items() for function in functions.split() or [""]}
-    new = [str(at) for kind, at in counted.found if kind == "read" and (at.file, at.function) not in known]
+    known = {
+        (file, function)
+        for file, functions in KNOWN.items()
+        for function in functions.split() or [""]
+    }
+    new = [
+        str(at)
+        for kind, at in counted.found
+        if kind == "read" and (at.file, at.function) not in known
+    ]
     assert not new, f"new waits for the device: {', '.join(sorted(new))}"
     assert counted.total("read") <= MOST_READS

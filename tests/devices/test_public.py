@@ -1,4 +1,6 @@
-"""Every public function with every tensor on another device: the CPU's result there, or an error that names it."""
+"""Every public function with every tensor on another device: the CPU's result there, or an error
+that names it.
+"""
 
 from typing import Any
 
@@ -29,7 +31,7 @@ from torchgrasp import (
     plan_grasps,
     sample_configurations,
     solve_ik,
-)  # fmt: skip
+)
 from torchgrasp.cloud import cut_object, estimate_normals, remove_outliers, voxel_downsample
 from torchgrasp.cloud.check import remove_duplicates
 from torchgrasp.cloud.prepare import clean_cloud, prepare_cloud
@@ -44,7 +46,8 @@ from torchgrasp.shape import extract_surface
 from torchgrasp.testing import random_joints
 from torchgrasp.values.planning import ContactPlan
 
-SPEC, CPU = ContactSpec(table=0.0), torch.device("cpu")
+SPEC = ContactSpec(table=0.0)
+CPU = torch.device("cpu")
 VIEW = load_object("cylinder").view
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
@@ -56,7 +59,9 @@ CLOUDS = {
     "fit_shape, paper": lambda cloud: fit_shape(cloud, support="paper"),
     "fit_shape, a kernel": lambda cloud: fit_shape(cloud, kernel="matern52", budget=30),
     "fit_shape, no camera": lambda cloud: fit_shape(PointCloud(cloud.points), budget=30),
-    "merge_clouds": lambda cloud: merge_clouds([cloud, cloud], torch.eye(4).to(cloud.points).expand(2, 4, 4)),
+    "merge_clouds": lambda cloud: merge_clouds(
+        [cloud, cloud], torch.eye(4).to(cloud.points).expand(2, 4, 4)
+    ),
     "clean_cloud": clean_cloud,
     "remove_outliers": remove_outliers,
     "voxel_downsample": lambda cloud: voxel_downsample(cloud, 0.005),
@@ -65,12 +70,16 @@ CLOUDS = {
     "remove_duplicates": remove_duplicates,
     "prepare_cloud": lambda cloud: prepare_cloud(cloud, torch.Generator().manual_seed(0)),
     "cut_object": lambda cloud: cut_object(cloud, UP.to(cloud.points)),
-    "cloud_from_depth": lambda cloud: cloud_from_depth(CLOSE.to(cloud.points), LENS.to(cloud.points)),
+    "cloud_from_depth": lambda cloud: cloud_from_depth(
+        CLOSE.to(cloud.points), LENS.to(cloud.points)
+    ),
 }
 
 
 def without_forces(plan: ContactPlan) -> tuple[Any, ...]:
-    """Return a plan without the coefficients of its forces: which of several balances is found depends on rounding."""
+    """Return a plan without the coefficients of its forces: which of several balances is found
+    depends on rounding.
+    """
     return plan.contacts, plan.quality, plan.status
 
 
@@ -83,14 +92,20 @@ SHAPES = {
     "contains": lambda shape, x: shape.contains(x),
     "extract_surface": lambda shape, x: extract_surface(shape, 24),
     "plan_contacts": lambda shape, x: without_forces(plan_contacts(shape, SPEC, 6)),
-    "plan_contacts, paper": lambda shape, x: without_forces(plan_contacts(shape, ContactSpec.paper(), 2)),
-    "plan_contacts, given starts": lambda shape, x: without_forces(plan_contacts(shape, SPEC, x[:12].reshape(4, 3, 3))),
+    "plan_contacts, paper": lambda shape, x: without_forces(
+        plan_contacts(shape, ContactSpec.paper(), 2)
+    ),
+    "plan_contacts, given starts": lambda shape, x: without_forces(
+        plan_contacts(shape, SPEC, x[:12].reshape(4, 3, 3))
+    ),
 }
 CONTACTS = {
     "certify": lambda contacts, shape: certify(contacts, SPEC),
     "closure_probability": lambda contacts, shape: closure_probability(shape, contacts, SPEC, 200),
     "encode": lambda contacts, shape: encode(contacts),
-    "least_friction_forces": lambda contacts, shape: least_friction_forces(contacts.points, contacts.normals),
+    "least_friction_forces": lambda contacts, shape: least_friction_forces(
+        contacts.points, contacts.normals
+    ),
 }
 HANDS = {
     "fingertips": lambda hand, joints: hand.fingertips(joints),
@@ -138,7 +153,9 @@ def test_joints_of_another_device_than_the_hand_are_refused(device, hand):
 
 
 def test_hand_and_model_follow_the_contacts(device, hand, grasps):
-    contacts, mixture, library = grasps.contacts[:1], load_mixture("barrett"), PostureLibrary.of(hand, 300)
+    contacts = grasps.contacts[:1]
+    mixture = load_mixture("barrett")
+    library = PostureLibrary.of(hand, 300)
 
     def solve(contacts) -> IKSolution:
         return solve_ik(hand, contacts, mixture, CollisionWorld(table=0.0), library=library)
@@ -192,7 +209,8 @@ def test_a_mixture_is_fitted_where_its_samples_are(device, hand):
 
 @pytest.mark.parametrize("name", ["energy", "joints", "modes"])
 def test_a_mixture_answers_where_it_is(device, grasps, name):
-    mixture, code = load_mixture("barrett"), encode(grasps.contacts)
+    mixture = load_mixture("barrett")
+    code = encode(grasps.contacts)
     if name == "energy":
         return same(sent(mixture).energy(sent(code)), mixture.energy(code))
     query = {"joints": lambda m, q: m.joints(q), "modes": lambda m, q: m.modes(q, 2)}[name]
@@ -201,7 +219,11 @@ def test_a_mixture_answers_where_it_is(device, grasps, name):
 
 def test_closing_is_on_the_cpu_whatever_is_given(device, hand, grasps):
     expected = closing_gains(grasps[0], hand)
-    for grasp, its_hand in ((sent(grasps[0]), hand), (grasps[0], sent(hand)), (sent(grasps[0]), sent(hand))):
+    for grasp, its_hand in (
+        (sent(grasps[0]), hand),
+        (grasps[0], sent(hand)),
+        (sent(grasps[0]), sent(hand)),
+    ):
         same(closing_gains(grasp, its_hand), expected, CPU)
 
 
@@ -213,7 +235,8 @@ def test_the_squeeze_follows_the_grasps(device, hand, grasps):
 def test_a_controller_runs_on_the_cpu(device, hand, grasps, shape, closing):
     reference = sent(ClosingReference.from_grasp(hand, grasps[0]))
     controller = GraspController(reference, closing=closing)
-    reference, tactile = controller.reference, no_contact()
+    reference = controller.reference
+    tactile = no_contact()
     point = reference.gains.target
     truth = TipContact(torch.ones(3).double(), -reference.normals, point, reference.normals)
     tactile = measure(tactile, truth, reference.normals, hand.tips.radius.double(), 0.02)

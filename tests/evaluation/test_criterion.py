@@ -1,4 +1,6 @@
-"""The criterion of a lift, on authored motions just above and just below each limit; no simulator is needed."""
+"""The criterion of a lift, on authored motions just above and just below each limit; no simulator
+is needed.
+"""
 
 import math
 from types import SimpleNamespace
@@ -20,7 +22,9 @@ CLOSED = 5
 
 
 def at(place=(0.0, 0.0, 0.0), turn=(0.0, 0.0, 0.0)):
-    """The pose of the object whose centre of mass is displaced by `place` [m] and which turned about it by `turn`."""
+    """The pose of the object whose centre of mass is displaced by `place` [m] and which turned
+    about it by `turn`.
+    """
     pose = np.eye(4)
     pose[:3, :3] = rotation_from_vector(torch.tensor(turn, dtype=torch.float64)).numpy()
     pose[:3, 3] = np.array(place) + CENTRE - pose[:3, :3] @ CENTRE
@@ -30,28 +34,42 @@ def at(place=(0.0, 0.0, 0.0), turn=(0.0, 0.0, 0.0)):
 class Authored(TrialRun):
     """A run of a trial in which hand, object and contacts move as the test says.
 
-    `motion` gives the object's pose, and `fingers` the number of touching fingers, at a time [s] from the begin of the
-    lift (negative while the hand closes) and a height [m] of the hand.
+    `motion` gives the object's pose, and `fingers` the number of touching fingers, at a time [s]
+    from the begin of the lift (negative while the hand closes) and a height [m] of the hand.
     """
 
-    starts, felt, slid = True, (0.0, 0.0), np.zeros(3)
+    starts = True
+    felt = (0.0, 0.0)
+    slid = np.zeros(3)
 
     def __init__(self, motion, fingers=lambda time: 3, spec=None, touched=True, strained=False):
         self.spec = TrialSpec(hold_time=0.3) if spec is None else spec
-        self.motion, self.fingers, self.strained = motion, fingers, lambda: strained
-        self.height, self.tick, self.turned = 0.0, -CLOSED, np.eye(4)
+        self.motion = motion
+        self.fingers = fingers
+        self.strained = lambda: strained
+        self.height = 0.0
+        self.tick = -CLOSED
+        self.turned = np.eye(4)
         zero = torch.zeros(3, 3, dtype=torch.float64)
         self.robot = SimpleNamespace(
-            period=1 / self.spec.control_rate, truth=TipContact(zero[0], zero, zero, zero, zero[0]), steps=0,
+            period=1 / self.spec.control_rate,
+            truth=TipContact(zero[0], zero, zero, zero, zero[0]),
+            steps=0,
             sent=np.zeros(4),
-            first_touch=[1.0 if touched else math.inf] * 3, unbalanced=lambda: 0.0, finger=np.zeros(3, dtype=bool),
-        )  # fmt: skip
+            first_touch=[1.0 if touched else math.inf] * 3,
+            unbalanced=lambda: 0.0,
+            finger=np.zeros(3, dtype=bool),
+        )
         self.robot.ticks = lambda seconds: max(1, round(seconds / self.robot.period))
         self.controller = SimpleNamespace(blend=zero[0], hold=None, status=Status.OK)
         self.scene = SimpleNamespace(
-            centre=CENTRE, lift=self.lift, joints=lambda: np.zeros(4), neighbour_poses=lambda: np.zeros((0, 4, 4)),
-            hand_pose=lambda: at((0.0, 0.0, self.height)), object_pose=lambda: self.motion(self.time, self.height),
-        )  # fmt: skip
+            centre=CENTRE,
+            lift=self.lift,
+            joints=lambda: np.zeros(4),
+            neighbour_poses=lambda: np.zeros((0, 4, 4)),
+            hand_pose=lambda: at((0.0, 0.0, self.height)),
+            object_pose=lambda: self.motion(self.time, self.height),
+        )
 
     @property
     def time(self):
@@ -78,9 +96,12 @@ def verdict(*arguments, **options):
 
 
 def slipping(place=(0.0, 0.0, 0.0), turn=(0.0, 0.0, 0.0), begin=0.1):
-    """The motion of an object that follows the hand and moves in the hand at a time after the begin of the lift."""
+    """The motion of an object that follows the hand and moves in the hand at a time after the begin
+    of the lift.
+    """
     return lambda time, height: at(
-        np.array([0, 0, height]) + np.array(place) * (time > begin), turn if time > begin else [0.0] * 3
+        np.array([0, 0, height]) + np.array(place) * (time > begin),
+        turn if time > begin else [0.0] * 3,
     )
 
 
@@ -104,14 +125,18 @@ def test_an_object_that_rose_and_fell_is_dropped():
     assert verdict(falling) is Status.DROPPED
 
 
-@pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0), (0.6, 0.0, 0.8)])
+@pytest.mark.parametrize(
+    "axis", [(1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0), (0.6, 0.0, 0.8)]
+)
 @pytest.mark.parametrize(("distance", "found"), [(0.0199, Status.OK), (0.0201, Status.SLIPPED)])
 def test_an_object_slips_by_less_than_20_mm(axis, distance, found):
     assert verdict(slipping(place=distance * np.array(axis))) is found
 
 
 @pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.6, 0.8)])
-@pytest.mark.parametrize(("degrees", "found"), [(29.9, Status.OK), (30.1, Status.SLIPPED), (179.0, Status.SLIPPED)])
+@pytest.mark.parametrize(
+    ("degrees", "found"), [(29.9, Status.OK), (30.1, Status.SLIPPED), (179.0, Status.SLIPPED)]
+)
 def test_an_object_turns_by_less_than_30_degrees(axis, degrees, found):
     assert verdict(slipping(turn=math.radians(degrees) * np.array(axis))) is found
 
@@ -123,14 +148,18 @@ def test_motion_before_the_hand_has_pressed_is_no_slip():
 
 
 def test_motion_with_the_hand_is_no_slip():
-    """Hand and object turn and move together, as with an arm that shakes: the motion in the hand is zero."""
+    """Hand and object turn and move together, as with an arm that shakes: the motion in the hand is
+    zero.
+    """
     run = Authored(None)
     carried = lambda: at([0.1 * run.height, 0.0, run.height], [0.0, 0.0, 10.0 * run.height])  # noqa: E731
     run.scene.hand_pose = run.scene.object_pose = carried
     assert _Lift(run).perform() is Status.OK
 
 
-@pytest.mark.parametrize(("count", "found"), [(3, Status.OK), (2, Status.OK), (1, Status.DROPPED), (0, Status.DROPPED)])
+@pytest.mark.parametrize(
+    ("count", "found"), [(3, Status.OK), (2, Status.OK), (1, Status.DROPPED), (0, Status.DROPPED)]
+)
 def test_two_fingers_touch_at_the_end(count, found):
     assert verdict(slipping(), lambda time: count if time > 0.2 else 3) is found
 
@@ -138,14 +167,18 @@ def test_two_fingers_touch_at_the_end(count, found):
 @pytest.mark.parametrize(("most", "found"), [(11, Status.OK), (10, Status.DROPPED)])
 @pytest.mark.parametrize("late", [True, False])
 def test_they_touch_in_most_of_the_last_fifth_of_a_second(most, found, late):
-    """At 100 Hz 20 ticks count: two fingers touch in 11 or 10 of them, the last or the first; before them, none."""
+    """At 100 Hz 20 ticks count: two fingers touch in 11 or 10 of them, the last or the first;
+    before them, none.
+    """
     end = round(100 * (LIFT_TIME + 0.3))
     first = end - most if late else end - 20
     touching = lambda time: 2 if first < round(100 * time) <= first + most else 0  # noqa: E731
     assert verdict(slipping(), touching) is found
 
 
-@pytest.mark.parametrize(("hold", "found"), [(0.48, Status.OK), (0.52, Status.SLIPPED), (2.0, Status.SLIPPED)])
+@pytest.mark.parametrize(
+    ("hold", "found"), [(0.48, Status.OK), (0.52, Status.SLIPPED), (2.0, Status.SLIPPED)]
+)
 def test_an_object_is_held_until_the_end_of_the_hold_time(hold, found):
     """The object slips out of the limits half a second after the lift."""
     spec = TrialSpec(hold_time=hold)
@@ -178,4 +211,7 @@ def test_a_trial_ends_early_when_the_object_is_far_away(gone, found):
 
 
 def test_a_simulation_that_diverged_is_unstable():
-    assert verdict(lambda time, height: at([math.nan if time > 0.2 else 0.0, 0.0, 0.0])) is Status.UNSTABLE
+    assert (
+        verdict(lambda time, height: at([math.nan if time > 0.2 else 0.0, 0.0, 0.0]))
+        is Status.UNSTABLE
+    )

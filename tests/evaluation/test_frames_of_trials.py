@@ -19,11 +19,17 @@ ERROR = rigid(torch.eye(3, dtype=torch.float64), real([0.002, -0.001, 0.001]))
 
 def moved(grasp, b_from_a):
     contacts = dataclasses.replace(
-        grasp.contacts, points=apply(b_from_a, grasp.contacts.points), normals=rotate(b_from_a, grasp.contacts.normals)
+        grasp.contacts,
+        points=apply(b_from_a, grasp.contacts.points),
+        normals=rotate(b_from_a, grasp.contacts.normals),
     )
     approach = rotate(b_from_a, grasp.approach[:, None])[:, 0]
     return dataclasses.replace(
-        grasp, contacts=contacts, approach=approach, obj_from_hand=b_from_a @ grasp.obj_from_hand, meta={}
+        grasp,
+        contacts=contacts,
+        approach=approach,
+        obj_from_hand=b_from_a @ grasp.obj_from_hand,
+        meta={},
     )
 
 
@@ -43,7 +49,8 @@ def trial(b_from_a, simulator, **options):
 @pytest.mark.parametrize(("simulator", "seed"), [("sapien", 0), ("mujoco", 1)])
 def test_a_moved_trial_is_the_same_trial(simulator, seed):
     b_from_a = random_motion(seed)
-    still, result = trial(torch.eye(4, dtype=torch.float64), simulator), trial(b_from_a, simulator)
+    still = trial(torch.eye(4, dtype=torch.float64), simulator)
+    result = trial(b_from_a, simulator)
     assert still.held
     for name in ("time", "forces", "joints"):
         assert torch.equal(getattr(result, name), getattr(still, name))
@@ -63,7 +70,9 @@ def test_a_plane_that_is_level_changes_a_trial_little():
     hand, grasp = pinch("allegro")
     mesh = cylinder()
     plain, level = (
-        close_hand(grasp, hand, mesh, dataclasses.replace(QUICK, noise=False), parts=[mesh], table=table)
+        close_hand(
+            grasp, hand, mesh, dataclasses.replace(QUICK, noise=False), parts=[mesh], table=table
+        )
         for table in (None, Plane.horizontal(0.0))
     )
     assert plain.held and level.held

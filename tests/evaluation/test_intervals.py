@@ -1,4 +1,6 @@
-"""Intervals over families: the quantiles of SciPy's bootstrap and of every resample, and what has no interval."""
+"""Intervals over families: the quantiles of SciPy's bootstrap and of every resample, and what has
+no interval.
+"""
 
 import math
 
@@ -9,8 +11,24 @@ from scipy import stats
 
 from torchgrasp.evaluation.intervals import contrast_over, share_over
 
-COUNTS = {"tin": (9, 10), "cup": (3, 12), "jug": (7, 7), "box": (1, 6), "egg": (5, 9), "rod": (20, 30), "can": (4, 4)}
-OTHERS = {"tin": (4, 10), "cup": (3, 11), "jug": (6, 7), "box": (3, 6), "egg": (0, 9), "rod": (10, 30), "can": (4, 4)}
+COUNTS = {
+    "tin": (9, 10),
+    "cup": (3, 12),
+    "jug": (7, 7),
+    "box": (1, 6),
+    "egg": (5, 9),
+    "rod": (20, 30),
+    "can": (4, 4),
+}
+OTHERS = {
+    "tin": (4, 10),
+    "cup": (3, 11),
+    "jug": (6, 7),
+    "box": (3, 6),
+    "egg": (0, 9),
+    "rod": (10, 30),
+    "can": (4, 4),
+}
 
 
 def exact(columns: list[dict[str, tuple[int, int]]], weights: list[float]) -> np.ndarray:
@@ -22,15 +40,26 @@ def exact(columns: list[dict[str, tuple[int, int]]], weights: list[float]) -> np
 
 
 def test_a_share_has_the_interval_of_scipy_s_bootstrap_of_a_ratio_of_sums() -> None:
-    found, table = share_over(COUNTS), np.array([*COUNTS.values()], float)
+    found = share_over(COUNTS)
+    table = np.array([*COUNTS.values()], float)
     assert found.value == pytest.approx(49 / 78) and found[3:] == (78, 7)
 
     def ratio(passed: np.ndarray, total: np.ndarray, axis: int = -1) -> np.ndarray:
         return passed.sum(axis) / total.sum(axis)
 
-    theirs = stats.bootstrap(table.T, ratio, paired=True, vectorized=True, n_resamples=20_000, method="percentile",
-                             rng=np.random.default_rng(1)).confidence_interval  # fmt: skip
-    assert (found.low, found.high) == (pytest.approx(theirs.low, abs=0.012), pytest.approx(theirs.high, abs=0.012))
+    theirs = stats.bootstrap(
+        table.T,
+        ratio,
+        paired=True,
+        vectorized=True,
+        n_resamples=20_000,
+        method="percentile",
+        rng=np.random.default_rng(1),
+    ).confidence_interval
+    assert (found.low, found.high) == (
+        pytest.approx(theirs.low, abs=0.012),
+        pytest.approx(theirs.high, abs=0.012),
+    )
 
 
 def test_paired_differences_and_contrasts_have_the_quantiles_of_every_resample() -> None:
@@ -39,10 +68,14 @@ def test_paired_differences_and_contrasts_have_the_quantiles_of_every_resample()
     assert found.value == pytest.approx(25 / 44 - 16 / 43)
     assert [found.low, found.high] == pytest.approx(exact([some, other], [1, -1]), abs=0.02)
     third = contrast_over([some, other, some], [0.5, -2.0, 0.25])
-    assert [third.low, third.high] == pytest.approx(exact([some, other, some], [0.5, -2.0, 0.25]), abs=0.05)
+    assert [third.low, third.high] == pytest.approx(
+        exact([some, other, some], [0.5, -2.0, 0.25]), abs=0.05
+    )
 
 
-def test_equal_columns_differ_by_nothing_one_unit_has_no_interval_and_means_of_zeros_and_ones_are_shares() -> None:
+def test_equal_columns_differ_by_nothing_one_unit_has_no_interval_and_means_of_zeros_and_ones_are_shares() -> (
+    None
+):
     assert contrast_over([COUNTS, COUNTS], [1.0, -1.0])[:3] == (0.0, 0.0, 0.0)
     assert share_over(dict(reversed(COUNTS.items()))) == share_over(COUNTS)
     assert share_over(COUNTS | {"none": (0, 0)}) == share_over(COUNTS)
@@ -53,7 +86,9 @@ def test_equal_columns_differ_by_nothing_one_unit_has_no_interval_and_means_of_z
         [COUNTS, {"tin": (1, 2)}], [1.0, -1.0]
     )  # resamples without the tin say nothing of the second
     assert lacking.low < lacking.value < lacking.high
-    values = [(name, float(k < passed)) for name, (passed, total) in COUNTS.items() for k in range(total)]
+    values = [
+        (name, float(k < passed)) for name, (passed, total) in COUNTS.items() for k in range(total)
+    ]
     assert mean_over(values) == contrast_over([COUNTS], [1.0])
     assert mean_over([*values, ("tin", math.nan)]) == mean_over(values)
     assert math.isnan(mean_over([("tin", math.nan)]).value)

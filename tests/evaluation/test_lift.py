@@ -1,4 +1,6 @@
-"""Trials on a standing cylinder: held by both hands, repeatable to the last bit, and with the right reason if not."""
+"""Trials on a standing cylinder: held by both hands, repeatable to the last bit, and with the right
+reason if not.
+"""
 
 import dataclasses
 import math
@@ -22,13 +24,16 @@ from torchgrasp.values.closing import ClosingOptions
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
 
 
-STILL, RIGID_ARM = dataclasses.replace(QUICK, noise=False), ClosingOptions(palm_reach=0.0, stops=0)
+STILL = dataclasses.replace(QUICK, noise=False)
+RIGID_ARM = ClosingOptions(palm_reach=0.0, stops=0)
 
 
 @pytest.fixture(scope="module")
 def seen():
     """The distance field of the planned cylinder."""
-    return field_from_surface(torch.tensor(cylinder().vertices), torch.tensor(cylinder().faces), 0.004)
+    return field_from_surface(
+        torch.tensor(cylinder().vertices), torch.tensor(cylinder().faces), 0.004
+    )
 
 
 @pytest.mark.parametrize("name", ["allegro", "barrett"])
@@ -37,7 +42,9 @@ def test_a_cylinder_is_held(name):
     assert result.held and result.status is Status.OK
     assert sorted(result.contact_order) == [0, 1, 2]
     rise = result.object_pose[-1, 2, 3] - result.object_pose[0, 2, 3]
-    assert float(rise) == pytest.approx(0.1, abs=0.01) and result.rise == pytest.approx(float(rise), abs=0.005)
+    assert float(rise) == pytest.approx(0.1, abs=0.01) and result.rise == pytest.approx(
+        float(rise), abs=0.005
+    )
     assert result.object_motion.distance < 0.01 and result.object_motion.angle < 0.2
     assert float(result.forces[-25:].amax(-1).mean()) == pytest.approx(4.0, rel=0.15)
     assert len(result.time) == len(result.forces) == len(result.joints) == len(result.hand_pose)
@@ -55,7 +62,9 @@ def test_same_seed_same_bits_here_and_in_another_process(simulator):
 
 @pytest.mark.parametrize(("name", "aside"), [("allegro", -0.008), ("barrett", 0.008)])
 def test_waiting_keeps_the_object_still(name, aside):
-    """The object stands 8 mm off: the finger that meets it first must not push it away before the others touch."""
+    """The object stands 8 mm off: the finger that meets it first must not push it away before the
+    others touch.
+    """
     waiting, pressing = (
         close(name, cylinder((0.0, aside)), dataclasses.replace(STILL, options=options))
         for options in (None, ClosingOptions(wait=False))
@@ -69,16 +78,25 @@ def test_an_object_where_it_was_seen_is_held_at_once(seen):
     assert (result.attempts, result.stops, result.held) == (1, 0, True)
 
 
-@pytest.mark.parametrize(("aside", "simulator"), [(0.026, "sapien"), (-0.026, "sapien"), (0.022, "mujoco")])
+@pytest.mark.parametrize(
+    ("aside", "simulator"), [(0.026, "sapien"), (-0.026, "sapien"), (0.022, "mujoco")]
+)
 def test_a_hand_that_closed_beside_the_object_closes_once_more(seen, aside, simulator):
-    """The object stands off along its own tangents at the contacts: no plane there tells it, its round surface does.
+    """The object stands off along its own tangents at the contacts: no plane there tells it, its
+    round surface does.
 
-    Whether the hand that closes once still lifts the object hangs on rounding; that the object slips, does not.
+    Whether the hand that closes once still lifts the object hangs on rounding; that the object
+    slips, does not.
     """
     pytest.importorskip(simulator)
     spec = dataclasses.replace(STILL, simulator=simulator)
     once, again = (
-        close("allegro", cylinder((aside, 0.0)), dataclasses.replace(spec, options=options), surface=seen)
+        close(
+            "allegro",
+            cylinder((aside, 0.0)),
+            dataclasses.replace(spec, options=options),
+            surface=seen,
+        )
         for options in (ClosingOptions(attempts=1), None)
     )
     assert once.attempts == 1 and once.slip.distance > 0.002
@@ -87,7 +105,9 @@ def test_a_hand_that_closed_beside_the_object_closes_once_more(seen, aside, simu
 
 @pytest.mark.parametrize("aside", [(0.0, 0.03), (0.0, -0.04)])
 def test_a_hand_that_touches_something_on_its_way_goes_round_it(seen, aside):
-    """The object stands where the opened hand comes down: pushed over by one that goes on, held by one that stops."""
+    """The object stands where the opened hand comes down: pushed over by one that goes on, held by
+    one that stops.
+    """
     swept, guarded = (
         close("allegro", cylinder(aside), dataclasses.replace(STILL, options=options), surface=seen)
         for options in (ClosingOptions(stops=0), None)
@@ -107,7 +127,9 @@ def test_the_papers_closings_lift_what_stands_where_it_was_seen(closing):
 
 def test_the_papers_forces_are_those_of_the_stability_model():
     hand, grasp = pinch("barrett")
-    sources = {c: derive_reference(hand, grasp, closing=c).gains.force_source for c in ("paper", "fixed")}
+    sources = {
+        c: derive_reference(hand, grasp, closing=c).gains.force_source for c in ("paper", "fixed")
+    }
     assert sources == {"paper": "stability", "fixed": "analytic"}
 
 
@@ -115,40 +137,59 @@ def test_pushes_and_slips_are_parts_of_the_motion():
     spec = dataclasses.replace(QUICK, hold_time=0.5, options=RIGID_ARM)
     result = close("allegro", cylinder((0.0, 0.008)), spec)
     centre = torch.tensor([0.0, 0.008, HEIGHT / 2]).double()
-    centres = (inverse(result.hand_pose) @ result.object_pose)[:, :3] @ torch.cat([centre, torch.ones(1).double()])
+    centres = (inverse(result.hand_pose) @ result.object_pose)[:, :3] @ torch.cat(
+        [centre, torch.ones(1).double()]
+    )
     touched = int((result.forces.cummax(0).values > 0).all(-1).int().argmax())
     pressed = len(result.time) - 1 - round((LIFT_TIME + spec.hold_time) * spec.control_rate)
     away = (result.hand_pose[: pressed + 1, :3, 3] - result.hand_pose[pressed, :3, 3]).norm(dim=-1)
     arrived = int((away < 5e-4).int().argmax())
-    ends = [(centres[arrived], centres[touched]), (centres[pressed], centres[-1]), (centres[arrived], centres[-1])]
+    ends = [
+        (centres[arrived], centres[touched]),
+        (centres[pressed], centres[-1]),
+        (centres[arrived], centres[-1]),
+    ]
     for motion, (start, end), tolerance in zip(
         (result.pushed, result.slip, result.object_motion), ends, (3e-4, 1e-9, 1e-4), strict=True
     ):
         assert motion.distance == pytest.approx(float((end - start).norm()), abs=tolerance)
     assert result.pushed.distance > 0.001
-    start, end = (result.object_pose[k, :3] @ torch.cat([centre, torch.ones(1).double()]) for k in (0, pressed))
+    start, end = (
+        result.object_pose[k, :3] @ torch.cat([centre, torch.ones(1).double()])
+        for k in (0, pressed)
+    )
     assert result.before_lift.distance == pytest.approx(float((end - start).norm()), abs=1e-9)
-    assert 0.0 < result.unbalanced < 0.3  # the fingers press on each other; the table may bear a little
+    assert (
+        0.0 < result.unbalanced < 0.3
+    )  # the fingers press on each other; the table may bear a little
 
 
 def test_the_palm_follows_an_object_that_stands_elsewhere():
-    """The hand's own motion is not the object's: `pushed` is small while the hand follows by most of the way."""
+    """The hand's own motion is not the object's: `pushed` is small while the hand follows by most
+    of the way.
+    """
     mesh = cylinder((0.0, 0.012))
-    following, resting = (close("allegro", mesh, dataclasses.replace(STILL, options=x)) for x in (None, RIGID_ARM))
+    following, resting = (
+        close("allegro", mesh, dataclasses.replace(STILL, options=x)) for x in (None, RIGID_ARM)
+    )
     _, grasp = pinch("allegro")
     shifts = []
     for result in (following, resting):
         pressed = len(result.time) - 1 - round((LIFT_TIME + STILL.hold_time) * STILL.control_rate)
         shifts.append(result.hand_pose[pressed, :3, 3] - grasp.obj_from_hand[0, :3, 3])
     assert following.held
-    assert 0.003 < float(shifts[0][1]) and float(shifts[0].norm()) <= 0.0205  # a light cylinder tips before it is felt
+    assert (
+        0.003 < float(shifts[0][1]) and float(shifts[0].norm()) <= 0.0205
+    )  # a light cylinder tips before it is felt
     assert float(shifts[1].norm()) < 1e-3
     assert following.before_lift.distance < 0.006
 
 
 def test_an_object_that_slips_in_the_hand_is_not_held(monkeypatch):
     pytest.importorskip("sapien")
-    trial = _Lift(TrialDriver(GraspTrial(*pinch("allegro"), Truth(cylinder((0.0, 0.008)))), QUICK).open())
+    trial = _Lift(
+        TrialDriver(GraspTrial(*pinch("allegro"), Truth(cylinder((0.0, 0.008)))), QUICK).open()
+    )
     assert trial.perform() is Status.OK
     slipped = trial.result(Status.OK, 0.0).slip
     for name, limit in (("SLIP_DISTANCE", slipped.distance), ("SLIP_ANGLE", slipped.angle)):
@@ -160,7 +201,9 @@ def test_an_object_that_slips_in_the_hand_is_not_held(monkeypatch):
 def test_the_hand_may_be_beside_its_planned_pose_and_may_be_shaken():
     aside = torch.eye(4, dtype=torch.float64)
     aside[0, 3] = 0.004
-    result = close("allegro", spec=dataclasses.replace(QUICK, shake=0.003, hold_time=0.5), error=aside.float())
+    result = close(
+        "allegro", spec=dataclasses.replace(QUICK, shake=0.003, hold_time=0.5), error=aside.float()
+    )
     assert result.held
     _, grasp = pinch("allegro")
     planned = (grasp.obj_from_hand[0] @ aside)[:3, 3]
@@ -183,16 +226,21 @@ def test_the_hand_comes_straight_to_where_it_was_planned():
 
 
 def test_all_a_fingertip_exerts_is_felt_friction_included():
-    """At rest the tips carry the object: their full forces sum to its weight, their normal parts are the readings."""
+    """At rest the tips carry the object: their full forces sum to its weight, their normal parts
+    are the readings.
+    """
     pytest.importorskip("sapien")
     hand, grasp = pinch("allegro")
-    run = TrialDriver(GraspTrial(hand, grasp, Truth(cylinder())), TrialSpec(approach=0.0, noise=False)).open()
+    run = TrialDriver(
+        GraspTrial(hand, grasp, Truth(cylinder())), TrialSpec(approach=0.0, noise=False)
+    ).open()
     for _ in run.close():
         pass
     for k in range(200):
         run.scene.lift(min(k, 100) * 5e-4)
         run.step()
-    observation, tactile = run.observation, run.observation.tactile
+    observation = run.observation
+    tactile = run.observation.tactile
     total = (grasp.obj_from_hand[0, :3, :3] @ tactile.forces.T).sum(1)
     assert torch.allclose(total, torch.tensor([0, 0, 0.981]).double(), atol=0.02)
     assert torch.allclose(-(tactile.forces * tactile.normals).sum(-1), tactile.reading, atol=0.02)
@@ -204,24 +252,38 @@ def test_all_a_fingertip_exerts_is_felt_friction_included():
 @pytest.mark.parametrize("simulator", ["sapien", "mujoco"])
 def test_a_start_in_the_object_missing_contact_and_too_little_friction_are_named(simulator):
     pytest.importorskip(simulator)
-    spec, (hand, grasp), forward = dataclasses.replace(QUICK, simulator=simulator), pinch("barrett"), torch.eye(4)
+    spec, (hand, grasp), forward = (
+        dataclasses.replace(QUICK, simulator=simulator),
+        pinch("barrett"),
+        torch.eye(4),
+    )
     forward[2, 3] = 0.2
     inside = close("barrett", spec=spec, error=forward)
     assert (inside.status, inside.held, len(inside.time)) == (Status.START_OVERLAP, False, 1)
     missed = lift_grasp(GraspTrial(hand, grasp, Truth(cylinder((0.4, 0.0)))), spec)
     assert (missed.status, missed.contact_order) == (Status.NO_CONTACT, ())
     slippery = close("allegro", spec=dataclasses.replace(spec, friction=0.02))
-    assert slippery.status in (Status.NOT_LIFTED, Status.EJECTED, Status.DROPPED) and not slippery.held
+    assert (
+        slippery.status in (Status.NOT_LIFTED, Status.EJECTED, Status.DROPPED) and not slippery.held
+    )
 
 
-@pytest.mark.parametrize(("friction", "simulator"), [(0.4, "sapien"), (0.8, "sapien"), (0.4, "mujoco")])
-@pytest.mark.parametrize(("share", "held"), [(0.85, True), (1.4, False)])  # a sagging finger presses harder
+@pytest.mark.parametrize(
+    ("friction", "simulator"), [(0.4, "sapien"), (0.8, "sapien"), (0.4, "mujoco")]
+)
+@pytest.mark.parametrize(
+    ("share", "held"), [(0.85, True), (1.4, False)]
+)  # a sagging finger presses harder
 def test_the_fingers_carry_the_weight_that_friction_allows(simulator, friction, share, held):
-    """Fingers that press horizontally with N in all carry at most friction x N, so at most friction x N / g [kg]."""
+    """Fingers that press horizontally with N in all carry at most friction x N, so at most friction
+    x N / g [kg].
+    """
     pytest.importorskip(simulator)
     gains = derive_reference(*pinch("allegro")).gains
     most = friction * float(gains.desired_force.norm(dim=-1).sum()) / 9.81
-    spec = dataclasses.replace(STILL, approach=0.0, friction=friction, mass=share * most, simulator=simulator)
+    spec = dataclasses.replace(
+        STILL, approach=0.0, friction=friction, mass=share * most, simulator=simulator
+    )
     spec = dataclasses.replace(spec, holding="force")
     found = close("allegro", spec=spec)
     assert found.held is held and (held or found.status in (Status.NOT_LIFTED, Status.DROPPED))
@@ -229,8 +291,13 @@ def test_the_fingers_carry_the_weight_that_friction_allows(simulator, friction, 
 
 def test_mass_density_and_friction_reach_the_simulators_parameters():
     hand, grasp = pinch("allegro")
-    for changes in ({"mass": 0.1}, {"mass": 0.7, "friction": 0.3}, {"density": 300.0, "gravity": 2.0}):
-        spec, mesh = TrialSpec(**changes), cylinder()
+    for changes in (
+        {"mass": 0.1},
+        {"mass": 0.7, "friction": 0.3},
+        {"density": 300.0, "gravity": 2.0},
+    ):
+        spec = TrialSpec(**changes)
+        mesh = cylinder()
         found = TrialDriver(GraspTrial(hand, grasp, Truth(mesh, [mesh])), spec).scene_spec
         mass = spec.mass if spec.density is None else 300.0 * mesh.volume
         assert (found.mass, found.friction, found.gravity) == (mass, spec.friction, spec.gravity)
@@ -243,7 +310,10 @@ def test_a_mesh_and_a_table_that_contradict_the_grasp_are_told_before_any_work(m
         raise InterruptedError  # the checks were passed
 
     monkeypatch.setattr("torchgrasp.evaluation.lift.lift_grasp", begin)
-    with pytest.raises(BadArgument, match=r"mesh: expected a contact of the grasp within 30 mm .* 3 of 3 about \d+ mm"):
+    with pytest.raises(
+        BadArgument,
+        match=r"mesh: expected a contact of the grasp within 30 mm .* 3 of 3 about \d+ mm",
+    ):
         close_hand(grasp, hand, cylinder((0.0, 0.16)))
     with pytest.raises(BadArgument, match="foot is 54 mm below the table"):
         close_hand(grasp, hand, cylinder(), table=Plane.horizontal(0.054))
@@ -272,13 +342,25 @@ def test_bad_arguments_are_refused():
 
 
 def test_a_push_beyond_friction_takes_the_object_and_one_below_it_does_not():
-    """Three fingers press with at most 4 N each, so that friction of 0.8 holds less than 10 N along the cylinder."""
-    weak, strong = (close("allegro", spec=dataclasses.replace(QUICK, push=(0.0, 0.0, -push))) for push in (1.0, 30.0))
+    """Three fingers press with at most 4 N each, so that friction of 0.8 holds less than 10 N along
+    the cylinder.
+    """
+    weak, strong = (
+        close("allegro", spec=dataclasses.replace(QUICK, push=(0.0, 0.0, -push)))
+        for push in (1.0, 30.0)
+    )
     assert weak.held and not strong.held and strong.rise < 0.05
 
 
 def test_an_object_that_slides_during_the_approach_is_met_where_it_went():
-    result = close("allegro", spec=dataclasses.replace(QUICK, approach=0.1), slide=torch.tensor([0.0, 0.006, 0.0]))
+    result = close(
+        "allegro",
+        spec=dataclasses.replace(QUICK, approach=0.1),
+        slide=torch.tensor([0.0, 0.006, 0.0]),
+    )
     moved = result.object_pose[:, :3, 3] - result.object_pose[0, :3, 3]
     arrived = int((result.time < result.phases[0]).sum())
-    assert float(moved[arrived].norm()) == pytest.approx(0.006, abs=1e-3) and result.before_lift.distance < 0.03
+    assert (
+        float(moved[arrived].norm()) == pytest.approx(0.006, abs=1e-3)
+        and result.before_lift.distance < 0.03
+    )

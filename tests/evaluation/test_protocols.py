@@ -1,4 +1,6 @@
-"""Where the hand and the object really stand: within the errors asked for, uniform, and the same for the same seed."""
+"""Where the hand and the object really stand: within the errors asked for, uniform, and the same
+for the same seed.
+"""
 
 import dataclasses
 import math
@@ -40,15 +42,26 @@ def test_errors_of_the_pose_stay_within_the_protocol_s():
 
 
 def test_every_object_view_row_and_draw_has_an_error_of_its_own_that_others_do_not_change():
-    names = [(o, v, r, d) for o in ("tin", "cup") for v in ("view0", "view1") for r in range(3) for d in range(3)]
+    names = [
+        (o, v, r, d)
+        for o in ("tin", "cup")
+        for v in ("view0", "view1")
+        for r in range(3)
+        for d in range(3)
+    ]
     seeds = {seed_of(seed, *name) for seed in (0, 1) for name in names}
     assert len(seeds) == 2 * len(names) and all(0 <= seed < 2**63 for seed in seeds)
     assert seed_of(0, "a", "b") != seed_of(0, "ab") and seed_of(0, "1") != seed_of(0, 1)
-    mesh, (_, grasp) = cylinder(), pinch("allegro")
+    mesh = cylinder()
+    (_, grasp) = pinch("allegro")
     for name in ("paper", "pose-noise"):
-        errors = torch.stack([draw_error(PROTOCOLS[name], grasp, mesh, seed_of(0, *row)) for row in names])
+        errors = torch.stack(
+            [draw_error(PROTOCOLS[name], grasp, mesh, seed_of(0, *row)) for row in names]
+        )
         assert len(errors[:, :3, 3].unique(dim=0)) == len(names)
-        assert torch.equal(draw_error(PROTOCOLS[name], grasp, mesh, seed_of(0, *names[-1])), errors[-1])
+        assert torch.equal(
+            draw_error(PROTOCOLS[name], grasp, mesh, seed_of(0, *names[-1])), errors[-1]
+        )
 
 
 def test_an_object_is_moved_on_its_table_and_turned_about_the_vertical() -> None:
@@ -74,7 +87,8 @@ def test_errors_of_any_dtype_and_device_move_the_hand_as_the_object_would_move(g
     true_pose = apply_error(obj_from_hand, error_from_object_pose(obj_from_hand, place))
     torch.testing.assert_close(apply(inverse(true_pose), points), seen)
     turn, shift = torch.randn(2, 3, generator=generator, dtype=torch.float64)
-    planned, error = rigid(rotation_from_vector(turn), shift), torch.eye(4, dtype=torch.float64)
+    planned = rigid(rotation_from_vector(turn), shift)
+    error = torch.eye(4, dtype=torch.float64)
     error[0, 3] = 0.25
     devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
     for device in devices:
@@ -97,8 +111,13 @@ def test_pushes_have_their_size_in_every_direction_and_slides_stay_on_the_table(
 
 
 def test_settings_of_lifts_and_pulls_do_not_mix():
-    lift, pull = find_protocol("table-lift"), find_protocol("dexgraspbench")
-    assert lift.trial.table_friction == 0.2 and lift.trial.friction == 0.8 and lift.criterion == "risen"
+    lift = find_protocol("table-lift")
+    pull = find_protocol("dexgraspbench")
+    assert (
+        lift.trial.table_friction == 0.2
+        and lift.trial.friction == 0.8
+        and lift.criterion == "risen"
+    )
     for bad in ({"push": 1.0}, {"criterion": "risen"}, {"displaced": "approach"}):
         with pytest.raises(BadArgument, match="pull"):
             dataclasses.replace(pull, **bad)
@@ -116,7 +135,9 @@ def test_the_command_line_changes_only_what_was_asked_for_and_displaces_no_objec
         return asked.disturbed(find_protocol(name))
 
     assert all(disturbed(name) == find_protocol(name) for name in PROTOCOLS)
-    assert disturbed("pose-noise", draws=1).noise == dataclasses.replace(find_protocol("pose-noise").noise, draws=1)
+    assert disturbed("pose-noise", draws=1).noise == dataclasses.replace(
+        find_protocol("pose-noise").noise, draws=1
+    )
     moved = disturbed("table-lift", displaced=0.03, during=True, push=2.5, draws=5)
     assert (moved.noise, moved.displaced, moved.push) == (PoseNoise(0.03, 0.0, 5), "approach", 2.5)
     with pytest.raises(BadArgument, match="--displaced"):

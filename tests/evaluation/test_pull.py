@@ -1,4 +1,6 @@
-"""Protocols on a pinched cylinder: what holds, what does not, and what statics says of how much it takes."""
+"""Protocols on a pinched cylinder: what holds, what does not, and what statics says of how much it
+takes.
+"""
 
 import dataclasses
 import math
@@ -34,16 +36,21 @@ def test_the_squeeze_presses_with_forces_that_cancel(name):
     hand, grasp = pinch(name)
     lead = squeeze(hand, grasp, force=4.0).joints[0] - grasp.joints[0]
     torque = joint_stiffness(hand) * lead
-    # Forces at the planned contacts, from the torques alone: J^T f = torque, of all f the one that cancels.
+    # Forces at the planned contacts, from the torques alone: J^T f = torque, of all f the one that
+    # cancels.
     hand_from_obj = inverse(grasp.obj_from_hand)
     points = apply(hand_from_obj, grasp.contacts.points)[0]
     jacobian = hand.jacobian(grasp.joints, points[None])[0].flatten(0, 1)
-    still = torch.cat([torch.eye(3).double().repeat(1, 3), torch.cat([cross(p) for p in points], 1)])
+    still = torch.cat(
+        [torch.eye(3).double().repeat(1, 3), torch.cat([cross(p) for p in points], 1)]
+    )
     system = torch.cat([jacobian.T, still])
     wished = torch.cat([torque, torch.zeros(6, dtype=torch.float64)])
     force = torch.linalg.lstsq(system, wished[:, None]).solution[:, 0]
     near(system @ force, wished, 1e-6)
-    push = -(force.reshape(3, 3) * (hand_from_obj[0, :3, :3] @ grasp.contacts.normals[0].T).T).sum(-1)
+    push = -(force.reshape(3, 3) * (hand_from_obj[0, :3, :3] @ grasp.contacts.normals[0].T).T).sum(
+        -1
+    )
     assert float(push.max()) == pytest.approx(4.0, rel=1e-6) and float(push.min()) > 1.0
     twice = squeeze(hand, grasp, force=4.0, kp=2 * hand.actuators[hand.joint_names[0]].kp).joints[0]
     torch.testing.assert_close(twice - grasp.joints[0], lead / 2, rtol=1e-9, atol=1e-12)
@@ -64,7 +71,9 @@ def test_a_pinched_cylinder_passes_and_the_same_numbers_come_twice():
 def test_more_pull_than_friction_can_hold_moves_the_object():
     """Three fingers of N newtons hold at most 3 mu N along the cylinder's axis."""
     held = 3 * 0.6 * 4.0
-    strong = pull("allegro", dataclasses.replace(PULL, acceleration=2 * held / MASS, seconds=1.0), force=4.0)
+    strong = pull(
+        "allegro", dataclasses.replace(PULL, acceleration=2 * held / MASS, seconds=1.0), force=4.0
+    )
     assert not strong.passed and strong.status is Status.MOVED
     assert strong.moved >= PULL.distance or strong.turned >= PULL.angle
     slippery = pull("allegro", friction=0.01)
@@ -73,14 +82,22 @@ def test_more_pull_than_friction_can_hold_moves_the_object():
 
 @pytest.mark.parametrize("closing", ["uncertainty", "position"])
 def test_a_controller_closes_and_holds(closing):
-    result = pull("allegro", dataclasses.replace(PULL, acceleration=2.0), force=4.0, closing=closing)
+    result = pull(
+        "allegro", dataclasses.replace(PULL, acceleration=2.0), force=4.0, closing=closing
+    )
     assert result.passed and 1.0 < result.force < 5.0
 
 
 def test_a_hand_inside_the_object_is_refused_and_one_beside_it_misses_it():
     hand, grasp = pinch("barrett")
-    result = pull_grasp(GraspTrial(hand, grasp, Truth(cylinder((0.0, 0.05)))), QUICK.with_trial(overlap=1e-3))
-    assert result.status is Status.START_OVERLAP and result.directions == 1 and math.isnan(result.force)
+    result = pull_grasp(
+        GraspTrial(hand, grasp, Truth(cylinder((0.0, 0.05)))), QUICK.with_trial(overlap=1e-3)
+    )
+    assert (
+        result.status is Status.START_OVERLAP
+        and result.directions == 1
+        and math.isnan(result.force)
+    )
     aside = torch.eye(4, dtype=torch.float64)
     aside[2, 3] = 0.2
     hand, grasp = pinch("allegro")
@@ -101,7 +118,11 @@ def test_bad_arguments_are_named():
     with pytest.raises(BadArgument, match=r"force: expected .*got -1"):
         QUICK.with_trial(force=-1.0)
     with pytest.raises(BadArgument, match=r"grasp\.pregrasp: expected .*got 9 for"):
-        pull_grasp(dataclasses.replace(trial, grasp=dataclasses.replace(grasp, pregrasp=grasp.pregrasp * 0 + 9)))
+        pull_grasp(
+            dataclasses.replace(
+                trial, grasp=dataclasses.replace(grasp, pregrasp=grasp.pregrasp * 0 + 9)
+            )
+        )
     with pytest.raises(BadArgument, match=r"error: expected .*got"):
         Truth(cylinder(), error=torch.full((4, 4), math.nan))
     with pytest.raises(BadArgument, match=r"grasps: expected .*got 12 joints"):

@@ -1,4 +1,6 @@
-"""Evaluations: what is counted, what is refused, and the same bits however many processes share the work."""
+"""Evaluations: what is counted, what is refused, and the same bits however many processes share the
+work.
+"""
 
 import dataclasses
 import json
@@ -28,7 +30,11 @@ FAMILIES = ((0, "round", "solid"), (1, "round", "solid"), (2, "round", "thin"), 
 
 def test_shares_count_every_view_groups_and_families_and_failures_their_one_stage():
     found = summarise(SCORES)
-    assert found["gsr"][::3] == (1 / 4, 4) and found["top1"][::3] == (1 / 4, 4) and found["objects"][::3] == (1 / 3, 3)
+    assert (
+        found["gsr"][::3] == (1 / 4, 4)
+        and found["top1"][::3] == (1 / 4, 4)
+        and found["objects"][::3] == (1 / 3, 3)
+    )
     assert found["refused"] == 2 and found["force_n"] == 4.0 and found["plan_cpu_s"] == 3.0
     assert found["overlap_mm"] == pytest.approx(3.0) and found["overlap_mm_max"] == 4.0
     assert found["cpu_s"] == 9.0 + 3.0 and found["executable"] == 10
@@ -38,17 +44,27 @@ def test_shares_count_every_view_groups_and_families_and_failures_their_one_stag
         "pulling or lifting": {"MOVED": 1},
         "simulation": {"TIMED_OUT": 1},
     }
-    assert found["by_object"]["tin"]["gsr"][::3] == (0.5, 2) and found["by_object"]["tin"]["refused"] == 1
-    noisy = [dataclasses.replace(SCORES[0], attempts=(GOOD, dataclasses.replace(STUCK, draw=1))), SCORES[1]]
+    assert (
+        found["by_object"]["tin"]["gsr"][::3] == (0.5, 2)
+        and found["by_object"]["tin"]["refused"] == 1
+    )
+    noisy = [
+        dataclasses.replace(SCORES[0], attempts=(GOOD, dataclasses.replace(STUCK, draw=1))),
+        SCORES[1],
+    ]
     assert summarise(noisy)["top1"][::3] == (1 / 4, 4)  # two draws each, of the refused view too
-    scores = [dataclasses.replace(SCORES[k], family=family, group=group) for k, family, group in FAMILIES]
+    scores = [
+        dataclasses.replace(SCORES[k], family=family, group=group) for k, family, group in FAMILIES
+    ]
     found = summarise(scores)
     assert found["by_group"].keys() == {"solid", "thin"}
     assert found["by_group"]["solid"]["top1"][::3] == (1 / 2, 2)
     assert found["objects"].units == 2 and found["gsr"].units == 1
     stages = [status for reasons in STAGES.values() for status in reasons]
     assert sorted(stages) == [
-        s for s in Status if s >= Status.START_OVERLAP and s not in (Status.BAD_OBJECT, Status.BROKEN)
+        s
+        for s in Status
+        if s >= Status.START_OVERLAP and s not in (Status.BAD_OBJECT, Status.BROKEN)
     ]
 
 
@@ -83,7 +99,8 @@ def folder(tmp_path_factory):
     tin = trimesh.creation.cylinder(radius=0.03, height=0.12, sections=64)
     tin.apply_translation([0, 0, 0.06])
     rng = np.random.default_rng(0)
-    angle, height = (rng.random(700) - 0.5) * 2.9, 0.12 * rng.random(700)
+    angle = (rng.random(700) - 0.5) * 2.9
+    height = 0.12 * rng.random(700)
     seen = np.stack([0.03 * np.cos(angle), 0.03 * np.sin(angle), height], -1)
     pose = np.eye(4)
     pose[:3, 3] = [0.45, 0.0, 0.15]
@@ -104,21 +121,39 @@ def test_any_number_of_workers_gives_the_same_bits_and_a_bad_object_is_refused(f
     noise = PoseNoise(0.002, 0.02, draws=2)
     quick = Protocol("quick", QUICK, noise=noise)
     spec = EvaluationSpec(2, "spread", starts=8)
-    one, two = (list(evaluate(folder, hand, quick, spec, workers=n, folder=tmp_path)) for n in (0, 2))
+    one, two = (
+        list(evaluate(folder, hand, quick, spec, workers=n, folder=tmp_path)) for n in (0, 2)
+    )
     assert without_times(one) == without_times(two)
     tin, torn = one
-    assert [(a.rank, a.draw) for a in tin.attempts] == [(r, d) for r in (0, tin.executable - 1) for d in (0, 1)]
-    assert (torn.executable, torn.refusal, torn.attempts) == (0, Status.BAD_OBJECT, ()) and "open surface" in torn.note
+    assert [(a.rank, a.draw) for a in tin.attempts] == [
+        (r, d) for r in (0, tin.executable - 1) for d in (0, 1)
+    ]
+    assert (torn.executable, torn.refusal, torn.attempts) == (
+        0,
+        Status.BAD_OBJECT,
+        (),
+    ) and "open surface" in torn.note
     assert len(load_grasps(tmp_path / "tin" / "view0.safetensors")) == tin.executable
     planned = dataclasses.replace(spec, grasps=1, planned=True)  # the best alone
     again = list(evaluate(folder, hand, quick, planned, folder=tmp_path))
-    assert without_times(again) == without_times([dataclasses.replace(tin, attempts=tin.attempts[:2]), torn])
+    assert without_times(again) == without_times(
+        [dataclasses.replace(tin, attempts=tin.attempts[:2]), torn]
+    )
     other = next(evaluate(folder, load_hand("allegro"), quick, planned, folder=tmp_path))
     assert other.refusal is Status.BAD_OBJECT and "another cloud or hand" in other.note
 
 
 def test_a_second_run_on_the_folder_is_refused_and_a_bad_input_leaves_none(tmp_path, capsys):
-    words = ["evaluate", "--objects", str(tmp_path / "none"), "--hand", "allegro", "--out", str(tmp_path / "out")]
+    words = [
+        "evaluate",
+        "--objects",
+        str(tmp_path / "none"),
+        "--hand",
+        "allegro",
+        "--out",
+        str(tmp_path / "out"),
+    ]
     with hold_folder(tmp_path / "out"):
         assert cli.main(words) == 2
         assert capsys.readouterr().err.startswith("torchgrasp: --out: expected")
@@ -129,24 +164,41 @@ def test_a_second_run_on_the_folder_is_refused_and_a_bad_input_leaves_none(tmp_p
 
 def without_times(scores):
     rows = [dataclasses.replace(x, seconds=0.0, attempts=()) for x in scores]
-    return str([rows, *(dataclasses.replace(a, seconds=0.0) for x in scores for a in x.attempts)])  # NaN is not NaN
+    return str(
+        [rows, *(dataclasses.replace(a, seconds=0.0) for x in scores for a in x.attempts)]
+    )  # NaN is not NaN
 
 
 @pytest.mark.filterwarnings("ignore")
 def test_grasps_of_an_earlier_call_keep_the_reason_why_there_are_none(folder, tmp_path):
-    smooth, spec = Protocol("smooth", TrialSpec(friction=0.0)), EvaluationSpec(1, starts=5, only=("tin",))
+    smooth = Protocol("smooth", TrialSpec(friction=0.0))
+    spec = EvaluationSpec(1, starts=5, only=("tin",))
     (score,) = evaluate(folder, load_hand("barrett"), smooth, spec, folder=tmp_path)
     assert score.executable == 0 and score.refusal is not Status.OK
-    (again,) = evaluate(folder, load_hand("barrett"), smooth, dataclasses.replace(spec, planned=True), folder=tmp_path)
-    assert again.refusal is score.refusal and summarise([again])["failures"] == {"planning": {score.refusal.name: 1}}
+    (again,) = evaluate(
+        folder,
+        load_hand("barrett"),
+        smooth,
+        dataclasses.replace(spec, planned=True),
+        folder=tmp_path,
+    )
+    assert again.refusal is score.refusal and summarise([again])["failures"] == {
+        "planning": {score.refusal.name: 1}
+    }
 
 
 @pytest.mark.sim
 @pytest.mark.filterwarnings("ignore")
-def test_each_view_is_grasped_with_the_fingers_that_were_chosen_for_it(folder, tmp_path, monkeypatch):
-    """Here most fingers always win, which are others than the hand's own; later trials find them by the files."""
+def test_each_view_is_grasped_with_the_fingers_that_were_chosen_for_it(
+    folder, tmp_path, monkeypatch
+):
+    """Here most fingers always win, which are others than the hand's own; later trials find them by
+    the files.
+    """
     pytest.importorskip("sapien")
-    monkeypatch.setattr("torchgrasp.planner.run.expected_success", lambda grasps: grasps.contacts.points.shape[1])
+    monkeypatch.setattr(
+        "torchgrasp.planner.run.expected_success", lambda grasps: grasps.contacts.points.shape[1]
+    )
     test = PROTOCOLS["dexgraspbench"]
     test = dataclasses.replace(test, pull=dataclasses.replace(test.pull, seconds=0.1))
     spec = EvaluationSpec(1, starts=8, only=("tin",), fingers="auto")
@@ -154,7 +206,9 @@ def test_each_view_is_grasped_with_the_fingers_that_were_chosen_for_it(folder, t
     assert score.fingers == "index,middle,ring,thumb" and len(score.attempts) == 1
     assert score.attempts[0].force > 1.0 and score.attempts[0].status in (Status.OK, Status.MOVED)
     assert summarise([score, SCORES[0]])["fingers"] == {score.fingers: 1, "": 1}
-    (again,) = evaluate(folder, load_hand("allegro"), test, dataclasses.replace(spec, planned=True), folder=tmp_path)
+    (again,) = evaluate(
+        folder, load_hand("allegro"), test, dataclasses.replace(spec, planned=True), folder=tmp_path
+    )
     assert without_times([again]) == without_times([score])
 
 
@@ -176,15 +230,43 @@ def test_the_command_writes_numbers_and_a_page(folder, tmp_path, capsys, monkeyp
     bench = PROTOCOLS["dexgraspbench"]
     short = dataclasses.replace(bench, pull=dataclasses.replace(bench.pull, seconds=0.2))
     monkeypatch.setitem(PROTOCOLS, "dexgraspbench", short)
-    words = ["evaluate", "--objects", str(folder), "--hand", "barrett", "--out", str(tmp_path / "out")]
+    words = [
+        "evaluate",
+        "--objects",
+        str(folder),
+        "--hand",
+        "barrett",
+        "--out",
+        str(tmp_path / "out"),
+    ]
     assert cli.main([*words, "--grasps", "2", "--starts", "6"]) == 0
-    written = json.loads((tmp_path / "out" / "evaluate.json").read_text(), parse_constant=pytest.fail)
+    written = json.loads(
+        (tmp_path / "out" / "evaluate.json").read_text(), parse_constant=pytest.fail
+    )
     assert written["views"][0]["object"] == "tin" and len(written["views"][0]["attempts"]) == 2
-    assert written["summary"]["top1"][3] == 2 and written["asked"]["protocol"]["name"] == "dexgraspbench"
+    assert (
+        written["summary"]["top1"][3] == 2
+        and written["asked"]["protocol"]["name"] == "dexgraspbench"
+    )
     assert "best-ranked grasps that pass" in capsys.readouterr().out
     page = (tmp_path / "out" / "evaluate.html").read_text()
-    assert "<h1>Grasps of the barrett hand under dexgraspbench</h1>" in page and "bad_object" in page
-    assert cli.main([*words, "--grasps", "1", "--planned", str(tmp_path / "out" / "grasps"), "--workers", "0"]) == 0
+    assert (
+        "<h1>Grasps of the barrett hand under dexgraspbench</h1>" in page and "bad_object" in page
+    )
+    assert (
+        cli.main(
+            [
+                *words,
+                "--grasps",
+                "1",
+                "--planned",
+                str(tmp_path / "out" / "grasps"),
+                "--workers",
+                "0",
+            ]
+        )
+        == 0
+    )
 
 
 @pytest.mark.parametrize(
@@ -198,7 +280,9 @@ def test_the_command_writes_numbers_and_a_page(folder, tmp_path, capsys, monkeyp
         ({"table": False, "approach": 0.0}, False),
     ],
 )
-def test_try_grasp_passes_the_surface_to_closings_that_compare_contacts_with_it(folder, monkeypatch, changes, known):
+def test_try_grasp_passes_the_surface_to_closings_that_compare_contacts_with_it(
+    folder, monkeypatch, changes, known
+):
     tried = []
 
     def run(trial, protocol, *at):
@@ -206,7 +290,8 @@ def test_try_grasp_passes_the_surface_to_closings_that_compare_contacts_with_it(
         return GOOD
 
     monkeypatch.setattr(views, "run_protocol", run)
-    hand, grasp = load_hand("allegro"), load_shipped_grasp("jug", "allegro")
+    hand = load_hand("allegro")
+    grasp = load_shipped_grasp("jug", "allegro")
     view = views.ObjectView(folder, "tin", "view0", hand.source)
     views.try_grasp(view, grasp, Protocol("quick", TrialSpec(**changes)), EvaluationSpec(1), (0, 0))
     (trial,) = tried

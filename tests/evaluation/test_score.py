@@ -32,13 +32,22 @@ def test_judge_agrees_with_scikit_learn(trials):
     assert [x.passed.units for x in bins] == [40] * 10 and sum(x.passed.total for x in bins) == 6000
 
 
-def test_judge_finds_true_probabilities_calibrated_shifted_ones_not_and_constants_without_skill(trials):
+def test_judge_finds_true_probabilities_calibrated_shifted_ones_not_and_constants_without_skill(
+    trials,
+):
     predicted, passed = trials
-    found, high = judge(predicted, passed, UNITS), judge(predicted.sqrt(), passed, UNITS)
-    assert found["error"] < 0.03 and found["skill"] == pytest.approx(1 / 3, abs=0.03)  # 1 - (1/6) / (1/4)
-    assert found["auc"] == pytest.approx(5 / 6, abs=0.02) and found["auc"] == pytest.approx(high["auc"])
+    found = judge(predicted, passed, UNITS)
+    high = judge(predicted.sqrt(), passed, UNITS)
+    assert found["error"] < 0.03 and found["skill"] == pytest.approx(
+        1 / 3, abs=0.03
+    )  # 1 - (1/6) / (1/4)
+    assert found["auc"] == pytest.approx(5 / 6, abs=0.02) and found["auc"] == pytest.approx(
+        high["auc"]
+    )
     assert all(x.passed.low - 0.02 <= x.predicted <= x.passed.high + 0.02 for x in found["bins"])
-    assert high["error"] == pytest.approx(2 / 3 - 1 / 2, abs=0.03) and high["skill"] < found["skill"]
+    assert (
+        high["error"] == pytest.approx(2 / 3 - 1 / 2, abs=0.03) and high["skill"] < found["skill"]
+    )
     _, passed = trials
     constant = torch.full((6000,), float(passed.double().mean()), dtype=torch.float64)
     found = judge(constant, passed, UNITS)

@@ -1,4 +1,6 @@
-"""Run by test_play.py with Newton and OpenUSD: checks the scene.usda of a folder, plays it, and prints results."""
+"""Run by test_play.py with Newton and OpenUSD: checks the scene.usda of a folder, plays it, and
+prints results.
+"""
 
 import json
 import math
@@ -11,7 +13,8 @@ import numpy as np
 import warp
 from pxr import Usd, UsdPhysics
 
-warp.config.quiet, folder = True, Path(sys.argv[1])
+warp.config.quiet = True
+folder = Path(sys.argv[1])
 play = json.loads((folder / "play.json").read_text())
 stage = Usd.Stage.Open(str(folder / "scene.usda"))
 parsed = UsdPhysics.LoadUsdPhysicsFromRange(stage, ["/"])
@@ -20,8 +23,10 @@ joints = {}
 for name in play["drives"]:
     prim = stage.GetPrimAtPath(f"/World/hand/{name}")
     turns = prim.IsA(UsdPhysics.RevoluteJoint)
-    drive, unit = UsdPhysics.DriveAPI.Get(prim, "angular" if turns else "linear"), math.degrees(1.0) if turns else 1.0
-    stiffness, damping = drive.GetStiffnessAttr().Get() * unit, drive.GetDampingAttr().Get() * unit
+    drive = UsdPhysics.DriveAPI.Get(prim, "angular" if turns else "linear")
+    unit = math.degrees(1.0) if turns else 1.0
+    stiffness = drive.GetStiffnessAttr().Get() * unit
+    damping = drive.GetDampingAttr().Get() * unit
     joints[name] = {"kp": stiffness, "kd": damping, "effort": drive.GetMaxForceAttr().Get()}
 sys.argv[1:] = ["0"]
 runpy.run_path(str(folder / "play.py"), run_name="__main__")
@@ -31,16 +36,20 @@ newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
 builder.add_usd(str(folder / "scene.usda"))
 label = {name.split("/")[-1]: k for k, name in enumerate(builder.joint_label)}
 body = next(k for k, name in enumerate(builder.body_label) if name.endswith("object"))
-times, names, step = np.array(list(play["times"].values())), list(play["drives"]), play["timestep"]
+times = np.array(list(play["times"].values()))
+names = list(play["drives"])
+step = play["timestep"]
 targets = np.array([[x[name] for name in names] for x in play["grasps"][0]["targets"].values()])
 places = [builder.joint_q_start[label[name]] for name in names]
 for place, position in zip(places, targets[0], strict=True):
     builder.joint_q[place] = builder.joint_target_q[place] = position
 model = builder.finalize(device="cpu")
-now, control = model.state(), model.control()
+now = model.state()
+control = model.control()
 newton.eval_fk(model, model.joint_q, model.joint_qd, now)
 solver = newton.solvers.SolverMuJoCo(model, use_mujoco_cpu=True, cone="elliptic", impratio=10.0)
-wanted, centre = control.joint_target_q.numpy(), play["object"]["centre"]
+wanted = control.joint_target_q.numpy()
+centre = play["object"]["centre"]
 for time in np.arange(0.0, times[-1], step):
     k = np.searchsorted(times[1:-1], time, side="right")
     share = (time - times[k]) / (times[k + 1] - times[k])
@@ -48,4 +57,13 @@ for time in np.arange(0.0, times[-1], step):
     control.joint_target_q.assign(wanted)
     solver.step(now, now, control, None, step)
 end = warp.transform_point(warp.transform(*now.body_q.numpy()[body].tolist()), warp.vec3(*centre))
-print(json.dumps({"valid": valid, "mass": builder.body_mass[body], "joints": joints, "rise": end[2] - centre[2]}))
+print(
+    json.dumps(
+        {
+            "valid": valid,
+            "mass": builder.body_mass[body],
+            "joints": joints,
+            "rise": end[2] - centre[2],
+        }
+    )
+)

@@ -1,4 +1,6 @@
-"""Exports with a robot's names of joints and the pose of its flange, and messages for a planning scene."""
+"""Exports with a robot's names of joints and the pose of its flange, and messages for a planning
+scene.
+"""
 
 import dataclasses
 import json
@@ -16,22 +18,31 @@ from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 
 yaml = pytest.importorskip("yaml")
-DRIVER = {f"joint_{k}": f"joint_{k}.0" for k in reversed(range(16))}  # in another order than the URDF's
+DRIVER = {
+    f"joint_{k}": f"joint_{k}.0" for k in reversed(range(16))
+}  # in another order than the URDF's
 
 
-@pytest.mark.parametrize(("table", "up"), [("0.6 0 0.8, offset 0.1", [0.6, 0, 0.8]), (None, [0, 0, 1])])
+@pytest.mark.parametrize(
+    ("table", "up"), [("0.6 0 0.8, offset 0.1", [0.6, 0, 0.8]), (None, [0, 0, 1])]
+)
 def test_the_retreat_lifts_off_the_table_of_the_plan_or_along_z(table, up):
     hand, grasp = pinch("allegro")
     normal = {} if table is None else {"table": f"normal {table}"}
     grasp = dataclasses.replace(grasp, meta={"hand": "allegro"} | normal)
     (message,) = yaml.safe_load(format_moveit(hand, grasp, object_id="jug"))
-    assert [message["post_grasp_retreat"]["direction"]["vector"][k] for k in "xyz"] == pytest.approx(up)
+    assert [
+        message["post_grasp_retreat"]["direction"]["vector"][k] for k in "xyz"
+    ] == pytest.approx(up)
     assert message["allowed_touch_objects"] == ["jug"]
 
 
 def test_a_turned_world_turns_the_retreat_with_it():
     hand, grasp = pinch("allegro")
-    turn = rigid(rotation_from_vector(torch.tensor([0.3, -0.8, 0.2]).double()), torch.tensor([0.1, 0, 0.2]).double())
+    turn = rigid(
+        rotation_from_vector(torch.tensor([0.3, -0.8, 0.2]).double()),
+        torch.tensor([0.1, 0, 0.2]).double(),
+    )
     turned = dataclasses.replace(
         grasp,
         obj_from_hand=turn @ grasp.obj_from_hand,
@@ -46,17 +57,32 @@ def test_a_turned_world_turns_the_retreat_with_it():
 def test_all_sixteen_joints_of_an_allegro_have_the_drivers_names_in_its_order(tmp_path):
     hand, grasp = pinch("allegro")
     assert grasp.joints.shape == (1, 12)  # the planned fingers alone
-    every = dict(zip(hand.tree.joint_names, hand.expand_joints(grasp.joints)[0].tolist(), strict=True))
-    assert [every[f"joint_{k}"] for k in range(8, 12)] == [0.0, -0.196, -0.174, -0.227]  # parked by hand.toml
+    every = dict(
+        zip(hand.tree.joint_names, hand.expand_joints(grasp.joints)[0].tolist(), strict=True)
+    )
+    assert [every[f"joint_{k}"] for k in range(8, 12)] == [
+        0.0,
+        -0.196,
+        -0.174,
+        -0.227,
+    ]  # parked by hand.toml
     (message,) = yaml.safe_load(format_moveit(hand, grasp, rename=DRIVER))
     trajectory = yaml.safe_load(format_trajectories(hand, grasp, rename=DRIVER))
     for posture, row in ((message["grasp_posture"], 0), (trajectory, 1)):
         assert posture["joint_names"] == list(DRIVER.values())
-        assert posture["points"][row]["positions"] == pytest.approx([every[joint] for joint in DRIVER], abs=1e-9)
+        assert posture["points"][row]["positions"] == pytest.approx(
+            [every[joint] for joint in DRIVER], abs=1e-9
+        )
     content = json.loads(format_grasps(hand, grasp, rename=DRIVER))
     row = content["grasps"][0]
-    assert list(row["joints"]["grasp"].items()) == [(DRIVER[joint], every[joint]) for joint in DRIVER]
-    assert set(content["actuated"]) == set(row["torque"]) == {DRIVER[joint] for joint in hand.joint_names}
+    assert list(row["joints"]["grasp"].items()) == [
+        (DRIVER[joint], every[joint]) for joint in DRIVER
+    ]
+    assert (
+        set(content["actuated"])
+        == set(row["torque"])
+        == {DRIVER[joint] for joint in hand.joint_names}
+    )
     assert set(content["stiffness"]) == set(DRIVER.values())
     (tmp_path / "grasps.json").write_text(json.dumps(content))
     assert torch.equal(read_foreign(tmp_path / "grasps.json", hand).joints, grasp.joints)
@@ -64,11 +90,17 @@ def test_all_sixteen_joints_of_an_allegro_have_the_drivers_names_in_its_order(tm
 
 def test_a_joint_that_is_not_named_keeps_its_name_after_the_others():
     hand, grasp = pinch("barrett")
-    names = yaml.safe_load(format_trajectories(hand, grasp, rename={"f1_flex": "a", "spread": "b"}))["joint_names"]
-    assert names[:2] == ["a", "b"] and names[2:] == [x for x in hand.tree.joint_names if x not in ("f1_flex", "spread")]
+    names = yaml.safe_load(
+        format_trajectories(hand, grasp, rename={"f1_flex": "a", "spread": "b"})
+    )["joint_names"]
+    assert names[:2] == ["a", "b"] and names[2:] == [
+        x for x in hand.tree.joint_names if x not in ("f1_flex", "spread")
+    ]
 
 
-@pytest.mark.parametrize("wrong", [{"joint_16": "a"}, {"joint_0": "a", "joint_1": "a"}, {"joint_0": "joint_1"}])
+@pytest.mark.parametrize(
+    "wrong", [{"joint_16": "a"}, {"joint_0": "a", "joint_1": "a"}, {"joint_0": "joint_1"}]
+)
 def test_unknown_joints_and_two_joints_of_one_name_are_refused(wrong):
     hand, grasp = pinch("allegro")
     for write in (format_grasps, format_moveit, format_trajectories):
@@ -82,23 +114,32 @@ def test_the_flange_is_where_the_mount_puts_it():
     mount = Rotation.from_euler("z", 90, degrees=True)
     flange = rigid(torch.tensor(mount.as_matrix()), torch.tensor([-0.095, 0.0, 0.0]).double())
     closed = grasp.obj_from_hand[0].numpy()
-    place, turn = closed[:3, :3] @ [-0.095, 0, 0] + closed[:3, 3], Rotation.from_matrix(closed[:3, :3]) * mount
+    place = closed[:3, :3] @ [-0.095, 0, 0] + closed[:3, 3]
+    turn = Rotation.from_matrix(closed[:3, :3]) * mount
     text = format_moveit(hand, grasp, flange=flange)
     assert "poses are of the flange" in text.splitlines()[0]
     pose = yaml.safe_load(text)[0]["grasp_pose"]["pose"]
     found = [pose["position"][k] for k in "xyz"], [pose["orientation"][k] for k in "xyzw"]
     row = json.loads(format_grasps(hand, grasp, flange=flange))["grasps"][0]
-    for position, quaternion in (found, (row["flange"]["position"], np.roll(row["flange"]["quaternion_wxyz"], -1))):
+    for position, quaternion in (
+        found,
+        (row["flange"]["position"], np.roll(row["flange"]["quaternion_wxyz"], -1)),
+    ):
         np.testing.assert_allclose(position, place, atol=1e-8)
         assert (Rotation.from_quat(quaternion) * turn.inv()).magnitude() < 1e-7
-    np.testing.assert_allclose(row["pose"]["position"], closed[:3, 3])  # the hand's pose stays beside it
+    np.testing.assert_allclose(
+        row["pose"]["position"], closed[:3, 3]
+    )  # the hand's pose stays beside it
 
 
 def test_the_command_takes_names_a_file_of_names_and_a_flange(tmp_path, capsys):
     hand, grasp = pinch("allegro")
-    dataclasses.replace(grasp, meta={"hand": "allegro", "hand_sha256": hand.source.sha256}).save(tmp_path / "g")
+    dataclasses.replace(grasp, meta={"hand": "allegro", "hand_sha256": hand.source.sha256}).save(
+        tmp_path / "g"
+    )
     (tmp_path / "names.json").write_text(json.dumps(DRIVER))
-    out, words = tmp_path / "out", ["export", str(tmp_path / "g"), "--out", str(tmp_path / "out"), "--format"]
+    out = tmp_path / "out"
+    words = ["export", str(tmp_path / "g"), "--out", str(tmp_path / "out"), "--format"]
     for names in (["joint_15=thumb.3", "joint_0=index.0"], [str(tmp_path / "names.json")]):
         assert cli.main([*words, "ros2", "--rename", *names]) == 0
         first = yaml.safe_load(out.read_text())["joint_names"][0]
@@ -116,7 +157,11 @@ def test_the_command_takes_names_a_file_of_names_and_a_flange(tmp_path, capsys):
             ["json", "--rename", "nofile.json"],
             ["mujoco", "--rename", "joint_0=a"],
         ),
-        "--flange": (["ros2", *mount], ["json", "--flange", *"0 0 0 2 0 0 0".split()], ["graspgen", *mount]),
+        "--flange": (
+            ["ros2", *mount],
+            ["json", "--flange", *"0 0 0 2 0 0 0".split()],
+            ["graspgen", *mount],
+        ),
         "--object": (["ros2", "--object", "jug"],),
     }
     for option, cases in wrong.items():

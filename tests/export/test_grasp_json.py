@@ -1,4 +1,6 @@
-"""Exported grasps, read back by others: yourdfpy places the tips of the JSON, MuJoCo those of the keyframes."""
+"""Exported grasps, read back by others: yourdfpy places the tips of the JSON, MuJoCo those of the
+keyframes.
+"""
 
 import dataclasses
 import json
@@ -34,7 +36,8 @@ def test_the_json_replays_to_the_planned_tips(name):
     robot = yourdfpy.URDF.load(str(hand.urdf_path), load_meshes=False, load_collision_meshes=False)
     robot.update_cfg(row["joints"]["grasp"])
     w, x, y, z = row["pose"]["quaternion_wxyz"]
-    turn, place = Rotation.from_quat([x, y, z, w]).as_matrix(), np.array(row["pose"]["position"])
+    turn = Rotation.from_quat([x, y, z, w]).as_matrix()
+    place = np.array(row["pose"]["position"])
     for i, contact in enumerate(row["contacts"]):
         assert contact["finger"] == hand.tips.names[i]
         tip = robot.get_transform(contact["link"], content["hand"]["root"])
@@ -46,7 +49,9 @@ def test_the_json_replays_to_the_planned_tips(name):
     for joint in content["actuated"]:  # stiffness x lead = torque
         lead = joints["squeeze"][joint] - joints["grasp"][joint]
         if name == "allegro":  # no coupling
-            assert content["stiffness"][joint] * lead == pytest.approx(row["torque"][joint], abs=1e-12)
+            assert content["stiffness"][joint] * lead == pytest.approx(
+                row["torque"][joint], abs=1e-12
+            )
     forces = np.array([contact["force"] for contact in row["contacts"]])
     normals = np.array([contact["normal"] for contact in row["contacts"]])
     np.testing.assert_allclose(forces.sum(0), 0, atol=1e-9)
@@ -62,7 +67,9 @@ def test_mujoco_loads_the_keyframes_and_places_the_tips(name):
     mujoco.mj_resetDataKeyframe(model, data, model.key("grasp_0_grasp").id)
     mujoco.mj_kinematics(model, data)
     for i, link in enumerate(hand.tips.links):
-        point = data.body(link).xmat.reshape(3, 3) @ hand.tips.contact[i].numpy() + data.body(link).xpos
+        point = (
+            data.body(link).xmat.reshape(3, 3) @ hand.tips.contact[i].numpy() + data.body(link).xpos
+        )
         np.testing.assert_allclose(point, planned_tips(hand, grasp)[i], atol=1e-9)
     pressed = hand.expand(squeeze(hand, grasp, 5.0).joints)
     key = model.key("grasp_0_squeeze")
@@ -78,10 +85,15 @@ def test_mujoco_loads_the_keyframes_and_places_the_tips(name):
 
 
 def test_a_hand_whose_opened_fingers_are_in_the_table_stays_above_its_pose():
-    """The table is 5 mm above the lowest sphere of the opened hand: by hand, the hand rises by 6 mm."""
+    """The table is 5 mm above the lowest sphere of the opened hand: by hand, the hand rises by 6
+    mm.
+    """
     mujoco = pytest.importorskip("mujoco")
     hand, grasp = pinch("barrett")
-    lowest = apply(grasp.obj_from_hand, hand.sphere_centres(grasp.pregrasp))[0, :, 2] - hand.collision_spheres.radius
+    lowest = (
+        apply(grasp.obj_from_hand, hand.sphere_centres(grasp.pregrasp))[0, :, 2]
+        - hand.collision_spheres.radius
+    )
     table = Plane.horizontal(float(lowest.min()) + 0.005)
     grasp = dataclasses.replace(grasp, meta=grasp.meta | {"table": table.describe()})
     row = json.loads(format_grasps(hand, grasp))["grasps"][0]
@@ -100,19 +112,29 @@ def test_a_robot_of_half_the_stiffness_gets_twice_the_lead():
     first, second = (content["grasps"][0] for content in (own, soft))
     assert second["torque"] == first["torque"] and second["contacts"] == first["contacts"]
     for joint in own["actuated"]:
-        leads = [row["joints"]["squeeze"][joint] - row["joints"]["grasp"][joint] for row in (first, second)]
+        leads = [
+            row["joints"]["squeeze"][joint] - row["joints"]["grasp"][joint]
+            for row in (first, second)
+        ]
         assert leads[1] == pytest.approx(2 * leads[0], abs=1e-12)
     gains = re.findall(r'<position kp="([0-9.]+)"', format_keyframes(hand, grasp, 5.0, 1.5))
     assert len(gains) == 16 and set(gains) == {"1.5"}
 
 
-def test_the_command_writes_both_names_what_is_wrong_and_no_grasps_are_an_empty_list(tmp_path, capsys):
+def test_the_command_writes_both_names_what_is_wrong_and_no_grasps_are_an_empty_list(
+    tmp_path, capsys
+):
     hand, grasp = pinch("allegro")
     grasp = dataclasses.replace(grasp, meta={"hand": "allegro", "hand_sha256": hand.source.sha256})
     grasp.save(tmp_path / "grasps.safetensors")
     words = ["export", str(tmp_path / "grasps.safetensors"), "--out", str(tmp_path / "out")]
-    assert cli.main(words) == 0 and json.loads((tmp_path / "out").read_text())["grasps"][0]["status"] == "OK"
-    assert cli.main([*words, "--format", "mujoco"]) == 0 and (tmp_path / "out").read_text().startswith("<mujoco")
+    assert (
+        cli.main(words) == 0
+        and json.loads((tmp_path / "out").read_text())["grasps"][0]["status"] == "OK"
+    )
+    assert cli.main([*words, "--format", "mujoco"]) == 0 and (
+        tmp_path / "out"
+    ).read_text().startswith("<mujoco")
     wrong = {"--hand": "barrett", "--force": "-1", "--most": "0", "--kp": "0"}
     for named, value in wrong.items():
         more = [named, value]

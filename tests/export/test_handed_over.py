@@ -1,4 +1,6 @@
-"""Grasps in others' formats, read back by independent readers and by kinematics written from the published models."""
+"""Grasps in others' formats, read back by independent readers and by kinematics written from the
+published models.
+"""
 
 import dataclasses
 import json
@@ -32,7 +34,8 @@ def pose(position, quaternion):
     """A 4 x 4 pose of a position and a quaternion (w, x, y, z) of any length."""
     w, x, y, z = quaternion
     matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = Rotation.from_quat([x, y, z, w]).as_matrix(), position
+    matrix[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
+    matrix[:3, 3] = position
     return matrix
 
 
@@ -44,12 +47,19 @@ def turned(axis, angle):
 
 
 def menagerie_tips(qpos):
-    """Distal frames of index and thumb by the numbers of MuJoCo Menagerie's right Allegro hand, its palm turned."""
-    start, q = pose(qpos[:3], qpos[3:7]) @ pose([0, 0, 0], [0, 1, 0, 1]), qpos[7:]
-    index = start @ pose([0, 0.0435, -0.001542], [0.999048, -0.0436194, 0, 0]) @ turned([0, 0, 1], q[0])
+    """Distal frames of index and thumb by the numbers of MuJoCo Menagerie's right Allegro hand, its
+    palm turned.
+    """
+    start = pose(qpos[:3], qpos[3:7]) @ pose([0, 0, 0], [0, 1, 0, 1])
+    q = qpos[7:]
+    index = (
+        start @ pose([0, 0.0435, -0.001542], [0.999048, -0.0436194, 0, 0]) @ turned([0, 0, 1], q[0])
+    )
     for height, angle in zip((0.0164, 0.054, 0.0384), q[1:4], strict=True):
         index = index @ pose([0, 0, height], [1, 0, 0, 0]) @ turned([0, 1, 0], angle)
-    thumb = start @ pose([-0.0182, 0.019333, -0.045987], [0.477714, -0.521334, -0.521334, -0.477714])
+    thumb = start @ pose(
+        [-0.0182, 0.019333, -0.045987], [0.477714, -0.521334, -0.521334, -0.477714]
+    )
     thumb = thumb @ turned([-1, 0, 0], q[12])
     thumb = thumb @ pose([-0.027, 0.005, 0.0399], [1, 0, 0, 0]) @ turned([0, 0, 1], q[13])
     for height, angle in zip((0.0177, 0.0514), q[14:16], strict=True):
@@ -69,12 +79,18 @@ def test_dexgraspbench_reads_its_fields_and_its_model_stands_where_ours_does(tmp
     content = np.load(path, allow_pickle=True).item()  # as its evaluator does
     assert path == tmp_path / "cup" / "0.npy" and content["obj_path"] == "assets/object/cup"
     assert content["obj_scale"] == 1.0 and content["obj_pose"].tolist() == [0, 0, 0, 1, 0, 0, 0]
-    postures = {"pregrasp": grasp.pregrasp, "grasp": grasp.joints, "squeeze": squeeze(hand, grasp, 5.0, 5.0).joints}
+    postures = {
+        "pregrasp": grasp.pregrasp,
+        "grasp": grasp.joints,
+        "squeeze": squeeze(hand, grasp, 5.0, 5.0).joints,
+    }
     for name, joints in postures.items():
         qpos = content[f"{name}_qpos"]
         assert qpos.shape == (23,) and qpos.dtype == np.float64
         for found, link in zip(menagerie_tips(qpos), ("index_distal", "thumb_distal"), strict=True):
-            np.testing.assert_allclose(found, link_in_object(hand, grasp, joints, link), atol=2e-6)  # six digits there
+            np.testing.assert_allclose(
+                found, link_in_object(hand, grasp, joints, link), atol=2e-6
+            )  # six digits there
 
 
 def test_a_hand_whose_frames_in_the_bench_are_unknown_is_refused(tmp_path):
@@ -89,17 +105,26 @@ def test_moveit_gets_postures_pose_approach_and_quality(name):
     (message,) = yaml.safe_load(format_moveit(hand, grasp, 5.0))
     squeezed = squeeze(hand, grasp, 5.0)
     assert message["grasp_quality"] == pytest.approx(float(grasp.success[0]), abs=1e-9)
-    opened, closed = message["pre_grasp_posture"], message["grasp_posture"]
+    opened = message["pre_grasp_posture"]
+    closed = message["grasp_posture"]
     order = opened["joint_names"]
     assert order == closed["joint_names"] == list(hand.tree.joint_names)
-    for points, joints in ((opened["points"][0], grasp.pregrasp), (closed["points"][0], grasp.joints)):
+    for points, joints in (
+        (opened["points"][0], grasp.pregrasp),
+        (closed["points"][0], grasp.joints),
+    ):
         expected = hand.expand(joints)
-        assert points["positions"] == pytest.approx([float(expected[joint][0]) for joint in order], abs=1e-9)
+        assert points["positions"] == pytest.approx(
+            [float(expected[joint][0]) for joint in order], abs=1e-9
+        )
         assert points["effort"] == []
     torque = dict(zip(hand.joint_names, squeezed.torques[0].tolist(), strict=True))
-    assert closed["points"][1]["effort"] == pytest.approx([torque.get(joint, 0.0) for joint in order], abs=1e-9)
+    assert closed["points"][1]["effort"] == pytest.approx(
+        [torque.get(joint, 0.0) for joint in order], abs=1e-9
+    )
     assert closed["points"][1]["time_from_start"] == {"sec": 0, "nanosec": 800_000_000}
-    place, q = message["grasp_pose"]["pose"]["position"], message["grasp_pose"]["pose"]["orientation"]
+    place = message["grasp_pose"]["pose"]["position"]
+    q = message["grasp_pose"]["pose"]["orientation"]
     found = pose([place[k] for k in "xyz"], [q[k] for k in "wxyz"])
     np.testing.assert_allclose(found, grasp.obj_from_hand[0], atol=1e-8)
     vectors = [
@@ -112,12 +137,16 @@ def test_moveit_gets_postures_pose_approach_and_quality(name):
     np.testing.assert_array_equal(back, [0, 0, 1])  # up, off the table of the pinch
     for key in ("pre_grasp_approach", "post_grasp_retreat", "post_place_retreat"):
         assert message[key]["min_distance"] < message[key]["desired_distance"] == 0.1
-    assert message["grasp_pose"]["header"] == {"frame_id": "object"} and message["allowed_touch_objects"] == ["object"]
+    assert message["grasp_pose"]["header"] == {"frame_id": "object"} and message[
+        "allowed_touch_objects"
+    ] == ["object"]
 
 
 def test_every_number_of_the_yaml_is_a_number_and_graspgen_finds_transforms_and_mask():
     hand, grasp = pinch("allegro")
-    tiny = dataclasses.replace(grasp, pregrasp=torch.full_like(grasp.pregrasp, 1e-12), score=torch.tensor([-40.0]))
+    tiny = dataclasses.replace(
+        grasp, pregrasp=torch.full_like(grasp.pregrasp, 1e-12), score=torch.tensor([-40.0])
+    )
     (message,) = yaml.safe_load(format_moveit(hand, tiny))
     assert all(isinstance(x, float) for x in message["pre_grasp_posture"]["points"][0]["positions"])
     assert message["grasp_quality"] == 0.0
@@ -134,11 +163,16 @@ def test_a_trajectory_each_goes_from_pregrasp_to_squeeze():
     two = grasp[torch.tensor([0, 0])]
     documents = list(yaml.safe_load_all(format_trajectories(hand, two, 5.0)))
     assert len(documents) == 2 and documents[0] == documents[1]
-    times = [p["time_from_start"]["sec"] + 1e-9 * p["time_from_start"]["nanosec"] for p in documents[0]["points"]]
+    times = [
+        p["time_from_start"]["sec"] + 1e-9 * p["time_from_start"]["nanosec"]
+        for p in documents[0]["points"]
+    ]
     assert times == pytest.approx([0.0, 0.4, 0.8])
     last = hand.expand(squeeze(hand, grasp, 5.0).joints)
     found = documents[0]["points"][2]["positions"]
-    assert found == pytest.approx([float(last[joint][0]) for joint in documents[0]["joint_names"]], abs=1e-9)
+    assert found == pytest.approx(
+        [float(last[joint][0]) for joint in documents[0]["joint_names"]], abs=1e-9
+    )
     none = grasp[torch.zeros(0, dtype=torch.int64)]
     assert yaml.safe_load(format_moveit(hand, none)) == []
 
@@ -148,9 +182,13 @@ def test_grasps_of_joints_alone_have_contacts_certificates_and_a_pregrasp(name):
     hand, planned = pinch(name)
     grasps = grasps_from_joints(hand, planned.joints, planned.obj_from_hand, std_m=0.003)
     gap = (grasps.contacts.points - planned.contacts.points).norm(dim=-1)
-    assert float(gap.max()) < 0.012  # the planned ones are where a sphere touches, off the middle of the pad
+    assert (
+        float(gap.max()) < 0.012
+    )  # the planned ones are where a sphere touches, off the middle of the pad
     proved = certify(grasps.contacts).closed
-    assert proved.tolist() == [name == "allegro"]  # the Barrett hand's pads stand up to 50 degrees off the cylinder
+    assert proved.tolist() == [
+        name == "allegro"
+    ]  # the Barrett hand's pads stand up to 50 degrees off the cylinder
     assert grasps.status.tolist() == [int(Status.OK if proved else Status.NOT_CLOSED)]
     radial = grasps.contacts.normals[0, :, :2] * planned.contacts.normals[0, :, :2]
     assert bool((radial.sum(-1) > 0.6).all())  # outward, as the cylinder's
@@ -181,8 +219,11 @@ def test_our_json_and_dexgraspbench_come_back_to_the_same_grasps(tmp_path):
 
 def test_multigrippergrasp_needs_the_order_of_its_joints(tmp_path):
     hand, grasp = pinch("barrett")
-    w, x, y, z = Rotation.from_matrix(grasp.obj_from_hand[0, :3, :3].numpy()).as_quat()[[3, 0, 1, 2]]
-    place, order = grasp.obj_from_hand[0, :3, 3].tolist(), ("f3_flex", "other", "spread", "f2_flex", "f1_flex")
+    w, x, y, z = Rotation.from_matrix(grasp.obj_from_hand[0, :3, :3].numpy()).as_quat()[
+        [3, 0, 1, 2]
+    ]
+    place = grasp.obj_from_hand[0, :3, 3].tolist()
+    order = ("f3_flex", "other", "spread", "f2_flex", "f1_flex")
     spread, f1, f2, f3 = grasp.joints[0].tolist()
     for quaternion, turn in (("wxyz", [w, x, y, z]), ("xyzw", [x, y, z, w])):
         content = {
@@ -204,7 +245,15 @@ def test_multigrippergrasp_needs_the_order_of_its_joints(tmp_path):
 
 @pytest.mark.parametrize(
     "content",
-    ["[]", "{}", '{"grasps": 1}', '{"grasps": [{}]}', '{"pose": [[1]], "dofs": [[1]]}', '{"pose": 1, "dofs": 2}', "\0"],
+    [
+        "[]",
+        "{}",
+        '{"grasps": 1}',
+        '{"grasps": [{}]}',
+        '{"pose": [[1]], "dofs": [[1]]}',
+        '{"pose": 1, "dofs": 2}',
+        "\0",
+    ],
 )
 def test_a_malformed_file_is_refused_by_name(tmp_path, content):
     hand, _ = pinch("barrett")
@@ -224,7 +273,12 @@ def test_poses_of_too_few_numbers_and_an_npz_of_pickles_wrong_shapes_or_nan_are_
     hand, _ = pinch("allegro")
     file = tmp_path / "grasps.npz"
     row = np.concatenate([[0, 0, 0, 1, 0, 0, 0], np.zeros(16)])
-    bad = [{"x": row}, {"grasp_qpos": row[:-1]}, {"grasp_qpos": np.array([{}])}, {"grasp_qpos": row * np.nan}]
+    bad = [
+        {"x": row},
+        {"grasp_qpos": row[:-1]},
+        {"grasp_qpos": np.array([{}])},
+        {"grasp_qpos": row * np.nan},
+    ]
     bad += [{"grasp_qpos": row, "pregrasp_qpos": np.stack([row, row])}, {"grasp_qpos": 2 * row}]
     for tables in bad:
         np.savez(file, **tables)
@@ -237,7 +291,11 @@ def test_poses_of_too_few_numbers_and_an_npz_of_pickles_wrong_shapes_or_nan_are_
 
 def test_the_commands_write_every_format_and_read_them_back(tmp_path, capsys):
     hand, grasp = pinch("allegro")
-    meta = {"hand": "allegro", "hand_sha256": hand.source.sha256, "joint_names": ",".join(hand.joint_names)}
+    meta = {
+        "hand": "allegro",
+        "hand_sha256": hand.source.sha256,
+        "joint_names": ",".join(hand.joint_names),
+    }
     grasp = dataclasses.replace(grasp, meta=meta)
     grasp.save(tmp_path / "g.safetensors")
     words = ["export", str(tmp_path / "g.safetensors"), "--format"]
@@ -247,14 +305,30 @@ def test_the_commands_write_every_format_and_read_them_back(tmp_path, capsys):
     for kind in ("dexgraspbench", "graspgen"):
         assert cli.main([*words, kind, "--out", str(tmp_path / kind)]) == 2
         assert "--object" in capsys.readouterr().err
-        assert cli.main([*words, kind, "--out", str(tmp_path / kind), "--object", "assets/cup"]) == 0
+        assert (
+            cli.main([*words, kind, "--out", str(tmp_path / kind), "--object", "assets/cup"]) == 0
+        )
     assert cli.main([*words, "json", "--out", str(tmp_path / "g.json"), "--object", "x"]) == 2
     assert cli.main([*words, "json", "--out", str(tmp_path / "g.json")]) == 0
     capsys.readouterr()
-    taken = ["import", str(tmp_path / "g.json"), "--hand", "allegro", "--out", str(tmp_path / "back.safetensors")]
+    taken = [
+        "import",
+        str(tmp_path / "g.json"),
+        "--hand",
+        "allegro",
+        "--out",
+        str(tmp_path / "back.safetensors"),
+    ]
     assert cli.main(taken) == 0 and "1 closed" in capsys.readouterr().out
-    assert cli.main(["export", str(tmp_path / "back.safetensors"), "--out", str(tmp_path / "again.json")]) == 0
-    first, again = (json.loads((tmp_path / f).read_text())["grasps"][0] for f in ("g.json", "again.json"))
+    assert (
+        cli.main(
+            ["export", str(tmp_path / "back.safetensors"), "--out", str(tmp_path / "again.json")]
+        )
+        == 0
+    )
+    first, again = (
+        json.loads((tmp_path / f).read_text())["grasps"][0] for f in ("g.json", "again.json")
+    )
     assert again["joints"]["grasp"] == pytest.approx(first["joints"]["grasp"])
 
 
@@ -268,10 +342,27 @@ def foreign(tmp_path, capsys):
     position = grasp.obj_from_hand[0, :3, 3].numpy()
 
     def run(scale, turn, *options, shift=(0, 0, 0), view=True):
-        pose = [*(scale * (position + shift)).tolist(), *((w, x, y, z) if turn == "wxyz" else (x, y, z, w))]
-        (tmp_path / "theirs.json").write_text(json.dumps({"pose": [pose], "dofs": grasp.joints.tolist()}))
-        words = ["import", str(tmp_path / "theirs.json"), "--hand", "barrett", "--out", str(tmp_path / "t.safetensors")]
-        words += ["--joints", *hand.joint_names, *options, *(["--cloud", str(tmp_path / "view.npz")] * view)]
+        pose = [
+            *(scale * (position + shift)).tolist(),
+            *((w, x, y, z) if turn == "wxyz" else (x, y, z, w)),
+        ]
+        (tmp_path / "theirs.json").write_text(
+            json.dumps({"pose": [pose], "dofs": grasp.joints.tolist()})
+        )
+        words = [
+            "import",
+            str(tmp_path / "theirs.json"),
+            "--hand",
+            "barrett",
+            "--out",
+            str(tmp_path / "t.safetensors"),
+        ]
+        words += [
+            "--joints",
+            *hand.joint_names,
+            *options,
+            *(["--cloud", str(tmp_path / "view.npz")] * view),
+        ]
         code = cli.main(words)
         return code, "".join(capsys.readouterr()), (tmp_path / "t.safetensors").exists()
 
@@ -279,12 +370,22 @@ def foreign(tmp_path, capsys):
 
 
 def test_poses_that_contradict_the_view_are_told_with_the_options_that_mend_them(foreign):
-    for scale, turn, mend in ((1, "xyzw", "--quaternion xyzw --unit m"), (100, "wxyz", "--quaternion wxyz --unit cm")):
+    for scale, turn, mend in (
+        (1, "xyzw", "--quaternion xyzw --unit m"),
+        (100, "wxyz", "--quaternion wxyz --unit cm"),
+    ):
         code, words, written = foreign(scale, turn)
-        assert code == 2 and not written and f"as with {mend}" in words and "contacts within 30 mm" in words
+        assert (
+            code == 2
+            and not written
+            and f"as with {mend}" in words
+            and "contacts within 30 mm" in words
+        )
     code, words, written = foreign(1000, "wxyz", view=False)
     assert code == 2 and not written and "a hand 326 m off" in words and "--unit" in words
-    code, words, written = foreign(1, "wxyz", shift=(0.2, 0, 0))  # another frame, which no option mends
+    code, words, written = foreign(
+        1, "wxyz", shift=(0.2, 0, 0)
+    )  # another frame, which no option mends
     assert code == 2 and not written and "one frame" in words and "as with" not in words
 
 

@@ -32,7 +32,9 @@ from torchgrasp.geometry.plane import Plane
 from torchgrasp.shape import extract_surface
 from torchgrasp.values.specs import TrialSpec
 
-OBJECTS, HANDS, MASSES = ("jug", "cylinder", "rabbit", "spray"), ("allegro", "barrett"), (0.25, 4.0)
+OBJECTS = ("jug", "cylinder", "rabbit", "spray")
+HANDS = ("allegro", "barrett")
+MASSES = (0.25, 4.0)
 """Objects, hands and masses [kg]: the heavy ones are beyond what most joints can press."""
 EACH = 4  # grasps of an object by a hand with a mass
 SPEC = TrialSpec(approach=0.05, hold_time=0.3)
@@ -47,12 +49,28 @@ LIBRARIES = {
 
 ISAAC_LAB = {
     "SimulationCfg": {"dt", "gravity", "device"},
-    "RigidBodyMaterialCfg": {"static_friction", "dynamic_friction", "restitution", "friction_combine_mode"},
+    "RigidBodyMaterialCfg": {
+        "static_friction",
+        "dynamic_friction",
+        "restitution",
+        "friction_combine_mode",
+    },
     "CuboidCfg": {"size", "collision_props", "physics_material", "rigid_props", "mass_props"},
     "CollisionPropertiesCfg": {"collision_enabled", "contact_offset", "rest_offset"},
-    "ArticulationRootPropertiesCfg": {"fix_root_link", "enabled_self_collisions", "articulation_enabled"},
+    "ArticulationRootPropertiesCfg": {
+        "fix_root_link",
+        "enabled_self_collisions",
+        "articulation_enabled",
+    },
     "UsdFileCfg": {"usd_path", "articulation_props", "rigid_props", "scale", "variants"},
-    "ImplicitActuatorCfg": {"joint_names_expr", "stiffness", "damping", "effort_limit_sim", "armature", "friction"},
+    "ImplicitActuatorCfg": {
+        "joint_names_expr",
+        "stiffness",
+        "damping",
+        "effort_limit_sim",
+        "armature",
+        "friction",
+    },
     "ArticulationCfg": {"prim_path", "spawn", "init_state", "actuators"},
     "InitialStateCfg": {"pos", "rot", "joint_pos", "joint_vel"},
     "RigidObjectCfg": {"prim_path", "spawn", "init_state"},
@@ -66,13 +84,18 @@ def spec_of(mass):
 
 
 def export(folder, player, name, hand, mass):
-    thing, grasp = load_object(name), load_shipped_grasp(name, hand)
-    return save_play(load_hand(hand), grasp, folder, player, thing.mesh, spec_of(mass), parts=thing.parts)
+    thing = load_object(name)
+    grasp = load_shipped_grasp(name, hand)
+    return save_play(
+        load_hand(hand), grasp, folder, player, thing.mesh, spec_of(mass), parts=thing.parts
+    )
 
 
 @functools.cache
 def planned(name, hand):
-    """Return the executable grasps of an object's view, the best ones first: as many as all masses need."""
+    """Return the executable grasps of an object's view, the best ones first: as many as all masses
+    need.
+    """
     grasps = plan_grasps(load_object(name), hand, ContactSpec(table=0.0), 60)[: EACH * len(MASSES)]
     assert len(grasps) == EACH * len(MASSES) and bool((grasps.status == Status.OK).all())
     return grasps
@@ -81,7 +104,8 @@ def planned(name, hand):
 @functools.cache
 def own_verdicts(name, hand, k):
     """Return whether our trials of the same motion lift the object with mass k by half of the lift."""
-    thing, grasps = load_object(name), planned(name, hand)[k :: len(MASSES)]
+    thing = load_object(name)
+    grasps = planned(name, hand)[k :: len(MASSES)]
     trial = dataclasses.replace(spec_of(MASSES[k]), closing="open_loop", simulator="mujoco")
     found = [close_hand(grasp, hand, thing.mesh, trial, parts=thing.parts) for grasp in grasps]
     return [x.rise >= 0.5 * trial.lift_height for x in found]
@@ -93,15 +117,25 @@ def test_a_simulator_has_the_verdict_of_our_trial(name, tmp_path):
     player, environment = PLAYERS[name]
     if not (ROOT / environment / "bin" / "python").exists():
         pytest.skip(f"scripts/beside makes {environment}")
-    folders, own = list[tuple[Path, int]](), list[bool]()
-    for thing, hand, (k, mass) in itertools.product(map(load_object, OBJECTS), HANDS, enumerate(MASSES)):
-        grasps, place = planned(thing.name, hand)[k :: len(MASSES)], tmp_path / f"{thing.name}_{hand}_{k}"
-        save_play(load_hand(hand), grasps, place, player, thing.mesh, spec_of(mass), parts=thing.parts)
+    folders = list[tuple[Path, int]]()
+    own = list[bool]()
+    for thing, hand, (k, mass) in itertools.product(
+        map(load_object, OBJECTS), HANDS, enumerate(MASSES)
+    ):
+        grasps = planned(thing.name, hand)[k :: len(MASSES)]
+        place = tmp_path / f"{thing.name}_{hand}_{k}"
+        save_play(
+            load_hand(hand), grasps, place, player, thing.mesh, spec_of(mass), parts=thing.parts
+        )
         folders.append((place, len(grasps)))
         own += own_verdicts(thing.name, hand, k)
     played = [x.held for x in play_all(environment, folders)]
-    assert len(own) >= 60 and sum(one == other for one, other in zip(played, own, strict=True)) >= LEAST_SAME * len(own)
-    assert 0.2 < sum(own) / len(own) < 0.9  # a scene in which nothing moves, or all is held, has other verdicts
+    assert len(own) >= 60 and sum(
+        one == other for one, other in zip(played, own, strict=True)
+    ) >= LEAST_SAME * len(own)
+    assert (
+        0.2 < sum(own) / len(own) < 0.9
+    )  # a scene in which nothing moves, or all is held, has other verdicts
 
 
 @pytest.mark.parametrize("player", LIBRARIES)
@@ -109,7 +143,12 @@ def test_a_script_is_short_and_needs_the_simulator_and_numpy(player, tmp_path):
     folder = export(tmp_path, player, "jug", "barrett", 0.25)
     text = (folder / "play.py").read_text()
     modules = {x.module for x in ast.walk(ast.parse(text)) if isinstance(x, ast.ImportFrom)}
-    modules |= {name.name for x in ast.walk(ast.parse(text)) if isinstance(x, ast.Import) for name in x.names}
+    modules |= {
+        name.name
+        for x in ast.walk(ast.parse(text))
+        if isinstance(x, ast.Import)
+        for name in x.names
+    }
     assert len(text.splitlines()) <= 40
     assert {x.split(".")[0] for x in modules} - sys.stdlib_module_names == LIBRARIES[player]
 
@@ -119,32 +158,54 @@ def test_a_script_is_short_and_needs_the_simulator_and_numpy(player, tmp_path):
 def test_a_script_refuses_a_grasp_that_it_has_not(player, word, tmp_path, monkeypatch):
     """The simulators are stand-ins, on which a script that goes on fails with another error."""
     folder = export(tmp_path, player, "jug", "barrett", 0.25)
-    play = types.SimpleNamespace(PLAY=json.loads((folder / "play.json").read_text()), DRIVES=(), RATE=1)
-    for name in LIBRARIES[player] - {"numpy", "torch"} | {"isaaclab.app", "isaaclab.sim", "isaaclab.actuators"}:
+    play = types.SimpleNamespace(
+        PLAY=json.loads((folder / "play.json").read_text()), DRIVES=(), RATE=1
+    )
+    for name in LIBRARIES[player] - {"numpy", "torch"} | {
+        "isaaclab.app",
+        "isaaclab.sim",
+        "isaaclab.actuators",
+    }:
         monkeypatch.setitem(sys.modules, name, play if name == "environment" else MagicMock())
     monkeypatch.setitem(sys.modules, "isaaclab.assets", MagicMock())
     monkeypatch.setattr(sys, "argv", ["play.py", word])
-    with pytest.raises(SystemExit, match=rf"^expected .* from 0 to 0, got {word}$"):  # Python prints it; the code is 1
+    with pytest.raises(
+        SystemExit, match=rf"^expected .* from 0 to 0, got {word}$"
+    ):  # Python prints it; the code is 1
         runpy.run_path(str(folder / "play.py"), run_name="__main__")
 
 
 def test_isaac_lab_gets_fields_that_its_documentation_lists(tmp_path):
     tree = ast.parse((export(tmp_path, "isaaclab", "jug", "barrett", 0.25) / "play.py").read_text())
-    calls = [(getattr(x.func, "attr", getattr(x.func, "id", "")), x) for x in ast.walk(tree) if isinstance(x, ast.Call)]
-    made = {name: {word.arg for word in call.keywords if word.arg} for name, call in calls if name.endswith("Cfg")}
+    calls = [
+        (getattr(x.func, "attr", getattr(x.func, "id", "")), x)
+        for x in ast.walk(tree)
+        if isinstance(x, ast.Call)
+    ]
+    made = {
+        name: {word.arg for word in call.keywords if word.arg}
+        for name, call in calls
+        if name.endswith("Cfg")
+    }
     assert made.keys() == ISAAC_LAB.keys() and all(made[name] <= ISAAC_LAB[name] for name in made)
 
 
 @pytest.mark.sim
 def test_a_scene_in_usd_is_valid_and_plays_in_newton(tmp_path):
-    """OpenUSD reads every body, joint and drive; Newton's reader builds a scene in which the jug is lifted."""
-    folder, python = export(tmp_path, "usd", "jug", "barrett", 0.25), ROOT / ".beside" / "newton" / "bin" / "python"
+    """OpenUSD reads every body, joint and drive; Newton's reader builds a scene in which the jug is
+    lifted.
+    """
+    folder = export(tmp_path, "usd", "jug", "barrett", 0.25)
+    python = ROOT / ".beside" / "newton" / "bin" / "python"
     if not python.exists():
         pytest.skip("scripts/beside makes .beside/newton")
     words = [str(python), "-W", "ignore", str(Path(__file__).with_name("play_usd.py")), str(folder)]
-    done = subprocess.run(words, capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": ""})
+    done = subprocess.run(
+        words, capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": ""}
+    )
     assert done.returncode == 0, done.stderr
-    found, hand = json.loads(done.stdout.splitlines()[-1]), load_hand("barrett")
+    found = json.loads(done.stdout.splitlines()[-1])
+    hand = load_hand("barrett")
     assert found["valid"] and found["rise"] > 0.5 * SPEC.lift_height
     play = json.loads((folder / "play.json").read_text())
     assert found["mass"] == pytest.approx(play["object"]["mass"])
@@ -171,20 +232,33 @@ def test_the_drives_have_the_effort_limits_of_the_urdf_and_the_gains_of_the_hand
     for servo in ET.parse(folder / "scene.xml").iter("position"):
         name = servo.get("name")
         assert float(servo.get("forcerange").split()[1]) == drives[name]["effort"]
-        assert float(servo.get("kp")) == drives[name]["kp"] and float(servo.get("kv")) == drives[name]["kd"]
+        assert (
+            float(servo.get("kp")) == drives[name]["kp"]
+            and float(servo.get("kv")) == drives[name]["kd"]
+        )
     urdf = ET.parse(export(tmp_path, "maniskill", "jug", "allegro", 0.25) / "hand.urdf")
-    efforts = {x.get("name"): x.find("limit").get("effort") for x in urdf.iter("joint") if x.get("name") in limits}
+    efforts = {
+        x.get("name"): x.find("limit").get("effort")
+        for x in urdf.iter("joint")
+        if x.get("name") in limits
+    }
     assert {name: float(effort) for name, effort in efforts.items()} == limits
 
 
 def test_the_motion_leads_from_the_approach_to_the_plan_and_up(tmp_path):
-    hand, grasp = load_hand("barrett"), load_shipped_grasp("jug", "barrett")
-    play = json.loads((export(tmp_path, "mujoco", "jug", "barrett", 0.25) / "play.json").read_text())
+    hand = load_hand("barrett")
+    grasp = load_shipped_grasp("jug", "barrett")
+    play = json.loads(
+        (export(tmp_path, "mujoco", "jug", "barrett", 0.25) / "play.json").read_text()
+    )
     assert list(play["times"]) == ["approach", "pregrasp", "grasp", "squeeze", "lift", "hold"]
     assert all(np.diff(list(play["times"].values())) > 0)
     (row,) = play["grasps"]
     planned = {name: float(q) for name, q in hand.expand(grasp.joints[0]).items()}
-    targets = {phase: np.array([posture[f"mount_{x}"] for x in "xyz"]) for phase, posture in row["targets"].items()}
+    targets = {
+        phase: np.array([posture[f"mount_{x}"] for x in "xyz"])
+        for phase, posture in row["targets"].items()
+    }
     assert {name: row["targets"]["grasp"][name] for name in planned} == pytest.approx(planned)
     rotation = grasp.obj_from_hand[0, :3, :3].double().numpy()
     assert rotation @ targets["lift"] == pytest.approx([0, 0, SPEC.lift_height])
@@ -194,10 +268,15 @@ def test_the_motion_leads_from_the_approach_to_the_plan_and_up(tmp_path):
 
 
 def test_a_tilted_table_is_level_in_the_folder(tmp_path):
-    """Everything is turned by an angle; the folder's object stands as that of the scene which was not turned."""
-    thing, hand, grasp = load_object("jug"), load_hand("barrett"), load_shipped_grasp("jug", "barrett")
+    """Everything is turned by an angle; the folder's object stands as that of the scene which was
+    not turned.
+    """
+    thing = load_object("jug")
+    hand = load_hand("barrett")
+    grasp = load_shipped_grasp("jug", "barrett")
     turn = rigid(
-        rotation_from_vector(torch.tensor([0.4, -0.2, 0.3], dtype=torch.float64)), torch.full((3,), 0.1).double()
+        rotation_from_vector(torch.tensor([0.4, -0.2, 0.3], dtype=torch.float64)),
+        torch.full((3,), 0.1).double(),
     )
     table = Plane.horizontal(0.0).moved(turn)
     moved = dataclasses.replace(
@@ -208,31 +287,65 @@ def test_a_tilted_table_is_level_in_the_folder(tmp_path):
     )
     mesh = thing.mesh.copy().apply_transform(turn.numpy())
     save_play(hand, moved, tmp_path, "mujoco", mesh, SPEC, parts=[mesh.convex_hull])
-    play, solid = json.loads((tmp_path / "play.json").read_text()), trimesh.load(tmp_path / "object.ply")
-    assert play["table_height"] == pytest.approx(0.0, abs=1e-5) and solid.bounds[0, 2] == pytest.approx(0.0, abs=1e-5)
-    assert play["grasps"][0]["position"][2] == pytest.approx(float(grasp.obj_from_hand[0, 2, 3]), abs=1e-5)
+    play = json.loads((tmp_path / "play.json").read_text())
+    solid = trimesh.load(tmp_path / "object.ply")
+    assert play["table_height"] == pytest.approx(0.0, abs=1e-5) and solid.bounds[
+        0, 2
+    ] == pytest.approx(0.0, abs=1e-5)
+    assert play["grasps"][0]["position"][2] == pytest.approx(
+        float(grasp.obj_from_hand[0, 2, 3]), abs=1e-5
+    )
     assert play["object"]["centre"][2] == pytest.approx(float(thing.mesh.center_mass[2]), abs=1e-5)
 
 
 def test_an_export_that_cannot_play_says_why(tmp_path, capsys):
-    hand, grasp, thing = load_hand("barrett"), load_shipped_grasp("jug", "barrett"), load_object("jug")
+    hand = load_hand("barrett")
+    grasp = load_shipped_grasp("jug", "barrett")
+    thing = load_object("jug")
     with pytest.raises(BadArgument, match="at least one grasp"):
         save_play(hand, grasp[:0], tmp_path, "mujoco", thing.mesh)
     with pytest.raises(MeshError):
-        save_play(hand, grasp, tmp_path, "mujoco", trimesh.Trimesh(thing.mesh.vertices, thing.mesh.faces[5:]))
+        save_play(
+            hand,
+            grasp,
+            tmp_path,
+            "mujoco",
+            trimesh.Trimesh(thing.mesh.vertices, thing.mesh.faces[5:]),
+        )
     grasp.save(tmp_path / "grasps.safetensors")
     call = ["export", str(tmp_path / "grasps.safetensors"), "--out", str(tmp_path / "out")]
-    assert cli.main([*call, "--format", "play-mujoco"]) == 2 and "--object" in capsys.readouterr().err
+    assert (
+        cli.main([*call, "--format", "play-mujoco"]) == 2 and "--object" in capsys.readouterr().err
+    )
 
 
 def test_the_command_plays_on_the_estimated_surface(tmp_path, capsys):
-    words = ["grasp", "cylinder", "--hand", "barrett", "--starts", "40", "--out", str(tmp_path), "--no-report"]
+    words = [
+        "grasp",
+        "cylinder",
+        "--hand",
+        "barrett",
+        "--starts",
+        "40",
+        "--out",
+        str(tmp_path),
+        "--no-report",
+    ]
     assert cli.main(words) == 0
     out = tmp_path / "play"
-    words = ["export", str(tmp_path / "grasps.safetensors"), "--format", "play-newton", "--out", str(out)]
+    words = [
+        "export",
+        str(tmp_path / "grasps.safetensors"),
+        "--format",
+        "play-newton",
+        "--out",
+        str(out),
+    ]
     assert cli.main(words) == 0 and str(out) in capsys.readouterr().out
     solid = trimesh.load(out / "object.ply")
-    assert solid.is_watertight and solid.extents == pytest.approx(load_object("cylinder").mesh.extents, abs=0.02)
+    assert solid.is_watertight and solid.extents == pytest.approx(
+        load_object("cylinder").mesh.extents, abs=0.02
+    )
     assert share_of_base(solid) > 0.5
 
 
@@ -243,25 +356,37 @@ def share_of_base(solid):
 
 
 def test_an_estimate_stands_on_the_table_and_a_true_mesh_stays_as_it_is(tmp_path):
-    thing, hand, grasp = load_object("cylinder"), load_hand("barrett"), load_shipped_grasp("cylinder", "barrett")
+    thing = load_object("cylinder")
+    hand = load_hand("barrett")
+    grasp = load_shipped_grasp("cylinder", "barrett")
     surface = extract_surface(fit_shape(thing.view, table=0.0), 24)
-    parts, low = [thing.mesh.convex_hull], thing.mesh.copy().apply_translation([0, 0, -0.003])
+    parts = [thing.mesh.convex_hull]
+    low = thing.mesh.copy().apply_translation([0, 0, -0.003])
     found = [
-        trimesh.load(save_play(hand, grasp, tmp_path / str(k), "mujoco", mesh, SPEC, parts=parts) / "object.ply")
+        trimesh.load(
+            save_play(hand, grasp, tmp_path / str(k), "mujoco", mesh, SPEC, parts=parts)
+            / "object.ply"
+        )
         for k, mesh in enumerate((surface, low))
     ]
-    assert surface.vertices[:, 2].min() < -1e-4 and found[0].bounds[0, 2] == pytest.approx(0.0, abs=1e-6)
+    assert surface.vertices[:, 2].min() < -1e-4 and found[0].bounds[0, 2] == pytest.approx(
+        0.0, abs=1e-6
+    )
     assert share_of_base(found[0]) > 0.5
     np.testing.assert_allclose(found[1].bounds, low.bounds, atol=1e-6)
 
 
 def test_the_parts_of_another_object_in_the_folder_are_not_used(tmp_path):
     for name in ("jug", "cylinder"):
-        folder, mesh = export(tmp_path, "maniskill", name, "barrett", 0.25), load_object(name).mesh
+        folder = export(tmp_path, "maniskill", name, "barrett", 0.25)
+        mesh = load_object(name).mesh
         files = json.loads((folder / "play.json").read_text())["object"]["files"]
         bounds = trimesh.util.concatenate([trimesh.load(folder / file) for file in files]).bounds
         assert bounds / 100 == pytest.approx(mesh.bounds, abs=1e-3)
-    assert len(files) < len(list(folder.glob("*.obj"))) and "glob" not in (folder / "environment.py").read_text()
+    assert (
+        len(files) < len(list(folder.glob("*.obj")))
+        and "glob" not in (folder / "environment.py").read_text()
+    )
 
 
 @pytest.mark.parametrize(
@@ -269,20 +394,28 @@ def test_the_parts_of_another_object_in_the_folder_are_not_used(tmp_path):
     [
         (["--format", "json", "--mass", "2"], "--mass: expected a format that it is for"),
         (["--format", "glb", "--friction", "0.5"], "--friction: expected a format that it is for"),
-        (["--format", "json", "--rename", "spread=a", "spread=b"], "--rename: expected each joint once"),
+        (
+            ["--format", "json", "--rename", "spread=a", "spread=b"],
+            "--rename: expected each joint once",
+        ),
     ],
 )
 def test_no_option_of_an_export_is_ignored(words, told, tmp_path, capsys):
     load_shipped_grasp("jug", "barrett").save(tmp_path / "grasps.safetensors")
     (tmp_path / "surface.ply").write_bytes(load_object("jug").mesh.export(file_type="ply"))
     out = tmp_path / "out"
-    assert cli.main(["export", str(tmp_path / "grasps.safetensors"), "--out", str(out), *words]) == 2
+    assert (
+        cli.main(["export", str(tmp_path / "grasps.safetensors"), "--out", str(out), *words]) == 2
+    )
     assert told in capsys.readouterr().err and not out.exists()
 
 
 def test_a_glb_counts_the_one_grasp_that_it_holds(tmp_path, capsys):
-    grasp, file = load_shipped_grasp("jug", "barrett"), tmp_path / "grasps.safetensors"
+    grasp = load_shipped_grasp("jug", "barrett")
+    file = tmp_path / "grasps.safetensors"
     grasp[[0, 0]].save(file)
     (tmp_path / "surface.ply").write_bytes(load_object("jug").mesh.export(file_type="ply"))
-    assert cli.main(["export", str(file), "--format", "glb", "--out", str(tmp_path / "jug.glb")]) == 0
+    assert (
+        cli.main(["export", str(file), "--format", "glb", "--out", str(tmp_path / "jug.glb")]) == 0
+    )
     assert capsys.readouterr().out.startswith("1 grasp of")

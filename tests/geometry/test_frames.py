@@ -22,7 +22,9 @@ def triangles(n: int, generator: torch.Generator) -> torch.Tensor:
     return torch.randn(n, 3, 3, generator=generator, dtype=torch.float64)
 
 
-def test_eq15_to_eq17_virtual_frame_is_rigid_at_the_mean_along_the_contacts_and_equivariant(generator, motion):
+def test_eq15_to_eq17_virtual_frame_is_rigid_at_the_mean_along_the_contacts_and_equivariant(
+    generator, motion
+):
     frame = virtual_frame(triangles(200, generator))
     rotation = frame[:, :3, :3]
     eye = torch.eye(3, dtype=torch.float64).expand(200, 3, 3)
@@ -30,7 +32,9 @@ def test_eq15_to_eq17_virtual_frame_is_rigid_at_the_mean_along_the_contacts_and_
     torch.testing.assert_close(torch.linalg.det(rotation), torch.ones(200, dtype=torch.float64))
     torch.testing.assert_close(frame[:, 3], real([0.0, 0, 0, 1]).expand(200, 4))
     points = triangles(50, generator)
-    torch.testing.assert_close(virtual_frame(points)[:, :3, 3], (points[:, 0] + points[:, 1] + points[:, 2]) / 3)
+    torch.testing.assert_close(
+        virtual_frame(points)[:, :3, 3], (points[:, 0] + points[:, 1] + points[:, 2]) / 3
+    )
     local = apply(inverse(virtual_frame(points)), points)
     near(local[..., 2], torch.zeros_like(local[..., 2]), 1e-12)  # z: the plane
     side = local[:, 2] - local[:, 0]
@@ -55,7 +59,11 @@ def test_rigid_motions_and_rotations(generator, motion):
     torch.testing.assert_close(apply(inverse(motion), apply(motion, points)), points)
     torch.testing.assert_close(rotate(motion, points), apply(motion, points) - motion[:3, 3])
     v = torch.randn(100, 3, generator=generator, dtype=torch.float64)
-    v = v * (torch.rand(100, 1, generator=generator, dtype=torch.float64) * 3.1 / v.norm(dim=1, keepdim=True))
+    v = v * (
+        torch.rand(100, 1, generator=generator, dtype=torch.float64)
+        * 3.1
+        / v.norm(dim=1, keepdim=True)
+    )
     torch.testing.assert_close(rotation_angle(rotation_from_vector(v)), v.norm(dim=1))
     w = torch.randn(100, 3, generator=generator, dtype=torch.float64)
     torch.testing.assert_close((skew(v) @ w[..., None])[..., 0], torch.linalg.cross(v, w))

@@ -69,21 +69,30 @@ def test_each_farthest_point_is_the_farthest_from_those_before_it_and_the_first_
         nearest = torch.cdist(p, p[picks[:k]]).amin(1)
         assert nearest[picks[k]] == nearest.max()
     p = torch.tensor([[0.0], [1.0], [1.0 + 1e-12]], dtype=torch.float64)
-    assert farthest_points(p, 2).tolist() == [0, 2] and farthest_points(p, 2, tie=1e-9).tolist() == [0, 1]
+    assert farthest_points(p, 2).tolist() == [0, 2] and farthest_points(
+        p, 2, tie=1e-9
+    ).tolist() == [0, 1]
 
 
 def test_farthest_points_by_any_distance_keep_away_from_points_before(generator):
     p = torch.rand(200, 3, generator=generator, dtype=torch.float64).round(decimals=1)  # with ties
     picks = farthest_points(p, 40, first=3, tie=1e-9)
-    assert torch.equal(picks, farthest_points(p, 40, first=3, tie=1e-9, distance=lambda x, y: (x - y).square().sum(-1)))
-    points, before = torch.rand(40, 2, generator=generator), torch.rand(7, 2, generator=generator)
-    picks, known = farthest_points(points, 12, before=before).tolist(), [*before]
+    assert torch.equal(
+        picks,
+        farthest_points(p, 40, first=3, tie=1e-9, distance=lambda x, y: (x - y).square().sum(-1)),
+    )
+    points = torch.rand(40, 2, generator=generator)
+    before = torch.rand(7, 2, generator=generator)
+    picks = farthest_points(points, 12, before=before).tolist()
+    known = [*before]
     for pick in picks:
         gaps = torch.stack([torch.stack([(p - q).norm() for q in known]).min() for p in points])
         assert float(gaps[pick]) >= float(gaps.max()) - 1e-7
         known.append(points[pick])
     assert len(set(picks)) == 12
-    assert torch.equal(farthest_points(points, 5, 3, before=points[:0]), farthest_points(points, 5, 3))
+    assert torch.equal(
+        farthest_points(points, 5, 3, before=points[:0]), farthest_points(points, 5, 3)
+    )
 
 
 @pytest.mark.parametrize(("n", "k", "rank"), [(984, 2, 2), (40, 7, 7), (40, 5, 3), (3, 6, 3)])
@@ -92,12 +101,16 @@ def test_least_squares_are_the_shortest(generator, n, k, rank):
     rows = rows @ torch.randn(rank, k, generator=generator, dtype=torch.float64)
     values = torch.randn(n, generator=generator, dtype=torch.float64)
     oracle = np.linalg.lstsq(rows.numpy(), values.numpy(), rcond=None)[0]
-    torch.testing.assert_close(solve_least_squares(rows, values), torch.from_numpy(oracle), rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(
+        solve_least_squares(rows, values), torch.from_numpy(oracle), rtol=1e-9, atol=1e-9
+    )
 
 
 @pytest.mark.promise("N10")
 def test_least_squares_have_the_same_bits_in_every_call(generator):
-    """Memory that others have used lies below each call: a workspace that is read before it is set shows."""
+    """Memory that others have used lies below each call: a workspace that is read before it is set
+    shows.
+    """
     rows = torch.randn(984, 2, generator=generator, dtype=torch.float64)
     values = torch.randn(984, generator=generator, dtype=torch.float64)
     first = solve_least_squares(rows, values)
@@ -108,7 +121,8 @@ def test_least_squares_have_the_same_bits_in_every_call(generator):
 
 
 def test_tests_check_annotations_a_wrong_rank_letter_and_type_are_refused():
-    rows, values = torch.rand(4, 2).double(), torch.rand(4).double()
+    rows = torch.rand(4, 2).double()
+    values = torch.rand(4).double()
     assert solve_least_squares(rows, values).shape == (2,)
     for arguments in ((values, values), (rows, values[:3]), (rows.long(), values)):
         with pytest.raises(TypeError):

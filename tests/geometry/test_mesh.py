@@ -1,4 +1,6 @@
-"""Meshes: refusals, closest points of triangles against trimesh, and cuts against areas in closed form."""
+"""Meshes: refusals, closest points of triangles against trimesh, and cuts against areas in closed
+form.
+"""
 
 import contextlib
 import threading
@@ -19,7 +21,9 @@ def cube(size: float = 0.1) -> trimesh.Trimesh:
 
 def changed(vertices=lambda x: x, faces=lambda x: x) -> trimesh.Trimesh:
     """A cube with other vertices or faces."""
-    return trimesh.Trimesh(vertices(np.array(cube().vertices)), faces(np.array(cube().faces)), process=False)
+    return trimesh.Trimesh(
+        vertices(np.array(cube().vertices)), faces(np.array(cube().faces)), process=False
+    )
 
 
 def turned(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -46,7 +50,10 @@ def one_turned(faces):
         (changed(not_finite), "non-finite"),
         (changed(lambda x: x * [1, 1, 0]), "volume"),
         (changed(faces=one_turned), "volume"),
-        (trimesh.util.concatenate([cube(), turned(cube(0.08)).apply_translation((0.3, 0, 0))]), "without inertia"),
+        (
+            trimesh.util.concatenate([cube(), turned(cube(0.08)).apply_translation((0.3, 0, 0))]),
+            "without inertia",
+        ),
         (trimesh.Trimesh(), "of 0 faces"),
     ],
     ids=["open", "inside out", "not finite", "flat", "one face turned", "one body turned", "empty"],
@@ -67,7 +74,10 @@ def test_groups_and_materials_of_an_obj_are_left_out(tmp_path):
     """Their reading took minutes; a corner with two textures made the surface open."""
     box = cube()
     corners = "".join(f"v {x} {y} {z}\n" for x, y, z in box.vertices) + "vt 0 0\nvt 1 0\nvt 0 1\n"
-    faces = "".join(f"o {k}\nusemtl {k}\nf {a + 1}/1 {b + 1}/2 {c + 1}/3\n" for k, (a, b, c) in enumerate(box.faces))
+    faces = "".join(
+        f"o {k}\nusemtl {k}\nf {a + 1}/1 {b + 1}/2 {c + 1}/3\n"
+        for k, (a, b, c) in enumerate(box.faces)
+    )
     empty = "".join(f"g {k}\nusemtl {k}\n" for k in range(20_000))
     (tmp_path / "box.obj").write_text(f"mtllib /dev/zero\n{corners}{faces}{empty}")
     mesh = read_mesh(tmp_path / "box.obj")
@@ -93,7 +103,9 @@ def test_bad_files_and_a_mesh_of_a_plane_are_refused(tmp_path):
     cube().export(path)
     assert read_mesh(str(path)).volume == pytest.approx(1e-3)
     box = cube()
-    lines = [f"v {x} {y}" for x, y, _ in box.vertices] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in box.faces]
+    lines = [f"v {x} {y}" for x, y, _ in box.vertices] + [
+        f"f {a + 1} {b + 1} {c + 1}" for a, b, c in box.faces
+    ]
     (tmp_path / "flat.obj").write_text("\n".join(lines) + "\n")
     with pytest.raises(MeshError, match="expected "):
         read_mesh(tmp_path / "flat.obj")
@@ -102,7 +114,8 @@ def test_bad_files_and_a_mesh_of_a_plane_are_refused(tmp_path):
 @pytest.mark.promise("H2")
 @pytest.mark.parametrize("suffix", [".ply", ".stl", ".obj", ".off"])
 def test_a_box_of_every_format_is_read_and_opens_nothing_else(tmp_path, suffix):
-    path, opened = tmp_path / f"box{suffix}", []
+    path = tmp_path / f"box{suffix}"
+    opened = []
     content = cube().export(file_type=suffix[1:])
     path.write_bytes(content.encode() if isinstance(content, str) else content)
     if suffix == ".obj":
@@ -110,14 +123,18 @@ def test_a_box_of_every_format_is_read_and_opens_nothing_else(tmp_path, suffix):
         (tmp_path.parent / "secret.mtl").write_text("newmtl a\n")
     read_mesh(path)  # what is imported late is imported now
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("builtins.open", lambda file, *at, **by: opened.append(str(file)) or open(file, *at, **by))
+        patch.setattr(
+            "builtins.open",
+            lambda file, *at, **by: opened.append(str(file)) or open(file, *at, **by),
+        )
         assert read_mesh(path).volume == pytest.approx(1e-3)
     assert set(opened) <= {str(path)}
 
 
 def test_closest_points_of_triangles_are_those_of_trimesh():
     rng = np.random.default_rng(0)
-    points, triangles = rng.normal(size=(500, 3)), rng.normal(size=(500, 3, 3))
+    points = rng.normal(size=(500, 3))
+    triangles = rng.normal(size=(500, 3, 3))
     found, feature = closest_on_triangles(points, triangles)
     np.testing.assert_allclose(found, trimesh.triangles.closest_point(triangles, points), atol=1e-9)
     assert set(feature.tolist()) == set(range(7))

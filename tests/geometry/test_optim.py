@@ -19,7 +19,8 @@ class Point(Batch):
 def rosenbrock(state: Point, rows: Tensor) -> Residuals:
     """Residuals (10 (y - x^2), 1 - x): a curved valley whose bottom is at (1, 1)."""
     x, y = state.x.unbind(1)
-    one, zero = torch.ones_like(x), torch.zeros_like(x)
+    one = torch.ones_like(x)
+    zero = torch.zeros_like(x)
     jacobian = torch.stack([torch.stack([-20 * x, 10 * one], 1), torch.stack([-one, zero], 1)], 1)
     return torch.stack([10 * (y - x * x), 1 - x], 1), jacobian
 
@@ -45,7 +46,9 @@ def test_no_step_raises_a_cost_or_is_longer_than_allowed(generator):
     here = starts(generator)
     for steps in range(1, 8):
         there = solve(here, steps=1)
-        before, after = (rosenbrock(Point(x), torch.arange(20))[0].square().sum(1) for x in (here, there))
+        before, after = (
+            rosenbrock(Point(x), torch.arange(20))[0].square().sum(1) for x in (here, there)
+        )
         assert bool((after <= before).all())
         assert float((there - here).abs().max()) <= 0.3 + 1e-12
         assert len(solve(here, steps=steps)) == 20
@@ -73,10 +76,14 @@ def test_rows_that_are_solved_or_hold_no_number_are_left_alone(generator, value)
     start[2] = 1.0 if value == 0.0 else value
     found = solve(start)
     torch.testing.assert_close(found[2], start[2], rtol=0, atol=0, equal_nan=True)
-    torch.testing.assert_close(found[[0, 1, 3]], torch.ones(3, 2, dtype=torch.float64), atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        found[[0, 1, 3]], torch.ones(3, 2, dtype=torch.float64), atol=1e-6, rtol=0
+    )
 
 
-def test_the_step_of_a_row_that_has_ended_is_zero_even_if_its_matrix_factors(generator, monkeypatch):
+def test_the_step_of_a_row_that_has_ended_is_zero_even_if_its_matrix_factors(
+    generator, monkeypatch
+):
     """A GPU factors a matrix with an infinite diagonal without complaint, and its step is NaN."""
 
     def factor(matrix: Tensor) -> tuple[Tensor, Tensor]:
@@ -88,4 +95,6 @@ def test_the_step_of_a_row_that_has_ended_is_zero_even_if_its_matrix_factors(gen
     model = problem.linearise(state, torch.arange(3))
     step, goes_on = problem.step(model, torch.tensor([1e-2, torch.inf, 1e-2], dtype=torch.float64))
     assert goes_on.tolist() == [False, False, True]
-    assert torch.equal(step[:2], torch.zeros(2, 2, dtype=torch.float64)) and bool(step[2].abs().gt(0).any())
+    assert torch.equal(step[:2], torch.zeros(2, 2, dtype=torch.float64)) and bool(
+        step[2].abs().gt(0).any()
+    )

@@ -21,9 +21,12 @@ def random_cloud(viewpoint: bool) -> PointCloud:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_heights_do_not_depend_on_the_frame_and_surfaces_move(seed):
-    plane, pose, points = Plane.horizontal(0.3), random_motion(seed), random_cloud(False).points
+    plane = Plane.horizontal(0.3)
+    pose = random_motion(seed)
+    points = random_cloud(False).points
     torch.testing.assert_close(plane.moved(pose).height(apply(pose, points)), points[:, 2] - 0.3)
-    pose, points = random_motion(2), random_cloud(False).points
+    pose = random_motion(2)
+    points = random_cloud(False).points
     faces = torch.arange(48).view(-1, 3)
     surface = Surface(points, faces, unit(points), points[:, 0])
     there = move(surface, pose)
@@ -43,14 +46,18 @@ def test_a_moved_cloud_is_the_same_to_the_last_bit_in_its_upright_frame(viewpoin
         pose = random_motion(seed)
         there = move(cloud, pose)
         other = round_upright(
-            there, upright_frame(there.points, there.viewpoint, None if table is None else table.moved(pose))
+            there,
+            upright_frame(
+                there.points, there.viewpoint, None if table is None else table.moved(pose)
+            ),
         )
         assert torch.equal(other.points, upright.points)
         assert viewpoint is False or torch.equal(other.viewpoint, upright.viewpoint)
 
 
 def test_an_upright_frame_stands_on_the_table_and_looks_at_the_camera_or_the_farthest_point():
-    cloud, pose = random_cloud(True), random_motion(3)
+    cloud = random_cloud(True)
+    pose = random_motion(3)
     table = Plane.horizontal(-0.1).moved(pose)
     moved = move(cloud, pose)
     frame = upright_frame(moved.points, moved.viewpoint, table)
@@ -75,7 +82,8 @@ def test_a_table_is_finite_and_below_the_object_and_a_normal_has_unit_length(tab
     cloud = random_cloud(viewpoint=True)
     above = 0.2 - cloud.points[:, 2].sort().values[24]
     with pytest.raises(
-        BadArgument, match=rf"^table: expected .*got a plane {above:.3g} m above the middle of the cloud"
+        BadArgument,
+        match=rf"^table: expected .*got a plane {above:.3g} m above the middle of the cloud",
     ):
         fit_shape(cloud, table=0.2)
     tilted = Plane(unit(torch.tensor([0.02, 0.0, 1.0], dtype=F64)), 0.003)

@@ -17,7 +17,9 @@ def test_distance_field_of_a_sphere(generator):
     points = 0.08 * (2 * torch.rand(4000, 3, generator=generator, dtype=torch.float64) - 1)
     distance, gradient = field.query(points)
     radius = torch.linalg.vector_norm(points, dim=1)
-    assert float((distance - (radius - 0.04)).abs().max()) < 3e-3  # interpolated far from the surface
+    assert (
+        float((distance - (radius - 0.04)).abs().max()) < 3e-3
+    )  # interpolated far from the surface
     near = (radius - 0.04).abs() < 0.018
     assert float((distance - (radius - 0.04)).abs()[near].max()) < 4e-4
     cosine = (gradient[near] * points[near]).sum(1) / radius[near]
@@ -37,7 +39,9 @@ def test_distance_field_of_a_box_has_the_right_sides(generator):
     assert float(error.median()) < 2e-4
 
 
-def test_distance_field_gradient_is_the_derivative_and_follows_dtype_and_shape_of_the_points(generator):
+def test_distance_field_gradient_is_the_derivative_and_follows_dtype_and_shape_of_the_points(
+    generator,
+):
     field = field_of_mesh(trimesh.creation.icosphere(3, 0.03), margin=0.02)
     points = (0.06 * torch.randn(300, 3, generator=generator, dtype=torch.float64)).requires_grad_()
     distance, gradient = field.query(points)
@@ -49,18 +53,29 @@ def test_distance_field_gradient_is_the_derivative_and_follows_dtype_and_shape_o
     torch.testing.assert_close(field.query(far)[0], at_border + 1.0 - reach)
     field = field_of_mesh(trimesh.creation.icosphere(2, 0.03), margin=0.02)
     distance, gradient = field.query(torch.zeros(2, 3, 4, 3))
-    assert (distance.shape, gradient.shape, distance.dtype) == ((2, 3, 4), (2, 3, 4, 3), torch.float32)
+    assert (distance.shape, gradient.shape, distance.dtype) == (
+        (2, 3, 4),
+        (2, 3, 4, 3),
+        torch.float32,
+    )
     torch.testing.assert_close(field.to(torch.float32).query(torch.zeros(2, 3, 4, 3))[0], distance)
 
 
 def test_distances_of_open_meshes_do_not_vanish_where_their_sign_jumps():
     side = 0.02
-    vertices = torch.tensor([[-side, -side, 0], [side, -side, 0], [side, side, 0], [-side, side, 0]]).double()
+    vertices = torch.tensor(
+        [[-side, -side, 0], [side, -side, 0], [side, side, 0], [-side, side, 0]]
+    ).double()
     field = field_from_surface(vertices, torch.tensor([[0, 1, 2], [0, 2, 3]]), margin=0.05)
     assert field.values.is_contiguous()  # else each query copies the whole grid
-    axes = (low + field.spacing * torch.arange(n) for low, n in zip(field.origin, field.values.shape, strict=True))
+    axes = (
+        low + field.spacing * torch.arange(n)
+        for low, n in zip(field.origin, field.values.shape, strict=True)
+    )
     nodes = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
-    beyond = torch.stack([(nodes[..., k].abs() - side).clamp_min(0) for k in range(2)] + [nodes[..., 2]], -1)
+    beyond = torch.stack(
+        [(nodes[..., k].abs() - side).clamp_min(0) for k in range(2)] + [nodes[..., 2]], -1
+    )
     error = (field.values.abs() - torch.linalg.vector_norm(beyond, dim=-1)).abs()
     assert float(error.max()) < 2e-3
     assert float(error.median()) < 1e-4
@@ -85,15 +100,16 @@ def test_bad_surfaces_are_named():
 
 
 def test_every_row_of_joined_fields_has_the_distances_of_its_own_field(generator):
-    shapes, fields = ((9, 7, 8), (5, 12, 6), (8, 8, 8)), list[SignedDistanceField]()
+    shapes = ((9, 7, 8), (5, 12, 6), (8, 8, 8))
+    fields = list[SignedDistanceField]()
     for k, shape in enumerate(shapes):
-        low, values = (
-            torch.rand(3, generator=generator).double() - 0.6,
-            torch.randn(shape, generator=generator).double(),
-        )
+        low = torch.rand(3, generator=generator).double() - 0.6
+        values = torch.randn(shape, generator=generator).double()
         fields.append(SignedDistanceField(low, 0.05 + 0.01 * k, values))
     owner = torch.randint(3, (50,), generator=generator)
-    points = torch.randn(50, 4, 3, generator=generator, dtype=torch.float64)  # some outside the grids
+    points = torch.randn(
+        50, 4, 3, generator=generator, dtype=torch.float64
+    )  # some outside the grids
     joined = FieldBatch.of(fields).rows(owner)
     for ask in (lambda field, x: field.query(x), lambda field, x: [field.nearest_node(x)]):
         found = ask(joined, points)

@@ -47,7 +47,9 @@ def test_a_noisy_table_is_found_in_place_and_moves_with_the_points(seen):
     plane = fit_support(points, viewpoint)
     generator = torch.Generator().manual_seed(1)
     for _ in range(5):
-        rotation = rotation_from_vector(2 * torch.randn(3, generator=generator, dtype=torch.float64))
+        rotation = rotation_from_vector(
+            2 * torch.randn(3, generator=generator, dtype=torch.float64)
+        )
         motion = rigid(rotation, torch.randn(3, generator=generator, dtype=torch.float64))
         moved = fit_support(apply(motion, points), apply(motion, viewpoint[None])[0])
         expected = plane.moved(motion)
@@ -95,13 +97,16 @@ def test_a_table_before_a_wall_or_above_a_deep_floor_needs_no_gravity():
 
 
 def test_the_table_comes_before_the_floor_that_carries_more_and_a_bins_floor_supports():
-    top, floor = box([0.5, 0.4, 0.02], [0.0, 0.0, -0.01]), box([4.0, 4.0, 0.01], [0.0, 0.0, -0.455])
+    top = box([0.5, 0.4, 0.02], [0.0, 0.0, -0.01])
+    floor = box([4.0, 4.0, 0.01], [0.0, 0.0, -0.455])
     boxes = [box([0.2, 0.2, 0.2], [x, y, -0.35]) for x in (0.5, -0.6) for y in (-0.5, 0.5)]
     cup = box([0.06, 0.06, 0.08], [0.0, 0.0, 0.04])
     pose = look_at(0.0, 35.0, 1.0)
     first, second = find_supports(*look([top, floor, *boxes, cup], table=None, pose=pose))[:2]
     assert abs(first.plane.offset) < 0.003 and abs(second.plane.offset + 0.45) < 0.01
-    assert bool(first.covers(torch.tensor([0.2, 0.1, 0.3]))) and not bool(first.covers(torch.tensor([0.3, 0.1, 0.3])))
+    assert bool(first.covers(torch.tensor([0.2, 0.1, 0.3]))) and not bool(
+        first.covers(torch.tensor([0.3, 0.1, 0.3]))
+    )
     walls = [box([0.02, 0.5, 0.25], [x, 0.0, 0.125]) for x in (-0.2, 0.2)]
     walls += [box([0.4, 0.02, 0.25], [0.0, y, 0.125]) for y in (-0.25, 0.25)]
     toy = box([0.05, 0.08, 0.04], [0.03, 0.05, 0.02])

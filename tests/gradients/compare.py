@@ -17,7 +17,10 @@ def scalar(function: Function) -> Callable[..., Tensor]:
 
 
 def weighted_sum(found: tuple[Tensor, ...]) -> Tensor:
-    weights = [torch.linspace(0.5, 1.5, y.numel(), dtype=y.dtype, device="cpu").view(y.shape) for y in found]
+    weights = [
+        torch.linspace(0.5, 1.5, y.numel(), dtype=y.dtype, device="cpu").view(y.shape)
+        for y in found
+    ]
     return sum((w * y).sum() for w, y in zip(weights, found, strict=True))
 
 

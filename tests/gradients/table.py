@@ -1,7 +1,7 @@
 """The table of gradients: each public function of tensors with the derivatives that it has.
 
-A row of `ROWS` is a differentiable function. `MASKS` take tensors by which derivatives are taken, and return none.
-All others refuse such tensors.
+A row of `ROWS` is a differentiable function. `MASKS` take tensors by which derivatives are taken,
+and return none. All others refuse such tensors.
 """
 
 import dataclasses
@@ -14,7 +14,18 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from torchgrasp import Contacts, ContactSpec, GraspMixture, Hand, Plane, PointCloud, ShapeGP, certify, encode, load_hand
+from torchgrasp import (
+    Contacts,
+    ContactSpec,
+    GraspMixture,
+    Hand,
+    Plane,
+    PointCloud,
+    ShapeGP,
+    certify,
+    encode,
+    load_hand,
+)
 from torchgrasp.control import law, squeeze
 from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.foundation.base import named_tensors
@@ -35,14 +46,17 @@ from torchgrasp.testing import random_joints
 
 Function = Callable[..., Any]
 Make = Callable[[torch.dtype], tuple[Function, tuple[Tensor, ...]]]
-TWICE, ONCE = 2, 1
+TWICE = 2
+ONCE = 1
 
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """A differentiable function: in what, how often, and what makes a function of tensors with arguments for it.
+    """A differentiable function: in what, how often, and what makes a function of tensors with
+    arguments for it.
 
-    The first `batched` arguments may have more leading axes. `lacks` are checks that it does not pass.
+    The first `batched` arguments may have more leading axes. `lacks` are checks that it does not
+    pass.
     """
 
     by: str
@@ -64,7 +78,9 @@ def outputs(result: Any) -> tuple[Tensor, ...]:
 
 
 def draw(*shape: int, seed: int = 0) -> Tensor:
-    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64, device="cpu")
+    return torch.randn(
+        shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64, device="cpu"
+    )
 
 
 def of_contacts(function: Function) -> Make:
@@ -72,7 +88,9 @@ def of_contacts(function: Function) -> Make:
 
     def make(dtype: torch.dtype) -> tuple[Function, tuple[Tensor, ...]]:
         points = 0.05 * draw(3, 3, 3)
-        normals = normalize(points - points.mean(1, keepdim=True) + 0.01 * draw(3, 3, 3, seed=1), dim=-1)
+        normals = normalize(
+            points - points.mean(1, keepdim=True) + 0.01 * draw(3, 3, 3, seed=1), dim=-1
+        )
         return function, (points.to(dtype), normals.to(dtype))
 
     return make
@@ -88,11 +106,17 @@ def code(points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def of_mixture(
-    kind: type[GaussianMixture], names: tuple[str, ...], query: Function, width: int, weighted: bool = True
+    kind: type[GaussianMixture],
+    names: tuple[str, ...],
+    query: Function,
+    width: int,
+    weighted: bool = True,
 ) -> Make:
     """Return what makes a function of rows and of a mixture's parameters; weights are a softmax."""
     d = len(names)
-    root, means, logits = 0.3 * draw(2, d, d) + torch.eye(d, device="cpu"), draw(2, d, seed=1), draw(2, seed=2)
+    root = 0.3 * draw(2, d, d) + torch.eye(d, device="cpu")
+    means = draw(2, d, seed=1)
+    logits = draw(2, seed=2)
 
     def function(x: Tensor, means: Tensor, root: Tensor, logits: Tensor = torch.zeros(2)) -> Any:  # noqa: B008
         covariances = root @ root.mT
@@ -129,11 +153,15 @@ def jacobian(dtype: torch.dtype) -> tuple[Function, tuple[Tensor, ...]]:
 
 
 def of_part(part: str, method: str, argument: Function) -> Make:
-    """Return what makes a method of a part of a hand, a function of what `argument` computes from joints."""
+    """Return what makes a method of a part of a hand, a function of what `argument` computes from
+    joints.
+    """
 
     def make(dtype: torch.dtype) -> tuple[Function, tuple[Tensor, ...]]:
         hand = hand_of(dtype).to("cpu")
-        return getattr(getattr(hand, part), method), (argument(hand, random_joints(hand, 2, 0).to(dtype)),)
+        return getattr(getattr(hand, part), method), (
+            argument(hand, random_joints(hand, 2, 0).to(dtype)),
+        )
 
     return make
 
@@ -156,7 +184,8 @@ def ball() -> SignedDistanceField:
 
 def pressed(dtype: torch.dtype) -> tuple[Function, tuple[Tensor, ...]]:
     """Return squeeze as a function of the joints of a grasp."""
-    hand, grasps = hand_of(dtype), load_shipped_grasp("jug", "barrett")
+    hand = hand_of(dtype)
+    grasps = load_shipped_grasp("jug", "barrett")
     press = lambda joints: squeeze(hand, dataclasses.replace(grasps, joints=joints))[::2]  # noqa: E731
     return press, (grasps.joints.to(dtype),)
 
@@ -170,26 +199,40 @@ KERNELS: dict[str, Kernel] = {
 }
 
 
-SIDES, TOLD, CENTER = normalize(draw(6, 3), dim=-1), 0.1 * draw(6, seed=1), 0.01 * draw(3, seed=2)
+SIDES = normalize(draw(6, 3), dim=-1)
+TOLD = 0.1 * draw(6, seed=1)
+CENTER = 0.01 * draw(3, seed=2)
 NOISE = torch.linspace(0.02, 0.05, 6, dtype=torch.float64, device="cpu")
 """Six points of a unit ball, the distances told there, the centre of the frame, and the noise."""
 
 
-def shape_of(kernel: str = "thin plate", distance: Tensor = TOLD, center: Tensor = CENTER) -> ShapeGP:
+def shape_of(
+    kernel: str = "thin plate", distance: Tensor = TOLD, center: Tensor = CENTER
+) -> ShapeGP:
     """Return a shape given six points, of which three have normals."""
     seen = Observations(SIDES, distance, SIDES, NOISE > 0.03, NOISE, 2 * NOISE)
-    return condition(seen, Normalisation(center, 0.05), PointCloud(0.05 * SIDES), kernel=KERNELS[kernel])
+    return condition(
+        seen, Normalisation(center, 0.05), PointCloud(0.05 * SIDES), kernel=KERNELS[kernel]
+    )
 
 
 def vessel_of(center: Tensor = CENTER) -> HollowShape:
-    return HollowShape.join(shape_of(center=center), shape_of("rbf", center=center), PointCloud(0.05 * SIDES))
+    return HollowShape.join(
+        shape_of(center=center), shape_of("rbf", center=center), PointCloud(0.05 * SIDES)
+    )
 
 
-def of_shape(make_shape: Callable[[], ShapeGP], method: str, arguments: tuple[Any, ...] = (), kernel: str = "") -> Make:
+def of_shape(
+    make_shape: Callable[[], ShapeGP],
+    method: str,
+    arguments: tuple[Any, ...] = (),
+    kernel: str = "",
+) -> Make:
     """Return what makes a method of a shape, a function of points in metres or of normalised ones."""
 
     def make(dtype: torch.dtype) -> tuple[Function, tuple[Tensor, ...]]:
-        shape, x = make_shape(), 0.8 * normalize(draw(2, 3, seed=3), dim=-1)
+        shape = make_shape()
+        x = 0.8 * normalize(draw(2, 3, seed=3), dim=-1)
         points = shape.metres(x) if method in METRES[:-1] else x
         points = shape.distance_rows(x) if method in ("whiten", "ordered") else points
         points = points.mT if method == "ordered" else points
@@ -203,7 +246,9 @@ UNCOMPILED = "not inside torch.compile"
 FITS = UNCOMPILED, ("single", "compile")
 METRES = "predict", "differentiate", "joint", "sample", "normalise", "metres"
 NORMALISED = "cross distance_rows estimate jet joint_at mean mean_and_gradient mean_jet whiten ordered".split()
-"""Methods of a shape that take points in any frame and dtype, and those that take normalised points of its own."""
+"""Methods of a shape that take points in any frame and dtype, and those that take normalised points
+of its own.
+"""
 SHAPES = {"torchgrasp.shape.gp.ShapeGP": shape_of, "torchgrasp.shape.hollow.HollowShape": vessel_of}
 BATCHED = "predict", "differentiate", "normalise", "metres"
 
@@ -221,12 +266,14 @@ def of_distances(dtype: torch.dtype) -> tuple[Function, tuple[Tensor, ...]]:
 
 CODE = ("j", *CODE_NAMES)
 PLAIN = ("a", "b")
-GAUSSIAN, GRASP = "torchgrasp.posture_model.gaussian.GaussianMixture", "torchgrasp.posture_model.mixture.GraspMixture"
+GAUSSIAN = "torchgrasp.posture_model.gaussian.GaussianMixture"
+GRASP = "torchgrasp.posture_model.mixture.GraspMixture"
 
 
 def densities(owner: str, kind: type[GaussianMixture], names: tuple[str, ...]) -> dict[str, Row]:
     """Return the rows of the methods that both kinds of mixtures have."""
-    rest, given = names[1:], {names[0]: 0.3}
+    rest = names[1:]
+    given = {names[0]: 0.3}
     queries: dict[str, tuple[Function, int, int]] = {
         "log_prob": (lambda mixture, x: mixture.log_prob(x), len(names), 1),
         "log_joint": (lambda mixture, x: mixture.log_joint(x), len(names), 0),
@@ -236,7 +283,10 @@ def densities(owner: str, kind: type[GaussianMixture], names: tuple[str, ...]) -
     by = {"marginal": "parameters", "condition": "parameters"}
     return {
         f"{owner}.{name}": Row(
-            by.get(name, "points, parameters"), TWICE, of_mixture(kind, names, query, width), batched
+            by.get(name, "points, parameters"),
+            TWICE,
+            of_mixture(kind, names, query, width),
+            batched,
         )
         for name, (query, width, batched) in queries.items()
     }
@@ -244,7 +294,10 @@ def densities(owner: str, kind: type[GaussianMixture], names: tuple[str, ...]) -
 
 ROWS: dict[str, Row] = {
     "torchgrasp.contacts.certify.certify": Row(
-        "contacts, for the margin", ONCE, of_contacts(margin), note="by the dual; a subgradient where it is not unique"
+        "contacts, for the margin",
+        ONCE,
+        of_contacts(margin),
+        note="by the dual; a subgradient where it is not unique",
     ),
     "torchgrasp.posture_model.mixture.encode": Row("points, normals", TWICE, of_contacts(code)),
     **densities(GAUSSIAN, GaussianMixture, PLAIN),
@@ -255,9 +308,14 @@ ROWS: dict[str, Row] = {
         of_mixture(GraspMixture, CODE, lambda m, q: m.energy(q), 6, weighted=False),
         note="a minimum over components",
     ),
-    f"{GRASP}.joints": Row("codes, parameters", TWICE, of_mixture(GraspMixture, CODE, lambda m, q: m.joints(q), 6)),
+    f"{GRASP}.joints": Row(
+        "codes, parameters", TWICE, of_mixture(GraspMixture, CODE, lambda m, q: m.joints(q), 6)
+    ),
     f"{GRASP}.modes": Row(
-        "codes, parameters", TWICE, of_mixture(GraspMixture, CODE, lambda m, q: m.modes(q, 2), 6), note="the k largest"
+        "codes, parameters",
+        TWICE,
+        of_mixture(GraspMixture, CODE, lambda m, q: m.modes(q, 2), 6),
+        note="the k largest",
     ),
     "torchgrasp.control.finger_forces.squeeze": Row("joints", TWICE, pressed),
     **{
@@ -274,8 +332,12 @@ ROWS: dict[str, Row] = {
         )
         for name in ("couple", "expand")
     },
-    "torchgrasp.hand.fingers.Fingertips.frames": Row("values", TWICE, of_part("tips", "frames", values_of)),
-    "torchgrasp.hand.kinematics.KinematicTree.frames": Row("values", TWICE, of_part("tree", "frames", values_of)),
+    "torchgrasp.hand.fingers.Fingertips.frames": Row(
+        "values", TWICE, of_part("tips", "frames", values_of)
+    ),
+    "torchgrasp.hand.kinematics.KinematicTree.frames": Row(
+        "values", TWICE, of_part("tree", "frames", values_of)
+    ),
     "torchgrasp.hand.kinematics.KinematicTree.poses": Row(
         "values", TWICE, of_part("tree", "poses", lambda h, q: h.actuated.expand(q))
     ),
@@ -288,9 +350,15 @@ ROWS: dict[str, Row] = {
         of_part("self_collision", "clearance", lambda h, q: h.tree.frames(values_of(h, q))),
         note="the least of all pairs",
     ),
-    "torchgrasp.geometry.plane.Plane.height": Row("points", TWICE, of_field(lambda _: Plane.horizontal(0.1).height), 1),
+    "torchgrasp.geometry.plane.Plane.height": Row(
+        "points", TWICE, of_field(lambda _: Plane.horizontal(0.1).height), 1
+    ),
     "torchgrasp.geometry.signed_distance.SignedDistanceField.query": Row(
-        "points", TWICE, of_field(lambda dtype: ball().to(dtype).query), 1, note="inside a cell of the grid"
+        "points",
+        TWICE,
+        of_field(lambda dtype: ball().to(dtype).query),
+        1,
+        note="inside a cell of the grid",
     ),
     **{
         f"{owner}.{name}": Row(
@@ -326,11 +394,19 @@ ROWS: dict[str, Row] = {
     "torchgrasp.shape.kernel.Kernel.derivatives": Row(
         "r, kernel",
         TWICE,
-        lambda dtype: ((lambda r: KERNELS["rbf"].derivatives(r, 3)), (draw(4).abs().to(dtype) + 0.1,)),
+        lambda dtype: (
+            (lambda r: KERNELS["rbf"].derivatives(r, 3)),
+            (draw(4).abs().to(dtype) + 0.1,),
+        ),
     ),
     **{
         f"torchgrasp.shape.estimate.Normalisation.{name}": Row(
-            "points", TWICE, of_field(lambda dtype, name=name: getattr(Normalisation(draw(3).to(dtype), 0.05), name)), 1
+            "points",
+            TWICE,
+            of_field(
+                lambda dtype, name=name: getattr(Normalisation(draw(3).to(dtype), 0.05), name)
+            ),
+            1,
         )
         for name in ("normalise", "metres")
     },
@@ -338,16 +414,26 @@ ROWS: dict[str, Row] = {
 MASKS = {
     *(f"{owner}.{name}" for owner in SHAPES for name in ("contains", "wall_at")),
     "torchgrasp.shape.hollow.HollowShape.of",  # a vessel is made by `join`
-    "torchgrasp.hand.fingers.ActuatedJoints.check", "torchgrasp.hand.fingers.ActuatedJoints.check_limits",
+    "torchgrasp.hand.fingers.ActuatedJoints.check",
+    "torchgrasp.hand.fingers.ActuatedJoints.check_limits",
     "torchgrasp.hand.self_collision.SelfCollision.count_near",
-}  # fmt: skip
-"""Functions that count, choose or check: they take differentiated tensors, and their results have no derivatives."""
+}
+"""Functions that count, choose or check: they take differentiated tensors, and their results have
+no derivatives.
+"""
 
 
 def of_law(function: Function, *shapes: tuple[int, ...]) -> Row:
-    """Return the row of a pure function of the closing law, twice differentiable in all its arguments."""
+    """Return the row of a pure function of the closing law, twice differentiable in all its
+    arguments.
+    """
     inputs = [0.1 * draw(2, *shape, seed=k) for k, shape in enumerate(shapes)]
-    return Row("all arguments", TWICE, lambda dtype: (function, tuple(x.to(dtype) for x in inputs)), len(shapes))
+    return Row(
+        "all arguments",
+        TWICE,
+        lambda dtype: (function, tuple(x.to(dtype) for x in inputs)),
+        len(shapes),
+    )
 
 
 def spread(root: Tensor) -> Tensor:
@@ -364,24 +450,39 @@ LAW = {
     "force_gain": of_law(lambda root, alpha: law.force_gain(spread(root), alpha), (3, 3), ()),
     "damped_inverse": of_law(law.damped_inverse, (2, 4)),
     "tip_velocity": of_law(law.tip_velocity, (3,), (3,), (), (3,), (3,)),
-    "stay_above": of_law(lambda v, h: law.stay_above(v, h, v.new_tensor([0.0, 0.6, 0.8])), (3,), ()),
+    "stay_above": of_law(
+        lambda v, h: law.stay_above(v, h, v.new_tensor([0.0, 0.6, 0.8])), (3,), ()
+    ),
     "joint_step": of_law(
-        lambda jacobian, velocity, error: law.joint_step(jacobian, velocity, 0.01, error), (3, 3, 4), (3, 3), (4,)
+        lambda jacobian, velocity, error: law.joint_step(jacobian, velocity, 0.01, error),
+        (3, 3, 4),
+        (3, 3),
+        (4,),
     ),
 }
 """Functions of `torchgrasp.control.law`, from which a closing law is made; they are not public."""
-LAW |= {f"predict, {name}": Row("points", TWICE, of_shape(partial(shape_of, name), "predict"), 1) for name in KERNELS}
+LAW |= {
+    f"predict, {name}": Row("points", TWICE, of_shape(partial(shape_of, name), "predict"), 1)
+    for name in KERNELS
+}
 
 
 def page() -> str:
-    """Return the table as it stands in docs/gradients.md; one line has all functions of an owner that are alike."""
+    """Return the table as it stands in docs/gradients.md; one line has all functions of an owner
+    that are alike.
+    """
     alike: dict[tuple[str, ...], list[str]] = {}
     for name, row in ROWS.items():
         owner, function = name.split(".")[-2:]
         owner = owner if owner[0].isupper() else ""
         order = {ONCE: "once", TWICE: "twice"}[row.order]
         alike.setdefault((owner, row.by, order, row.note), []).append(f"`{function}`")
-    lines = ["| of | functions | differentiable in | how often | note |", "| --- | --- | --- | --- | --- |"]
+    lines = [
+        "| of | functions | differentiable in | how often | note |",
+        "| --- | --- | --- | --- | --- |",
+    ]
     for (owner, by, order, note), functions in sorted(alike.items()):
-        lines.append(f"| {owner and f'`{owner}`'} | {', '.join(functions)} | {by} | {order} | {note} |")
+        lines.append(
+            f"| {owner and f'`{owner}`'} | {', '.join(functions)} | {by} | {order} | {note} |"
+        )
     return "\n".join(lines) + "\n"

@@ -1,4 +1,6 @@
-"""Derivatives at the edges: parameters that an optimiser changes, rows that are not finite, verdicts that have none."""
+"""Derivatives at the edges: parameters that an optimiser changes, rows that are not finite,
+verdicts that have none.
+"""
 
 import dataclasses
 from typing import Any
@@ -28,8 +30,14 @@ def two(means: Tensor, root: Tensor, logits: Tensor) -> GaussianMixture:
 def test_a_mixture_is_fitted_by_gradient(generator):
     """Two clouds of points; the density of the points grows, and the means end at the clouds."""
     centres = real([[3.0, 0.0], [-3.0, 1.0]])
-    points = centres.repeat(40, 1) + 0.3 * torch.randn(80, 2, generator=generator, dtype=torch.float64)
-    free = [real([[1.0, 0], [-1, 0]]), torch.eye(2, dtype=torch.float64).repeat(2, 1, 1), real([0.5, -0.5])]
+    points = centres.repeat(40, 1) + 0.3 * torch.randn(
+        80, 2, generator=generator, dtype=torch.float64
+    )
+    free = [
+        real([[1.0, 0], [-1, 0]]),
+        torch.eye(2, dtype=torch.float64).repeat(2, 1, 1),
+        real([0.5, -0.5]),
+    ]
     optimiser = torch.optim.Adam([x.requires_grad_() for x in free], lr=0.2)
     for _ in range(80):
         optimiser.zero_grad()
@@ -46,7 +54,9 @@ def test_what_a_mixture_keeps_is_dropped_when_a_parameter_becomes_free(generator
     before = mixture.log_prob(x)
     mixture.means.requires_grad_()
     (slope,) = torch.autograd.grad(mixture.log_prob(x).sum(), mixture.means)
-    wanted = grad(lambda means: dataclasses.replace(shipped, means=means).log_prob(x).sum())(shipped.means)
+    wanted = grad(lambda means: dataclasses.replace(shipped, means=means).log_prob(x).sum())(
+        shipped.means
+    )
     near(slope, wanted, 1e-9)
     assert bool(slope.any())
     with torch.no_grad():  # an optimiser's step
@@ -63,7 +73,11 @@ def test_codes_that_are_not_finite_spoil_no_gradient_of_parameters_or_of_other_c
     for name in ("energy", "joints"):
 
         def total(means: Tensor, q: Tensor, name: str = name) -> Tensor:
-            return getattr(dataclasses.replace(shipped, means=means), name)(q + 0.01).nan_to_num().sum()
+            return (
+                getattr(dataclasses.replace(shipped, means=means), name)(q + 0.01)
+                .nan_to_num()
+                .sum()
+            )
 
         found = grad(total, (0, 1))(shipped.means, q)
         near(found[0], grad(total)(shipped.means, q[[0, 2]]), 1e-9)
@@ -72,7 +86,9 @@ def test_codes_that_are_not_finite_spoil_no_gradient_of_parameters_or_of_other_c
 
 def test_contacts_on_a_line_spoil_no_gradient_of_other_codes(generator):
     points = torch.cat([TRIANGLE, 0 * TRIANGLE, 1.5 * TRIANGLE])
-    slope = grad(lambda p: encode((p, unit(TRIANGLE).repeat(3, 1, 1))).q.nan_to_num().square().sum())(points)
+    slope = grad(
+        lambda p: encode((p, unit(TRIANGLE).repeat(3, 1, 1))).q.nan_to_num().square().sum()
+    )(points)
     assert bool(slope.isfinite().all()) and bool((slope[1] == 0).all()) and bool(slope[2].any())
 
 
@@ -94,10 +110,15 @@ def test_other_fields_of_a_certificate_and_forces_have_no_derivative():
     for field in ("rank_ratio", "residual", "witness"):
         with pytest.raises(BadArgument, match="margin"):
             margin(TRIANGLE.clone().requires_grad_(), field).sum().backward()
-        assert bool(jvp(lambda p, field=field: margin(p, field), (TRIANGLE,), (TRIANGLE,))[1].isnan().all())
+        assert bool(
+            jvp(lambda p, field=field: margin(p, field), (TRIANGLE,), (TRIANGLE,))[1].isnan().all()
+        )
     assert not margin(TRIANGLE.clone().requires_grad_(), "closed").requires_grad
-    hand, grasps = load_hand("barrett"), load_shipped_grasp("jug", "barrett")
-    moved: dict[str, Any] = {"contacts": dataclasses.replace(grasps.contacts, points=tracked(grasps.contacts.points))}
+    hand = load_hand("barrett")
+    grasps = load_shipped_grasp("jug", "barrett")
+    moved: dict[str, Any] = {
+        "contacts": dataclasses.replace(grasps.contacts, points=tracked(grasps.contacts.points))
+    }
     for name, value in (moved | {"obj_from_hand": tracked(grasps.obj_from_hand)}).items():
         with pytest.raises(BadArgument, match=f"grasps.{name}"):
             squeeze(hand, dataclasses.replace(grasps, **{name: value}))
@@ -111,5 +132,7 @@ def test_inside_vmap_degenerate_contacts_and_indefinite_matrices_give_nan():
     frames = vmap(virtual_frame)(torch.cat([TRIANGLE, 0 * TRIANGLE]))
     near(frames[0], virtual_frame(TRIANGLE[0]), 1e-12)
     assert bool(frames[1, :3].isnan().any()) and bool(frames[0].isfinite().all())
-    factors = vmap(lambda x: cholesky(x, "a matrix", "none"))(torch.stack([torch.eye(2), -torch.eye(2)]))
+    factors = vmap(lambda x: cholesky(x, "a matrix", "none"))(
+        torch.stack([torch.eye(2), -torch.eye(2)])
+    )
     assert bool(factors[1].isnan().all()) and torch.equal(factors[0], torch.eye(2))

@@ -1,4 +1,6 @@
-"""Each row of the table of gradients under every transform and setting, and the table beside the public functions."""
+"""Each row of the table of gradients under every transform and setting, and the table beside the
+public functions.
+"""
 
 import inspect
 import pickle
@@ -51,7 +53,12 @@ def check_jacobians(row: Row, f: Function, x: tuple[Tensor, ...]) -> None:
 def check_hessian(row: Row, f: Function, x: tuple[Tensor, ...]) -> None:
     """Hessians are symmetric, and they are the finite differences of gradients."""
     if row.order < 2:
-        for how in (hessian, lambda g: jacrev(jacrev(g)), lambda g: jacfwd(jacfwd(g)), lambda g: jacrev(jacfwd(g))):
+        for how in (
+            hessian,
+            lambda g: jacrev(jacrev(g)),
+            lambda g: jacfwd(jacfwd(g)),
+            lambda g: jacrev(jacfwd(g)),
+        ):
             with pytest.raises(BadArgument, match="second derivative"):
                 how(scalar(f))(*x)
         return
@@ -78,7 +85,9 @@ def check_vmap(row: Row, f: Function, x: tuple[Tensor, ...]) -> None:
 def check_jvp(row: Row, f: Function, x: tuple[Tensor, ...]) -> None:
     way = tuple(draw(*v.shape, seed=5) for v in x)
     value, change = jvp(lambda *v: outputs(f(*v)), x, way)
-    after, before = (outputs(f(*(v + sign * STEP * w for v, w in zip(x, way, strict=True)))) for sign in (1, -1))
+    after, before = (
+        outputs(f(*(v + sign * STEP * w for v, w in zip(x, way, strict=True)))) for sign in (1, -1)
+    )
     near(value, outputs(f(*x)))
     near(change, tuple((a - b) / (2 * STEP) for a, b in zip(after, before, strict=True)), 1e-5)
 
@@ -103,14 +112,16 @@ def check_axes(row: Row, f: Function, x: tuple[Tensor, ...]) -> None:
 
 def check_default_device(row: Row, f: Function, x: tuple[Tensor, ...]) -> None:
     """With another default device, whose tensors have no numbers, nothing changes."""
-    expected, expected_slopes = outputs(f(*x)), slopes(f, x)
+    expected = outputs(f(*x))
+    expected_slopes = slopes(f, x)
     with torch.device("meta"):
         near(outputs(f(*x)), expected)
         near(slopes(f, x), expected_slopes)
 
 
 def check_default_dtype(row: Row, f: Function, x: tuple[Tensor, ...]) -> None:
-    expected, expected_slopes = outputs(f(*x)), slopes(f, x)
+    expected = outputs(f(*x))
+    expected_slopes = slopes(f, x)
     torch.set_default_dtype(F64)
     try:
         near(outputs(f(*x)), expected)
@@ -121,7 +132,8 @@ def check_default_dtype(row: Row, f: Function, x: tuple[Tensor, ...]) -> None:
 
 def check_order_of_calls(row: Row, f: Function, x: tuple[Tensor, ...]) -> None:
     """What a first call keeps, in inference mode or inside a transform, spoils no later gradient."""
-    expected, expected_slopes = outputs(f(*x)), slopes(f, x)
+    expected = outputs(f(*x))
+    expected_slopes = slopes(f, x)
     for first in (inferred, jacrev, jacfwd):
         fresh, y = row.make(F64)
         first(lambda *v, fresh=fresh: outputs(fresh(*v)))(*y)
@@ -146,11 +158,17 @@ ALIKE = re.compile(
     r"HollowShape\.(?!predict|mean$)|GraspMixture\.(log|marg|cond)|jet|joint_at|estimate|predict, "
 ).search
 """Finds rows that share most of their code with others; a quick run leaves them out."""
-CHECKS = {name.removeprefix("check_"): check for name, check in globals().items() if name.startswith("check_")}
+CHECKS = {
+    name.removeprefix("check_"): check
+    for name, check in globals().items()
+    if name.startswith("check_")
+}
 
 
 def cells() -> Iterator[Any]:
-    """Yield the rows and checks that are tried; of rows that share their code, the derivatives alone."""
+    """Yield the rows and checks that are tried; of rows that share their code, the derivatives
+    alone.
+    """
     for name in ALL:
         for check in CHECKS:
             if not ALIKE(name):
@@ -170,13 +188,26 @@ def test_a_row_of_the_table(name: str, check: str):
 
 @pytest.mark.slow
 def test_compiled_rows_are_the_same():
-    """In a process of its own: the checks of annotations, which tests add to each function, cannot be compiled."""
-    alike = "HollowShape", ".sample", ".joint", "distance_rows"  # they share their code with `ShapeGP.predict`
-    alike += "SelfCollision", "log_joint", ".marginal"  # and these with `Hand.self_clearance` and `log_prob`
+    """In a process of its own: the checks of annotations, which tests add to each function, cannot
+    be compiled.
+    """
+    alike = (
+        "HollowShape",
+        ".sample",
+        ".joint",
+        "distance_rows",
+    )  # they share their code with `ShapeGP.predict`
+    alike += (
+        "SelfCollision",
+        "log_joint",
+        ".marginal",
+    )  # and these with `Hand.self_clearance` and `log_prob`
     names = [name for name, row in ROWS.items() if "compile" not in row.lacks and not ALIKE(name)]
     names = [name for name in names if not any(part in name for part in alike)]
     code = f"from tests.gradients.compare import compile_rows; compile_rows({names})"
-    done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], cwd=ROOT, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", code], cwd=ROOT, capture_output=True, text=True
+    )
     assert done.stdout.split() == names, done.stderr[-3000:]
 
 
@@ -197,7 +228,9 @@ def has_numbers(value: Any) -> bool:
 
 
 def changed(function: Function, value: Any) -> Any:
-    """Return an argument with all its floating-point tensors replaced by those that a function returns."""
+    """Return an argument with all its floating-point tensors replaced by those that a function
+    returns.
+    """
     if isinstance(value, tuple | list):
         parts = [changed(function, part) for part in value]
         return type(value)(*parts) if hasattr(value, "_fields") else type(value)(parts)
@@ -207,7 +240,9 @@ def changed(function: Function, value: Any) -> Any:
 
 
 def refusing(call: Function, arguments: dict[str, Any], key: str) -> Iterator[tuple[str, Function]]:
-    """Yield calls of a function with an argument by which derivatives are taken, in each way of torch."""
+    """Yield calls of a function with an argument by which derivatives are taken, in each way of
+    torch.
+    """
 
     def with_argument(function: Function) -> Any:
         try:
@@ -228,15 +263,20 @@ def refusing(call: Function, arguments: dict[str, Any], key: str) -> Iterator[tu
     yield "vmap", lambda: vmap(shifted)(torch.zeros(2, device="cpu"))
 
 
-REFUSING = sorted({name for name, (_, thing) in THINGS.items() if not inspect.isclass(thing)} - {*ROWS, *MASKS})
+REFUSING = sorted(
+    {name for name, (_, thing) in THINGS.items() if not inspect.isclass(thing)} - {*ROWS, *MASKS}
+)
 
 
 @pytest.mark.parametrize("name", REFUSING)
 @pytest.mark.filterwarnings("ignore")
-def test_all_other_functions_refuse_tensors_by_which_derivatives_are_taken(name: str, tmp_path: Path):
+def test_all_other_functions_refuse_tensors_by_which_derivatives_are_taken(
+    name: str, tmp_path: Path
+):
     make, annotated = THINGS[name]
     call = make()
-    arguments, missed = required(annotated, call, tmp_path), []
+    arguments = required(annotated, call, tmp_path)
+    missed = []
     for key in (key for key, value in arguments.items() if has_numbers(value)):
         for how, attempt in refusing(call, arguments, key):
             try:

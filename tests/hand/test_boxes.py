@@ -34,7 +34,9 @@ def test_two_boxes_overlap_exactly_where_a_linear_programme_finds_a_common_point
     for k in range(60):
         rows = np.concatenate([a[..., k].T, -a[..., k].T, b[..., k].T, -b[..., k].T])
         shift = b[..., k].T @ gap[:, k]
-        limits = np.concatenate([half_a[:, k], half_a[:, k], half_b[:, k] + shift, half_b[:, k] - shift])
+        limits = np.concatenate(
+            [half_a[:, k], half_a[:, k], half_b[:, k] + shift, half_b[:, k] - shift]
+        )
         common = linprog(np.zeros(3), rows, limits, bounds=(None, None)).status == 0
         assert common == (found[k] < 0)
 
@@ -50,7 +52,9 @@ def test_separation_of_boxes_is_coals_depth_and_at_most_its_distance(generator):
         places = coal.Transform3s(a[..., k], np.zeros(3)), coal.Transform3s(b[..., k], gap[:, k])
         request = coal.DistanceRequest()
         request.enable_signed_distance = True
-        truth[k] = coal.distance(shapes[0], places[0], shapes[1], places[1], request, coal.DistanceResult())
+        truth[k] = coal.distance(
+            shapes[0], places[0], shapes[1], places[1], request, coal.DistanceResult()
+        )
     met = truth < 0
     np.testing.assert_allclose(found.numpy()[met], truth[met], atol=1e-6)
     assert (found.numpy()[~met] <= truth[~met] + 1e-6).all()
@@ -58,7 +62,8 @@ def test_separation_of_boxes_is_coals_depth_and_at_most_its_distance(generator):
 
 
 def test_separation_of_boxes_closed_forms_gradient_and_dtype(generator):
-    eye, unit = torch.eye(3, dtype=torch.float64)[..., None], torch.ones(3, 1, dtype=torch.float64)
+    eye = torch.eye(3, dtype=torch.float64)[..., None]
+    unit = torch.ones(3, 1, dtype=torch.float64)
     quarter = rotation_from_vector(real([0.0, 0.0, torch.pi / 4]))[..., None]
     tilted = rotation_from_vector(real([torch.pi / 4, 0.0, 0.0]))[..., None]
     for a, b, gap, expected in [
@@ -66,9 +71,13 @@ def test_separation_of_boxes_closed_forms_gradient_and_dtype(generator):
         (eye, eye, (0.5, 0.0, 1.0), -1.0),  # within one another
         (eye, quarter, (4.0, 0.0, 0.0), 3 - 2**0.5),  # face to edge
         (quarter, tilted, (2.0, 0.0, 0.0), 1 - 2**0.5),  # an edge in a face
-        (quarter, rotation_from_vector(torch.tensor([0.0, torch.pi / 4, 0]).double())[..., None], (4.0, 0.0, 0.0),
-         4 - 2 * 2**0.5),  # crossing edges
-    ]:  # fmt: skip
+        (
+            quarter,
+            rotation_from_vector(torch.tensor([0.0, torch.pi / 4, 0]).double())[..., None],
+            (4.0, 0.0, 0.0),
+            4 - 2 * 2**0.5,
+        ),  # crossing edges
+    ]:
         found = separation(a, b, real(gap)[:, None], unit, unit)
         assert float(found) == pytest.approx(expected, abs=1e-12)
     given = [x[..., 10:] for x in boxes(30, generator)]  # where axes are parallel it has kinks

@@ -21,18 +21,23 @@ tip = "point"
 
 def with_more_fingers(folder, count):
     """Add fingers to the toy hand, each like its third."""
-    urdf, toml = (folder / "hand.urdf").read_text(), (folder / "hand.toml").read_text()
+    urdf = (folder / "hand.urdf").read_text()
+    toml = (folder / "hand.toml").read_text()
     link = re.search(r"<link name=.t3.*?</link>", urdf)[0]
     joint = re.search(r"<joint name=.j3.*?</joint>", urdf)[0]
     for k in range(4, count + 1):
-        more = (link + joint).replace("t3", f"t{k}").replace("j3", f"j{k}").replace("0.03", f"0.0{k}")
+        more = (
+            (link + joint).replace("t3", f"t{k}").replace("j3", f"j{k}").replace("0.03", f"0.0{k}")
+        )
         urdf = urdf.replace("</robot>", more + "</robot>")
         toml += FINGER.format(k)
     (folder / "hand.urdf").write_text(urdf)
     return toml
 
 
-@pytest.mark.parametrize("wanted", ["four", 4, "4", ("index", "middle", "ring", "thumb"), "index,middle,ring,thumb"])
+@pytest.mark.parametrize(
+    "wanted", ["four", 4, "4", ("index", "middle", "ring", "thumb"), "index,middle,ring,thumb"]
+)
 def test_an_option_its_number_and_its_fingers_are_the_same_hand(wanted):
     hand = load_hand("allegro", wanted)
     assert hand.source.option == "four" and hand.dof == 16
@@ -41,7 +46,10 @@ def test_an_option_its_number_and_its_fingers_are_the_same_hand(wanted):
     hand = load_hand("allegro")
     assert with_fingers(hand, "default") is hand and with_fingers(hand, hand.finger_names) is hand
     four = with_fingers(hand.to(torch.float32), 4)
-    assert four.finger_names == ("index", "middle", "ring", "thumb") and four.lower.dtype == torch.float32
+    assert (
+        four.finger_names == ("index", "middle", "ring", "thumb")
+        and four.lower.dtype == torch.float32
+    )
     assert hand.source.options == ("default", "four", "paper_literal")
 
 
@@ -56,7 +64,9 @@ def test_each_finger_touches_where_it_does_in_the_options_of_three(generator):
         used = [four.joint_names.index(name) for name in three.joint_names]
         for ours, theirs in zip((points, normals), three.fingertips(joints[:, used]), strict=True):
             torch.testing.assert_close(ours[:, own], theirs, rtol=0, atol=1e-12)
-        torch.testing.assert_close(four.jacobian(joints)[:, own][..., used], three.jacobian(joints[:, used]))
+        torch.testing.assert_close(
+            four.jacobian(joints)[:, own][..., used], three.jacobian(joints[:, used])
+        )
 
 
 def test_other_fingers_are_parked_where_an_option_parks_them_or_straight():
@@ -64,34 +74,53 @@ def test_other_fingers_are_parked_where_an_option_parks_them_or_straight():
     assert hand.source.option == "paper_literal"
     chosen = load_hand("allegro", "thumb,middle,index")  # in another order than any option's
     assert chosen.source.option == "thumb,middle,index"
-    default = dict(zip(chosen.tree.joint_names, load_hand("allegro").actuated.offset.tolist(), strict=True))
+    default = dict(
+        zip(chosen.tree.joint_names, load_hand("allegro").actuated.offset.tolist(), strict=True)
+    )
     parked = dict(zip(chosen.tree.joint_names, chosen.actuated.offset.tolist(), strict=True))
     assert parked == default and parked["joint_11"] == -0.227
     without_index = load_hand("allegro", ("middle", "ring", "thumb"))
     assert without_index.actuated.offset.abs().max() == 0  # no option parks the index finger
-    assert bool((without_index.self_clearance((without_index.lower + without_index.upper)[None] / 2) > 0).all())
+    assert bool(
+        (
+            without_index.self_clearance((without_index.lower + without_index.upper)[None] / 2) > 0
+        ).all()
+    )
 
 
 def test_parked_joints_without_zero_in_their_range_stay_at_the_limit_next_to_it(toy_hand):
     toml = with_more_fingers(toy_hand, 5)
     (toy_hand / "hand.toml").write_text(
         toml.replace(
-            "[options.default]", '[options.all]\nfingers = ["f1","f2","f3","f4","f5"]\n[options.default]', 1
+            "[options.default]",
+            '[options.all]\nfingers = ["f1","f2","f3","f4","f5"]\n[options.default]',
+            1,
         ).replace('"f3"]', '"f3"]\nparked = { j4 = 0.5, j5 = 0.0 }', 1)
     )
     urdf = (toy_hand / "hand.urdf").read_text()
-    (toy_hand / "hand.urdf").write_text(urdf.replace('lower="-1" upper="1"', 'lower="0.2" upper="1"', 1))
+    (toy_hand / "hand.urdf").write_text(
+        urdf.replace('lower="-1" upper="1"', 'lower="0.2" upper="1"', 1)
+    )
     names = load_hand(toy_hand, "all").tree.joint_names
     offset = load_hand(toy_hand, ("f2", "f3", "f5")).actuated.offset
-    assert dict(zip(names, offset.tolist(), strict=True)) == {"j1": 0.2, "j2": 0.0, "j3": 0.0, "j4": 0.5, "j5": 0.0}
+    assert dict(zip(names, offset.tolist(), strict=True)) == {
+        "j1": 0.2,
+        "j2": 0.0,
+        "j3": 0.0,
+        "j4": 0.5,
+        "j5": 0.0,
+    }
     assert load_hand(toy_hand, 5).dof == 5
 
 
 @pytest.mark.parametrize(
-    "wanted", ["three", 2, 5, 6, (), ("index", "thumb"), ("index", "index", "thumb"), "index,,thumb"]
+    "wanted",
+    ["three", 2, 5, 6, (), ("index", "thumb"), ("index", "index", "thumb"), "index,,thumb"],
 )
 def test_fingers_that_a_hand_has_not_are_refused_with_those_that_it_has(wanted):
-    with pytest.raises(BadArgument, match=r"fingers.*'default', 'four'.*three to five.*'index', 'middle'"):
+    with pytest.raises(
+        BadArgument, match=r"fingers.*'default', 'four'.*three to five.*'index', 'middle'"
+    ):
         load_hand("allegro", wanted)
 
 

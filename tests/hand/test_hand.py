@@ -1,4 +1,6 @@
-"""The hand as a value: kinematics against yourdfpy, derivatives against finite differences, facts of the two hands."""
+"""The hand as a value: kinematics against yourdfpy, derivatives against finite differences, facts
+of the two hands.
+"""
 
 import math
 
@@ -12,7 +14,12 @@ from torchgrasp.geometry.frames import rotation_from_rpy
 from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.testing import largest_fk_error, random_joints
 
-HANDS = [("allegro", "default"), ("allegro", "paper_literal"), ("allegro", "four"), ("barrett", "default")]
+HANDS = [
+    ("allegro", "default"),
+    ("allegro", "paper_literal"),
+    ("allegro", "four"),
+    ("barrett", "default"),
+]
 HANDS += [("leap", "default"), ("shadow", "default")]
 
 
@@ -35,12 +42,14 @@ def test_fk_equals_yourdfpy_coupled_joints_included_and_float32_within_a_microme
 
 @pytest.mark.parametrize("given", [False, True], ids=["pads", "given points"])
 def test_jacobian_equals_finite_differences_of_points_fixed_to_the_tips(hand, given):
-    joints, steps = random_joints(hand, 20).reshape(4, 5, hand.dof), 1e-5 * torch.eye(hand.dof, dtype=torch.float64)
+    joints = random_joints(hand, 20).reshape(4, 5, hand.dof)
+    steps = 1e-5 * torch.eye(hand.dof, dtype=torch.float64)
 
     def carried(joints):
         if not given:
             return hand.fingertips(joints)[0]
-        poses, local = hand.link_poses(joints)[..., hand.tips.index, :, :], hand.tips.center + 0.01
+        poses = hand.link_poses(joints)[..., hand.tips.index, :, :]
+        local = hand.tips.center + 0.01
         return (poses[..., :3, :3] @ local[..., None])[..., 0] + poses[..., :3, 3]
 
     jacobian = hand.jacobian(joints, carried(joints) if given else None)
@@ -50,10 +59,14 @@ def test_jacobian_equals_finite_differences_of_points_fixed_to_the_tips(hand, gi
 
 
 def test_joint_axes_and_origins_give_the_derivative_of_any_point_of_a_link(hand):
-    joints, spheres = random_joints(hand, 1)[0], hand.collision_spheres
+    joints = random_joints(hand, 1)[0]
+    spheres = hand.collision_spheres
     axes, origins = hand.tree.joint_axes(hand.link_poses(joints))
     arms = hand.sphere_centres(joints)[:, None] - origins
-    velocities = torch.linalg.cross(axes.expand_as(arms), arms) * hand.tree.moves[spheres.link_index][..., None]
+    velocities = (
+        torch.linalg.cross(axes.expand_as(arms), arms)
+        * hand.tree.moves[spheres.link_index][..., None]
+    )
     derivative = torch.einsum("sjx,jh->sxh", velocities, hand.actuated.coupling)
     truth = torch.autograd.functional.jacobian(hand.sphere_centres, joints)
     torch.testing.assert_close(derivative, truth, atol=2e-8, rtol=1e-6)
@@ -78,12 +91,17 @@ def test_contact_lies_on_the_tips_sphere_along_the_normal_and_touching_spheres_a
     points, normals = hand.fingertips(joints)
     radius = hand.tips.radius[:, None]
     torch.testing.assert_close(
-        torch.linalg.vector_norm(normals, dim=-1), torch.ones(50, len(hand.finger_names), dtype=torch.float64)
+        torch.linalg.vector_norm(normals, dim=-1),
+        torch.ones(50, len(hand.finger_names), dtype=torch.float64),
     )
     near(hand.tip_centres(joints) + radius * normals, points, 1e-8)
     cover = hand.collision_spheres
-    assert sorted(set(cover.link_index[cover.touching].tolist())) == sorted(hand.tips.index.tolist())
-    parked = {-2} if bool((hand.actuated.coupling == 0).all(1).any()) else set()  # a joint that nothing moves
+    assert sorted(set(cover.link_index[cover.touching].tolist())) == sorted(
+        hand.tips.index.tolist()
+    )
+    parked = (
+        {-2} if bool((hand.actuated.coupling == 0).all(1).any()) else set()
+    )  # a joint that nothing moves
     assert set(cover.finger.tolist()) == {-1, *range(len(hand.finger_names))} | parked
 
 
@@ -102,8 +120,14 @@ def test_expand_names_every_joint_and_couples_exactly():
 
 def test_barrett_is_the_published_hand_and_symmetric_left_to_right():
     hand = load_hand("barrett")
-    poses = dict(zip(hand.tree.link_names, hand.link_poses(torch.zeros(4, dtype=torch.float64)), strict=True))
-    expected = {"f1_dist": (-25.0, -119.94, 78.4), "f2_dist": (25.0, -119.94, 78.4), "f3_dist": (0.0, 119.94, 78.4)}
+    poses = dict(
+        zip(hand.tree.link_names, hand.link_poses(torch.zeros(4, dtype=torch.float64)), strict=True)
+    )
+    expected = {
+        "f1_dist": (-25.0, -119.94, 78.4),
+        "f2_dist": (25.0, -119.94, 78.4),
+        "f3_dist": (0.0, 119.94, 78.4),
+    }
     for link, mm in expected.items():
         near(poses[link][:3, 3] * 1e3, torch.tensor(mm).double(), 1e-3)
     # spread by half a turn brings fingers 1 and 2 to the side of finger 3
@@ -132,7 +156,8 @@ def test_allegro_thumb_opposes_the_fingers():
 
 
 def test_spheres_cover_the_collision_shapes(hand):
-    cover, generator = hand.collision_spheres, torch.Generator().manual_seed(0)
+    cover = hand.collision_spheres
+    generator = torch.Generator().manual_seed(0)
     for index, link in enumerate(read_urdf(hand.urdf_path).links):
         for shape in link.shapes:
             if shape.kind != "box":
@@ -168,12 +193,17 @@ def test_joints_outside_the_limits_are_named():
 
 
 def test_tactile_fingertips_reach_23_mm_farther_and_change_nothing_else():
-    """Reach from the last joint with NVIDIA's model of the sensors: 61.8 mm, thumb 77.4 mm; stock 38.7 and 54.3 mm."""
-    stock, tactile = load_hand("allegro"), load_hand("allegro_biotac")
+    """Reach from the last joint with NVIDIA's model of the sensors: 61.8 mm, thumb 77.4 mm; stock
+    38.7 and 54.3 mm.
+    """
+    stock = load_hand("allegro")
+    tactile = load_hand("allegro_biotac")
     reach = []
     for hand in (stock, tactile):
         poses = hand.link_poses(torch.zeros(hand.dof, dtype=torch.float64))
-        tips = torch.linalg.inv(poses[[hand.tree.link_names.index(f"{f}_distal") for f in hand.tips.names]])
+        tips = torch.linalg.inv(
+            poses[[hand.tree.link_names.index(f"{f}_distal") for f in hand.tips.names]]
+        )
         centres = (tips @ poses[hand.tips.index])[:, :3, 3]
         reach.append(centres[:, 2] + hand.tips.radius)
     near(reach[0], torch.tensor([0.0387, 0.0387, 0.0543]).double(), 1e-6)
@@ -181,5 +211,7 @@ def test_tactile_fingertips_reach_23_mm_farther_and_change_nothing_else():
     same = [name for name in stock.tree.link_names if not name.endswith("tip")]
     joints = 0.5 * (stock.lower + stock.upper)
     for name in same:
-        found = [hand.link_poses(joints)[hand.tree.link_names.index(name)] for hand in (stock, tactile)]
+        found = [
+            hand.link_poses(joints)[hand.tree.link_names.index(name)] for hand in (stock, tactile)
+        ]
         torch.testing.assert_close(*found, rtol=0, atol=1e-12)

@@ -1,7 +1,8 @@
-"""Hostile hands: whatever a URDF, a hand.toml or a model file holds, it is refused by name or read for what it is.
+"""Hostile hands: whatever a URDF, a hand.toml or a model file holds, it is refused by name or read
+for what it is.
 
-The corpus is read in a process of its own whose files, memory and time are watched: nothing outside the hand's folder
-is opened, nothing is run, and little is allocated.
+The corpus is read in a process of its own whose files, memory and time are watched: nothing outside
+the hand's folder is opened, nothing is run, and little is allocated.
 """
 
 import json
@@ -34,7 +35,8 @@ def chain(n: int, close: bool = False) -> str:
     links = "".join(f'<link name="c{k}"/>' for k in range(n))
     ends = [(k, k + 1) for k in range(n - 1)] + ([(n - 1, 0)] if close else [])
     joints = "".join(
-        f'<joint name="q{a}" type="fixed"><parent link="c{a}"/><child link="c{b}"/></joint>' for a, b in ends
+        f'<joint name="q{a}" type="fixed"><parent link="c{a}"/><child link="c{b}"/></joint>'
+        for a, b in ends
     )
     return links + joints
 
@@ -44,10 +46,25 @@ MESH = '<link name="v"><{0}><geometry><mesh filename="{1}"/></geometry></{0}></l
 MESH += '<joint name="w" type="fixed"><parent link="base"/><child link="v"/></joint>'
 
 NAMES = (
-    "../secret.stl", "../../../../etc/secret.stl", "/etc/secret.stl", "/dev/zero", "file:///etc/secret.stl",
-    "FILE:x.stl", "http://localhost/x.stl", "package://claw/../../x.stl", "a\\..\\x.stl", "x" * 5000 + ".stl",
-    "", "x.dae", "x.stl/../../../x.stl", "link.stl", "pipe.stl", "folder.stl", "huge.stl", "&#0;.stl",
-)  # fmt: skip
+    "../secret.stl",
+    "../../../../etc/secret.stl",
+    "/etc/secret.stl",
+    "/dev/zero",
+    "file:///etc/secret.stl",
+    "FILE:x.stl",
+    "http://localhost/x.stl",
+    "package://claw/../../x.stl",
+    "a\\..\\x.stl",
+    "x" * 5000 + ".stl",
+    "",
+    "x.dae",
+    "x.stl/../../../x.stl",
+    "link.stl",
+    "pipe.stl",
+    "folder.stl",
+    "huge.stl",
+    "&#0;.stl",
+)
 """Files of meshes. A visual one is never opened, so its name does no harm."""
 
 
@@ -55,11 +72,14 @@ def urdf_corpus(good: str) -> dict[str, str | bytes]:
     """Name broken and hostile variants of a good URDF (the claw's)."""
     body = good.removesuffix(END)
     corpus: dict[str, str | bytes] = {
-        "entity bomb": '<!DOCTYPE r [<!ENTITY a "aaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;">]>' + good,
+        "entity bomb": '<!DOCTYPE r [<!ENTITY a "aaaaaaaa"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;">]>'
+        + good,
         "external entity": '<!DOCTYPE r [<!ENTITY x SYSTEM "file:///etc/passwd">]>' + good,
         "external dtd": '<!DOCTYPE r SYSTEM "http://localhost/x.dtd">' + good,
         "parameter entity": '<!DOCTYPE r [<!ENTITY % p SYSTEM "file:///etc/hostname"> %p;]>' + good,
-        "included file": body + '<xi:include xmlns:xi="http://www.w3.org/2001/XInclude" href="/etc/passwd"/>' + END,
+        "included file": body
+        + '<xi:include xmlns:xi="http://www.w3.org/2001/XInclude" href="/etc/passwd"/>'
+        + END,
         "utf-16": good.encode("utf-16"),
         "utf-16 without a mark": good.encode("utf-16-le"),
         "utf-7 declared": '<?xml version="1.0" encoding="utf-7"?>' + good,
@@ -81,11 +101,12 @@ def urdf_corpus(good: str) -> dict[str, str | bytes]:
         "underscored number": good.replace('upper="0.5"', 'upper="0_0.5"', 1),
         "other digits": good.replace('upper="0.5"', 'upper="\u0661.5"', 1),
         "comma": good.replace('upper="0.5"', 'upper="0,5"', 1),
-        "mimic loop": good.replace('joint="left_bend"', 'joint="right_follow"')
-        .replace('joint="right_bend"', 'joint="left_follow"'),
+        "mimic loop": good.replace('joint="left_bend"', 'joint="right_follow"').replace(
+            'joint="right_bend"', 'joint="left_follow"'
+        ),
         "mimic of a fixed joint": good.replace('joint="left_bend"', 'joint="left_end"'),
         "box without size": good.replace('<box size="0.11 0.1 0.03"/>', "<box/>"),
-    }  # fmt: skip
+    }
     for name in NAMES:
         corpus[f"mesh {name[:30]!r}"] = body + MESH.format("collision", name) + END
         corpus[f"seen {name[:30]!r}"] = body + MESH.format("visual", name) + END
@@ -107,10 +128,13 @@ def toml_corpus(good: str) -> dict[str, str | bytes]:
         "urdf by a link": good.replace('"claw.urdf"', '"link.urdf"'),
         "urdf that is a folder": good.replace('"claw.urdf"', '"."'),
         "many fingers": good + "[[finger]]\n" * 5000,
-        "mimic given as free": good[: good.index("[coupling]")] + good[good.index("[options.default]") :],
+        "mimic given as free": good[: good.index("[coupling]")]
+        + good[good.index("[options.default]") :],
         "another ratio": good.replace("ratio = -0.7", "ratio = 0.7", 1),
-        "parked and grasping": good.replace("[options.default]", "[options.default]\nparked = { left_bend = 0.0 }"),
-    }  # fmt: skip
+        "parked and grasping": good.replace(
+            "[options.default]", "[options.default]\nparked = { left_bend = 0.0 }"
+        ),
+    }
 
 
 def prepare(folder: Path) -> tuple[str, str]:
@@ -138,10 +162,15 @@ def outcome(action: Callable[[], object]) -> str:
 
 
 def outcomes(folder: Path) -> dict[str, str]:
-    """Load the hand with each file of the corpus in the place of the good one, and tell what came of it."""
+    """Load the hand with each file of the corpus in the place of the good one, and tell what came
+    of it.
+    """
     urdf, toml = prepare(folder)
     found = {}
-    for file, good, corpus in (("claw.urdf", urdf, urdf_corpus(urdf)), ("hand.toml", toml, toml_corpus(toml))):
+    for file, good, corpus in (
+        ("claw.urdf", urdf, urdf_corpus(urdf)),
+        ("hand.toml", toml, toml_corpus(toml)),
+    ):
         for name, content in corpus.items():
             assert content != good, name
             (folder / file).write_bytes(content if isinstance(content, bytes) else content.encode())
@@ -216,7 +245,13 @@ def written(value: Any) -> str:
 
 def places(value: Any, path: tuple[Any, ...] = ()):
     """Yield the path of every value inside a table."""
-    for key, inner in value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ():
+    for key, inner in (
+        value.items()
+        if isinstance(value, dict)
+        else enumerate(value)
+        if isinstance(value, list)
+        else ()
+    ):
         yield (*path, key)
         yield from places(inner, (*path, key))
 
@@ -225,23 +260,34 @@ def replaced(value: Any, path: tuple[Any, ...], new: Any) -> Any:
     """Return a table with one value replaced, or removed for `...`."""
     if not path:
         return new
-    key, rest = path[0], path[1:]
+    key = path[0]
+    rest = path[1:]
     items = list(value.items() if isinstance(value, dict) else enumerate(value))
-    changed = [(k, replaced(v, rest, new) if k == key else v) for k, v in items if (k, new, rest) != (key, ..., ())]
+    changed = [
+        (k, replaced(v, rest, new) if k == key else v)
+        for k, v in items
+        if (k, new, rest) != (key, ..., ())
+    ]
     return dict(changed) if isinstance(value, dict) else [v for _, v in changed]
 
 
 @pytest.mark.promise("H5")
 def test_every_value_of_a_hand_toml_in_every_wrong_type(claw):
-    """A value of another type is refused by name, or is as good as the old one; nothing else ends the reading."""
+    """A value of another type is refused by name, or is as good as the old one; nothing else ends
+    the reading.
+    """
     good = tomllib.loads(draft_hand(claw))
     good["self_collision"]["pairs"] = good["self_collision"]["pairs"][:2]
-    target, accepted, refused = claw.parent / "hand.toml", [], []
+    target = claw.parent / "hand.toml"
+    accepted = []
+    refused = []
     paths = [p for p in places(good) if not (p[0] == "finger" and len(p) > 1 and p[1] != 0)]
     for path in paths:
         for new in (*WRONG, ...):
             table = replaced(good, path, new)
-            target.write_text("\n".join(f"{json.dumps(k)} = {written(v)}" for k, v in table.items()))
+            target.write_text(
+                "\n".join(f"{json.dumps(k)} = {written(v)}" for k, v in table.items())
+            )
             try:
                 load_hand(claw.parent)
                 accepted.append((path, new))
@@ -251,7 +297,9 @@ def test_every_value_of_a_hand_toml_in_every_wrong_type(claw):
     assert all(any(word in said for word in ("hand.toml", "urdf", "fingers")) for said in refused)
     for path, new in accepted:  # what remains means something else, but means it
         number = isinstance(new, (int, float)) and not isinstance(new, bool)
-        left_out = new in (..., [], {}) and (path[0] == "self_collision" or isinstance(path[-1], int))
+        left_out = new in (..., [], {}) and (
+            path[0] == "self_collision" or isinstance(path[-1], int)
+        )
         assert number or left_out or (path[-1] == "name" and new == "word"), (path, new)
 
 
@@ -259,13 +307,16 @@ def test_every_value_of_a_hand_toml_in_every_wrong_type(claw):
 def test_model_files_cut_or_changed_are_refused(tmp_path):
     whole = (hands_folder() / "barrett" / "mixture.safetensors").read_bytes()
     header = 8 + int.from_bytes(whole[:8], "little")
-    rng, path = np.random.default_rng(0), tmp_path / "mixture.safetensors"
+    rng = np.random.default_rng(0)
+    path = tmp_path / "mixture.safetensors"
     for n in [*range(0, header + 1, 5), *rng.integers(header, len(whole), 50).tolist()]:
         path.write_bytes(whole[:n])
         with pytest.raises(ModelFileError):
             load_mixture(path)
     for at in rng.integers(0, header, 100).tolist():
-        path.write_bytes(whole[:at] + bytes([whole[at] ^ (1 << int(rng.integers(8)))]) + whole[at + 1 :])
+        path.write_bytes(
+            whole[:at] + bytes([whole[at] ^ (1 << int(rng.integers(8)))]) + whole[at + 1 :]
+        )
         try:
             load_mixture(path)  # a letter of the metadata
         except ModelFileError:

@@ -1,4 +1,6 @@
-"""Kinematics against three other readers of the same URDF, by joint name, and its derivatives of both orders."""
+"""Kinematics against three other readers of the same URDF, by joint name, and its derivatives of
+both orders.
+"""
 
 import numpy as np
 import pytest
@@ -36,9 +38,13 @@ def assert_same_poses(found: torch.Tensor, truth: torch.Tensor) -> None:
 
 def test_fk_equals_pytorch_kinematics_and_the_derivative_of_the_jacobian_is_symmetric(hand):
     """Its own reader keeps seven digits of an angle."""
-    joints, chain = random_joints(hand, 100), build_chain_from_urdf(hand.urdf_path.read_bytes()).to(torch.float64)
+    joints = random_joints(hand, 100)
+    chain = build_chain_from_urdf(hand.urdf_path.read_bytes()).to(torch.float64)
     poses = chain.forward_kinematics(hand.expand(joints))
-    assert_same_poses(hand.link_poses(joints), torch.stack([poses[n].get_matrix() for n in hand.tree.link_names], 1))
+    assert_same_poses(
+        hand.link_poses(joints),
+        torch.stack([poses[n].get_matrix() for n in hand.tree.link_names], 1),
+    )
     second = torch.func.jacfwd(hand.jacobian)(random_joints(hand, 1)[0])
     near(second, second.mT, 1e-12)  # as second derivatives are
 
@@ -50,7 +56,11 @@ def test_the_chain_is_pytorch_kinematics_own_and_keeps_dtype_and_place_of_the_ha
     near(found, hand.link_poses(joints)[:, hand.tree.link_names.index(tip)], 1e-8)
     assert torch.autograd.grad(found.sum(), joints)[0].abs().max() > 0
     serial = SerialChain(hand.chain, tip, dtype=torch.float64)
-    assert serial.jacobian(torch.zeros(2, serial.n_joints, dtype=torch.float64)).shape == (2, 6, serial.n_joints)
+    assert serial.jacobian(torch.zeros(2, serial.n_joints, dtype=torch.float64)).shape == (
+        2,
+        6,
+        serial.n_joints,
+    )
     assert hand.to(torch.float32).chain.dtype == torch.float32
     joints = random_joints(hand, 3)
     moved = hand.to(torch.float32)
@@ -62,13 +72,15 @@ def test_the_chain_is_pytorch_kinematics_own_and_keeps_dtype_and_place_of_the_ha
 def test_fk_and_jacobian_equal_pinocchios_by_joint_name(hand):
     pin = pytest.importorskip("pinocchio")
     model = pin.buildModelFromUrdf(str(hand.urdf_path))
-    data, joints = model.createData(), random_joints(hand, 100)
+    data = model.createData()
+    joints = random_joints(hand, 100)
     every = {name: values.tolist() for name, values in hand.expand(joints).items()}
     order = [every[name] for name in list(model.names)[1:]]
     frames = [model.getFrameId(name) for name in hand.tree.link_names]
     truth = torch.zeros(100, len(frames), 4, 4, dtype=torch.float64)
     column = [hand.tree.joint_names.index(name) for name in list(model.names)[1:]]
-    found, at = hand.jacobian(joints), [frames[k] for k in hand.tips.index.tolist()]
+    found = hand.jacobian(joints)
+    at = [frames[k] for k in hand.tips.index.tolist()]
     for row in range(100):
         q = np.array([values[row] for values in order])
         pin.framesForwardKinematics(model, data, q)
@@ -77,7 +89,9 @@ def test_fk_and_jacobian_equal_pinocchios_by_joint_name(hand):
         if row % 5:
             continue
         for finger, frame in enumerate(at):
-            twist = torch.from_numpy(pin.computeFrameJacobian(model, data, q, frame, pin.LOCAL_WORLD_ALIGNED))
+            twist = torch.from_numpy(
+                pin.computeFrameJacobian(model, data, q, frame, pin.LOCAL_WORLD_ALIGNED)
+            )
             arm = torch.from_numpy(data.oMf[frame].rotation) @ hand.tips.contact[finger]
             moved = twist[:3] + torch.linalg.cross(twist[3:], arm[:, None].expand(3, len(q)), dim=0)
             near(found[row, finger], moved @ hand.actuated.coupling[column], 1e-12)
@@ -100,6 +114,8 @@ def test_a_tree_of_every_kind_of_joint_is_that_of_pytorch_kinematics(tmp_path, g
     assert tree.joint_names == ("end", "turn", "slide", "away")
     values = torch.randn(50, 4, generator=generator, dtype=torch.float64)
     chain = chain_from_urdf(urdf)
-    poses = chain_poses(chain, tree.joint_names, values.T)[[chain.frame_to_idx[link] for link in tree.link_names]]
+    poses = chain_poses(chain, tree.joint_names, values.T)[
+        [chain.frame_to_idx[link] for link in tree.link_names]
+    ]
     near(tree.poses(values), poses.transpose(0, 1), 1e-12)
     assert torch.autograd.gradgradcheck(tree.poses, values[:1].requires_grad_())

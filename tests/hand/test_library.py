@@ -1,4 +1,6 @@
-"""The hand's chain on its path: pytorch-kinematics itself beside the tables that are compiled from its tensors."""
+"""The hand's chain on its path: pytorch-kinematics itself beside the tables that are compiled from
+its tensors.
+"""
 
 import functools
 import io
@@ -20,16 +22,28 @@ from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.testing import random_joints
 
 SHIPPED = sorted(path.parent.name for path in hands_folder().glob("*/hand.toml"))
-METHODS = ("fingertips", "tip_centres", "jacobian", "link_poses", "sphere_centres", "self_clearance", "check_joints")
+METHODS = (
+    "fingertips",
+    "tip_centres",
+    "jacobian",
+    "link_poses",
+    "sphere_centres",
+    "self_clearance",
+    "check_joints",
+)
 
 
 def library_jacobian(hand: Hand) -> Callable[[torch.Tensor], torch.Tensor]:
     """Return the Jacobian of contact points by the library's serial chains."""
     chains = [SerialChain(hand.chain, link, dtype=hand.chain.dtype) for link in hand.tips.links]
-    columns = [[hand.tree.joint_names.index(name) for name in x.get_joint_parameter_names()] for x in chains]
+    columns = [
+        [hand.tree.joint_names.index(name) for name in x.get_joint_parameter_names()]
+        for x in chains
+    ]
 
     def jacobian(joints: torch.Tensor) -> torch.Tensor:
-        every, moved = hand.expand_joints(joints), []
+        every = hand.expand_joints(joints)
+        moved = []
         for chain, column, contact in zip(chains, columns, hand.tips.contact, strict=True):
             found = chain.jacobian(every[:, column], locations=contact.expand(len(joints), 3))
             moved.append(found[:, :3] @ hand.actuated.coupling[column])
@@ -43,7 +57,9 @@ def library_jacobian(hand: Hand) -> Callable[[torch.Tensor], torch.Tensor]:
 def test_both_backends_place_fingertips_within_a_micrometre_at_1000_postures(name):
     hand = load_hand(name)
     joints = random_joints(hand, 1000)
-    (points, normals), (others, directions) = (hand.fingertips(joints, x) for x in ("torchgrasp", "pytorch_kinematics"))
+    (points, normals), (others, directions) = (
+        hand.fingertips(joints, x) for x in ("torchgrasp", "pytorch_kinematics")
+    )
     near(points, others, 1e-12)
     near(normals, directions, 1e-12)
     near(hand.jacobian(joints), library_jacobian(hand)(joints), 1e-12)
@@ -70,7 +86,9 @@ def test_the_library_is_differentiable_twice_and_refuses_vmap_by_name():
     def squares(q: torch.Tensor, backend: Any) -> torch.Tensor:
         return sum((x**2).sum() for x in hand.fingertips(q, backend))
 
-    ours, theirs = (functools.partial(squares, backend=x) for x in ("torchgrasp", "pytorch_kinematics"))
+    ours, theirs = (
+        functools.partial(squares, backend=x) for x in ("torchgrasp", "pytorch_kinematics")
+    )
     near(hessian(theirs)(joints[0]), hessian(ours)(joints[0]), 1e-10)
     assert torch.autograd.gradcheck(theirs, joints)
     with pytest.raises(BadArgument, match=r"pytorch_kinematics inside torch\.vmap"):
@@ -80,7 +98,8 @@ def test_the_library_is_differentiable_twice_and_refuses_vmap_by_name():
 @pytest.mark.parametrize("name", METHODS)
 def test_a_first_call_inside_a_transform_leaves_nothing_behind(name):
     """What a hand keeps for later calls is made outside the transform."""
-    hand, joints = load_hand("allegro"), random_joints(load_hand("allegro"), 3)
+    hand = load_hand("allegro")
+    joints = random_joints(load_hand("allegro"), 3)
     action = getattr(hand, name)
     first = (lambda q: action(q)[0]) if name == "fingertips" else action
     jacobian = jacrev(first)(joints[0])
@@ -91,7 +110,8 @@ def test_a_first_call_inside_a_transform_leaves_nothing_behind(name):
 
 def test_a_moved_hand_has_a_chain_of_its_own():
     hand = load_hand("barrett")
-    moved, again = hand.to(torch.float32), load_hand("barrett")
+    moved = hand.to(torch.float32)
+    again = load_hand("barrett")
     assert (hand.chain.dtype, moved.chain.dtype) == (torch.float64, torch.float32)
     assert hand.chain is not again.chain
     joints = random_joints(hand, 5).float()
@@ -104,7 +124,9 @@ def results(joints: torch.Tensor) -> dict[str, torch.Tensor]:
     found = named_tensors(hand) | {"cone": hand.tips.cone}
     for name in METHODS:
         value = getattr(hand, name)(joints)
-        found |= {f"{name} {k}": x for k, x in enumerate(value if isinstance(value, tuple) else (value,))}
+        found |= {
+            f"{name} {k}": x for k, x in enumerate(value if isinstance(value, tuple) else (value,))
+        }
     frames = hand.tree.frames(hand.expand_joints(joints).T.contiguous())
     found |= {f"place {k}": x for k, x in enumerate(hand.motion.place(frames))}
     found |= {f"push {k}": x for k, x in enumerate(hand.self_collision.pushes(frames, 0.01))}
@@ -136,7 +158,8 @@ def test_self_clearance_maps_and_differentiates():
         action = functools.partial(hand.self_clearance, below=below)
         torch.testing.assert_close(vmap(action)(joints), action(joints))
         torch.testing.assert_close(
-            vmap(jacrev(action))(joints), torch.autograd.functional.jacobian(action, joints).diagonal(dim1=0, dim2=1).T
+            vmap(jacrev(action))(joints),
+            torch.autograd.functional.jacobian(action, joints).diagonal(dim1=0, dim2=1).T,
         )
     frames = hand.tree.frames(hand.expand_joints(joints).T.contiguous())
     with pytest.raises(BadArgument, match=r"frames: expected .*vmap"):

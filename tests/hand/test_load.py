@@ -1,4 +1,6 @@
-"""Loading a hand: which hands there are, and hand.toml files that are broken or do not fit their URDF."""
+"""Loading a hand: which hands there are, and hand.toml files that are broken or do not fit their
+URDF.
+"""
 
 import shutil
 
@@ -35,7 +37,7 @@ def test_a_shipped_name_that_is_a_folder_here_is_refused(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("old", "new", "match"),
     [
-        ('name = "toy"', 'name = 3', "name"),
+        ('name = "toy"', "name = 3", "name"),
         ('name = "toy"', 'name = "toy', "TOML"),
         ("kp = 1.0", "kp = nan", "kp"),
         ("kp = 1.0", 'kp = "much"', "kp"),
@@ -55,10 +57,18 @@ def test_a_shipped_name_that_is_a_folder_here_is_refused(tmp_path, monkeypatch):
         ('urdf = "hand.urdf"', 'urdf = "hand\\u0000.urdf"', "urdf"),
         ('name = "f3"', 'name = "f2"', "f2"),
         ("limit_margin = 0.0", "limit_margin = 1.0", "limit_margin"),
-        ('fingers = ["f1", "f2", "f3"]', 'fingers = ["f1", "f2", "f3"]\nparked = { j1 = 0.0 }', "j1"),
-        ("[options.default]", "[self_collision]\npairs = [['t1', 't1']]\n[options.default]", "pairs"),
+        (
+            'fingers = ["f1", "f2", "f3"]',
+            'fingers = ["f1", "f2", "f3"]\nparked = { j1 = 0.0 }',
+            "j1",
+        ),
+        (
+            "[options.default]",
+            "[self_collision]\npairs = [['t1', 't1']]\n[options.default]",
+            "pairs",
+        ),
     ],
-)  # fmt: skip
+)
 def test_broken_hand_toml_is_refused(toy_hand, old, new, match):
     text = (toy_hand / "hand.toml").read_text()
     assert old in text
@@ -76,7 +86,8 @@ def test_a_parked_finger_may_be_coupled(toy_hand):
         f'<child link="{child}"/><axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>'
         for name, parent, child in (("j4", "palm", "t4"), ("j5", "t4", "t5"))
     )
-    urdf, toml = toy_hand / "hand.urdf", toy_hand / "hand.toml"
+    urdf = toy_hand / "hand.urdf"
+    toml = toy_hand / "hand.toml"
     urdf.write_text(urdf.read_text().replace("</robot>", more + "</robot>"))
     old = 'fingers = ["f1", "f2", "f3"]\n'
     new = old + 'parked = {PARK}\n[coupling]\nj5 = { source = "j4", ratio = 0.5, offset = 0.1 }\n'
@@ -103,6 +114,9 @@ def test_links_that_no_check_could_see_are_refused(toy_hand, link, match):
 def test_the_toy_hand_turns_its_fingers(toy_hand):
     hand = load_hand(toy_hand)
     points, normals = hand.fingertips(torch.tensor([0.5, 0.0, 0.0], dtype=torch.float64))
-    sine, cosine = torch.sin(torch.tensor(0.5)).double(), torch.cos(torch.tensor(0.5)).double()
-    torch.testing.assert_close(points[0], torch.stack([0.01 + 0.1 * sine, 0 * sine, 0.1 * cosine]), atol=1e-7, rtol=0)
+    sine = torch.sin(torch.tensor(0.5)).double()
+    cosine = torch.cos(torch.tensor(0.5)).double()
+    torch.testing.assert_close(
+        points[0], torch.stack([0.01 + 0.1 * sine, 0 * sine, 0.1 * cosine]), atol=1e-7, rtol=0
+    )
     torch.testing.assert_close(normals[0], torch.stack([sine, 0 * sine, cosine]), atol=1e-7, rtol=0)

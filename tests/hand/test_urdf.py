@@ -27,9 +27,15 @@ def write(tmp_path: Path, text: str | bytes) -> Path:
 
 def test_a_tree_is_read_and_too_large_and_missing_files_are_refused(tmp_path):
     urdf = read_urdf(write(tmp_path, GOOD))
-    assert (urdf.root, [j.name for j in urdf.joints], [x.name for x in urdf.links]) == ("a", ["j"], ["a", "b"])
+    assert (urdf.root, [j.name for j in urdf.joints], [x.name for x in urdf.links]) == (
+        "a",
+        ["j"],
+        ["a", "b"],
+    )
     chain = JOINT + JOINT.replace('"j"', '"k"').replace('"b"', '"c"').replace('"a"', '"b"')
-    urdf = read_urdf(write(tmp_path, GOOD.replace(LINKS + JOINT, LINKS + '<link name="c"/>' + chain)))
+    urdf = read_urdf(
+        write(tmp_path, GOOD.replace(LINKS + JOINT, LINKS + '<link name="c"/>' + chain))
+    )
     assert [[j.name for j in urdf.joints_above(x)] for x in "abc"] == [[], ["j"], ["k", "j"]]
     with pytest.raises(HandFileError, match="bytes"):
         read_urdf(write(tmp_path, GOOD + " " * URDF_BYTES))
@@ -53,13 +59,19 @@ BOMB = '<!DOCTYPE x [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]>'
 HOSTILE = {
     "doctype": (f"<!DOCTYPE robot>{GOOD}", "declaration"),
     "entity bomb": (BOMB + GOOD, "declaration"),
-    "external entity": ('<!DOCTYPE x [<!ENTITY e SYSTEM "file:///etc/passwd">]>' + GOOD, "declaration"),
+    "external entity": (
+        '<!DOCTYPE x [<!ENTITY e SYSTEM "file:///etc/passwd">]>' + GOOD,
+        "declaration",
+    ),
     "doctype after a comment": (f"<!-- x --><!DOCTYPE robot>{GOOD}", "declaration"),
-    "doctype between instructions": ("<?x <!-- ?><!DOCTYPE r [<!ENTITY e 'x'>]><?y --> ?>" + GOOD, "declaration"),
+    "doctype between instructions": (
+        "<?x <!-- ?><!DOCTYPE r [<!ENTITY e 'x'>]><?y --> ?>" + GOOD,
+        "declaration",
+    ),
     "doctype between comments": (f"<!--><!DOCTYPE robot>-->{GOOD}", "XML|declaration"),
     "utf-16": (GOOD.encode("utf-16"), "UTF-8|encoding|XML"),
     "declared encoding": ('<?xml version="1.0" encoding="utf-7"?>' + GOOD, "encoding"),
-    "latin bytes": (GOOD.replace("name=\"r\"", "name=\"\xe9\"").encode("latin-1"), "UTF-8"),
+    "latin bytes": (GOOD.replace('name="r"', 'name="\xe9"').encode("latin-1"), "UTF-8"),
     "empty": ("", "XML"),
     "not xml": ("hello", "XML"),
     "cut short": (GOOD[:-9], "XML"),
@@ -67,7 +79,10 @@ HOSTILE = {
     "not a robot": ("<sdf/>", "<robot>"),
     "unknown tag": (GOOD.replace("</robot>", "<plugin/></robot>"), "plugin"),
     "no links": ("<robot name='r'/>", "links"),
-    "513 links": ("<robot name='r'>" + "".join(f"<link name='l{i}'/>" for i in range(513)) + "</robot>", "512"),
+    "513 links": (
+        "<robot name='r'>" + "".join(f"<link name='l{i}'/>" for i in range(513)) + "</robot>",
+        "512",
+    ),
     "link twice": (GOOD.replace(LINKS, LINKS + '<link name="a"/>'), "twice"),
     "two parents": (GOOD.replace("</robot>", JOINT.replace('"j"', '"k"') + "</robot>"), "twice"),
     "two roots": (GOOD.replace(LINKS, LINKS + '<link name="c"/>'), "root"),
@@ -75,21 +90,29 @@ HOSTILE = {
     "no parent": (GOOD.replace('<parent link="a"/>', ""), "parent"),
     "self loop": (GOOD.replace('<parent link="a"/>', '<parent link="b"/>'), "root|cycle"),
     "cycle": (
-        GOOD.replace("</robot>", JOINT.replace('"j"', '"k"').replace('"a"', '"t"').replace('"b"', '"a"') + "</robot>")
-        .replace('link="t"', 'link="b"'),
+        GOOD.replace(
+            "</robot>",
+            JOINT.replace('"j"', '"k"').replace('"a"', '"t"').replace('"b"', '"a"') + "</robot>",
+        ).replace('link="t"', 'link="b"'),
         "cycle",
     ),
     "cycle beside the tree": (
-        "<robot name='r'>" + LINKS + '<link name="c"/><link name="d"/>' + JOINT
+        "<robot name='r'>"
+        + LINKS
+        + '<link name="c"/><link name="d"/>'
+        + JOINT
         + JOINT.replace('"j"', '"k"').replace('"a"', '"c"').replace('"b"', '"d"')
-        + JOINT.replace('"j"', '"m"').replace('"a"', '"d"').replace('"b"', '"c"') + "</robot>",
+        + JOINT.replace('"j"', '"m"').replace('"a"', '"d"').replace('"b"', '"c"')
+        + "</robot>",
         "cycle",
     ),
     "line of 101": (
-        '<robot name="r"><link name="l0"/>' + "".join(
+        '<robot name="r"><link name="l0"/>'
+        + "".join(
             f'<link name="l{k}"/><joint name="j{k}" type="fixed"><parent link="l{k - 1}"/><child link="l{k}"/></joint>'
             for k in range(1, 101)
-        ) + "</robot>",
+        )
+        + "</robot>",
         "100 links",
     ),
     "tab in a name": (GOOD.replace('link name="a"', 'link name="a&#9;"'), "printable"),
@@ -99,45 +122,125 @@ HOSTILE = {
     "nan limit": (GOOD.replace('lower="-1"', 'lower="nan"'), "lower"),
     "infinite limit": (GOOD.replace('upper="1"', 'upper="inf"'), "upper"),
     "swapped limits": (GOOD.replace('lower="-1"', 'lower="2"'), "lower < upper: are they swapped"),
-    "limits in degrees": (GOOD.replace('lower="-1" upper="1"', 'lower="-29" upper="108"'), "in degrees"),
+    "limits in degrees": (
+        GOOD.replace('lower="-1" upper="1"', 'lower="-29" upper="108"'),
+        "in degrees",
+    ),
     "limits in millimetres": (
-        GOOD.replace("revolute", "prismatic").replace('upper="1"', 'upper="40"'), "in millimetres"),
+        GOOD.replace("revolute", "prismatic").replace('upper="1"', 'upper="40"'),
+        "in millimetres",
+    ),
     "a lower limit alone": (GOOD.replace('upper="1" ', ""), "both limits, or none"),
     "an upper limit alone": (GOOD.replace('lower="-1" ', ""), "both limits, or none"),
-    "angles in degrees": (GOOD.replace("<axis", '<origin rpy="0 90 0"/><axis'), "radians .in degrees. 90 is 1.57 rad"),
+    "angles in degrees": (
+        GOOD.replace("<axis", '<origin rpy="0 90 0"/><axis'),
+        "radians .in degrees. 90 is 1.57 rad",
+    ),
     "xacro variable": (GOOD.replace('upper="1"', 'upper="${pi/2}"'), "without xacro .*pi/2"),
-    "xacro argument": (GOOD.replace('name="j"', 'name="$(arg prefix)j"'), "without xacro .*arg prefix"),
-    "xacro tag": (GOOD.replace("<robot", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"').replace(
-        "</robot>", '<xacro:finger side="left"/></robot>'), "without xacro .*xacro:finger"),
-    "xacro tag in a link": (GOOD.replace("<robot", '<robot xmlns:xacro="http://ros.org/wiki/xacro"').replace(
-        '<link name="a"/>', '<link name="a"><xacro:inertia/></link>'), "link a 'xacro:inertia"),
-    "xacro tag without its name": (GOOD.replace("</robot>", "<xacro:finger/></robot>"), "without xacro"),
-    "xacro find": (GOOD.replace('<link name="a"/>', '<link name="a"><collision><geometry>'
-                                '<mesh filename="$(find h)/x.stl"/></geometry></collision></link>'), "xacro .*find h"),
-    "two scales": (GOOD.replace('<link name="a"/>', '<link name="a"><collision><geometry>'
-                                '<mesh filename="x.stl" scale="1 1"/></geometry></collision></link>'), "3 finite"),
+    "xacro argument": (
+        GOOD.replace('name="j"', 'name="$(arg prefix)j"'),
+        "without xacro .*arg prefix",
+    ),
+    "xacro tag": (
+        GOOD.replace("<robot", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"').replace(
+            "</robot>", '<xacro:finger side="left"/></robot>'
+        ),
+        "without xacro .*xacro:finger",
+    ),
+    "xacro tag in a link": (
+        GOOD.replace("<robot", '<robot xmlns:xacro="http://ros.org/wiki/xacro"').replace(
+            '<link name="a"/>', '<link name="a"><xacro:inertia/></link>'
+        ),
+        "link a 'xacro:inertia",
+    ),
+    "xacro tag without its name": (
+        GOOD.replace("</robot>", "<xacro:finger/></robot>"),
+        "without xacro",
+    ),
+    "xacro find": (
+        GOOD.replace(
+            '<link name="a"/>',
+            '<link name="a"><collision><geometry>'
+            '<mesh filename="$(find h)/x.stl"/></geometry></collision></link>',
+        ),
+        "xacro .*find h",
+    ),
+    "two scales": (
+        GOOD.replace(
+            '<link name="a"/>',
+            '<link name="a"><collision><geometry>'
+            '<mesh filename="x.stl" scale="1 1"/></geometry></collision></link>',
+        ),
+        "3 finite",
+    ),
     "no limits": (re.sub("<limit[^>]*>", "", GOOD), "limit"),
     "nan origin": (GOOD.replace("<axis", '<origin xyz="nan 0 0"/><axis'), "origin"),
     "two numbers": (GOOD.replace("<axis", '<origin xyz="0 0"/><axis'), "3 finite"),
     "mimics nothing": (GOOD.replace("<axis", '<mimic joint="z"/><axis'), "'z'"),
-    "huge box": (GOOD.replace('<link name="a"/>', '<link name="a"><collision><geometry><box size="1 10 1"/>'
-                              "</geometry></collision></link>"), "2 m"),
-    "1001 shapes": (GOOD.replace('<link name="a"/>', '<link name="a">' + '<collision><geometry><sphere radius="1"/>'
-                                 "</geometry></collision>" * 1001 + "</link>"), "1001"),
-    "follows a follower": (GOOD.replace("</robot>", '<link name="c"/>' + JOINT.replace('"j"', '"k"')
-                                        .replace('"b"', '"c"').replace("<axis", '<mimic joint="j"/><axis') + "</robot>")
-                           .replace("</robot>", '<link name="d"/>' + JOINT.replace('"j"', '"m"').replace('"b"', '"d"')
-                                    .replace("<axis", '<mimic joint="k"/><axis') + "</robot>"), "coupled"),
+    "huge box": (
+        GOOD.replace(
+            '<link name="a"/>',
+            '<link name="a"><collision><geometry><box size="1 10 1"/>'
+            "</geometry></collision></link>",
+        ),
+        "2 m",
+    ),
+    "1001 shapes": (
+        GOOD.replace(
+            '<link name="a"/>',
+            '<link name="a">' + '<collision><geometry><sphere radius="1"/>'
+            "</geometry></collision>" * 1001 + "</link>",
+        ),
+        "1001",
+    ),
+    "follows a follower": (
+        GOOD.replace(
+            "</robot>",
+            '<link name="c"/>'
+            + JOINT.replace('"j"', '"k"')
+            .replace('"b"', '"c"')
+            .replace("<axis", '<mimic joint="j"/><axis')
+            + "</robot>",
+        ).replace(
+            "</robot>",
+            '<link name="d"/>'
+            + JOINT.replace('"j"', '"m"')
+            .replace('"b"', '"d"')
+            .replace("<axis", '<mimic joint="k"/><axis')
+            + "</robot>",
+        ),
+        "coupled",
+    ),
     "continuous": (GOOD.replace("revolute", "continuous"), "limit"),
     "mimics itself": (GOOD.replace("<axis", '<mimic joint="j"/><axis'), "coupled"),
-    "capsule": (GOOD.replace('<link name="a"/>', '<link name="a"><collision><geometry><capsule/></geometry>'
-                             "</collision></link>"), "capsule"),
-    "collision mesh": (GOOD.replace('<link name="a"/>', '<link name="a"><collision><geometry><mesh filename="x.stl"/>'
-                                    "</geometry></collision></link>"), "box, cylinder or sphere"),
-    "many joints of one name": ("<robot name='r'>" + LINKS + JOINT * 20_000 + "</robot>", "elements|twice"),
-    "negative box": (GOOD.replace('<link name="a"/>', '<link name="a"><collision><geometry><box size="1 -1 1"/>'
-                                  "</geometry></collision></link>"), "positive"),
-}  # fmt: skip
+    "capsule": (
+        GOOD.replace(
+            '<link name="a"/>',
+            '<link name="a"><collision><geometry><capsule/></geometry></collision></link>',
+        ),
+        "capsule",
+    ),
+    "collision mesh": (
+        GOOD.replace(
+            '<link name="a"/>',
+            '<link name="a"><collision><geometry><mesh filename="x.stl"/>'
+            "</geometry></collision></link>",
+        ),
+        "box, cylinder or sphere",
+    ),
+    "many joints of one name": (
+        "<robot name='r'>" + LINKS + JOINT * 20_000 + "</robot>",
+        "elements|twice",
+    ),
+    "negative box": (
+        GOOD.replace(
+            '<link name="a"/>',
+            '<link name="a"><collision><geometry><box size="1 -1 1"/>'
+            "</geometry></collision></link>",
+        ),
+        "positive",
+    ),
+}
 
 
 @pytest.mark.promise("H1")
@@ -148,12 +251,23 @@ def test_hostile_urdf_is_refused(tmp_path, name):
         read_urdf(write(tmp_path, text))
 
 
-VISUALS = ["../../x.stl", "/etc/x.stl", "file:///x.stl", "http://x/x.stl", "package://a/../../x.stl", "a.dae", "", "."]
+VISUALS = [
+    "../../x.stl",
+    "/etc/x.stl",
+    "file:///x.stl",
+    "http://x/x.stl",
+    "package://a/../../x.stl",
+    "a.dae",
+    "",
+    ".",
+]
 
 
 @pytest.mark.parametrize("mesh", VISUALS)
 def test_what_is_only_seen_is_not_read(tmp_path, mesh):
-    """A visual mesh that is missing, or lies anywhere, says nothing about the hand; no reader gets its name."""
+    """A visual mesh that is missing, or lies anywhere, says nothing about the hand; no reader gets
+    its name.
+    """
     link = f'<link name="a"><visual><geometry><mesh filename="{mesh}"/></geometry></visual></link>'
     urdf = read_urdf(write(tmp_path, GOOD.replace('<link name="a"/>', link)))
     assert urdf.links == read_urdf(write(tmp_path, GOOD)).links
@@ -163,14 +277,22 @@ def test_what_is_only_seen_is_not_read(tmp_path, mesh):
 def test_the_inertia_of_a_turned_frame_is_turned(tmp_path):
     """R diag(1, 2, 3) R', here by SciPy's rotation."""
     inertia = '<inertia ixx="1" ixy="0" ixz="0" iyy="2" iyz="0" izz="3"/>'
-    body = f'<inertial><origin xyz="0 0 1" rpy="0.3 -0.4 0.5"/><mass value="1"/>{inertia}</inertial>'
-    link = read_urdf(write(tmp_path, GOOD.replace('<link name="a"/>', f'<link name="a">{body}</link>'))).links[0]
+    body = (
+        f'<inertial><origin xyz="0 0 1" rpy="0.3 -0.4 0.5"/><mass value="1"/>{inertia}</inertial>'
+    )
+    link = read_urdf(
+        write(tmp_path, GOOD.replace('<link name="a"/>', f'<link name="a">{body}</link>'))
+    ).links[0]
     turn = Rotation.from_euler("xyz", [0.3, -0.4, 0.5]).as_matrix()
     assert link.com == (0, 0, 1)
-    np.testing.assert_allclose(link.inertia, (turn @ np.diag([1, 2, 3]) @ turn.T)[np.triu_indices(3)], atol=1e-12)
+    np.testing.assert_allclose(
+        link.inertia, (turn @ np.diag([1, 2, 3]) @ turn.T)[np.triu_indices(3)], atol=1e-12
+    )
 
 
-@pytest.mark.parametrize("rpy", ["0.1 -0.2 0.3", "0 -1.65806279 -1.5707963", "3 1.2 -2", "0 -1.57079 0", "1 2 3"])
+@pytest.mark.parametrize(
+    "rpy", ["0.1 -0.2 0.3", "0 -1.65806279 -1.5707963", "3 1.2 -2", "0 -1.57079 0", "1 2 3"]
+)
 def test_angles_come_back_as_they_stand_in_the_file(tmp_path, rpy):
     text = GOOD.replace("<axis", f'<origin xyz="0 0 0" rpy="{rpy}"/><axis')
     found = Rotation.from_euler("xyz", read_urdf(write(tmp_path, text)).joints[0].rpy)
@@ -180,7 +302,9 @@ def test_angles_come_back_as_they_stand_in_the_file(tmp_path, rpy):
 
 def test_a_scale_of_one_number_counts_for_all_axes(tmp_path):
     mesh = '<collision><geometry><mesh filename="x.stl" scale="0.001"/></geometry></collision>'
-    urdf = read_published(write(tmp_path, GOOD.replace('<link name="a"/>', f'<link name="a">{mesh}</link>')))
+    urdf = read_published(
+        write(tmp_path, GOOD.replace('<link name="a"/>', f'<link name="a">{mesh}</link>'))
+    )
     assert urdf.links[0].shapes[0].size == (0.001,) * 3
 
 

@@ -23,7 +23,8 @@ from tests.hostile.samples import Lengths, hints_of, sample, sample_tensor
 from torchgrasp.foundation.checks import ANY, RIGID, Range, Taken, _lengths
 from torchgrasp.foundation.errors import Status
 
-NAN, INF = float("nan"), float("inf")
+NAN = float("nan")
+INF = float("inf")
 
 
 class Odd:
@@ -34,12 +35,57 @@ class Odd:
 
 
 HOSTILE = [
-    None, "x", "", "a" * 5000, "a\0b", b"x", True, False, -1, 0, 1, 1.5, -0.5, NAN, INF, -INF, 2**63, -(2**63) - 1,
-    2**64, 10**400, 1 + 1j, [], [1], [None], {}, {"a": 1}, (), (1,), {1}, Odd(), Odd, int, len, np.float64("nan"),
-    np.int64(-7), np.zeros(3), np.array(["x"]), np.array([None, 1]), torch.tensor(1), torch.tensor([1.0, 2.0]),
-    torch.zeros(0), torch.zeros(2, 3, 4, 5), torch.zeros(3, dtype=torch.complex64), Path("x"), range(3), iter(()),
-    Status.OK, torch.device("cpu"), torch.float16, trimesh.Trimesh(),
-]  # fmt: skip
+    None,
+    "x",
+    "",
+    "a" * 5000,
+    "a\0b",
+    b"x",
+    True,
+    False,
+    -1,
+    0,
+    1,
+    1.5,
+    -0.5,
+    NAN,
+    INF,
+    -INF,
+    2**63,
+    -(2**63) - 1,
+    2**64,
+    10**400,
+    1 + 1j,
+    [],
+    [1],
+    [None],
+    {},
+    {"a": 1},
+    (),
+    (1,),
+    {1},
+    Odd(),
+    Odd,
+    int,
+    len,
+    np.float64("nan"),
+    np.int64(-7),
+    np.zeros(3),
+    np.array(["x"]),
+    np.array([None, 1]),
+    torch.tensor(1),
+    torch.tensor([1.0, 2.0]),
+    torch.zeros(0),
+    torch.zeros(2, 3, 4, 5),
+    torch.zeros(3, dtype=torch.complex64),
+    Path("x"),
+    range(3),
+    iter(()),
+    Status.OK,
+    torch.device("cpu"),
+    torch.float16,
+    trimesh.Trimesh(),
+]
 """What people and programs pass by mistake."""
 
 
@@ -62,7 +108,12 @@ def broken(valid: Tensor) -> dict[str, Tensor]:
     if valid.ndim:
         out["sparse"] = valid.to_sparse()
     if valid.is_floating_point():
-        out |= {"half": valid.half(), "bfloat16": valid.bfloat16(), "int": valid.long(), "bool": valid > 0}
+        out |= {
+            "half": valid.half(),
+            "bfloat16": valid.bfloat16(),
+            "int": valid.long(),
+            "bool": valid > 0,
+        }
         out |= {
             "negative bit": torch._neg_view(-valid),
             "quantised": torch.quantize_per_tensor(valid.float(), 0.1, 0, torch.qint8),
@@ -76,8 +127,11 @@ def broken(valid: Tensor) -> dict[str, Tensor]:
 
 def longer(valid: Tensor, hint: Any, own: Lengths) -> list[Tensor]:
     """Return tensors that are too long along an axis whose length is given."""
-    axes, given = hint.dim_str.split(), len(valid.shape)
-    places = [k for k, axis in enumerate(axes[::-1]) if axis.isdigit() or axis in own]  # variable axes are first
+    axes = hint.dim_str.split()
+    given = len(valid.shape)
+    places = [
+        k for k, axis in enumerate(axes[::-1]) if axis.isdigit() or axis in own
+    ]  # variable axes are first
     return [torch.cat([valid, valid.narrow(-1 - k, 0, 1)], -1 - k) for k in places if k < given]
 
 
@@ -86,25 +140,40 @@ def spoilt(valid: Tensor) -> dict[str, Tensor]:
     if not valid.is_floating_point() or not valid.numel():
         return {}
     last = torch.arange(valid.numel()).reshape(valid.shape) == valid.numel() - 1
-    return {str(x): torch.where(last, torch.tensor(x, dtype=valid.dtype), valid) for x in (NAN, INF, -INF)}
+    return {
+        str(x): torch.where(last, torch.tensor(x, dtype=valid.dtype), valid)
+        for x in (NAN, INF, -INF)
+    }
 
 
 def crooked(valid: Tensor) -> list[Tensor]:
     """Return transforms that scale, mirror or shear, and one of zeros."""
-    return [3 * valid, torch.diag(torch.tensor([-1.0, 1, 1, 1])).to(valid) @ valid, valid.cumsum(-1), 0 * valid]
+    return [
+        3 * valid,
+        torch.diag(torch.tensor([-1.0, 1, 1, 1])).to(valid) @ valid,
+        valid.cumsum(-1),
+        0 * valid,
+    ]
 
 
 def is_wrong(value: Any, hint: Any) -> bool:
-    """Tell by beartype whether a value breaks an annotation; whole numbers and NumPy's are numbers, too."""
+    """Tell by beartype whether a value breaks an annotation; whole numbers and NumPy's are numbers,
+    too.
+    """
     hints = [hint]
     while hints:
         one = hints.pop()
-        origin, inside = typing.get_origin(one), typing.get_args(one)
+        origin = typing.get_origin(one)
+        inside = typing.get_args(one)
         if origin in (typing.Union, types.UnionType):
             hints += inside
         elif origin is typing.Annotated and isinstance(inside[1], Range):
             huge = isinstance(value, int) and abs(value) >= 2**1024  # no floating number
-            if is_number(value, inside[0]) and inside[1].low <= value <= inside[1].high and not huge:
+            if (
+                is_number(value, inside[0])
+                and inside[1].low <= value <= inside[1].high
+                and not huge
+            ):
                 return False
         elif origin is typing.Annotated and inside == (float, ANY):
             if is_number(value, float) and (not abs(value) >= 1e308 or isinstance(value, float)):
@@ -116,14 +185,18 @@ def is_wrong(value: Any, hint: Any) -> bool:
             hints.append(inside[0])
         else:
             with jaxtyped("context"):
-                if not isinstance(value, Tensor) or tensors_in(one) or one is Tensor:  # beartype asks for their length
+                if (
+                    not isinstance(value, Tensor) or tensors_in(one) or one is Tensor
+                ):  # beartype asks for their length
                     if is_bearable(value, one) or is_bearable(floated(value), one):
                         return False
     return True
 
 
 def floated(value: Any) -> Any:
-    """Return a container with its whole numbers as floating ones, which any container of those may hold."""
+    """Return a container with its whole numbers as floating ones, which any container of those may
+    hold.
+    """
     if isinstance(value, dict):
         return {key: float(x) if is_number(x, int) else x for key, x in value.items()}
     if isinstance(value, list | tuple | range) and not isinstance(value, str):
@@ -140,13 +213,18 @@ def is_number(value: Any, kind: type) -> bool:
 
 def tensors_in(hint: Any) -> list[Any]:
     """Return the annotations of tensors that an argument may be, of which one alone."""
-    origin, inside = typing.get_origin(hint), typing.get_args(hint)
+    origin = typing.get_origin(hint)
+    inside = typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         return [x for part in inside for x in tensors_in(part)]
     if origin is typing.Annotated:
         found = tensors_in(inside[0])
         return found if isinstance(inside[1], Taken) else [hint] * bool(found)
-    return [hint] if isinstance(hint, type) and issubclass(hint, AbstractArray) and hint.array_type is Tensor else []
+    return (
+        [hint]
+        if isinstance(hint, type) and issubclass(hint, AbstractArray) and hint.array_type is Tensor
+        else []
+    )
 
 
 def public() -> dict[str, Any]:
@@ -167,7 +245,8 @@ def behind(thing: Any) -> bool:
 
 
 def methods_of(kind: type) -> dict[str, tuple[Any, Any]]:
-    """Return the public methods of a class that take arguments, as they are found in it, and as functions.
+    """Return the public methods of a class that take arguments, as they are found in it, and as
+    functions.
 
     Those of the library alone, inherited ones, too; what is abstract is for others to write.
     """
@@ -176,7 +255,9 @@ def methods_of(kind: type) -> dict[str, tuple[Any, Any]]:
         method = inspect.getattr_static(kind, key)
         function = method.__func__ if isinstance(method, classmethod | staticmethod) else method
         own = inspect.isfunction(function) and function.__module__.startswith("torchgrasp")
-        open_to_all = getattr(function, "__isabstractmethod__", False) or getattr(kind, "_is_protocol", False)
+        open_to_all = getattr(function, "__isabstractmethod__", False) or getattr(
+            kind, "_is_protocol", False
+        )
         if own and not key.startswith("_") and not open_to_all:
             if len(inspect.signature(function).parameters) > (not isinstance(method, staticmethod)):
                 found[key] = method, function
@@ -184,7 +265,9 @@ def methods_of(kind: type) -> dict[str, tuple[Any, Any]]:
 
 
 def checked_things() -> dict[str, tuple[Callable[[], Any], Any]]:
-    """Return what gives each function, value and method of a value to call, and what has its annotations, by name."""
+    """Return what gives each function, value and method of a value to call, and what has its
+    annotations, by name.
+    """
     found: dict[str, tuple[Callable[[], Any], Any]] = {}
     for name, thing in public().items():
         if inspect.isfunction(thing) and behind(thing):
@@ -208,7 +291,8 @@ def _method(thing: type, key: str, still: bool) -> Any:
 
 
 def required(thing: Any, call: Any, path: Path) -> dict[str, Any]:
-    hints, parameters = hints_of(thing), inspect.signature(call).parameters
+    hints = hints_of(thing)
+    parameters = inspect.signature(call).parameters
     return {
         key: sample(hints[key], path, own_lengths(call))
         for key, p in parameters.items()
@@ -239,7 +323,11 @@ def wrong_values(hint: Any, own: Lengths) -> list[Any]:
         bare = getattr(tensor, "__origin__", tensor)
         valid = sample_tensor(bare, own)
         values += [x for x in longer(valid, bare, own) if bare is hint or is_wrong(x, hint)]
-        values += [value for how, value in broken(valid).items() if how in NO_NUMBERS or is_wrong(value, hint)]
+        values += [
+            value
+            for how, value in broken(valid).items()
+            if how in NO_NUMBERS or is_wrong(value, hint)
+        ]
         if getattr(tensor, "__metadata__", ())[:1] == (RIGID,):
             values += crooked(valid)
         if getattr(tensor, "__metadata__", ())[:1] != (ANY,):

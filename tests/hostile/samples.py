@@ -19,7 +19,15 @@ from typing_extensions import Unpack
 
 import torchgrasp
 from tests.make import see
-from torchgrasp import ClosingReference, GraspController, GraspMixture, PointCloud, fit_shape, load_hand, load_object
+from torchgrasp import (
+    ClosingReference,
+    GraspController,
+    GraspMixture,
+    PointCloud,
+    fit_shape,
+    load_hand,
+    load_object,
+)
 from torchgrasp.arm import Arm
 from torchgrasp.cloud import estimate_normals
 from torchgrasp.contacts import ShapeLike
@@ -51,7 +59,9 @@ NONE: Lengths = types.MappingProxyType({})
 
 
 def hints_of(thing: Any) -> dict[str, Any]:
-    """Return the annotations of a function or dataclass with their marks, those of `**options` among them."""
+    """Return the annotations of a function or dataclass with their marks, those of `**options`
+    among them.
+    """
     hints = typing.get_type_hints(thing, include_extras=True)
     for hint in [x for x in hints.values() if typing.get_origin(x) is Unpack]:
         hints |= typing.get_type_hints(typing.get_args(hint)[0], include_extras=True)
@@ -62,7 +72,12 @@ def hints_of(thing: Any) -> dict[str, Any]:
 def special(kind: type) -> Any:
     """Return a valid object of a class whose fields depend on each other."""
     half = torch.full((1, 7), 0.5, dtype=torch.float64)
-    mixture = (torch.ones(1, dtype=torch.float64), half, torch.eye(7, dtype=torch.float64)[None], ("j", *CODE_NAMES))
+    mixture = (
+        torch.ones(1, dtype=torch.float64),
+        half,
+        torch.eye(7, dtype=torch.float64)[None],
+        ("j", *CODE_NAMES),
+    )
     nine = GaussianMixture(torch.ones(1), torch.zeros(1, 9), torch.eye(9)[None], NAMES)
     made = {
         torchgrasp.Hand: lambda: load_hand("barrett"),
@@ -72,7 +87,9 @@ def special(kind: type) -> Any:
         Grasps: lambda: load_shipped_grasp("jug", "barrett"),
         Contacts: lambda: special(Grasps).contacts,
         Certificate: lambda: special(Grasps).certificate,
-        ClosingReference: lambda: ClosingReference.from_grasp(special(torchgrasp.Hand), special(Grasps)),
+        ClosingReference: lambda: ClosingReference.from_grasp(
+            special(torchgrasp.Hand), special(Grasps)
+        ),
         Arm: lambda: ur5e(special(torchgrasp.Hand)),
         GraspController: lambda: GraspController(special(ClosingReference)),
         GraspProblem: grasp_problem,
@@ -80,13 +97,21 @@ def special(kind: type) -> Any:
         Impedance: impedance,
         Urdf: lambda: read_urdf(special(torchgrasp.Hand).urdf_path),
         Funnel: lambda: Funnel((Losses("contacts", "starts", 50, {Status.NOT_CLOSED: 10}),)),
-        SampleFolder: lambda: write_samples(special(torchgrasp.Hand), SampleSpec(20), tempfile.mkdtemp()),
+        SampleFolder: lambda: write_samples(
+            special(torchgrasp.Hand), SampleSpec(20), tempfile.mkdtemp()
+        ),
         Completion: lambda: complete_cloud(estimate_normals(special(PointCloud))),
         Outlines: lambda: silhouettes(special(PointCloud)),
         Silhouette: lambda: special(Outlines).views[0],
         Posterior: lambda: special(torchgrasp.ShapeGP),
-        HollowShape: lambda: HollowShape.join(*[special(torchgrasp.ShapeGP)] * 2, special(PointCloud)),
-        SimulatedScene: type("Nowhere", (SimulatedScene,), {name: nothing for name in ("__init__", *SimulatedScene.__abstractmethods__)}),
+        HollowShape: lambda: HollowShape.join(
+            *[special(torchgrasp.ShapeGP)] * 2, special(PointCloud)
+        ),
+        SimulatedScene: type(
+            "Nowhere",
+            (SimulatedScene,),
+            {name: nothing for name in ("__init__", *SimulatedScene.__abstractmethods__)},
+        ),
         SimulatedHand: simulated_hand,
         torchgrasp.Plane: lambda: torchgrasp.Plane.horizontal(0.0),
         torchgrasp.ShapeGP: lambda: fit_shape(special(PointCloud), budget=30),
@@ -97,8 +122,12 @@ def special(kind: type) -> Any:
         StabilityModel: lambda: StabilityModel(nine, nine, 0.5),
         trimesh.Trimesh: lambda: trimesh.creation.box([0.05, 0.05, 0.1]),
         torch.Generator: lambda: torch.Generator().manual_seed(0),
-    }  # fmt: skip
-    of_hand = {type(part): part for part in vars(load_hand("barrett")).values() if dataclasses.is_dataclass(part)}
+    }
+    of_hand = {
+        type(part): part
+        for part in vars(load_hand("barrett")).values()
+        if dataclasses.is_dataclass(part)
+    }
     return made[kind]() if kind in made else of_hand.get(kind)
 
 
@@ -119,21 +148,28 @@ def nothing(*arguments: Any) -> None:
 
 def simulated_hand() -> SimulatedHand:
     """Return a hand whose scene has nothing but names: what a border refuses reaches none."""
-    reference, scene = special(ClosingReference), special(SimulatedScene)
-    scene.timestep, scene.joint_names = 0.002, reference.hand.tree.joint_names
+    reference = special(ClosingReference)
+    scene = special(SimulatedScene)
+    scene.timestep = 0.002
+    scene.joint_names = reference.hand.tree.joint_names
     return SimulatedHand(scene, reference, 50.0, None)
 
 
 def grasp_problem() -> GraspProblem:
     """Return a problem of inverse kinematics, whose contacts have a deviation."""
-    fields = {name: sample(hint, Path()) for name, hint in hints_of(GraspProblem).items() if name != "reachable"}
+    fields = {
+        name: sample(hint, Path())
+        for name, hint in hints_of(GraspProblem).items()
+        if name != "reachable"
+    }
     std = torch.full_like(fields["contacts"].points[..., 0], 0.001)
     return GraspProblem(**fields | {"contacts": dataclasses.replace(fields["contacts"], std_m=std)})
 
 
 def sample(hint: Any, path: Path, own: Lengths = NONE) -> Any:
     """Return a valid argument for an annotation; `own` are the lengths of some letters."""
-    origin, inside = typing.get_origin(hint), typing.get_args(hint)
+    origin = typing.get_origin(hint)
+    inside = typing.get_args(hint)
     if origin is typing.Annotated:
         mark = inside[1]
         if isinstance(mark, Range):
@@ -146,8 +182,21 @@ def sample(hint: Any, path: Path, own: Lengths = NONE) -> Any:
         return inside[0]
     if isinstance(hint, type) and issubclass(hint, AbstractArray):
         return sample_tensor(hint, own)
-    simple = {int: 1, float: 0.5, bool: True, str: "x", bytes: b"x", Path: path / "x", object: 0, Any: 0}
-    simple |= {type(None): None, Tensor: torch.ones(3, dtype=torch.float64), np.ndarray: np.ones((6, 3))}
+    simple = {
+        int: 1,
+        float: 0.5,
+        bool: True,
+        str: "x",
+        bytes: b"x",
+        Path: path / "x",
+        object: 0,
+        Any: 0,
+    }
+    simple |= {
+        type(None): None,
+        Tensor: torch.ones(3, dtype=torch.float64),
+        np.ndarray: np.ones((6, 3)),
+    }
     if hint in simple:
         return simple[hint]
     if origin is collections.abc.Callable:
@@ -164,7 +213,11 @@ def sample(hint: Any, path: Path, own: Lengths = NONE) -> Any:
         return Status.OK
     found = special(hint)
     if found is None and dataclasses.is_dataclass(hint):
-        required = [f.name for f in dataclasses.fields(hint) if f.default is f.default_factory is dataclasses.MISSING]
+        required = [
+            f.name
+            for f in dataclasses.fields(hint)
+            if f.default is f.default_factory is dataclasses.MISSING
+        ]
         hints = hints_of(hint)
         found = hint(**{name: sample(hints[name], path) for name in required})
     if found is None and issubclass(hint, tuple):

@@ -1,4 +1,6 @@
-"""Every public function and value with every wrong argument: `BadArgument` with its name, before any work."""
+"""Every public function and value with every wrong argument: `BadArgument` with its name, before
+any work.
+"""
 
 import dataclasses
 import inspect
@@ -9,18 +11,56 @@ import torch
 from torch.autograd import forward_ad
 
 import torchgrasp
-from tests.hostile.arguments import HOSTILE, behind, checked_things, methods_of, public, required, wrong_arguments
+from tests.hostile.arguments import (
+    HOSTILE,
+    behind,
+    checked_things,
+    methods_of,
+    public,
+    required,
+    wrong_arguments,
+)
 from tests.hostile.samples import sample
 from torchgrasp.foundation.checks import Count, checked
 from torchgrasp.foundation.errors import BadArgument
 
 MADE_INSIDE = {
-    "ActuatedJoints", "CollisionSpheres", "Completion", "Components", "Fingertips", "Hand", "HollowShape", "Joint",
-    "JointEstimate", "KinematicTree", "Link", "Normalisation", "Observations", "Outlines", "PreparedCloud", "Progress",
-    "SampleFolder", "SceneSpec", "SelfCollision", "Shape", "ShapeDerivatives", "ShapeGP", "Silhouette", "StepContacts",
-    "SurfaceJet", "MeanJet", "ClosingTrace", "Urdf", "Advice", "Explanation", "Funnel", "Losses", "Trial",
-    "GraspShards", "Arm",
-}  # fmt: skip
+    "ActuatedJoints",
+    "CollisionSpheres",
+    "Completion",
+    "Components",
+    "Fingertips",
+    "Hand",
+    "HollowShape",
+    "Joint",
+    "JointEstimate",
+    "KinematicTree",
+    "Link",
+    "Normalisation",
+    "Observations",
+    "Outlines",
+    "PreparedCloud",
+    "Progress",
+    "SampleFolder",
+    "SceneSpec",
+    "SelfCollision",
+    "Shape",
+    "ShapeDerivatives",
+    "ShapeGP",
+    "Silhouette",
+    "StepContacts",
+    "SurfaceJet",
+    "MeanJet",
+    "ClosingTrace",
+    "Urdf",
+    "Advice",
+    "Explanation",
+    "Funnel",
+    "Losses",
+    "Trial",
+    "GraspShards",
+    "Arm",
+}
 """Values that only the library makes, many of them in each step of a loop."""
 THINGS = checked_things()
 
@@ -31,10 +71,23 @@ def test_every_public_function_method_and_value_is_behind_the_border():
         if inspect.isfunction(thing) and not behind(thing) and inspect.signature(thing).parameters:
             open_ones.append(name)
         elif inspect.isclass(thing):
-            if dataclasses.is_dataclass(thing) and not behind(thing.__init__) and thing.__name__ not in MADE_INSIDE:
+            if (
+                dataclasses.is_dataclass(thing)
+                and not behind(thing.__init__)
+                and thing.__name__ not in MADE_INSIDE
+            ):
                 open_ones.append(name)
-            open_ones += [function.__qualname__ for _, function in methods_of(thing).values() if not behind(function)]
-    known = {"torchgrasp.app.cli.main", "Value.to", "ShapeGP.to", "Hand.to"}  # `to` refuses what torch does
+            open_ones += [
+                function.__qualname__
+                for _, function in methods_of(thing).values()
+                if not behind(function)
+            ]
+    known = {
+        "torchgrasp.app.cli.main",
+        "Value.to",
+        "ShapeGP.to",
+        "Hand.to",
+    }  # `to` refuses what torch does
     assert {*open_ones} == known
 
 
@@ -56,7 +109,8 @@ def test_values_are_moved_or_name_what_is_wrong(kind, tmp_path):
 def test_wrong_arguments_are_refused_by_name(name, tmp_path):
     make, annotated = THINGS[name]
     call = make()
-    good, missed = required(annotated, call, tmp_path), []
+    good = required(annotated, call, tmp_path)
+    missed = []
     for key, value in wrong_arguments(annotated, call):
         try:
             call(**good | {key: value})

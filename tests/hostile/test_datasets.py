@@ -1,4 +1,6 @@
-"""Hostile folders of objects: names never leave the folder, and one bad entry costs its own object alone."""
+"""Hostile folders of objects: names never leave the folder, and one bad entry costs its own object
+alone.
+"""
 
 import dataclasses
 import json
@@ -58,7 +60,21 @@ ENTRIES = {
     "a group of a million letters": GOOD | {"group": "x" * 10**6},
 }
 
-NAMES = ["", ".", "..", "../outside", "a/b", "/tmp", "a\\b", "c:", "a\0b", "a\nb", "\x1b]0;x\x07", " a", "a."]
+NAMES = [
+    "",
+    ".",
+    "..",
+    "../outside",
+    "a/b",
+    "/tmp",
+    "a\\b",
+    "c:",
+    "a\0b",
+    "a\nb",
+    "\x1b]0;x\x07",
+    " a",
+    "a.",
+]
 NAMES += ["a" * 101, "\ud800", "\u202eexe"]
 
 FILES = {
@@ -90,14 +106,18 @@ def put(folder: Path, size: float = 0.06, view: str = "v0") -> None:
     box.apply_translation([0, 0, size / 2])
     box.export(folder / "mesh.ply")
     points, faces = trimesh.sample.sample_surface(box, 1500, seed=0)
-    points = points[box.face_normals[faces] @ [0.7, 0.0, 0.7] > 0.1]  # what a camera sees from above and ahead
+    points = points[
+        box.face_normals[faces] @ [0.7, 0.0, 0.7] > 0.1
+    ]  # what a camera sees from above and ahead
     save_cloud(PointCloud(torch.from_numpy(np.array(points))), folder / f"{view}_noisy.ply")
 
 
 @pytest.mark.parametrize("name", ENTRIES)
 def test_a_bad_entry_is_refused_by_field_and_the_others_are_read(tmp_path: Path, name: str):
     write(tmp_path, {"bad": ENTRIES[name], "good": GOOD})
-    assert list(read_entries(tmp_path)) == ["bad", "good"] and list_views(tmp_path, only=["good"]) == [("good", "v0")]
+    assert list(read_entries(tmp_path)) == ["bad", "good"] and list_views(
+        tmp_path, only=["good"]
+    ) == [("good", "v0")]
     with pytest.raises(DatasetError, match=r"manifest\.json: objects\.bad") as refused:
         read_entry(tmp_path, "bad")
     assert len(str(refused.value)) < 500
@@ -126,7 +146,10 @@ def test_pipes_and_links_to_the_outside_are_refused(tmp_path: Path):
     put(folder / "cup")
     write(folder, {"cup": GOOD})
     assert read_object_mesh(folder, "cup").volume == pytest.approx(0.06**3)
-    for file, read in (("mesh.ply", read_object_mesh), ("v0_noisy.ply", lambda *at: read_view(*at, "v0"))):
+    for file, read in (
+        ("mesh.ply", read_object_mesh),
+        ("v0_noisy.ply", lambda *at: read_view(*at, "v0")),
+    ):
         (folder / "cup" / file).unlink()
         (folder / "cup" / file).symlink_to(tmp_path / "outside" / file)
         with pytest.raises(DatasetError, match="files within"):
@@ -153,8 +176,13 @@ def test_bad_entries_and_names_cost_their_objects_alone(tmp_path: Path):
     put(tmp_path / "objects" / "gone")
     precious = tmp_path / "outside_v0.safetensors"
     precious.write_text("precious")
-    write(tmp_path / "objects", {str(outside): GOOD, "../outside": GOOD, "loose": {"views": 5}, "torn": GOOD})
-    scores = list(evaluate(tmp_path / "objects", load_hand("barrett"), spec=EvaluationSpec(1, starts=5)))
+    write(
+        tmp_path / "objects",
+        {str(outside): GOOD, "../outside": GOOD, "loose": {"views": 5}, "torn": GOOD},
+    )
+    scores = list(
+        evaluate(tmp_path / "objects", load_hand("barrett"), spec=EvaluationSpec(1, starts=5))
+    )
     assert [score.refusal for score in scores] == [Status.BAD_OBJECT] * 4
     assert all(score.note.startswith(("objects: expected", "mesh: expected")) for score in scores)
     assert sum(math.isnan(score.seconds) for score in scores) == 3  # the fourth was looked at
@@ -163,24 +191,36 @@ def test_bad_entries_and_names_cost_their_objects_alone(tmp_path: Path):
 
 @pytest.mark.promise("H2")
 def test_two_names_never_share_a_file_of_grasps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Each view keeps grasps with a score of its own, which its attempts read; nothing is planned or simulated."""
-    objects, grasps = tmp_path / "objects", load_shipped_grasp("jug", "barrett")
+    """Each view keeps grasps with a score of its own, which its attempts read; nothing is planned
+    or simulated.
+    """
+    objects = tmp_path / "objects"
+    grasps = load_shipped_grasp("jug", "barrett")
     put(objects / "a", 0.06, "b_c"), put(objects / "a_b", 0.05, "c")
     view = GOOD["views"]["v0"]
     write(objects, {"a": {"views": {"b_c": view}}, "a_b": {"views": {"c": view}}})
 
     def plan(view: ObjectView, shelf: Path, friction: float, spec: EvaluationSpec) -> ViewScore:
-        dataclasses.replace(grasps, score=torch.full((1,), float(len(view.object)))).save(view.file(shelf))
+        dataclasses.replace(grasps, score=torch.full((1,), float(len(view.object)))).save(
+            view.file(shelf)
+        )
         return dataclasses.replace(view.score, executable=1)
 
     def attempt(
         view: ObjectView, shelf: Path, protocol: Protocol, spec: EvaluationSpec, row: int, draw: int
     ) -> ProtocolResult:
-        return ProtocolResult(row, draw, True, Status.OK, force=float(load_grasps(view.file(shelf)).score))
+        return ProtocolResult(
+            row, draw, True, Status.OK, force=float(load_grasps(view.file(shelf)).score)
+        )
 
     monkeypatch.setattr("torchgrasp.evaluation.sweep._plan", plan)
     monkeypatch.setattr("torchgrasp.evaluation.sweep._try", attempt)
-    scores = list(evaluate(objects, load_hand("barrett"), spec=EvaluationSpec(1), folder=tmp_path / "grasps"))
-    written = sorted(str(x.relative_to(tmp_path / "grasps")) for x in (tmp_path / "grasps").rglob("*.safetensors"))
+    scores = list(
+        evaluate(objects, load_hand("barrett"), spec=EvaluationSpec(1), folder=tmp_path / "grasps")
+    )
+    written = sorted(
+        str(x.relative_to(tmp_path / "grasps"))
+        for x in (tmp_path / "grasps").rglob("*.safetensors")
+    )
     assert written == ["a/b_c.safetensors", "a_b/c.safetensors"]
     assert [attempt.force for score in scores for attempt in score.attempts] == [1.0, 3.0]

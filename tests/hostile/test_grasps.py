@@ -1,4 +1,6 @@
-"""Hostile files of grasps: whatever they hold, they are refused by name, and no error comes from inside."""
+"""Hostile files of grasps: whatever they hold, they are refused by name, and no error comes from
+inside.
+"""
 
 import json
 import os
@@ -54,12 +56,17 @@ SHAPES = {
 def test_a_good_file_is_read(tmp_path: Path, grasps: Grasps):
     tensors = named_tensors(grasps)
     again = load_grasps(write(tmp_path / "g.safetensors", tensors, header(grasps)))
-    assert all(torch.equal(x, tensors[name]) for name, x in named_tensors(again).items()) and again.meta == grasps.meta
+    assert (
+        all(torch.equal(x, tensors[name]) for name, x in named_tensors(again).items())
+        and again.meta == grasps.meta
+    )
 
 
 @pytest.mark.promise("H4")
 @pytest.mark.parametrize("change", SHAPES)
-def test_a_tensor_of_another_shape_or_type_is_refused_by_name(tmp_path: Path, grasps: Grasps, change: str):
+def test_a_tensor_of_another_shape_or_type_is_refused_by_name(
+    tmp_path: Path, grasps: Grasps, change: str
+):
     for name, tensor in named_tensors(grasps).items():
         wrong = named_tensors(grasps) | {name: SHAPES[change](tensor)}
         with pytest.raises(ModelFileError, match="expected "):
@@ -71,21 +78,33 @@ def test_a_tensor_of_another_shape_or_type_is_refused_by_name(tmp_path: Path, gr
     [
         ("obj_from_hand", lambda x: 3 * x, "not rigid"),
         ("obj_from_hand", lambda x: 0 * x, "not rigid"),
-        ("obj_from_hand", lambda x: x * torch.tensor([-1.0, 1, 1, 1], dtype=x.dtype)[:, None], "not rigid"),
-        ("obj_from_hand", lambda x: x + torch.tensor([0, 0, 0, 1.0], dtype=x.dtype)[:, None], "not rigid"),
+        (
+            "obj_from_hand",
+            lambda x: x * torch.tensor([-1.0, 1, 1, 1], dtype=x.dtype)[:, None],
+            "not rigid",
+        ),
+        (
+            "obj_from_hand",
+            lambda x: x + torch.tensor([0, 0, 0, 1.0], dtype=x.dtype)[:, None],
+            "not rigid",
+        ),
         ("status", lambda x: x + 9999, "status"),
         ("status", lambda x: x - 1, "status"),
         ("permutation", lambda x: 0 * x, "permutation"),
         ("permutation", lambda x: x + 7, "permutation"),
     ],
 )
-def test_a_value_that_means_nothing_is_refused(tmp_path: Path, grasps: Grasps, name: str, change: Any, said: str):
+def test_a_value_that_means_nothing_is_refused(
+    tmp_path: Path, grasps: Grasps, name: str, change: Any, said: str
+):
     wrong = named_tensors(grasps) | {name: change(named_tensors(grasps)[name])}
     with pytest.raises(ModelFileError, match=said):
         load_grasps(write(tmp_path / "g.safetensors", wrong, header(grasps)))
 
 
-@pytest.mark.parametrize("meta", ["null", "[]", "5", '"x"', "", "[1,2", "[" * 100_000, "1" * 5000, "NaN", "{}"])
+@pytest.mark.parametrize(
+    "meta", ["null", "[]", "5", '"x"', "", "[1,2", "[" * 100_000, "1" * 5000, "NaN", "{}"]
+)
 def test_metadata_that_is_no_object_is_refused(tmp_path: Path, grasps: Grasps, meta: str):
     with pytest.raises(ModelFileError):
         load_grasps(write(tmp_path / "g.safetensors", named_tensors(grasps), meta))
@@ -111,13 +130,20 @@ def test_a_path_that_is_no_file_is_refused(tmp_path: Path):
 
 @pytest.mark.parametrize("name", ["a" * 5000, "a\0b"])
 def test_a_path_that_no_file_can_have_is_refused_by_every_reader(name: str):
-    for read, suffix in ((read_cloud, ".ply"), (read_mesh, ".stl"), (read_scene, ".npz"), (load_grasps, "")):
+    for read, suffix in (
+        (read_cloud, ".ply"),
+        (read_mesh, ".stl"),
+        (read_scene, ".npz"),
+        (load_grasps, ""),
+    ):
         with pytest.raises(BadArgument, match="expected "):
             read(name + suffix)
 
 
 @pytest.mark.parametrize("format", ["json", "mujoco", "moveit", "ros2"])
-def test_what_is_read_can_be_exported_or_is_refused(tmp_path: Path, grasps: Grasps, format: str, capsys: Any):
+def test_what_is_read_can_be_exported_or_is_refused(
+    tmp_path: Path, grasps: Grasps, format: str, capsys: Any
+):
     good = named_tensors(grasps)
     changes = {
         "joints": good["joints"] + 100,

@@ -1,4 +1,6 @@
-"""A command that is told to end lets go of what it held and says why; standard streams may be full or closed."""
+"""A command that is told to end lets go of what it held and says why; standard streams may be full
+or closed.
+"""
 
 import multiprocessing
 import os
@@ -43,10 +45,15 @@ cli.run_and_exit()
 @pytest.mark.promise("F6")
 @pytest.mark.parametrize(
     ("command", "code", "words", "said"),
-    [("wait", 130, ["works", "tidies", "leaves"], "torchgrasp: interrupted\n"), ("last", 0, ["leaves"], "")],
+    [
+        ("wait", 130, ["works", "tidies", "leaves"], "torchgrasp: interrupted\n"),
+        ("last", 0, ["leaves"], ""),
+    ],
 )
 def test_signals_do_not_disturb_an_end(command: str, code: int, words: list[str], said: str):
-    """An impatient user sends both signals while the command tidies up, and while Python itself ends."""
+    """An impatient user sends both signals while the command tidies up, and while Python itself
+    ends.
+    """
     run = start_process([sys.executable, "-c", ENDING, command], stdout=subprocess.PIPE)
     assert run.stdout is not None
     for word in words:
@@ -94,19 +101,26 @@ if __name__ == "__main__":
 def test_a_command_that_is_told_to_end_says_so_alone_and_leaves_nothing(
     tmp_path: Path, send: str, sign: str, code: int, said: str
 ):
-    """A terminal sends Ctrl-C to all processes of a command; its worker says nothing, and its folder is let go."""
+    """A terminal sends Ctrl-C to all processes of a command; its worker says nothing, and its
+    folder is let go.
+    """
     pytest.importorskip("pebble")
-    script, mark = tmp_path / "script.py", tmp_path / "mark"
+    script = tmp_path / "script.py"
+    mark = tmp_path / "mark"
     script.write_text(WORKING)
     command = [sys.executable, str(script), "work", "--out", str(tmp_path / "out")]
     run = start_process(command, start_new_session=True)
     while run.poll() is None and not mark.exists():
         time.sleep(0.05)
-    getattr(os, send)(run.pid, getattr(signal, sign))  # to all processes of the command, or to the command alone
+    getattr(os, send)(
+        run.pid, getattr(signal, sign)
+    )  # to all processes of the command, or to the command alone
     _, told = run.communicate()
     assert (run.returncode, told) == (code, f"torchgrasp: {said}\n")
     assert sorted(tmp_path.iterdir()) == [mark, script]
-    while Path(f"/proc/{mark.read_text()}").exists():  # a worker that stayed ends the test by its time
+    while Path(
+        f"/proc/{mark.read_text()}"
+    ).exists():  # a worker that stayed ends the test by its time
         time.sleep(0.05)
 
 
@@ -138,7 +152,9 @@ def exit_code_without(closed: set[int], act: Callable[[], int]) -> int | None:
 def test_a_full_disk_behind_stdout_is_named():
     script = "import sys; from torchgrasp.app.cli import main; sys.exit(main(['objects']))"
     with open("/dev/full", "w") as full:
-        run = subprocess.run([sys.executable, "-c", script], stdout=full, stderr=subprocess.PIPE, text=True)
+        run = subprocess.run(
+            [sys.executable, "-c", script], stdout=full, stderr=subprocess.PIPE, text=True
+        )
     assert (run.returncode, run.stderr) == (2, "torchgrasp: [Errno 28] No space left on device\n")
 
 
@@ -148,7 +164,9 @@ def test_without_stdout_a_command_does_its_work():
 
 @pytest.mark.parametrize("closed", [{2}, {1, 2}, {0, 1, 2}])
 def test_without_streams_a_command_ends_as_with_them_and_no_file_takes_their_place(closed):
-    """A command is refused; then a file is opened, which may be no standard stream: libraries print into those."""
+    """A command is refused; then a file is opened, which may be no standard stream: libraries print
+    into those.
+    """
 
     def act() -> int:
         code = cli.main(["cloud", "check", "none.ply"])

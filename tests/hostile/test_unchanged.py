@@ -1,6 +1,8 @@
-"""Public calls, with valid and with hostile arguments, change neither these nor the state of the process.
+"""Public calls, with valid and with hostile arguments, change neither these nor the state of the
+process.
 
-They run in a process of their own: the annotation checks of the tests draw from Python's global generator themselves.
+They run in a process of their own: the annotation checks of the tests draw from Python's global
+    generator themselves.
 """
 
 import dataclasses
@@ -26,10 +28,14 @@ from torchgrasp.values.closing import ClosingOptions
 from torchgrasp.values.specs import TrialSpec
 
 IMPORTED = "sympy", "sapien"
-"""Packages of others that are imported late, and leave a filter of warnings and variables of the environment."""
+"""Packages of others that are imported late, and leave a filter of warnings and variables of the
+environment.
+"""
 ONCE = dataclasses.replace(QUICK, options=ClosingOptions(attempts=1))
 """A trial in which a hand that misses the object ends soon."""
-SWEEP = "from pathlib import Path; from tests.hostile.test_unchanged import sweep; sweep(Path({!r}))"
+SWEEP = (
+    "from pathlib import Path; from tests.hostile.test_unchanged import sweep; sweep(Path({!r}))"
+)
 
 
 def sweep(folder: Path) -> None:
@@ -38,7 +44,8 @@ def sweep(folder: Path) -> None:
     for package in filter(find_spec, IMPORTED):
         import_module(package)
     for name, (make, annotated) in sorted(checked_things().items()):
-        call, hints = make(), hints_of(annotated)
+        call = make()
+        hints = hints_of(annotated)
         good = required(annotated, call, folder)
         least = {Count: 1, TrialSpec | None: ONCE}  # one start, one row, a short trial: little work
         one: dict[str, Any] = {key: least[hint] for key, hint in hints.items() if hint in least}
@@ -73,7 +80,9 @@ def sweep(folder: Path) -> None:
     ],
 )
 def test_changes_are_noticed_even_where_the_call_raises(change, found):
-    given, path, state = {"points": torch.ones(2, 3)}, list(sys.path), random.getstate()
+    given = {"points": torch.ones(2, 3)}
+    path = list(sys.path)
+    state = random.getstate()
 
     def call() -> None:
         change(given)

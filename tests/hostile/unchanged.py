@@ -21,7 +21,9 @@ from torch import Tensor
 
 
 def global_state() -> dict[str, Any]:
-    """Return the state that all code of a process shares, by name; none of it is changed by looking."""
+    """Return the state that all code of a process shares, by name; none of it is changed by
+    looking.
+    """
     mask = os.umask(0)
     os.umask(mask)
     return {
@@ -30,7 +32,11 @@ def global_state() -> dict[str, Any]:
         "generator of torch": digest(torch.get_rng_state()),
         "generator of NumPy": digest(list(np.random.get_state())),  # noqa: NPY002
         "generator of Python": random.getstate(),
-        "gradients": (torch.is_grad_enabled(), torch.is_inference_mode_enabled(), torch.is_anomaly_enabled()),
+        "gradients": (
+            torch.is_grad_enabled(),
+            torch.is_inference_mode_enabled(),
+            torch.is_anomaly_enabled(),
+        ),
         "threads of torch": (torch.get_num_threads(), torch.get_num_interop_threads()),
         "determinism": (
             torch.are_deterministic_algorithms_enabled(),
@@ -75,7 +81,15 @@ def _parts(value: Any, above: tuple[int, ...]) -> Iterator[bytes]:
     if isinstance(value, Tensor):
         yield f"{value.shape} {value.dtype} {value.device} {value.requires_grad} {value._version}".encode()
         if value.layout is torch.strided and not value.is_meta and not value.is_quantized:
-            yield value.detach().resolve_neg().contiguous().reshape(-1).view(torch.uint8).numpy().tobytes()
+            yield (
+                value.detach()
+                .resolve_neg()
+                .contiguous()
+                .reshape(-1)
+                .view(torch.uint8)
+                .numpy()
+                .tobytes()
+            )
     elif isinstance(value, torch.Generator):
         yield value.get_state().numpy().tobytes()
     elif isinstance(value, np.ndarray):
@@ -98,8 +112,11 @@ def _parts(value: Any, above: tuple[int, ...]) -> Iterator[bytes]:
 
 
 def changes(call: Callable[[], object], *arguments: Any) -> list[str]:
-    """Return what a call changed of the global state and of its arguments, whatever it returned or raised."""
-    before, was = global_state(), [digest(x) for x in arguments]
+    """Return what a call changed of the global state and of its arguments, whatever it returned or
+    raised.
+    """
+    before = global_state()
+    was = [digest(x) for x in arguments]
     try:
         call()
     except Exception:  # what may be raised is another test's

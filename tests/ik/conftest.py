@@ -7,9 +7,24 @@ from typing import NamedTuple
 import pytest
 
 from tests.make import load_hand
-from torchgrasp import ContactSpec, Grasps, ShapeGP, Status, certify, fit_shape, load_object, plan_contacts
+from torchgrasp import (
+    ContactSpec,
+    Grasps,
+    ShapeGP,
+    Status,
+    certify,
+    fit_shape,
+    load_object,
+    plan_contacts,
+)
 from torchgrasp.geometry.signed_distance import field_from_surface
-from torchgrasp.ik import CollisionWorld, GraspProblem, PostureLibrary, nearest_postures, solve_joint
+from torchgrasp.ik import (
+    CollisionWorld,
+    GraspProblem,
+    PostureLibrary,
+    nearest_postures,
+    solve_joint,
+)
 from torchgrasp.shape.surface import Surface, extract_surface
 
 
@@ -42,12 +57,16 @@ def jugs():
 
     @functools.cache
     def make(fingertips: int) -> Jug:
-        spec, (shape, surface) = ContactSpec(table=0.0, fingertips=fingertips), jug_shape()
-        plan, hand = plan_contacts(shape, spec, starts=18, seed=2), load_hand("allegro", fingertips)
+        spec = ContactSpec(table=0.0, fingertips=fingertips)
+        (shape, surface) = jug_shape()
+        plan = plan_contacts(shape, spec, starts=18, seed=2)
+        hand = load_hand("allegro", fingertips)
         certificate = certify(plan.contacts, spec)
         good = (plan.status == Status.OK) & certificate.closed
         world = CollisionWorld(field_from_surface(surface.vertices, surface.faces), spec.table)
-        problem = GraspProblem(hand, plan.contacts[good], certificate[good], world, surface.vertices.mean(0))
+        problem = GraspProblem(
+            hand, plan.contacts[good], certificate[good], world, surface.vertices.mean(0)
+        )
         return Jug(problem, PostureLibrary.of(hand, 600), shape, surface, spec)
 
     return make

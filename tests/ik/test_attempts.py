@@ -1,4 +1,6 @@
-"""Attempts: which seeds are refined in which round, the best result of each row, and grasps on fixed contacts."""
+"""Attempts: which seeds are refined in which round, the best result of each row, and grasps on
+fixed contacts.
+"""
 
 import dataclasses
 
@@ -30,8 +32,11 @@ class Outcome(Batch):
 def seeds_of(row: list[int], energy: list[float]) -> IKSeeds:
     """Seeds that `energy` tells apart."""
     g = len(row)
-    order, poses = torch.arange(3).expand(g, 3), torch.eye(4).expand(g, 4, 4)
-    return IKSeeds(torch.zeros(g, 4), poses, torch.tensor(row), order, torch.tensor(energy), torch.zeros(g, 3))
+    order = torch.arange(3).expand(g, 3)
+    poses = torch.eye(4).expand(g, 4, 4)
+    return IKSeeds(
+        torch.zeros(g, 4), poses, torch.tensor(row), order, torch.tensor(energy), torch.zeros(g, 3)
+    )
 
 
 def by_sign(refined: list[list[float]]):
@@ -56,7 +61,9 @@ def test_later_rounds_refine_only_unsolved_triples_and_the_best_is_a_success_or_
     attempts.refine(seeds, rank_in_group(seeds.row), [1, 1], by_sign(refined))
     assert refined == [[5.0, 4.0], [-1.0, 3.0]]  # triple 2 was not to be solved
     assert attempts.unsolved.tolist() == [False, True, False, True]
-    attempts.refine(seeds, rank_in_group(seeds.row), [3], by_sign(refined))  # another refinement starts anew
+    attempts.refine(
+        seeds, rank_in_group(seeds.row), [3], by_sign(refined)
+    )  # another refinement starts anew
     assert refined[2:] == [[4.0, 3.0, -6.0]]
     assert attempts.unsolved.tolist() == [False, False, False, True]
     attempts = Attempts(torch.ones(3, dtype=torch.bool), solves)
@@ -85,7 +92,9 @@ def test_assign_gives_finger_i_its_contact(generator):
 
 
 def test_grasps_are_checked_and_ranked():
-    """Contacts on a ball within the Barrett hand's reach: the executable grasps come first, best first."""
+    """Contacts on a ball within the Barrett hand's reach: the executable grasps come first, best
+    first.
+    """
     hand = load_hand("barrett")
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.035)
     turn = torch.linspace(0, 1.5, 6, dtype=torch.float64)
@@ -94,8 +103,11 @@ def test_grasps_are_checked_and_ranked():
     normals = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], -1)
     contacts = Contacts(0.035 * normals, normals, std_m=flat)
     ones = torch.ones(6, dtype=torch.float64)
-    certificate = Certificate(torch.arange(6, dtype=torch.float64), ones, ones, ones > 0, ones[:, None].expand(6, 6))
-    world, center = CollisionWorld(field_of_mesh(mesh)), torch.zeros(3, dtype=torch.float64)
+    certificate = Certificate(
+        torch.arange(6, dtype=torch.float64), ones, ones, ones > 0, ones[:, None].expand(6, 6)
+    )
+    world = CollisionWorld(field_of_mesh(mesh))
+    center = torch.zeros(3, dtype=torch.float64)
     problem = GraspProblem(hand, contacts, certificate, world, center)
     seeds = query_mixture(hand, contacts, load_mixture("barrett"))
     grasps = solve_contact_first(problem, seeds)
@@ -105,7 +117,9 @@ def test_grasps_are_checked_and_ranked():
     for part in (grasps[good], grasps[~good]):
         assert (part.score.diff() <= 0).all()
     row = certificate.margin.tolist().index(float(grasps.certificate.margin[0]))
-    torch.testing.assert_close(grasps.contacts.points[0], contacts.points[row, grasps.permutation[0]])
+    torch.testing.assert_close(
+        grasps.contacts.points[0], contacts.points[row, grasps.permutation[0]]
+    )
     tips = apply(grasps.obj_from_hand, hand.tip_centres(grasps.joints))[good]
     gap = torch.linalg.vector_norm(tips, dim=-1) - 0.035 - hand.tips.radius
     assert float(gap.abs().max()) < 2.1e-3

@@ -34,27 +34,36 @@ def cylinder_distance(points):
 def test_the_path_is_as_clear_of_the_object_and_the_table_as_said(name):
     hand, grasp = pinch(name)
     posture = Configuration(grasp.pregrasp, grasp.obj_from_hand)
-    direction, clearance = find_approach(hand, posture, CollisionWorld(field_of_mesh(cylinder()), 0.0))
+    direction, clearance = find_approach(
+        hand, posture, CollisionWorld(field_of_mesh(cylinder()), 0.0)
+    )
     assert float(direction.norm()) == pytest.approx(1.0)
     centres, radius = spheres_on_path(posture, hand, direction)
     away = centres[: 81 - 5]  # the last sixteenth is the pre-grasp's own matter
-    least = min(float((cylinder_distance(away) - radius).min()), float((away[..., 2] - radius).min()))
+    least = min(
+        float((cylinder_distance(away) - radius).min()), float((away[..., 2] - radius).min())
+    )
     assert least > 0
     assert float(clearance) == pytest.approx(least, abs=5e-4)
 
 
 def test_a_wall_is_avoided_and_a_cage_leaves_no_path():
     hand, grasp = pinch("allegro")
-    posture, center = Configuration(grasp.pregrasp, grasp.obj_from_hand), grasp.obj_from_hand[0, :3, 3]
+    posture = Configuration(grasp.pregrasp, grasp.obj_from_hand)
+    center = grasp.obj_from_hand[0, :3, 3]
     free, _ = find_approach(hand, posture, CollisionWorld(field_of_mesh(cylinder()), None))
 
     def wall(points):
         """Distance to all that is more than 0.1 m behind the hand on that path."""
         return ((points - center) * free[0]).sum(-1) + 0.1
 
-    other, clearance = find_approach(hand, posture, CollisionWorld(distance_field(wall, center, 0.4, 0.01), None))
+    other, clearance = find_approach(
+        hand, posture, CollisionWorld(distance_field(wall, center, 0.4, 0.01), None)
+    )
     before = (wall(spheres_on_path(posture, hand, free)[0]) - hand.collision_spheres.radius).min()
-    after = (wall(spheres_on_path(posture, hand, other)[0][:-5]) - hand.collision_spheres.radius).min()
+    after = (
+        wall(spheres_on_path(posture, hand, other)[0][:-5]) - hand.collision_spheres.radius
+    ).min()
     assert float(after) > float(before) + 0.02
     assert float(clearance) == pytest.approx(float(after), abs=1e-12)
 
@@ -62,7 +71,9 @@ def test_a_wall_is_avoided_and_a_cage_leaves_no_path():
         """Distance to all that is more than 0.15 m from the middle of the hand."""
         return 0.15 - (points - center).norm(dim=-1)
 
-    _, none = find_approach(hand, posture, CollisionWorld(distance_field(cage, center, 0.4, 0.01), None))
+    _, none = find_approach(
+        hand, posture, CollisionWorld(distance_field(cage, center, 0.4, 0.01), None)
+    )
     assert float(none) < 0
 
 
@@ -72,14 +83,19 @@ def wall_of(normal, origin):
 
 
 def test_the_path_turns_with_hand_and_frame():
-    """A wall behind the hand that leans by 40 degrees leaves most room on the path that is tilted towards it."""
+    """A wall behind the hand that leans by 40 degrees leaves most room on the path that is tilted
+    towards it.
+    """
     hand, grasp = pinch("barrett")
     posture = Configuration(grasp.pregrasp, grasp.obj_from_hand)
     axis, side = torch.eye(3).double()[[2, 0]]
     tilted = math.sqrt(0.5) * (axis + side)
     leaning = math.cos(math.radians(40)) * axis - math.sin(math.radians(40)) * side
     assert torch.equal(hand.approach.double(), axis)
-    motion = rigid(rotation_from_vector(torch.tensor([0.3, -0.8, 0.5]).double()), torch.tensor([0.2, 0.1, -0.3]))
+    motion = rigid(
+        rotation_from_vector(torch.tensor([0.3, -0.8, 0.5]).double()),
+        torch.tensor([0.2, 0.1, -0.3]),
+    )
     clearances = []
     for turn in (torch.eye(4).double(), motion.double()):
         turned = Configuration(posture.joints, turn @ posture.obj_from_hand)
@@ -97,18 +113,30 @@ def test_the_path_turns_with_hand_and_frame():
 
 
 def test_what_is_called_free_is_free_where_the_nearest_node_errs(generator):
-    """Nodes 3 cm apart rank the paths badly; one that is free is chosen all the same, and its clearance is exact."""
+    """Nodes 3 cm apart rank the paths badly; one that is free is chosen all the same, and its
+    clearance is exact.
+    """
     hand, grasp = pinch("allegro")
     posture = Configuration(grasp.pregrasp, grasp.obj_from_hand)
-    centres = SpatialJacobian.at(hand, posture).points(hand.collision_spheres.link_index, hand.collision_spheres.center)
-    middle, radius, erred = centres[0].mean(0), hand.collision_spheres.radius, 0
+    centres = SpatialJacobian.at(hand, posture).points(
+        hand.collision_spheres.link_index, hand.collision_spheres.center
+    )
+    middle = centres[0].mean(0)
+    radius = hand.collision_spheres.radius
+    erred = 0
     for _ in range(8):
         normal = unit(torch.randn(3, generator=generator, dtype=torch.float64))
         directions = approach_directions(hand, posture, None)[0]
-        paths = [spheres_on_path(posture, hand, d[None], FINE_STEPS + 1)[0][:-1] for d in directions]
+        paths = [
+            spheres_on_path(posture, hand, d[None], FINE_STEPS + 1)[0][:-1] for d in directions
+        ]
         room = torch.stack([(wall_of(normal, middle)(path) - radius).min() for path in paths])
-        field = distance_field(wall_of(normal, middle + (room.max() - 1e-3) * normal), middle, 0.42, 0.03)
-        by_node = torch.stack([(field.nearest_node(path) - radius).min() for path in paths]).argmax()
+        field = distance_field(
+            wall_of(normal, middle + (room.max() - 1e-3) * normal), middle, 0.42, 0.03
+        )
+        by_node = torch.stack(
+            [(field.nearest_node(path) - radius).min() for path in paths]
+        ).argmax()
         erred += int(room[by_node] < room.max() - 1e-3)
         direction, clearance = find_approach(hand, posture, CollisionWorld(field, None))
         which = (directions - direction).norm(dim=1).argmin()

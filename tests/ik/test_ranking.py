@@ -13,7 +13,8 @@ from torchgrasp.values.planning import Contacts
 def test_rank_in_group_against_brute_force(generator):
     cost = torch.randint(0, 40, (200,), generator=generator).double()  # with ties
     group = torch.randint(0, 30, (200,), generator=generator)
-    place, counts = torch.zeros(200, dtype=torch.int64), {}
+    place = torch.zeros(200, dtype=torch.int64)
+    counts = {}
     for i in sorted(range(200), key=lambda i: (float(cost[i]), i)):
         place[i] = counts.get(int(group[i]), 0)
         counts[int(group[i])] = int(place[i]) + 1

@@ -1,4 +1,6 @@
-"""From contacts to postures: held-out postures are found again, in any frame; what cannot be reached says so."""
+"""From contacts to postures: held-out postures are found again, in any frame; what cannot be
+reached says so.
+"""
 
 import pytest
 import torch
@@ -13,12 +15,20 @@ from torchgrasp.ik.configuration import Configuration
 
 
 def four_fingers():
-    """The Allegro with all fingers, its postures, and contacts of other postures with their fingers mixed up."""
+    """The Allegro with all fingers, its postures, and contacts of other postures with their fingers
+    mixed up.
+    """
     hand = load_hand("allegro", 4)
     contacts = touched_contacts(hand, sample_configurations(hand, 12, seed=5).joints)
-    order = torch.stack([torch.randperm(4, generator=torch.Generator().manual_seed(k)) for k in range(12)])
+    order = torch.stack(
+        [torch.randperm(4, generator=torch.Generator().manual_seed(k)) for k in range(12)]
+    )
     at = torch.arange(12)[:, None]
-    return hand, PostureLibrary.of(hand, 2000), Contacts(contacts.points[at, order], contacts.normals[at, order])
+    return (
+        hand,
+        PostureLibrary.of(hand, 2000),
+        Contacts(contacts.points[at, order], contacts.normals[at, order]),
+    )
 
 
 def test_contacts_of_four_fingers_are_solved_in_any_order():
@@ -29,7 +39,10 @@ def test_contacts_of_four_fingers_are_solved_in_any_order():
     near(solution.tip_error, miss(hand, solution, contacts), 1e-9)
     assert float(solution.tip_error[solved].max()) < 1e-3
     assert bool((solution.permutation.sort(1).values == torch.arange(4)).all())
-    for options, word in (({"method": "cobyla"}, "method"), ({"mixture": load_mixture("allegro")}, "mixture")):
+    for options, word in (
+        ({"method": "cobyla"}, "method"),
+        ({"mixture": load_mixture("allegro")}, "mixture"),
+    ):
         with pytest.raises(BadArgument, match=rf"{word}: expected three fingertips.*4 fingertips"):
             solve_ik(hand, contacts, library=library, **options)
     with pytest.raises(BadArgument, match=r"contacts\.points"):
@@ -45,9 +58,12 @@ def scene(request):
 
 
 def miss(hand, solution, contacts):
-    """The distance of each round tip's surface point from its contact [m], by the hand's public functions alone."""
+    """The distance of each round tip's surface point from its contact [m], by the hand's public
+    functions alone.
+    """
     at = torch.arange(len(contacts))[:, None]
-    points, normals = contacts.points[at, solution.permutation], contacts.normals[at, solution.permutation]
+    points = contacts.points[at, solution.permutation]
+    normals = contacts.normals[at, solution.permutation]
     centres = apply(solution.obj_from_hand, hand.tip_centres(solution.joints))
     return (centres - hand.tips.radius[:, None] * normals - points).norm(dim=-1)
 
@@ -82,8 +98,11 @@ def test_cobyla_moves_pose_and_joints_until_the_contact_points_meet():
     hand = load_hand("barrett")
     true = real([[0.3, 0.9, 1.0, 0.8], [0.1, 1.2, 0.6, 1.0]])
     points, normals = hand.fingertips(true)
-    contacts, nowhere = Contacts(points, -normals), torch.eye(4, dtype=torch.float64).expand(2, 4, 4)
-    solution = refine_by_cobyla(hand, Configuration(true + 0.05, nowhere), contacts, CollisionWorld())
+    contacts = Contacts(points, -normals)
+    nowhere = torch.eye(4, dtype=torch.float64).expand(2, 4, 4)
+    solution = refine_by_cobyla(
+        hand, Configuration(true + 0.05, nowhere), contacts, CollisionWorld()
+    )
     tips = hand.fingertips(solution.joints)[0]
     assert float((apply(solution.obj_from_hand, tips) - points).norm(dim=-1).max()) < 1e-4
     near(solution.obj_from_hand @ virtual_frame(tips), virtual_frame(points), 1e-9)
@@ -98,7 +117,9 @@ def test_a_table_is_kept_clear_of(scene):
     solution = solve_ik(hand, contacts[:6], mixture, CollisionWorld(table=height), library=library)
     good = solution.status == Status.OK
     cover = hand.collision_spheres
-    lowest = (apply(solution.obj_from_hand, hand.sphere_centres(solution.joints))[..., 2] - cover.radius).amin(1)
+    lowest = (
+        apply(solution.obj_from_hand, hand.sphere_centres(solution.joints))[..., 2] - cover.radius
+    ).amin(1)
     assert bool(good.any()) and bool((lowest[good] >= height).all())
     assert bool((solution.status[~good] >= Status.OUT_OF_REACH).all())
 

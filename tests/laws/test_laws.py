@@ -50,13 +50,17 @@ def test_the_posterior_moves_with_its_observations(seen_cylinder, motion, genera
     )
     turn = motion[:3, :3]
     turned = Observations(
-        x @ turn.T, observations.distance, observations.normal @ turn.T, *list(vars(observations).values())[3:]
+        x @ turn.T,
+        observations.distance,
+        observations.normal @ turn.T,
+        *list(vars(observations).values())[3:],
     )
     origin = torch.zeros(3, dtype=torch.float64)
     here = condition(observations, Normalisation(origin, 0.1), seen_cylinder)
     there = condition(turned, Normalisation(motion[:3, 3], 0.1), seen_cylinder)
     queries = 0.01 * torch.randn(40, 3, generator=generator, dtype=torch.float64)
-    a, b = here.predict(queries), there.predict(apply(motion, queries))
+    a = here.predict(queries)
+    b = there.predict(apply(motion, queries))
     torch.testing.assert_close(a.distance, b.distance, rtol=0, atol=1e-8)
     torch.testing.assert_close(a.normal @ turn.T, b.normal, rtol=0, atol=1e-8)
     torch.testing.assert_close(a.variance, b.variance, rtol=0, atol=1e-8)
@@ -70,7 +74,9 @@ def test_a_shifted_cloud_gives_a_shifted_shape(name):
     shift = torch.tensor([3.0, -2.0, 5.0], dtype=torch.float64)
     queries = view.points[::50]
     a = fit_shape(view, table=0.0).predict(queries)
-    b = fit_shape(PointCloud(view.points + shift, None, view.viewpoint + shift), table=5.0).predict(queries + shift)
+    b = fit_shape(PointCloud(view.points + shift, None, view.viewpoint + shift), table=5.0).predict(
+        queries + shift
+    )
     torch.testing.assert_close(a.distance, b.distance, rtol=0, atol=1e-7)
     torch.testing.assert_close(a.variance, b.variance, rtol=0, atol=1e-7)
 
@@ -92,7 +98,8 @@ def test_certificates_and_codes_ignore_frames_and_units(generator, motion):
 def test_the_code_of_a_permuted_triple_is_the_permuted_set(generator):
     contacts = ball_contacts(10, generator)
     swapped = Contacts(contacts.points.flip(1), contacts.normals.flip(1))
-    a, b = encode(contacts).q, encode(swapped).q
+    a = encode(contacts).q
+    b = encode(swapped).q
     permutations = encode(contacts).permutation.tolist()
     index = [permutations.index([2 - i, 2 - j, 2 - k]) for i, j, k in permutations]
     torch.testing.assert_close(a, b[:, index])
@@ -120,13 +127,18 @@ for threads, path in enumerate({!r}, 1):
 
 @pytest.mark.promise("N10")
 @pytest.mark.slow
-def test_the_same_seed_gives_the_same_grasps_in_another_process_and_with_two_threads_but_for_rounding(tmp_path):
+def test_the_same_seed_gives_the_same_grasps_in_another_process_and_with_two_threads_but_for_rounding(
+    tmp_path,
+):
     paths = [tmp_path / "one", tmp_path / "two", tmp_path / "here"]
     ended = run_python("-c", GRASP.format([str(path) for path in paths[:2]]))
     assert ended.returncode == 0, ended.stderr
-    plan_grasps(load_object("cylinder").view, load_hand("barrett"), starts=20, seed=3).save(paths[2])
+    plan_grasps(load_object("cylinder").view, load_hand("barrett"), starts=20, seed=3).save(
+        paths[2]
+    )
     assert paths[0].read_bytes() == paths[2].read_bytes()
-    one, two = load_grasps(paths[0]), load_grasps(paths[1])
+    one = load_grasps(paths[0])
+    two = load_grasps(paths[1])
     assert len(one) > 0 and torch.equal(one.status, two.status)
     torch.testing.assert_close(one.joints, two.joints, rtol=0, atol=1e-6)
     torch.testing.assert_close(one.obj_from_hand, two.obj_from_hand, rtol=0, atol=1e-6)
@@ -135,16 +147,22 @@ def test_the_same_seed_gives_the_same_grasps_in_another_process_and_with_two_thr
 @pytest.mark.promise("I6")
 @pytest.mark.parametrize("metres", [10.0, 1000.0])
 def test_contacts_far_from_the_origin_are_those_near_it(metres):
-    view, shift = load_object("cylinder").view, metres * torch.tensor([0.6, -0.8, 0.3], dtype=torch.float64)
+    view = load_object("cylinder").view
+    shift = metres * torch.tensor([0.6, -0.8, 0.3], dtype=torch.float64)
     far = PointCloud(view.points + shift, None, view.viewpoint + shift)
-    shapes, plans = [], []
+    shapes = []
+    plans = []
     for cloud, table in ((view, 0.0), (far, float(shift[2]))):
         shapes.append(fit_shape(cloud, table=Plane.horizontal(table)))
         plans.append(plan_contacts(shapes[-1], ContactSpec(table=table), starts=30, seed=0))
     here, there = plans
     assert torch.equal(here.status, there.status) and int((here.status == Status.OK).sum()) > 5
-    torch.testing.assert_close(there.contacts.points - shift, here.contacts.points, rtol=0, atol=1e-8)
-    near = shapes[0].predict(there.contacts.points - shift)  # a normal turns by 32 rad a metre on the way between both
+    torch.testing.assert_close(
+        there.contacts.points - shift, here.contacts.points, rtol=0, atol=1e-8
+    )
+    near = shapes[0].predict(
+        there.contacts.points - shift
+    )  # a normal turns by 32 rad a metre on the way between both
     torch.testing.assert_close(there.contacts.normals, near.normal, rtol=0, atol=1e-10)
 
 
@@ -161,7 +179,9 @@ SIZES = {  # half sides [m]
 @pytest.mark.promise("N1")
 @pytest.mark.parametrize("name", SIZES)
 def test_what_is_tiny_huge_thin_or_long_has_closed_contacts_or_a_status(name):
-    """Whatever is called closed is so by an independent programme; every other row says what it lacks."""
+    """Whatever is called closed is so by an independent programme; every other row says what it
+    lacks.
+    """
     half = np.array(SIZES[name])
     box = trimesh.creation.box(2 * half)
     box.apply_translation([0, 0, half[2]])
@@ -173,15 +193,20 @@ def test_what_is_tiny_huge_thin_or_long_has_closed_contacts_or_a_status(name):
     assert len(plan) == 30 and set(plan.status.tolist()) <= set(map(int, Status))
     for row in plan:
         if int(row.status) == Status.OK:
-            points, normals = row.contacts.points[0].numpy(), row.contacts.normals[0].numpy()
-            assert np.isfinite(points).all() and margin(points, normals, spec.planned_friction, 64) > -1e-9
+            points = row.contacts.points[0].numpy()
+            normals = row.contacts.normals[0].numpy()
+            assert (
+                np.isfinite(points).all()
+                and margin(points, normals, spec.planned_friction, 64) > -1e-9
+            )
     if name == "cube of 1 cm":
         assert not bool((plan.status == Status.OK).any())  # three fingertips have no room
 
 
 def margin(points: np.ndarray, normals: np.ndarray, friction: float, edges: int) -> float:
     """Return the largest s of Eq. (13) by SciPy, from points and outward normals alone."""
-    columns, centre = [], points.mean(0)
+    columns = []
+    centre = points.mean(0)
     radius = np.linalg.norm(points - centre, axis=1).max()
     for point, normal in zip(points, normals, strict=True):
         inward = -normal / np.linalg.norm(normal)
@@ -191,10 +216,16 @@ def margin(points: np.ndarray, normals: np.ndarray, friction: float, edges: int)
         for angle in 2 * np.pi * np.arange(edges) / edges:
             force = inward + friction * (np.cos(angle) * one + np.sin(angle) * two)
             columns.append(np.concatenate([force, np.cross(point - centre, force) / radius]))
-    wrenches, n = np.array(columns).T, len(columns)
-    equal = np.vstack([np.hstack([wrenches, wrenches.sum(1, keepdims=True)]), np.append(np.ones(n), n)])
+    wrenches = np.array(columns).T
+    n = len(columns)
+    equal = np.vstack(
+        [np.hstack([wrenches, wrenches.sum(1, keepdims=True)]), np.append(np.ones(n), n)]
+    )
     found = linprog(
-        np.append(np.zeros(n), -1.0), A_eq=equal, b_eq=[0] * 6 + [1], bounds=[(0, None)] * n + [(None, None)]
+        np.append(np.zeros(n), -1.0),
+        A_eq=equal,
+        b_eq=[0] * 6 + [1],
+        bounds=[(0, None)] * n + [(None, None)],
     )
     return -found.fun if found.status == 0 else -np.inf
 
@@ -212,17 +243,21 @@ def test_friction_and_edges_decide_as_an_independent_programme_does_and_more_nev
     def verdicts(friction: float) -> list[bool]:
         """Whether the independent programme calls each contact set closed, with a cone of 48 edges."""
         return [
-            margin(p, n, friction, 48) > 1e-9 for p, n in zip(contacts.points.numpy(), normals.numpy(), strict=True)
+            margin(p, n, friction, 48) > 1e-9
+            for p, n in zip(contacts.points.numpy(), normals.numpy(), strict=True)
         ]
 
     for friction, edges in itertools.product((0.05, 0.3, 0.8, 2.0), (3, 4, 8, 24)):
         found = certify(contacts, ContactSpec(friction=friction, friction_margin=1.0, edges=edges))
         closed[friction, edges] = found.closed
-        low, high = verdicts(friction * np.cos(np.pi / edges)), verdicts(friction / np.cos(np.pi / 48))
+        low = verdicts(friction * np.cos(np.pi / edges))
+        high = verdicts(friction / np.cos(np.pi / 48))
         for verdict, least, most in zip(found.closed.tolist(), low, high, strict=True):
             assert least <= verdict <= most  # the cone of so many edges lies between two round ones
     for (friction, edges), found in closed.items():
-        assert bool((found <= closed[2.0, edges]).all()) and bool((closed[0.05, edges] <= found).all())
+        assert bool((found <= closed[2.0, edges]).all()) and bool(
+            (closed[0.05, edges] <= found).all()
+        )
         if edges in (4, 8):
             assert bool((found <= closed[friction, 24]).all())
     assert 0 < int(closed[0.3, 8].sum()) < int(closed[2.0, 24].sum())

@@ -22,6 +22,7 @@ def run(request):
     stages = {}
     name, mode = request.param
     note = lambda stage, text, value: stages.update({stage: value})  # noqa: E731
-    view, spec = load_object("cylinder").view, ContactSpec(table=0.0)
+    view = load_object("cylinder").view
+    spec = ContactSpec(table=0.0)
     grasps = plan_grasps(view, load_hand(name), spec, starts=48, mode=mode, observer=note)
     return load_hand(name), grasps, stages

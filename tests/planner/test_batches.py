@@ -20,7 +20,8 @@ from torchgrasp.planner.schedule import FIRST, schedule
 from torchgrasp.values.planning import Certificate, Contacts, IKSeeds
 
 SPEC = ContactSpec(table=0.0)
-HAND, VIEW = load_hand("barrett"), load_object("cylinder").view
+HAND = load_hand("barrett")
+VIEW = load_object("cylinder").view
 
 
 @pytest.fixture(scope="module")
@@ -35,8 +36,12 @@ def whole():
 def streamed():
     """The same batch by batch, and what an observer heard before the first and after it."""
     heard = []
-    stream = stream_grasps(VIEW, HAND, SPEC, 48, observer=lambda stage, text, value: heard.append(stage))
-    before, first, after = heard.copy(), next(stream), heard.copy()
+    stream = stream_grasps(
+        VIEW, HAND, SPEC, 48, observer=lambda stage, text, value: heard.append(stage)
+    )
+    before = heard.copy()
+    first = next(stream)
+    after = heard.copy()
     return [first, *stream], before, after
 
 
@@ -45,7 +50,9 @@ def parts(streamed):
     return streamed[0]
 
 
-def test_the_union_of_the_stream_is_the_batch_call_and_each_batch_is_executable_best_first(whole, parts):
+def test_the_union_of_the_stream_is_the_batch_call_and_each_batch_is_executable_best_first(
+    whole, parts
+):
     grasps, _ = whole
     assert len(parts) > 1
     union = join(parts)
@@ -54,7 +61,11 @@ def test_the_union_of_the_stream_is_the_batch_call_and_each_batch_is_executable_
     assert [int(part.meta["starts"]) for part in parts] == [32, 48]
     assert parts[-1].meta == grasps.meta
     for part in parts:
-        assert len(part) and bool((part.status == Status.OK).all()) and bool(part.certificate.closed.all())
+        assert (
+            len(part)
+            and bool((part.status == Status.OK).all())
+            and bool(part.certificate.closed.all())
+        )
         assert bool((part.score.diff() <= 0).all())
     points = join(parts).contacts.points.flatten(1)
     assert len(points.unique(dim=0)) == len(points)  # no triple twice
@@ -67,11 +78,15 @@ def test_no_batch_is_planned_before_it_is_asked_for(streamed):
 
 def test_a_budget_ends_after_the_batch_that_passes_it(parts):
     heard = []
-    short = plan_grasps(VIEW, HAND, SPEC, 48, time_budget=1e-3, observer=lambda *stage: heard.append(stage))
+    short = plan_grasps(
+        VIEW, HAND, SPEC, 48, time_budget=1e-3, observer=lambda *stage: heard.append(stage)
+    )
     assert same_bits(short[short.status == Status.OK], parts[0])
     assert short.meta["starts"] == "32"
     stages = {stage: value for stage, _, value in heard}
-    assert list(stages) == ["shape", "batch", "plan", "certify", "query", "refine"] and len(heard) == 6
+    assert (
+        list(stages) == ["shape", "batch", "plan", "certify", "query", "refine"] and len(heard) == 6
+    )
     assert len(stages["plan"]) == 32  # what was not planned has no status
     assert len(short) <= FIRST
     for wrong in (0.0, -1.0, float("nan")):
@@ -112,14 +127,21 @@ def test_without_a_grasp_contacts_are_planned_on_smaller_flat_areas():
 def test_a_low_plate_is_grasped_on_its_rim():
     plate = trimesh.creation.box((0.04, 0.08, 0.012))
     plate.apply_translation([0.0, 0.0, 0.006])
-    view, hand, plans = partial_view(plate, look_at(60.0, 35.0, target=plate), seed=1), load_hand("allegro"), []
+    view = partial_view(plate, look_at(60.0, 35.0, target=plate), seed=1)
+    hand = load_hand("allegro")
+    plans = []
     note = lambda stage, text, value: plans.extend([value] * (stage == "plan"))  # noqa: E731
     found = plan_grasps(view, hand, SPEC, 50, observer=note)
     good = found[found.status == Status.OK]
     assert len(good) and not bool((plans[0].status == Status.OK).any())
-    assert float(good.meta["planned_friction"]) == pytest.approx(0.4)  # the margin is spent on lower plates alone
+    assert float(good.meta["planned_friction"]) == pytest.approx(
+        0.4
+    )  # the margin is spent on lower plates alone
     slope = good.contacts.normals[..., 2]
-    assert bool(((good.contacts.points[..., 2] + 0.012 * slope) > 0.0119).all()) and float(slope.amax(1).min()) > 0.0
+    assert (
+        bool(((good.contacts.points[..., 2] + 0.012 * slope) > 0.0119).all())
+        and float(slope.amax(1).min()) > 0.0
+    )
     assert bool(certify(good.contacts, dataclasses.replace(SPEC, friction_margin=1.0)).closed.all())
     strict = dataclasses.replace(SPEC, flat_radius=0.003)
     assert not bool((plan_grasps(view, hand, strict, 50).status == Status.OK).any())
@@ -127,11 +149,18 @@ def test_a_low_plate_is_grasped_on_its_rim():
 
 def test_relaxed_constraints_spend_margins_on_the_rim_alone():
     flat = [spec for spec in ContactSpec().relaxed(0.006, 0.012)]
-    assert [spec.flat_radius for spec in flat] == [0.004, 0.003] and not any(spec.tip_radius for spec in flat)
+    assert [spec.flat_radius for spec in flat] == [0.004, 0.003] and not any(
+        spec.tip_radius for spec in flat
+    )
     rims = list(SPEC.relaxed(0.003, 0.0096))
-    assert [spec.friction_margin for spec in rims] == [0.5, 0.75, 1.0] and len({spec.flat_radius for spec in rims}) == 1
+    assert [spec.friction_margin for spec in rims] == [0.5, 0.75, 1.0] and len(
+        {spec.flat_radius for spec in rims}
+    ) == 1
     assert [spec.tip_radius for spec in rims] == pytest.approx([0.012, 0.0108, 0.0096])
-    assert {spec.tip_radius for spec in dataclasses.replace(SPEC, tip_radius=0.02).relaxed(0.003, 0.0096)} == {0.02}
+    assert {
+        spec.tip_radius
+        for spec in dataclasses.replace(SPEC, tip_radius=0.02).relaxed(0.003, 0.0096)
+    } == {0.02}
     for fixed in (dataclasses.replace(SPEC, flat_radius=0.004), ContactSpec.paper(table=0.0)):
         assert not list(fixed.relaxed(0.008, 0.012))
 
@@ -144,20 +173,37 @@ def test_batches_plan_all_starts_and_try_all_rows():
             assert sum(batch.tried for batch in batches) == min(starts, most)
             assert min(batch.tried for batch in batches) >= min(FIRST, starts)
             assert all(b.tried >= a.tried for a, b in pairwise(batches))
-            assert batches[0].starts >= batches[0].tried and min(batch.starts for batch in batches) >= 0
+            assert (
+                batches[0].starts >= batches[0].tried
+                and min(batch.starts for batch in batches) >= 0
+            )
 
 
 def offer(points, seeds_of):
     """Contacts at the given points; row i has the seeds `seeds_of[i]`, each known by its energy."""
-    n, nan = len(points), torch.full((len(points),), torch.nan, dtype=torch.float64)
+    n = len(points)
+    nan = torch.full((len(points),), torch.nan, dtype=torch.float64)
     row = torch.tensor([i for i, found in enumerate(seeds_of) for _ in found], dtype=torch.int64)
     energy = real([e for found in seeds_of for e in found])
     g = len(row)
-    pose = rigid(torch.eye(3, dtype=torch.float64).expand(g, 3, 3), torch.zeros(g, 3, dtype=torch.float64))
-    seeds = IKSeeds(torch.zeros(g, 4).double(), pose, row, torch.arange(3).repeat(g, 1), energy, torch.zeros(g, 3))
-    certificate = Certificate(nan, nan, nan, torch.ones(n, dtype=torch.bool), torch.zeros(n, 6).double())
-    contacts, seeds = Contacts(points, torch.zeros_like(points)), dataclasses.replace(seeds, row=row)
-    owner, load = torch.zeros(n, dtype=torch.int64), torch.zeros(n, 6).double()
+    pose = rigid(
+        torch.eye(3, dtype=torch.float64).expand(g, 3, 3), torch.zeros(g, 3, dtype=torch.float64)
+    )
+    seeds = IKSeeds(
+        torch.zeros(g, 4).double(),
+        pose,
+        row,
+        torch.arange(3).repeat(g, 1),
+        energy,
+        torch.zeros(g, 3),
+    )
+    certificate = Certificate(
+        nan, nan, nan, torch.ones(n, dtype=torch.bool), torch.zeros(n, 6).double()
+    )
+    contacts = Contacts(points, torch.zeros_like(points))
+    seeds = dataclasses.replace(seeds, row=row)
+    owner = torch.zeros(n, dtype=torch.int64)
+    load = torch.zeros(n, 6).double()
     return SeededContacts(contacts, certificate, seeds, owner, load)
 
 
@@ -194,16 +240,22 @@ def test_sets_that_do_not_resist_the_task_are_taken_only_where_others_lack():
         taken = {int(i) for i in pool.take(most).seeds.energy}
         strong = {i for i in taken if i % 3 == 0}
         assert len(taken) == most and len(strong) == min(most, 10)
-        assert taken - strong == set(sorted(set(range(30)) - set(range(0, 30, 3)))[: most - len(strong)])
+        assert taken - strong == set(
+            sorted(set(range(30)) - set(range(0, 30, 3)))[: most - len(strong)]
+        )
 
 
 def test_the_contact_sets_of_several_clouds_are_chosen_at_once_as_those_of_each_alone():
-    rng, clouds = torch.Generator().manual_seed(4), 3
+    rng = torch.Generator().manual_seed(4)
+    clouds = 3
     points = torch.rand(40, 3, 3, generator=rng, dtype=torch.float64)
     cost = torch.rand(40, generator=rng, dtype=torch.float64)
-    cost[7], owner = torch.inf, torch.randint(clouds - 1, (40,), generator=rng) * 2  # the cloud in the middle has none
+    # the cloud in the middle has none
+    cost[7] = torch.inf
+    owner = torch.randint(clouds - 1, (40,), generator=rng) * 2
     cost[10:34] += WEAK
-    together, alone = Pool(clouds), [Pool(1) for _ in range(clouds)]
+    together = Pool(clouds)
+    alone = [Pool(1) for _ in range(clouds)]
     together.add(offer(points[:0], []), cost[:0])
     assert len(together.take(4).contacts) == 0
     for rows in (torch.arange(15), torch.arange(15, 40)):

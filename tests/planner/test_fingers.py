@@ -37,21 +37,28 @@ ALL = ("index", "middle", "ring", "thumb")
 @pytest.fixture(scope="module")
 def grasps():
     """Grasps of the shipped cylinder with all fingers of the Allegro."""
-    return plan_grasps(load_object("cylinder").view, load_hand("allegro"), SPEC, starts=12, fingers=4)
+    return plan_grasps(
+        load_object("cylinder").view, load_hand("allegro"), SPEC, starts=12, fingers=4
+    )
 
 
 def test_four_fingers_touch_their_contacts_and_close(grasps):
-    hand, good = hand_of(grasps), grasps[grasps.status == Status.OK]
+    hand = hand_of(grasps)
+    good = grasps[grasps.status == Status.OK]
     assert hand.finger_names == ALL and grasps.meta["finger_names"] == ",".join(ALL)
     assert len(good) >= 4 and good.contacts.points.shape[1:] == (4, 3)
     assert bool((good.success > 0.5).any())
     tips = apply(good.obj_from_hand, hand.tip_centres(good.joints))
     wanted = good.contacts.points + hand.tips.radius[:, None] * good.contacts.normals
     assert float((tips - wanted).norm(dim=-1).max()) < 1e-3
-    assert bool((hand.self_clearance(good.joints) >= 0).all()) and bool((hand.self_clearance(good.pregrasp) >= 0).all())
+    assert bool((hand.self_clearance(good.joints) >= 0).all()) and bool(
+        (hand.self_clearance(good.pregrasp) >= 0).all()
+    )
     assert bool((good.permutation.sort(1).values == torch.arange(4)).all())
     for grasp in good:
-        margin, rank = closure_margin(grasp.contacts.points[0], grasp.contacts.normals[0], SPEC.planned_friction)
+        margin, rank = closure_margin(
+            grasp.contacts.points[0], grasp.contacts.normals[0], SPEC.planned_friction
+        )
         assert margin > 1e-8 and rank == 6
 
 
@@ -64,7 +71,9 @@ def test_files_keep_the_fingers_and_forces_of_four_balance(grasps, tmp_path):
     content = json.loads(format_grasps(hand_of(grasps), grasps[:5], 4.0))
     for row in content["grasps"]:
         assert [contact["finger"] for contact in row["contacts"]] == list(ALL)
-        points, normals, forces = (np.array([c[key] for c in row["contacts"]]) for key in ("point", "normal", "force"))
+        points, normals, forces = (
+            np.array([c[key] for c in row["contacts"]]) for key in ("point", "normal", "force")
+        )
         push = -(forces * normals).sum(1)
         assert push.min() > 0 and push.max() == pytest.approx(4.0, rel=1e-6)
         np.testing.assert_allclose(forces.sum(0), 0, atol=1e-6)
@@ -84,24 +93,43 @@ def test_another_hand_or_other_fingers_are_refused_by_name(grasps):
         hand_of(grasps, "barrett")
     for fingers, mode in ((4, "paper"), (4, "contact_first"), ("auto", "paper")):
         with pytest.raises(BadArgument, match="mode"):
-            plan_grasps(load_object("cylinder").view, load_hand("allegro"), fingers=fingers, mode=mode)
-    for spec, word in ((TrialSpec(closing="paper"), "closing"), (TrialSpec(holding="impedance"), "holding")):
+            plan_grasps(
+                load_object("cylinder").view, load_hand("allegro"), fingers=fingers, mode=mode
+            )
+    for spec, word in (
+        (TrialSpec(closing="paper"), "closing"),
+        (TrialSpec(holding="impedance"), "holding"),
+    ):
         pytest.importorskip("sapien")
         with pytest.raises(BadArgument, match=rf"{word}: expected three.*4 fingertips"):
             close_hand(grasps[0], hand_of(grasps), load_object("cylinder").mesh, spec)
 
 
 def test_auto_takes_the_set_whose_best_grasps_are_likeliest_to_succeed():
-    view, hand, notes = load_object("cylinder").view, load_hand("allegro"), []
-    best = plan_grasps(view, hand, SPEC, 6, fingers="auto", observer=lambda *stage: notes.append(stage))
+    view = load_object("cylinder").view
+    hand = load_hand("allegro")
+    notes = []
+    best = plan_grasps(
+        view, hand, SPEC, 6, fingers="auto", observer=lambda *stage: notes.append(stage)
+    )
     hands = finger_sets(hand, "auto")
-    assert [one.finger_names for one in hands] == [hand.finger_names, ALL, ("index", "middle", "ring")]
+    assert [one.finger_names for one in hands] == [
+        hand.finger_names,
+        ALL,
+        ("index", "middle", "ring"),
+    ]
     told = [text for stage, text, _ in notes if stage == "fingers"]
-    assert len(told) == 3 and all(", ".join(one.finger_names) in text for one, text in zip(hands, told, strict=True))
+    assert len(told) == 3 and all(
+        ", ".join(one.finger_names) in text for one, text in zip(hands, told, strict=True)
+    )
     planned = [value for stage, _, value in notes if stage == "fingers"]
     likeliest = max(range(3), key=lambda k: expected_success(planned[k]))
     alone = plan_grasps(view, hands[likeliest], SPEC, 6)
-    assert same_bits(best, planned[likeliest]) and best.meta == alone.meta and torch.equal(best.joints, alone.joints)
+    assert (
+        same_bits(best, planned[likeliest])
+        and best.meta == alone.meta
+        and torch.equal(best.joints, alone.joints)
+    )
     stages = [stage for stage, _, _ in notes if stage != "fingers"]
     assert stages == ["shape", "plan", "certify", "query", "refine"]
 
@@ -112,14 +140,21 @@ def test_the_command_grasps_with_the_fingers_asked_for(tmp_path, capsys):
     assert cli.main([*words, "--fingers", "4"]) == 0
     assert load_grasps(tmp_path / "grasps.safetensors").meta["finger_names"] == ",".join(ALL)
     assert "ring" in (tmp_path / "report.html").read_text()
-    assert cli.main(["export", str(tmp_path / "grasps.safetensors"), "--out", str(tmp_path / "a.json")]) == 0
+    assert (
+        cli.main(
+            ["export", str(tmp_path / "grasps.safetensors"), "--out", str(tmp_path / "a.json")]
+        )
+        == 0
+    )
     assert len(json.loads((tmp_path / "a.json").read_text())["grasps"][0]["contacts"]) == 4
     assert cli.main([*words, "--fingers", "index,thumb"]) == 2
     assert "--fingers" in capsys.readouterr().err
 
 
 def test_a_thing_of_a_scene_is_grasped_with_the_fingers_asked_for(monkeypatch):
-    scene, hand, asked = load_scene(), load_hand("allegro"), []
+    scene = load_scene()
+    hand = load_hand("allegro")
+    asked = []
     best = plan_scene(scene, hand, starts=6, fingers=4, enough=0.0).things[0]
     assert best.grasps is not None, best.reason
     assert hand_of(best.grasps, hand).finger_names == ALL and best.grasps.joints.shape[1] == 16

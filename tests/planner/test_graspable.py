@@ -24,10 +24,13 @@ BOX = (0.0, 0.0, 0.06, 0.1)
 
 def without(scene: Scene, rows: torch.Tensor) -> Scene:
     """Return the scene without the depth of some of its points."""
-    depth, labels = scene.image.depth.clone(), torch.zeros(scene.image.depth.shape, dtype=torch.int64)
+    depth = scene.image.depth.clone()
+    labels = torch.zeros(scene.image.depth.shape, dtype=torch.int64)
     depth[tuple(scene.pixels[rows].T)] = 0.0
     labels[tuple(scene.pixels.T)] = scene.labels
-    return Scene.from_depth(depth, INTRINSICS, scene.image.obj_from_camera, labels=labels, table=scene.table)
+    return Scene.from_depth(
+        depth, INTRINSICS, scene.image.obj_from_camera, labels=labels, table=scene.table
+    )
 
 
 def glass() -> Scene:
@@ -65,13 +68,18 @@ def test_an_object_is_judged_by_its_picture(status):
 
 
 def test_a_lower_object_than_the_least_height_offers_no_rim_on_which_a_tip_sticks():
-    slope, rim = torch.linspace(0.0, 1.0, 10_001, dtype=torch.float64), 0.003
+    slope = torch.linspace(0.0, 1.0, 10_001, dtype=torch.float64)
+    rim = 0.003
     for friction, radius in itertools.product((0.0, 0.3, 0.8), (0.008, 0.012, 0.02)):
         spec = ContactSpec(friction=friction, edges=1024, tip_radius=radius)
         sticks = slope <= friction * (1 - slope**2).sqrt()
-        lowest = (radius - radius * slope + rim - rim * slope)[sticks].min()  # the tip's centre is a radius high
+        lowest = (radius - radius * slope + rim - rim * slope)[
+            sticks
+        ].min()  # the tip's centre is a radius high
         assert spec.least_height == pytest.approx(float(lowest), abs=1e-5)
-        assert dataclasses.replace(spec, flat_radius=rim).least_height == pytest.approx(radius + rim)
+        assert dataclasses.replace(spec, flat_radius=rim).least_height == pytest.approx(
+            radius + rim
+        )
 
 
 def test_only_objects_beside_the_table_are_refused_cut_off_feet_and_distance_refuse_nothing():
@@ -79,7 +87,8 @@ def test_only_objects_beside_the_table_are_refused_cut_off_feet_and_distance_ref
     scene = see((0.262, 0.095, 0.03, 0.12), (-0.1, 0.0, 0.06, 0.1))
     assert int(scene.pixels[scene.labels == 1, 0].max()) == scene.image.depth.shape[0] - 1
     assert judge_things(scene, HAND)[1] is Status.OK
-    near, far = see((0.1, 0.0, 0.06, 0.1), (-0.15, 0.0, 0.06, 0.1)), None
+    near = see((0.1, 0.0, 0.06, 0.1), (-0.15, 0.0, 0.06, 0.1))
+    far = None
     coarse = dataclasses.replace(near.image, intrinsics=near.image.intrinsics / 40)
     far = dataclasses.replace(near, image=coarse)
     assert order_by_ease(near) in ([1, 2], [2, 1]) and order_by_ease(far) == order_by_ease(near)
@@ -93,7 +102,8 @@ def test_a_hand_spans_what_its_pads_enclose_and_a_shape_that_may_be_anything_is_
 
 
 def test_refused_objects_are_not_planned(monkeypatch):
-    scene, planned = see((0.2, 0.0, 0.1, 0.004), BOX, (-0.15, 0.1, 0.1, 0.0035)), []
+    scene = see((0.2, 0.0, 0.1, 0.004), BOX, (-0.15, 0.1, 0.1, 0.0035))
+    planned = []
 
     def plan(scene, plan):
         planned.append(scene.target)
@@ -107,12 +117,17 @@ def test_refused_objects_are_not_planned(monkeypatch):
 def test_a_vague_shape_ends_the_planning_with_its_status(monkeypatch):
     monkeypatch.setattr("torchgrasp.planner.scene.is_vague", lambda shape: True)
     (thing,) = plan_scene(see(BOX), HAND, starts=5).things
-    assert thing.status is Status.TOO_VAGUE and thing.reason == thing.status.sentence and thing.grasps is None
+    assert (
+        thing.status is Status.TOO_VAGUE
+        and thing.reason == thing.status.sentence
+        and thing.grasps is None
+    )
 
 
 def see_box(size: tuple[float, float, float], x: float, y: float, distance: float = 0.7) -> Scene:
     """Return the scene of a box on the table, and of a smaller one beside it."""
-    box, cube = trimesh.creation.box(size), trimesh.creation.box([0.05, 0.05, 0.03])
+    box = trimesh.creation.box(size)
+    cube = trimesh.creation.box([0.05, 0.05, 0.03])
     box.apply_translation([x, y, size[2] / 2])
     cube.apply_translation([0.1, -0.12, 0.015])
     camera = look_at(20.0, 45.0, distance)
@@ -152,7 +167,9 @@ def test_the_success_of_a_good_grasp_of_a_whole_box_is_known():
 def test_a_heap_of_specks_costs_no_planning(monkeypatch):
     scene = see(BOX)
     tile = scene.pixels // 8
-    labels = torch.where(scene.labels == 0, 1 + tile[:, 0] % 5 + 5 * (tile[:, 1] % 6), 0) * (tile.sum(-1) % 9 == 0)
+    labels = torch.where(scene.labels == 0, 1 + tile[:, 0] % 5 + 5 * (tile[:, 1] % 6), 0) * (
+        tile.sum(-1) % 9 == 0
+    )
     many = dataclasses.replace(scene, labels=labels * (torch.rand(len(labels)) < 0.02))
     monkeypatch.setattr("torchgrasp.planner.scene._plan_thing", None)
     plan = plan_scene(many, HAND)
@@ -164,4 +181,7 @@ def test_an_object_partly_hidden_is_less_easy(label):
     scene = see((-0.1, 0.0, 0.06, 0.1), (0.1, 0.0, 0.06, 0.1))
     row, column = scene.pixels[scene.labels == label].double().mean(0)
     hidden = (scene.labels == label) & (scene.pixels[:, 0] > row) & (scene.pixels[:, 1] > column)
-    assert order_by_ease(dataclasses.replace(scene, labels=torch.where(hidden, 0, scene.labels)))[-1] == label
+    assert (
+        order_by_ease(dataclasses.replace(scene, labels=torch.where(hidden, 0, scene.labels)))[-1]
+        == label
+    )

@@ -1,4 +1,6 @@
-"""Many clouds in one call: the grasps of each are those of a call of its own, on any number of processes."""
+"""Many clouds in one call: the grasps of each are those of a call of its own, on any number of
+processes.
+"""
 
 import pytest
 import torch
@@ -57,7 +59,9 @@ def test_what_no_row_can_have_is_refused_before_any_work():
 @pytest.mark.parametrize(("name", "fingers", "workers"), [("barrett", 3, 1), ("allegro", 4, 0)])
 def test_clouds_that_are_planned_at_once_have_the_grasps_of_each_alone(name, fingers, workers):
     hand = load_hand(name) if fingers == 3 else load_hand(name, fingers)
-    clouds, spec, task = [load_object("jug").view, SMALL, cup_view(0.004)], ContactSpec(table=0.0), GraspTask(0.1)
+    clouds = [load_object("jug").view, SMALL, cup_view(0.004)]
+    spec = ContactSpec(table=0.0)
+    task = GraspTask(0.1)
     requests = [Request(cloud, hand, spec, 12, task=task) for cloud in clouds]
     together = list(plan_stacks(requests, estimate_shapes(requests, workers), torch.device("cpu")))
     assert "refused" in together[1].meta
@@ -68,9 +72,14 @@ def test_clouds_that_are_planned_at_once_have_the_grasps_of_each_alone(name, fin
 
 
 def share_found(expected, found):
-    """The share of grasps that another result has, too: with this status, these joints, pose, score and interval."""
+    """The share of grasps that another result has, too: with this status, these joints, pose, score
+    and interval.
+    """
     rows = [
-        torch.cat([x.status[:, None], x.joints, x.obj_from_hand.flatten(1), x.score[:, None], x.interval], 1)
+        torch.cat(
+            [x.status[:, None], x.joints, x.obj_from_hand.flatten(1), x.score[:, None], x.interval],
+            1,
+        )
         for x in (expected, found)
     ]
     return float((torch.cdist(*rows, p=torch.inf).amin(1) < 1e-6).double().mean())

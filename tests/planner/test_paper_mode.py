@@ -18,7 +18,8 @@ SPEC = ContactSpec.paper(table=0.0)
 @pytest.fixture(scope="module")
 def run():
     stages = {}
-    hand, view = load_hand("allegro"), load_object("jug").view
+    hand = load_hand("allegro")
+    view = load_object("jug").view
     note = lambda stage, text, value: stages.update({stage: value})  # noqa: E731
     return hand, plan_grasps(view, hand, SPEC, starts=16, mode="paper", observer=note), stages
 
@@ -26,7 +27,9 @@ def run():
 def test_shape_contacts_eq21_seeds_and_ranking_are_the_papers(run):
     _, grasps, stages = run
     shape = stages["shape"]
-    assert len(shape.x) == 70 and int((~shape.has_normal).sum()) == 21  # the centre and 20 points outside
+    assert (
+        len(shape.x) == 70 and int((~shape.has_normal).sum()) == 21
+    )  # the centre and 20 points outside
     assert grasps.meta["mode"] == "paper" and grasps.meta["ranking"] == "variance"
     estimate = shape.predict(grasps.contacts.points)
     assert float(estimate.variance.max()) < 0.03 + 1e-6  # Eq. (12)
@@ -41,7 +44,9 @@ def test_shape_contacts_eq21_seeds_and_ranking_are_the_papers(run):
     _, grasps, _ = run
     mixed = grasps[torch.randperm(len(grasps), generator=torch.Generator().manual_seed(0))]
     ranked = rank_by_variance(mixed)
-    assert torch.equal(ranked.status != Status.OK, (ranked.status != Status.OK).sort(stable=True).values)
+    assert torch.equal(
+        ranked.status != Status.OK, (ranked.status != Status.OK).sort(stable=True).values
+    )
     good = ranked[ranked.status == Status.OK]
     total = good.contacts.variance.sum(1)
     assert torch.equal(total, total.sort().values)
@@ -60,10 +65,14 @@ def test_every_assignment_that_eq21_accepts_is_tried_until_enough_grasps_are_exe
 @pytest.mark.parametrize("name", ["allegro", "barrett"])
 def test_the_model_of_mode_paper_knows_small_triples_better(name):
     hand = load_hand(name)
-    own, other = (load_mixture(hand.urdf_path.parent / f"{file}.safetensors") for file in ("paper", "mixture"))
+    own, other = (
+        load_mixture(hand.urdf_path.parent / f"{file}.safetensors") for file in ("paper", "mixture")
+    )
     samples = sample_configurations(hand, 3000, seed=5, sampling="grasping")
     small = samples.q[samples.q[:, :3].mean(1) < 0.045]
-    accepted = [float((model.energy(small) < PAPER_ENERGY).double().mean()) for model in (own, other)]
+    accepted = [
+        float((model.energy(small) < PAPER_ENERGY).double().mean()) for model in (own, other)
+    ]
     assert len(small) > 30 and accepted[0] > 1.2 * accepted[1]
 
 
@@ -82,7 +91,9 @@ def test_eq24_contact_points_meet_the_contacts_and_the_hand_is_clear(run):
         assert float(heights.min()) >= SPEC.table
     surface = extract_surface(stages["shape"])
     links = apply(good.obj_from_hand, hand.sphere_centres(good.joints))[:, ~cover.touching]
-    for centre, radius in zip(links.flatten(0, 1), cover.radius[~cover.touching].repeat(len(good)), strict=True):
+    for centre, radius in zip(
+        links.flatten(0, 1), cover.radius[~cover.touching].repeat(len(good)), strict=True
+    ):
         away = centre - surface.vertices
         nearest = int(away.norm(dim=-1).argmin())
         # vertices are 4 mm apart, so their tangent planes tell the distance to a millimetre or two

@@ -1,4 +1,6 @@
-"""Grasps that resist a task: the loads in the caller's frame, their proof, and what becomes of weaker grasps."""
+"""Grasps that resist a task: the loads in the caller's frame, their proof, and what becomes of
+weaker grasps.
+"""
 
 import json
 
@@ -7,7 +9,15 @@ import torch
 
 from tests.contacts.test_resist import by_highs
 from tests.make import directions, load_hand, random_motion, real, same_bits
-from torchgrasp import ContactSpec, GraspTask, Status, explain_empty, load_grasps, load_object, plan_grasps
+from torchgrasp import (
+    ContactSpec,
+    GraspTask,
+    Status,
+    explain_empty,
+    load_grasps,
+    load_object,
+    plan_grasps,
+)
 from torchgrasp.app.report.page import grasp_columns, grasp_rows
 from torchgrasp.export import format_grasps
 from torchgrasp.foundation.errors import BadArgument
@@ -22,7 +32,8 @@ from torchgrasp.planner.stack import Stack
 from torchgrasp.success import TaskWrenches
 from torchgrasp.success.task import loads_of
 
-HAND, VIEW = load_hand("allegro"), load_object("jug").view
+HAND = load_hand("allegro")
+VIEW = load_object("jug").view
 FRAME = random_motion(7)
 SPEC = ContactSpec(table=Plane.horizontal(0.0).moved(FRAME))
 MASS = 0.2
@@ -31,7 +42,9 @@ MASS = 0.2
 @pytest.fixture(scope="module")
 def poured():
     """Grasps that resist pouring, of a jug on a tilted table."""
-    return plan_grasps(move(VIEW, FRAME), HAND, SPEC, 30, task=GraspTask(MASS), resist=("lift", "pour"))
+    return plan_grasps(
+        move(VIEW, FRAME), HAND, SPEC, 30, task=GraspTask(MASS), resist=("lift", "pour")
+    )
 
 
 def test_every_tilt_of_the_weight_is_resisted_and_weaker_grasps_say_so(poured):
@@ -43,16 +56,24 @@ def test_every_tilt_of_the_weight_is_resisted_and_weaker_grasps_say_so(poured):
     tilted = directions(300)
     tilted = rotate(FRAME, tilted[tilted[:, 2] < 0.5])  # at most 120 degrees from straight down
     for grasp in good[:3]:
-        points, normals = grasp.contacts.points[0], grasp.contacts.normals[0]
+        points = grasp.contacts.points[0]
+        normals = grasp.contacts.normals[0]
         load = grasp.certificate.task_load[0]
         centre = points.mean(0) + offset(load)  # the object's, seen from that of the contacts
         for force in 9.81 * MASS * tilted[::20]:
             wrench = torch.cat([force, torch.linalg.cross(centre, force)])
-            assert by_highs(points, normals, grasp.certificate.task_strength[0].numpy(), wrench.numpy()) >= 1 - 1e-9
+            assert (
+                by_highs(
+                    points, normals, grasp.certificate.task_strength[0].numpy(), wrench.numpy()
+                )
+                >= 1 - 1e-9
+            )
 
 
 def offset(load):
-    """The arm on which the force of a load has its torque; the part along the force does not matter."""
+    """The arm on which the force of a load has its torque; the part along the force does not
+    matter.
+    """
     return torch.linalg.cross(load[:3], load[3:]) / load[:3].square().sum()
 
 
@@ -60,7 +81,9 @@ def test_no_drive_gives_more_than_its_torque_for_the_strength_of_a_fingertip(pou
     good = poured[poured.status == Status.OK]
     obj_from_hand = good.obj_from_hand
     jacobian = HAND.jacobian(good.joints, apply(inverse(obj_from_hand), good.contacts.points))
-    push = -good.certificate.task_strength[..., None] * rotate(inverse(obj_from_hand), good.contacts.normals)
+    push = -good.certificate.task_strength[..., None] * rotate(
+        inverse(obj_from_hand), good.contacts.normals
+    )
     torque = torch.einsum("gfih,gfi->gfh", jacobian, push).abs()
     share = (torque / real([HAND.actuators[name].effort for name in HAND.joint_names])).amax(-1)
     assert float(share.max()) < 1 + 1e-9
@@ -71,24 +94,34 @@ def test_the_proof_is_saved_exported_and_shown(poured, tmp_path):
     poured.save(tmp_path / "grasps.safetensors")
     assert same_bits(load_grasps(tmp_path / "grasps.safetensors"), poured)
     best = json.loads(format_grasps(HAND, poured[:1]))["grasps"][0]
-    assert best["task_margin"] == float(poured.certificate.task_margin[0]) and len(best["task_forces"]) == 3
+    assert (
+        best["task_margin"] == float(poured.certificate.task_margin[0])
+        and len(best["task_forces"]) == 3
+    )
     assert grasp_columns(poured)[-1] == "task margin"
     assert grasp_rows(poured, 1)[0][-1] == f"{best['task_margin']:.2f}"
     assert "pour" in poured.meta["resist"] and "0.2 kg" in poured.meta["resist"]
 
 
 def test_wrenches_about_a_point_are_those_of_the_callers_frame():
-    point, about = real([0.1, 0.2, 0.3]), real([[1.0, 2.0, 3.0, 0.1, 0.2, 0.3]])
+    point = real([0.1, 0.2, 0.3])
+    about = real([[1.0, 2.0, 3.0, 0.1, 0.2, 0.3]])
     for given in (point, None):
         (there,) = loads_of(
-            TaskWrenches(about, given), 1.0, apply(inverse(FRAME), point[None])[0], inverse(FRAME), True
+            TaskWrenches(about, given),
+            1.0,
+            apply(inverse(FRAME), point[None])[0],
+            inverse(FRAME),
+            True,
         )
         force, torque = rotate(FRAME, there.view(2, 3))
         foot = FRAME[:3, 3]  # the origin of the upright frame
         torch.testing.assert_close(force, about[0, :3])
         torch.testing.assert_close(torque, about[0, 3:] + torch.linalg.cross(point - foot, force))
     down = loads_of("lift", 1.0, torch.zeros(3).double(), inverse(FRAME), False)[0, :3]
-    torch.testing.assert_close(rotate(FRAME, down[None])[0], real([0.0, 0.0, -9.81]))  # of the cloud, without a table
+    torch.testing.assert_close(
+        rotate(FRAME, down[None])[0], real([0.0, 0.0, -9.81])
+    )  # of the cloud, without a table
     with pytest.raises(BadArgument, match="wrenches"):
         TaskWrenches(torch.zeros(1, 6))
     with pytest.raises(BadArgument, match=r"resist: .*no load"):
@@ -96,27 +129,36 @@ def test_wrenches_about_a_point_are_those_of_the_callers_frame():
 
 
 def test_many_clouds_resist_alone_as_together():
-    hand, spec, views = load_hand("barrett"), ContactSpec(table=0.0), [VIEW, load_object("cylinder").view]
+    hand = load_hand("barrett")
+    spec = ContactSpec(table=0.0)
+    views = [VIEW, load_object("cylinder").view]
     alone = plan_grasps(views, hand, spec, 4, resist="lift")
     requests = [Request(view, hand, spec, 4, resist="lift") for view in views]
     stacked = plan_stacks(requests, estimate_shapes(requests, 0), torch.device("cpu"))
     for one, other in zip(alone, stacked, strict=True):
         assert torch.equal(one.status, other.status)
         shared = one.status == Status.OK
-        torch.testing.assert_close(one.certificate.task_margin[shared], other.certificate.task_margin[shared])
+        torch.testing.assert_close(
+            one.certificate.task_margin[shared], other.certificate.task_margin[shared]
+        )
 
 
 def test_a_load_that_is_too_great_is_named_and_given_up():
     heavy = TaskWrenches(real([[0.0, 0.0, -500.0, 0.0, 0.0, 0.0]]))
     told = explain_empty(VIEW, HAND, ContactSpec(table=0.0), 20, resist=heavy)
     assert told.best is not None and told.best.words == "without resist"
-    assert told.funnel.reason is Status.NOT_RESISTED and told.funnel.stages[0].lost[Status.NOT_RESISTED] > 0
+    assert (
+        told.funnel.reason is Status.NOT_RESISTED
+        and told.funnel.stages[0].lost[Status.NOT_RESISTED] > 0
+    )
 
 
 def could_resist(stack, contacts, owner, strength) -> list[bool]:
     """Whether contacts of these strengths [N] resist all loads of their cloud, by HiGHS."""
     found = list[bool]()
-    for p, n, own, most in zip(contacts.points, contacts.normals, owner.tolist(), strength, strict=True):
+    for p, n, own, most in zip(
+        contacts.points, contacts.normals, owner.tolist(), strength, strict=True
+    ):
         loads = stack.problems[own].loads.numpy()
         found.append(all(by_highs(p, n, most.numpy(), load) >= 1 for load in loads))
     return found
@@ -126,14 +168,23 @@ def could_resist(stack, contacts, owner, strength) -> list[bool]:
 def steered():
     """The plan of two clouds that must resist pushes, with the contact sets that the hand may try."""
     views = [VIEW, load_object("cylinder").view]
-    stack = Stack.of([Problem.of(Request(x, HAND, ContactSpec(table=0.0), 40, resist="push"), HAND) for x in views])
+    stack = Stack.of(
+        [
+            Problem.of(Request(x, HAND, ContactSpec(table=0.0), 40, resist="push"), HAND)
+            for x in views
+        ]
+    )
     plan, owner = next(stack.plans())
     told = {}
-    found = find_contacts(stack, plan, owner, 1000, lambda stage, value, **_: told.update({stage: value}))
+    found = find_contacts(
+        stack, plan, owner, 1000, lambda stage, value, **_: told.update({stage: value})
+    )
     return stack, (plan, owner), told["plan"], found
 
 
-def test_the_hand_tries_the_contact_sets_that_resist_with_the_greatest_forces_and_the_plan_says_so_of_others(steered):
+def test_the_hand_tries_the_contact_sets_that_resist_with_the_greatest_forces_and_the_plan_says_so_of_others(
+    steered,
+):
     stack, (plan, owner), told, found = steered
     rows = torch.nonzero(plan.status == Status.OK)[:, 0]
     strength = torch.full((len(rows), 3), 15.0)  # the greatest force of a finger
@@ -146,12 +197,18 @@ def test_the_hand_tries_the_contact_sets_that_resist_with_the_greatest_forces_an
 
 def test_contact_sets_and_postures_that_resist_the_worst_load_come_first(steered):
     found, cost = contact_costs(steered[0], steered[-1])
-    seeds, contacts = found.seeds, assign(found.contacts, found.seeds)
+    seeds = found.seeds
+    contacts = assign(found.contacts, found.seeds)
     hand_from_obj = inverse(seeds.obj_from_hand)
     jacobian = HAND.jacobian(seeds.joints, apply(hand_from_obj, contacts.points))
     torque = torch.einsum("gfih,gfi->gfh", jacobian, rotate(hand_from_obj, contacts.normals)).abs()
-    strength = (real([HAND.actuators[name].effort for name in HAND.joint_names]) / torque).amin(-1).clamp(max=15)
-    points, loads = contacts.points - contacts.points.mean(1, keepdim=True), found.load[seeds.row]
+    strength = (
+        (real([HAND.actuators[name].effort for name in HAND.joint_names]) / torque)
+        .amin(-1)
+        .clamp(max=15)
+    )
+    points = contacts.points - contacts.points.mean(1, keepdim=True)
+    loads = found.load[seeds.row]
     rows = zip(points, contacts.normals, strength.numpy(), loads.numpy(), strict=True)
     margins = real([by_highs(*row) for row in rows]).clamp(max=1)
     of_sets = [margins[seeds.row == row] for row in range(len(cost))]

@@ -17,7 +17,8 @@ HAND = load_hand("barrett")
 
 
 def test_room_and_height_are_easy_and_what_something_lies_on_is_not():
-    near, flat = (0.0, 0.0, 0.06, 0.1), (0.15, 0.0, 0.06, 0.015)
+    near = (0.0, 0.0, 0.06, 0.1)
+    flat = (0.15, 0.0, 0.06, 0.015)
     scene = see(near, (0.0, 0.07, 0.06, 0.1), flat, (-0.15, 0.1, 0.06, 0.1))
     assert order_by_ease(scene)[0] == 4
     covered = see((0.0, 0.0, 0.1, 0.05), (0.0, 0.0, 0.06, 0.06, 0.05), (0.2, 0.0, 0.04, 0.1))
@@ -53,8 +54,12 @@ def test_no_link_comes_into_a_neighbour_whose_presence_lowers_success_unless_pus
 
 def test_a_scene_in_another_frame_gives_the_same_grasps():
     boxes = (0.0, 0.0, 0.06, 0.12), (0.0, -0.1, 0.06, 0.14)
-    pose = rigid(rotation_from_vector(torch.tensor([0.3, 1.0, -2.0]).double()), torch.tensor([0.5, -1.0, 2.0]).double())
-    here, there = see(*boxes).select(1), see(*boxes, pose=pose).select(1)
+    pose = rigid(
+        rotation_from_vector(torch.tensor([0.3, 1.0, -2.0]).double()),
+        torch.tensor([0.5, -1.0, 2.0]).double(),
+    )
+    here = see(*boxes).select(1)
+    there = see(*boxes, pose=pose).select(1)
     there = dataclasses.replace(there, table=here.table.moved(pose))  # a fit differs by rounding
     first, second = (plan_grasps(scene, HAND, starts=10) for scene in (here, there))
     assert torch.equal(first.status, second.status)
@@ -63,7 +68,8 @@ def test_a_scene_in_another_frame_gives_the_same_grasps():
 
 
 def test_reachable_is_asked_in_the_given_frame_and_its_word_counts():
-    scene, asked = see((0.0, 0.0, 0.06, 0.12)).select(1), []
+    scene = see((0.0, 0.0, 0.06, 0.12)).select(1)
+    asked = []
 
     def reachable(obj_from_hand):
         asked.append(obj_from_hand)
@@ -73,7 +79,9 @@ def test_reachable_is_asked_in_the_given_frame_and_its_word_counts():
     good = grasps[grasps.status == Status.OK]
     assert len(good) and float(good.obj_from_hand[:, 0, 3].min()) > 0.0
     places = torch.cat(asked)[:, :3, 3]
-    assert float(apply(torch.eye(4).double(), places)[:, 2].max()) < 0.6  # palms near the box, in the scene's frame
+    assert (
+        float(apply(torch.eye(4).double(), places)[:, 2].max()) < 0.6
+    )  # palms near the box, in the scene's frame
 
 
 def test_things_are_ranked_with_reasons():

@@ -1,15 +1,26 @@
-"""Grasps whose contacts keep to regions: in every frame, in scenes, and explained where there are none."""
+"""Grasps whose contacts keep to regions: in every frame, in scenes, and explained where there are
+none.
+"""
 
 import pytest
 import torch
 
 from tests.make import load_hand, random_motion, see
-from torchgrasp import ContactSpec, Region, Status, explain_empty, load_object, plan_grasps, plan_scene
+from torchgrasp import (
+    ContactSpec,
+    Region,
+    Status,
+    explain_empty,
+    load_object,
+    plan_grasps,
+    plan_scene,
+)
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.geometry.plane import Plane, move
 
-HAND, VIEW = load_hand("barrett"), load_object("jug").view
+HAND = load_hand("barrett")
+VIEW = load_object("jug").view
 
 
 def test_all_contacts_are_inside_keep_and_outside_avoid_in_the_frame_of_the_caller():
@@ -51,7 +62,11 @@ def test_the_marked_object_of_a_scene_is_held_where_it_is_marked():
 
 
 def test_what_is_no_distance_is_told_by_the_name_of_its_argument():
-    for name, wrong in (("keep", lambda x: x), ("avoid", lambda x: 3.0), ("keep", Region(lambda x: x[:, 0] / 0))):
+    for name, wrong in (
+        ("keep", lambda x: x),
+        ("avoid", lambda x: 3.0),
+        ("keep", Region(lambda x: x[:, 0] / 0)),
+    ):
         with pytest.raises(BadArgument, match=f"^{name}: .*one finite number each"):
             plan_grasps(VIEW, HAND, starts=4, **{name: wrong})
 

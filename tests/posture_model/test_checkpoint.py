@@ -1,4 +1,6 @@
-"""A fit that was killed goes on at its last step, to the same bits; several processes fit what one does."""
+"""A fit that was killed goes on at its last step, to the same bits; several processes fit what one
+does.
+"""
 
 import dataclasses
 from pathlib import Path
@@ -39,25 +41,32 @@ def fit_until(step: int, path: Path, samples: HandSamples) -> None:
 
 @pytest.mark.promise("F2")
 def test_a_fit_goes_on_where_it_was_killed(tmp_path):
-    samples, path = ring(), tmp_path / "fit.safetensors"
+    samples = ring()
+    path = tmp_path / "fit.safetensors"
     whole = fit_mixture(samples, 5, iterations=20, tolerance=0.0)
     for step in (1, 3, 8):  # killed three times
         fit_until(step, path, samples)
     steps: list[FitProgress] = []
-    again = fit_mixture(samples, 5, iterations=20, tolerance=0.0, checkpoint=path, observer=steps.append)
+    again = fit_mixture(
+        samples, 5, iterations=20, tolerance=0.0, checkpoint=path, observer=steps.append
+    )
     assert len(steps) == 20 - (1 + 3 + 8)
     assert torch.equal(parameters(again), parameters(whole))
     assert again.meta == whole.meta
     # Asked once more, the finished fit takes no step; with more iterations it takes those.
     assert torch.equal(
-        parameters(fit_mixture(samples, 5, iterations=20, tolerance=0.0, checkpoint=path)), parameters(whole)
+        parameters(fit_mixture(samples, 5, iterations=20, tolerance=0.0, checkpoint=path)),
+        parameters(whole),
     )
     longer = fit_mixture(samples, 5, iterations=25, tolerance=0.0, checkpoint=path)
-    assert torch.equal(parameters(longer), parameters(fit_mixture(samples, 5, iterations=25, tolerance=0.0)))
+    assert torch.equal(
+        parameters(longer), parameters(fit_mixture(samples, 5, iterations=25, tolerance=0.0))
+    )
 
 
 def test_the_checkpoint_of_another_fit_a_damaged_one_and_bad_folders_are_refused(tmp_path):
-    samples, path = ring(), tmp_path / "fit.safetensors"
+    samples = ring()
+    path = tmp_path / "fit.safetensors"
     fit_mixture(samples, 5, iterations=2, checkpoint=path)
     moved = dataclasses.replace(samples, joints=samples.joints * (1 + 1e-6))
     for other, given in [
@@ -73,7 +82,11 @@ def test_the_checkpoint_of_another_fit_a_damaged_one_and_bad_folders_are_refused
             fit_mixture(other, **given, iterations=2, checkpoint=path)
     mixture = fit_mixture(samples, 5, iterations=2, checkpoint=path)
     data = path.read_bytes()
-    for damaged in (b"", data[: len(data) // 2], mixture.save(tmp_path / "mixture.safetensors").read_bytes()):
+    for damaged in (
+        b"",
+        data[: len(data) // 2],
+        mixture.save(tmp_path / "mixture.safetensors").read_bytes(),
+    ):
         path.write_bytes(damaged)
         with pytest.raises(ModelFileError):
             fit_mixture(samples, 5, checkpoint=path)
@@ -97,17 +110,22 @@ parts = fit_mixture(share, 5, seed=3, iterations=60, distributed=True, subset=40
 parts.save(path + f"/parts{{rank}}.safetensors")
 torch.distributed.destroy_process_group()
 """)
-    done = run_python("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script))
+    done = run_python(
+        "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script)
+    )
     assert done.returncode == 0, done.stderr
     first, second = (load_mixture(tmp_path / f"{rank}.safetensors") for rank in (0, 1))
     assert torch.equal(parameters(first), parameters(second))
     one = fit_mixture(ring(), 5, seed=3, iterations=25, tolerance=0.0)
     torch.testing.assert_close(parameters(first), parameters(one), rtol=1e-9, atol=1e-12)
     assert first.meta == one.meta
-    parts, one = load_mixture(tmp_path / "parts1.safetensors"), fit_mixture(ring(), 5, 3, 60, subset=400, starts=2)
+    parts = load_mixture(tmp_path / "parts1.safetensors")
+    one = fit_mixture(ring(), 5, 3, 60, subset=400, starts=2)
     torch.testing.assert_close(parameters(parts), parameters(one), rtol=1e-7, atol=1e-10)
     # One process goes on where two stood.
-    longer = fit_mixture(ring(), 5, seed=3, iterations=30, tolerance=0.0, checkpoint=tmp_path / "fit")
+    longer = fit_mixture(
+        ring(), 5, seed=3, iterations=30, tolerance=0.0, checkpoint=tmp_path / "fit"
+    )
     assert longer.meta["iterations"] == "30"
 
 
@@ -123,11 +141,19 @@ def test_processes_whose_checkpoints_differ_are_all_refused_and_no_group_is_name
     mixture = fit_mixture(ring(), 5, iterations=2, checkpoint=path)
     shapes = {"weights", "means", "covariances", "reseeded", "log_likelihood", "centre", "scale"}
     tensors, meta = load_tensors(path, "em", shapes)
-    settings = {name: meta[name] for name in ("rows", "components", "seed", "starts", "regularisation")}
+    settings = {
+        name: meta[name] for name in ("rows", "components", "seed", "starts", "regularisation")
+    }
     alone = Checkpoint(path, DataRows(ring().rows()), tensors["centre"], tensors["scale"], settings)
     progress = alone.load()
-    assert progress is not None and len(progress.log_likelihood) == 2 == int(mixture.meta["iterations"])
-    with pytest.raises(BadArgument, match="some processes see"):  # although 2 steps are the mean of 1, 2 and 3
+    assert progress is not None and len(progress.log_likelihood) == 2 == int(
+        mixture.meta["iterations"]
+    )
+    with pytest.raises(
+        BadArgument, match="some processes see"
+    ):  # although 2 steps are the mean of 1, 2 and 3
         dataclasses.replace(alone, shard=OtherProcesses(ring().rows(), 1, 3)).load()
-    with pytest.raises(BadArgument, match=r"distributed: expected .*got True in a process without a group"):
+    with pytest.raises(
+        BadArgument, match=r"distributed: expected .*got True in a process without a group"
+    ):
         fit_mixture(ring(), 5, distributed=True)

@@ -1,4 +1,6 @@
-"""Samples on disk: the same bytes for any number of workers and after a kill; faults of the disk; damaged folders."""
+"""Samples on disk: the same bytes for any number of workers and after a kill; faults of the disk;
+damaged folders.
+"""
 
 import json
 import os
@@ -32,14 +34,17 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("sampling", ["uniform", "grasping"])
-def test_a_folder_holds_what_sample_configurations_returns_for_any_number_of_workers(tmp_path, small, sampling):
+def test_a_folder_holds_what_sample_configurations_returns_for_any_number_of_workers(
+    tmp_path, small, sampling
+):
     hand = load_hand("barrett")
     spec = SampleSpec(1700, 3, sampling)
     written = write_samples(hand, spec, tmp_path / "one")
     write_samples(hand, spec, tmp_path / "three", workers=3)
     assert contents(tmp_path / "one") == contents(tmp_path / "three")
     assert len(contents(tmp_path / "one")) == 5
-    result, truth = load_samples(tmp_path / "one"), sample_configurations(hand, 1700, seed=3, sampling=sampling)
+    result = load_samples(tmp_path / "one")
+    truth = sample_configurations(hand, 1700, seed=3, sampling=sampling)
     assert result == written
     assert len(result) == 1700
     assert [len(chunk) for chunk in result] == [500, 500, 500, 200]
@@ -55,12 +60,17 @@ def test_a_folder_holds_what_sample_configurations_returns_for_any_number_of_wor
 
 def test_a_folder_serves_a_loader_posture_by_posture(tmp_path, small):
     write_samples(load_hand("barrett"), SampleSpec(1100), tmp_path)
-    samples, whole = load_samples(tmp_path), load_samples(tmp_path).read()
+    samples = load_samples(tmp_path)
+    whole = load_samples(tmp_path).read()
     drawn = torch.Generator().manual_seed(0)
-    batches = list(torch.utils.data.DataLoader(samples, batch_size=64, shuffle=True, generator=drawn))
+    batches = list(
+        torch.utils.data.DataLoader(samples, batch_size=64, shuffle=True, generator=drawn)
+    )
     joints, codes = (torch.cat(parts) for parts in zip(*batches, strict=True))
     order = torch.cat([joints, codes], 1)[:, 0].argsort()
-    assert torch.equal(joints[order], whole.joints[whole.joints[:, 0].argsort()]) and codes.shape == (1100, 6)
+    assert torch.equal(
+        joints[order], whole.joints[whole.joints[:, 0].argsort()]
+    ) and codes.shape == (1100, 6)
     assert torch.equal(samples[-1][1], whole.q[1099])
     with pytest.raises(IndexError):
         samples[1100]
@@ -94,17 +104,34 @@ sys.exit(main({arguments!r}))
 
 @pytest.mark.promise("F1")
 def test_a_run_that_was_interrupted_and_killed_is_continued_to_the_same_bytes(tmp_path, small):
-    hand, n, folder = load_hand("barrett"), 3500, tmp_path / "killed"
-    arguments = ["hand", "sample", "--hand", "barrett", "--n", str(n), "--out", str(folder), "--workers", "2"]
+    hand = load_hand("barrett")
+    n = 3500
+    folder = tmp_path / "killed"
+    arguments = [
+        "hand",
+        "sample",
+        "--hand",
+        "barrett",
+        "--n",
+        str(n),
+        "--out",
+        str(folder),
+        "--workers",
+        "2",
+    ]
     for sign, expected, held in ((signal.SIGINT, 130, 2), (signal.SIGKILL, -signal.SIGKILL, 5)):
         before = {path: path.stat().st_mtime_ns for path in folder.glob("chunk-*")}
-        run = subprocess.Popen([sys.executable, "-c", HELD_RUN.format(held=held, arguments=arguments)])
+        run = subprocess.Popen(
+            [sys.executable, "-c", HELD_RUN.format(held=held, arguments=arguments)]
+        )
         while run.poll() is None and len(list(folder.glob("chunk-*"))) < held:
             time.sleep(0.01)
         os.kill(run.pid, sign)
         assert run.wait() == expected
         assert len(before) < held <= len(list(folder.glob("chunk-*"))) < 7
-        assert all(path.stat().st_mtime_ns == then for path, then in before.items())  # whole chunks were kept
+        assert all(
+            path.stat().st_mtime_ns == then for path, then in before.items()
+        )  # whole chunks were kept
     with pytest.raises(ModelFileError, match="without"):
         load_samples(folder)
     write_samples(hand, SampleSpec(n), folder)
@@ -118,17 +145,26 @@ def test_half_a_chunk_is_never_taken_for_a_whole_one(tmp_path, small):
     write_samples(hand, SampleSpec(1100), tmp_path)
     whole = contents(tmp_path)
     chunk = tmp_path / "chunk-000001.safetensors"
-    for damaged in (whole[chunk.name][:-8], b"", whole["chunk-000000.safetensors"], whole["chunk-000002.safetensors"]):
+    for damaged in (
+        whole[chunk.name][:-8],
+        b"",
+        whole["chunk-000000.safetensors"],
+        whole["chunk-000002.safetensors"],
+    ):
         chunk.write_bytes(damaged)
         with pytest.raises(ModelFileError, match="chunk-000001"):
             load_samples(tmp_path).read()
-        (tmp_path / ".chunk-000001.safetensors.abc.part").write_bytes(damaged)  # of a run that was killed
+        (tmp_path / ".chunk-000001.safetensors.abc.part").write_bytes(
+            damaged
+        )  # of a run that was killed
         write_samples(hand, SampleSpec(1100), tmp_path)
         assert contents(tmp_path) == whole
 
 
 @pytest.mark.promise("F3")
-def test_a_full_disk_leaves_nothing_half_written_and_the_run_goes_on_later(tmp_path, small, monkeypatch):
+def test_a_full_disk_leaves_nothing_half_written_and_the_run_goes_on_later(
+    tmp_path, small, monkeypatch
+):
     hand = load_hand("barrett")
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
@@ -146,7 +182,9 @@ def test_a_full_disk_leaves_nothing_half_written_and_the_run_goes_on_later(tmp_p
         write_samples(hand, SampleSpec(1100), tmp_path / "full")
 
 
-@pytest.mark.parametrize("half", [".samples.json.abc123.part", ".chunk-000000.safetensors.abc123.part"])
+@pytest.mark.parametrize(
+    "half", [".samples.json.abc123.part", ".chunk-000000.safetensors.abc123.part"]
+)
 def test_a_run_killed_between_a_temporary_file_and_its_name_is_continued(tmp_path, small, half):
     (tmp_path / half).write_text("{")
     write_samples(load_hand("barrett"), SampleSpec(600), tmp_path)
@@ -179,7 +217,9 @@ def test_a_folder_in_use_or_of_other_samples_or_files_is_refused(tmp_path, small
     with hold_folder(held), pytest.raises(OutputError, match=f"in use by process {os.getpid()} on"):
         write_samples(hand, SampleSpec(100), held)
     held.mkdir(exist_ok=True)
-    (held / ".lock").write_text("process 1 on nowhere")  # left by a run that was killed: nobody holds it
+    (held / ".lock").write_text(
+        "process 1 on nowhere"
+    )  # left by a run that was killed: nobody holds it
     write_samples(hand, SampleSpec(100), held)
     assert not (held / ".lock").exists()
 
@@ -189,9 +229,19 @@ def test_a_damaged_manifest_and_what_is_none_are_refused(tmp_path, small):
     path = tmp_path / "samples.json"
     good = json.loads(path.read_text())
     for change in (
-        {"n": 0}, {"n": True}, {"n": 10**12}, {"n": "600"}, {"joint_names": []}, {"joint_names": "abcd"}, {"seed": 0},
-        {"chunk": 7}, {"version": 2}, {"torchgrasp": "grasps"}, {"joint_names": ["a"]}, {"hand": "allegro"},
-    ):  # fmt: skip
+        {"n": 0},
+        {"n": True},
+        {"n": 10**12},
+        {"n": "600"},
+        {"joint_names": []},
+        {"joint_names": "abcd"},
+        {"seed": 0},
+        {"chunk": 7},
+        {"version": 2},
+        {"torchgrasp": "grasps"},
+        {"joint_names": ["a"]},
+        {"hand": "allegro"},
+    ):
         path.write_text(json.dumps(good | change))
         with pytest.raises(ModelFileError):
             load_samples(tmp_path).read()
@@ -208,7 +258,12 @@ def test_command(tmp_path, small, capsys):
     assert main([*arguments, "--out", str(tmp_path / "a")]) == 0
     assert "700 grasping postures of barrett" in capsys.readouterr().out
     assert len(load_samples(tmp_path / "a")) == 700
-    for wrong, named in [(["--hand", "fist"], "--hand"), (["--n", "0"], "--n"), (["--seed", "-1"], "--seed"),
-                         (["--fingers", "toes"], "--fingers"), (["--seed", "1"], "--out")]:  # fmt: skip
+    for wrong, named in [
+        (["--hand", "fist"], "--hand"),
+        (["--n", "0"], "--n"),
+        (["--seed", "-1"], "--seed"),
+        (["--fingers", "toes"], "--fingers"),
+        (["--seed", "1"], "--out"),
+    ]:
         assert main([*arguments, "--out", str(tmp_path / "a"), *wrong]) == 2
         assert f"torchgrasp: {named}" in capsys.readouterr().err

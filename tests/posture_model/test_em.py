@@ -29,21 +29,30 @@ def clustered(n: int = 6000, d: int = 5, m: int = 4) -> torch.Tensor:
     rng = np.random.default_rng(3)
     turn = rng.normal(size=(m, d, d)) * 0.5
     which = rng.integers(m, size=n)
-    x = rng.normal(size=(m, d))[which] * 2 + np.einsum("nij,nj->ni", turn[which], rng.normal(size=(n, d)))
+    x = rng.normal(size=(m, d))[which] * 2 + np.einsum(
+        "nij,nj->ni", turn[which], rng.normal(size=(n, d))
+    )
     return torch.from_numpy((x - x.mean(0)) / x.std(0))
 
 
-def test_eq19_features_give_the_gaussian_density_and_eq20_one_component_the_sample_moments(generator):
-    d, m = 4, 3
+def test_eq19_features_give_the_gaussian_density_and_eq20_one_component_the_sample_moments(
+    generator,
+):
+    d = 4
+    m = 3
     root = torch.randn(m, d, d, generator=generator, dtype=torch.float64)
     covariances = root @ root.transpose(1, 2) + 0.1 * torch.eye(d, dtype=torch.float64)
     means = torch.randn(m, d, generator=generator, dtype=torch.float64)
     weights = real([0.2, 0.3, 0.5])
     x = torch.randn(50, d, generator=generator, dtype=torch.float64)
-    result = coefficients_from_components(Components(weights, means, covariances)) @ features_from_data(x)
+    result = coefficients_from_components(
+        Components(weights, means, covariances)
+    ) @ features_from_data(x)
     for k in range(m):
         gaussian = torch.distributions.MultivariateNormal(means[k], covariances[k])
-        torch.testing.assert_close(result[k], gaussian.log_prob(x) + weights[k].log(), rtol=1e-9, atol=1e-9)
+        torch.testing.assert_close(
+            result[k], gaussian.log_prob(x) + weights[k].log(), rtol=1e-9, atol=1e-9
+        )
     x = clustered()
     result = components_from_sums(features_from_data(x).sum(1)[None], len(x), 0.0)
     torch.testing.assert_close(result.weights, torch.ones(1, dtype=torch.float64))
@@ -54,7 +63,9 @@ def test_eq19_features_give_the_gaussian_density_and_eq20_one_component_the_samp
 @pytest.mark.promise("N11")
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 def test_eq20_em_equals_scikit_learn_from_the_same_start():
-    x, m, steps = clustered(), 6, 15
+    x = clustered()
+    m = 6
+    steps = 15
     start = start_components(DataRows(x), m, seed=0, regularisation=1e-6)
     ours = expectation_maximisation(DataRows(x), start, steps, tolerance=0.0, regularisation=1e-6)
     first = start.components
@@ -78,7 +89,11 @@ def test_eq20_em_equals_scikit_learn_from_the_same_start():
 def test_log_likelihood_never_decreases(m):
     x = clustered()
     fit = expectation_maximisation(
-        DataRows(x), start_components(DataRows(x), m, 1, 1e-6), 60, tolerance=0.0, regularisation=1e-6
+        DataRows(x),
+        start_components(DataRows(x), m, 1, 1e-6),
+        60,
+        tolerance=0.0,
+        regularisation=1e-6,
     )
     assert float(fit.log_likelihood.diff().min()) >= -1e-9
     # The last entry belongs to the components that are returned.
@@ -90,9 +105,13 @@ def test_start_finds_separate_clusters_by_the_seed_and_names_fewer_rows_than_com
     x = clustered()
     first, second = (start_components(DataRows(x), 5, 7, 1e-6) for _ in range(2))
     assert torch.equal(first.components.means, second.components.means)
-    assert not torch.equal(first.components.means, start_components(DataRows(x), 5, 8, 1e-6).components.means)
+    assert not torch.equal(
+        first.components.means, start_components(DataRows(x), 5, 8, 1e-6).components.means
+    )
     centres = real([[-2.0, 0], [2, 0], [0, 3]])
-    x = (centres[:, None] + 0.05 * torch.randn(3, 200, 2, generator=generator, dtype=torch.float64)).flatten(0, 1)
+    x = (
+        centres[:, None] + 0.05 * torch.randn(3, 200, 2, generator=generator, dtype=torch.float64)
+    ).flatten(0, 1)
     start = start_components(DataRows(x), 3, 0, 0.0).components
     torch.testing.assert_close(start.weights, torch.full((3,), 1 / 3, dtype=torch.float64))
     assert float(torch.cdist(centres, start.means).amin(1).max()) < 0.02
@@ -120,7 +139,9 @@ def test_a_collapsed_component_is_placed_anew_and_the_fit_recovers():
     start = start_components(DataRows(x), 3, 0, 1e-6)
     # A component so far away that no row belongs to it: it takes half of the heaviest one.
     means = start.components.means.index_fill(0, torch.tensor([1]), 50.0)
-    lost = FitProgress(dataclasses.replace(start.components, means=means), start.reseeded, start.log_likelihood)
+    lost = FitProgress(
+        dataclasses.replace(start.components, means=means), start.reseeded, start.log_likelihood
+    )
     steps: list[FitProgress] = []
     fit = expectation_maximisation(DataRows(x), lost, 200, 1e-6, 1e-6, observer=steps.append)
     assert fit.reseeded.tolist() == [0, 1, 0]
@@ -147,7 +168,9 @@ def test_a_component_is_placed_anew_three_times_and_no_more():
         middle = (result.means[2] + result.means[heaviest]) / 2
         torch.testing.assert_close(middle, sums[heaviest, 1:6] / sums[heaviest, 0])
         # apart by one standard deviation along the longest axis
-        spread, axes = torch.linalg.eigh(components_from_sums(sums, len(x), 0.0).covariances[heaviest])
+        spread, axes = torch.linalg.eigh(
+            components_from_sums(sums, len(x), 0.0).covariances[heaviest]
+        )
         apart = (result.means[2] - result.means[heaviest]).abs()
         torch.testing.assert_close(apart, spread[-1].sqrt() * axes[:, -1].abs())
     with pytest.raises(IndefiniteCovariance, match=r"component 2, of 0\.0 rows, collapsed 4 times"):

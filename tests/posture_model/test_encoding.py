@@ -34,23 +34,35 @@ def test_eq18_code_by_hand_and_bad_arguments(generator):
 
 
 @pytest.mark.promise("N6")
-def test_eq18_code_is_invariant_under_motion_and_sign_and_ties_no_normals_to_the_triangle(generator, motion):
+def test_eq18_code_is_invariant_under_motion_and_sign_and_ties_no_normals_to_the_triangle(
+    generator, motion
+):
     points, normals = triples(100, generator)
     q = encode_fingertips(points, normals)
     torch.testing.assert_close(encode_fingertips(apply(motion, points), rotate(motion, normals)), q)
     torch.testing.assert_close(encode_fingertips(points, -normals), q)
     mirror = real([1.0, 1.0, -1.0])
-    torch.testing.assert_close(encode_fingertips(points * mirror, normals), encode_fingertips(points, normals))
-    torch.testing.assert_close(encode_fingertips(points, rotate(motion, normals)), encode_fingertips(points, normals))
+    torch.testing.assert_close(
+        encode_fingertips(points * mirror, normals), encode_fingertips(points, normals)
+    )
+    torch.testing.assert_close(
+        encode_fingertips(points, rotate(motion, normals)), encode_fingertips(points, normals)
+    )
 
 
 def test_eq15_to_eq18_codes_and_frames_of_all_six_permutations(generator):
     points, normals = triples(20, generator)
     code = encode((points, normals))
-    assert [tuple(p) for p in code.permutation.tolist()] == list(PERMUTATIONS) == list(itertools.permutations(range(3)))
+    assert (
+        [tuple(p) for p in code.permutation.tolist()]
+        == list(PERMUTATIONS)
+        == list(itertools.permutations(range(3)))
+    )
     assert code.q.shape == (20, 6, 6)
     for k, order in enumerate(PERMUTATIONS):
-        torch.testing.assert_close(code.q[:, k], encode_fingertips(points[:, list(order)], normals[:, list(order)]))
+        torch.testing.assert_close(
+            code.q[:, k], encode_fingertips(points[:, list(order)], normals[:, list(order)])
+        )
     for k, order in enumerate(PERMUTATIONS):
         torch.testing.assert_close(code.obj_from_vf[:, k], virtual_frame(points[:, list(order)]))
         local = apply(inverse(code.obj_from_vf[:, k]), points[:, list(order)])

@@ -13,7 +13,9 @@ from torchgrasp.posture_model.training import TRIAL_STEPS, fit_mixture
 
 
 def banana(n: int = 4000, unit: float = 1.0) -> HandSamples:
-    """Two joints and a code that depends on them, smoothly and with little noise; lengths in `unit` metres."""
+    """Two joints and a code that depends on them, smoothly and with little noise; lengths in `unit`
+    metres.
+    """
     rng = np.random.default_rng(4)
     joints = rng.uniform(-1, 1, size=(n, 2))
     a, b = joints.T
@@ -35,7 +37,9 @@ def test_eq20_fit_reports_what_it_did_and_the_bic_of_one_gaussian_in_closed_form
     mean = float(mixture.log_prob(samples.rows()).mean())
     assert math.isclose(float(mixture.meta["log_likelihood"]), mean, abs_tol=1e-5)
     # The mixture has the mean of its data: a property of every step of EM.
-    torch.testing.assert_close(mixture.weights @ mixture.means, samples.rows().mean(0), rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(
+        mixture.weights @ mixture.means, samples.rows().mean(0), rtol=1e-6, atol=1e-6
+    )
     samples = banana(500)
     mixture = fit_mixture(samples, 1, regularisation=0.0)
     covariance = torch.cov(samples.rows().T, correction=0)
@@ -46,22 +50,32 @@ def test_eq20_fit_reports_what_it_did_and_the_bic_of_one_gaussian_in_closed_form
 
 
 def test_eq23_more_components_predict_better_and_units_do_not_matter():
-    train, test = banana(), banana(1000)
-    errors = [float((fit_mixture(train, m).joints(test.q) - test.joints).abs().mean()) for m in (1, 4, 16)]
+    train = banana()
+    test = banana(1000)
+    errors = [
+        float((fit_mixture(train, m).joints(test.q) - test.joints).abs().mean()) for m in (1, 4, 16)
+    ]
     assert errors[0] > errors[1] > errors[2]
     assert errors[2] < 0.1
-    metres, millimetres = fit_mixture(banana(), 5), fit_mixture(banana(unit=1e-3), 5)
+    metres = fit_mixture(banana(), 5)
+    millimetres = fit_mixture(banana(unit=1e-3), 5)
     unit = torch.tensor([1.0, 1, 1e3, 1e3, 1e3, 1, 1, 1], dtype=torch.float64)
     torch.testing.assert_close(metres.weights, millimetres.weights, rtol=1e-6, atol=1e-9)
     torch.testing.assert_close(metres.means * unit, millimetres.means, rtol=1e-6, atol=1e-9)
-    torch.testing.assert_close(metres.covariances * unit[:, None] * unit, millimetres.covariances, rtol=1e-5, atol=1e-9)
+    torch.testing.assert_close(
+        metres.covariances * unit[:, None] * unit, millimetres.covariances, rtol=1e-5, atol=1e-9
+    )
 
 
 def test_same_seed_same_mixture_and_the_likeliest_of_several_starts_goes_on():
     samples = banana(1500)
-    first, second = fit_mixture(samples, 4, seed=2), fit_mixture(samples, 4, seed=2)
+    first = fit_mixture(samples, 4, seed=2)
+    second = fit_mixture(samples, 4, seed=2)
     assert torch.equal(first.covariances, second.covariances)
-    alone = [fit_mixture(samples, 6, seed=seed, iterations=TRIAL_STEPS, tolerance=0.0) for seed in (2, 3, 4)]
+    alone = [
+        fit_mixture(samples, 6, seed=seed, iterations=TRIAL_STEPS, tolerance=0.0)
+        for seed in (2, 3, 4)
+    ]
     best = max(alone, key=lambda mixture: float(mixture.meta["log_likelihood"]))
     together = fit_mixture(samples, 6, seed=2, iterations=TRIAL_STEPS, tolerance=0.0, starts=3)
     assert len({mixture.meta["log_likelihood"] for mixture in alone}) == 3
@@ -69,7 +83,10 @@ def test_same_seed_same_mixture_and_the_likeliest_of_several_starts_goes_on():
     # The steps of the trial count, and more follow.
     assert together.meta["iterations"] == str(TRIAL_STEPS)
     assert fit_mixture(samples, 6, iterations=1).meta["iterations"] == "1"
-    assert fit_mixture(samples, 6, seed=2, iterations=30, tolerance=0.0, starts=3).meta["iterations"] == "30"
+    assert (
+        fit_mixture(samples, 6, seed=2, iterations=30, tolerance=0.0, starts=3).meta["iterations"]
+        == "30"
+    )
 
 
 def test_bad_arguments():
@@ -81,7 +98,9 @@ def test_bad_arguments():
         fit_mixture(samples[:3], 1)
     with pytest.raises(BadArgument, match=r"regularisation: expected .*got nan"):
         fit_mixture(samples, 1, regularisation=float("nan"))
-    stiff = dataclasses.replace(samples, joints=samples.joints.index_fill(1, torch.tensor([0]), 0.5))
+    stiff = dataclasses.replace(
+        samples, joints=samples.joints.index_fill(1, torch.tensor([0]), 0.5)
+    )
     with pytest.raises(BadArgument, match=r"got no variation in a$"):
         fit_mixture(stiff, 2)
     with pytest.raises(BadArgument, match=r"q: expected .*got nan"):

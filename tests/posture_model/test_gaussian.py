@@ -1,4 +1,6 @@
-"""Marginals, conditionals, samples and density of a mixture against SciPy, scikit-learn and Bayes' rule."""
+"""Marginals, conditionals, samples and density of a mixture against SciPy, scikit-learn and Bayes'
+rule.
+"""
 
 import itertools
 import math
@@ -20,7 +22,9 @@ def random_mixture(m: int = 3, seed: int = 0) -> GaussianMixture:
     root = torch.randn(m, 4, 4, generator=rng, dtype=torch.float64)
     weights = torch.rand(m, generator=rng, dtype=torch.float64) + 0.2
     means = torch.randn(m, 4, generator=rng, dtype=torch.float64)
-    return GaussianMixture(weights / weights.sum(), means, root @ root.transpose(1, 2) + 0.2 * torch.eye(4), NAMES)
+    return GaussianMixture(
+        weights / weights.sum(), means, root @ root.transpose(1, 2) + 0.2 * torch.eye(4), NAMES
+    )
 
 
 def as_peer(mixture: GaussianMixture) -> Peer:
@@ -37,24 +41,35 @@ def test_eq19_log_prob_equals_scikit_learn_and_scipy(generator):
     mixture = random_mixture()
     x = 2 * torch.randn(50, 4, generator=generator, dtype=torch.float64)
     result = mixture.log_prob(x).numpy()
-    np.testing.assert_allclose(result, as_peer(mixture).score_samples(x.numpy()), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(
+        result, as_peer(mixture).score_samples(x.numpy()), rtol=1e-9, atol=1e-9
+    )
     parts = [
         float(w) * scipy.stats.multivariate_normal(mean.numpy(), covariance.numpy()).pdf(x.numpy())
-        for w, mean, covariance in zip(mixture.weights, mixture.means, mixture.covariances, strict=True)
+        for w, mean, covariance in zip(
+            mixture.weights, mixture.means, mixture.covariances, strict=True
+        )
     ]
     np.testing.assert_allclose(result, np.log(sum(parts)), rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("names", [s for k in (1, 2, 3) for s in itertools.permutations(NAMES, k)])
-def test_eq22_every_marginal_is_the_density_of_a_part_and_eq23_every_conditional_joint_over_marginal(names, generator):
-    mixture, index = random_mixture(), [NAMES.index(name) for name in names]
+def test_eq22_every_marginal_is_the_density_of_a_part_and_eq23_every_conditional_joint_over_marginal(
+    names, generator
+):
+    mixture = random_mixture()
+    index = [NAMES.index(name) for name in names]
     x = torch.randn(5, len(names), generator=generator, dtype=torch.float64)
     density = sum(
-        float(w) * scipy.stats.multivariate_normal(mean[index].numpy(), s[index][:, index].numpy()).pdf(x.numpy())
+        float(w)
+        * scipy.stats.multivariate_normal(mean[index].numpy(), s[index][:, index].numpy()).pdf(
+            x.numpy()
+        )
         for w, mean, s in zip(mixture.weights, mixture.means, mixture.covariances, strict=True)
     )
     np.testing.assert_allclose(mixture.marginal(names).log_prob(x).exp(), density, rtol=1e-9)
-    values, rest = x[0], [k for k in range(4) if k not in index]
+    values = x[0]
+    rest = [k for k in range(4) if k not in index]
     result = mixture.condition(dict(zip(names, values.tolist(), strict=True)))
     assert result.names == tuple(NAMES[k] for k in rest)
     whole = torch.randn(6, 4, generator=generator, dtype=torch.float64)
@@ -65,7 +80,8 @@ def test_eq22_every_marginal_is_the_density_of_a_part_and_eq23_every_conditional
 
 def test_conditions_one_after_the_other_are_both_at_once_and_far_ones_leave_some_components():
     mixture = random_mixture()
-    both, after = mixture.condition({"a": 0.3, "d": -1.0}), mixture.condition({"d": -1.0}).condition({"a": 0.3})
+    both = mixture.condition({"a": 0.3, "d": -1.0})
+    after = mixture.condition({"d": -1.0}).condition({"a": 0.3})
     for name in ("weights", "means", "covariances"):
         torch.testing.assert_close(getattr(both, name), getattr(after, name))
     assert mixture.condition({}).names == NAMES
@@ -77,7 +93,8 @@ def test_conditions_one_after_the_other_are_both_at_once_and_far_ones_leave_some
 
 
 def test_samples_have_the_density_of_the_mixture_and_touch_no_global_generator():
-    mixture, n = random_mixture(), 200_000
+    mixture = random_mixture()
+    n = 200_000
     x = mixture.sample(n, seed=1)
     assert torch.equal(x, mixture.sample(n, seed=1))
     assert not torch.equal(x[:10], mixture.sample(10, seed=2))
@@ -95,7 +112,12 @@ def test_samples_have_the_density_of_the_mixture_and_touch_no_global_generator()
         one = mixture.marginal((name,))
 
         def below(v, one=one):
-            parts = zip(one.weights.tolist(), one.means[:, 0].tolist(), one.covariances[:, 0, 0].tolist(), strict=True)
+            parts = zip(
+                one.weights.tolist(),
+                one.means[:, 0].tolist(),
+                one.covariances[:, 0, 0].tolist(),
+                strict=True,
+            )
             return sum(w * scipy.stats.norm.cdf(v, mu, math.sqrt(s)) for w, mu, s in parts)
 
         assert scipy.stats.kstest(x[:20_000, k].numpy(), below).pvalue > 1e-4
@@ -113,7 +135,10 @@ def test_bad_arguments():
         (lambda: mixture.marginal(()), "names: expected"),
         (lambda: mixture.condition({"z": 1.0}), "names: expected"),
         (lambda: mixture.condition({"a": float("nan")}), "given.*: expected .*got nan"),
-        (lambda: mixture.condition(dict.fromkeys(NAMES, 0.0)), "given: expected .*got every dimension"),
+        (
+            lambda: mixture.condition(dict.fromkeys(NAMES, 0.0)),
+            "given: expected .*got every dimension",
+        ),
         (lambda: mixture.sample(-1), "n: expected .*got -1"),
         (lambda: mixture.log_prob(torch.zeros(3, 3)), "x: expected .*got shape"),
     ]:

@@ -1,4 +1,6 @@
-"""The mixture against torch.distributions, brute-force Bayes and Monte Carlo; its file against abuse."""
+"""The mixture against torch.distributions, brute-force Bayes and Monte Carlo; its file against
+abuse.
+"""
 
 import math
 
@@ -10,7 +12,13 @@ from scipy.stats import chi2
 
 from torchgrasp.files import save_tensors
 from torchgrasp.foundation.errors import BadArgument, ModelFileError
-from torchgrasp.posture_model.mixture import CODE_NAMES, DEFAULT_ENERGY, PAPER_ENERGY, GraspMixture, load_mixture
+from torchgrasp.posture_model.mixture import (
+    CODE_NAMES,
+    DEFAULT_ENERGY,
+    PAPER_ENERGY,
+    GraspMixture,
+    load_mixture,
+)
 
 NAMES = ("a", "b", *CODE_NAMES)
 
@@ -21,7 +29,9 @@ def random_mixture(m: int, seed: int = 0) -> GraspMixture:
     root = torch.randn(m, d, d, generator=rng, dtype=torch.float64)
     weights = torch.rand(m, generator=rng, dtype=torch.float64) + 0.2
     means = 2 * torch.randn(m, d, generator=rng, dtype=torch.float64)
-    return GraspMixture(weights / weights.sum(), means, root @ root.transpose(1, 2) / d + 0.1 * torch.eye(d), NAMES)
+    return GraspMixture(
+        weights / weights.sum(), means, root @ root.transpose(1, 2) / d + 0.1 * torch.eye(d), NAMES
+    )
 
 
 def gaussians(mixture: GraspMixture) -> list[torch.distributions.MultivariateNormal]:
@@ -29,7 +39,9 @@ def gaussians(mixture: GraspMixture) -> list[torch.distributions.MultivariateNor
     return [torch.distributions.MultivariateNormal(mean, covariance) for mean, covariance in pairs]
 
 
-def test_eq19_log_prob_is_the_density_and_eq21_energy_half_the_least_mahalanobis_distance(generator):
+def test_eq19_log_prob_is_the_density_and_eq21_energy_half_the_least_mahalanobis_distance(
+    generator,
+):
     mixture = random_mixture(5)
     x = 2 * torch.randn(40, 3, 8, generator=generator, dtype=torch.float64)
     density = torch.stack([g.log_prob(x).exp() for g in gaussians(mixture)], -1) @ mixture.weights
@@ -38,7 +50,10 @@ def test_eq19_log_prob_is_the_density_and_eq21_energy_half_the_least_mahalanobis
     q = torch.randn(30, 6, 6, generator=generator, dtype=torch.float64)
     each = []
     for mean, covariance in zip(mixture.means[:, 2:], mixture.covariances[:, 2:, 2:], strict=True):
-        each.append(0.5 * torch.einsum("...i,ij,...j->...", q - mean, torch.linalg.inv(covariance), q - mean))
+        each.append(
+            0.5
+            * torch.einsum("...i,ij,...j->...", q - mean, torch.linalg.inv(covariance), q - mean)
+        )
     torch.testing.assert_close(mixture.energy(q), torch.stack(each).amin(0), rtol=1e-9, atol=1e-9)
     mixture = random_mixture(3)
     q = torch.randn(10, 6, generator=torch.Generator().manual_seed(2))
@@ -62,7 +77,8 @@ def test_eq21_thresholds_accept_what_their_names_say():
 
 @pytest.mark.promise("N11")
 def test_eq23_conditional_mean_is_brute_force_bayes():
-    # Two joints: sum the joint density over a fine grid of both, a Riemann sum that is exact for Gaussians.
+    # Two joints: sum the joint density over a fine grid of both, a Riemann sum that is exact for
+    # Gaussians.
     mixture = random_mixture(3)
     q = mixture.means[:2, 2:] + 0.1
     axis = torch.linspace(-12, 12, 401, dtype=torch.float64)
@@ -102,7 +118,11 @@ def test_save_and_load_give_the_same_mixture_and_other_files_are_refused(tmp_pat
     again = load_mixture(path)
     for name in ("weights", "means", "covariances"):
         assert torch.equal(getattr(mixture, name), getattr(again, name))
-    assert (again.names, again.regularisation, again.meta) == (mixture.names, mixture.regularisation, mixture.meta)
+    assert (again.names, again.regularisation, again.meta) == (
+        mixture.names,
+        mixture.regularisation,
+        mixture.meta,
+    )
     assert again.joint_names == ("a", "b")
     save_file(tensors_of(random_mixture(2)), tmp_path / "plain.safetensors")
     (tmp_path / "text.safetensors").write_text("no tensors")
@@ -147,8 +167,12 @@ def test_malformed_mixtures_are_refused(tmp_path, name, spoil):
         load_mixture(path)
 
 
-@pytest.mark.parametrize("meta", [{}, {"names": "a b", "regularisation": "0"}, {"names": " ".join(NAMES)}])
+@pytest.mark.parametrize(
+    "meta", [{}, {"names": "a b", "regularisation": "0"}, {"names": " ".join(NAMES)}]
+)
 def test_missing_metadata_is_refused(tmp_path, meta):
-    path = save_tensors(tmp_path / "hand.safetensors", "mixture", tensors_of(random_mixture(3)), meta)
+    path = save_tensors(
+        tmp_path / "hand.safetensors", "mixture", tensors_of(random_mixture(3)), meta
+    )
     with pytest.raises(ModelFileError):
         load_mixture(path)

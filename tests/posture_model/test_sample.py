@@ -62,11 +62,15 @@ def test_grasping_samples_are_free_and_repeat():
     # Rolled tips have other codes than the middles of their pads.
     middles = encode_fingertips(*hand.fingertips(samples.joints))
     assert 0.2 < float((samples.q - middles)[:, 3:].abs().mean()) < 0.6
-    assert float((samples.q - middles)[:, :3].abs().max()) < 0.024  # a tip rolls by at most its diameter
+    assert (
+        float((samples.q - middles)[:, :3].abs().max()) < 0.024
+    )  # a tip rolls by at most its diameter
 
 
 def test_a_hand_that_can_hardly_move_is_refused(monkeypatch):
-    monkeypatch.setattr("torchgrasp.posture_model.sample.can_close", lambda points, _: torch.zeros(len(points)) > 0)
+    monkeypatch.setattr(
+        "torchgrasp.posture_model.sample.can_close", lambda points, _: torch.zeros(len(points)) > 0
+    )
     with pytest.raises(BadArgument, match=r"hand: expected .*got 0 kept of 5000 postures"):
         sample_configurations(load_hand("barrett"), 10, sampling="grasping")
 

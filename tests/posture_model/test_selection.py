@@ -1,4 +1,6 @@
-"""The criterion over the number of components, cross-validation, and the judgement on held-out postures."""
+"""The criterion over the number of components, cross-validation, and the judgement on held-out
+postures.
+"""
 
 import math
 
@@ -33,17 +35,24 @@ def test_bic_is_that_of_the_fit_and_finds_the_number_of_true_components():
     curve = bic_curve(samples, (2,), seed=3)
     log_likelihood = float(fit_mixture(samples, 2, seed=3).log_prob(samples.rows()).sum())
     parameters = 1 + 2 * (8 + 8 * 9 // 2)  # one weight, two means and covariances
-    assert math.isclose(float(curve.bic[0]), -2 * log_likelihood + parameters * math.log(len(samples)), abs_tol=0.1)
+    assert math.isclose(
+        float(curve.bic[0]), -2 * log_likelihood + parameters * math.log(len(samples)), abs_tol=0.1
+    )
 
 
 def test_growing_fits_find_the_number_of_true_components_and_are_as_likely_as_new_fits():
-    samples, seen = islands(), []
+    samples = islands()
+    seen = []
     curve = growing_bic(samples, 6, observer=seen.append)
     assert seen == curve.components.tolist() == [1, 2, 3, 4, 5, 6]
     assert int(curve.components[curve.bic.argmin()]) == 4
     apart = bic_curve(samples, range(1, 7)).bic
-    torch.testing.assert_close(curve.bic[:1], apart[:1], rtol=0, atol=0.1)  # one Gaussian has one fit
-    torch.testing.assert_close(curve.bic[3:4], apart[3:4], rtol=0, atol=2.0)  # the true number has one good fit
+    torch.testing.assert_close(
+        curve.bic[:1], apart[:1], rtol=0, atol=0.1
+    )  # one Gaussian has one fit
+    torch.testing.assert_close(
+        curve.bic[3:4], apart[3:4], rtol=0, atol=2.0
+    )  # the true number has one good fit
     assert bool((curve.bic <= apart * 1.02).all())
     assert torch.equal(growing_bic(samples, 2).bic, curve.bic[:2])  # the fits use no random number
     with pytest.raises(BadArgument, match=r"components: expected .*got 200"):
@@ -51,7 +60,8 @@ def test_growing_fits_find_the_number_of_true_components_and_are_as_likely_as_ne
 
 
 def test_a_killed_sweep_goes_on(tmp_path):
-    samples, whole = islands(), bic_curve(islands(), (1, 2, 3))
+    samples = islands()
+    whole = bic_curve(islands(), (1, 2, 3))
 
     def kill(m, mixture):
         if m == 2:
@@ -59,7 +69,10 @@ def test_a_killed_sweep_goes_on(tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         bic_curve(samples, (1, 2, 3), checkpoints=tmp_path, observer=kill)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["em_1.safetensors", "em_2.safetensors"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "em_1.safetensors",
+        "em_2.safetensors",
+    ]
     assert torch.equal(bic_curve(samples, (1, 2, 3), checkpoints=tmp_path).bic, whole.bic)
 
 
@@ -67,12 +80,15 @@ def test_cross_validation_judges_each_posture_once_and_by_others():
     samples = islands(400)
     result = cross_validate(samples, (1, 4), folds=4, seed=1)
     assert result.log_likelihood.shape == result.error.shape == (2, 4)
-    # One Gaussian by hand: the same division, the moments of three parts, the density on the fourth.
+    # One Gaussian by hand: the same division, the moments of three parts, the density on the
+    # fourth.
     parts = torch.randperm(400, generator=torch.Generator().manual_seed(1)).tensor_split(4)
     x = samples.rows()
     for fold, held_out in enumerate(parts):
         rest = torch.cat([part for part in parts if part is not held_out])
-        gaussian = torch.distributions.MultivariateNormal(x[rest].mean(0), torch.cov(x[rest].T, correction=0))
+        gaussian = torch.distributions.MultivariateNormal(
+            x[rest].mean(0), torch.cov(x[rest].T, correction=0)
+        )
         expected = float(gaussian.log_prob(x[held_out]).mean())
         assert math.isclose(float(result.log_likelihood[0, fold]), expected, abs_tol=1e-3)
     assert bool((result.log_likelihood[1] > result.log_likelihood[0]).all())
@@ -93,7 +109,10 @@ def test_a_judgement_is_what_it_says():
     pairs = zip(modes, held_out.joints, strict=True)
     off = [min(float((mode - joints).abs().mean()) for mode in found) for found, joints in pairs]
     assert math.isclose(result.nearest_mode, sum(off) / len(off), rel_tol=1e-9)
-    accepted = [float((mixture.energy(held_out.q) < r).double().mean()) for r in (PAPER_ENERGY, DEFAULT_ENERGY)]
+    accepted = [
+        float((mixture.energy(held_out.q) < r).double().mean())
+        for r in (PAPER_ENERGY, DEFAULT_ENERGY)
+    ]
     assert [result.paper_coverage, result.default_coverage] == accepted
     assert result.meta()["acceptance_paper_coverage"] == f"{accepted[0]:.4f}"
     assert "within reach" in str(result) and "a " in str(result)

@@ -1,4 +1,6 @@
-"""Rolled contacts stay on their tips and in their cones; closing triples are those of a linear program."""
+"""Rolled contacts stay on their tips and in their cones; closing triples are those of a linear
+program.
+"""
 
 import dataclasses
 import itertools
@@ -19,12 +21,15 @@ def test_a_rolled_contact_lies_on_the_sphere_along_its_normal(name):
     hand = load_hand(name)
     joints = sample_configurations(hand, 2000, seed=4).joints
     points, normals = roll_contacts(hand, joints, np.random.default_rng(0))
-    torch.testing.assert_close(points, hand.tip_centres(joints) + hand.tip_radius[:, None] * normals)
+    torch.testing.assert_close(
+        points, hand.tip_centres(joints) + hand.tip_radius[:, None] * normals
+    )
     axes = hand.fingertips(joints)[1]
     angle = torch.acos((normals * axes).sum(-1))
     assert float(angle.max()) <= math.radians(60) + 1e-9
     # The tilt follows Rayleigh's law, cut off at the cone, in every direction about the axis.
-    law, most = rayleigh(scale=ROLL), rayleigh(scale=ROLL).cdf(math.radians(60))
+    law = rayleigh(scale=ROLL)
+    most = rayleigh(scale=ROLL).cdf(math.radians(60))
     assert kstest(angle.flatten().numpy(), lambda x: law.cdf(x) / most).pvalue > 1e-3
     side = (normals - (normals * axes).sum(-1, keepdim=True) * axes).mean(0)
     assert float(side.norm(dim=-1).max()) < 0.05
@@ -32,17 +37,26 @@ def test_a_rolled_contact_lies_on_the_sphere_along_its_normal(name):
 
 def test_a_flat_tip_tilts_and_keeps_its_contact_point():
     hand = load_hand("barrett")
-    hand = dataclasses.replace(hand, tips=dataclasses.replace(hand.tips, radius=torch.zeros(3, dtype=torch.float64)))
+    hand = dataclasses.replace(
+        hand, tips=dataclasses.replace(hand.tips, radius=torch.zeros(3, dtype=torch.float64))
+    )
     joints = sample_configurations(hand, 200, seed=4).joints
     points, normals = roll_contacts(hand, joints, np.random.default_rng(0))
     middles, axes = hand.fingertips(joints)
     assert torch.equal(points, middles)
-    assert math.radians(39) < float(torch.acos((normals * axes).sum(-1)).max()) <= math.radians(40) + 1e-9
+    assert (
+        math.radians(39)
+        < float(torch.acos((normals * axes).sum(-1)).max())
+        <= math.radians(40) + 1e-9
+    )
 
 
 def closes(points: np.ndarray, inward: np.ndarray, friction: float, edges: int = 64) -> float:
-    """The largest s with balanced forces inside the friction cones and normal forces of at least s, which sum to 1."""
-    columns, normal = [], []
+    """The largest s with balanced forces inside the friction cones and normal forces of at least s,
+    which sum to 1.
+    """
+    columns = []
+    normal = []
     for point, n in zip(points - points.mean(0), inward, strict=True):
         first = np.cross(n, np.eye(3)[np.abs(n).argmin()])
         first /= np.linalg.norm(first)
@@ -66,17 +80,32 @@ def closes(points: np.ndarray, inward: np.ndarray, friction: float, edges: int =
     return result.x[-1] if result.status == 0 else 0.0
 
 
-def test_eq13_closing_triples_are_those_of_a_linear_program_and_more_contacts_close_by_three(generator):
-    hand, friction = load_hand("barrett"), ContactSpec().friction
-    points, normals = roll_contacts(hand, sample_configurations(hand, 3000, seed=6).joints, np.random.default_rng(1))
+def test_eq13_closing_triples_are_those_of_a_linear_program_and_more_contacts_close_by_three(
+    generator,
+):
+    hand = load_hand("barrett")
+    friction = ContactSpec().friction
+    points, normals = roll_contacts(
+        hand, sample_configurations(hand, 3000, seed=6).joints, np.random.default_rng(1)
+    )
     closed = can_close(points, normals)
     assert 0.02 < float(closed.double().mean()) < 0.2
     rows = torch.cat([torch.nonzero(closed)[:40, 0], torch.nonzero(~closed)[:200, 0]])
-    margin = np.array([closes(points[k].numpy(), normals[k].numpy(), friction) for k in rows.tolist()])
+    margin = np.array(
+        [closes(points[k].numpy(), normals[k].numpy(), friction) for k in rows.tolist()]
+    )
     assert (margin[:40] > 0).all()  # what balances does close
     assert (margin[40:] > 0.02).mean() < 0.02  # and of the others only narrow ones do
     points, normals = torch.randn(2, 300, 5, 3, generator=generator, dtype=torch.float64)
     normals = normals / normals.norm(dim=-1, keepdim=True)
-    by_three = [can_close(points[:, k], normals[:, k]) for k in map(list, itertools.combinations(range(5), 3))]
+    by_three = [
+        can_close(points[:, k], normals[:, k])
+        for k in map(list, itertools.combinations(range(5), 3))
+    ]
     assert torch.equal(can_close(points, normals), torch.stack(by_three).any(0))
-    assert 0 < int(can_close(points[:, :4], normals[:, :4]).sum()) < int(can_close(points, normals).sum()) < 300
+    assert (
+        0
+        < int(can_close(points[:, :4], normals[:, :4]).sum())
+        < int(can_close(points, normals).sum())
+        < 300
+    )

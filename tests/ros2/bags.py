@@ -1,4 +1,6 @@
-"""Messages without ROS: rosbags' definitions, ours of MoveIt and of the action, strict types, and .mcap files."""
+"""Messages without ROS: rosbags' definitions, ours of MoveIt and of the action, strict types, and
+.mcap files.
+"""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -30,7 +32,9 @@ MOVEIT = {
 """The fields of two messages of MoveIt."""
 ACTION = (ROOT / "examples/ros2/action/PlanGrasp.action").read_text().split("---\n")
 for name, text in MOVEIT.items():
-    STORE.register(get_types_from_msg("\n".join(map(str.strip, text.splitlines())), f"moveit_msgs/msg/{name}"))
+    STORE.register(
+        get_types_from_msg("\n".join(map(str.strip, text.splitlines())), f"moveit_msgs/msg/{name}")
+    )
 for name, text in zip(("Goal", "Result", "Feedback"), ACTION, strict=True):
     STORE.register(get_types_from_msg(text, f"torchgrasp_ros/msg/PlanGrasp_{name}"))
 
@@ -42,8 +46,12 @@ def message(name, /, **fields):
 
 def types():
     """The classes that the nodes need, of rosbags."""
-    classes = {name: STORE.types[f"{package}/msg/{name}"] for name, package in messages.PACKAGES.items()}
-    return SimpleNamespace(**classes, floats=lambda numbers: np.array(list(numbers), dtype=np.float64))
+    classes = {
+        name: STORE.types[f"{package}/msg/{name}"] for name, package in messages.PACKAGES.items()
+    }
+    return SimpleNamespace(
+        **classes, floats=lambda numbers: np.array(list(numbers), dtype=np.float64)
+    )
 
 
 def time(seconds):
@@ -55,14 +63,19 @@ def header(frame):
 
 
 def check(value, name):
-    """Refuse a field of another type than its definition's, as strictly as rclpy: a whole number is no float."""
+    """Refuse a field of another type than its definition's, as strictly as rclpy: a whole number is
+    no float.
+    """
     assert type(value).__name__ == name.replace("/", "__"), f"{type(value)} for {name}"
     for field, (kind, of) in STORE.fielddefs[name][1]:
-        inner, found = of, getattr(value, field)
+        inner = of
+        found = getattr(value, field)
         if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
             (kind, inner), _ = of
             if kind is Nodetype.BASE and inner[0] != "string":
-                assert isinstance(found, np.ndarray) and found.dtype == inner[0], f"{field}: {found!r}"
+                assert isinstance(found, np.ndarray) and found.dtype == inner[0], (
+                    f"{field}: {found!r}"
+                )
                 continue
             assert isinstance(found, list), f"{field}: {found!r}"
         else:
@@ -71,12 +84,16 @@ def check(value, name):
             if kind is Nodetype.NAME:
                 check(item, inner)
             else:
-                wanted = {"string": str, "bool": bool}.get(inner[0], float if "float" in inner[0] else int)
+                wanted = {"string": str, "bool": bool}.get(
+                    inner[0], float if "float" in inner[0] else int
+                )
                 assert type(item) is wanted, f"{name}.{field}: {item!r}"
 
 
 def through_mcap(path, name, *written):
-    """The messages as they are read back from an .mcap file that holds them; each is checked against its definition."""
+    """The messages as they are read back from an .mcap file that holds them; each is checked
+    against its definition.
+    """
     full = name.replace("/", "/msg/")
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
         topic = bag.add_connection("/topic", full, typestore=STORE)
@@ -85,7 +102,10 @@ def through_mcap(path, name, *written):
             bag.write(topic, stamp, STORE.serialize_cdr(one, full))
     (file,) = path.glob("*.mcap")
     with Reader(file.parent) as bag:
-        return [STORE.deserialize_cdr(data, connection.msgtype) for connection, _, data in bag.messages()]
+        return [
+            STORE.deserialize_cdr(data, connection.msgtype)
+            for connection, _, data in bag.messages()
+        ]
 
 
 def through_cdr(one, name):

@@ -25,10 +25,15 @@ def file(tmp_path):
 
 
 class Driver:
-    """Stands for a driver and its ROS: it takes the place of a trial's controller, and knows only messages."""
+    """Stands for a driver and its ROS: it takes the place of a trial's controller, and knows only
+    messages.
+    """
 
     def __init__(self, loop, order, zero, names):
-        self.loop, self.order, self.zero, self.names = loop, order, zero, names
+        self.loop = loop
+        self.order = order
+        self.zero = zero
+        self.names = names
         self.commands = []
 
     def say(self, joints):
@@ -72,9 +77,13 @@ def allegro(loop):
 def test_a_cylinder_is_lifted_through_messages(file, feel, rate):
     pytest.importorskip("mujoco")
     hand, grasp = pinch("allegro")
-    spec = TrialSpec(simulator="mujoco", control_rate=rate, hold_time=0.1, approach=0.0, lift_height=0.1)
+    spec = TrialSpec(
+        simulator="mujoco", control_rate=rate, hold_time=0.1, approach=0.0, lift_height=0.1
+    )
     run = TrialDriver(GraspTrial(hand, grasp, Truth(cylinder())), spec).open()
-    run.controller = driver = allegro(close_node.HandLoop(close_node.Settings(file, rate=rate, feel=feel)))
+    run.controller = driver = allegro(
+        close_node.HandLoop(close_node.Settings(file, rate=rate, feel=feel))
+    )
     driver.say(driver.loop.pregrasp)
     assert driver.loop.close()
     trial = lift._Lift(run)
@@ -87,16 +96,19 @@ def test_a_cylinder_is_lifted_through_messages(file, feel, rate):
 def test_the_hand_opens_before_it_closes_and_opens_again(file):
     """Joints that follow at once: a joint 0.4 rad off comes to its pre-grasp in 0.8 s at 0.5 rad/s."""
     loop = close_node.HandLoop(close_node.Settings(file))
-    driver, start = allegro(loop), loop.pregrasp.clone()
+    driver = allegro(loop)
+    start = loop.pregrasp.clone()
     start[12] -= 0.4
     assert driver.answer() is None and not loop.close()  # before the first joint state
-    joints, ticks = start, 0
+    joints = start
+    ticks = 0
     while not torch.equal(joints, loop.pregrasp):
         driver.say(joints)
         assert not loop.close()
         moved = driver.answer()
         assert float((moved - joints).abs().max()) <= 0.5 / 200 + 1e-12
-        joints, ticks = moved, ticks + 1
+        joints = moved
+        ticks = ticks + 1
     assert ticks in (160, 161) and loop.close()
     for _ in range(100):
         driver.say(joints)

@@ -26,7 +26,11 @@ class Node:
     """A node that keeps what is registered with it."""
 
     def __init__(self, parameters):
-        self.parameters, self.published, self.timers, self.services, self.heard = parameters, [], [], {}, {}
+        self.parameters = parameters
+        self.published = []
+        self.timers = []
+        self.services = {}
+        self.heard = {}
 
     def declare_parameter(self, name, default):
         assert isinstance(default, str | int | float | bool | list)
@@ -50,10 +54,13 @@ class Node:
 
 @pytest.fixture
 def ros(monkeypatch):
-    """A function that runs a node's `main` with parameters, and returns the node and its action's callback."""
+    """A function that runs a node's `main` with parameters, and returns the node and its action's
+    callback.
+    """
 
     def run(main, poses=None, **parameters):
-        node, served = Node(parameters), []
+        node = Node(parameters)
+        served = []
         transforms = poses or {}
 
         def look_up(frame, source, stamp, wait):
@@ -61,13 +68,25 @@ def ros(monkeypatch):
                 raise Lost(f"no {source} in {frame}")
             return SimpleNamespace(transform=transforms[frame, source])
 
-        actions = {x: bags.STORE.types[f"torchgrasp_ros/msg/PlanGrasp_{x}"] for x in ("Result", "Feedback")}
+        actions = {
+            x: bags.STORE.types[f"torchgrasp_ros/msg/PlanGrasp_{x}"] for x in ("Result", "Feedback")
+        }
         content = {
-            "rclpy": {"init": lambda: None, "create_node": lambda name: node, "spin": lambda *_: None},
-            "rclpy.action": {"ActionServer": lambda *a, **k: served.append(a[3]), "CancelResponse": MagicMock()},
+            "rclpy": {
+                "init": lambda: None,
+                "create_node": lambda name: node,
+                "spin": lambda *_: None,
+            },
+            "rclpy.action": {
+                "ActionServer": lambda *a, **k: served.append(a[3]),
+                "CancelResponse": MagicMock(),
+            },
             "rclpy.callback_groups": {"ReentrantCallbackGroup": MagicMock()},
             "rclpy.duration": {"Duration": lambda seconds: seconds},
-            "rclpy.executors": {"ExternalShutdownException": Lost, "MultiThreadedExecutor": MagicMock()},
+            "rclpy.executors": {
+                "ExternalShutdownException": Lost,
+                "MultiThreadedExecutor": MagicMock(),
+            },
             "tf2_ros": {
                 "Buffer": lambda: SimpleNamespace(lookup_transform=look_up),
                 "TransformListener": MagicMock(),
@@ -78,13 +97,17 @@ def ros(monkeypatch):
         }
         for package in {*messages.PACKAGES.values()}:
             of = [name for name, home in messages.PACKAGES.items() if home == package]
-            content[f"{package}.msg"] = {name: bags.STORE.types[f"{package}/msg/{name}"] for name in of}
+            content[f"{package}.msg"] = {
+                name: bags.STORE.types[f"{package}/msg/{name}"] for name in of
+            }
         content["std_msgs.msg"]["Bool"] = bags.STORE.types["std_msgs/msg/Bool"]
         for name, attributes in content.items():
             module = ModuleType(name)
             vars(module).update(attributes)
             monkeypatch.setitem(sys.modules, name, module)
-        monkeypatch.setattr(messages._Ros, "floats", staticmethod(lambda x: np.array(list(x), dtype=np.float64)))
+        monkeypatch.setattr(
+            messages._Ros, "floats", staticmethod(lambda x: np.array(list(x), dtype=np.float64))
+        )
         monkeypatch.setattr("gc.freeze", lambda: None)
         main()
         assert not node.parameters  # each is a parameter of the node
@@ -103,17 +126,23 @@ def as_transform(pose):
     )
 
 
-def test_the_action_gives_pose_and_camera_to_the_plan_and_its_grasps_to_the_result(ros, monkeypatch):
+def test_the_action_gives_pose_and_camera_to_the_plan_and_its_grasps_to_the_result(
+    ros, monkeypatch
+):
     hand, grasp = pinch("allegro")
     given = []
 
     def plan(types, asked, pose, camera, settings, tell):
         given.extend((pose, camera, settings))
         tell("shape", "a line")
-        return plan_node.Planned(messages.write_grasps(types, format_moveit(hand, grasp), "base", bags.time(7)), "file")
+        return plan_node.Planned(
+            messages.write_grasps(types, format_moveit(hand, grasp), "base", bags.time(7)), "file"
+        )
 
     monkeypatch.setattr(plan_node, "plan", plan)
-    _, (execute,) = ros(plan_node.main, {("base", "camera"): as_transform(CAMERA.numpy())}, starts=7)
+    _, (execute,) = ros(
+        plan_node.main, {("base", "camera"): as_transform(CAMERA.numpy())}, starts=7
+    )
     handle = MagicMock(request=goal(), is_cancel_requested=False)
     result = bags.through_cdr(execute(handle), "torchgrasp_ros/PlanGrasp_Result")
     assert result.file == "file" and len(result.grasps) == 1 and given[2].starts == 7
@@ -144,14 +173,24 @@ def test_the_timer_hears_the_allegro_and_sends_its_commands(ros, tmp_path):
     node, _ = ros(close_node.main, grasps=str(tmp_path / "g"), rate=250.0)
     ((period, tick),) = node.timers
     tick()
-    assert period == 1 / 250 and [topic for topic, _ in node.published] == ["~/closed"]  # nothing was heard yet
+    assert period == 1 / 250 and [topic for topic, _ in node.published] == [
+        "~/closed"
+    ]  # nothing was heard yet
     opened = hand.expand_joints(grasp.pregrasp)[0]
-    state = bags.message("sensor_msgs/JointState", header=bags.header(""), name=[], position=opened.numpy(),
-                         velocity=np.zeros(0), effort=np.zeros(0))  # fmt: skip
+    state = bags.message(
+        "sensor_msgs/JointState",
+        header=bags.header(""),
+        name=[],
+        position=opened.numpy(),
+        velocity=np.zeros(0),
+        effort=np.zeros(0),
+    )
     node.heard["allegroHand/joint_states"](state)
     tick()
     topic, command = node.published[1]
-    assert topic == "allegroHand/joint_cmd" and torch.allclose(torch.from_numpy(command.position), opened)
+    assert topic == "allegroHand/joint_cmd" and torch.allclose(
+        torch.from_numpy(command.position), opened
+    )
     bags.through_cdr(command, "sensor_msgs/JointState")
     for wish, sent in ((True, True), (False, False)):
         answer = node.services["~/close"](SimpleNamespace(data=wish), SimpleNamespace())

@@ -1,4 +1,6 @@
-"""The planning node without ROS: a cloud from an .mcap file goes in, grasps go into an .mcap file and come back."""
+"""The planning node without ROS: a cloud from an .mcap file goes in, grasps go into an .mcap file
+and come back.
+"""
 
 import dataclasses
 import functools
@@ -23,13 +25,16 @@ from torchgrasp.geometry.frames import inverse, rigid
 HAND = "leap"  # whose URDF has another order of joints than the driver
 NAMES = bags.ROOT / "examples/ros2/drivers/leap.json"
 CAMERA = rigid(
-    torch.tensor(Rotation.from_euler("xyz", [-2.2, 0.2, 1.0]).as_matrix()), torch.tensor([0.3, -0.4, 0.5]).double()
+    torch.tensor(Rotation.from_euler("xyz", [-2.2, 0.2, 1.0]).as_matrix()),
+    torch.tensor([0.3, -0.4, 0.5]).double(),
 )
 """Pose of the camera in the frame of gravity."""
 
 
 def seen():
-    """A cylinder on a part of its table, in the camera's frame, organised, with pixels without depth."""
+    """A cylinder on a part of its table, in the camera's frame, organised, with pixels without
+    depth.
+    """
     thing = load_object("cylinder").view.points.double()
     steps = torch.linspace(-0.15, 0.15, 40, dtype=torch.float64)
     x, y = torch.meshgrid(steps, steps, indexing="ij")
@@ -65,7 +70,9 @@ def planned(folder):
     tell = lambda stage, message: stages.append((stage, message))  # noqa: E731
     flange = (0.0, 0.0, -0.05, 0.0, 0.0, math.sin(0.2), math.cos(0.2))
     settings = plan_node.Settings(starts=20, folder=str(folder), names=str(NAMES), flange=flange)
-    found = plan_node.plan(bags.types(), asked, CAMERA.numpy(), CAMERA[:3, 3].numpy(), settings, tell)
+    found = plan_node.plan(
+        bags.types(), asked, CAMERA.numpy(), CAMERA[:3, 3].numpy(), settings, tell
+    )
     return found, stages, flange
 
 
@@ -78,29 +85,48 @@ def test_the_grasps_come_back_from_an_mcap_file_as_they_were_planned(folder):
     found, stages, flange = planned(folder)
     assert [stage for stage, _ in stages][:3] == ["cloud", "shape", "plan"] and not found.message
     for stage, text in stages:
-        bags.through_cdr(bags.message("torchgrasp_ros/PlanGrasp_Feedback", stage=stage, message=text),
-                         "torchgrasp_ros/PlanGrasp_Feedback")  # fmt: skip
+        bags.through_cdr(
+            bags.message("torchgrasp_ros/PlanGrasp_Feedback", stage=stage, message=text),
+            "torchgrasp_ros/PlanGrasp_Feedback",
+        )
     result = bags.message("torchgrasp_ros/PlanGrasp_Result", **found._asdict())
     (read,) = bags.through_mcap(folder / "out", "torchgrasp_ros/PlanGrasp_Result", result)
     assert Path(read.file).parent == folder  # whatever the id is
-    grasps, hand, names = load_grasps(read.file), load_hand(HAND), json.loads(NAMES.read_text())
+    grasps = load_grasps(read.file)
+    hand = load_hand(HAND)
+    names = json.loads(NAMES.read_text())
     assert 1 <= len(read.grasps) == len(grasps) <= 3 and bool((grasps.status == Status.OK).all())
-    assert abs(grasps.table.offset) < 0.002 and float(grasps.table.normal[2]) > 0.999  # found below the cylinder
+    assert (
+        abs(grasps.table.offset) < 0.002 and float(grasps.table.normal[2]) > 0.999
+    )  # found below the cylinder
     order = [hand.tree.joint_names.index(joint) for joint in names]
     mount = Rotation.from_quat(flange[3:])
     for row, one in enumerate(read.grasps):
         assert one.id == f"grasp_{row}" and one.allowed_touch_objects == ["../can"]
         assert one.grasp_quality == pytest.approx(float(grasps.success[row]), abs=1e-8)
-        for posture, joints in ((one.pre_grasp_posture, grasps.pregrasp), (one.grasp_posture, grasps.joints)):
+        for posture, joints in (
+            (one.pre_grasp_posture, grasps.pregrasp),
+            (one.grasp_posture, grasps.joints),
+        ):
             assert posture.joint_names == [str(k) for k in range(16)]
-            np.testing.assert_allclose(posture.points[0].positions, hand.expand_joints(joints)[row, order], atol=1e-6)
-        assert one.grasp_posture.points[1].effort.any() and one.grasp_posture.points[1].time_from_start.nanosec == 8e8
+            np.testing.assert_allclose(
+                posture.points[0].positions, hand.expand_joints(joints)[row, order], atol=1e-6
+            )
+        assert (
+            one.grasp_posture.points[1].effort.any()
+            and one.grasp_posture.points[1].time_from_start.nanosec == 8e8
+        )
         pose = grasps.obj_from_hand[row].double().numpy()
-        place, turn = one.grasp_pose.pose.position, one.grasp_pose.pose.orientation
+        place = one.grasp_pose.pose.position
+        turn = one.grasp_pose.pose.orientation
         assert one.grasp_pose.header.frame_id == "base" and one.grasp_pose.header.stamp.sec == 7
-        np.testing.assert_allclose([place.x, place.y, place.z], pose[:3, 3] - 0.05 * pose[:3, 2], atol=1e-6)
+        np.testing.assert_allclose(
+            [place.x, place.y, place.z], pose[:3, 3] - 0.05 * pose[:3, 2], atol=1e-6
+        )
         wanted = Rotation.from_matrix(pose[:3, :3]) * mount
-        assert (Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]) * wanted.inv()).magnitude() < 1e-5
+        assert (
+            Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]) * wanted.inv()
+        ).magnitude() < 1e-5
         there, back, up = (
             [move.direction.vector.x, move.direction.vector.y, move.direction.vector.z]
             for move in (one.pre_grasp_approach, one.post_place_retreat, one.post_grasp_retreat)
@@ -111,25 +137,35 @@ def test_the_grasps_come_back_from_an_mcap_file_as_they_were_planned(folder):
         assert one.post_grasp_retreat.min_distance < one.post_grasp_retreat.desired_distance
 
 
-@pytest.mark.parametrize(("wrong", "words"), [({"hand": "no_hand"}, "no_hand"), ({"cut": False, "table": 2.0}, "")])
+@pytest.mark.parametrize(
+    ("wrong", "words"), [({"hand": "no_hand"}, "no_hand"), ({"cut": False, "table": 2.0}, "")]
+)
 def test_a_goal_without_grasps_says_why(wrong, words):
-    pose, camera = CAMERA.numpy(), CAMERA[:3, 3].numpy()
-    found = plan_node.plan(bags.types(), goal(**wrong), pose, camera, plan_node.Settings(starts=5), print)
+    pose = CAMERA.numpy()
+    camera = CAMERA[:3, 3].numpy()
+    found = plan_node.plan(
+        bags.types(), goal(**wrong), pose, camera, plan_node.Settings(starts=5), print
+    )
     assert found.grasps == [] and words in found.message and found.message
     bags.through_cdr(
-        bags.message("torchgrasp_ros/PlanGrasp_Result", **found._asdict()), "torchgrasp_ros/PlanGrasp_Result"
+        bags.message("torchgrasp_ros/PlanGrasp_Result", **found._asdict()),
+        "torchgrasp_ros/PlanGrasp_Result",
     )
 
 
 def test_parameters_that_cannot_be_read_are_told_before_planning(tmp_path):
     for wrong in ({"names": str(tmp_path / "none.json")}, {"flange": (0.0,) * 7}):
         settings = plan_node.Settings(starts=5)._replace(**wrong)
-        found = plan_node.plan(bags.types(), goal(), CAMERA.numpy(), None, settings, lambda *_: pytest.fail("planned"))
+        found = plan_node.plan(
+            bags.types(), goal(), CAMERA.numpy(), None, settings, lambda *_: pytest.fail("planned")
+        )
         assert found.grasps == [] and found.message
 
 
 def test_the_object_at_a_place_is_cut_out_of_a_scene():
-    """Nothing is within half a metre of a place 2 m off; at the cylinder there is the cylinder, without its table."""
+    """Nothing is within half a metre of a place 2 m off; at the cylinder there is the cylinder,
+    without its table.
+    """
     told = []
 
     def stop(stage, message):
@@ -138,7 +174,9 @@ def test_the_object_at_a_place_is_cut_out_of_a_scene():
 
     for x in (0.0, 2.0):
         near = bags.message("geometry_msgs/Point", x=x, y=0.0, z=0.05)
-        found = plan_node.plan(bags.types(), goal(near=near), CAMERA.numpy(), None, plan_node.Settings(), stop)
+        found = plan_node.plan(
+            bags.types(), goal(near=near), CAMERA.numpy(), None, plan_node.Settings(), stop
+        )
         assert (found.message == "enough") == (x == 0.0)
     assert len(told) == 1 and int(told[0].split()[0]) <= len(load_object("cylinder").view)
 

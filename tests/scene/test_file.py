@@ -25,7 +25,9 @@ def test_the_target_of_a_saved_scene_comes_back(tmp_path):
         assert read_scene(save_scene(chosen, tmp_path / "scene.npz")).target == target
 
 
-@pytest.mark.parametrize(("target", "error"), [(7, BadArgument), (2.5, CloudFileError), ([1, 2], CloudFileError)])
+@pytest.mark.parametrize(
+    ("target", "error"), [(7, BadArgument), (2.5, CloudFileError), ([1, 2], CloudFileError)]
+)
 def test_a_target_that_is_no_label_is_refused(tmp_path, target, error):
     path = save_scene(load_scene(), tmp_path / "scene.npz")
     np.savez(path, **dict(np.load(path)) | {"target": np.array(target)})

@@ -27,7 +27,8 @@ def as_text(counts):
     for k, count in enumerate(counts):
         value = count - counts[k - 2] if k > 2 else count
         while True:
-            bits, value = value & 31, value >> 5
+            bits = value & 31
+            value = value >> 5
             more = value != (-1 if bits & 16 else 0)
             text += chr(48 + bits + 32 * more)
             if not more:
@@ -54,7 +55,12 @@ COLOURS = np.array([[0, 0, 0], [0, 9, 7], [200, 0, 0]], dtype=np.uint8)[LABELS]
         [{"segmentation": mask, "area": int(mask.sum())} for mask in masks()],
         [{"size": list(SHAPE), "counts": run_lengths(mask)} for mask in masks()],
         [{"size": list(SHAPE), "counts": as_text(run_lengths(mask)).encode()} for mask in masks()],
-        {"annotations": [{"segmentation": {"size": list(SHAPE), "counts": run_lengths(mask)}} for mask in masks()]},
+        {
+            "annotations": [
+                {"segmentation": {"size": list(SHAPE), "counts": run_lengths(mask)}}
+                for mask in masks()
+            ]
+        },
     ],
 )
 def test_every_form_of_labels_is_the_same(given):
@@ -97,8 +103,14 @@ def test_a_transparent_picture_has_no_object_there():
         ([LABELS == 1] * 1001, "1001 masks"),
         ([[[1, 2], [1]], [[1]]], "whole numbers"),
         ([{"segmentation": [1, 2, 3, 4]}], "got shape"),
-        (functools.reduce(lambda inner, _: [{"segmentation": inner}], range(3000), [1]), "whole numbers"),
-        (functools.reduce(lambda inner, _: {"segmentation": inner}, range(3000), [1]), "whole numbers"),
+        (
+            functools.reduce(lambda inner, _: [{"segmentation": inner}], range(3000), [1]),
+            "whole numbers",
+        ),
+        (
+            functools.reduce(lambda inner, _: {"segmentation": inner}, range(3000), [1]),
+            "whole numbers",
+        ),
     ],
 )
 def test_a_bad_mask_is_one_sentence(given, message):
@@ -109,10 +121,14 @@ def test_a_bad_mask_is_one_sentence(given, message):
 
 def test_a_mask_of_object_and_table_is_trimmed_with_a_note():
     pose = look_at(20.0, 45.0, 0.7)
-    depth, labels = render_depth([box((0.06, 0.05, 0.1)), box((0.05, 0.05, 0.06), (0.05, 0.14))], pose)
+    depth, labels = render_depth(
+        [box((0.06, 0.05, 0.1)), box((0.05, 0.05, 0.06), (0.05, 0.14))], pose
+    )
     row, column = torch.nonzero(labels == 2).T
     drawn = torch.zeros_like(labels, dtype=torch.bool)
-    drawn[row.min() - 9 : row.max() + 9, column.min() - 9 : column.max() + 9] = True  # a box about the object
+    drawn[row.min() - 9 : row.max() + 9, column.min() - 9 : column.max() + 9] = (
+        True  # a box about the object
+    )
     masked = Scene.from_depth(depth, INTRINSICS, pose, mask=drawn)
     listed = Scene.from_depth(depth, INTRINSICS, pose, labels=[labels == 1, drawn & (labels != 1)])
     exact = Scene.from_depth(depth, INTRINSICS, pose, labels=labels)
@@ -129,5 +145,7 @@ def test_a_mask_of_object_and_table_is_trimmed_with_a_note():
 def test_a_photograph_is_no_mask():
     photograph = np.random.default_rng(0).integers(0, 256, (60, 80, 3), dtype=np.uint8)
     for given in (photograph, photograph.astype(np.int32) @ [1, 256, 0]):
-        with pytest.raises(BadArgument, match=r"mask: expected at most 1000 objects, got 4.* as of a photograph"):
+        with pytest.raises(
+            BadArgument, match=r"mask: expected at most 1000 objects, got 4.* as of a photograph"
+        ):
             read_mask(given, (60, 80))

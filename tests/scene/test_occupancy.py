@@ -37,7 +37,9 @@ def scene():
     pixels = torch.nonzero(depth > 0)
     points = cloud_from_depth(depth, INTRINSICS, camera_pose=CAMERA).points
     image = DepthImage(depth, INTRINSICS, CAMERA)
-    return Scene(points, labels[pixels[:, 0], pixels[:, 1]], image, pixels, Plane.horizontal(0.0), 1)
+    return Scene(
+        points, labels[pixels[:, 0], pixels[:, 1]], image, pixels, Plane.horizontal(0.0), 1
+    )
 
 
 @pytest.fixture(scope="module")
@@ -51,12 +53,15 @@ def signed(points, which):
     for k in which:
         size, place = BOXES[k]
         middle = torch.tensor([*place, size[2] / 2], dtype=torch.float64)
-        parts.append(((points - middle).abs() - torch.tensor(size, dtype=torch.float64) / 2).amax(-1))
+        parts.append(
+            ((points - middle).abs() - torch.tensor(size, dtype=torch.float64) / 2).amax(-1)
+        )
     return torch.stack(parts).amin(0)
 
 
 def test_boxes_are_found_where_they_are(occupancy):
-    truth, p = signed(occupancy.centres, (2, 3, 4)), occupancy.probability
+    truth = signed(occupancy.centres, (2, 3, 4))
+    p = occupancy.probability
     assert bool(((p >= 0) & (p <= 1)).all())
     full = p >= 0.5
     assert float(full[truth < -0.005].double().mean()) > 0.85  # what is full is said to be full
@@ -68,7 +73,9 @@ def test_what_the_camera_sees_through_is_never_full(occupancy):
     ahead = CAMERA[:3, 3] - centres
     meshes = trimesh.util.concatenate([box(*b) for b in BOXES.values()])
     hidden = meshes.ray.intersects_any(centres.numpy(), ahead.numpy())
-    free = ~torch.from_numpy(hidden) & (signed(centres, BOXES) > 0.025)  # rim pixels fly off by up to that
+    free = ~torch.from_numpy(hidden) & (
+        signed(centres, BOXES) > 0.025
+    )  # rim pixels fly off by up to that
     assert int(free.sum()) > 10_000
     p = occupancy.probability.reshape(-1)[::7][free]
     assert float(p.max()) < 0.5
@@ -85,15 +92,21 @@ def test_the_target_and_the_table_are_no_obstacles(scene, occupancy):
 def test_things_without_label_are_obstacles_and_the_targets_rim_is_not(scene, occupancy):
     unlabelled = dataclasses.replace(scene, labels=torch.where(scene.labels == 1, 1, 0))
     same = estimate_occupancy(unlabelled, 1)
-    assert float(((same.probability >= 0.5) != (occupancy.probability >= 0.5)).double().mean()) < 0.01
+    assert (
+        float(((same.probability >= 0.5) != (occupancy.probability >= 0.5)).double().mean()) < 0.01
+    )
 
     from scipy.ndimage import binary_closing, binary_erosion
 
     mask = np.zeros(scene.image.depth.shape, bool)
     row, column = scene.pixels.T.numpy()
     mask[row, column] = (scene.labels == 1).numpy()
-    shrunk = torch.from_numpy(binary_erosion(binary_closing(mask, iterations=3), iterations=3)[row, column])
-    trimmed = dataclasses.replace(scene, labels=torch.where((scene.labels == 1) & ~shrunk, 0, scene.labels))
+    shrunk = torch.from_numpy(
+        binary_erosion(binary_closing(mask, iterations=3), iterations=3)[row, column]
+    )
+    trimmed = dataclasses.replace(
+        scene, labels=torch.where((scene.labels == 1) & ~shrunk, 0, scene.labels)
+    )
     p = estimate_occupancy(trimmed, 1)
     near = signed(p.centres, (1,)) < 0.01
     assert float((p.probability[near] >= 0.5).double().mean()) < 0.005

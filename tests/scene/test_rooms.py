@@ -1,4 +1,6 @@
-"""Rendered rooms: tables with edges, floors, walls, bins, shelves and boards, taken by noisy cameras."""
+"""Rendered rooms: tables with edges, floors, walls, bins, shelves and boards, taken by noisy
+cameras.
+"""
 
 import functools
 
@@ -25,13 +27,18 @@ def test_a_room_tells_what_is_true_about_it(kind):
     assert not bool((seen.labels > 0)[seen.furniture > 0].any())
     for k, mesh in enumerate(seen.meshes, start=1):
         own = points[(seen.labels == k) & (seen.depth > 0)]
-        assert len(own) == 0 or float((own - torch.tensor(mesh.centroid)).norm(dim=-1).median()) < 0.15
-        assert float(seen.table.height(torch.tensor(mesh.vertices)).min()) == pytest.approx(0.0, abs=1e-9)
+        assert (
+            len(own) == 0 or float((own - torch.tensor(mesh.centroid)).norm(dim=-1).median()) < 0.15
+        )
+        assert float(seen.table.height(torch.tensor(mesh.vertices)).min()) == pytest.approx(
+            0.0, abs=1e-9
+        )
     assert float(seen.table.height(seen.camera_pose[:3, 3])) > 0
 
 
 def test_a_room_is_repeatable():
-    first, second = rooms(3), rooms(3)
+    first = rooms(3)
+    second = rooms(3)
     assert torch.equal(first.depth, second.depth)
     assert first.names == second.names
     assert not torch.equal(first.depth, rooms(11).depth)
@@ -46,8 +53,12 @@ def cases(**seeds: tuple[int, ...]) -> list[tuple[str, int]]:
     return [(kind, seed) for kind, some in seeds.items() for seed in some]
 
 
-OPEN = cases(round=(5, 0), rectangular=(0, 6), holes=(6, 5), board=(4, 7), ground=(5, 7), above=(0, 3, 5))
-"""Rooms without walls near the things; seeds modulo 4 are RealSense, Kinect v1, Azure Kinect and Zivid."""
+OPEN = cases(
+    round=(5, 0), rectangular=(0, 6), holes=(6, 5), board=(4, 7), ground=(5, 7), above=(0, 3, 5)
+)
+"""Rooms without walls near the things; seeds modulo 4 are RealSense, Kinect v1, Azure Kinect and
+Zivid.
+"""
 WALLED = cases(wall=(1, 3, 7), bin=(1, 6, 7), shelf=(3, 6))
 """Rooms whose walls are near the things."""
 

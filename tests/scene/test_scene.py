@@ -42,7 +42,9 @@ def middle(labels, k):
 
 
 def agreement(scene, picture, k):
-    """Return the share of a thing's measured pixels that the target has, and of the target's that are others'."""
+    """Return the share of a thing's measured pixels that the target has, and of the target's that
+    are others'.
+    """
     depth, labels = picture
     target = torch.zeros_like(labels, dtype=torch.bool)
     row, column = scene.pixels[scene.rows_of()].unbind(-1)
@@ -67,7 +69,8 @@ def test_a_clicked_thing_is_found_whole_and_alone(scene, picture):
 
 def test_labels_are_the_same_wherever_the_camera_stands(scene, picture):
     motion = rigid(
-        rotation_from_vector(torch.tensor([1.0, 2.0, -0.5]).double()), torch.tensor([3.0, -1.0, 2.0]).double()
+        rotation_from_vector(torch.tensor([1.0, 2.0, -0.5]).double()),
+        torch.tensor([3.0, -1.0, 2.0]).double(),
     )
     moved = Scene.from_depth(picture[0], K, motion @ POSE)
     assert torch.equal(moved.labels, scene.labels)
@@ -81,7 +84,9 @@ def test_labels_are_the_same_wherever_the_camera_stands(scene, picture):
 
 def test_other_types_give_the_same_scene(scene, picture):
     millimetres = (1000 * picture[0]).round().numpy().astype(np.uint16)
-    found = Scene.from_depth(millimetres, (616.0, 616.0, 319.5, 239.5), POSE.numpy(), point=middle(picture[1], 1))
+    found = Scene.from_depth(
+        millimetres, (616.0, 616.0, 319.5, 239.5), POSE.numpy(), point=middle(picture[1], 1)
+    )
     assert agreement(found, picture, 1)[0] > 0.95
     missing = torch.where(picture[0] > 0, picture[0], torch.nan)
     assert torch.equal(Scene.from_depth(missing, K, POSE).labels, scene.labels)
@@ -92,7 +97,11 @@ def test_masks_off_by_three_pixels_lose_table_and_neighbours(picture):
 
     depth, labels = picture
     true = (labels == 2).numpy()
-    for mask in (true, binary_dilation(true, iterations=3), binary_erosion(true, iterations=3).astype(np.uint8)):
+    for mask in (
+        true,
+        binary_dilation(true, iterations=3),
+        binary_erosion(true, iterations=3).astype(np.uint8),
+    ):
         scene = Scene.from_depth(depth, K, POSE, mask=mask)
         share, others = agreement(scene, picture, 2)
         assert scene.target == 1 and len(scene.things) == 3
@@ -138,7 +147,8 @@ def test_a_target_cut_off_at_the_border_is_told(picture):
     depth, labels = picture
     assert Scene.from_depth(depth, K, POSE, mask=labels == 1).advice == ()
     row = int(torch.nonzero(labels == 1)[:, 0].double().mean())
-    cut, k = depth[:row], K.clone()
+    cut = depth[:row]
+    k = K.clone()
     k[1, 2] = min(float(K[1, 2]), 0.6 * row)
     mask = (labels == 1)[:row]
     (sentence,) = Scene.from_depth(cut, k, mask=mask, table=None).advice
@@ -159,7 +169,10 @@ def test_a_target_cut_off_at_the_border_is_told(picture):
         ({"labels": np.zeros((4, 6), int)}, "labels: expected .*got shape"),
         ({"table": 2.0}, "table: expected .*got the camera .* below it"),
         ({"up": (0.0, 0.0, -1.0)}, "camera_pose: expected .*another `up`.*180 degrees from up"),
-        ({"intrinsics": (308.0, 308.0, 159.5, 119.5)}, "intrinsics: expected .*got a principal point"),
+        (
+            {"intrinsics": (308.0, 308.0, 159.5, 119.5)},
+            "intrinsics: expected .*got a principal point",
+        ),
         ({"scale": 1000.0}, "depth: expected a median depth.*got 582 m"),
     ],
 )
@@ -181,7 +194,8 @@ def test_no_table_and_no_camera_are_refused(picture):
 
 
 def test_other_supports_are_told_and_survive_a_file(tmp_path):
-    top, floor = box([0.5, 0.4, 0.02], [0.0, 0.0, -0.01]), box([4.0, 4.0, 0.01], [0.0, 0.0, -0.455])
+    top = box([0.5, 0.4, 0.02], [0.0, 0.0, -0.01])
+    floor = box([4.0, 4.0, 0.01], [0.0, 0.0, -0.455])
     stools = [box([0.2, 0.2, 0.2], [x, y, -0.35]) for x in (0.5, -0.6) for y in (-0.5, 0.5)]
     cup = box([0.06, 0.06, 0.08], [0.0, 0.0, 0.04])
     pose = look_at(0.0, 35.0, 1.0)
@@ -192,4 +206,6 @@ def test_other_supports_are_told_and_survive_a_file(tmp_path):
     again = read_scene(save_scene(scene, tmp_path / "scene.npz"))
     assert again.supports[1].offset == scene.supports[1].offset and again.advice == scene.advice
     on_floor = Scene.from_depth(depth, INTRINSICS, pose, table=scene.supports[1])
-    assert on_floor.supports == (scene.supports[1],) and len(on_floor.things) >= 3  # the table, two stools
+    assert (
+        on_floor.supports == (scene.supports[1],) and len(on_floor.things) >= 3
+    )  # the table, two stools

@@ -18,7 +18,9 @@ TABLE = Plane.horizontal(0.0)
 
 def cup():
     outer = trimesh.creation.annulus(0.037, 0.04, 0.08)
-    return trimesh.util.concatenate([outer.apply_translation([0, 0, 0.04]), trimesh.creation.cylinder(0.037, 0.01)])
+    return trimesh.util.concatenate(
+        [outer.apply_translation([0, 0, 0.04]), trimesh.creation.cylinder(0.037, 0.01)]
+    )
 
 
 def look(meshes, elevation=40.0, noise=True):
@@ -36,7 +38,11 @@ def look(meshes, elevation=40.0, noise=True):
             box([0.04, 0.1, 0.12], [-0.01, 0, 0.06]),
         ],  # one hides another's foot
         [cup()],  # its inside is seen over its rim
-        [trimesh.util.concatenate(box([0.06, 0.06, 0.05], [0, 0, 0.025]), box([0.02, 0.12, 0.01], [0, 0.08, 0.045]))],
+        [
+            trimesh.util.concatenate(
+                box([0.06, 0.06, 0.05], [0, 0, 0.025]), box([0.02, 0.12, 0.01], [0, 0.08, 0.045])
+            )
+        ],
         [box([0.15, 0.07, 0.008], [0, 0, 0.004])],
     ],
     ids=["behind", "cup", "overhang", "flat"],
@@ -59,11 +65,14 @@ def test_an_empty_table_has_no_things():
 
 def test_flying_pixels_belong_to_nothing():
     image, labels = look([box([0.06, 0.06, 0.1], [0, 0, 0.05])], noise=False)
-    row, column = torch.nonzero(labels == 1)[:, 0].min(), 320
+    row = torch.nonzero(labels == 1)[:, 0].min()
+    column = 320
     exact = rests_on(image, TABLE)
     assert (exact & (labels == 1)).sum() > 0.96 * (labels == 1).sum()
     flying = image.depth.clone()
-    away = 0.015 + 0.06 * torch.rand(2, 40, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    away = 0.015 + 0.06 * torch.rand(
+        2, 40, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
+    )
     flying[row - 2 : row, column - 20 : column + 20] = image.depth[row + 3, column] + away
     moved = DepthImage(flying, image.intrinsics, image.obj_from_camera)
     assert not rests_on(moved, TABLE)[row - 2 : row, column - 20 : column + 20].any()
@@ -77,7 +86,9 @@ def test_the_floor_of_a_pan_belongs_to_it_and_the_table_in_a_ring_does_not():
     ring, _ = look([rim], 60.0)
     inside = (pan.points()[..., :2].norm(dim=-1) < 0.07) & (labels == 1)
     assert (segment(pan, SupportPlane(TABLE))[inside & (pan.depth > 0)] == 1).double().mean() > 0.95
-    assert (segment(ring, SupportPlane(TABLE))[inside & (ring.depth > 0)] == 0).double().mean() > 0.95
+    assert (
+        segment(ring, SupportPlane(TABLE))[inside & (ring.depth > 0)] == 0
+    ).double().mean() > 0.95
 
 
 def torus(major, minor, place, turn=0.0):
@@ -120,7 +131,9 @@ def test_objects_that_touch_are_cut_at_the_crease_and_told(meshes):
 
 
 def test_objects_apart_do_not_touch_and_a_convex_surface_has_no_crease():
-    image, _ = look([box([0.05, 0.05, 0.06], [0, -0.05, 0.03]), box([0.05, 0.05, 0.06], [0, 0.05, 0.03])], 45.0)
+    image, _ = look(
+        [box([0.05, 0.05, 0.06], [0, -0.05, 0.03]), box([0.05, 0.05, 0.06], [0, 0.05, 0.03])], 45.0
+    )
     found = segment(image, SupportPlane(TABLE))
     assert found.max() == 2 and find_touching(image, found) == []
     assert torch.equal(cut_creases(image, found), found)
@@ -136,8 +149,12 @@ def test_an_uneven_place_of_the_table_is_no_object():
 
 
 def test_a_box_upon_a_box_is_an_object_and_a_knob_upon_a_box_is_a_part():
-    base, jump = box([0.16, 0.16, 0.05], [0, 0, 0.025]), torch.full((480, 640), 0.008, dtype=torch.float64)
-    for top, count in ((box([0.07, 0.09, 0.06], [0, 0, 0.08]), 2), (box([0.02, 0.02, 0.02], [0, 0, 0.06]), 1)):
+    base = box([0.16, 0.16, 0.05], [0, 0, 0.025])
+    jump = torch.full((480, 640), 0.008, dtype=torch.float64)
+    for top, count in (
+        (box([0.07, 0.09, 0.06], [0, 0, 0.08]), 2),
+        (box([0.02, 0.02, 0.02], [0, 0, 0.06]), 1),
+    ):
         image, labels = look([base, top], 45.0)
         pieces = torch.where(image.depth > 0, labels, 0)
         assert len(merge_pieces(image, pieces, TABLE, jump)[1:].unique()) == count

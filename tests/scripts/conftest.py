@@ -26,15 +26,24 @@ def _simulator(request):
 @pytest.fixture
 def tin(tmp_path):
     """A folder with a standing cylinder, seen from one side."""
-    folder, pose, rng = tmp_path / "objects", np.eye(4), np.random.default_rng(0)
+    folder = tmp_path / "objects"
+    pose = np.eye(4)
+    rng = np.random.default_rng(0)
     (folder / "tin").mkdir(parents=True)
-    mesh = trimesh.creation.cylinder(radius=0.03, height=0.12, sections=64).apply_translation([0, 0, 0.06])
+    mesh = trimesh.creation.cylinder(radius=0.03, height=0.12, sections=64).apply_translation(
+        [0, 0, 0.06]
+    )
     mesh.export(folder / "tin" / "mesh.ply")
-    angle, height = (rng.random(700) - 0.5) * 2.9, 0.12 * rng.random(700)
+    angle = (rng.random(700) - 0.5) * 2.9
+    height = 0.12 * rng.random(700)
     seen = np.stack([0.03 * np.cos(angle), 0.03 * np.sin(angle), height], -1)
     trimesh.PointCloud(seen).export(folder / "tin" / "view0_noisy.ply")
     pose[:3, 3] = [0.45, 0.0, 0.15]
-    entry = {"views": {"view0": {"T_object_camera": pose.tolist()}}, "family": "tin", "group": "solid"}
+    entry = {
+        "views": {"view0": {"T_object_camera": pose.tolist()}},
+        "family": "tin",
+        "group": "solid",
+    }
     (folder / "manifest.json").write_text(json.dumps({"objects": {"tin": entry}}))
     return folder
 
@@ -58,7 +67,8 @@ def steps(monkeypatch):
 
     def lift(grasp, hand, mesh, spec, seed, *, parts, error):
         step()
-        motion, status = ObjectMotion(1e-6 * (seed % 1000), 0.1), Status.OK if seed % 3 else Status.DROPPED
+        motion = ObjectMotion(1e-6 * (seed % 1000), 0.1)
+        status = Status.OK if seed % 3 else Status.DROPPED
         return SimpleNamespace(status=status, pushed=motion, slip=motion, contact_order=(1, 0, 2))
 
     monkeypatch.setattr(trials, "list_objects", lambda: ("cylinder", "jug"))

@@ -1,4 +1,6 @@
-"""scripts/bench.py and scripts/train.py: each bench runs on its smallest case; measures agree with closed forms."""
+"""scripts/bench.py and scripts/train.py: each bench runs on its smallest case; measures agree with
+closed forms.
+"""
 
 import dataclasses
 import json
@@ -21,7 +23,12 @@ from benchmarks.gpu.compare import bench_kernel
 from benchmarks.gpu.kernels import kernels
 from benchmarks.ground_truth import nearest_on_mesh, sample_mesh
 from benchmarks.load.campaign import Rates
-from benchmarks.plan.exact_lp import exact_margin, proves_margin_above, proves_margin_below, wrench_matrix
+from benchmarks.plan.exact_lp import (
+    exact_margin,
+    proves_margin_above,
+    proves_margin_below,
+    wrench_matrix,
+)
 from benchmarks.shape.accuracy import find_edges, mean_row, measure_shape
 from benchmarks.shape.walls import measure_walls
 from scipy.spatial.transform import Rotation
@@ -49,13 +56,22 @@ SIMULATED = ("close/perturb", "load/campaign")
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("name", [*RUNS, *(pytest.param(x, marks=pytest.mark.sim) for x in SIMULATED)])
+@pytest.mark.parametrize(
+    "name", [*RUNS, *(pytest.param(x, marks=pytest.mark.sim) for x in SIMULATED)]
+)
 def test_bench_writes_its_rows(name, tin, tmp_path):
     subject, short = name.split("/")
     options = Options(
-        (short,), (tin,), hands=("barrett",), conditions=("none",),
-        starts=30, batches=(1,), scale=2e-4, workers=0, out=tmp_path / "out",
-    )  # fmt: skip
+        (short,),
+        (tin,),
+        hands=("barrett",),
+        conditions=("none",),
+        starts=30,
+        batches=(1,),
+        scale=2e-4,
+        workers=0,
+        out=tmp_path / "out",
+    )
     rows = measure(subject, options)
     assert len(rows) > 0
     written = json.loads((tmp_path / "out" / f"bench_{subject}.json").read_text())
@@ -67,12 +83,22 @@ def test_bench_writes_its_rows(name, tin, tmp_path):
 def test_a_fleet_is_as_fast_as_its_slower_part():
     """A core plans 3 s and tries 20 grasps of half a second; a core beside a GPU only tries."""
     rates = Rates(3.0, 0.5, 20.0, *[0.0] * (len(Rates._fields) - 3))
-    assert rates.views_per_hour(13) == pytest.approx(3600) and rates.views_per_hour(10, 1, 100.0) == pytest.approx(3600)
-    assert rates.views_per_hour(160, 1, 2.0) == pytest.approx(7200) == rates.views_per_hour(160, 2, 1.0)
+    assert rates.views_per_hour(13) == pytest.approx(3600) and rates.views_per_hour(
+        10, 1, 100.0
+    ) == pytest.approx(3600)
+    assert (
+        rates.views_per_hour(160, 1, 2.0)
+        == pytest.approx(7200)
+        == rates.views_per_hour(160, 2, 1.0)
+    )
 
 
 def test_kernels_of_the_gpu_bench_agree_with_themselves():
-    quick = [kernel for kernel in kernels(True) if kernel.name in ("condition", "certify", "Hand.jacobian", "EM step")]
+    quick = [
+        kernel
+        for kernel in kernels(True)
+        if kernel.name in ("condition", "certify", "Hand.jacobian", "EM step")
+    ]
     assert len(quick) == 4
     for kernel in quick:
         small = dataclasses.replace(kernel, sizes=kernel.sizes[:1])
@@ -94,15 +120,20 @@ def test_measure_refuses_an_unknown_bench():
 
 
 def ball(radius: float, n: int) -> torch.Tensor:
-    return radius * unit(torch.randn(n, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64))
+    return radius * unit(
+        torch.randn(n, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    )
 
 
 def test_measure_shape_of_a_larger_ball_is_the_difference_of_the_radii():
     points = ball(0.04, 2000)
-    shape, cloud = fit_shape(PointCloud(points, unit(points))), PointCloud(points)
+    shape = fit_shape(PointCloud(points, unit(points)))
+    cloud = PointCloud(points)
     row = measure_shape(shape, trimesh.creation.icosphere(subdivisions=4, radius=0.043), cloud)
     assert row["seen_median_mm"] == pytest.approx(3.0, abs=0.2) and row["seen_normal_deg"] < 4
-    assert math.isnan(measure_shape(shape, trimesh.creation.icosphere(4, 0.04), cloud)["hidden_median_mm"])
+    assert math.isnan(
+        measure_shape(shape, trimesh.creation.icosphere(4, 0.04), cloud)["hidden_median_mm"]
+    )
     assert mean_row([{"a": 1.0, "b": math.nan}, {"a": 3.0, "b": 5.0}]) == {"a": 2.0, "b": 5.0}
 
 
@@ -113,19 +144,27 @@ def test_measure_walls_of_a_cup_finds_its_thickness():
 
 
 def test_find_edges_marks_edges_but_not_thin_walls():
-    points, normals = sample_mesh(trimesh.creation.box([0.1, 0.1, 0.004]), 3000, np.random.default_rng(0))
-    edge, off = find_edges(points, normals), points[:, :2].abs().amax(1)
+    points, normals = sample_mesh(
+        trimesh.creation.box([0.1, 0.1, 0.004]), 3000, np.random.default_rng(0)
+    )
+    edge = find_edges(points, normals)
+    off = points[:, :2].abs().amax(1)
     assert not bool(edge[off < 0.041].any()) and float(edge[off > 0.046].double().mean()) > 0.95
 
 
 def test_nearest_on_mesh_is_exact_and_takes_the_facing_side():
-    mesh, points = trimesh.creation.icosphere(subdivisions=4, radius=0.04), 1.2 * ball(0.04, 100)
+    mesh = trimesh.creation.icosphere(subdivisions=4, radius=0.04)
+    points = 1.2 * ball(0.04, 100)
     found, _ = nearest_on_mesh(mesh, points)
     distance = trimesh.proximity.closest_point_naive(mesh, points.numpy())[1]
     assert np.abs((found - points).norm(dim=-1).numpy() - distance).max() < 1e-4
     plate = trimesh.creation.box([0.1, 0.1, 0.002]).subdivide_to_size(0.01)
-    below, up = torch.tensor([[0.01, 0.02, -0.0008]]).double(), torch.tensor([[0.0, 0.0, 1.0]]).double()
-    assert nearest_on_mesh(plate, below)[1][0, 2] == -1 and nearest_on_mesh(plate, below, up)[1][0, 2] == 1
+    below = torch.tensor([[0.01, 0.02, -0.0008]]).double()
+    up = torch.tensor([[0.0, 0.0, 1.0]]).double()
+    assert (
+        nearest_on_mesh(plate, below)[1][0, 2] == -1
+        and nearest_on_mesh(plate, below, up)[1][0, 2] == 1
+    )
 
 
 def test_exact_arithmetic_confirms_certificates(generator):
@@ -135,19 +174,30 @@ def test_exact_arithmetic_confirms_certificates(generator):
     phi, _ = solve_closure_lp(wrenches(points, normals, 0.6, 8).flatten(1, 2))
     for i in range(10):
         matrix = wrench_matrix(points[i].numpy(), normals[i].numpy(), 0.6, 8)
-        exact, little, witness = exact_margin(matrix), Fraction(1, 10**9), found.witness[i].numpy()
+        exact = exact_margin(matrix)
+        little = Fraction(1, 10**9)
+        witness = found.witness[i].numpy()
         assert float(exact) == pytest.approx(float(found.margin[i]), abs=1e-10)
-        assert [proves_margin_above(matrix, phi[i].numpy(), exact + k * little) for k in (-1, 1)] == [True, False]
-        assert [proves_margin_below(matrix, witness, exact + k * little) for k in (-1, 1)] == [False, True]
+        assert [
+            proves_margin_above(matrix, phi[i].numpy(), exact + k * little) for k in (-1, 1)
+        ] == [True, False]
+        assert [proves_margin_below(matrix, witness, exact + k * little) for k in (-1, 1)] == [
+            False,
+            True,
+        ]
 
 
 @pytest.mark.parametrize("condition", ["in place", "20 mm", "10 degrees", "afloat, 10 mm"])
 def test_misplace_moves_the_object_by_the_amount_of_the_condition(condition):
-    wrong, mesh, (_, grasp) = CONDITIONS[condition], cylinder((0.02, 0.01)), pinch("allegro")
-    planned, centre = grasp.obj_from_hand[0].double(), torch.tensor([*mesh.center_mass, 1.0])
+    wrong = CONDITIONS[condition]
+    mesh = cylinder((0.02, 0.01))
+    (_, grasp) = pinch("allegro")
+    planned = grasp.obj_from_hand[0].double()
+    centre = torch.tensor([*mesh.center_mass, 1.0])
     for seed in range(5):
         moved = planned @ inverse(planned @ _misplace(wrong, grasp, mesh, seed))
-        shift, turned = moved @ centre - centre, Rotation.from_matrix(moved[:3, :3].numpy()).as_rotvec()
+        shift = moved @ centre - centre
+        turned = Rotation.from_matrix(moved[:3, :3].numpy()).as_rotvec()
         assert float(shift.norm()) == pytest.approx(wrong.distance, abs=1e-9)
         assert math.hypot(*turned) == pytest.approx(wrong.angle, abs=1e-7)
         assert wrong.afloat or abs(float(shift[2])) < 1e-9
@@ -155,15 +205,22 @@ def test_misplace_moves_the_object_by_the_amount_of_the_condition(condition):
 
 def test_draw_solid_is_closed_and_near_the_mean_surface():
     shape = fit_shape(load_object("jug").view, table=0.0)
-    one, other = draw_solid(shape, 0), draw_solid(shape, 1)
+    one = draw_solid(shape, 0)
+    other = draw_solid(shape, 1)
     assert one.is_watertight and not np.array_equal(one.vertices, other.vertices)
 
 
 def test_median_over_resamples_families():
-    assert median_over([("tin", 1.0), ("tin", 3.0), ("cup", 2.0), ("jug", math.nan)]) == (2.0, 2.0, 2.0)
+    assert median_over([("tin", 1.0), ("tin", 3.0), ("cup", 2.0), ("jug", math.nan)]) == (
+        2.0,
+        2.0,
+        2.0,
+    )
 
 
-PINCH = torch.tensor([[0.03, 0.0, 0.0], [-0.03, 0.0, 0.0], [0.0, 0.03, 0.0], [0.0, -0.03, 0.0]]).double()
+PINCH = torch.tensor(
+    [[0.03, 0.0, 0.0], [-0.03, 0.0, 0.0], [0.0, 0.03, 0.0], [0.0, -0.03, 0.0]]
+).double()
 UP = torch.tensor([0.0, 0.0, 2.0, 0.0, 0.0, 0.0]).double()
 
 
@@ -173,7 +230,11 @@ def test_least_grip_of_opposing_fingers_is_the_weight_over_the_friction(friction
     forces = least_grip(PINCH, normals, UP, friction)
     assert forces is not None and torch.allclose(forces.sum(0), UP[:3], atol=1e-8)
     total = float(-(forces * normals).sum())
-    assert 2.0 / friction <= total * 1.0000001 <= 2.0 / friction / math.cos(math.pi / EDGES) * 1.0000001
+    assert (
+        2.0 / friction
+        <= total * 1.0000001
+        <= 2.0 / friction / math.cos(math.pi / EDGES) * 1.0000001
+    )
 
 
 def test_least_grip_is_none_for_fingers_on_one_side_and_for_weak_drives():
@@ -186,7 +247,8 @@ def test_least_grip_is_none_for_fingers_on_one_side_and_for_weak_drives():
 
 
 def test_two_fingers_hold_a_load_beside_their_line_by_the_torque_of_their_patches_alone():
-    points, normals = PINCH[:2], PINCH[:2] / 0.03
+    points = PINCH[:2]
+    normals = PINCH[:2] / 0.03
     load = UP + torch.tensor([0.0, 0.0, 0.0, 0.016, 0.0, 0.0])
     assert least_grip(points, normals, load, 0.5) is None
     forces = least_grip(points, normals, load, 0.5, patch=0.005)
@@ -195,7 +257,8 @@ def test_two_fingers_hold_a_load_beside_their_line_by_the_torque_of_their_patche
 
 
 def test_contacts_on_the_true_surface_hold_a_cylinder_unless_it_is_heavy_on_one_side():
-    hand, (_, grasp) = "barrett", pinch("barrett")
+    hand = "barrett"
+    (_, grasp) = pinch("barrett")
     points, normals = true_contacts(grasp, cylinder())
     np.testing.assert_allclose(points, grasp.contacts.points[0], atol=2e-3)  # a polygon of 32 sides
     assert float((torch.from_numpy(normals) * grasp.contacts.normals[0]).sum(-1).min()) > 0.99

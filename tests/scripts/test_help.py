@@ -17,7 +17,11 @@ else:
 ROOT = Path(__file__).parents[2]
 SCRIPTS = ROOT / "scripts"
 PYTHON = sorted(path for path in SCRIPTS.glob("*.py") if path.read_text().startswith("#!"))
-SHELL = sorted(path for path in SCRIPTS.iterdir() if path.is_file() and path.suffix == "" and path.name[0] != "_")
+SHELL = sorted(
+    path
+    for path in SCRIPTS.iterdir()
+    if path.is_file() and path.suffix == "" and path.name[0] != "_"
+)
 
 
 @pytest.mark.parametrize("path", PYTHON, ids=lambda path: path.stem)
@@ -30,7 +34,13 @@ def test_a_python_script_has_help(path, monkeypatch, capsys):
 
 @pytest.mark.parametrize("path", SHELL, ids=lambda path: path.name)
 def test_a_shell_script_has_help_and_sets_nothing_up_for_it(path, tmp_path):
-    done = subprocess.run([path, "--help"], cwd=tmp_path, env={"PATH": "/usr/bin:/bin"}, capture_output=True, text=True)
+    done = subprocess.run(
+        [path, "--help"],
+        cwd=tmp_path,
+        env={"PATH": "/usr/bin:/bin"},
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 0 and done.stderr == ""
     assert path.read_text().splitlines()[1] == f"# {done.stdout.strip()}"
 
@@ -43,7 +53,17 @@ def test_files_that_scripts_name_exist():
 
 def test_scripts_are_found():
     names = {path.stem for path in (*PYTHON, *SHELL)}
-    assert names >= {"bench", "beside", "demo", "docs", "package", "reproduce", "survey", "test", "train"}
+    assert names >= {
+        "bench",
+        "beside",
+        "demo",
+        "docs",
+        "package",
+        "reproduce",
+        "survey",
+        "test",
+        "train",
+    }
 
 
 def test_the_long_description_leads_nowhere_inside_the_project():
@@ -55,15 +75,26 @@ def test_the_long_description_leads_nowhere_inside_the_project():
         shown = re.sub(change["pattern"], change["replacement"], shown)
     targets = re.findall(r"\]\(([^)]*)\)", shown)
     assert all(target.startswith("https://") for target in targets)
-    assert [x for x in readme.splitlines() if x.startswith("#")] == [x for x in shown.splitlines() if x.startswith("#")]
+    assert [x for x in readme.splitlines() if x.startswith("#")] == [
+        x for x in shown.splitlines() if x.startswith("#")
+    ]
 
 
 def test_run_hides_the_surrounding_package_and_ends_with_the_last_words(tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", "/nowhere")
-    assert package.run(sys.executable, "-c", "import os; print('PYTHONPATH' in os.environ)", cwd=tmp_path) == "False\n"
-    assert package.run(sys.executable, "-c", "import sys; sys.exit(1)", cwd=tmp_path, codes=(1,)) == ""
+    assert (
+        package.run(
+            sys.executable, "-c", "import os; print('PYTHONPATH' in os.environ)", cwd=tmp_path
+        )
+        == "False\n"
+    )
+    assert (
+        package.run(sys.executable, "-c", "import sys; sys.exit(1)", cwd=tmp_path, codes=(1,)) == ""
+    )
     with pytest.raises(SystemExit, match=r"ended with 3:\nthe reason"):
-        package.run(sys.executable, "-c", "import sys; print('the reason'); sys.exit(3)", cwd=tmp_path)
+        package.run(
+            sys.executable, "-c", "import sys; print('the reason'); sys.exit(3)", cwd=tmp_path
+        )
 
 
 def test_one_interpreter_of_each_version_is_found(tmp_path, monkeypatch):

@@ -33,27 +33,38 @@ def test_a_cycle_has_each_of_more_than_thirty_families(bodies):
 
 
 def test_equal_numbers_give_equal_bodies_and_a_family_draws_anew(bodies):
-    again, other = author_household(CYCLE + 3), author_household(3)
+    again = author_household(CYCLE + 3)
+    other = author_household(3)
     assert (again.name, again.family) == (bodies[3].name, other.family)
     assert np.array_equal(again.mesh.vertices, bodies[3].mesh.vertices)
-    assert all(np.array_equal(a.vertices, b.vertices) for a, b in zip(again.parts, bodies[3].parts, strict=True))
+    assert all(
+        np.array_equal(a.vertices, b.vertices)
+        for a, b in zip(again.parts, bodies[3].parts, strict=True)
+    )
     assert not np.allclose(np.sort(other.mesh.extents), np.sort(again.mesh.extents))
 
 
 def test_each_body_is_one_closed_solid_of_a_graspable_size(bodies):
     for body in bodies:
         assert body.mesh.is_volume and body.mesh.body_count == 1, body.name
-        assert body.mesh.extents.min() >= 0.006 and 0.015 <= body.mesh.extents.max() <= 0.25, body.name
+        assert body.mesh.extents.min() >= 0.006 and 0.015 <= body.mesh.extents.max() <= 0.25, (
+            body.name
+        )
 
 
 def test_each_body_rests_on_the_table_below_its_mass_centre(bodies):
     for body in bodies:
         (x0, y0, low), (x1, y1, _) = body.mesh.bounds
         assert [x0 + x1, y0 + y1, low] == pytest.approx([0, 0, 0], abs=1e-9), body.name
-        foot = body.mesh.vertices[body.mesh.vertices[:, 2] < 1e-5, :2]  # a hundredth of a millimetre
-        centre, angle = body.mesh.center_mass[:2], np.linspace(0, 2 * np.pi, 90)
+        foot = body.mesh.vertices[
+            body.mesh.vertices[:, 2] < 1e-5, :2
+        ]  # a hundredth of a millimetre
+        centre = body.mesh.center_mass[:2]
+        angle = np.linspace(0, 2 * np.pi, 90)
         ahead = np.stack([np.cos(angle), np.sin(angle)])
-        assert (((foot - centre) @ ahead).max(0) > 0).all(), body.name  # no line parts it from its feet
+        assert (((foot - centre) @ ahead).max(0) > 0).all(), (
+            body.name
+        )  # no line parts it from its feet
 
 
 def depths(points: np.ndarray, part: trimesh.Trimesh) -> np.ndarray:
@@ -102,5 +113,10 @@ def test_a_tilted_box_comes_to_rest_on_its_nearest_steady_face():
 def test_a_folder_of_bodies_reads_back_with_its_view(tmp_path):
     household(tmp_path, 1, first=5)
     body = author_household(5)
-    assert list_views(tmp_path) == [(body.name, "view0")] and len(read_view(tmp_path, body.name, "view0")) > 100
-    assert read_mesh(tmp_path / body.name / "mesh.ply").volume == pytest.approx(body.mesh.volume, rel=1e-4)
+    assert (
+        list_views(tmp_path) == [(body.name, "view0")]
+        and len(read_view(tmp_path, body.name, "view0")) > 100
+    )
+    assert read_mesh(tmp_path / body.name / "mesh.ply").volume == pytest.approx(
+        body.mesh.volume, rel=1e-4
+    )

@@ -1,4 +1,6 @@
-"""Household perturbations: errors of the given amount, each independent of the others, equal for equal seeds."""
+"""Household perturbations: errors of the given amount, each independent of the others, equal for
+equal seeds.
+"""
 
 import dataclasses
 import math
@@ -14,7 +16,9 @@ from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.values.planning import PointCloud
 from torchgrasp.values.specs import TrialSpec
 
-RADIUS, CAMERA, CENTRE = 0.04, real([0.4, 0.1, 0.3]), real([0.0, 0.0, 0.04])
+RADIUS = 0.04
+CAMERA = real([0.4, 0.1, 0.3])
+CENTRE = real([0.0, 0.0, 0.04])
 DISTANCE = float((CAMERA - CENTRE).norm())
 
 
@@ -22,8 +26,12 @@ def seen_ball(n: int = 1000) -> PointCloud:
     """What the camera sees of a ball on the table, evenly over its image."""
     normals = directions(20 * n, 5)
     facing = normals @ (CAMERA - CENTRE) / DISTANCE
-    even = torch.rand(20 * n, generator=torch.Generator().manual_seed(5), dtype=torch.float64) < facing
-    return PointCloud((CENTRE + RADIUS * normals)[(facing > RADIUS / DISTANCE) & even][:n], None, CAMERA)
+    even = (
+        torch.rand(20 * n, generator=torch.Generator().manual_seed(5), dtype=torch.float64) < facing
+    )
+    return PointCloud(
+        (CENTRE + RADIUS * normals)[(facing > RADIUS / DISTANCE) & even][:n], None, CAMERA
+    )
 
 
 CLOUD = seen_ball()
@@ -47,18 +55,24 @@ def test_the_table_is_off_by_the_amounts_about_the_foot_of_the_cloud():
     tilted = [perturb_view(CLOUD, PERTURBATIONS["up"], seed)[1] for seed in range(60)]
     offsets = [table.offset for table in high]
     assert all(table.normal.tolist() == [0.0, 0.0, 1.0] for table in high)
-    assert sorted({round(x, 12) for x in offsets}) == [-0.003, 0.003] and 15 < sum(x > 0 for x in offsets) < 45
+    assert (
+        sorted({round(x, 12) for x in offsets}) == [-0.003, 0.003]
+        and 15 < sum(x > 0 for x in offsets) < 45
+    )
     normals = torch.stack([table.normal for table in tilted]).numpy()
     assert np.degrees(np.arccos(normals[:, 2])) == pytest.approx(2.0, abs=1e-9)
     assert max(abs(float(table.height(FOOT))) for table in tilted) < 1e-15
-    assert min(np.histogram(np.arctan2(normals[:, 1], normals[:, 0]), 4, (-math.pi, math.pi))[0]) >= 6
+    assert (
+        min(np.histogram(np.arctan2(normals[:, 1], normals[:, 0]), 4, (-math.pi, math.pi))[0]) >= 6
+    )
 
 
 def test_a_wrong_camera_moves_all_it_sees_about_itself():
     seen, table = perturb_view(CLOUD, PERTURBATIONS["camera"], 3)
     assert table.offset == 0.0 and seen.viewpoint is not None
     assert float((seen.viewpoint - CAMERA).norm()) == pytest.approx(0.003, rel=1e-9)
-    before, after = (CLOUD.points - CAMERA).numpy(), (seen.points - seen.viewpoint).numpy()
+    before = (CLOUD.points - CAMERA).numpy()
+    after = (seen.points - seen.viewpoint).numpy()
     turn, _ = Rotation.align_vectors(after, before)  # its residual is a difference of large sums
     assert np.abs(turn.apply(before) - after).max() < 1e-12
     assert math.degrees(turn.magnitude()) == pytest.approx(1.0, rel=1e-6)
@@ -78,7 +92,9 @@ def test_a_wrong_mask_loses_the_rim_and_finds_the_table_beside(seed):
 
 
 def test_friction_is_drawn_evenly_and_the_mass_is_the_true_one():
-    trials = [perturb_trial(TrialSpec(), PERTURBATIONS["friction"], 0.7, seed) for seed in range(200)]
+    trials = [
+        perturb_trial(TrialSpec(), PERTURBATIONS["friction"], 0.7, seed) for seed in range(200)
+    ]
     friction = np.array([trial.friction for trial in trials])
     assert 0.4 <= friction.min() < 0.42 and 0.98 < friction.max() <= 1.0
     assert friction.std() == pytest.approx(0.6 / math.sqrt(12), rel=0.1)
@@ -88,12 +104,21 @@ def test_friction_is_drawn_evenly_and_the_mass_is_the_true_one():
 
 
 def test_each_factor_is_drawn_the_same_alone_and_among_all():
-    views = {name: perturb_view(CLOUD, PERTURBATIONS[name], 7) for name in ("all", "table", "up", "camera")}
-    (seen, table), high, tilted = views["all"], views["table"][1], views["up"][1]
+    views = {
+        name: perturb_view(CLOUD, PERTURBATIONS[name], 7)
+        for name in ("all", "table", "up", "camera")
+    }
+    tilted = views["up"][1]
+    high = views["table"][1]
+    (seen, table) = views["all"]
     assert torch.equal(table.normal, tilted.normal)
-    assert float(table.height(FOOT)) == pytest.approx(-high.offset * float(tilted.normal[2]), abs=1e-15)
+    assert float(table.height(FOOT)) == pytest.approx(
+        -high.offset * float(tilted.normal[2]), abs=1e-15
+    )
     assert torch.equal(seen.viewpoint, views["camera"][0].viewpoint)  # pyright: ignore[reportArgumentType]
-    one, other = (perturb_trial(TrialSpec(), PERTURBATIONS[name], 0.7, 7) for name in ("friction", "all"))
+    one, other = (
+        perturb_trial(TrialSpec(), PERTURBATIONS[name], 0.7, 7) for name in ("friction", "all")
+    )
     assert one.friction == other.friction
 
 

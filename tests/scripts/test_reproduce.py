@@ -15,21 +15,30 @@ from tests.pinch import pinch
 from torchgrasp.foundation.base import join
 from torchgrasp.foundation.errors import BadArgument, Status
 
-TINY = Sizes(starts=8, drawn=8, postures=200, fitted=100, apart=50, folds=2, families=0, grasps=2, draws=1)
+TINY = Sizes(
+    starts=8, drawn=8, postures=200, fitted=100, apart=50, folds=2, families=0, grasps=2, draws=1
+)
 
 
 def test_reproduce_continues_an_interrupted_run_to_equal_bytes(steps, tmp_path, capsys):
     whole = Whole(tmp_path / "whole", parts=("fig7", "table6"), workers=0)
     reproduce(whole, TINY)
-    total, results = steps.count, (whole.out / "results.json").read_bytes()
+    total = steps.count
+    results = (whole.out / "results.json").read_bytes()
     page = (whole.out / "index.html").read_text()
-    assert page.count("<h2>") == 2 and "Not finished." not in page and "data:image/jpeg;base64," in page
+    assert (
+        page.count("<h2>") == 2
+        and "Not finished." not in page
+        and "data:image/jpeg;base64," in page
+    )
     stopped = dataclasses.replace(whole, out=tmp_path / "stopped")
-    steps.count, steps.stop = 0, total // 2
+    steps.count = 0
+    steps.stop = total // 2
     with pytest.raises(KeyboardInterrupt):
         reproduce(stopped, TINY)
     assert (stopped.out / "index.html").read_text().count("Not finished.") == 1
-    steps.count, steps.stop = 0, None
+    steps.count = 0
+    steps.stop = None
     reproduce(stopped, TINY)
     assert 0 < steps.count < total and (stopped.out / "results.json").read_bytes() == results
     capsys.readouterr()
@@ -53,12 +62,17 @@ def test_parts_cover_the_paper():
 def test_rungs_of_the_ladder_exchange_one_stage_at_a_time():
     flat = [dataclasses.asdict(row) | dataclasses.asdict(row.plan) for row in RUNGS]
     for above, below in itertools.pairwise(flat):
-        changed = [name for name in below if name not in ("plan", "name") and above[name] != below[name]]
+        changed = [
+            name for name in below if name not in ("plan", "name") and above[name] != below[name]
+        ]
         assert len(changed) == 1, below["name"]
 
 
 def test_rows_share_plans_and_errors(steps, tmp_path):
-    rows = Row("one", Plan(), "success", "uncertainty", "force"), Row("two", Plan(), "risky", "position", "position")
+    rows = (
+        Row("one", Plan(), "success", "uncertainty", "force"),
+        Row("two", Plan(), "risky", "position", "position"),
+    )
     spec = TableSpec(tmp_path, hands=("allegro",), only=("cylinder",), draws=2, workers=0)
     ((one, two),) = first = list(run_cells(spec, rows))
     assert steps.count == 1 + 2 * 4  # one plan; two grasps and two draws in each row
@@ -77,12 +91,17 @@ def test_in_order_sorts_by_the_sum_of_variances():
 
 def test_an_object_without_a_grasp_fails_every_lift(tmp_path):
     def cell(name: str, held: int, of: int, row: str) -> Cell:
-        lifts = tuple(Lift("view", 0, k, Status.OK if k < held else Status.DROPPED) for k in range(of))
+        lifts = tuple(
+            Lift("view", 0, k, Status.OK if k < held else Status.DROPPED) for k in range(of)
+        )
         return Cell(name, name, "", "allegro", row, lifts, int(not of), 0.01, 2.0)
 
     below = [cell("x", 2, 2, "row"), cell("y", 0, 0, "row"), cell("z", 1, 2, "row")]
     assert count_all(below, 2) == {"x": (2, 2), "y": (0, 2), "z": (1, 2)}
-    found = judge(TableSpec(tmp_path, grasps=1, draws=2), [below, [cell(name, 2, 2, "better") for name in "xyz"]])
+    found = judge(
+        TableSpec(tmp_path, grasps=1, draws=2),
+        [below, [cell(name, 2, 2, "better") for name in "xyz"]],
+    )
     assert found["row"]["held_of_all"].value == 0.5 and found["row"]["held_of_lifted"].value == 0.75
     assert found["better"]["worth"][:2] == (0.5, 0.0)
 

@@ -1,4 +1,6 @@
-"""What the set-up decides about torch, run against a stand-in for Python and pip: nothing is downloaded."""
+"""What the set-up decides about torch, run against a stand-in for Python and pip: nothing is
+downloaded.
+"""
 
 import json
 import os
@@ -13,7 +15,8 @@ ROOT = Path(__file__).parents[2]
 INDEX = "https://download.example.org/whl/cpu"
 
 STAND_IN = """#!{python}
-# Plays python3 and .venv/bin/python: makes the environment, answers pip from answers.json, runs any other code.
+# Plays python3 and .venv/bin/python: makes the environment, answers pip from answers.json, runs any
+# other code.
 import json, os, pathlib, shutil, sys
 arguments, here = sys.argv[1:], pathlib.Path({folder!r})
 if arguments[:2] == ["-m", "venv"]:
@@ -38,14 +41,20 @@ elif "import sapien" not in arguments[-1]:
 def report(wheel: Path, *needs: str) -> dict:
     """What pip would say of a torch with these requirements."""
     metadata = {"name": "torch", "requires_dist": ["filelock", 'numpy; extra == "np"', *needs]}
-    metadata["project_url"] = ["Repository, https://example.org/code", "Homepage, https://example.org"]
+    metadata["project_url"] = [
+        "Repository, https://example.org/code",
+        "Homepage, https://example.org",
+    ]
     return {"install": [{"download_info": {"url": wheel.as_uri()}, "metadata": metadata}]}
 
 
 @pytest.fixture
 def set_up(tmp_path):
-    """Return a function that runs scripts/_setup in a copy of the project; it returns the run and pip's calls."""
-    project, fake = tmp_path / "project", tmp_path / "fake"
+    """Return a function that runs scripts/_setup in a copy of the project; it returns the run and
+    pip's calls.
+    """
+    project = tmp_path / "project"
+    fake = tmp_path / "fake"
     (project / "scripts").mkdir(parents=True)
     fake.mkdir()
     for name in ("pyproject.toml", "constraints.txt", "scripts/_setup"):
@@ -65,40 +74,60 @@ def set_up(tmp_path):
         done = subprocess.run(
             ["bash", "-euo", "pipefail", "-c", "source scripts/_setup"],
             cwd=project,
-            env={**clean, "PYTHON": str(fake / "python"), "PATH": f"{tools}:{clean['PATH']}", **environment},
+            env={
+                **clean,
+                "PYTHON": str(fake / "python"),
+                "PATH": f"{tools}:{clean['PATH']}",
+                **environment,
+            },
             capture_output=True,
             text=True,
             check=False,
         )
-        calls = (fake / "calls.txt").read_text().splitlines() if (fake / "calls.txt").exists() else []
+        calls = (
+            (fake / "calls.txt").read_text().splitlines() if (fake / "calls.txt").exists() else []
+        )
         return done, [c for c in calls if c.startswith("install") and "--report" not in c]
 
     return run
 
 
-CPU, CUDA = (), ("nvidia-cublas-cu12; platform_system == 'Linux'",)
+CPU = ()
+CUDA = ("nvidia-cublas-cu12; platform_system == 'Linux'",)
 CASES = {
     "the configured index has a CPU build": (CPU, {}, False, ""),
     "PyTorch's index has a CPU build": (CUDA, {"own": True}, True, "looking for a CPU build"),
-    "a CPU build is asked for beside a GPU": (CUDA, {"own": True, "gpu": True, "TORCHGRASP_CUDA": "0"}, True, ""),
+    "a CPU build is asked for beside a GPU": (
+        CUDA,
+        {"own": True, "gpu": True, "TORCHGRASP_CUDA": "0"},
+        True,
+        "",
+    ),
     "there is no CPU build": (CUDA, {}, False, "taking the CUDA build, 2.3 GB"),
     "there is a GPU": (CUDA, {"own": True, "gpu": True}, False, "taking the CUDA build, 2.3 GB"),
     "torch is installed": (CUDA, {"own": True, "installed": True}, False, ""),
     "a CUDA build is asked for": (CUDA, {"own": True, "TORCHGRASP_CUDA": "1"}, False, ""),
 }
-"""What the configured build of torch needs, the surroundings, whether PyTorch's index is used, and what is told."""
+"""What the configured build of torch needs, the surroundings, whether PyTorch's index is used, and
+what is told.
+"""
 
 
 @pytest.mark.parametrize(("needs", "around", "own_index", "told"), CASES.values(), ids=CASES)
 def test_setup_chooses_a_build_of_torch(set_up, tmp_path, needs, around, own_index, told):
-    wheel, around = tmp_path / "torch.whl", dict(around)
+    wheel = tmp_path / "torch.whl"
+    around = dict(around)
     wheel.touch()
     os.truncate(wheel, 2_300_000_000)  # a sparse file: it takes no space
     index = report(wheel) if around.pop("own", False) else None
     done, installs = set_up(configured=report(wheel, *needs), index=index, **around)
-    assert done.returncode == 0 and told in done.stdout and ("GB" in done.stdout) is ("GB" in told), done.stderr
+    assert (
+        done.returncode == 0 and told in done.stdout and ("GB" in done.stdout) is ("GB" in told)
+    ), done.stderr
     assert (f"--index-url {INDEX}" in installs[0]) is own_index and "torch==" in installs[0]
-    assert "--index-url" not in installs[1] and "-e .[sim,mujoco,cluster,data,dev,docs]" in installs[1]
+    assert (
+        "--index-url" not in installs[1] and "-e .[sim,mujoco,cluster,data,dev,docs]" in installs[1]
+    )
     done, installs = set_up()  # a second run does nothing
     assert done.returncode == 0 and installs == [] and done.stdout == ""
 

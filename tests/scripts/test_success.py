@@ -5,7 +5,13 @@ import pytest
 
 pytest.importorskip("sklearn")
 from benchmarks.close import success as bench
-from benchmarks.close.success import Cell, judge_order, judge_predictions, judge_promise, judge_trials
+from benchmarks.close.success import (
+    Cell,
+    judge_order,
+    judge_predictions,
+    judge_promise,
+    judge_trials,
+)
 from train.measured import Trials
 from train.success import find_bands, fit_model, judge, keep_trials
 
@@ -18,18 +24,27 @@ def draw_trials(count: int = 6000, families: int = 30, seed: int = 0) -> tuple[T
     """Return trials whose log-odds depend on two features, and the true probabilities."""
     draw = np.random.default_rng(seed)
     features = draw.uniform(0.0, 1.0, (count, len(FEATURES)))
-    odds = 4.0 - 9.0 * features[:, FEATURES.index("force needed")] + 2.0 * features[:, FEATURES.index("force to spare")]
-    beside = np.stack([features, draw.uniform(0.0, 1.0, features.shape), np.full_like(features, np.nan)], 1)
+    odds = (
+        4.0
+        - 9.0 * features[:, FEATURES.index("force needed")]
+        + 2.0 * features[:, FEATURES.index("force to spare")]
+    )
+    beside = np.stack(
+        [features, draw.uniform(0.0, 1.0, features.shape), np.full_like(features, np.nan)], 1
+    )
     chance = 1 / (1 + np.exp(-odds))
     family = np.array([f"family {k:02d}" for k in draw.integers(families, size=count)])
-    hand, rank = np.array(["allegro"] * count), draw.integers(40, size=count)
+    hand = np.array(["allegro"] * count)
+    rank = draw.integers(40, size=count)
     passed = draw.random(count) < chance
     return Trials(features, passed, family, rank, hand, beside, np.zeros(count, dtype=int)), chance
 
 
 @pytest.fixture(scope="module")
 def fitted():
-    """A model fitted to drawn trials, the mask of the families that calibrated it, trials and true probabilities."""
+    """A model fitted to drawn trials, the mask of the families that calibrated it, trials and true
+    probabilities.
+    """
     trials, chance = draw_trials()
     left = np.isin(trials.family, np.unique(trials.family)[::3])
     return fit_model(trials, left), left, trials, chance
@@ -41,13 +56,24 @@ def test_the_model_finds_true_probabilities_and_families_that_calibrate_fit_no_t
     assert np.abs(predicted - chance)[left].mean() < 0.07
     lied = trials._replace(passed=np.where(left, ~trials.passed, trials.passed))
     other = fit_model(lied, left)
-    assert np.array_equal(other.feature.numpy(), model.feature.numpy())  # the same trees, calibrated to the lie
-    assert np.corrcoef(other.log_odds(tensor(trials.features)), model.log_odds(tensor(trials.features)))[0, 1] < -0.99
+    assert np.array_equal(
+        other.feature.numpy(), model.feature.numpy()
+    )  # the same trees, calibrated to the lie
+    assert (
+        np.corrcoef(
+            other.log_odds(tensor(trials.features)), model.log_odds(tensor(trials.features))
+        )[0, 1]
+        < -0.99
+    )
     lines = judge(model, trials.select(left))
-    assert lines[0].startswith("all: predicted") and any(line.startswith("best of its body") for line in lines)
+    assert lines[0].startswith("all: predicted") and any(
+        line.startswith("best of its body") for line in lines
+    )
 
 
-def test_the_best_of_a_body_has_the_greatest_prediction_and_promises_know_outcomes_and_families(fitted):
+def test_the_best_of_a_body_has_the_greatest_prediction_and_promises_know_outcomes_and_families(
+    fitted,
+):
     model, left, trials, _ = fitted
     others = trials.select(left)
     own, other = (model.log_odds(tensor(others.beside[:, k])).numpy() for k in (0, 1))
@@ -59,7 +85,8 @@ def test_the_best_of_a_body_has_the_greatest_prediction_and_promises_know_outcom
 
 def test_bands_contain_the_true_share_and_widen_when_families_differ():
     draw = np.random.default_rng(1)
-    odds, family = draw.normal(size=8000), draw.integers(40, size=8000)
+    odds = draw.normal(size=8000)
+    family = draw.integers(40, size=8000)
     chance = 1 / (1 + np.exp(-odds))
     bands = find_bands(odds, draw.random(8000) < chance, family)
     assert np.all(np.diff(bands, axis=0)[:, 0] > 0) and np.all(bands[:, 1] < bands[:, 2])
@@ -78,23 +105,37 @@ def cell(family: str, group: str, outcomes: list[bool], predicted: list[float]) 
 
 def test_the_bench_counts_the_best_grasp_two_tries_and_the_promise(monkeypatch):
     high = [0.99, 0.98, 0.5, 0.4]
-    first, second = [True, False, True, False], [False, True, False, False]
-    cells = [cell(f"s{k}", "solid", first, high) for k in range(3)] + [cell("t", "thin", second, high)]
+    first = [True, False, True, False]
+    second = [False, True, False, False]
+    cells = [cell(f"s{k}", "solid", first, high) for k in range(3)] + [
+        cell("t", "thin", second, high)
+    ]
     rows = {row.what: row for row in judge_order(cells)}
-    assert rows["best one over the mean of 20 best"].measured.startswith("+31.2")  # 3 of +50, 1 of -25
-    assert rows["best one, solid"].met and not rows["best one, thin"].met and rows["within two tries, thin"].met
+    assert rows["best one over the mean of 20 best"].measured.startswith(
+        "+31.2"
+    )  # 3 of +50, 1 of -25
+    assert (
+        rows["best one, solid"].met
+        and not rows["best one, thin"].met
+        and rows["within two tries, thin"].met
+    )
     assert rows["best one, shell"].met is None
     cells += [cell("t", "thin", second, [0.6, 0.5, 0.4, 0.3])]
     monkeypatch.setattr(bench, "find_promise", lambda share: Promise(2.0, 100, 30))  # 0.88
     promised = {row.what.removeprefix("promise 0.9: "): row for row in judge_promise(cells)}
     assert promised["views refused"].measured == "20.0 %" and not promised["views refused"].met
-    assert promised["held of returned, all"].measured.startswith("75.0 %") and promised["held of returned, solid"].met
+    assert (
+        promised["held of returned, all"].measured.startswith("75.0 %")
+        and promised["held of returned, solid"].met
+    )
     monkeypatch.setattr(bench, "find_promise", lambda share: None)
     assert [row.met for row in judge_promise(cells)] == [False]
     trials = [(f"f{k % 7}", 0, p, (k % 10) < 10 * p) for k in range(200) for p in (0.2, 0.8)]
     said = judge_trials(trials)
     assert said["error"] < 0.01 and said["auc"] == pytest.approx(0.8)
-    many = [cell(f"f{k}", "solid", [(k + j) % 5 < 4 for j in range(4)], [0.8] * 4) for k in range(40)]
+    many = [
+        cell(f"f{k}", "solid", [(k + j) % 5 < 4 for j in range(4)], [0.8] * 4) for k in range(40)
+    ]
     error = next(row for row in judge_predictions(many) if row.what == "calibration error, all")
     assert error.met and "of 160" in error.measured
 
@@ -103,7 +144,9 @@ def test_the_shipped_model_names_all_features():
     model = load_success_model()
     friction, mass = (model.range[FEATURES.index(name)].tolist() for name in ("friction", "mass"))
     assert friction[1] == -mass[0] > 1e8 and friction[0] < 0.3 and 0.5 < mass[1] < 2.0
-    assert len(model.range) == len(model.usual) == len(FEATURES) and int(model.feature.max()) < len(FEATURES)
+    assert len(model.range) == len(model.usual) == len(FEATURES) and int(model.feature.max()) < len(
+        FEATURES
+    )
 
 
 def tensor(rows: np.ndarray):

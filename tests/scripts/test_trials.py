@@ -1,4 +1,6 @@
-"""Trials of the predicted success: tasks are drawn within bounds, ranks are of both ends, jobs are the same again."""
+"""Trials of the predicted success: tasks are drawn within bounds, ranks are of both ends, jobs are
+the same again.
+"""
 
 import json
 
@@ -22,21 +24,39 @@ from torchgrasp.success.features import FEATURES
 def test_tasks_lie_within_their_bounds_and_half_keep_the_planned_friction():
     draw = np.random.default_rng(0)
     tasks = [draw_task(draw, 0.9) for _ in range(400)]
-    assert all(FRICTION[0] <= x.friction <= FRICTION[1] and MASS[0] <= x.mass <= MASS[1] for x in tasks)
-    assert all(x.lift or x.force is not None for x in tasks)  # a pulled object weighs nothing that a hand may feel
+    assert all(
+        FRICTION[0] <= x.friction <= FRICTION[1] and MASS[0] <= x.mass <= MASS[1] for x in tasks
+    )
+    assert all(
+        x.lift or x.force is not None for x in tasks
+    )  # a pulled object weighs nothing that a hand may feel
     assert all(x.force is None or FORCE[0] <= x.force <= FORCE[1] for x in tasks)
-    for share in (x.friction == 0.9 for x in tasks), (x.errs for x in tasks), (2 * x.lift for x in tasks):
+    for share in (
+        (x.friction == 0.9 for x in tasks),
+        (x.errs for x in tasks),
+        (2 * x.lift for x in tasks),
+    ):
         assert 0.4 < np.mean(list(share)) < 0.6
 
 
 def test_a_task_says_what_its_trial_is():
-    lift, pull = Task(True, "uncertainty", 0.6, 0.3, None, True), Task(False, "open_loop", 0.4, 0.05, 5.0, True)
+    lift = Task(True, "uncertainty", 0.6, 0.3, None, True)
+    pull = Task(False, "open_loop", 0.4, 0.05, 5.0, True)
     trial = lift.protocol.trial
     assert (trial.mass, trial.friction, trial.patch, trial.pressing) == (0.3, 0.6, 0.0, "grip")
     assert trial.table_friction == pytest.approx(0.15)
-    assert (lift.protocol.criterion, lift.protocol.tries, lift.protocol.noise.translation) == ("held", 1, 0.03)
+    assert (lift.protocol.criterion, lift.protocol.tries, lift.protocol.noise.translation) == (
+        "held",
+        1,
+        0.03,
+    )
     trial = pull.protocol.trial
-    assert (trial.force, trial.closing, trial.gravity, trial.simulator) == (5.0, "open_loop", 0.0, "mujoco")
+    assert (trial.force, trial.closing, trial.gravity, trial.simulator) == (
+        5.0,
+        "open_loop",
+        0.0,
+        "mujoco",
+    )
     assert trial.friction * trial.patch == pytest.approx(0.02)
     assert pull.protocol.noise.translation == 0.005
 
@@ -53,18 +73,24 @@ def test_ordinary_tasks_are_lighter_and_keep_the_planned_friction():
     assert all(x.friction == 0.7 and not x.errs and MASS[0] <= x.mass <= 0.25 for x in tasks)
     assert all(x.force is None or x.force >= 4.0 for x in tasks)
     known = [x.known for x in tasks]
-    assert [(x.mass, x.lift, x.displaced) for x in known] == [(x.mass, x.lift, x.errs) for x in tasks]
+    assert [(x.mass, x.lift, x.displaced) for x in known] == [
+        (x.mass, x.lift, x.errs) for x in tasks
+    ]
 
 
 @pytest.mark.sim
-def test_the_best_grasp_is_tried_for_each_ordinary_task_on_families_that_calibrate(tmp_path, monkeypatch):
+def test_the_best_grasp_is_tried_for_each_ordinary_task_on_families_that_calibrate(
+    tmp_path, monkeypatch
+):
     monkeypatch.setattr(runner, "STARTS", 20)
     monkeypatch.setattr(runner, "TASKS", 1)
     number = next(k for k in range(0, 400, 4) if family_of(k) in CALIBRATING)
     data = run_trials("allegro", 4, tmp_path, 0, first=number, best=True)
     assert len(data.jobs) == 1 and data.jobs[0].family in CALIBRATING and data.jobs[0].grasps <= 1
     assert not len(
-        run_trials("allegro", 4, tmp_path / "other", 0, first=number + 4 * len(FAMILIES) + 1, best=True).jobs
+        run_trials(
+            "allegro", 4, tmp_path / "other", 0, first=number + 4 * len(FAMILIES) + 1, best=True
+        ).jobs
     )
 
 
@@ -74,7 +100,9 @@ def test_trials_are_kept_and_read_with_their_tasks(tmp_path, monkeypatch):
     monkeypatch.setattr(runner, "BEST", 1)
     monkeypatch.setattr(runner, "SPREAD", 0)
     data = run_trials("allegro", 1, tmp_path, 0)
-    [(row, cloud, grasps, [trial])] = read_rows([load_shard(tmp_path / "allegro" / "shard-000000.safetensors", {})])
+    [(row, cloud, grasps, [trial])] = read_rows(
+        [load_shard(tmp_path / "allegro" / "shard-000000.safetensors", {})]
+    )
     assert (row.object, row.status, trial.status in Status) == ("body00000", Status.OK, True)
     assert len(cloud) == row.points and len(grasps) == 1 and trial.rank < 20
     assert json.loads(row.meta["ranks"]) == [trial.rank]

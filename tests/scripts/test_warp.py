@@ -15,7 +15,9 @@ from torchgrasp.foundation.errors import BadArgument, MissingExtra, Status
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
 PROTOCOL = dataclasses.replace(
-    PROTOCOLS["dexgraspbench"].with_trial(mass=0.05, simulator="mujoco", timestep=0.004, overlap=1e-3),
+    PROTOCOLS["dexgraspbench"].with_trial(
+        mass=0.05, simulator="mujoco", timestep=0.004, overlap=1e-3
+    ),
     pull=PullSpec(10.0, 0.2, 0.05, math.radians(15)),
 )
 
@@ -23,7 +25,10 @@ PROTOCOL = dataclasses.replace(
 def halves():
     """The upper and the lower half of the cylinder."""
     middle = (0.0, 0.0, HEIGHT / 2)
-    return [trimesh.intersections.slice_mesh_plane(cylinder(), (0, 0, z), middle, cap=True) for z in (1, -1)]
+    return [
+        trimesh.intersections.slice_mesh_plane(cylinder(), (0, 0, z), middle, cap=True)
+        for z in (1, -1)
+    ]
 
 
 def pinched(parts=None, ahead=0.0, name="allegro"):
@@ -37,9 +42,12 @@ def pinched(parts=None, ahead=0.0, name="allegro"):
 def test_trials_at_once_end_as_each_alone():
     pytest.importorskip("mujoco_warp")
     trials = [pinched(), pinched(halves()), pinched(ahead=0.2), pinched(halves(), ahead=-0.05)]
-    here, there = pull_grasps(trials, PROTOCOL, "cpu"), [pull_grasp(trial, PROTOCOL) for trial in trials]
+    here = pull_grasps(trials, PROTOCOL, "cpu")
+    there = [pull_grasp(trial, PROTOCOL) for trial in trials]
     assert [x.status for x in there] == [Status.OK, Status.OK, Status.MOVED, Status.START_OVERLAP]
-    assert [(x.status, x.passed, x.directions) for x in here] == [(x.status, x.passed, x.directions) for x in there]
+    assert [(x.status, x.passed, x.directions) for x in here] == [
+        (x.status, x.passed, x.directions) for x in there
+    ]
     for one, other in zip(here, there, strict=True):
         assert one.moved == pytest.approx(other.moved, abs=2e-4)
         assert one.turned == pytest.approx(other.turned, abs=1e-3)
@@ -50,7 +58,11 @@ def test_trials_at_once_end_as_each_alone():
 def test_bad_arguments_and_a_missing_package_are_named(monkeypatch):
     for trials, protocol, message in (
         ([pinched()], "paper", "protocol: expected one that closes in open loop"),
-        ([pinched()], PROTOCOL.with_trial(closing="uncertainty"), "protocol: expected one that closes in open loop"),
+        (
+            [pinched()],
+            PROTOCOL.with_trial(closing="uncertainty"),
+            "protocol: expected one that closes in open loop",
+        ),
         ([pinched(), pinched(name="barrett")], PROTOCOL, "trials: expected .*got 2 hands"),
         ([], PROTOCOL, "trials: expected .*got 0 hands"),
     ):

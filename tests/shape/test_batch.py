@@ -21,7 +21,9 @@ def shapes():
 
 @pytest.fixture
 def rows(shapes, generator):
-    """Rows of three points each in and around the objects, their clouds, and the stack of their shapes."""
+    """Rows of three points each in and around the objects, their clouds, and the stack of their
+    shapes.
+    """
     owner = torch.randint(len(shapes), (60,), generator=generator)
     points = 0.6 * torch.randn(60, 3, 3, generator=generator, dtype=torch.float64)
     return points, owner, ShapeBatch.of(shapes).rows(owner)
@@ -42,7 +44,9 @@ def test_every_row_has_the_values_of_its_own_shape(shapes, rows, name):
     found = [x.unflatten(0, points.shape[:2]) for x in METHODS[name](stack, points.flatten(0, 1))]
     for k, shape in enumerate(shapes):
         own = owner == k
-        for value, expected in zip(found, METHODS[name](shape, points[own].flatten(0, 1)), strict=True):
+        for value, expected in zip(
+            found, METHODS[name](shape, points[own].flatten(0, 1)), strict=True
+        ):
             torch.testing.assert_close(value[own].flatten(0, 1), expected, rtol=1e-9, atol=1e-9)
 
 
@@ -58,9 +62,12 @@ def test_numbers_and_frames_of_rows_are_those_of_their_clouds(shapes, rows):
 
 def test_some_rows_and_single_walls_can_be_asked_for(shapes, rows):
     points, owner, stack = rows
-    every, some = stack.jet(points.flatten(0, 1)), torch.tensor([7, 3, 40])
+    every = stack.jet(points.flatten(0, 1))
+    some = torch.tensor([7, 3, 40])
     found = stack.rows(some).jet(points[some].flatten(0, 1))
-    torch.testing.assert_close(found.variance, every.variance.view(60, 3)[some].flatten(), rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(
+        found.variance, every.variance.view(60, 3)[some].flatten(), rtol=1e-9, atol=1e-9
+    )
     for side, wall in enumerate(stack.walls):
         own = shapes[1].walls[side].mean_and_gradient(points[owner == 1].flatten(0, 1))[0]
         distance = wall.mean_and_gradient(points.flatten(0, 1))[0].view(60, 3)

@@ -16,7 +16,9 @@ from torchgrasp.shape.kernel import Kernel, KernelName, matern52_kernel
 
 
 def _side(angle_from: float, angle_to: float) -> Tensor:
-    """Points on the cylinder's side, by the angle [rad] from the camera's direction, away from its ends."""
+    """Points on the cylinder's side, by the angle [rad] from the camera's direction, away from its
+    ends.
+    """
     angle = torch.linspace(angle_from, angle_to, 12, dtype=torch.float64)
     height = torch.linspace(0.025, 0.095, 8, dtype=torch.float64)
     a, h = (g.reshape(-1) for g in torch.meshgrid(angle, height, indexing="ij"))
@@ -26,7 +28,9 @@ def _side(angle_from: float, angle_to: float) -> Tensor:
 @pytest.fixture(scope="module")
 def cloud(seen_cylinder: PointCloud) -> PointCloud:
     """A noisy single view of a cylinder, r 30 mm and h 120 mm, without normals."""
-    noise = torch.randn(seen_cylinder.points.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    noise = torch.randn(
+        seen_cylinder.points.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64
+    )
     return PointCloud(seen_cylinder.points + 0.0005 * noise, None, seen_cylinder.viewpoint)
 
 
@@ -40,25 +44,33 @@ def paper(cloud: PointCloud) -> ShapeGP:
     return fit_shape(cloud, support="paper", budget=60, seed=3)
 
 
-def test_seen_side_is_within_a_millimetre_and_the_hidden_one_better_than_the_papers(shape: ShapeGP, paper: ShapeGP):
+def test_seen_side_is_within_a_millimetre_and_the_hidden_one_better_than_the_papers(
+    shape: ShapeGP, paper: ShapeGP
+):
     points = _side(-1.2, 1.2)
     found = shape.predict(points)
     assert (found.distance.abs() * shape.scale).median() < 0.001
     assert _normal_error(found.normal, points).median() < 8
     assert found.variance.median() < 0.03
     points = _side(2.2, 4.1)
-    found, seen = shape.predict(points), shape.predict(_side(-1.2, 1.2))
+    found = shape.predict(points)
+    seen = shape.predict(_side(-1.2, 1.2))
     assert (found.distance.abs() * shape.scale).median() < 0.003
     assert _normal_error(found.normal, points).median() < 15
     assert found.std_m.median() > seen.std_m.median()
     assert (found.distance.abs() * shape.scale < 2 * found.std_m).double().mean() > 0.9
-    ours, theirs = shape.predict(points), paper.predict(points)
-    assert _normal_error(ours.normal, points).median() < _normal_error(theirs.normal, points).median()
+    ours = shape.predict(points)
+    theirs = paper.predict(points)
+    assert (
+        _normal_error(ours.normal, points).median() < _normal_error(theirs.normal, points).median()
+    )
     assert ours.variance.median() < theirs.variance.median()
 
 
 def test_what_is_observed_outside_allows_for_the_hidden_side_and_distance_is_metric(shape: ShapeGP):
-    """Measured to the cloud alone, points behind the object would be a diameter too far away, and shrink it."""
+    """Measured to the cloud alone, points behind the object would be a diameter too far away, and
+    shrink it.
+    """
     outside = shape.metres(shape.x[torch.linalg.vector_norm(shape.x, dim=-1).sub(1.2).abs() < 1e-9])
     assert len(outside) == 20
     radial = torch.linalg.vector_norm(outside[:, :2], dim=-1) - 0.03
@@ -70,32 +82,48 @@ def test_what_is_observed_outside_allows_for_the_hidden_side_and_distance_is_met
     near(shape.predict(axis).distance * shape.scale, real([0.015, 0.0, -0.01]), 0.003)
 
 
-def test_paper_support_observes_what_the_paper_does_and_copies_change_nothing(paper: ShapeGP, cloud: PointCloud):
-    inner, outer = paper.x[~paper.has_normal][0], paper.x[~paper.has_normal][1:]
+def test_paper_support_observes_what_the_paper_does_and_copies_change_nothing(
+    paper: ShapeGP, cloud: PointCloud
+):
+    inner = paper.x[~paper.has_normal][0]
+    outer = paper.x[~paper.has_normal][1:]
     assert len(paper.x) == 60 and paper.std_factor == 1.0
     assert inner.abs().max() == 0
-    torch.testing.assert_close(torch.linalg.vector_norm(outer, dim=-1), torch.full((20,), 1.2, dtype=torch.float64))
+    torch.testing.assert_close(
+        torch.linalg.vector_norm(outer, dim=-1), torch.full((20,), 1.2, dtype=torch.float64)
+    )
     assert torch.linalg.vector_norm(paper.x[paper.has_normal], dim=-1).max() <= 1 + 1e-12
-    near(paper.predict(paper.metres(paper.x[~paper.has_normal])).distance, real([-1.0] + [1.0] * 20), 0.02)
+    near(
+        paper.predict(paper.metres(paper.x[~paper.has_normal])).distance,
+        real([-1.0] + [1.0] * 20),
+        0.02,
+    )
     before = torch.get_rng_state()
     again, other = (fit_shape(cloud, support="paper", budget=60, seed=seed) for seed in (3, 6))
     assert torch.equal(again.weights, paper.weights) and not torch.equal(again.x, other.x)
     assert torch.equal(torch.get_rng_state(), before)
-    once, rows = ball(), torch.cat([torch.arange(300), torch.arange(150)])
+    once = ball()
+    rows = torch.cat([torch.arange(300), torch.arange(150)])
     assert once.normals is not None
     twice = PointCloud(once.points[rows], once.normals[rows])
-    assert torch.equal(fit_shape(once, support="paper").weights, fit_shape(twice, support="paper").weights)
+    assert torch.equal(
+        fit_shape(once, support="paper").weights, fit_shape(twice, support="paper").weights
+    )
 
 
 @pytest.mark.parametrize("support", ["camera", "paper"])
-def test_the_papers_psi_raises_and_its_fix_works(cloud: PointCloud, support: Literal["camera", "paper"]):
+def test_the_papers_psi_raises_and_its_fix_works(
+    cloud: PointCloud, support: Literal["camera", "paper"]
+):
     with pytest.raises(IndefiniteCovariance, match=r"psi_scale of at least 1\.34"):
         fit_shape(cloud, psi_scale=1.0, support=support)
     fit_shape(cloud, psi_scale=1.34, support=support)
 
 
 @pytest.mark.parametrize("viewpoint", [None, real([0.0, 0.0, 0.5])])
-def test_a_whole_surface_needs_no_completion_and_a_viewpoint_does_not_turn_it(viewpoint: Tensor | None):
+def test_a_whole_surface_needs_no_completion_and_a_viewpoint_does_not_turn_it(
+    viewpoint: Tensor | None,
+):
     whole = ball(900, viewpoint=viewpoint)
     shape = fit_shape(whole)
     found = shape.predict(whole.points)
@@ -105,7 +133,9 @@ def test_a_whole_surface_needs_no_completion_and_a_viewpoint_does_not_turn_it(vi
 
 
 @pytest.mark.parametrize("viewpoint", [None, real([0.3, 0.1, 0.4])])
-def test_a_whole_surface_without_normals_is_refused_and_not_turned_inside_out(viewpoint: Tensor | None):
+def test_a_whole_surface_without_normals_is_refused_and_not_turned_inside_out(
+    viewpoint: Tensor | None,
+):
     for shape in (real([1.0, 1.0, 1.0]), real([0.4, 1.0, 2.0])):
         with pytest.raises(BadArgument, match=r"cloud: .* outward normals.* behind others"):
             fit_shape(PointCloud(ball(900).points * shape, None, viewpoint))
@@ -122,12 +152,29 @@ def test_few_points_in_float32_give_a_shape_in_float64(cloud: PointCloud):
 
 @pytest.mark.parametrize(
     ("name", "bad"),
-    [("noise", 0.0), ("noise", -1.0), ("noise", math.nan), ("budget", 3), ("budget", 0), ("budget", 1001),
-     ("psi_scale", 0.9), ("psi_scale", math.inf), ("seed", -1), ("table", math.nan), ("seed", 1.5), ("budget", 70.5),
-     ("kernel", "cubic"), ("criterion", "chance"), ("budget", "many"), ("support", "guess")],
-)  # fmt: skip
+    [
+        ("noise", 0.0),
+        ("noise", -1.0),
+        ("noise", math.nan),
+        ("budget", 3),
+        ("budget", 0),
+        ("budget", 1001),
+        ("psi_scale", 0.9),
+        ("psi_scale", math.inf),
+        ("seed", -1),
+        ("table", math.nan),
+        ("seed", 1.5),
+        ("budget", 70.5),
+        ("kernel", "cubic"),
+        ("criterion", "chance"),
+        ("budget", "many"),
+        ("support", "guess"),
+    ],
+)
 def test_bad_arguments_are_refused_by_name(cloud: PointCloud, name: str, bad: Any):
-    with pytest.raises((BadArgument, TypeError), match=name):  # TypeError: annotations, checked in tests
+    with pytest.raises(
+        (BadArgument, TypeError), match=name
+    ):  # TypeError: annotations, checked in tests
         fit_shape(cloud, **{name: bad})
 
 
@@ -143,7 +190,9 @@ def test_clouds_in_millimetres_or_around_their_viewpoint_are_refused(cloud: Poin
 def test_points_are_taken_until_the_whole_cloud_is_certain(
     cloud: PointCloud, criterion: Criterion, support: Literal["camera", "paper"]
 ):
-    shape, few = (fit_shape(cloud, budget=n, support=support, criterion=criterion) for n in ("sure", 30))
+    shape, few = (
+        fit_shape(cloud, budget=n, support=support, criterion=criterion) for n in ("sure", 30)
+    )
     assert shape.predict(shape.cloud.points).variance.max() <= 0.01
     assert len(few.x) < len(shape.x) and few.predict(few.cloud.points).variance.max() > 0.01
 
@@ -171,17 +220,23 @@ def test_the_less_is_known_of_the_hidden_side_the_larger_is_its_deviation():
 @pytest.mark.parametrize("table", [0.0, None])
 def test_the_deviation_has_the_factor_of_the_kind_and_the_table(seen_cylinder, table):
     shape = fit_shape(seen_cylinder, table=table)
-    assert shape.kind == "revolution" and shape.std_factor == STD_FACTORS[shape.kind, table is not None]
+    assert (
+        shape.kind == "revolution"
+        and shape.std_factor == STD_FACTORS[shape.kind, table is not None]
+    )
 
 
 def test_the_default_device_and_dtype_change_no_shape(cloud: PointCloud, shape: ShapeGP):
-    view, points = cup_view(0.003), cloud.points[:5]
+    view = cup_view(0.003)
+    points = cloud.points[:5]
     vessel = fit_shape(view, table=0.0)
     torch.set_default_device("meta")
     torch.set_default_dtype(torch.float64)
     try:
-        found, hollow = fit_shape(cloud, table=0.0), fit_shape(view, table=0.0)
-        touched, drawn = found.update(points[:1]), found.sample(points, 2)
+        found = fit_shape(cloud, table=0.0)
+        hollow = fit_shape(view, table=0.0)
+        touched = found.update(points[:1])
+        drawn = found.sample(points, 2)
         slopes = found.differentiate(points)
     finally:
         torch.set_default_device(None)

@@ -1,4 +1,6 @@
-"""The estimate of half a sphere against finite differences, closed forms, and the theory of the kernel's domain."""
+"""The estimate of half a sphere against finite differences, closed forms, and the theory of the
+kernel's domain.
+"""
 
 from functools import partial
 
@@ -25,23 +27,34 @@ def shape() -> ShapeGP:
 
 def test_eq1_estimate_has_the_shape_and_dtype_of_the_points_and_unit_normals(shape: ShapeGP):
     points = queries(shape, 12).reshape(3, 4, 3)
-    found, flat = shape.predict(points), shape.predict(points.reshape(-1, 3))
+    found = shape.predict(points)
+    flat = shape.predict(points.reshape(-1, 3))
     assert found.distance.shape == (3, 4) and found.covariance.shape == (3, 4, 4, 4)
     torch.testing.assert_close(found.normal.norm(dim=-1), torch.ones(3, 4, dtype=torch.float64))
     torch.testing.assert_close(flat.variance.reshape(3, 4), found.variance)
-    single, double = shape.predict(points.float()), shape.predict(points.float().double())
-    assert single.distance.dtype == torch.float32 and shape.to(torch.float32).factor.dtype == torch.float64
+    single = shape.predict(points.float())
+    double = shape.predict(points.float().double())
+    assert (
+        single.distance.dtype == torch.float32
+        and shape.to(torch.float32).factor.dtype == torch.float64
+    )
     torch.testing.assert_close(single.distance, double.distance.float())
     none = shape.predict(torch.zeros(2, 0, 3))
     assert none.covariance.shape == (2, 0, 4, 4) and none.std_m.shape == (2, 0)
 
 
 @pytest.mark.promise("N4")
-def test_eq8_variance_is_within_zero_and_the_prior_and_eq9_zero_level_is_the_sphere_where_seen(shape: ShapeGP):
+def test_eq8_variance_is_within_zero_and_the_prior_and_eq9_zero_level_is_the_sphere_where_seen(
+    shape: ShapeGP,
+):
     found = shape.predict(queries(shape, 3000))
     assert found.variance.min() > 0 and found.variance.max() < shape.psi**3
     assert torch.linalg.eigvalsh(found.covariance).min() > -1e-6
-    assert shape.predict(shape.metres(EYE[0])).variance < 0.01 < shape.predict(shape.metres(-EYE[0])).variance
+    assert (
+        shape.predict(shape.metres(EYE[0])).variance
+        < 0.01
+        < shape.predict(shape.metres(-EYE[0])).variance
+    )
     known = half_sphere()
     on = known.x[known.has_normal]
     found = shape.predict(shape.metres(on))
@@ -49,14 +62,20 @@ def test_eq8_variance_is_within_zero_and_the_prior_and_eq9_zero_level_is_the_sph
     assert (found.normal * on).sum(-1).min() > 0.99
 
 
-def test_std_m_is_the_calibrated_deviation_in_metres_over_the_slope(shape: ShapeGP, seen_cylinder: PointCloud):
+def test_std_m_is_the_calibrated_deviation_in_metres_over_the_slope(
+    shape: ShapeGP, seen_cylinder: PointCloud
+):
     points = queries(shape, 5)
-    found, slope = shape.predict(points), shape.differentiate(points).distance.norm(dim=-1) * shape.scale
+    found = shape.predict(points)
+    slope = shape.differentiate(points).distance.norm(dim=-1) * shape.scale
     torch.testing.assert_close(found.std_m, 0.65 * shape.scale * found.variance.sqrt() / slope)
-    steep, step = fit_shape(seen_cylinder, support="paper"), 1e-6
+    steep = fit_shape(seen_cylinder, support="paper")
+    step = 1e-6
     surface = extract_surface(steep, 16)
     found = steep.predict(surface.vertices)
-    up, down = (steep.predict(surface.vertices + k * step * surface.normals).distance for k in (1, -1))
+    up, down = (
+        steep.predict(surface.vertices + k * step * surface.normals).distance for k in (1, -1)
+    )
     slope = (up - down) / (2 * step)  # per metre
     assert float((slope * steep.scale).quantile(0.9)) > 1.2  # the paper's means are steep
     for std_m in (found.std_m, surface.std_m):
@@ -64,9 +83,11 @@ def test_std_m_is_the_calibrated_deviation_in_metres_over_the_slope(shape: Shape
 
 
 def test_jet_equals_predict_and_its_gradients_equal_finite_differences(shape: ShapeGP):
-    points, step = queries(shape, 300), 1e-5
+    points = queries(shape, 300)
+    step = 1e-5
     x = shape.normalise(points)
-    jet, found = shape.jet(x), shape.predict(points)
+    jet = shape.jet(x)
+    found = shape.predict(points)
     for distance in (found.distance, shape.mean(x), shape.mean_and_gradient(x)[0]):
         near(jet.distance, distance, 1e-9)
     near(shape.mean_and_gradient(x)[1], jet.gradient, 1e-9)
@@ -74,27 +95,39 @@ def test_jet_equals_predict_and_its_gradients_equal_finite_differences(shape: Sh
     near(jet.variance, found.variance, 1e-6)
     near(unit(jet.gradient), found.normal, 1e-8)
     for m, move in enumerate(step * EYE):
-        up, down = shape.jet(x + move), shape.jet(x - move)
+        up = shape.jet(x + move)
+        down = shape.jet(x - move)
         near(jet.gradient[:, m], (up.distance - down.distance) / (2 * step), 1e-5)
-        torch.testing.assert_close(jet.hessian[:, m], (up.gradient - down.gradient) / (2 * step), rtol=1e-4, atol=1e-3)
+        torch.testing.assert_close(
+            jet.hessian[:, m], (up.gradient - down.gradient) / (2 * step), rtol=1e-4, atol=1e-3
+        )
         normals = (shape.mean_jet(x + move).normals - shape.mean_jet(x - move).normals) / (2 * step)
-        torch.testing.assert_close(shape.mean_jet(x).normal_jacobian[..., m], normals, rtol=1e-3, atol=1e-4)
+        torch.testing.assert_close(
+            shape.mean_jet(x).normal_jacobian[..., m], normals, rtol=1e-3, atol=1e-4
+        )
         wider = shape.jet(x + 30 * move).variance - shape.jet(x - 30 * move).variance
-        torch.testing.assert_close(jet.variance_gradient[:, m], wider / (60 * step), rtol=1e-3, atol=1e-3)
+        torch.testing.assert_close(
+            jet.variance_gradient[:, m], wider / (60 * step), rtol=1e-3, atol=1e-3
+        )
     there = shape.jet(shape.x)  # at the observations
     assert all(
-        torch.isfinite(t).all() for t in (there.distance, there.gradient, there.hessian, there.variance_gradient)
+        torch.isfinite(t).all()
+        for t in (there.distance, there.gradient, there.hessian, there.variance_gradient)
     )
     assert torch.isfinite(shape.mean_and_gradient(shape.x)[1]).all()
     assert shape.jet(shape.x[:0]).hessian.shape == (0, 3, 3)
 
 
-def test_a_rigid_motion_and_a_scale_move_the_estimate_with_the_object(shape: ShapeGP, motion: Tensor):
-    known, turn = half_sphere(), motion[:3, :3]
+def test_a_rigid_motion_and_a_scale_move_the_estimate_with_the_object(
+    shape: ShapeGP, motion: Tensor
+):
+    known = half_sphere()
+    turn = motion[:3, :3]
     moved = Observations(**{**vars(known), "x": known.x @ turn.T, "normal": known.normal @ turn.T})
     other = condition(moved, Normalisation(motion[:3, 3], 0.08), PointCloud(known.x))
     points = queries(shape, 50)
-    a, b = shape.predict(points), other.predict(other.metres(shape.normalise(points) @ turn.T))
+    a = shape.predict(points)
+    b = other.predict(other.metres(shape.normalise(points) @ turn.T))
     near(a.distance, b.distance, 1e-9)
     near(a.normal @ turn.T, b.normal, 1e-8)
     near(a.variance, b.variance, 1e-6)
@@ -102,7 +135,9 @@ def test_a_rigid_motion_and_a_scale_move_the_estimate_with_the_object(shape: Sha
 
 def test_points_far_outside_the_domain_or_not_finite_are_refused_by_name(shape: ShapeGP):
     edge = shape.domain_radius * shape.scale * EYE[0]
-    points, twice = (shape.center + k * torch.stack([0.999 * edge, 1.001 * edge]) for k in (1.0, 2.0))
+    points, twice = (
+        shape.center + k * torch.stack([0.999 * edge, 1.001 * edge]) for k in (1.0, 2.0)
+    )
     assert shape.contains(points).tolist() == [True, False]
     shape.predict(torch.cat([points, twice[:1]]))
     with pytest.raises(BadArgument, match="1 of 2 points far outside the domain"):
@@ -115,8 +150,11 @@ def test_points_far_outside_the_domain_or_not_finite_are_refused_by_name(shape: 
 
 
 @pytest.mark.promise("N4")
-def test_beside_the_domain_distance_grows_outward_from_its_edge_and_the_deviation_is_the_priors(shape: ShapeGP):
-    out, radius = unit(queries(shape, 40) - shape.center), shape.domain_radius * shape.scale
+def test_beside_the_domain_distance_grows_outward_from_its_edge_and_the_deviation_is_the_priors(
+    shape: ShapeGP,
+):
+    out = unit(queries(shape, 40) - shape.center)
+    radius = shape.domain_radius * shape.scale
 
     def at(share: float) -> Tensor:
         return shape.center + share * radius * out
@@ -127,16 +165,20 @@ def test_beside_the_domain_distance_grows_outward_from_its_edge_and_the_deviatio
         found = shape.predict(at(share))
         grown = (found.distance - edge.distance) * shape.scale / radius
         near(grown, torch.full_like(grown, share - 1.0), 1e-7)
-        # The closed form of the thin plate's prior: the variances psi^3 of a distance, 6 psi of a gradient's component.
+        # The closed form of the thin plate's prior: the variances psi^3 of a distance, 6 psi of a
+        # gradient's component.
         prior = torch.diag(real([shape.psi**3, *[6 * shape.psi] * 3]))
         near(found.covariance, prior.expand(40, 4, 4), 1e-9)
         near(found.std_m, torch.full_like(grown, 0.65 * shape.scale * shape.psi**1.5), 1e-9)
         assert (found.variance > edge.variance).all()
-    points, step = torch.cat([at(1.3), at(0.3)]).requires_grad_(), 1e-7
+    points = torch.cat([at(1.3), at(0.3)]).requires_grad_()
+    step = 1e-7
     mixed = shape.predict(points)
     near(mixed.distance[40:].detach(), inside.distance, 1e-12)  # neighbours outside change nothing
     (slope,) = torch.autograd.grad(mixed.distance.sum(), points)
-    moved = [shape.predict(points.detach() + k * step * axis).distance for k in (1, -1) for axis in EYE]
+    moved = [
+        shape.predict(points.detach() + k * step * axis).distance for k in (1, -1) for axis in EYE
+    ]
     near(slope, (torch.stack(moved[:3], 1) - torch.stack(moved[3:], 1)) / (2 * step), 1e-3)
     near(mixed.normal.detach(), unit(slope), 1e-9)
 
@@ -153,12 +195,15 @@ def test_a_sum_of_an_estimate_and_other_terms_is_minimised_on_the_surface(shape:
 @pytest.mark.promise("I11")
 def test_three_points_make_the_papers_psi_indefinite_and_the_default_not():
     x = real([[0, 0, 0.5], [0, 0, -0.5], [3**0.5 / 4, 0, 0.25]])
-    has, zero = torch.ones(3, dtype=torch.bool), torch.zeros(3, dtype=torch.float64)
+    has = torch.ones(3, dtype=torch.bool)
+    zero = torch.zeros(3, dtype=torch.float64)
     matrix = covariance(x, x, has, has, partial(thin_plate, psi=longest_distance(x)))
     assert torch.linalg.eigvalsh(matrix).min().item() == pytest.approx(-0.2519, abs=1e-3)
     known = Observations(x, zero, unit(x), has, zero + 0.01, zero + 0.01)
     rest = Normalisation(zero, 1.0), PointCloud(torch.rand(5, 3))
-    with pytest.raises(IndefiniteCovariance, match=r"eigenvalue -0\.2.*psi_scale of at least 1\.34"):
+    with pytest.raises(
+        IndefiniteCovariance, match=r"eigenvalue -0\.2.*psi_scale of at least 1\.34"
+    ):
         condition(known, *rest, psi_scale=1.0)
     assert condition(known, *rest).domain_radius <= 1.5 * 3 / 8
     noisy = Observations(x, zero, unit(x), torch.arange(3) < 2, zero + 0.01, zero + 2.0)

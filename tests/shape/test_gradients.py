@@ -1,4 +1,6 @@
-"""Derivatives of a shape against a plain Gaussian process, finite differences, and one transform against another."""
+"""Derivatives of a shape against a plain Gaussian process, finite differences, and one transform
+against another.
+"""
 
 import dataclasses
 from collections.abc import Callable
@@ -35,17 +37,26 @@ KERNELS = {
     "rbf": rbf_kernel(1.5, 10.0),
     "own": Kernel(lambda r: 4.0 / (1.0 + 0.3 * r * r)),
 }
-PLATE, BY_AUTOGRAD = thin_plate_kernel(4.0), thin_plate_kernel(4.0, closed_form=False)
+PLATE = thin_plate_kernel(4.0)
+BY_AUTOGRAD = thin_plate_kernel(4.0, closed_form=False)
 EVERY_KERNEL = pytest.mark.parametrize("kernel", KERNELS)
-FRAME, POINTS = Normalisation(real([0.1, 0.2, 0.3]), 0.05), 0.8 * directions(2, seed=3)
+FRAME = Normalisation(real([0.1, 0.2, 0.3]), 0.05)
+POINTS = 0.8 * directions(2, seed=3)
 NOISE = torch.linspace(0.02, 0.05, 6, dtype=torch.float64)
 SEEN = Observations(
-    directions(6), 0.1 * torch.cos(3 * directions(6)[:, 0]), directions(6), torch.arange(6) % 3 > 0, NOISE, 2 * NOISE
+    directions(6),
+    0.1 * torch.cos(3 * directions(6)[:, 0]),
+    directions(6),
+    torch.arange(6) % 3 > 0,
+    NOISE,
+    2 * NOISE,
 )
 Outputs = tuple[Tensor, ...]
 
 
-def shape_of(kernel: str | Kernel, seen: Observations = SEEN, frame: Normalisation = FRAME) -> ShapeGP:
+def shape_of(
+    kernel: str | Kernel, seen: Observations = SEEN, frame: Normalisation = FRAME
+) -> ShapeGP:
     kernel = KERNELS[kernel] if isinstance(kernel, str) else kernel
     return condition(seen, frame, PointCloud(0.05 * SEEN.x), kernel=kernel)
 
@@ -71,10 +82,15 @@ def total(function: Callable[[Tensor], Outputs]) -> Callable[[Tensor], Tensor]:
 
 
 def check(function: Callable[[Tensor], Outputs], x: Tensor, tolerance: float = 1e-9) -> None:
-    """Check first and second derivatives by finite differences, and that forward mode agrees with reverse mode."""
-    tracked, attached = x.clone().requires_grad_(), lambda x: tuple(y + 0.0 * x.sum() for y in function(x))
+    """Check first and second derivatives by finite differences, and that forward mode agrees with
+    reverse mode.
+    """
+    tracked = x.clone().requires_grad_()
+    attached = lambda x: tuple(y + 0.0 * x.sum() for y in function(x))  # noqa: E731
     close(function(tracked), function(x), tolerance)
-    assert gradcheck(attached, tracked, fast_mode=True, atol=1e-4)  # which skips no output that does not depend on x
+    assert gradcheck(
+        attached, tracked, fast_mode=True, atol=1e-4
+    )  # which skips no output that does not depend on x
     assert gradgradcheck(attached, tracked, fast_mode=True, atol=1e-3)
     close(torch.func.jacrev(function)(x), torch.func.jacfwd(function)(x), tolerance)
 
@@ -84,29 +100,39 @@ def close(found: Outputs, wanted: Outputs, tolerance: float = 1e-9) -> None:
         torch.testing.assert_close(a, b, rtol=tolerance, atol=tolerance)
 
 
-def plain_posterior(profile: Callable[[Tensor], Tensor], seen: Observations, x: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean (4,) and covariance (4, 4) of a Gaussian process at a point; covariances are derivatives of k(|a - b|)."""
+def plain_posterior(
+    profile: Callable[[Tensor], Tensor], seen: Observations, x: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Mean (4,) and covariance (4, 4) of a Gaussian process at a point; covariances are derivatives
+    of k(|a - b|).
+    """
 
     def block(a: Tensor, b: Tensor) -> Tensor:
         k = lambda a, b: profile((a - b).square().sum().sqrt())  # noqa: E731
-        by_a, by_b, both = torch.func.grad(k), torch.func.grad(k, 1), torch.func.jacrev(torch.func.grad(k), 1)
+        by_a = torch.func.grad(k)
+        by_b = torch.func.grad(k, 1)
+        both = torch.func.jacrev(torch.func.grad(k), 1)
         top = torch.cat([k(a, b)[None], by_b(a, b)])
         return torch.cat([top[None], torch.cat([by_a(a, b)[:, None], both(a, b)], 1)])
 
     def matrix(a: Tensor, b: Tensor) -> Tensor:
-        return torch.cat([torch.cat([block(p, q + 1e-9) for q in b], 1) for p in a])  # r > 0: sqrt has no slope at 0
+        return torch.cat(
+            [torch.cat([block(p, q + 1e-9) for q in b], 1) for p in a]
+        )  # r > 0: sqrt has no slope at 0
 
     keep = torch.stack([torch.ones_like(seen.has_normal), *[seen.has_normal] * 3], 1).flatten()
     y = torch.cat([seen.distance[:, None], seen.normal], 1).flatten()[keep]
     noise = torch.stack([seen.distance_noise, *[seen.normal_noise] * 3], 1).flatten()[keep]
-    cross, own = matrix(x[None], seen.x)[:, keep], matrix(seen.x, seen.x)[keep][:, keep]
+    cross = matrix(x[None], seen.x)[:, keep]
+    own = matrix(seen.x, seen.x)[keep][:, keep]
     solved = torch.linalg.solve(own + torch.diag(noise**2), torch.cat([y[:, None], cross.T], 1))
     return cross @ solved[:, 0], matrix(x[None], x[None]) - cross @ solved[:, 1:]
 
 
 @EVERY_KERNEL
 def test_estimates_and_their_derivatives_are_those_of_a_plain_gaussian_process(kernel: str):
-    shape, x = shape_of(kernel), POINTS[:1]
+    shape = shape_of(kernel)
+    x = POINTS[:1]
     wanted = plain_posterior(KERNELS[kernel].profile, SEEN, x[0])
     for found, exact in zip(shape.estimate(x), wanted, strict=True):
         near(found[0], exact, 1e-6)
@@ -116,7 +142,8 @@ def test_estimates_and_their_derivatives_are_those_of_a_plain_gaussian_process(k
 
 
 @pytest.mark.parametrize(
-    ("kernel", "name"), [(k, "predict") for k in KERNELS] + [("own", name) for name in ("jet", "joint_at", "sample")]
+    ("kernel", "name"),
+    [(k, "predict") for k in KERNELS] + [("own", name) for name in ("jet", "joint_at", "sample")],
 )
 def test_estimates_are_twice_differentiable_in_the_points(kernel: str, name: str):
     shape = shape_of(kernel)
@@ -131,7 +158,16 @@ def test_estimates_are_twice_differentiable_in_the_points(kernel: str, name: str
 @pytest.mark.parametrize("kernel", ["thin_plate", "matern52"])
 def test_every_transform_gives_the_same_derivatives(kernel: str):
     shape = shape_of(kernel)
-    names = ("mean", "mean_and_gradient", "mean_jet", "jet", "estimate", "cross", "distance_rows", "joint_at")
+    names = (
+        "mean",
+        "mean_and_gradient",
+        "mean_jet",
+        "jet",
+        "estimate",
+        "cross",
+        "distance_rows",
+        "joint_at",
+    )
     functions = [partial(predict, shape), lambda x: tensors(shape.differentiate(shape.metres(x)))]
     functions += [lambda x, name=name: tensors(getattr(shape, name)(x)) for name in names]
     for function in functions:
@@ -139,7 +175,9 @@ def test_every_transform_gives_the_same_derivatives(kernel: str):
         close(torch.vmap(function)(POINTS[:, None]), tuple(map(torch.stack, alone)), 1e-7)
         close(torch.func.jacrev(function)(POINTS), torch.func.jacfwd(function)(POINTS), 1e-7)
         with dual_level():
-            slopes = [unpack_dual(y).tangent for y in function(make_dual(POINTS, torch.ones_like(POINTS)))]
+            slopes = [
+                unpack_dual(y).tangent for y in function(make_dual(POINTS, torch.ones_like(POINTS)))
+            ]
         close(
             tuple(y for y in slopes if y is not None),
             torch.func.jvp(function, (POINTS,), (torch.ones_like(POINTS),))[1],
@@ -149,35 +187,53 @@ def test_every_transform_gives_the_same_derivatives(kernel: str):
 @EVERY_KERNEL
 def test_hessians_equal_finite_differences_of_gradients_at_observed_points_too(kernel: str):
     shape = shape_of(kernel)
-    smooth = kernel != "thin_plate"  # the thin plate's normals have no second derivative at observed points
+    smooth = (
+        kernel != "thin_plate"
+    )  # the thin plate's normals have no second derivative at observed points
     for x in (POINTS[0], SEEN.x[0], SEEN.x[1])[: 3 if smooth else 1]:
         function = total(lambda x: predict(shape, x))
-        slope, step = torch.func.grad(function), 3e-4  # leaves the polynomial near r = 0
-        wanted = torch.stack([(slope(x + e) - slope(x - e)) / (2 * step) for e in step * torch.eye(3).double()])
+        # leaves the polynomial near r = 0
+        slope = torch.func.grad(function)
+        step = 3e-4
+        wanted = torch.stack(
+            [(slope(x + e) - slope(x - e)) / (2 * step) for e in step * torch.eye(3).double()]
+        )
         found = torch.func.hessian(function)(x)
         assert (found - wanted).abs().max() < 3e-3 * wanted.abs().max()
     for x in (SEEN.x[:1], SEEN.x[1:2]):  # first derivatives exist everywhere
-        assert gradcheck(lambda x: shape.mean_and_gradient(x), x.clone().requires_grad_(), eps=1e-8, atol=1e-4)
+        assert gradcheck(
+            lambda x: shape.mean_and_gradient(x), x.clone().requires_grad_(), eps=1e-8, atol=1e-4
+        )
 
 
 @EVERY_KERNEL
 def test_derivatives_of_a_kernel_are_differentiable_by_the_distance(kernel: str):
     check(lambda r: KERNELS[kernel].derivatives(r, 4), real([0.3, 1.1]), tolerance=1e-7)
     r = real([0.0, 1.1])  # the thin plate's second derivative is infinite at 0 and counts as 0
-    close(torch.vmap(lambda r: KERNELS[kernel].derivatives(r, 3))(r), KERNELS[kernel].derivatives(r, 3))
+    close(
+        torch.vmap(lambda r: KERNELS[kernel].derivatives(r, 3))(r),
+        KERNELS[kernel].derivatives(r, 3),
+    )
     r = torch.zeros(1, dtype=torch.float64, requires_grad=True)
     (slope,) = torch.autograd.grad(KERNELS[kernel].derivatives(r, 1)[0], r, create_graph=True)
     assert slope == 0  # k'(0) = 0, and k''(0) is the first derivative by r^2 / 2
-    torch.testing.assert_close(torch.autograd.grad(slope, r)[0], KERNELS[kernel].derivatives(r, 2)[1])
+    torch.testing.assert_close(
+        torch.autograd.grad(slope, r)[0], KERNELS[kernel].derivatives(r, 2)[1]
+    )
 
 
 def test_the_thin_plate_by_autograd_of_its_profile_equals_the_closed_form_in_values_and_gradients():
     assert PLATE.closed_form and not dataclasses.replace(PLATE, closed_form=False).closed_form
-    fast, slow = shape_of(PLATE), shape_of(BY_AUTOGRAD)
+    fast = shape_of(PLATE)
+    slow = shape_of(BY_AUTOGRAD)
     x = 0.9 * directions(50, seed=5)
     for name in ("cross", "estimate", "mean_and_gradient", "mean_jet", "jet"):
         close(tensors(getattr(slow, name)(x)), tensors(getattr(fast, name)(x)), 1e-9)
-    close(tensors(slow.differentiate(slow.metres(x))), tensors(fast.differentiate(fast.metres(x))), 1e-9)
+    close(
+        tensors(slow.differentiate(slow.metres(x))),
+        tensors(fast.differentiate(fast.metres(x))),
+        1e-9,
+    )
     close((slow.weights, slow.factor), (fast.weights, fast.factor))
     r = x.norm(dim=1)
     close(BY_AUTOGRAD.derivatives(r, 4), PLATE.derivatives(r, 4))
@@ -189,7 +245,9 @@ FIELDS = ("distance", "distance_noise", "normal_noise", "x", "normal")
 
 
 def observed(kernel: str, rows: Tensor) -> Outputs:
-    """Everything that `predict` returns, given the tensors of the observations beside each other: (6, 9)."""
+    """Everything that `predict` returns, given the tensors of the observations beside each other:
+    (6, 9).
+    """
     tensors = dict(zip(FIELDS, [*rows[:, :3].unbind(1), rows[:, 3:6], rows[:, 6:]], strict=True))
     return predict(shape_of(kernel, dataclasses.replace(SEEN, **tensors)), POINTS)
 
@@ -205,8 +263,14 @@ def test_estimates_are_differentiable_in_all_tensors_of_the_observations(kernel:
 
 def test_vmap_maps_over_all_tensors_of_the_observations_but_the_points():
     def by_values(values: Tensor) -> Outputs:
-        tensors = dict(zip(("distance", "distance_noise", "normal_noise"), values[:, :3].unbind(1), strict=True))
-        return predict(shape_of("matern52", dataclasses.replace(SEEN, **tensors, normal=values[:, 6:])), POINTS)
+        tensors = dict(
+            zip(
+                ("distance", "distance_noise", "normal_noise"), values[:, :3].unbind(1), strict=True
+            )
+        )
+        return predict(
+            shape_of("matern52", dataclasses.replace(SEEN, **tensors, normal=values[:, 6:])), POINTS
+        )
 
     rows = torch.stack([rows_of(SEEN), 1.1 * rows_of(SEEN)])
     alone = zip(*map(by_values, rows), strict=True)
@@ -225,11 +289,18 @@ def test_estimates_are_differentiable_in_parameters_of_a_kernel_and_in_the_frame
     for function, value in ((by_psi, 4.0), (by_length, 1.5)):
         check(function, torch.tensor(value, dtype=torch.float64), tolerance=1e-7)
     assert (
-        shape_of("rbf", frame=FRAME.to(torch.float32)).predict(FRAME.metres(POINTS).float()).distance.dtype
+        shape_of("rbf", frame=FRAME.to(torch.float32))
+        .predict(FRAME.metres(POINTS).float())
+        .distance.dtype
         == torch.float32
     )
-    points, touch, still = FRAME.metres(POINTS), FRAME.metres(POINTS[:1]), torch.eye(4)
-    check(lambda c: tensors(shape_of("rbf", frame=Normalisation(c, 0.05)).predict(points).distance), FRAME.center)
+    points = FRAME.metres(POINTS)
+    touch = FRAME.metres(POINTS[:1])
+    still = torch.eye(4)
+    check(
+        lambda c: tensors(shape_of("rbf", frame=Normalisation(c, 0.05)).predict(points).distance),
+        FRAME.center,
+    )
     later = lambda y: shape_of("rbf", dataclasses.replace(SEEN, distance=y)).update(touch)  # noqa: E731
     check(lambda y: tensors(later(y).predict(points).distance), SEEN.distance)
     turned = lambda y: shape_of("rbf", dataclasses.replace(SEEN, distance=y)).moved(still)  # noqa: E731
@@ -237,15 +308,23 @@ def test_estimates_are_differentiable_in_parameters_of_a_kernel_and_in_the_frame
 
 
 @pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
-def test_single_precision_and_batches_of_any_shape_give_the_gradients_of_double_precision(batch: tuple[int, ...]):
-    shape, x = shape_of("thin_plate"), 0.8 * directions(6, seed=4)
+def test_single_precision_and_batches_of_any_shape_give_the_gradients_of_double_precision(
+    batch: tuple[int, ...],
+):
+    shape = shape_of("thin_plate")
+    x = 0.8 * directions(6, seed=4)
     points = shape.metres(x[: max(torch.Size(batch).numel(), 1)].reshape(*batch, 3)).float()
     for name in ("distance", "normal", "variance", "covariance", "std_m"):
         slope = torch.func.grad(lambda p, name=name: (getattr(shape.predict(p), name) ** 3).sum())
-        single, double = slope(points), slope(points.double())
+        single = slope(points)
+        double = slope(points.double())
         assert single.dtype == torch.float32 and single.shape == (*batch, 3)
-        torch.testing.assert_close(single.double(), double, rtol=1e-4, atol=1e-4 * float(double.abs().max()))
-    slopes = torch.func.jacrev(lambda p: shape.predict(p).normal.reshape(-1, 3).sum(0))(points.double())
+        torch.testing.assert_close(
+            single.double(), double, rtol=1e-4, atol=1e-4 * float(double.abs().max())
+        )
+    slopes = torch.func.jacrev(lambda p: shape.predict(p).normal.reshape(-1, 3).sum(0))(
+        points.double()
+    )
     torch.testing.assert_close(shape.differentiate(points.double()).normal, slopes.movedim(0, -2))
 
 
@@ -260,15 +339,25 @@ def test_a_vessel_is_differentiable_on_both_walls(vessel: HollowShape):
     x = vessel.normalise(vessel.cloud.points.double()[::600][:2] + 0.002)
     assert len(x) == 2
     slow = torch.func.jacrev(partial(predict, vessel))(x)
-    step, e = 1e-6, directions(2, seed=9)
-    up, down = predict(vessel, x + step * e), predict(vessel, x - step * e)
+    step = 1e-6
+    e = directions(2, seed=9)
+    up = predict(vessel, x + step * e)
+    down = predict(vessel, x - step * e)
     for jacobian, a, b in zip(slow, up, down, strict=True):
         wanted = (a - b) / (2 * step)
         near((jacobian * e).sum((-1, -2)), wanted, 1e-4 * float(1 + wanted.abs().max()))
     close(slow, torch.func.jacfwd(partial(predict, vessel))(x), 1e-7)
-    close(torch.vmap(partial(predict, vessel))(x[:, None]), tuple(y[:, None] for y in predict(vessel, x)), 1e-7)
+    close(
+        torch.vmap(partial(predict, vessel))(x[:, None]),
+        tuple(y[:, None] for y in predict(vessel, x)),
+        1e-7,
+    )
     for name in ("mean_and_gradient", "mean_jet", "jet", "joint_at"):
-        close(tensors(getattr(vessel, name)(x.clone().requires_grad_())), tensors(getattr(vessel, name)(x)), 1e-6)
+        close(
+            tensors(getattr(vessel, name)(x.clone().requires_grad_())),
+            tensors(getattr(vessel, name)(x)),
+            1e-6,
+        )
 
 
 @pytest.mark.parametrize("kernel", ["thin_plate", "rbf"])
@@ -279,7 +368,8 @@ def test_estimates_beside_the_domain_have_derivatives_too(kernel: str):
 
 
 def test_what_is_not_differentiable_refuses_by_name():
-    shape, y = shape_of("rbf"), SEEN.distance.clone().requires_grad_()
+    shape = shape_of("rbf")
+    y = SEEN.distance.clone().requires_grad_()
     tracked = shape_of("rbf", dataclasses.replace(SEEN, distance=y))
     for function in (extract_surface, surface_field):
         with pytest.raises(BadArgument, match=r"shape\.weights: .* gradient"):

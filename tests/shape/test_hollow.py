@@ -27,11 +27,16 @@ def vessel() -> HollowShape:
 
 def _both_walls() -> tuple[Tensor, Tensor]:
     """Points of the cup's walls all around, off the rim and the floor, with outward normals."""
-    (outer, out), (inner, into) = ring(RADIUS, 0.012, HEIGHT - 0.01), ring(RADIUS - WALL, 0.012, HEIGHT - 0.01)
+    (outer, out), (inner, into) = (
+        ring(RADIUS, 0.012, HEIGHT - 0.01),
+        ring(RADIUS - WALL, 0.012, HEIGHT - 0.01),
+    )
     return torch.cat([outer, inner]), torch.cat([out, -into])
 
 
-def test_both_walls_are_surfaces_the_inside_is_empty_and_all_moves_with_the_vessel(vessel: HollowShape, motion: Tensor):
+def test_both_walls_are_surfaces_the_inside_is_empty_and_all_moves_with_the_vessel(
+    vessel: HollowShape, motion: Tensor
+):
     points, normals = _both_walls()
     found = vessel.predict(points)
     off = found.distance.abs() * vessel.scale
@@ -46,16 +51,20 @@ def test_both_walls_are_surfaces_the_inside_is_empty_and_all_moves_with_the_vess
     assert (vessel.predict(around).distance > 0).all()
     points, _ = _both_walls()
     there = points @ motion[:3, :3].T + motion[:3, 3]
-    found, moved = vessel.predict(points), vessel.moved(motion).predict(there)
+    found = vessel.predict(points)
+    moved = vessel.moved(motion).predict(there)
     near(moved.distance, found.distance, 1e-9)
     near(moved.normal, found.normal @ motion[:3, :3].T, 1e-8)
 
 
-def test_a_touch_moves_the_wall_that_it_meets_and_closed_bodies_have_one_surface(seen_cylinder, vessel: HollowShape):
+def test_a_touch_moves_the_wall_that_it_meets_and_closed_bodies_have_one_surface(
+    seen_cylinder, vessel: HollowShape
+):
     assert not isinstance(fit_shape(cup_view(WALL)), HollowShape)
     solid = fit_shape(seen_cylinder, table=0.0)
     assert not isinstance(solid, HollowShape) and solid.walls == (solid,)
-    point, normal = torch.tensor([[-RADIUS - 0.002, 0.0, 0.04]]).double(), torch.tensor([[-1.0, 0.0, 0.0]]).double()
+    point = torch.tensor([[-RADIUS - 0.002, 0.0, 0.04]]).double()
+    normal = torch.tensor([[-1.0, 0.0, 0.0]]).double()
     touched = vessel.update(point, normal)
     assert isinstance(touched, HollowShape)
     assert touched.predict(point).distance.abs() * vessel.scale < 0.001
@@ -63,10 +72,13 @@ def test_a_touch_moves_the_wall_that_it_meets_and_closed_bodies_have_one_surface
     torch.testing.assert_close(touched.inner.mean(inside), vessel.inner.mean(inside))
 
 
-def test_the_greater_distance_counts_with_its_own_normal_and_covariance(vessel: HollowShape, generator):
+def test_the_greater_distance_counts_with_its_own_normal_and_covariance(
+    vessel: HollowShape, generator
+):
     x = 0.8 * unit(torch.randn(60, 3, generator=generator, dtype=torch.float64))
     outer, inner = vessel.walls
-    a, b = outer.estimate(x), inner.estimate(x)
+    a = outer.estimate(x)
+    b = inner.estimate(x)
     inner = b[0][:, 0] > a[0][:, 0]
     assert 5 < int(inner.sum()) < 55
     mean, covariance = vessel.estimate(x)
@@ -82,7 +94,8 @@ def test_the_greater_distance_counts_with_its_own_normal_and_covariance(vessel: 
 
 
 def test_samples_of_a_wall_vary_together_and_of_two_walls_alone(vessel: HollowShape):
-    outside, inside = ring(RADIUS, 0.03, 0.05)[0][:6], ring(RADIUS - WALL, 0.03, 0.05)[0][:6]
+    outside = ring(RADIUS, 0.03, 0.05)[0][:6]
+    inside = ring(RADIUS - WALL, 0.03, 0.05)[0][:6]
     points = torch.cat([outside, inside])
     joint = vessel.joint(points)
     blocks = joint.covariance.reshape(12, 4, 12, 4)
@@ -102,7 +115,9 @@ def test_the_mesh_has_both_walls_and_the_volume_of_the_material(vessel: HollowSh
     assert 0.2 < float(inner.double().mean()) < 0.6
     mesh = surface.mesh()
     assert isinstance(mesh, trimesh.Trimesh)
-    assert abs(mesh.volume / true.volume - 1) < 0.5  # 1 mm of 3 mm; filled it would be six times as much
+    assert (
+        abs(mesh.volume / true.volume - 1) < 0.5
+    )  # 1 mm of 3 mm; filled it would be six times as much
     corners = torch.from_numpy(true.triangles.copy())
     points = surface.vertices[surface.vertices[:, 2] > 0.01][::7].numpy()
     gaps = []
@@ -115,7 +130,9 @@ def test_the_mesh_has_both_walls_and_the_volume_of_the_material(vessel: HollowSh
 def test_a_fingers_line_meets_the_wall_of_its_contact(vessel: HollowShape):
     angle = torch.arange(3, dtype=torch.float64) * (2 * torch.pi / 3)
     out = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], 1)
-    points = torch.stack([RADIUS * out[0], (RADIUS - WALL) * out[1], RADIUS * out[2]]) + torch.tensor([0, 0, 0.05])
+    points = torch.stack(
+        [RADIUS * out[0], (RADIUS - WALL) * out[1], RADIUS * out[2]]
+    ) + torch.tensor([0, 0, 0.05])
     normals = torch.stack([out[0], -out[1], out[2]])
     lines = line_posterior(vessel, Contacts(points[None], normals[None]))
     covariance = (lines.root @ lines.root).reshape(3, 20, 3, 20)
@@ -127,9 +144,12 @@ def test_a_fingers_line_meets_the_wall_of_its_contact(vessel: HollowShape):
         torch.testing.assert_close(lines.slope[0, k], whole.slope[0, k])
 
 
-def test_walls_are_tied_at_their_thickness_and_floors_only_where_they_are_thinner(vessel: HollowShape):
+def test_walls_are_tied_at_their_thickness_and_floors_only_where_they_are_thinner(
+    vessel: HollowShape,
+):
     places = vessel.normalise(ring(RADIUS - WALL / 2, 0.02, HEIGHT - 0.02)[0])
-    every, thickness = torch.ones(len(places), dtype=torch.bool), 0.005 / vessel.scale
+    every = torch.ones(len(places), dtype=torch.bool)
+    thickness = 0.005 / vessel.scale
 
     def sum_of(shape: HollowShape) -> Tensor:
         return shape.outer.mean(places) + shape.inner.mean(places)
@@ -145,7 +165,13 @@ def test_walls_are_tied_at_their_thickness_and_floors_only_where_they_are_thinne
 def test_a_thin_wall_has_no_holes(seed: int):
     shape = fit_shape(cup_view(0.002, seed=seed), table=0.0)
     middle, _ = ring(RADIUS - 0.001, 0.015, HEIGHT - 0.012)
-    out = middle * torch.tensor([1.0, 1.0, 0.0]) / torch.linalg.vector_norm(middle[:, :2], dim=1)[:, None]
-    across = torch.stack([middle + s * out for s in torch.linspace(-0.004, 0.004, 17, dtype=torch.float64)], 1)
+    out = (
+        middle
+        * torch.tensor([1.0, 1.0, 0.0])
+        / torch.linalg.vector_norm(middle[:, :2], dim=1)[:, None]
+    )
+    across = torch.stack(
+        [middle + s * out for s in torch.linspace(-0.004, 0.004, 17, dtype=torch.float64)], 1
+    )
     material = (shape.predict(across).distance < 0).any(1)
     assert material.double().mean() > 0.96

@@ -1,4 +1,6 @@
-"""Covariance blocks against a closed form of the thin plate, other kernels, and the definition by derivatives."""
+"""Covariance blocks against a closed form of the thin plate, other kernels, and the definition by
+derivatives.
+"""
 
 from functools import partial
 
@@ -16,7 +18,9 @@ PLATE = partial(thin_plate, psi=PSI)
 
 
 def _points(n: int, seed: int = 0) -> Tensor:
-    return torch.randn(n, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)) * 0.5
+    return (
+        torch.randn(n, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)) * 0.5
+    )
 
 
 def _block(a: Tensor, b: Tensor, profile: Profile = PLATE) -> Tensor:
@@ -37,8 +41,10 @@ def _closed_form(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def test_eq2_blocks_equal_the_closed_form_and_have_the_stated_order():
-    x, y = _points(7), _points(5, seed=1)
-    has, other = torch.arange(7) % 2 == 0, torch.arange(5) < 2
+    x = _points(7)
+    y = _points(5, seed=1)
+    has = torch.arange(7) % 2 == 0
+    other = torch.arange(5) < 2
     found = covariance(x, y, has, other, partial(thin_plate, psi=PSI))
     rows = [(i, 0) for i in range(7)] + [(i, m) for m in (1, 2, 3) for i in range(7) if has[i]]
     columns = [(j, 0) for j in range(5)] + [(j, m) for m in (1, 2, 3) for j in range(5) if other[j]]
@@ -57,12 +63,15 @@ def test_eq3_to_eq5_covariances_are_the_kernel_and_its_derivatives_one_in_each_a
     torch.testing.assert_close(block[1:, 0], da)
     torch.testing.assert_close(block[0, 1:], db)
     a, b = _points(2)
-    step, fd = 1e-4, torch.empty(3, 3, dtype=torch.float64)
+    step = 1e-4
+    fd = torch.empty(3, 3, dtype=torch.float64)
     for m in range(3):
         for n in range(3):
             em, en = torch.eye(3, dtype=torch.float64)[[m, n]] * step
             corners = [(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]
-            fd[m, n] = sum(w * thin_plate((a + s * em - b - t * en).norm(), PSI) for s, t, w in corners) / (4 * step**2)
+            fd[m, n] = sum(
+                w * thin_plate((a + s * em - b - t * en).norm(), PSI) for s, t, w in corners
+            ) / (4 * step**2)
     near(_block(a, b)[1:, 1:], fd, 1e-5)
 
 
@@ -106,8 +115,12 @@ def test_derivatives_in_half_the_squared_distance_are_those_of_a_polynomial_or_z
     u = r * r / 2
     found = differentiate(lambda r: (r * r / 2) ** 3 + 2 * (r * r / 2) ** 2 - r * r / 2, u, 4)
     wanted = (u**3 + 2 * u**2 - u, 3 * u**2 + 4 * u - 1, 6 * u + 4, torch.full_like(u, 6.0))
-    for a, b, factor in zip(found, wanted, (1.0, 1.0, r**2, r**3), strict=True):  # with which covariances take them
+    for a, b, factor in zip(
+        found, wanted, (1.0, 1.0, r**2, r**3), strict=True
+    ):  # with which covariances take them
         near(a * factor, b * factor, 1e-8)
     r = torch.tensor([0.5, 1.0])
-    torch.testing.assert_close(differentiate(lambda r: 1 - r, r * r / 2, 2)[1], torch.tensor([-2.0, -1.0]))
+    torch.testing.assert_close(
+        differentiate(lambda r: 1 - r, r * r / 2, 2)[1], torch.tensor([-2.0, -1.0])
+    )
     assert not any(d.any() for d in differentiate(torch.ones_like, r * r / 2, 4)[1:])

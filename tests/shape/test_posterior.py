@@ -1,4 +1,6 @@
-"""Joint posterior, samples, derivatives, other kernels and later observations, against dense algebra and refits."""
+"""Joint posterior, samples, derivatives, other kernels and later observations, against dense
+algebra and refits.
+"""
 
 import math
 from functools import partial
@@ -8,7 +10,15 @@ import pytest
 import torch
 from sklearn.gaussian_process.kernels import RBF, Matern
 
-from tests.make import covariance, dense_posterior, fit_half_sphere, half_sphere, near, queries, real
+from tests.make import (
+    covariance,
+    dense_posterior,
+    fit_half_sphere,
+    half_sphere,
+    near,
+    queries,
+    real,
+)
 from torchgrasp.foundation.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.conditioning import append_observations, posterior_given
@@ -34,7 +44,8 @@ def test_eq7_and_eq8_joint_posterior_equals_a_dense_solve(name: KernelName):
     known = half_sphere()
     shape = fit_half_sphere(known, name)
     points = queries(shape, 5)
-    joint, alone = shape.joint(points), shape.predict(points)
+    joint = shape.joint(points)
+    alone = shape.predict(points)
     mean, spread = dense_posterior(known, shape.kernel.profile, shape.normalise(points))
     near(joint.mean, mean.reshape(4, 5).T, 1e-8)
     blocks = joint.covariance.reshape(5, 4, 5, 4)
@@ -47,7 +58,8 @@ def test_eq7_and_eq8_joint_posterior_equals_a_dense_solve(name: KernelName):
 def test_samples_have_the_joint_mean_and_covariance_and_repeat_with_their_seed():
     shape = fit_half_sphere(half_sphere())
     points = queries(shape, 3)
-    joint, drawn = shape.joint(points), shape.sample(points, 40000, seed=1)
+    joint = shape.joint(points)
+    drawn = shape.sample(points, 40000, seed=1)
     assert drawn.shape == (40000, 3, 4)
     deviation = joint.covariance.diagonal().sqrt()
     off = (drawn.mean(0) - joint.mean).reshape(-1) / deviation
@@ -64,12 +76,14 @@ def test_samples_have_the_joint_mean_and_covariance_and_repeat_with_their_seed()
 
 @EVERY_KERNEL
 def test_derivatives_equal_finite_differences_of_predictions(name: KernelName):
-    shape, step = fit_half_sphere(half_sphere(), name), 1e-6
+    shape = fit_half_sphere(half_sphere(), name)
+    step = 1e-6
     points = queries(shape, 30).reshape(5, 6, 3)
     found = shape.differentiate(points)
     assert found.normal.shape == (5, 6, 3, 3)
     for m, move in enumerate(step * torch.eye(3, dtype=torch.float64)):
-        up, down = shape.predict(points + move), shape.predict(points - move)
+        up = shape.predict(points + move)
+        down = shape.predict(points - move)
         for field in ("distance", "normal", "variance"):
             wanted = (getattr(up, field) - getattr(down, field)) / (2 * step)
             atol = 1e-3 * float(wanted.abs().max()) + 1e-4
@@ -95,12 +109,18 @@ def test_closed_forms_of_a_kernel_equal_autograd_of_its_profile(name: KernelName
 
 def test_kernels_are_those_of_scikit_learn_or_of_any_profile_and_unknown_ones_are_named():
     a = torch.rand(4, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    for ours, theirs in ((matern52_kernel(0.7, 2.0), Matern(0.7, nu=2.5)), (rbf_kernel(0.7, 2.0), RBF(0.7))):
-        torch.testing.assert_close(ours.profile(torch.cdist(a, a)), 2.0 * torch.as_tensor(theirs(a.numpy())))
+    for ours, theirs in (
+        (matern52_kernel(0.7, 2.0), Matern(0.7, nu=2.5)),
+        (rbf_kernel(0.7, 2.0), RBF(0.7)),
+    ):
+        torch.testing.assert_close(
+            ours.profile(torch.cdist(a, a)), 2.0 * torch.as_tensor(theirs(a.numpy()))
+        )
     known = half_sphere(12)
     shape = fit_half_sphere(known)
     own = fit_half_sphere(known, Kernel(partial(thin_plate, psi=shape.psi), shape.kernel.diameter))
-    found, wanted = own.predict(queries(shape, 20)), shape.predict(queries(shape, 20))
+    found = own.predict(queries(shape, 20))
+    wanted = shape.predict(queries(shape, 20))
     near(found.distance, wanted.distance, 1e-8)
     near(found.covariance, wanted.covariance, 1e-6)
     with pytest.raises(BadArgument, match="kernel"):
@@ -116,17 +136,22 @@ def test_updates_equal_a_refit(name: KernelName, with_normals: bool):
     if not with_normals:
         has = torch.arange(len(known.x)) < len(known.x) - 6
         known = Observations(**{**vars(known), "has_normal": known.has_normal & has})
-    first, rest = known[slice(0, -6)], known[slice(-6, None)]
+    first = known[slice(0, -6)]
+    rest = known[slice(-6, None)]
     shape = fit_half_sphere(first, name)
-    updated, refit = shape, fit_half_sphere(known, shape.kernel)
+    updated = shape
+    refit = fit_half_sphere(known, shape.kernel)
     for rows in (slice(0, 1), slice(1, 3), slice(3, 6)):  # one after the other, and several at once
         new = rest[rows]
         normals = 3.0 * new.normal if with_normals else None  # of any length
-        updated = updated.update(shape.metres(new.x), normals, noise=0.02 * shape.scale, normal_noise=0.05)
+        updated = updated.update(
+            shape.metres(new.x), normals, noise=0.02 * shape.scale, normal_noise=0.05
+        )
     near(updated.x, refit.x, 1e-12)
     assert torch.equal(updated.has_normal, refit.has_normal)
     points = queries(shape, 200)
-    a, b = updated.predict(points), refit.predict(points)
+    a = updated.predict(points)
+    b = refit.predict(points)
     for field in ("distance", "normal", "variance", "covariance", "std_m"):
         near(getattr(a, field), getattr(b, field), 1e-9)
     a, b = (one.jet(shape.normalise(points)) for one in (updated, refit))
@@ -137,9 +162,13 @@ def test_updates_equal_a_refit(name: KernelName, with_normals: bool):
 
 def test_errors_that_new_observations_share_equal_a_dense_solve():
     """Some of the new points have normals, and the errors of their distances two common causes."""
-    known, kernel = half_sphere(30, extra=6), kernel_by_name("thin_plate", 3.6)
-    known = Observations(**{**vars(known), "has_normal": known.has_normal & (torch.arange(len(known.x)) % 3 > 0)})
-    old, new = known[slice(0, -6)], known[slice(-6, None)]
+    known = half_sphere(30, extra=6)
+    kernel = kernel_by_name("thin_plate", 3.6)
+    known = Observations(
+        **{**vars(known), "has_normal": known.has_normal & (torch.arange(len(known.x)) % 3 > 0)}
+    )
+    old = known[slice(0, -6)]
+    new = known[slice(-6, None)]
     generator = torch.Generator().manual_seed(1)
     shared = 0.1 * torch.randn(6, 2, dtype=torch.float64, generator=generator)
     x = 0.9 * unit(torch.randn(20, 3, dtype=torch.float64, generator=generator))

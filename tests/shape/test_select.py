@@ -20,7 +20,9 @@ AXES = real([1.0, 0.5, 0.8])
 
 
 def _scene(n: int) -> tuple[Observations, Observations]:
-    """Points of an ellipsoid, and what is known beside them: its centre and points outside, a few with normals."""
+    """Points of an ellipsoid, and what is known beside them: its centre and points outside, a few
+    with normals.
+    """
     rng = torch.Generator().manual_seed(5)
     x = unit(torch.randn(n, 3, dtype=torch.float64, generator=rng)) * AXES
     outer = 1.2 * unit(torch.randn(20, 3, dtype=torch.float64, generator=rng))
@@ -31,7 +33,11 @@ def _scene(n: int) -> tuple[Observations, Observations]:
 
 
 def _select(
-    points: Observations, known: Observations, budget: int, criterion: Criterion = "variance", stop: float = -math.inf
+    points: Observations,
+    known: Observations,
+    budget: int,
+    criterion: Criterion = "variance",
+    stop: float = -math.inf,
 ) -> Selection:
     return select_points(points, known, PLATE, budget, criterion, stop)
 
@@ -49,7 +55,11 @@ def test_picks_are_those_of_refitting_every_time(criterion: Criterion, kernel: K
     wanted: list[int] = []
     for _ in range(20):
         mean, variance = _distances(join([known, points[wanted]]), chosen, points.x)
-        score = {"variance": variance, "error": mean.abs(), "both": mean.abs() + 2.0 * variance.sqrt()}[criterion]
+        score = {
+            "variance": variance,
+            "error": mean.abs(),
+            "both": mean.abs() + 2.0 * variance.sqrt(),
+        }[criterion]
         score[wanted] = -torch.inf
         wanted.append(int(score.argmax()))
     assert select_points(points, known, chosen, 20, criterion).picks.tolist() == wanted
@@ -68,7 +78,9 @@ def test_informative_points_leave_less_variance_and_picking_stops_when_all_is_ce
     points, known = _scene(300)
     random = torch.randperm(300, generator=torch.Generator().manual_seed(1))[:30]
     picks = _select(points, known, 30).picks
-    ours, theirs = (float(_distances(points[rows], PLATE, points.x)[1].max()) for rows in (picks, random))
+    ours, theirs = (
+        float(_distances(points[rows], PLATE, points.x)[1].max()) for rows in (picks, random)
+    )
     assert ours < 0.5 * theirs
     picks = _select(points, known, 300, stop=0.01).picks
     assert torch.equal(picks, _select(points, known, len(picks)).picks)
@@ -83,13 +95,16 @@ def test_the_factor_of_the_selection_is_that_of_the_posterior(criterion: Criteri
     points, known = _scene(120)
     found = _select(points, known, 20, criterion)
     every = join([known, points[found.picks]])
-    grown, fresh = found.posterior, posterior_given(every, PLATE)
+    grown = found.posterior
+    fresh = posterior_given(every, PLATE)
     assert torch.equal(grown.x, fresh.x) and torch.equal(grown.has_normal, fresh.has_normal)
     near(grown.weights, fresh.weights, 1e-7)
     order = grown.order
     assert order is not None
     noise = every.with_normals_first().rows()[1]
-    wanted = covariance(grown.x, grown.x, grown.has_normal, grown.has_normal, PLATE.profile) + torch.diag(noise)
+    wanted = covariance(
+        grown.x, grown.x, grown.has_normal, grown.has_normal, PLATE.profile
+    ) + torch.diag(noise)
     assert torch.equal(grown.factor, grown.factor.tril())
     near(grown.factor @ grown.factor.T, wanted[order][:, order], 1e-10)
     for one, other in zip(grown.estimate(points.x), fresh.estimate(points.x), strict=True):

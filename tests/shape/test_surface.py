@@ -13,7 +13,8 @@ from torchgrasp import PointCloud, ShapeGP, fit_shape
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.shape.surface import _grid, extract_mesh, extract_surface
 
-RADIUS, CENTER = 0.04, real([0.2, -0.1, 0.3])
+RADIUS = 0.04
+CENTER = real([0.2, -0.1, 0.3])
 
 
 @pytest.fixture(scope="module")
@@ -33,12 +34,16 @@ def test_eq9_surface_is_the_zero_level_closed_and_wound_outward(ball: ShapeGP):
     assert mesh.is_watertight and mesh.body_count == 1
     assert mesh.volume == pytest.approx(4 / 3 * math.pi * RADIUS**3, rel=0.1)
     assert np.abs(np.linalg.norm(mesh.vertices - CENTER.numpy(), axis=1) - RADIUS).max() < 0.002
-    mesh, surface = extract_mesh(ball), extract_surface(ball)
+    mesh = extract_mesh(ball)
+    surface = extract_surface(ball)
     assert torch.equal(mesh.vertices, surface.vertices) and torch.equal(mesh.faces, surface.faces)
 
 
-def test_a_finer_grid_gives_more_triangles_and_the_surface_carries_the_cloud(ball: ShapeGP, seen_cylinder: PointCloud):
-    coarse, fine = extract_surface(ball, 16), extract_surface(ball, 32)
+def test_a_finer_grid_gives_more_triangles_and_the_surface_carries_the_cloud(
+    ball: ShapeGP, seen_cylinder: PointCloud
+):
+    coarse = extract_surface(ball, 16)
+    fine = extract_surface(ball, 32)
     assert len(fine.faces) > 3 * len(coarse.faces)
     assert torch.cdist(coarse.vertices, fine.vertices).amin(1).max() < 0.006
     surface = extract_surface(fit_shape(seen_cylinder, table=0.0), resolution=32)
@@ -53,17 +58,24 @@ def test_the_grid_is_the_mean_wherever_the_surface_passes(
     support: Literal["camera", "paper"], seen_cylinder: PointCloud
 ):
     shape = fit_shape(seen_cylinder, support=support, table=0.0 if support == "camera" else None)
-    radius, step = shape.domain_radius, 2 * shape.domain_radius / 32
+    radius = shape.domain_radius
+    step = 2 * shape.domain_radius / 32
     found = _grid(shape, radius, step, 32)
     line = torch.linspace(-radius, radius, 33, dtype=torch.float64)
     nodes = torch.cartesian_prod(line, line, line)
     mean = shape.mean(nodes).reshape(33, 33, 33).numpy()
     inside = ~np.isnan(found)
-    assert (inside == (torch.linalg.vector_norm(nodes, dim=1) <= radius * (1 + 1e-9)).reshape(33, 33, 33).numpy()).all()
+    assert (
+        inside
+        == (torch.linalg.vector_norm(nodes, dim=1) <= radius * (1 + 1e-9))
+        .reshape(33, 33, 33)
+        .numpy()
+    ).all()
     assert (np.sign(found) == np.sign(mean))[inside].all()
     exact = np.isclose(found, mean, rtol=0, atol=1e-9)
     for axis in range(3):  # both ends of an edge across the surface are exact
-        sign, sure = np.moveaxis(mean > 0, axis, 0), np.moveaxis(exact | ~inside, axis, 0)
+        sign = np.moveaxis(mean > 0, axis, 0)
+        sure = np.moveaxis(exact | ~inside, axis, 0)
         across = sign[1:] != sign[:-1]
         assert sure[1:][across].all() and sure[:-1][across].all()
     assert exact.mean() < 0.6

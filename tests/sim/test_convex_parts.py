@@ -29,7 +29,9 @@ def test_convex_parts_of_a_convex_mesh_is_its_hull_and_that_of_a_plane_has_no_vo
     assert parts[0].volume == pytest.approx(mesh.volume)
     assert not list(tmp_path.iterdir())
     corners = np.zeros((12, 3))
-    corners[0, 0], corners[10], corners[11] = -0.016, (-0.0325, 0.0, -0.0263), (-0.0325, 0.0, 0.0263)
+    corners[0, 0] = -0.016
+    corners[10] = (-0.0325, 0.0, -0.0263)
+    corners[11] = (-0.0325, 0.0, 0.0263)
     assert hull(corners).volume == 0
 
 
@@ -48,7 +50,9 @@ def test_convex_parts_fill_a_concave_mesh_and_are_cached(tmp_path, capfd, monkey
     again = convex_parts(mesh, tmp_path)
     assert len(again) == len(parts)
     for a, b in zip(parts, again, strict=True):
-        assert np.array_equal(a.vertices, b.vertices)  # to the last bit, or a trial would depend on the cache
+        assert np.array_equal(
+            a.vertices, b.vertices
+        )  # to the last bit, or a trial would depend on the cache
     good = files[0].read_bytes()
     far = good[:-8] + np.float64(1e20).tobytes()  # its last corner
     cut = [(np.asarray(part.vertices), np.asarray(part.faces)) for part in parts]
@@ -57,7 +61,10 @@ def test_convex_parts_fill_a_concave_mesh_and_are_cached(tmp_path, capfd, monkey
     for damaged in (b"damaged", far):
         files[0].write_bytes(damaged)
         assert len(convex_parts(mesh, tmp_path)) == len(parts)
-        assert len(files[0].read_bytes()) == len(good) and files[0].read_bytes() not in (b"damaged", far)
+        assert len(files[0].read_bytes()) == len(good) and files[0].read_bytes() not in (
+            b"damaged",
+            far,
+        )
 
 
 @pytest.mark.sim

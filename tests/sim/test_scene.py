@@ -67,9 +67,19 @@ def build(name, mesh, simulator="sapien", **options):
     hand = load_hand(name)
     joints = 0.5 * (hand.lower + hand.upper)
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec([0.3, -0.8, 1.1]).as_matrix(), [0.05, -0.1, 0.6]
+    pose[:3, :3] = Rotation.from_rotvec([0.3, -0.8, 1.1]).as_matrix()
+    pose[:3, 3] = [0.05, -0.1, 0.6]
     start = {k: float(v) for k, v in hand.expand(joints).items()}
-    args = (hand.urdf_path, pose, start, hand.actuators, hand.tips.links, mesh, [mesh.convex_hull], 0.36)
+    args = (
+        hand.urdf_path,
+        pose,
+        start,
+        hand.actuators,
+        hand.tips.links,
+        mesh,
+        [mesh.convex_hull],
+        0.36,
+    )
     return hand, joints, torch.from_numpy(pose), open_scene(SceneSpec(*args, **options), simulator)
 
 
@@ -101,17 +111,23 @@ def test_scene_supports_the_objects_weight(timestep, simulator):
 
 @simulated
 def test_scene_object_has_the_inertia_of_its_mesh(simulator):
-    radius, height, mass = 0.03, 0.12, 0.36
+    radius = 0.03
+    height = 0.12
+    mass = 0.36
     mesh = standing(radius, height)
     mesh.apply_transform(trimesh.transformations.rotation_matrix(0.7, [1, 2, 3]))
     *_, scene = build("barrett", mesh, simulator)
     if simulator == "sapien":
-        inertia, centre = scene.body.inertia, np.asarray(scene.body.cmass_local_pose.p)
+        inertia = scene.body.inertia
+        centre = np.asarray(scene.body.cmass_local_pose.p)
         frame = scene.body.cmass_local_pose.to_transformation_matrix()[:3, :3]
     else:
         body = scene.model.body("torchgrasp_object")
-        inertia, centre, frame = body.inertia, body.ipos, Rotation.from_quat(body.iquat, scalar_first=True).as_matrix()
-    across, along = mass * (3 * radius**2 + height**2) / 12, mass * radius**2 / 2
+        inertia = body.inertia
+        centre = body.ipos
+        frame = Rotation.from_quat(body.iquat, scalar_first=True).as_matrix()
+    across = mass * (3 * radius**2 + height**2) / 12
+    along = mass * radius**2 / 2
     assert np.sort(inertia) == pytest.approx([along, across, across], rel=0.02)
     assert centre == pytest.approx(mesh.center_mass, abs=1e-6)
     assert frame @ np.diag(inertia) @ frame.T == pytest.approx(
@@ -139,22 +155,29 @@ BODY = """<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iy
 def test_jacobian_of_sliding_joints_is_along_their_axes(tmp_path, simulator):
     pytest.importorskip(simulator)
     kinds = [("prismatic", "1 0 0"), ("prismatic", "0 0 1"), ("revolute", "0 1 0")]
-    fingers = "".join(SLIDER.format(k=k, kind=d, axis=x, body=BODY) for k, (d, x) in enumerate(kinds, start=1))
+    fingers = "".join(
+        SLIDER.format(k=k, kind=d, axis=x, body=BODY) for k, (d, x) in enumerate(kinds, start=1)
+    )
     (tmp_path / "hand.urdf").write_text(SLIDING.format(body=BODY, fingers=fingers))
-    names, mesh = ("j1", "j2", "j3"), standing()
-    start, drives = dict.fromkeys(names, 0.0), dict.fromkeys(names, Actuator(1.0, 1.0, 1.0, 0.1))
+    names = ("j1", "j2", "j3")
+    mesh = standing()
+    start = dict.fromkeys(names, 0.0)
+    drives = dict.fromkeys(names, Actuator(1.0, 1.0, 1.0, 0.1))
     pose = np.eye(4)
     pose[0, 3] = 5.0
     urdf = tmp_path / "hand.urdf"
     scene = open_scene(
-        SceneSpec(urdf, pose, start, drives, ("t1", "t2", "t3"), mesh, [mesh.convex_hull], 0.36), simulator
+        SceneSpec(urdf, pose, start, drives, ("t1", "t2", "t3"), mesh, [mesh.convex_hull], 0.36),
+        simulator,
     )
     scene.step()
     assert set(scene.joint_names) == set(names)
     points = scene.tip_poses()[:, :3, 3] + [0.0, 0.0, 0.5]
     found = scene.jacobian(points)[:, :, [scene.joint_names.index(n) for n in names]]
     expected = np.zeros((3, 3, 3))
-    expected[0, :, 0], expected[1, :, 1], expected[2, :, 2] = [1, 0, 0], [0, 0, 1], [0.5, 0, 0]
+    expected[0, :, 0] = [1, 0, 0]
+    expected[1, :, 1] = [0, 0, 1]
+    expected[2, :, 2] = [0.5, 0, 0]
     assert np.abs(found - expected).max() < 1e-3
 
 
@@ -169,7 +192,9 @@ def test_scene_pulls_at_the_mass_centre_and_lifts_at_a_speed(simulator):
         scene.step()
     moved = np.eye(4)
     moved[1, 3] = 0.5 * (0.072 / 0.36) * 0.5**2
-    assert scene.object_pose() == pytest.approx(moved, abs=3e-4)  # turned nowhere, moved by F t^2 / 2 m
+    assert scene.object_pose() == pytest.approx(
+        moved, abs=3e-4
+    )  # turned nowhere, moved by F t^2 / 2 m
     assert scene.hand_pose()[2, 3] - 0.6 == pytest.approx(0.02, abs=3e-4)
 
 
@@ -192,8 +217,11 @@ def test_skipped_steps_are_the_steps_that_are_watched(simulator):
 @simulated
 def test_open_scene_refuses_joints_without_a_drive(simulator):
     pytest.importorskip(simulator)
-    mesh, hand = standing(), load_hand("barrett")
-    setup = SceneSpec(hand.urdf_path, np.eye(4), {}, hand.actuators, hand.tips.links, mesh, [mesh], 0.1)
+    mesh = standing()
+    hand = load_hand("barrett")
+    setup = SceneSpec(
+        hand.urdf_path, np.eye(4), {}, hand.actuators, hand.tips.links, mesh, [mesh], 0.1
+    )
     with pytest.raises(BadArgument, match=r"no position or drive for .*spread"):
         open_scene(setup, simulator)
     with pytest.raises(BadArgument, match=r"simulator: expected .*got 'bullet'"):

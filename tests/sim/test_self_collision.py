@@ -37,10 +37,14 @@ def test_pair_masks_let_only_named_pairs_collide_and_refuse_more_than_bits(name)
 @pytest.mark.parametrize("simulator", ["sapien", "mujoco"])
 @pytest.mark.parametrize("name", ["allegro", "barrett"])
 def test_scene_stops_fingers_driven_through_each_other(name, simulator):
-    """The hand's own boxes tell how deep its links end in each other: a reference that no simulator computes."""
+    """The hand's own boxes tell how deep its links end in each other: a reference that no simulator
+    computes.
+    """
     pytest.importorskip(simulator)
     hand = load_hand(name)
-    drawn = torch.rand(1000, hand.dof, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    drawn = torch.rand(
+        1000, hand.dof, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
     joints = hand.lower + (hand.upper - hand.lower) * drawn
     clear = hand.self_clearance(joints)
     opened, crossed = (hand.expand(joints[row]) for row in (clear.argmax(), clear.argmin()))
@@ -50,7 +54,9 @@ def test_scene_stops_fingers_driven_through_each_other(name, simulator):
     ends = {}
     for pairs in ((), hand.self_pairs):
         start = {joint: float(value) for joint, value in opened.items()}
-        spec = SceneSpec(hand.urdf_path, pose, start, hand.actuators, hand.tips.links, ball, [ball], 0.1)
+        spec = SceneSpec(
+            hand.urdf_path, pose, start, hand.actuators, hand.tips.links, ball, [ball], 0.1
+        )
         spec = dataclasses.replace(spec, self_pairs=pairs)
         scene = open_scene(spec, simulator)
         assert scene.penetration() == 0.0
@@ -60,7 +66,9 @@ def test_scene_stops_fingers_driven_through_each_other(name, simulator):
         order = [scene.joint_names.index(joint) for joint in hand.tree.joint_names]
         frames = hand.tree.frames(torch.from_numpy(scene.joints()[order])[:, None].contiguous())
         ends[bool(pairs)] = float(hand.self_collision.clearance(frames))
-        inside = dataclasses.replace(spec, joints={joint: float(value) for joint, value in crossed.items()})
+        inside = dataclasses.replace(
+            spec, joints={joint: float(value) for joint, value in crossed.items()}
+        )
         depth = open_scene(inside, simulator).penetration()
         assert depth == pytest.approx(-float(clear.min()) if pairs else 0.0, rel=0.05)
     assert ends[False] == pytest.approx(float(clear.min()), abs=1e-4)
@@ -76,7 +84,9 @@ def test_trial_refuses_a_hand_that_starts_in_itself():
         1000, hand.dof, generator=torch.Generator().manual_seed(0), dtype=torch.float64
     )
     crossed = joints[hand.self_clearance(joints).argmin()][None]
-    trial = GraspTrial(hand, dataclasses.replace(grasp, pregrasp=crossed), Truth(cylinder((1.0, 0.0))))
+    trial = GraspTrial(
+        hand, dataclasses.replace(grasp, pregrasp=crossed), Truth(cylinder((1.0, 0.0)))
+    )
     for on in (True, False):
         run = TrialDriver(trial, dataclasses.replace(QUICK, table=False, self_collision=on)).open()
         assert run.starts is not on
@@ -85,6 +95,9 @@ def test_trial_refuses_a_hand_that_starts_in_itself():
 @pytest.mark.sim
 @pytest.mark.filterwarnings("ignore")
 def test_trial_is_the_same_with_self_collision_if_fingers_stay_apart():
-    there, here = quick_trial(), close("allegro", spec=dataclasses.replace(QUICK, self_collision=False))
+    there = quick_trial()
+    here = close("allegro", spec=dataclasses.replace(QUICK, self_collision=False))
     assert there.status is Status.OK
-    assert torch.equal(there.joints, here.joints) and torch.equal(there.object_pose, here.object_pose)
+    assert torch.equal(there.joints, here.joints) and torch.equal(
+        there.object_pose, here.object_pose
+    )

@@ -32,7 +32,9 @@ def both():
 @pytest.mark.parametrize("name", ["allegro", "barrett"])
 def test_simulators_hold_a_cylinder_with_equal_forces(name):
     spec = dataclasses.replace(QUICK, noise=False)
-    there, here = (close(name, spec=dataclasses.replace(spec, simulator=s)) for s in ("sapien", "mujoco"))
+    there, here = (
+        close(name, spec=dataclasses.replace(spec, simulator=s)) for s in ("sapien", "mujoco")
+    )
     assert there.held and here.held
     assert np.abs(here.forces[-1] - there.forces[-1]).max() < 0.6
     assert np.abs(here.object_pose[-1] - there.object_pose[-1]).max() < 0.05
@@ -44,7 +46,9 @@ def test_simulators_agree_on_a_pull(pull):
     hand, grasp = pinch("allegro")
     trial = GraspTrial(hand, grasp, Truth(cylinder()))
     protocol = dataclasses.replace(PULL, pull=dataclasses.replace(PULL.pull, acceleration=pull))
-    there, here = (pull_grasp(trial, protocol.with_trial(simulator=s)) for s in ("sapien", "mujoco"))
+    there, here = (
+        pull_grasp(trial, protocol.with_trial(simulator=s)) for s in ("sapien", "mujoco")
+    )
     assert there.passed == here.passed == (pull < 100)
     assert here.force == pytest.approx(there.force, rel=0.05)
 
@@ -54,7 +58,8 @@ def test_a_kept_run_goes_on_bitwise_as_the_run_itself_and_as_a_new_run_do(simula
     hand, grasp = pinch("barrett")
     spec = PULL.with_trial(simulator=simulator, closing="uncertainty", force=4.0).trial
     driver = TrialDriver(GraspTrial(hand, grasp, Truth(cylinder())), spec)
-    first, new = closed(driver), closed(driver)
+    first = closed(driver)
+    new = closed(driver)
     reopen = first.keep()
     expected = pulled(first)
     assert np.abs(expected[-1] - expected[0]).max() > 1e-6  # the pull moves something
@@ -70,13 +75,17 @@ def closed(driver: TrialDriver) -> TrialRun:
 
 
 def pulled(run: TrialRun) -> np.ndarray:
-    """Pull at the object; return its poses, the joints, and the forces that the noisy fingertips report."""
+    """Pull at the object; return its poses, the joints, and the forces that the noisy fingertips
+    report.
+    """
     run.scene.pull(np.array([0.2, 0.0, 0.3]))
     states = []
     for _ in range(10):
         run.step()
         felt = run.observation.tactile.forces.numpy()
-        states.append(np.concatenate([x.ravel() for x in (run.scene.object_pose(), run.scene.joints(), felt)]))
+        states.append(
+            np.concatenate([x.ravel() for x in (run.scene.object_pose(), run.scene.joints(), felt)])
+        )
     return np.array(states)
 
 
@@ -86,26 +95,38 @@ def test_simulators_report_drives_that_are_too_weak(simulator):
     drives = {name: drive._replace(effort=0.01) for name, drive in hand.actuators.items()}
     spec = dataclasses.replace(QUICK, simulator=simulator, options=ONCE)
     result = close_hand(grasp, dataclasses.replace(hand, actuators=drives), cylinder(), spec)
-    assert result.status is Status.TOO_WEAK and quick_trial("allegro", simulator).status is Status.OK
+    assert (
+        result.status is Status.TOO_WEAK and quick_trial("allegro", simulator).status is Status.OK
+    )
 
 
 @pytest.mark.parametrize("simulator", ["sapien", "mujoco"])
 def test_simulators_never_hold_a_diverged_or_overlapping_trial(simulator, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     hand, grasp = pinch("allegro")
-    drives = {name: drive._replace(kp=1e12, kd=0.0, effort=1e30) for name, drive in hand.actuators.items()}
-    wild, protocol = dataclasses.replace(hand, actuators=drives), PULL.with_trial(simulator=simulator)
+    drives = {
+        name: drive._replace(kp=1e12, kd=0.0, effort=1e30) for name, drive in hand.actuators.items()
+    }
+    wild = dataclasses.replace(hand, actuators=drives)
+    protocol = PULL.with_trial(simulator=simulator)
     for closing, options in (("open_loop", None), ("uncertainty", ONCE)):
         spec = dataclasses.replace(QUICK, simulator=simulator, closing=closing, options=options)
         found = close_hand(grasp, wild, cylinder(), spec)
-        assert not found.held or float(found.forces.max()) < 50.0  # PhysX's drives are stable at any stiffness
+        assert (
+            not found.held or float(found.forces.max()) < 50.0
+        )  # PhysX's drives are stable at any stiffness
         result = pull_grasp(
-            GraspTrial(wild, grasp, Truth(cylinder())), protocol.with_trial(closing=closing, options=options, kp=None)
+            GraspTrial(wild, grasp, Truth(cylinder())),
+            protocol.with_trial(closing=closing, options=options, kp=None),
         )
-        assert result.status in (Status.UNSTABLE, Status.MOVED) or (result.passed and result.force < 50.0)
+        assert result.status in (Status.UNSTABLE, Status.MOVED) or (
+            result.passed and result.force < 50.0
+        )
     deep = GraspTrial(hand, grasp, Truth(cylinder((0.04, 0.04))))
     assert pull_grasp(deep, protocol).status is Status.START_OVERLAP
-    thrown = pull_grasp(deep, protocol.with_trial(overlap=1.0))  # no overlap is refused: the object is thrown out
+    thrown = pull_grasp(
+        deep, protocol.with_trial(overlap=1.0)
+    )  # no overlap is refused: the object is thrown out
     assert thrown.status in (Status.EJECTED, Status.MOVED) and not thrown.passed
     assert not list(tmp_path.iterdir())
 
@@ -120,7 +141,8 @@ def test_a_faceted_ball_stands_still(simulator):
     ball.apply_translation([0.0, 0.0, -ball.bounds[0, 2]])
     above = np.eye(4) + 0.5 * np.eye(4, k=1) * [[0], [0], [1], [0]]
     scene = open_scene(
-        SceneSpec(hand.urdf_path, above, start, hand.actuators, hand.tips.links, ball, [ball], 0.1), simulator
+        SceneSpec(hand.urdf_path, above, start, hand.actuators, hand.tips.links, ball, [ball], 0.1),
+        simulator,
     )
     for _ in range(500):
         scene.step()
@@ -135,8 +157,11 @@ def test_scene_mjcf_is_a_complete_model():
 
     hand, grasp = pinch("allegro")
     start = {k: float(v) for k, v in hand.expand(grasp.pregrasp[0]).items()}
-    mesh, where = cylinder(), grasp.obj_from_hand[0].numpy()
-    setup = SceneSpec(hand.urdf_path, where, start, hand.actuators, hand.tips.links, mesh, [mesh], 0.1, patch=0.0)
+    mesh = cylinder()
+    where = grasp.obj_from_hand[0].numpy()
+    setup = SceneSpec(
+        hand.urdf_path, where, start, hand.actuators, hand.tips.links, mesh, [mesh], 0.1, patch=0.0
+    )
     model = mujoco.MjModel.from_xml_string(scene_mjcf(setup))
     assert model.nu == len(hand.tree.joint_names) + 1
     assert model.body("torchgrasp_object").mass[0] == pytest.approx(0.1)
@@ -146,27 +171,67 @@ def test_scene_mjcf_is_a_complete_model():
 
 @pytest.mark.parametrize("simulator", ["sapien", "mujoco"])
 def test_simulators_let_no_bar_creep_in_the_hand(simulator):
-    """Forces far inside the friction cones hold a slender bar without turning it, as Coulomb's law says."""
+    """Forces far inside the friction cones hold a slender bar without turning it, as Coulomb's law
+    says.
+    """
     hand, grasp = pinch("allegro")
     rows = {
-        "joints": [0.1011, 0.0616, 1.1738, 0.2043, -0.3042, 1.1764, 0.7055, 0.6981, 0.9696, 0.8732, 1.2688, 0.1154],
-        "pregrasp": [0.1895, 0.0153, 1.0919, 0.0211, -0.4374, 1.1155, 0.6795, 0.6495, 0.72, 1.0272, 1.3282, 0.3955],
+        "joints": [
+            0.1011,
+            0.0616,
+            1.1738,
+            0.2043,
+            -0.3042,
+            1.1764,
+            0.7055,
+            0.6981,
+            0.9696,
+            0.8732,
+            1.2688,
+            0.1154,
+        ],
+        "pregrasp": [
+            0.1895,
+            0.0153,
+            1.0919,
+            0.0211,
+            -0.4374,
+            1.1155,
+            0.6795,
+            0.6495,
+            0.72,
+            1.0272,
+            1.3282,
+            0.3955,
+        ],
         "approach": [0.0, 0.0, -1.0],
     }
-    x, y = [-0.0342, 0.2479, -0.9682], [0.6474, -0.7325, -0.2104]
+    x = [-0.0342, 0.2479, -0.9682]
+    y = [0.6474, -0.7325, -0.2104]
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = np.stack([x, y, np.cross(x, y)], 1), [0.0099, -0.0111, 0.0992]
+    pose[:3, :3] = np.stack([x, y, np.cross(x, y)], 1)
+    pose[:3, 3] = [0.0099, -0.0111, 0.0992]
     points = [[-0.0147, -0.0796, 0.0087], [-0.0043, 0.0296, 0.0089], [0.0097, 0.0145, 0.0089]]
-    normals = torch.tensor([[[-0.351, -0.893, 0.282], [-0.932, 0.246, 0.267], [0.964, 0.056, 0.261]]]).double()
+    normals = torch.tensor(
+        [[[-0.351, -0.893, 0.282], [-0.932, 0.246, 0.267], [0.964, 0.056, 0.261]]]
+    ).double()
     normals = normals / normals.norm(dim=-1, keepdim=True)
-    contacts = Contacts(torch.tensor([points]).double(), normals, std_m=torch.full((1, 3), 0.001).double())
+    contacts = Contacts(
+        torch.tensor([points]).double(), normals, std_m=torch.full((1, 3), 0.001).double()
+    )
     grasp = dataclasses.replace(
-        grasp, contacts=contacts, obj_from_hand=torch.from_numpy(pose)[None],
+        grasp,
+        contacts=contacts,
+        obj_from_hand=torch.from_numpy(pose)[None],
         **{name: torch.tensor([row]).double() for name, row in rows.items()},
-    )  # fmt: skip
+    )
     bar = trimesh.creation.box((0.0151, 0.1569, 0.012))
-    bar.apply_transform(trimesh.transformations.rotation_matrix(-math.asin(0.111), [0, 0, 1], [0, 0, 0]))
+    bar.apply_transform(
+        trimesh.transformations.rotation_matrix(-math.asin(0.111), [0, 0, 1], [0, 0, 0])
+    )
     bar.apply_translation([0, 0, 0.006])
     spec = TrialSpec(mass=0.249, table_friction=0.2, simulator=simulator, push=(0.0, 0.0, -1.5))
-    result = close_hand(grasp, hand, bar, spec)  # MuJoCo: 0.9 mm and 3.5 degrees; PhysX's TGS lets the bar fall
+    result = close_hand(
+        grasp, hand, bar, spec
+    )  # MuJoCo: 0.9 mm and 3.5 degrees; PhysX's TGS lets the bar fall
     assert result.held and result.slip.distance < 0.0013 and math.degrees(result.slip.angle) < 5

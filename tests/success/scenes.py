@@ -36,21 +36,34 @@ UNEVEN = (0.3, 2.4, 4.6, 5.4, 1.3)
 
 def around(*heights, angles=UNEVEN[:3]):
     """One set of contacts around z at each height [m] on the ball."""
-    angle, height = real(angles), real([heights]).T
+    angle = real(angles)
+    height = real([heights]).T
     level = (RADIUS**2 - height**2).sqrt()
-    points = torch.stack([level * angle.cos(), level * angle.sin(), height.expand(-1, len(angle))], -1)
+    points = torch.stack(
+        [level * angle.cos(), level * angle.sin(), height.expand(-1, len(angle))], -1
+    )
     return Contacts(
-        points, unit(points), std_m=real([0.001, 0.003, 0.002, 0.001, 0.002])[: len(angle)].expand(points.shape[:2])
+        points,
+        unit(points),
+        std_m=real([0.001, 0.003, 0.002, 0.001, 0.002])[: len(angle)].expand(points.shape[:2]),
     )
 
 
 def grasps_at(contacts, name="allegro", opens=0.9, score=None, status=None):
-    """Grasps of a hand at contacts, as if it reached them, half closed; their opened fingers are `opens` as closed."""
-    hand, n = load_hand(name, contacts.fingertips), len(contacts)
-    joints = torch.lerp(hand.lower, hand.upper, torch.linspace(0.35, 0.6, hand.dof, dtype=torch.float64)).repeat(n, 1)
+    """Grasps of a hand at contacts, as if it reached them, half closed; their opened fingers are
+    `opens` as closed.
+    """
+    hand = load_hand(name, contacts.fingertips)
+    n = len(contacts)
+    joints = torch.lerp(
+        hand.lower, hand.upper, torch.linspace(0.35, 0.6, hand.dof, dtype=torch.float64)
+    ).repeat(n, 1)
     pose = torch.eye(4, dtype=torch.float64).repeat(n, 1, 1)
-    fingers, one = torch.zeros_like(contacts.points[..., 0]), torch.ones(n, dtype=torch.float64)
-    certificate = Certificate(0.01 * one, one, 0 * one, one.bool(), torch.zeros(n, 6, dtype=torch.float64))
+    fingers = torch.zeros_like(contacts.points[..., 0])
+    one = torch.ones(n, dtype=torch.float64)
+    certificate = Certificate(
+        0.01 * one, one, 0 * one, one.bool(), torch.zeros(n, 6, dtype=torch.float64)
+    )
     return hand, Grasps(
         joints=joints,
         pregrasp=opens * joints,
@@ -69,11 +82,19 @@ def grasps_at(contacts, name="allegro", opens=0.9, score=None, status=None):
 
 
 def stump(feature, threshold, below, above):
-    """A model of one tree: its log-odds are `below` where a feature is at most the threshold, else `above`."""
+    """A model of one tree: its log-odds are `below` where a feature is at most the threshold, else
+    `above`.
+    """
     bands = real([[-5.0, 0.1, 0.3], [0.0, 0.4, 0.6], [5.0, 0.9, 1.0]])
     most = torch.full((len(FEATURES),), 10.0, dtype=torch.float64)
     return SuccessModel(
-        torch.tensor([[FEATURES.index(feature), 0, 0]]), real([[threshold, 0, 0]]),
-        torch.tensor([[[1, 2], [1, 1], [2, 2]]]), real([[0, below, above]]), real(0.0),
-        torch.stack([-most, most], -1), 0 * most, bands, torch.zeros(0, 3, dtype=torch.float64),
-    )  # fmt: skip
+        torch.tensor([[FEATURES.index(feature), 0, 0]]),
+        real([[threshold, 0, 0]]),
+        torch.tensor([[[1, 2], [1, 1], [2, 2]]]),
+        real([[0, below, above]]),
+        real(0.0),
+        torch.stack([-most, most], -1),
+        0 * most,
+        bands,
+        torch.zeros(0, 3, dtype=torch.float64),
+    )

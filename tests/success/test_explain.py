@@ -1,4 +1,6 @@
-"""What moves the predicted success: costs by hand, causes in order, and sentences that hold the features' values."""
+"""What moves the predicted success: costs by hand, causes in order, and sentences that hold the
+features' values.
+"""
 
 import dataclasses
 import functools
@@ -20,14 +22,24 @@ from torchgrasp.success.model import load_success_model
 from torchgrasp.success.reasons import SENTENCES, measure_again
 
 UNITS = {name: unit for names in CAUSES.values() for name, unit in names.items()}
-SHOWN = {"m": (1000.0, " mm"), "rad": (180 / math.pi, " degrees"), "1": (1.0, ""), "N": (1.0, " N"), "kg": (1.0, " kg")}
+SHOWN = {
+    "m": (1000.0, " mm"),
+    "rad": (180 / math.pi, " degrees"),
+    "1": (1.0, ""),
+    "N": (1.0, " N"),
+    "kg": (1.0, " kg"),
+}
 TASK = GraspTask(mass=0.5)
 
 
 @functools.cache
 def jug():
     """The shape of the jug, and the shipped grasp of it with its hand."""
-    return load_shipped_grasp("jug", "barrett"), load_hand("barrett"), fit_shape(load_object("jug").view, table=0.0)
+    return (
+        load_shipped_grasp("jug", "barrett"),
+        load_hand("barrett"),
+        fit_shape(load_object("jug").view, table=0.0),
+    )
 
 
 @functools.cache
@@ -46,18 +58,23 @@ def wary(name, usual=None):
     """A model that takes two log-odds for a feature as it is, and none for its usual value."""
     value = float(features()[0, FEATURES.index(name)])
     model = stump(name, value - 1e-6, 0.0, -2.0)
-    return dataclasses.replace(model, usual=torch.full_like(model.usual, value - 1.0 if usual is None else usual))
+    return dataclasses.replace(
+        model, usual=torch.full_like(model.usual, value - 1.0 if usual is None else usual)
+    )
 
 
 def test_the_cost_of_a_cause_is_what_its_usual_values_gain_and_the_three_greatest_are_told():
-    model, row = load_success_model(), features()
+    model = load_success_model()
+    row = features()
     gains = {}
     for cause, names in CAUSES.items():
         better = row.clone()
         for name in names:
             better[0, FEATURES.index(name)] = model.usual[FEATURES.index(name)]
         gains[cause] = float(model.log_odds(better) - model.log_odds(row))
-    wanted = sorted((cause for cause in gains if gains[cause] > 0), key=lambda cause: -gains[cause])[:3]
+    wanted = sorted(
+        (cause for cause in gains if gains[cause] > 0), key=lambda cause: -gains[cause]
+    )[:3]
     told = explain_success(*jug(), TASK)
     assert [cost.cause for cost in told] == wanted
     assert [cost.log_odds for cost in told] == pytest.approx([gains[cause] for cause in wanted])
@@ -74,7 +91,9 @@ def test_only_the_cause_that_costs_is_told_with_the_numbers_and_units_of_its_fea
     for name, text in zip(names, texts, strict=True):
         scale, unit = SHOWN[UNITS[name]]
         value = scale * float(features()[0, FEATURES.index(name)])
-        assert text.endswith(unit) and float(text.removesuffix(unit)) == pytest.approx(value, rel=0.05)
+        assert text.endswith(unit) and float(text.removesuffix(unit)) == pytest.approx(
+            value, rel=0.05
+        )
 
 
 def test_a_cause_that_does_not_lower_the_success_is_not_told(use):
@@ -84,7 +103,10 @@ def test_a_cause_that_does_not_lower_the_success_is_not_told(use):
 
 def test_a_heavier_object_makes_the_load_or_the_task_a_cause(use):
     for name, cause in (("mass", "task"), ("force needed", "load")):
-        light, heavy = (measure_again(*jug(), GraspTask(mass=mass))[0, FEATURES.index(name)] for mass in (0.05, 2.0))
+        light, heavy = (
+            measure_again(*jug(), GraspTask(mass=mass))[0, FEATURES.index(name)]
+            for mass in (0.05, 2.0)
+        )
         assert light < heavy
         use(stump(name, float(light + heavy) / 2, 1.0, -1.0))
         assert explain_success(*jug(), GraspTask(mass=0.05)) == ()
@@ -93,7 +115,9 @@ def test_a_heavier_object_makes_the_load_or_the_task_a_cause(use):
 
 def test_the_frame_of_object_and_grasp_does_not_matter(motion):
     grasp, hand, shape = jug()
-    there = dataclasses.replace(move(grasp, motion), meta=grasp.meta | {"table": grasp.table.moved(motion).describe()})
+    there = dataclasses.replace(
+        move(grasp, motion), meta=grasp.meta | {"table": grasp.table.moved(motion).describe()}
+    )
     found = measure_again(there, hand, shape.moved(motion), TASK)
     torch.testing.assert_close(found, features(), rtol=0.05, atol=1e-3)
 
@@ -105,13 +129,17 @@ def test_the_default_task_is_that_of_a_plan():
 def test_grasps_and_hand_may_have_different_dtypes():
     grasp, hand, shape = jug()
     for parts in ((grasp, hand.to(torch.float32)), (grasp.to(torch.float32), hand)):
-        torch.testing.assert_close(measure_again(*parts, shape, TASK), features(), rtol=1e-2, atol=1e-3)
+        torch.testing.assert_close(
+            measure_again(*parts, shape, TASK), features(), rtol=1e-2, atol=1e-3
+        )
 
 
 def test_no_grasps_and_grasps_of_unknown_friction_are_refused():
     grasp, hand, shape = jug()
     with pytest.raises(BadArgument, match="grasps"):
         explain_success(grasp[:0], hand, shape)
-    bare = dataclasses.replace(grasp, meta={key: text for key, text in grasp.meta.items() if key != "friction"})
+    bare = dataclasses.replace(
+        grasp, meta={key: text for key, text in grasp.meta.items() if key != "friction"}
+    )
     with pytest.raises(BadArgument, match="grasps"):
         explain_success(bare, hand, shape)

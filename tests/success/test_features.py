@@ -1,4 +1,6 @@
-"""Features of grasps: each by hand on a ball, the frame that does not matter, and which way load and friction count."""
+"""Features of grasps: each by hand on a ball, the frame that does not matter, and which way load
+and friction count.
+"""
 
 import dataclasses
 import math
@@ -26,7 +28,9 @@ EVEN = (0.0, 2 * math.pi / 3, 4 * math.pi / 3)
 
 def measure(hand, grasps, shape=None, vertices=VERTICES, friction=0.6, lifted=True, **task):
     """The features of grasps of the ball by name."""
-    found = measure_grasps(hand, ball_body(vertices, shape), grasps, friction, GraspTask(**task), lifted)
+    found = measure_grasps(
+        hand, ball_body(vertices, shape), grasps, friction, GraspTask(**task), lifted
+    )
     assert found.shape == (len(grasps), len(FEATURES)) and found.dtype == torch.float64
     return dict(zip(FEATURES, found.T, strict=True))
 
@@ -41,14 +45,24 @@ def surrounding(contacts):
 
 def test_every_feature_has_one_cause_and_an_si_unit():
     assert len(set(FEATURES)) == len(FEATURES) == sum(map(len, CAUSES.values()))
-    assert {unit for names in CAUSES.values() for unit in names.values()} <= {"m", "rad", "N", "kg", "1"}
+    assert {unit for names in CAUSES.values() for unit in names.values()} <= {
+        "m",
+        "rad",
+        "N",
+        "kg",
+        "1",
+    }
 
 
 def test_features_of_a_ball_by_hand():
     contacts = around(0.01)
     hand, grasp = grasps_at(contacts)
-    found = {name: float(x) for name, x in measure(hand, grasp, mass=0.3, force=5.0, displaced=True).items()}
-    p, v = contacts.points[0].numpy(), VERTICES.numpy()
+    found = {
+        name: float(x)
+        for name, x in measure(hand, grasp, mass=0.3, force=5.0, displaced=True).items()
+    }
+    p = contacts.points[0].numpy()
+    v = VERTICES.numpy()
     center = v.mean(0)
     spread = np.linalg.eigvalsh(np.cov(v[:, :2].T, bias=True)) ** 0.5
     exact = {
@@ -95,7 +109,9 @@ def test_the_force_to_spare_where_the_body_is_moved_is_the_mean_over_the_displac
         rows = slice(k * len(grasps), (k + 1) * len(grasps))
         contacts = moved.contacts[rows]
         for friction, mine in spare.items():
-            needed = carrying_force(contacts, moved.forces[rows], VERTICES.mean(0), (friction,), down, pull)[0]
+            needed = carrying_force(
+                contacts, moved.forces[rows], VERTICES.mean(0), (friction,), down, pull
+            )[0]
             mine.append(torch.log(strength / needed.clamp(1e-3, 1e3)).where(touched, -9.0))
     full, half = (torch.stack(x) for x in spare.values())
     near(found["carried if moved"], (full > 0).double().mean(0), 1e-9)
@@ -109,17 +125,22 @@ def test_a_turn_about_the_vertical_and_a_shift_of_the_whole_scene_change_nothing
     hand, grasps = grasps_at(around(0.01, -0.02, 0.0), name)
     pose = rigid(rotation_from_vector(real([0.0, 0.0, 1.1])), real([0.3, -0.1, 0.2]))
     here = measure(hand, grasps, mass=0.4)
-    there = measure(hand, move(grasps, pose), whole_ball().moved(pose), apply(pose, VERTICES), mass=0.4)
+    there = measure(
+        hand, move(grasps, pose), whole_ball().moved(pose), apply(pose, VERTICES), mass=0.4
+    )
     searched = {"force needed", "force to spare", *CAUSES["moved"]}
     for feature in FEATURES:
         wanted = here[feature]
         tolerance = 0.02 if feature in searched else 1e-5  # the search begins with fixed directions
-        torch.testing.assert_close(there[feature], wanted, rtol=tolerance, atol=tolerance, msg=feature)
+        torch.testing.assert_close(
+            there[feature], wanted, rtol=tolerance, atol=tolerance, msg=feature
+        )
 
 
 def test_grasps_do_not_depend_on_each_other_and_none_have_no_features():
     hand, grasps = grasps_at(around(0.01, -0.02, 0.0))
-    every, last = measure(hand, grasps), measure(hand, grasps[1:])
+    every = measure(hand, grasps)
+    last = measure(hand, grasps[1:])
     for feature in FEATURES:
         near(last[feature], every[feature][1:], 1e-9)
     assert [len(x) for x in measure(hand, grasps[:0]).values()] == [0] * len(FEATURES)
@@ -134,13 +155,24 @@ def test_the_force_needed_is_proportional_to_the_load_and_friction_lessens_it():
         near(heavy["force to spare"], light["force to spare"] - math.log(2), 1e-6)
         changed = {name for name in FEATURES if not torch.equal(light[name], heavy[name])}
         assert changed <= {"force needed", "force to spare", "mass", *CAUSES["moved"]}
-        slippery, rough = (measure(hand, grasps, lifted=lifted, friction=friction) for friction in (0.45, 0.9))
+        slippery, rough = (
+            measure(hand, grasps, lifted=lifted, friction=friction) for friction in (0.45, 0.9)
+        )
         assert bool((rough["force needed"] < 0.8 * slippery["force needed"]).all())
         for better, worse in ((light, heavy), (rough, slippery)):
-            assert all(bool((better[name] >= worse[name]).all()) for name in ("force to spare", *CAUSES["moved"]))
-        near(rough["force to spare if moved and slippery"], slippery["force to spare if moved"], 1e-6)
-    pulled, hung = (measure(hand, grasps, lifted=lifted)["force needed"] for lifted in (False, True))
-    assert bool((pulled > hung).all())  # a pull may have the direction of the weight, and is stronger by 2 %
+            assert all(
+                bool((better[name] >= worse[name]).all())
+                for name in ("force to spare", *CAUSES["moved"])
+            )
+        near(
+            rough["force to spare if moved and slippery"], slippery["force to spare if moved"], 1e-6
+        )
+    pulled, hung = (
+        measure(hand, grasps, lifted=lifted)["force needed"] for lifted in (False, True)
+    )
+    assert bool(
+        (pulled > hung).all()
+    )  # a pull may have the direction of the weight, and is stronger by 2 %
 
 
 def test_the_tilt_is_the_deviation_of_the_normals_of_drawn_surfaces():
@@ -153,7 +185,9 @@ def test_the_tilt_is_the_deviation_of_the_normals_of_drawn_surfaces():
         mean = slope.mean(0)
         across = np.linalg.svd(mean[None])[2][1:]  # two directions in the surface
         largest = max(
-            largest, np.linalg.eigvalsh(np.cov(slope @ across.T, rowvar=False))[-1] ** 0.5 / np.linalg.norm(mean)
+            largest,
+            np.linalg.eigvalsh(np.cov(slope @ across.T, rowvar=False))[-1] ** 0.5
+            / np.linalg.norm(mean),
         )
     found = measure(hand, grasp, shape)
     assert float(found["tilt"]) == pytest.approx(1.7 * largest, rel=0.03)
@@ -164,12 +198,18 @@ def test_hands_of_more_fingers_have_finite_features(name, fingers):
     hand, grasps = grasps_at(around(0.01, -0.01, angles=UNEVEN[:fingers]), name)
     found = measure(hand, grasps)
     assert all(bool(x.isfinite().all()) for x in found.values())
-    near(found["offset"], torch.linalg.vector_norm(grasps.contacts.points.mean(1) - VERTICES.mean(0), dim=-1), 1e-9)
+    near(
+        found["offset"],
+        torch.linalg.vector_norm(grasps.contacts.points.mean(1) - VERTICES.mean(0), dim=-1),
+        1e-9,
+    )
 
 
 def test_contacts_that_nothing_balances_have_finite_features_and_no_force_to_spare():
     one_side = around(0.01)
-    alike = dataclasses.replace(one_side, normals=one_side.normals[:, :1].expand(1, 3, 3).contiguous())
+    alike = dataclasses.replace(
+        one_side, normals=one_side.normals[:, :1].expand(1, 3, 3).contiguous()
+    )
     both = join([one_side, alike])
     found = measure(*grasps_at(both))
     assert all(bool(x.isfinite().all()) for x in found.values())
@@ -181,13 +221,18 @@ def test_contacts_that_nothing_balances_have_finite_features_and_no_force_to_spa
 
 def test_grasps_in_float32_have_the_features_of_those_in_float64():
     hand, grasps = grasps_at(around(0.01, -0.02))
-    exact, rounded = measure(hand, grasps), measure(hand.to(torch.float32), grasps.to(torch.float32))
+    exact = measure(hand, grasps)
+    rounded = measure(hand.to(torch.float32), grasps.to(torch.float32))
     for feature in FEATURES:
-        torch.testing.assert_close(rounded[feature], exact[feature], rtol=1e-3, atol=1e-4, msg=feature)
+        torch.testing.assert_close(
+            rounded[feature], exact[feature], rtol=1e-3, atol=1e-4, msg=feature
+        )
 
 
 def test_contacts_without_deviation_are_refused():
     hand, grasp = grasps_at(around(0.01))
-    bare = dataclasses.replace(grasp, contacts=Contacts(grasp.contacts.points, grasp.contacts.normals))
+    bare = dataclasses.replace(
+        grasp, contacts=Contacts(grasp.contacts.points, grasp.contacts.normals)
+    )
     with pytest.raises(BadArgument, match="std_m"):
         measure(hand, bare)

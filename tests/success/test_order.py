@@ -1,4 +1,6 @@
-"""The order of grasps: known before unknown before failed, each by score; the domain of trials; kept promises."""
+"""The order of grasps: known before unknown before failed, each by score; the domain of trials;
+kept promises.
+"""
 
 import dataclasses
 import math
@@ -15,7 +17,8 @@ from torchgrasp.success.model import load_success_model
 from torchgrasp.success.promise import Promise
 from torchgrasp.values.planning import format_success
 
-OK, FAILED = int(Status.OK), int(Status.BURIED)
+OK = int(Status.OK)
+FAILED = int(Status.BURIED)
 MODEL = stump("mass", 0.5, 1.0, -1.0)
 
 
@@ -56,19 +59,29 @@ def test_the_order_is_known_then_unknown_then_failed_each_by_falling_score(gener
     status = [FAILED if k % 3 == 0 else OK for k in range(60)]
     known = [bool(k % 2) for k in range(60)]
     rows = grasps_of(draw, status, known)
-    wanted = sorted(range(60), key=lambda k: (status[k] != OK, status[k] == OK and not known[k], -draw[k]))
+    wanted = sorted(
+        range(60), key=lambda k: (status[k] != OK, status[k] == OK and not known[k], -draw[k])
+    )
     found = order.by_success(rows)
     assert torch.equal(found.contacts.points, rows.contacts.points[wanted])
     assert found.score.tolist() == [draw[k] for k in wanted]
     plain = order.by_success(dataclasses.replace(rows, known=None))
-    assert plain.score.tolist() == [draw[k] for k in sorted(range(60), key=lambda k: (status[k] != OK, -draw[k]))]
+    assert plain.score.tolist() == [
+        draw[k] for k in sorted(range(60), key=lambda k: (status[k] != OK, -draw[k]))
+    ]
 
 
 def test_scores_intervals_and_knowledge_are_those_of_the_executable_grasps(model):
     rows = grasps_of([9.0, 8.0, 7.0, 6.0], [OK, FAILED, OK, OK])
-    odds, known = real([-1.0, 3.0, 2.0]), torch.tensor([True, False, True])
+    odds = real([-1.0, 3.0, 2.0])
+    known = torch.tensor([True, False, True])
     ranked = order.by_success(order.grade(rows, odds, known))
-    assert ranked.score.tolist() == [2.0, -1.0, 3.0, 8.0] and ranked.status.tolist() == [OK, OK, OK, FAILED]
+    assert ranked.score.tolist() == [2.0, -1.0, 3.0, 8.0] and ranked.status.tolist() == [
+        OK,
+        OK,
+        OK,
+        FAILED,
+    ]
     assert ranked.known.tolist() == [True, True, False, True]
     near(ranked.interval[:2], MODEL.interval(real([2.0, -1.0])), 1e-9)
     assert ranked.interval[2].tolist() == [0.0, 1.0]  # nothing is known of it
@@ -79,7 +92,10 @@ def test_scores_intervals_and_knowledge_are_those_of_the_executable_grasps(model
 def test_float32_and_no_grasps_keep_their_dtype_and_shape(model):
     rows = grasps_of([1.0, 2.0]).to(torch.float32)
     ranked = order.by_success(order.grade(rows, real([0.5, 1.5]), torch.tensor([True, True])))
-    assert ranked.score.dtype == ranked.interval.dtype == torch.float32 and ranked.score.tolist() == [1.5, 0.5]
+    assert (
+        ranked.score.dtype == ranked.interval.dtype == torch.float32
+        and ranked.score.tolist() == [1.5, 0.5]
+    )
     none = order.by_success(order.grade(rows[:0], real([]), torch.zeros(0, dtype=torch.bool)))
     assert none.interval.shape == (0, 2) and len(order.by_success(none)) == 0
     assert len(order.keep_promise(none, 0.9)) == 0
@@ -92,7 +108,9 @@ def promised(monkeypatch, found):
 
 def test_a_promise_refuses_executable_grasps_below_its_bound_or_unknown_ones(monkeypatch):
     promised(monkeypatch, Promise(1.0, 100, 50))
-    rows = grasps_of([3.0, 0.9, 2.0, 1.0, 5.0], [OK, OK, OK, OK, FAILED], [True, True, False, True, True])
+    rows = grasps_of(
+        [3.0, 0.9, 2.0, 1.0, 5.0], [OK, OK, OK, OK, FAILED], [True, True, False, True, True]
+    )
     kept = order.by_success(order.keep_promise(rows, 0.9))
     refused = int(Status.NO_PROMISE)
     assert kept.status.tolist() == [OK, OK, FAILED, refused, refused]
@@ -114,8 +132,14 @@ def test_by_variance_the_surest_contacts_come_first_and_are_needed():
     rows = grasps_of([1.0, 2.0, 3.0], [OK, OK, FAILED])
     with pytest.raises(BadArgument, match="variance"):
         order.rank_by_variance(rows)
-    contacts = dataclasses.replace(rows.contacts, variance=real([[1.0, 1, 1], [0.5, 0.5, 1], [0.1, 0.1, 0.1]]))
-    assert order.rank_by_variance(dataclasses.replace(rows, contacts=contacts)).score.tolist() == [2.0, 1.0, 3.0]
+    contacts = dataclasses.replace(
+        rows.contacts, variance=real([[1.0, 1, 1], [0.5, 0.5, 1], [0.1, 0.1, 0.1]])
+    )
+    assert order.rank_by_variance(dataclasses.replace(rows, contacts=contacts)).score.tolist() == [
+        2.0,
+        1.0,
+        3.0,
+    ]
 
 
 def test_equal_scores_are_ordered_by_the_margin_of_their_certificates():

@@ -1,4 +1,6 @@
-"""A promise: bounds keep it on fresh families in the mean, need enough families, and rise with the share."""
+"""A promise: bounds keep it on fresh families in the mean, need enough families, and rise with the
+share.
+"""
 
 import functools
 import math
@@ -13,7 +15,9 @@ from torchgrasp.success.promise import describe_promise, find_promise, least_log
 
 
 def draw_trials(families, seed, bias=0.0, size=4):
-    """Log-odds of trials and whether they held, a row for each family, which is easier or harder than predicted."""
+    """Log-odds of trials and whether they held, a row for each family, which is easier or harder
+    than predicted.
+    """
     draw = np.random.default_rng(seed)
     said = draw.normal(2.0, 1.5, size=(families, size))
     true = said + bias + draw.normal(size=(families, 1))
@@ -29,7 +33,9 @@ def draw_blindly(families, seed, rate=0.88):
 def least(said, held, share):
     """The bound of the trials of families, each a row."""
     family = torch.arange(len(said)).repeat_interleave(said.shape[1])
-    return least_log_odds(torch.from_numpy(said).flatten(), torch.from_numpy(held).flatten(), family, share)
+    return least_log_odds(
+        torch.from_numpy(said).flatten(), torch.from_numpy(held).flatten(), family, share
+    )
 
 
 def mean_loss(said, held, bound, share):
@@ -38,9 +44,13 @@ def mean_loss(said, held, bound, share):
     return float(np.mean(returned * ((~held) - (1 - share))))
 
 
-@pytest.mark.parametrize("draw", [draw_trials, functools.partial(draw_trials, bias=-1.0)], ids=["true", "boasts"])
+@pytest.mark.parametrize(
+    "draw", [draw_trials, functools.partial(draw_trials, bias=-1.0)], ids=["true", "boasts"]
+)
 @pytest.mark.parametrize("share", [0.8, 0.9])
-def test_bounds_keep_their_promise_on_fresh_families_in_the_mean_even_if_all_predictions_are_too_high(draw, share):
+def test_bounds_keep_their_promise_on_fresh_families_in_the_mean_even_if_all_predictions_are_too_high(
+    draw, share
+):
     said, held = draw(20_000, 999)
     bounds = [least(*draw(150, seed), share) for seed in range(100)]
     assert np.mean([mean_loss(said, held, bound, share) for bound in bounds]) <= 0.0
@@ -71,9 +81,12 @@ def test_a_bound_is_the_least_of_two_hundred_at_which_the_families_outweigh_one_
 @pytest.mark.parametrize("share", [0.5, 0.8, 0.9, 0.95])
 def test_so_many_families_are_needed_that_one_more_which_fails_would_not_break_the_promise(share):
     needed = math.ceil(share / (1 - share) - 1e-9)
-    said, held = np.full((needed + 1, 3), 2.0), np.ones((needed + 1, 3), dtype=bool)
+    said = np.full((needed + 1, 3), 2.0)
+    held = np.ones((needed + 1, 3), dtype=bool)
     assert least(said, held, share) is not None and least(said[2:], held[2:], share) is None
-    assert least(said[2:].repeat(50, 1), held[2:].repeat(50, 1), share) is None  # more trials are no more families
+    assert (
+        least(said[2:].repeat(50, 1), held[2:].repeat(50, 1), share) is None
+    )  # more trials are no more families
     assert least(said, ~held, share) is None
 
 
@@ -96,7 +109,9 @@ def test_numbers_and_order_of_families_do_not_matter():
     order = np.random.default_rng(0).permutation(150)
     assert least(said[order], held[order], 0.85) == pytest.approx(found)
     family = 7 * torch.arange(150).repeat_interleave(4) + 3  # numbers with gaps
-    again = least_log_odds(torch.from_numpy(said).flatten(), torch.from_numpy(held).flatten(), family, 0.85)
+    again = least_log_odds(
+        torch.from_numpy(said).flatten(), torch.from_numpy(held).flatten(), family, 0.85
+    )
     assert again == pytest.approx(found)
 
 

@@ -45,7 +45,10 @@ def test_a_task_says_what_it_is_and_two_alike_are_equal():
     assert GraspTask().describe() == "task of 0.25 kg"
     assert GraspTask(lift=True, mass=1.0, displaced=True).describe() == "lift of 1 kg, displaced"
     assert GraspTask(lift=False, force=3.5).describe() == "pulls of 0.25 kg with 3.5 N"
-    assert GraspTask(0.5) == GraspTask(mass=0.5) != GraspTask(mass=0.6) and len({GraspTask(), GraspTask()}) == 1
+    assert (
+        GraspTask(0.5) == GraspTask(mass=0.5) != GraspTask(mass=0.6)
+        and len({GraspTask(), GraspTask()}) == 1
+    )
 
 
 def test_a_table_is_a_plane():
@@ -55,4 +58,6 @@ def test_a_table_is_a_plane():
 
 def test_a_hand_presses_as_told_grips_in_a_lift_and_presses_a_little_in_pulls():
     assert GraspTask(force=6.0).pressing(True) == GraspTask(force=6.0).pressing(False) == 6.0
-    assert GraspTask().pressing(True) == 0.0 and GraspTask().pressing(False) == TrialSpec().strongest
+    assert (
+        GraspTask().pressing(True) == 0.0 and GraspTask().pressing(False) == TrialSpec().strongest
+    )

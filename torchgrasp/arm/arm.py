@@ -1,4 +1,6 @@
-"""A robot arm that carries a hand: its chain of joints, its collision spheres, and random postures to start from."""
+"""A robot arm that carries a hand: its chain of joints, its collision spheres, and random postures
+to start from.
+"""
 
 import dataclasses
 import math
@@ -20,17 +22,21 @@ from torchgrasp.hand.urdf import Urdf, read_published
 from torchgrasp.ik.clearance import MILLIMETRE
 from torchgrasp.ik.motion import APPROACH_DISTANCE
 
-LEVER = APPROACH_DISTANCE / MILLIMETRE  # distance [mm] that a turn by one radian counts as: the depth of a hand
+LEVER = (
+    APPROACH_DISTANCE / MILLIMETRE
+)  # distance [mm] that a turn by one radian counts as: the depth of a hand
 
 
 @dataclasses.dataclass(frozen=True)
 class Arm(Value):
-    """A robot arm that carries a hand, from `load_arm`. Postures (k, n) hold n joints [rad], from the base to the tip.
+    """A robot arm that carries a hand, from `load_arm`. Postures (k, n) hold n joints [rad], from
+    the base to the tip.
 
-    `urdf` is the chain of links from base to tip. `speed` [rad/s] is the greatest of each joint. The s collision
-    spheres [m] are those of the links, then those of the hand's palm. Those of `moving` links keep clear of objects
-    and, if they turn, of the table; the `pairs` of each other. `library` holds m random postures, with the features of
-    their tips. `hand_sha256` names the files of the hand.
+    `urdf` is the chain of links from base to tip. `speed` [rad/s] is the greatest of each joint.
+    The s collision spheres [m] are those of the links, then those of the hand's palm. Those of
+    `moving` links keep clear of objects and, if they turn, of the table; the `pairs` of each other.
+    `library` holds m random postures, with the features of their tips. `hand_sha256` names the
+    files of the hand.
     """
 
     urdf: Urdf = dataclasses.field(repr=False)
@@ -67,22 +73,33 @@ class Arm(Value):
     @checked
     def tip_poses(self, obj_from_hand: Float[Tensor, "k 4 4"]) -> Float[Tensor, "3 4 k"]:
         """Return the poses of the tip, in the base's frame, that put the hand at given poses."""
-        base_from_tip = inverse(self.obj_from_base) @ obj_from_hand.to(self.lower) @ inverse(self.tip_from_hand)
+        base_from_tip = (
+            inverse(self.obj_from_base) @ obj_from_hand.to(self.lower) @ inverse(self.tip_from_hand)
+        )
         return base_from_tip[:, :3].permute(1, 2, 0).contiguous()
 
     @checked
-    def tip_motion(self, joints: Float[Tensor, "n k"]) -> tuple[Float[Tensor, "3 4 k"], Float[Tensor, "6 n k"]]:
-        """Return the tip's poses, and its motion by each joint: translation [mm], rotation times `LEVER`."""
+    def tip_motion(
+        self, joints: Float[Tensor, "n k"]
+    ) -> tuple[Float[Tensor, "3 4 k"], Float[Tensor, "6 n k"]]:
+        """Return the tip's poses, and its motion by each joint: translation [mm], rotation times
+        `LEVER`.
+        """
         frames = self.tree.frames(joints)
-        tip, child = frames[:, :, -1], frames.index_select(2, self.tree.child)
-        axes, slides = map_directions(child, self.tree.axis), self.tree.prismatic[:, None] > 0
-        place = torch.where(slides, axes, torch.linalg.cross(axes, tip[:, 3, None] - child[:, 3], dim=0))
+        tip = frames[:, :, -1]
+        child = frames.index_select(2, self.tree.child)
+        axes = map_directions(child, self.tree.axis)
+        slides = self.tree.prismatic[:, None] > 0
+        place = torch.where(
+            slides, axes, torch.linalg.cross(axes, tip[:, 3, None] - child[:, 3], dim=0)
+        )
         return tip, torch.cat([place / MILLIMETRE, LEVER * torch.where(slides, 0.0, axes)])
 
     @checked
     def sphere_centres(self, joints: Float[Tensor, "n k"]) -> Float[Tensor, "3 s k"]:
         """Return the centres [m] of all collision spheres in the object's frame."""
-        frames, pose = self.tree.frames(joints.contiguous()).index_select(2, self.link), self.obj_from_base
+        frames = self.tree.frames(joints.contiguous()).index_select(2, self.link)
+        pose = self.obj_from_base
         centres = map_points(frames, self.center)
         return (pose[:3, :3] @ centres.flatten(1)).view_as(centres) + pose[:3, 3, None, None]
 
@@ -95,7 +112,9 @@ class Arm(Value):
 
 
 def features(tip: Float[Tensor, "3 4 k"]) -> Float[Tensor, "k 12"]:
-    """Return numbers of each pose whose distance is a distance [mm]; a small turn counts as its angle times `LEVER`."""
+    """Return numbers of each pose whose distance is a distance [mm]; a small turn counts as its
+    angle times `LEVER`.
+    """
     return torch.cat([tip[:, 3] / MILLIMETRE, LEVER / math.sqrt(2) * tip[:, :3].flatten(0, 1)]).T
 
 
@@ -111,72 +130,124 @@ def load_arm(
 ) -> Arm:
     """Load a robot arm that carries a hand from the arm's URDF, for `plan_grasps`.
 
-    Args:
-        urdf: path of the file; a joint without limits gets one turn either way.
-        hand: the hand on the arm, or its name or folder.
-        tip: the link that carries the hand; by default the one that most joints move, the last of equals.
-        obj_from_base: pose of the arm's root link in the frame of the cloud; by default the same frame.
-        tip_from_hand: pose of the hand's root link in the frame of the tip; by default the same frame.
-        seed: random seed of the postures from which inverse kinematics starts.
+    Args: urdf: path of the file; a joint without limits gets one turn either way. hand: the hand on
+        the arm, or its name or folder. tip: the link that carries the hand; by default the one that
+        most joints move, the last of equals. obj_from_base: pose of the arm's root link in the
+        frame of the cloud; by default the same frame. tip_from_hand: pose of the hand's root link
+        in the frame of the tip; by default the same frame. seed: random seed of the postures from
+        which inverse kinematics starts.
 
-    Raises `HandFileError` for a URDF that is missing or malformed. On the way to the tip it may have no mesh, which
-    `clean_arm` replaces, and no joint without a drive. Raises `BadArgument` for a tip that fewer than six joints move.
+    Raises `HandFileError` for a URDF that is missing or malformed. On the way to the tip it may
+    have no mesh, which `clean_arm` replaces, and no joint without a drive. Raises `BadArgument` for
+    a tip that fewer than six joints move.
 
     >>> from torchgrasp import load_hand
     >>> load_arm(load_hand("allegro").urdf_path, "allegro", "thumb_tip")
     Traceback (most recent call last):
         ...
-    torchgrasp.foundation.errors.BadArgument: tip: expected a link that at least six joints move, got 'thumb_tip'
+    torchgrasp.foundation.errors.BadArgument: tip: expected a link that at least six joints move,
+    got 'thumb_tip'
     """
-    hand, whole = as_hand(hand, "hand"), read_published(urdf)
+    hand = as_hand(hand, "hand")
+    whole = read_published(urdf)
     named = {link.name: link for link in whole.links}
     tip = max(reversed(named), key=lambda name: len(whole.movers(name))) if tip is None else tip
     if tip not in named or len(whole.movers(tip)) < 6:
         raise BadArgument("tip", repr(tip), "a link that at least six joints move")
     turn = 2 * math.pi
     if followers := [joint.name for joint in whole.joints_above(tip) if joint.mimic]:
-        raise whole.wrong(f"joint {followers[0]} that follows another", "joints that each have a drive, up to the tip")
-    way = [dataclasses.replace(j, lower=max(j.lower, -turn), upper=min(j.upper, turn)) for j in whole.joints_above(tip)]
-    chain = dataclasses.replace(
-        whole, links=(named[whole.root], *(named[j.child] for j in reversed(way))), joints=tuple(reversed(way))
-    )
-    if bare := [link.name for link in chain.links if any(shape.kind == "mesh" for shape in link.shapes)]:
         raise whole.wrong(
-            f"link {bare[0]} with a mesh", "boxes, cylinders or spheres, as torchgrasp.app.author.clean_arm writes"
+            f"joint {followers[0]} that follows another",
+            "joints that each have a drive, up to the tip",
         )
-    tree, joints, one = (
-        tree_from_urdf(chain),
-        chain.movable,
-        real([[float(i == j) for j in range(4)] for i in range(4)]),
+    way = [
+        dataclasses.replace(j, lower=max(j.lower, -turn), upper=min(j.upper, turn))
+        for j in whole.joints_above(tip)
+    ]
+    chain = dataclasses.replace(
+        whole,
+        links=(named[whole.root], *(named[j.child] for j in reversed(way))),
+        joints=tuple(reversed(way)),
     )
+    if bare := [
+        link.name for link in chain.links if any(shape.kind == "mesh" for shape in link.shapes)
+    ]:
+        raise whole.wrong(
+            f"link {bare[0]} with a mesh",
+            "boxes, cylinders or spheres, as torchgrasp.app.author.clean_arm writes",
+        )
+    tree = tree_from_urdf(chain)
+    joints = chain.movable
+    one = real([[float(i == j) for j in range(4)] for i in range(4)])
     lower, upper, speed = real([(j.lower, j.upper, j.velocity or math.pi) for j in joints]).T
-    generator, many = torch.Generator().manual_seed(seed), 1024  # random postures: one is not far from any pose
+    # random postures: one is not far from any pose
+    generator = torch.Generator().manual_seed(seed)
+    many = 1024
     share = 2 * torch.rand(many, len(joints), generator=generator, dtype=torch.float64) - 1
-    library = (lower + upper) / 2 + share * ((upper - lower) / 2).clamp_max(math.pi)  # each direction of a joint once
-    base, mount = (one if x is None else x.to("cpu", torch.float64) for x in (obj_from_base, tip_from_hand))
+    library = (lower + upper) / 2 + share * ((upper - lower) / 2).clamp_max(
+        math.pi
+    )  # each direction of a joint once
+    base, mount = (
+        one if x is None else x.to("cpu", torch.float64) for x in (obj_from_base, tip_from_hand)
+    )
     link, center, radius, palm = _spheres(chain, hand.to("cpu", torch.float64), mount)
     above = tree.moves.sum(1).long()[link]  # the number of joints that move each sphere
-    moving, pairs = torch.nonzero((above > 0) & ~palm)[:, 0], torch.nonzero(above - above[:, None] > 1)
+    moving = torch.nonzero((above > 0) & ~palm)[:, 0]
+    pairs = torch.nonzero(above - above[:, None] > 1)
     found = features(tree.frames(library.T.contiguous())[:, :, -1])
     arm = Arm(
-        chain, tree, lower, upper, speed, base, mount, link, center, radius, moving, pairs, library, found,
+        chain,
+        tree,
+        lower,
+        upper,
+        speed,
+        base,
+        mount,
+        link,
+        center,
+        radius,
+        moving,
+        pairs,
+        library,
+        found,
         hand.source.sha256,
-    )  # fmt: skip
+    )
     met = arm.overlaps(arm.sphere_centres(library[:200].T))
     bodies, owner = torch.unique((link + palm)[pairs], dim=0, return_inverse=True)
-    often = torch.zeros(len(bodies), met.shape[1]).index_add(0, owner, met.float()).gt(0).float().mean(1)
-    return dataclasses.replace(arm, pairs=pairs[often[owner] <= ALWAYS])  # others touch by construction
+    often = (
+        torch.zeros(len(bodies), met.shape[1])
+        .index_add(0, owner, met.float())
+        .gt(0)
+        .float()
+        .mean(1)
+    )
+    return dataclasses.replace(
+        arm, pairs=pairs[often[owner] <= ALWAYS]
+    )  # others touch by construction
 
 
-def _spheres(chain: Urdf, hand: Hand, tip_from_hand: Float[Tensor, "4 4"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return link, centre [m] and radius [m] of spheres around an arm's links and the hand's palm, and a palm mask."""
-    cell, bulge = 0.065, 0.01  # [m]: one sphere fills a section of a thin link; how far it may stand out of a shape
-    covers = [(k, *cover(shape, cell, bulge)) for k, link in enumerate(chain.links) for shape in link.shapes]
+def _spheres(
+    chain: Urdf, hand: Hand, tip_from_hand: Float[Tensor, "4 4"]
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return link, centre [m] and radius [m] of spheres around an arm's links and the hand's palm,
+    and a palm mask.
+    """
+    # [m]: one sphere fills a section of a thin link; how far it may stand out of a shape
+    cell = 0.065
+    bulge = 0.01
+    covers = [
+        (k, *cover(shape, cell, bulge))
+        for k, link in enumerate(chain.links)
+        for shape in link.shapes
+    ]
     rows = [(k, *centre, radius) for k, centres, radius in covers for centre in centres]
     palm = hand.collision_spheres.finger == -1
     centres = apply(tip_from_hand, hand.sphere_centres(hand.lower)[palm])
     last = real([len(chain.links) - 1.0]).expand(len(centres), 1)
     every = torch.cat(
-        [real(rows).reshape(-1, 5), torch.cat([last, centres, hand.collision_spheres.radius[palm, None]], 1)]
+        [
+            real(rows).reshape(-1, 5),
+            torch.cat([last, centres, hand.collision_spheres.radius[palm, None]], 1),
+        ]
     )
     return every[:, 0].long(), every[:, 1:4], every[:, 4], torch.arange(len(every)) >= len(rows)

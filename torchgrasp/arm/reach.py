@@ -1,8 +1,9 @@
 """Inverse kinematics of an arm: which hand poses it reaches, and its way through a grasp.
 
-Postures are moved by damped least squares until the hand is in place: first those of the arm's library whose tips are
-nearest, then along a way each from the one before. A way is w poses: the straight approach of the opened hand, the
-grasp, the lift.
+Postures are moved by damped least squares until the hand is in place: first those of the arm's
+    library whose tips are
+nearest, then along a way each from the one before. A way is w poses: the straight approach of the
+opened hand, the grasp, the lift.
 """
 
 import dataclasses
@@ -21,12 +22,16 @@ from torchgrasp.ik.motion import APPROACH_DISTANCE, COARSE_STEPS, UP, opened_pos
 from torchgrasp.values.planning import Grasps
 
 Way = tuple[Float[Tensor, "g w n"], Bool[Tensor, "g"], Float[Tensor, "g 2"]]
-"""The postures on the way through each grasp, whether the arm can go it, and its ease, as in `Grasps`."""
+"""The postures on the way through each grasp, whether the arm can go it, and its ease, as in
+`Grasps`.
+"""
 
 
 def reach_poses(arm: Arm, obj_from_hand: Float[Tensor, "k 4 4"]) -> Bool[Tensor, "k"]:
     """Return a mask of the hand poses that the arm reaches within its joint limits."""
-    target, starts = arm.tip_poses(obj_from_hand), 4  # postures that are tried for a pose
+    # postures that are tried for a pose
+    target = arm.tip_poses(obj_from_hand)
+    starts = 4
     reached = torch.zeros(len(obj_from_hand), dtype=torch.bool, device=target.device)
     for start in _nearest(arm, target, starts).unbind(1):
         left = torch.nonzero(~reached)[:, 0]
@@ -34,47 +39,69 @@ def reach_poses(arm: Arm, obj_from_hand: Float[Tensor, "k 4 4"]) -> Bool[Tensor,
     return reached.to(obj_from_hand.device)
 
 
-def with_arm(arm: Arm, hand: Hand, grasps: Grasps, world: CollisionWorld, up: Float[Tensor, "3"]) -> Grasps:
-    """Return grasps with the postures of the arm; executable ones through which it has no way become `UNREACHABLE`."""
+def with_arm(
+    arm: Arm, hand: Hand, grasps: Grasps, world: CollisionWorld, up: Float[Tensor, "3"]
+) -> Grasps:
+    """Return grasps with the postures of the arm; executable ones through which it has no way
+    become `UNREACHABLE`.
+    """
     rows = torch.nonzero(grasps.status == Status.OK)[:, 0]
     way, found, least = follow_grasps(arm, hand, grasps[rows], world, up)
-    status = grasps.status.index_put((rows[~found],), torch.tensor(int(Status.UNREACHABLE)).to(grasps.status))
+    status = grasps.status.index_put(
+        (rows[~found],), torch.tensor(int(Status.UNREACHABLE)).to(grasps.status)
+    )
     joints = way.new_zeros(len(grasps), way.shape[2]).index_copy(0, rows, way[:, COARSE_STEPS + 1])
     ease = least.new_zeros(len(grasps), 2).index_copy(0, rows, least)
     return dataclasses.replace(grasps, status=status, arm=joints, ease=ease)
 
 
-def follow_grasps(arm: Arm, hand: Hand, grasps: Grasps, world: CollisionWorld, up: Float[Tensor, "3"] = UP) -> Way:
+def follow_grasps(
+    arm: Arm, hand: Hand, grasps: Grasps, world: CollisionWorld, up: Float[Tensor, "3"] = UP
+) -> Way:
     """Return the arm's way through each grasp, zeros if there is none.
 
-    It goes through the easiest posture that reaches the grasp, and from which it can follow the whole way: without a
-    jump, a joint beyond its limits, or a collision of its links with the world, each other or the palm.
+    It goes through the easiest posture that reaches the grasp, and from which it can follow the
+    whole way: without a jump, a joint beyond its limits, or a collision of its links with the
+    world, each other or the palm.
     """
-    poses, starts, at = way_of(hand, grasps, world, up).to(arm.lower), 8, COARSE_STEPS + 1
+    poses = way_of(hand, grasps, world, up).to(arm.lower)
+    starts = 8
+    at = COARSE_STEPS + 1
     (g, w), tips = poses.shape[:2], arm.tip_poses(poses.flatten(0, 1)).unflatten(2, poses.shape[:2])
     near = _nearest(arm, tips[..., at], starts).flatten()
-    joints, solved = solve_tips(arm, arm.library[near].T, tips[..., at].repeat_interleave(starts, 2))
+    joints, solved = solve_tips(
+        arm, arm.library[near].T, tips[..., at].repeat_interleave(starts, 2)
+    )
     solved &= in_chunks(lambda x: (_is_clear(arm, x[:, None], world),), joints.T, 256)[0]
     ease = torch.where(solved, measure_ease(arm, joints).prod(1), -1.0).view(g, starts)
-    way, found, least = poses.new_zeros(g, w, len(joints)), solved.new_zeros(g), poses.new_zeros(g, 2)
+    way = poses.new_zeros(g, w, len(joints))
+    found = solved.new_zeros(g)
+    least = poses.new_zeros(g, 2)
     for choice in ease.argsort(dim=1, descending=True, stable=True).unbind(1):
         rows = torch.nonzero(~found & (ease.gather(1, choice[:, None])[:, 0] >= 0))[:, 0]
         if not len(rows):
             break
         path, good = track(arm, joints[:, rows * starts + choice[rows]], tips[:, :, rows])
         good &= in_chunks(lambda x: (_is_clear(arm, x, world),), path, 64)[0]
-        rows, path = rows[good], path[good]
-        way[rows], found[rows] = path, True
+        rows = rows[good]
+        path = path[good]
+        way[rows] = path
+        found[rows] = True
         least[rows] = measure_ease(arm, path.flatten(0, 1).T).view(-1, w, 2).amin(1)
     return way, found, least
 
 
-def way_of(hand: Hand, grasps: Grasps, world: CollisionWorld, up: Float[Tensor, "3"] = UP) -> Float[Tensor, "g w 4 4"]:
-    """Return the hand's poses on its way: in the first half it is opened, in the second half it has closed.
+def way_of(
+    hand: Hand, grasps: Grasps, world: CollisionWorld, up: Float[Tensor, "3"] = UP
+) -> Float[Tensor, "g w 4 4"]:
+    """Return the hand's poses on its way: in the first half it is opened, in the second half it has
+    closed.
 
     It is lifted along the normal of the table, or `up` without a table.
     """
-    closed, height = grasps.obj_from_hand, 0.1  # [m], of the lift
+    # [m], of the lift
+    closed = grasps.obj_from_hand
+    height = 0.1
     opened = opened_pose(hand, grasps.pregrasp, closed, world.plane)
     share = torch.linspace(0, 1, COARSE_STEPS + 1, device="cpu").to(closed)[:, None]
     up = (up if world.plane is None else world.plane.normal).to(closed)
@@ -87,13 +114,18 @@ def way_of(hand: Hand, grasps: Grasps, world: CollisionWorld, up: Float[Tensor, 
 def track(
     arm: Arm, start: Float[Tensor, "n g"], tips: Float[Tensor, "3 4 g w"]
 ) -> tuple[Float[Tensor, "g w n"], Bool[Tensor, "g"]]:
-    """Return postures that follow the tips from the grasp both ways, and whether each does so steadily.
+    """Return postures that follow the tips from the grasp both ways, and whether each does so
+    steadily.
 
     At a speed of 0.1 m/s no joint may turn faster than it can.
     """
-    speed, at = 0.1, COARSE_STEPS + 1
-    path, steady = {at: start}, torch.ones_like(start[0], dtype=torch.bool)
-    for k, last in [(k, k + 1) for k in reversed(range(at))] + [(k, k - 1) for k in range(at + 1, 2 * at)]:
+    speed = 0.1
+    at = COARSE_STEPS + 1
+    path = {at: start}
+    steady = torch.ones_like(start[0], dtype=torch.bool)
+    for k, last in [(k, k + 1) for k in reversed(range(at))] + [
+        (k, k - 1) for k in range(at + 1, 2 * at)
+    ]:
         path[k], solved = solve_tips(arm, path[last], tips[..., k], steps=4)
         seconds = torch.linalg.vector_norm(tips[:, 3, :, k] - tips[:, 3, :, last], dim=0) / speed
         steady &= solved & ((path[k] - path[last]).abs() <= arm.speed[:, None] * seconds).all(0)
@@ -101,16 +133,21 @@ def track(
 
 
 def _is_clear(arm: Arm, path: Float[Tensor, "g w n"], world: CollisionWorld) -> Bool[Tensor, "g"]:
-    """Return a mask of the ways on which no link touches the world; of whole ways nor another link or the palm."""
+    """Return a mask of the ways on which no link touches the world; of whole ways nor another link
+    or the palm.
+    """
     centres = arm.sphere_centres(path.flatten(0, 1).T).unflatten(2, path.shape[:2])
-    links, radius = centres[:, arm.moving].permute(2, 3, 1, 0), arm.radius[arm.moving]
+    links = centres[:, arm.moving].permute(2, 3, 1, 0)
+    radius = arm.radius[arm.moving]
     clear = torch.ones_like(path[:, 0, 0], dtype=torch.bool)
     if world.plane is not None:  # what only slides, as a base on a rail, may stand on the table
         turns = (arm.tree.moves @ (1 - arm.tree.prismatic))[arm.link[arm.moving]] > 0
         height = along(links[:, :, turns], world.plane) - radius[turns]
         clear &= height.flatten(1).amin(1) >= world.plane.offset
     if world.field is not None:  # a lifted object is not in the way
-        clear &= (world.field.query(links[:, : COARSE_STEPS + 2])[0] - radius).flatten(1).amin(1) >= 0
+        clear &= (world.field.query(links[:, : COARSE_STEPS + 2])[0] - radius).flatten(1).amin(
+            1
+        ) >= 0
     if world.obstacles is not None and world.guarded:
         clear &= (world.obstacles.field.query(links)[0] - radius).flatten(1).amin(1) >= 0
     if path.shape[1] > 1:  # the links come near each other slowly
@@ -119,30 +156,45 @@ def _is_clear(arm: Arm, path: Float[Tensor, "g w n"], world: CollisionWorld) -> 
 
 
 def measure_ease(arm: Arm, joints: Float[Tensor, "n k"]) -> Float[Tensor, "k 2"]:
-    """Return the least distance of a joint from its limits, as a share of half its range, and the manipulability."""
-    lower, upper, motion = arm.lower[:, None], arm.upper[:, None], arm.tip_motion(joints)[1]
+    """Return the least distance of a joint from its limits, as a share of half its range, and the
+    manipulability.
+    """
+    lower = arm.lower[:, None]
+    upper = arm.upper[:, None]
+    motion = arm.tip_motion(joints)[1]
     room = (2 * torch.minimum(joints - lower, upper - joints) / (upper - lower)).amin(0)
     jacobian = torch.cat([motion[:3] * MILLIMETRE, motion[3:] / LEVER]).permute(2, 0, 1)
     return torch.stack([room, torch.linalg.det(jacobian @ jacobian.mT).clamp_min(0).sqrt()], 1)
 
 
 def _nearest(arm: Arm, target: Float[Tensor, "3 4 k"], count: int) -> Int[Tensor, "k s"]:
-    """Return the indices of the `count` postures of the library whose tips are nearest to each target."""
+    """Return the indices of the `count` postures of the library whose tips are nearest to each
+    target.
+    """
     size = arm.features.square().sum(1) / 2
     find = lambda wanted: ((size - wanted @ arm.features.T).topk(count, 1, largest=False).indices,)  # noqa: E731
     return in_chunks(find, features(target), 256)[0]
 
 
 def solve_tips(
-    arm: Arm, start: Float[Tensor, "n k"], target: Float[Tensor, "3 4 k"], steps: int = 12, solved: float = 1e-4
+    arm: Arm,
+    start: Float[Tensor, "n k"],
+    target: Float[Tensor, "3 4 k"],
+    steps: int = 12,
+    solved: float = 1e-4,
 ) -> tuple[Float[Tensor, "n k"], Bool[Tensor, "k"]]:
-    """Move postures within their limits until the tips are in place; return them, and whether each tip is.
+    """Move postures within their limits until the tips are in place; return them, and whether each
+    tip is.
 
-    In place means a sum of squared errors below `solved` [mm2], by default of a hundredth of a millimetre.
-    The damping is half the squared error (Sugihara, IEEE Transactions on Robotics 27, 2011).
+    In place means a sum of squared errors below `solved` [mm2], by default of a hundredth of a
+    millimetre. The damping is half the squared error (Sugihara, IEEE Transactions on Robotics 27,
+    2011).
     """
-    joints, rows = start.clone(), torch.arange(start.shape[1], device=start.device)
-    lower, upper, done = arm.lower[:, None], arm.upper[:, None], torch.zeros_like(rows, dtype=torch.bool)
+    joints = start.clone()
+    rows = torch.arange(start.shape[1], device=start.device)
+    lower = arm.lower[:, None]
+    upper = arm.upper[:, None]
+    done = torch.zeros_like(rows, dtype=torch.bool)
     for step in range(steps + 1):
         tip, motion = arm.tip_motion(joints[:, rows])
         gap = _gap(tip, target[..., rows])
@@ -151,7 +203,10 @@ def solve_tips(
         left = torch.nonzero(error >= solved)[:, 0]
         if step == steps or not len(left):
             break
-        rows, motion, gap, error = rows[left], motion[..., left], gap[:, left], error[left]
+        rows = rows[left]
+        motion = motion[..., left]
+        gap = gap[:, left]
+        error = error[left]
         normal = (motion[:, :, None] * motion[:, None]).sum(0)
         normal.diagonal().T.add_(error / 2 + 1)
         step, _ = torch.linalg.solve_ex(normal.permute(2, 0, 1), (motion * gap[:, None]).sum(0).T)
@@ -163,6 +218,7 @@ def solve_tips(
 def _gap(tip: Float[Tensor, "3 4 k"], target: Float[Tensor, "3 4 k"]) -> Float[Tensor, "6 k"]:
     """Return the translation [mm] from tips to targets, and the rotation vector times `LEVER`."""
     axis = torch.linalg.cross(tip[:, :3], target[:, :3], dim=0).sum(1) / 2
-    sine, cosine = torch.linalg.vector_norm(axis, dim=0), ((tip[:, :3] * target[:, :3]).sum((0, 1)) - 1) / 2
+    sine = torch.linalg.vector_norm(axis, dim=0)
+    cosine = ((tip[:, :3] * target[:, :3]).sum((0, 1)) - 1) / 2
     turn = axis * (torch.atan2(sine, cosine) / sine.clamp_min(1e-12))
     return torch.cat([(target[:, 3] - tip[:, 3]) / MILLIMETRE, LEVER * turn])

@@ -1,4 +1,6 @@
-"""Campaigns: data sets of clouds, grasps, certificates and simulated verdicts, made by many processes or machines."""
+"""Campaigns: data sets of clouds, grasps, certificates and simulated verdicts, made by many
+processes or machines.
+"""
 
 from torchgrasp.campaign.campaign import CampaignSpec, run_campaign
 

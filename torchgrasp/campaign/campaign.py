@@ -6,7 +6,14 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from torchgrasp.campaign.cluster import OnGpu, empty_shard, plan_jobs, run_job, run_on_cluster, versions
+from torchgrasp.campaign.cluster import (
+    OnGpu,
+    empty_shard,
+    plan_jobs,
+    run_job,
+    run_on_cluster,
+    versions,
+)
 from torchgrasp.campaign.folder import Campaign, carry_out
 from torchgrasp.data.manifest import read_entries
 from torchgrasp.data.reader import GraspShards
@@ -29,16 +36,15 @@ LONGEST_LICENCE = 100  # letters of a licence's name; those of the SPDX list hav
 class CampaignSpec(Value):
     """Options of a campaign: protocol, trials, licence and size of the files.
 
-    Raises `BadArgument` for an unknown protocol, or trials of whole clouds, of grasps that were planned before, or of
-    other fingers than the hand's.
+    Raises `BadArgument` for an unknown protocol, or trials of whole clouds, of grasps that were
+    planned before, or of other fingers than the hand's.
 
-    Args:
-        protocol: test protocol of each grasp, or its name in `torchgrasp.evaluation.PROTOCOLS`.
-        trials: which views are planned on, and how many of their grasps are tried, with the hand's own fingers.
-        licence: licence of the data set, preferably an SPDX identifier such as "CC-BY-4.0".
-        jobs_in_shard: number of jobs (an object and a view) in one file.
-        device: "cuda" plans on all views of a file at once, on the workers of a Dask cluster that have a GPU and the
-            resource "GPU". A GPU's rounding may change grasps.
+    Args: protocol: test protocol of each grasp, or its name in `torchgrasp.evaluation.PROTOCOLS`.
+        trials: which views are planned on, and how many of their grasps are tried, with the hand's
+        own fingers. licence: licence of the data set, preferably an SPDX identifier such as
+        "CC-BY-4.0". jobs_in_shard: number of jobs (an object and a view) in one file. device:
+        "cuda" plans on all views of a file at once, on the workers of a Dask cluster that have a
+        GPU and the resource "GPU". A GPU's rounding may change grasps.
 
     >>> CampaignSpec("dexgraspbench").test.trial.friction
     0.6
@@ -51,13 +57,21 @@ class CampaignSpec(Value):
     device: Literal["cpu", "cuda"] = "cpu"
 
     def __post_init__(self) -> None:
-        """Raise `BadArgument` unless trials plan on partial views with default fingers, or for a bad licence."""
+        """Raise `BadArgument` unless trials plan on partial views with default fingers, or for a
+        bad licence.
+        """
         trials = self.trials
         if trials.planned or trials.complete or trials.fingers is not None:
-            found = next(name for name in ("planned", "complete", "fingers") if getattr(trials, name))
-            raise BadArgument("trials", f"{found} = {getattr(trials, found)!r}", "views that are planned on anew")
+            found = next(
+                name for name in ("planned", "complete", "fingers") if getattr(trials, name)
+            )
+            raise BadArgument(
+                "trials", f"{found} = {getattr(trials, found)!r}", "views that are planned on anew"
+            )
         if not self.licence.isprintable() or not 0 < len(self.licence) <= LONGEST_LICENCE:
-            raise BadArgument("licence", repr(self.licence), f"a line of 1 to {LONGEST_LICENCE} letters")
+            raise BadArgument(
+                "licence", repr(self.licence), f"a line of 1 to {LONGEST_LICENCE} letters"
+            )
 
     @property
     def test(self) -> Protocol:
@@ -74,27 +88,25 @@ def run_campaign(
     workers: Annotated[int, Range(0, 1024)] | str = 0,
     observer: Callable[[JobRow], object] = lambda row: None,
 ) -> GraspShards:
-    """Plan on every view of a folder of objects, try the grasps in simulation, and write a data set of the results.
+    """Plan on every view of a folder of objects, try the grasps in simulation, and write a data set
+    of the results.
 
-    Each job, one object and view, gives a row: its grasps, or the reason why there are none. A finished job is on disk
-    at once. The same call continues an interrupted run, and retries failed jobs (`WORKER_DIED`, `TIMED_OUT`, `BROKEN`).
-    Equal results give equal bytes, whatever the workers, their order and the interruptions (docs/promises.md, N10, on
-    equal results).
+    Each job, one object and view, gives a row: its grasps, or the reason why there are none. A
+    finished job is on disk at once. The same call continues an interrupted run, and retries failed
+    jobs (`WORKER_DIED`, `TIMED_OUT`, `BROKEN`). Equal results give equal bytes, whatever the
+    workers, their order and the interruptions (docs/promises.md, N10, on equal results).
 
-    Args:
-        objects: a folder as in `torchgrasp.data`. On a cluster it has the same path on every machine.
-        hand: from `load_hand`, with the fingers that grasp.
-        folder: folder of the data set; no other run may write to it at the same time.
-        spec: options of the campaign; `CampaignSpec()` by default.
-        workers: number of processes on this machine, where 0 means this process. Or the address of a Dask scheduler,
-            such as "tcp://10.0.0.1:8786", whose workers have one thread each.
-        observer: called with the row of each finished job.
+    Args: objects: a folder as in `torchgrasp.data`. On a cluster it has the same path on every
+        machine. hand: from `load_hand`, with the fingers that grasp. folder: folder of the data
+        set; no other run may write to it at the same time. spec: options of the campaign;
+        `CampaignSpec()` by default. workers: number of processes on this machine, where 0 means
+        this process. Or the address of a Dask scheduler, such as "tcp://10.0.0.1:8786", whose
+        workers have one thread each. observer: called with the row of each finished job.
 
-    Raises:
-        BadArgument: no objects, no scheduler at the address or for "cuda", or a machine with other versions or another
-            hand.
-        OutputError: the folder holds another campaign or other files, another run holds it, or it cannot be written.
-        MissingExtra: the simulator, pebble for workers, or Dask for a cluster is not installed.
+    Raises: BadArgument: no objects, no scheduler at the address or for "cuda", or a machine with
+        other versions or another hand. OutputError: the folder holds another campaign or other
+        files, another run holds it, or it cannot be written. MissingExtra: the simulator, pebble
+        for workers, or Dask for a cluster is not installed.
 
     >>> import tempfile, trimesh
     >>> from torchgrasp import load_hand
@@ -111,16 +123,26 @@ def run_campaign(
     spec = CampaignSpec() if spec is None else spec
     if spec.device != "cpu" and not isinstance(workers, str):
         raise BadArgument("workers", workers, "a Dask scheduler, whose workers have the GPUs")
-    place, test = Path(objects).resolve(), spec.test
+    place = Path(objects).resolve()
+    test = spec.test
     rows = _list_jobs(place, spec)
     of_hand = {"name": hand.name, "option": hand.source.option, "sha256": hand.source.sha256}
-    of_hand |= {"joint_names": ", ".join(hand.joint_names), "finger_names": ", ".join(hand.finger_names)}
+    of_hand |= {
+        "joint_names": ", ".join(hand.joint_names),
+        "finger_names": ", ".join(hand.finger_names),
+    }
     asked = {
-        "torchgrasp": "campaign", "version": 1, "licence": spec.licence,
-        "objects_sha256": sha256(place / "manifest.json"), "hand": of_hand, "protocol": dataclasses.asdict(test),
-        "trials": dataclasses.asdict(spec.trials), "jobs_in_shard": spec.jobs_in_shard, "versions": versions(),
+        "torchgrasp": "campaign",
+        "version": 1,
+        "licence": spec.licence,
+        "objects_sha256": sha256(place / "manifest.json"),
+        "hand": of_hand,
+        "protocol": dataclasses.asdict(test),
+        "trials": dataclasses.asdict(spec.trials),
+        "jobs_in_shard": spec.jobs_in_shard,
+        "versions": versions(),
         "device": spec.device,
-    }  # fmt: skip
+    }
     campaign = Campaign(asked, rows, lambda row: empty_shard(row, hand, test.noise.draws))
     source = HandSource(hand.source.option, hand.source.urdf_path, hand.source.sha256)
     views = [ObjectView(place, row.object, row.view, source) for row in rows]
@@ -132,25 +154,45 @@ def run_campaign(
         return run_as_they_end(run_job, tasks(numbers), workers, limit)
 
     def tasks(numbers: Sequence[int]) -> Iterator[tuple[Any, ...]]:
-        size, meta = spec.jobs_in_shard, campaign.meta
+        size = spec.jobs_in_shard
+        meta = campaign.meta
         for k, own in itertools.groupby(numbers, lambda j: j // size):
-            shard = [j for j in range(k * size, min((k + 1) * size, len(rows))) if rows[j].status is Status.OK]
-            plan = OnGpu(plan_jobs, (meta, [views[j] for j in shard], test, spec.trials, spec.device))
+            shard = [
+                j
+                for j in range(k * size, min((k + 1) * size, len(rows)))
+                if rows[j].status is Status.OK
+            ]
+            plan = OnGpu(
+                plan_jobs, (meta, [views[j] for j in shard], test, spec.trials, spec.device)
+            )
             for j in own:  # a shard has one plan, whichever of its jobs are left
-                yield views[j], test, spec.trials, meta, None if spec.device == "cpu" else plan, shard.index(j)
+                yield (
+                    views[j],
+                    test,
+                    spec.trials,
+                    meta,
+                    None if spec.device == "cpu" else plan,
+                    shard.index(j),
+                )
 
     return carry_out(campaign, Path(folder), work, observer)
 
 
 def _list_jobs(objects: Path, spec: CampaignSpec) -> tuple[JobRow, ...]:
-    """Return one row for each job (a view of an object), in order; an object with a bad entry gives a single row."""
+    """Return one row for each job (a view of an object), in order; an object with a bad entry gives
+    a single row.
+    """
     rows: list[JobRow] = []
     for name, entry in read_entries(objects, spec.trials.only).items():
         if isinstance(entry, DatasetError):
             rows.append(JobRow(short(ascii(name)), "", Status.BAD_OBJECT, short(str(entry))))
         else:
             of_object = JobRow(name, "", family=entry.family, group=entry.group)
-            rows += [of_object._replace(view=view) for view in entry.list_views(most=spec.trials.views)]
+            rows += [
+                of_object._replace(view=view) for view in entry.list_views(most=spec.trials.views)
+            ]
             if not entry.views:
-                rows.append(of_object._replace(status=Status.BAD_OBJECT, note="the manifest names no view"))
+                rows.append(
+                    of_object._replace(status=Status.BAD_OBJECT, note="the manifest names no view")
+                )
     return tuple(rows)

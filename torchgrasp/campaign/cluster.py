@@ -1,4 +1,6 @@
-"""One job of a campaign, and running jobs on a Dask cluster, where a worker that dies loses only its own job."""
+"""One job of a campaign, and running jobs on a Dask cluster, where a worker that dies loses only
+its own job.
+"""
 
 import contextlib
 import importlib.metadata
@@ -14,7 +16,14 @@ import torch
 
 from torchgrasp.data.shards import JobRow, Records, Shard, pack_shard, short
 from torchgrasp.evaluation.protocols import Protocol
-from torchgrasp.evaluation.views import EvaluationSpec, ObjectView, choose_rows, plan_view, plan_views, try_grasp
+from torchgrasp.evaluation.views import (
+    EvaluationSpec,
+    ObjectView,
+    choose_rows,
+    plan_view,
+    plan_views,
+    try_grasp,
+)
 from torchgrasp.foundation.errors import BadArgument, MissingExtra, OutputError, Status
 from torchgrasp.foundation.threads import one_thread
 from torchgrasp.hand.hand import Hand
@@ -25,14 +34,17 @@ PACKAGES = ("torchgrasp", "torch", "numpy", "scipy", "trimesh", "sapien", "mujoc
 """Packages whose versions may change the results of a campaign."""
 Result = TypeVar("Result")
 CONNECTING = "30s"  # longest time for the scheduler to answer
-OUTSTANDING = 10_000  # tasks that the scheduler holds at once: ten for each of a thousand workers; a task costs memory
+# tasks that the scheduler holds at once: ten for each of a thousand workers; a task costs memory
+OUTSTANDING = 10_000
 
 
 def versions() -> dict[str, str]:
     """Return the installed versions of `PACKAGES`; "none" for a package that is not installed."""
     from torchgrasp import __version__
 
-    found = dict.fromkeys(PACKAGES, "none") | {"torchgrasp": __version__}  # of the source; an installation may be older
+    found = dict.fromkeys(PACKAGES, "none") | {
+        "torchgrasp": __version__
+    }  # of the source; an installation may be older
     for name in PACKAGES[1:]:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             found[name] = importlib.metadata.version(name)
@@ -40,7 +52,9 @@ def versions() -> dict[str, str]:
 
 
 def check_versions(meta: dict[str, str]) -> None:
-    """Raise `BadArgument` unless this machine has the software of the machine that began the campaign."""
+    """Raise `BadArgument` unless this machine has the software of the machine that began the
+    campaign.
+    """
     if (here := json.dumps(versions())) != meta["versions"]:
         raise BadArgument("workers", f"one with {here}", f"workers with {meta['versions']}")
 
@@ -53,7 +67,9 @@ class OnGpu(NamedTuple):
 
 
 def plan_jobs(meta: dict[str, str], *task: Any) -> list[Grasps | None]:
-    """Return `plan_views(*task)`: plans of several jobs for `run_job`, which says what every machine must have."""
+    """Return `plan_views(*task)`: plans of several jobs for `run_job`, which says what every
+    machine must have.
+    """
     check_versions(meta)
     return plan_views(*task)
 
@@ -66,59 +82,93 @@ def run_job(
     plans: object = None,
     place: int = 0,
 ) -> bytes:
-    """Plan and try the grasps of one job; return the bytes of a shard file that holds only this job.
+    """Plan and try the grasps of one job; return the bytes of a shard file that holds only this
+    job.
 
-    Every machine must have the same hand and the same software as the machine that began the campaign: `meta` holds the
-    `versions` of the software. A faulty object gives a row with the reason. Errors that are not the object's fault are
-    raised. The job's plan is `plans[place]` if there are `plans`, from `plan_jobs`; they are a status if it took long.
+    Every machine must have the same hand and the same software as the machine that began the
+    campaign: `meta` holds the `versions` of the software. A faulty object gives a row with the
+    reason. Errors that are not the object's fault are raised. The job's plan is `plans[place]` if
+    there are `plans`, from `plan_jobs`; they are a status if it took long.
     """
     check_versions(meta)
     hand = view.load_hand()
     if hand.source.sha256 != view.hand.sha256:
-        raise BadArgument("hand", f"{view.hand.urdf_path} with other files", "the same hand on every machine")
+        raise BadArgument(
+            "hand", f"{view.hand.urdf_path} with other files", "the same hand on every machine"
+        )
     try:
         shard = _work(view, hand, protocol, spec, plans[place] if isinstance(plans, list) else None)
     except (MissingExtra, OutputError, MemoryError, OSError):
         raise
     except Exception as error:  # of the library: a week of other jobs shall not end with it
-        row = JobRow(view.object, view.view, Status.BROKEN, short(f"{type(error).__name__}: {error}"))
+        row = JobRow(
+            view.object, view.view, Status.BROKEN, short(f"{type(error).__name__}: {error}")
+        )
         shard = empty_shard(row, hand, protocol.noise.draws)
     return pack_shard(shard, meta)
 
 
-def _work(view: ObjectView, hand: Hand, protocol: Protocol, spec: EvaluationSpec, plan: Grasps | None) -> Shard:
-    """Plan grasps on the view of a job unless there is a plan, and try the chosen grasps in simulation."""
+def _work(
+    view: ObjectView, hand: Hand, protocol: Protocol, spec: EvaluationSpec, plan: Grasps | None
+) -> Shard:
+    """Plan grasps on the view of a job unless there is a plan, and try the chosen grasps in
+    simulation.
+    """
     score, cloud, found = plan_view(view, protocol, spec, plan)
-    row = JobRow(view.object, view.view, score.refusal, short(score.note), score.family, score.group)
+    row = JobRow(
+        view.object, view.view, score.refusal, short(score.note), score.family, score.group
+    )
     if cloud is None or found is None:
         return empty_shard(row, hand, protocol.noise.draws)
     ranks = choose_rows(len(found), spec.grasps, spec.ranks)
-    grasps, draws = found[ranks], range(protocol.noise.draws)
-    tries = [try_grasp(view, found[rank], protocol, spec, (rank, draw)) for rank in ranks for draw in draws]
-    passed = torch.tensor([x.passed for x in tries], dtype=torch.bool).reshape(len(ranks), len(draws))
+    grasps = found[ranks]
+    draws = range(protocol.noise.draws)
+    tries = [
+        try_grasp(view, found[rank], protocol, spec, (rank, draw))
+        for rank in ranks
+        for draw in draws
+    ]
+    passed = torch.tensor([x.passed for x in tries], dtype=torch.bool).reshape(
+        len(ranks), len(draws)
+    )
     outcome = torch.tensor([int(x.status) for x in tries], dtype=torch.int64).reshape(passed.shape)
-    eye = torch.zeros(3, dtype=torch.float64) if cloud.viewpoint is None else cloud.viewpoint.double()
-    counts = {"executable": len(found), "points": len(cloud), "grasps": len(ranks), "passed": int(passed.sum())}
+    eye = (
+        torch.zeros(3, dtype=torch.float64) if cloud.viewpoint is None else cloud.viewpoint.double()
+    )
+    counts = {
+        "executable": len(found),
+        "points": len(cloud),
+        "grasps": len(ranks),
+        "passed": int(passed.sum()),
+    }
     row = row._replace(**counts, meta=found.meta)
     return Shard((row,), Records(cloud.points.double(), eye[None], grasps, passed, outcome))
 
 
 def empty_shard(row: JobRow, hand: Hand, draws: int) -> Shard:
     """Return the data of a job that has neither a cloud nor grasps, as a shard."""
-    points, tried = torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, draws, dtype=torch.int64)
-    return Shard((row,), Records(points, torch.zeros(1, 3, dtype=torch.float64), no_grasps(hand), tried.bool(), tried))
+    points = torch.zeros(0, 3, dtype=torch.float64)
+    tried = torch.zeros(0, draws, dtype=torch.int64)
+    return Shard(
+        (row,),
+        Records(
+            points, torch.zeros(1, 3, dtype=torch.float64), no_grasps(hand), tried.bool(), tried
+        ),
+    )
 
 
 def run_on_cluster(
     function: Callable[..., Result], tasks: Iterable[tuple[Any, ...]], address: str, limit: float
 ) -> Generator[tuple[int, Result | Status], None, None]:
-    """Run tasks on a Dask cluster; yield the index of each task and its result, in the order in which they end.
+    """Run tasks on a Dask cluster; yield the index of each task and its result, in the order in
+    which they end.
 
     A task whose worker dies is given to another worker; after the deaths that the scheduler allows
-    (`distributed.scheduler.allowed-failures`, 3 by default) it gives `Status.WORKER_DIED`. A task that takes longer
-    than `limit` [s] ends its worker, and gives `Status.TIMED_OUT`. The scheduler holds `OUTSTANDING` tasks at most,
-    which wait until a worker is free. Successive tasks share an equal argument `OnGpu`. Without Dask, `MissingExtra` is
-    raised; without a scheduler at the address, `BadArgument`.
+    (`distributed.scheduler.allowed-failures`, 3 by default) it gives `Status.WORKER_DIED`. A task
+    that takes longer than `limit` [s] ends its worker, and gives `Status.TIMED_OUT`. The scheduler
+    holds `OUTSTANDING` tasks at most, which wait until a worker is free. Successive tasks share an
+    equal argument `OnGpu`. Without Dask, `MissingExtra` is raised; without a scheduler at the
+    address, `BadArgument`.
     """
     try:
         from distributed import CancelledError, Client, Event, KilledWorker, as_completed
@@ -130,8 +180,12 @@ def run_on_cluster(
         allowed = "the address of a running Dask scheduler, as tcp://10.0.0.1:8786"
         raise BadArgument("workers", f"{address!r} ({error})", allowed) from error
     with client:
-        run, waiting, futures = uuid.uuid4().hex, enumerate(tasks), dict[Any, int]()
-        ended, plan = as_completed(loop=client.loop), (None, None)  # the last task on a GPU, and its future
+        run = uuid.uuid4().hex
+        waiting = enumerate(tasks)
+        futures = dict[Any, int]()
+        # the last task on a GPU, and its future
+        ended = as_completed(loop=client.loop)
+        plan = (None, None)
 
         def submit(most: int) -> None:
             nonlocal plan
@@ -140,7 +194,9 @@ def run_on_cluster(
                     call = _bounded, new.function, limit, f"{run}-plan-{number}", *new.task
                     plan = new, client.submit(*call, pure=False, priority=1, resources={"GPU": 1})
                 given = (plan[1] if isinstance(x, OnGpu) else x for x in task)
-                future = client.submit(_bounded, function, limit, f"{run}-{number}", *given, pure=False)
+                future = client.submit(
+                    _bounded, function, limit, f"{run}-{number}", *given, pure=False
+                )
                 futures[future] = number
                 ended.add(future)
 
@@ -155,7 +211,9 @@ def run_on_cluster(
                     result = Status.TIMED_OUT if late else Status.WORKER_DIED
                 except CancelledError as error:
                     found = f"{address!r}, which ended during the work"
-                    raise BadArgument("workers", found, "a scheduler that goes on; the same call continues") from error
+                    raise BadArgument(
+                        "workers", found, "a scheduler that goes on; the same call continues"
+                    ) from error
                 del future  # results that were yielded leave the memory
                 submit(1)
                 yield number, result
@@ -163,8 +221,12 @@ def run_on_cluster(
             client.cancel(list(futures))
 
 
-def _bounded(function: Callable[..., Result], limit: float, name: str, *task: Any) -> Result | Status:
-    """Call a function on one thread of a worker process; end the process if the call takes longer than `limit` [s]."""
+def _bounded(
+    function: Callable[..., Result], limit: float, name: str, *task: Any
+) -> Result | Status:
+    """Call a function on one thread of a worker process; end the process if the call takes longer
+    than `limit` [s].
+    """
     from distributed import Event
 
     late = Event(name)

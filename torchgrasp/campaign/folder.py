@@ -1,4 +1,6 @@
-"""The folder of a campaign: one file for each finished job until its shard is complete, and the data set's cards."""
+"""The folder of a campaign: one file for each finished job until its shard is complete, and the
+data set's cards.
+"""
 
 import contextlib
 import hashlib
@@ -14,18 +16,28 @@ from torchgrasp.data.table_folder import render_card
 from torchgrasp.files import begin_folder, format_json, hold_folder, remove_file, sha256, write_file
 from torchgrasp.foundation.errors import ModelFileError, Status
 
-ASKED, README, PARTS = "campaign.json", "README.md", "parts"
-"""Names in a campaign's folder: its request, its text for people, and the folder for jobs of incomplete shards."""
+ASKED = "campaign.json"
+README = "README.md"
+PARTS = "parts"
+"""Names in a campaign's folder: its request, its text for people, and the folder for jobs of
+incomplete shards.
+"""
 ROUNDS = 3
-"""How often a job whose process died is tried in one call, because a dying process also ends jobs beside its own."""
+"""How often a job whose process died is tried in one call, because a dying process also ends jobs
+beside its own.
+"""
 FAILED = (Status.WORKER_DIED, Status.TIMED_OUT, Status.BROKEN)
 """Statuses of a failed job that say nothing about its object: the next call tries the job again."""
 Work = Callable[[Sequence[int]], Generator[tuple[int, bytes | Status], None, None]]
-"""Function of job indices that yields, as each job ends, a position in these indices, and a file or a failure."""
+"""Function of job indices that yields, as each job ends, a position in these indices, and a file or
+a failure.
+"""
 
 
 class Campaign(NamedTuple):
-    """The request of a campaign, as in `campaign.json`, and one row for each job (one view of one object)."""
+    """The request of a campaign, as in `campaign.json`, and one row for each job (one view of one
+    object).
+    """
 
     asked: dict[str, Any]
     rows: tuple[JobRow, ...]  # a job whose row has a status other than OK is not run
@@ -44,16 +56,22 @@ class Campaign(NamedTuple):
 
 
 def carry_out(
-    campaign: Campaign, folder: Path, work: Work, observer: Callable[[JobRow], object] = lambda row: None
+    campaign: Campaign,
+    folder: Path,
+    work: Work,
+    observer: Callable[[JobRow], object] = lambda row: None,
 ) -> GraspShards:
-    """Run the jobs that a folder lacks, and write its data set; the observer gets the row of each finished job."""
+    """Run the jobs that a folder lacks, and write its data set; the observer gets the row of each
+    finished job.
+    """
     with hold_folder(folder):
         begin_folder(folder / ASKED, campaign.text, "campaigns")
         store = _Store(campaign, folder)
         for j in store.missing():
             if campaign.rows[j].status is not Status.OK:
                 observer(store.put(j, pack_shard(campaign.empty(campaign.rows[j]), campaign.meta)))
-        waiting, lost = store.missing(), dict[int, Status]()
+        waiting = store.missing()
+        lost = dict[int, Status]()
         if waiting:
             remove_file(folder / CARD)  # until the new one is true
         for _ in range(ROUNDS):
@@ -76,10 +94,13 @@ def carry_out(
 
 
 class _Store:
-    """The files of a campaign; `rows` holds, by index, the rows of all jobs that are undamaged on disk."""
+    """The files of a campaign; `rows` holds, by index, the rows of all jobs that are undamaged on
+    disk.
+    """
 
     def __init__(self, campaign: Campaign, folder: Path) -> None:
-        self.campaign, self.folder = campaign, folder
+        self.campaign = campaign
+        self.folder = folder
         self.size = int(campaign.asked["jobs_in_shard"])
         self.shards = range(-(-len(campaign.rows) // self.size))
         self.rows: dict[int, JobRow] = {}
@@ -101,7 +122,9 @@ class _Store:
         return self.rows[j]
 
     def finish(self) -> None:
-        """Write the README, then `card.json`, which marks a complete data set; remove the folder of single jobs."""
+        """Write the README, then `card.json`, which marks a complete data set; remove the folder of
+        single jobs.
+        """
         rows = [self.rows[j] for j in range(len(self.campaign.rows))]
         card = card_of(self.campaign, rows, [self.digests[k] for k in self.shards])
         write_file(self.folder / README, render_card("shards.md", card=card))
@@ -110,8 +133,11 @@ class _Store:
             (self.folder / PARTS).rmdir()
 
     def _find(self, k: int) -> dict[int, Shard]:
-        """Return the undamaged jobs of shard k by index, read from the file of the job or of the shard."""
-        jobs, found = self._jobs(k), dict[int, Shard]()
+        """Return the undamaged jobs of shard k by index, read from the file of the job or of the
+        shard.
+        """
+        jobs = self._jobs(k)
+        found = dict[int, Shard]()
         with contextlib.suppress(ModelFileError):
             found = dict(zip(jobs, self._load(shard_path(self.folder, k), jobs), strict=True))
         for j in jobs:
@@ -120,8 +146,11 @@ class _Store:
         return found
 
     def _close(self, k: int) -> None:
-        """If all jobs of shard k have finished, write the shard file and remove the files of the single jobs."""
-        path, jobs = shard_path(self.folder, k), self._jobs(k)
+        """If all jobs of shard k have finished, write the shard file and remove the files of the
+        single jobs.
+        """
+        path = shard_path(self.folder, k)
+        jobs = self._jobs(k)
         if any(j not in self.rows for j in jobs):
             return
         if any(self._part(j).is_file() for j in jobs):
@@ -140,17 +169,22 @@ class _Store:
         return self.folder / PARTS / f"job-{j:06d}.safetensors"
 
     def _load(self, path: Path, jobs: Sequence[int]) -> list[Shard]:
-        """Return the jobs in a file, one shard for each job; raise `ModelFileError` unless they are the given jobs."""
+        """Return the jobs in a file, one shard for each job; raise `ModelFileError` unless they are
+        the given jobs.
+        """
         shard = load_shard(path, self.campaign.meta)
         held = [(row.object, row.view) for row in shard.rows]
-        if held != (asked := [(self.campaign.rows[j].object, self.campaign.rows[j].view) for j in jobs]):
+        if held != (
+            asked := [(self.campaign.rows[j].object, self.campaign.rows[j].view) for j in jobs]
+        ):
             raise ModelFileError("path", f"{path} of {held}", f"{asked}")
         return [shard.take(i) for i in range(len(jobs))]
 
 
 def card_of(campaign: Campaign, rows: Sequence[JobRow], digests: list[str]) -> dict[str, Any]:
     """Return the content of `card.json`, given the rows of all jobs and the SHA-256 of each shard."""
-    asked, tries = campaign.asked, campaign.asked["protocol"]["noise"]["draws"]
+    asked = campaign.asked
+    tries = campaign.asked["protocol"]["noise"]["draws"]
     counts = {
         "jobs": len(rows),
         "status": dict(Counter(row.status.name for row in rows).most_common()),
@@ -164,7 +198,13 @@ def card_of(campaign: Campaign, rows: Sequence[JobRow], digests: list[str]) -> d
     }
     jobs = [{name: x for name, x in row.as_json().items() if name != "meta"} for row in rows]
     return {
-        "torchgrasp": "grasp-shards", "version": 1, "licence": asked["licence"], "campaign": campaign.meta["campaign"],
-        "jobs_in_shard": asked["jobs_in_shard"], "asked": asked, "counts": counts, "shards_sha256": digests,
+        "torchgrasp": "grasp-shards",
+        "version": 1,
+        "licence": asked["licence"],
+        "campaign": campaign.meta["campaign"],
+        "jobs_in_shard": asked["jobs_in_shard"],
+        "asked": asked,
+        "counts": counts,
+        "shards_sha256": digests,
         "jobs": jobs,
-    }  # fmt: skip
+    }

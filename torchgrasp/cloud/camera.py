@@ -19,8 +19,13 @@ from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
 from torchgrasp.values.planning import PointCloud
 
 Transform = Float[Tensor, "4 4"]
-WIDTH, HEIGHT, FOCAL = 640, 480, 616.0  # columns, rows and focal length [px] of the default camera
-INTRINSICS = torch.tensor([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1]], dtype=torch.float64)
+# columns, rows and focal length [px] of the default camera
+WIDTH = 640
+HEIGHT = 480
+FOCAL = 616.0
+INTRINSICS = torch.tensor(
+    [[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1]], dtype=torch.float64
+)
 """Intrinsics [px] of the default camera."""
 
 
@@ -33,19 +38,22 @@ def look_at(
 ) -> Transform:
     """Return the pose obj_from_camera (4 x 4) of an upright camera that looks at a target.
 
-    Args:
-        azimuth: direction of the camera, from x towards y [deg].
-        elevation: angle of the camera above the horizontal [deg], in [-89.9, 89.9].
-        distance: distance of the camera from the target [m], in [0.01, 10].
-        target: point (3,) [m] in the middle of the image; or a mesh for the centre of its box, or None for the origin.
+    Args: azimuth: direction of the camera, from x towards y [deg]. elevation: angle of the camera
+        above the horizontal [deg], in [-89.9, 89.9]. distance: distance of the camera from the
+        target [m], in [0.01, 10]. target: point (3,) [m] in the middle of the image; or a mesh for
+        the centre of its box, or None for the origin.
 
-    Raises `BadArgument` for an angle or a distance outside its range, and `MeshError` for a mesh without faces.
+    Raises `BadArgument` for an angle or a distance outside its range, and `MeshError` for a mesh
+    without faces.
 
     >>> look_at(0.0, 0.0, 0.5)[:3, 3]
     tensor([0.5000, 0.0000, 0.0000], dtype=torch.float64)
     """
-    a, e = math.radians(azimuth), math.radians(elevation)
-    away = torch.tensor([math.cos(a) * math.cos(e), math.sin(a) * math.cos(e), math.sin(e)], dtype=torch.float64)
+    a = math.radians(azimuth)
+    e = math.radians(elevation)
+    away = torch.tensor(
+        [math.cos(a) * math.cos(e), math.sin(a) * math.cos(e), math.sin(e)], dtype=torch.float64
+    )
     right = torch.tensor([-math.sin(a), math.cos(a), 0.0], dtype=torch.float64)
     down = torch.linalg.cross(-away, right)
     position = distance * away
@@ -66,19 +74,19 @@ def partial_view(
     noise: bool | SensorName | SensorNoise = True,
     seed: Seed = 0,
 ) -> PointCloud:
-    """Return n points [m] of a mesh that the default camera sees, with a viewpoint and without normals.
+    """Return n points [m] of a mesh that the default camera sees, with a viewpoint and without
+    normals.
 
-    By default the noise is that of an active stereo camera: noise and steps of the disparity, a smooth bias, flying and
-    missing pixels at rims, and surfaces that fade out at grazing angles. Raises `BadArgument` for fewer than 4 points
-    or a pose that is not rigid, `MeshError` for a mesh without faces, and `TooFewPoints` if the camera sees nothing of
-    the mesh.
+    By default the noise is that of an active stereo camera: noise and steps of the disparity, a
+    smooth bias, flying and missing pixels at rims, and surfaces that fade out at grazing angles.
+    Raises `BadArgument` for fewer than 4 points or a pose that is not rigid, `MeshError` for a mesh
+    without faces, and `TooFewPoints` if the camera sees nothing of the mesh.
 
-    Args:
-        mesh: surface of the object, in the object frame [m].
-        camera_pose: transform obj_from_camera (4 x 4), see `look_at`.
-        n: number of pixels drawn at random; if there are fewer pixels, all are returned.
-        noise: True for the default noise, False for exact depths, the name of a camera, or a `SensorNoise`.
-        seed: random seed of the noise and of the choice of points.
+    Args: mesh: surface of the object, in the object frame [m]. camera_pose: transform
+        obj_from_camera (4 x 4), see `look_at`. n: number of pixels drawn at random; if there are
+        fewer pixels, all are returned. noise: True for the default noise, False for exact depths,
+        the name of a camera, or a `SensorNoise`. seed: random seed of the noise and of the choice
+        of points.
 
     >>> import trimesh
     >>> box = trimesh.creation.box([0.06, 0.06, 0.1])
@@ -95,19 +103,27 @@ def partial_view(
 
 
 def cast_mesh(mesh: "trimesh.Trimesh", obj_from_camera: Transform) -> tuple[Image, Image]:
-    """Return a mesh's depth image [m], and |cosine| between ray and face normal; both are 0 where a ray misses."""
+    """Return a mesh's depth image [m], and |cosine| between ray and face normal; both are 0 where a
+    ray misses.
+    """
     if not len(mesh.faces):
         raise MeshError("mesh", "no faces", "a mesh with a surface")
-    row, column = torch.meshgrid(torch.arange(HEIGHT).double(), torch.arange(WIDTH).double(), indexing="ij")
-    x, y = (column - INTRINSICS[0, 2]) / FOCAL, (row - INTRINSICS[1, 2]) / FOCAL
+    row, column = torch.meshgrid(
+        torch.arange(HEIGHT).double(), torch.arange(WIDTH).double(), indexing="ij"
+    )
+    x = (column - INTRINSICS[0, 2]) / FOCAL
+    y = (row - INTRINSICS[1, 2]) / FOCAL
     rays = torch.stack([x, y, torch.ones_like(x)], -1)
     inside = _in_image_box(mesh, obj_from_camera, x, y)
     direction = rotate(obj_from_camera, rays[inside]).numpy()
     origin = obj_from_camera[:3, 3].numpy()
-    face = np.asarray(mesh.ray.intersects_first(np.broadcast_to(origin, direction.shape), direction))
+    face = np.asarray(
+        mesh.ray.intersects_first(np.broadcast_to(origin, direction.shape), direction)
+    )
     hit = face >= 0
     # Embree works in float32: it gives the face, whose plane gives the distance in float64.
-    normal, corner = mesh.face_normals[face[hit]], mesh.vertices[mesh.faces[face[hit], 0]]
+    normal = mesh.face_normals[face[hit]]
+    corner = mesh.vertices[mesh.faces[face[hit], 0]]
     against = (normal * direction[hit]).sum(-1)
     z = ((corner - origin) * normal).sum(-1) / against
     cosine = np.abs(against) / np.linalg.norm(direction[hit], axis=-1)
@@ -117,14 +133,25 @@ def cast_mesh(mesh: "trimesh.Trimesh", obj_from_camera: Transform) -> tuple[Imag
     return images[0], images[1]
 
 
-def _in_image_box(mesh: "trimesh.Trimesh", obj_from_camera: Transform, x: Image, y: Image) -> Bool[Tensor, "h w"]:
-    """Return a mask of the camera rays (x, y, 1) that pass through the bounding box of the mesh in the image."""
+def _in_image_box(
+    mesh: "trimesh.Trimesh", obj_from_camera: Transform, x: Image, y: Image
+) -> Bool[Tensor, "h w"]:
+    """Return a mask of the camera rays (x, y, 1) that pass through the bounding box of the mesh in
+    the image.
+    """
     vertices = torch.from_numpy(np.array(mesh.vertices, dtype=np.float64))
     u, v, depth = apply(inverse(obj_from_camera), vertices).unbind(-1)
     if float(depth.min()) <= 1e-3:
         return torch.ones_like(x, dtype=torch.bool)
-    u, v, margin = u / depth, v / depth, 1e-2
-    return (x >= u.min() - margin) & (x <= u.max() + margin) & (y >= v.min() - margin) & (y <= v.max() + margin)
+    u = u / depth
+    v = v / depth
+    margin = 1e-2
+    return (
+        (x >= u.min() - margin)
+        & (x <= u.max() + margin)
+        & (y >= v.min() - margin)
+        & (y <= v.max() + margin)
+    )
 
 
 def render_depth(
@@ -135,18 +162,24 @@ def render_depth(
     noise: bool | SensorName | SensorNoise = True,
     seed: int = 0,
 ) -> tuple[Image, Int[Tensor, "h w"]]:
-    """Return a depth image [m] of meshes on a table, as the default camera measures it, and true pixel labels.
+    """Return a depth image [m] of meshes on a table, as the default camera measures it, and true
+    pixel labels.
 
-    Depth is 0 where nothing was measured. Label 0 is the table or nothing, label k is mesh k - 1. The table is a disc
-    of radius 0.6 m about the origin at the height `table` [m]; None means no table. `noise` is that of `partial_view`.
+    Depth is 0 where nothing was measured. Label 0 is the table or nothing, label k is mesh k - 1.
+    The table is a disc of radius 0.6 m about the origin at the height `table` [m]; None means no
+    table. `noise` is that of `partial_view`.
     """
     pose = check_rigid("camera_pose", camera_pose).double()
     depth = torch.full((HEIGHT, WIDTH), torch.inf, dtype=torch.float64)
-    cosine, labels = torch.zeros_like(depth), torch.zeros(HEIGHT, WIDTH, dtype=torch.int64)
+    cosine = torch.zeros_like(depth)
+    labels = torch.zeros(HEIGHT, WIDTH, dtype=torch.int64)
     layers = [(0, *_cast_table(table, pose))] if table is not None else []
-    for label, z, against in layers + [(k + 1, *cast_mesh(mesh, pose)) for k, mesh in enumerate(meshes)]:
+    for label, z, against in layers + [
+        (k + 1, *cast_mesh(mesh, pose)) for k, mesh in enumerate(meshes)
+    ]:
         nearer = (z > 0) & (z < depth)
-        depth, cosine = torch.where(nearer, z, depth), torch.where(nearer, against, cosine)
+        depth = torch.where(nearer, z, depth)
+        cosine = torch.where(nearer, against, cosine)
         labels[nearer] = label
     depth = torch.where(torch.isfinite(depth), depth, 0.0)
     if (sensor := find_sensor(noise)) is not None:
@@ -155,10 +188,15 @@ def render_depth(
 
 
 def _cast_table(height: float, obj_from_camera: Transform) -> tuple[Image, Image]:
-    """Return the table's depth image [m], and |cosine| between ray and normal; both are 0 where a ray misses."""
-    row, column = torch.meshgrid(torch.arange(HEIGHT).double(), torch.arange(WIDTH).double(), indexing="ij")
+    """Return the table's depth image [m], and |cosine| between ray and normal; both are 0 where a
+    ray misses.
+    """
+    row, column = torch.meshgrid(
+        torch.arange(HEIGHT).double(), torch.arange(WIDTH).double(), indexing="ij"
+    )
     rays = torch.stack([column, row, torch.ones_like(row)], -1) @ torch.linalg.inv(INTRINSICS).T
-    direction, origin = rotate(obj_from_camera, rays), obj_from_camera[:3, 3]
+    direction = rotate(obj_from_camera, rays)
+    origin = obj_from_camera[:3, 3]
     depth = (height - origin[2]) / direction[..., 2]
     where = origin[:2] + depth[..., None] * direction[..., :2]
     met = (depth > 0) & (torch.linalg.vector_norm(where, dim=-1) < 0.6)

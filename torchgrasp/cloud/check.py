@@ -1,4 +1,6 @@
-"""Checks of point clouds, and removal of points: duplicates, outliers, and surplus points of dense clouds."""
+"""Checks of point clouds, and removal of points: duplicates, outliers, and surplus points of dense
+clouds.
+"""
 
 from typing import Annotated
 
@@ -19,13 +21,13 @@ FEW_POINTS = 100  # fewer points are a speck of noise, or too coarse for a shape
 
 @checked
 def check_cloud(cloud: PointCloud) -> PointCloud:
-    """Return the cloud itself if it is fit for grasp planning, else raise an error. A flat cloud is fit, too.
+    """Return the cloud itself if it is fit for grasp planning, else raise an error. A flat cloud is
+    fit, too.
 
-    Raises:
-        BadArgument: a number that is not finite; a tensor that requires a gradient; points that all coincide or lie
-            on a line; a normal of length zero.
-        TooFewPoints: fewer than 4 distinct points.
-        SuspiciousScale: the longest side of the bounding box is outside [5 mm, 2 m]; the unit is often mm.
+    Raises: BadArgument: a number that is not finite; a tensor that requires a gradient; points that
+        all coincide or lie on a line; a normal of length zero. TooFewPoints: fewer than 4 distinct
+        points. SuspiciousScale: the longest side of the bounding box is outside [5 mm, 2 m]; the
+        unit is often mm.
 
     >>> check_cloud(PointCloud(torch.rand(50, 3))).viewpoint is None
     True
@@ -38,7 +40,9 @@ def check_cloud(cloud: PointCloud) -> PointCloud:
 
 @checked
 def remove_duplicates(cloud: PointCloud) -> PointCloud:
-    """Check a cloud, and return it without duplicate points, which would count as independent measurements."""
+    """Check a cloud, and return it without duplicate points, which would count as independent
+    measurements.
+    """
     points = _check(cloud)
     rows = _distinct_rows(points)
     _check_distinct(points, rows)
@@ -47,11 +51,12 @@ def remove_duplicates(cloud: PointCloud) -> PointCloud:
 
 @checked
 def voxel_downsample(cloud: PointCloud, voxel: Annotated[float, Range(1e-5, 1.0)]) -> PointCloud:
-    """Return a thinned cloud with one point of each voxel, the nearest to the voxel's centre, in the given order.
+    """Return a thinned cloud with one point of each voxel, the nearest to the voxel's centre, in
+    the given order.
 
-    The grid of voxels of side `voxel` [m] starts at the lowest corner of the cloud. Points are not averaged, since a
-    mean may lie inside a thin wall. Raises the errors of `check_cloud`, and `TooFewPoints` if fewer than 4 voxels hold
-    points.
+    The grid of voxels of side `voxel` [m] starts at the lowest corner of the cloud. Points are not
+    averaged, since a mean may lie inside a thin wall. Raises the errors of `check_cloud`, and
+    `TooFewPoints` if fewer than 4 voxels hold points.
 
     >>> len(voxel_downsample(PointCloud(0.1 * torch.rand(5000, 3)), 0.05)) <= 27
     True
@@ -64,7 +69,11 @@ def voxel_downsample(cloud: PointCloud, voxel: Annotated[float, Range(1e-5, 1.0)
     order = torch.argsort(torch.linalg.vector_norm(place - cell - 0.5, dim=-1), stable=True)
     rows = order[first_of_each(group[order])].sort().values
     if len(rows) < MIN_POINTS:
-        raise TooFewPoints("points", f"{len(rows)} voxels of {voxel:g} m", f"points in at least {MIN_POINTS} voxels")
+        raise TooFewPoints(
+            "points",
+            f"{len(rows)} voxels of {voxel:g} m",
+            f"points in at least {MIN_POINTS} voxels",
+        )
     return cloud.select(rows)
 
 
@@ -72,8 +81,8 @@ def voxel_downsample(cloud: PointCloud, voxel: Annotated[float, Range(1e-5, 1.0)
 def remove_outliers(cloud: PointCloud) -> PointCloud:
     """Return a cloud without duplicate points and without outliers, such as flying pixels.
 
-    The mean distance of an outlier to its 8 nearest neighbours is above 2.5 times the median of this distance.
-    Raises the errors of `check_cloud`.
+    The mean distance of an outlier to its 8 nearest neighbours is above 2.5 times the median of
+    this distance. Raises the errors of `check_cloud`.
 
     >>> points = torch.cat([0.1 * torch.rand(500, 3), torch.ones(1, 3)])
     >>> bool(remove_outliers(PointCloud(points)).points.max() < 0.2)
@@ -84,32 +93,46 @@ def remove_outliers(cloud: PointCloud) -> PointCloud:
 
 
 def _check_distinct(points: Float[Tensor, "n 3"], rows: Int[Tensor, "m"]) -> None:
-    """Raise an error if the distinct points, at the indices `rows`, are too few, or if all points lie on a line."""
+    """Raise an error if the distinct points, at the indices `rows`, are too few, or if all points
+    lie on a line.
+    """
     if len(rows) < MIN_POINTS:
-        raise TooFewPoints("points", f"{len(rows)} distinct points", f"at least {MIN_POINTS} distinct points")
+        raise TooFewPoints(
+            "points", f"{len(rows)} distinct points", f"at least {MIN_POINTS} distinct points"
+        )
     spread = torch.linalg.svdvals((points - points.mean(0)).double())
     if float(spread[1]) < 1e-6 * float(spread[0]):
         raise BadArgument("points", f"{len(points)} points on one line", "points of a surface")
 
 
 def _check(cloud: PointCloud) -> Float[Tensor, "n 3"]:
-    """Return the cloud's points, or raise an error if its extent is implausible or a normal has length zero."""
+    """Return the cloud's points, or raise an error if its extent is implausible or a normal has
+    length zero.
+    """
     points = cloud.points
     extent = float((points.amax(0) - points.amin(0)).max())
     if extent == 0.0:
-        raise BadArgument("points", f"{len(points)} points that all coincide", "points of a surface")
+        raise BadArgument(
+            "points", f"{len(points)} points that all coincide", "points of a surface"
+        )
     if not MIN_EXTENT <= extent <= MAX_EXTENT:
         allowed = f"an extent of {MIN_EXTENT:g} to {MAX_EXTENT:g} metres"
-        raise SuspiciousScale("points", f"{extent:.4g} m; is this cloud {_guess_unit(extent)}?", allowed)
+        raise SuspiciousScale(
+            "points", f"{extent:.4g} m; is this cloud {_guess_unit(extent)}?", allowed
+        )
     if cloud.normals is not None:
         zero = int((torch.linalg.vector_norm(cloud.normals, dim=-1) == 0).sum())
         if zero:
-            raise BadArgument("normals", f"{zero} normals of length zero", "normals with a direction")
+            raise BadArgument(
+                "normals", f"{zero} normals of length zero", "normals with a direction"
+            )
     return points
 
 
 def _guess_unit(extent: float) -> str:
-    """Guess the unit of an extent that is too large or too small to be in metres: objects are 5 to 45 cm long."""
+    """Guess the unit of an extent that is too large or too small to be in metres: objects are 5 to
+    45 cm long.
+    """
     if extent < MIN_EXTENT:
         return "normalised"
     if extent < 10:
@@ -119,20 +142,33 @@ def _guess_unit(extent: float) -> str:
 
 
 def _distinct_rows(points: Float[Tensor, "n 3"]) -> Int[Tensor, "m"]:
-    """Return the indices of the distinct points, ascending; of coincident points only the first counts."""
+    """Return the indices of the distinct points, ascending; of coincident points only the first
+    counts.
+    """
     points = points.detach().double()
     low = points.amin(0)
-    tolerance = 1e-9 * float((points.amax(0) - low).max())  # above rounding, below any sensor's resolution
-    # Points that share a cell of half the tolerance coincide: one point a cell leaves few pairs among many copies.
-    _, group = torch.unique(torch.floor((points - low) / (tolerance / 2)), dim=0, return_inverse=True)
+    tolerance = 1e-9 * float(
+        (points.amax(0) - low).max()
+    )  # above rounding, below any sensor's resolution
+    # Points that share a cell of half the tolerance coincide: one point a cell leaves few pairs
+    # among many copies.
+    _, group = torch.unique(
+        torch.floor((points - low) / (tolerance / 2)), dim=0, return_inverse=True
+    )
     rows = first_of_each(group).sort().values
     pairs = spatial.KDTree(points[rows].cpu().numpy()).query_pairs(tolerance, output_type="ndarray")
     keep = torch.ones(len(rows), dtype=torch.bool, device=rows.device)
-    keep[torch.from_numpy(pairs[:, 1]).to(rows.device)] = False  # the first index of a pair is the smaller one
+    keep[torch.from_numpy(pairs[:, 1]).to(rows.device)] = (
+        False  # the first index of a pair is the smaller one
+    )
     return rows[keep]
 
 
 def first_of_each(group: Int[Tensor, "n"]) -> Int[Tensor, "groups"]:
-    """Return the first index of each of the numbers 0, 1, ... in `group`, which holds each point's group number."""
+    """Return the first index of each of the numbers 0, 1, ... in `group`, which holds each point's
+    group number.
+    """
     order = torch.arange(len(group), device=group.device)
-    return torch.full_like(order, len(order)).scatter_reduce(0, group, order, "amin")[: int(group.max()) + 1]
+    return torch.full_like(order, len(order)).scatter_reduce(0, group, order, "amin")[
+        : int(group.max()) + 1
+    ]

@@ -1,4 +1,6 @@
-"""Outliers, local planes and local quadrics of a cloud, computed from the nearest neighbours of each point."""
+"""Outliers, local planes and local quadrics of a cloud, computed from the nearest neighbours of
+each point.
+"""
 
 import math
 
@@ -12,7 +14,9 @@ from torchgrasp.geometry.linalg import Points, unit
 
 
 def draw_rows(count: int, most: int) -> Int[Tensor, "m"]:
-    """Return at most `most` of the indices 0 to `count` - 1, drawn with a fixed seed, in ascending order."""
+    """Return at most `most` of the indices 0 to `count` - 1, drawn with a fixed seed, in ascending
+    order.
+    """
     if count <= most:
         return torch.arange(count)
     return torch.randperm(count, generator=torch.Generator().manual_seed(0))[:most].sort().values
@@ -21,72 +25,100 @@ def draw_rows(count: int, most: int) -> Int[Tensor, "m"]:
 def nearest(
     points: Points, k: int, rows: Int[Tensor, "m"] | None = None
 ) -> tuple[Float[Tensor, "m k"], Int[Tensor, "m k"]]:
-    """Return distances and indices of the k nearest points to each point in `rows`, by default to every point.
+    """Return distances and indices of the k nearest points to each point in `rows`, by default to
+    every point.
 
     Each point itself comes first in its row. A cloud of fewer than k points gives fewer columns.
     """
     array = points.detach().cpu().numpy()
     asked = array if rows is None else array[rows.cpu().numpy()]
     distance, index = spatial.KDTree(array).query(asked, k=min(k, len(array)))
-    return torch.from_numpy(distance).to(points), torch.from_numpy(np.asarray(index, dtype=np.int64)).to(points.device)
+    return torch.from_numpy(distance).to(points), torch.from_numpy(
+        np.asarray(index, dtype=np.int64)
+    ).to(points.device)
 
 
 def find_inliers(points: Points, rows: Int[Tensor, "m"] | None = None) -> Bool[Tensor, "m"]:
-    """Return a mask of the given points (by default all points) that are not outliers; see `remove_outliers`."""
-    spacing = nearest(points, 9, rows)[0][:, 1:].mean(-1)  # to eight: more than fly off a rim together
-    return spacing <= 2.5 * spacing.median()  # the spacing of real views varies less, with depth and slope
+    """Return a mask of the given points (by default all points) that are not outliers; see
+    `remove_outliers`.
+    """
+    spacing = nearest(points, 9, rows)[0][:, 1:].mean(
+        -1
+    )  # to eight: more than fly off a rim together
+    return (
+        spacing <= 2.5 * spacing.median()
+    )  # the spacing of real views varies less, with depth and slope
 
 
 def is_flat(points: Points) -> bool:
-    """Return whether a cloud is no thicker than its noise: twice the error of quadrics around the points."""
+    """Return whether a cloud is no thicker than its noise: twice the error of quadrics around the
+    points.
+    """
     points = points[draw_rows(len(points), 2000).to(points.device)].double()
     points = points[find_inliers(points)]
-    thickness, _, length = (torch.linalg.svdvals(points - points.mean(0)) / math.sqrt(len(points))).sort().values
+    thickness, _, length = (
+        (torch.linalg.svdvals(points - points.mean(0)) / math.sqrt(len(points))).sort().values
+    )
     return float(thickness) < max(2 * float(fit_quadrics(points)[2].median()), 1e-3 * float(length))
 
 
 def fit_local_planes(
     points: Points, rows: Int[Tensor, "m"] | None = None
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m"]]:
-    """Fit a plane around each point in `rows`, by default each point; return normals of any sign and rms errors [m]."""
+    """Fit a plane around each point in `rows`, by default each point; return normals of any sign
+    and rms errors [m].
+    """
     distance, index = nearest(points, 25, rows)  # about eight for each of a plane's three unknowns
     mean_squares, axes = _principal_axes(points[index], _weigh(distance))
     return axes[..., 0], mean_squares[:, 0].clamp_min(0).sqrt()
 
 
 def fit_quadrics(points: Points) -> tuple[Points, Points, Float[Tensor, "n"]]:
-    """Fit a quadric around each point; return the point moved onto it, the unit normal there, and the rms error [m].
+    """Fit a quadric around each point; return the point moved onto it, the unit normal there, and
+    the rms error [m].
 
-    Planes would move the points of a ball of radius r inward by s^2 / 2r, where s is the neighbours' spread.
+    Planes would move the points of a ball of radius r inward by s^2 / 2r, where s is the
+    neighbours' spread.
     """
     block = 1 << 14  # bounds the memory for clouds of any size
     distance, index = nearest(points, 30)  # five for each of a quadric's six unknowns
     blocks = zip(points.split(block), distance.split(block), index.split(block), strict=True)
-    feet, normals, rms = zip(*(_fit_block(at, points[rows], _weigh(d)) for at, d, rows in blocks), strict=True)
+    feet, normals, rms = zip(
+        *(_fit_block(at, points[rows], _weigh(d)) for at, d, rows in blocks), strict=True
+    )
     return torch.cat(feet), torch.cat(normals), torch.cat(rms)
 
 
 def _fit_block(
     points: Float[Tensor, "m 3"], near: Float[Tensor, "m k 3"], weight: Float[Tensor, "m k"]
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"], Float[Tensor, "m"]]:
-    """Return the results of `fit_quadrics` for some points, given each point's neighbours and their weights."""
+    """Return the results of `fit_quadrics` for some points, given each point's neighbours and their
+    weights.
+    """
     _, axes = _principal_axes(near, weight)
     height, u, v = ((near - points[:, None]) @ axes).unbind(-1)
     size = torch.stack([u, v], -1).norm(dim=-1).amax(-1, keepdim=True)
-    u, v = u / size, v / size
+    u = u / size
+    v = v / size
     terms = torch.stack([torch.ones_like(u), u, v, u * u, u * v, v * v], -1)
     weighted = weight[..., None] * terms
-    flat = 1e-3 * torch.tensor([0.0, 1.0, 1.0, 1.0, 1.0, 1.0]).to(points)  # decides only where points are few
+    flat = 1e-3 * torch.tensor([0.0, 1.0, 1.0, 1.0, 1.0, 1.0]).to(
+        points
+    )  # decides only where points are few
     moments = weighted.transpose(-1, -2) @ terms + torch.diag_embed(flat)
     quadric = torch.linalg.solve(moments, (weighted * height[..., None]).sum(-2))
     residual = height - (terms * quadric[:, None]).sum(-1)
-    gradient = torch.stack([torch.ones_like(size[:, 0]), -quadric[:, 1] / size[:, 0], -quadric[:, 2] / size[:, 0]], -1)
+    gradient = torch.stack(
+        [torch.ones_like(size[:, 0]), -quadric[:, 1] / size[:, 0], -quadric[:, 2] / size[:, 0]], -1
+    )
     feet = points + quadric[:, :1] * axes[..., 0]
     return feet, unit((axes @ gradient[..., None])[..., 0]), (weight * residual**2).sum(-1).sqrt()
 
 
 def _weigh(distance: Float[Tensor, "m k"]) -> Float[Tensor, "m k"]:
-    """Return the weights exp(-(d / 0.7 d_k)^2) of neighbours, scaled to sum 1; d_k is the farthest distance d."""
+    """Return the weights exp(-(d / 0.7 d_k)^2) of neighbours, scaled to sum 1; d_k is the farthest
+    distance d.
+    """
     weight = torch.exp(-((distance / (0.7 * distance[:, -1:])) ** 2))
     return weight / weight.sum(-1, keepdim=True)
 
@@ -94,6 +126,8 @@ def _weigh(distance: Float[Tensor, "m k"]) -> Float[Tensor, "m k"]:
 def _principal_axes(
     near: Float[Tensor, "n k 3"], weight: Float[Tensor, "n k"]
 ) -> tuple[Points, Float[Tensor, "n 3 3"]]:
-    """Return the weighted variances of neighbours along their principal axes, ascending, and the axes as columns."""
+    """Return the weighted variances of neighbours along their principal axes, ascending, and the
+    axes as columns.
+    """
     difference = near - (weight[..., None] * near).sum(1)[:, None]
     return torch.linalg.eigh((weight[..., None] * difference).transpose(-1, -2) @ difference)

@@ -11,7 +11,15 @@ from torchgrasp.foundation.limits import CLOUD_POINTS, TEXT_MESH_BYTES
 from torchgrasp.geometry.mesh import load_triangles
 
 TYPES = {
-    **{"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2"},
+    **{
+        "char": "i1",
+        "int8": "i1",
+        "uchar": "u1",
+        "uint8": "u1",
+        "short": "i2",
+        "int16": "i2",
+        "ushort": "u2",
+    },
     **{"uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4"},
     **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
 }
@@ -20,9 +28,12 @@ Property = tuple[str, str, str]  # name, type, and type of the length if it is a
 
 
 def parse_ply(data: bytes) -> dict[str, Any]:
-    """Return points, normals, viewpoint, frustum and table of a PLY file by name, where it has them."""
+    """Return points, normals, viewpoint, frustum and table of a PLY file by name, where it has
+    them.
+    """
     header, body = _split_header(data)
-    encoding, known = "", dict[str, np.ndarray]()
+    encoding = ""
+    known = dict[str, np.ndarray]()
     sizes = {"viewpoint": 3, "frustum": 12, "table": 4}
     elements: list[tuple[str, int, list[Property]]] = []
     for line in header:
@@ -30,10 +41,14 @@ def parse_ply(data: bytes) -> dict[str, Any]:
             case ["format", kind, "1.0"]:
                 encoding = kind
             case ["comment", name, *numbers] if len(numbers) == sizes.get(name):
-                known[name] = np.array([float(x) for x in numbers]).reshape((4, 3) if name == "frustum" else -1)
+                known[name] = np.array([float(x) for x in numbers]).reshape(
+                    (4, 3) if name == "frustum" else -1
+                )
             case ["element", name, count]:
                 elements.append((name, int(count), []))
-            case ["property", "list", length, kind, name] if elements and {length, kind} <= TYPES.keys():
+            case ["property", "list", length, kind, name] if (
+                elements and {length, kind} <= TYPES.keys()
+            ):
                 elements[-1][2].append((name, TYPES[kind], TYPES[length]))
             case ["property", kind, name] if elements and kind in TYPES:
                 elements[-1][2].append((name, TYPES[kind], ""))
@@ -43,17 +58,23 @@ def parse_ply(data: bytes) -> dict[str, Any]:
         raise Malformed(f"the encoding {encoding!r}")
     # Before the body is parsed: a mesh has twice as many faces as corners.
     if any(not 0 <= count <= 2 * CLOUD_POINTS for _, count, _ in elements):
-        raise Malformed(f"elements {[(name, count) for name, count, _ in elements]}; at most {CLOUD_POINTS} points")
+        raise Malformed(
+            f"elements {[(name, count) for name, count, _ in elements]}; at most {CLOUD_POINTS} points"
+        )
     faces = sum(count for name, count, _ in elements if name == "face")
     if faces:
         if encoding == "ascii" and len(body) > TEXT_MESH_BYTES:
-            raise Malformed(f"a mesh of {len(body)} bytes of text, which may have {TEXT_MESH_BYTES}")
+            raise Malformed(
+                f"a mesh of {len(body)} bytes of text, which may have {TEXT_MESH_BYTES}"
+            )
         points, normals = _sample_mesh(data)
         return {"points": points, "normals": normals, "viewpoint": known.get("viewpoint")}
     if not elements or elements[0][0] != "vertex":
         raise Malformed("a first element that is not called vertex")
     _, count, properties = elements[0]
-    found = _read_columns(body, encoding, count, properties, not any(more for _, more, _ in elements[1:]))
+    found = _read_columns(
+        body, encoding, count, properties, not any(more for _, more, _ in elements[1:])
+    )
     return found | known
 
 
@@ -64,7 +85,9 @@ def format_ply(
     frustum: np.ndarray | None = None,
     table: np.ndarray | None = None,
 ) -> bytes:
-    """Return the bytes of a binary PLY file; comment lines hold the viewpoint, the frustum and the table."""
+    """Return the bytes of a binary PLY file; comment lines hold the viewpoint, the frustum and the
+    table.
+    """
     lines = ["ply", "format binary_little_endian 1.0"]
     for name, numbers in (("viewpoint", viewpoint), ("frustum", frustum), ("table", table)):
         if numbers is not None:
@@ -85,14 +108,23 @@ def _split_header(data: bytes) -> tuple[list[str], bytes]:
     return data[:end].decode("ascii").splitlines()[1:], data[stop:]
 
 
-def _read_columns(body: bytes, encoding: str, count: int, properties: list[Property], last: bool) -> dict[str, Any]:
-    """Return points and normals of the vertices; their lists must be as long as those of the first vertex."""
+def _read_columns(
+    body: bytes, encoding: str, count: int, properties: list[Property], last: bool
+) -> dict[str, Any]:
+    """Return points and normals of the vertices; their lists must be as long as those of the first
+    vertex.
+    """
     order = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}[encoding]
-    names, fields, lengths = list[str](), list[tuple[str, int]](), dict[int, int]()
+    names = list[str]()
+    fields = list[tuple[str, int]]()
+    lengths = dict[int, int]()
     for name, kind, counter in properties:
         if counter:
-            names, fields = [*names, "_"], [*fields, (counter, 1)]
-            lengths[len(fields)] = int(read_fields(body, fields, min(count, 1), order, False)[-1][0, 0])
+            names = [*names, "_"]
+            fields = [*fields, (counter, 1)]
+            lengths[len(fields)] = int(
+                read_fields(body, fields, min(count, 1), order, False)[-1][0, 0]
+            )
         fields.append((kind, lengths.get(len(fields), 1)))
         names.append(f"list {name}" if counter else name)
     columns = read_fields(body, fields, count, order, last)
@@ -103,12 +135,18 @@ def _read_columns(body: bytes, encoding: str, count: int, properties: list[Prope
 
 
 def _sample_mesh(data: bytes) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return points on the surface of a PLY file's mesh, and their normals; None if the mesh is not closed."""
+    """Return points on the surface of a PLY file's mesh, and their normals; None if the mesh is not
+    closed.
+    """
     try:
         mesh = load_triangles(data, ".ply", process=False)
     except Exception as error:  # the parser raises whatever the bytes provoke
         raise Malformed(f"a mesh with {explain(error)}") from error
-    if not isinstance(mesh, trimesh.Trimesh) or not mesh.area > 0 or not np.isfinite(mesh.vertices).all():
+    if (
+        not isinstance(mesh, trimesh.Trimesh)
+        or not mesh.area > 0
+        or not np.isfinite(mesh.vertices).all()
+    ):
         raise Malformed("a mesh without a surface")
     points, faces = trimesh.sample.sample_surface(mesh, 2000, seed=0)[:2]
     mesh.merge_vertices()

@@ -22,10 +22,18 @@ UNIT = "depth in metres: depth_unit (--depth-unit) says how many metres a count 
 
 
 def check_rigid(name: str, pose: Tensor) -> Float[Tensor, "4 4"]:
-    """Return the given pose if it is rigid to 1e-4; else raise `BadArgument`, which names the fault."""
-    fixes = {(3, 4): "add the row 0 0 0 1", (16,): "reshape it to 4 x 4", (7,): "make a matrix of the quaternion"}
+    """Return the given pose if it is rigid to 1e-4; else raise `BadArgument`, which names the
+    fault.
+    """
+    fixes = {
+        (3, 4): "add the row 0 0 0 1",
+        (16,): "reshape it to 4 x 4",
+        (7,): "make a matrix of the quaternion",
+    }
     if tuple(pose.shape) in fixes:
-        raise BadArgument(name, f"shape {tuple(pose.shape)}", f"a 4 x 4 matrix: {fixes[tuple(pose.shape)]}")
+        raise BadArgument(
+            name, f"shape {tuple(pose.shape)}", f"a 4 x 4 matrix: {fixes[tuple(pose.shape)]}"
+        )
     check_tensor(name, pose, (4, 4))
     if not bool(is_rigid(pose)):
         raise BadArgument(name, f"{pose.tolist()}{_describe_fault(pose.double())}", RIGID)
@@ -36,7 +44,8 @@ def _describe_fault(pose: Float[Tensor, "4 4"]) -> str:
     """Return, as the end of a sentence, why a matrix is no rigid transform, and the fix."""
     if bool(pose[3, :3].any()) and not bool(pose[:3, 3].any()):
         return ", a transposed pose: give its transpose"
-    length, side = torch.linalg.vector_norm(pose[:3, :3], dim=0), torch.linalg.det(pose[:3, :3])
+    length = torch.linalg.vector_norm(pose[:3, :3], dim=0)
+    side = torch.linalg.det(pose[:3, :3])
     if not bool((length > 0).all()) or pose[3].tolist() != [0, 0, 0, 1]:
         return ""
     axes = pose[:3, :3] / length
@@ -60,7 +69,9 @@ def read_camera_pose(pose: Tensor | np.ndarray) -> Float[Tensor, "4 4"]:
 
 
 def check_distance(pose: Float[Tensor, "4 4"], distance: float, most: float, what: str) -> None:
-    """Refuse a pose as not in metres if `what`, such as the camera, is over `most` [m] from the frame's origin."""
+    """Refuse a pose as not in metres if `what`, such as the camera, is over `most` [m] from the
+    frame's origin.
+    """
     if abs(distance) > most:
         factor = 1000 if float(pose[:3, 3].abs().max()) > 200 else 100
         allowed = f"a pose in metres; in {'mm' if factor == 1000 else 'cm'}, divide camera_pose[:3, 3] by {factor}"
@@ -74,21 +85,31 @@ def read_pose(name: str, path: Path | str) -> Float[Tensor, "4 4"]:
         table = parse_npy(data) if suffix == ".npy" else read_lines(data)
         pose = torch.from_numpy(np.array(table, dtype=np.float64))
     except Exception as error:
-        raise BadArgument(name, f"{path}: {explain(error)}", f"a well-formed {suffix} file of 4 x 4 numbers") from error
+        raise BadArgument(
+            name, f"{path}: {explain(error)}", f"a well-formed {suffix} file of 4 x 4 numbers"
+        ) from error
     return check_rigid(name, pose)
 
 
 def find_plausible(
-    points: Points, pose: Float[Tensor, "4 4"], table: Plane | float | None, up: object, known_unit: bool
+    points: Points,
+    pose: Float[Tensor, "4 4"],
+    table: Plane | float | None,
+    up: object,
+    known_unit: bool,
 ) -> tuple[SupportPlane, ...]:
-    """Return the planes on which objects may stand; refuse a pose or a depth unit that contradicts the view."""
+    """Return the planes on which objects may stand; refuse a pose or a depth unit that contradicts
+    the view.
+    """
     eye = pose[:3, 3]
     try:
         supports = find_table(points, eye, table, up)
     except NoSupport:
         middle = float(((points - eye) @ pose[:3, 2]).median())
         if table is None and not 0.15 < middle < 4.0:
-            raise BadArgument("depth", f"a median depth of {middle:.3g} m, and no table", UNIT) from None
+            raise BadArgument(
+                "depth", f"a median depth of {middle:.3g} m, and no table", UNIT
+            ) from None
         if up is not None and table is None and not _is_own(pose):
             with contextlib.suppress(NoSupport):
                 _check_normals(find_table(points, eye, None, None), pose, up)
@@ -101,20 +122,29 @@ def find_plausible(
 
 
 def check_view(points: Points, pose: Float[Tensor, "4 4"], up: object, known_unit: bool) -> None:
-    """Raise `BadArgument` if a table in the view contradicts the camera's pose or the unit of the depth."""
+    """Raise `BadArgument` if a table in the view contradicts the camera's pose or the unit of the
+    depth.
+    """
     with contextlib.suppress(NoSupport):
         _check_supports(find_table(points, pose[:3, 3], None, None), pose, up, known_unit)
 
 
 def _is_own(pose: Float[Tensor, "4 4"]) -> bool:
-    """Return whether a pose is nearly the identity, so that the frame is the camera's, where z need not be up."""
-    return float(torch.diagonal(pose[:3, :3]).min()) > 0.985 and float(torch.linalg.vector_norm(pose[:3, 3])) < 0.1
+    """Return whether a pose is nearly the identity, so that the frame is the camera's, where z need
+    not be up.
+    """
+    return (
+        float(torch.diagonal(pose[:3, :3]).min()) > 0.985
+        and float(torch.linalg.vector_norm(pose[:3, 3])) < 0.1
+    )
 
 
 def _check_supports(
     supports: tuple[SupportPlane, ...], pose: Float[Tensor, "4 4"], up: object, known_unit: bool
 ) -> None:
-    """Refuse a pose that contradicts the planes on which objects stand, or a camera too high above the first one."""
+    """Refuse a pose that contradicts the planes on which objects stand, or a camera too high above
+    the first one.
+    """
     plane = supports[0].plane
     if not _is_own(pose):
         _check_normals(supports, pose, up)
@@ -124,21 +154,33 @@ def _check_supports(
         raise BadArgument("depth", f"a camera {height:.3g} m above the table", UNIT)
 
 
-def _check_normals(supports: tuple[SupportPlane, ...], pose: Float[Tensor, "4 4"], up: object) -> None:
-    """Refuse a pose with the table upside down, or tilted where another pose convention would make it level."""
-    sky = torch.tensor([0.0, 0.0, 1.0]).double() if up is None else unit(torch.as_tensor(up).double().cpu())
+def _check_normals(
+    supports: tuple[SupportPlane, ...], pose: Float[Tensor, "4 4"], up: object
+) -> None:
+    """Refuse a pose with the table upside down, or tilted where another pose convention would make
+    it level.
+    """
+    sky = (
+        torch.tensor([0.0, 0.0, 1.0]).double()
+        if up is None
+        else unit(torch.as_tensor(up).double().cpu())
+    )
     normals = torch.stack([support.plane.normal.double() for support in supports])
     tilt = math.degrees(math.acos(min(1.0, max(-1.0, float((normals @ sky).max())))))
     if tilt < 3.0:
         return
-    turn, flip = pose[:3, :3], torch.diag(torch.tensor([1.0, -1.0, -1.0]).double())
+    turn = pose[:3, :3]
+    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0]).double())
     optical = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]).double()
-    mirror, upset = (torch.diag(torch.tensor(signs).double()) for signs in ([-1.0, 1.0, 1.0], [1.0, -1.0, 1.0]))
+    mirror, upset = (
+        torch.diag(torch.tensor(signs).double()) for signs in ([-1.0, 1.0, 1.0], [1.0, -1.0, 1.0])
+    )
     meant = {
         "camera_pose @ diag(1, -1, -1, 1), if it is OpenGL's (y up, z backward)": turn @ flip,
         "the inverse of camera_pose, if it is camera_from_world": turn.T,
         "inv(camera_pose) @ diag(1, -1, -1, 1), if it is OpenGL's view matrix": turn.T @ flip,
-        "the pose of the optical frame, if it is of ROS's camera_link (x forward, z up)": turn @ optical,
+        "the pose of the optical frame, if it is of ROS's camera_link (x forward, z up)": turn
+        @ optical,
         "depth[::-1], if the image is upside down": turn @ upset,
         "depth[:, ::-1], if the image is mirrored": turn @ mirror,
     }
@@ -148,32 +190,56 @@ def _check_normals(supports: tuple[SupportPlane, ...], pose: Float[Tensor, "4 4"
     cosine = float(normals[0] @ sky)
     if not fixes and (tilt < 15.0 or cosine > -math.cos(math.radians(15.0))):
         return  # a frame that is tilted
-    angle, other = math.degrees(math.acos(max(-1.0, cosine))), "`up`, if z is not up" if up is None else "another `up`"
+    angle = math.degrees(math.acos(max(-1.0, cosine)))
+    other = "`up`, if z is not up" if up is None else "another `up`"
     normal = ", ".join(f"{x:.2f}" for x in normals[0].tolist())
     allowed = f"a pose in which the table's normal points up: {' or '.join([*fixes[:3], other])}"
-    raise BadArgument("camera_pose", f"a table whose normal ({normal}) is {angle:.0f} degrees from up", allowed)
+    raise BadArgument(
+        "camera_pose", f"a table whose normal ({normal}) is {angle:.0f} degrees from up", allowed
+    )
 
 
 def _check_given_table(points: Points, plane: Plane) -> None:
-    """Refuse a given table that the camera did not see: it is above most points, or far below all points."""
+    """Refuse a given table that the camera did not see: it is above most points, or far below all
+    points.
+    """
     height = plane.height(points[:: 1 + len(points) // 20_000].double())
-    low, middle = float(torch.quantile(height, 0.01)), float(height.median())
+    low = float(torch.quantile(height, 0.01))
+    middle = float(height.median())
     if float((height.abs() < 0.03).double().mean()) < 0.001 and (middle < 0 or low > 0.5):
         found = f"one that no point is near: they are {middle:.3g} m above it, in the middle"
-        raise BadArgument("table", found, "the table in the frame of a camera_pose in metres, whose z looks forward")
+        raise BadArgument(
+            "table",
+            found,
+            "the table in the frame of a camera_pose in metres, whose z looks forward",
+        )
 
 
-def check_sizes(points: Points, labels: Tensor, pose: Float[Tensor, "4 4"], plane: Plane) -> tuple[str, ...]:
-    """Refuse a depth unit that makes objects too large or small for a hand; return a note if the camera is high."""
+def check_sizes(
+    points: Points, labels: Tensor, pose: Float[Tensor, "4 4"], plane: Plane
+) -> tuple[str, ...]:
+    """Refuse a depth unit that makes objects too large or small for a hand; return a note if the
+    camera is high.
+    """
     parts = [points[labels == k] for k in labels.unique().tolist() if k > 0]
     sizes = sorted(float((part.amax(0) - part.amin(0)).max()) for part in parts if len(part) >= 100)
-    height, above_origin = float(plane.height(pose[:3, 3])), float(plane.normal @ pose[:3, 3])
-    # Counts of 0.25 mm read as millimetres put the camera four times too high above a table near z = 0.
-    scaled = plane.offset < -0.5 and any(abs(above_origin - factor * height) < 0.05 for factor in (0.25, 0.1))
+    height = float(plane.height(pose[:3, 3]))
+    above_origin = float(plane.normal @ pose[:3, 3])
+    # Counts of 0.25 mm read as millimetres put the camera four times too high above a table near z
+    # = 0.
+    scaled = plane.offset < -0.5 and any(
+        abs(above_origin - factor * height) < 0.05 for factor in (0.25, 0.1)
+    )
     found = f"a camera {height:.3g} m above the table"
     if sizes:
         most = sizes[len(sizes) // 5]  # nearly all objects are larger
-        large = (most > 0.2 and height > 1.5) or (scaled and not _is_own(pose) and most > 0.12 and height > 1.0)
+        large = (most > 0.2 and height > 1.5) or (
+            scaled and not _is_own(pose) and most > 0.12 and height > 1.0
+        )
         if large or (most > 0.5 and height > 1.0) or (sizes[-1] < 0.03 and height < 0.12):
-            raise BadArgument("depth", f"{found} and objects of {sizes[0]:.2g} to {sizes[-1]:.2g} m", UNIT)
-    return (f"{found}: if it was not so high, depth_unit (--depth-unit) says the metres of a count",) * (height > 1.0)
+            raise BadArgument(
+                "depth", f"{found} and objects of {sizes[0]:.2g} to {sizes[-1]:.2g} m", UNIT
+            )
+    return (
+        f"{found}: if it was not so high, depth_unit (--depth-unit) says the metres of a count",
+    ) * (height > 1.0)

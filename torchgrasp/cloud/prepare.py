@@ -1,4 +1,6 @@
-"""Preparation of clouds for the fit of a shape: outliers are removed, outward normals fitted, views merged."""
+"""Preparation of clouds for the fit of a shape: outliers are removed, outward normals fitted, views
+merged.
+"""
 
 import dataclasses
 from collections.abc import Sequence
@@ -40,58 +42,85 @@ class PreparedCloud(Value):
     cloud: PointCloud  # distinct points [m] with outward normals, in the given dtype
     points: Points  # at most 2000 of them, in float64
     normals: Points  # at `points`, of unit length
-    viewpoint: Float[Tensor, "*views 3"] | None  # the camera [m] of all `points`, or of each, if known
-    frustum: Float[Tensor, "*views 4 3"] | None  # normals of the sides of the camera's view, if known
+    viewpoint: (
+        Float[Tensor, "*views 3"] | None
+    )  # the camera [m] of all `points`, or of each, if known
+    frustum: (
+        Float[Tensor, "*views 4 3"] | None
+    )  # normals of the sides of the camera's view, if known
 
     @property
     def one_sided(self) -> bool:
         """Whether the cloud shows only what its cameras see, so that the object has a hidden side."""
-        return self.viewpoint is not None and share_facing(self.points, self.normals, self.viewpoint) >= FACING
+        return (
+            self.viewpoint is not None
+            and share_facing(self.points, self.normals, self.viewpoint) >= FACING
+        )
 
 
 @checked
 def prepare_cloud(
     cloud: PointCloud, generator: torch.Generator, clean: bool = True, up: Vector | None = None
 ) -> PreparedCloud:
-    """Check a cloud, and return the points and normals to which a shape is fitted: at most 2000, drawn at random.
+    """Check a cloud, and return the points and normals to which a shape is fitted: at most 2000,
+    drawn at random.
 
-    Normals of random signs are ignored: with them a single view would look like a whole surface. If `clean`, outliers
-    are removed, all normals are fitted anew, and a missing viewpoint is estimated above the object, where `up` points.
+    Normals of random signs are ignored: with them a single view would look like a whole surface. If
+    `clean`, outliers are removed, all normals are fitted anew, and a missing viewpoint is estimated
+    above the object, where `up` points.
     A viewpoint that too few given normals face is then ignored: the cloud is a whole surface.
     """
-    max_views, min_points = 16, 10
+    max_views = 16
+    min_points = 10
     cloud = remove_duplicates(cloud)
-    points, normals, viewpoint = cloud.points, cloud.normals, cloud.viewpoint
+    points = cloud.points
+    normals = cloud.normals
+    viewpoint = cloud.viewpoint
     if viewpoint is not None and viewpoint.ndim == 2:
         _, count = viewpoint.unique(dim=0, return_counts=True)
         if len(count) > max_views:
-            raise BadArgument("viewpoint", f"{len(count)} different cameras", f"at most {max_views} cameras")
+            raise BadArgument(
+                "viewpoint", f"{len(count)} different cameras", f"at most {max_views} cameras"
+            )
         if int(count.min()) < min_points:
             allowed = f"at least {min_points} points of each view"
             raise TooFewPoints("points", f"{count.min()} points of one view", allowed)
     if normals is not None and not compare_normals(points.double(), normals.double()).oriented:
         normals = None
-    if clean and normals is not None and viewpoint is not None and share_facing(points, normals, viewpoint) < FACING:
+    if (
+        clean
+        and normals is not None
+        and viewpoint is not None
+        and share_facing(points, normals, viewpoint) < FACING
+    ):
         viewpoint = None
     cloud = dataclasses.replace(cloud, normals=normals, viewpoint=viewpoint)
     if clean or normals is None:
         cloud = _fit_normals(cloud, clean, up)
     precise = cloud.to(torch.float64)
     if clean and precise.viewpoint is None:
-        guess = guess_viewpoint(precise.points, fit_local_planes(precise.points)[0], up)[0].to(points.dtype)
+        guess = guess_viewpoint(precise.points, fit_local_planes(precise.points)[0], up)[0].to(
+            points.dtype
+        )
         precise = dataclasses.replace(precise, viewpoint=guess.double())
     if len(precise) > MAX_POINTS:
-        precise = precise.select(torch.randperm(len(precise), generator=generator)[:MAX_POINTS].to(points.device))
+        precise = precise.select(
+            torch.randperm(len(precise), generator=generator)[:MAX_POINTS].to(points.device)
+        )
     assert precise.normals is not None
-    return PreparedCloud(cloud, precise.points, unit(precise.normals), precise.viewpoint, precise.frustum)
+    return PreparedCloud(
+        cloud, precise.points, unit(precise.normals), precise.viewpoint, precise.frustum
+    )
 
 
 @checked
 def estimate_normals(cloud: PointCloud) -> PointCloud:
-    """Return a cloud without duplicate points, with outward unit normals of quadrics fitted around the points.
+    """Return a cloud without duplicate points, with outward unit normals of quadrics fitted around
+    the points.
 
-    Outward is towards the viewpoint. If the viewpoint is unknown, outward is the side of the given normals. If normals
-    are missing, too, the viewpoint is estimated. Raises the errors of `check_cloud`.
+    Outward is towards the viewpoint. If the viewpoint is unknown, outward is the side of the given
+    normals. If normals are missing, too, the viewpoint is estimated. Raises the errors of
+    `check_cloud`.
 
     >>> estimate_normals(PointCloud(torch.rand(90, 3), viewpoint=torch.tensor([0.5, 0.5, 9.0]))).normals.shape
     torch.Size([90, 3])
@@ -101,12 +130,16 @@ def estimate_normals(cloud: PointCloud) -> PointCloud:
 
 @checked
 def clean_cloud(cloud: PointCloud) -> PointCloud:
-    """Return a cloud without outliers, moved onto quadrics fitted around the points, with outward normals."""
+    """Return a cloud without outliers, moved onto quadrics fitted around the points, with outward
+    normals.
+    """
     return _fit_normals(remove_duplicates(cloud), clean=True)
 
 
 def _fit_normals(cloud: PointCloud, clean: bool, up: Vector | None = None) -> PointCloud:
-    """Return distinct points with fitted outward normals; if `clean`, without outliers and moved onto the fit."""
+    """Return distinct points with fitted outward normals; if `clean`, without outliers and moved
+    onto the fit.
+    """
     if clean:
         cloud = cloud.select(find_inliers(cloud.points.double()))
     points = cloud.points
@@ -114,7 +147,9 @@ def _fit_normals(cloud: PointCloud, clean: bool, up: Vector | None = None) -> Po
     if clean:
         offset = torch.linalg.vector_norm(points.double() - feet, dim=-1)
         keep = offset <= 4.5 * rms.median() + 1e-12  # beyond Gaussian noise
-        cloud, points, normals = cloud.select(keep), feet.to(points.dtype)[keep], normals[keep]
+        cloud = cloud.select(keep)
+        points = feet.to(points.dtype)[keep]
+        normals = normals[keep]
     viewpoint = cloud.viewpoint
     if viewpoint is None and cloud.normals is not None:
         outward = cloud.normals.double()
@@ -128,24 +163,35 @@ def _fit_normals(cloud: PointCloud, clean: bool, up: Vector | None = None) -> Po
 
 
 def compare_normals(points: Points, normals: Points) -> NormalCheck:
-    """Return how well normals agree among neighbouring points: which are flipped, and whether signs can be trusted."""
-    distance, index = nearest(points, 9)  # the point itself and eight neighbours: enough for a majority
+    """Return how well normals agree among neighbouring points: which are flipped, and whether signs
+    can be trusted.
+    """
+    distance, index = nearest(
+        points, 9
+    )  # the point itself and eight neighbours: enough for a majority
     directions = unit(normals)
     cosine = (directions[:, None] * directions[index[:, 1:]]).sum(-1)
     height = ((points[index[:, 1:]] - points[:, None]) * directions[:, None]).sum(-1).abs()
-    # Signs are not compared across an edge of 45 degrees, nor far over the tangent plane, maybe behind a thin wall.
+    # Signs are not compared across an edge of 45 degrees, nor far over the tangent plane, maybe
+    # behind a thin wall.
     compared = (cosine.abs() > 0.7) & (height <= 0.3 * distance[:, 1:])
     against = compared & (cosine < 0)
     pairs = int(compared.sum())
-    opposed = int(against.sum()) / pairs if pairs >= 20 else 0.0  # of fewer pairs any share may be chance
-    scaled = (torch.linalg.vector_norm(normals, dim=-1) - 1).abs() > 1e-3  # text files round to three digits
+    opposed = (
+        int(against.sum()) / pairs if pairs >= 20 else 0.0
+    )  # of fewer pairs any share may be chance
+    scaled = (
+        torch.linalg.vector_norm(normals, dim=-1) - 1
+    ).abs() > 1e-3  # text files round to three digits
     flipped = 2 * against.sum(-1) > compared.sum(-1)
     # Random signs oppose half of the pairs.
     return NormalCheck(flipped, opposed, oriented=opposed < 0.35, scaled=int(scaled.sum()))
 
 
 def share_facing(points: Points, normals: Points, viewpoint: Float[Tensor, "*views 3"]) -> float:
-    """Return the share of normals that face the camera: nearly 1 in a single view, half on a whole surface."""
+    """Return the share of normals that face the camera: nearly 1 in a single view, half on a whole
+    surface.
+    """
     return float((((viewpoint - points) * normals).sum(-1) > 0).double().mean())
 
 
@@ -153,13 +199,15 @@ def share_facing(points: Points, normals: Points, viewpoint: Float[Tensor, "*vie
 def merge_clouds(
     clouds: Sequence[PointCloud], poses: Sequence[Float[Tensor, "4 4"]] | Float[Tensor, "k 4 4"]
 ) -> PointCloud:
-    """Return one cloud of several views in a common frame, with the normal and the camera position of each point.
+    """Return one cloud of several views in a common frame, with the normal and the camera position
+    of each point.
 
-    `estimate_normals` gives normals to a view without normals. A view with normals but without viewpoint leaves the
-    result without viewpoint. Points are denser where views overlap; `voxel_downsample` evens the density. The rigid
-    `poses` obj_from_cloud (4, 4) [m] lead from the frames of the views. Raises `BadArgument` for no cloud, another
-    number of poses, a pose that is not rigid, or clouds of several dtypes or devices. The views and the result may
-    raise the errors of `check_cloud`.
+    `estimate_normals` gives normals to a view without normals. A view with normals but without
+    viewpoint leaves the result without viewpoint. Points are denser where views overlap;
+    `voxel_downsample` evens the density. The rigid `poses` obj_from_cloud (4, 4) [m] lead from the
+    frames of the views. Raises `BadArgument` for no cloud, another number of poses, a pose that is
+    not rigid, or clouds of several dtypes or devices. The views and the result may raise the errors
+    of `check_cloud`.
 
     >>> view = PointCloud(0.1 * torch.rand(90, 3), viewpoint=torch.tensor([0.0, 0.0, 1.0]))
     >>> len(merge_clouds([view, view], [torch.eye(4), torch.eye(4)]))
@@ -168,7 +216,9 @@ def merge_clouds(
     if not len(clouds):
         raise BadArgument("clouds", "none", "at least one PointCloud")
     if len(poses) != len(clouds):
-        raise BadArgument("poses", f"{len(poses)} for {len(clouds)} clouds", "one pose for each cloud")
+        raise BadArgument(
+            "poses", f"{len(poses)} for {len(clouds)} clouds", "one pose for each cloud"
+        )
     for i, (cloud, pose) in enumerate(zip(clouds, poses, strict=True)):
         check_cloud(cloud)
         check_rigid(f"poses[{i}]", pose)
@@ -183,18 +233,25 @@ def merge_clouds(
     viewpoint = torch.cat(viewpoints) if len(viewpoints) == len(views) else None
     frustums = [v.frustum.expand(len(v), 4, 3) for v in views if v.frustum is not None]
     frustum = torch.cat(frustums) if len(frustums) == len(views) else None
-    return check_cloud(PointCloud(torch.cat([v.points for v in views]), torch.cat(normals), viewpoint, frustum))
+    return check_cloud(
+        PointCloud(torch.cat([v.points for v in views]), torch.cat(normals), viewpoint, frustum)
+    )
 
 
 def _view_in_frame(cloud: PointCloud, obj_from_cloud: Float[Tensor, "4 4"]) -> PointCloud:
     """Return a view, with unit normals, transformed into the frame of the merged cloud."""
     cloud = estimate_normals(cloud) if cloud.normals is None else cloud
     assert cloud.normals is not None
-    pose, dtype = obj_from_cloud.to(cloud.points).double(), cloud.points.dtype
-    points, normals = apply(pose, cloud.points.double()), rotate(pose, unit_of_any(cloud.normals.double()))
-    viewpoint, frustum = cloud.viewpoint, cloud.frustum
+    pose = obj_from_cloud.to(cloud.points).double()
+    dtype = cloud.points.dtype
+    points = apply(pose, cloud.points.double())
+    normals = rotate(pose, unit_of_any(cloud.normals.double()))
+    viewpoint = cloud.viewpoint
+    frustum = cloud.frustum
     if viewpoint is not None:
-        viewpoint = apply(pose, viewpoint.double().reshape(-1, 3)).reshape(viewpoint.shape).to(dtype)
+        viewpoint = (
+            apply(pose, viewpoint.double().reshape(-1, 3)).reshape(viewpoint.shape).to(dtype)
+        )
     if frustum is not None:
         frustum = rotate(pose, frustum.double().reshape(-1, 3)).reshape(frustum.shape).to(dtype)
     return PointCloud(points.to(dtype), normals.to(dtype), viewpoint, frustum)

@@ -32,7 +32,8 @@ TEXTS = (".xyz", ".txt", ".csv", ".asc", ".pts", ".xyzi", ".xyzn", ".xyzrgb")  #
 @checked
 @dataclasses.dataclass(frozen=True)
 class CloudFile(Value):
-    """A cloud read from a file; `notes` holds a sentence for each kind of data in the file that was left out.
+    """A cloud read from a file; `notes` holds a sentence for each kind of data in the file that was
+    left out.
 
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp(), "cloud.npy")
@@ -48,52 +49,56 @@ class CloudFile(Value):
 
 @checked
 def read_cloud(
-    path: Path | str, viewpoint: Sequence[float | int] | Tensor | None = None, unit: Literal["m", "cm", "mm"] = "m"
+    path: Path | str,
+    viewpoint: Sequence[float | int] | Tensor | None = None,
+    unit: Literal["m", "cm", "mm"] = "m",
 ) -> PointCloud:
-    """Read the point cloud of one object, in float64; `read_cloud_file` also reports what was left out.
+    """Read the point cloud of one object, in float64; `read_cloud_file` also reports what was left
+    out.
 
-    * `.ply`, ascii or binary: x y z, optionally nx ny nz; header lines `comment viewpoint x y z` and
-      `comment frustum` with 12 numbers give the camera, `comment table` with 4 the table.
-      A mesh gives 2000 surface points, with normals if it is closed.
-    * `.pcd`, ascii, binary or compressed: x y z, optionally normal_x normal_y normal_z; VIEWPOINT gives the camera.
-      Its default `0 0 0 1 0 0 0` counts only if the points look like those of a camera in the origin.
-    * `.npz`: arrays `points` (n, 3), optionally `normals` (n, 3), `viewpoint` (3,), `frustum` (4, 3), `table` (4,);
-      for several views, `viewpoint` (n, 3) and `frustum` (n, 4, 3).
+    * `.ply`, ascii or binary: x y z, optionally nx ny nz; header lines `comment viewpoint x y z`
+      and `comment frustum` with 12 numbers give the camera, `comment table` with 4 the table. A
+      mesh gives 2000 surface points, with normals if it is closed.
+    * `.pcd`, ascii, binary or compressed: x y z, optionally normal_x normal_y normal_z; VIEWPOINT
+      gives the camera. Its default `0 0 0 1 0 0 0` counts only if the points look like those of a
+      camera in the origin.
+    * `.npz`: arrays `points` (n, 3), optionally `normals` (n, 3), `viewpoint` (3,), `frustum` (4,
+      3), `table` (4,); for several views, `viewpoint` (n, 3) and `frustum` (n, 4, 3).
     * `.npy`: an (n, 3) array, or (n, 6) with normals; colours are left out.
-    * `.xyz`, `.txt`, `.csv`, `.asc`, `.pts`, `.xyzi`, `.xyzn`, `.xyzrgb`: the same as text. A first line may name the
-      columns, as in x y z nx ny nz, or count the rows.
+    * `.xyz`, `.txt`, `.csv`, `.asc`, `.pts`, `.xyzi`, `.xyzn`, `.xyzrgb`: the same as text. A first
+      line may name the columns, as in x y z nx ny nz, or count the rows.
 
-    Images (h, w, 3) of points are accepted. Rows with NaN or infinity are left out; so are zero rows, if several.
+    Images (h, w, 3) of points are accepted. Rows with NaN or infinity are left out; so are zero
+    rows, if several.
 
-    Args:
-        path: the file.
-        viewpoint: the camera's position (3,) [m] in the cloud's frame; None for the viewpoint in the file.
-        unit: unit of length of the file's points and viewpoint.
+    Args: path: the file. viewpoint: the camera's position (3,) [m] in the cloud's frame; None for
+        the viewpoint in the file. unit: unit of length of the file's points and viewpoint.
 
-    Raises:
-        CloudFileError: no such file; an unknown suffix; malformed content; more than 512 MB or 5 million points.
-        BadArgument: a viewpoint other than three numbers; points on one line.
-        TooFewPoints: fewer than 4 distinct points.
-        SuspiciousScale: an extent outside [5 mm, 2 m].
+    Raises: CloudFileError: no such file; an unknown suffix; malformed content; more than 512 MB or
+        5 million points. BadArgument: a viewpoint other than three numbers; points on one line.
+        TooFewPoints: fewer than 4 distinct points. SuspiciousScale: an extent outside [5 mm, 2 m].
 
     >>> read_cloud("scan.docx")
-    Traceback (most recent call last):
-    torchgrasp.foundation.errors.CloudFileError: path: expected a file ending in .ply, ..., got scan.docx
+    Traceback (most recent call last): torchgrasp.foundation.errors.CloudFileError: path: expected a
+    file ending in .ply, ..., got scan.docx
     """
     return check_cloud(read_cloud_file(path, viewpoint, unit).cloud)
 
 
 @checked
 def read_cloud_file(
-    path: Path | str, viewpoint: Sequence[float | int] | Tensor | None = None, unit: Literal["m", "cm", "mm"] = "m"
+    path: Path | str,
+    viewpoint: Sequence[float | int] | Tensor | None = None,
+    unit: Literal["m", "cm", "mm"] = "m",
 ) -> CloudFile:
-    """Read a cloud of any size, such as a whole scene, with notes on what was left out; see `read_cloud`.
+    """Read a cloud of any size, such as a whole scene, with notes on what was left out; see
+    `read_cloud`.
 
     Raises `CloudFileError`, `BadArgument` and `TooFewPoints` as `read_cloud`.
 
     >>> read_cloud_file("none.ply")
-    Traceback (most recent call last):
-    torchgrasp.foundation.errors.CloudFileError: path: expected a .ply file, got none.ply, which is no file
+    Traceback (most recent call last): torchgrasp.foundation.errors.CloudFileError: path: expected a
+    .ply file, got none.ply, which is no file
     """
     try:
         position = None if viewpoint is None else torch.as_tensor(viewpoint, dtype=torch.float64)
@@ -105,45 +110,62 @@ def read_cloud_file(
     parsers = {
         ".ply": parse_ply,
         ".pcd": parse_pcd,
-        ".npz": lambda data: parse_npz(data, ("points", "normals", "viewpoint", "frustum", "table"), "points"),
+        ".npz": lambda data: parse_npz(
+            data, ("points", "normals", "viewpoint", "frustum", "table"), "points"
+        ),
         ".npy": lambda data: {"columns": parse_npy(data)},
         **dict.fromkeys(TEXTS, lambda data: parse_text(data, suffix)),
     }
     if suffix not in parsers:
-        raise CloudFileError("path", path, f"a file ending in .ply, .pcd, .npz, .npy, {', '.join(TEXTS)}")
-    data = read_bounded(path, CLOUD_BYTES, f"a {suffix} file", functools.partial(CloudFileError, "path"))
+        raise CloudFileError(
+            "path", path, f"a file ending in .ply, .pcd, .npz, .npy, {', '.join(TEXTS)}"
+        )
+    data = read_bounded(
+        path, CLOUD_BYTES, f"a {suffix} file", functools.partial(CloudFileError, "path")
+    )
     try:
         arrays = parsers[suffix](data)
     except Exception as error:  # zlib, zipfile, numpy and trimesh each raise their own
-        raise CloudFileError("path", f"{path}: {explain(error)}", f"a well-formed {suffix} file") from error
+        raise CloudFileError(
+            "path", f"{path}: {explain(error)}", f"a well-formed {suffix} file"
+        ) from error
     return make_cloud(str(path), arrays, position, {"m": 1.0, "cm": 0.01, "mm": 0.001}[unit])
 
 
 @checked
 def cloud_from_array(
-    points: np.ndarray, normals: np.ndarray | None = None, viewpoint: np.ndarray | Sequence[float | int] | None = None
+    points: np.ndarray,
+    normals: np.ndarray | None = None,
+    viewpoint: np.ndarray | Sequence[float | int] | None = None,
 ) -> PointCloud:
-    """Return a cloud made of NumPy arrays [m]; points that were not measured, and colours, are left out.
+    """Return a cloud made of NumPy arrays [m]; points that were not measured, and colours, are left
+    out.
 
-    `points` are (n, 3), or (h, w, 3) for an image; or have six columns, of which the last three are normals. `normals`
-    have the shape of the points. Raises the errors of `check_cloud`.
+    `points` are (n, 3), or (h, w, 3) for an image; or have six columns, of which the last three are
+    normals. `normals` have the shape of the points. Raises the errors of `check_cloud`.
 
     >>> len(cloud_from_array(np.random.default_rng(0).random((6, 8, 3))))
     48
     """
-    arrays = {"columns" if normals is None else "points": points, "normals": normals, "viewpoint": viewpoint}
+    arrays = {
+        "columns" if normals is None else "points": points,
+        "normals": normals,
+        "viewpoint": viewpoint,
+    }
     return check_cloud(make_cloud("an array", arrays).cloud)
 
 
 @checked
 def save_cloud(cloud: PointCloud, path: Path | str, table: Plane | None = None) -> Path:
-    """Write a cloud, and its table if given, as `.npz` (exact) or binary `.ply` (float32), in one atomic step.
+    """Write a cloud, and its table if given, as `.npz` (exact) or binary `.ply` (float32), in one
+    atomic step.
 
-    Raises `OutputError`, and `BadArgument` for another suffix, or several views for `.ply`, which has one viewpoint.
+    Raises `OutputError`, and `BadArgument` for another suffix, or several views for `.ply`, which
+    has one viewpoint.
 
     >>> save_cloud(PointCloud(torch.rand(9, 3)), "cloud.txt")
-    Traceback (most recent call last):
-    torchgrasp.foundation.errors.BadArgument: path: expected a file ending in .npz or .ply, got cloud.txt
+    Traceback (most recent call last): torchgrasp.foundation.errors.BadArgument: path: expected a
+    file ending in .npz or .ply, got cloud.txt
     """
     path = Path(path)
     arrays = {name: tensor.detach().cpu().numpy() for name, tensor in named_tensors(cloud).items()}
@@ -157,21 +179,33 @@ def save_cloud(cloud: PointCloud, path: Path | str, table: Plane | None = None) 
     return write_file(path, format_ply(**arrays))
 
 
-def make_cloud(source: str, arrays: dict[str, Any], viewpoint: Tensor | None = None, scale: float = 1.0) -> CloudFile:
-    """Return a `CloudFile` made of named arrays in units of `scale` metres, without rows that were not measured."""
+def make_cloud(
+    source: str, arrays: dict[str, Any], viewpoint: Tensor | None = None, scale: float = 1.0
+) -> CloudFile:
+    """Return a `CloudFile` made of named arrays in units of `scale` metres, without rows that were
+    not measured.
+    """
     notes: list[str] = []
     if "columns" in arrays:
         arrays = _split_columns(source, arrays, notes)
     if arrays.get("other"):
         notes.append(f"columns {', '.join(arrays['other'])[:200]} were left out")
     points = scale * _as_rows(source, "points", arrays["points"])
-    normals = None if arrays.get("normals") is None else _as_rows(source, "normals", arrays["normals"])
+    normals = (
+        None if arrays.get("normals") is None else _as_rows(source, "normals", arrays["normals"])
+    )
     default = bool(arrays.get("default")) and viewpoint is None
-    frustum = None if viewpoint is not None else arrays.get("frustum")  # it belongs to the arrays' camera
+    frustum = (
+        None if viewpoint is not None else arrays.get("frustum")
+    )  # it belongs to the arrays' camera
     if viewpoint is None and arrays.get("viewpoint") is not None:
         viewpoint = scale * _as_rows(source, "viewpoint", arrays["viewpoint"])
         if not bool(torch.isfinite(viewpoint).all()):
-            raise BadArgument("path", f"{source}: a viewpoint with NaN or infinity", "a viewpoint of finite numbers")
+            raise BadArgument(
+                "path",
+                f"{source}: a viewpoint with NaN or infinity",
+                "a viewpoint of finite numbers",
+            )
     if normals is not None and len(normals) != len(points):
         found = f"{source}: {len(normals)} normals of {len(points)} points"
         raise CloudFileError("path", found, "one normal for each point")
@@ -194,13 +228,17 @@ def make_cloud(source: str, arrays: dict[str, Any], viewpoint: Tensor | None = N
     if table is not None:
         *normal, offset = _as_numbers(source, "table", table, (4,)).tolist()
         if not abs(math.hypot(*normal) - 1) < 1e-4:
-            raise CloudFileError("path", f"{source}: a table with the normal {normal}", "a unit vector")
+            raise CloudFileError(
+                "path", f"{source}: a table with the normal {normal}", "a unit vector"
+            )
         table = Plane(torch.tensor(normal, dtype=torch.float64), scale * offset)
     return CloudFile(cloud, tuple(notes), table)
 
 
 def _as_numbers(source: str, name: str, array: Any, *shapes: tuple[int, ...]) -> Tensor:
-    """Return an array as a tensor if it has finite numbers and an allowed shape; else refuse the file `source`."""
+    """Return an array as a tensor if it has finite numbers and an allowed shape; else refuse the
+    file `source`.
+    """
     array = np.asarray(array)
     if array.dtype.kind not in "fiu" or array.shape not in shapes or not np.isfinite(array).all():
         allowed = f"finite numbers of shape {' or '.join(map(str, shapes))}"
@@ -209,7 +247,9 @@ def _as_numbers(source: str, name: str, array: Any, *shapes: tuple[int, ...]) ->
 
 
 def _as_rows(source: str, name: str, array: Any) -> Tensor:
-    """Return an array of points as float64 rows (n, 3), or refuse the file `source`; a viewpoint may be (3,)."""
+    """Return an array of points as float64 rows (n, 3), or refuse the file `source`; a viewpoint
+    may be (3,).
+    """
     array = np.asarray(array)
     if array.dtype.kind not in "fiu":
         raise CloudFileError("path", f"{source}: {name} of type {array.dtype}", "real numbers")
@@ -217,15 +257,20 @@ def _as_rows(source: str, name: str, array: Any) -> Tensor:
         allowed = "an array of shape (n, 3), or (h, w, 3) of an image, or (3,) of one viewpoint"
         raise CloudFileError("path", f"{source}: {name} of shape {array.shape}", allowed)
     if array.size > 3 * CLOUD_POINTS:
-        raise CloudFileError("path", f"{source} with {array.size // 3} points", f"at most {CLOUD_POINTS} points")
-    # A copy is owned, writable and of native bytes. Numbers beyond double precision become infinite, as if missing.
+        raise CloudFileError(
+            "path", f"{source} with {array.size // 3} points", f"at most {CLOUD_POINTS} points"
+        )
+    # A copy is owned, writable and of native bytes. Numbers beyond double precision become
+    # infinite, as if missing.
     with np.errstate(invalid="ignore", over="ignore"):
         rows = np.array(array, dtype=np.float64, order="C")
     return torch.from_numpy(rows if array.ndim < 3 else rows.reshape(-1, 3))
 
 
 def _split_columns(source: str, arrays: dict[str, Any], notes: list[str]) -> dict[str, Any]:
-    """Return arrays in which the table of 3 or 6 columns is split into points and normals; colours are left out."""
+    """Return arrays in which the table of 3 or 6 columns is split into points and normals; colours
+    are left out.
+    """
     table = np.asarray(arrays["columns"])
     if names := table.dtype.names:
         return find_columns(names, [table[name] for name in names])
@@ -237,7 +282,9 @@ def _split_columns(source: str, arrays: dict[str, Any], notes: list[str]) -> dic
     if table.shape[-1] == 6:
         more = table[..., 3:].reshape(-1, 3).astype(np.float64)
         more = more[np.isfinite(more).all(1) & more.any(1)]
-        length = np.linalg.norm(more.clip(-2, 2), axis=1)  # squares of larger numbers would overflow
+        length = np.linalg.norm(
+            more.clip(-2, 2), axis=1
+        )  # squares of larger numbers would overflow
         if len(more) and np.mean(np.abs(length - 1) < 0.05) >= 0.9:
             split["normals"] = table[..., 3:]
         else:
@@ -245,14 +292,22 @@ def _split_columns(source: str, arrays: dict[str, Any], notes: list[str]) -> dic
     return split
 
 
-def _find_measured(points: Tensor, normals: Tensor | None, notes: list[str]) -> tuple[Tensor, Tensor | None]:
-    """Return a mask of the measured rows, and the normals (None if most are missing); add notes on the other rows."""
+def _find_measured(
+    points: Tensor, normals: Tensor | None, notes: list[str]
+) -> tuple[Tensor, Tensor | None]:
+    """Return a mask of the measured rows, and the normals (None if most are missing); add notes on
+    the other rows.
+    """
     finite = torch.isfinite(points).all(1)
     if not bool(finite.all()):
-        notes.append(f"{int((~finite).sum())} of {len(points)} rows with NaN or infinity were left out")
+        notes.append(
+            f"{int((~finite).sum())} of {len(points)} rows with NaN or infinity were left out"
+        )
     origin = (points == 0).all(1)
     if int(origin.sum()) > 1:
-        notes.append(f"{int(origin.sum())} of {len(points)} rows at exactly (0, 0, 0), missing pixels, were left out")
+        notes.append(
+            f"{int(origin.sum())} of {len(points)} rows at exactly (0, 0, 0), missing pixels, were left out"
+        )
         finite &= ~origin
     if normals is None:
         return finite, None
@@ -262,17 +317,23 @@ def _find_measured(points: Tensor, normals: Tensor | None, notes: list[str]) -> 
     if 2 * int(bad.sum()) > int(finite.sum()):
         notes.append(f"{int(bad.sum())} normals are missing (NaN or zero): all were left out")
         return finite, None
-    notes.append(f"{int(bad.sum())} of {len(points)} rows without a normal (NaN or zero) were left out")
+    notes.append(
+        f"{int(bad.sum())} of {len(points)} rows without a normal (NaN or zero) were left out"
+    )
     return finite & ~bad, normals
 
 
 def _judge_default(cloud: PointCloud, notes: list[str]) -> PointCloud:
-    """Return the cloud, without its viewpoint (0, 0, 0) if no camera can have been there; a note then says so."""
+    """Return the cloud, without its viewpoint (0, 0, 0) if no camera can have been there; a note
+    then says so.
+    """
     points = cloud.points[draw_rows(len(cloud), 2000)]
     if bool(points.ne(points[0]).any()):  # else all coincide, which is refused later
         points = points[find_inliers(points)]
         if can_see(points, fit_local_planes(points)[0], torch.zeros(3, dtype=points.dtype)):
             return cloud
     default = "the default viewpoint (0, 0, 0) of PCD"
-    notes.append(f"{default}, from which a camera cannot have seen these points, was left out (--viewpoint gives one)")
+    notes.append(
+        f"{default}, from which a camera cannot have seen these points, was left out (--viewpoint gives one)"
+    )
     return PointCloud(cloud.points, cloud.normals)

@@ -1,4 +1,6 @@
-"""Safe readers of untrusted files: NumPy arrays, images and camera intrinsics. No file can run code."""
+"""Safe readers of untrusted files: NumPy arrays, images and camera intrinsics. No file can run
+code.
+"""
 
 import functools
 import io
@@ -19,14 +21,20 @@ from torchgrasp.foundation.limits import CLOUD_BYTES, JSON_BYTES, TOML_BYTES
 
 
 def parse_npy(data: bytes) -> np.ndarray:
-    """Return the array of a .npy file; raise `Malformed` for objects and for fewer bytes than its header promises."""
+    """Return the array of a .npy file; raise `Malformed` for objects and for fewer bytes than its
+    header promises.
+    """
     if not data.startswith(b"\x93NUMPY"):
         raise Malformed("no header of an .npy file")
     stream = io.BytesIO(data)
     version = np.lib.format.read_magic(stream)
     if version not in ((1, 0), (2, 0)):
         raise Malformed(f"version {version} of the npy format")
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    read = (
+        np.lib.format.read_array_header_1_0
+        if version == (1, 0)
+        else np.lib.format.read_array_header_2_0
+    )
     shape, _, dtype = read(stream)
     if dtype.hasobject or dtype.itemsize * math.prod(shape) > len(data):
         raise Malformed(f"an array of shape {shape} and type {dtype}, which the file cannot hold")
@@ -35,27 +43,39 @@ def parse_npy(data: bytes) -> np.ndarray:
 
 
 def parse_npz(data: bytes, names: Sequence[str], required: str = "") -> dict[str, np.ndarray]:
-    """Return the arrays of a .npz file by name, all if no `names` are given; raise `Malformed` for a bad file."""
+    """Return the arrays of a .npz file by name, all if no `names` are given; raise `Malformed` for
+    a bad file.
+    """
     if not zipfile.is_zipfile(io.BytesIO(data)):
         raise Malformed("no archive, as .npz files are")
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        members = [info for info in archive.infolist() if not names or info.filename.removesuffix(".npy") in names]
+        members = [
+            info
+            for info in archive.infolist()
+            if not names or info.filename.removesuffix(".npy") in names
+        ]
         if required and f"{required}.npy" not in [info.filename for info in members]:
             found = [info.filename.removesuffix(".npy") for info in archive.infolist()][:8]
             raise Malformed(f"no array named {required!r}, but {found}")
         if sum(info.file_size for info in members) > CLOUD_BYTES:
             raise Malformed(f"arrays of more than {CLOUD_BYTES} bytes")
-        return {info.filename.removesuffix(".npy"): parse_npy(archive.read(info)) for info in members}
+        return {
+            info.filename.removesuffix(".npy"): parse_npy(archive.read(info)) for info in members
+        }
 
 
 def read_image_file(name: str, path: Path | str) -> Any:
-    """Return the array in an image file: .npy, .npz, .png or .tiff; also .exr for depth, or .json for masks.
+    """Return the array in an image file: .npy, .npz, .png or .tiff; also .exr for depth, or .json
+    for masks.
 
-    The argument `name` "depth" has one channel, and is the array `depth` of a .npz file. The argument "mask" may be a
-    picture or several masks, in each form that `torchgrasp.scene.masks.read_labels` takes.
+    The argument `name` "depth" has one channel, and is the array `depth` of a .npz file. The
+    argument "mask" may be a picture or several masks, in each form that
+    `torchgrasp.scene.masks.read_labels` takes.
     """
     masks = name == "mask"
-    data, suffix = read_suffixed(name, path, (".npy", ".npz", ".png", ".tif", ".tiff", ".json" if masks else ".exr"))
+    data, suffix = read_suffixed(
+        name, path, (".npy", ".npz", ".png", ".tif", ".tiff", ".json" if masks else ".exr")
+    )
     try:
         if suffix == ".npy":
             return parse_npy(data)
@@ -67,7 +87,9 @@ def read_image_file(name: str, path: Path | str) -> Any:
             return parse_json(data)
         return _read_exr(Path(path)) if suffix == ".exr" else _parse_picture(data, masks)
     except ModuleNotFoundError as error:
-        raise BadArgument(name, f"{path} without the package OpenEXR", "pip install OpenEXR, or a .png file") from error
+        raise BadArgument(
+            name, f"{path} without the package OpenEXR", "pip install OpenEXR, or a .png file"
+        ) from error
     except Exception as error:  # zlib, zipfile, numpy and Pillow each raise their own
         allowed = f"a well-formed {suffix} file" + " of one channel" * (not masks)
         raise BadArgument(name, f"{path}: {explain(error)}", allowed) from error
@@ -98,14 +120,19 @@ def read_intrinsics(name: str, path: Path | str, image: str = "") -> Any:
                 raise Malformed(f"{len(data)} bytes")
             found = next(yaml.safe_load_all(data))
     except Exception as error:  # YAML and JSON each raise their own
-        raise BadArgument(name, f"{path}: {explain(error)}", f"a well-formed {suffix} file of intrinsics") from error
+        raise BadArgument(
+            name, f"{path}: {explain(error)}", f"a well-formed {suffix} file of intrinsics"
+        ) from error
     entry = str(int(image)) if image.isdecimal() else ""
     return found[entry] if isinstance(found, dict) and entry in found else found
 
 
 def read_suffixed(name: str, path: Path | str, suffixes: tuple[str, ...]) -> tuple[bytes, str]:
-    """Return the bytes and the suffix of a file; raise `BadArgument` if missing, too large or of another suffix."""
-    path, allowed = Path(path), f"a {', '.join(suffixes[:-1])} or {suffixes[-1]} file"
+    """Return the bytes and the suffix of a file; raise `BadArgument` if missing, too large or of
+    another suffix.
+    """
+    path = Path(path)
+    allowed = f"a {', '.join(suffixes[:-1])} or {suffixes[-1]} file"
     check_file(path, CLOUD_BYTES, allowed, functools.partial(BadArgument, name))
     if path.suffix.lower() not in suffixes:
         raise BadArgument(name, path, allowed)
@@ -113,9 +140,15 @@ def read_suffixed(name: str, path: Path | str, suffixes: tuple[str, ...]) -> tup
 
 
 def _parse_picture(data: bytes, colours: bool) -> np.ndarray:
-    """Return the pixels of a PNG or TIFF image of one channel; if `colours`, several channels are allowed, too."""
+    """Return the pixels of a PNG or TIFF image of one channel; if `colours`, several channels are
+    allowed, too.
+    """
     with Image.open(io.BytesIO(data), formats=("PNG", "TIFF")) as image:
-        if colours and image.mode in ("P", "RGB", "RGBA"):  # the number of a palette's colour is the label
+        if colours and image.mode in (
+            "P",
+            "RGB",
+            "RGBA",
+        ):  # the number of a palette's colour is the label
             return np.asarray(image)
         if image.mode not in ("1", "L", "I", "I;16", "I;16B", "F"):
             raise Malformed(f"a picture of mode {image.mode}")

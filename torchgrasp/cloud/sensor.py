@@ -1,4 +1,6 @@
-"""The noise of depth cameras: added to exact images, estimated from real images, and reduced by a median of frames."""
+"""The noise of depth cameras: added to exact images, estimated from real images, and reduced by a
+median of frames.
+"""
 
 import dataclasses
 import types
@@ -25,7 +27,8 @@ SensorName = Literal["realsense", "kinect_v1", "azure", "zivid"]
 @checked
 @dataclasses.dataclass(frozen=True)
 class SensorNoise(Value):
-    """A model of a depth camera's noise: random noise, depth steps, smooth bias, and faults at rims and corners.
+    """A model of a depth camera's noise: random noise, depth steps, smooth bias, and faults at rims
+    and corners.
 
     >>> float(SENSORS["kinect_v1"].sigma(torch.tensor(2.0))) < 0.007
     True
@@ -36,48 +39,79 @@ class SensorNoise(Value):
     step: float = 0.0  # between two values of the disparity [px]; 0: none
     floor: float = 0.0  # standard deviation [m] at any distance
     growth: float = 0.0  # without a base: standard deviation over the squared distance [1/m]
-    grain: float = 0.0  # width of the patches in which pixels have similar noise [px]; 0: each has its own
+    grain: float = (
+        0.0  # width of the patches in which pixels have similar noise [px]; 0: each has its own
+    )
     bias: float = 0.0008  # standard deviation of the smooth bias [m]
     bias_width: float = 12.0  # width of the patches of the bias [px]
-    shadow: bool = False  # whether the second camera or projector misses surfaces beside nearer ones
+    shadow: bool = (
+        False  # whether the second camera or projector misses surfaces beside nearer ones
+    )
     flying: float = 0.25  # share of flying pixels at rims
     flight: float = 0.008  # mean distance of flying pixels behind the rim [m]
     lost_rim: float = 0.35  # share of rim pixels without depth
     lost: float = 0.01  # share of all pixels without depth
-    grazing: tuple[float, float] = (72.5, 87.0)  # angle of ray and normal [deg] at which pixels fade, and are gone
-    multipath: float = 0.0  # excess of depth in a corner, over the corner's depth behind its surroundings
+    grazing: tuple[float, float] = (
+        72.5,
+        87.0,
+    )  # angle of ray and normal [deg] at which pixels fade, and are gone
+    multipath: float = (
+        0.0  # excess of depth in a corner, over the corner's depth behind its surroundings
+    )
 
     @checked
     def sigma(self, depth: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-        """Return the standard deviation [m] of the random noise at a depth [m], without bias and steps."""
+        """Return the standard deviation [m] of the random noise at a depth [m], without bias and
+        steps.
+        """
         growth = self.disparity / self.base if self.base else self.growth
         return torch.sqrt(self.floor**2 + (growth * depth * depth) ** 2)
 
 
 ACTIVE_STEREO = SensorNoise(base=616.0 * 0.055, disparity=0.12, step=1 / 32)
-"""Noise of an active stereo camera with a baseline of 55 mm and independent pixels; `noise=True` selects it."""
-SENSORS: Mapping[SensorName, SensorNoise] = types.MappingProxyType({
-    # Intel's tuning guide of the D400: about 0.08 px of subpixel noise, 50 mm baseline; patches as in public frames.
-    "realsense": SensorNoise(30.8, 0.08, 1 / 32, grain=5.0, bias=0.0015, bias_width=18.0, shadow=True),
-    # Khoshelham and Oude Elberink 2012: 0.00143 z^2 in all, steps of 1/8 px; 580 px and 75 mm.
-    "kinect_v1": SensorNoise(43.5, 0.05, 1 / 8, grain=2.0, bias=0.0014, bias_width=18.0, shadow=True),
-    # Toelgyessy et al. 2021: below 17 mm and 11 mm of bias up to 3.5 m; flying pixels and multipath of time of flight.
-    "azure": SensorNoise(floor=0.001, growth=0.0005, bias=0.002, bias_width=30.0, flying=0.6, multipath=0.3),
-    # Zivid's data sheet of the Two M70: point precision 0.055 mm at 0.7 m.
-    "zivid": SensorNoise(growth=0.00011, bias=0.0001, bias_width=30.0, flying=0.05, lost_rim=0.5, lost=0.02),
-})  # fmt: skip
+"""Noise of an active stereo camera with a baseline of 55 mm and independent pixels; `noise=True`
+selects it.
+"""
+SENSORS: Mapping[SensorName, SensorNoise] = types.MappingProxyType(
+    {
+        # Intel's tuning guide of the D400: about 0.08 px of subpixel noise, 50 mm baseline; patches
+        # as in public frames.
+        "realsense": SensorNoise(
+            30.8, 0.08, 1 / 32, grain=5.0, bias=0.0015, bias_width=18.0, shadow=True
+        ),
+        # Khoshelham and Oude Elberink 2012: 0.00143 z^2 in all, steps of 1/8 px; 580 px and 75 mm.
+        "kinect_v1": SensorNoise(
+            43.5, 0.05, 1 / 8, grain=2.0, bias=0.0014, bias_width=18.0, shadow=True
+        ),
+        # Toelgyessy et al. 2021: below 17 mm and 11 mm of bias up to 3.5 m; flying pixels and
+        # multipath of time of flight.
+        "azure": SensorNoise(
+            floor=0.001, growth=0.0005, bias=0.002, bias_width=30.0, flying=0.6, multipath=0.3
+        ),
+        # Zivid's data sheet of the Two M70: point precision 0.055 mm at 0.7 m.
+        "zivid": SensorNoise(
+            growth=0.00011, bias=0.0001, bias_width=30.0, flying=0.05, lost_rim=0.5, lost=0.02
+        ),
+    }
+)
 """Noise of known cameras, by name."""
 
 
 def find_sensor(noise: bool | SensorName | SensorNoise) -> SensorNoise | None:
-    """Return the noise of a camera. True means the noise of an active stereo camera; False gives None: no noise."""
+    """Return the noise of a camera. True means the noise of an active stereo camera; False gives
+    None: no noise.
+    """
     if isinstance(noise, bool):
         return ACTIVE_STEREO if noise else None
     return SENSORS[noise] if isinstance(noise, str) else noise
 
 
-def add_noise(depth: Image, cosine: Image, generator: torch.Generator, sensor: SensorNoise = ACTIVE_STEREO) -> Image:
-    """Return a depth image [m] with a camera's noise, given |cosine| between each ray and the surface normal."""
+def add_noise(
+    depth: Image, cosine: Image, generator: torch.Generator, sensor: SensorNoise = ACTIVE_STEREO
+) -> Image:
+    """Return a depth image [m] with a camera's noise, given |cosine| between each ray and the
+    surface normal.
+    """
     normal = partial(torch.randn, depth.shape, generator=generator, dtype=torch.float64)
     uniform = partial(torch.rand, depth.shape, generator=generator, dtype=torch.float64)
 
@@ -90,7 +124,9 @@ def add_noise(depth: Image, cosine: Image, generator: torch.Generator, sensor: S
     noisy = torch.where(measured, depth, 1.0)
     if sensor.base:
         disparity = sensor.base / noisy + sensor.disparity * own
-        noisy = sensor.base / (torch.round(disparity / sensor.step) * sensor.step).clamp_min(sensor.step)
+        noisy = sensor.base / (torch.round(disparity / sensor.step) * sensor.step).clamp_min(
+            sensor.step
+        )
     else:
         noisy = noisy + sensor.sigma(noisy) * own
     noisy = noisy + patches(sensor.bias, sensor.bias_width)
@@ -110,28 +146,39 @@ def add_noise(depth: Image, cosine: Image, generator: torch.Generator, sensor: S
     lost = lost | (uniform() < (angle - low) / (high - low))
     if sensor.shadow:
         column = torch.arange(depth.shape[1], dtype=torch.float64)
-        second = column - torch.where(measured, sensor.base / depth, 0.0)  # column in the other eye's image
+        second = column - torch.where(
+            measured, sensor.base / depth, 0.0
+        )  # column in the other eye's image
         lost = lost | (second.flip(1).cummin(1).values.flip(1) < second)
     return torch.where(measured & ~lost, noisy, 0.0)
 
 
 def estimate_noise(
-    depth: Float[Tensor, "h w"], intrinsics: Float[Tensor, "3 3"], table: Plane, on_table: Bool[Tensor, "h w"]
+    depth: Float[Tensor, "h w"],
+    intrinsics: Float[Tensor, "3 3"],
+    table: Plane,
+    on_table: Bool[Tensor, "h w"],
 ) -> SensorNoise | None:
-    """Return the noise that a table shows: its random part as `floor` and `growth`, its smooth part as `bias`.
+    """Return the noise that a table shows: its random part as `floor` and `growth`, its smooth part
+    as `bias`.
 
-    The plane is in the camera's frame. Of the pixels `on_table`, those over 20 mm from the plane do not count. The
-    noise is None if fewer than 1000 pixels show the table.
+    The plane is in the camera's frame. Of the pixels `on_table`, those over 20 mm from the plane do
+    not count. The noise is None if fewer than 1000 pixels show the table.
     """
-    patch, least = 21, 1000  # pixels
+    # pixels
+    patch = 21
+    least = 1000
     row, column = (torch.arange(n, dtype=torch.float64) for n in depth.shape)
-    x, y = (column - intrinsics[0, 2]) / intrinsics[0, 0], (row - intrinsics[1, 2]) / intrinsics[1, 1]
+    x = (column - intrinsics[0, 2]) / intrinsics[0, 0]
+    y = (row - intrinsics[1, 2]) / intrinsics[1, 1]
     a, b, c = table.normal.double().tolist()
     along = a * x + b * y[:, None] + c  # of a ray with depth 1 and the table's normal
     error = depth - table.offset / along
     on = on_table & (depth > 0) & ((error * along).abs() < 0.02)
     share = torch.from_numpy(ndimage.uniform_filter(on.double().numpy(), patch))
-    mean = torch.from_numpy(ndimage.uniform_filter(torch.where(on, error, 0.0).numpy(), patch)) / share.clamp_min(1e-9)
+    mean = torch.from_numpy(
+        ndimage.uniform_filter(torch.where(on, error, 0.0).numpy(), patch)
+    ) / share.clamp_min(1e-9)
     on = on & (share > 0.9)  # away from the feet of objects
     if int(on.sum()) < least:
         return None
@@ -141,7 +188,9 @@ def estimate_noise(
 
 
 def fit_noise(depth: Float[Tensor, "n"], error: Float[Tensor, "n"]) -> SensorNoise:
-    """Return a noise model whose `floor` and `growth` are fitted robustly to depth errors [m] at given depths [m]."""
+    """Return a noise model whose `floor` and `growth` are fitted robustly to depth errors [m] at
+    given depths [m].
+    """
     if len(depth) < 100:
         return SensorNoise()
     groups = torch.argsort(depth).tensor_split(8)
@@ -154,23 +203,28 @@ def fit_noise(depth: Float[Tensor, "n"], error: Float[Tensor, "n"]) -> SensorNoi
 
 @checked
 def median_depth(frames: Sequence[Tensor | np.ndarray]) -> Tensor:
-    """Return the median depth of each pixel over several depth images, in which camera and scene stand still.
+    """Return the median depth of each pixel over several depth images, in which camera and scene
+    stand still.
 
     Pixels that most frames miss (0, NaN or infinity) are 0. The unit is that of the frames.
 
-    The `frames` are images (h, w) of one size and one dtype. Raises `BadArgument` for no frame, for frames of several
-    sizes or dtypes, or if camera or scene have moved in one.
+    The `frames` are images (h, w) of one size and one dtype. Raises `BadArgument` for no frame, for
+    frames of several sizes or dtypes, or if camera or scene have moved in one.
 
     >>> median_depth([torch.tensor([[0.0, 0.7]]), torch.tensor([[0.0, 0.701]]), torch.tensor([[0.5, 0.702]])])
     tensor([[0.0000, 0.7010]])
     """
     images = [
-        frame if isinstance(frame, Tensor) else torch.from_numpy(np.array(frame, frame.dtype.newbyteorder("=")))
+        frame
+        if isinstance(frame, Tensor)
+        else torch.from_numpy(np.array(frame, frame.dtype.newbyteorder("=")))
         for frame in frames
     ]
     kinds = sorted({f"{tuple(image.shape)} {image.dtype}" for image in images})
     if len(kinds) != 1 or images[0].ndim != 2:
-        raise BadArgument("frames", " and ".join(kinds) or "none", "images (h, w) of one size and one dtype")
+        raise BadArgument(
+            "frames", " and ".join(kinds) or "none", "images (h, w) of one size and one dtype"
+        )
     stack = torch.stack(images).double()
     stack = torch.where(torch.isfinite(stack) & (stack > 0), stack, torch.nan)
     middle = torch.nanquantile(stack, 0.5, dim=0)

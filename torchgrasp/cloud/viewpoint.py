@@ -12,7 +12,8 @@ from torchgrasp.foundation.lazy import spatial
 from torchgrasp.geometry.linalg import Points, Vector, fibonacci_sphere, unit
 from torchgrasp.geometry.support_planes import find_supports
 
-MAX_EDGE_ON, MAX_BEHIND = 0.15, 0.2
+MAX_EDGE_ON = 0.15
+MAX_BEHIND = 0.2
 """Largest shares of a view's points that its camera sees edge-on, and that lie behind others."""
 DRAWN = 2000  # most points that tell where the camera was
 
@@ -20,20 +21,28 @@ DRAWN = 2000  # most points that tell where the camera was
 def guess_viewpoint(
     points: Points, normals: Points, up: Vector | None = None, assumed: bool = False
 ) -> tuple[Vector, float]:
-    """Return a camera position [m] that explains a view, and the angle [deg] within which the camera is likely.
+    """Return a camera position [m] that explains a view, and the angle [deg] within which the
+    camera is likely.
 
-    Of all directions above the support, the one that explains the points best is taken; the camera is placed along it,
-    4 radii of the cloud away. The direction `up` is above the support; the normal of a support in the points replaces
-    it. If `up` is None or `assumed`, a guess, the camera may be at the origin, where the points lie in front of it and
-    a camera can have taken the view. An angle of 180 degrees means that the points hardly tell the direction.
+    Of all directions above the support, the one that explains the points best is taken; the camera
+    is placed along it, 4 radii of the cloud away. The direction `up` is above the support; the
+    normal of a support in the points replaces it. If `up` is None or `assumed`, a guess, the camera
+    may be at the origin, where the points lie in front of it and a camera can have taken the view.
+    An angle of 180 degrees means that the points hardly tell the direction.
     """
     rows = draw_rows(len(points), DRAWN).to(points.device)
-    points, normals = points[rows], normals[rows]
+    points = points[rows]
+    normals = normals[rows]
     in_front = points[:, 2] > math.cos(math.radians(50)) * torch.linalg.vector_norm(points, dim=-1)
     centre, radius = _enclose(points)
     above = up is None or assumed or float(centre @ up.to(points)) < 0
     far = bool(torch.linalg.vector_norm(centre) > 2 * radius)
-    if far and above and bool(in_front.all()) and can_see(points, normals, torch.zeros_like(points[0])):
+    if (
+        far
+        and above
+        and bool(in_front.all())
+        and can_see(points, normals, torch.zeros_like(points[0]))
+    ):
         return torch.zeros_like(points[0]), 15.0
     try:
         up = find_supports(points, up=up)[0].plane.normal
@@ -53,11 +62,13 @@ def guess_viewpoint(
 def can_see(points: Points, normals: Points, viewpoint: Vector) -> bool:
     """Return whether a camera at a place [m] can have taken a view.
 
-    Seen from there, points must not hide other points. In addition, one of three conditions must hold: the points are
-    as dense as the camera's pixels; no other place explains the points much better; the camera looks down on a support.
+    Seen from there, points must not hide other points. In addition, one of three conditions must
+    hold: the points are as dense as the camera's pixels; no other place explains the points much
+    better; the camera looks down on a support.
     """
     rows = draw_rows(len(points), DRAWN).to(points.device)
-    points, normals = points[rows], normals[rows]
+    points = points[rows]
+    normals = normals[rows]
     edge_on, behind = share_unseen(points, normals, viewpoint)
     if edge_on > MAX_EDGE_ON or behind > MAX_BEHIND:
         return False
@@ -75,8 +86,12 @@ def can_see(points: Points, normals: Points, viewpoint: Vector) -> bool:
 
 
 def _enclose(points: Points) -> tuple[Vector, Float[Tensor, ""]]:
-    """Return the centre of the points' box along their principal axes, and its distance to the farthest point."""
-    axes = torch.linalg.svd(points - points.mean(0), full_matrices=False).Vh  # independent of the frame
+    """Return the centre of the points' box along their principal axes, and its distance to the
+    farthest point.
+    """
+    axes = torch.linalg.svd(
+        points - points.mean(0), full_matrices=False
+    ).Vh  # independent of the frame
     along = points @ axes.T
     centre = (along.amax(0) + along.amin(0)) / 2 @ axes
     return centre, torch.linalg.vector_norm(points - centre, dim=-1).max()
@@ -85,16 +100,19 @@ def _enclose(points: Points) -> tuple[Vector, Float[Tensor, ""]]:
 def _explain(
     points: Points, normals: Points, viewpoints: Float[Tensor, "k 3"]
 ) -> tuple[Float[Tensor, "k"], Float[Tensor, "k"]]:
-    """Return two scores of each camera position, at most 1, for how well it explains a view's bulge and point density.
+    """Return two scores of each camera position, at most 1, for how well it explains a view's bulge
+    and point density.
 
-    Visible surfaces bulge towards the camera. A pixel covers an area that grows with the squared distance, over the
-    cosine between ray and normal.
+    Visible surfaces bulge towards the camera. A pixel covers an area that grows with the squared
+    distance, over the cosine between ray and normal.
     """
     away = viewpoints - points[:, None]
     distance = torch.linalg.vector_norm(away, dim=-1).clamp_min(1e-12)
     cosine = (away * normals[:, None]).sum(-1) / distance
     bulge = (normals * (points - _enclose(points)[0])).sum(-1)
-    bulging = (bulge[:, None] * torch.tanh(cosine / 0.3)).sum(0) / bulge.abs().sum().clamp_min(1e-12)
+    bulging = (bulge[:, None] * torch.tanh(cosine / 0.3)).sum(0) / bulge.abs().sum().clamp_min(
+        1e-12
+    )
     density = -2 * torch.log(nearest(points, 13)[0][:, -1].clamp_min(1e-12))  # up to a constant
     density = density - density.median()
     error = density[:, None] - torch.log(cosine.abs().clamp_min(0.1)) + 2 * torch.log(distance)
@@ -103,12 +121,15 @@ def _explain(
 
 
 def share_unseen(points: Points, normals: Points, viewpoint: Vector) -> tuple[float, float]:
-    """Return the share of points that a camera would see edge-on, and the share of points hidden behind others.
+    """Return the share of points that a camera would see edge-on, and the share of points hidden
+    behind others.
 
     The second share is 1 if a point lies behind the camera.
     """
     ray = unit(points - viewpoint)
-    edge_on = float(((ray * normals).sum(-1).abs() < 0.17).double().mean())  # the cosine of 80 degrees
+    edge_on = float(
+        ((ray * normals).sum(-1).abs() < 0.17).double().mean()
+    )  # the cosine of 80 degrees
     middle = (points.amax(0) + points.amin(0)) / 2
     forward = middle - viewpoint
     if not bool(forward.any()) or bool(((points - viewpoint) @ forward <= 0).any()):

@@ -1,11 +1,13 @@
-"""Certificates of frictional form closure, Eq. (13) of the paper: for each contact set a verdict, with a proof.
+"""Certificates of frictional form closure, Eq. (13) of the paper: for each contact set a verdict,
+with a proof.
 
-Positive coefficients phi that balance all contact wrenches prove closure, and bound its margin from below. A witness,
-which is a wrench that no contact opposes, disproves closure, and bounds the margin from above. A batched simplex method
-(module `closure`) finds both. The solver HiGHS decides where the two bounds leave the verdict open.
+Positive coefficients phi that balance all contact wrenches prove closure, and bound its margin from
+below. A witness, which is a wrench that no contact opposes, disproves closure, and bounds the
+margin from above. A batched simplex method (module `closure`) finds both. The solver HiGHS decides
+where the two bounds leave the verdict open.
 
-The multipliers y of W phi = 0 are a multiple of the witness. By the envelope theorem a change dW of the wrenches
-changes the margin by -y . (dW phi).
+The multipliers y of W phi = 0 are a multiple of the witness. By the envelope theorem a change dW of
+the wrenches changes the margin by -y . (dW phi).
 """
 
 from typing import Any
@@ -15,7 +17,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.contacts.form_closure import MIN_MARGIN, MIN_RANK_RATIO, Vectors, rank_ratio, solve_closure_lp, wrenches
+from torchgrasp.contacts.form_closure import (
+    MIN_MARGIN,
+    MIN_RANK_RATIO,
+    Vectors,
+    rank_ratio,
+    solve_closure_lp,
+    wrenches,
+)
 from torchgrasp.foundation.base import FINGERTIPS
 from torchgrasp.foundation.checks import checked, is_known
 from torchgrasp.foundation.errors import BadArgument
@@ -25,10 +34,15 @@ from torchgrasp.values.planning import Certificate, Contacts
 from torchgrasp.values.specs import ContactSpec
 
 EXACT = 1e-13  # largest |W phi| of a balance that needs no solver: an exact balance is near
-GAP = 1e-9  # largest difference of the two bounds of a proven margin, which must lie twice as far from `MIN_MARGIN`
+# largest difference of the two bounds of a proven margin, which must lie twice as far from
+# `MIN_MARGIN`
+GAP = 1e-9
 MAX_RESIDUAL = 1e-6  # largest |W phi| of a balance found by HiGHS, for wrenches of length about 1
-STRICT = 1e-10  # tolerance of HiGHS, its least. With its default, 1e-7, margins err by 1e-8 and may cross `MIN_MARGIN`.
-UNIT_TOLERANCE = 1e-3  # largest difference of a given normal's length from 1: what rounding in a text file leaves
+# tolerance of HiGHS, its least. With its default, 1e-7, margins err by 1e-8 and may cross
+# `MIN_MARGIN`.
+STRICT = 1e-10
+# largest difference of a given normal's length from 1: what rounding in a text file leaves
+UNIT_TOLERANCE = 1e-3
 
 
 @checked(gradients=True)
@@ -36,19 +50,22 @@ UNIT_TOLERANCE = 1e-3  # largest difference of a given normal's length from 1: w
 def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
     """Prove in float64 whether contact sets have frictional form closure, Eq. (13) of the paper.
 
-    The margin is the largest s for which coefficients phi >= s with sum phi = 1 balance the wrenches W of all cone
-    edges, W phi = 0; it is -inf if no phi balances them. The friction cones have `spec.edges` edges at friction
-    `spec.planned_friction`. A set is `closed` if its margin is at least 1e-6 and its wrenches have full rank.
+    The margin is the largest s for which coefficients phi >= s with sum phi = 1 balance the
+    wrenches W of all cone edges, W phi = 0; it is -inf if no phi balances them. The friction cones
+    have `spec.edges` edges at friction `spec.planned_friction`. A set is `closed` if its margin is
+    at least 1e-6 and its wrenches have full rank.
 
-    If a set is not closed, its `witness` v is a wrench that no contact force opposes: v.w >= 0 for every edge wrench w,
-    up to rounding. For a margin between 0 and 1e-6, v.w >= -margin. If only the rank is too low, the wrenches are
-    smallest along v. Sets with contacts that are not finite are not closed, and their margin and witness are NaN.
+    If a set is not closed, its `witness` v is a wrench that no contact force opposes: v.w >= 0 for
+    every edge wrench w, up to rounding. For a margin between 0 and 1e-6, v.w >= -margin. If only
+    the rank is too low, the wrenches are smallest along v. Sets with contacts that are not finite
+    are not closed, and their margin and witness are NaN.
 
-    The margin is differentiable once in points and normals. Where several phi or v are optimal, its derivative is that
-    of one of them; where the margin is -inf, its derivative is NaN. A second derivative, and one of another field,
-    raise `BadArgument`; in forward mode the latter is NaN. The `contacts` are sets of three to five with outward unit
-    normals, from any planner. Raises `BadArgument` for contacts of a wrong shape, normals that are not of length 1 (to
-    1e-3), or no `ContactSpec`.
+    The margin is differentiable once in points and normals. Where several phi or v are optimal, its
+    derivative is that of one of them; where the margin is -inf, its derivative is NaN. A second
+    derivative, and one of another field, raise `BadArgument`; in forward mode the latter is NaN.
+    The `contacts` are sets of three to five with outward unit normals, from any planner. Raises
+    `BadArgument` for contacts of a wrong shape, normals that are not of length 1 (to 1e-3), or no
+    `ContactSpec`.
 
     >>> corners = torch.tensor([[[1.0, 0, 0], [-0.6, 0.8, 0], [-0.6, -0.8, 0]]])
     >>> certify(Contacts(corners, corners)).closed
@@ -61,11 +78,15 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
 
 
 class _Proof(torch.autograd.Function):
-    """The fields of a `Certificate` given m wrenches, then phi and multipliers; a `flat` set is on a line."""
+    """The fields of a `Certificate` given m wrenches, then phi and multipliers; a `flat` set is on
+    a line.
+    """
 
     @staticmethod
     def forward(wrench: Float[Tensor, "b m 6"], flat: Bool[Tensor, "b"]) -> tuple[Tensor, ...]:
-        """Return the fields of the certificate, phi and multipliers; NaN for wrenches that are not finite."""
+        """Return the fields of the certificate, phi and multipliers; NaN for wrenches that are not
+        finite.
+        """
         b, m, _ = wrench.shape
         margin, ratio, residual = (wrench.new_full((b,), torch.nan) for _ in range(3))
         witness, phi, dual = (wrench.new_full((b, width), torch.nan) for width in (6, m, 6))
@@ -90,10 +111,14 @@ class _Proof(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, None]:
-        """Return the derivative in the wrenches; raise `BadArgument` unless it is of the margin alone."""
+        """Return the derivative in the wrenches; raise `BadArgument` unless it is of the margin
+        alone.
+        """
         margin, wrench, phi, dual = grads[0], *ctx.saved_tensors
         if any(x is not None for x in grads[1:]):
-            raise BadArgument("contacts", "a derivative of another field of the certificate", "one of its margin")
+            raise BadArgument(
+                "contacts", "a derivative of another field of the certificate", "one of its margin"
+            )
         if margin is None:
             return None, None
         return _Once.apply(-margin[:, None, None] * phi[..., None] * dual[:, None], wrench), None
@@ -107,10 +132,14 @@ class _Proof(torch.autograd.Function):
         return change, unknown, unknown, None, unknown[:, None].repeat(1, 6), None, None
 
     @staticmethod
-    def vmap(info: Any, in_dims: tuple[int | None, ...], *args: Tensor) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
+    def vmap(
+        info: Any, in_dims: tuple[int | None, ...], *args: Tensor
+    ) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
         """Prove the sets of all values of an axis together."""
         pairs = zip(args, in_dims, strict=True)
-        rows = [x.expand(info.batch_size, *x.shape) if k is None else x.movedim(k, 0) for x, k in pairs]
+        rows = [
+            x.expand(info.batch_size, *x.shape) if k is None else x.movedim(k, 0) for x, k in pairs
+        ]
         proof = _Proof.apply(*(x.flatten(0, 1) for x in rows))
         return tuple(x.unflatten(0, rows[0].shape[:2]) for x in proof), (0,) * len(proof)
 
@@ -132,18 +161,26 @@ class _Once(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *_: Any) -> Any:
         """Raise `BadArgument`."""
-        raise BadArgument("contacts", "a second derivative of the margin", "a first derivative: the rest is not smooth")
+        raise BadArgument(
+            "contacts",
+            "a second derivative of the margin",
+            "a first derivative: the rest is not smooth",
+        )
 
     jvp = backward
 
 
 def _prove(wrench: Float[Tensor, "b m 6"]) -> tuple[Tensor, ...]:
-    """Return for m wrenches the margin of force closure, the residual |W phi|, a witness, phi, and the multipliers."""
+    """Return for m wrenches the margin of force closure, the residual |W phi|, a witness, phi, and
+    the multipliers.
+    """
     phi, witness = solve_closure_lp(wrench)
     residual = (phi[:, None] @ wrench)[:, 0].abs().amax(-1)
-    margin, upper = phi.amin(-1), bound_margin(wrench, witness)
+    margin = phi.amin(-1)
+    upper = bound_margin(wrench, witness)
     unbalanced = upper < -1 / GAP
-    margin, residual = torch.where(unbalanced, -torch.inf, margin), torch.where(unbalanced, torch.inf, residual)
+    margin = torch.where(unbalanced, -torch.inf, margin)
+    residual = torch.where(unbalanced, torch.inf, residual)
     proven = (residual <= EXACT) & (upper - margin <= GAP) & ((margin - MIN_MARGIN).abs() > 2 * GAP)
     for row in torch.nonzero(~(proven | unbalanced))[:, 0].tolist():
         margin[row], residual[row], dual, balance = solve_by_highs(wrench[row].cpu().numpy())
@@ -155,22 +192,31 @@ def _prove(wrench: Float[Tensor, "b m 6"]) -> tuple[Tensor, ...]:
     return margin, residual, witness, phi, dual
 
 
-def bound_margin(wrench: Float[Tensor, "b m 6"], witness: Float[Tensor, "b 6"]) -> Float[Tensor, "b"]:
-    """Return the upper bound of the closure margin that each direction `witness` in wrench space proves, or NaN."""
-    # With g_k = w.w_k and phi >= s: 0 = sum phi g >= s sum g + (1 - m s) min g, hence s <= -min g / sum(g - min g).
+def bound_margin(
+    wrench: Float[Tensor, "b m 6"], witness: Float[Tensor, "b 6"]
+) -> Float[Tensor, "b"]:
+    """Return the upper bound of the closure margin that each direction `witness` in wrench space
+    proves, or NaN.
+    """
+    # With g_k = w.w_k and phi >= s: 0 = sum phi g >= s sum g + (1 - m s) min g, hence s <= -min g /
+    # sum(g - min g).
     product = (wrench @ witness[..., None])[..., 0]
     least = product.amin(-1)
     return -least / (product - least[:, None]).sum(-1)
 
 
 def solve_by_highs(wrench: np.ndarray) -> tuple[float, float, np.ndarray | None, Tensor]:
-    """Return closure margin, residual max |W phi|, witness (None if unknown) and phi of m wrenches, by HiGHS."""
+    """Return closure margin, residual max |W phi|, witness (None if unknown) and phi of m wrenches,
+    by HiGHS.
+    """
     from scipy.optimize import linprog
 
     m = len(wrench)  # seven equations in the margin s and psi = phi - s >= 0
     equations = np.zeros((7, m + 1))
-    equations[:6, :m], equations[:6, m] = wrench.T, wrench.sum(0)
-    equations[6, :m], equations[6, m] = 1.0, m
+    equations[:6, :m] = wrench.T
+    equations[:6, m] = wrench.sum(0)
+    equations[6, :m] = 1.0
+    equations[6, m] = m
     solution = linprog(
         c=np.r_[np.zeros(m), -1.0],
         A_eq=equations,
@@ -181,14 +227,19 @@ def solve_by_highs(wrench: np.ndarray) -> tuple[float, float, np.ndarray | None,
     )
     if solution.x is None:
         return -np.inf, np.inf, None, torch.zeros(m, device="cpu")
-    phi, dual = solution.x[:m] + solution.x[m], solution.eqlin.marginals[:6]
+    phi = solution.x[:m] + solution.x[m]
+    dual = solution.eqlin.marginals[:6]
     length = np.linalg.norm(dual)
-    witness = -dual / length if length > 0 else None  # no multipliers: the balance of wrenches costs no margin
+    witness = (
+        -dual / length if length > 0 else None
+    )  # no multipliers: the balance of wrenches costs no margin
     return float(solution.x[m]), float(np.abs(phi @ wrench).max()), witness, torch.from_numpy(phi)
 
 
 def check_unit(normals: Vectors) -> Vectors:
-    """Return the normals; raise `BadArgument` if the length of a normal is not 1. Normals with NaN are accepted."""
+    """Return the normals; raise `BadArgument` if the length of a normal is not 1. Normals with NaN
+    are accepted.
+    """
     if not is_known(normals):
         return normals
     length = torch.linalg.vector_norm(normals.detach(), dim=-1)
@@ -201,12 +252,16 @@ def check_unit(normals: Vectors) -> Vectors:
 
 
 def check_contacts(contacts: Contacts) -> Contacts:
-    """Return the contacts; raise `BadArgument` if shapes are wrong, or if a set has not 3 to 5 contacts."""
+    """Return the contacts; raise `BadArgument` if shapes are wrong, or if a set has not 3 to 5
+    contacts.
+    """
     points = contacts.points
     for name, value in (("points", points), ("normals", contacts.normals)):
         if value.shape != (*points.shape[:2], 3) or not value.is_floating_point():
             found = f"shape {tuple(value.shape)} of {value.dtype}"
-            raise BadArgument(f"contacts.{name}", found, "floating numbers of shape b x f x 3, as many of each")
+            raise BadArgument(
+                f"contacts.{name}", found, "floating numbers of shape b x f x 3, as many of each"
+            )
     if not FINGERTIPS[0] <= points.shape[1] <= FINGERTIPS[1]:
         allowed = f"{FINGERTIPS[0]} to {FINGERTIPS[1]}, one for each fingertip"
         raise BadArgument("contacts.points", f"{points.shape[1]} contacts a row", allowed)

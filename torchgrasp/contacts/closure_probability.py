@@ -1,7 +1,7 @@
 """The probability that a grasp has force closure on the true surface, given the uncertain shape.
 
-Each fingertip approaches along the normal of its contact. Random surfaces are drawn from the Gaussian process along
-these lines, and give the points and normals at which the fingertips touch.
+Each fingertip approaches along the normal of its contact. Random surfaces are drawn from the
+Gaussian process along these lines, and give the points and normals at which the fingertips touch.
 """
 
 import dataclasses
@@ -26,53 +26,85 @@ from torchgrasp.shape.posterior import combined_covariance, symmetric_root
 from torchgrasp.values.planning import Contacts
 from torchgrasp.values.specs import ContactSpec
 
-FOOTPRINT = 0.012  # half the width [m] over which a fingertip senses the slope of the surface: the radius of its sphere
-NODES = (4.0, 1.5, 0.0, -1.5, -4.0)  # nodes of a line, in standard deviations of the surface at its contact
+# half the width [m] over which a fingertip senses the slope of the surface: the radius of its
+# sphere
+FOOTPRINT = 0.012
+NODES = (
+    4.0,
+    1.5,
+    0.0,
+    -1.5,
+    -4.0,
+)  # nodes of a line, in standard deviations of the surface at its contact
 OUTER_GRID = (12.0, 9.0, 6.5, 4.0, 3.375, 2.75, 2.125, 1.5, 1.125, 0.75, 0.375, 0.0)
-"""Outer half of the grid on a line, in standard deviations of the surface; all nodes are grid points."""
+"""Outer half of the grid on a line, in standard deviations of the surface; all nodes are grid
+points.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
 class LinePosterior(Batch):
-    """The joint Gaussian of signed distance d and its gradient w along the lines x + t n through the contacts."""
+    """The joint Gaussian of signed distance d and its gradient w along the lines x + t n through
+    the contacts.
+    """
 
     points: Vectors  # planned contacts x, in normalised units
     normals: Vectors  # outward unit normals n
-    deviation: Float[Tensor, "b f"]  # of the surface at each contact; t of nodes and grid points is a multiple of it
-    distance: Float[Tensor, "b f 23"]  # mean of d at the grid points of each line, from outside to inside
+    deviation: Float[
+        Tensor, "b f"
+    ]  # of the surface at each contact; t of nodes and grid points is a multiple of it
+    distance: Float[
+        Tensor, "b f 23"
+    ]  # mean of d at the grid points of each line, from outside to inside
     slope: Float[Tensor, "b f 5 3"]  # mean of w at the five nodes of each line
-    root: Float[Tensor, "b z z"]  # of the covariance of the z = 20 f values (d, w) at all nodes, by line, then by node
+    root: Float[
+        Tensor, "b z z"
+    ]  # of the covariance of the z = 20 f values (d, w) at all nodes, by line, then by node
 
 
 @functools.cache
 def grid() -> Float[Tensor, "23"]:
     """Return the 23 grid positions on a line, in standard deviations, from outside to inside."""
-    return torch.tensor([*OUTER_GRID, *(-t for t in reversed(OUTER_GRID[:-1]))], dtype=torch.float64, device="cpu")
+    return torch.tensor(
+        [*OUTER_GRID, *(-t for t in reversed(OUTER_GRID[:-1]))], dtype=torch.float64, device="cpu"
+    )
 
 
 def interpolation(at: Float[Tensor, "*b"], nodes: Float[Tensor, "k"]) -> Float[Tensor, "*b k"]:
-    """Return the weights of k nodes at positions in descending order, for linear interpolation at positions `at`."""
+    """Return the weights of k nodes at positions in descending order, for linear interpolation at
+    positions `at`.
+    """
     held = torch.minimum(torch.maximum(at, nodes[-1]), nodes[0])[..., None]
     gaps = nodes[:-1] - nodes[1:]
     share = ((nodes[:-1] - held) / gaps).clamp(0, 1)  # how far each gap has been passed
-    return torch.cat([torch.ones_like(held), share], -1) - torch.cat([share, torch.zeros_like(held)], -1)
+    return torch.cat([torch.ones_like(held), share], -1) - torch.cat(
+        [share, torch.zeros_like(held)], -1
+    )
 
 
 def well_inside(shape: ShapeGP, contacts: Contacts) -> Bool[Tensor, "b"]:
-    """Return a mask of the contact sets inside the shape's domain, at least half a fingertip's width from its edge."""
-    radius = torch.linalg.vector_norm(shape.normalise(contacts.points.detach().double().to(shape.device)), dim=-1)
+    """Return a mask of the contact sets inside the shape's domain, at least half a fingertip's
+    width from its edge.
+    """
+    radius = torch.linalg.vector_norm(
+        shape.normalise(contacts.points.detach().double().to(shape.device)), dim=-1
+    )
     return (radius + FOOTPRINT / shape.scale <= shape.domain_radius).all(-1)
 
 
 def line_posterior(shape: ShapeGP, contacts: Contacts) -> LinePosterior:
-    """Return the posterior of the surface along each contact's normal line; errors are as in `closure_probability`."""
+    """Return the posterior of the surface along each contact's normal line; errors are as in
+    `closure_probability`.
+    """
     f = check_contacts(contacts).fingertips
     for name, value in (("points", contacts.points), ("normals", contacts.normals)):
         check_tensor(f"contacts.{name}", value, (len(contacts), f, 3))
     points = shape.normalise(contacts.points.detach().double().to(shape.device))
     normals = check_unit(contacts.normals.detach().double().to(shape.device))
     if not bool(well_inside(shape, contacts).all()):
-        raise BadArgument("contacts.points", "a contact at the edge of the domain", "contacts further inside")
+        raise BadArgument(
+            "contacts.points", "a contact at the edge of the domain", "contacts further inside"
+        )
     (wall, own), *others = walls_at(shape, points)
     deviation, distance, slope, covariance = _along_lines(wall, shape.std_factor, points, normals)
     covariance = covariance * _on_same(own)  # errors of different walls are independent
@@ -88,23 +120,33 @@ def line_posterior(shape: ShapeGP, contacts: Contacts) -> LinePosterior:
 
 
 def _on_same(own: Bool[Tensor, "b f"]) -> Bool[Tensor, "b z z"]:
-    """Return a mask of the covariance entries of two contacts on the same wall; `own` marks the wall's contacts."""
+    """Return a mask of the covariance entries of two contacts on the same wall; `own` marks the
+    wall's contacts.
+    """
     own = own.repeat_interleave(4 * len(NODES), 1)
     return own[:, :, None] & own[:, None]
 
 
 def _along_lines(
     shape: ShapeGP, factor: float, points: Vectors, normals: Vectors
-) -> tuple[Float[Tensor, "b f"], Float[Tensor, "b f 23"], Float[Tensor, "b f 5 3"], Float[Tensor, "b z z"]]:
-    """Return, on lines along the normals: standard deviations, mean distances, mean gradients and covariances."""
+) -> tuple[
+    Float[Tensor, "b f"], Float[Tensor, "b f 23"], Float[Tensor, "b f 5 3"], Float[Tensor, "b z z"]
+]:
+    """Return, on lines along the normals: standard deviations, mean distances, mean gradients and
+    covariances.
+    """
     jet = shape.jet(points.flatten(0, 1))
     deviation = factor * surface_deviation(jet.variance, jet.gradient).reshape(points.shape[:2])
     nodes = deviation[..., None] * torch.tensor(NODES, device="cpu").to(deviation)
     values = 4 * len(NODES) * points.shape[1]
     covariance = points.new_empty(len(points), values, values)
-    for rows in torch.arange(len(points), device=points.device).split(32):  # the distances of a part stay in the cache
+    for rows in torch.arange(len(points), device=points.device).split(
+        32
+    ):  # the distances of a part stay in the cache
         covariance[rows] = node_covariance(shape, points[rows], normals[rows], nodes[rows])
-    slope = shape.mean_and_gradient((points[:, :, None] + nodes[..., None] * normals[:, :, None]).reshape(-1, 3))[1]
+    slope = shape.mean_and_gradient(
+        (points[:, :, None] + nodes[..., None] * normals[:, :, None]).reshape(-1, 3)
+    )[1]
     t = deviation[..., None] * grid().to(deviation)
     distance = shape.mean((points[:, :, None] + t[..., None] * normals[:, :, None]).reshape(-1, 3))
     return deviation, distance.reshape(t.shape), slope.reshape(*nodes.shape, 3), covariance
@@ -113,52 +155,68 @@ def _along_lines(
 def node_covariance(
     shape: ShapeGP, points: Vectors, normals: Vectors, nodes: Float[Tensor, "b f 5"]
 ) -> Float[Tensor, "b z z"]:
-    """Return the posterior covariance of signed distance d and gradient w at all nodes of the lines.
+    """Return the posterior covariance of signed distance d and gradient w at all nodes of the
+    lines.
 
-    Nodes outside the domain are moved to its edge. The gradient is a difference quotient over a fingertip's width.
+    Nodes outside the domain are moved to its edge. The gradient is a difference quotient over a
+    fingertip's width.
     """
     width = FOOTPRINT / shape.scale
     along = (points * normals).sum(-1)
     half_chord = (along**2 + (shape.domain_radius - width) ** 2 - (points**2).sum(-1)).sqrt()
-    nodes = torch.maximum(torch.minimum(nodes, (half_chord - along)[..., None]), -(half_chord + along)[..., None])
+    nodes = torch.maximum(
+        torch.minimum(nodes, (half_chord - along)[..., None]), -(half_chord + along)[..., None]
+    )
     first = tangents(points, normals)
-    axes = torch.stack([normals, first, torch.linalg.cross(normals, first)], 2)  # (b, line, axis, 3)
+    axes = torch.stack(
+        [normals, first, torch.linalg.cross(normals, first)], 2
+    )  # (b, line, axis, 3)
     around = torch.cat([torch.zeros_like(axes[:, :, :1]), axes, -axes], 2) * width
     places = points[:, :, None] + nodes[..., None] * normals[:, :, None]
     queries = places[:, :, :, None] + around[:, :, None]  # (b, line, node, 7, 3)
     weights = points.new_zeros(*points.shape[:2], 4, 7)
     weights[..., 0, 0] = 1.0
     weights[..., 1:, 1:] = torch.cat([axes, -axes], 2).mT / (2 * width)
-    return combined_covariance(shape, queries.flatten(1, 2), weights.repeat_interleave(len(NODES), 1))
+    return combined_covariance(
+        shape, queries.flatten(1, 2), weights.repeat_interleave(len(NODES), 1)
+    )
 
 
 TouchPoints = Float[Tensor, "b n f 3"]
 
 
-def first_contact(lines: LinePosterior, drawn: Float[Tensor, "b n z"]) -> tuple[TouchPoints, TouchPoints]:
-    """Return points and normals at which fingertips touch n random surfaces; NaN where a line meets no surface.
+def first_contact(
+    lines: LinePosterior, drawn: Float[Tensor, "b n z"]
+) -> tuple[TouchPoints, TouchPoints]:
+    """Return points and normals at which fingertips touch n random surfaces; NaN where a line meets
+    no surface.
 
     `drawn` holds the deviations of the random surfaces from the mean, at the nodes of the lines.
     """
     deviation = drawn.unflatten(-1, (lines.points.shape[1], len(NODES), 4))
-    t, nodes = grid().to(drawn), torch.tensor(NODES, device="cpu").to(drawn)
+    t = grid().to(drawn)
+    nodes = torch.tensor(NODES, device="cpu").to(drawn)
     distance = lines.distance[:, None] + deviation[..., 0] @ interpolation(t, nodes).T
     crosses = (distance[..., :-1] > 0) & (distance[..., 1:] <= 0)
     far = torch.where(crosses, t[:-1].abs(), torch.inf)
     nearest, before = far.min(-1, keepdim=True)
-    high, low = distance.gather(-1, before), distance.gather(-1, before + 1)
+    high = distance.gather(-1, before)
+    low = distance.gather(-1, before + 1)
     stop = torch.lerp(t[before], t[before + 1], high / (high - low))
     stop = torch.where(torch.isinf(nearest), torch.nan, stop)
     weights = interpolation(stop, nodes)  # (b, n, f, 1, k)
     slope = lines.slope[:, None] + deviation[..., 1:]
     motion = stop * lines.deviation[:, None, :, None]
-    return lines.points[:, None] + motion * lines.normals[:, None], unit((weights @ slope)[..., 0, :])
+    return lines.points[:, None] + motion * lines.normals[:, None], unit(
+        (weights @ slope)[..., 0, :]
+    )
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class ClosureProbability(Batch):
-    """The `probability` that each contact set has force closure on the true surface, with its `standard_error`.
+    """The `probability` that each contact set has force closure on the true surface, with its
+    `standard_error`.
 
     >>> ClosureProbability(torch.tensor([0.97]), torch.tensor([0.01])).probability
     tensor([0.9700])
@@ -177,19 +235,20 @@ def closure_probability(
     n: Annotated[int, Range(1, 10**8)] = 2500,
     seed: Seed = 0,
 ) -> ClosureProbability:
-    """Return the probability that each contact set has force closure on the uncertain surface, by Monte Carlo.
+    """Return the probability that each contact set has force closure on the uncertain surface, by
+    Monte Carlo.
 
-    All contact sets share the random surfaces, and no result depends on another set. Raises `BadArgument` for a wrong
-    argument, or a contact that is not finite or outside the shape's domain.
+    All contact sets share the random surfaces, and no result depends on another set. Raises
+    `BadArgument` for a wrong argument, or a contact that is not finite or outside the shape's
+    domain.
 
-    Args:
-        shape: the uncertain shape.
-        contacts: sets of 3 to 5 contacts [m] with outward unit normals, inside the domain of the shape. A draw in which
-            a finger meets no surface within 12 standard deviations counts as one without force closure.
-        spec: its `friction` is used, the friction coefficient at execution; `planned_friction` is not used.
-        n: number of random surfaces. The standard error is at most 1 / (2 sqrt(n)): 0.01 for 2500. It is computed for
-            the fraction (k + 1) / (n + 2) if k draws have force closure, and so never 0.
-        seed: random seed.
+    Args: shape: the uncertain shape. contacts: sets of 3 to 5 contacts [m] with outward unit
+        normals, inside the domain of the shape. A draw in which a finger meets no surface within 12
+        standard deviations counts as one without force closure. spec: its `friction` is used, the
+        friction coefficient at execution; `planned_friction` is not used. n: number of random
+        surfaces. The standard error is at most 1 / (2 sqrt(n)): 0.01 for 2500. It is computed for
+        the fraction (k + 1) / (n + 2) if k draws have force closure, and so never 0. seed: random
+        seed.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -204,17 +263,26 @@ def closure_probability(
 
 
 def closed_share(lines: LinePosterior, friction: float, n: int, seed: int) -> Float[Tensor, "b"]:
-    """Return the fraction of n random surfaces, drawn on `lines`, on which each contact set has force closure."""
+    """Return the fraction of n random surfaces, drawn on `lines`, on which each contact set has
+    force closure.
+    """
     draws_per_chunk = 8192  # drawn rows that are judged at a time: their tensors take about 20 MB
-    gpu_draws = 2**18  # the same on a GPU, which fewer leave idle: about 700 MB (`scripts/bench.py gpu`)
+    gpu_draws = (
+        2**18
+    )  # the same on a GPU, which fewer leave idle: about 700 MB (`scripts/bench.py gpu`)
     generator = torch.Generator().manual_seed(seed)
     count = lines.points.new_zeros(len(lines))
-    guess = None if lines.points.shape[1] == 3 else first_balance(lines.points, lines.normals, friction)
-    at_once, judged = min(n, draws_per_chunk), draws_per_chunk if count.device.type == "cpu" else gpu_draws
+    guess = (
+        None if lines.points.shape[1] == 3 else first_balance(lines.points, lines.normals, friction)
+    )
+    at_once = min(n, draws_per_chunk)
+    judged = draws_per_chunk if count.device.type == "cpu" else gpu_draws
     for start in range(0, n, at_once):
         size = min(at_once, n - start), lines.root.shape[-1]
         standard = torch.randn(size, dtype=torch.float64, generator=generator, device="cpu")
-        for rows in torch.arange(len(lines), device=count.device).split(max(judged // len(standard), 1)):
+        for rows in torch.arange(len(lines), device=count.device).split(
+            max(judged // len(standard), 1)
+        ):
             points, normals = first_contact(lines[rows], standard.to(count) @ lines.root[rows])
             balance = None if guess is None else guess[rows].repeat_interleave(len(standard), 0)
             closed = closed_exact(points.flatten(0, 1), normals.flatten(0, 1), friction, balance)

@@ -1,4 +1,6 @@
-"""Constraint checks of planned contacts: flatness of the surface around each contact, and all other constraints."""
+"""Constraint checks of planned contacts: flatness of the surface around each contact, and all other
+constraints.
+"""
 
 import dataclasses
 import math
@@ -35,8 +37,11 @@ from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.estimate import surface_deviation
 from torchgrasp.values.planning import ContactPlan, Contacts
 
-JUDGED_POINTS, GUIDING_POINTS = 8, 4  # points of the ring on which a plan is judged, and fewer that guide a solver
-INSIDE = 0.95  # share of the largest variation that guiding points allow: the judged points lie between them
+# points of the ring on which a plan is judged, and fewer that guide a solver
+JUDGED_POINTS = 8
+GUIDING_POINTS = 4
+# share of the largest variation that guiding points allow: the judged points lie between them
+INSIDE = 0.95
 
 
 def ring_directions(normals: Vectors, points: Vectors, n: int) -> Float[Tensor, "b f n 3"]:
@@ -45,11 +50,17 @@ def ring_directions(normals: Vectors, points: Vectors, n: int) -> Float[Tensor, 
 
 
 def normal_variation(
-    shape: ShapeLike, points: Vectors, normals: Vectors, radius: PerRow, among: Bool[Tensor, "b f"] | None = None
+    shape: ShapeLike,
+    points: Vectors,
+    normals: Vectors,
+    radius: PerRow,
+    among: Bool[Tensor, "b f"] | None = None,
 ) -> Float[Tensor, "b f"]:
-    """Return for each contact the largest angle [rad] between its normal and the normals on a ring around it.
+    """Return for each contact the largest angle [rad] between its normal and the normals on a ring
+    around it.
 
-    The ring has the given normalised `radius`. Contacts outside the mask `among` have infinite angles.
+    The ring has the given normalised `radius`. Contacts outside the mask `among` have infinite
+    angles.
     """
     variation = torch.full_like(points[..., 0], math.inf)
     among = torch.ones_like(variation, dtype=torch.bool) if among is None else among
@@ -68,10 +79,11 @@ def normal_variation(
 
 @dataclasses.dataclass(frozen=True)
 class FlatnessConstraint(Batch):
-    """A linear model, near the contact points `at`, of k constraint values that are <= 0 where the surface is flat.
+    """A linear model, near the contact points `at`, of k constraint values that are <= 0 where the
+    surface is flat.
 
-    `by_points` holds their derivatives by the 3 f coordinates of a contact set. To build this model costs as much as
-    several solver steps, so build it rarely.
+    `by_points` holds their derivatives by the 3 f coordinates of a contact set. To build this model
+    costs as much as several solver steps, so build it rarely.
     """
 
     value: Float[Tensor, "b k"]
@@ -79,31 +91,43 @@ class FlatnessConstraint(Batch):
     at: Vectors
 
     def values(self, points: Vectors) -> Float[Tensor, "b k"]:
-        """Return the constraint values at points near `at`, from the linear model; one row per contact set."""
+        """Return the constraint values at points near `at`, from the linear model; one row per
+        contact set.
+        """
         return self.value + (self.by_points @ (points - self.at).flatten(1)[..., None])[..., 0]
 
 
-def flatness_constraint(shape: ShapeLike, points: Vectors, flatness: float, radius: PerRow) -> FlatnessConstraint:
-    """Model by how much the normals around each contact differ from its normal beyond the angle `flatness` [rad].
+def flatness_constraint(
+    shape: ShapeLike, points: Vectors, flatness: float, radius: PerRow
+) -> FlatnessConstraint:
+    """Model by how much the normals around each contact differ from its normal beyond the angle
+    `flatness` [rad].
 
-    A value is |n - n_k|, for the normals n at a contact and n_k on a ring of normalised `radius` around it, less the
-    chord of the angle `flatness`. It is multiplied by the ring's radius, and so is a length.
+    A value is |n - n_k|, for the normals n at a contact and n_k on a ring of normalised `radius`
+    around it, less the chord of the angle `flatness`. It is multiplied by the ring's radius, and so
+    is a length.
     """
     (first, _), *others = walls_at(shape, points)
     found = _wall_constraint(first, points, flatness, radius)
     for wall, own in others:
-        other, own = _wall_constraint(wall, points, flatness, radius), own.repeat(1, GUIDING_POINTS)
+        other = _wall_constraint(wall, points, flatness, radius)
+        own = own.repeat(1, GUIDING_POINTS)
         slope = torch.where(own[..., None], other.by_points, found.by_points)
         found = FlatnessConstraint(torch.where(own, other.value, found.value), slope, points)
     return found
 
 
-def _wall_constraint(shape: ShapeLike, points: Vectors, flatness: float, radius: PerRow) -> FlatnessConstraint:
-    """Return the linear flatness constraint for contacts on one surface of the shape, such as a vessel's outer wall."""
+def _wall_constraint(
+    shape: ShapeLike, points: Vectors, flatness: float, radius: PerRow
+) -> FlatnessConstraint:
+    """Return the linear flatness constraint for contacts on one surface of the shape, such as a
+    vessel's outer wall.
+    """
     jet = triple_mean_jet(shape, points)
     identity = torch.eye(3, dtype=points.dtype, device=points.device)
     around = ring_directions(jet.normals, points, GUIDING_POINTS).transpose(1, 2)
-    normal, normal_jacobian = jet.normals[:, None], jet.normal_jacobian[:, None]
+    normal = jet.normals[:, None]
+    normal_jacobian = jet.normal_jacobian[:, None]
     ring = points[:, None] + spread(radius, around) * around  # (b, k, f, 3)
     # The ring turns with the normal at its centre.
     turned = around[..., None, :] @ normal_jacobian
@@ -115,7 +139,9 @@ def _wall_constraint(shape: ShapeLike, points: Vectors, flatness: float, radius:
     change = there.normal_jacobian.view(*ring.shape, 3) @ ring_by_point - normal_jacobian
     slope = (direction[..., None, :] @ change)[..., 0, :]
     own = torch.eye(points.shape[1], dtype=points.dtype, device=points.device)
-    by_points = torch.einsum("bkij,il->bkilj", spread(radius, slope) * slope, own).flatten(3).flatten(1, 2)
+    by_points = (
+        torch.einsum("bkij,il->bkilj", spread(radius, slope) * slope, own).flatten(3).flatten(1, 2)
+    )
     value = spread(radius, points[:, 0]) * (chord - 2 * math.sin(INSIDE * flatness / 2)).flatten(1)
     return FlatnessConstraint(value, by_points, points)
 
@@ -124,10 +150,14 @@ ON_SURFACE = 1e-6  # largest |f_d| of a contact on the surface, normalised: far 
 
 
 def check_feasibility(shape: ShapeLike, problem: ContactProblem, points: Vectors) -> ContactPlan:
-    """Check contact sets at normalised `points`; return them as a plan, with each set's first violated constraint."""
-    spec, scale = problem.spec, shape.scale
+    """Check contact sets at normalised `points`; return them as a plan, with each set's first
+    violated constraint.
+    """
+    spec = problem.spec
+    scale = shape.scale
     jet = triple_jet(shape, points)
-    normals, metres = jet.normals, shape.metres(points)
+    normals = jet.normals
+    metres = shape.metres(points)
     wrench = wrenches(points, normals, spec.planned_friction, spec.edges)
     finite = torch.isfinite(wrench).flatten(1).all(1)
     wrench = torch.where(finite[:, None, None, None], wrench, 0.0)
@@ -140,7 +170,8 @@ def check_feasibility(shape: ShapeLike, problem: ContactProblem, points: Vectors
     apart = torch.linalg.vector_norm(problem.sides(points, normals), dim=-1).amin(-1) * scale
     room = problem.room(points, normals)
     good = {
-        Status.OUT_OF_DOMAIN: torch.linalg.vector_norm(points, dim=-1).amax(-1) <= shape.domain_radius,
+        Status.OUT_OF_DOMAIN: torch.linalg.vector_norm(points, dim=-1).amax(-1)
+        <= shape.domain_radius,
         Status.OFF_SURFACE: (jet.distance.abs() <= ON_SURFACE).all(-1),
         Status.OUTSIDE: within(problem, points).all(-1),
         Status.TOO_UNCERTAIN: ((jet.variance >= 0) & (jet.variance < spec.max_variance)).all(-1),
@@ -149,28 +180,37 @@ def check_feasibility(shape: ShapeLike, problem: ContactProblem, points: Vectors
         Status.DEGENERATE: ~degenerate(points),
     }
     if spec.flatness is not None:
-        # A ring costs eight evaluations a contact, so it is measured only where nothing has failed before.
+        # A ring costs eight evaluations a contact, so it is measured only where nothing has failed
+        # before.
         rows = torch.nonzero(torch.stack(list(good.values())).all(0))[:, 0]
         ring = problem.rows(rows).ring
-        flat_rows = normal_variation(rows_of(shape, rows), points[rows], normals[rows], ring).amax(-1) <= spec.flatness
+        flat_rows = (
+            normal_variation(rows_of(shape, rows), points[rows], normals[rows], ring).amax(-1)
+            <= spec.flatness
+        )
         good[Status.NOT_FLAT] = torch.ones_like(closed).index_put((rows,), flat_rows)
     good[Status.NOT_CLOSED] = closed
     deviation = surface_deviation(jet.variance, jet.gradient)
     std_m = spread(shape.std_factor * scale, deviation) * deviation
-    contacts, phi = Contacts(metres, normals, jet.variance, std_m), coefficients.unflatten(1, wrench.shape[1:3])
+    contacts = Contacts(metres, normals, jet.variance, std_m)
+    phi = coefficients.unflatten(1, wrench.shape[1:3])
     quality = torch.linalg.vector_norm(points.mean(1), dim=-1) * scale
     return ContactPlan(contacts, phi, quality, first_violation(good))
 
 
 def within(problem: ContactProblem, points: Float[Tensor, "*b 3"]) -> Bool[Tensor, "*b"]:
-    """Return which normalised points lie in the region where contacts may be; at its border by more than rounding."""
+    """Return which normalised points lie in the region where contacts may be; at its border by more
+    than rounding.
+    """
     if problem.beyond is None:
         return torch.ones_like(points[..., 0], dtype=torch.bool)
     return (problem.beyond(points.flatten(0, -2)) < -1e-9).view(points.shape[:-1])
 
 
 def first_violation(good: dict[Status, Bool[Tensor, "b"]]) -> Int[Tensor, "b"]:
-    """Return the first status, in the dictionary's order, whose condition is false; OK if all are true."""
+    """Return the first status, in the dictionary's order, whose condition is false; OK if all are
+    true.
+    """
     met = torch.stack(list(good.values()))
     codes = torch.tensor([*good, Status.OK], device=met.device)
     return codes[torch.where(met.all(0), len(good), (~met).to(torch.uint8).argmax(0))]

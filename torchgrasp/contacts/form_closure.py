@@ -1,19 +1,22 @@
-"""Frictional form closure, Eq. (13) of the paper: its margin with linearised cones, and exact tests with round cones.
+"""Frictional form closure, Eq. (13) of the paper: its margin with linearised cones, and exact tests
+with round cones.
 
-**The margin.** W holds the m contact wrenches a_k, and a is their mean. The linear programme is: maximise s with
-W phi = 0, sum phi = 1, phi >= s. With c_k = m (a - a_k) its dual is: maximise a.v with c_k.v <= 1, in six unknowns v;
-then s = 1/m - a.v. The point v = 0 is feasible, so the simplex method needs no first phase. At the optimum six
-constraints are tight, and a = sum lambda_k c_k over these six with lambda >= 0. Then
+**The margin.** W holds the m contact wrenches a_k, and a is their mean. The linear programme is:
+maximise s with W phi = 0, sum phi = 1, phi >= s. With c_k = m (a - a_k) its dual is: maximise a.v
+with c_k.v <= 1, in six unknowns v; then s = 1/m - a.v. The point v = 0 is feasible, so the simplex
+method needs no first phase. At the optimum six constraints are tight, and a = sum lambda_k c_k over
+these six with lambda >= 0. Then
 
     phi_k = s + m lambda_k  balances with margin s;      w = v has  w . a_k >= -s  for all k.
 
-phi proves that the margin is at least s, and the witness w proves that it is at most s. If s <= 0, no contact can push
-against w.
+phi proves that the margin is at least s, and the witness w proves that it is at most s. If s <= 0,
+no contact can push against w.
 
-**Round cones.** Three balanced forces are coplanar, so a test in the plane of three contacts decides. Four or five
-contacts are decided by proofs. A positive balance of some cone edges proves closure. A wrench that no force of a round
-cone opposes disproves closure. A linear programme over some edges finds a balance, or a wrench that no edge opposes. In
-the second case the forces that oppose the wrench most become further edges.
+**Round cones.** Three balanced forces are coplanar, so a test in the plane of three contacts
+decides. Four or five contacts are decided by proofs. A positive balance of some cone edges proves
+closure. A wrench that no force of a round cone opposes disproves closure. A linear programme over
+some edges finds a balance, or a wrench that no edge opposes. In the second case the forces that
+oppose the wrench most become further edges.
 """
 
 import math
@@ -28,13 +31,25 @@ from torchgrasp.geometry.linalg import unit
 
 Vectors = Float[Tensor, "b f 3"]  # points or normals of the contacts in every row
 Guess = Float[Tensor, "b m"] | None  # coefficients of the first wrenches of each cone
-BALANCED = 1e-9  # largest |W phi| of balanced coefficients: above rounding in float64, far below any wrench (about 1)
-MIN_MARGIN = 1e-6  # least positive coefficient: far above the certificate's errors, far below 1 / (f e)
-MIN_RANK_RATIO = 1e-3  # least singular value of the wrenches over the largest: contacts on a line have 0
-PIVOTS = 100  # most pivots of one grasp: six reach a vertex, and with 24 wrenches fewer than 30 more reach the optimum
+# largest |W phi| of balanced coefficients: above rounding in float64, far below any wrench (about
+# 1)
+BALANCED = 1e-9
+MIN_MARGIN = (
+    1e-6  # least positive coefficient: far above the certificate's errors, far below 1 / (f e)
+)
+MIN_RANK_RATIO = (
+    1e-3  # least singular value of the wrenches over the largest: contacts on a line have 0
+)
+# most pivots of one grasp: six reach a vertex, and with 24 wrenches fewer than 30 more reach the
+# optimum
+PIVOTS = 100
 OPTIMAL = 1e-12  # multipliers below this are zero: the objective grows no further
-ARTIFICIAL_GAIN = 1e3  # added to the gain of the artificial rows, far above any multiplier: they leave first
-BLOCKING = 1e-11  # a bound approached more slowly than this, for each unit of the step, is parallel to it
+ARTIFICIAL_GAIN = (
+    1e3  # added to the gain of the artificial rows, far above any multiplier: they leave first
+)
+BLOCKING = (
+    1e-11  # a bound approached more slowly than this, for each unit of the step, is parallel to it
+)
 GRASPS_PER_CHUNK = 2048  # grasps at a time: their tableaux stay in the cache
 PARALLEL = 1e-9  # planar wrenches (of length about 1) with a shorter cross product are parallel
 FIRST_EDGES = 4  # edges of a cone in the first programme
@@ -42,21 +57,28 @@ ROUNDS = 12  # most programmes: more make hardly a verdict sharper
 
 
 def centre_and_radius(points: Vectors) -> tuple[Float[Tensor, "b 1 3"], Float[Tensor, "b 1 1"]]:
-    """Return the centroid and root-mean-square radius of each contact set; the radius is 1 if it would be 0."""
+    """Return the centroid and root-mean-square radius of each contact set; the radius is 1 if it
+    would be 0.
+    """
     centre = points.mean(-2, keepdim=True)
-    radius = torch.linalg.vector_norm(points - centre, dim=(-2, -1), keepdim=True) / math.sqrt(points.shape[-2])
+    radius = torch.linalg.vector_norm(points - centre, dim=(-2, -1), keepdim=True) / math.sqrt(
+        points.shape[-2]
+    )
     return centre, torch.where(radius == 0, 1.0, radius)
 
 
 def tangents(points: Vectors, normals: Vectors) -> Vectors:
     """Return a unit tangent at each contact, along which the first edge of its friction cone leans.
 
-    The tangent rotates with the object. It lies in the plane of three contacts; of four or five contacts, the three are
-    taken whose plane is the most perpendicular to the tangent plane, weighted by area. The tangent is arbitrary where
-    no plane gives one and friction cannot give closure.
+    The tangent rotates with the object. It lies in the plane of three contacts; of four or five
+    contacts, the three are taken whose plane is the most perpendicular to the tangent plane,
+    weighted by area. The tangent is arbitrary where no plane gives one and friction cannot give
+    closure.
     """
     first, second, third = subsets(points.shape[1], 3, points.device).unbind(1)
-    plane = torch.linalg.cross(points[:, second] - points[:, first], points[:, third] - points[:, first])  # (b, k, 3)
+    plane = torch.linalg.cross(
+        points[:, second] - points[:, first], points[:, third] - points[:, first]
+    )  # (b, k, 3)
     inside = torch.linalg.cross(plane[:, None], normals[:, :, None])  # (b, f, k, 3)
     length, best = torch.linalg.vector_norm(inside, dim=-1).max(-1, keepdim=True)
     inside = _take(inside, best)
@@ -81,17 +103,23 @@ def _take(vectors: Float[Tensor, "b f k 3"], index: Int[Tensor, "b f 1"]) -> Vec
 def cone_edges(
     normals: Float[Tensor, "*b 3"], tangent: Float[Tensor, "*b 3"], friction: float, edges: int
 ) -> Float[Tensor, "*b e 3"]:
-    """Return the edges of linearised friction cones: forces of normal component 1; the first leans along `tangent`."""
+    """Return the edges of linearised friction cones: forces of normal component 1; the first leans
+    along `tangent`.
+    """
     angle = torch.arange(edges, dtype=normals.dtype, device=normals.device) * (2 * math.pi / edges)
     other = torch.linalg.cross(normals, tangent)
     lean = angle.cos()[:, None] * tangent[..., None, :] + angle.sin()[:, None] * other[..., None, :]
     return friction * lean - normals[..., None, :]
 
 
-def wrenches(points: Vectors, normals: Vectors, friction: float, edges: int = 8) -> Float[Tensor, "b f e 6"]:
-    """Return the wrench (force, then torque) of each edge of all linearised friction cones: w in Eq. (13) of the paper.
+def wrenches(
+    points: Vectors, normals: Vectors, friction: float, edges: int = 8
+) -> Float[Tensor, "b f e 6"]:
+    """Return the wrench (force, then torque) of each edge of all linearised friction cones: w in
+    Eq. (13) of the paper.
 
-    The torque is about the contacts' centroid, and lengths are divided by the contacts' root-mean-square radius.
+    The torque is about the contacts' centroid, and lengths are divided by the contacts'
+    root-mean-square radius.
     """
     force = cone_edges(normals, tangents(points, normals), friction, edges)
     centre, radius = centre_and_radius(points)
@@ -100,23 +128,30 @@ def wrenches(points: Vectors, normals: Vectors, friction: float, edges: int = 8)
 
 
 def rank_ratio(wrench: Float[Tensor, "b f e 6"]) -> Float[Tensor, "b"]:
-    """Return each grasp's ratio of the smallest to the largest singular value of its wrench matrix (6 x f e)."""
+    """Return each grasp's ratio of the smallest to the largest singular value of its wrench matrix
+    (6 x f e).
+    """
     values = torch.linalg.svdvals(wrench.flatten(1, 2))
     return values[:, -1] / values[:, 0]
 
 
-def solve_closure_lp(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b m"], Float[Tensor, "b 6"]]:
-    """Return for each grasp the coefficients phi that balance its m wrenches with the greatest margin, and a witness.
+def solve_closure_lp(
+    wrench: Float[Tensor, "b m 6"],
+) -> tuple[Float[Tensor, "b m"], Float[Tensor, "b 6"]]:
+    """Return for each grasp the coefficients phi that balance its m wrenches with the greatest
+    margin, and a witness.
 
-    The margin is the smallest coefficient. The witness, a unit wrench, proves that no margin is greater. If no
-    coefficients balance the wrenches, the witness proves that instead, and phi has no meaning. Rounding or too few
-    pivots may spoil both: check them.
+    The margin is the smallest coefficient. The witness, a unit wrench, proves that no margin is
+    greater. If no coefficients balance the wrenches, the witness proves that instead, and phi has
+    no meaning. Rounding or too few pivots may spoil both: check them.
     """
     return in_chunks(_solve, wrench, at_once(wrench, GRASPS_PER_CHUNK))  # pyright: ignore[reportReturnType]
 
 
 def _solve(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b m"], Float[Tensor, "b 6"]]:
-    """Return the result of `solve_closure_lp`, from the dual programme in the six unknowns of a wrench."""
+    """Return the result of `solve_closure_lp`, from the dual programme in the six unknowns of a
+    wrench.
+    """
     b, m, _ = wrench.shape
     mean = wrench.mean(1)
     found, index, multiplier = maximise(mean, m * (mean[:, None] - wrench))
@@ -128,10 +163,12 @@ def _solve(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b m"], Float[
 def maximise(
     objective: Float[Tensor, "b d"], bounds: Float[Tensor, "b m d"]
 ) -> tuple[Float[Tensor, "b d"], Int[Tensor, "b d"], Float[Tensor, "b d"]]:
-    """Maximise a.v with c_k.v <= 1 for all k, for objectives a and m bounds c of each row, by the simplex method.
+    """Maximise a.v with c_k.v <= 1 for all k, for objectives a and m bounds c of each row, by the
+    simplex method.
 
-    Return the best v, or a direction in which a.v grows for ever; the d tight bounds; and their multipliers. All
-    programmes run at once, until all are optimal. The point v = 0 is feasible, so there is no first phase.
+    Return the best v, or a direction in which a.v grows for ever; the d tight bounds; and their
+    multipliers. All programmes run at once, until all are optimal. The point v = 0 is feasible, so
+    there is no first phase.
     """
     b, m, d = bounds.shape
     row = torch.arange(b, device=bounds.device)
@@ -141,13 +178,18 @@ def maximise(
     slack = bounds.new_ones(b, m)
     ray = bounds.new_zeros(b, d)
     running = torch.ones_like(row, dtype=torch.bool)
-    every = 1 if bounds.device.type == "cpu" else 16  # pivots between two looks at whether any programme goes on
+    every = (
+        1 if bounds.device.type == "cpu" else 16
+    )  # pivots between two looks at whether any programme goes on
     for k in range(PIVOTS):
         multiplier = (objective[:, None] @ inverse)[:, 0]
         artificial = tight < 0
-        # Leave along the edge on which the objective grows fastest; the multiplier of a bound may not be negative.
+        # Leave along the edge on which the objective grows fastest; the multiplier of a bound may
+        # not be negative.
         gain = torch.where(artificial, multiplier.abs(), -multiplier)
-        most, leaving = torch.where(artificial & (gain > OPTIMAL), gain + ARTIFICIAL_GAIN, gain).max(1)
+        most, leaving = torch.where(
+            artificial & (gain > OPTIMAL), gain + ARTIFICIAL_GAIN, gain
+        ).max(1)
         running = running & (most > OPTIMAL)
         if k % every == 0 and not bool(running.any()):
             break
@@ -156,7 +198,9 @@ def maximise(
         step = sign[:, None] * edge
         rate = (bounds @ step[:, :, None])[:, :, 0]
         blocking = rate > BLOCKING * torch.linalg.vector_norm(step, dim=1, keepdim=True)
-        blocking.scatter_(1, tight.clamp(min=0), blocking.gather(1, tight.clamp(min=0)) & artificial)
+        blocking.scatter_(
+            1, tight.clamp(min=0), blocking.gather(1, tight.clamp(min=0)) & artificial
+        )
         length, entering = torch.where(blocking, slack / rate, torch.inf).min(1)
         unbounded = running & torch.isinf(length)
         ray = torch.where(unbounded[:, None], step, ray)
@@ -174,15 +218,20 @@ def maximise(
     artificial = tight < 0
     index = tight.clamp(min=0)
     identity = torch.eye(d, dtype=bounds.dtype, device=bounds.device)
-    basis = torch.where(artificial[:, :, None], identity, bounds.gather(1, index[:, :, None].expand(b, d, d)))
+    basis = torch.where(
+        artificial[:, :, None], identity, bounds.gather(1, index[:, :, None].expand(b, d, d))
+    )
     vertex, _ = torch.linalg.solve_ex(basis, (~artificial).to(bounds))
     multiplier, _ = torch.linalg.solve_ex(basis.mT, objective)
     multiplier = torch.where(artificial, 0.0, multiplier)
     return torch.where((ray != 0).any(1, keepdim=True), ray, vertex), index, multiplier
 
 
-def closed_exact(points: Vectors, normals: Vectors, friction: float, guess: Guess = None) -> Bool[Tensor, "b"]:
-    """Return a mask of the contact sets with frictional form closure under round cones; borderline sets are not closed.
+def closed_exact(
+    points: Vectors, normals: Vectors, friction: float, guess: Guess = None
+) -> Bool[Tensor, "b"]:
+    """Return a mask of the contact sets with frictional form closure under round cones; borderline
+    sets are not closed.
 
     `guess` holds wrench coefficients from `first_balance` for similar contacts, which save time.
     """
@@ -192,25 +241,32 @@ def closed_exact(points: Vectors, normals: Vectors, friction: float, guess: Gues
 
 
 def first_balance(points: Vectors, normals: Vectors, friction: float) -> Float[Tensor, "b m"]:
-    """Return coefficients that balance wrenches of few cone edges with the greatest margin; arbitrary if none do."""
+    """Return coefficients that balance wrenches of few cone edges with the greatest margin;
+    arbitrary if none do.
+    """
     return solve_closure_lp(wrenches(points, normals, friction, FIRST_EDGES).flatten(1, 2))[0]
 
 
 def _closed_in_plane(points: Vectors, normals: Vectors, friction: float) -> Bool[Tensor, "b"]:
-    """Return which sets of three contacts have force closure: balanced forces lie in the plane of the contacts.
+    """Return which sets of three contacts have force closure: balanced forces lie in the plane of
+    the contacts.
 
-    Each friction cone cuts an angle from the plane. The six planar wrenches along the sides of these angles must
-    positively span all planar wrenches: no plane through two of the wrenches has the others on one side.
+    Each friction cone cuts an angle from the plane. The six planar wrenches along the sides of
+    these angles must positively span all planar wrenches: no plane through two of the wrenches has
+    the others on one side.
     """
     centre, radius = centre_and_radius(points)
     arm = (points - centre) / radius
     across = unit(torch.linalg.cross(arm[:, 1] - arm[:, 0], arm[:, 2] - arm[:, 0]))
     along = unit(arm[:, 1] - arm[:, 0])
     basis = torch.stack([along, torch.linalg.cross(across, along)], -1)  # (b, 3, 2)
-    inward, position = -normals @ basis, arm @ basis
+    inward = -normals @ basis
+    position = arm @ basis
     projected = torch.linalg.vector_norm(inward, dim=-1)
     cone = math.cos(math.atan(friction))
-    rows = torch.nonzero((projected > cone).all(-1))[:, 0]  # the others have a cone that the plane does not cut
+    rows = torch.nonzero((projected > cone).all(-1))[
+        :, 0
+    ]  # the others have a cone that the plane does not cut
     closed = torch.zeros(len(points), dtype=torch.bool, device=points.device)
     closed[rows] = _spans_plane(inward[rows], position[rows], torch.arccos(cone / projected[rows]))
     return closed
@@ -221,12 +277,16 @@ def _spans_plane(
 ) -> Bool[Tensor, "b"]:
     """Return which sets of three planar cones positively span all planar wrenches.
 
-    A cone has its apex at a `position`, and its axis along `inward`, with an angle `half` [rad] between axis and sides.
+    A cone has its apex at a `position`, and its axis along `inward`, with an angle `half` [rad]
+    between axis and sides.
     """
     middle = torch.atan2(inward[..., 1], inward[..., 0])
     angle = torch.stack([middle - half, middle + half], -1)  # (b, 3, 2)
-    c, s = angle.cos(), angle.sin()
-    planar = torch.stack([c, s, position[..., 0, None] * s - position[..., 1, None] * c], -1).flatten(1, 2)
+    c = angle.cos()
+    s = angle.sin()
+    planar = torch.stack(
+        [c, s, position[..., 0, None] * s - position[..., 1, None] * c], -1
+    ).flatten(1, 2)
     first, second = subsets(6, 2, inward.device).unbind(-1)
     plane = torch.linalg.cross(planar[:, first], planar[:, second])  # (b, 15, 3)
     side = plane @ planar.mT  # (b, 15, 6)
@@ -235,8 +295,12 @@ def _spans_plane(
     return (both | ~spans).all(-1) & spans.any(-1)
 
 
-def _closed_by_proof(points: Vectors, normals: Vectors, friction: float, guess: Guess) -> Bool[Tensor, "b"]:
-    """Return which sets of four or five contacts have force closure; cones get edges until each verdict is proven."""
+def _closed_by_proof(
+    points: Vectors, normals: Vectors, friction: float, guess: Guess
+) -> Bool[Tensor, "b"]:
+    """Return which sets of four or five contacts have force closure; cones get edges until each
+    verdict is proven.
+    """
     closed = torch.zeros(len(points), dtype=torch.bool, device=points.device)
     if friction == 0:  # forces along normals may balance, but only seven or more span all wrenches
         return closed
@@ -249,7 +313,8 @@ def _closed_by_proof(points: Vectors, normals: Vectors, friction: float, guess: 
         dual = torch.cholesky_solve((phi[:, None] @ wrench).mT, factor)
         proven = _balances(wrench, phi - (weighted @ dual)[..., 0])
         closed[rows[proven]] = True
-        rows, wrench = rows[~proven], wrench[~proven]
+        rows = rows[~proven]
+        wrench = wrench[~proven]
     for _ in range(ROUNDS):
         phi, witness = solve_closure_lp(wrench)
         proven = _balances(wrench, phi)
@@ -258,21 +323,26 @@ def _closed_by_proof(points: Vectors, normals: Vectors, friction: float, guess: 
         left = torch.nonzero(~proven & (least.amin(-1) < -BALANCED))[:, 0]
         if len(left) == 0:
             break
-        rows, wrench = rows[left], torch.cat([wrench[left], opposing[left]], 1)
+        rows = rows[left]
+        wrench = torch.cat([wrench[left], opposing[left]], 1)
     return closed
 
 
 def _balances(wrench: Float[Tensor, "b m 6"], phi: Float[Tensor, "b m"]) -> Bool[Tensor, "b"]:
-    """Return for each contact set whether the coefficients `phi` are positive and sum its wrenches to zero."""
+    """Return for each contact set whether the coefficients `phi` are positive and sum its wrenches
+    to zero.
+    """
     return ((phi[:, None] @ wrench)[:, 0].abs().amax(-1) <= BALANCED) & (phi.amin(-1) > BALANCED)
 
 
 def most_opposing(
     points: Vectors, normals: Vectors, friction: float, witness: Float[Tensor, "b 6"]
 ) -> tuple[Float[Tensor, "b f"], Float[Tensor, "b f 6"]]:
-    """Return the least product of the witness with a wrench in each contact's round friction cone, and that wrench.
+    """Return the least product of the witness with a wrench in each contact's round friction cone,
+    and that wrench.
 
-    A witness is a wrench that disproves force closure: its products with all contact wrenches are at least 0.
+    A witness is a wrench that disproves force closure: its products with all contact wrenches are
+        at least 0.
     """
     centre, radius = centre_and_radius(points)
     arm = (points - centre) / radius
@@ -282,4 +352,6 @@ def most_opposing(
     sideways = motion - along * normals
     length = torch.linalg.vector_norm(sideways, dim=-1, keepdim=True)
     push = -normals - friction * sideways / torch.where(length == 0, 1.0, length)
-    return -(along + friction * length)[..., 0], torch.cat([push, torch.linalg.cross(arm, push)], -1)
+    return -(along + friction * length)[..., 0], torch.cat(
+        [push, torch.linalg.cross(arm, push)], -1
+    )

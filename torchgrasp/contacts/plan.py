@@ -1,4 +1,6 @@
-"""The contact planner: solves Eqs. (10)-(14) on an uncertain shape, from many initial guesses at once."""
+"""The contact planner: solves Eqs. (10)-(14) on an uncertain shape, from many initial guesses at
+once.
+"""
 
 import time
 from collections.abc import Iterator
@@ -11,7 +13,13 @@ from torchgrasp.contacts.feasibility import check_feasibility
 from torchgrasp.contacts.form_closure import Vectors
 from torchgrasp.contacts.problem import ContactProblem, ShapeLike, rows_of
 from torchgrasp.contacts.solver import FINISH, Stage, descend, project, start_state
-from torchgrasp.contacts.starts import check_starts, drawn_starts, given_starts, settle_flatness, start_chunks
+from torchgrasp.contacts.starts import (
+    check_starts,
+    drawn_starts,
+    given_starts,
+    settle_flatness,
+    start_chunks,
+)
 from torchgrasp.foundation.base import join, pick, put
 from torchgrasp.foundation.checks import Count, Positive, Seed, checked
 from torchgrasp.foundation.errors import Status
@@ -20,9 +28,14 @@ from torchgrasp.values.planning import ContactPlan
 from torchgrasp.values.specs import ContactSpec
 
 SEARCH = (Stage(3.0, 0.3, 10), Stage(1.0, 3.0, 6)) * 4 + (Stage(0.3, 0.3, 8), Stage(0.3, 3.0, 8))
-"""Stages from any initial guess: weights of centre and cones, steps. Each kind goes on where the other is stuck."""
-TO_CENTRE = (Stage(0.3, 3.0, 8, exact=False),)  # from candidates, most of which are feasible but for rounding
-LEAST_STARTS = 25  # fewest starts at a time under a time budget: with less, the overhead of each step outweighs them
+"""Stages from any initial guess: weights of centre and cones, steps. Each kind goes on where the
+other is stuck.
+"""
+TO_CENTRE = (
+    Stage(0.3, 3.0, 8, exact=False),
+)  # from candidates, most of which are feasible but for rounding
+# fewest starts at a time under a time budget: with less, the overhead of each step outweighs them
+LEAST_STARTS = 25
 
 
 @checked
@@ -35,19 +48,19 @@ def plan_contacts(
     *,
     time_budget: Positive | None = None,
 ) -> ContactPlan:
-    """Plan contact sets, Eqs. (10)-(14) of the paper: `spec.fingertips` contacts for each initial guess, in order.
+    """Plan contact sets, Eqs. (10)-(14) of the paper: `spec.fingertips` contacts for each initial
+    guess, in order.
 
-    A failed set carries the `Status` of the first constraint that it violates. If the solver fails from a feasible
-    initial guess, the guess itself is the result. Without `time_budget` the result is deterministic, and the sets from
-    500 or 1000 initial guesses are the first sets of a plan from more. Raises `BadArgument` for `starts` that are not
-    positive, of a wrong shape, or outside the shape's domain, or another wrong argument.
+    A failed set carries the `Status` of the first constraint that it violates. If the solver fails
+    from a feasible initial guess, the guess itself is the result. Without `time_budget` the result
+    is deterministic, and the sets from 500 or 1000 initial guesses are the first sets of a plan
+    from more. Raises `BadArgument` for `starts` that are not positive, of a wrong shape, or outside
+    the shape's domain, or another wrong argument.
 
-    Args:
-        shape: a `ShapeGP`, or another implicit surface with the same methods.
-        spec: the constraints on contacts; `ContactSpec()` by default.
-        starts: number of random initial guesses (Sec. 6.2), or the initial contact points [m].
-        seed: random seed.
-        time_budget: wall time [s] of the call, in which at least 25 starts are planned; by default all are planned.
+    Args: shape: a `ShapeGP`, or another implicit surface with the same methods. spec: the
+        constraints on contacts; `ContactSpec()` by default. starts: number of random initial
+        guesses (Sec. 6.2), or the initial contact points [m]. seed: random seed. time_budget: wall
+        time [s] of the call, in which at least 25 starts are planned; by default all are planned.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> plan = plan_contacts(fit_shape(load_object("jug").view), ContactSpec.paper(), starts=8)
@@ -58,9 +71,11 @@ def plan_contacts(
     check_starts(shape, spec, starts)
     settled = settle_flatness(shape, spec, seed)
     if isinstance(starts, Tensor):
-        stages, firsts = SEARCH, given_starts(shape, starts)
+        stages = SEARCH
+        firsts = given_starts(shape, starts)
     else:
-        stages, firsts = stages_for(settled.spec), drawn_starts(shape, settled, start_chunks(starts), seed)
+        stages = stages_for(settled.spec)
+        firsts = drawn_starts(shape, settled, start_chunks(starts), seed)
     if time_budget is not None:
         firsts = _within(time_budget, firsts)
     problem = ContactProblem.of(shape, settled.spec)
@@ -68,13 +83,19 @@ def plan_contacts(
 
 
 def stages_for(spec: ContactSpec) -> tuple[Stage, ...]:
-    """Return the solver stages for random initial guesses; they depend on whether contacts must be flat."""
+    """Return the solver stages for random initial guesses; they depend on whether contacts must be
+    flat.
+    """
     return SEARCH if spec.flatness is None else TO_CENTRE
 
 
 def _within(seconds: float, firsts: Iterator[Vectors]) -> Iterator[Vectors]:
-    """Yield as many initial guesses as can be planned in the given time, judged by the speed so far."""
-    began, done, fits = time.monotonic(), 0, LEAST_STARTS
+    """Yield as many initial guesses as can be planned in the given time, judged by the speed so
+    far.
+    """
+    began = time.monotonic()
+    done = 0
+    fits = LEAST_STARTS
     for first in firsts:
         while len(first) > 0:
             if done:
@@ -83,10 +104,13 @@ def _within(seconds: float, firsts: Iterator[Vectors]) -> Iterator[Vectors]:
             if fits < LEAST_STARTS:
                 return
             yield first[:fits]
-            done, first = done + len(first[:fits]), first[fits:]
+            done = done + len(first[:fits])
+            first = first[fits:]
 
 
-def plan_chunk(shape: ShapeLike, problem: ContactProblem, first: Vectors, stages: tuple[Stage, ...]) -> ContactPlan:
+def plan_chunk(
+    shape: ShapeLike, problem: ContactProblem, first: Vectors, stages: tuple[Stage, ...]
+) -> ContactPlan:
     """Return the contact plan from initial guesses on the surface, in normalised units."""
     state = start_state(shape, first)
     for stage in (*stages, FINISH):

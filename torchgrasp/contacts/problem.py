@@ -1,10 +1,11 @@
 """The contact planning problem, Eqs. (10)-(14) of the paper, for a batch of contact sets.
 
-Unknowns x of a contact set are its f normalised points (f, 3) and a tension for each of the p pairs of points. Eq. (11)
-defines the normals. Eq. (13) asks for balanced forces in the friction cones. Three forces balance if and only if each
-force is the sum of the pulls along the two sides at its contact [1]. At four or five contacts, pulls between all pairs
-balance too, and give every balance unless the contacts lie in one plane. So W phi = 0 in Eq. (13) holds for all
-tensions, and one inequality for each friction cone is left. Every inequality has the form: value <= 0.
+Unknowns x of a contact set are its f normalised points (f, 3) and a tension for each of the p pairs
+of points. Eq. (11) defines the normals. Eq. (13) asks for balanced forces in the friction cones.
+Three forces balance if and only if each force is the sum of the pulls along the two sides at its
+contact [1]. At four or five contacts, pulls between all pairs balance too, and give every balance
+unless the contacts lie in one plane. So W phi = 0 in Eq. (13) holds for all tensions, and one
+inequality for each friction cone is left. Every inequality has the form: value <= 0.
 
 [1] Yoshikawa and Nagai, IEEE Trans. Robotics and Automation 7, 1991.
 """
@@ -25,9 +26,15 @@ from torchgrasp.shape.batch import ShapeBatch
 from torchgrasp.shape.estimate import MeanJet, SurfaceJet
 from torchgrasp.values.specs import ContactSpec
 
-INSIDE = 0.99  # inequalities are solved to this share of their bound: the last steps onto the surface stay inside it
-CONE_MARGIN = 0.02  # the cosine between force and inward normal exceeds that of the cone by this much
-LEAST_SIDE = 0.05  # least distance of two tip centres, normalised: wrenches of coincident tips lack rank
+# inequalities are solved to this share of their bound: the last steps onto the surface stay inside
+# it
+INSIDE = 0.99
+CONE_MARGIN = (
+    0.02  # the cosine between force and inward normal exceeds that of the cone by this much
+)
+LEAST_SIDE = (
+    0.05  # least distance of two tip centres, normalised: wrenches of coincident tips lack rank
+)
 
 
 PerRow = float | Float[Tensor, "b"]
@@ -38,9 +45,9 @@ PerRow = float | Float[Tensor, "b"]
 class ShapeLike(Protocol):
     """The interface of a shape with uncertainty: a `ShapeGP`, or another implicit surface.
 
-    `scale` [m] is the length of one normalised unit, `domain_radius` (normalised) the radius in which the shape is
-    known, and `std_factor` multiplies standard deviations. `jet` gives signed distance, variance and derivatives.
-    A `ShapeBatch` has these numbers for each row.
+    `scale` [m] is the length of one normalised unit, `domain_radius` (normalised) the radius in
+    which the shape is known, and `std_factor` multiplies standard deviations. `jet` gives signed
+    distance, variance and derivatives. A `ShapeBatch` has these numbers for each row.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> shape = fit_shape(load_object("jug").view)
@@ -55,7 +62,9 @@ class ShapeLike(Protocol):
     @property
     def std_factor(self) -> PerRow: ...  # noqa: D102
     def jet(self, x: Float[Tensor, "q 3"]) -> SurfaceJet: ...  # noqa: D102
-    def mean_and_gradient(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q"], Float[Tensor, "q 3"]]: ...  # noqa: D102
+    def mean_and_gradient(  # noqa: D102
+        self, x: Float[Tensor, "q 3"]
+    ) -> tuple[Float[Tensor, "q"], Float[Tensor, "q 3"]]: ...
     def normalise(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]: ...  # noqa: D102
     def metres(self, x: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]: ...  # noqa: D102
 
@@ -74,16 +83,20 @@ def rows_of(shape: AnyShape, rows: Int[Tensor, "k"]) -> AnyShape:
 
 
 def walls_of(shape: AnyShape) -> tuple[AnyShape, ...]:
-    """Return the surfaces of a shape as shapes: the outer and inner wall of an open vessel, else the shape itself."""
+    """Return the surfaces of a shape as shapes: the outer and inner wall of an open vessel, else
+    the shape itself.
+    """
     return getattr(shape, "walls", (shape,))
 
 
 def walls_at(shape: AnyShape, points: Vectors) -> list[tuple[AnyShape, Bool[Tensor, "b f"]]]:
-    """Return each surface (wall) of a shape, together with a mask (b, f) of the contacts that lie on it."""
+    """Return each surface (wall) of a shape, together with a mask (b, f) of the contacts that lie
+    on it.
+    """
     walls = walls_of(shape)
     if len(walls) == 1:
         return [(walls[0], torch.ones(points.shape[:2], dtype=torch.bool, device=points.device))]
-    owner = getattr(shape, "wall_at")(points.flatten(0, 1))  # noqa: B009 a shape of one wall need not have it
+    owner = getattr(shape, "wall_at")(points.flatten(0, 1))  # noqa: B009
     return list(zip(walls, owner.unflatten(0, points.shape[:2]).unbind(-1), strict=True))
 
 
@@ -93,39 +106,53 @@ def triple_jet(shape: ShapeLike, points: Vectors) -> SurfaceJet:
 
 
 def triple_mean_jet(shape: ShapeLike, points: Vectors) -> MeanJet:
-    """Return the mean signed distance and its derivatives at all contacts; the variance is not computed if possible."""
+    """Return the mean signed distance and its derivatives at all contacts; the variance is not
+    computed if possible.
+    """
     jet = getattr(shape, "mean_jet", shape.jet)(points.flatten(0, 1))
-    return MeanJet(*(x.unflatten(0, points.shape[:2]) for x in (jet.distance, jet.gradient, jet.hessian)))
+    return MeanJet(
+        *(x.unflatten(0, points.shape[:2]) for x in (jet.distance, jet.gradient, jet.hessian))
+    )
 
 
 @functools.cache
 def contact_pairs(fingertips: int, device: torch.device) -> Int[Tensor, "2 p"]:
     """Return the indices of all p pairs of contacts: neighbours (i, i + 1) first, then (i, i + 2)."""
-    order = [(i, (i + gap) % fingertips) for gap in range(1, fingertips // 2 + 1) for i in range(fingertips)]
+    order = [
+        (i, (i + gap) % fingertips)
+        for gap in range(1, fingertips // 2 + 1)
+        for i in range(fingertips)
+    ]
     return torch.tensor(order[: fingertips * (fingertips - 1) // 2], device=device).T
 
 
 @functools.cache
 def pull_signs(fingertips: int, device: torch.device) -> Float[Tensor, "f p"]:
-    """Return for contact i and pair k: 1 if the contact is the first of the pair, -1 if it is the second, else 0."""
+    """Return for contact i and pair k: 1 if the contact is the first of the pair, -1 if it is the
+    second, else 0.
+    """
     pairs = contact_pairs(fingertips, device)
     at = torch.arange(fingertips, device=device)[:, None]
     return (at == pairs[0]).double() - (at == pairs[1]).double()
 
 
 def split_unknowns(x: Float[Tensor, "b u"]) -> tuple[Vectors, Float[Tensor, "b p"]]:
-    """Split each vector of u unknowns into f contact points (f, 3) and the tensions of all p pairs of contacts."""
+    """Split each vector of u unknowns into f contact points (f, 3) and the tensions of all p pairs
+    of contacts.
+    """
     fingertips = (math.isqrt(25 + 8 * x.shape[1]) - 5) // 2
     return x[:, : 3 * fingertips].unflatten(1, (fingertips, 3)), x[:, 3 * fingertips :]
 
 
 @dataclasses.dataclass(frozen=True)
 class Constraints(Batch):
-    """Values of all constraints, and their Jacobians by the u unknowns: point coordinates, then tensions.
+    """Values of all constraints, and their Jacobians by the u unknowns: point coordinates, then
+    tensions.
 
-    `centre` is the centroid of the f contacts, and `surface` their signed distances from the surface; both should be 0.
-    `bounds` should be <= 0. It holds f friction cones, f variances, f domain limits, p distances between fingertips,
-    with a table f heights, and with a region f distances from it.
+    `centre` is the centroid of the f contacts, and `surface` their signed distances from the
+    surface; both should be 0. `bounds` should be <= 0. It holds f friction cones, f variances, f
+    domain limits, p distances between fingertips, with a table f heights, and with a region f
+    distances from it.
     """
 
     centre: Float[Tensor, "b 3"]
@@ -146,24 +173,34 @@ class Constraints(Batch):
         return torch.cat([self.centre_by_x, self.surface_by_x, self.bounds_by_x], 1)
 
 
-def forces_from_tensions(points: Vectors, tension: Float[Tensor, "b p"]) -> tuple[Vectors, Float[Tensor, "b p 3"]]:
-    """Return the forces at the contacts, and the vector of each pair; a pair pulls by tension times vector."""
+def forces_from_tensions(
+    points: Vectors, tension: Float[Tensor, "b p"]
+) -> tuple[Vectors, Float[Tensor, "b p 3"]]:
+    """Return the forces at the contacts, and the vector of each pair; a pair pulls by tension times
+    vector.
+    """
     first, second = contact_pairs(points.shape[1], points.device)
     sides = points[:, second] - points[:, first]
-    return pull_signs(points.shape[1], points.device).to(points) @ (tension[..., None] * sides), sides
+    return pull_signs(points.shape[1], points.device).to(points) @ (
+        tension[..., None] * sides
+    ), sides
 
 
-Bounds = tuple[Float[Tensor, "b k"], Float[Tensor, "b k u"]]  # values that should be <= 0, with Jacobian
+Bounds = tuple[
+    Float[Tensor, "b k"], Float[Tensor, "b k u"]
+]  # values that should be <= 0, with Jacobian
 
 
 @dataclasses.dataclass(frozen=True)
 class ContactProblem:
-    """The contact planning problem, Eqs. (10)-(14) of the paper, in the normalised units of one shape, or of each row.
+    """The contact planning problem, Eqs. (10)-(14) of the paper, in the normalised units of one
+    shape, or of each row.
 
-    `friction` is the coefficient of the largest round cone inside the friction cone with flat sides that `certify`
-    uses. `separation` is the least distance of two fingertip centres, `ring` the radius within which the surface is
-    flat. The table has the normal `up` and the distance `floor` from the origin. `beyond` returns the signed distance
-    of normalised points from the region where contacts may be.
+    `friction` is the coefficient of the largest round cone inside the friction cone with flat sides
+    that `certify` uses. `separation` is the least distance of two fingertip centres, `ring` the
+    radius within which the surface is flat. The table has the normal `up` and the distance `floor`
+    from the origin. `beyond` returns the signed distance of normalised points from the region where
+    contacts may be.
     """
 
     spec: ContactSpec
@@ -177,22 +214,47 @@ class ContactProblem:
     beyond: Callable[[Tensor], Tensor] | None = None
 
     @classmethod
-    def of(cls, shape: ShapeLike, spec: ContactSpec, ring_radius: PerRow | None = None) -> "ContactProblem":
-        """Return the problem of a shape and a contact specification; `ring_radius` [m] is by default the spec's."""
-        table, up, floor = spec.plane, None, 0.0
-        scale, radius = (x if isinstance(x, Tensor) else float(x) for x in (shape.scale, shape.domain_radius))
+    def of(
+        cls, shape: ShapeLike, spec: ContactSpec, ring_radius: PerRow | None = None
+    ) -> "ContactProblem":
+        """Return the problem of a shape and a contact specification; `ring_radius` [m] is by
+        default the spec's.
+        """
+        table = spec.plane
+        up = None
+        floor = 0.0
+        scale, radius = (
+            x if isinstance(x, Tensor) else float(x) for x in (shape.scale, shape.domain_radius)
+        )
         if table is not None:
-            up, foot = table.normal.to(device_of(shape)), table.offset * table.normal
+            up = table.normal.to(device_of(shape))
+            foot = table.offset * table.normal
             if isinstance(scale, Tensor):
                 floor = shape.normalise(foot.to(scale).expand(len(scale), 3)) @ up
             else:
                 floor = float(shape.normalise(foot) @ table.normal)
         separation = spec.least_separation / scale
-        separation = separation.clamp_min(LEAST_SIDE) if isinstance(separation, Tensor) else max(separation, LEAST_SIDE)
+        separation = (
+            separation.clamp_min(LEAST_SIDE)
+            if isinstance(separation, Tensor)
+            else max(separation, LEAST_SIDE)
+        )
         ring = (spec.ring_radius if ring_radius is None else ring_radius) / scale
         friction = spec.planned_friction * math.cos(math.pi / spec.edges)
-        beyond = None if (region := spec.region) is None else lambda x: region(shape.metres(x)) / scale
-        return cls(spec, friction, radius, separation, spec.fingertip_radius / scale, ring, up, floor, beyond)
+        beyond = (
+            None if (region := spec.region) is None else lambda x: region(shape.metres(x)) / scale
+        )
+        return cls(
+            spec,
+            friction,
+            radius,
+            separation,
+            spec.fingertip_radius / scale,
+            ring,
+            up,
+            floor,
+            beyond,
+        )
 
     def rows(self, index: Int[Tensor, "k"]) -> "ContactProblem":
         """Return the problems of some of the rows."""
@@ -200,35 +262,59 @@ class ContactProblem:
         own = {name: x[index] for name in names if isinstance(x := getattr(self, name), Tensor)}
         return dataclasses.replace(self, **own) if own else self
 
-    def room(self, points: Float[Tensor, "*b 3"], normals: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return how high (normalised) each contact is above the height at which its round tip touches the table."""
+    def room(
+        self, points: Float[Tensor, "*b 3"], normals: Float[Tensor, "*b 3"]
+    ) -> Float[Tensor, "*b"]:
+        """Return how high (normalised) each contact is above the height at which its round tip
+        touches the table.
+        """
         if self.up is None:
             return torch.full_like(points[..., 0], math.inf)
         up = self.up.to(points)
-        height, slant = points @ up, 1 - normals @ up
+        height = points @ up
+        slant = 1 - normals @ up
         return height - spread(self.floor, height) - spread(self.tip_radius, slant) * slant
 
-    def sides(self, points: Float[Tensor, "*b f 3"], normals: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b p 3"]:
-        """Return the vectors (normalised) from the first to the second fingertip centre of each pair of contacts."""
+    def sides(
+        self, points: Float[Tensor, "*b f 3"], normals: Float[Tensor, "*b f 3"]
+    ) -> Float[Tensor, "*b p 3"]:
+        """Return the vectors (normalised) from the first to the second fingertip centre of each
+        pair of contacts.
+        """
         centres = points + spread(self.tip_radius, normals) * normals
         first, second = contact_pairs(points.shape[-2], points.device)
         return centres[..., second, :] - centres[..., first, :]
 
-    def constraints(self, points: Vectors, tension: Float[Tensor, "b p"], jet: SurfaceJet) -> Constraints:
-        """Evaluate all constraints and their Jacobians; `jet` holds signed distance and variance at the points."""
+    def constraints(
+        self, points: Vectors, tension: Float[Tensor, "b p"], jet: SurfaceJet
+    ) -> Constraints:
+        """Evaluate all constraints and their Jacobians; `jet` holds signed distance and variance at
+        the points.
+        """
         b, f = points.shape[:2]
         unknowns = 3 * f + tension.shape[1]
         own = functools.partial(_by_own_point, unknowns=unknowns)
         identity = torch.eye(3, dtype=points.dtype, device=points.device)
-        threshold, ball = self.spec.max_variance * INSIDE, self.domain_radius * INSIDE
+        threshold = self.spec.max_variance * INSIDE
+        ball = self.domain_radius * INSIDE
         edge = spread(ball, tension)
-        half_slope = 2 * threshold**0.5  # slope of the variance at the threshold, for a linear standard deviation
-        centre_by_point = identity + spread(self.tip_radius, jet.normal_jacobian) * jet.normal_jacobian
+        half_slope = (
+            2 * threshold**0.5
+        )  # slope of the variance at the threshold, for a linear standard deviation
+        centre_by_point = (
+            identity + spread(self.tip_radius, jet.normal_jacobian) * jet.normal_jacobian
+        )
         cones, cones_by_x = self._cones(points, tension, jet)
         distances, distances_by_x = self._distances(points, jet.normals, centre_by_point)
-        beyond, beyond_by_x = ((points * points).sum(-1) - edge**2) / (2 * edge), own(points / spread(ball, points))
+        beyond = ((points * points).sum(-1) - edge**2) / (2 * edge)
+        beyond_by_x = own(points / spread(ball, points))
         values = [cones, (jet.variance - threshold) / half_slope, beyond, distances]
-        jacobians = [cones_by_x, own(jet.variance_gradient / half_slope), beyond_by_x, distances_by_x]
+        jacobians = [
+            cones_by_x,
+            own(jet.variance_gradient / half_slope),
+            beyond_by_x,
+            distances_by_x,
+        ]
         if self.up is not None:
             up = self.up.to(points)
             values.append((1 - INSIDE) * 0.1 - self.room(points, jet.normals))
@@ -237,20 +323,28 @@ class ContactProblem:
             value, slope = self._outside(points)
             values.append((1 - INSIDE) * 0.1 + value)
             jacobians.append(own(slope))
-        centre_by_x = torch.cat([identity.repeat(1, f) / f, identity.new_zeros(3, tension.shape[1])], 1)
+        centre_by_x = torch.cat(
+            [identity.repeat(1, f) / f, identity.new_zeros(3, tension.shape[1])], 1
+        )
         slopes = centre_by_x.expand(b, 3, unknowns), own(jet.gradient), torch.cat(jacobians, 1)
         return Constraints(points.mean(1), jet.distance, torch.cat(values, 1), *slopes)
 
     def _outside(self, points: Vectors) -> tuple[Float[Tensor, "b f"], Vectors]:
-        """Return the distance (normalised) of contacts from where they may be, and its central differences."""
+        """Return the distance (normalised) of contacts from where they may be, and its central
+        differences.
+        """
         assert self.beyond is not None
         step = 1e-4  # far below any region, far above rounding
         sides = step * torch.cat([torch.eye(3), -torch.eye(3), torch.zeros(1, 3)]).to(points)
         found = self.beyond((points[:, :, None] + sides).flatten(0, 2)).view(*points.shape[:2], 7)
         return found[..., 6], (found[..., :3] - found[..., 3:6]) / (2 * step)
 
-    def _distances(self, points: Vectors, normals: Vectors, centre_by_point: Float[Tensor, "b f 3 3"]) -> Bounds:
-        """Return by how much each pair of fingertip centres is too close (negative if far enough), with derivatives."""
+    def _distances(
+        self, points: Vectors, normals: Vectors, centre_by_point: Float[Tensor, "b f 3 3"]
+    ) -> Bounds:
+        """Return by how much each pair of fingertip centres is too close (negative if far enough),
+        with derivatives.
+        """
         sides = self.sides(points, normals)
         length = torch.linalg.vector_norm(sides, dim=-1)
         along = (sides / length[..., None])[..., None, :]
@@ -260,22 +354,32 @@ class ContactProblem:
         blocks[:, pair, first] = (along @ centre_by_point[:, first])[..., 0, :]
         blocks[:, pair, second] = -(along @ centre_by_point[:, second])[..., 0, :]
         by_tension = points.new_zeros(len(points), len(pair), len(pair))
-        return spread(self.separation / INSIDE, length) - length, torch.cat([blocks.flatten(2), by_tension], 2)
+        return spread(self.separation / INSIDE, length) - length, torch.cat(
+            [blocks.flatten(2), by_tension], 2
+        )
 
     def _cones(self, points: Vectors, tension: Float[Tensor, "b p"], jet: SurfaceJet) -> Bounds:
-        """Return by how much each force is outside its friction cone, as a difference of cosines, with derivatives."""
-        # With u = f / |f| the bound is n.u + cosine. It changes by (1 - u u^T) n / |f| with f, and by u with n.
-        normals, at = jet.normals, torch.arange(points.shape[1], device=points.device)
+        """Return by how much each force is outside its friction cone, as a difference of cosines,
+        with derivatives.
+        """
+        # With u = f / |f| the bound is n.u + cosine. It changes by (1 - u u^T) n / |f| with f, and
+        # by u with n.
+        normals = jet.normals
+        at = torch.arange(points.shape[1], device=points.device)
         force, sides = forces_from_tensions(points, tension)
         size = torch.linalg.vector_norm(force, dim=-1, keepdim=True)
         direction = force / size
         outward = (normals * direction).sum(-1, keepdim=True)
         by_force = (normals - outward * direction) / size
         steep = torch.linalg.vector_norm(jet.gradient, dim=-1, keepdim=True)
-        across = (direction - outward * normals) / steep  # (1 - n n^T) u / |g|, which the Hessian carries to the point
+        across = (
+            direction - outward * normals
+        ) / steep  # (1 - n n^T) u / |g|, which the Hessian carries to the point
         by_point = (across[..., None, :] @ jet.hessian)[..., 0, :]
         first, second = contact_pairs(len(at), points.device)
-        between = tension.new_zeros(len(points), len(at), len(at))  # the tension between two contacts
+        between = tension.new_zeros(
+            len(points), len(at), len(at)
+        )  # the tension between two contacts
         between[:, first, second] = between[:, second, first] = tension
         blocks = between[..., None] * by_force[:, :, None]
         blocks[:, at, at] = by_point - between.sum(2, keepdim=True) * by_force
@@ -286,8 +390,11 @@ class ContactProblem:
 
 
 def _by_own_point(slope: Vectors, unknowns: int) -> Float[Tensor, "b f u"]:
-    """Return the Jacobian by all unknowns of f values, each of which depends (by `slope`) only on its own contact."""
+    """Return the Jacobian by all unknowns of f values, each of which depends (by `slope`) only on
+    its own contact.
+    """
     b, f = slope.shape[:2]
-    jacobian, at = slope.new_zeros(b, f, unknowns), torch.arange(f, device=slope.device)
+    jacobian = slope.new_zeros(b, f, unknowns)
+    at = torch.arange(f, device=slope.device)
     jacobian[:, :, : 3 * f].unflatten(2, (f, 3))[:, at, at] = slope
     return jacobian

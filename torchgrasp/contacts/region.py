@@ -1,4 +1,6 @@
-"""Regions of space that contacts must keep to, or avoid: boxes, meshes, masks of an image, or any signed distance."""
+"""Regions of space that contacts must keep to, or avoid: boxes, meshes, masks of an image, or any
+signed distance.
+"""
 
 import dataclasses
 import functools
@@ -28,7 +30,8 @@ Distance = Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n"]]
 @checked
 @dataclasses.dataclass(frozen=True)
 class Region(Value):
-    """A region of space in the frame of the cloud; `distance` is any function of points (n, 3) in float64.
+    """A region of space in the frame of the cloud; `distance` is any function of points (n, 3) in
+    float64.
 
     Errors call the function by the `name`.
 
@@ -43,42 +46,71 @@ class Region(Value):
 
     @checked
     def __call__(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return the signed distance [m] of points, negative inside; raise `BadArgument` if it is no finite number."""
+        """Return the signed distance [m] of points, negative inside; raise `BadArgument` if it is
+        no finite number.
+        """
         flat = points.detach().double().reshape(-1, 3)
         found = self.distance(flat)
-        if not (isinstance(found, Tensor) and found.shape == flat.shape[:1] and bool(torch.isfinite(found).all())):
-            raise BadArgument(self.name, f"{show(found)} for {len(flat)} points", "a tensor of one finite number each")
+        if not (
+            isinstance(found, Tensor)
+            and found.shape == flat.shape[:1]
+            and bool(torch.isfinite(found).all())
+        ):
+            raise BadArgument(
+                self.name,
+                f"{show(found)} for {len(flat)} points",
+                "a tensor of one finite number each",
+            )
         return found.to(points).reshape(points.shape[:-1])
 
     @classmethod
     @checked
-    def box(cls, low: Float[Tensor, "3"], high: Float[Tensor, "3"], obj_from_box: Pose | None = None) -> "Region":
-        """Return the box between two corners [m], along the axes of the cloud, or of a frame `obj_from_box`."""
+    def box(
+        cls, low: Float[Tensor, "3"], high: Float[Tensor, "3"], obj_from_box: Pose | None = None
+    ) -> "Region":
+        """Return the box between two corners [m], along the axes of the cloud, or of a frame
+        `obj_from_box`.
+        """
         if not bool((low < high).all()):
-            raise BadArgument("low", f"{low.tolist()} beside high {high.tolist()}", "less than high on each axis")
-        middle, half = (low + high).double() / 2, (high - low).double() / 2
-        frame = torch.eye(4, dtype=torch.float64) if obj_from_box is None else inverse(obj_from_box.double())
+            raise BadArgument(
+                "low", f"{low.tolist()} beside high {high.tolist()}", "less than high on each axis"
+            )
+        middle = (low + high).double() / 2
+        half = (high - low).double() / 2
+        frame = (
+            torch.eye(4, dtype=torch.float64)
+            if obj_from_box is None
+            else inverse(obj_from_box.double())
+        )
 
         def distance(points: Tensor) -> Tensor:
             beyond = (apply(frame.to(points), points) - middle.to(points)).abs() - half.to(points)
-            return torch.linalg.vector_norm(beyond.clamp_min(0), dim=-1) + beyond.amax(-1).clamp_max(0)
+            return torch.linalg.vector_norm(beyond.clamp_min(0), dim=-1) + beyond.amax(
+                -1
+            ).clamp_max(0)
 
         return cls(distance)
 
     @classmethod
     @checked
     def mesh(cls, mesh: "trimesh.Trimesh | Path | str") -> "Region":
-        """Return the inside of a closed mesh [m], a file or given; raise the errors of a bad mesh (`MeshError`)."""
+        """Return the inside of a closed mesh [m], a file or given; raise the errors of a bad mesh
+        (`MeshError`).
+        """
         solid = read_mesh(mesh)
-        surface = surface_distance(torch.tensor(np.array(solid.vertices)), torch.tensor(np.array(solid.faces)))
+        surface = surface_distance(
+            torch.tensor(np.array(solid.vertices)), torch.tensor(np.array(solid.faces))
+        )
         return cls(lambda points: torch.from_numpy(surface(points.cpu().numpy())).to(points))
 
     @classmethod
     @checked
     def mask(cls, scene: Scene, mask: Bool[Tensor, "h w"]) -> "Region":
-        """Return what the pixels of a scene's image cover: the cone of their view rays, the seen and the unseen side.
+        """Return what the pixels of a scene's image cover: the cone of their view rays, the seen
+        and the unseen side.
 
-        So a contact behind a marked part of the object is inside, too. What is out of the image is outside.
+        So a contact behind a marked part of the object is inside, too. What is out of the image is
+        outside.
         """
         image = scene.image
         if mask.shape != image.depth.shape or not bool(mask.any()):
@@ -86,9 +118,13 @@ class Region(Value):
             raise BadArgument("mask", f"{int(mask.sum())} pixels of {tuple(mask.shape)}", wanted)
         inside = np.pad(mask.cpu().numpy(), 1)  # what lies beyond the border is outside
         outward, inward = (np.asarray(ndimage.distance_transform_edt(x)) for x in (~inside, inside))
-        pixels = np.where(inside, 0.5 - inward, outward - 0.5)  # from the middle of a pixel to a border
-        k, camera = image.intrinsics.double().cpu().numpy(), inverse(image.obj_from_camera.double()).cpu()
-        focal, middle = np.diag(k)[:2], k[:2, 2] + 1
+        pixels = np.where(
+            inside, 0.5 - inward, outward - 0.5
+        )  # from the middle of a pixel to a border
+        k = image.intrinsics.double().cpu().numpy()
+        camera = inverse(image.obj_from_camera.double()).cpu()
+        focal = np.diag(k)[:2]
+        middle = k[:2, 2] + 1
 
         def distance(points: Tensor) -> Tensor:
             seen = apply(camera, points.cpu()).numpy()
@@ -109,13 +145,27 @@ class Region(Value):
         return cls(lambda points: level - plane.height(points))
 
 
-def combine(keep: Distance | None, avoid: Distance | None, also: Distance | None = None) -> Distance | None:
+def combine(
+    keep: Distance | None, avoid: Distance | None, also: Distance | None = None
+) -> Distance | None:
     """Return the region inside `keep` and `also` and outside `avoid`; None if none is given."""
     named = ("keep", keep, 1), ("spec.region", also, 1), ("avoid", avoid, -1)
-    parts = [(Region(x.distance if isinstance(x, Region) else x, name), k) for name, x, k in named if x is not None]
-    return Region(lambda x: functools.reduce(torch.maximum, (k * part(x) for part, k in parts))) if parts else None
+    parts = [
+        (Region(x.distance if isinstance(x, Region) else x, name), k)
+        for name, x, k in named
+        if x is not None
+    ]
+    return (
+        Region(lambda x: functools.reduce(torch.maximum, (k * part(x) for part, k in parts)))
+        if parts
+        else None
+    )
 
 
 def seen_from(region: Distance | None, obj_from_frame: Float[Tensor, "4 4"]) -> Distance | None:
     """Return a region of the frame `obj` as a function of points in another frame."""
-    return None if region is None else lambda points: region(apply(obj_from_frame.to(points), points.reshape(-1, 3)))
+    return (
+        None
+        if region is None
+        else lambda points: region(apply(obj_from_frame.to(points), points.reshape(-1, 3)))
+    )

@@ -1,12 +1,14 @@
-"""The greatest multiple of a task's wrench that contacts resist, with a proof by linear programming duality.
+"""The greatest multiple of a task's wrench that contacts resist, with a proof by linear programming
+duality.
 
-A contact pushes with at most its strength b_i along the edges of its friction cone. K holds the wrenches of all such
-forces; -t is the wrench that balances the load t. The greatest s with -s t in K is the least value of
+A contact pushes with at most its strength b_i along the edges of its friction cone. K holds the
+wrenches of all such forces; -t is the wrench that balances the load t. The greatest s with -s t in
+K is the least value of
 
     sum_i b_i max(0, max_k y.w_ik)    among the twists y with y.t = -1,
 
-so each such y proves that s is no greater. The simplex method maximises -t.y, whose greatest value is 1/s, with
-z_i >= b_i y.w_ik, z_i >= 0 and sum_i z_i <= 1. It begins at y = 0, z_i = 1/(2f).
+so each such y proves that s is no greater. The simplex method maximises -t.y, whose greatest value
+is 1/s, with z_i >= b_i y.w_ik, z_i >= 0 and sum_i z_i <= 1. It begins at y = 0, z_i = 1/(2f).
 """
 
 from typing import NamedTuple
@@ -15,12 +17,21 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.contacts.form_closure import BALANCED, GRASPS_PER_CHUNK, Vectors, centre_and_radius, maximise, wrenches
+from torchgrasp.contacts.form_closure import (
+    BALANCED,
+    GRASPS_PER_CHUNK,
+    Vectors,
+    centre_and_radius,
+    maximise,
+    wrenches,
+)
 from torchgrasp.values.specs import ContactSpec
 
 
 class Resisted(NamedTuple):
-    """For each grasp the multiple s of its worst load t, t and y about the contacts' centroid, and forces for -s t."""
+    """For each grasp the multiple s of its worst load t, t and y about the contacts' centroid, and
+    forces for -s t.
+    """
 
     margin: Float[Tensor, "b"]
     load: Float[Tensor, "b 6"]
@@ -29,9 +40,14 @@ class Resisted(NamedTuple):
 
 
 def resist_loads(
-    points: Vectors, normals: Vectors, strength: Float[Tensor, "b f"], loads: Float[Tensor, "b w 6"], spec: ContactSpec
+    points: Vectors,
+    normals: Vectors,
+    strength: Float[Tensor, "b f"],
+    loads: Float[Tensor, "b w 6"],
+    spec: ContactSpec,
 ) -> Resisted:
-    """Return how much of the worst of w loads (force, then torque about the origin) contacts resist.
+    """Return how much of the worst of w loads (force, then torque about the origin) contacts
+    resist.
 
     `strength` is the greatest normal force [N] of each contact; cones are those of `certify`.
     """
@@ -39,7 +55,9 @@ def resist_loads(
     centre, radius = centre_and_radius(points)
     force, torque = loads.split(3, -1)
     about = torch.cat([force, torque - torch.linalg.cross(centre.expand_as(force), force)], -1)
-    unit = torch.cat([torch.ones_like(radius), radius], 1).repeat_interleave(3, 1).mT  # of wrenches in Eq. (13)
+    unit = (
+        torch.cat([torch.ones_like(radius), radius], 1).repeat_interleave(3, 1).mT
+    )  # of wrenches in Eq. (13)
     edge = strength[..., None, None] * wrenches(points, normals, spec.planned_friction, spec.edges)
     edge = torch.cat([edge, torch.zeros_like(edge[:, :, :1])], 2)  # the last is no push
     goal = (-about / unit).flatten(0, 1)
@@ -51,15 +69,27 @@ def resist_loads(
     return Resisted(margin[row], about.flatten(0, 1)[row], twist[row] / unit[:, 0], forces[row])
 
 
-def _solve(edge: Float[Tensor, "r f e 6"], goal: Float[Tensor, "r 6"]) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the greatest multiple of each wrench `goal` that forces along the edges make, with twist and forces."""
+def _solve(
+    edge: Float[Tensor, "r f e 6"], goal: Float[Tensor, "r 6"]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the greatest multiple of each wrench `goal` that forces along the edges make, with
+    twist and forces.
+    """
     r, f, e, _ = edge.shape
     own = torch.eye(f).to(edge)  # the unknowns are y and u_i = 2f z_i - 1
     above = torch.cat([2 * f * edge, -own[:, None].expand(r, f, e, f)], -1).flatten(1, 2)
     total = torch.cat([edge.new_zeros(6), edge.new_full((f,), 1 / f)]).expand(r, 1, -1)
-    found, tight, weight = maximise(torch.cat([goal, goal.new_zeros(r, f)], 1), torch.cat([above, total], 1))
+    found, tight, weight = maximise(
+        torch.cat([goal, goal.new_zeros(r, f)], 1), torch.cat([above, total], 1)
+    )
     share = goal.new_zeros(r, f * e + 1).scatter_add(1, tight, weight)[:, :-1].view(r, f, e, 1)
-    made, gauge, y = (2 * f * share * edge).sum(2), weight.sum(1), found[:, :6]
-    exact = ((made.sum(1) - goal).abs().amax(1) <= BALANCED) & (weight.amin(1) >= -BALANCED) & (gauge > 0)
+    made = (2 * f * share * edge).sum(2)
+    gauge = weight.sum(1)
+    y = found[:, :6]
+    exact = (
+        ((made.sum(1) - goal).abs().amax(1) <= BALANCED)
+        & (weight.amin(1) >= -BALANCED)
+        & (gauge > 0)
+    )
     margin = torch.where(exact, 1 / gauge, 0.0)
     return margin, y / (goal * y).sum(1, keepdim=True), made[..., :3] * margin[:, None, None]

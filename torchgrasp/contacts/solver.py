@@ -1,7 +1,7 @@
 """The solver of a `ContactProblem`: Levenberg-Marquardt steps along the surface.
 
-After every step one Newton step on the mean signed distance brings the points back to the surface. This projection
-costs a fraction of a full evaluation, and allows long steps.
+After every step one Newton step on the mean signed distance brings the points back to the surface.
+This projection costs a fraction of a full evaluation, and allows long steps.
 """
 
 import dataclasses
@@ -23,21 +23,36 @@ from torchgrasp.contacts.problem import (
     triple_mean_jet,
 )
 from torchgrasp.foundation.base import Batch
-from torchgrasp.geometry.optim import Damping, Linearisation, Minimisation, Step, Steps, Verdict, levenberg_marquardt
+from torchgrasp.geometry.optim import (
+    Damping,
+    Linearisation,
+    Minimisation,
+    Step,
+    Steps,
+    Verdict,
+    levenberg_marquardt,
+)
 from torchgrasp.shape.surface import newton_step
 
-LONGEST_STEP = 0.3  # a point moves at most this far in a step (normalised): there the surface is smooth
-TENSION_DAMPING = 0.1  # damping of the tensions relative to that of the points: tensions may change faster
-SURFACE = 10.0  # weight of the surface: a step off it would be undone by the projection, which the cones then resist
+LONGEST_STEP = (
+    0.3  # a point moves at most this far in a step (normalised): there the surface is smooth
+)
+TENSION_DAMPING = (
+    0.1  # damping of the tensions relative to that of the points: tensions may change faster
+)
+# weight of the surface: a step off it would be undone by the projection, which the cones then
+# resist
+SURFACE = 10.0
 BOUNDS = 3.0  # weight of all bounds but the cones, as great as that of the cones in the last stage
 
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
-    """A solver stage: at most `steps` steps, with weights for the offset from the `centre` and for friction `cones`.
+    """A solver stage: at most `steps` steps, with weights for the offset from the `centre` and for
+    friction `cones`.
 
-    A contact set stops when its step (normalised) is shorter than `settled`. Unless `exact`, the variance of the
-    surface is extrapolated linearly.
+    A contact set stops when its step (normalised) is shorter than `settled`. Unless `exact`, the
+    variance of the surface is extrapolated linearly.
     """
 
     centre: float
@@ -47,12 +62,16 @@ class Stage:
     exact: bool = True
 
 
-FINISH = Stage(centre=0.0, cones=3.0, steps=30, settled=1e-8, exact=False)  # the last stage, feasibility alone
+FINISH = Stage(
+    centre=0.0, cones=3.0, steps=30, settled=1e-8, exact=False
+)  # the last stage, feasibility alone
 
 
 @dataclasses.dataclass(frozen=True)
 class State(Batch):
-    """The solver's state: normalised contact points, the tension of each pair, and the shape's values at the points."""
+    """The solver's state: normalised contact points, the tension of each pair, and the shape's
+    values at the points.
+    """
 
     points: Vectors
     tension: Float[Tensor, "b p"]
@@ -61,7 +80,9 @@ class State(Batch):
 
 @dataclasses.dataclass(frozen=True)
 class LinearConstraints(Linearisation):
-    """The linearised constraints: weighted residuals, their weights, and the Jacobian without weights."""
+    """The linearised constraints: weighted residuals, their weights, and the Jacobian without
+    weights.
+    """
 
     residual: Float[Tensor, "a r"]
     weight: Float[Tensor, "a r"]
@@ -83,7 +104,9 @@ class Descent(Minimisation[State, LinearConstraints]):
     stage: Stage
 
     def linearise(self, state: State, rows: Int[Tensor, "a"]) -> LinearConstraints:
-        """Evaluate the constraints and their Jacobian at a state; satisfied inequalities have weight 0."""
+        """Evaluate the constraints and their Jacobian at a state; satisfied inequalities have
+        weight 0.
+        """
         problem = self.problem.rows(rows)
         constraints = problem.constraints(state.points, state.tension, state.jet)
         bounds = torch.full_like(constraints.bounds, BOUNDS)
@@ -97,7 +120,9 @@ class Descent(Minimisation[State, LinearConstraints]):
         return LinearConstraints(cost, residual, weight, constraints.jacobian, inside)
 
     def step(self, model: LinearConstraints, damping: Damping) -> Steps:
-        """Return each contact set's damped step (NaN for a singular matrix), and whether the step is long enough."""
+        """Return each contact set's damped step (NaN for a singular matrix), and whether the step
+        is long enough.
+        """
         jacobian = model.weighted_jacobian
         scale = jacobian.new_ones(1, jacobian.shape[2])
         split_unknowns(scale)[1][:] = TENSION_DAMPING
@@ -121,18 +146,27 @@ class Descent(Minimisation[State, LinearConstraints]):
         slope = state.jet.variance_gradient
         variance = state.jet.variance + (slope * (points - state.points)).sum(-1)
         mean = triple_mean_jet(shape, points)
-        return State(points, tension, SurfaceJet(**vars(mean), variance=variance, variance_gradient=slope))
+        return State(
+            points, tension, SurfaceJet(**vars(mean), variance=variance, variance_gradient=slope)
+        )
 
-    def judge(self, model: LinearConstraints, trial: LinearConstraints, x: Step, damping: Damping) -> Verdict:
-        """Return a mask of the steps that lower the cost inside the domain, and the next damping (Nielsen's rule)."""
+    def judge(
+        self, model: LinearConstraints, trial: LinearConstraints, x: Step, damping: Damping
+    ) -> Verdict:
+        """Return a mask of the steps that lower the cost inside the domain, and the next damping
+        (Nielsen's rule).
+        """
         kept = (model.cost - trial.cost) / promised_decrease(model, x)
         accepted = (kept > 0) & trial.inside  # NaN is not accepted
         eased = damping * (1 - (2 * kept - 1) ** 3).clamp(min=1 / 5, max=2.0)
         return accepted, torch.where(accepted, eased.clamp(min=1e-9), (4 * damping).clamp(max=1e9))
 
     def refuse(self, model: LinearConstraints, trial: LinearConstraints) -> LinearConstraints:
-        """Return the model after a rejected step; its Jacobian is the mean of the Jacobians at the step's two ends."""
-        # Near an observation a thin plate's normals change abruptly. The mean Jacobian points down along the kink.
+        """Return the model after a rejected step; its Jacobian is the mean of the Jacobians at the
+        step's two ends.
+        """
+        # Near an observation a thin plate's normals change abruptly. The mean Jacobian points down
+        # along the kink.
         return dataclasses.replace(model, jacobian=(model.jacobian + trial.jacobian) / 2)
 
 
@@ -148,7 +182,9 @@ def descend(shape: ShapeLike, problem: ContactProblem, state: State, stage: Stag
 
 
 def project(shape: ShapeLike, points: Float[Tensor, "b k 3"], steps: int) -> Float[Tensor, "b k 3"]:
-    """Move normalised points onto the surface, where the signed distance is 0, by Newton steps along the gradient."""
+    """Move normalised points onto the surface, where the signed distance is 0, by Newton steps
+    along the gradient.
+    """
     x = points.flatten(0, 1)
     for _ in range(steps):
         distance, gradient = shape.mean_and_gradient(x)
@@ -162,7 +198,8 @@ def start_state(shape: ShapeLike, points: Vectors) -> State:
 
 
 def equal_tensions(points: Vectors) -> Float[Tensor, "b p"]:
-    """Return equal tensions for all pairs of contacts; the force at each contact then points to the centroid.
+    """Return equal tensions for all pairs of contacts; the force at each contact then points to the
+    centroid.
 
     A pair of contacts pulls together with its tension times its distance.
     """

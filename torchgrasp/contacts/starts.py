@@ -1,4 +1,6 @@
-"""Initial guesses of the contact planner: on the paper's sphere, from candidate contacts, or given by the caller."""
+"""Initial guesses of the contact planner: on the paper's sphere, from candidate contacts, or given
+by the caller.
+"""
 
 import dataclasses
 from collections.abc import Iterable, Iterator
@@ -19,14 +21,23 @@ from torchgrasp.values.specs import FLAT_RADII, ContactSpec
 CANDIDATE_TRIPLES = 350  # triples of surface points among which candidates are found
 CANDIDATE_FLATNESS = 0.9  # share of the largest normal variation that a candidate may have
 FAR = 0.1  # a start farther than this from the surface (normalised) is no guess of contacts
-NEAR_CENTRE = 0.1  # normalised distance from the centre to which such a start is drawn in: the paper's radius of starts
-DRAWN_PER_START, ROUNDS = 20, 8  # rows drawn for each start in one round, and most rounds: few rows are closed
-ENOUGH_CLOSED, SURVEYED = 0.1, 250  # share of starts, and of how many, that must be closed: contacts can be so flat
-STARTS_PER_CHUNK = 500  # starts planned at once: memory is bounded, and a plan from fewer starts begins one from more
+# normalised distance from the centre to which such a start is drawn in: the paper's radius of
+# starts
+NEAR_CENTRE = 0.1
+# rows drawn for each start in one round, and most rounds: few rows are closed
+DRAWN_PER_START = 20
+ROUNDS = 8
+# share of starts, and of how many, that must be closed: contacts can be so flat
+ENOUGH_CLOSED = 0.1
+SURVEYED = 250
+# starts planned at once: memory is bounded, and a plan from fewer starts begins one from more
+STARTS_PER_CHUNK = 500
 
 
 def check_starts(shape: ShapeLike, spec: ContactSpec, starts: int | Tensor) -> None:
-    """Raise `BadArgument` for initial guesses with a wrong number of contacts, or outside the shape's domain."""
+    """Raise `BadArgument` for initial guesses with a wrong number of contacts, or outside the
+    shape's domain.
+    """
     if isinstance(starts, Tensor):
         if starts.ndim == 3 and starts.shape[1] != spec.fingertips:
             allowed = f"as many as spec.fingertips: {spec.fingertips}"
@@ -38,22 +49,30 @@ def check_starts(shape: ShapeLike, spec: ContactSpec, starts: int | Tensor) -> N
             allowed = f"at most {float(shape.domain_radius) * float(shape.scale):.4g} m, where the shape is known"
             raise BadArgument("starts", found, allowed)
     elif spec.start_radius > shape.domain_radius:
-        raise BadArgument("spec.start_radius", spec.start_radius, f"at most {float(shape.domain_radius):.4g}")
+        raise BadArgument(
+            "spec.start_radius", spec.start_radius, f"at most {float(shape.domain_radius):.4g}"
+        )
 
 
 def given_starts(shape: ShapeLike, starts: Vectors) -> Iterator[Float[Tensor, "_ f 3"]]:
-    """Yield chunks of the caller's initial contact points [m], moved onto the surface, in normalised units."""
+    """Yield chunks of the caller's initial contact points [m], moved onto the surface, in
+    normalised units.
+    """
     for points in starts.detach().to(device_of(shape), torch.float64).split(STARTS_PER_CHUNK):
         yield project(shape, draw_in(shape, shape.normalise(points)), steps=6)
 
 
 def start_chunks(starts: int) -> list[int]:
-    """Split a number of initial guesses into chunks that are planned at once; return the size of each chunk."""
+    """Split a number of initial guesses into chunks that are planned at once; return the size of
+    each chunk.
+    """
     return [min(STARTS_PER_CHUNK, starts - begin) for begin in range(0, starts, STARTS_PER_CHUNK)]
 
 
 class FlatCandidates(NamedTuple):
-    """A specification with a known `flat_radius`, and p candidate contacts on flat surface, with their normals."""
+    """A specification with a known `flat_radius`, and p candidate contacts on flat surface, with
+    their normals.
+    """
 
     spec: ContactSpec
     candidates: tuple[Points, Points] | None  # None: no flatness
@@ -64,12 +83,15 @@ def drawn_starts(
 ) -> Iterator[Float[Tensor, "_ f 3"]]:
     """Yield random initial guesses on the surface in normalised units, `sizes[k]` at a time.
 
-    Without `spec.flatness` the guesses are drawn as in the paper (Sec. 6.2). With flatness they are sets of candidate
-    contacts, because the centroid of contacts on flat surface may lie far from the object's centre.
+    Without `spec.flatness` the guesses are drawn as in the paper (Sec. 6.2). With flatness they are
+    sets of candidate contacts, because the centroid of contacts on flat surface may lie far from
+    the object's centre.
     """
     (spec, candidates), generator = settled, torch.Generator().manual_seed(seed)
     if candidates is not None:
-        draw(shape, spec, (CANDIDATE_TRIPLES, 3), generator)  # the rows are drawn after the candidates
+        draw(
+            shape, spec, (CANDIDATE_TRIPLES, 3), generator
+        )  # the rows are drawn after the candidates
     for count in sizes:
         if candidates is None:
             drawn = draw(shape, spec, (count, spec.fingertips), generator)
@@ -79,19 +101,26 @@ def drawn_starts(
 
 
 def settle_flatness(shape: ShapeLike, spec: ContactSpec, seed: int) -> FlatCandidates:
-    """Choose `flat_radius` if it is not given, as the largest with which enough guesses have force closure.
+    """Choose `flat_radius` if it is not given, as the largest with which enough guesses have force
+    closure.
 
-    The candidates are the points at which the surface is flat, or all points of `survey` if too few points are flat.
+    The candidates are the points at which the surface is flat, or all points of `survey` if too few
+    points are flat.
     """
     if spec.flatness is None:
         return FlatCandidates(spec, None)
-    problem, points = ContactProblem.of(shape, spec), survey(shape, spec, torch.Generator().manual_seed(seed))
+    problem = ContactProblem.of(shape, spec)
+    points = survey(shape, spec, torch.Generator().manual_seed(seed))
     good, normals = qualify(shape, spec, points)
-    settled, flat = spec, good
+    settled = spec
+    flat = good
     for radius in FLAT_RADII if spec.flat_radius is None else (spec.flat_radius,):
         settled = dataclasses.replace(spec, flat_radius=radius)
         ring = radius / float(shape.scale)
-        flat = normal_variation(shape, points, normals, ring, good) < CANDIDATE_FLATNESS * spec.flatness
+        flat = (
+            normal_variation(shape, points, normals, ring, good)
+            < CANDIDATE_FLATNESS * spec.flatness
+        )
         if int(flat.sum()) >= spec.fingertips and radius not in (spec.flat_radius, FLAT_RADII[-1]):
             generator = torch.Generator().manual_seed(seed)
             _, closed = candidate_rows(problem, points[flat], normals[flat], SURVEYED, generator)
@@ -105,24 +134,32 @@ def settle_flatness(shape: ShapeLike, spec: ContactSpec, seed: int) -> FlatCandi
 def draw(
     shape: ShapeLike, spec: ContactSpec, size: tuple[int, int], generator: torch.Generator
 ) -> Float[Tensor, "_ f 3"]:
-    """Return random points on the sphere of `spec.start_radius`, in normalised units; `size` is (sets, contacts)."""
+    """Return random points on the sphere of `spec.start_radius`, in normalised units; `size` is
+    (sets, contacts).
+    """
     points = unit(torch.randn(*size, 3, generator=generator, dtype=torch.float64, device="cpu"))
     return (spec.start_radius * points).to(device_of(shape))
 
 
-def survey(shape: ShapeLike, spec: ContactSpec, generator: torch.Generator) -> Float[Tensor, "_ f 3"]:
-    """Return points all over the surface, from which candidates are chosen; for a vessel, half are on each wall."""
+def survey(
+    shape: ShapeLike, spec: ContactSpec, generator: torch.Generator
+) -> Float[Tensor, "_ f 3"]:
+    """Return points all over the surface, from which candidates are chosen; for a vessel, half are
+    on each wall.
+    """
     walls = walls_of(shape)
     triples = CANDIDATE_TRIPLES * (1 if spec.region is None else 4)  # few of them lie in a region
     drawn = draw(shape, spec, (triples, 3), generator).tensor_split(len(walls))
-    return torch.cat([project(wall, points, steps=6) for wall, points in zip(walls, drawn, strict=True)])
+    return torch.cat(
+        [project(wall, points, steps=6) for wall, points in zip(walls, drawn, strict=True)]
+    )
 
 
 def draw_in(shape: ShapeLike, points: Vectors) -> Vectors:
     """Move initial guesses that are far from the surface close to the centroid of their contacts.
 
-    Points projected from near the centroid spread over the surface around it. Points from afar all end on the nearest
-    surface.
+    Points projected from near the centroid spread over the surface around it. Points from afar all
+    end on the nearest surface.
     """
     distance, _ = shape.mean_and_gradient(points.flatten(0, 1))
     far = distance.view(points.shape[:2]).abs().amax(-1) > FAR
@@ -132,12 +169,20 @@ def draw_in(shape: ShapeLike, points: Vectors) -> Vectors:
     return torch.where(far[:, None, None], drawn, points)
 
 
-def qualify(shape: ShapeLike, spec: ContactSpec, points: Vectors) -> tuple[Bool[Tensor, "b f"], Vectors]:
-    """Return a mask of usable points (on the surface, of low variance, in the domain, above table), and all normals."""
+def qualify(
+    shape: ShapeLike, spec: ContactSpec, points: Vectors
+) -> tuple[Bool[Tensor, "b f"], Vectors]:
+    """Return a mask of usable points (on the surface, of low variance, in the domain, above table),
+    and all normals.
+    """
     problem = ContactProblem.of(shape, spec)
-    distance, gradient = (x.unflatten(0, points.shape[:2]) for x in shape.mean_and_gradient(points.flatten(0, 1)))
+    distance, gradient = (
+        x.unflatten(0, points.shape[:2]) for x in shape.mean_and_gradient(points.flatten(0, 1))
+    )
     normals = unit(gradient)
-    good = (distance.abs() < 1e-4) & (torch.linalg.vector_norm(points, dim=-1) < problem.domain_radius)
+    good = (distance.abs() < 1e-4) & (
+        torch.linalg.vector_norm(points, dim=-1) < problem.domain_radius
+    )
     good &= (problem.room(points, normals) > 0) & within(problem, points)
     variance = shape.jet(points[good]).variance  # it costs more than all else
     good[good.clone()] = (variance >= 0) & (variance < spec.max_variance)
@@ -145,22 +190,39 @@ def qualify(shape: ShapeLike, spec: ContactSpec, points: Vectors) -> tuple[Bool[
 
 
 def candidate_rows(
-    problem: ContactProblem, points: Points, normals: Points, starts: int, generator: torch.Generator
+    problem: ContactProblem,
+    points: Points,
+    normals: Points,
+    starts: int,
+    generator: torch.Generator,
 ) -> tuple[Vectors, int]:
-    """Return random sets of candidate contacts, and how many of them have force closure and are well separated.
+    """Return random sets of candidate contacts, and how many of them have force closure and are
+    well separated.
 
     If too few of the drawn sets are such, the rest are any candidates.
     """
-    rows, missing, f = [], starts, problem.spec.fingertips
+    rows = []
+    missing = starts
+    f = problem.spec.fingertips
     drawn = DRAWN_PER_START * starts, f
     for _ in range(ROUNDS):
-        choice = torch.randint(len(points), drawn, generator=generator, device="cpu").to(points.device)
-        apart = torch.linalg.vector_norm(problem.sides(points[choice], normals[choice]), dim=-1).amin(-1)
+        choice = torch.randint(len(points), drawn, generator=generator, device="cpu").to(
+            points.device
+        )
+        apart = torch.linalg.vector_norm(
+            problem.sides(points[choice], normals[choice]), dim=-1
+        ).amin(-1)
         choice = choice[apart > problem.separation]
         closed = choice[closed_exact(points[choice], normals[choice], problem.friction)][:missing]
         rows.append(points[closed])
         missing -= len(closed)
         if missing == 0:
             break
-    rows.append(points[torch.randint(len(points), (missing, f), generator=generator, device="cpu").to(points.device)])
+    rows.append(
+        points[
+            torch.randint(len(points), (missing, f), generator=generator, device="cpu").to(
+                points.device
+            )
+        ]
+    )
     return torch.cat(rows), starts - missing

@@ -1,4 +1,6 @@
-"""The grasp controller: approach that stops at a touch, closing of the fingers, and hold. It needs no simulator."""
+"""The grasp controller: approach that stops at a touch, closing of the fingers, and hold. It needs
+no simulator.
+"""
 
 import dataclasses
 import functools
@@ -11,9 +13,20 @@ from torch import Tensor
 
 from torchgrasp.control.holding import ForceHold, GripHold, keep_targets
 from torchgrasp.control.object_pose import Touches
-from torchgrasp.control.paper.closings import Impedance, OpenLoopClosing, PaperClosing, PositionClosing
+from torchgrasp.control.paper.closings import (
+    Impedance,
+    OpenLoopClosing,
+    PaperClosing,
+    PositionClosing,
+)
 from torchgrasp.control.paper.stability import load_stability
-from torchgrasp.control.recovery import PRESSING_TIME, GraspCheck, GuardedApproach, Reopening, can_guard
+from torchgrasp.control.recovery import (
+    PRESSING_TIME,
+    GraspCheck,
+    GuardedApproach,
+    Reopening,
+    can_guard,
+)
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.relook import relocate
 from torchgrasp.control.tactile import STILL, Observation, Targets
@@ -28,34 +41,40 @@ from torchgrasp.values.planning import PointCloud
 from torchgrasp.values.specs import ClosingMode, HoldingMode, check_modes, default_holding
 
 Step = Callable[[Observation, float], Float[Tensor, " j"]]
-"""Function of an observation and the time [s] to the next tick, which returns the targets [rad] of all joints."""
+"""Function of an observation and the time [s] to the next tick, which returns the targets [rad] of
+all joints.
+"""
 Closing = OpenLoopClosing | PositionClosing | PaperClosing | UncertaintyClosing
 Period = Annotated[float, Range(1e-5, 1.0)]
-CLOSING_TIME = 4.0  # longest time [s] of closing before the hand presses with the contacts that it has
+CLOSING_TIME = (
+    4.0  # longest time [s] of closing before the hand presses with the contacts that it has
+)
 
 
 class GraspController:
-    """Close a hand and hold the object: each `step` takes an observation and returns `Targets`, all on the CPU.
+    """Close a hand and hold the object: each `step` takes an observation and returns `Targets`, all
+    on the CPU.
 
-    A closing controller brings the fingers to the object, then a hold controller presses. After `PRESSING_TIME` of
-    pressing, `closed` becomes true: the hand may be lifted, but `step` must still be called. If the plan includes the
-    table and the grasp seems too weak to lift the object, the hand opens, locates the object from its touches and
-    closes again; `attempts` counts the closings.
+    A closing controller brings the fingers to the object, then a hold controller presses. After
+    `PRESSING_TIME` of pressing, `closed` becomes true: the hand may be lifted, but `step` must
+    still be called. If the plan includes the table and the grasp seems too weak to lift the object,
+    the hand opens, locates the object from its touches and closes again; `attempts` counts the
+    closings.
 
-    With `approach` > 0 the opened hand starts away from its pre-grasp, the pose from which the fingers close. While
-    `approaching`, a robot arm must keep the hand at the distance `Targets.left` from the pre-grasp; `stops` counts the
-    stops at an unexpected touch. A new view of the object (`relook`) moves this path.
+    With `approach` > 0 the opened hand starts away from its pre-grasp, the pose from which the
+    fingers close. While `approaching`, a robot arm must keep the hand at the distance
+    `Targets.left` from the pre-grasp; `stops` counts the stops at an unexpected touch. A new view
+    of the object (`relook`) moves this path.
 
-    Args:
-        reference: the closing plan.
-        closing, holding, options: modes of closing and holding, and options of the closing, as in `TrialSpec`.
-            The holding None means "grip", or "force" where the closing or the sensor does not allow it.
-        approach: remaining length [m] of the approach; it is 0 if the hand is at its pre-grasp.
+    Args: reference: the closing plan. closing, holding, options: modes of closing and holding, and
+        options of the closing, as in `TrialSpec`. The holding None means "grip", or "force" where
+        the closing or the sensor does not allow it. approach: remaining length [m] of the approach;
+        it is 0 if the hand is at its pre-grasp.
 
-    Raises:
-        BadArgument: unknown modes; options or the holding "law" for a closing mode that does not allow them;
-            "impedance" for more than three fingertips; modes that need more than the sensor measures; an approach
-            whose options allow no stops, or whose plan lacks a table, a surface or tactile fingertips.
+    Raises: BadArgument: unknown modes; options or the holding "law" for a closing mode that does
+        not allow them; "impedance" for more than three fingertips; modes that need more than the
+        sensor measures; an approach whose options allow no stops, or whose plan lacks a table, a
+        surface or tactile fingertips.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp import ClosingReference
@@ -82,7 +101,9 @@ class GraspController:
         holding = holding or default_holding(reference.sensor, closing)
         check_modes(reference.sensor, closing, holding)
         if approach and not (self.options.stops and can_guard(reference)):
-            allowed = "0 without stops, or without a table, a surface and a direction in the reference"
+            allowed = (
+                "0 without stops, or without a table, a surface and a direction in the reference"
+            )
             raise BadArgument("approach", approach, allowed)
         self._make_hold = choose_holding(reference.hand, holding)
         self.mode: ClosingMode = closing
@@ -92,18 +113,31 @@ class GraspController:
 
     def _prepare(self, reference: ClosingReference, approach: float) -> None:
         """Begin with a plan: first its approach, if there is one, and then its closing."""
-        self.reference, self.attempts, self.stops, self.length = reference, 0, 0, approach
-        self.judges = self.options.attempts > 1 and reference.table is not None  # the grasp, before the lift
+        self.reference = reference
+        self.attempts = 0
+        self.stops = 0
+        self.length = approach
+        self.judges = (
+            self.options.attempts > 1 and reference.table is not None
+        )  # the grasp, before the lift
         self.felt: list[Touches] = []  # at each stop, and in each closing that is judged
-        self.guard = GuardedApproach(reference, self.options, approach, self.felt) if approach else None
+        self.guard = (
+            GuardedApproach(reference, self.options, approach, self.felt) if approach else None
+        )
         self._make_closing = functools.partial(make_closing, reference, self.mode, self.options)
         self._begin(self._make_closing())
-        self.targets = Targets(reference.expand(reference.pregrasp), self.path + reference.rise, approach)
+        self.targets = Targets(
+            reference.expand(reference.pregrasp), self.path + reference.rise, approach
+        )
 
     def _begin(self, closing: Closing) -> None:
         """Start a new attempt to close the hand, controlled by `closing`, and count it."""
-        self.closing, self.hold, self.check, self.reopening = closing, None, None, None
-        self.time, self.pressed = 0.0, 0.0
+        self.closing = closing
+        self.hold = None
+        self.check = None
+        self.reopening = None
+        self.time = 0.0
+        self.pressed = 0.0
         self.attempts += 1
 
     @property
@@ -120,14 +154,18 @@ class GraspController:
 
     @property
     def status(self) -> Status:
-        """`OK`, or `TOO_HEAVY` if the hold mode "grip" feels more load than the hand can hold: put the object down."""
+        """`OK`, or `TOO_HEAVY` if the hold mode "grip" feels more load than the hand can hold: put
+        the object down.
+        """
         return self.hold.status if isinstance(self.hold, GripHold) else Status.OK
 
     @property
     def blend(self) -> Float[Tensor, " f"]:
-        """Each finger's share of force control, from 0 to 1, at the last tick: lambda in Eq. (26) of the paper.
+        """Each finger's share of force control, from 0 to 1, at the last tick: lambda in Eq. (26)
+        of the paper.
 
-        The shares are NaN before the first tick, and at ticks at which the control law does not command the fingers.
+        The shares are NaN before the first tick, and at ticks at which the control law does not
+        command the fingers.
         """
         acts = self.hold is None and self.reopening is None and self.time > 0.0
         if acts and isinstance(self.closing, PaperClosing | UncertaintyClosing):
@@ -136,16 +174,19 @@ class GraspController:
 
     @checked
     def relook(self, cloud: PointCloud) -> None:
-        """Move the palm's path to where a new view shows the object; `targets.palm` is then where the path begins.
+        """Move the palm's path to where a new view shows the object; `targets.palm` is then where
+        the path begins.
 
         The palm does not rotate, so the contacts of a turned object are found by touch.
 
-        The `cloud` has points [m] of the object alone, in the frame of the grasp. Raises `BadArgument` if the hand has
-        no approach, or has begun it.
+        The `cloud` has points [m] of the object alone, in the frame of the grasp. Raises
+        `BadArgument` if the hand has no approach, or has begun it.
         """
         reference = self.planned
         if self.guard is None or self.guard.left < self.guard.length:
-            raise BadArgument("cloud", "a view of the object after the start of the approach", "one before it")
+            raise BadArgument(
+                "cloud", "a view of the object after the start of the approach", "one before it"
+            )
         assert reference.surface is not None and reference.table is not None
         moved = relocate(reference.surface, cloud, reference.table.moved(reference.obj_from_hand))
         in_hand = inverse(reference.obj_from_hand) @ moved @ reference.obj_from_hand
@@ -159,46 +200,63 @@ class GraspController:
     def step(self, observation: Observation, period: Period) -> Targets:
         """Return the targets of joints and palm for the next tick, which comes `period` [s] later.
 
-        In the tick in which the closing ends, the targets do not change: that tick computes the forces of holding.
-        Raises `BadArgument` for an observation of another hand or on a device other than the CPU, or a period out of
-        range.
+        In the tick in which the closing ends, the targets do not change: that tick computes the
+        forces of holding. Raises `BadArgument` for an observation of another hand or on a device
+        other than the CPU, or a period out of range.
         """
         shape = len(self.reference.normals), 3, len(self.targets.joints)
         found = tuple(observation.jacobian.shape)
         if found != shape or observation.tactile.reading.shape != shape[:1]:
-            raise BadArgument("observation", f"fingertips, 3 and joints {found}", f"those of the hand, {shape}")
-        check_device("observation", observation.joints.device, "the controller", self.targets.joints.device)
+            raise BadArgument(
+                "observation", f"fingertips, 3 and joints {found}", f"those of the hand, {shape}"
+            )
+        check_device(
+            "observation", observation.joints.device, "the controller", self.targets.joints.device
+        )
         if self.guard is not None:
             self.targets = self._approach(self.guard, observation, period)
         elif self.reopening is not None:
             self.targets = self._reopen(self.reopening, period)
         else:
-            self.targets = Targets(self._close_or_hold(observation, period), self.path + self.closing.palm)
+            self.targets = Targets(
+                self._close_or_hold(observation, period), self.path + self.closing.palm
+            )
             self._judge(observation)
         return self.targets
 
     def _approach(self, guard: GuardedApproach, observation: Observation, period: float) -> Targets:
-        """Return the targets during the approach; at its end, give the closing the object pose found by touch."""
+        """Return the targets during the approach; at its end, give the closing the object pose
+        found by touch.
+        """
         guard(observation, period)
         if guard.done:
-            self.guard, self.stops = None, self.stops + guard.stops
+            self.guard = None
+            self.stops = self.stops + guard.stops
             if (guard.stops or self.attempts > 1) and isinstance(self.closing, UncertaintyClosing):
                 self.closing.begin_at(guard.displacement, guard.palm)
         return Targets(self.targets.joints, self.path + guard.palm, guard.left)
 
     def _close_or_hold(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
-        """Return the joint targets of the closing controller, or of the hold controller once closing has ended."""
+        """Return the joint targets of the closing controller, or of the hold controller once
+        closing has ended.
+        """
         over = self.closing.done or self.time >= CLOSING_TIME
         if self.hold is not None:
             self.pressed += period
-            missed = isinstance(self.closing, UncertaintyClosing) and not bool(self.closing.touched.all())
+            missed = isinstance(self.closing, UncertaintyClosing) and not bool(
+                self.closing.touched.all()
+            )
             if missed and self.check is not None and not self.check.judged:
-                return self.targets.joints  # without a finger that opposes them, pressing ones push the object away
+                return (
+                    self.targets.joints
+                )  # without a finger that opposes them, pressing ones push the object away
             return self.hold(observation, period)
         if not over or isinstance(self.closing, OpenLoopClosing):
             if self.judges:
                 if self.time == 0.0:
-                    self.felt.append(Touches(self.reference, torch.zeros(0, 4, dtype=torch.float64)))
+                    self.felt.append(
+                        Touches(self.reference, torch.zeros(0, 4, dtype=torch.float64))
+                    )
                 self.felt[-1].add(observation, self.closing.palm)
             self.time += period
             return self.closing(observation, period)
@@ -221,26 +279,43 @@ class GraspController:
         self.check(observation, self.pressed)
         if self.check.judged and not self.check.secure:
             assert isinstance(self.closing, UncertaintyClosing)
-            reach, palm = 0.0 if self.length else self.options.palm_reach, self.closing.palm
+            reach = 0.0 if self.length else self.options.palm_reach
+            palm = self.closing.palm
             raised = bool(self.reference.rise.any())
-            begun = palm if bool(observation.tactile.contact.any()) and not raised else self.closing.begun
-            self.reopening = Reopening(self.reference, self.check.displacement, observation.joints, palm, begun, reach)
-            self.hold, self.check, self.pressed = None, None, 0.0
+            begun = (
+                palm
+                if bool(observation.tactile.contact.any()) and not raised
+                else self.closing.begun
+            )
+            self.reopening = Reopening(
+                self.reference, self.check.displacement, observation.joints, palm, begun, reach
+            )
+            self.hold = None
+            self.check = None
+            self.pressed = 0.0
 
     def _reopen(self, reopening: Reopening, period: float) -> Targets:
-        """Return the targets of the opening hand; once it is open, start the next approach or the next closing."""
+        """Return the targets of the opening hand; once it is open, start the next approach or the
+        next closing.
+        """
         targets = Targets(reopening(period), self.path + reopening.palm)
         if reopening.done:
             closing = self._make_closing()
             assert isinstance(closing, UncertaintyClosing)
             self._begin(closing.begin_at(reopening.displacement, reopening.palm))
             if self.length:
-                self.guard = GuardedApproach(self.reference, self.options, self.length, self.felt, reopening)
+                self.guard = GuardedApproach(
+                    self.reference, self.options, self.length, self.felt, reopening
+                )
         return targets
 
 
-def make_closing(reference: ClosingReference, mode: ClosingMode, options: ClosingOptions) -> Closing:
-    """Return the controller that closes the hand along the plan `reference`, for a closing mode such as "paper"."""
+def make_closing(
+    reference: ClosingReference, mode: ClosingMode, options: ClosingOptions
+) -> Closing:
+    """Return the controller that closes the hand along the plan `reference`, for a closing mode
+    such as "paper".
+    """
     match mode:
         case "open_loop":
             return OpenLoopClosing(reference)
@@ -259,7 +334,9 @@ def make_closing(reference: ClosingReference, mode: ClosingMode, options: Closin
 def choose_holding(
     hand: Hand, mode: HoldingMode
 ) -> Callable[[ClosingReference, Observation, Float[Tensor, " j"]], Step] | None:
-    """Return the function that makes a mode's hold controller; None if the closing controller goes on to hold."""
+    """Return the function that makes a mode's hold controller; None if the closing controller goes
+    on to hold.
+    """
     if mode == "impedance":
         hand.require_three("holding", "'impedance', whose virtual frame is of three,")
         return functools.partial(Impedance, stability=load_stability(hand))

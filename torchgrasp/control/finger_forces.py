@@ -1,4 +1,6 @@
-"""Desired forces of the fingers, and the joint targets that exert them with position-controlled drives."""
+"""Desired forces of the fingers, and the joint targets that exert them with position-controlled
+drives.
+"""
 
 from typing import NamedTuple
 
@@ -21,10 +23,12 @@ def desired_forces(
     strongest: float = 4.0,
     preferred: Float[Tensor, "*#b f"] | None = None,
 ) -> Float[Tensor, "*b f 3"]:
-    """Return balanced fingertip forces [N] on the object that need the least friction (`least_friction_forces`).
+    """Return balanced fingertip forces [N] on the object that need the least friction
+    (`least_friction_forces`).
 
-    The largest normal force is `strongest` [N]; `preferred` are wanted ratios of the normal forces. Where no balanced
-    forces press at every contact, each force is `strongest` along the inward normal.
+    The largest normal force is `strongest` [N]; `preferred` are wanted ratios of the normal forces.
+    Where no balanced forces press at every contact, each force is `strongest` along the inward
+    normal.
     """
     balanced = least_friction_forces(points, normals, strongest, preferred)
     return torch.where(torch.isfinite(balanced), balanced, -strongest * normals)
@@ -34,11 +38,15 @@ def contacts_in_hand(grasps: Grasps) -> tuple[Float[Tensor, "g f 3"], Float[Tens
     """Return the planned contact points [m] and outward normals of grasps, in the hand's frame."""
     hand_from_obj = inverse(grasps.obj_from_hand.double())
     contacts = grasps.contacts
-    return apply(hand_from_obj, contacts.points.double()), rotate(hand_from_obj, contacts.normals.double())
+    return apply(hand_from_obj, contacts.points.double()), rotate(
+        hand_from_obj, contacts.normals.double()
+    )
 
 
 class Squeeze(NamedTuple):
-    """Joint targets [rad] that press on the object in g grasps, the fingertip forces [N] and joint torques [N m]."""
+    """Joint targets [rad] that press on the object in g grasps, the fingertip forces [N] and joint
+    torques [N m].
+    """
 
     joints: Float[Tensor, "g h"]
     forces: Float[Tensor, "g f 3"]
@@ -49,12 +57,14 @@ class Squeeze(NamedTuple):
 def squeeze(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None = None) -> Squeeze:
     """Return joint targets with which position-controlled fingers press at their planned contacts.
 
-    The targets solve J^T f = kp (target - q) for the `desired_forces` f. They may exceed a joint's limits. They are
-    differentiable in the joints of the grasps; the forces, found by a search, are not differentiable in the contacts.
+    The targets solve J^T f = kp (target - q) for the `desired_forces` f. They may exceed a joint's
+    limits. They are differentiable in the joints of the grasps; the forces, found by a search, are
+    not differentiable in the contacts.
 
-    `force` [N] is the normal force of the strongest finger, `kp` [N m/rad] the stiffness of every joint's drive, by
-    default the hand's own. The hand follows the grasps to their device. Raises `BadArgument` for joints or fingers of
-    another hand, a force or stiffness that is not positive, contacts or poses by which derivatives are taken.
+    `force` [N] is the normal force of the strongest finger, `kp` [N m/rad] the stiffness of every
+    joint's drive, by default the hand's own. The hand follows the grasps to their device. Raises
+    `BadArgument` for joints or fingers of another hand, a force or stiffness that is not positive,
+    contacts or poses by which derivatives are taken.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -64,21 +74,26 @@ def squeeze(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None 
     check_same_hand(hand, grasps)
     for name, x in named_tensors(grasps, "grasps.").items():
         check_dense(name, x, gradients=name == "grasps.joints")
-    hand, joints = settle(hand.to(torch.float64), grasps.joints.device), grasps.joints.double()
+    hand = settle(hand.to(torch.float64), grasps.joints.device)
+    joints = grasps.joints.double()
     points, normals = contacts_in_hand(grasps)
     forces = desired_forces(points, normals, force)
     return press(joints, hand.jacobian(joints, points), forces, joint_stiffness(hand, kp))
 
 
 def check_same_hand(hand: Hand, grasps: Grasps) -> None:
-    """Raise `BadArgument` for grasps whose fingers or joints are not the hand's; grasps may lack finger names."""
+    """Raise `BadArgument` for grasps whose fingers or joints are not the hand's; grasps may lack
+    finger names.
+    """
     names = grasps.meta.get("finger_names", ",".join(hand.finger_names)).split(",")
     if tuple(names) != hand.finger_names or grasps.contacts.fingertips != len(names):
         found = f"{grasps.contacts.fingertips} contacts a row, of the fingers {', '.join(names)}"
         allowed = f"those of the hand: {', '.join(hand.finger_names)}; `hand_of(grasps)` loads the fingers of grasps"
         raise BadArgument("grasps", found, allowed)
     if grasps.joints.shape[-1] != hand.dof:
-        raise BadArgument("grasps", f"{grasps.joints.shape[-1]} joints", f"the {hand.dof} joints of {hand.name}")
+        raise BadArgument(
+            "grasps", f"{grasps.joints.shape[-1]} joints", f"the {hand.dof} joints of {hand.name}"
+        )
 
 
 def press(
@@ -87,26 +102,36 @@ def press(
     forces: Float[Tensor, "g f 3"],
     stiffness: Float[Tensor, " h"],
 ) -> Squeeze:
-    """Return targets [rad] and torques [N m] with which joint drives of a `stiffness` [N m/rad] exert given forces."""
+    """Return targets [rad] and torques [N m] with which joint drives of a `stiffness` [N m/rad]
+    exert given forces.
+    """
     torques = torch.einsum("gcih,gci->gh", jacobian, forces)
     return Squeeze(joints + torques / stiffness, forces, torques)
 
 
 def drive_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, " j"]:
-    """Return the drive stiffness [N m/rad] of every joint of the URDF: `kp` if given, else the hand's own."""
+    """Return the drive stiffness [N m/rad] of every joint of the URDF: `kp` if given, else the
+    hand's own.
+    """
     kps = [hand.actuators[name].kp if kp is None else kp for name in hand.tree.joint_names]
     return torch.tensor(kps, dtype=torch.float64, device="cpu")
 
 
 def joint_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, "h"]:
-    """Return the stiffness [N m/rad] of each actuated joint, coupled joints included; `kp` replaces the hand's own."""
+    """Return the stiffness [N m/rad] of each actuated joint, coupled joints included; `kp` replaces
+    the hand's own.
+    """
     coupling = hand.actuated.coupling
     return (coupling**2 * drive_stiffness(hand, kp).to(coupling)[:, None]).sum(0)
 
 
 def tip_compliance(
-    jacobian: Float[Tensor, "*b f 3 h"], normals: Float[Tensor, "*b f 3"], stiffness: Float[Tensor, "h"]
+    jacobian: Float[Tensor, "*b f 3 h"],
+    normals: Float[Tensor, "*b f 3"],
+    stiffness: Float[Tensor, "h"],
 ) -> Float[Tensor, "*b f"]:
-    """Return how far each fingertip yields along its normal per force [m/N], given the joint stiffness [N m/rad]."""
+    """Return how far each fingertip yields along its normal per force [m/N], given the joint
+    stiffness [N m/rad].
+    """
     along = torch.einsum("...cih,...ci->...ch", jacobian, normals)
     return (along**2 / stiffness).sum(-1)

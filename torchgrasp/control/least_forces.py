@@ -1,13 +1,14 @@
-"""The least fingertip forces that carry a load, by a barrier method with a few Newton steps per tick.
+"""The least fingertip forces that carry a load, by a barrier method with a few Newton steps per
+tick.
 
-For normal forces n_i above floor_i, tangential forces t_i, joint torques tau_j, friction coefficient mu and a small
-weight eps of the barrier, the method minimises
+For normal forces n_i above floor_i, tangential forces t_i, joint torques tau_j, friction
+coefficient mu and a small weight eps of the barrier, the method minimises
 
     sum n_i + PENALTY sum max(|tau_j| / effort_j - KNEE, 0)^2
         - eps sum [log(mu^2 (n_i - reserve_i)^2 - |t_i|^2) + log(n_i - floor_i)]
 
-over all forces that balance the load. A reserve keeps a force within its cone when a push changes the force. It is
-written in NumPy, whose calls cost less than torch's for small matrices.
+over all forces that balance the load. A reserve keeps a force within its cone when a push changes
+the force. It is written in NumPy, whose calls cost less than torch's for small matrices.
 """
 
 import math
@@ -20,15 +21,19 @@ from jaxtyping import Bool, Float
 from torchgrasp.contacts.balance import grasp_map
 
 Array = np.ndarray
-PENALTY, KNEE = 500.0, 0.9
-"""Weight [N] of the penalty on joint torques and normal forces, and the share of their limits where it begins."""
+PENALTY = 500.0
+KNEE = 0.9
+"""Weight [N] of the penalty on joint torques and normal forces, and the share of their limits where
+it begins.
+"""
 
 
 class Balance(NamedTuple):
-    """The grasp map of contacts (matrix from n force components to the wrench), its pseudo-inverse and its null space.
+    """The grasp map of contacts (matrix from n force components to the wrench), its pseudo-inverse
+    and its null space.
 
-    The columns of `free` are a basis of the null space: k internal forces, which exert no wrench. A finger in the air
-    exerts none either, so its force is free.
+    The columns of `free` are a basis of the null space: k internal forces, which exert no wrench. A
+    finger in the air exerts none either, so its force is free.
     """
 
     wrench: Float[Array, "6 n"]
@@ -41,29 +46,39 @@ class Balance(NamedTuple):
 
 
 def balance(points: Float[Array, "f 3"], touching: Bool[Array, "f"] | bool = True) -> Balance:
-    """Return the grasp map at contact points [m] that touch, its pseudo-inverse and its null space, from one SVD."""
-    wrench = grasp_map(torch.from_numpy(points)).numpy() * np.repeat(np.broadcast_to(touching, len(points)), 3)
+    """Return the grasp map at contact points [m] that touch, its pseudo-inverse and its null space,
+    from one SVD.
+    """
+    wrench = grasp_map(torch.from_numpy(points)).numpy() * np.repeat(
+        np.broadcast_to(touching, len(points)), 3
+    )
     left, values, right = np.linalg.svd(wrench)
     rank = int((values > 1e-12 * values[0]).sum())  # that of contacts on one line is 5
     return Balance(wrench, (right[:rank].T / values[:rank]) @ left[:, :rank].T, right[rank:].T)
 
 
 def friction_ratios(forces: Float[Array, "f 3"], normals: Float[Array, "f 3"]) -> Float[Array, "f"]:
-    """Return each finger's ratio of tangential to normal force; the ratio is infinite if the finger does not press."""
+    """Return each finger's ratio of tangential to normal force; the ratio is infinite if the finger
+    does not press.
+    """
     push = -(forces * normals).sum(-1)
     slide = np.linalg.norm(forces + push[:, None] * normals, axis=-1)
     return np.where(push > 0, slide / np.maximum(push, 1e-12), np.inf)
 
 
 class LeastForces:
-    """A solver for the least fingertip forces [N] that carry a load; each call of `solve` starts from the last forces.
+    """A solver for the least fingertip forces [N] that carry a load; each call of `solve` starts
+    from the last forces.
 
-    The first call starts from the forces `start`, which press at every contact. `effort` [N m] limits the torque of
-    every joint, `most` [N] limits the normal force of every finger.
+    The first call starts from the forces `start`, which press at every contact. `effort` [N m]
+    limits the torque of every joint, `most` [N] limits the normal force of every finger.
     """
 
     def __init__(self, start: Float[Array, "f 3"], effort: Float[Array, " j"], most: float) -> None:
-        self.forces, self.start, self.effort, self.most = start, start, effort, most
+        self.forces = start
+        self.start = start
+        self.effort = effort
+        self.most = most
 
     def solve(
         self,
@@ -75,26 +90,36 @@ class LeastForces:
         floor: Float[Array, "f"],
         reserve: Float[Array, "f"] | float = 0.0,
     ) -> Float[Array, "f 3"]:
-        """Return the least forces [N] that exert the wrench `load`, with normal forces above each finger's `floor` [N].
+        """Return the least forces [N] that exert the wrench `load`, with normal forces above each
+        finger's `floor` [N].
 
-        Without the normal force `reserve` [N], the forces are within the cones of the coefficient `friction`. If no
-        such forces are found, the coefficient is raised to the least with which forces were found. The coefficient is
-        also at least 1.25 times the one that the internal forces `start` need: below it the forces would grow huge.
+        Without the normal force `reserve` [N], the forces are within the cones of the coefficient
+        `friction`. If no such forces are found, the coefficient is raised to the least with which
+        forces were found. The coefficient is also at least 1.25 times the one that the internal
+        forces `start` need: below it the forces would grow huge.
         """
         floor = np.maximum(floor, reserve)
         count = len(normals)
         push = -(np.eye(count)[:, :, None] * normals / self.most).reshape(count, -1)
         limits = np.concatenate([jacobian.reshape(3 * count, -1).T / self.effort[:, None], push])
-        gap = 0.01 * (float(np.linalg.norm(load[:3])) + float(floor.sum()))  # distance from the cones beyond the noise
+        gap = 0.01 * (
+            float(np.linalg.norm(load[:3])) + float(floor.sum())
+        )  # distance from the cones beyond the noise
         barrier = _Barrier(contacts, normals, limits, load, gap, reserve)
-        growth = np.concatenate([[0.0], 0.02 * 2.0 ** np.arange(9)])  # added internal forces, if the load has grown
+        growth = np.concatenate(
+            [[0.0], 0.02 * 2.0 ** np.arange(9)]
+        )  # added internal forces, if the load has grown
         tried = barrier.place(self.forces) + growth[:, None] * barrier.place(self.start, 0.0)
         needed = 1.25 * float(friction_ratios(contacts.inner(self.start), normals).max())
         friction = max(friction, needed) if math.isfinite(needed) else friction
-        strides = 2.0 ** np.arange(8)  # multiples of a step that is safe for every self-concordant function
+        strides = 2.0 ** np.arange(
+            8
+        )  # multiples of a step that is safe for every self-concordant function
         with np.errstate(invalid="ignore", divide="ignore"):  # of logarithms outside the cones
             z = barrier.choose(tried, friction, floor)
-            for _ in range(8 if math.isfinite(barrier.squared) else 0):  # no cone contains a finger that does not press
+            for _ in range(
+                8 if math.isfinite(barrier.squared) else 0
+            ):  # no cone contains a finger that does not press
                 step, decrement = barrier.newton(z)
                 trial = z + np.minimum(strides / (1 + decrement), 1.0)[:, None] * step
                 value = barrier.value(trial)
@@ -108,15 +133,22 @@ class LeastForces:
         return self.forces
 
     def share(
-        self, forces: Float[Array, "f 3"], normals: Float[Array, "f 3"], jacobian: Float[Array, "f 3 j"]
+        self,
+        forces: Float[Array, "f 3"],
+        normals: Float[Array, "f 3"],
+        jacobian: Float[Array, "f 3 j"],
     ) -> float:
-        """Return the largest ratio of a joint torque or normal force to its limit, for given forces [N]."""
+        """Return the largest ratio of a joint torque or normal force to its limit, for given forces
+        [N].
+        """
         torque = np.abs(np.einsum("nij,ni->j", jacobian, forces)) / self.effort
         return max(float(torque.max()), float((-(forces * normals).sum(-1)).max()) / self.most)
 
 
 class _Barrier:
-    """The objective that the solver minimises, as a function of the k coordinates z of the internal forces."""
+    """The objective that the solver minimises, as a function of the k coordinates z of the internal
+    forces.
+    """
 
     def __init__(
         self,
@@ -127,18 +159,23 @@ class _Barrier:
         gap: float,
         reserve: Float[Array, "f"] | float,
     ) -> None:
-        self.count, self.gap, self.reserve = len(normals), gap, reserve
-        self.basis, self.carried = contacts.free, contacts.inverse @ load
+        self.count = len(normals)
+        self.gap = gap
+        self.reserve = reserve
+        self.basis = contacts.free
+        self.carried = contacts.inverse @ load
         self.rows = self.basis.reshape(self.count, 3, -1)
         self.spread = np.einsum("nik,nil->nkl", self.rows, self.rows)
-        self.tau, self.tau_0 = limits @ self.basis, limits @ self.carried
+        self.tau = limits @ self.basis
+        self.tau_0 = limits @ self.carried
         self.push = -np.einsum("ni,nik->nk", normals, self.rows)
         self.push_0 = -(normals * self.carried.reshape(self.count, 3)).sum(-1)
 
     def place(self, forces: Float[Array, "f 3"], share: float = 1.0) -> Float[Array, " k"]:
         """Return z, the coordinates of given forces in the basis of the internal forces.
 
-        Before that, `share` times the forces that carry the load is subtracted from the given forces.
+        Before that, `share` times the forces that carry the load is subtracted from the given
+        forces.
         """
         return self.basis.T @ (forces.ravel() - share * self.carried)
 
@@ -146,9 +183,14 @@ class _Barrier:
         """Return the fingertip forces [N] at coordinates z; they carry the load."""
         return (self.carried + z @ self.basis.T).reshape(*z.shape[:-1], self.count, 3)
 
-    def choose(self, tried: Float[Array, "g k"], friction: float, floor: Float[Array, "f"]) -> Float[Array, " k"]:
-        """Return the best of g coordinates z; if none is feasible, raise friction and lower floors and reserves."""
-        push, forces = tried @ self.push.T + self.push_0, self.forces(tried)
+    def choose(
+        self, tried: Float[Array, "g k"], friction: float, floor: Float[Array, "f"]
+    ) -> Float[Array, " k"]:
+        """Return the best of g coordinates z; if none is feasible, raise friction and lower floors
+        and reserves.
+        """
+        push = tried @ self.push.T + self.push_0
+        forces = self.forces(tried)
         across = np.sqrt(np.maximum((forces**2).sum(-1) - push**2, 0.0))
         above = (push > floor).all(-1)
         above = above if (reached := bool(above.any())) else np.arange(len(tried)) == len(tried) - 1
@@ -164,8 +206,11 @@ class _Barrier:
         return tried[best if math.isfinite(value[best]) else int(ratio.argmin())]
 
     def value(self, z: Float[Array, "g k"]) -> Float[Array, " g"]:
-        """Return the objective at each row of coordinates z; it is infinite outside the friction cones."""
-        n, t = z @ self.push.T + self.push_0, z @ self.tau.T + self.tau_0
+        """Return the objective at each row of coordinates z; it is infinite outside the friction
+        cones.
+        """
+        n = z @ self.push.T + self.push_0
+        t = z @ self.tau.T + self.tau_0
         cone = self.squared * (n - self.reserve) ** 2 + n * n - (self.forces(z) ** 2).sum(-1)
         inside = ((cone > 0) & (n > self.floor)).all(-1)
         logs = np.log(cone).sum(-1) + np.log(n - self.floor).sum(-1)
@@ -173,16 +218,32 @@ class _Barrier:
         return np.where(inside, n.sum(-1) + over - self.gap * logs, np.inf)
 
     def newton(self, z: Float[Array, " k"]) -> tuple[Float[Array, " k"], float]:
-        """Return Newton's step at coordinates z, and the Newton decrement, which measures how far the optimum is."""
-        gap, push = self.gap, self.push
-        n, t, force = push @ z + self.push_0, self.tau @ z + self.tau_0, self.forces(z)
+        """Return Newton's step at coordinates z, and the Newton decrement, which measures how far
+        the optimum is.
+        """
+        gap = self.gap
+        push = self.push
+        n = push @ z + self.push_0
+        t = self.tau @ z + self.tau_0
+        force = self.forces(z)
         left = n - self.reserve
         cone = self.squared * left * left + n * n - (force * force).sum(-1)
-        half = (self.squared * left + n)[:, None] * push - np.einsum("ni,nik->nk", force, self.rows)  # of the gradient
-        above, over = n - self.floor, np.sign(t) * np.maximum(np.abs(t) - KNEE, 0.0)
-        gradient = push.sum(0) + 2 * PENALTY * over @ self.tau - gap * ((2 / cone) @ half + (1 / above) @ push)
-        hessian = (self.tau.T * (2 * PENALTY * (over != 0))) @ self.tau + gap * ((push.T / above**2) @ push)
-        hessian += gap * ((half.T * (4 / cone**2)) @ half - 2 * (1 + self.squared) * (push.T / cone) @ push)
+        half = (self.squared * left + n)[:, None] * push - np.einsum(
+            "ni,nik->nk", force, self.rows
+        )  # of the gradient
+        above = n - self.floor
+        over = np.sign(t) * np.maximum(np.abs(t) - KNEE, 0.0)
+        gradient = (
+            push.sum(0)
+            + 2 * PENALTY * over @ self.tau
+            - gap * ((2 / cone) @ half + (1 / above) @ push)
+        )
+        hessian = (self.tau.T * (2 * PENALTY * (over != 0))) @ self.tau + gap * (
+            (push.T / above**2) @ push
+        )
+        hessian += gap * (
+            (half.T * (4 / cone**2)) @ half - 2 * (1 + self.squared) * (push.T / cone) @ push
+        )
         hessian += gap * np.einsum("n,nkl->kl", 2 / cone, self.spread)
         step = -np.linalg.solve(hessian + 1e-9 * np.eye(len(z)), gradient)
         return step, math.sqrt(max(-float(gradient @ step), 0.0) / gap)

@@ -1,4 +1,5 @@
-"""Recovery when the object is not where it was seen: an approach that stops at a touch, a second closing, and a check.
+"""Recovery when the object is not where it was seen: an approach that stops at a touch, a second
+closing, and a check.
 
 The first two locate the object from touches (`Localization`) and move the palm to the object.
 """
@@ -21,46 +22,76 @@ from torchgrasp.geometry.linalg import limit_norm, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.values.closing import ClosingOptions
 
-SPEED, ACCELERATION = 0.1, 1.0  # largest speed [m/s] of the approach, and its acceleration [m/s^2]
-PRESSING_TIME = 0.5  # time [s] from the end of closing until the hand counts as closed, and is judged
+# largest speed [m/s] of the approach, and its acceleration [m/s^2]
+SPEED = 0.1
+ACCELERATION = 1.0
+PRESSING_TIME = (
+    0.5  # time [s] from the end of closing until the hand counts as closed, and is judged
+)
 MISPLACED = 0.008
-"""Distance [m] between the displacements of object and palm from which the hand opens: twice the estimate's error."""
+"""Distance [m] between the displacements of object and palm from which the hand opens: twice the
+estimate's error.
+"""
 OPENING_TIME = 0.5  # time [s] in which the fingers open
 
 
 def can_guard(reference: ClosingReference) -> bool:
-    """Return whether the hand can stop at a touch: the plan has approach, table and surface, the tips are tactile."""
-    known = reference.approach is not None and reference.table is not None and reference.surface is not None
+    """Return whether the hand can stop at a touch: the plan has approach, table and surface, the
+    tips are tactile.
+    """
+    known = (
+        reference.approach is not None
+        and reference.table is not None
+        and reference.surface is not None
+    )
     return known and reference.sensor.kind == "tactile"
 
 
 class GuardedApproach:
-    """Move the opened hand to its pre-grasp, `length` [m] away, and stop it when a finger touches (guarded move).
+    """Move the opened hand to its pre-grasp, `length` [m] away, and stop it when a finger touches
+    (guarded move).
 
-    Fingertips sense a touch, and other links are felt by the drives of their joints. At a touch the hand draws back at
-    once, so that it pushes the object little. It averages its touch readings, locates the object, moves its palm
-    sideways and goes on. After the last allowed stop the hand ignores touches. A hand that has been reopened (`after`)
-    starts at its pre-grasp, and retreats first.
+    Fingertips sense a touch, and other links are felt by the drives of their joints. At a touch the
+    hand draws back at once, so that it pushes the object little. It averages its touch readings,
+    locates the object, moves its palm sideways and goes on. After the last allowed stop the hand
+    ignores touches. A hand that has been reopened (`after`) starts at its pre-grasp, and retreats
+    first.
 
-    `left` [m] is the remaining length of the approach, `palm` [m] the palm's displacement from its planned path,
-    `stops` the number of stops. The touches of each stop are appended to `felt`. `displacement` holds the object's
-    translation [m] and rotation [rad] at the last touch.
+    `left` [m] is the remaining length of the approach, `palm` [m] the palm's displacement from its
+    planned path, `stops` the number of stops. The touches of each stop are appended to `felt`.
+    `displacement` holds the object's translation [m] and rotation [rad] at the last touch.
     """
 
     def __init__(
-        self, reference: ClosingReference, options: ClosingOptions, length: float, felt: list[Touches],
+        self,
+        reference: ClosingReference,
+        options: ClosingOptions,
+        length: float,
+        felt: list[Touches],
         after: "Reopening | None" = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         assert reference.approach is not None
-        self.reference, self.options, self.length, self.direction = reference, options, length, reference.approach
-        self.left, self.speed, self.retreat, self.stops = length, 0.0, 0.0, 0
-        self.palm, self.goal, self.displacement = reference.rise, reference.rise, torch.zeros(6, dtype=torch.float64)
-        self.time, self.feeling = 0.0, False
-        self.rest, self.inertia = None, torch.zeros_like(reference.kp)
+        self.reference = reference
+        self.options = options
+        self.length = length
+        self.direction = reference.approach
+        self.left = length
+        self.speed = 0.0
+        self.retreat = 0.0
+        self.stops = 0
+        self.palm = reference.rise
+        self.goal = reference.rise
+        self.displacement = torch.zeros(6, dtype=torch.float64)
+        self.time = 0.0
+        self.feeling = False
+        self.rest = None
+        self.inertia = torch.zeros_like(reference.kp)
         if after is not None:
-            self.left, self.palm = 0.0, after.palm
+            self.left = 0.0
+            self.palm = after.palm
             self._turn_to(after.displacement)
-        self.felt, self.search = felt, Localization(reference, ())
+        self.felt = felt
+        self.search = Localization(reference, ())
 
     @property
     def done(self) -> bool:
@@ -84,58 +115,85 @@ class GuardedApproach:
     def _advance(self, observation: Observation, period: float) -> None:
         """Move on towards the pre-grasp, or stop at a touch of a fingertip or of another link."""
         links = self._touching_links(observation)
-        if self.stops < self.options.stops and (bool(observation.tactile.contact.any()) or len(links)):
-            self.speed, self.time, self.feeling = SPEED, 0.0, True
+        if self.stops < self.options.stops and (
+            bool(observation.tactile.contact.any()) or len(links)
+        ):
+            self.speed = SPEED
+            self.time = 0.0
+            self.feeling = True
             self.retreat = min(self.left + 0.02, self.length)
             self.felt.append(Touches(self.reference, links))
             self.search = Localization(self.reference, self.felt)
             self.felt[-1].add(observation, self.palm - self.left * self.direction)
         else:
-            braking = math.sqrt(2 * ACCELERATION * self.left)  # the speed from which the hand just stops in time
-            self.speed = min(self.speed + ACCELERATION * period, SPEED, max(braking, ACCELERATION * period))
+            braking = math.sqrt(
+                2 * ACCELERATION * self.left
+            )  # the speed from which the hand just stops in time
+            self.speed = min(
+                self.speed + ACCELERATION * period, SPEED, max(braking, ACCELERATION * period)
+            )
             self.left = max(self.left - self.speed * period, 0.0)
 
     def _touching_links(self, observation: Observation) -> Float[Tensor, "m 4"]:
-        """Return spheres of links of which one touches, as the drives feel: centres and radii [m]; or none."""
-        hand, joints, settled = self.reference.hand, observation.joints, 0.05  # [m/s]: the palm has not just stopped
+        """Return spheres of links of which one touches, as the drives feel: centres and radii [m];
+        or none.
+        """
+        # [m/s]: the palm has not just stopped
+        hand = self.reference.hand
+        joints = observation.joints
+        settled = 0.05
         self.rest = joints if self.rest is None else self.rest
         pushes = (self.reference.kp * (joints - self.rest)).abs()
         if self.length - self.left < 0.02:  # the hand is far from the object, and speeds up
             self.inertia = torch.maximum(self.inertia, pushes)
-        excess, spheres = pushes - self.inertia - 3 * TORQUE_NOISE, hand.collision_spheres
+        excess = pushes - self.inertia - 3 * TORQUE_NOISE
+        spheres = hand.collision_spheres
         if self.speed < settled or bool((excess <= 0.0).all()):
             return torch.zeros(0, 4, dtype=torch.float64)
         moved = hand.tree.moves[:, excess.argmax()][spheres.link_index] > 0
-        centres = hand.sphere_centres(self.reference.pick(joints))[moved] + self.palm - self.left * self.direction
+        centres = (
+            hand.sphere_centres(self.reference.pick(joints))[moved]
+            + self.palm
+            - self.left * self.direction
+        )
         return torch.cat([centres, spheres.radius.double()[moved, None]], -1)
 
     def _feel(self, observation: Observation, period: float) -> None:
-        """Average the touch readings, then locate the object, then choose the palm's new goal: one stage per call."""
+        """Average the touch readings, then locate the object, then choose the palm's new goal: one
+        stage per call.
+        """
         if self.time < 0.06:  # [s]
             self.time += period
             self.felt[-1].add(observation, self.palm - self.left * self.direction)
         elif not self.search.done and (bool(self.felt[-1].felt.any()) or len(self.felt[-1].links)):
             self.search()
         else:
-            self.feeling, self.stops = False, self.stops + 1
+            self.feeling = False
+            self.stops = self.stops + 1
             if self.search.done:
                 self._turn_to(self.search.displacement)
 
     def _turn_to(self, displacement: Float[Tensor, "6"]) -> None:
-        """Let the palm follow a displacement of the object, after a retreat as far as the palm then moves."""
+        """Let the palm follow a displacement of the object, after a retreat as far as the palm then
+        moves.
+        """
         self.displacement = displacement
-        self.goal = self.reference.rise + palm_goal(displacement[:3], self.reference.table, self.options.palm_reach)
+        self.goal = self.reference.rise + palm_goal(
+            displacement[:3], self.reference.table, self.options.palm_reach
+        )
         way = float(torch.linalg.vector_norm(self.goal - self.palm))
         self.retreat = max(self.retreat, min(self.left + way, self.length))
 
 
 class GraspCheck:
-    """Judge a pressing grasp: `judged` turns true when the result is known, `secure` says whether to lift.
+    """Judge a pressing grasp: `judged` turns true when the result is known, `secure` says whether
+    to lift.
 
-    `displacement` holds the object's translation [m] and rotation [rad] that the closing estimated. If the plan has
-    table and surface, they are estimated anew from all touches. These are `felt`, of which the last are those of the
-    closing; the touches of the pressing hand replace them. `palm` [m] is the palm's displacement from its plan. In the
-    `last` attempt every grasp counts as secure.
+    `displacement` holds the object's translation [m] and rotation [rad] that the closing estimated.
+    If the plan has table and surface, they are estimated anew from all touches. These are `felt`,
+    of which the last are those of the closing; the touches of the pressing hand replace them.
+    `palm` [m] is the palm's displacement from its plan. In the `last` attempt every grasp counts as
+    secure.
     """
 
     def __init__(
@@ -146,14 +204,19 @@ class GraspCheck:
         last: bool,
         felt: list[Touches],
     ) -> None:
-        self.reference, self.palm, self.displacement = reference, palm, displacement
-        self.touches, self.felt = Touches(reference), felt
+        self.reference = reference
+        self.palm = palm
+        self.displacement = displacement
+        self.touches = Touches(reference)
+        self.felt = felt
         self.known = reference.surface is not None and reference.table is not None
         self.search: Localization | None = None
         self.judged = self.secure = last
 
     def __call__(self, observation: Observation, pressed: float) -> None:
-        """Average the touches, locate the object, and judge the grasp once `pressed` [s] reaches `PRESSING_TIME`."""
+        """Average the touches, locate the object, and judge the grasp once `pressed` [s] reaches
+        `PRESSING_TIME`.
+        """
         if self.judged or pressed < 0.1:
             return
         if pressed < 0.3:
@@ -169,7 +232,9 @@ class GraspCheck:
             self.judged, self.secure = True, self._is_secure()
 
     def _is_secure(self) -> bool:
-        """Return whether all fingers touch, planned friction lets forces balance, and the palm has followed."""
+        """Return whether all fingers touch, planned friction lets forces balance, and the palm has
+        followed.
+        """
         touches = self.touches
         if not bool((touches.contact | ~touches.known).all()):
             return False
@@ -179,15 +244,19 @@ class GraspCheck:
             return True  # without all places of contacts the forces cannot be judged
         points, normals = touches.means()
         ratio = tangential_ratio(least_friction_forces(points, normals), normals)
-        return bool((ratio <= self.reference.friction).all())  # false for NaN, where no forces balance
+        return bool(
+            (ratio <= self.reference.friction).all()
+        )  # false for NaN, where no forces balance
 
 
 class Reopening:
-    """Open the hand and move its palm to the displaced object; `done` says when the hand may close again.
+    """Open the hand and move its palm to the displaced object; `done` says when the hand may close
+    again.
 
-    The fingers leave the object at the same time, because their targets begin at the measured `joints` [rad]. Meanwhile
-    the palm returns from its displacement `palm` [m] to `begun` [m], where the open hand met nothing. Then it follows
-    the object's `displacement` [m, rad] to at most `reach` [m], or stays if `reach` is 0.
+    The fingers leave the object at the same time, because their targets begin at the measured
+    `joints` [rad]. Meanwhile the palm returns from its displacement `palm` [m] to `begun` [m],
+    where the open hand met nothing. Then it follows the object's `displacement` [m, rad] to at most
+    `reach` [m], or stays if `reach` is 0.
     """
 
     def __init__(
@@ -199,9 +268,16 @@ class Reopening:
         begun: Float[Tensor, "3"],
         reach: float,
     ) -> None:
-        self.displacement, self.start, self.opened = displacement, joints, reference.expand(reference.pregrasp)
-        self.palm, self.closed, self.begun, self.time = palm, palm, begun, 0.0
-        self.goal = reference.rise + palm_goal(displacement[:3], reference.table, reach) if reach else begun
+        self.displacement = displacement
+        self.start = joints
+        self.opened = reference.expand(reference.pregrasp)
+        self.palm = palm
+        self.closed = palm
+        self.begun = begun
+        self.time = 0.0
+        self.goal = (
+            reference.rise + palm_goal(displacement[:3], reference.table, reach) if reach else begun
+        )
 
     @property
     def done(self) -> bool:
@@ -209,7 +285,9 @@ class Reopening:
         return self.time >= OPENING_TIME + 0.1
 
     def __call__(self, period: float) -> Float[Tensor, " j"]:
-        """Return the targets of all joints [rad] for the next tick: first the fingers open, then the palm moves."""
+        """Return the targets of all joints [rad] for the next tick: first the fingers open, then
+        the palm moves.
+        """
         opens = self.time < OPENING_TIME
         if opens or torch.equal(self.palm, self.goal):
             self.time += period
@@ -222,11 +300,13 @@ class Reopening:
 
 
 class LiftCheck:
-    """Feel while a closed hand rises, and holds, whether it loses the object; `lost` then stays true.
+    """Feel while a closed hand rises, and holds, whether it loses the object; `lost` then stays
+    true.
 
-    The object is lost if fewer than two fingertips touch, and these carry hardly any load along the table's normal. The
-    hand will lose the object if two fingertips slide along it in the first 20 mm of the lift. Only touches count for
-    binary sensors, or without a table. Broken sensors count as touching.
+    The object is lost if fewer than two fingertips touch, and these carry hardly any load along the
+    table's normal. The hand will lose the object if two fingertips slide along it in the first 20
+    mm of the lift. Only touches count for binary sensors, or without a table. Broken sensors count
+    as touching.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.control import no_contact, observe
@@ -238,14 +318,24 @@ class LiftCheck:
 
     @checked
     def __init__(self, reference: ClosingReference) -> None:
-        self.alive, self.lost, self.load = reference.alive, False, 0.0
+        self.alive = reference.alive
+        self.lost = False
+        self.load = 0.0
         self.slid = torch.zeros(len(self.alive), dtype=torch.float64)  # by each fingertip [m]
         self.table = None if reference.sensor.kind == "binary" else reference.table
 
     @checked
-    def __call__(self, observation: Observation, height: float, period: Annotated[float, Range(1e-5, 1.0)]) -> bool:
-        """Return `lost` at the end of a tick of `period` [s], in which the hand has risen to `height` [m]."""
-        least, first, low, slip = 0.2, 0.01, 0.02, 0.0015  # load [N], heights of touches and slides, slide [m]
+    def __call__(
+        self, observation: Observation, height: float, period: Annotated[float, Range(1e-5, 1.0)]
+    ) -> bool:
+        """Return `lost` at the end of a tick of `period` [s], in which the hand has risen to
+        `height` [m].
+        """
+        # load [N], heights of touches and slides, slide [m]
+        least = 0.2
+        first = 0.01
+        low = 0.02
+        slip = 0.0015
         tactile = observation.tactile
         if height <= low:
             self.slid = self.slid + period * tactile.sliding
@@ -259,14 +349,23 @@ class LiftCheck:
 
 
 def palm_goal(shift: Float[Tensor, "3"], table: Plane | None, reach: float) -> Float[Tensor, "3"]:
-    """Return the palm displacement [m] that follows an object's `shift` [m] along the table, up to `reach` [m]."""
+    """Return the palm displacement [m] that follows an object's `shift` [m] along the table, up to
+    `reach` [m].
+    """
     if table is not None:
         up = unit(table.normal)
         shift = shift - (shift @ up) * up
     return limit_norm(shift, reach)
 
 
-def next_palm(palm: Float[Tensor, "3"], goal: Float[Tensor, "3"], period: float) -> Float[Tensor, "3"]:
-    """Return the palm displacement [m] one tick later, on a straight line to its goal at `PALM_SPEED`."""
-    way, longest = goal - palm, PALM_SPEED * period
-    return goal if float(torch.linalg.vector_norm(way)) <= longest else palm + limit_norm(way, longest)
+def next_palm(
+    palm: Float[Tensor, "3"], goal: Float[Tensor, "3"], period: float
+) -> Float[Tensor, "3"]:
+    """Return the palm displacement [m] one tick later, on a straight line to its goal at
+    `PALM_SPEED`.
+    """
+    way = goal - palm
+    longest = PALM_SPEED * period
+    return (
+        goal if float(torch.linalg.vector_norm(way)) <= longest else palm + limit_norm(way, longest)
+    )

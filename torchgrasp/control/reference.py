@@ -29,26 +29,23 @@ from torchgrasp.values.specs import ContactSpec
 @checked
 @dataclasses.dataclass(frozen=True)
 class ClosingReference(Value):
-    """The plan for closing a hand on one grasp, in the hand's frame. Joints are the actuated joints [rad].
+    """The plan for closing a hand on one grasp, in the hand's frame. Joints are the actuated joints
+    [rad].
 
-    Args:
-        hand: the hand, in float64.
-        kp: stiffness of every joint's drive [N m/rad], in the order of `hand.tree.joint_names`.
-        obj_from_hand: planned pose of the hand in the frame of the grasp.
-        pregrasp: joints of the opened hand.
-        joints: joints of the grasp.
-        squeeze: joint targets that press on the object without feedback, from `torchgrasp.control.squeeze`.
-        normals: outward normals of the planned contacts.
-        gains: contacts, controller gains and desired forces, of the closing "uncertainty" unless `as_printed`.
-        approach: unit vector along which the opened hand moves to its pre-grasp; None means no approach.
-        table: the table, which no fingertip enters while it searches, or None if it is unknown.
-        surface: estimated surface of the object in the frame of the grasp (`surface_field`), with which touches are
-            compared to locate the object. Without it, the tangent planes of the contacts are used.
-        sensor: sensors of the fingertips.
-        max_force: largest normal force [N] of a fingertip; None means no limit.
-        distance_variance: variance [m^2] of the signed distance at each contact (f_cov in Eq. 12 of the paper); None
-            if it is unknown. The closing "paper" needs it.
-        friction: coefficient of friction that the grasp was planned for.
+    Args: hand: the hand, in float64. kp: stiffness of every joint's drive [N m/rad], in the order
+        of `hand.tree.joint_names`. obj_from_hand: planned pose of the hand in the frame of the
+        grasp. pregrasp: joints of the opened hand. joints: joints of the grasp. squeeze: joint
+        targets that press on the object without feedback, from `torchgrasp.control.squeeze`.
+        normals: outward normals of the planned contacts. gains: contacts, controller gains and
+        desired forces, of the closing "uncertainty" unless `as_printed`. approach: unit vector
+        along which the opened hand moves to its pre-grasp; None means no approach. table: the
+        table, which no fingertip enters while it searches, or None if it is unknown. surface:
+        estimated surface of the object in the frame of the grasp (`surface_field`), with which
+        touches are compared to locate the object. Without it, the tangent planes of the contacts
+        are used. sensor: sensors of the fingertips. max_force: largest normal force [N] of a
+        fingertip; None means no limit. distance_variance: variance [m^2] of the signed distance at
+        each contact (f_cov in Eq. 12 of the paper); None if it is unknown. The closing "paper"
+        needs it. friction: coefficient of friction that the grasp was planned for.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -85,82 +82,118 @@ class ClosingReference(Value):
     ) -> "ClosingReference":
         """Return the closing plan of one grasp, on the CPU.
 
-        Args:
-            grasp: a single grasp, planned for the hand.
-            force: normal force of the strongest finger [N].
-            kp: stiffness of every joint's drive [N m/rad]; by default the hand's own.
-            stability: model that chooses among balanced forces that need nearly equal friction, and gives the
-                covariance of the forces; without it the covariance grows with the force.
+        Args: grasp: a single grasp, planned for the hand. force: normal force of the strongest
+            finger [N]. kp: stiffness of every joint's drive [N m/rad]; by default the hand's own.
+            stability: model that chooses among balanced forces that need nearly equal friction, and
+            gives the covariance of the forces; without it the covariance grows with the force.
 
-        Raises `BadArgument` for not exactly one grasp, joints or fingers of another hand, a force or stiffness that is
-        not positive, joints beyond their limits, or numbers in the grasp that are not finite.
+        Raises `BadArgument` for not exactly one grasp, joints or fingers of another hand, a force
+        or stiffness that is not positive, joints beyond their limits, or numbers in the grasp that
+        are not finite.
         """
         check_single(grasp)
         finger_forces.check_same_hand(hand, grasp)
         contacts = grasp.contacts
         check_tensor("grasp.contacts.points", contacts.points, (1, len(hand.tips), 3))
         check_tensor("grasp.contacts.normals", contacts.normals, (1, len(hand.tips), 3))
-        std_m = check_tensor("grasp.contacts.std_m", contacts.std_m, (1, len(hand.tips))).to("cpu", torch.float64)
+        std_m = check_tensor("grasp.contacts.std_m", contacts.std_m, (1, len(hand.tips))).to(
+            "cpu", torch.float64
+        )
         if stability is not None:
             hand.require_three("stability", "a model of stability")
-        hand, grasp = hand.to("cpu", torch.float64), grasp.to("cpu", torch.float64)
+        hand = hand.to("cpu", torch.float64)
+        grasp = grasp.to("cpu", torch.float64)
         hand.actuated.check_limits(grasp.joints, "grasp.joints")
         hand.actuated.check_limits(grasp.pregrasp, "grasp.pregrasp")
         points, normals = finger_forces.contacts_in_hand(grasp)
-        preferred, deviation, sure = None, None, law.FORCE_FLOOR
+        preferred = None
+        deviation = None
+        sure = law.FORCE_FLOOR
         if stability is not None:
             tips = points[0] + hand.tips.radius[:, None] * normals[0]
             preferred = stability.preferred_forces(tips, force).forces[None]
-            deviation = stability.preferred_forces(tips).covariance.diagonal()[None].sqrt()  # a given force has none
+            deviation = (
+                stability.preferred_forces(tips).covariance.diagonal()[None].sqrt()
+            )  # a given force has none
             sure = math.hypot(law.FORCE_FLOOR, float(deviation.min()))
         desired = finger_forces.desired_forces(points, normals, force, preferred)
-        covariance, jacobian = law.surface_covariance(normals, std_m), hand.jacobian(grasp.joints, points)
-        compliance = finger_forces.tip_compliance(jacobian, normals, finger_forces.joint_stiffness(hand))
+        covariance = law.surface_covariance(normals, std_m)
+        jacobian = hand.jacobian(grasp.joints, points)
+        compliance = finger_forces.tip_compliance(
+            jacobian, normals, finger_forces.joint_stiffness(hand)
+        )
         force_covariance = law.force_covariance(desired, normals, deviation)
         gains = ClosingGains(
             target=points[0],
             covariance=covariance[0],
             position_gain=law.position_gain(covariance)[0],
-            force_gain=law.force_gain(force_covariance, law.FORCE_BANDWIDTH * sure**2 * compliance)[0],
+            force_gain=law.force_gain(force_covariance, law.FORCE_BANDWIDTH * sure**2 * compliance)[
+                0
+            ],
             desired_force=desired[0],
             force_source="analytic" if stability is None else "stability",
         )
-        squeeze = finger_forces.press(grasp.joints, jacobian, desired, finger_forces.joint_stiffness(hand, kp)).joints
-        pose, opened, joints = grasp.obj_from_hand[0], grasp.pregrasp[0], grasp.joints[0]
+        squeeze = finger_forces.press(
+            grasp.joints, jacobian, desired, finger_forces.joint_stiffness(hand, kp)
+        ).joints
+        pose = grasp.obj_from_hand[0]
+        opened = grasp.pregrasp[0]
+        joints = grasp.joints[0]
         direction = rotate(inverse(grasp.obj_from_hand), grasp.approach[:, None])[0, 0]
-        approach = unit(direction) if bool((direction != 0.0).any()) else None  # in the hand's frame
+        approach = (
+            unit(direction) if bool((direction != 0.0).any()) else None
+        )  # in the hand's frame
         plan = cls(
-            hand, finger_forces.drive_stiffness(hand, kp), pose, opened, joints, squeeze[0], normals[0], gains, approach
+            hand,
+            finger_forces.drive_stiffness(hand, kp),
+            pose,
+            opened,
+            joints,
+            squeeze[0],
+            normals[0],
+            gains,
+            approach,
         )
         friction = _number(grasp, "friction")
         told = {} if friction is None else {"friction": friction}
         return dataclasses.replace(plan, distance_variance=_distance_variance(grasp), **told)
 
     def as_printed(self) -> "ClosingReference":
-        """Return the plan with Sigma_cov and K_P of Eqs. (26) and (27) as the paper prints them, for closing "paper".
+        """Return the plan with Sigma_cov and K_P of Eqs. (26) and (27) as the paper prints them,
+        for closing "paper".
 
         Raises `BadArgument` if the plan lacks `distance_variance`.
         """
         if self.distance_variance is None:
             found = "'paper' without f_cov, the variance of the signed distance [m^2]"
-            raise BadArgument("closing", found, "grasps of `plan_grasps`, whose metadata hold unit_m")
+            raise BadArgument(
+                "closing", found, "grasps of `plan_grasps`, whose metadata hold unit_m"
+            )
         covariance = law.printed_covariance(self.normals, self.distance_variance)
-        gains = dataclasses.replace(self.gains, covariance=covariance, position_gain=law.position_gain(covariance))
+        gains = dataclasses.replace(
+            self.gains, covariance=covariance, position_gain=law.position_gain(covariance)
+        )
         return dataclasses.replace(self, gains=gains)
 
     @checked
     def expand(self, actuated: Annotated[Float[Tensor, " h"], ANY]) -> Float[Tensor, " j"]:
-        """Return the positions of all joints of the URDF [rad], given the actuated joints [rad]; NaN is allowed."""
+        """Return the positions of all joints of the URDF [rad], given the actuated joints [rad];
+        NaN is allowed.
+        """
         return self.hand.actuated.coupling @ actuated + self.hand.actuated.offset
 
     @checked
     def pick(self, joints: Annotated[Float[Tensor, " j"], ANY]) -> Float[Tensor, " h"]:
-        """Return the actuated joints [rad], given the positions of all joints of the URDF [rad]; NaN is allowed."""
+        """Return the actuated joints [rad], given the positions of all joints of the URDF [rad];
+        NaN is allowed.
+        """
         return joints[self._actuated]
 
     @functools.cached_property
     def rise(self) -> Float[Tensor, "3"]:
-        """How far [m] the opened hand is above its planned pose before it closes, so that no link is in the table."""
+        """How far [m] the opened hand is above its planned pose before it closes, so that no link
+        is in the table.
+        """
         planned = torch.eye(4, dtype=torch.float64)[None]
         return opened_pose(self.hand, self.pregrasp[None], planned, self.table)[0, :3, 3]
 
@@ -171,8 +204,11 @@ class ClosingReference(Value):
 
     @property
     def alive(self) -> Bool[Tensor, "f"]:
-        """Whether the sensor of each fingertip works; raises `BadArgument` if the plan names an unknown finger."""
-        names, dead = self.hand.finger_names, self.sensor.dead
+        """Whether the sensor of each fingertip works; raises `BadArgument` if the plan names an
+        unknown finger.
+        """
+        names = self.hand.finger_names
+        dead = self.sensor.dead
         if not set(dead) <= set(names):
             raise BadArgument("sensor", f"dead fingers {dead}", f"dead fingers among {names}")
         return torch.tensor([name not in dead for name in names])
@@ -184,14 +220,18 @@ class ClosingReference(Value):
 
     @checked
     def contact_points(self, tips: Float[Tensor, "f 3"]) -> Float[Tensor, "f 3"]:
-        """Return the points [m] where tips with given centres [m] would touch, one tip radius towards the contact."""
+        """Return the points [m] where tips with given centres [m] would touch, one tip radius
+        towards the contact.
+        """
         return tips - self.hand.tips.radius[:, None] * self.normals
 
 
 def check_single(grasp: Grasps) -> None:
     """Raise `BadArgument` unless there is exactly one grasp."""
     if len(grasp) != 1:
-        raise BadArgument("grasp", f"{len(grasp)} rows", "exactly one: index the grasps, as in grasps[0]")
+        raise BadArgument(
+            "grasp", f"{len(grasp)} rows", "exactly one: index the grasps, as in grasps[0]"
+        )
 
 
 def next_target(
@@ -203,20 +243,27 @@ def next_target(
     period: float,
     fastest: float = math.inf,
 ) -> Float[Tensor, " h"]:
-    """Return the target of the actuated joints [rad] one tick later, at most `lead` [rad] off the measured joints.
+    """Return the target of the actuated joints [rad] one tick later, at most `lead` [rad] off the
+    measured joints.
 
-    No target moves faster than `fastest` [rad/s]: all joints slow down together, so tips keep their directions.
+    No target moves faster than `fastest` [rad/s]: all joints slow down together, so tips keep their
+    directions.
     """
     jacobian = observation.jacobian @ reference.hand.actuated.coupling
     step = law.joint_step(jacobian, velocity, period, reference.joints - target)
     step = step * min(1.0, fastest * period / max(float(step.abs().max()), 1e-9))
     joints = reference.pick(observation.joints)
-    return reference.clamp(torch.minimum(torch.maximum(target + step, joints - lead), joints + lead))
+    return reference.clamp(
+        torch.minimum(torch.maximum(target + step, joints - lead), joints + lead)
+    )
 
 
 def _distance_variance(grasp: Grasps) -> Float[Tensor, "f"] | None:
-    """Return f_cov [m^2] of one grasp's contacts; `std_m`^2 without a normalised variance, None without its unit."""
-    contacts, unit_m = grasp.contacts, _number(grasp, "unit_m")
+    """Return f_cov [m^2] of one grasp's contacts; `std_m`^2 without a normalised variance, None
+    without its unit.
+    """
+    contacts = grasp.contacts
+    unit_m = _number(grasp, "unit_m")
     if contacts.variance is None:
         return contacts.require_std()[0] ** 2
     return None if unit_m is None else contacts.variance[0] * unit_m**2
@@ -241,8 +288,8 @@ def closing_gains(
 ) -> ClosingGains:
     """Return contact, gains and desired force of each finger for one grasp, in the hand's frame.
 
-    The gains are those of the closing "uncertainty"; `ClosingReference.as_printed` has those that the paper prints.
-    Arguments and errors are as in `ClosingReference.from_grasp`.
+    The gains are those of the closing "uncertainty"; `ClosingReference.as_printed` has those that
+    the paper prints. Arguments and errors are as in `ClosingReference.from_grasp`.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp

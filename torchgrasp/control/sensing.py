@@ -1,6 +1,8 @@
-"""Simpler fingertip sensors than tactile ones: binary contact or joint torques, with delay, noise and dead sensors.
+"""Simpler fingertip sensors than tactile ones: binary contact or joint torques, with delay, noise
+and dead sensors.
 
-A robot with such sensors makes its `TactileState` with `feel_flags` or `feel_torques` instead of `measure`.
+A robot with such sensors makes its `TactileState` with `feel_flags` or `feel_torques` instead of
+`measure`.
 """
 
 import dataclasses
@@ -28,20 +30,25 @@ from torchgrasp.foundation.checks import Positive, checked
 from torchgrasp.foundation.errors import BadArgument
 
 WAITING_FORCE = 0.3
-"""Largest force [N] of a finger that waits until the others touch, and the reading that stands for a binary contact."""
+"""Largest force [N] of a finger that waits until the others touch, and the reading that stands for
+a binary contact.
+"""
 TORQUE_NOISE = 0.01  # standard deviation [N m] of a sensed joint torque
 
 
 @checked
 def feel_flags(tactile: TactileState, touching: Bool[Tensor, "f"]) -> TactileState:
-    """Return the tactile state of fingertips that sense only whether they touch; `tactile` is the last state.
+    """Return the tactile state of fingertips that sense only whether they touch; `tactile` is the
+    last state.
 
     >>> feel_flags(no_contact(), torch.tensor([True, False, False])).reading
     tensor([0.3000, 0.0000, 0.0000], dtype=torch.float64)
     """
     nothing = no_contact(fingers=len(touching))
     reading = WAITING_FORCE * touching.double()
-    return dataclasses.replace(nothing, reading=reading, contact=touching, average=reading, age=tactile.age)
+    return dataclasses.replace(
+        nothing, reading=reading, contact=touching, average=reading, age=tactile.age
+    )
 
 
 @checked
@@ -54,12 +61,11 @@ def feel_torques(
 ) -> TactileState:
     """Return the tactile state of fingertips whose forces are estimated from joint torques.
 
-    Args:
-        tactile: the state at the last tick.
-        reference: the closing plan; its normals give the direction in which a finger presses.
-        jacobian: Jacobian of the fingertips by all joints [m/rad], as in `Observation`.
-        torques: torques of all joints [N m] that contacts cause, without those of weight, friction and acceleration.
-        period: time since the last readings [s].
+    Args: tactile: the state at the last tick. reference: the closing plan; its normals give the
+        direction in which a finger presses. jacobian: Jacobian of the fingertips by all joints
+        [m/rad], as in `Observation`. torques: torques of all joints [N m] that contacts cause,
+        without those of weight, friction and acceleration. period: time since the last readings
+        [s].
 
     Raises `BadArgument` for a Jacobian with the shape of another hand.
 
@@ -69,48 +75,68 @@ def feel_torques(
     >>> feel_torques(no_contact(), reference, torch.ones(3, 3, 8), torch.zeros(8), 0.01).contact
     tensor([False, False, False])
     """
-    jacobian, torques = jacobian.double(), torques.double()
+    jacobian = jacobian.double()
+    torques = torques.double()
     shape = len(reference.normals), 3, len(reference.kp)
     if jacobian.shape != shape:
         found = f"fingertips, 3 and joints {tuple(jacobian.shape)}"
         raise BadArgument("jacobian", found, f"those of the hand, {shape}")
-    forces_by, radius = _forces_by_torques(reference, jacobian), reference.hand.tips.radius
+    forces_by = _forces_by_torques(reference, jacobian)
+    radius = reference.hand.tips.radius
     forces = forces_by @ torques
-    push, nowhere = -(forces * reference.normals).sum(-1), torch.full_like(forces, torch.nan)
+    push = -(forces * reference.normals).sum(-1)
+    nowhere = torch.full_like(forces, torch.nan)
     pushes = TipContact(push.clamp_min(0.0), forces, nowhere, nowhere)
     sensed = measure(tactile, pushes, reference.normals, radius, period)
     if sensed.reading is tactile.reading:
         return sensed
-    factor = torch.einsum("fc,fcj->fj", reference.normals, forces_by).norm(dim=-1) * TORQUE_NOISE / NOISE
+    factor = (
+        torch.einsum("fc,fcj->fj", reference.normals, forces_by).norm(dim=-1) * TORQUE_NOISE / NOISE
+    )
     factor = (factor * reference.sensor.noise).clamp_min(1.0)
     return dataclasses.replace(sensed, contact=flag(tactile.contact, sensed.average, factor))
 
 
-def _forces_by_torques(reference: ClosingReference, jacobian: Float[Tensor, "f 3 j"]) -> Float[Tensor, "f 3 j"]:
-    """Return the matrix that gives each finger's most probable contact force [N] from joint torques [N m]."""
+def _forces_by_torques(
+    reference: ClosingReference, jacobian: Float[Tensor, "f 3 j"]
+) -> Float[Tensor, "f 3 j"]:
+    """Return the matrix that gives each finger's most probable contact force [N] from joint torques
+    [N m].
+    """
     along = reference.normals[:, :, None] * reference.normals[:, None]
-    across, up = ((TORQUE_NOISE / std) ** 2 for std in (0.5, 3.0))  # [N] across and along the normal
+    across, up = (
+        (TORQUE_NOISE / std) ** 2 for std in (0.5, 3.0)
+    )  # [N] across and along the normal
     prior = across * torch.eye(3, dtype=jacobian.dtype) + (up - across) * along
     return torch.linalg.solve(jacobian @ jacobian.mT + prior, jacobian)
 
 
 class DriveFeel:
-    """Estimate contact forces only from the joint drives: a blocked joint does not reach its target.
+    """Estimate contact forces only from the joint drives: a blocked joint does not reach its
+    target.
 
-    A drive of stiffness k and damping d exerts the torque k (target - q) - d dq/dt at the joint angle q.
+    A drive of stiffness k and damping d exerts the torque k (target - q) - d dq/dt at the joint
+    angle q.
     """
 
     def __init__(self, reference: ClosingReference) -> None:
         hand = reference.hand
-        self.reference, self.before = reference, reference.expand(reference.pregrasp)
+        self.reference = reference
+        self.before = reference.expand(reference.pregrasp)
         damping = [hand.actuators[name].kd for name in hand.tree.joint_names]
         self.damping = torch.tensor(damping, dtype=torch.float64)
         self.pushes = torch.zeros_like(reference.normals[:, 0])
 
-    def __call__(self, observation: Observation, targets: Float[Tensor, " j"], period: float) -> Float[Tensor, "f"]:
-        """Return the low-passed normal force [N] of each fingertip, given the joint targets [rad] of the tick."""
+    def __call__(
+        self, observation: Observation, targets: Float[Tensor, " j"], period: float
+    ) -> Float[Tensor, "f"]:
+        """Return the low-passed normal force [N] of each fingertip, given the joint targets [rad]
+        of the tick.
+        """
         joints = observation.joints
-        torques = self.reference.kp * (targets - joints) - self.damping * (joints - self.before) / period
+        torques = (
+            self.reference.kp * (targets - joints) - self.damping * (joints - self.before) / period
+        )
         self.before = joints
         forces = _forces_by_torques(self.reference, observation.jacobian) @ torques
         pushes = -(forces * self.reference.normals).sum(-1)
@@ -119,9 +145,11 @@ class DriveFeel:
 
 
 class FingertipSensor:
-    """Simulate the fingertip sensors that a `SensorModel` describes: a call takes true contacts, and returns readings.
+    """Simulate the fingertip sensors that a `SensorModel` describes: a call takes true contacts,
+    and returns readings.
 
-    The closing plan has the sensor model. The `generator` draws the noise; without one there is no noise.
+    The closing plan has the sensor model. The `generator` draws the noise; without one there is no
+    noise.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -132,21 +160,30 @@ class FingertipSensor:
     tensor([ True, False, False])
     """
 
-    def __init__(self, reference: ClosingReference, generator: torch.Generator | None = None) -> None:
-        self.reference, self.model = reference, reference.sensor
+    def __init__(
+        self, reference: ClosingReference, generator: torch.Generator | None = None
+    ) -> None:
+        self.reference = reference
+        self.model = reference.sensor
         self.generator = generator
         fingers = len(reference.normals)
         self.sensed = no_contact(fingers=fingers)
         self.switched = torch.zeros(fingers, dtype=torch.bool)
         self.reports = [self.sensed]
-        self.alive, self.whole = reference.alive, bool(reference.alive.all())
+        self.alive = reference.alive
+        self.whole = bool(reference.alive.all())
 
-    def __call__(self, truth: TipContact, jacobian: Float[Tensor, "f 3 j"], period: float) -> TactileState:
-        """Return what the sensors report at the end of a control tick of `period` [s], delayed as the sensor is.
+    def __call__(
+        self, truth: TipContact, jacobian: Float[Tensor, "f 3 j"], period: float
+    ) -> TactileState:
+        """Return what the sensors report at the end of a control tick of `period` [s], delayed as
+        the sensor is.
 
-        `truth` holds the true contacts during the tick, `jacobian` is that of the fingertips by all joints [m/rad].
+        `truth` holds the true contacts during the tick, `jacobian` is that of the fingertips by all
+        joints [m/rad].
         """
-        reference, before = self.reference, self.sensed
+        reference = self.reference
+        before = self.sensed
         if self.model.kind == "torque":
             torques = torch.einsum("fcj,fc->j", jacobian, truth.forces)
             if self.generator is not None:
@@ -154,14 +191,20 @@ class FingertipSensor:
                 torques = torques + self.model.noise * TORQUE_NOISE * drawn
             self.sensed = feel_torques(before, reference, jacobian, torques, period)
         else:
-            radius, noise = reference.hand.tips.radius, self.model.noise
-            self.sensed = measure(before, truth, reference.normals, radius, period, self.generator, noise)
+            radius = reference.hand.tips.radius
+            noise = self.model.noise
+            self.sensed = measure(
+                before, truth, reference.normals, radius, period, self.generator, noise
+            )
         report = self.sensed
         if self.model.kind == "binary":  # a switch closes at 0.45 N and opens at TOUCH_ON
-            self.switched = torch.where(self.switched, report.reading > TOUCH_ON, report.reading >= 0.45)
+            self.switched = torch.where(
+                self.switched, report.reading > TOUCH_ON, report.reading >= 0.45
+            )
             report = feel_flags(report, self.switched)
         if not self.whole:
-            nothing, column = no_contact(fingers=len(self.alive)), self.alive[:, None]
+            nothing = no_contact(fingers=len(self.alive))
+            column = self.alive[:, None]
             silence = lambda x, no: torch.where(self.alive if x.ndim == 1 else column, x, no)  # noqa: E731
             report = map_tensors(silence, report, nothing)
         late = round(self.model.delay / max(period, 1 / SAMPLING_RATE))

@@ -16,7 +16,9 @@ from torchgrasp.hand.hand import Hand
 SAMPLING_RATE = 100.0  # samples of a fingertip a second [Hz]
 NOISE = 0.1  # standard deviation [N] of the normal force (Sec. 6.5).
 FLAG_CUTOFF = 5.0  # cut-off [Hz] of the average force behind the contact flag
-TOUCH_ON = 0.2  # average force [N] at which the contact flag turns on; it turns off at half of this force
+TOUCH_ON = (
+    0.2  # average force [N] at which the contact flag turns on; it turns off at half of this force
+)
 STILL = torch.zeros(3, dtype=torch.float64)  # displacement of a palm that stays on its path
 
 
@@ -25,8 +27,9 @@ STILL = torch.zeros(3, dtype=torch.float64)  # displacement of a palm that stays
 class TipContact(Value):
     """True contacts of f fingertips, averaged over a tick.
 
-    `forces` [N] act on the object, friction included. `points` [m] and outward `normals` are NaN for tips without
-    contact. `sliding` [m/s] is the speed of each tip along the surface; None means that no tip slides.
+    `forces` [N] act on the object, friction included. `points` [m] and outward `normals` are NaN
+    for tips without contact. `sliding` [m/s] is the speed of each tip along the surface; None means
+    that no tip slides.
     """
 
     normal_force: Float[Tensor, "*b f"]
@@ -65,15 +68,19 @@ class TactileState(Value):
 
 @checked
 def no_contact(*batch: Count, fingers: Annotated[int, Range(*FINGERTIPS)] = 3) -> TactileState:
-    """Return the tactile state, with leading axes `batch`, of tips that touch nothing and are sampled at the next tick.
+    """Return the tactile state, with leading axes `batch`, of tips that touch nothing and are
+    sampled at the next tick.
 
     >>> no_contact().contact
     tensor([False, False, False])
     """
     lagged = torch.zeros(*batch, fingers, 5, dtype=torch.float64)
-    zero, vectors = lagged[..., 0], lagged[..., 1:4]
+    zero = lagged[..., 0]
+    vectors = lagged[..., 1:4]
     nothing = torch.full_like(vectors, torch.nan)
-    return TactileState(zero, vectors, zero > 0, nothing, nothing, lagged, zero, zero, 1 / SAMPLING_RATE)
+    return TactileState(
+        zero, vectors, zero > 0, nothing, nothing, lagged, zero, zero, 1 / SAMPLING_RATE
+    )
 
 
 @checked
@@ -86,15 +93,14 @@ def measure(
     generator: torch.Generator | None = None,
     noise: Annotated[float, Range(0.0, 100.0)] = 1.0,
 ) -> TactileState:
-    """Return the simulated tactile state one tick later, with lag, noise and sampling of the sensors.
+    """Return the simulated tactile state one tick later, with lag, noise and sampling of the
+    sensors.
 
-    Args:
-        tactile: the state at the last tick.
-        pads: outward surface normals at the planned contacts, which direct the noise of tips that touch nothing.
-        radius: radius of the tips [m]; 0 means that they are not round, and 12 mm is assumed.
-        period: period of the tick [s].
-        generator: draws the noise; without one there is no noise.
-        noise: factor on the standard deviation of the noise.
+    Args: tactile: the state at the last tick. pads: outward surface normals at the planned
+        contacts, which direct the noise of tips that touch nothing. radius: radius of the tips [m];
+        0 means that they are not round, and 12 mm is assumed. period: period of the tick [s].
+        generator: draws the noise; without one there is no noise. noise: factor on the standard
+        deviation of the noise.
 
     Raises `BadArgument` for true contacts on another device than the state.
 
@@ -108,31 +114,44 @@ def measure(
     sliding = torch.zeros_like(truth.normal_force) if truth.sliding is None else truth.sliding
     force = torch.cat([truth.normal_force[..., None], truth.forces, sliding[..., None]], dim=-1)
     lagged = tactile.lagged + low_pass(20.0, period) * (force - tactile.lagged)
-    age, interval = tactile.age + period, 1 / SAMPLING_RATE
+    age = tactile.age + period
+    interval = 1 / SAMPLING_RATE
     if age < interval - 1e-9:
         return dataclasses.replace(tactile, lagged=lagged, age=age)
-    reading, forces, sliding = lagged[..., 0], lagged[..., 1:4], lagged[..., 4]
-    points, normals = truth.points, truth.normals
+    reading = lagged[..., 0]
+    forces = lagged[..., 1:4]
+    sliding = lagged[..., 4]
+    points = truth.points
+    normals = truth.normals
     if generator is not None:
-        place_noise, tangential_noise, slide_noise = 1.5e-3, 0.3, 2e-3  # [m, N, m/s]
+        # [m, N, m/s]
+        place_noise = 1.5e-3
+        tangential_noise = 0.3
+        slide_noise = 2e-3
         along = torch.where(torch.isfinite(normals), normals, pads)
         drawn = noise * torch.randn(2, *forces.shape, generator=generator, dtype=forces.dtype)
         normal_part = (drawn * along).sum(-1, keepdim=True)
-        push, across = normal_part[0], drawn - normal_part * along
+        push = normal_part[0]
+        across = drawn - normal_part * along
         reading = reading + NOISE * push[..., 0]
         sliding = sliding + slide_noise * normal_part[1, ..., 0]
         forces = forces - NOISE * push * along + tangential_noise * across[0]
         curvature_radius = torch.where(radius > 0, radius, 0.012)[:, None]
         normals = unit(truth.normals + place_noise / curvature_radius * across[1])
         points = truth.points + curvature_radius * (truth.normals - normals)
-    average = tactile.average + low_pass(FLAG_CUTOFF, max(period, interval)) * (reading - tactile.average)
+    average = tactile.average + low_pass(FLAG_CUTOFF, max(period, interval)) * (
+        reading - tactile.average
+    )
     contact = flag(tactile.contact, average, 1.0 if generator is None else max(noise, 1.0))
     age = min(max(age - interval, 0.0), interval)
     return TactileState(reading, forces, contact, points, normals, lagged, average, sliding, age)
 
 
-def flag(before: Bool[Tensor, "*b f"], average: Float[Tensor, "*b f"], factor: Float[Tensor, "f"] | float) -> Tensor:
-    """Return contact flags from the flags `before` and the low-passed force `average` [N], with hysteresis.
+def flag(
+    before: Bool[Tensor, "*b f"], average: Float[Tensor, "*b f"], factor: Float[Tensor, "f"] | float
+) -> Tensor:
+    """Return contact flags from the flags `before` and the low-passed force `average` [N], with
+    hysteresis.
 
     `factor` multiplies the two thresholds, for noisier sensors.
     """
@@ -140,17 +159,19 @@ def flag(before: Bool[Tensor, "*b f"], average: Float[Tensor, "*b f"], factor: F
 
 
 def low_pass(cutoff: float, period: float) -> float:
-    """Return the weight of the new value in a first-order low-pass filter, given cut-off [Hz] and period [s]."""
+    """Return the weight of the new value in a first-order low-pass filter, given cut-off [Hz] and
+    period [s].
+    """
     return 1 - math.exp(-2 * math.pi * cutoff * period)
 
 
 class Targets(NamedTuple):
     """Commands to hand and arm until the next tick.
 
-    Args:
-        joints: targets of all joints of the URDF, in the order of `hand.tree.joint_names` [rad].
-        palm: displacement of the palm [m] from its planned path, in the hand's axes; the palm does not rotate.
-        left: remaining length [m] of the approach; it is 0 if the hand is at its pre-grasp.
+    Args: joints: targets of all joints of the URDF, in the order of `hand.tree.joint_names` [rad].
+        palm: displacement of the palm [m] from its planned path, in the hand's axes; the palm does
+        not rotate. left: remaining length [m] of the approach; it is 0 if the hand is at its
+        pre-grasp.
     """
 
     joints: Float[Tensor, " j"]
@@ -178,7 +199,8 @@ class Observation(Value):
 
 @checked
 def observe(hand: Hand, joints: Float[Tensor, " h"], tactile: TactileState) -> Observation:
-    """Return the observation of a robot, from its measured actuated joints [rad] and fingertip readings.
+    """Return the observation of a robot, from its measured actuated joints [rad] and fingertip
+    readings.
 
     Raises `BadArgument` for joints or fingertips on another device than the hand.
 
@@ -189,12 +211,17 @@ def observe(hand: Hand, joints: Float[Tensor, " h"], tactile: TactileState) -> O
     """
     check_device("tactile", tactile.lagged.device, "the hand", hand.lower.device)
     joints = joints.double()
-    tips, everything = hand.tip_centres(joints), hand.expand_joints(joints)
+    tips = hand.tip_centres(joints)
+    everything = hand.expand_joints(joints)
     return Observation(everything, tips, joint_jacobian(hand, everything, tips), tactile)
 
 
-def joint_jacobian(hand: Hand, joints: Float[Tensor, " j"], points: Float[Tensor, "f 3"]) -> Float[Tensor, "f 3 j"]:
-    """Return the Jacobian [m/rad] of points [m] on the fingertips for all URDF joints, as if no joints were coupled."""
+def joint_jacobian(
+    hand: Hand, joints: Float[Tensor, " j"], points: Float[Tensor, "f 3"]
+) -> Float[Tensor, "f 3 j"]:
+    """Return the Jacobian [m/rad] of points [m] on the fingertips for all URDF joints, as if no
+    joints were coupled.
+    """
     axes, origins = hand.tree.joint_axes(hand.tree.poses(joints[None])[0])
     turning = torch.linalg.cross(axes.expand(len(points), -1, 3), points[:, None] - origins)
     columns = torch.where(hand.tree.prismatic[:, None] > 0, axes, turning)

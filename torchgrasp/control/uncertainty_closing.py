@@ -1,4 +1,6 @@
-"""The default closing: a control law like the paper's, extended where the object is not where it was seen."""
+"""The default closing: a control law like the paper's, extended where the object is not where it
+was seen.
+"""
 
 import dataclasses
 import math
@@ -7,7 +9,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.control.law import POSITION_FLOOR, POSITION_RATE, blend, joint_step, stay_above, tip_velocity
+from torchgrasp.control.law import (
+    POSITION_FLOOR,
+    POSITION_RATE,
+    blend,
+    joint_step,
+    stay_above,
+    tip_velocity,
+)
 from torchgrasp.control.object_pose import ContactPlanes
 from torchgrasp.control.paper.closings import SETTLED, Settled, strongest_lead
 from torchgrasp.control.reference import ClosingReference, next_target
@@ -16,39 +25,56 @@ from torchgrasp.control.tactile import STILL, Observation
 from torchgrasp.geometry.linalg import limit_norm
 from torchgrasp.values.closing import ClosingOptions
 
-PATIENCE = 2.5  # longest time [s] from the first touch until the closing ends, even if some finger has not touched
-QUICK_TOUCH = 0.45  # reading [N] of a tactile fingertip that counts as a touch before the contact flag turns on
+# longest time [s] from the first touch until the closing ends, even if some finger has not touched
+PATIENCE = 2.5
+# reading [N] of a tactile fingertip that counts as a touch before the contact flag turns on
+QUICK_TOUCH = 0.45
 PALM_SPEED = 0.04  # largest speed [m/s] of the palm that follows the object
 STALLED = 0.25  # force [N] of its drives at which a finger without a sensor counts as touching
 LEAD = 0.04
-"""Largest lead [rad] of a waiting finger's target over its joint: it bounds the force of a link that is blocked."""
+"""Largest lead [rad] of a waiting finger's target over its joint: it bounds the force of a link
+that is blocked.
+"""
 
 
 class UncertaintyClosing:
-    """The default closing controller: Eqs. (25), (26) and (28) of the paper with `surface_covariance` and extensions.
+    """The default closing controller: Eqs. (25), (26) and (28) of the paper with
+    `surface_covariance` and extensions.
 
-    * A finger that does not touch searches along the normal of its planned contact, even beyond the contact, but not
-      below the table. A finger that touches is force-controlled, whatever its position error.
+    * A finger that does not touch searches along the normal of its planned contact, even beyond the
+      contact, but not below the table. A finger that touches is force-controlled, whatever its
+      position error.
     * Before the first touch the fingers keep pace: all reach their contacts at the same time.
-    * A finger without a working sensor rests at its estimated contact until the others touch. Then it searches until
-      its drives feel a contact, or until it is three standard deviations beyond the contact.
-    * Fingertips whose contacts are on the rim of a low object go down to the table, and slide along it to the object.
-    * A palm that begins above its planned pose (`ClosingReference.rise`) goes down as far as the fingers' arcs go up.
-    * The options `wait`, `pose_estimate` and `palm_reach` of `ClosingOptions` act while the fingers close.
+    * A finger without a working sensor rests at its estimated contact until the others touch. Then
+      it searches until its drives feel a contact, or until it is three standard deviations beyond
+      the contact.
+    * Fingertips whose contacts are on the rim of a low object go down to the table, and slide along
+      it to the object.
+    * A palm that begins above its planned pose (`ClosingReference.rise`) goes down as far as the
+      fingers' arcs go up.
+    * The options `wait`, `pose_estimate` and `palm_reach` of `ClosingOptions` act while the fingers
+      close.
     """
 
     def __init__(self, reference: ClosingReference, options: ClosingOptions) -> None:
-        self.reference, self.waits, self.reach = reference, options.wait, options.palm_reach
+        self.reference = reference
+        self.waits = options.wait
+        self.reach = options.palm_reach
         self.planes = ContactPlanes(reference) if options.pose_estimate else None
-        self.begun = self.palm = reference.rise  # displacement [m] of the palm when the closing began, and now
+        self.begun = self.palm = (
+            reference.rise
+        )  # displacement [m] of the palm when the closing began, and now
         self.raised = bool(self.palm.any())
         self.displacement = torch.zeros(6, dtype=torch.float64)  # of the object [m, rad]
         self.touched = torch.zeros_like(reference.normals[:, 0], dtype=torch.bool)
-        self.alive, self.quick = reference.alive, reference.sensor.kind == "tactile" and reference.sensor.noise <= 1.0
+        self.alive = reference.alive
+        self.quick = reference.sensor.kind == "tactile" and reference.sensor.noise <= 1.0
         self.drives = None if bool(self.alive.all()) else DriveFeel(reference)
-        self.strongest, self.target = strongest_lead(reference), reference.pregrasp
+        self.strongest = strongest_lead(reference)
+        self.target = reference.pregrasp
         self.share = torch.zeros_like(reference.normals[:, 0])
-        self.waiting, self.settled = 0.0, Settled(reference)
+        self.waiting = 0.0
+        self.settled = Settled(reference)
         self.low = rim_contacts(reference)
 
     @property
@@ -56,28 +82,43 @@ class UncertaintyClosing:
         """Whether the closing has ended."""
         return self.settled.time >= SETTLED or (self.waits and self.waiting >= PATIENCE)
 
-    def begin_at(self, displacement: Float[Tensor, "6"], palm: Float[Tensor, "3"]) -> "UncertaintyClosing":
-        """Set the palm's initial displacement [m] and the object's expected displacement [m, rad]; return `self`."""
-        self.planes, self.palm, self.begun = ContactPlanes(self.reference, displacement), palm, palm
+    def begin_at(
+        self, displacement: Float[Tensor, "6"], palm: Float[Tensor, "3"]
+    ) -> "UncertaintyClosing":
+        """Set the palm's initial displacement [m] and the object's expected displacement [m, rad];
+        return `self`.
+        """
+        self.planes = ContactPlanes(self.reference, displacement)
+        self.palm = palm
+        self.begun = palm
         self.displacement = displacement
         return self
 
     def press(self) -> "UncertaintyClosing":
-        """Let all fingers, even waiting ones, press with their desired forces; keep the palm at rest; return `self`."""
-        self.waits, self.reach, self.raised = False, 0.0, False
+        """Let all fingers, even waiting ones, press with their desired forces; keep the palm at
+        rest; return `self`.
+        """
+        self.waits = False
+        self.reach = 0.0
+        self.raised = False
         return self
 
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
         """Return the targets [rad] of all joints for the next tick, `period` [s] later."""
-        reference, gains, normals = self.reference, self.reference.gains, self.reference.normals
-        contact, reading = observation.tactile.contact, observation.tactile.reading
+        reference = self.reference
+        gains = self.reference.gains
+        normals = self.reference.normals
+        contact = observation.tactile.contact
+        reading = observation.tactile.reading
         tips = observation.tips + self.palm
         if self.waits:
             contact = self.touched | contact | (reading >= QUICK_TOUCH if self.quick else contact)
         points = reference.contact_points(tips)
         planned, drift = self._follow(points, contact)
         error = planned - points
-        ahead = -(error * normals).sum(-1)  # how far [m] each planned contact still lies ahead of its fingertip
+        ahead = -(error * normals).sum(
+            -1
+        )  # how far [m] each planned contact still lies ahead of its fingertip
         touches, rests = self._without_sensor(observation, ahead, contact, period)
         contact = contact | touches
         if self.waits:
@@ -100,20 +141,33 @@ class UncertaintyClosing:
             velocity = slide_along(velocity, height, reference.table.normal, self.low)
         velocity, descent = self._descend(velocity - drift, observation, period)
         self.palm = self.palm + period * (drift + descent)
-        lead = LEAD * (1 + self.waiting / 0.25) if self.waits else self.strongest  # grows while others are awaited
-        fastest = 0.8 if bool(self.low.any()) else math.inf  # [rad/s]: faster joints lag, and tips leave the table
-        self.target = next_target(reference, self.target, velocity, observation, lead, period, fastest)
+        lead = (
+            LEAD * (1 + self.waiting / 0.25) if self.waits else self.strongest
+        )  # grows while others are awaited
+        fastest = (
+            0.8 if bool(self.low.any()) else math.inf
+        )  # [rad/s]: faster joints lag, and tips leave the table
+        self.target = next_target(
+            reference, self.target, velocity, observation, lead, period, fastest
+        )
         return reference.expand(self.target)
 
-    def _follow(self, points: Float[Tensor, "f 3"], contact: Bool[Tensor, "f"]) -> tuple[Tensor, Tensor]:
-        """Return the planned contacts [m] on the displaced object (f, 3), and the palm's velocity (3,) [m/s]."""
+    def _follow(
+        self, points: Float[Tensor, "f 3"], contact: Bool[Tensor, "f"]
+    ) -> tuple[Tensor, Tensor]:
+        """Return the planned contacts [m] on the displaced object (f, 3), and the palm's velocity
+        (3,) [m/s].
+        """
         if self.planes is None:
             return self.reference.gains.target, STILL
         self.displacement = self.planes.displacement(points, contact)
         drift = STILL
         if self.reach:
-            way, table = limit_norm(self.displacement[:3], self.reach) - self.palm, self.reference.table
-            if self.raised and table is not None:  # what the palm has left of its descent is no drift
+            way = limit_norm(self.displacement[:3], self.reach) - self.palm
+            table = self.reference.table
+            if (
+                self.raised and table is not None
+            ):  # what the palm has left of its descent is no drift
                 way = way - (way @ table.normal) * table.normal
             drift = limit_norm(6.0 * way, PALM_SPEED)
         return self.planes.moved(self.displacement), drift
@@ -123,24 +177,34 @@ class UncertaintyClosing:
     ) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "3"]]:
         """Return velocities [m/s] of fingertips in the hand, and of a palm that began raised.
 
-        Then the fingers move their tips along the table only. The palm moves along its normal, so that no tip is lower
-        than it should be.
+        Then the fingers move their tips along the table only. The palm moves along its normal, so
+        that no tip is lower than it should be.
         """
         if not self.raised or self.reference.table is None:
             return velocity, STILL
-        up, jacobian = self.reference.table.normal, observation.jacobian @ self.reference.hand.actuated.coupling
+        up = self.reference.table.normal
+        jacobian = observation.jacobian @ self.reference.hand.actuated.coupling
         flat = jacobian - up[:, None] * (up @ jacobian)[:, None]
-        made = jacobian @ joint_step(flat, velocity - (velocity @ up)[:, None] * up, period) / period
+        made = (
+            jacobian @ joint_step(flat, velocity - (velocity @ up)[:, None] * up, period) / period
+        )
         return made, limit_norm(((velocity - made) @ up).amax() * up, PALM_SPEED)
 
     def _without_sensor(
-        self, observation: Observation, ahead: Float[Tensor, "f"], contact: Bool[Tensor, "f"], period: float
+        self,
+        observation: Observation,
+        ahead: Float[Tensor, "f"],
+        contact: Bool[Tensor, "f"],
+        period: float,
     ) -> tuple[Bool[Tensor, "f"], Bool[Tensor, "f"]]:
-        """Return which fingers without a working sensor probably touch, and which of them wait for the others."""
+        """Return which fingers without a working sensor probably touch, and which of them wait for
+        the others.
+        """
         blind = ~self.alive
         if self.drives is None:
             return blind, blind
-        normals, covariance = self.reference.normals, self.reference.gains.covariance
+        normals = self.reference.normals
+        covariance = self.reference.gains.covariance
         deviation = torch.einsum("fi,fij,fj->f", normals, covariance, normals).sqrt()
         pushes = self.drives(observation, self.reference.expand(self.target), period)
         touches = blind & ((pushes >= STALLED) | (ahead <= -3.0 * deviation))
@@ -150,7 +214,9 @@ class UncertaintyClosing:
     def _desired(
         self, reading: Float[Tensor, "f"], contact: Bool[Tensor, "f"], rests: Bool[Tensor, "f"]
     ) -> Float[Tensor, "f"]:
-        """Return the desired normal force [N] of each finger; if the sensor is dead, the force error is zero."""
+        """Return the desired normal force [N] of each finger; if the sensor is dead, the force
+        error is zero.
+        """
         desired = -(self.reference.gains.desired_force * self.reference.normals).sum(-1)
         if self.waits:
             rest = WAITING_FORCE if bool(contact.all()) else reading.clamp_max(WAITING_FORCE)
@@ -159,29 +225,45 @@ class UncertaintyClosing:
 
 
 def rim_contacts(reference: ClosingReference) -> Bool[Tensor, "f"]:
-    """Return a mask of the contacts that fingertips at the table touch with inclined normals, on the rim above them."""
+    """Return a mask of the contacts that fingertips at the table touch with inclined normals, on
+    the rim above them.
+    """
     if reference.table is None:
         return torch.zeros_like(reference.alive)
-    least, near, normals, radius = 0.25, 0.004, reference.normals, reference.hand.tips.radius  # slope, and [m]
+    # slope, and [m]
+    least = 0.25
+    near = 0.004
+    normals = reference.normals
+    radius = reference.hand.tips.radius
     height = reference.table.height(reference.gains.target + radius[:, None] * normals) - radius
     return (normals @ reference.table.normal > least) & (height < near)
 
 
 def slide_along(
-    velocity: Float[Tensor, "f 3"], height: Float[Tensor, "f"], up: Float[Tensor, "3"], low: Bool[Tensor, "f"]
+    velocity: Float[Tensor, "f 3"],
+    height: Float[Tensor, "f"],
+    up: Float[Tensor, "3"],
+    low: Bool[Tensor, "f"],
 ) -> Float[Tensor, "f 3"]:
-    """Return fingertip velocities [m/s]; `low` tips at `height` [m] over the table go down, and then keep low."""
-    rate, gap = 12.0, 0.0003  # [1/s], [m]: the lower a tip, the flatter its contact's normal
+    """Return fingertip velocities [m/s]; `low` tips at `height` [m] over the table go down, and
+    then keep low.
+    """
+    # [1/s], [m]: the lower a tip, the flatter its contact's normal
+    rate = 12.0
+    gap = 0.0003
     down = rate * (gap - height) - velocity @ up
     return velocity + (down * low)[:, None] * up
 
 
 def with_equal_gains(reference: ClosingReference) -> ClosingReference:
-    """Return the plan with equal gains at all contacts, for the closing "fixed", which ignores uncertainty."""
+    """Return the plan with equal gains at all contacts, for the closing "fixed", which ignores
+    uncertainty.
+    """
     gains = reference.gains
     isotropic = dataclasses.replace(
         gains,
-        covariance=POSITION_FLOOR**2 * torch.eye(3, dtype=gains.covariance.dtype).expand_as(gains.covariance),
+        covariance=POSITION_FLOOR**2
+        * torch.eye(3, dtype=gains.covariance.dtype).expand_as(gains.covariance),
         position_gain=torch.full_like(gains.position_gain, POSITION_RATE),
         force_gain=gains.force_gain.amax(-1, keepdim=True).expand_as(gains.force_gain),
     )

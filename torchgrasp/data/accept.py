@@ -1,4 +1,5 @@
-"""What public functions take in place of a cloud, a scene or a hand: arrays, clouds of other programs, files, names.
+"""What public functions take in place of a cloud, a scene or a hand: arrays, clouds of other
+programs, files, names.
 
 The border (`checked`) turns it into a value, so that all other functions take values alone.
 """
@@ -29,7 +30,8 @@ CLOUD = (
     "a PointCloud, an array (n, 3) in metres (cloud_from_array takes normals and the camera's position, too), "
     "a cloud of Open3D or trimesh, a file or a GraspObject"
 )
-SCENE, HAND = "a Scene, or a file of save_scene", "a Hand, the name of a shipped hand, or the folder of another hand"
+SCENE = "a Scene, or a file of save_scene"
+HAND = "a Hand, the name of a shipped hand, or the folder of another hand"
 
 
 @runtime_checkable
@@ -76,7 +78,9 @@ def as_cloud(value: Any) -> PointCloud:
         return make_cloud("an array", {"columns": value}).cloud
     for surface in ("faces", "triangles"):
         if hasattr(value, surface):
-            raise BadArgument("cloud", f"a mesh ({show(value)})", f"points that a camera saw: {CLOUD}")
+            raise BadArgument(
+                "cloud", f"a mesh ({show(value)})", f"points that a camera saw: {CLOUD}"
+            )
     points = getattr(value, "points", getattr(value, "vertices", None))
     if points is None or isinstance(value, Value):
         raise BadArgument("cloud", show(value), CLOUD)
@@ -104,7 +108,9 @@ def as_seen(value: Any) -> PointCloud | Scene:
 
 @_named
 def as_hand(value: Any) -> Hand:
-    """Return a value as a hand; a shipped hand is loaded once, so that what the planner derives from it is kept."""
+    """Return a value as a hand; a shipped hand is loaded once, so that what the planner derives
+    from it is kept.
+    """
     if isinstance(value, Hand):
         return value
     if not isinstance(value, str | Path):
@@ -118,12 +124,18 @@ def _load_shipped(name: str) -> Hand:
     return load_hand(name)
 
 
-Given = PointCloud | np.ndarray | Float[Tensor, "n 3"] | Path | str | GraspObject | _Open3D | _Trimesh
+Given = (
+    PointCloud | np.ndarray | Float[Tensor, "n 3"] | Path | str | GraspObject | _Open3D | _Trimesh
+)
 CloudLike = Annotated[Given, Taken("CloudLike", PointCloud, CLOUD, as_cloud)]
-"""A cloud, or what becomes one: points are in metres, in the frame of the results; the camera is as a rule unknown."""
+"""A cloud, or what becomes one: points are in metres, in the frame of the results; the camera is as
+a rule unknown.
+"""
 SceneLike = Annotated[Scene | Path | str, Taken("SceneLike", Scene, SCENE, as_scene)]
 """A scene, or a file of one."""
-SeenLike = Annotated[Given | Scene, Taken("SeenLike", PointCloud | Scene, f"{CLOUD}, or a Scene", as_seen)]
+SeenLike = Annotated[
+    Given | Scene, Taken("SeenLike", PointCloud | Scene, f"{CLOUD}, or a Scene", as_seen)
+]
 """What a camera saw: a cloud or a scene, or what becomes one."""
 HandLike = Annotated[Hand | Path | str, Taken("HandLike", Hand, HAND, as_hand)]
 """A hand, or a name or folder for `load_hand`."""

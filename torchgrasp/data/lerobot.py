@@ -12,7 +12,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.data.table_folder import as_table, import_arrow, pack_table, render_card, write_folder
+from torchgrasp.data.table_folder import (
+    as_table,
+    import_arrow,
+    pack_table,
+    render_card,
+    write_folder,
+)
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import spatial
@@ -26,7 +32,8 @@ Episodes = Sequence[tuple[str, ClosureResult]]
 def write_lerobot(folder: Path | str, episodes: Episodes, hand: Hand) -> Path:
     """Write closings, each with its task in words, as a LeRobot data set (v3.0); return the folder.
 
-    `LeRobotDataset(name, root=folder)` reads it. A frame is a control tick; poses [m] are in the frame of the grasp:
+    `LeRobotDataset(name, root=folder)` reads it. A frame is a control tick; poses [m] are in the
+    frame of the grasp:
 
     | feature | contents |
     | --- | --- |
@@ -36,8 +43,9 @@ def write_lerobot(folder: Path | str, episodes: Episodes, hand: Hand) -> Path:
     | `action` | the joints' targets in the next tick [rad], then position and quaternion of the hand at its end |
     | `next.done`, `next.success` | whether the next tick is the last one, and whether the object is then held |
 
-    Raises `BadArgument` for no closing, a closing of a single tick, or one of another hand or rate than the first;
-    `OutputError` if the folder holds other files or cannot be written; `MissingExtra` without pyarrow.
+    Raises `BadArgument` for no closing, a closing of a single tick, or one of another hand or rate
+    than the first; `OutputError` if the folder holds other files or cannot be written;
+    `MissingExtra` without pyarrow.
 
     >>> import tempfile
     >>> from torchgrasp import TrialSpec, close_hand, load_hand, load_object
@@ -49,13 +57,18 @@ def write_lerobot(folder: Path | str, episodes: Episodes, hand: Hand) -> Path:
     ['spread', 'spread_mimic', 'f1_flex']
     """
     import_arrow()
-    joints, rates = sorted(hand.tree.joint_names), list[float]()
+    joints = sorted(hand.tree.joint_names)
+    rates = list[float]()
     for i, (_, x) in enumerate(episodes):
         rates.append(round(1 / float(x.time[1] - x.time[0]), 6) if len(x.time) > 1 else 0.0)
         same = sorted(x.joint_names) == joints and x.forces.shape[1] == len(hand.finger_names)
         if not same or not rates[i] or rates[i] != rates[0]:
             found = f"{len(x.time)} ticks at {rates[i]:g} Hz of {len(x.joint_names)} joints"
-            raise BadArgument(f"episodes[{i}]", found, f"a closing of {hand.name}, two ticks or more, all at one rate")
+            raise BadArgument(
+                f"episodes[{i}]",
+                found,
+                f"a closing of {hand.name}, two ticks or more, all at one rate",
+            )
     if not rates:
         raise BadArgument("episodes", "none", "at least one closing")
     files = dict(_files(episodes, hand, rates[0]))
@@ -65,8 +78,10 @@ def write_lerobot(folder: Path | str, episodes: Episodes, hand: Hand) -> Path:
 
 def _files(episodes: Episodes, hand: Hand, rate: float) -> Iterator[tuple[str, str | bytes]]:
     """Yield names and contents of the files, `meta/info.json` at the end."""
-    tasks, file = list(dict.fromkeys(task for task, _ in episodes)), "chunk-000/file-000.parquet"
-    parts, joints = list[dict[str, Tensor]](), hand.tree.joint_names
+    tasks = list(dict.fromkeys(task for task, _ in episodes))
+    file = "chunk-000/file-000.parquet"
+    parts = list[dict[str, Tensor]]()
+    joints = hand.tree.joint_names
     for task, x in episodes:
         order = [x.joint_names.index(name) for name in joints]  # simulators have their own
         parts.append(_frames(x, order, rate, len(parts), tasks.index(task)))
@@ -77,30 +92,59 @@ def _files(episodes: Episodes, hand: Hand, rate: float) -> Iterator[tuple[str, s
     for i, (start, end) in enumerate(itertools.pairwise(ends)):
         row = {"episode_index": i, "tasks": [episodes[i][0]], "length": end - start}
         row |= {"dataset_from_index": start, "dataset_to_index": end}
-        row |= {f"{of}/{index}_index": 0 for of in ("data", "meta/episodes") for index in ("chunk", "file")}
+        row |= {
+            f"{of}/{index}_index": 0
+            for of in ("data", "meta/episodes")
+            for index in ("chunk", "file")
+        }
         stats = {name: _stats(x[start:end]) for name, x in frames.items()}
-        rows.append(row | {f"stats/{name}/{key}": x for name, of in stats.items() for key, x in of.items()})
+        rows.append(
+            row | {f"stats/{name}/{key}": x for name, of in stats.items() for key, x in of.items()}
+        )
     yield f"data/{file}", pack_table(as_table(frames, {}))
     yield f"meta/episodes/{file}", pack_table(import_arrow().Table.from_pylist(rows))
-    words = as_table({"task_index": torch.arange(len(tasks)), "task": tasks}, {"pandas": render_card("tasks.json")})
+    words = as_table(
+        {"task_index": torch.arange(len(tasks)), "task": tasks},
+        {"pandas": render_card("tasks.json")},
+    )
     yield "meta/tasks.parquet", pack_table(words)
     yield "meta/stats.json", json.dumps({name: _stats(x) for name, x in frames.items()}, indent=1)
-    pose, fingers = ("x", "y", "z", "qx", "qy", "qz", "qw"), hand.finger_names
+    pose = ("x", "y", "z", "qx", "qy", "qz", "qw")
+    fingers = hand.finger_names
     names = {"action": [*joints, *(f"hand.{x}" for x in pose)]}
-    names |= {"observation.state": names["action"], "observation.environment_state": [f"object.{x}" for x in pose]}
+    names |= {
+        "observation.state": names["action"],
+        "observation.environment_state": [f"object.{x}" for x in pose],
+    }
     names["observation.forces"] = [f"{finger}.{axis}" for finger in fingers for axis in "xyz"]
     features = {
-        name: {"dtype": str(x.dtype).removeprefix("torch."), "shape": [*x.shape[1:]] or [1], "names": names.get(name)}
+        name: {
+            "dtype": str(x.dtype).removeprefix("torch."),
+            "shape": [*x.shape[1:]] or [1],
+            "names": names.get(name),
+        }
         for name, x in frames.items()
     }
-    about = {"hand": hand, "rate": rate, "episodes": rows, "frames": ends[-1], "tasks": tasks, "features": features}
+    about = {
+        "hand": hand,
+        "rate": rate,
+        "episodes": rows,
+        "frames": ends[-1],
+        "tasks": tasks,
+        "features": features,
+    }
     yield "README.md", render_card("lerobot.md", **about)
     yield "meta/info.json", render_card("info.json", **about)
 
 
-def _frames(closing: ClosureResult, order: list[int], rate: float, episode: int, task: int) -> dict[str, Tensor]:
-    """Return the features of a closing's frames: all its ticks but the last one, after which nothing is done."""
-    hand, thing = _numbers(closing.hand_pose), _numbers(closing.object_pose)
+def _frames(
+    closing: ClosureResult, order: list[int], rate: float, episode: int, task: int
+) -> dict[str, Tensor]:
+    """Return the features of a closing's frames: all its ticks but the last one, after which
+    nothing is done.
+    """
+    hand = _numbers(closing.hand_pose)
+    thing = _numbers(closing.object_pose)
     number = torch.arange(len(hand) - 1)
     done = number == number[-1]
     return {
@@ -108,15 +152,20 @@ def _frames(closing: ClosureResult, order: list[int], rate: float, episode: int,
         "observation.forces": closing.trace.forces.flatten(1)[:-1].float(),
         "observation.environment_state": thing[:-1].float(),
         "action": torch.cat([closing.targets[:, order], hand], 1)[1:].float(),
-        "next.done": done, "next.success": done & closing.held, "timestamp": (number / rate).float(),
-        "frame_index": number, "episode_index": torch.full_like(number, episode),
+        "next.done": done,
+        "next.success": done & closing.held,
+        "timestamp": (number / rate).float(),
+        "frame_index": number,
+        "episode_index": torch.full_like(number, episode),
         "task_index": torch.full_like(number, task),
-    }  # fmt: skip
+    }
 
 
 def _numbers(poses: Float[Tensor, "t 4 4"]) -> Float[Tensor, "t 7"]:
     """Return poses as positions [m] and quaternions (x, y, z, w), whose signs do not jump."""
-    turns = torch.from_numpy(spatial.transform.Rotation.from_matrix(poses[:, :3, :3].numpy()).as_quat(canonical=True))
+    turns = torch.from_numpy(
+        spatial.transform.Rotation.from_matrix(poses[:, :3, :3].numpy()).as_quat(canonical=True)
+    )
     signs = torch.where((turns[1:] * turns[:-1]).sum(1) < 0, -1.0, 1.0).cumprod(0)
     return torch.cat([poses[:, :3, 3], torch.cat([turns[:1], turns[1:] * signs[:, None]])], 1)
 

@@ -1,12 +1,12 @@
 """Folders of objects: true meshes and views of them.
 
-`manifest.json` holds "objects" by name. An object has "views" by name, each with "T_object_camera" (4x4). An object's
-folder has `mesh.ply` and `<view>_noisy.ply` [m], resting at z = 0. All readers apply the object's "suggested_scale"
-(default 1), which makes it graspable. Optional are "mass_kg", the "family" of similar objects, and the "group", such as
-"solid".
+`manifest.json` holds "objects" by name. An object has "views" by name, each with "T_object_camera"
+(4x4). An object's folder has `mesh.ply` and `<view>_noisy.ply` [m], resting at z = 0. All readers
+apply the object's "suggested_scale" (default 1), which makes it graspable. Optional are "mass_kg",
+the "family" of similar objects, and the "group", such as "solid".
 
-A folder from a stranger may hold anything. A name of an object or a view is one part of a path, and no file outside the
-folder is read.
+A folder from a stranger may hold anything. A name of an object or a view is one part of a path, and
+no file outside the folder is read.
 """
 
 import dataclasses
@@ -25,36 +25,56 @@ from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.values.planning import PointCloud
 
-WHOLE = "whole"  # name of the view that shows an object from all sides, with normals: `full_normals.ply`
-MOST_SCALE, MOST_METRES, MOST_MASS = 1e4, 1e4, 1e4
-"""Largest scale, its inverse being the least, largest coordinate [m] of a camera, and largest mass [kg]."""
-MESHES = (".ply", ".stl", ".obj", ".off")  # suffixes of the meshes that `write_objects` takes from a folder
+# name of the view that shows an object from all sides, with normals: `full_normals.ply`
+WHOLE = "whole"
+MOST_SCALE = 1e4
+MOST_METRES = 1e4
+MOST_MASS = 1e4
+"""Largest scale, its inverse being the least, largest coordinate [m] of a camera, and largest mass
+[kg].
+"""
+MESHES = (
+    ".ply",
+    ".stl",
+    ".obj",
+    ".off",
+)  # suffixes of the meshes that `write_objects` takes from a folder
 
 
 @dataclasses.dataclass(frozen=True)
 class ObjectEntry:
     """The description of an object in the manifest of a folder of objects."""
 
-    views: dict[str, tuple[float, ...]]  # position [m] of the camera of each view by name, at scale 1
+    views: dict[
+        str, tuple[float, ...]
+    ]  # position [m] of the camera of each view by name, at scale 1
     scale: float  # scale factor of mesh and clouds
     family: str  # family of similar objects; the object's own name by default
     group: str  # such as "solid", "thin" or "shell"; "" by default
     mass: float | None  # mass [kg] of the real object at any scale, or None
 
     def list_views(self, whole: bool = False, most: int | None = None) -> list[str]:
-        """Return at most `most` names of views, sorted; with `whole`, only `WHOLE`, the view that shows all sides."""
+        """Return at most `most` names of views, sorted; with `whole`, only `WHOLE`, the view that
+        shows all sides.
+        """
         return ([WHOLE] if whole else sorted(self.views))[:most]
 
 
 @checked
 def read_entry(objects: Path | str, name: str) -> ObjectEntry:
-    """Return the description of an object from its folder's manifest; raise `DatasetError` for a bad or missing one."""
+    """Return the description of an object from its folder's manifest; raise `DatasetError` for a
+    bad or missing one.
+    """
     return _parse_entry(name, _read_fields(objects, [name])[name])
 
 
 @checked
-def read_entries(objects: Path | str, only: Sequence[str] = ()) -> dict[str, ObjectEntry | DatasetError]:
-    """Return each object's description from the manifest, sorted by name, or the error of a bad description."""
+def read_entries(
+    objects: Path | str, only: Sequence[str] = ()
+) -> dict[str, ObjectEntry | DatasetError]:
+    """Return each object's description from the manifest, sorted by name, or the error of a bad
+    description.
+    """
     found: dict[str, ObjectEntry | DatasetError] = {}
     for name, field in sorted(_read_fields(objects, only).items()):
         try:
@@ -67,7 +87,8 @@ def read_entries(objects: Path | str, only: Sequence[str] = ()) -> dict[str, Obj
 def _parse_entry(name: str, field: Field) -> ObjectEntry:
     """Check an object's entry in the manifest, and return it."""
     _check_name(field, name)
-    fields, views = field.entries("views"), {}
+    fields = field.entries("views")
+    views = {}
     for view, of_view in fields["views"].entries().items():
         _check_name(of_view, view)
         pose = of_view.entries("T_object_camera")["T_object_camera"]
@@ -75,7 +96,9 @@ def _parse_entry(name: str, field: Field) -> ObjectEntry:
         if len(rows) != 4:
             raise pose.wrong("4 rows of 4 numbers")
         views[view] = tuple(row[3] for row in rows[:3])
-    scale, mass, family, group = (fields.get(key) for key in ("suggested_scale", "mass_kg", "family", "group"))
+    scale, mass, family, group = (
+        fields.get(key) for key in ("suggested_scale", "mass_kg", "family", "group")
+    )
     return ObjectEntry(
         views,
         1.0 if scale is None else scale.number(1 / MOST_SCALE, MOST_SCALE),
@@ -86,14 +109,17 @@ def _parse_entry(name: str, field: Field) -> ObjectEntry:
 
 
 @checked
-def write_objects(meshes: Path | str, out: Path | str, views: Count = 3, seed: Seed = 0) -> list[str]:
-    """Make a folder of objects from a folder of mesh files; return the objects' names, the file names without suffix.
+def write_objects(
+    meshes: Path | str, out: Path | str, views: Count = 3, seed: Seed = 0
+) -> list[str]:
+    """Make a folder of objects from a folder of mesh files; return the objects' names, the file
+    names without suffix.
 
-    Each mesh is moved so that its lowest point is at z = 0 and the middle of its box above the origin. Each view is
-    rendered by the depth camera of `partial_view` from a random side. The manifest is written last, so that a folder
-    with a manifest is complete. The `meshes` are closed, in metres, with z up (.ply, .stl, .obj, .off). Raises
-    `DatasetError` for no meshes or two meshes of one name, the errors of `read_mesh`, and `OutputError` if the folder
-    cannot be written.
+    Each mesh is moved so that its lowest point is at z = 0 and the middle of its box above the
+    origin. Each view is rendered by the depth camera of `partial_view` from a random side. The
+    manifest is written last, so that a folder with a manifest is complete. The `meshes` are closed,
+    in metres, with z up (.ply, .stl, .obj, .off). Raises `DatasetError` for no meshes or two meshes
+    of one name, the errors of `read_mesh`, and `OutputError` if the folder cannot be written.
 
     >>> import tempfile, trimesh
     >>> folder = Path(tempfile.mkdtemp())
@@ -103,24 +129,34 @@ def write_objects(meshes: Path | str, out: Path | str, views: Count = 3, seed: S
     >>> len(read_view(folder / "objects", "carton", "view0"))
     1000
     """
-    lowest, highest, distance = 25.0, 45.0, 0.5  # angles of the camera above the horizontal [deg], its distance [m]
+    # angles of the camera above the horizontal [deg], its distance [m]
+    lowest = 25.0
+    highest = 45.0
+    distance = 0.5
     files = sorted(path for path in Path(meshes).glob("*") if path.suffix.lower() in MESHES)
     names = [path.stem for path in files]
     if not files or len(set(names)) != len(names):
         found = f"{meshes} without meshes" if not files else f"{meshes} with two meshes of one name"
-        raise DatasetError("meshes", found, f"a folder of files {', '.join(MESHES)}, each of its own name")
-    generator, entries = torch.Generator().manual_seed(seed), dict[str, object]()
+        raise DatasetError(
+            "meshes", found, f"a folder of files {', '.join(MESHES)}, each of its own name"
+        )
+    generator = torch.Generator().manual_seed(seed)
+    entries = dict[str, object]()
     for path in files:
         mesh = read_mesh(path)
         low, high = mesh.bounds
-        mesh = mesh.copy().apply_translation([-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2]])
+        mesh = mesh.copy().apply_translation(
+            [-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2]]
+        )
         write_file(Path(out) / path.stem / "mesh.ply", mesh.export(file_type="ply"))
         poses = dict[str, object]()
         for k in range(views):
             first, second = torch.rand(2, generator=generator).tolist()
             camera = look_at(360.0 * first, lowest + (highest - lowest) * second, distance, mesh)
             noise = int(torch.randint(2**31, (1,), generator=generator))
-            save_cloud(partial_view(mesh, camera, seed=noise), Path(out) / path.stem / f"view{k}_noisy.ply")
+            save_cloud(
+                partial_view(mesh, camera, seed=noise), Path(out) / path.stem / f"view{k}_noisy.ply"
+            )
             poses[f"view{k}"] = {"T_object_camera": camera.tolist()}
         entries[path.stem] = {"views": poses}
     write_file(Path(out) / "manifest.json", format_json({"objects": entries}))
@@ -128,7 +164,9 @@ def write_objects(meshes: Path | str, out: Path | str, views: Count = 3, seed: S
 
 
 def _check_name(field: Field, name: str) -> None:
-    """Raise the field's error for a name that is more than one part of a path, or that is not printable."""
+    """Raise the field's error for a name that is more than one part of a path, or that is not
+    printable.
+    """
     longest_name = 100  # most letters of a name: file names have 255 bytes
     plain = name.isprintable() and not set(name) & set("/\\:") and name == name.strip(" .")
     if not plain or not 0 < len(name.encode("utf-8", "surrogatepass")) <= longest_name:
@@ -142,8 +180,9 @@ def list_views(
 ) -> list[tuple[str, str]]:
     """Return sorted pairs of object and view, at most `most` views of each object, by default all.
 
-    `only` selects objects by name; with `whole` each object has the single view `WHOLE`, which shows all sides. Raises
-    `DatasetError` for no manifest, none of the objects in it, or a bad entry.
+    `only` selects objects by name; with `whole` each object has the single view `WHOLE`, which
+    shows all sides. Raises `DatasetError` for no manifest, none of the objects in it, or a bad
+    entry.
 
     >>> import tempfile, trimesh
     >>> folder = Path(tempfile.mkdtemp())
@@ -152,15 +191,20 @@ def list_views(
     >>> list_views(folder / "objects")
     [('carton', 'view0')]
     """
-    entries = {name: _parse_entry(name, field) for name, field in sorted(_read_fields(objects, only).items())}
+    entries = {
+        name: _parse_entry(name, field)
+        for name, field in sorted(_read_fields(objects, only).items())
+    }
     return [(name, view) for name, x in entries.items() for view in x.list_views(whole, most)]
 
 
 @checked
 def read_view(objects: Path | str, name: str, view: str, camera: bool = True) -> PointCloud:
-    """Return the point cloud of a noisy view without normals, with the position of the camera if `camera` is true.
+    """Return the point cloud of a noisy view without normals, with the position of the camera if
+    `camera` is true.
 
-    Raises `DatasetError` as `read_entry` and for an unknown view, and `CloudFileError` for a bad file.
+    Raises `DatasetError` as `read_entry` and for an unknown view, and `CloudFileError` for a bad
+    file.
 
     >>> import tempfile, trimesh
     >>> folder = Path(tempfile.mkdtemp())
@@ -174,7 +218,9 @@ def read_view(objects: Path | str, name: str, view: str, camera: bool = True) ->
         cloud = read_cloud(_file(objects, name, "full_normals.ply"))
         return PointCloud(cloud.points * entry.scale, cloud.normals)
     if view not in entry.views:
-        raise DatasetError("objects", f"{objects}: view {view!r} of {name!r}", f"one of {sorted(entry.views)}")
+        raise DatasetError(
+            "objects", f"{objects}: view {view!r} of {name!r}", f"one of {sorted(entry.views)}"
+        )
     cloud = read_cloud(_file(objects, name, f"{view}_noisy.ply"))
     viewpoint = torch.tensor(entry.views[view], dtype=torch.float64)
     return PointCloud(cloud.points * entry.scale, None, viewpoint * entry.scale if camera else None)
@@ -182,7 +228,8 @@ def read_view(objects: Path | str, name: str, view: str, camera: bool = True) ->
 
 @checked
 def read_object_mesh(objects: Path | str, name: str) -> "trimesh.Trimesh":
-    """Return the true, closed mesh [m] of an object in a folder; raises the errors of `read_entry` and `read_mesh`.
+    """Return the true, closed mesh [m] of an object in a folder; raises the errors of `read_entry`
+    and `read_mesh`.
 
     >>> import tempfile, trimesh
     >>> folder = Path(tempfile.mkdtemp())
@@ -196,21 +243,32 @@ def read_object_mesh(objects: Path | str, name: str) -> "trimesh.Trimesh":
 
 
 def _file(objects: Path | str, name: str, file: str) -> Path:
-    """Return the path of an object's file; raise `DatasetError` if it is a link to a file outside the folder."""
-    path, folder = Path(objects) / name / file, Path(objects).resolve()
+    """Return the path of an object's file; raise `DatasetError` if it is a link to a file outside
+    the folder.
+    """
+    path = Path(objects) / name / file
+    folder = Path(objects).resolve()
     if not path.resolve().is_relative_to(folder):
-        raise DatasetError("objects", f"{path}, which is {path.resolve()}", f"files within {folder}")
+        raise DatasetError(
+            "objects", f"{path}, which is {path.resolve()}", f"files within {folder}"
+        )
     return path
 
 
 def _read_fields(objects: Path | str, only: Sequence[str]) -> dict[str, Field]:
-    """Return the unchecked manifest entries, by name, of the objects in `only`; an empty `only` selects all."""
+    """Return the unchecked manifest entries, by name, of the objects in `only`; an empty `only`
+    selects all.
+    """
     refuse = functools.partial(DatasetError, "objects")
     path = Path(objects) / "manifest.json"
-    allowed = "a folder with a manifest.json in UTF-8 (`torchgrasp cloud views` makes one from meshes)"
+    allowed = (
+        "a folder with a manifest.json in UTF-8 (`torchgrasp cloud views` makes one from meshes)"
+    )
     top = read_json(path, refuse, allowed).entries()
     entries = top["objects"].entries() if "objects" in top else {}
     chosen = {name: entries[name] for name in entries if not only or name in only}
     if not chosen:
-        raise refuse(f"{path} with {sorted(entries)[:100]}", "a manifest with the objects asked for")
+        raise refuse(
+            f"{path} with {sorted(entries)[:100]}", "a manifest with the objects asked for"
+        )
     return chosen

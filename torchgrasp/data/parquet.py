@@ -1,4 +1,6 @@
-"""A campaign's data set as Parquet files with a Croissant card, which other libraries load in one line."""
+"""A campaign's data set as Parquet files with a Croissant card, which other libraries load in one
+line.
+"""
 
 import itertools
 import json
@@ -9,7 +11,14 @@ from typing import Any
 import torch
 
 from torchgrasp.data.reader import CARD, GraspShards
-from torchgrasp.data.table_folder import as_column, as_table, import_arrow, pack_table, render_card, write_folder
+from torchgrasp.data.table_folder import (
+    as_column,
+    as_table,
+    import_arrow,
+    pack_table,
+    render_card,
+    write_folder,
+)
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, ModelFileError, Status
 from torchgrasp.foundation.lazy import jinja2
@@ -19,26 +28,36 @@ from torchgrasp.foundation.lazy import jinja2
 def write_parquet(data: GraspShards, folder: Path | str) -> Path:
     """Write a data set as Parquet with cards in Markdown and Croissant; return the folder.
 
-    In `datasets`, `load_dataset(folder)` reads a row for each grasp: the numbers of an item of `GraspShards`, with
-    object, view, hand, friction, seed and the status of each try. `load_dataset(folder, "views")` reads a row for each
-    job: its cloud and counts. The joints' names are in the cards, and in the metadata of each file's schema.
+    In `datasets`, `load_dataset(folder)` reads a row for each grasp: the numbers of an item of
+    `GraspShards`, with object, view, hand, friction, seed and the status of each try.
+    `load_dataset(folder, "views")` reads a row for each job: its cloud and counts. The joints'
+    names are in the cards, and in the metadata of each file's schema.
 
-    Raises `BadArgument` for no grasps, `ModelFileError` for a damaged shard or card, `OutputError` if the folder holds
-    other files or cannot be written, `MissingExtra` without pyarrow.
+    Raises `BadArgument` for no grasps, `ModelFileError` for a damaged shard or card, `OutputError`
+    if the folder holds other files or cannot be written, `MissingExtra` without pyarrow.
 
     >>> write_parquet(read_shards("campaign"), "parquet")  # doctest: +SKIP
     """
     import_arrow()
     if not len(data):
-        raise BadArgument("data", f"{len(data.jobs)} jobs without a grasp", "a data set with grasps")
+        raise BadArgument(
+            "data", f"{len(data.jobs)} jobs without a grasp", "a data set with grasps"
+        )
     try:
         source = {name: data.card[name] for name in ("campaign", "licence", "asked")}
-        asked, trial = source["asked"], source["asked"]["protocol"]["trial"]
+        asked = source["asked"]
+        trial = source["asked"]["protocol"]["trial"]
         of_campaign = {name: asked[name]["name"] for name in ("hand", "protocol")}
-        of_campaign |= {"simulator": trial["simulator"], "friction": trial["friction"], "seed": asked["trials"]["seed"]}
+        of_campaign |= {
+            "simulator": trial["simulator"],
+            "friction": trial["friction"],
+            "seed": asked["trials"]["seed"],
+        }
         render_card("shards.md", card=data.card)
     except (LookupError, TypeError, jinja2.TemplateError) as error:
-        raise ModelFileError("data", f"{data.folder / CARD} ({error})", "the card of `torchgrasp campaign`") from error
+        raise ModelFileError(
+            "data", f"{data.folder / CARD} ({error})", "the card of `torchgrasp campaign`"
+        ) from error
     return write_folder(folder, source, _files(data, of_campaign))
 
 
@@ -68,34 +87,60 @@ def _grasp_columns(data: GraspShards, jobs: range, of_campaign: dict[str, Any]) 
     of = [int(item["job"]) for item in items]
     tries = itertools.chain(*(data.job(j).outcome.tolist() for j in jobs))
     of_view = "job", "points", "viewpoint"
-    return {} if not items else {
-        "grasp": list(numbers), "job": of,
-        **{name: [getattr(data.jobs[j], name) for j in of] for name in ("object", "view", "family", "group")},
-        **{name: [value] * len(items) for name, value in of_campaign.items()},
-        **{name: torch.stack([x[name] for x in items]) for name in items[0] if name not in of_view},
-        "outcomes": [[Status(status).name for status in of_grasp] for of_grasp in tries],
-    }  # fmt: skip
+    return (
+        {}
+        if not items
+        else {
+            "grasp": list(numbers),
+            "job": of,
+            **{
+                name: [getattr(data.jobs[j], name) for j in of]
+                for name in ("object", "view", "family", "group")
+            },
+            **{name: [value] * len(items) for name, value in of_campaign.items()},
+            **{
+                name: torch.stack([x[name] for x in items])
+                for name in items[0]
+                if name not in of_view
+            },
+            "outcomes": [[Status(status).name for status in of_grasp] for of_grasp in tries],
+        }
+    )
 
 
 def _view_columns(data: GraspShards, jobs: range) -> dict[str, Any]:
     """Return the columns of some jobs by name; a view without a known camera has no viewpoint."""
-    arrow, rows, clouds = import_arrow(), data.jobs[jobs.start : jobs.stop], [data.job(j).cloud for j in jobs]
-    places, points = arrow.list_(arrow.float32(), 3), [torch.zeros(0, 3) if x is None else x.points for x in clouds]
+    arrow = import_arrow()
+    rows = data.jobs[jobs.start : jobs.stop]
+    clouds = [data.job(j).cloud for j in jobs]
+    places = arrow.list_(arrow.float32(), 3)
+    points = [torch.zeros(0, 3) if x is None else x.points for x in clouds]
     eyes = [None if x is None or x.viewpoint is None else x.viewpoint.tolist() for x in clouds]
     ends = [0, *itertools.accumulate(map(len, points))]
     return {
         "job": list(jobs),
-        **{name: [getattr(row, name) for row in rows] for name in ("object", "view", "family", "group")},
+        **{
+            name: [getattr(row, name) for row in rows]
+            for name in ("object", "view", "family", "group")
+        },
         "status": [row.status.name for row in rows],
-        **{name: [getattr(row, name) for row in rows] for name in ("note", "executable", "grasps", "passed")},
+        **{
+            name: [getattr(row, name) for row in rows]
+            for name in ("note", "executable", "grasps", "passed")
+        },
         "viewpoint": arrow.array(eyes, places),
-        "points": arrow.ListArray.from_arrays(arrow.array(ends, arrow.int32()), as_column(torch.cat(points).float())),
+        "points": arrow.ListArray.from_arrays(
+            arrow.array(ends, arrow.int32()), as_column(torch.cat(points).float())
+        ),
     }
 
 
 def _describe(field: Any) -> dict[str, str]:
-    """Return name, kind and shape of a column; -1 in the shape is a length that differs from row to row."""
-    kind, shape = field.type, list[str]()
+    """Return name, kind and shape of a column; -1 in the shape is a length that differs from row to
+    row.
+    """
+    kind = field.type
+    shape = list[str]()
     while hasattr(kind, "value_type"):
         shape.append(str(getattr(kind, "list_size", -1)))
         kind = kind.value_type

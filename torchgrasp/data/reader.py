@@ -19,13 +19,16 @@ from torchgrasp.foundation.checks import Count, Range, checked
 from torchgrasp.foundation.errors import ModelFileError
 from torchgrasp.values.planning import Grasps, PointCloud
 
-CARD = "card.json"  # file that describes a data set; it is written last, so a folder with a card is complete
+# file that describes a data set; it is written last, so a folder with a card is complete
+CARD = "card.json"
 
 
 class ShardJob(NamedTuple):
-    """One job of a data set: its row, the cloud (None if no view was read) and the grasps that were tried.
+    """One job of a data set: its row, the cloud (None if no view was read) and the grasps that were
+    tried.
 
-    `passed` and `outcome` (a `Status`) have a row for each grasp, and a column for each simulated trial.
+    `passed` and `outcome` (a `Status`) have a row for each grasp, and a column for each simulated
+    trial.
     """
 
     row: JobRow
@@ -39,18 +42,16 @@ class ShardJob(NamedTuple):
 class GraspShards:
     """A data set of grasps on disk; a map-style dataset for `torch.utils.data.DataLoader`.
 
-    `len` counts the grasps. Item i is a dict of float32 tensors [m, rad] in the object's frame: `points` (n, 3) and
-    `viewpoint` (3,) of the cloud; `joints` and `pregrasp` (h,), `approach` (3,), `obj_from_hand` (4, 4); `contacts` and
-    `normals` (f, 3), `std_m` (f,); `margin` and `witness` (6,) as in `Certificate`; `clearance`; `predicted` success;
-    `simulated`, the fraction of simulated trials that passed. `closed` (a bool) tells whether the grasp has force
-    closure, `job` is the index in `jobs`.
+    `len` counts the grasps. Item i is a dict of float32 tensors [m, rad] in the object's frame:
+    `points` (n, 3) and `viewpoint` (3,) of the cloud; `joints` and `pregrasp` (h,), `approach`
+    (3,), `obj_from_hand` (4, 4); `contacts` and `normals` (f, 3), `std_m` (f,); `margin` and
+    `witness` (6,) as in `Certificate`; `clearance`; `predicted` success; `simulated`, the fraction
+    of simulated trials that passed. `closed` (a bool) tells whether the grasp has force closure,
+    `job` is the index in `jobs`.
 
-    Args:
-        folder: folder of the data set.
-        card: content of `card.json`.
-        jobs: a row for each object and view, with or without grasps.
-        size: number of jobs in a shard.
-        points: number of points of each item's cloud; None means all points, so that clouds may differ in size.
+    Args: folder: folder of the data set. card: content of `card.json`. jobs: a row for each object
+        and view, with or without grasps. size: number of jobs in a shard. points: number of points
+        of each item's cloud; None means all points, so that clouds may differ in size.
     """
 
     folder: Path
@@ -58,11 +59,15 @@ class GraspShards:
     jobs: tuple[JobRow, ...]
     size: int
     points: int | None = None
-    recent: Recent[Any] = dataclasses.field(default_factory=lambda: Recent[Any](32), repr=False, compare=False)
+    recent: Recent[Any] = dataclasses.field(
+        default_factory=lambda: Recent[Any](32), repr=False, compare=False
+    )
 
     @functools.cached_property
     def starts(self) -> list[int]:
-        """The index of the first grasp of each job in the data set; the last entry is the total number of grasps."""
+        """The index of the first grasp of each job in the data set; the last entry is the total
+        number of grasps.
+        """
         return list(itertools.accumulate((row.grasps for row in self.jobs), initial=0))
 
     def __len__(self) -> int:
@@ -74,28 +79,42 @@ class GraspShards:
     def __getitem__(self, i: int) -> dict[str, Tensor]:
         """Return grasp i of the data set, with its cloud, as a dict of tensors by name.
 
-        Raises `IndexError` for no such grasp, and `ModelFileError` if the file of its shard is damaged.
+        Raises `IndexError` for no such grasp, and `ModelFileError` if the file of its shard is
+        damaged.
         """
         i = range(len(self))[operator.index(i)]
         j = bisect.bisect_right(self.starts, i) - 1
         _, records = self.recent.get(j // self.size, self._read).take(j % self.size)
-        grasps, g = records.grasps, i - self.starts[j]
-        contacts, certificate = grasps.contacts, grasps.certificate
+        grasps = records.grasps
+        g = i - self.starts[j]
+        contacts = grasps.contacts
+        certificate = grasps.certificate
         names = ("joints", "pregrasp", "approach", "obj_from_hand", "clearance")
         item = {name: getattr(grasps, name)[g] for name in names}
-        item |= {"contacts": contacts.points[g], "normals": contacts.normals[g], "std_m": contacts.require_std()[g]}
+        item |= {
+            "contacts": contacts.points[g],
+            "normals": contacts.normals[g],
+            "std_m": contacts.require_std()[g],
+        }
         item |= {"margin": certificate.margin[g], "witness": certificate.witness[g]}
-        item |= {"predicted": torch.sigmoid(grasps.score[g]), "simulated": records.passed[g].double().mean()}
-        item |= {"points": _choose(records.points, self.points, i), "viewpoint": records.viewpoints[0]}
+        item |= {
+            "predicted": torch.sigmoid(grasps.score[g]),
+            "simulated": records.passed[g].double().mean(),
+        }
+        item |= {
+            "points": _choose(records.points, self.points, i),
+            "viewpoint": records.viewpoints[0],
+        }
         single = {name: x.float() for name, x in item.items()}
         return {**single, "closed": certificate.closed[g], "job": torch.tensor(j)}
 
     @checked
     def job(self, j: Annotated[int, Range(0, MOST)]) -> ShardJob:
-        """Return the cloud, the grasps and the results of trials of job j, in the precision of the file.
+        """Return the cloud, the grasps and the results of trials of job j, in the precision of the
+        file.
 
-        Raises `IndexError` for no such job, and `ModelFileError` if its file is missing, damaged, or of another
-        campaign.
+        Raises `IndexError` for no such job, and `ModelFileError` if its file is missing, damaged,
+        or of another campaign.
         """
         j = range(len(self.jobs))[j]
         row, records = self.recent.get(j // self.size, self._read).take(j % self.size)
@@ -105,7 +124,9 @@ class GraspShards:
         return ShardJob(row[0], cloud, grasps, records.passed, records.outcome)
 
     def _read(self, k: int) -> Shard:
-        """Read shard k (a file of results); raise an error if its jobs are not those listed in `card.json`."""
+        """Read shard k (a file of results); raise an error if its jobs are not those listed in
+        `card.json`.
+        """
         path = shard_path(self.folder, k)
         shard = load_shard(path, {"campaign": str(self.card["campaign"])})
         bare = tuple(row._replace(meta={}) for row in shard.rows)
@@ -123,8 +144,8 @@ def shard_path(folder: Path, k: int) -> Path:
 def read_shards(folder: Path | str, points: Count | None = None) -> GraspShards:
     """Open a data set that a campaign has written; shards are read on demand.
 
-    Of each cloud `points` points are drawn, the same in every call; a smaller cloud repeats points. None means all.
-    Raises `ModelFileError` if the campaign is not finished, or its card is damaged.
+    Of each cloud `points` points are drawn, the same in every call; a smaller cloud repeats points.
+    None means all. Raises `ModelFileError` if the campaign is not finished, or its card is damaged.
 
     >>> import tempfile, trimesh
     >>> from torchgrasp import load_hand
@@ -140,15 +161,21 @@ def read_shards(folder: Path | str, points: Count | None = None) -> GraspShards:
     >>> data[0]["points"].shape, data.jobs[0].object, data.job(0).row.grasps
     (torch.Size([100, 3]), 'carton', 1)
     """
-    folder, most_card = Path(folder), 256 * 1024**2  # largest card in bytes
+    # largest card in bytes
+    folder = Path(folder)
+    most_card = 256 * 1024**2
     refuse = functools.partial(ModelFileError, "folder")
-    card = read_json(folder / CARD, refuse, "a folder that `torchgrasp campaign` finished", most_card)
+    card = read_json(
+        folder / CARD, refuse, "a folder that `torchgrasp campaign` finished", most_card
+    )
     fields = card.entries("campaign", "jobs_in_shard", "jobs")
     fields["campaign"].text()
     jobs = tuple(read_row(row, bare=True) for row in fields["jobs"].items(MOST))
     size = fields["jobs_in_shard"].whole(1, MOST)
     if lacking := sum(not shard_path(folder, k).is_file() for k in range(-(-len(jobs) // size))):
-        raise refuse(f"{folder} without {lacking} of its shards", "all shards: run the campaign again")
+        raise refuse(
+            f"{folder} without {lacking} of its shards", "all shards: run the campaign again"
+        )
     return GraspShards(folder, card.value, jobs, size, points)
 
 

@@ -1,4 +1,6 @@
-"""Files of grasps: of a plan, or a shard with the records of a campaign's jobs. A job is one object and view."""
+"""Files of grasps: of a plan, or a shard with the records of a campaign's jobs. A job is one object
+and view.
+"""
 
 import dataclasses
 import functools
@@ -24,11 +26,13 @@ MOST = 1_000_000  # most points, grasps and tries of one job
 
 
 class JobRow(NamedTuple):
-    """The outcome of one job (one view of one object): status, counts of grasps and trials, metadata.
+    """The outcome of one job (one view of one object): status, counts of grasps and trials,
+    metadata.
 
-    `status` is OK, or the reason why there is no grasp: the most frequent failure, a bad object, or how the process
-    ended. `note` gives details. `executable` grasps were planned; `grasps` of them were kept and tried; `passed` is the
-    number of trials that passed. `points` is the size of the cloud. `meta` is the metadata of its `Grasps`.
+    `status` is OK, or the reason why there is no grasp: the most frequent failure, a bad object, or
+    how the process ended. `note` gives details. `executable` grasps were planned; `grasps` of them
+    were kept and tried; `passed` is the number of trials that passed. `points` is the size of the
+    cloud. `meta` is the metadata of its `Grasps`.
 
     >>> JobRow("mug", "view0", Status.NOT_CLOSED, points=1000).as_json()["status"]
     'NOT_CLOSED'
@@ -53,10 +57,12 @@ class JobRow(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Records(Value):
-    """The results of several jobs (one view of one object each), concatenated in the order of the jobs.
+    """The results of several jobs (one view of one object each), concatenated in the order of the
+    jobs.
 
-    Letters: p points, j jobs, g grasps, d trials of a grasp. A job without a camera has a viewpoint of zeros. `passed`
-    and `outcome` (a `Status`) are for each simulated trial. Lengths are in metres, in the object's frame.
+    Letters: p points, j jobs, g grasps, d trials of a grasp. A job without a camera has a viewpoint
+    of zeros. `passed` and `outcome` (a `Status`) are for each simulated trial. Lengths are in
+    metres, in the object's frame.
     """
 
     points: Float[Tensor, "p 3"]
@@ -74,9 +80,13 @@ class Shard(NamedTuple):
 
     def take(self, i: int) -> "Shard":
         """Return a shard that holds only job i."""
-        row, before = self.rows[i], self.rows[:i]
-        p, g = sum(x.points for x in before), sum(x.grasps for x in before)
-        points, grasps, records = slice(p, p + row.points), slice(g, g + row.grasps), self.records
+        row = self.rows[i]
+        before = self.rows[:i]
+        p = sum(x.points for x in before)
+        g = sum(x.grasps for x in before)
+        points = slice(p, p + row.points)
+        grasps = slice(g, g + row.grasps)
+        records = self.records
         tried = records.grasps[grasps], records.passed[grasps], records.outcome[grasps]
         return Shard((row,), Records(records.points[points], records.viewpoints[i : i + 1], *tried))
 
@@ -94,7 +104,9 @@ def pack_shard(shard: Shard, meta: dict[str, str]) -> bytes:
 
 
 def load_shard(path: Path, meta: dict[str, str]) -> Shard:
-    """Read a shard file; raise `ModelFileError` if it is missing or damaged, or its metadata differs from `meta`."""
+    """Read a shard file; raise `ModelFileError` if it is missing or damaged, or its metadata
+    differs from `meta`.
+    """
     records, found = read_value(path, KIND, Records)
     if (other := {key: found.get(key) for key in meta}) != meta:
         raise ModelFileError("path", f"{path} of {other}", f"a shard of {meta}")
@@ -109,7 +121,9 @@ def load_shard(path: Path, meta: dict[str, str]) -> Shard:
     sizes = len(records.points), len(records.viewpoints), len(records.grasps)
     known = {int(status) for status in Status}
     if counted != sizes or not set(records.outcome.unique().tolist()) <= known:
-        raise refuse(f"{path} of {counted} points, jobs and grasps, with tensors of {sizes}", "equal counts")
+        raise refuse(
+            f"{path} of {counted} points, jobs and grasps, with tensors of {sizes}", "equal counts"
+        )
     return Shard(rows, records)
 
 
@@ -117,12 +131,16 @@ def read_row(field: Field, bare: bool = False) -> JobRow:
     """Read the row of a job from JSON; a `bare` row has no metadata."""
     fields = field.entries(*JobRow._fields[: -1 if bare else None])  # the metadata comes last
     texts = {name: fields[name].text() for name in ("object", "view", "note", "family", "group")}
-    counts = {name: fields[name].whole(0, MOST) for name in ("executable", "points", "grasps", "passed")}
+    counts = {
+        name: fields[name].whole(0, MOST) for name in ("executable", "points", "grasps", "passed")
+    }
     status = fields["status"].text()
     if status not in Status.__members__:
         raise fields["status"].wrong("the name of a Status")
     longest_meta = 10_000  # letters of an entry of the metadata, which may name all joints
-    meta = {} if bare else {key: x.text(longest_meta) for key, x in fields["meta"].entries().items()}
+    meta = (
+        {} if bare else {key: x.text(longest_meta) for key, x in fields["meta"].entries().items()}
+    )
     return JobRow(**texts, status=Status[status], **counts, meta=meta)  # pyright: ignore[reportArgumentType]
 
 
@@ -136,7 +154,8 @@ def short(text: str) -> str:
 def load_grasps(path: Path | str) -> Grasps:
     """Read grasps that `Grasps.save` wrote.
 
-    Raises `ModelFileError` if the file is missing, or a pose, a status or the number of contacts is not valid.
+    Raises `ModelFileError` if the file is missing, or a pose, a status or the number of contacts is
+    not valid.
 
     >>> import tempfile
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -153,10 +172,16 @@ def check_grasps(path: Path | str, grasps: Grasps) -> None:
     """Raise `ModelFileError` if grasps from a file cannot have been written by `Grasps.save`."""
     f = grasps.contacts.fingertips
     wrong = {
-        f"{f} fingertips, not three to five": torch.tensor([not FINGERTIPS[0] <= f <= FINGERTIPS[1]], device="cpu"),
+        f"{f} fingertips, not three to five": torch.tensor(
+            [not FINGERTIPS[0] <= f <= FINGERTIPS[1]], device="cpu"
+        ),
         "obj_from_hand that is not rigid": ~is_rigid(grasps.obj_from_hand),
-        "an unknown status": ~torch.isin(grasps.status, torch.tensor([int(status) for status in Status], device="cpu")),
-        "a permutation that is none": (grasps.permutation.sort(1).values != torch.arange(f, device="cpu")).any(1),
+        "an unknown status": ~torch.isin(
+            grasps.status, torch.tensor([int(status) for status in Status], device="cpu")
+        ),
+        "a permutation that is none": (
+            grasps.permutation.sort(1).values != torch.arange(f, device="cpu")
+        ).any(1),
     }
     for found in (name for name, rows in wrong.items() if bool(rows.any())):
         raise ModelFileError("path", f"{path}: {found}", "grasps that Grasps.save wrote")

@@ -14,19 +14,29 @@ from torchgrasp.scene.file import read_scene
 from torchgrasp.scene.scene import Scene
 from torchgrasp.values.planning import Grasps, PointCloud
 
-DATA = Path(__file__).parent / "assets"  # `<name>/mesh.ply`, `<name>/parts.npz` and `<name>/view.ply`
+DATA = (
+    Path(__file__).parent / "assets"
+)  # `<name>/mesh.ply`, `<name>/parts.npz` and `<name>/view.ply`
 SCENE = DATA / "scene.npz"  # a depth image of the objects on a table, with labels, camera and table
-MASSES = {"cylinder": 0.15, "jug": 0.20, "rabbit": 0.10, "spray": 0.15}  # masses [kg] of the objects
-GRASPED = {(name, hand) for name in ("cylinder", "jug") for hand in ("allegro", "barrett")}  # of the shipped grasps
+MASSES = {
+    "cylinder": 0.15,
+    "jug": 0.20,
+    "rabbit": 0.10,
+    "spray": 0.15,
+}  # masses [kg] of the objects
+GRASPED = {
+    (name, hand) for name in ("cylinder", "jug") for hand in ("allegro", "barrett")
+}  # of the shipped grasps
 
 
 @checked
 @dataclasses.dataclass(frozen=True, eq=False)
 class GraspObject:
-    """An object to grasp with its mass [kg]; all lengths are in metres, and the object rests at z = 0 with z up.
+    """An object to grasp with its mass [kg]; all lengths are in metres, and the object rests at z =
+    0 with z up.
 
-    `mesh` is the true, closed surface. In simulation the convex `parts`, whose union is the object, are used. `view` is
-    a noisy point cloud from one side, with its viewpoint.
+    `mesh` is the true, closed surface. In simulation the convex `parts`, whose union is the object,
+    are used. `view` is a noisy point cloud from one side, with its viewpoint.
 
     >>> jug = load_object("jug")
     >>> jug.mass, [f"{1000 * side:.0f} mm" for side in jug.mesh.extents], len(jug.parts)
@@ -51,7 +61,8 @@ def list_objects() -> tuple[str, ...]:
 
 @checked
 def load_object(name: str) -> GraspObject:
-    """Return a shipped object by its name: mesh, mass and a noisy view; raise `BadArgument` for an unknown name.
+    """Return a shipped object by its name: mesh, mass and a noisy view; raise `BadArgument` for an
+    unknown name.
 
     >>> jug = load_object("jug")
     >>> jug.mesh.is_watertight, len(jug.view)
@@ -68,7 +79,8 @@ def load_object(name: str) -> GraspObject:
 
 @checked
 def load_shipped_grasp(name: str, hand: str) -> Grasps:
-    """Return a shipped grasp of a shipped object, to close or draw at once; raise `BadArgument` for an unknown one.
+    """Return a shipped grasp of a shipped object, to close or draw at once; raise `BadArgument` for
+    an unknown one.
 
     The objects are "cylinder" and "jug", the hands "allegro" and "barrett".
 
@@ -83,7 +95,8 @@ def load_shipped_grasp(name: str, hand: str) -> Grasps:
 
 
 def load_scene() -> Scene:
-    """Return a scene of the shipped objects on a table: a rendered, noisy depth image with true labels; z is up.
+    """Return a scene of the shipped objects on a table: a rendered, noisy depth image with true
+    labels; z is up.
 
     >>> load_scene().things
     (1, 2, 3, 4)

@@ -14,7 +14,9 @@ SOURCE = "source.json"  # file that says what a folder of tables is made from
 
 
 def import_arrow() -> Any:
-    """Return the module pyarrow, with `pyarrow.parquet`; raise `MissingExtra` if it is not installed."""
+    """Return the module pyarrow, with `pyarrow.parquet`; raise `MissingExtra` if it is not
+    installed.
+    """
     try:
         import pyarrow.parquet
     except ImportError as error:
@@ -23,7 +25,9 @@ def import_arrow() -> Any:
 
 
 def as_column(rows: Tensor) -> Any:
-    """Return a tensor as a column: for each index of the first axis a number, or fixed lists of numbers."""
+    """Return a tensor as a column: for each index of the first axis a number, or fixed lists of
+    numbers.
+    """
     arrow = import_arrow()
     column = arrow.array(rows.cpu().reshape(-1).numpy())
     for size in reversed(rows.shape[1:]):
@@ -32,7 +36,9 @@ def as_column(rows: Tensor) -> Any:
 
 
 def as_table(columns: Mapping[str, Any], meta: Mapping[str, str]) -> Any:
-    """Return a table of columns by name, of which tensors become `as_column`; its schema has the metadata."""
+    """Return a table of columns by name, of which tensors become `as_column`; its schema has the
+    metadata.
+    """
     cells = {name: as_column(x) if isinstance(x, Tensor) else x for name, x in columns.items()}
     return import_arrow().table(cells).replace_schema_metadata(dict(meta))
 
@@ -40,17 +46,25 @@ def as_table(columns: Mapping[str, Any], meta: Mapping[str, str]) -> Any:
 def pack_table(table: Any) -> bytes:
     """Return the bytes of the Parquet file of a table."""
     # Without dictionaries: hardly any number comes twice.
-    import_arrow().parquet.write_table(table, buffer := io.BytesIO(), compression="zstd", use_dictionary=False)
+    import_arrow().parquet.write_table(
+        table, buffer := io.BytesIO(), compression="zstd", use_dictionary=False
+    )
     return buffer.getvalue()
 
 
 def render_card(template: str, **values: Any) -> str:
     """Return a text beside the tables, for people or programs, from its template."""
-    return render(Path(__file__).parent / "templates" / f"{template}.jinja", Status=Status, **values)
+    return render(
+        Path(__file__).parent / "templates" / f"{template}.jinja", Status=Status, **values
+    )
 
 
-def write_folder(folder: Path | str, source: Mapping[str, Any], files: Iterable[tuple[str, str | bytes]]) -> Path:
-    """Write files by name, one by one; `source.json` says what they are made from, and keeps other files out."""
+def write_folder(
+    folder: Path | str, source: Mapping[str, Any], files: Iterable[tuple[str, str | bytes]]
+) -> Path:
+    """Write files by name, one by one; `source.json` says what they are made from, and keeps other
+    files out.
+    """
     with hold_folder(folder := Path(folder)):
         begin_folder(folder / SOURCE, format_json(source) + "\n", "data")
         for name, content in files:

@@ -1,4 +1,6 @@
-"""Why an object was not held: the cause of a failed trial, from the trial's record and the true object."""
+"""Why an object was not held: the cause of a failed trial, from the trial's record and the true
+object.
+"""
 
 import dataclasses
 import json
@@ -22,40 +24,61 @@ from torchgrasp.values.closing import ClosureResult
 from torchgrasp.values.specs import TrialSpec
 
 CAUSES: dict[str, list[str]] = json.loads(Path(__file__).with_suffix(".json").read_text("utf-8"))
-"""Causes by name: the unit of the size, and a sentence. The first that applies to a trial is its cause."""
+"""Causes by name: the unit of the size, and a sentence. The first that applies to a trial is its
+cause.
+"""
 
 
 @checked
 def find_cause(tries: Sequence[LiftTry], trial: GraspTrial, spec: TrialSpec) -> tuple[str, float]:
-    """Return why the object was not held in the last try of a trial (`CAUSES`), and the size of the cause.
+    """Return why the object was not held in the last try of a trial (`CAUSES`), and the size of the
+    cause.
 
     The result is "" and NaN if the object was held.
     """
-    (*before, (row, lift)), truth = tries, trial.truth
+    truth = trial.truth
+    (*before, (row, lift)) = tries
     if lift.held or lift.status is Status.UNSTABLE:
         return "", math.nan
     if lift.status is Status.START_OVERLAP:
         return "start overlap", 1e3 * lift.start_overlap
-    for _, result in reversed(before):  # each record begins with the object where the try before left it
+    for _, result in reversed(
+        before
+    ):  # each record begins with the object where the try before left it
         lift = dataclasses.replace(lift, object_pose=lift.object_pose @ result.object_pose[-1])
         truth = dataclasses.replace(truth, slide=None)
     trial = dataclasses.replace(trial, grasp=trial.grasp[row], truth=truth)
     return next((cause, size) for cause, size, least in _sizes(lift, trial, spec) if size > least)
 
 
-def _sizes(lift: ClosureResult, trial: GraspTrial, spec: TrialSpec) -> Iterator[tuple[str, float, float]]:
-    """Yield every cause of a lift, its size, and the size above which it applies; NaN if it cannot apply."""
-    mesh, truth = read_mesh(trial.truth.mesh), trial.truth
-    up = torch.tensor([0.0, 0.0, 1.0]).double() if truth.table is None else truth.table.normal.double()
-    centre, (touched, pressed) = torch.tensor(mesh.center_mass.tolist()).double(), (tick_of(lift, k) for k in (1, 2))
-    start, closed, lifted = apply(lift.object_pose[[0, touched, pressed]], centre.expand(3, 1, 3))[:, 0]
+def _sizes(
+    lift: ClosureResult, trial: GraspTrial, spec: TrialSpec
+) -> Iterator[tuple[str, float, float]]:
+    """Yield every cause of a lift, its size, and the size above which it applies; NaN if it cannot
+    apply.
+    """
+    mesh = read_mesh(trial.truth.mesh)
+    truth = trial.truth
+    up = (
+        torch.tensor([0.0, 0.0, 1.0]).double()
+        if truth.table is None
+        else truth.table.normal.double()
+    )
+    centre = torch.tensor(mesh.center_mass.tolist()).double()
+    (touched, pressed) = (tick_of(lift, k) for k in (1, 2))
+    start, closed, lifted = apply(lift.object_pose[[0, touched, pressed]], centre.expand(3, 1, 3))[
+        :, 0
+    ]
     start = start if truth.slide is None else start + truth.slide.to(start)
     upright = lift.object_pose[[0, pressed], :3, :3] @ up
     tilt = torch.atan2(torch.linalg.cross(*upright).norm(), upright[0] @ upright[1])
     yield "toppled", math.degrees(tilt), math.degrees(SLIP_ANGLE)
     yield "pushed away", 1e3 * float((closed - start).norm()), 1e3 * SLIP_DISTANCE
     yield "ejected", 1e3 * float((lifted - closed).norm()), 1e3 * SLIP_DISTANCE
-    off = 1e3 * trimesh.proximity.closest_point(mesh, trial.grasp.contacts.points[0].double().numpy())[1]
+    off = (
+        1e3
+        * trimesh.proximity.closest_point(mesh, trial.grasp.contacts.points[0].double().numpy())[1]
+    )
     yield "shape off", float(off.max()), 10.0
     missing = [finger for finger in range(len(off)) if finger not in lift.contact_order]
     yield "never met", float(off[missing].max()) if missing else math.nan, -1.0
@@ -63,7 +86,8 @@ def _sizes(lift: ClosureResult, trial: GraspTrial, spec: TrialSpec) -> Iterator[
     yield "too weak", float(lift.forces[pressed].max()) if weak else math.nan, -1.0
     slid, turned = (motion[pressed:] for motion in moved_in_hand(lift, centre))
     lost = (slid >= SLIP_DISTANCE) | (turned >= SLIP_ANGLE)
-    first, heights = int(lost.int().argmax()), (lift.hand_pose[pressed:, :3, 3] - lift.hand_pose[pressed, :3, 3]) @ up
+    first = int(lost.int().argmax())
+    heights = (lift.hand_pose[pressed:, :3, 3] - lift.hand_pose[pressed, :3, 3]) @ up
     risen = int((heights >= spec.lift_height - 1e-3).int().argmax()) or -1
     yield "dropped when pushed", math.nan if bool(lost[risen]) else math.hypot(*spec.push), 0.0
     rotates = bool(lost[first]) and bool(slid[first] < SLIP_DISTANCE)
@@ -72,13 +96,19 @@ def _sizes(lift: ClosureResult, trial: GraspTrial, spec: TrialSpec) -> Iterator[
 
 
 def tick_of(lift: ClosureResult, phase: int) -> int:
-    """Return the tick at which phase 0 (approach), 1 (closing) or 2 (pressing) ended; the last tick if it never did."""
+    """Return the tick at which phase 0 (approach), 1 (closing) or 2 (pressing) ended; the last tick
+    if it never did.
+    """
     end = lift.phases[phase]
     return int((lift.time - end).abs().argmin()) if bool(end.isfinite()) else len(lift.time) - 1
 
 
-def moved_in_hand(lift: ClosureResult, centre: Float[Tensor, "3"]) -> tuple[Float[Tensor, " t"], Float[Tensor, " t"]]:
-    """Return for each tick how far the object has moved [m] and turned [rad] in the hand since the hand pressed."""
+def moved_in_hand(
+    lift: ClosureResult, centre: Float[Tensor, "3"]
+) -> tuple[Float[Tensor, " t"], Float[Tensor, " t"]]:
+    """Return for each tick how far the object has moved [m] and turned [rad] in the hand since the
+    hand pressed.
+    """
     hand_from_object = inverse(lift.hand_pose.double()) @ lift.object_pose.double()
     start = hand_from_object[tick_of(lift, 2)]
     centres = apply(hand_from_object, centre.double().expand(len(hand_from_object), 1, 3))[:, 0]

@@ -1,4 +1,6 @@
-"""The criterion of a lift: whether an object was held, judged by its motion and the touching fingers."""
+"""The criterion of a lift: whether an object was held, judged by its motion and the touching
+fingers.
+"""
 
 import dataclasses
 import math
@@ -14,16 +16,18 @@ from torchgrasp.foundation.errors import Status
 from torchgrasp.geometry.frames import apply, inverse, rotation_angle
 from torchgrasp.values.closing import ObjectMotion
 
-SLIP_DISTANCE, SLIP_ANGLE = 0.02, math.radians(30)
+SLIP_DISTANCE = 0.02
+SLIP_ANGLE = math.radians(30)
 """Motion [m, rad] of the object in the closed hand that counts as slipped."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Tick(Value):
-    """The state of the simulation at one control tick; with a leading axis, the states at all ticks.
+    """The state of the simulation at one control tick; with a leading axis, the states at all
+    ticks.
 
-    `touching` is the number of fingers on the object, `centre` [m] its centre of mass. `felt` holds the controller's
-    estimates of friction and load [N], `truth` the true contacts.
+    `touching` is the number of fingers on the object, `centre` [m] its centre of mass. `felt` holds
+    the controller's estimates of friction and load [N], `truth` the true contacts.
     """
 
     time: Float[Tensor, "*t"]
@@ -40,24 +44,35 @@ class Tick(Value):
 
 
 def judge_lift(ticks: Sequence[Tick], pressed: int, judged: int, lift_height: float) -> Status:
-    """Return whether an object was held in a lift of some height [m]: `OK`, `SLIPPED`, `DROPPED` or `NOT_LIFTED`.
+    """Return whether an object was held in a lift of some height [m]: `OK`, `SLIPPED`, `DROPPED` or
+    `NOT_LIFTED`.
 
-    It is held if its centre rose by half of the lift, two fingers touch it in most of the last `judged` ticks, and it
-    slipped less than the limits since the tick `pressed`.
+    It is held if its centre rose by half of the lift, two fingers touch it in most of the last
+    `judged` ticks, and it slipped less than the limits since the tick `pressed`.
     """
     half = 0.5 * lift_height
     rise = [float(tick.centre[2] - ticks[0].centre[2]) for tick in ticks]
     gripped = [bool(tick.touching >= 2) for tick in ticks[-judged:]]
     if rise[-1] >= half and sum(gripped) > 0.5 * len(gripped):
         slip = motion_between(ticks[pressed], ticks[-1])
-        return Status.OK if slip.distance < SLIP_DISTANCE and slip.angle < SLIP_ANGLE else Status.SLIPPED
+        return (
+            Status.OK
+            if slip.distance < SLIP_DISTANCE and slip.angle < SLIP_ANGLE
+            else Status.SLIPPED
+        )
     return Status.DROPPED if max(rise) >= half else Status.NOT_LIFTED
 
 
 def motion_between(first: Tick, last: Tick, in_hand: bool = True) -> ObjectMotion:
-    """Return the motion of the object's centre and its rotation between two ticks, relative to the hand or world."""
+    """Return the motion of the object's centre and its rotation between two ticks, relative to the
+    hand or world.
+    """
     eye = torch.eye(4, dtype=torch.float64)
     start, end = (inverse(tick.hand_pose) if in_hand else eye for tick in (first, last))
-    centres = apply(torch.stack([start, end]), torch.stack([first.centre, last.centre])[:, None])[:, 0]
+    centres = apply(torch.stack([start, end]), torch.stack([first.centre, last.centre])[:, None])[
+        :, 0
+    ]
     turned = (start @ first.object_pose)[:3, :3].T @ (end @ last.object_pose)[:3, :3]
-    return ObjectMotion(float(torch.linalg.vector_norm(centres[1] - centres[0])), float(rotation_angle(turned)))
+    return ObjectMotion(
+        float(torch.linalg.vector_norm(centres[1] - centres[0])), float(rotation_angle(turned))
+    )

@@ -1,4 +1,6 @@
-"""The simulator's frame: its pose in the frame of a grasp, and grasps and meshes that are converted to it."""
+"""The simulator's frame: its pose in the frame of a grasp, and grasps and meshes that are converted
+to it.
+"""
 
 import dataclasses
 
@@ -17,13 +19,16 @@ from torchgrasp.values.planning import Grasps
 def world_frame(table: Plane, obj_from_hand: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
     """Return the pose of the simulator's frame in the frame of the grasp.
 
-    The table is at z = 0, the hand above the origin. The x axis is along the hand's x axis, or along the hand's y axis
-    if the former is steeper than 60 degrees.
+    The table is at z = 0, the hand above the origin. The x axis is along the hand's x axis, or
+    along the hand's y axis if the former is steeper than 60 degrees.
     """
-    z, origin = unit(table.normal.double()), obj_from_hand[:3, 3]
+    z = unit(table.normal.double())
+    origin = obj_from_hand[:3, 3]
     level = [axis - (axis @ z) * z for axis in obj_from_hand[:3, :2].unbind(-1)]
     x = unit(level[0] if torch.linalg.vector_norm(level[0]) > 0.5 else level[1])
-    return rigid(torch.stack([x, torch.linalg.cross(z, x), z], -1), origin - table.height(origin) * z)
+    return rigid(
+        torch.stack([x, torch.linalg.cross(z, x), z], -1), origin - table.height(origin) * z
+    )
 
 
 def to_frame(grasp: Grasps, obj_from_frame: Float[Tensor, "4 4"]) -> Grasps:
@@ -34,10 +39,14 @@ def to_frame(grasp: Grasps, obj_from_frame: Float[Tensor, "4 4"]) -> Grasps:
         return rounded(vectors @ frame_from_obj[:3, :3].T)
 
     contacts = dataclasses.replace(
-        grasp.contacts, points=to_upright(grasp.contacts.points, obj_from_frame), normals=turn(grasp.contacts.normals)
+        grasp.contacts,
+        points=to_upright(grasp.contacts.points, obj_from_frame),
+        normals=turn(grasp.contacts.normals),
     )
     pose = rounded(frame_from_obj @ grasp.obj_from_hand)
-    return dataclasses.replace(grasp, contacts=contacts, obj_from_hand=pose, approach=turn(grasp.approach))
+    return dataclasses.replace(
+        grasp, contacts=contacts, obj_from_hand=pose, approach=turn(grasp.approach)
+    )
 
 
 def rounded(numbers: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
@@ -46,6 +55,10 @@ def rounded(numbers: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
 
 
 def moved_mesh(mesh: "trimesh.Trimesh", obj_from_world: Float[Tensor, "4 4"]) -> "trimesh.Trimesh":
-    """Return a mesh, converted to the simulator's frame, with vertices rounded to multiples of `GRID`."""
-    vertices = to_upright(torch.from_numpy(np.array(mesh.vertices, dtype=np.float64)), obj_from_world)
+    """Return a mesh, converted to the simulator's frame, with vertices rounded to multiples of
+    `GRID`.
+    """
+    vertices = to_upright(
+        torch.from_numpy(np.array(mesh.vertices, dtype=np.float64)), obj_from_world
+    )
     return trimesh.Trimesh(vertices.numpy(), mesh.faces, process=False)

@@ -1,7 +1,8 @@
 """The golden set: shipped grasps with known verdicts, to check that an installed simulator works.
 
-`scripts/train.py golden` makes the grasps. In two cases the hand is displaced by 60 mm, so that the fingers miss the
-object. Two heavy objects weigh a little less and more than the 0.65 kg that fingers can carry by friction with 4 N.
+`scripts/train.py golden` makes the grasps. In two cases the hand is displaced by 60 mm, so that the
+fingers miss the object. Two heavy objects weigh a little less and more than the 0.65 kg that
+fingers can carry by friction with 4 N.
 """
 
 from collections.abc import Iterator
@@ -18,7 +19,9 @@ from torchgrasp.values.specs import Simulator, TrialSpec
 
 
 class GoldenCase(NamedTuple):
-    """A shipped grasp, its right verdict, how far [m] the hand is from its place, and the mass [kg] of the object."""
+    """A shipped grasp, its right verdict, how far [m] the hand is from its place, and the mass [kg]
+    of the object.
+    """
 
     object: str
     hand: str
@@ -28,16 +31,25 @@ class GoldenCase(NamedTuple):
 
 
 GOLDEN = (
-    *(GoldenCase(name, hand, True) for hand in ("allegro", "barrett") for name in ("cylinder", "jug")),
+    *(
+        GoldenCase(name, hand, True)
+        for hand in ("allegro", "barrett")
+        for name in ("cylinder", "jug")
+    ),
     GoldenCase("cylinder", "allegro", False, shift=0.06),
     GoldenCase("jug", "barrett", False, shift=0.06),
-    *(GoldenCase("cylinder", "barrett", held, mass=mass) for held, mass in ((True, 0.5), (False, 0.8))),
+    *(
+        GoldenCase("cylinder", "barrett", held, mass=mass)
+        for held, mass in ((True, 0.5), (False, 0.8))
+    ),
 )
 """The test cases: grasps of two hands on two objects, some of which hold the object."""
 
 
 class GoldenResult(NamedTuple):
-    """A test case, whether the simulated hand held the object, and the wall time of the trial in seconds."""
+    """A test case, whether the simulated hand held the object, and the wall time of the trial in
+    seconds.
+    """
 
     case: GoldenCase
     held: bool
@@ -53,11 +65,14 @@ class GoldenResult(NamedTuple):
 def run_golden(simulator: Simulator) -> Iterator[GoldenResult]:
     """Simulate each test case of `GOLDEN`, and yield its result."""
     for case in GOLDEN:
-        thing, hand = load_object(case.object), load_hand(case.hand)
+        thing = load_object(case.object)
+        hand = load_hand(case.hand)
         grasp = load_shipped_grasp(case.object, case.hand)
         error = torch.eye(4, dtype=torch.float64)
         error[:3, 3] = -case.shift * hand.approach
         once = ClosingOptions(attempts=1)  # a hand that misses the object ends soon
-        spec = TrialSpec(force=4.0, simulator=simulator, mass=case.mass, hold_time=0.5, options=once)
+        spec = TrialSpec(
+            force=4.0, simulator=simulator, mass=case.mass, hold_time=0.5, options=once
+        )
         found = close_hand(grasp, hand, thing.mesh, spec, error=error, parts=thing.parts)
         yield GoldenResult(case, found.held, found.seconds)

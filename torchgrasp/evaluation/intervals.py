@@ -1,7 +1,7 @@
 """Success rates and their 95 % intervals, by a bootstrap over families of objects.
 
-Trials of one object are correlated, and so are objects of one family. The bootstrap therefore resamples whole families,
-10 000 times. The interval lies between the 2.5 % and 97.5 % quantiles.
+Trials of one object are correlated, and so are objects of one family. The bootstrap therefore
+resamples whole families, 10 000 times. The interval lies between the 2.5 % and 97.5 % quantiles.
 """
 
 import math
@@ -15,11 +15,14 @@ from torch import Tensor
 from torchgrasp.foundation.checks import Seed, checked
 
 Counts = Mapping[str, tuple[int | float, int]]
-"""Passed trials and all trials of each resampled unit, a family or an object. For a mean: sum and number of values."""
+"""Passed trials and all trials of each resampled unit, a family or an object. For a mean: sum and
+number of values.
+"""
 
 
 class Share(NamedTuple):
-    """A success rate, mean or difference, with its 95 % interval, and the numbers of trials and of resampled units.
+    """A success rate, mean or difference, with its 95 % interval, and the numbers of trials and of
+    resampled units.
 
     With a single unit the interval is NaN. Without trials all values are NaN.
     """
@@ -33,7 +36,9 @@ class Share(NamedTuple):
 
 @checked
 def count_by(outcomes: Iterable[tuple[str, bool]]) -> dict[str, tuple[int, int]]:
-    """Return the numbers of passed and of all trials for each unit, given pairs of unit name and outcome."""
+    """Return the numbers of passed and of all trials for each unit, given pairs of unit name and
+    outcome.
+    """
     counts: dict[str, tuple[int, int]] = {}
     for name, passed in outcomes:
         before = counts.get(name, (0, 0))
@@ -45,8 +50,8 @@ def count_by(outcomes: Iterable[tuple[str, bool]]) -> dict[str, tuple[int, int]]
 def share_over(counts: Counts, seed: Seed = 0) -> Share:
     """Return the success rate over all trials, with its 95 % interval from resampling the units.
 
-    If all trials passed, or none, resampling gives no width. The interval is then the one-sided 95 % bound of n
-    independent trials, n being the number of units: its lower end is 0.05 ** (1 / n).
+    If all trials passed, or none, resampling gives no width. The interval is then the one-sided 95
+    % bound of n independent trials, n being the number of units: its lower end is 0.05 ** (1 / n).
     """
     found = contrast_over([counts], [1.0], seed)
     if found.units > 1 and found.value in (0.0, 1.0):
@@ -57,22 +62,27 @@ def share_over(counts: Counts, seed: Seed = 0) -> Share:
 
 @checked
 def contrast_over(columns: Sequence[Counts], weights: Sequence[float], seed: Seed = 0) -> Share:
-    """Return a weighted sum of success rates, with a 95 % interval; all rates use the same resampled units.
+    """Return a weighted sum of success rates, with a 95 % interval; all rates use the same
+    resampled units.
 
-    Each of `columns` holds the counts of one rate. `total` counts the trials of the first column. Resamples in which a
-    column has no trial are left out. The weights 1 and -1 give a difference. An interval of zero width means that the
-    units agree, not that the value is exact.
+    Each of `columns` holds the counts of one rate. `total` counts the trials of the first column.
+    Resamples in which a column has no trial are left out. The weights 1 and -1 give a difference.
+    An interval of zero width means that the units agree, not that the value is exact.
     """
     resamples = 10_000  # number of resamples behind an interval
     names = sorted({name for counts in columns for name, (_, total) in counts.items() if total})
     total = sum(total for _, total in columns[0].values())
     if not names:
         return Share(math.nan, math.nan, math.nan, 0, 0)
-    table = torch.tensor([[counts.get(name, (0, 0)) for counts in columns] for name in names], dtype=torch.float64)
+    table = torch.tensor(
+        [[counts.get(name, (0, 0)) for counts in columns] for name in names], dtype=torch.float64
+    )
     value = float(_combine(table.sum(0), weights))
     if len(names) == 1:
         return Share(value, math.nan, math.nan, total, 1)
-    drawn = torch.randint(len(names), (resamples, len(names)), generator=torch.Generator().manual_seed(seed))
+    drawn = torch.randint(
+        len(names), (resamples, len(names)), generator=torch.Generator().manual_seed(seed)
+    )
     times = torch.zeros(resamples, len(names), dtype=torch.float64)
     times.scatter_add_(1, drawn, torch.ones_like(drawn, dtype=torch.float64))
     values = _combine(torch.einsum("ru,uck->rck", times, table), weights)
@@ -81,7 +91,9 @@ def contrast_over(columns: Sequence[Counts], weights: Sequence[float], seed: See
 
 
 def _combine(sums: Float[Tensor, "*r c 2"], weights: Sequence[float]) -> Float[Tensor, "*r"]:
-    """Return the weighted sum of c success rates, given passed and all trials of each; NaN if a rate has no trial."""
+    """Return the weighted sum of c success rates, given passed and all trials of each; NaN if a
+    rate has no trial.
+    """
     return (sums[..., 0] / sums[..., 1]) @ sums.new_tensor(weights)
 
 

@@ -33,7 +33,9 @@ from torchgrasp.values.planning import Grasps
 from torchgrasp.values.specs import TrialSpec
 
 LIFT_TIME = 1.0  # time [s] in which the hand rises
-PUSHED_DISTANCE = 0.05  # motion [m] of the object's centre during the closing that counts as ejected
+PUSHED_DISTANCE = (
+    0.05  # motion [m] of the object's centre during the closing that counts as ejected
+)
 
 
 @checked
@@ -55,31 +57,29 @@ def close_hand(
 ) -> ClosureResult:
     """Close a hand on the true object, lift it and hold it, in simulation.
 
-    The opened hand moves straight to its pre-grasp, closes and presses (`GraspController`), rises and holds. The object
-    is **held** if its centre rose by half the lift, two fingers touch it at the end, and it slipped by less than 20 mm
-    and 30 degrees in the closed hand. Equal arguments give bitwise equal results.
+    The opened hand moves straight to its pre-grasp, closes and presses (`GraspController`), rises
+    and holds. The object is **held** if its centre rose by half the lift, two fingers touch it at
+    the end, and it slipped by less than 20 mm and 30 degrees in the closed hand. Equal arguments
+    give bitwise equal results.
 
-    Args:
-        grasp: a single grasp.
-        hand: the hand of the grasp, or its name or folder.
-        mesh: the true object [m], closed, in the frame of the grasp: a trimesh, a file, or a `GraspObject` with parts.
-        spec: parameters of the trial; `TrialSpec()` by default.
-        seed: random seed of the tactile sensors' noise.
-        error: true pose of the hand in its planned frame, unknown to the controller; by default the planned pose.
-        parts: convex parts of the mesh; by default they are computed (`convex_parts`).
-        table: the true table below the object, in the grasp's frame; by default level, at the mesh's lowest point.
-        neighbours: other bodies on the table, which the hand may push.
-        told: the table that the controller knows, in the grasp's frame; by default that of the plan (`Grasps.table`).
-        surface: estimated surface of the object (`surface_field`), to estimate the object's pose from touches. Without
-            it, only the tangent planes of the planned contacts are used.
-        slide: motion [m] of the object along the table, halfway through the approach, unknown to the controller.
+    Args: grasp: a single grasp. hand: the hand of the grasp, or its name or folder. mesh: the true
+        object [m], closed, in the frame of the grasp: a trimesh, a file, or a `GraspObject` with
+        parts. spec: parameters of the trial; `TrialSpec()` by default. seed: random seed of the
+        tactile sensors' noise. error: true pose of the hand in its planned frame, unknown to the
+        controller; by default the planned pose. parts: convex parts of the mesh; by default they
+        are computed (`convex_parts`). table: the true table below the object, in the grasp's frame;
+        by default level, at the mesh's lowest point. neighbours: other bodies on the table, which
+        the hand may push. told: the table that the controller knows, in the grasp's frame; by
+        default that of the plan (`Grasps.table`). surface: estimated surface of the object
+        (`surface_field`), to estimate the object's pose from touches. Without it, only the tangent
+        planes of the planned contacts are used. slide: motion [m] of the object along the table,
+        halfway through the approach, unknown to the controller.
 
-    Raises:
-        BadArgument: not exactly one grasp, joints of another hand, or a pre-grasp outside the joint limits; an approach
-            that is no unit vector; contacts off the mesh; a table that the mesh does not stand on; the holding "law"
-            for a closing that does not follow it (Eq. 25).
-        MeshError: the mesh is missing, open or without volume.
-        MissingExtra: the simulator is not installed.
+    Raises: BadArgument: not exactly one grasp, joints of another hand, or a pre-grasp outside the
+        joint limits; an approach that is no unit vector; contacts off the mesh; a table that the
+        mesh does not stand on; the holding "law" for a closing that does not follow it (Eq. 25).
+        MeshError: the mesh is missing, open or without volume. MissingExtra: the simulator is not
+        installed.
 
     >>> from torchgrasp import load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -90,9 +90,13 @@ def close_hand(
     """
     check_single(grasp)
     if isinstance(mesh, GraspObject):
-        mesh, parts = mesh.mesh, mesh.parts if parts is None else parts
-    mesh, hand = read_mesh(mesh), hand if isinstance(hand, Hand) else hand_of(grasp, hand)
-    check_agreement("mesh", grasp.contacts.points[0], "a contact of the grasp", mesh, slack=0.03, share=0.99)
+        parts = mesh.parts if parts is None else parts
+        mesh = mesh.mesh
+    mesh = read_mesh(mesh)
+    hand = hand if isinstance(hand, Hand) else hand_of(grasp, hand)
+    check_agreement(
+        "mesh", grasp.contacts.points[0], "a contact of the grasp", mesh, slack=0.03, share=0.99
+    )
     if table is not None:
         check_stand(mesh, table)
     truth = Truth(mesh, parts, error, table, neighbours, slide)
@@ -121,9 +125,13 @@ class _Lift:
     """One lift trial and the record of its ticks."""
 
     def __init__(self, run: TrialRun) -> None:
-        self.run, self.spec = run, run.spec
+        self.run = run
+        self.spec = run.spec
         self.ticks: list[Tick] = []
-        self.arrived, self.pushed, self.strained, self.unbalanced = 0, 0.0, False, math.nan
+        self.arrived = 0
+        self.pushed = 0.0
+        self.strained = False
+        self.unbalanced = math.nan
         self.touched: int | None = None
         self.pressed: int | None = None
 
@@ -139,12 +147,15 @@ class _Lift:
             self.arrived = len(self.ticks) - 1
             for _ in run.close():
                 self._record()
-                all_touched = run.controller.hold is not None or bool(np.isfinite(run.robot.first_touch).all())
+                all_touched = run.controller.hold is not None or bool(
+                    np.isfinite(run.robot.first_touch).all()
+                )
                 if self.touched is None and all_touched:
                     self.touched = len(self.ticks) - 1
             self.pressed = len(self.ticks) - 1
             self.touched = self.pressed if self.touched is None else self.touched
-            self.pushed, self.strained = self._moved(), run.strained()
+            self.pushed = self._moved()
+            self.strained = run.strained()
             self.unbalanced = run.robot.unbalanced()
             rising = run.robot.ticks(LIFT_TIME)
             for k in range(rising + run.robot.ticks(self.spec.hold_time)):
@@ -167,18 +178,24 @@ class _Lift:
         return self.run.controller.status is Status.TOO_HEAVY
 
     def _put_down(self, time: float, rising: float) -> Status:
-        """Lower the hand for as long as it rose; return `TOO_HEAVY`, or `DROPPED` if the object is then elsewhere."""
+        """Lower the hand for as long as it rose; return `TOO_HEAVY`, or `DROPPED` if the object is
+        then elsewhere.
+        """
         height, _ = self._height(time, rising)
         ticks = self.run.robot.ticks(min(time, rising))
         for k in range(ticks):
             share, rate = smooth_step((k + 1) / ticks)
-            self.run.scene.lift(height * (1 - share), -height * rate / (ticks * self.run.robot.period))
+            self.run.scene.lift(
+                height * (1 - share), -height * rate / (ticks * self.run.robot.period)
+            )
             self.run.step()
             self._record()
         return Status.TOO_HEAVY if self._moved() < PUSHED_DISTANCE else Status.DROPPED
 
     def _height(self, time: float, rising: float) -> tuple[float, float]:
-        """Return target height [m] and speed [m/s] at a time, for a rise of `rising` seconds and then shaking."""
+        """Return target height [m] and speed [m/s] at a time, for a rise of `rising` seconds and
+        then shaking.
+        """
         rate_hz = 5.0  # frequency of the shaking [Hz]
         share, rate = smooth_step(min(time / rising, 1.0))
         height = self.spec.lift_height * share
@@ -186,17 +203,32 @@ class _Lift:
             return height, self.spec.lift_height * rate / rising
         frequency = 2 * math.pi * rate_hz
         phase = frequency * (time - rising)
-        return height + self.spec.shake * math.sin(phase), self.spec.shake * frequency * math.cos(phase)
+        return height + self.spec.shake * math.sin(phase), self.spec.shake * frequency * math.cos(
+            phase
+        )
 
     def _record(self) -> None:
-        """Record a tick; raise an error if the simulation has diverged or the object is too far away."""
-        robot, scene = self.run.robot, self.run.scene
-        pose, joints = scene.object_pose(), scene.joints()
+        """Record a tick; raise an error if the simulation has diverged or the object is too far
+        away.
+        """
+        robot = self.run.robot
+        scene = self.run.scene
+        pose = scene.object_pose()
+        joints = scene.joints()
         arrays = (
-            np.float64(robot.steps * self.spec.timestep), pose, scene.hand_pose(), scene.neighbour_poses(),
-            joints, robot.sent, robot.finger.sum(), pose[:3, :3] @ scene.centre + pose[:3, 3], np.array(self.run.felt),
-        )  # fmt: skip
-        tick = Tick(*map(torch.as_tensor, arrays), blend=self.run.controller.blend, truth=robot.truth)
+            np.float64(robot.steps * self.spec.timestep),
+            pose,
+            scene.hand_pose(),
+            scene.neighbour_poses(),
+            joints,
+            robot.sent,
+            robot.finger.sum(),
+            pose[:3, :3] @ scene.centre + pose[:3, 3],
+            np.array(self.run.felt),
+        )
+        tick = Tick(
+            *map(torch.as_tensor, arrays), blend=self.run.controller.blend, truth=robot.truth
+        )
         self.ticks.append(tick)
         moved = self._moved()
         if not np.isfinite(joints).all() or not math.isfinite(moved):
@@ -206,13 +238,19 @@ class _Lift:
             raise _ObjectLost
 
     def _moved(self) -> float:
-        """Return how far [m] the object's centre of mass is from its place before the hand touched the object."""
+        """Return how far [m] the object's centre of mass is from its place before the hand touched
+        the object.
+        """
         start = self.ticks[0].centre + torch.from_numpy(self.run.slid)
         return float(torch.linalg.vector_norm(self.ticks[-1].centre - start))
 
     def _verdict(self) -> Status:
-        """Return the status of a completed trial: `Status.OK` if the object was held, or else the first failure."""
-        judged = judge_lift(self.ticks, self.pressed or 0, self.run.robot.ticks(0.2), self.spec.lift_height)
+        """Return the status of a completed trial: `Status.OK` if the object was held, or else the
+        first failure.
+        """
+        judged = judge_lift(
+            self.ticks, self.pressed or 0, self.run.robot.ticks(0.2), self.spec.lift_height
+        )
         if judged in (Status.OK, Status.SLIPPED):
             return judged
         if not np.isfinite(self.run.robot.first_touch).all():
@@ -222,7 +260,9 @@ class _Lift:
         return Status.TOO_WEAK if self.strained else judged
 
     def _motion(self, first: int | None, last: int | None, in_hand: bool = True) -> ObjectMotion:
-        """Return the object's motion between two ticks, relative to the hand or the world; NaN if a tick is None."""
+        """Return the object's motion between two ticks, relative to the hand or the world; NaN if a
+        tick is None.
+        """
         if first is None or last is None:
             return ObjectMotion(math.nan, math.nan)
         return motion_between(self.ticks[first], self.ticks[last], in_hand)
@@ -230,31 +270,54 @@ class _Lift:
     def result(self, status: Status, seconds: float) -> ClosureResult:
         """Return the record of the trial as a `ClosureResult`."""
         ticks = map_tensors(lambda *tensors: torch.stack(tensors), *self.ticks)
-        robot, obj_from_world = self.run.robot, self.run.obj_from_world
-        reached = [math.nan if k is None else ticks.time[k] for k in (self.arrived, self.touched, self.pressed)]
-        first_touch, first_stray, truth = robot.first_touch, torch.from_numpy(robot.first_stray), ticks.truth
+        robot = self.run.robot
+        obj_from_world = self.run.obj_from_world
+        reached = [
+            math.nan if k is None else ticks.time[k]
+            for k in (self.arrived, self.touched, self.pressed)
+        ]
+        first_touch = robot.first_touch
+        first_stray = torch.from_numpy(robot.first_stray)
+        truth = ticks.truth
         touched = [finger for finger, step in enumerate(first_touch) if np.isfinite(step)]
         assert truth.sliding is not None
         if not torch.equal(obj_from_world, torch.eye(4, dtype=torch.float64)):
             bodies = {"object_pose": ticks.object_pose, "neighbour_pose": ticks.neighbour_pose}
-            moved = {name: obj_from_world @ x @ inverse(obj_from_world) for name, x in bodies.items()}
+            moved = {
+                name: obj_from_world @ x @ inverse(obj_from_world) for name, x in bodies.items()
+            }
             ticks = dataclasses.replace(ticks, hand_pose=obj_from_world @ ticks.hand_pose, **moved)
         disturbance = Disturbance(
-            first_stray * self.spec.timestep, torch.from_numpy(robot.stray), torch.from_numpy(robot.most_stray),
-            early=first_stray < min(first_touch), neighbour_pose=ticks.neighbour_pose,
-        )  # fmt: skip
+            first_stray * self.spec.timestep,
+            torch.from_numpy(robot.stray),
+            torch.from_numpy(robot.most_stray),
+            early=first_stray < min(first_touch),
+            neighbour_pose=ticks.neighbour_pose,
+        )
         return ClosureResult(
-            held=status is Status.OK, status=status, time=ticks.time, forces=truth.normal_force,
-            object_pose=ticks.object_pose, hand_pose=ticks.hand_pose, joints=ticks.joints,
-            targets=ticks.targets, joint_names=self.run.scene.joint_names,
+            held=status is Status.OK,
+            status=status,
+            time=ticks.time,
+            forces=truth.normal_force,
+            object_pose=ticks.object_pose,
+            hand_pose=ticks.hand_pose,
+            joints=ticks.joints,
+            targets=ticks.targets,
+            joint_names=self.run.scene.joint_names,
             contact_order=tuple(sorted(touched, key=lambda finger: first_touch[finger])),
             object_motion=self._motion(self.arrived, -1),
             pushed=self._motion(self.arrived, self.touched, in_hand=False),
             before_lift=self._motion(0, self.pressed, in_hand=False),
-            rise=float(ticks.centre[-1, 2] - ticks.centre[0, 2]), unbalanced=self.unbalanced,
-            slip=self._motion(self.pressed, -1), start_overlap=self.run.overlap,
+            rise=float(ticks.centre[-1, 2] - ticks.centre[0, 2]),
+            unbalanced=self.unbalanced,
+            slip=self._motion(self.pressed, -1),
+            start_overlap=self.run.overlap,
             disturbance=disturbance,
-            trace=ClosingTrace(truth.forces, truth.points, truth.normals, truth.sliding, ticks.blend, *ticks.felt.T),
+            trace=ClosingTrace(
+                truth.forces, truth.points, truth.normals, truth.sliding, ticks.blend, *ticks.felt.T
+            ),
             phases=torch.tensor(reached, dtype=torch.float64),
-            stops=self.run.controller.stops, attempts=self.run.controller.attempts, seconds=seconds,
-        )  # fmt: skip
+            stops=self.run.controller.stops,
+            attempts=self.run.controller.attempts,
+            seconds=seconds,
+        )

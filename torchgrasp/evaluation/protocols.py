@@ -1,4 +1,6 @@
-"""Settings of the trials that test grasps: lifts, and published pulls at the object without table and gravity."""
+"""Settings of the trials that test grasps: lifts, and published pulls at the object without table
+and gravity.
+"""
 
 import dataclasses
 import hashlib
@@ -24,7 +26,9 @@ from torchgrasp.values.specs import TrialSpec
 @checked
 @dataclasses.dataclass(frozen=True)
 class PoseNoise(Value):
-    """Random pose errors of at most `translation` [m] along and `rotation` [rad] about each axis; `draws` per grasp."""
+    """Random pose errors of at most `translation` [m] along and `rotation` [rad] about each axis;
+    `draws` per grasp.
+    """
 
     translation: Length = 0.0
     rotation: Annotated[float, Range(0.0, math.pi)] = 0.0
@@ -34,7 +38,9 @@ class PoseNoise(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class PullSpec(Value):
-    """A pull with the force mass x `acceleration` [m/s^2], and the largest motion [m] and rotation [rad] that pass."""
+    """A pull with the force mass x `acceleration` [m/s^2], and the largest motion [m] and rotation
+    [rad] that pass.
+    """
 
     acceleration: Annotated[float, Range(0.0, 1000.0)]
     seconds: Annotated[float, Range(0.0, 60.0)]
@@ -45,20 +51,21 @@ class PullSpec(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class Protocol(Value):
-    """The settings of the simulated trials that test a grasp: they pull at the object, or lift it if `pull` is None.
+    """The settings of the simulated trials that test a grasp: they pull at the object, or lift it
+    if `pull` is None.
 
-    Raises `BadArgument` for a rotation during the approach, or a push or a displacement in a protocol of pulls.
+    Raises `BadArgument` for a rotation during the approach, or a push or a displacement in a
+    protocol of pulls.
 
-    Args:
-        name: the protocol's name.
-        trial: parameters of the simulated trials.
-        pull: the pulls; None means a lift.
-        noise: random errors of the hand's pose in pulls, and displacements of the object along the table in lifts.
-        criterion: a lift passes if the object is "held" (`close_hand`), or has "risen" by half of the lift at the end.
-        displaced: when the object of a lift is displaced: "before" the approach, or halfway through the "approach".
-        push: size of a force [N] in a random direction at the lifted object.
-        relook: whether the camera looks at the object of a lift once more, from the same place, before the approach.
-        tries: largest number of grasps to try in a lift: another grasp where the object stays behind (`lift_grasps`).
+    Args: name: the protocol's name. trial: parameters of the simulated trials. pull: the pulls;
+        None means a lift. noise: random errors of the hand's pose in pulls, and displacements of
+        the object along the table in lifts. criterion: a lift passes if the object is "held"
+        (`close_hand`), or has "risen" by half of the lift at the end. displaced: when the object of
+        a lift is displaced: "before" the approach, or halfway through the "approach". push: size of
+        a force [N] in a random direction at the lifted object. relook: whether the camera looks at
+        the object of a lift once more, from the same place, before the approach. tries: largest
+        number of grasps to try in a lift: another grasp where the object stays behind
+        (`lift_grasps`).
     """
 
     name: str
@@ -74,7 +81,11 @@ class Protocol(Value):
     def __post_init__(self) -> None:
         """Raise `BadArgument` if fields contradict each other."""
         if self.displaced == "approach" and self.noise.rotation:
-            raise BadArgument("noise.rotation", self.noise.rotation, "0 for an object displaced during the approach")
+            raise BadArgument(
+                "noise.rotation",
+                self.noise.rotation,
+                "0 for an object displaced during the approach",
+            )
         lifts = self.criterion, self.displaced, self.push, self.relook, self.tries
         if self.pull is not None and lifts != ("held", "before", 0.0, False, 1):
             found = "a pull with a criterion, displacement, push, second look or tries of a lift"
@@ -87,10 +98,17 @@ class Protocol(Value):
         >>> find_protocol("dexgraspbench").task.describe()
         'pulls of 0.1 kg with 7 N'
         """
-        trial, lift = self.trial, self.pull is None
+        trial = self.trial
+        lift = self.pull is None
         mass = trial.mass if self.pull is None else trial.mass * self.pull.acceleration / 10.0
         closing = "open_loop" if trial.closing == "open_loop" and not lift else "uncertainty"
-        return GraspTask(max(mass, 1e-3), trial.force, lift, closing, self.noise.translation + self.noise.rotation > 0)
+        return GraspTask(
+            max(mass, 1e-3),
+            trial.force,
+            lift,
+            closing,
+            self.noise.translation + self.noise.rotation > 0,
+        )
 
     @checked
     def with_trial(self, **changes: Any) -> "Protocol":
@@ -103,10 +121,21 @@ class Protocol(Value):
 
 
 _FLOATING = TrialSpec(
-    closing="open_loop", force=7.0, mass=0.1, friction=0.6, patch=0.02 / 0.6, kp=5.0, overlap=0.01,
-    gravity=0.0, table=False, approach=0.0, lift_height=0.0,
-)  # fmt: skip
-"""DexGraspBench's trial. PhysX resists torsion by friction x force x patch: torsional over sliding friction [m]."""
+    closing="open_loop",
+    force=7.0,
+    mass=0.1,
+    friction=0.6,
+    patch=0.02 / 0.6,
+    kp=5.0,
+    overlap=0.01,
+    gravity=0.0,
+    table=False,
+    approach=0.0,
+    lift_height=0.0,
+)
+"""DexGraspBench's trial. PhysX resists torsion by friction x force x patch: torsional over sliding
+friction [m].
+"""
 _PULL = PullSpec(10.0, 2.0, 0.05, math.radians(15))  # DexGraspBench's
 POSE_NOISE = PoseNoise(0.005, math.radians(5))  # as large as in Get a Grip (CoRL 2024)
 PROTOCOLS = {
@@ -118,7 +147,11 @@ PROTOCOLS = {
             PullSpec(0.5, 1.0, 0.02, math.inf),
         ),
         Protocol("dexgraspbench", _FLOATING, _PULL),
-        Protocol("dexgraspbench-hard", dataclasses.replace(_FLOATING, friction=0.3, patch=0.002 / 0.3), _PULL),
+        Protocol(
+            "dexgraspbench-hard",
+            dataclasses.replace(_FLOATING, friction=0.3, patch=0.002 / 0.3),
+            _PULL,
+        ),
         Protocol("pose-noise", _FLOATING, _PULL, dataclasses.replace(POSE_NOISE, draws=20)),
         Protocol("paper", TrialSpec(), noise=POSE_NOISE),
         Protocol("tabletop", TrialSpec(friction=0.6, shake=0.003)),
@@ -137,18 +170,20 @@ PROTOCOLS = {
 * dexgraspbench: force closure for floating objects (as of BODex, arXiv 2412.16490).
 * dexgraspbench-hard: the same with halved friction, as in Dexonomy (arXiv 2504.18829).
 * pose-noise: the same with errors of the hand's pose.
-* paper: the paper's lift (Sec. 6.5) at friction 0.8; errors of the object's pose stand for a real robot's chance.
+* paper: the paper's lift (Sec. 6.5) at friction 0.8; errors of the object's pose stand for a real
+    robot's chance.
 * tabletop: a lift by 0.1 m at friction 0.6, held for 2 s while the hand shakes.
 * household: the same at friction 0.8.
-* table-lift: a lift by 0.2 m of 0.249 kg with friction 0.8 at the fingertips and 0.2 at the table, as published for
-  single-view policies. One of three grasps must have raised the object by 0.1 m at the end; `noise` and `push`
-  displace and push it.
+* table-lift: a lift by 0.2 m of 0.249 kg with friction 0.8 at the fingertips and 0.2 at the table,
+  as published for single-view policies. One of three grasps must have raised the object by 0.1 m at
+  the end; `noise` and `push` displace and push it.
 """
 
 
 @checked
 def find_protocol(protocol: Protocol | str) -> Protocol:
-    """Return a protocol, given its name or the protocol itself; raise `BadArgument` for an unknown name.
+    """Return a protocol, given its name or the protocol itself; raise `BadArgument` for an unknown
+    name.
 
     >>> find_protocol("tabletop").trial.friction
     0.6
@@ -162,16 +197,24 @@ def find_protocol(protocol: Protocol | str) -> Protocol:
 
 @checked
 def apply_error(obj_from_hand: Pose, error: Pose | None) -> Float[Tensor, "4 4"]:
-    """Return the true pose of a hand, given its planned pose and the pose error, on the CPU in float64."""
+    """Return the true pose of a hand, given its planned pose and the pose error, on the CPU in
+    float64.
+    """
     planned = obj_from_hand.to("cpu", torch.float64)
-    return planned if error is None else planned @ check_tensor("error", error, (4, 4)).to("cpu", torch.float64)
+    return (
+        planned
+        if error is None
+        else planned @ check_tensor("error", error, (4, 4)).to("cpu", torch.float64)
+    )
 
 
 @checked
 def seed_of(seed: Seed, *names: str | int) -> int:
-    """Return the random seed for one purpose: a hash of the evaluation's seed and the names of the purpose.
+    """Return the random seed for one purpose: a hash of the evaluation's seed and the names of the
+    purpose.
 
-    Draws for different objects, views, grasps or repetitions are independent of each other and of their order.
+    Draws for different objects, views, grasps or repetitions are independent of each other and of
+    their order.
     """
     digest = hashlib.sha256(json.dumps([seed, *names]).encode()).digest()
     return int.from_bytes(digest[:8], "big") >> 1
@@ -188,24 +231,36 @@ def draw_hand_errors(noise: PoseNoise, count: Count, seed: Seed) -> Float[Tensor
 
 
 @checked
-def draw_object_poses(noise: PoseNoise, pivot: Float[Tensor, "3"], count: Count, seed: Seed) -> Float[Tensor, "n 4 4"]:
-    """Return random displacements of an object along its table and about the vertical through `pivot` [m]."""
+def draw_object_poses(
+    noise: PoseNoise, pivot: Float[Tensor, "3"], count: Count, seed: Seed
+) -> Float[Tensor, "n 4 4"]:
+    """Return random displacements of an object along its table and about the vertical through
+    `pivot` [m].
+    """
     pivot = pivot.to("cpu", torch.float64)
     generator = torch.Generator().manual_seed(seed)
     drawn = 2 * torch.rand(count, 3, generator=generator, dtype=torch.float64) - 1
     up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     rotation = rotation_from_vector(noise.rotation * drawn[:, :1] * up)
-    return rigid(rotation, noise.translation * drawn[:, [1, 2, 2]] * (1 - up) + pivot - rotation @ pivot)
+    return rigid(
+        rotation, noise.translation * drawn[:, [1, 2, 2]] * (1 - up) + pivot - rotation @ pivot
+    )
 
 
 def error_from_object_pose(obj_from_hand: Pose, object_pose: Pose) -> Float[Tensor, "4 4"]:
-    """Return the pose error of the hand that is equivalent to a displacement of the object by `object_pose`."""
+    """Return the pose error of the hand that is equivalent to a displacement of the object by
+    `object_pose`.
+    """
     return inverse(obj_from_hand) @ inverse(object_pose) @ obj_from_hand
 
 
 @checked
-def draw_error(protocol: Protocol, grasp: Grasps, mesh: "trimesh.Trimesh", seed: Seed) -> Float[Tensor, "4 4"]:
-    """Return the random pose error of the hand for one trial of a grasp; `seed_of` gives the seed of the trial."""
+def draw_error(
+    protocol: Protocol, grasp: Grasps, mesh: "trimesh.Trimesh", seed: Seed
+) -> Float[Tensor, "4 4"]:
+    """Return the random pose error of the hand for one trial of a grasp; `seed_of` gives the seed
+    of the trial.
+    """
     if protocol.pull is not None:
         return draw_hand_errors(protocol.noise, 1, seed)[0]
     pivot = torch.tensor(mesh.center_mass.tolist(), dtype=torch.float64)
@@ -215,13 +270,21 @@ def draw_error(protocol: Protocol, grasp: Grasps, mesh: "trimesh.Trimesh", seed:
 
 @checked
 def draw_slide(noise: PoseNoise, seed: Seed) -> Float[Tensor, "3"]:
-    """Return a random displacement [m] of an object along its table, of at most `noise.translation` on each axis."""
-    return draw_object_poses(dataclasses.replace(noise, rotation=0.0), torch.zeros(3), 1, seed)[0, :3, 3]
+    """Return a random displacement [m] of an object along its table, of at most `noise.translation`
+    on each axis.
+    """
+    return draw_object_poses(dataclasses.replace(noise, rotation=0.0), torch.zeros(3), 1, seed)[
+        0, :3, 3
+    ]
 
 
 @checked
-def draw_push(force: Annotated[float, Range(0.0, 1000.0)], seed: Seed) -> tuple[float, float, float]:
-    """Return a force of the size `force` [N] in a random direction; all directions are equally likely."""
+def draw_push(
+    force: Annotated[float, Range(0.0, 1000.0)], seed: Seed
+) -> tuple[float, float, float]:
+    """Return a force of the size `force` [N] in a random direction; all directions are equally
+    likely.
+    """
     generator = torch.Generator().manual_seed(seed)
     x, y, z = (force * unit(torch.randn(3, generator=generator, dtype=torch.float64))).tolist()
     return x, y, z

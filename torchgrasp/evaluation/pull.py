@@ -28,11 +28,12 @@ INTERVAL = 0.2  # interval [s] at which the pulled object's motion is checked
 @checked
 @dataclasses.dataclass(frozen=True)
 class PullResult(Value):
-    """The result of a pull trial: whether the object stayed in the hand when pulled in each direction.
+    """The result of a pull trial: whether the object stayed in the hand when pulled in each
+    direction.
 
-    `directions` is the number of pulls that were tried, `status` that of the last one. The object's largest motion is
-    `moved` [m] and `turned` [rad]. `force` [N] is the fingers' mean normal force before the first pull, or NaN.
-    `seconds` is CPU time.
+    `directions` is the number of pulls that were tried, `status` that of the last one. The object's
+    largest motion is `moved` [m] and `turned` [rad]. `force` [N] is the fingers' mean normal force
+    before the first pull, or NaN. `seconds` is CPU time.
     """
 
     passed: bool
@@ -47,10 +48,12 @@ class PullResult(Value):
 @checked
 @single_threaded
 def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") -> PullResult:
-    """Close a hand on the true object and pull along the world's axes, from the same grasp, until a pull fails.
+    """Close a hand on the true object and pull along the world's axes, from the same grasp, until a
+    pull fails.
 
-    The object's motion includes its motion during the closing. `protocol` may be a name in `PROTOCOLS`. Raises the
-    errors of `close_hand`, and `BadArgument` for an unknown protocol, or a protocol that lifts.
+    The object's motion includes its motion during the closing. `protocol` may be a name in
+    `PROTOCOLS`. Raises the errors of `close_hand`, and `BadArgument` for an unknown protocol, or a
+    protocol that lifts.
 
     >>> from torchgrasp import load_hand, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -69,9 +72,13 @@ def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") ->
 
 def run_pulls(driver: TrialDriver, spec: PullSpec) -> PullResult:
     """Grasp the object once, and pull it in each direction from the grasp on, until one pull fails."""
-    started, run = time.process_time(), driver.open()
-    start, force, tried = run.scene.object_pose(), math.nan, 1
-    status, largest = Status.START_OVERLAP, np.zeros(2)
+    started = time.process_time()
+    run = driver.open()
+    start = run.scene.object_pose()
+    force = math.nan
+    tried = 1
+    status = Status.START_OVERLAP
+    largest = np.zeros(2)
     if run.starts:
         for _ in run.close():
             pass
@@ -79,20 +86,26 @@ def run_pulls(driver: TrialDriver, spec: PullSpec) -> PullResult:
         status, largest = _look(run, spec, start)
         status = Status.EJECTED if status is Status.MOVED else status
     if status is Status.OK:
-        largest, reopen = np.zeros(2), run.keep()
+        largest = np.zeros(2)
+        reopen = run.keep()
         for tried, direction in enumerate(DIRECTIONS, start=1):
             status, motion = _pull(run if tried == 1 else reopen(), spec, start, direction)
             largest = np.maximum(largest, motion)
             if status is not Status.OK:
                 break
     moved, turned = largest.tolist()
-    return PullResult(status is Status.OK, status, tried, moved, turned, force, time.process_time() - started)
+    return PullResult(
+        status is Status.OK, status, tried, moved, turned, force, time.process_time() - started
+    )
 
 
-def _pull(run: TrialRun, spec: PullSpec, start: np.ndarray, direction: np.ndarray) -> tuple[Status, np.ndarray]:
+def _pull(
+    run: TrialRun, spec: PullSpec, start: np.ndarray, direction: np.ndarray
+) -> tuple[Status, np.ndarray]:
     """Pull in one direction; return status and largest motion [m, rad] from the pose `start`."""
     run.scene.pull(spec.acceleration * run.mass * direction)
-    status, largest = Status.OK, np.zeros(2)
+    status = Status.OK
+    largest = np.zeros(2)
     for _ in range(round(spec.seconds / INTERVAL)):
         run.hold(INTERVAL)
         status, motion = _look(run, spec, start)
@@ -103,13 +116,18 @@ def _pull(run: TrialRun, spec: PullSpec, start: np.ndarray, direction: np.ndarra
 
 
 def _look(run: TrialRun, spec: PullSpec, start: np.ndarray) -> tuple[Status, np.ndarray]:
-    """Return `OK` or a failure if the object has moved too far, and the object's motion [m, rad] from the start."""
-    pose, centre = run.scene.object_pose(), np.append(run.scene.centre, 1.0)
+    """Return `OK` or a failure if the object has moved too far, and the object's motion [m, rad]
+    from the start.
+    """
+    pose = run.scene.object_pose()
+    centre = np.append(run.scene.centre, 1.0)
     if not np.isfinite(pose).all():
         return Status.UNSTABLE, np.full(2, math.inf)
     moved = np.linalg.norm((pose @ centre - start @ centre)[:3])
     turned = float(rotation_angle(torch.from_numpy(start[:3, :3].T @ pose[:3, :3])))
-    return Status.OK if moved < spec.distance and turned < spec.angle else Status.MOVED, np.array([moved, turned])
+    return Status.OK if moved < spec.distance and turned < spec.angle else Status.MOVED, np.array(
+        [moved, turned]
+    )
 
 
 @checked
@@ -120,24 +138,34 @@ def run_protocol(
     rank: Annotated[int, Range(0, 1000000)] = 0,
     draw: Annotated[int, Range(0, 1000000)] = 0,
 ) -> ProtocolResult:
-    """Run one trial of a grasp, pulls or a lift; the result stores the grasp's `rank` and the pose error's `draw`.
+    """Run one trial of a grasp, pulls or a lift; the result stores the grasp's `rank` and the pose
+    error's `draw`.
 
-    With `protocol.tries` > 1 the trial may hold further grasps, which are tried where a lift fails (`lift_grasps`).
-    A force of the size `protocol.push` in a direction drawn from the trial's seed pushes the lifted object.
+    With `protocol.tries` > 1 the trial may hold further grasps, which are tried where a lift fails
+    (`lift_grasps`). A force of the size `protocol.push` in a direction drawn from the trial's seed
+    pushes the lifted object.
     """
     started = time.process_time()
     if protocol.push:
         protocol = protocol.with_trial(push=draw_push(protocol.push, seed_of(trial.seed, "push")))
     first = trial if protocol.tries == 1 else dataclasses.replace(trial, grasp=trial.grasp[0])
-    driver, tries = TrialDriver(first, protocol.trial), 1
+    driver = TrialDriver(first, protocol.trial)
+    tries = 1
     overlap = driver.grasp_overlap()
     if protocol.pull is not None:
         pull = run_pulls(driver, protocol.pull)
-        status, moved, turned, force = pull.status, pull.moved, pull.turned, pull.force
-        slip, passed, cause, size = ObjectMotion(math.nan, math.nan), status is Status.OK, "", math.nan
+        status = pull.status
+        moved = pull.moved
+        turned = pull.turned
+        force = pull.force
+        slip = ObjectMotion(math.nan, math.nan)
+        passed = status is Status.OK
+        cause = ""
+        size = math.nan
     else:
         lifts = run_lifts(driver, trial.grasp, protocol.tries)
-        tries, lift = len(lifts), lifts[-1].result
+        tries = len(lifts)
+        lift = lifts[-1].result
         status, (moved, turned), slip = lift.status, lift.object_motion, lift.slip
         force = math.nan if status is Status.START_OVERLAP else float(lift.forces[-1].mean())
         risen = lift.rise >= 0.5 * protocol.trial.lift_height
@@ -145,4 +173,6 @@ def run_protocol(
         cause, size = find_cause(lifts, trial, protocol.trial)
     spent = time.process_time() - started
     measured = moved, turned, force, overlap, spent, *slip
-    return ProtocolResult(rank, draw, passed, status, *measured, tries=tries, cause=cause, size=size)
+    return ProtocolResult(
+        rank, draw, passed, status, *measured, tries=tries, cause=cause, size=size
+    )

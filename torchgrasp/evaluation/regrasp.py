@@ -1,4 +1,6 @@
-"""A trial over several grasps: where the object stays behind in a lift, the hand opens and tries another grasp."""
+"""A trial over several grasps: where the object stays behind in a lift, the hand opens and tries
+another grasp.
+"""
 
 import dataclasses
 import math
@@ -34,10 +36,14 @@ from torchgrasp.values.specs import TrialSpec
 
 
 @checked
-def next_grasp(grasps: Grasps, tried: Sequence[int], surface: SignedDistanceField | None = None) -> int:
-    """Return the grasp of `list_others` that most likely holds, given that those `tried` have failed.
+def next_grasp(
+    grasps: Grasps, tried: Sequence[int], surface: SignedDistanceField | None = None
+) -> int:
+    """Return the grasp of `list_others` that most likely holds, given that those `tried` have
+    failed.
 
-    Without an estimated surface and table, or in another ranking than by success, it is the best-ranked one.
+    Without an estimated surface and table, or in another ranking than by success, it is the
+    best-ranked one.
     """
     others = list_others(grasps, tried)
     if surface is None or grasps.table is None or grasps.meta.get("ranking") != "success":
@@ -47,30 +53,42 @@ def next_grasp(grasps: Grasps, tried: Sequence[int], surface: SignedDistanceFiel
 
 @checked
 def list_others(grasps: Grasps, tried: Sequence[int]) -> Int[Tensor, "k"]:
-    """Return the rows of the grasps that differ from all `tried`: by 30 degrees in approach, or 15 mm in contacts."""
-    approach, points = grasps.approach, grasps.contacts.points.double()
+    """Return the rows of the grasps that differ from all `tried`: by 30 degrees in approach, or 15
+    mm in contacts.
+    """
+    approach = grasps.approach
+    points = grasps.contacts.points.double()
     gaps = torch.linalg.vector_norm(points[:, None] - points[list(tried)], dim=-1).mean(-1)
     differs = (gaps > 0.015) | (approach @ approach[list(tried)].T < math.cos(math.radians(30)))
     return differs.all(-1).nonzero()[:, 0]
 
 
-def _chances(grasps: Grasps, table: Plane, surface: SignedDistanceField, tried: Sequence[int]) -> Float[Tensor, "g"]:
-    """Return each grasp's probability of success given that the tried ones failed; 0 if it is unknown.
+def _chances(
+    grasps: Grasps, table: Plane, surface: SignedDistanceField, tried: Sequence[int]
+) -> Float[Tensor, "g"]:
+    """Return each grasp's probability of success given that the tried ones failed; 0 if it is
+    unknown.
 
     A share of the mass may be at any point of the surface, which may explain the failures.
     """
-    share, count = 0.35, 64  # of mass; places
+    # of mass; places
+    share = 0.35
+    count = 64
     shell = (surface.values.abs() < surface.spacing).nonzero().double()
     places = surface.origin.double() + surface.spacing * shell[:: max(1, len(shell) // count)]
     middle = places.mean(0)
     centers = torch.cat([middle[None], middle + share * (places - middle)])
-    log_odds = log_odds_about(grasps, centers, float(grasps.meta["friction"]), (-table.normal).tolist())
+    log_odds = log_odds_about(
+        grasps, centers, float(grasps.meta["friction"]), (-table.normal).tolist()
+    )
     weight = torch.sigmoid(-log_odds[list(tried)]).prod(0)
     return (torch.sigmoid(log_odds) @ weight / weight.sum()).where(grasps.success > 0, 0.0)
 
 
 class LiftTry(NamedTuple):
-    """One try of a trial over several grasps: the row of the grasp that was tried, and the result of its lift."""
+    """One try of a trial over several grasps: the row of the grasp that was tried, and the result
+    of its lift.
+    """
 
     row: int
     result: ClosureResult
@@ -78,15 +96,19 @@ class LiftTry(NamedTuple):
 
 @checked
 @single_threaded
-def lift_grasps(trial: GraspTrial, spec: TrialSpec | None = None, tries: Count = 3) -> tuple[LiftTry, ...]:
-    """Lift an object with the first grasp of a trial, and with others where a lift fails; return all tries.
+def lift_grasps(
+    trial: GraspTrial, spec: TrialSpec | None = None, tries: Count = 3
+) -> tuple[LiftTry, ...]:
+    """Lift an object with the first grasp of a trial, and with others where a lift fails; return
+    all tries.
 
-    Where the hand feels that the object slides or stays behind (`LiftCheck`), or is too heavy, it goes down, opens and
-    withdraws. The object stays where it then is. The robot expects it where the touches of the last try tell, or looks
-    once more, and tries the grasp of `next_grasp`.
+    Where the hand feels that the object slides or stays behind (`LiftCheck`), or is too heavy, it
+    goes down, opens and withdraws. The object stays where it then is. The robot expects it where
+    the touches of the last try tell, or looks once more, and tries the grasp of `next_grasp`.
 
-    The trial's grasps are in the order of preference; the truth's `error` is that of the first grasp. With one of the
-    `tries` the trial is that of `close_hand`. Raises the errors of `close_hand`.
+    The trial's grasps are in the order of preference; the truth's `error` is that of the first
+    grasp. With one of the `tries` the trial is that of `close_hand`. Raises the errors of
+    `close_hand`.
 
     >>> from torchgrasp import load_hand, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -101,18 +123,26 @@ def lift_grasps(trial: GraspTrial, spec: TrialSpec | None = None, tries: Count =
 
 def run_lifts(driver: TrialDriver, grasps: Grasps, tries: int) -> tuple[LiftTry, ...]:
     """Run the trial of the first of several grasps, and trials of others where a lift fails."""
-    tried, done = [0], list[LiftTry]()
+    tried = [0]
+    done = list[LiftTry]()
     while len(tried) < tries and len(list_others(grasps, tried)):
-        lift, started = _CheckedLift(driver.open()), time.perf_counter()
+        lift = _CheckedLift(driver.open())
+        started = time.perf_counter()
         result = lift.result(lift.perform(), time.perf_counter() - started)
         done.append(LiftTry(tried[-1], result))
         if not (lift.check.lost or result.status is Status.TOO_HEAVY):
             return tuple(done)
-        trial, controller = driver.trial, lift.run.controller
+        trial = driver.trial
+        controller = lift.run.controller
         row = next_grasp(grasps, tried, trial.surface)
-        truth = _left_behind(trial, result, _felt(controller), grasps.obj_from_hand[row].to("cpu", torch.float64))
-        trial = dataclasses.replace(trial, grasp=grasps[row], truth=truth, seed=seed_of(trial.seed, "again"))
-        tried, driver = [*tried, row], TrialDriver(trial, driver.spec)
+        truth = _left_behind(
+            trial, result, _felt(controller), grasps.obj_from_hand[row].to("cpu", torch.float64)
+        )
+        trial = dataclasses.replace(
+            trial, grasp=grasps[row], truth=truth, seed=seed_of(trial.seed, "again")
+        )
+        tried = [*tried, row]
+        driver = TrialDriver(trial, driver.spec)
     last = run_lift(driver)  # it goes on whatever the hand feels
     return *done, LiftTry(tried[-1], last)
 
@@ -131,9 +161,15 @@ class _CheckedLift(_Lift):
         return super()._gives_up(height) or lost
 
     def _put_down(self, time: float, rising: float) -> Status:
-        """Lower the hand, open it, withdraw it and let the object come to rest; return why the lift failed."""
-        status, run, length = super()._put_down(time, rising), self.run, self.spec.approach
-        joints, palm, here = run.observation.joints, run.controller.targets.palm, torch.zeros(6, dtype=torch.float64)
+        """Lower the hand, open it, withdraw it and let the object come to rest; return why the lift
+        failed.
+        """
+        status = super()._put_down(time, rising)
+        run = self.run
+        length = self.spec.approach
+        joints = run.observation.joints
+        palm = run.controller.targets.palm
+        here = torch.zeros(6, dtype=torch.float64)
         reference = run.robot.reference
         opening = Reopening(reference, here, joints, palm, palm + reference.rise, reach=0.0)
         while not opening.done:
@@ -149,15 +185,26 @@ class _CheckedLift(_Lift):
 
 
 def _left_behind(
-    trial: GraspTrial, result: ClosureResult, felt: Float[Tensor, "4 4"], following: Float[Tensor, "4 4"]
+    trial: GraspTrial,
+    result: ClosureResult,
+    felt: Float[Tensor, "4 4"],
+    following: Float[Tensor, "4 4"],
 ) -> Truth:
     """Return the truth of the next try: all bodies are where the last try left them.
 
-    The hand errs as before, and the robot follows the displacement that it has felt, in the planned hand's frame.
+    The hand errs as before, and the robot follows the displacement that it has felt, in the planned
+    hand's frame.
     """
-    truth, planned = trial.truth, trial.grasp.obj_from_hand[0].to("cpu", torch.float64)
-    error = inverse(following) @ apply_error(planned, truth.error) @ felt @ inverse(planned) @ following
-    table = Plane.horizontal(float(read_mesh(truth.mesh).bounds[0, 2])) if truth.table is None else truth.table
+    truth = trial.truth
+    planned = trial.grasp.obj_from_hand[0].to("cpu", torch.float64)
+    error = (
+        inverse(following) @ apply_error(planned, truth.error) @ felt @ inverse(planned) @ following
+    )
+    table = (
+        Plane.horizontal(float(read_mesh(truth.mesh).bounds[0, 2]))
+        if truth.table is None
+        else truth.table
+    )
     bodies = Neighbour(read_mesh(truth.mesh), truth.parts), *truth.neighbours
     poses = result.object_pose[-1], *result.disturbance.neighbour_pose[-1]
     target, *others = (_moved(body, pose.numpy()) for body, pose in zip(bodies, poses, strict=True))
@@ -166,11 +213,15 @@ def _left_behind(
 
 
 def _felt(controller: GraspController) -> Float[Tensor, "4 4"]:
-    """Return the displacement of the object that a controller has felt, in the planned hand's frame."""
-    closing, centre = controller.closing, controller.reference.gains.target.mean(0)
+    """Return the displacement of the object that a controller has felt, in the planned hand's
+    frame.
+    """
+    closing = controller.closing
+    centre = controller.reference.gains.target.mean(0)
     if not isinstance(closing, UncertaintyClosing):
         return torch.eye(4, dtype=torch.float64)
-    shift, rotation = closing.displacement[:3], rotation_from_vector(closing.displacement[3:])
+    shift = closing.displacement[:3]
+    rotation = rotation_from_vector(closing.displacement[3:])
     return rigid(rotation, centre + shift - rotation @ centre)
 
 

@@ -1,4 +1,6 @@
-"""Summary of an evaluation: success rates, failures by stage, forces, times, calibration of predicted success."""
+"""Summary of an evaluation: success rates, failures by stage, forces, times, calibration of
+predicted success.
+"""
 
 import dataclasses
 import math
@@ -31,20 +33,17 @@ STAGES: dict[str, tuple[Status, ...]] = {
 @checked
 @dataclasses.dataclass(frozen=True)
 class ProtocolResult(Value):
-    """The outcome of one trial of the grasp at `rank`, with the pose error of number `draw`; NaN if not measured.
+    """The outcome of one trial of the grasp at `rank`, with the pose error of number `draw`; NaN if
+    not measured.
 
-    Args:
-        moved: motion of the object [m]; in a lift relative to the hand.
-        turned: rotation of the object [rad]; in a lift relative to the hand.
-        force: mean normal force of the fingers [N].
-        overlap: overlap of hand and object at the grasp [m].
-        seconds: CPU time.
-        slip: motion of the object in the closed hand [m], in a lift.
-        slip_angle: rotation of the object in the closed hand [rad], in a lift.
-        predicted: predicted success of the grasp.
-        tries: number of grasps that were tried; all but `predicted`, `rank` and `overlap` is of the last grasp.
-        cause: why the object of a lift was not held, a name in `CAUSES`, or "".
-        size: size of the cause, in the cause's unit.
+    Args: moved: motion of the object [m]; in a lift relative to the hand. turned: rotation of the
+        object [rad]; in a lift relative to the hand. force: mean normal force of the fingers [N].
+        overlap: overlap of hand and object at the grasp [m]. seconds: CPU time. slip: motion of the
+        object in the closed hand [m], in a lift. slip_angle: rotation of the object in the closed
+        hand [rad], in a lift. predicted: predicted success of the grasp. tries: number of grasps
+        that were tried; all but `predicted`, `rank` and `overlap` is of the last grasp. cause: why
+        the object of a lift was not held, a name in `CAUSES`, or "". size: size of the cause, in
+        the cause's unit.
     """
 
     rank: int
@@ -65,7 +64,9 @@ class ProtocolResult(Value):
 
     @property
     def held(self) -> bool:
-        """Whether the status is `OK`: in a lift the object is then held without slip (`close_hand`)."""
+        """Whether the status is `OK`: in a lift the object is then held without slip
+        (`close_hand`).
+        """
         return self.status is Status.OK
 
 
@@ -98,20 +99,24 @@ class ViewScore(Value):
 
     @property
     def unit(self) -> str:
-        """The unit that confidence intervals resample: the object's family, or the object if it has no family."""
+        """The unit that confidence intervals resample: the object's family, or the object if it has
+        no family.
+        """
         return self.family or self.object
 
 
 @checked
 def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
-    """Return the figures of an evaluation by name; their 95 % intervals resample families of objects.
+    """Return the figures of an evaluation by name; their 95 % intervals resample families of
+    objects.
 
     * "gsr": grasp success rate, the fraction of trials that passed.
     * "top1": fraction of best-ranked grasps that passed; a view without grasps counts as failed.
     * "objects": fraction of objects with a success. "refused": number of views without a grasp.
     * "by_object", "by_group": the same numbers for each object or group.
     * "tries": numbers of trials that passed with the first grasp, with the second grasp, and so on.
-    * "failures": counts of statuses by stage. "causes": why objects were not held, with counts and median sizes.
+    * "failures": counts of statuses by stage. "causes": why objects were not held, with counts and
+      median sizes.
     * "fingers": counts of views by the grasping fingers.
     * "force_n", "overlap_mm", "plan_cpu_s", "trial_cpu_s": means. "cpu_s": total.
     * "slip_mm", "slip_deg": median and 95 % quantile over the held grasps.
@@ -126,24 +131,36 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
     attempts = [attempt for score in scores for attempt in score.attempts]
     spent = [*(score.seconds for score in scores), *(a.seconds for a in attempts)]
     names = sorted({score.object for score in scores})
-    by_object = {name: _shares([score for score in scores if score.object == name]) for name in names}
+    by_object = {
+        name: _shares([score for score in scores if score.object == name]) for name in names
+    }
     groups = sorted({score.group for score in scores if score.group})
     most = max((attempt.tries for attempt in attempts), default=1)
-    known = [(score.unit, a) for score in scores for a in score.attempts if not math.isnan(a.predicted)]
+    known = [
+        (score.unit, a) for score in scores for a in score.attempts if not math.isnan(a.predicted)
+    ]
     predicted = torch.tensor([attempt.predicted for _, attempt in known], dtype=torch.float64)
     passed = torch.tensor([attempt.passed for _, attempt in known], dtype=torch.bool)
     reasons_of = {"planning": Counter(s.refusal.name for s in scores if s.refusal is not Status.OK)}
     for stage, reasons in STAGES.items():
-        reasons_of[stage] = Counter(a.status.name for a in attempts if not a.passed and a.status in reasons)
+        reasons_of[stage] = Counter(
+            a.status.name for a in attempts if not a.passed and a.status in reasons
+        )
     return {
         **_shares(scores),
         "tries": [sum(a.passed and a.tries == k for a in attempts) for k in range(1, most + 1)],
-        "failures": {stage: dict(counts.most_common()) for stage, counts in reasons_of.items() if counts},
+        "failures": {
+            stage: dict(counts.most_common()) for stage, counts in reasons_of.items() if counts
+        },
         "causes": _count_causes(scores),
-        "fingers": dict(Counter(score.fingers for score in scores if score.executable).most_common()),
+        "fingers": dict(
+            Counter(score.fingers for score in scores if score.executable).most_common()
+        ),
         "force_n": _mean(a.force for a in attempts),
         "overlap_mm": _mean(1e3 * a.overlap for a in attempts),
-        "overlap_mm_max": max((1e3 * a.overlap for a in attempts if not math.isnan(a.overlap)), default=None),
+        "overlap_mm_max": max(
+            (1e3 * a.overlap for a in attempts if not math.isnan(a.overlap)), default=None
+        ),
         "slip_mm": _quantiles(1e3 * a.slip for a in attempts if a.passed),
         "slip_deg": _quantiles(math.degrees(a.slip_angle) for a in attempts if a.passed),
         "plan_cpu_s": _mean(score.seconds for score in scores),
@@ -151,12 +168,16 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
         "cpu_s": sum(x for x in spent if not math.isnan(x)),
         "success": judge(predicted, passed, [unit for unit, _ in known]) if known else None,
         "by_object": by_object,
-        "by_group": {name: _shares([score for score in scores if score.group == name]) for name in groups},
+        "by_group": {
+            name: _shares([score for score in scores if score.group == name]) for name in groups
+        },
     }
 
 
 def _count_causes(scores: Sequence[ViewScore]) -> dict[str, dict[str, Any]]:
-    """Return for each cause of objects not held its count, counts by group, and median size; the commonest first."""
+    """Return for each cause of objects not held its count, counts by group, and median size; the
+    commonest first.
+    """
     lost = [(a.cause, score.group, a.size) for score in scores for a in score.attempts if a.cause]
     found = {}
     for cause, count in Counter(name for name, _, _ in lost).most_common():
@@ -167,7 +188,9 @@ def _count_causes(scores: Sequence[ViewScore]) -> dict[str, dict[str, Any]]:
 
 
 def _shares(scores: Sequence[ViewScore]) -> dict[str, Share | int]:
-    """Return success rates over some views, the number of views without any grasp, and that of executable grasps."""
+    """Return success rates over some views, the number of views without any grasp, and that of
+    executable grasps.
+    """
     draws = 1 + max((attempt.draw for score in scores for attempt in score.attempts), default=0)
     tried = [(score.unit, attempt) for score in scores for attempt in score.attempts]
     best = [(unit, attempt.passed) for unit, attempt in tried if attempt.rank == 0]
@@ -184,7 +207,9 @@ def _shares(scores: Sequence[ViewScore]) -> dict[str, Share | int]:
 
 
 def _quantiles(values: Iterable[float]) -> tuple[float, float] | None:
-    """Return the median and the 95 % quantile of the values that are not NaN; None if there are none."""
+    """Return the median and the 95 % quantile of the values that are not NaN; None if there are
+    none.
+    """
     known = torch.tensor([value for value in values if not math.isnan(value)], dtype=torch.float64)
     if not len(known):
         return None
@@ -199,7 +224,9 @@ def _mean(values: Iterable[float]) -> float | None:
 
 
 class Bin(NamedTuple):
-    """A calibration bin: predictions in [low, high), their mean, and the success rate of their trials."""
+    """A calibration bin: predictions in [low, high), their mean, and the success rate of their
+    trials.
+    """
 
     low: float
     high: float
@@ -214,12 +241,14 @@ def judge(
 
     Trials with the same name in `units` count as dependent in the bins' confidence intervals.
 
-    "predicted" and "passed" are means. "brier" is the mean squared error. "skill" is 1 for perfect predictions and 0
-    for always predicting the mean. "auc" is the area under the ROC curve. "error" is the expected calibration error
-    over the "bins".
+    "predicted" and "passed" are means. "brier" is the mean squared error. "skill" is 1 for perfect
+    predictions and 0 for always predicting the mean. "auc" is the area under the ROC curve. "error"
+    is the expected calibration error over the "bins".
     """
     outcome = passed.to(predicted)
-    brier, rate, bins = float((predicted - outcome).square().mean()), outcome.mean(), _bins(predicted, passed, units)
+    brier = float((predicted - outcome).square().mean())
+    rate = outcome.mean()
+    bins = _bins(predicted, passed, units)
     off = sum(abs(x.predicted - x.passed.value) * x.passed.total for x in bins)
     return {
         "predicted": float(predicted.mean()),
@@ -232,9 +261,12 @@ def judge(
     }
 
 
-def _bins(predicted: Float[Tensor, "n"], passed: Bool[Tensor, "n"], units: Sequence[str]) -> list[Bin]:
+def _bins(
+    predicted: Float[Tensor, "n"], passed: Bool[Tensor, "n"], units: Sequence[str]
+) -> list[Bin]:
     """Return calibration bins of width 0.1 of the predicted probability, without the empty ones."""
-    at, bins = (predicted * 10).long().clamp(0, 9), []
+    at = (predicted * 10).long().clamp(0, 9)
+    bins = []
     for k in at.unique().tolist():
         rows: list[int] = torch.nonzero(at == k)[:, 0].tolist()
         counts = count_by((units[row], bool(passed[row])) for row in rows)
@@ -243,9 +275,13 @@ def _bins(predicted: Float[Tensor, "n"], passed: Bool[Tensor, "n"], units: Seque
 
 
 def _area_under_curve(predicted: Float[Tensor, "n"], passed: Bool[Tensor, "n"]) -> float:
-    """Return the area under the ROC curve: how often a passed trial had a higher prediction than a failed one."""
-    good, bad = predicted[passed], predicted[~passed].sort().values
+    """Return the area under the ROC curve: how often a passed trial had a higher prediction than a
+    failed one.
+    """
+    good = predicted[passed]
+    bad = predicted[~passed].sort().values
     if not len(good) or not len(bad):
         return math.nan
-    below, upto = torch.searchsorted(bad, good), torch.searchsorted(bad, good, right=True)
+    below = torch.searchsorted(bad, good)
+    upto = torch.searchsorted(bad, good, right=True)
     return float((below + upto).double().mean()) / 2 / len(bad)

@@ -1,4 +1,6 @@
-"""Evaluation of a folder of objects: plans grasps on all views, saves them, and tries them in simulation."""
+"""Evaluation of a folder of objects: plans grasps on all views, saves them, and tries them in
+simulation.
+"""
 
 import contextlib
 import dataclasses
@@ -12,14 +14,23 @@ from torchgrasp.data.manifest import read_entries
 from torchgrasp.data.shards import load_grasps
 from torchgrasp.evaluation.protocols import Protocol, find_protocol
 from torchgrasp.evaluation.summary import ProtocolResult, ViewScore
-from torchgrasp.evaluation.views import REFUSAL, EvaluationSpec, ObjectView, choose_rows, plan_view, try_grasp
+from torchgrasp.evaluation.views import (
+    REFUSAL,
+    EvaluationSpec,
+    ObjectView,
+    choose_rows,
+    plan_view,
+    try_grasp,
+)
 from torchgrasp.files import hold_folder, temporary_folder
 from torchgrasp.foundation.checks import Range, checked
 from torchgrasp.foundation.errors import DatasetError, Status
 from torchgrasp.foundation.jobs import run_tasks
 from torchgrasp.hand.hand import Hand
 
-PLAN_LIMIT, TRIAL_LIMIT = 900.0, 120.0  # limits of the wall time [s] of planning on a view and of an attempt
+# limits of the wall time [s] of planning on a view and of an attempt
+PLAN_LIMIT = 900.0
+TRIAL_LIMIT = 120.0
 
 
 @checked
@@ -32,20 +43,19 @@ def evaluate(
     folder: Path | None = None,
     workers: Annotated[int, Range(0, 1024)] = 0,
 ) -> Generator[ViewScore, None, None]:
-    """Plan grasps on every view of a folder of objects, try them in simulation, and yield the score of each view.
+    """Plan grasps on every view of a folder of objects, try them in simulation, and yield the score
+    of each view.
 
-    Only the simulator uses the true mesh. An object with bad files or a bad entry gets a score with a refusal. Raises
-    `BadArgument` for an unknown protocol or no objects, and `OutputError` if another run holds the folder or it cannot
-    be written. Without the simulator, or pebble for workers, `MissingExtra` is raised.
+    Only the simulator uses the true mesh. An object with bad files or a bad entry gets a score with
+    a refusal. Raises `BadArgument` for an unknown protocol or no objects, and `OutputError` if
+    another run holds the folder or it cannot be written. Without the simulator, or pebble for
+    workers, `MissingExtra` is raised.
 
-    Args:
-        objects: a folder as in `torchgrasp.data`.
-        hand: the hand that grasps.
-        protocol: a protocol or its name in `PROTOCOLS`.
-        spec: which views and grasps are tried; `EvaluationSpec()` by default.
-        folder: folder for the executable grasps of each view, OBJECT/VIEW.safetensors; by default a temporary folder.
-            No other run may write to it at the same time.
-        workers: number of worker processes; the scores do not depend on it.
+    Args: objects: a folder as in `torchgrasp.data`. hand: the hand that grasps. protocol: a
+        protocol or its name in `PROTOCOLS`. spec: which views and grasps are tried;
+        `EvaluationSpec()` by default. folder: folder for the executable grasps of each view,
+        OBJECT/VIEW.safetensors; by default a temporary folder. No other run may write to it at the
+        same time. workers: number of worker processes; the scores do not depend on it.
 
     >>> import tempfile
     >>> from torchgrasp import load_hand, load_object
@@ -57,12 +67,16 @@ def evaluate(
     >>> [score.executable > 0 for score in scores]
     [True]
     """
-    protocol, spec = find_protocol(protocol), EvaluationSpec() if spec is None else spec
-    views, refused = [], []
+    protocol = find_protocol(protocol)
+    spec = EvaluationSpec() if spec is None else spec
+    views = []
+    refused = []
     for name, entry in read_entries(objects, spec.only).items():
         if isinstance(entry, DatasetError):
             note = " ".join(str(entry).split())
-            refused.append(ViewScore(ascii(name), "", 0, math.nan, refusal=Status.BAD_OBJECT, note=note))
+            refused.append(
+                ViewScore(ascii(name), "", 0, math.nan, refusal=Status.BAD_OBJECT, note=note)
+            )
         else:
             names = entry.list_views(spec.complete, spec.views)
             views += [ObjectView(Path(objects), name, view, hand.source) for view in names]
@@ -83,23 +97,35 @@ def _evaluate(
         shelf = stack.enter_context(temporary_folder()) if folder is None else Path(folder)
         if folder is not None and not spec.planned:  # grasps that are only read need no lock
             stack.enter_context(hold_folder(shelf))
-        plans = run_tasks(_plan, [(view, shelf, protocol, spec) for view in views], workers, PLAN_LIMIT)
+        plans = run_tasks(
+            _plan, [(view, shelf, protocol, spec) for view in views], workers, PLAN_LIMIT
+        )
         scores = [
-            dataclasses.replace(view.score, seconds=math.nan, refusal=plan) if isinstance(plan, Status) else plan
+            dataclasses.replace(view.score, seconds=math.nan, refusal=plan)
+            if isinstance(plan, Status)
+            else plan
             for view, plan in zip(views, plans, strict=True)
         ]
         rows = [choose_rows(score.executable, spec.grasps, spec.ranks) for score in scores]
         places = [list(itertools.product(chosen, range(protocol.noise.draws))) for chosen in rows]
-        tasks = [(view, shelf, protocol, spec, *at) for view, some in zip(views, places, strict=True) for at in some]
+        tasks = [
+            (view, shelf, protocol, spec, *at)
+            for view, some in zip(views, places, strict=True)
+            for at in some
+        ]
         with contextlib.closing(run_tasks(_try, tasks, workers, TRIAL_LIMIT)) as results:
             for score, some in zip(scores, places, strict=True):
                 tried = [(at, next(results)) for at in some]
-                attempts = (ProtocolResult(*at, False, x) if isinstance(x, Status) else x for at, x in tried)
+                attempts = (
+                    ProtocolResult(*at, False, x) if isinstance(x, Status) else x for at, x in tried
+                )
                 yield dataclasses.replace(score, attempts=tuple(attempts))
 
 
 def _plan(view: ObjectView, shelf: Path, protocol: Protocol, spec: EvaluationSpec) -> ViewScore:
-    """Plan grasps on a view and save them in the folder `shelf`, or count the grasps that an earlier call saved."""
+    """Plan grasps on a view and save them in the folder `shelf`, or count the grasps that an
+    earlier call saved.
+    """
     found = plan_view(view, protocol, spec, view.file(shelf) if spec.planned else None)
     if found.grasps is not None and not spec.planned:
         meta = found.grasps.meta | {REFUSAL: found.score.refusal.name}
@@ -110,7 +136,11 @@ def _plan(view: ObjectView, shelf: Path, protocol: Protocol, spec: EvaluationSpe
 def _try(
     view: ObjectView, shelf: Path, protocol: Protocol, spec: EvaluationSpec, row: int, draw: int
 ) -> ProtocolResult:
-    """Try the saved grasp with index `row` of a view in simulation, with the pose error of number `draw`."""
+    """Try the saved grasp with index `row` of a view in simulation, with the pose error of number
+    `draw`.
+    """
     grasps = load_grasps(view.file(shelf))
-    others = [k for k in range(len(grasps)) if k != row and protocol.tries > 1]  # tried where the lift fails
+    others = [
+        k for k in range(len(grasps)) if k != row and protocol.tries > 1
+    ]  # tried where the lift fails
     return try_grasp(view, grasps[[row, *others]], protocol, spec, (row, draw))

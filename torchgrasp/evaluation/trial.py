@@ -40,10 +40,12 @@ from torchgrasp.values.specs import ClosingMode, TrialSpec
 @checked
 @dataclasses.dataclass(frozen=True)
 class Truth:
-    """The true world of a trial, which only the simulator gets; the fields are arguments of `close_hand`.
+    """The true world of a trial, which only the simulator gets; the fields are arguments of
+    `close_hand`.
 
-    The object slides by `slide` [m] halfway through the approach. `camera` is the pose, in the frame of the grasp, of a
-    depth camera that looks at the object once more before the hand comes to its approach.
+    The object slides by `slide` [m] halfway through the approach. `camera` is the pose, in the
+    frame of the grasp, of a depth camera that looks at the object once more before the hand comes
+    to its approach.
     """
 
     mesh: "trimesh.Trimesh | Path | str"
@@ -58,7 +60,9 @@ class Truth:
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspTrial:
-    """The input of a trial: the truth, and what the robot knows; the fields are arguments of `close_hand`."""
+    """The input of a trial: the truth, and what the robot knows; the fields are arguments of
+    `close_hand`.
+    """
 
     hand: Hand
     grasp: Grasps
@@ -69,63 +73,107 @@ class GraspTrial:
 
 
 class TrialDriver:
-    """A trial that is checked once and can run any number of times; a wrong one raises the errors of `close_hand`.
+    """A trial that is checked once and can run any number of times; a wrong one raises the errors
+    of `close_hand`.
 
-    Attributes:
-        reference: the closing plan; by default derived from what the robot knows of the trial.
-        obj_from_world: pose of the simulator's frame in the grasp's frame. If there is a true table, the frame is
-            upright on it. Numbers are then rounded, so that results are bitwise invariant to rigid motion.
+    Attributes: reference: the closing plan; by default derived from what the robot knows of the
+        trial. obj_from_world: pose of the simulator's frame in the grasp's frame. If there is a
+        true table, the frame is upright on it. Numbers are then rounded, so that results are
+        bitwise invariant to rigid motion.
     """
 
-    def __init__(self, trial: GraspTrial, spec: TrialSpec, reference: ClosingReference | None = None) -> None:
+    def __init__(
+        self, trial: GraspTrial, spec: TrialSpec, reference: ClosingReference | None = None
+    ) -> None:
         check_single(trial.grasp)
-        self.trial, self.spec = trial, spec
-        hand, planned = trial.hand.to("cpu", torch.float64), trial.grasp.to("cpu", torch.float64)
-        self.obj_from_world, grasp, known = torch.eye(4, dtype=torch.float64), planned, planned
-        told, pose = trial.grasp.table if trial.told is None else trial.told, planned.obj_from_hand[0]
+        self.trial = trial
+        self.spec = spec
+        hand = trial.hand.to("cpu", torch.float64)
+        planned = trial.grasp.to("cpu", torch.float64)
+        self.obj_from_world = torch.eye(4, dtype=torch.float64)
+        grasp = planned
+        known = planned
+        told = trial.grasp.table if trial.told is None else trial.told
+        pose = planned.obj_from_hand[0]
         if trial.truth.table is not None:
             self.obj_from_world = world_frame(trial.truth.table, pose)
-            grasp, known = to_frame(planned, self.obj_from_world), to_frame(planned, pose)
+            grasp = to_frame(planned, self.obj_from_world)
+            known = to_frame(planned, pose)
             if told is not None:
                 told = told.moved(inverse(pose))
                 told = Plane(rounded(told.normal), round(told.offset, 9))
         if reference is None:
             reference = derive_reference(
-                hand, known, told if spec.table else None, trial.surface, spec.closing, spec.strongest, spec.kp,
-                spec.sensor, spec.max_force,
-            )  # fmt: skip
+                hand,
+                known,
+                told if spec.table else None,
+                trial.surface,
+                spec.closing,
+                spec.strongest,
+                spec.kp,
+                spec.sensor,
+                spec.max_force,
+            )
             reference = dataclasses.replace(reference, obj_from_hand=pose)
         hand.check_joints(grasp.pregrasp)
         if spec.approach and not abs(float(torch.linalg.vector_norm(grasp.approach)) - 1) < 1e-4:
-            raise BadArgument("grasp", f"an approach along {grasp.approach[0].tolist()}", "a unit vector")
+            raise BadArgument(
+                "grasp", f"an approach along {grasp.approach[0].tolist()}", "a unit vector"
+            )
         self.reference = reference
         self.scene_spec = self._scene_spec(hand, grasp)
 
     def _scene_spec(self, hand: Hand, grasp: Grasps) -> SceneSpec:
-        """Return the parameters of the simulated scene; the hand's true pose in it includes the trial's pose error."""
-        spec, truth, drives, rise = self.spec, self.trial.truth, hand.actuators, self.reference.rise
+        """Return the parameters of the simulated scene; the hand's true pose in it includes the
+        trial's pose error.
+        """
+        spec = self.spec
+        truth = self.trial.truth
+        drives = hand.actuators
+        rise = self.reference.rise
         body = self._body(truth)
         if spec.kp is not None:
             drives = {name: drive._replace(kp=spec.kp) for name, drive in drives.items()}
         true_pose = apply_error(grasp.obj_from_hand[0], truth.error)
-        approach = true_pose[:3, :3] @ grasp.obj_from_hand[0, :3, :3].T @ grasp.approach[0] * spec.approach
+        approach = (
+            true_pose[:3, :3] @ grasp.obj_from_hand[0, :3, :3].T @ grasp.approach[0] * spec.approach
+        )
         return SceneSpec(
-            urdf_path=hand.urdf_path, world_from_hand=true_pose.numpy(), joints=_by_name(hand, grasp.pregrasp[0]),
-            drives=drives, tip_links=tuple(hand.tips.links), mesh=body.mesh, parts=list(body.parts), mass=body.mass,
-            friction=spec.friction, table_friction=spec.table_friction, gravity=spec.gravity,
-            timestep=spec.timestep, travel=spec.lift_height,
-            approach=tuple(approach.tolist()), table=spec.table, patch=spec.patch,
+            urdf_path=hand.urdf_path,
+            world_from_hand=true_pose.numpy(),
+            joints=_by_name(hand, grasp.pregrasp[0]),
+            drives=drives,
+            tip_links=tuple(hand.tips.links),
+            mesh=body.mesh,
+            parts=list(body.parts),
+            mass=body.mass,
+            friction=spec.friction,
+            table_friction=spec.table_friction,
+            gravity=spec.gravity,
+            timestep=spec.timestep,
+            travel=spec.lift_height,
+            approach=tuple(approach.tolist()),
+            table=spec.table,
+            patch=spec.patch,
             height=None if truth.table is None else 0.0,
             neighbours=tuple(self._body(x, x.mass) for x in truth.neighbours),
             self_pairs=hand.self_pairs if spec.self_collision else (),
-            yields=spec.components.palm_reach + 1.5 * REACH * (truth.camera is not None) + float(rise.norm()),
-        )  # fmt: skip
+            yields=spec.components.palm_reach
+            + 1.5 * REACH * (truth.camera is not None)
+            + float(rise.norm()),
+        )
 
     def _body(self, given: Truth | Neighbour, mass: float | None = None) -> Body:
-        """Return a mesh as a body of the scene: in the simulator's frame, with its convex parts and its mass [kg]."""
+        """Return a mesh as a body of the scene: in the simulator's frame, with its convex parts and
+        its mass [kg].
+        """
         mesh, parts = read_solid(given.mesh, given.parts)
         if mass is None:
-            mass = self.spec.mass if self.spec.density is None else self.spec.density * float(mesh.volume)
+            mass = (
+                self.spec.mass
+                if self.spec.density is None
+                else self.spec.density * float(mesh.volume)
+            )
         if self.trial.truth.table is not None:
             mesh, *parts = (moved_mesh(x, self.obj_from_world) for x in (mesh, *parts))
         return Body(mesh, parts, mass)
@@ -135,7 +183,9 @@ class TrialDriver:
         return open_scene(spec, self.spec.simulator)
 
     def open(self) -> "TrialRun":
-        """Return a run of the trial in a fresh scene; raises `MissingExtra` if the simulator is not installed."""
+        """Return a run of the trial in a fresh scene; raises `MissingExtra` if the simulator is not
+        installed.
+        """
         return TrialRun(self)
 
     def grasp_overlap(self) -> float:
@@ -147,58 +197,94 @@ class TrialDriver:
 
 
 def derive_reference(
-    hand: Hand, grasp: Grasps, table: Plane | None = None, surface: SignedDistanceField | None = None,
-    closing: ClosingMode = "uncertainty", force: float = 4.0, kp: float | None = None,
-    sensor: SensorModel | None = None, max_force: float | None = None,
-) -> ClosingReference:  # fmt: skip
-    """Return the closing plan, given all that the robot knows; its table is in the frame of the grasp."""
+    hand: Hand,
+    grasp: Grasps,
+    table: Plane | None = None,
+    surface: SignedDistanceField | None = None,
+    closing: ClosingMode = "uncertainty",
+    force: float = 4.0,
+    kp: float | None = None,
+    sensor: SensorModel | None = None,
+    max_force: float | None = None,
+) -> ClosingReference:
+    """Return the closing plan, given all that the robot knows; its table is in the frame of the
+    grasp.
+    """
     stability = None
     if closing == "paper":
         hand.require_three("closing", "'paper', whose model of stability is of three,")
         stability = load_stability(hand)
     plan = ClosingReference.from_grasp(hand, grasp, force, kp, stability)
-    table, sensor = table and table.moved(inverse(grasp.obj_from_hand[0])), sensor or plan.sensor
-    return dataclasses.replace(plan, table=table, surface=surface, sensor=sensor, max_force=max_force)
+    table = table and table.moved(inverse(grasp.obj_from_hand[0]))
+    sensor = sensor or plan.sensor
+    return dataclasses.replace(
+        plan, table=table, surface=surface, sensor=sensor, max_force=max_force
+    )
 
 
 class TrialRun:
-    """One run of a trial in a fresh scene; its phases are iterators that yield after every control tick."""
+    """One run of a trial in a fresh scene; its phases are iterators that yield after every control
+    tick.
+    """
 
     def __init__(self, driver: TrialDriver) -> None:
-        spec, trial = driver.spec, driver.trial
-        self.spec, self.mass, self.obj_from_world = spec, driver.scene_spec.mass, driver.obj_from_world
-        slide, world_from_obj = trial.truth.slide, driver.obj_from_world[:3, :3].T
-        self.slide = None if slide is None else (world_from_obj @ slide.to("cpu", torch.float64)).numpy()
+        spec = driver.spec
+        trial = driver.trial
+        self.spec = spec
+        self.mass = driver.scene_spec.mass
+        self.obj_from_world = driver.obj_from_world
+        slide = trial.truth.slide
+        world_from_obj = driver.obj_from_world[:3, :3].T
+        self.slide = (
+            None if slide is None else (world_from_obj @ slide.to("cpu", torch.float64)).numpy()
+        )
         guarded = spec.approach if spec.components.stops and can_guard(driver.reference) else 0.0
-        self.controller = GraspController(driver.reference, spec.closing, spec.pressing, spec.options, guarded)
+        self.controller = GraspController(
+            driver.reference, spec.closing, spec.pressing, spec.options, guarded
+        )
         if trial.truth.camera is not None:
             self._relook(driver, trial.truth.camera)
         start = driver.scene_spec.world_from_hand[:3, :3] @ self.controller.targets.palm.numpy()
-        self.scene = driver._open_scene(dataclasses.replace(driver.scene_spec, start=tuple(start.tolist())))
+        self.scene = driver._open_scene(
+            dataclasses.replace(driver.scene_spec, start=tuple(start.tolist()))
+        )
         generator = torch.Generator().manual_seed(trial.seed) if spec.noise else None
         self.robot = SimulatedHand(self.scene, driver.reference, spec.control_rate, generator)
-        self.overlap, self.slid = self.scene.penetration(), np.zeros(3)
+        self.overlap = self.scene.penetration()
+        self.slid = np.zeros(3)
 
     def _relook(self, driver: TrialDriver, camera: Float[Tensor, "4 4"]) -> None:
         """Show the controller what a camera sees."""
-        seen_from, scene_spec = driver.reference.obj_from_hand.numpy(), driver.scene_spec
+        seen_from = driver.reference.obj_from_hand.numpy()
+        scene_spec = driver.scene_spec
         mesh = scene_spec.mesh.copy()
-        mesh.apply_transform(seen_from @ np.linalg.inv(scene_spec.world_from_hand))  # the robot takes its pose for true
-        self.controller.relook(partial_view(mesh, camera, seed=seed_of(driver.trial.seed, "relook")))
+        mesh.apply_transform(
+            seen_from @ np.linalg.inv(scene_spec.world_from_hand)
+        )  # the robot takes its pose for true
+        self.controller.relook(
+            partial_view(mesh, camera, seed=seed_of(driver.trial.seed, "relook"))
+        )
 
     @property
     def starts(self) -> bool:
-        """Whether the hand's initial penetration of the object is within the limit, so that the trial starts."""
+        """Whether the hand's initial penetration of the object is within the limit, so that the
+        trial starts.
+        """
         return self.overlap <= self.spec.overlap
 
     def keep(self) -> "Callable[[], TrialRun]":
-        """Return a function that returns runs in the present state of this one, which go on bitwise as this one."""
-        reopen, hand = self.scene.keep(), self.robot.reference.hand
+        """Return a function that returns runs in the present state of this one, which go on bitwise
+        as this one.
+        """
+        reopen = self.scene.keep()
+        hand = self.robot.reference.hand
         kept = copy.deepcopy(self, {id(x): x for x in (self.scene, hand)})
         return lambda: copy.deepcopy(kept, {id(self.scene): reopen(), id(hand): hand})
 
     def approach(self) -> Iterator[None]:
-        """Move the opened hand straight to its pre-grasp; in a guarded approach, a touch stops the hand."""
+        """Move the opened hand straight to its pre-grasp; in a guarded approach, a touch stops the
+        hand.
+        """
         speed = 0.2  # mean speed [m/s] of an unguarded approach
         half = 0.5 * self.spec.approach
         if self.controller.approaching:
@@ -220,10 +306,13 @@ class TrialRun:
             yield
 
     def _slide(self, due: bool) -> None:
-        """Displace the object once, when it is due, if the truth says that the object moves during the approach."""
+        """Displace the object once, when it is due, if the truth says that the object moves during
+        the approach.
+        """
         if due and self.slide is not None:
             self.scene.displace(self.slide)
-            self.slid, self.slide = self.slide, None
+            self.slid = self.slide
+            self.slide = None
 
     def close(self) -> Iterator[None]:
         """Close the fingers and press until the closing has ended."""
@@ -244,8 +333,8 @@ class TrialRun:
     def hold(self, seconds: float) -> None:
         """Hold the object for a time.
 
-        A hand that closed in open loop reaches its last targets one tick after its closing ends. Then it keeps them,
-        whatever it would observe.
+        A hand that closed in open loop reaches its last targets one tick after its closing ends.
+        Then it keeps them, whatever it would observe.
         """
         ticks = self.robot.ticks(seconds)
         rests = isinstance(self.controller.closing, OpenLoopClosing) and self.controller.closed
@@ -256,21 +345,39 @@ class TrialRun:
 
     @property
     def felt(self) -> tuple[float, float]:
-        """The controller's estimates of friction coefficient and load [N]; NaN unless it holds in the mode "grip"."""
+        """The controller's estimates of friction coefficient and load [N]; NaN unless it holds in
+        the mode "grip".
+        """
         hold = self.controller.hold
-        return (hold.friction.mean, hold.weight) if isinstance(hold, GripHold) else (math.nan, math.nan)
+        return (
+            (hold.friction.mean, hold.weight)
+            if isinstance(hold, GripHold)
+            else (math.nan, math.nan)
+        )
 
     def strained(self) -> bool:
-        """Return whether any joint's drive would need its greatest torque or more to reach its target, or to grip."""
-        reference, hold = self.robot.reference, self.controller.hold
+        """Return whether any joint's drive would need its greatest torque or more to reach its
+        target, or to grip.
+        """
+        reference = self.robot.reference
+        hold = self.controller.hold
         if isinstance(hold, GripHold):
             return hold.strained
-        effort = torch.tensor([reference.hand.actuators[name].effort for name in reference.hand.tree.joint_names])
-        return bool((reference.kp * (self.controller.targets.joints - self.observation.joints).abs() >= effort).any())
+        effort = torch.tensor(
+            [reference.hand.actuators[name].effort for name in reference.hand.tree.joint_names]
+        )
+        return bool(
+            (
+                reference.kp * (self.controller.targets.joints - self.observation.joints).abs()
+                >= effort
+            ).any()
+        )
 
 
 def smooth_step(time: float) -> tuple[float, float]:
-    """Return position and speed, at a `time` in [0, 1], of a motion from 0 to 1 that starts and ends at rest."""
+    """Return position and speed, at a `time` in [0, 1], of a motion from 0 to 1 that starts and
+    ends at rest.
+    """
     return time * time * (3 - 2 * time), 6 * time * (1 - time)
 
 

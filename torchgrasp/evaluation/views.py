@@ -1,4 +1,6 @@
-"""One view of a dataset object: plans grasps on it, and tries them under a protocol on the true mesh."""
+"""One view of a dataset object: plans grasps on it, and tries them under a protocol on the true
+mesh.
+"""
 
 import contextlib
 import dataclasses
@@ -41,7 +43,9 @@ from torchgrasp.values.specs import ContactSpec
 
 REFUSAL = "refusal"  # key of the metadata of saved grasps with the reason why a view has none
 Ranks = Literal["best", "spread"]
-"""Which grasps of a view are tried: the best grasps, or the same number of grasps spread over all ranks."""
+"""Which grasps of a view are tried: the best grasps, or the same number of grasps spread over all
+ranks.
+"""
 
 
 @checked
@@ -78,11 +82,15 @@ class EvaluationSpec(Value):
         """Text that says which grasps are tried, such as "the 20 best of each view"."""
         if self.ranks == "spread":
             return f"up to {self.grasps} of each view, spread over all ranks"
-        return f"the {self.grasps} best of each view" if self.grasps > 1 else "the best of each view"
+        return (
+            f"the {self.grasps} best of each view" if self.grasps > 1 else "the best of each view"
+        )
 
 
 def choose_rows(executable: int, most: int, ranks: Ranks) -> list[int]:
-    """Return the indices of the grasps to try: at most `most` of the `executable` grasps, which are in ranked order."""
+    """Return the indices of the grasps to try: at most `most` of the `executable` grasps, which are
+    in ranked order.
+    """
     most = min(most, executable)
     if ranks == "best" or most < 2:
         return list(range(most))
@@ -100,7 +108,9 @@ class ObjectView:
 
     @property
     def score(self) -> ViewScore:
-        """The result for the view before planning: names of object, view, family and group, but no grasps."""
+        """The result for the view before planning: names of object, view, family and group, but no
+        grasps.
+        """
         entry = read_entry(self.objects, self.object)
         return ViewScore(self.object, self.view, 0, 0.0, family=entry.family, group=entry.group)
 
@@ -114,7 +124,9 @@ class ObjectView:
 
 
 class PlannedView(NamedTuple):
-    """The result of planning on a view: score, cloud and executable grasps; the latter are None for a bad object."""
+    """The result of planning on a view: score, cloud and executable grasps; the latter are None for
+    a bad object.
+    """
 
     score: ViewScore
     cloud: PointCloud | None = None
@@ -124,25 +136,39 @@ class PlannedView(NamedTuple):
 def plan_views(
     views: Sequence[ObjectView], protocol: Protocol, spec: EvaluationSpec, device: str
 ) -> list[Grasps | None]:
-    """Plan on several views at once on a device; return the executable grasps of each, or None, for `plan_view`."""
-    clouds, planned, where = dict[int, PointCloud](), dict[int, Grasps](), torch.device(device)
+    """Plan on several views at once on a device; return the executable grasps of each, or None, for
+    `plan_view`.
+    """
+    clouds = dict[int, PointCloud]()
+    planned = dict[int, Grasps]()
+    where = torch.device(device)
     for k, view in enumerate(views):
         with contextlib.suppress(GraspError):  # which `plan_view` meets again
             clouds[k] = read_view(view.objects, view.object, view.view).to(where)
     name = torch.cuda.get_device_name(where) if where.type == "cuda" else device
     try:
-        for k, found in zip(clouds, _plan(list(clouds.values()), views[0], protocol, spec), strict=True):
+        for k, found in zip(
+            clouds, _plan(list(clouds.values()), views[0], protocol, spec), strict=True
+        ):
             good = dataclasses.replace(found, meta=found.meta | {"device": name})
             planned[k] = good[found.status == Status.OK].to("cpu")
     except Exception as error:  # of the library: a cloud that breaks it costs no other its grasps
-        logging.getLogger(__name__).warning("%d views are planned one by one: %s", len(views), error)
+        logging.getLogger(__name__).warning(
+            "%d views are planned one by one: %s", len(views), error
+        )
     return [planned.get(k) for k in range(len(views))]
 
 
-def _plan(cloud: Any, view: ObjectView, protocol: Protocol, spec: EvaluationSpec, **more: Any) -> Any:
+def _plan(
+    cloud: Any, view: ObjectView, protocol: Protocol, spec: EvaluationSpec, **more: Any
+) -> Any:
     """Plan grasps on the cloud of a view, or on several clouds."""
-    most_friction = 1.0  # largest friction that grasps are planned for, below the friction of some protocols
-    contacts = ContactSpec(friction=min(protocol.trial.friction, most_friction), table=Plane.horizontal(0.0))
+    most_friction = (
+        1.0  # largest friction that grasps are planned for, below the friction of some protocols
+    )
+    contacts = ContactSpec(
+        friction=min(protocol.trial.friction, most_friction), table=Plane.horizontal(0.0)
+    )
     more |= {"fingers": spec.fingers, "task": protocol.task}
     return plan_grasps(cloud, view.load_hand(), contacts, spec.starts, spec.seed, **more)
 
@@ -150,13 +176,18 @@ def _plan(cloud: Any, view: ObjectView, protocol: Protocol, spec: EvaluationSpec
 def plan_view(
     view: ObjectView, protocol: Protocol, spec: EvaluationSpec, planned: Path | Grasps | None = None
 ) -> PlannedView:
-    """Plan grasps for a protocol on a view, or take those that are `planned`, in a file or by `plan_views`.
+    """Plan grasps for a protocol on a view, or take those that are `planned`, in a file or by
+    `plan_views`.
 
     If `plan_views` found none, the view is planned anew, to say why.
     """
-    hand, score, started = view.load_hand(), view.score, time.process_time()
+    hand = view.load_hand()
+    score = view.score
+    started = time.process_time()
     try:
-        mesh, _ = _read_solid(view.objects, view.object)  # a bad mesh is refused before planning; its parts are cached
+        mesh, _ = _read_solid(
+            view.objects, view.object
+        )  # a bad mesh is refused before planning; its parts are cached
         cloud = read_view(view.objects, view.object, view.view)
         check_mesh(cloud, mesh)
         check_stand(mesh, Plane.horizontal(0.0))
@@ -165,30 +196,45 @@ def plan_view(
         started = time.process_time()
         stages: dict[str, Any] = {}
         found = planned or _plan(
-            cloud, view, protocol, spec, observer=lambda name, _, value: stages.setdefault(name, value)
+            cloud,
+            view,
+            protocol,
+            spec,
+            observer=lambda name, _, value: stages.setdefault(name, value),
         )
     except (MissingExtra, OutputError):
         raise
     except GraspError as error:
-        note, spent = " ".join(str(error).split()), time.process_time() - started
-        return PlannedView(dataclasses.replace(score, refusal=Status.BAD_OBJECT, note=note, seconds=spent))
-    grasps, status = found[found.status == Status.OK], found.status if len(found) else stages["plan"].status
+        note = " ".join(str(error).split())
+        spent = time.process_time() - started
+        return PlannedView(
+            dataclasses.replace(score, refusal=Status.BAD_OBJECT, note=note, seconds=spent)
+        )
+    grasps = found[found.status == Status.OK]
+    status = found.status if len(found) else stages["plan"].status
     failed = count_status(status[status != Status.OK])
     refusal = Status.OK if len(grasps) else next(iter(failed), Status.OUT_OF_REACH)
     score = dataclasses.replace(
-        score, executable=len(grasps), refusal=refusal, fingers=found.meta["finger_names"],
+        score,
+        executable=len(grasps),
+        refusal=refusal,
+        fingers=found.meta["finger_names"],
         seconds=time.process_time() - started,
-    )  # fmt: skip
+    )
     return PlannedView(score, cloud, grasps)
 
 
 def _read_planned(path: Path, score: ViewScore, cloud: PointCloud, hand: Hand) -> PlannedView:
     """Read the grasps of a view that an earlier call planned with the same cloud and hand."""
     grasps = load_grasps(path)
-    if (grasps.meta.get("cloud_sha256"), grasps.meta.get("hand_sha256")) != (digest(cloud), hand.source.sha256):
+    if (grasps.meta.get("cloud_sha256"), grasps.meta.get("hand_sha256")) != (
+        digest(cloud),
+        hand.source.sha256,
+    ):
         raise BadArgument("folder", f"{path} of another cloud or hand", "grasps of this view")
     reason = Status.__members__.get(grasps.meta.get(REFUSAL, ""), Status.OUT_OF_REACH)
-    refusal, fingers = Status.OK if len(grasps) else reason, grasps.meta.get("finger_names", "")
+    refusal = Status.OK if len(grasps) else reason
+    fingers = grasps.meta.get("finger_names", "")
     score = dataclasses.replace(score, executable=len(grasps), refusal=refusal, fingers=fingers)
     return PlannedView(score, cloud, grasps)
 
@@ -196,29 +242,39 @@ def _read_planned(path: Path, score: ViewScore, cloud: PointCloud, hand: Hand) -
 def try_grasp(
     view: ObjectView, grasp: Grasps, protocol: Protocol, spec: EvaluationSpec, at: tuple[int, int]
 ) -> ProtocolResult:
-    """Try the first grasp of a view in simulation; `at` is its rank and the number of the pose error's draw."""
+    """Try the first grasp of a view in simulation; `at` is its rank and the number of the pose
+    error's draw.
+    """
     hand = hand_of(grasp, view.load_hand())
     mesh, parts = _read_solid(view.objects, view.object)
     seed = seed_of(spec.seed, view.object, view.view, *at)
     trial = protocol.trial
-    during, surface = protocol.displaced == "approach", None
+    during = protocol.displaced == "approach"
+    surface = None
     error = None if during else draw_error(protocol, grasp, mesh, seed)
     slide = draw_slide(protocol.noise, seed) if during else None
     if trial.table and (trial.components.stops or trial.components.attempts > 1):
         surface = _fit_surface(view.objects, view.object, view.view)
-    camera = _camera_of(read_view(view.objects, view.object, view.view)) if protocol.relook else None
+    camera = (
+        _camera_of(read_view(view.objects, view.object, view.view)) if protocol.relook else None
+    )
     truth = Truth(mesh, parts, error, slide=slide, camera=camera)
     attempt = GraspTrial(hand, grasp, truth, seed_of(seed, "touch"), surface=surface)
-    return dataclasses.replace(run_protocol(attempt, protocol, *at), predicted=float(grasp.success[0]))
+    return dataclasses.replace(
+        run_protocol(attempt, protocol, *at), predicted=float(grasp.success[0])
+    )
 
 
 def _camera_of(cloud: PointCloud) -> Float[Tensor, "4 4"]:
     """Return the pose of a camera at the viewpoint of a cloud that looks at the cloud."""
     if cloud.viewpoint is None:
-        raise BadArgument("relook", "a view without the camera's position", "views with a viewpoint")
+        raise BadArgument(
+            "relook", "a view without the camera's position", "views with a viewpoint"
+        )
     middle = cloud.points.double().mean(0)
     x, y, z = (cloud.viewpoint.double().reshape(-1, 3)[0] - middle).tolist()
-    azimuth, elevation = math.atan2(y, x), math.atan2(z, math.hypot(x, y))
+    azimuth = math.atan2(y, x)
+    elevation = math.atan2(z, math.hypot(x, y))
     return look_at(math.degrees(azimuth), math.degrees(elevation), math.hypot(x, y, z), middle)
 
 

@@ -9,7 +9,20 @@ from torchgrasp.export.play import save_play
 from torchgrasp.export.ros_messages import format_motion, format_moveit, format_trajectories
 
 __all__ = [
-    "ArmMotion", "ForeignGrasps", "check_surface_path", "format_graspgen", "format_grasps", "format_keyframes",
-    "format_motion", "format_moveit", "format_trajectories", "grasps_from_joints", "largest_std", "plan_motion",
-    "read_foreign", "save_dexgraspbench", "save_play", "save_surface",
-]  # fmt: skip
+    "ArmMotion",
+    "ForeignGrasps",
+    "check_surface_path",
+    "format_graspgen",
+    "format_grasps",
+    "format_keyframes",
+    "format_motion",
+    "format_moveit",
+    "format_trajectories",
+    "grasps_from_joints",
+    "largest_std",
+    "plan_motion",
+    "read_foreign",
+    "save_dexgraspbench",
+    "save_play",
+    "save_surface",
+]

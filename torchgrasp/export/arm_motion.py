@@ -22,10 +22,11 @@ from torchgrasp.values.planning import Grasps
 @checked
 @dataclasses.dataclass(frozen=True)
 class ArmMotion(Value):
-    """The motions of an arm and its hand through g grasps, at t `times` [s]: `positions` of all joints [rad] by name.
+    """The motions of an arm and its hand through g grasps, at t `times` [s]: `positions` of all
+    joints [rad] by name.
 
-    `phases` names the times at which the hand is above its pre-grasp, at the pre-grasp, at the grasp, presses (its
-    joints are then targets), and has lifted the object.
+    `phases` names the times at which the hand is above its pre-grasp, at the pre-grasp, at the
+    grasp, presses (its joints are then targets), and has lifted the object.
 
     >>> motion = ArmMotion(("a", "b"), torch.tensor([0.0, 1.0]), torch.zeros(1, 2, 2), {"above": 0, "pregrasp": 1})
     >>> motion.positions[0, motion.phases["pregrasp"]]
@@ -39,33 +40,57 @@ class ArmMotion(Value):
 
 
 @checked
-def plan_motion(arm: Arm, hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None = None) -> ArmMotion:
+def plan_motion(
+    arm: Arm, hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None = None
+) -> ArmMotion:
     """Return the motions of arm and hand through executable grasps that were planned with the arm.
 
-    The hand comes straight at 0.1 m/s from 0.1 m, and is lifted by 0.1 m as fast. `force` and `kp` are those of
-    `format_grasps`. The way to the first posture is not planned. Without a table z points up. Raises `BadArgument`
-    for grasps without postures of this arm where it stands, and the errors of `format_grasps`.
+    The hand comes straight at 0.1 m/s from 0.1 m, and is lifted by 0.1 m as fast. `force` and `kp`
+    are those of `format_grasps`. The way to the first posture is not planned. Without a table z
+    points up. Raises `BadArgument` for grasps without postures of this arm where it stands, and the
+    errors of `format_grasps`.
 
     >>> motion = plan_motion(arm, hand, plan_grasps(cloud, hand, spec, arm=arm)[:1])  # doctest: +SKIP
     >>> motion.phases  # doctest: +SKIP
     {'above': 0, 'pregrasp': 8, 'grasp': 9, 'squeeze': 10, 'lift': 18}
     """
-    arm, grasps = arm.to("cpu", torch.float64), grasps.to("cpu", torch.float64)
-    if grasps.arm is None or grasps.arm.shape[1] != len(arm.lower) or not _holds(arm, grasps.arm, grasps.obj_from_hand):
-        raise BadArgument("grasps", "a grasp without a posture of this arm", "executable grasps of plan_grasps(arm=)")
-    near, step = COARSE_STEPS, 1.0 / COARSE_STEPS  # [s], at 0.1 m/s
+    arm = arm.to("cpu", torch.float64)
+    grasps = grasps.to("cpu", torch.float64)
+    if (
+        grasps.arm is None
+        or grasps.arm.shape[1] != len(arm.lower)
+        or not _holds(arm, grasps.arm, grasps.obj_from_hand)
+    ):
+        raise BadArgument(
+            "grasps",
+            "a grasp without a posture of this arm",
+            "executable grasps of plan_grasps(arm=)",
+        )
+    # [s], at 0.1 m/s
+    near = COARSE_STEPS
+    step = 1.0 / COARSE_STEPS
     poses = way_of(hand.to("cpu", torch.float64), grasps, CollisionWorld(table=grasps.table))
     tips = arm.tip_poses(poses.flatten(0, 1)).unflatten(2, poses.shape[:2])
     way, _ = track(arm, grasps.arm.T.contiguous(), tips)
     postures = named_postures(hand, grasps, force, kp)[1]
-    opened, closed, pressed = (torch.stack(list(joints.values()), -1)[:, None] for joints in postures.values())
-    fingers = torch.cat([opened.expand(-1, near + 1, -1), closed, pressed.expand(-1, near + 1, -1)], 1)
+    opened, closed, pressed = (
+        torch.stack(list(joints.values()), -1)[:, None] for joints in postures.values()
+    )
+    fingers = torch.cat(
+        [opened.expand(-1, near + 1, -1), closed, pressed.expand(-1, near + 1, -1)], 1
+    )
     steps = [0.0, *[step] * near, POSE_TIME, POSE_TIME, *[step] * near]
     return ArmMotion(
         (*arm.joint_names, *postures["grasp"]),
         torch.tensor(steps, dtype=torch.float64).cumsum(0),
         torch.cat([torch.cat([way[:, : near + 2], way[:, near + 1 :]], 1), fingers], 2),
-        {"above": 0, "pregrasp": near, "grasp": near + 1, "squeeze": near + 2, "lift": 2 * near + 2},
+        {
+            "above": 0,
+            "pregrasp": near,
+            "grasp": near + 1,
+            "squeeze": near + 2,
+            "lift": 2 * near + 2,
+        },
     )
 
 

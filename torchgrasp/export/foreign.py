@@ -1,6 +1,7 @@
 """Import of grasps from other planners and from our own JSON, as `Grasps`.
 
-DexGraspBench's .npy is a pickle, which could run code when it is read, so it is rejected. docs/exchange.md converts it.
+DexGraspBench's .npy is a pickle, which could run code when it is read, so it is rejected.
+docs/exchange.md converts it.
 """
 
 import functools
@@ -34,7 +35,9 @@ Quaternion = Literal["wxyz", "xyzw"]
 
 
 class ForeignGrasps(NamedTuple):
-    """Imported grasps: joints [rad], poses of the hand's root link in the object's frame, pre-grasp joints if known."""
+    """Imported grasps: joints [rad], poses of the hand's root link in the object's frame, pre-grasp
+    joints if known.
+    """
 
     joints: Float[Tensor, "g h"]
     obj_from_hand: Float[Tensor, "g 4 4"]
@@ -53,12 +56,12 @@ def read_foreign(
     | `.json` with `pose` and `dofs` (MultiGripperGrasp) | lists of seven numbers and of joints, in the `order` given |
     | `.npz` with `grasp_qpos` (DexGraspBench) | rows of pose and joints; `pregrasp_qpos`, if it is there |
 
-    Args:
-        hand: the grasping hand. For the Allegro hand DexGraspBench's frame and joint order are known.
-        order: names (as in the hand's URDF) of the joints in the file; other names are ignored.
-        quaternion: order of the numbers in a pose, after its position.
+    Args: hand: the grasping hand. For the Allegro hand DexGraspBench's frame and joint order are
+        known. order: names (as in the hand's URDF) of the joints in the file; other names are
+        ignored. quaternion: order of the numbers in a pose, after its position.
 
-    Raises `ModelFileError` for a missing or malformed file, and `BadArgument` for an order that misses a joint.
+    Raises `ModelFileError` for a missing or malformed file, and `BadArgument` for an order that
+    misses a joint.
 
     >>> import tempfile
     >>> from torchgrasp import load_hand
@@ -76,9 +79,13 @@ def read_foreign(
     file = read_json(path, _refuse, "a JSON file of grasps, or .npz")
     if "grasps" in (fields := file.entries()):
         names = fields["rename"].entries() if "rename" in fields else {}
-        return _read_own(fields["grasps"], hand, [names[j].text() if j in names else j for j in hand.joint_names])
-    content, places = file.entries("pose", "dofs"), _places(hand, tuple(order))
-    pose, dofs = _table(content["pose"], 7), _table(content["dofs"], len(order))
+        return _read_own(
+            fields["grasps"], hand, [names[j].text() if j in names else j for j in hand.joint_names]
+        )
+    content = file.entries("pose", "dofs")
+    places = _places(hand, tuple(order))
+    pose = _table(content["pose"], 7)
+    dofs = _table(content["dofs"], len(order))
     if len(pose) != len(dofs):
         raise _refuse(f"{path}: {len(pose)} poses, {len(dofs)} postures", "as many of either")
     return ForeignGrasps(torch.tensor(dofs[:, places]), read_poses(pose, quaternion), None)
@@ -86,29 +93,50 @@ def read_foreign(
 
 def _read_own(rows: Field, hand: Hand, names: list[str]) -> ForeignGrasps:
     """Read grasps in the JSON format of `format_grasps`, whose actuated joints have `names`."""
-    joints, opened, poses = list[list[float]](), list[list[float]](), list[list[float]]()
+    joints = list[list[float]]()
+    opened = list[list[float]]()
+    poses = list[list[float]]()
     for row in rows.items(MOST_GRASPS):
         fields = row.entries("joints", "pose")
-        postures, pose = fields["joints"].entries("grasp", "pregrasp"), fields["pose"]
+        postures = fields["joints"].entries("grasp", "pregrasp")
+        pose = fields["pose"]
         for name, values in (("grasp", joints), ("pregrasp", opened)):
             posture = postures[name].entries(*names)
             values.append([posture[joint].number(-FAR, FAR) for joint in names])
         place = pose.entries("position", "quaternion_wxyz")
-        poses.append([*place["position"].numbers(3, -FAR, FAR), *place["quaternion_wxyz"].numbers(4, -FAR, FAR)])
-    closed, pregrasp = (torch.tensor(x, dtype=torch.float64).reshape(-1, hand.dof) for x in (joints, opened))
-    return ForeignGrasps(closed, read_poses(np.array(poses, dtype=float).reshape(-1, 7), "wxyz"), pregrasp)
+        poses.append(
+            [
+                *place["position"].numbers(3, -FAR, FAR),
+                *place["quaternion_wxyz"].numbers(4, -FAR, FAR),
+            ]
+        )
+    closed, pregrasp = (
+        torch.tensor(x, dtype=torch.float64).reshape(-1, hand.dof) for x in (joints, opened)
+    )
+    return ForeignGrasps(
+        closed, read_poses(np.array(poses, dtype=float).reshape(-1, 7), "wxyz"), pregrasp
+    )
 
 
 def _table(field: Field, width: int) -> np.ndarray:
-    """Return a field as an array (n, width); raise an error for anything but a list of lists of numbers."""
-    return np.array([row.numbers(width, -FAR, FAR) for row in field.items(MOST_GRASPS)]).reshape(-1, width)
+    """Return a field as an array (n, width); raise an error for anything but a list of lists of
+    numbers.
+    """
+    return np.array([row.numbers(width, -FAR, FAR) for row in field.items(MOST_GRASPS)]).reshape(
+        -1, width
+    )
 
 
-def _read_bench(path: Path, hand: Hand, order: tuple[str, ...], quaternion: Quaternion) -> ForeignGrasps:
-    """Read an .npz file in DexGraspBench's format; the file holds one grasp, or one row for each of several grasps."""
+def _read_bench(
+    path: Path, hand: Hand, order: tuple[str, ...], quaternion: Quaternion
+) -> ForeignGrasps:
+    """Read an .npz file in DexGraspBench's format; the file holds one grasp, or one row for each of
+    several grasps.
+    """
     bench_from_root, known = bench_frame(hand)
     order = order or known
-    places, width = _places(hand, order), 7 + len(order)
+    places = _places(hand, order)
+    width = 7 + len(order)
     try:
         if not is_file(path) or path.stat().st_size > CLOUD_BYTES:
             raise ValueError("no file, or a larger one")
@@ -119,11 +147,17 @@ def _read_bench(path: Path, hand: Hand, order: tuple[str, ...], quaternion: Quat
         good = table.dtype.kind == "f" and table.ndim in (1, 2) and table.shape[-1] == width
         if not good or table.size > MOST_GRASPS * width or not np.isfinite(table).all():
             found = f"{path}: {name} of shape {table.shape}, {table.dtype}"
-            raise _refuse(found, f"finite numbers (g, {width}): seven of the pose, {len(order)} joints")
+            raise _refuse(
+                found, f"finite numbers (g, {width}): seven of the pose, {len(order)} joints"
+            )
     rows = {name: table.reshape(-1, width).astype(float) for name, table in tables.items()}
     if len({len(table) for table in rows.values()}) != 1:
-        raise _refuse(f"{path}: {', '.join(f'{len(x)} of {name}' for name, x in rows.items())}", "as many of either")
-    grasp, opened = rows["grasp_qpos"], rows.get("pregrasp_qpos")
+        raise _refuse(
+            f"{path}: {', '.join(f'{len(x)} of {name}' for name, x in rows.items())}",
+            "as many of either",
+        )
+    grasp = rows["grasp_qpos"]
+    opened = rows.get("pregrasp_qpos")
     return ForeignGrasps(
         torch.tensor(grasp[:, 7:][:, places]),
         read_poses(grasp[:, :7], quaternion) @ bench_from_root,
@@ -132,22 +166,36 @@ def _read_bench(path: Path, hand: Hand, order: tuple[str, ...], quaternion: Quat
 
 
 def _places(hand: Hand, order: tuple[str, ...]) -> list[int]:
-    """Return the index in a file's joint order of each actuated joint; refuse an order that lacks one."""
+    """Return the index in a file's joint order of each actuated joint; refuse an order that lacks
+    one.
+    """
     missing = [name for name in hand.joint_names if name not in order]
     if missing or len(set(order)) != len(order):
-        found = f"{len(order)} names without {', '.join(missing[:4])}" if missing else "a name twice"
+        found = (
+            f"{len(order)} names without {', '.join(missing[:4])}" if missing else "a name twice"
+        )
         raise BadArgument("order", found, f"each of {', '.join(hand.joint_names)} once")
     return [order.index(name) for name in hand.joint_names]
 
 
 def read_poses(numbers: np.ndarray, quaternion: Quaternion) -> Float[Tensor, "g 4 4"]:
-    """Return pose matrices from rows (g, 7) of a position [m] and a unit quaternion in the given order."""
+    """Return pose matrices from rows (g, 7) of a position [m] and a unit quaternion in the given
+    order.
+    """
     turns = numbers[:, 3:] if quaternion == "xyzw" else numbers[:, [4, 5, 6, 3]]
-    far = np.abs(np.linalg.norm(turns, axis=1) - 1) > 1e-3  # more than the rounding of a file of few digits
+    far = (
+        np.abs(np.linalg.norm(turns, axis=1) - 1) > 1e-3
+    )  # more than the rounding of a file of few digits
     if far.any():
         length = float(np.linalg.norm(turns[far][0]))
-        raise _refuse(f"pose {int(np.argmax(far))} with a quaternion of length {length:.4g}", "length 1")
-    matrices = spatial.transform.Rotation.from_quat(turns).as_matrix() if len(turns) else np.zeros((0, 3, 3))
+        raise _refuse(
+            f"pose {int(np.argmax(far))} with a quaternion of length {length:.4g}", "length 1"
+        )
+    matrices = (
+        spatial.transform.Rotation.from_quat(turns).as_matrix()
+        if len(turns)
+        else np.zeros((0, 3, 3))
+    )
     return rigid(torch.tensor(matrices), torch.tensor(numbers[:, :3]))
 
 
@@ -160,19 +208,19 @@ def grasps_from_joints(
     spec: ContactSpec | None = None,
     std_m: Length | None = None,
 ) -> Grasps:
-    """Return imported joints and poses as `Grasps`, for `certify`, `close_hand`, `evaluate` and the exporters.
+    """Return imported joints and poses as `Grasps`, for `certify`, `close_hand`, `evaluate` and the
+    exporters.
 
-    Contacts are at the middle of each pad, with normals opposite to the pads'. Certificates are for these contacts; a
-    grasp without force closure gets `Status.NOT_CLOSED`. Replace contacts and certificate if you know the surface.
-    `clearance` is that of self-collision, and success is unknown, because no object is known. The
-    approach is the hand's own approach axis.
+    Contacts are at the middle of each pad, with normals opposite to the pads'. Certificates are for
+    these contacts; a grasp without force closure gets `Status.NOT_CLOSED`. Replace contacts and
+    certificate if you know the surface. `clearance` is that of self-collision, and success is
+    unknown, because no object is known. The approach is the hand's own approach axis.
 
-    Args:
-        joints: actuated joints [rad], in the order of `hand.joint_names`.
-        obj_from_hand: poses of the root link of the hand's URDF.
-        pregrasp: joints of the opened hand; by default each tip moves 20 mm off its contact, or as far as limits allow.
-        spec: friction and number of cone edges of the certificate; `ContactSpec()` by default.
-        std_m: standard deviation [m] of the surface at each contact, for closing controllers that use it.
+    Args: joints: actuated joints [rad], in the order of `hand.joint_names`. obj_from_hand: poses of
+        the root link of the hand's URDF. pregrasp: joints of the opened hand; by default each tip
+        moves 20 mm off its contact, or as far as limits allow. spec: friction and number of cone
+        edges of the certificate; `ContactSpec()` by default. std_m: standard deviation [m] of the
+        surface at each contact, for closing controllers that use it.
 
     Raises `BadArgument` for wrong shapes, joints outside the limits, or poses that are not rigid.
 
@@ -182,30 +230,52 @@ def grasps_from_joints(
     >>> grasps_from_joints(hand, joints, torch.eye(4, dtype=torch.float64)[None]).contacts.points.shape
     torch.Size([1, 3, 3])
     """
-    hand, joints, pose = hand.to("cpu", torch.float64), joints.double().cpu(), obj_from_hand.double().cpu()
+    hand = hand.to("cpu", torch.float64)
+    joints = joints.double().cpu()
+    pose = obj_from_hand.double().cpu()
     hand.check_joints(joints)
     pads, pad_normals = hand.fingertips(joints)
     normals = -rotate(pose, pad_normals)
     std = None if std_m is None else torch.full_like(normals[..., 0], std_m)
     contacts = Contacts(apply(pose, pads), normals, std_m=std)
     certificate = certify(contacts, spec)
-    opened = _open(hand, joints, -pad_normals) if pregrasp is None else hand.check_joints(pregrasp.double().cpu())
+    opened = (
+        _open(hand, joints, -pad_normals)
+        if pregrasp is None
+        else hand.check_joints(pregrasp.double().cpu())
+    )
     g, f = normals.shape[:2]
     zeros = torch.zeros(g, f, dtype=torch.float64)
     meta = {"hand": hand.name, "hand_sha256": hand.source.sha256, "units": "metre, radian"}
     meta |= {"joint_names": ",".join(hand.joint_names), "finger_names": ",".join(hand.finger_names)}
     return Grasps(
-        joints, opened, rotate(pose, hand.approach.expand(g, 1, 3))[:, 0], pose, contacts,
-        permutation=torch.arange(f).expand(g, f).clone(), tip_error=zeros, clearance=hand.self_clearance(joints),
-        normal_angle=zeros, certificate=certificate, score=torch.zeros(g, dtype=torch.float64),
-        status=torch.where(certificate.closed, int(Status.OK), int(Status.NOT_CLOSED)), meta=meta,
-        known=torch.zeros(g, dtype=torch.bool), interval=torch.tensor([[0.0, 1.0]], dtype=torch.float64).repeat(g, 1),
-    )  # fmt: skip
+        joints,
+        opened,
+        rotate(pose, hand.approach.expand(g, 1, 3))[:, 0],
+        pose,
+        contacts,
+        permutation=torch.arange(f).expand(g, f).clone(),
+        tip_error=zeros,
+        clearance=hand.self_clearance(joints),
+        normal_angle=zeros,
+        certificate=certificate,
+        score=torch.zeros(g, dtype=torch.float64),
+        status=torch.where(certificate.closed, int(Status.OK), int(Status.NOT_CLOSED)),
+        meta=meta,
+        known=torch.zeros(g, dtype=torch.bool),
+        interval=torch.tensor([[0.0, 1.0]], dtype=torch.float64).repeat(g, 1),
+    )
 
 
-def _open(hand: Hand, joints: Float[Tensor, "g h"], away: Float[Tensor, "g f 3"]) -> Float[Tensor, "g h"]:
-    """Return joints at which each fingertip has moved 20 mm off its contact along `away`, if joint limits allow."""
-    opening, steps = 0.02, 4  # distance [m], and linear steps, which reach it within 1 mm
+def _open(
+    hand: Hand, joints: Float[Tensor, "g h"], away: Float[Tensor, "g f 3"]
+) -> Float[Tensor, "g h"]:
+    """Return joints at which each fingertip has moved 20 mm off its contact along `away`, if joint
+    limits allow.
+    """
+    # distance [m], and linear steps, which reach it within 1 mm
+    opening = 0.02
+    steps = 4
     for _ in range(steps):
         jacobian = hand.jacobian(joints).flatten(1, 2)
         step = damped_inverse(jacobian) @ (opening / steps * away).flatten(1)[..., None]

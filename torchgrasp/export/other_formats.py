@@ -1,7 +1,9 @@
-"""Export of grasps for DexGraspBench's evaluator and GraspGen's loader, and of the surface as a mesh.
+"""Export of grasps for DexGraspBench's evaluator and GraspGen's loader, and of the surface as a
+mesh.
 
-DexGraspBench reads each grasp by NumPy's `load` with pickles allowed. The format exists only as a pickle, and
-`save_dexgraspbench` is the one function of torchgrasp that writes one. No function of torchgrasp reads a pickle.
+DexGraspBench reads each grasp by NumPy's `load` with pickles allowed. The format exists only as a
+pickle, and `save_dexgraspbench` is the one function of torchgrasp that writes one. No function of
+torchgrasp reads a pickle.
 
 Facts: https://github.com/JYChen18/DexGraspBench (README and src/util/hand_util.py) and
 https://github.com/NVlabs/GraspGen (docs/GRASP_DATASET_FORMAT.md).
@@ -27,28 +29,36 @@ from torchgrasp.shape.surface import Surface
 from torchgrasp.values.planning import Grasps
 
 BENCH_HANDS = {"allegro": ([1.0, 0.0, 1.0, 0.0], tuple(f"joint_{k}" for k in range(16)))}
-"""Hands that DexGraspBench has: rotation (x, y, z, w) of the root link in its hand frame, and joints in its order."""
+"""Hands that DexGraspBench has: rotation (x, y, z, w) of the root link in its hand frame, and
+joints in its order.
+"""
 
 
 @checked
 def save_dexgraspbench(
-    hand: Hand, grasps: Grasps, folder: Path | str, object_path: str, force: Force = 4.0, kp: Positive = 5.0
+    hand: Hand,
+    grasps: Grasps,
+    folder: Path | str,
+    object_path: str,
+    force: Force = 4.0,
+    kp: Positive = 5.0,
 ) -> list[Path]:
-    """Write each grasp as a file `folder/0.npy`, `folder/1.npy` and so on, for DexGraspBench's evaluator.
+    """Write each grasp as a file `folder/0.npy`, `folder/1.npy` and so on, for DexGraspBench's
+    evaluator.
 
-    A file is a dictionary: `obj_path`, `obj_scale` (1), `obj_pose` (identity), and `pregrasp_qpos`, `grasp_qpos`,
-    `squeeze_qpos` (23): position [m] and quaternion (w, x, y, z) of the hand, then 16 joints [rad]. The evaluator only
-    accepts a pickled dictionary; ours holds only arrays, numbers and a text.
+    A file is a dictionary: `obj_path`, `obj_scale` (1), `obj_pose` (identity), and `pregrasp_qpos`,
+    `grasp_qpos`, `squeeze_qpos` (23): position [m] and quaternion (w, x, y, z) of the hand, then 16
+    joints [rad]. The evaluator only accepts a pickled dictionary; ours holds only arrays, numbers
+    and a text.
 
-    Args:
-        hand: the Allegro hand, whose model the bench has.
-        grasps: grasps planned for this hand.
-        folder: folder to write, in the bench `output/NAME_allegro/graspdata/OBJECT`.
-        object_path: the object's folder in the bench (`assets/...`); its frame must be that of the planned cloud.
-        force: normal force of the strongest finger [N].
-        kp: stiffness of the bench's drives [N m/rad].
+    Args: hand: the Allegro hand, whose model the bench has. grasps: grasps planned for this hand.
+        folder: folder to write, in the bench `output/NAME_allegro/graspdata/OBJECT`. object_path:
+        the object's folder in the bench (`assets/...`); its frame must be that of the planned
+        cloud. force: normal force of the strongest finger [N]. kp: stiffness of the bench's drives
+        [N m/rad].
 
-    Raises `OutputError`, and `BadArgument` for a hand that is not in the bench, or joints of another hand.
+    Raises `OutputError`, and `BadArgument` for a hand that is not in the bench, or joints of
+    another hand.
 
     >>> import tempfile
     >>> from torchgrasp import load_hand
@@ -71,18 +81,25 @@ def save_dexgraspbench(
         for name, joints in postures.items():
             obj_from_bench = (opened if name == "pregrasp" else closed)[row] @ bench_from_root.mT
             place = [*obj_from_bench[:3, 3].tolist(), *quaternion(obj_from_bench)]
-            content[f"{name}_qpos"] = np.array([*place, *(float(joints[joint][row]) for joint in order)])
-        paths.append(write_file(Path(folder) / f"{row}.npy", lambda file, x=content: np.save(file, np.array(x))))
+            content[f"{name}_qpos"] = np.array(
+                [*place, *(float(joints[joint][row]) for joint in order)]
+            )
+        paths.append(
+            write_file(
+                Path(folder) / f"{row}.npy", lambda file, x=content: np.save(file, np.array(x))
+            )
+        )
     return paths
 
 
 @checked
 def format_graspgen(grasps: Grasps, object_path: str) -> str:
-    """Return grasps as the JSON of a GraspGen data set: poses of the hand's root link in the object's frame.
+    """Return grasps as the JSON of a GraspGen data set: poses of the hand's root link in the
+    object's frame.
 
-    `object_in_gripper` says which grasps are executable. The fields `success` (predicted), `joints` and `joint_names`
-    are our additions. `object_path` is the path of the mesh in the data set; its frame is that of the planned cloud,
-    its scale 1.
+    `object_in_gripper` says which grasps are executable. The fields `success` (predicted), `joints`
+    and `joint_names` are our additions. `object_path` is the path of the mesh in the data set; its
+    frame is that of the planned cloud, its scale 1.
 
     >>> import json
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -96,11 +113,15 @@ def format_graspgen(grasps: Grasps, object_path: str) -> str:
         "joints": grasps.joints.tolist(),
     }
     joint_names = grasps.meta.get("joint_names", "").split(",")
-    return format_json({"object": {"file": object_path, "scale": 1.0}, "joint_names": joint_names, "grasps": rows})
+    return format_json(
+        {"object": {"file": object_path, "scale": 1.0}, "joint_names": joint_names, "grasps": rows}
+    )
 
 
 def bench_frame(hand: Hand) -> tuple[Float[Tensor, "4 4"], tuple[str, ...]]:
-    """Return the root link's pose in DexGraspBench's hand frame, and its joint order; identity and () if not known."""
+    """Return the root link's pose in DexGraspBench's hand frame, and its joint order; identity and
+    () if not known.
+    """
     turn, order = BENCH_HANDS.get(hand.name, ([0.0, 0.0, 0.0, 1.0], ()))
     rotation = torch.from_numpy(spatial.transform.Rotation.from_quat(turn).as_matrix())
     return rigid(rotation, torch.zeros_like(rotation[0])), order
@@ -108,10 +129,11 @@ def bench_frame(hand: Hand) -> tuple[Float[Tensor, "4 4"], tuple[str, ...]]:
 
 @checked
 def save_surface(surface: Surface, path: Path | str) -> Path:
-    """Write a surface with its uncertainty as colours to `.ply` (with `std_m` [m] of each vertex) or `.glb`.
+    """Write a surface with its uncertainty as colours to `.ply` (with `std_m` [m] of each vertex)
+    or `.glb`.
 
-    Yellow marks a standard deviation of `largest_std`, violet 0. Raises `OutputError`, and `BadArgument` for another
-    suffix.
+    Yellow marks a standard deviation of `largest_std`, violet 0. Raises `OutputError`, and
+    `BadArgument` for another suffix.
 
     >>> import tempfile
     >>> from torchgrasp import fit_shape, load_object
@@ -123,10 +145,16 @@ def save_surface(surface: Surface, path: Path | str) -> Path:
     path = check_surface_path(path)
     std = surface.std_m.detach().cpu().double().numpy()
     shares = np.clip(std / largest_std(surface), 0.0, 1.0)
-    colors = (255 * matplotlib.colormaps["viridis"](shares) + 0.5).astype(np.uint8)  # as in the report
-    vertices, normals = (x.detach().cpu().double().numpy() for x in (surface.vertices, surface.normals))
+    colors = (255 * matplotlib.colormaps["viridis"](shares) + 0.5).astype(
+        np.uint8
+    )  # as in the report
+    vertices, normals = (
+        x.detach().cpu().double().numpy() for x in (surface.vertices, surface.normals)
+    )
     faces = surface.faces.cpu().numpy()
-    mesh = trimesh.Trimesh(vertices, faces, vertex_normals=normals, vertex_colors=colors, process=False)
+    mesh = trimesh.Trimesh(
+        vertices, faces, vertex_normals=normals, vertex_colors=colors, process=False
+    )
     if path.suffix.lower() == ".ply":
         mesh.vertex_attributes["std_m"] = std.astype(np.float32)
     content = mesh.export(file_type=path.suffix.lower()[1:])
@@ -136,7 +164,8 @@ def save_surface(surface: Surface, path: Path | str) -> Path:
 
 @checked
 def largest_std(surface: Surface) -> float:
-    """Return the largest standard deviation [m] of the colour scale: the 99 % quantile over the vertices.
+    """Return the largest standard deviation [m] of the colour scale: the 99 % quantile over the
+    vertices.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> from torchgrasp.shape import extract_surface
@@ -149,7 +178,8 @@ def largest_std(surface: Surface) -> float:
 
 @checked
 def check_surface_path(path: Path | str) -> Path:
-    """Return the path if `save_surface` can write a file with its suffix; otherwise raise `BadArgument`.
+    """Return the path if `save_surface` can write a file with its suffix; otherwise raise
+    `BadArgument`.
 
     >>> check_surface_path("a.glb").suffix
     '.glb'

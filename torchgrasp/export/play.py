@@ -1,4 +1,6 @@
-"""Folders that play grasps in a simulator: models of hand, object and table, the motion as data, and a short script."""
+"""Folders that play grasps in a simulator: models of hand, object and table, the motion as data,
+and a short script.
+"""
 
 import dataclasses
 import json
@@ -28,7 +30,14 @@ from torchgrasp.shape.surface import Surface
 from torchgrasp.sim.convex_parts import hull, read_solid
 from torchgrasp.sim.mujoco_scene import scene_mjcf
 from torchgrasp.sim.sapien_bodies import split_hull
-from torchgrasp.sim.scene_spec import ARMATURE, MOUNT_DRIVE, SceneSpec, Slide, mounted_urdf, pair_masks
+from torchgrasp.sim.scene_spec import (
+    ARMATURE,
+    MOUNT_DRIVE,
+    SceneSpec,
+    Slide,
+    mounted_urdf,
+    pair_masks,
+)
 from torchgrasp.values.planning import Grasps
 from torchgrasp.values.specs import TrialSpec
 
@@ -50,22 +59,22 @@ def save_play(
     *,
     parts: "Sequence[trimesh.Trimesh] | None" = None,
 ) -> Path:
-    """Write a folder in which `python play.py 0` plays the first grasp, with the simulator and NumPy alone.
+    """Write a folder in which `python play.py 0` plays the first grasp, with the simulator and
+    NumPy alone.
 
-    The hand comes along its approach, closes in open loop, presses, lifts and holds. The script prints one line of
-    JSON: how far the object rose [m], and whether that is half of the lift. `play.json` has the motion, drives,
-    contacts and the object; its text "frames" explains the numbers.
+    The hand comes along its approach, closes in open loop, presses, lifts and holds. The script
+    prints one line of JSON: how far the object rose [m], and whether that is half of the lift.
+    `play.json` has the motion, drives, contacts and the object; its text "frames" explains the
+    numbers.
 
-    Args:
-        hand: the hand.
-        grasps: one or more grasps of the hand.
-        folder: the folder to write.
-        player: the simulator.
-        mesh: closed mesh of the object [m] in the frame of the grasps; or the estimated surface, which then stands.
-        spec: mass, friction, force, stiffness, heights, times and timestep; `TrialSpec()` by default.
-        parts: convex parts of the mesh; by default they are computed (`convex_parts`).
+    Args: hand: the hand. grasps: one or more grasps of the hand. folder: the folder to write.
+        player: the simulator. mesh: closed mesh of the object [m] in the frame of the grasps; or
+        the estimated surface, which then stands. spec: mass, friction, force, stiffness, heights,
+        times and timestep; `TrialSpec()` by default. parts: convex parts of the mesh; by default
+        they are computed (`convex_parts`).
 
-    Raises `BadArgument` for no grasps or joints of another hand, `MeshError` for an open mesh, and `OutputError`.
+    Raises `BadArgument` for no grasps or joints of another hand, `MeshError` for an open mesh, and
+    `OutputError`.
 
     >>> import tempfile
     >>> from torchgrasp import load_hand, load_object
@@ -77,16 +86,25 @@ def save_play(
     """
     if not len(grasps):
         raise BadArgument("grasps", "none", "at least one grasp")
-    hand, grasps, spec, folder = hand.to("cpu"), grasps.to("cpu", torch.float64), spec or TrialSpec(), Path(folder)
-    solid, pieces = read_solid(stand(mesh, grasps.table).mesh() if isinstance(mesh, Surface) else mesh, parts)
+    hand = hand.to("cpu")
+    grasps = grasps.to("cpu", torch.float64)
+    spec = spec or TrialSpec()
+    folder = Path(folder)
+    solid, pieces = read_solid(
+        stand(mesh, grasps.table).mesh() if isinstance(mesh, Surface) else mesh, parts
+    )
     world_from_obj = _world_from_obj(grasps, solid)
     if not torch.equal(world_from_obj, torch.eye(4, dtype=torch.float64)):
-        solid, *pieces = (body.copy().apply_transform(world_from_obj.numpy()) for body in (solid, *pieces))
+        solid, *pieces = (
+            body.copy().apply_transform(world_from_obj.numpy()) for body in (solid, *pieces)
+        )
     scene = _scene(hand, spec, solid, pieces)
     write_file(folder / "object.ply", _mesh_file(solid, "ply"))
     if player in ("mujoco", "newton"):
         write_file(folder / "scene.xml", scene_mjcf(scene))
-    values = _describe(hand, grasps, world_from_obj, scene, spec) | (describe_bodies(scene) if player in USD else {})
+    values = _describe(hand, grasps, world_from_obj, scene, spec) | (
+        describe_bodies(scene) if player in USD else {}
+    )
     if player == "maniskill":
         write_file(folder / "hand.urdf", mounted_urdf(scene))
         split = [some for corners in scene.hulls[0] for some in split_hull(corners)]
@@ -95,7 +113,10 @@ def save_play(
         ]  # others may lie there of an earlier call
         for name, corners in zip(values["body"]["files"], split, strict=True):
             write_file(folder / name, _mesh_file(hull(100.0 * corners), "obj"))
-    filters = {"json": json.dumps, "vector": lambda numbers: f"({', '.join(repr(float(x)) for x in numbers)})"}
+    filters = {
+        "json": json.dumps,
+        "vector": lambda numbers: f"({', '.join(repr(float(x)) for x in numbers)})",
+    }
     for name in ("play.json", *USD.get(player, ())):
         write_file(folder / name, render(TEMPLATES / f"{name}.jinja", filters, **values))
     for path in TEMPLATES.glob(f"{player}*.py.txt"):
@@ -105,7 +126,9 @@ def save_play(
 
 
 def stand(surface: Surface, table: Plane | None) -> Surface:
-    """Return an estimate whose points below the table are moved up to it: on its round base it would rock."""
+    """Return an estimate whose points below the table are moved up to it: on its round base it
+    would rock.
+    """
     if table is None:
         return surface
     below = table.height(surface.vertices).clamp(max=0)[:, None] * table.normal.to(surface.vertices)
@@ -113,53 +136,88 @@ def stand(surface: Surface, table: Plane | None) -> Surface:
 
 
 def _world_from_obj(grasps: Grasps, mesh: "trimesh.Trimesh") -> Float[Tensor, "4 4"]:
-    """Return the frame of the grasps, or one upright on the planned table where the table is tilted."""
+    """Return the frame of the grasps, or one upright on the planned table where the table is
+    tilted.
+    """
     table = grasps.table
     if table is None or float(table.normal[2]) > 1 - 1e-12:
         return torch.eye(4, dtype=torch.float64)
     return inverse(upright_frame(torch.from_numpy(np.array(mesh.vertices)), None, table))
 
 
-def _scene(hand: Hand, spec: TrialSpec, mesh: "trimesh.Trimesh", parts: "Sequence[trimesh.Trimesh]") -> SceneSpec:
-    """Return the scene with all joints at zero, and the hand's mount along the axes of its root link."""
+def _scene(
+    hand: Hand, spec: TrialSpec, mesh: "trimesh.Trimesh", parts: "Sequence[trimesh.Trimesh]"
+) -> SceneSpec:
+    """Return the scene with all joints at zero, and the hand's mount along the axes of its root
+    link.
+    """
     reach = spec.approach + spec.lift_height + 0.1  # [m]
     axes = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
     slides = [Slide(f"mount_{x}", axis, -reach, reach, 0.0) for x, axis in axes.items()]
-    drives = {name: x if spec.kp is None else x._replace(kp=spec.kp) for name, x in hand.actuators.items()}
+    drives = {
+        name: x if spec.kp is None else x._replace(kp=spec.kp) for name, x in hand.actuators.items()
+    }
     mass = spec.mass if spec.density is None else spec.density * float(mesh.volume)
     return SceneSpec(
-        hand.urdf_path, np.eye(4), dict.fromkeys(drives, 0.0), drives, tuple(hand.tips.links), mesh, list(parts), mass,
-        spec.friction, spec.gravity, spec.timestep, patch=spec.patch, self_pairs=hand.self_pairs,
-        table_friction=spec.table_friction, mount=tuple(slides),
-    )  # fmt: skip
+        hand.urdf_path,
+        np.eye(4),
+        dict.fromkeys(drives, 0.0),
+        drives,
+        tuple(hand.tips.links),
+        mesh,
+        list(parts),
+        mass,
+        spec.friction,
+        spec.gravity,
+        spec.timestep,
+        patch=spec.patch,
+        self_pairs=hand.self_pairs,
+        table_friction=spec.table_friction,
+        mount=tuple(slides),
+    )
 
 
 @checked
 def pressing_force(spec: TrialSpec, mass: Positive) -> float:
-    """Return the normal force [N] of the strongest finger in play, by default what an object of a `mass` [kg] needs.
+    """Return the normal force [N] of the strongest finger in play, by default what an object of a
+    `mass` [kg] needs.
 
-    Two opposite fingers then hold the weight and a push of `PUSH` with half of the friction, as planned.
+    Two opposite fingers then hold the weight and a push of `PUSH` with half of the friction, as
+    planned.
 
     >>> round(pressing_force(TrialSpec(friction=0.8), 0.25), 1), pressing_force(TrialSpec(force=3.0), 0.25)
     (6.2, 3.0)
     """
-    least, most = 0.1, 100.0  # friction; force [N], far beyond what hands exert
-    needed = min((mass * spec.gravity + PUSH) / max(spec.friction, least), spec.max_force or most, most)
+    # friction; force [N], far beyond what hands exert
+    least = 0.1
+    most = 100.0
+    needed = min(
+        (mass * spec.gravity + PUSH) / max(spec.friction, least), spec.max_force or most, most
+    )
     return needed if spec.force is None else spec.force
 
 
 def _describe(
-    hand: Hand, grasps: Grasps, world_from_obj: Float[Tensor, "4 4"], scene: SceneSpec, spec: TrialSpec
+    hand: Hand,
+    grasps: Grasps,
+    world_from_obj: Float[Tensor, "4 4"],
+    scene: SceneSpec,
+    spec: TrialSpec,
 ) -> dict[str, Any]:
     """Return the values of play.json."""
     mount = {slide.name: MOUNT_DRIVE for slide in scene.slides}
     masks = pair_masks(scene.self_pairs, first=1)
     _, postures = named_postures(hand, grasps, pressing_force(spec, scene.mass), spec.kp)
     poses = world_from_obj @ grasps.obj_from_hand
-    rise = (world_from_obj @ opened_pose(hand, grasps.pregrasp, grasps.obj_from_hand, grasps.table) - poses)[:, :3, 3]
+    rise = (
+        world_from_obj @ opened_pose(hand, grasps.pregrasp, grasps.obj_from_hand, grasps.table)
+        - poses
+    )[:, :3, 3]
     far = -spec.approach * (grasps.approach @ world_from_obj[:3, :3].T)
     up = torch.tensor([0.0, 0.0, spec.lift_height], dtype=torch.float64).expand_as(rise)
-    motion = {  # by the name of the phase that ends: displacement of the hand in the world, posture, duration [s]
+    # by the name of the phase that ends: displacement of the hand in the world, posture, duration
+    # [s]
+    motion = {
         "approach": (rise + far, "pregrasp", 0.0),
         "pregrasp": (rise, "pregrasp", spec.approach / 0.2),  # the mean speed [m/s] of our trials
         "grasp": (0 * rise, "grasp", POSE_TIME),
@@ -168,13 +226,23 @@ def _describe(
         "hold": (up, "squeeze", spec.hold_time),
     }
     return {
-        "hand": hand.name, "timestep": spec.timestep, "gravity": spec.gravity, "armature": ARMATURE,
+        "hand": hand.name,
+        "timestep": spec.timestep,
+        "gravity": spec.gravity,
+        "armature": ARMATURE,
         "friction": {"hand": scene.friction, "table": scene.body_friction},
-        "table_height": scene.table_height, "lift_height": spec.lift_height,
-        "body": {"mass": scene.mass, "centre": scene.mesh.center_mass.tolist(), **_principal(scene.body.inertia)},
+        "table_height": scene.table_height,
+        "lift_height": spec.lift_height,
+        "body": {
+            "mass": scene.mass,
+            "centre": scene.mesh.center_mass.tolist(),
+            **_principal(scene.body.inertia),
+        },
         "drives": {name: x._asdict() for name, x in (mount | scene.drives).items()},
         "collision": {link.name: masks.get(link.name, (0, 0)) for link in scene.urdf.links},
-        "times": dict(zip(motion, np.cumsum([x[2] for x in motion.values()]).tolist(), strict=True)),
+        "times": dict(
+            zip(motion, np.cumsum([x[2] for x in motion.values()]).tolist(), strict=True)
+        ),
         "grasps": [
             {
                 "position": pose[:3, 3].tolist(),
@@ -187,13 +255,18 @@ def _describe(
             }
             for row, pose in enumerate(poses)
         ],
-    }  # fmt: skip
+    }
 
 
 def _principal(inertia: np.ndarray) -> dict[str, list[float]]:
-    """Return the principal moments of an inertia (3, 3) [kg m^2], and the quaternion (w, x, y, z) of its axes."""
+    """Return the principal moments of an inertia (3, 3) [kg m^2], and the quaternion (w, x, y, z)
+    of its axes.
+    """
     moments, axes = np.linalg.eigh(inertia)
-    return {"moments": moments.tolist(), "axes": _turn(axes * [1.0, 1.0, np.sign(np.linalg.det(axes))])}
+    return {
+        "moments": moments.tolist(),
+        "axes": _turn(axes * [1.0, 1.0, np.sign(np.linalg.det(axes))]),
+    }
 
 
 def _turn(rotation: np.ndarray) -> list[float]:
@@ -202,21 +275,39 @@ def _turn(rotation: np.ndarray) -> list[float]:
 
 
 def describe_bodies(scene: SceneSpec) -> dict[str, Any]:
-    """Return what USD needs: the parts of the object, and links and joints of hand and mount, all joints at zero.
+    """Return what USD needs: the parts of the object, and links and joints of hand and mount, all
+    joints at zero.
 
     Raises `BadArgument` for names of links or joints that USD does not allow.
     """
-    urdf, still = scene.urdf, Link("base", 0.1, (0.0, 0.0, 0.0), (1e-4, 0.0, 0.0, 1e-4, 0.0, 1e-4), ())
+    urdf = scene.urdf
+    still = Link("base", 0.1, (0.0, 0.0, 0.0), (1e-4, 0.0, 0.0, 1e-4, 0.0, 1e-4), ())
     names = ["base", *(f"{slide.name}_link" for slide in scene.slides)]
     joints = [
-        Joint(x.name, "prismatic", parent, child, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), x.axis, x.lower, x.upper)
+        Joint(
+            x.name,
+            "prismatic",
+            parent,
+            child,
+            (0.0, 0.0, 0.0),
+            (0.0, 0.0, 0.0),
+            x.axis,
+            x.lower,
+            x.upper,
+        )
         for x, parent, child in zip(scene.slides, names, names[1:], strict=False)
     ]
-    joints += [Joint("wrist", "fixed", names[-1], urdf.root, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), *urdf.joints]
+    joints += [
+        Joint("wrist", "fixed", names[-1], urdf.root, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+        *urdf.joints,
+    ]
     links = [*(dataclasses.replace(still, name=name) for name in names), *urdf.links]
     if wrong := [x.name for x in (*links, *joints) if not x.name.isidentifier()]:
-        raise BadArgument("hand", f"{wrong[0]!r}", "names of letters, digits and _, which USD allows")
-    poses, left = {"base": np.eye(4)}, list(joints)
+        raise BadArgument(
+            "hand", f"{wrong[0]!r}", "names of letters, digits and _, which USD allows"
+        )
+    poses = {"base": np.eye(4)}
+    left = list(joints)
     while left:
         for joint in [x for x in left if x.parent in poses]:
             left.remove(joint)
@@ -228,29 +319,42 @@ def describe_bodies(scene: SceneSpec) -> dict[str, Any]:
         "parts": [hull(corners) for corners in scene.hulls[0]],
         "links": [
             {
-                "name": link.name, "mass": link.mass, "centre": link.com,
-                "place": poses[link.name][:3, 3], "rotation": _turn(poses[link.name][:3, :3]),
-                "passes": [x.name for x in links[k + 1 :] if frozenset((x.name, link.name)) not in meet],
-                "shapes": [vars(x) | {"place": x.xyz, "rotation": _turn(_pose(x)[:3, :3])} for x in link.shapes],
+                "name": link.name,
+                "mass": link.mass,
+                "centre": link.com,
+                "place": poses[link.name][:3, 3],
+                "rotation": _turn(poses[link.name][:3, :3]),
+                "passes": [
+                    x.name for x in links[k + 1 :] if frozenset((x.name, link.name)) not in meet
+                ],
+                "shapes": [
+                    vars(x) | {"place": x.xyz, "rotation": _turn(_pose(x)[:3, :3])}
+                    for x in link.shapes
+                ],
                 **_principal(np.array(link.inertia)[[[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]]),
             }
             for k, link in enumerate(links)
         ],
         "joints": [
-            vars(x) | {
-                "place": x.xyz, "axis": _turn(_along(x.axis)), "rotation": _turn(_pose(x)[:3, :3] @ _along(x.axis)),
-                "drive": None if x.kind == "fixed" else drives[x.name], "armature": ARMATURE * (x in urdf.joints),
+            vars(x)
+            | {
+                "place": x.xyz,
+                "axis": _turn(_along(x.axis)),
+                "rotation": _turn(_pose(x)[:3, :3] @ _along(x.axis)),
+                "drive": None if x.kind == "fixed" else drives[x.name],
+                "armature": ARMATURE * (x in urdf.joints),
                 "degrees": math.degrees(1.0) if x.kind == "revolute" else 1.0,
             }
             for x in joints
         ],
-    }  # fmt: skip
+    }
 
 
 def _pose(of: "Joint | LinkShape") -> np.ndarray:
     """Return the pose (4, 4) of a joint or a shape in its link."""
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation_from_rpy(of.rpy).numpy(), of.xyz
+    pose[:3, :3] = rotation_from_rpy(of.rpy).numpy()
+    pose[:3, 3] = of.xyz
     return pose
 
 

@@ -23,24 +23,33 @@ from torchgrasp.ik.motion import APPROACH_DISTANCE, opened_pose
 from torchgrasp.sim.mujoco_scene import nest_links, render_mjcf
 from torchgrasp.values.planning import Grasps
 
-CONVENTIONS: dict[str, Any] = json.loads((Path(__file__).parent / "templates" / "conventions.json").read_text("utf-8"))
+CONVENTIONS: dict[str, Any] = json.loads(
+    (Path(__file__).parent / "templates" / "conventions.json").read_text("utf-8")
+)
 """Meaning of the numbers in a JSON file of grasps; the file contains this text."""
 TASK = "task_margin", "task_load", "task_twist", "task_forces", "task_strength"
-"""Fields of the `Certificate`, which explains them, that stand in the file if grasps were planned with `resist`."""
+"""Fields of the `Certificate`, which explains them, that stand in the file if grasps were planned
+with `resist`.
+"""
 
 
 @checked
 def format_grasps(
-    hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None = None,
-    rename: Mapping[str, str] | None = None, flange: Pose | None = None,
-) -> str:  # fmt: skip
+    hand: Hand,
+    grasps: Grasps,
+    force: Force = 4.0,
+    kp: Positive | None = None,
+    rename: Mapping[str, str] | None = None,
+    flange: Pose | None = None,
+) -> str:
     """Return grasps as JSON, together with `CONVENTIONS`, which explain the numbers.
 
-    The hand moves along "approach" to "pose" and its "rise", in its "pregrasp" posture. It closes to "grasp" in the
-    given time, and in the same time again it presses towards "squeeze". All joints move evenly. The strongest finger
-    presses with a normal force of `force` [N]. `kp` is the stiffness of the robot's position control [N m/rad], by
-    default the hand's. `rename` and `flange` are as in `format_moveit`; "flange" stands beside "pose". Raises
-    `BadArgument` for joints of another hand, unknown or equal names, or a force or stiffness that is not positive.
+    The hand moves along "approach" to "pose" and its "rise", in its "pregrasp" posture. It closes
+    to "grasp" in the given time, and in the same time again it presses towards "squeeze". All
+    joints move evenly. The strongest finger presses with a normal force of `force` [N]. `kp` is the
+    stiffness of the robot's position control [N m/rad], by default the hand's. `rename` and
+    `flange` are as in `format_moveit`; "flange" stands beside "pose". Raises `BadArgument` for
+    joints of another hand, unknown or equal names, or a force or stiffness that is not positive.
 
     >>> import json
     >>> from torchgrasp import load_hand
@@ -49,22 +58,31 @@ def format_grasps(
     >>> sorted(json.loads(text)["grasps"][0]["joints"])
     ['grasp', 'pregrasp', 'squeeze']
     """
-    grasps, path = grasps.to("cpu"), hand.urdf_path
+    grasps = grasps.to("cpu")
+    path = hand.urdf_path
     squeezed, postures = named_postures(hand, grasps, force, kp)
     opened = opened_pose(hand.to("cpu"), grasps.pregrasp, grasps.obj_from_hand, grasps.table)
     names = rename_joints(hand, rename)
     actuated = [names[joint] for joint in hand.joint_names]
-    forces, std = rotate(grasps.obj_from_hand.double(), squeezed.forces), grasps.contacts.std_m
+    forces = rotate(grasps.obj_from_hand.double(), squeezed.forces)
+    std = grasps.contacts.std_m
     rows = [
         {
             "rank": row,
             "status": Status(int(grasps.status[row])).name,
             "success": float(grasps.success[row]),
             "pose": describe_pose(pose),
-            **({} if flange is None else {"flange": describe_pose(pose.double() @ flange.double().cpu())}),
+            **(
+                {}
+                if flange is None
+                else {"flange": describe_pose(pose.double() @ flange.double().cpu())}
+            ),
             "approach": {"direction": grasps.approach[row].tolist(), "distance": APPROACH_DISTANCE},
             "rise": (opened[row] - pose)[:3, 3].tolist(),
-            "joints": {name: {names[joint]: float(q[joint][row]) for joint in names} for name, q in postures.items()},
+            "joints": {
+                name: {names[joint]: float(q[joint][row]) for joint in names}
+                for name, q in postures.items()
+            },
             "torque": dict(zip(actuated, squeezed.torques[row].tolist(), strict=True)),
             "contacts": [
                 {
@@ -76,11 +94,17 @@ def format_grasps(
                     "std_m": None if std is None else float(std[row, i]),
                     "tip_error": float(grasps.tip_error[row, i]),
                 }
-                for i, (finger, link) in enumerate(zip(hand.tips.names, hand.tips.links, strict=True))
+                for i, (finger, link) in enumerate(
+                    zip(hand.tips.names, hand.tips.links, strict=True)
+                )
             ],
             "clearance": float(grasps.clearance[row]),
             "closure_margin": float(grasps.certificate.margin[row]),
-            **{name: x[row].tolist() for name, x in vars(grasps.certificate).items() if x is not None and name in TASK},
+            **{
+                name: x[row].tolist()
+                for name, x in vars(grasps.certificate).items()
+                if x is not None and name in TASK
+            },
         }
         for row, pose in enumerate(grasps.obj_from_hand)
     ]
@@ -88,10 +112,17 @@ def format_grasps(
         "format": "torchgrasp grasps",
         "version": 3,  # version 1 had no approach, version 2 no rise
         **CONVENTIONS,
-        "hand": {"name": hand.name, "urdf": path.name, "root": read_urdf(path).root, "sha256": hand.source.sha256},
+        "hand": {
+            "name": hand.name,
+            "urdf": path.name,
+            "root": read_urdf(path).root,
+            "sha256": hand.source.sha256,
+        },
         "actuated": actuated,
         "rename": dict(rename or {}),
-        "stiffness": {names[joint]: drive.kp if kp is None else kp for joint, drive in hand.actuators.items()},
+        "stiffness": {
+            names[joint]: drive.kp if kp is None else kp for joint, drive in hand.actuators.items()
+        },
         "strongest_normal_force": force,
         "time": {"pregrasp": 0.0, "grasp": POSE_TIME, "squeeze": 2 * POSE_TIME},
         "provenance": grasps.meta,
@@ -103,16 +134,26 @@ def format_grasps(
 def named_postures(
     hand: Hand, grasps: Grasps, force: float, kp: float | None
 ) -> tuple[Squeeze, dict[str, dict[str, Float[Tensor, "g"]]]]:
-    """Return pressing targets and forces, and the joints [rad] by name of "pregrasp", "grasp" and "squeeze" (CPU)."""
-    hand, grasps = hand.to("cpu"), grasps.to("cpu")
+    """Return pressing targets and forces, and the joints [rad] by name of "pregrasp", "grasp" and
+    "squeeze" (CPU).
+    """
+    hand = hand.to("cpu")
+    grasps = grasps.to("cpu")
     squeezed = squeeze(hand, grasps, force, kp)
-    postures = {"pregrasp": grasps.pregrasp.double(), "grasp": grasps.joints.double(), "squeeze": squeezed.joints}
+    postures = {
+        "pregrasp": grasps.pregrasp.double(),
+        "grasp": grasps.joints.double(),
+        "squeeze": squeezed.joints,
+    }
     return squeezed, {name: hand.expand(joints) for name, joints in postures.items()}
 
 
 def rename_joints(hand: Hand, rename: Mapping[str, str] | None) -> dict[str, str]:
-    """Return the robot's name of each joint of the URDF: those of `rename` first, in its order. Refuse equal names."""
-    given, ours = dict(rename or {}), hand.tree.joint_names
+    """Return the robot's name of each joint of the URDF: those of `rename` first, in its order.
+    Refuse equal names.
+    """
+    given = dict(rename or {})
+    ours = hand.tree.joint_names
     if unknown := [joint for joint in given if joint not in ours]:
         raise BadArgument("rename", repr(unknown[0]), f"a joint of the hand: {', '.join(ours)}")
     names = given | {joint: joint for joint in ours if joint not in given}
@@ -128,19 +169,25 @@ def describe_pose(a_from_b: Float[Tensor, "4 4"]) -> dict[str, list[float]]:
 
 def quaternion(a_from_b: Float[Tensor, "4 4"]) -> list[float]:
     """Return the rotation of a pose as a unit quaternion (w, x, y, z)."""
-    x, y, z, w = spatial.transform.Rotation.from_matrix(a_from_b[:3, :3].double().cpu().numpy()).as_quat()
+    x, y, z, w = spatial.transform.Rotation.from_matrix(
+        a_from_b[:3, :3].double().cpu().numpy()
+    ).as_quat()
     return [float(q) for q in (w, x, y, z)]
 
 
 @checked
-def format_keyframes(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None = None) -> str:
-    """Return the hand as MJCF with four keyframes for each grasp: grasp_0_approach, _pregrasp, _grasp, _squeeze.
+def format_keyframes(
+    hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None = None
+) -> str:
+    """Return the hand as MJCF with four keyframes for each grasp: grasp_0_approach, _pregrasp,
+    _grasp, _squeeze.
 
-    The world is the object's frame. `qpos` is the free joint, then the joints of the model; `ctrl` is the targets of
-    the actuators. The text elements "qpos" and "ctrl" name their order. The approach has the joints of the pre-grasp.
-    The squeeze has the joints of the grasp and targets that press. `force` [N] is the normal force of the strongest
-    finger. `kp` is the stiffness of every drive [N m/rad], by default the hand's own. Raises `BadArgument` for joints
-    of another hand, or a force or stiffness that is not positive.
+    The world is the object's frame. `qpos` is the free joint, then the joints of the model; `ctrl`
+    is the targets of the actuators. The text elements "qpos" and "ctrl" name their order. The
+    approach has the joints of the pre-grasp. The squeeze has the joints of the grasp and targets
+    that press. `force` [N] is the normal force of the strongest finger. `kp` is the stiffness of
+    every drive [N m/rad], by default the hand's own. Raises `BadArgument` for joints of another
+    hand, or a force or stiffness that is not positive.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -148,25 +195,40 @@ def format_keyframes(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positiv
     >>> text.count("<key ")
     4
     """
-    grasps, urdf = grasps.to("cpu"), read_urdf(hand.urdf_path)
+    grasps = grasps.to("cpu")
+    urdf = read_urdf(hand.urdf_path)
     _, postures = named_postures(hand, grasps, force, kp)
     nested = nest_links(urdf)
-    order = [joint.name for _, joint, _ in nested if joint and joint.kind != "fixed"]  # as MuJoCo numbers them
+    order = [
+        joint.name for _, joint, _ in nested if joint and joint.kind != "fixed"
+    ]  # as MuJoCo numbers them
     steps = (  # name, distance from the pose, joints, targets
         ("approach", APPROACH_DISTANCE, "pregrasp", "pregrasp"),
         ("pregrasp", 0.0, "pregrasp", "pregrasp"),
         ("grasp", 0.0, "grasp", "grasp"),
         ("squeeze", 0.0, "grasp", "squeeze"),
     )
-    opened, keys = opened_pose(hand.to("cpu"), grasps.pregrasp, grasps.obj_from_hand, grasps.table), []
+    opened = opened_pose(hand.to("cpu"), grasps.pregrasp, grasps.obj_from_hand, grasps.table)
+    keys = []
     for row, closed in enumerate(grasps.obj_from_hand):
         for name, distance, state, targets in steps:
             pose = opened[row] if state == "pregrasp" else closed
             position = pose[:3, 3] - distance * grasps.approach[row]
-            joints, control = ([float(postures[x][joint][row]) for joint in order] for x in (state, targets))
-            keys.append((f"grasp_{row}_{name}", [*position.tolist(), *quaternion(pose), *joints], control))
+            joints, control = (
+                [float(postures[x][joint][row]) for joint in order] for x in (state, targets)
+            )
+            keys.append(
+                (f"grasp_{row}_{name}", [*position.tolist(), *quaternion(pose), *joints], control)
+            )
     drives = {name: x if kp is None else x._replace(kp=kp) for name, x in hand.actuators.items()}
-    known = {"name": hand.name, "nested": nested, "pose": np.eye(4), "order": order, "drives": drives, "keys": keys}
+    known = {
+        "name": hand.name,
+        "nested": nested,
+        "pose": np.eye(4),
+        "order": order,
+        "drives": drives,
+        "keys": keys,
+    }
     root = ET.fromstring(render_mjcf("robot.xml", **known, free=True))
     ET.indent(root)
     return ET.tostring(root, encoding="unicode") + "\n"

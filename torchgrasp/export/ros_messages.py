@@ -1,4 +1,6 @@
-"""Export of grasps as ROS 2 messages in YAML: moveit_msgs/Grasp and trajectory_msgs/JointTrajectory."""
+"""Export of grasps as ROS 2 messages in YAML: moveit_msgs/Grasp and
+trajectory_msgs/JointTrajectory.
+"""
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
@@ -20,11 +22,15 @@ from torchgrasp.ik.motion import APPROACH_DISTANCE, UP, opened_pose
 from torchgrasp.values.planning import Grasps
 
 OBJECT_FRAME = "object"
-"""Name in the messages of the object's frame, which is the frame of the cloud; publish a transform of that name."""
+"""Name in the messages of the object's frame, which is the frame of the cloud; publish a transform
+of that name.
+"""
 
 
 class _Dumper(yaml.SafeDumper):
-    """Writes YAML with nine decimals and no exponent in each number, because YAML 1.1 reads 1e-05 as a text."""
+    """Writes YAML with nine decimals and no exponent in each number, because YAML 1.1 reads 1e-05
+    as a text.
+    """
 
     def ignore_aliases(self, data: Any) -> bool:
         """Return True, so that a list that occurs twice is written twice instead of as a reference."""
@@ -32,7 +38,9 @@ class _Dumper(yaml.SafeDumper):
 
     def represent_number(self, number: float) -> yaml.ScalarNode:
         """Return a float as a YAML number without an exponent."""
-        return self.represent_scalar("tag:yaml.org,2002:float", f"{number:.9f}" if math.isfinite(number) else ".nan")
+        return self.represent_scalar(
+            "tag:yaml.org,2002:float", f"{number:.9f}" if math.isfinite(number) else ".nan"
+        )
 
 
 _Dumper.add_representer(float, _Dumper.represent_number)
@@ -40,25 +48,30 @@ _Dumper.add_representer(float, _Dumper.represent_number)
 
 @checked
 def format_moveit(
-    hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None = None,
-    rename: Mapping[str, str] | None = None, flange: Pose | None = None, object_id: str = OBJECT_FRAME,
-) -> str:  # fmt: skip
+    hand: Hand,
+    grasps: Grasps,
+    force: Force = 4.0,
+    kp: Positive | None = None,
+    rename: Mapping[str, str] | None = None,
+    flange: Pose | None = None,
+    object_id: str = OBJECT_FRAME,
+) -> str:
     """Return grasps as a YAML list of moveit_msgs/Grasp.
 
-    `grasp_pose` is the pose in `OBJECT_FRAME` of the root link of the hand's URDF, or of a robot's flange. The
-    pre-grasp posture has positions; the grasp posture closes to the contacts, then to targets that press, with the
-    torques [N m] as effort. `grasp_quality` is the predicted success. The retreat is up: the normal of the plan's
-    table, or z.
+    `grasp_pose` is the pose in `OBJECT_FRAME` of the root link of the hand's URDF, or of a robot's
+    flange. The pre-grasp posture has positions; the grasp posture closes to the contacts, then to
+    targets that press, with the torques [N m] as effort. `grasp_quality` is the predicted success.
+    The retreat is up: the normal of the plan's table, or z.
 
-    Args:
-        force: normal force of the strongest finger [N].
-        kp: stiffness of the robot's own position control [N m/rad]; by default the hand's.
-        rename: the robot's names of joints, by their names in the URDF; these joints come first, in this order.
-        flange: pose of the robot's flange in the frame of the root link.
-        object_id: id of the object in the planning scene, which the hand may touch.
+    Args: force: normal force of the strongest finger [N]. kp: stiffness of the robot's own position
+        control [N m/rad]; by default the hand's. rename: the robot's names of joints, by their
+        names in the URDF; these joints come first, in this order. flange: pose of the robot's
+        flange in the frame of the root link. object_id: id of the object in the planning scene,
+        which the hand may touch.
 
-    Raises `BadArgument` for joints of another hand, a force or stiffness that is not positive, unknown or equal names,
-    or a grasp whose hand goes down while it closes (`opened_pose`), which a message with one pose cannot tell.
+    Raises `BadArgument` for joints of another hand, a force or stiffness that is not positive,
+    unknown or equal names, or a grasp whose hand goes down while it closes (`opened_pose`), which a
+    message with one pose cannot tell.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -66,11 +79,20 @@ def format_moveit(
     >>> print(text.splitlines()[2])
     # the hand's frame is link 'palm' of hand.urdf; joints in the order of joint_names
     """
-    hand, grasps = hand.to("cpu"), grasps.to("cpu")
+    hand = hand.to("cpu")
+    grasps = grasps.to("cpu")
     up = UP if grasps.table is None else grasps.table.normal
-    poses = grasps.obj_from_hand.double() if flange is None else grasps.obj_from_hand.double() @ flange.double().cpu()
-    if not torch.equal(opened_pose(hand, grasps.pregrasp, grasps.obj_from_hand, grasps.table), grasps.obj_from_hand):
-        raise BadArgument("grasps", "a hand that goes down while it closes", "hands that close at one pose")
+    poses = (
+        grasps.obj_from_hand.double()
+        if flange is None
+        else grasps.obj_from_hand.double() @ flange.double().cpu()
+    )
+    if not torch.equal(
+        opened_pose(hand, grasps.pregrasp, grasps.obj_from_hand, grasps.table), grasps.obj_from_hand
+    ):
+        raise BadArgument(
+            "grasps", "a hand that goes down while it closes", "hands that close at one pose"
+        )
     messages = [
         {
             "id": f"grasp_{row}",
@@ -92,12 +114,17 @@ def format_moveit(
 
 @checked
 def format_trajectories(
-    hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None = None, rename: Mapping[str, str] | None = None
+    hand: Hand,
+    grasps: Grasps,
+    force: Force = 4.0,
+    kp: Positive | None = None,
+    rename: Mapping[str, str] | None = None,
 ) -> str:
-    """Return a YAML document of trajectory_msgs/JointTrajectory for each grasp: pre-grasp, grasp, squeeze.
+    """Return a YAML document of trajectory_msgs/JointTrajectory for each grasp: pre-grasp, grasp,
+    squeeze.
 
-    The hand must already be at its pose, which `format_moveit` and `format_grasps` give. Arguments and errors are those
-    of `format_moveit`.
+    The hand must already be at its pose, which `format_moveit` and `format_grasps` give. Arguments
+    and errors are those of `format_moveit`.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -105,13 +132,15 @@ def format_trajectories(
     >>> text.count("time_from_start")
     3
     """
-    what, documents = "a trajectory_msgs/JointTrajectory for each grasp", _trajectories(hand, grasps, force, kp, rename)
+    what = "a trajectory_msgs/JointTrajectory for each grasp"
+    documents = _trajectories(hand, grasps, force, kp, rename)
     return _document(hand, what, documents)
 
 
 @checked
 def format_motion(hand: Hand, motion: ArmMotion) -> str:
-    """Return a YAML document of trajectory_msgs/JointTrajectory, with the joints of arm and hand, for each grasp.
+    """Return a YAML document of trajectory_msgs/JointTrajectory, with the joints of arm and hand,
+    for each grasp.
 
     >>> from torchgrasp import load_hand
     >>> motion = ArmMotion(("a",), torch.tensor([0.0, 1.5]), torch.zeros(1, 2, 1), {"above": 0})
@@ -122,19 +151,26 @@ def format_motion(hand: Hand, motion: ArmMotion) -> str:
     documents = [
         {
             "joint_names": list(motion.joint_names),
-            "points": [{"positions": q, "time_from_start": at} for q, at in zip(rows, times, strict=True)],
+            "points": [
+                {"positions": q, "time_from_start": at} for q, at in zip(rows, times, strict=True)
+            ],
         }
         for rows in motion.positions.tolist()
     ]
-    return _document(hand, "a trajectory_msgs/JointTrajectory of arm and hand for each grasp", documents)
+    return _document(
+        hand, "a trajectory_msgs/JointTrajectory of arm and hand for each grasp", documents
+    )
 
 
 def _trajectories(
     hand: Hand, grasps: Grasps, force: float, kp: float | None, rename: Mapping[str, str] | None
 ) -> Iterator[dict[str, Any]]:
-    """Yield for each grasp a trajectory_msgs/JointTrajectory, as a dict, with all joints of the hand."""
+    """Yield for each grasp a trajectory_msgs/JointTrajectory, as a dict, with all joints of the
+    hand.
+    """
     squeezed, postures = named_postures(hand, grasps, force, kp)
-    names, root = rename_joints(hand, rename), read_urdf(hand.urdf_path).root
+    names = rename_joints(hand, rename)
+    root = read_urdf(hand.urdf_path).root
     for row in range(len(grasps)):
         torque = dict(zip(hand.joint_names, squeezed.torques[row].tolist(), strict=True))
         efforts = [], [], [torque.get(joint, 0.0) for joint in names]
@@ -157,18 +193,29 @@ def _pose(obj_from_hand: Float[Tensor, "4 4"]) -> dict[str, Any]:
 
 
 def _translation(direction: Float[Tensor, "3"]) -> dict[str, Any]:
-    """Return a moveit_msgs/GripperTranslation, as a dict: as far as the approach, of which half must be free."""
+    """Return a moveit_msgs/GripperTranslation, as a dict: as far as the approach, of which half
+    must be free.
+    """
     vector = dict(zip("xyz", direction.tolist(), strict=True))
     stamped = {"header": {"frame_id": OBJECT_FRAME}, "vector": vector}
-    return {"direction": stamped, "desired_distance": APPROACH_DISTANCE, "min_distance": APPROACH_DISTANCE / 2}
+    return {
+        "direction": stamped,
+        "desired_distance": APPROACH_DISTANCE,
+        "min_distance": APPROACH_DISTANCE / 2,
+    }
 
 
 def _document(hand: Hand, what: str, documents: Iterable[Any]) -> str:
-    """Return one YAML text of all documents, below comment lines that say `what` they are and explain the numbers."""
-    root, file = read_urdf(hand.urdf_path).root, hand.urdf_path.name
+    """Return one YAML text of all documents, below comment lines that say `what` they are and
+    explain the numbers.
+    """
+    root = read_urdf(hand.urdf_path).root
+    file = hand.urdf_path.name
     heading = (
         f"# {what}, for the {hand.name} hand, by torchgrasp\n"
         f"# metres, radians, newtons, N m; quaternions by name; frame {OBJECT_FRAME!r}: that of the planned cloud\n"
         f"# the hand's frame is link {root!r} of {file}; joints in the order of joint_names\n"
     )
-    return heading + yaml.dump_all(documents, None, _Dumper, default_flow_style=None, width=math.inf, sort_keys=False)
+    return heading + yaml.dump_all(
+        documents, None, _Dumper, default_flow_style=None, width=math.inf, sort_keys=False
+    )

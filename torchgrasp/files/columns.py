@@ -17,9 +17,11 @@ from torchgrasp.foundation.limits import CLOUD_POINTS, LINE_LETTERS, TEXT_COLUMN
 def find_columns(names: Sequence[str], columns: Sequence[np.ndarray]) -> dict[str, Any]:
     """Return `points` (n, 3), their `normals` or None, and the `other` names, of columns by name.
 
-    Names are x, y, z, nx, ny, nz in any case, or as in normal_x. Of a column (n, k) the first number counts.
+    Names are x, y, z, nx, ny, nz in any case, or as in normal_x. Of a column (n, k) the first
+    number counts.
     """
-    places, other = dict[str, int](), list[str]()
+    places = dict[str, int]()
+    other = list[str]()
     for i, name in enumerate(names):
         meant = re.fullmatch(r"(?:(n)(?:ormal)?_?)?([xyz])", name.lower())
         axis = "".join(meant.groups("")) if meant else ""
@@ -32,35 +34,54 @@ def find_columns(names: Sequence[str], columns: Sequence[np.ndarray]) -> dict[st
     axes = ["x", "y", "z"] + ["nx", "ny", "nz"] * (not places.keys() <= {*"xyz"})
     if missing := [axis for axis in axes if axis not in places]:
         raise Malformed(f"columns {' '.join(names)[:200]!r} without {', '.join(missing)}")
-    found = np.stack([columns[places[axis]].reshape(len(columns[0]), -1)[:, 0] for axis in axes], -1)
-    return {"points": found[:, :3], "normals": found[:, 3:] if len(axes) > 3 else None, "other": other}
+    found = np.stack(
+        [columns[places[axis]].reshape(len(columns[0]), -1)[:, 0] for axis in axes], -1
+    )
+    return {
+        "points": found[:, :3],
+        "normals": found[:, 3:] if len(axes) > 3 else None,
+        "other": other,
+    }
 
 
 def read_fields(
     data: bytes, fields: Sequence[tuple[str, int]], count: int, order: str = "", last: bool = True
 ) -> list[np.ndarray]:
-    """Return the numbers (count, n) of each field, given its type and n. Without an `order` of bytes, data are text.
+    """Return the numbers (count, n) of each field, given its type and n. Without an `order` of
+    bytes, data are text.
 
-    Little memory beyond the numbers is used. Raises `Malformed` for too little data, or a longer row or another row
-    where nothing should follow the `last` row.
+    Little memory beyond the numbers is used. Raises `Malformed` for too little data, or a longer
+    row or another row where nothing should follow the `last` row.
     """
     if not 0 <= count <= CLOUD_POINTS:
         raise Malformed(f"{count} points, not up to {CLOUD_POINTS}")
     sizes = [n for _, n in fields]
     wanted = count * sum(sizes)
     if order:
-        dtype = np.dtype([(str(i), order + kind, (n,)) for i, (kind, n) in enumerate(fields)])  # names may be alike
-        if not 0 <= len(data) - count * dtype.itemsize < (dtype.itemsize if last else len(data) + 1):
-            raise Malformed(f"{len(data)} bytes of points, where the header promises {count * dtype.itemsize}")
+        dtype = np.dtype(
+            [(str(i), order + kind, (n,)) for i, (kind, n) in enumerate(fields)]
+        )  # names may be alike
+        if (
+            not 0
+            <= len(data) - count * dtype.itemsize
+            < (dtype.itemsize if last else len(data) + 1)
+        ):
+            raise Malformed(
+                f"{len(data)} bytes of points, where the header promises {count * dtype.itemsize}"
+            )
         rows = np.frombuffer(data, dtype=dtype, count=count)
         return [rows[str(i)] for i in range(len(fields))]
     first = next(iter(data[:LINE_LETTERS].lstrip().splitlines()), b"").split()
     if last and wanted and len(first) != sum(sizes):
-        raise Malformed(f"{len(first)} numbers in the first row, where the header promises {sum(sizes)}")
+        raise Malformed(
+            f"{len(first)} numbers in the first row, where the header promises {sum(sizes)}"
+        )
     numbers = np.zeros(0)
     if 0 < 2 * wanted <= len(data) + 1:  # a number has at least a digit and a space
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)  # at a word that is no number; the count shows it
+            warnings.simplefilter(
+                "ignore", DeprecationWarning
+            )  # at a word that is no number; the count shows it
             numbers = np.fromstring(data, dtype=np.float64, count=wanted, sep=" ")
     if len(numbers) < wanted:
         raise Malformed(f"fewer numbers than {count} points have, or a word that is no number")
@@ -68,9 +89,11 @@ def read_fields(
 
 
 def parse_text(data: bytes, suffix: str) -> dict[str, Any]:
-    """Return a text's columns by the names in its first line, or `columns` if there are three or six without names.
+    """Return a text's columns by the names in its first line, or `columns` if there are three or
+    six without names.
 
-    A first line of one number counts the rows. In `.xyzi` and `.pts` files an intensity may follow x, y and z.
+    A first line of one number counts the rows. In `.xyzi` and `.pts` files an intensity may follow
+    x, y and z.
     """
     names, table = _read_text(data)
     rows, width = table.shape
@@ -81,13 +104,18 @@ def parse_text(data: bytes, suffix: str) -> dict[str, Any]:
     if not names and suffix in (".xyzi", ".pts") and width in (4, 7):
         names = ["x", "y", "z", "intensity", "red", "green", "blue"][:width]
     if len(names or [0] * width) != width or (not names and width not in (3, 6)):
-        named = f"the names {' '.join(names)[:200]!r}" if names else "no line of names above, such as x y z nx ny nz"
+        named = (
+            f"the names {' '.join(names)[:200]!r}"
+            if names
+            else "no line of names above, such as x y z nx ny nz"
+        )
         raise Malformed(f"{width} columns with {named}")
     return find_columns(names, list(table.T)) if names else {"columns": table}
 
 
 def read_lines(data: bytes) -> Float[np.ndarray, "rows columns"]:
-    """Return a text's numbers, one row for each line; blanks, commas or semicolons separate the numbers.
+    """Return a text's numbers, one row for each line; blanks, commas or semicolons separate the
+    numbers.
 
     `#` or `//` starts a comment. A first line of words is left out.
     """
@@ -95,7 +123,9 @@ def read_lines(data: bytes) -> Float[np.ndarray, "rows columns"]:
 
 
 def _read_text(data: bytes) -> tuple[list[str], Float[np.ndarray, "rows columns"]]:
-    """Return a text's numbers, and the words of a line above them that names the columns or counts the rows."""
+    """Return a text's numbers, and the words of a line above them that names the columns or counts
+    the rows.
+    """
     comment: str = ""
     shown: str = ""
     number = rows = width = 0
@@ -120,23 +150,31 @@ def _read_text(data: bytes) -> tuple[list[str], Float[np.ndarray, "rows columns"
                 _check_line(line.strip())
             yield line.replace(",", " ").replace(";", " ").replace('"', " ")
 
-    every, names = lines(), list[str]()
+    every = lines()
+    names = list[str]()
     try:
         some = [next(every, "")]
         if some[0].strip().isdecimal():  # a count of the rows, if the next line has more numbers
             some.append(next(every, ""))
         width = len(some[-1].split())
-        if not re.search(r"(?i)(?:^|\s)[-+.]*(?:\d|(?:nan|inf)\b)", some[0]) or len(some[0].split()) < width:
+        if (
+            not re.search(r"(?i)(?:^|\s)[-+.]*(?:\d|(?:nan|inf)\b)", some[0])
+            or len(some[0].split()) < width
+        ):
             names = some.pop(0).split()
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of a file without numbers, which is refused below
+            warnings.simplefilter(
+                "ignore", UserWarning
+            )  # of a file without numbers, which is refused below
             table = np.loadtxt(itertools.chain(filter(None, some), every), ndmin=2)
     except Malformed:
         raise
     except UnicodeDecodeError as error:
         raise Malformed("text of another encoding than UTF-8") from error
     except ValueError as error:
-        raise Malformed(f"line {number}, {shown.strip()[:60]!r}, where {width} numbers should be") from error
+        raise Malformed(
+            f"line {number}, {shown.strip()[:60]!r}, where {width} numbers should be"
+        ) from error
     if not table.size:
         raise Malformed("no numbers")
     words = [*comment.replace(",", " ").split()]  # also a comment may name the columns
@@ -144,7 +182,9 @@ def _read_text(data: bytes) -> tuple[list[str], Float[np.ndarray, "rows columns"
 
 
 def _check_line(line: str) -> None:
-    """Raise `Malformed` for a line of too many numbers, with decimal commas, as in 0,03;0,1, or with an empty cell."""
+    """Raise `Malformed` for a line of too many numbers, with decimal commas, as in 0,03;0,1, or
+    with an empty cell.
+    """
     if len(re.split(r"[\s,;]+", line)) > TEXT_COLUMNS:
         raise Malformed(f"more than {TEXT_COLUMNS} numbers in a line")
     mixed = re.search(r"\d,\d", line) and re.search(r'[;"]|[^\s,]\s+[^\s,]', line)

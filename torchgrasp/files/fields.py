@@ -1,4 +1,5 @@
-"""Values in files: JSON and TOML field by field, tensors with metadata as safetensors; both are checked when read.
+"""Values in files: JSON and TOML field by field, tensors with metadata as safetensors; both are
+checked when read.
 
 An error names the file and the field, such as `objects.cup.views.front`.
 """
@@ -22,7 +23,13 @@ from torchgrasp.files.write import Refuse, check_file, read_bounded, write_file
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import is_tensor
 from torchgrasp.foundation.errors import BadArgument, ModelFileError
-from torchgrasp.foundation.limits import JSON_BYTES, JSON_LETTERS, LARGEST_NUMBER, SHOWN_LETTERS, TENSOR_FILE_BYTES
+from torchgrasp.foundation.limits import (
+    JSON_BYTES,
+    JSON_LETTERS,
+    LARGEST_NUMBER,
+    SHOWN_LETTERS,
+    TENSOR_FILE_BYTES,
+)
 
 Item = TypeVar("Item")
 SomeValue = TypeVar("SomeValue", bound=Value)
@@ -31,7 +38,9 @@ DTYPES = (torch.float32, torch.float64, torch.int64, torch.bool)  # dtypes in ou
 
 
 class Field(NamedTuple):
-    """A value in a JSON or TOML file, with the file's `path` and the `place` in it; `refuse` makes errors about it."""
+    """A value in a JSON or TOML file, with the file's `path` and the `place` in it; `refuse` makes
+    errors about it.
+    """
 
     path: Path
     place: str
@@ -48,19 +57,26 @@ class Field(NamedTuple):
         return self.refuse(f"{self.path}: {self.place or 'the file'} = {shown}", allowed)
 
     def entries(self, *required: str) -> "dict[str, Field]":
-        """Return the fields of a JSON object by name; raise an error if it lacks one of the `required` names."""
+        """Return the fields of a JSON object by name; raise an error if it lacks one of the
+        `required` names.
+        """
         if not isinstance(self.value, dict):
             raise self.wrong("an object { }")
         if missing := [name for name in required if name not in self.value]:
             raise self.wrong(f"an object with {missing[0]!r}")
         within = f"{self.place}." if self.place else ""
-        return {key: Field(self.path, f"{within}{key}", value, self.refuse) for key, value in self.value.items()}
+        return {
+            key: Field(self.path, f"{within}{key}", value, self.refuse)
+            for key, value in self.value.items()
+        }
 
     def items(self, most: int = 1000) -> "list[Field]":
         """Return the items of a list as fields; raise an error if there are more than `most`."""
         if not isinstance(self.value, list) or len(self.value) > most:
             raise self.wrong(f"a list of at most {most}")
-        return [Field(self.path, f"{self.place}[{i}]", x, self.refuse) for i, x in enumerate(self.value)]
+        return [
+            Field(self.path, f"{self.place}[{i}]", x, self.refuse) for i, x in enumerate(self.value)
+        ]
 
     def text(self, most: int = JSON_LETTERS) -> str:
         """Return the value as a text of at most `most` letters."""
@@ -71,11 +87,21 @@ class Field(NamedTuple):
     def number(self, low: float = -sys.float_info.max, high: float = sys.float_info.max) -> float:
         """Return the value as a number in [low, high]; by default any finite number."""
         number = self.value
-        if isinstance(number, bool) or not isinstance(number, int | float) or not low <= number <= high:
-            raise self.wrong("a finite number" if high == sys.float_info.max else f"a number in [{low:g}, {high:g}]")
+        if (
+            isinstance(number, bool)
+            or not isinstance(number, int | float)
+            or not low <= number <= high
+        ):
+            raise self.wrong(
+                "a finite number"
+                if high == sys.float_info.max
+                else f"a number in [{low:g}, {high:g}]"
+            )
         return float(number)
 
-    def numbers(self, count: int, low: float = -sys.float_info.max, high: float = sys.float_info.max) -> list[float]:
+    def numbers(
+        self, count: int, low: float = -sys.float_info.max, high: float = sys.float_info.max
+    ) -> list[float]:
         """Return the value as a list of `count` numbers in [low, high]."""
         if not isinstance(self.value, list) or len(self.value) != count:
             raise self.wrong(f"{count} numbers")
@@ -83,13 +109,19 @@ class Field(NamedTuple):
 
     def whole(self, low: int, high: int) -> int:
         """Return the value as a whole number in [low, high]."""
-        if isinstance(self.value, bool) or not isinstance(self.value, int) or not low <= self.value <= high:
+        if (
+            isinstance(self.value, bool)
+            or not isinstance(self.value, int)
+            or not low <= self.value <= high
+        ):
             raise self.wrong(f"a whole number in [{low}, {high}]")
         return self.value
 
 
 def read_json(path: Path, refuse: Refuse, allowed: str, most: int = JSON_BYTES) -> Field:
-    """Read a JSON file (UTF-8, at most `most` bytes, no NaN) as a field; raise the error of `refuse` for others."""
+    """Read a JSON file (UTF-8, at most `most` bytes, no NaN) as a field; raise the error of
+    `refuse` for others.
+    """
     data = read_bounded(path, most, allowed, refuse)
     try:
         value = json.loads(data.decode("utf-8"), parse_constant=_refuse_constant)
@@ -103,17 +135,29 @@ def _refuse_constant(name: str) -> float:
     raise ValueError(f"{name}, which is no JSON")
 
 
-def save_tensors(path: Path | str, kind: str, tensors: dict[str, Tensor], meta: dict[str, str]) -> Path:
-    """Write tensors and metadata to a safetensors file that names its `kind`; raise `OutputError` if this fails."""
+def save_tensors(
+    path: Path | str, kind: str, tensors: dict[str, Tensor], meta: dict[str, str]
+) -> Path:
+    """Write tensors and metadata to a safetensors file that names its `kind`; raise `OutputError`
+    if this fails.
+    """
     # as bytes, since a full disk then is an OSError, which save_file makes an error of its own
     return write_file(path, pack_tensors(kind, tensors, meta))
 
 
 def pack_tensors(kind: str, tensors: dict[str, Tensor], meta: dict[str, str]) -> bytes:
-    """Return the bytes of a safetensors file that names its `kind`; equal tensors and metadata give equal bytes."""
-    contiguous = {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}  # a file shares no memory
-    # One JSON string: safetensors writes several metadata keys in random order, and equal values must give equal bytes.
-    return save(contiguous, {"torchgrasp": json.dumps({**meta, "kind": kind, "version": VERSION}, sort_keys=True)})
+    """Return the bytes of a safetensors file that names its `kind`; equal tensors and metadata give
+    equal bytes.
+    """
+    contiguous = {
+        name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()
+    }  # a file shares no memory
+    # One JSON string: safetensors writes several metadata keys in random order, and equal values
+    # must give equal bytes.
+    return save(
+        contiguous,
+        {"torchgrasp": json.dumps({**meta, "kind": kind, "version": VERSION}, sort_keys=True)},
+    )
 
 
 def load_tensors(
@@ -121,7 +165,8 @@ def load_tensors(
 ) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Read tensors by name and the metadata from a safetensors file of a `kind`.
 
-    The file must hold the tensors `names`, and may hold those in `optional`; other files raise `ModelFileError`.
+    The file must hold the tensors `names`, and may hold those in `optional`; other files raise
+    `ModelFileError`.
     """
     allowed = names.union(optional)
     refuse = functools.partial(ModelFileError, "path")
@@ -130,7 +175,8 @@ def load_tensors(
         with safe_open(path, framework="pt") as file:
             meta = json.loads((file.metadata() or {}).get("torchgrasp", "{}"))
             found = set(file.keys())
-            # The others stay unread. A copy is aligned as what was saved: unaligned numbers round otherwise.
+            # The others stay unread. A copy is aligned as what was saved: unaligned numbers round
+            # otherwise.
             tensors = {name: file.get_tensor(name).clone() for name in found & allowed}
     except (SafetensorError, OSError, ValueError, KeyError, RecursionError) as error:
         raise refuse(f"{path}: {error}", f"a safetensors file of kind {kind!r}") from error
@@ -150,10 +196,14 @@ def load_tensors(
     return tensors, meta
 
 
-def read_value(path: Path | str, kind: str, of: type[SomeValue], **rest: Any) -> tuple[SomeValue, dict[str, str]]:
-    """Read a value and metadata from a safetensors file of a `kind`; raise `ModelFileError` for other shapes or types.
+def read_value(
+    path: Path | str, kind: str, of: type[SomeValue], **rest: Any
+) -> tuple[SomeValue, dict[str, str]]:
+    """Read a value and metadata from a safetensors file of a `kind`; raise `ModelFileError` for
+    other shapes or types.
 
-    The tensors have the names of the fields of class `of`. `rest` gives its other fields; they may keep their defaults.
+    The tensors have the names of the fields of class `of`. `rest` gives its other fields; they may
+    keep their defaults.
     """
     fields = _tensor_fields(of)
     optional = {name for name, kinds in fields.items() if type(None) in kinds}
@@ -162,12 +212,18 @@ def read_value(path: Path | str, kind: str, of: type[SomeValue], **rest: Any) ->
         for name, tensor in tensors.items():
             if not isinstance(tensor, fields[name][0]):
                 found = f"{path}: {name} of shape {tuple(tensor.shape)} and {tensor.dtype}"
-                raise ModelFileError("path", found, f"{fields[name][0]}, and one size for each letter")
-    return _build(of, tensors, "", rest), {k: v for k, v in meta.items() if k not in ("kind", "version")}
+                raise ModelFileError(
+                    "path", found, f"{fields[name][0]}, and one size for each letter"
+                )
+    return _build(of, tensors, "", rest), {
+        k: v for k, v in meta.items() if k not in ("kind", "version")
+    }
 
 
 def _tensor_fields(of: type[Value], prefix: str = "") -> dict[str, tuple[Any, ...]]:
-    """Return the allowed types of all tensors in a value class by dotted name; for an optional one also NoneType."""
+    """Return the allowed types of all tensors in a value class by dotted name; for an optional one
+    also NoneType.
+    """
     fields: dict[str, tuple[Any, ...]] = {}
     for name, hint in _hints(of).items():
         kinds = typing.get_args(hint) if typing.get_origin(hint) not in (None, dict) else (hint,)
@@ -178,11 +234,20 @@ def _tensor_fields(of: type[Value], prefix: str = "") -> dict[str, tuple[Any, ..
     return fields
 
 
-def _build(of: type[SomeValue], tensors: dict[str, Tensor], prefix: str, rest: dict[str, Any]) -> SomeValue:
-    """Return a value of class `of` built from tensors by dotted name; a missing tensor becomes None."""
-    values = {name: tensors.get(prefix + name) for name in _tensor_fields(of) if "." not in name} | rest
+def _build(
+    of: type[SomeValue], tensors: dict[str, Tensor], prefix: str, rest: dict[str, Any]
+) -> SomeValue:
+    """Return a value of class `of` built from tensors by dotted name; a missing tensor becomes
+    None.
+    """
+    values = {
+        name: tensors.get(prefix + name) for name in _tensor_fields(of) if "." not in name
+    } | rest
     nested = {name: hint for name, hint in _hints(of).items() if _is_value(hint)}
-    return of(**values, **{name: _build(hint, tensors, f"{prefix}{name}.", {}) for name, hint in nested.items()})
+    return of(
+        **values,
+        **{name: _build(hint, tensors, f"{prefix}{name}.", {}) for name, hint in nested.items()},
+    )
 
 
 def _hints(of: type[Value]) -> dict[str, Any]:
@@ -195,7 +260,9 @@ def _is_value(hint: Any) -> bool:
 
 
 class Recent(Generic[Item]):
-    """A cache of the last few items that were read, each with a number; a copy in another process starts empty."""
+    """A cache of the last few items that were read, each with a number; a copy in another process
+    starts empty.
+    """
 
     def __init__(self, most: int) -> None:
         self.most = most

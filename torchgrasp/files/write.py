@@ -1,4 +1,6 @@
-"""Atomic writing of files (written under another name, then moved into place), and locks on folders and files."""
+"""Atomic writing of files (written under another name, then moved into place), and locks on folders
+and files.
+"""
 
 import contextlib
 import functools
@@ -19,16 +21,20 @@ from torchgrasp.foundation.errors import BadArgument, OutputError, Status
 from torchgrasp.foundation.lazy import jinja2
 
 Refuse = Callable[[str, str], BadArgument]  # makes an error of what was found and what is allowed
-ENDING = ".part"  # ending of the name under which a file is written; a dot and the name of the file come first
+# ending of the name under which a file is written; a dot and the name of the file come first
+ENDING = ".part"
 LOCK = ".lock"  # name of the lock file in a folder. It holds the process and host of the run.
 
 
 def write_file(path: Path | str, content: str | bytes | Callable[[IO[bytes]], object]) -> Path:
-    """Write text (as UTF-8), bytes, or what a function writes to a file object, atomically; return the path.
+    """Write text (as UTF-8), bytes, or what a function writes to a file object, atomically; return
+    the path.
 
-    A missing folder is created. `OutputError` is raised if the folder cannot be written, or the disk is full.
+    A missing folder is created. `OutputError` is raised if the folder cannot be written, or the
+    disk is full.
     """
-    path, data = Path(path), content.encode() if isinstance(content, str) else content
+    path = Path(path)
+    data = content.encode() if isinstance(content, str) else content
     if not isinstance(data, bytes):
         buffer = io.BytesIO()
         data(buffer)
@@ -49,7 +55,9 @@ def write_file(path: Path | str, content: str | bytes | Callable[[IO[bytes]], ob
                 os.unlink(part)
             raise
     except OSError as error:
-        raise OutputError("path", f"{path} ({error.strerror or error})", "a file in a writable folder") from error
+        raise OutputError(
+            "path", f"{path} ({error.strerror or error})", "a file in a writable folder"
+        ) from error
     return path
 
 
@@ -58,7 +66,9 @@ def remove_file(path: Path) -> None:
     try:
         path.unlink(missing_ok=True)
     except OSError as error:
-        raise OutputError("path", f"{path} ({error.strerror or error})", "a file that can be removed") from error
+        raise OutputError(
+            "path", f"{path} ({error.strerror or error})", "a file that can be removed"
+        ) from error
 
 
 class Malformed(ValueError):
@@ -66,7 +76,9 @@ class Malformed(ValueError):
 
 
 def explain(error: Exception) -> str:
-    """Return what is wrong with a file that a parser failed on; sentences of other libraries are left out."""
+    """Return what is wrong with a file that a parser failed on; sentences of other libraries are
+    left out.
+    """
     return str(error) if isinstance(error, Malformed) else "a content that is broken or cut off"
 
 
@@ -85,7 +97,9 @@ def read_bytes(path: Path | str) -> bytes:
 
 
 def read_bounded(path: Path | str, most: int, allowed: str, refuse: Refuse) -> bytes:
-    """Return the content of a regular file of at most `most` bytes; raise the error of `refuse` for other files."""
+    """Return the content of a regular file of at most `most` bytes; raise the error of `refuse` for
+    other files.
+    """
     check_file(path, most, allowed, refuse)
     try:
         data = read_bytes(path)
@@ -125,8 +139,12 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def render(template: Path, filters: Mapping[str, Callable[..., object]] | None = None, **values: Any) -> str:
-    """Return a text from a template of Jinja and values; texts that are put into HTML or XML are escaped."""
+def render(
+    template: Path, filters: Mapping[str, Callable[..., object]] | None = None, **values: Any
+) -> str:
+    """Return a text from a template of Jinja and values; texts that are put into HTML or XML are
+    escaped.
+    """
     engine = template_engine(template.parent)
     engine.filters |= filters or {}
     return engine.get_template(template.name).render(values)
@@ -135,14 +153,21 @@ def render(template: Path, filters: Mapping[str, Callable[..., object]] | None =
 @functools.cache
 def template_engine(folder: Path) -> "jinja2.Environment":
     """Return the template engine of a folder."""
-    loader, escape = jinja2.FileSystemLoader(folder), jinja2.select_autoescape(("html", "js", "css", "xml.jinja"))
+    loader = jinja2.FileSystemLoader(folder)
+    escape = jinja2.select_autoescape(("html", "js", "css", "xml.jinja"))
     return jinja2.Environment(
-        loader=loader, autoescape=escape, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
+        loader=loader,
+        autoescape=escape,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
     )
 
 
 def format_columns(rows: Sequence[Sequence[str]], left: Collection[int] = ()) -> str:
-    """Return rows of cells as aligned lines of text; columns are right-aligned except the indices in `left`."""
+    """Return rows of cells as aligned lines of text; columns are right-aligned except the indices
+    in `left`.
+    """
     longest = [max(map(len, column)) for column in zip(*rows, strict=True)]
     widths = [-width if k in left else width for k, width in enumerate(longest)]
     return "\n".join(format_line(row, widths) for row in rows)
@@ -156,7 +181,9 @@ def format_line(cells: Sequence[object], widths: Sequence[int]) -> str:
 
 @contextlib.contextmanager
 def hold_folder(folder: Path) -> Iterator[None]:
-    """Create and lock a folder within the context; remove half-written files. A folder in use raises `OutputError`."""
+    """Create and lock a folder within the context; remove half-written files. A folder in use
+    raises `OutputError`.
+    """
     with _hold("folder", folder, folder / LOCK):
         _remove_parts(folder.rglob(f".*{ENDING}"))
         yield
@@ -164,19 +191,29 @@ def hold_folder(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def hold_file(path: Path) -> Iterator[None]:
-    """Lock a file within the context by a lock file beside it; remove half-written copies of broken-off runs."""
+    """Lock a file within the context by a lock file beside it; remove half-written copies of
+    broken-off runs.
+    """
     with _hold("path", path, path.with_name(f".{path.name}{LOCK}")):
-        _remove_parts(x for x in path.parent.glob(f".*{ENDING}") if x.name.startswith(f".{path.name}."))
+        _remove_parts(
+            x for x in path.parent.glob(f".*{ENDING}") if x.name.startswith(f".{path.name}.")
+        )
         yield
 
 
 def begin_folder(path: Path, content: str, what: str) -> None:
-    """Write a file that describes its folder; raise `OutputError` if the folder holds other files or other content."""
+    """Write a file that describes its folder; raise `OutputError` if the folder holds other files
+    or other content.
+    """
     check_begun(path)
     if not path.exists():
         write_file(path, content)
     elif path.read_text("utf-8", errors="replace") != content:
-        raise OutputError("folder", f"{path.parent}, which holds other {what}", f"an empty folder, or the same {what}")
+        raise OutputError(
+            "folder",
+            f"{path.parent}, which holds other {what}",
+            f"an empty folder, or the same {what}",
+        )
 
 
 def check_begun(path: Path) -> None:
@@ -206,18 +243,24 @@ def _hold(argument: str, what: Path, path: Path) -> Iterator[None]:
         allowed = f"a {'folder' if argument == 'folder' else 'file'} that no other run writes"
         raise OutputError(argument, f"{what}, in use by {_holder(path)}", allowed) from error
     except OSError as error:
-        allowed = f"a {'folder' if argument == 'folder' else 'file in a folder'} that can be written"
+        allowed = (
+            f"a {'folder' if argument == 'folder' else 'file in a folder'} that can be written"
+        )
         raise OutputError(argument, f"{what} ({error.strerror or error})", allowed) from error
     try:
         with contextlib.suppress(OSError):  # on some systems nobody can write a locked file
             path.write_text(f"process {os.getpid()} on {socket.gethostname()}", encoding="utf-8")
         yield
     finally:
-        with contextlib.suppress(OSError):  # before the release: another run might lock the file before it is removed
+        with contextlib.suppress(
+            OSError
+        ):  # before the release: another run might lock the file before it is removed
             path.unlink(missing_ok=True)
         lock.release()
         with contextlib.suppress(OSError):
-            path.unlink(missing_ok=True) if os.name == "nt" else None  # Windows removes no locked file
+            path.unlink(
+                missing_ok=True
+            ) if os.name == "nt" else None  # Windows removes no locked file
             for empty in made:
                 empty.rmdir()
 
@@ -231,7 +274,9 @@ def _holder(path: Path) -> str:
 
 
 def _remove_parts(paths: Iterator[Path]) -> None:
-    """Remove half-written files of an interrupted run; the lock ensures that no run is writing them."""
+    """Remove half-written files of an interrupted run; the lock ensures that no run is writing
+    them.
+    """
     for part in list(paths):
         with contextlib.suppress(OSError):
             part.unlink()

@@ -1,1 +1,3 @@
-"""What every other folder builds on, without robotics: errors, checks of arguments, values, processes, limits."""
+"""What every other folder builds on, without robotics: errors, checks of arguments, values,
+processes, limits.
+"""

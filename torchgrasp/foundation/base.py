@@ -13,14 +13,18 @@ from torch import Tensor
 from torchgrasp.foundation.checks import Range, check_moved, read_number, show
 from torchgrasp.foundation.errors import BadArgument, FailedRows, Status
 
-FINGERTIPS = (3, 5)  # fewest and most fingertips on an object: two contacts do not resist a rotation about their line
+FINGERTIPS = (
+    3,
+    5,
+)  # fewest and most fingertips on an object: two contacts do not resist a rotation about their line
 Kept = TypeVar("Kept")
 SomeValue = TypeVar("SomeValue", bound="Value")
 SomeBatch = TypeVar("SomeBatch", bound="Batch")
 
 
 def map_tensors(function: Callable[..., Tensor], *values: SomeValue) -> SomeValue:
-    """Apply a function to the tensors that several values have in the same field; return a value of the results.
+    """Apply a function to the tensors that several values have in the same field; return a value of
+    the results.
 
     Values in fields are mapped, too. Fields without tensors are copied from the first value.
     """
@@ -38,13 +42,17 @@ def map_tensors(function: Callable[..., Tensor], *values: SomeValue) -> SomeValu
     fields = {name: merge(name, *(getattr(value, name) for value in values)) for name in names}
     if hasattr(kind, "__post_init__"):
         return kind(**fields)
-    new = object.__new__(kind)  # checked fields need no second check, and loops make thousands of values
+    new = object.__new__(
+        kind
+    )  # checked fields need no second check, and loops make thousands of values
     new.__dict__.update(fields)
     return new
 
 
 class kept(functools.cached_property[Kept]):
-    """A cached property of tensors. Inside a transform of torch.func it keeps none: they would mean nothing later."""
+    """A cached property of tensors. Inside a transform of torch.func it keeps none: they would mean
+    nothing later.
+    """
 
     def __get__(self, instance: Any, owner: Any = None) -> Any:
         """Return the value of the property."""
@@ -56,9 +64,11 @@ class kept(functools.cached_property[Kept]):
 
 
 class Value:
-    """Base class of all values: frozen dataclasses of tensors. `.to()` returns a copy on another device or dtype.
+    """Base class of all values: frozen dataclasses of tensors. `.to()` returns a copy on another
+    device or dtype.
 
-    Values are equal if all their numbers are, on one device; NaN equals NaN. Copies and pickled values keep no caches.
+    Values are equal if all their numbers are, on one device; NaN equals NaN. Copies and pickled
+    values keep no caches.
     """
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -68,7 +78,10 @@ class Value:
                 setattr(cls, name, vars(Value)[name])
 
     def __eq__(self, other: object) -> bool:
-        return _same(self._compared(), other._compared()) if type(self) is type(other) else NotImplemented  # pyright: ignore
+        if type(self) is not type(other):
+            return NotImplemented
+        assert isinstance(other, Value)
+        return _same(self._compared(), other._compared())
 
     def __hash__(self) -> int:
         return _digest(self._compared())
@@ -81,10 +94,14 @@ class Value:
         return tuple(getattr(self, f.name) for f in dataclasses.fields(self) if f.compare)  # pyright: ignore
 
     def __repr__(self) -> str:
-        """Return the fields in at most 12 lines: types and shapes of tensors, numbers of small tensors."""
+        """Return the fields in at most 12 lines: types and shapes of tensors, numbers of small
+        tensors.
+        """
         fields = [f for f in dataclasses.fields(self) if f.repr]  # pyright: ignore[reportArgumentType]
         parts = [*self._about(), *(f"{f.name}={_short(getattr(self, f.name))}" for f in fields)]
-        lines = textwrap.wrap(f"{type(self).__name__}({', '.join(parts)})", 110, subsequent_indent="    ")
+        lines = textwrap.wrap(
+            f"{type(self).__name__}({', '.join(parts)})", 110, subsequent_indent="    "
+        )
         return "\n".join(lines if len(lines) <= 12 else [*lines[:11], "    ...)"])
 
     def _about(self) -> list[str]:
@@ -92,9 +109,11 @@ class Value:
         return []
 
     def to(self: SomeValue, *args: Any, **kwargs: Any) -> SomeValue:
-        """Return the value on another device or in another floating dtype; integer tensors keep their dtype.
+        """Return the value on another device or in another floating dtype; integer tensors keep
+        their dtype.
 
-        Raises `BadArgument` if the device does not exist, or the dtype is neither float32 nor float64.
+        Raises `BadArgument` if the device does not exist, or the dtype is neither float32 nor
+        float64.
         """
         check_moved(*args, **kwargs)
 
@@ -120,11 +139,16 @@ def _same(one: Any, other: Any) -> bool:
 def _digest(value: Any) -> int:
     """Return a number that equal fields share, from a few numbers of each tensor."""
     if isinstance(value, Tensor):
-        flat, some = value.detach().reshape(-1), 8
+        flat = value.detach().reshape(-1)
+        some = 8
         return hash((value.shape, *flat[:: max(1, len(flat) // some)].nan_to_num().tolist()))
     if isinstance(value, dict):
         return hash(frozenset((key, _digest(x)) for key, x in value.items()))
-    return hash(tuple(map(_digest, value)) if isinstance(value, tuple | list) else not _is_nan(value) and value)
+    return hash(
+        tuple(map(_digest, value))
+        if isinstance(value, tuple | list)
+        else not _is_nan(value) and value
+    )
 
 
 def _is_nan(value: Any) -> bool:
@@ -132,14 +156,18 @@ def _is_nan(value: Any) -> bool:
 
 
 def _short(value: Any) -> str:
-    """Return a short text for one field's value: type and shape of a tensor, length of a long list, or the value."""
+    """Return a short text for one field's value: type and shape of a tensor, length of a long list,
+    or the value.
+    """
     if isinstance(value, Tensor):
         if value.numel() <= 4 and value.device.type == "cpu":
             return _digits(value.tolist())
         return f"{str(value.dtype).removeprefix('torch.')}{list(value.shape)}"
     if isinstance(value, dict | list | tuple) and len(value) > 4:
         return f"{type(value).__name__} of {len(value)}"
-    text = " ".join(repr(value).split()) if isinstance(value, Value) else repr(value)  # wrapped once, as a whole
+    text = (
+        " ".join(repr(value).split()) if isinstance(value, Value) else repr(value)
+    )  # wrapped once, as a whole
     return text if len(text) <= 110 or isinstance(value, Value) else f"{text[:107]}..."
 
 
@@ -151,18 +179,23 @@ def _digits(value: Any) -> str:
 
 
 class Batch(Value):
-    """A value whose tensors share their first axis, the rows. An index selects rows; `len` is their number."""
+    """A value whose tensors share their first axis, the rows. An index selects rows; `len` is their
+    number.
+    """
 
     def __len__(self) -> int:
         return len(getattr(self, dataclasses.fields(self)[0].name))  # pyright: ignore[reportArgumentType]
 
     def __getitem__(self: SomeBatch, rows: Any) -> SomeBatch:
-        """Return a batch of the rows that a slice, a mask or indices select. A single index gives a batch of one row.
+        """Return a batch of the rows that a slice, a mask or indices select. A single index gives a
+        batch of one row.
 
-        Raises `BadArgument` for an index of another kind, such as a single boolean, and `IndexError` beyond the last
-        row.
+        Raises `BadArgument` for an index of another kind, such as a single boolean, and
+        `IndexError` beyond the last row.
         """
-        chosen = read_rows(rows, len(self))  # once for all tensors: on a GPU the host waits for the number of rows
+        chosen = read_rows(
+            rows, len(self)
+        )  # once for all tensors: on a GPU the host waits for the number of rows
         return map_tensors(lambda x: x[chosen], self)
 
     def __iter__(self: SomeBatch) -> Iterator[SomeBatch]:
@@ -170,17 +203,25 @@ class Batch(Value):
         return (self[i] for i in range(len(self)))
 
     def raise_for_status(self: SomeBatch) -> SomeBatch:
-        """Return this batch if the status of every row is `Status.OK`; else raise `FailedRows` with the counts."""
+        """Return this batch if the status of every row is `Status.OK`; else raise `FailedRows` with
+        the counts.
+        """
         counts = count_status(getattr(self, "status"))  # noqa: B009
         failed = {s: k for s, k in counts.items() if s is not Status.OK}
         if failed:
-            raise FailedRows("; ".join(f"{k} of {len(self)} rows: {s.sentence}" for s, k in failed.items()))
+            raise FailedRows(
+                "; ".join(f"{k} of {len(self)} rows: {s.sentence}" for s, k in failed.items())
+            )
         return self
 
 
 def read_rows(rows: Any, count: int) -> slice | Tensor:
-    """Convert any index of a batch of `count` rows to a slice or a tensor; raise the errors of `Batch.__getitem__`."""
-    refused = BadArgument("rows", show(rows), "an index, a slice, a mask of all rows or a tensor of indices")
+    """Convert any index of a batch of `count` rows to a slice or a tensor; raise the errors of
+    `Batch.__getitem__`.
+    """
+    refused = BadArgument(
+        "rows", show(rows), "an index, a slice, a mask of all rows or a tensor of indices"
+    )
     if isinstance(rows, slice):
         return rows
     try:
@@ -209,17 +250,24 @@ def join(parts: Sequence[SomeBatch]) -> SomeBatch:
 
 
 def pick(choose: Bool[Tensor, "b"], new: SomeBatch, old: SomeBatch) -> SomeBatch:
-    """Return a batch that takes each row from `new` where `choose` is True, and from `old` where it is False."""
-    return map_tensors(lambda a, b: torch.where(choose.view(-1, *[1] * (a.ndim - 1)), a, b), new, old)
+    """Return a batch that takes each row from `new` where `choose` is True, and from `old` where it
+    is False.
+    """
+    return map_tensors(
+        lambda a, b: torch.where(choose.view(-1, *[1] * (a.ndim - 1)), a, b), new, old
+    )
 
 
 def put(whole: SomeBatch, at: Int[Tensor, "a"], part: SomeBatch) -> SomeBatch:
-    """Return the batch `whole` after its rows at the indices `at` are replaced by the rows of `part`."""
+    """Return the batch `whole` after its rows at the indices `at` are replaced by the rows of
+    `part`.
+    """
     return map_tensors(lambda rows, new: rows.index_copy(0, at, new), whole, part)
 
 
 def spread(value: float | Tensor, like: Tensor, own: int = 0) -> float | Tensor:
-    """Return a number, or one value for each row, with axes added so that it applies to all of `like` of its row.
+    """Return a number, or one value for each row, with axes added so that it applies to all of
+    `like` of its row.
 
     A value of each row has `own` axes itself.
     """
@@ -229,19 +277,29 @@ def spread(value: float | Tensor, like: Tensor, own: int = 0) -> float | Tensor:
 
 
 def at_once(x: Tensor, size: int) -> int:
-    """Return how many rows of `x` to work on at once: `size` on a CPU, whose cache then holds all temporaries."""
-    return size if x.device.type == "cpu" else 256 * size  # fewer leave an accelerator idle, more fill its memory
+    """Return how many rows of `x` to work on at once: `size` on a CPU, whose cache then holds all
+    temporaries.
+    """
+    return (
+        size if x.device.type == "cpu" else 256 * size
+    )  # fewer leave an accelerator idle, more fill its memory
 
 
-def in_chunks(evaluate: Callable[[Tensor], tuple[Any, ...]], x: Tensor, size: int) -> tuple[Any, ...]:
-    """Evaluate a function on chunks of `size` rows of x, which bounds the memory; return the joined outputs."""
+def in_chunks(
+    evaluate: Callable[[Tensor], tuple[Any, ...]], x: Tensor, size: int
+) -> tuple[Any, ...]:
+    """Evaluate a function on chunks of `size` rows of x, which bounds the memory; return the joined
+    outputs.
+    """
     if len(x) <= size:
         return evaluate(x)
     return tuple(map(torch.cat, zip(*map(evaluate, x.split(size)), strict=True)))
 
 
 def lexical_order(*keys: Tensor) -> Int[Tensor, "g"]:
-    """Return the indices that sort rows ascending by the first key; ties are sorted by the next key."""
+    """Return the indices that sort rows ascending by the first key; ties are sorted by the next
+    key.
+    """
     order = torch.argsort(keys[-1], stable=True)
     for key in reversed(keys[:-1]):
         order = order[torch.argsort(key[order], stable=True)]
@@ -249,16 +307,22 @@ def lexical_order(*keys: Tensor) -> Int[Tensor, "g"]:
 
 
 def rank_in_group(group: Int[Tensor, "g"], *keys: Tensor) -> Int[Tensor, "g"]:
-    """Return the rank (from 0) of each row in its group, sorted ascending by the first key, ties by the next key."""
+    """Return the rank (from 0) of each row in its group, sorted ascending by the first key, ties by
+    the next key.
+    """
     order = lexical_order(group, *keys)
     grouped = group[order].contiguous()
     rank = torch.empty_like(order)
-    rank[order] = torch.arange(len(order), device=order.device) - torch.searchsorted(grouped, grouped)
+    rank[order] = torch.arange(len(order), device=order.device) - torch.searchsorted(
+        grouped, grouped
+    )
     return rank
 
 
 def named_tensors(value: Value, prefix: str = "") -> dict[str, Tensor]:
-    """Return all tensors of a value and of the values in its fields by dotted name, such as `contacts.points`."""
+    """Return all tensors of a value and of the values in its fields by dotted name, such as
+    `contacts.points`.
+    """
     tensors: dict[str, Tensor] = {}
     for field in dataclasses.fields(value):  # pyright: ignore[reportArgumentType]
         inner = getattr(value, field.name)
@@ -270,18 +334,30 @@ def named_tensors(value: Value, prefix: str = "") -> dict[str, Tensor]:
 
 
 def settle(value: SomeValue, device: torch.device) -> SomeValue:
-    """Return a value moved to a device; a value that is already there is returned itself, with its caches."""
-    return value if all(x.device == device for x in named_tensors(value).values()) else value.to(device)
+    """Return a value moved to a device; a value that is already there is returned itself, with its
+    caches.
+    """
+    return (
+        value
+        if all(x.device == device for x in named_tensors(value).values())
+        else value.to(device)
+    )
 
 
 def check_device(name: str, found: torch.device, beside: str, wanted: torch.device) -> None:
-    """Raise `BadArgument` unless the device `found` of argument `name` is the one `wanted` by argument `beside`."""
+    """Raise `BadArgument` unless the device `found` of argument `name` is the one `wanted` by
+    argument `beside`.
+    """
     if found != wanted:
-        raise BadArgument(name, f"tensors on {found}", f"tensors on {wanted}, as {beside}: `.to` moves them")
+        raise BadArgument(
+            name, f"tensors on {found}", f"tensors on {wanted}, as {beside}: `.to` moves them"
+        )
 
 
 def count_status(status: Int[Tensor, "*b"]) -> dict[Status, int]:
-    """Return the number of rows with each status, as a dict that begins with the most frequent status."""
+    """Return the number of rows with each status, as a dict that begins with the most frequent
+    status.
+    """
     codes, counts = torch.unique(status, return_counts=True)
     pairs = sorted(zip(codes.tolist(), counts.tolist(), strict=True), key=lambda p: (-p[1], p[0]))
     return {Status(code): count for code, count in pairs}

@@ -1,7 +1,9 @@
-"""Argument validation: public functions and values check their arguments by annotations, with jaxtyping and beartype.
+"""Argument validation: public functions and values check their arguments by annotations, with
+jaxtyping and beartype.
 
-`checked` decorates a public function or the class of a value. A call from outside the library is compared with the
-signature: type, shape, dtype, finite numbers, range. Calls that the library makes itself are not checked again.
+`checked` decorates a public function or the class of a value. A call from outside the library is
+compared with the signature: type, shape, dtype, finite numbers, range. Calls that the library makes
+itself are not checked again.
 """
 
 import collections.abc
@@ -27,11 +29,37 @@ from typing_extensions import Unpack
 from torchgrasp.foundation.errors import BadArgument
 
 # isort: off
-from torchgrasp.foundation.rules import (  # noqa: F401
-    ANY, DTYPES, FINITE, LEAST, MOST, NUMBERS, RIGID, Count, Force, Fraction, Length, Measured, Pose, Poses, Positive,
-    Range, Rows, Seed, Taken, check_dense, check_moved, check_path, describe, fits, is_known, is_rigid, is_tensor,
-    is_tracked, show,
-)  # fmt: skip
+from torchgrasp.foundation.rules import (
+    ANY,
+    DTYPES,
+    FINITE,
+    LEAST,  # noqa: F401
+    MOST,
+    NUMBERS,
+    RIGID,
+    Count,  # noqa: F401
+    Force,  # noqa: F401
+    Fraction,  # noqa: F401
+    Length,  # noqa: F401
+    Measured,  # noqa: F401
+    Pose,  # noqa: F401
+    Poses,  # noqa: F401
+    Positive,  # noqa: F401
+    Range,
+    Rows,
+    Seed,  # noqa: F401
+    Taken,
+    check_dense,
+    check_moved,  # noqa: F401
+    check_path,
+    describe,
+    fits,
+    is_known,
+    is_rigid,
+    is_tensor,
+    is_tracked,  # noqa: F401
+    show,
+)
 # isort: on
 
 Checked = TypeVar("Checked", bound=Callable[..., Any])
@@ -40,7 +68,9 @@ _thread = threading.local()  # `inside` is True while this thread is in a checke
 
 @dataclasses.dataclass
 class _Call:
-    """The state while the arguments of one call are checked: options, axis sizes found so far, tensors to test."""
+    """The state while the arguments of one call are checked: options, axis sizes found so far,
+    tensors to test.
+    """
 
     gradients: bool
     deep: bool = True
@@ -50,8 +80,13 @@ class _Call:
     rigid: dict[str, Tensor] = dataclasses.field(default_factory=dict[str, Tensor])
 
     def check_numbers(self) -> None:
-        """Raise `BadArgument` if a tensor to test has NaN or infinity, or a transform to test is not rigid."""
-        for tensors, test, allowed in ((self.finite, torch.isfinite, "finite numbers"), (self.rigid, is_rigid, RIGID)):
+        """Raise `BadArgument` if a tensor to test has NaN or infinity, or a transform to test is
+        not rigid.
+        """
+        for tensors, test, allowed in (
+            (self.finite, torch.isfinite, "finite numbers"),
+            (self.rigid, is_rigid, RIGID),
+        ):
             for name, x in tensors.items():
                 if is_known(x) and not bool((good := test(x)).all()):
                     first = tuple(torch.nonzero(~good)[0].tolist())
@@ -64,13 +99,15 @@ def checked(thing: Checked) -> Checked: ...
 @overload
 def checked(*, gradients: bool) -> Callable[[Checked], Checked]: ...
 def checked(thing: Any = None, *, gradients: bool = False) -> Any:
-    """Check the arguments of a function, or the fields of a dataclass when it is made, against their annotations.
+    """Check the arguments of a function, or the fields of a dataclass when it is made, against
+    their annotations.
 
-    NumPy numbers become Python numbers. If an argument is a value, its fields are checked again. In a method, a letter
-    in a shape has the same size as in the fields of the object. A value without `__post_init__` that the library makes
-    from tensors is not checked. With `gradients` True, the function is differentiable: it takes tensors that require a
-    gradient, dual tensors and tensors inside a transform of torch.func, which other functions refuse. Numbers inside
-    torch.vmap and arguments inside torch.compile are not checked. A wrong argument raises `BadArgument`.
+    NumPy numbers become Python numbers. If an argument is a value, its fields are checked again. In
+    a method, a letter in a shape has the same size as in the fields of the object. A value without
+    `__post_init__` that the library makes from tensors is not checked. With `gradients` True, the
+    function is differentiable: it takes tensors that require a gradient, dual tensors and tensors
+    inside a transform of torch.func, which other functions refuse. Numbers inside torch.vmap and
+    arguments inside torch.compile are not checked. A wrong argument raises `BadArgument`.
     """
     if thing is None:
         return functools.partial(checked, gradients=gradients)
@@ -82,22 +119,34 @@ def checked(thing: Any = None, *, gradients: bool = False) -> Any:
 
 
 def _guard(function: Any, owner: Any, gradients: bool, always: Callable[[], bool]) -> Any:
-    """Return `function` with a check of its arguments; `always()` tells whether to check calls by the library, too."""
+    """Return `function` with a check of its arguments; `always()` tells whether to check calls by
+    the library, too.
+    """
     signature = inspect.signature(function)
     is_method = next(iter(signature.parameters), "") == "self" and not isinstance(owner, type)
-    several = {p.name: p.kind for p in signature.parameters.values() if p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD)}
+    several = {
+        p.name: p.kind
+        for p in signature.parameters.values()
+        if p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD)
+    }
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
-        compiling = gradients and torch.compiler.is_compiling()  # a compiler traces the function, not the checks
+        compiling = (
+            gradients and torch.compiler.is_compiling()
+        )  # a compiler traces the function, not the checks
         if compiling or ((inside := getattr(_thread, "inside", False)) and not always()):
             return function(*args, **kwargs)
-        bound, shared, hints = signature.bind(*args, **kwargs), _Call(gradients, deep=not inside), _hints(owner)
+        bound = signature.bind(*args, **kwargs)
+        shared = _Call(gradients, deep=not inside)
+        hints = _hints(owner)
         if is_method:
             shared.sizes.update(_lengths(bound.arguments["self"]))
         for name, value in bound.arguments.items():
             if several.get(name) == inspect.Parameter.VAR_KEYWORD and name in hints:
-                bound.arguments[name] = {k: _read(k, x, _option(hints[name], k), shared) for k, x in value.items()}
+                bound.arguments[name] = {
+                    k: _read(k, x, _option(hints[name], k), shared) for k, x in value.items()
+                }
             elif name in hints:
                 hint = tuple[hints[name], ...] if name in several else hints[name]
                 bound.arguments[name] = _read(name, value, hint, shared)
@@ -117,7 +166,8 @@ def _each(items: Generator[Any, Any, Any]) -> Iterator[Any]:
     """Yield the items of a generator, whose own calls of the library are not checked."""
     with contextlib.closing(items):
         while True:
-            inside, _thread.inside = getattr(_thread, "inside", False), True
+            inside = getattr(_thread, "inside", False)
+            _thread.inside = True
             try:
                 item = next(items)
             except StopIteration:
@@ -128,8 +178,11 @@ def _each(items: Generator[Any, Any, Any]) -> Iterator[Any]:
 
 
 def _read(name: str, value: Any, hint: Any, call: _Call) -> Any:
-    """Return an argument if it satisfies its annotation, a number as a Python number; else raise `BadArgument`."""
-    origin, inside = typing.get_origin(hint), typing.get_args(hint)
+    """Return an argument if it satisfies its annotation, a number as a Python number; else raise
+    `BadArgument`.
+    """
+    origin = typing.get_origin(hint)
+    inside = typing.get_args(hint)
     if origin is Annotated:
         return _read_marked(name, value, inside[0], inside[1], call)
     if origin in (typing.Union, types.UnionType):
@@ -156,7 +209,9 @@ def _read(name: str, value: Any, hint: Any, call: _Call) -> Any:
 
 
 def _refuse_gradients(name: str, value: Any) -> None:
-    """Raise `BadArgument` if derivatives are taken by a tensor of a value whose fields are not checked."""
+    """Raise `BadArgument` if derivatives are taken by a tensor of a value whose fields are not
+    checked.
+    """
     for field, x in vars(value).items():
         if isinstance(x, Tensor):
             check_dense(f"{name}.{field}", x, gradients=False)
@@ -165,21 +220,29 @@ def _refuse_gradients(name: str, value: Any) -> None:
 
 
 def read_number(name: str, value: Any, kind: Any, allowed: Range | None) -> Any:
-    """Return a value as int, float or bool; raise `BadArgument` if it is of another kind or outside the range."""
+    """Return a value as int, float or bool; raise `BadArgument` if it is of another kind or outside
+    the range.
+    """
     number: Any = value
     if kind is bool:
         good = isinstance(value, bool | np.bool_)
     else:
         good = isinstance(value, Integral if kind is int else Real) and not isinstance(value, bool)
     if good and allowed is not None:  # huge whole numbers are compared as they are
-        good = allowed.low <= number <= allowed.high and (abs(number) <= MOST or isinstance(value, float))
+        good = allowed.low <= number <= allowed.high and (
+            abs(number) <= MOST or isinstance(value, float)
+        )
     if not good:
-        raise BadArgument(name, show(value), describe(Annotated[kind, allowed] if allowed else kind))
+        raise BadArgument(
+            name, show(value), describe(Annotated[kind, allowed] if allowed else kind)
+        )
     return kind(number)
 
 
 def _read_marked(name: str, value: Any, hint: Any, mark: Any, call: _Call) -> Any:
-    """Return an argument if it satisfies the rule in its annotation, such as a range; else raise `BadArgument`."""
+    """Return an argument if it satisfies the rule in its annotation, such as a range; else raise
+    `BadArgument`.
+    """
     if isinstance(mark, Range):
         return read_number(name, value, hint, mark)
     if isinstance(mark, Taken):
@@ -188,16 +251,22 @@ def _read_marked(name: str, value: Any, hint: Any, mark: Any, call: _Call) -> An
         return value
     if mark == ANY and not call.strict:
         call = dataclasses.replace(call, finite={})
-    result = _read(name, value, hint, dataclasses.replace(call, strict=True) if mark == FINITE else call)
+    result = _read(
+        name, value, hint, dataclasses.replace(call, strict=True) if mark == FINITE else call
+    )
     if mark == RIGID:
         call.rigid[name] = result
-    if isinstance(mark, Rows) and (wanted := call.sizes.setdefault(mark.letter, len(result))) != len(result):
+    if isinstance(mark, Rows) and (
+        wanted := call.sizes.setdefault(mark.letter, len(result))
+    ) != len(result):
         raise BadArgument(name, f"{len(result)} rows", f"{wanted} rows, as many as the others have")
     return result
 
 
 def _read_union(name: str, value: Any, hint: Any, options: tuple[Any, ...], call: _Call) -> Any:
-    """Return an argument if it satisfies one type of a union; otherwise raise the error of the closest type."""
+    """Return an argument if it satisfies one type of a union; otherwise raise the error of the
+    closest type.
+    """
     errors: list[BadArgument] = []
     for option in (x for x in options if x is not int or float not in options):
         try:
@@ -212,18 +281,30 @@ def _read_union(name: str, value: Any, hint: Any, options: tuple[Any, ...], call
     shapes = [x for x in near if str(x.found).startswith("shape")]
     if near and len(near) == len(shapes):
         raise BadArgument(near[0].argument, near[0].found, " or ".join(x.allowed for x in near))
-    raise next(x for x in near if x not in shapes) if near else BadArgument(name, show(value), describe(hint))
+    raise (
+        next(x for x in near if x not in shapes)
+        if near
+        else BadArgument(name, show(value), describe(hint))
+    )
 
 
 def _read_tensor(name: str, value: Any, hint: Any, call: _Call) -> Tensor:
-    """Return a tensor if it has the annotated shape and dtype; record the sizes of the axes that are letters."""
-    axes, sizes, kind = hint.dim_str.split(), dict(call.sizes), hint.dtype.__name__
+    """Return a tensor if it has the annotated shape and dtype; record the sizes of the axes that
+    are letters.
+    """
+    axes = hint.dim_str.split()
+    sizes = dict(call.sizes)
+    kind = hint.dtype.__name__
     if not isinstance(value, Tensor):
         raise BadArgument(name, show(value), f"a torch {describe(hint)[2:]}")
     check_dense(name, value, gradients=True)
     if not fits(axes, tuple(value.shape), sizes):
-        known = [f"{axis} = {call.sizes[axis]}" for axis in dict.fromkeys(axes) if axis in call.sizes]
-        allowed = ", ".join([describe(hint).removeprefix("a tensor of ") if axes else "shape ()", *known])
+        known = [
+            f"{axis} = {call.sizes[axis]}" for axis in dict.fromkeys(axes) if axis in call.sizes
+        ]
+        allowed = ", ".join(
+            [describe(hint).removeprefix("a tensor of ") if axes else "shape ()", *known]
+        )
         raise BadArgument(name, f"shape {tuple(value.shape)}", allowed)
     if value.dtype not in (dtypes := DTYPES.get(kind) or sum(DTYPES.values(), ())):
         raise BadArgument(name, str(value.dtype), " or ".join(map(str, dtypes)))
@@ -234,14 +315,25 @@ def _read_tensor(name: str, value: Any, hint: Any, call: _Call) -> Tensor:
     return value
 
 
-def _read_container(name: str, value: Any, origin: type, inside: tuple[Any, ...], call: _Call) -> Any:
-    """Return a tuple, sequence or mapping after a check of its items; items of an iterator are checked when drawn."""
+def _read_container(
+    name: str, value: Any, origin: type, inside: tuple[Any, ...], call: _Call
+) -> Any:
+    """Return a tuple, sequence or mapping after a check of its items; items of an iterator are
+    checked when drawn.
+    """
     fixed = origin is tuple and inside[-1:] != (...,)
     wrong = not isinstance(value, origin) or isinstance(value, str | bytes | Tensor | np.ndarray)
     if wrong or (fixed and len(value) != len(inside)):
-        raise BadArgument(name, show(value), f"a tuple of {len(inside)}" if fixed else f"a {origin.__name__.lower()}")
+        raise BadArgument(
+            name,
+            show(value),
+            f"a tuple of {len(inside)}" if fixed else f"a {origin.__name__.lower()}",
+        )
     if isinstance(value, collections.abc.Mapping):
-        items = {_read(name, k, inside[0], call): _read(f"{name}[{k!r}]", x, inside[1], call) for k, x in value.items()}
+        items = {
+            _read(name, k, inside[0], call): _read(f"{name}[{k!r}]", x, inside[1], call)
+            for k, x in value.items()
+        }
         return items if type(value) is dict else value
     if not inside or not isinstance(value, collections.abc.Iterable):
         return value
@@ -249,7 +341,11 @@ def _read_container(name: str, value: Any, origin: type, inside: tuple[Any, ...]
     if not isinstance(value, collections.abc.Sized):
         return parts
     read = list(parts)
-    return (read if isinstance(value, list) else tuple(read)) if isinstance(value, collections.abc.Sequence) else value
+    return (
+        (read if isinstance(value, list) else tuple(read))
+        if isinstance(value, collections.abc.Sequence)
+        else value
+    )
 
 
 def _has_tensor(hint: Any) -> bool:
@@ -259,7 +355,9 @@ def _has_tensor(hint: Any) -> bool:
 
 @functools.cache
 def _always(kind: type) -> bool:
-    """Return whether a class of values is checked even if the library makes the value, as its numbers may be bad."""
+    """Return whether a class of values is checked even if the library makes the value, as its
+    numbers may be bad.
+    """
     return hasattr(kind, "__post_init__") or not any(map(_has_tensor, _fields(kind).values()))
 
 
@@ -271,10 +369,22 @@ def _fields(kind: type) -> dict[str, Any]:
 
 
 def _lengths(value: Any) -> dict[str, int]:
-    """Return the size of each letter in the annotated shapes of a value's tensors, such as {"n": 100}."""
-    tensors = {field: hint.dim_str.split() for field, hint in _fields(type(value)).items() if is_tensor(hint)}
-    simple = {field: axes for field, axes in tensors.items() if not any(axis[0] in "*.#" for axis in axes)}
-    pairs = (pair for field, axes in simple.items() for pair in zip(axes, getattr(value, field).shape, strict=False))
+    """Return the size of each letter in the annotated shapes of a value's tensors, such as {"n":
+    100}.
+    """
+    tensors = {
+        field: hint.dim_str.split()
+        for field, hint in _fields(type(value)).items()
+        if is_tensor(hint)
+    }
+    simple = {
+        field: axes for field, axes in tensors.items() if not any(axis[0] in "*.#" for axis in axes)
+    }
+    pairs = (
+        pair
+        for field, axes in simple.items()
+        for pair in zip(axes, getattr(value, field).shape, strict=False)
+    )
     return {axis: n for axis, n in pairs if axis.isalpha()}
 
 
@@ -285,16 +395,24 @@ def _hints(thing: Any) -> dict[str, Any]:
 
 
 def _option(hint: Any, key: str) -> Any:
-    """Return the type annotation of the keyword argument `key` of `**options`; raise `TypeError` if there is none."""
+    """Return the type annotation of the keyword argument `key` of `**options`; raise `TypeError` if
+    there is none.
+    """
     options = _hints(typing.get_args(hint)[0]) if typing.get_origin(hint) is Unpack else {key: hint}
     if key not in options:
-        raise TypeError(f"got an unexpected keyword argument {key!r}: expected one of {', '.join(options)}")
+        raise TypeError(
+            f"got an unexpected keyword argument {key!r}: expected one of {', '.join(options)}"
+        )
     return options[key]
 
 
 def check_tensor(name: str, value: Any, shape: tuple[int | None, ...]) -> Tensor:
-    """Return a finite floating-point tensor of a shape, in which None allows any size, or raise `BadArgument`."""
+    """Return a finite floating-point tensor of a shape, in which None allows any size, or raise
+    `BadArgument`.
+    """
     call = _Call(gradients=True)
-    _read_tensor(name, value, Float[Tensor, " ".join("_" if s is None else str(s) for s in shape)], call)
+    _read_tensor(
+        name, value, Float[Tensor, " ".join("_" if s is None else str(s) for s in shape)], call
+    )
     call.check_numbers()
     return value

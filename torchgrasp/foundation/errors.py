@@ -1,7 +1,7 @@
 """The errors of torchgrasp, and the status of each row of a batch.
 
-A bad argument raises a subclass of `GraspError` at the public function, before any work. A failed row of a batch does
-not raise: it has a `Status`, which explains the failure in a sentence.
+A bad argument raises a subclass of `GraspError` at the public function, before any work. A failed
+row of a batch does not raise: it has a `Status`, which explains the failure in a sentence.
 """
 
 import copyreg
@@ -28,13 +28,19 @@ class GraspError(Exception):
 
 
 class BadArgument(GraspError, ValueError):
-    """An argument has a wrong shape, type or range; the message says what was found and what is allowed."""
+    """An argument has a wrong shape, type or range; the message says what was found and what is
+    allowed.
+    """
 
     def __init__(self, argument: str, found: object, allowed: str):
         parts = (argument, str(found), allowed)
-        named, shown, wanted = (x if len(x) <= MESSAGE_LETTERS else f"{x[:MESSAGE_LETTERS]}..." for x in parts)
+        named, shown, wanted = (
+            x if len(x) <= MESSAGE_LETTERS else f"{x[:MESSAGE_LETTERS]}..." for x in parts
+        )
         super().__init__(f"{named}: expected {wanted}, got {shown}")
-        self.argument, self.found, self.allowed = argument, found, allowed
+        self.argument = argument
+        self.found = found
+        self.allowed = allowed
 
 
 class TooFewPoints(BadArgument):
@@ -50,7 +56,9 @@ class NoSupport(BadArgument):
 
 
 class CloudFileError(BadArgument):
-    """A point-cloud file is missing or empty, or its content is not of the format that its suffix names."""
+    """A point-cloud file is missing or empty, or its content is not of the format that its suffix
+    names.
+    """
 
 
 class MeshError(BadArgument):
@@ -62,7 +70,9 @@ class HandFileError(BadArgument):
 
 
 class ModelFileError(BadArgument):
-    """A safetensors file is missing or truncated, or does not hold the tensors expected of its kind."""
+    """A safetensors file is missing or truncated, or does not hold the tensors expected of its
+    kind.
+    """
 
 
 class DatasetError(BadArgument):
@@ -74,11 +84,14 @@ class OutputError(BadArgument):
 
 
 class MissingExtra(GraspError, ImportError):
-    """A package that an optional feature needs is not installed; the message names the extra to install."""
+    """A package that an optional feature needs is not installed; the message names the extra to
+    install.
+    """
 
     def __init__(self, package: str, extra: str):
         super().__init__(f"{package} is not installed: pip install 'torchgrasp[{extra}]'")
-        self.package, self.extra = package, extra
+        self.package = package
+        self.extra = extra
 
 
 class NoWorkers(GraspError, RuntimeError):
@@ -86,14 +99,18 @@ class NoWorkers(GraspError, RuntimeError):
 
     def __init__(self) -> None:
         fix = 'workers=0, or in a script `if __name__ == "__main__":` around the call'
-        super().__init__(f"no worker process can start; the standard error says why. What may help: {fix}")
+        super().__init__(
+            f"no worker process can start; the standard error says why. What may help: {fix}"
+        )
 
 
 class IndefiniteCovariance(GraspError, ValueError):
     """A covariance matrix is not positive definite. The library never adds jitter."""
 
     def __init__(self, what: str, smallest_eigenvalue: float, fix: str):
-        super().__init__(f"{what} is not positive definite (smallest eigenvalue {smallest_eigenvalue:.3g}): {fix}")
+        super().__init__(
+            f"{what} is not positive definite (smallest eigenvalue {smallest_eigenvalue:.3g}): {fix}"
+        )
         self.smallest_eigenvalue = smallest_eigenvalue
 
 
@@ -163,13 +180,19 @@ class Status(enum.IntEnum):
     OUT_OF_DOMAIN = 10, "a contact lies outside the ball in which the shape model holds"
     OFF_SURFACE = 11, "a contact is not on the estimated surface"
     TOO_UNCERTAIN = 12, "the shape at a contact is less certain than max_variance allows"
-    NOT_CLOSED = 13, "the contacts do not resist every wrench at the planned friction (no frictional form closure)"
+    NOT_CLOSED = (
+        13,
+        "the contacts do not resist every wrench at the planned friction (no frictional form closure)",
+    )
     TOO_CLOSE = 14, "two fingertips on their contacts would overlap"
     NOT_FLAT = 15, "the surface around a contact bends too sharply for a fingertip"
     BELOW_TABLE = 16, "a fingertip on its contact would be below the table"
     DEGENERATE = 17, "the contacts lie on a line or in a point: they span no virtual frame"
     OUTSIDE = 18, "a contact lies outside the region where contacts may be (`keep`, `avoid`)"
-    NOT_RESISTED = 19, "the fingers' forces on the contacts do not resist a wrench of the task (`resist`)"
+    NOT_RESISTED = (
+        19,
+        "the fingers' forces on the contacts do not resist a wrench of the task (`resist`)",
+    )
     # hand configuration
     OUT_OF_REACH = 20, "no posture of this hand spans the contacts"
     TIP_ERROR = 21, "a fingertip does not reach its contact"
@@ -180,18 +203,39 @@ class Status(enum.IntEnum):
     TABLE_COLLISION = 26, "a link of the hand would penetrate the table"
     PREGRASP = 27, "the hand cannot open at this pose without touching something"
     NO_APPROACH = 28, "the opened hand cannot come straight to this pose without touching something"
-    NEIGHBOUR_COLLISION = 29, "a link of the hand would touch a neighbour of the object, or space that may be full"
+    NEIGHBOUR_COLLISION = (
+        29,
+        "a link of the hand would touch a neighbour of the object, or space that may be full",
+    )
     UNREACHABLE = 30, "the arm cannot bring the hand to this pose (`reachable` refuses it)"
     BURIED = 31, "something lies on the object or leans over it"
-    NO_PROMISE = 39, "the predicted success is less than the promise needs: give a lower one, or add a second view"
+    NO_PROMISE = (
+        39,
+        "the predicted success is less than the promise needs: give a lower one, or add a second view",
+    )
     # the object in its picture, before it is planned
     FEW_PIXELS = 32, "too few pixels show the object: bring the camera nearer"
     OFF_TABLE = 33, "the object is not over the table: give the table that it stands on"
-    CUT_OFF = 34, "the border of the image cuts off a side that fingers need: turn the camera to the object"
-    NO_DEPTH = 35, "most of the object has no depth, as glass or a mirror: coat it matt, or look from another side"
-    TOO_LOW = 36, "the object is lower than fingertips on the table need: take a hand with smaller fingertips"
-    TOO_WIDE = 37, "the object is wider than the hand spans: take a larger hand, or choose the object to plan anyway"
-    TOO_VAGUE = 38, "the shape may be off by more than half the object: add a second view, or bring the camera nearer"
+    CUT_OFF = (
+        34,
+        "the border of the image cuts off a side that fingers need: turn the camera to the object",
+    )
+    NO_DEPTH = (
+        35,
+        "most of the object has no depth, as glass or a mirror: coat it matt, or look from another side",
+    )
+    TOO_LOW = (
+        36,
+        "the object is lower than fingertips on the table need: take a hand with smaller fingertips",
+    )
+    TOO_WIDE = (
+        37,
+        "the object is wider than the hand spans: take a larger hand, or choose the object to plan anyway",
+    )
+    TOO_VAGUE = (
+        38,
+        "the shape may be off by more than half the object: add a second view, or bring the camera nearer",
+    )
     # closing
     START_OVERLAP = 40, "the hand overlaps the object or the table before closing starts"
     NO_CONTACT = 41, "a fingertip never touched the object"
@@ -202,7 +246,10 @@ class Status(enum.IntEnum):
     MOVED = 46, "the object moved or turned too far in the hand when it was pulled"
     TOO_WEAK = 47, "the hand's drives were at their largest torque and the object was not held"
     SLIPPED = 48, "the object was lifted, but slipped or turned too far in the hand"
-    TOO_HEAVY = 49, "the object is heavier than the hand can hold at the friction it felt, and was put down"
+    TOO_HEAVY = (
+        49,
+        "the object is heavier than the hand can hold at the friction it felt, and was put down",
+    )
     # the run
     BAD_OBJECT = 60, "the files of the object are not what they should be"
     TIMED_OUT = 61, "it took longer than its limit and was ended"

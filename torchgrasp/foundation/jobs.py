@@ -33,15 +33,17 @@ def run_tasks(
     workers: Annotated[int, Range(0, 1024)] = 1,
     limit: Annotated[float, Range(0.001, math.inf)] = 60.0,
 ) -> Generator[Result | Status, None, None]:
-    """Run `function(*task)` for each task in worker processes; yield the results in the order of the tasks.
+    """Run `function(*task)` for each task in worker processes; yield the results in the order of
+    the tasks.
 
-    Each task runs on one thread of a separate process. A task that exceeds the limit gives `Status.TIMED_OUT`. A task
-    whose process dies twice gives `Status.WORKER_DIED`. The error of a task is raised in place of its result. All
-    workers end when the caller stops iterating. Raises `NoWorkers` if no process can start.
+    Each task runs on one thread of a separate process. A task that exceeds the limit gives
+    `Status.TIMED_OUT`. A task whose process dies twice gives `Status.WORKER_DIED`. The error of a
+    task is raised in place of its result. All workers end when the caller stops iterating. Raises
+    `NoWorkers` if no process can start.
 
-    Each worker imports the module of the function, but not the caller's script, unless the function is of the script.
-    Tasks must hold no tensors, because processes would share them: see `pack`. If `workers` is 0, the tasks run in this
-    process, without the `limit` [s] on the time of a task.
+    Each worker imports the module of the function, but not the caller's script, unless the function
+    is of the script. Tasks must hold no tensors, because processes would share them: see `pack`. If
+    `workers` is 0, the tasks run in this process, without the `limit` [s] on the time of a task.
     """
     return _in_order(_run(function, tasks, workers, limit))
 
@@ -49,7 +51,9 @@ def run_tasks(
 def run_as_they_end(
     function: Callable[..., Result], tasks: Iterable[Task], workers: int, limit: float
 ) -> Generator[tuple[int, Result | Status], None, None]:
-    """Run tasks like `run_tasks`, but yield the index and the result of each task as soon as it ends."""
+    """Run tasks like `run_tasks`, but yield the index and the result of each task as soon as it
+    ends.
+    """
     with contextlib.closing(_run(function, tasks, workers, limit)) as results:
         for number, ended in results:
             yield number, ended if isinstance(ended, Status) else ended.result()
@@ -72,7 +76,9 @@ def _in_order(
 def _run(
     function: Callable[..., Result], tasks: Iterable[Task], workers: int, limit: float
 ) -> Generator[tuple[int, Future[Result] | Status], None, None]:
-    """Run the tasks; yield the index and the result of each when it ends. A broken pool of processes is replaced."""
+    """Run the tasks; yield the index and the result of each when it ends. A broken pool of
+    processes is replaced.
+    """
     if not workers:
         for number, task in enumerate(tasks):
             future = Future[Result]()
@@ -83,8 +89,10 @@ def _run(
                     future.set_exception(error)
             yield number, future
         return
-    waiting, died = deque(enumerate(tasks)), set[int]()
-    broken, worked = 0, False
+    waiting = deque(enumerate(tasks))
+    died = set[int]()
+    broken = 0
+    worked = False
     while waiting:
         before = len(waiting)
         yield from _run_pool(function, waiting, died, workers, limit)
@@ -98,19 +106,29 @@ def _run(
 
 
 def _run_pool(
-    function: Callable[..., Result], waiting: deque[tuple[int, Task]], died: set[int], workers: int, limit: float
+    function: Callable[..., Result],
+    waiting: deque[tuple[int, Task]],
+    died: set[int],
+    workers: int,
+    limit: float,
 ) -> Generator[tuple[int, Future[Result] | Status], None, None]:
-    """Run `waiting` tasks in one pool until all end or the pool breaks; `died` are tasks whose process died once."""
+    """Run `waiting` tasks in one pool until all end or the pool breaks; `died` are tasks whose
+    process died once.
+    """
     try:
         from pebble import ProcessExpired, ProcessPool
     except ImportError as error:
         raise MissingExtra("pebble", "sim") from error
     # The initializer imports the module of the function before the time of the first task begins.
-    own = b"__main__" in bytes(reduction.ForkingPickler.dumps(function))  # only the script has the function
+    own = b"__main__" in bytes(
+        reduction.ForkingPickler.dumps(function)
+    )  # only the script has the function
     pool = ProcessPool(
-        min(workers, len(waiting)), initializer=_begin, initargs=[function],
+        min(workers, len(waiting)),
+        initializer=_begin,
+        initargs=[function],
         context=multiprocessing.get_context("spawn") if own else _Apart(),
-    )  # fmt: skip
+    )
     ended = queue.SimpleQueue[int]()
     running: dict[int, tuple[Task, Future[Result]]] = {}
     try:
@@ -134,27 +152,37 @@ def _run_pool(
                 return
             task, future = running.pop(number)
             if isinstance(error, ProcessExpired) and number not in died:
-                died.add(number)  # a machine short of memory may kill any process: try once more, first
+                died.add(
+                    number
+                )  # a machine short of memory may kill any process: try once more, first
                 waiting.appendleft((number, task))
             elif isinstance(error, ProcessExpired):
                 yield number, Status.WORKER_DIED
             else:
                 yield number, Status.TIMED_OUT if isinstance(error, TimeoutError) else future
     finally:
-        waiting.extendleft((number, task) for number, (task, _) in sorted(running.items(), reverse=True))
+        waiting.extendleft(
+            (number, task) for number, (task, _) in sorted(running.items(), reverse=True)
+        )
         pool.stop()
-        with contextlib.suppress(TimeoutError):  # a signal can leave pebble's threads waiting for each other
+        with contextlib.suppress(
+            TimeoutError
+        ):  # a signal can leave pebble's threads waiting for each other
             pool.join(10.0)
 
 
 class _Process(SpawnProcess):
-    """A process that does not run the caller's script, which would begin the work anew where it has no guard."""
+    """A process that does not run the caller's script, which would begin the work anew where it has
+    no guard.
+    """
 
     def start(self) -> None:
         """Start the process without the name of the script."""
         with _starting:
             known = spawn.get_preparation_data
-            spawn.get_preparation_data = lambda name: {k: x for k, x in known(name).items() if k[:9] != "init_main"}
+            spawn.get_preparation_data = lambda name: {
+                k: x for k, x in known(name).items() if k[:9] != "init_main"
+            }
             try:
                 super().start()
             finally:
@@ -181,14 +209,17 @@ def _begin(function: Callable[..., Any]) -> None:
 
 
 class _Packed(NamedTuple):
-    """A tensor as array with the name of its device, or the attributes of a dataclass, cached ones among them."""
+    """A tensor as array with the name of its device, or the attributes of a dataclass, cached ones
+    among them.
+    """
 
     kind: type | str
     content: Any
 
 
 def pack(value: Any, known: dict[int, Any] | None = None) -> Any:
-    """Return a value for another process: arrays in place of tensors, which processes would share; see `unpack`.
+    """Return a value for another process: arrays in place of tensors, which processes would share;
+    see `unpack`.
 
     `known` holds by identity what was packed before, so that what a value holds twice is sent once.
     """
@@ -216,7 +247,9 @@ def unpack(packed: Any) -> Any:
 
 
 def _map_items(function: Callable[[Any], Any], value: Any) -> Any:
-    """Return a dictionary, list or tuple with the results of a function of its items; another value as it is."""
+    """Return a dictionary, list or tuple with the results of a function of its items; another value
+    as it is.
+    """
     if isinstance(value, dict):
         return {key: function(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

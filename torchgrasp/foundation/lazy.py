@@ -1,4 +1,6 @@
-"""Modules that take long to import, or that few users need: each is imported when one of its names is first used."""
+"""Modules that take long to import, or that few users need: each is imported when one of its names
+is first used.
+"""
 
 import importlib
 import types
@@ -13,7 +15,11 @@ class _Late(types.ModuleType):
         if name.startswith("__"):
             raise AttributeError(name)
         module = importlib.import_module(self.__name__)
-        return getattr(module, name) if hasattr(module, name) else importlib.import_module(f"{self.__name__}.{name}")
+        return (
+            getattr(module, name)
+            if hasattr(module, name)
+            else importlib.import_module(f"{self.__name__}.{name}")
+        )
 
 
 if TYPE_CHECKING:
@@ -30,9 +36,14 @@ if TYPE_CHECKING:
     from scipy import sparse as sparse
     from scipy import spatial as spatial
 else:
-    jinja2, matplotlib, pytorch_kinematics = _Late("jinja2"), _Late("matplotlib"), _Late("pytorch_kinematics")
-    trimesh, yourdfpy = _Late("trimesh"), _Late("yourdfpy")
-    Image, ImageDraw, ImageFont = (_Late(f"PIL.{name}") for name in ("Image", "ImageDraw", "ImageFont"))
+    jinja2 = _Late("jinja2")
+    matplotlib = _Late("matplotlib")
+    pytorch_kinematics = _Late("pytorch_kinematics")
+    trimesh = _Late("trimesh")
+    yourdfpy = _Late("yourdfpy")
+    Image, ImageDraw, ImageFont = (
+        _Late(f"PIL.{name}") for name in ("Image", "ImageDraw", "ImageFont")
+    )
     ndimage, optimize, sparse, spatial = map(
         _Late, ("scipy.ndimage", "scipy.optimize", "scipy.sparse", "scipy.spatial")
     )

@@ -1,4 +1,6 @@
-"""Rules that type annotations carry, such as ranges, and helpers of argument validation (`torchgrasp.foundation.checks`)."""
+"""Rules that type annotations carry, such as ranges, and helpers of argument validation
+(`torchgrasp.foundation.checks`).
+"""
 
 import collections.abc
 import os
@@ -20,7 +22,9 @@ from torchgrasp.foundation.limits import NAME_BYTES, PATH_BYTES, SHOWN_LETTERS
 
 
 class Range(NamedTuple):
-    """A rule in an annotation: a number must lie in [`low`, `high`]. `words` describe the range in errors."""
+    """A rule in an annotation: a number must lie in [`low`, `high`]. `words` describe the range in
+    errors.
+    """
 
     low: float
     high: float
@@ -28,13 +32,17 @@ class Range(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """Annotation of a field that holds a batch, with as many rows as the axis `letter` of the other fields is long."""
+    """Annotation of a field that holds a batch, with as many rows as the axis `letter` of the other
+    fields is long.
+    """
 
     letter: str
 
 
 class Taken(NamedTuple):
-    """A rule in an annotation called `alias`: `read`, given an argument and its name, makes a value of a `kind`."""
+    """A rule in an annotation called `alias`: `read`, given an argument and its name, makes a value
+    of a `kind`.
+    """
 
     alias: str
     kind: Any
@@ -42,12 +50,21 @@ class Taken(NamedTuple):
     read: Callable[[Any, str], Any]
 
 
-ANY, FINITE = "any number, NaN and infinity too", "finite numbers in every field"
-"""Rules in annotations. Tensors must be finite unless annotated `ANY`; `FINITE` demands it of all fields of a value."""
+ANY = "any number, NaN and infinity too"
+FINITE = "finite numbers in every field"
+"""Rules in annotations. Tensors must be finite unless annotated `ANY`; `FINITE` demands it of all
+fields of a value.
+"""
 RIGID = "a rigid transform: a right-handed rotation, and the row 0 0 0 1"
-"""The rule for transforms: a matrix that scales or mirrors would give wrong results without an error."""
-LEAST, MOST = sys.float_info.min, sys.float_info.max  # least positive and largest finite number
-Seed = Annotated[int, Range(0, 2**63 - 1, "a whole number from 0 to 2**63 - 1")]  # a seed of random draws
+"""The rule for transforms: a matrix that scales or mirrors would give wrong results without an
+error.
+"""
+# least positive and largest finite number
+LEAST = sys.float_info.min
+MOST = sys.float_info.max
+Seed = Annotated[
+    int, Range(0, 2**63 - 1, "a whole number from 0 to 2**63 - 1")
+]  # a seed of random draws
 Count = Annotated[int, Range(1, 1_000_000)]  # a number of objects that are kept in memory
 Positive = Annotated[float, Range(LEAST, MOST, "a positive number")]  # a number above zero
 Fraction = Annotated[float, Range(0.0, 1.0)]  # a share or a probability
@@ -56,55 +73,83 @@ Pose = Annotated[Float[Tensor, "4 4"], RIGID]  # a rigid transform
 Poses = Annotated[Float[Tensor, "g 4 4"], RIGID]  # a rigid transform for each row
 Force = Annotated[float, Range(0.01, 100.0)]  # a normal force [N] of a finger
 Length = Annotated[float, Range(0.0, 10.0)]  # a length [m] within reach
-DTYPES = {"Float": (torch.float32, torch.float64), "Int": (torch.int64, torch.int32), "Bool": (torch.bool,)}
+DTYPES = {
+    "Float": (torch.float32, torch.float64),
+    "Int": (torch.int64, torch.int32),
+    "Bool": (torch.bool,),
+}
 """The dtypes that each kind of annotation allows."""
-NUMBERS = {int: Range(-(2**63), 2**63 - 1, "a whole number"), float: Range(-MOST, MOST, "a finite number")}
+NUMBERS = {
+    int: Range(-(2**63), 2**63 - 1, "a whole number"),
+    float: Range(-MOST, MOST, "a finite number"),
+}
 """The ranges of numbers whose annotation gives no range."""
 
 
 def describe(hint: Any) -> str:
     """Return in words which arguments an annotation allows."""
-    origin, inside = typing.get_origin(hint), typing.get_args(hint)
+    origin = typing.get_origin(hint)
+    inside = typing.get_args(hint)
     if origin is Annotated and isinstance(inside[1], Range):
-        kind, (low, high, words) = "a whole number" if inside[0] is int else "a number", inside[1]
+        kind = "a whole number" if inside[0] is int else "a number"
+        (low, high, words) = inside[1]
         return words or f"{kind} in [{low:.12g}, {high:.12g}]"
     if origin is Annotated:
         return inside[1].words if isinstance(inside[1], Taken) else describe(inside[0])
     if origin in (typing.Union, types.UnionType):
-        return " or ".join(dict.fromkeys(describe(x) for x in inside if x is not int or float not in inside))
+        return " or ".join(
+            dict.fromkeys(describe(x) for x in inside if x is not int or float not in inside)
+        )
     if origin is typing.Literal:
         return "one of " * (len(inside) > 1) + ", ".join(map(repr, inside))
     if is_tensor(hint):
-        axes = (axis.lstrip("*#") if axis[0] not in "*." else "..." for axis in hint.dim_str.split())
+        axes = (
+            axis.lstrip("*#") if axis[0] not in "*." else "..." for axis in hint.dim_str.split()
+        )
         return f"a tensor of shape {' x '.join(axes)}"
     if hint in NUMBERS:
         return NUMBERS[hint].words
-    named = {bool: "True or False", type(None): "None", str: "a text", collections.abc.Callable: "a function"}
+    named = {
+        bool: "True or False",
+        type(None): "None",
+        str: "a text",
+        collections.abc.Callable: "a function",
+    }
     name = getattr(origin or hint, "__name__", "value")
     return named.get(origin or hint, f"a {name if origin is None else name.lower()}")
 
 
 def is_tensor(hint: Any) -> bool:
     """Return whether an annotation is a tensor type such as `Float[Tensor, "n 3"]`."""
-    is_array = typing.get_origin(hint) is None and isinstance(hint, type) and issubclass(hint, AbstractArray)
+    is_array = (
+        typing.get_origin(hint) is None
+        and isinstance(hint, type)
+        and issubclass(hint, AbstractArray)
+    )
     return is_array and hint.array_type is Tensor
 
 
 def fits(axes: list[str], shape: tuple[int, ...], sizes: dict[str, Any]) -> bool:
-    """Return whether a shape matches the axes of a jaxtyping annotation; record the size of each letter in `sizes`."""
+    """Return whether a shape matches the axes of a jaxtyping annotation; record the size of each
+    letter in `sizes`.
+    """
     for k in [k for k, axis in enumerate(axes) if axis[0] in "*."]:
-        letter, end = axes[k].lstrip("*#"), len(shape) - (len(axes) - k - 1)
+        letter = axes[k].lstrip("*#")
+        end = len(shape) - (len(axes) - k - 1)
         if end < k:
             return False
         middle = shape[k:end]
         known = middle if axes[k] == "..." else sizes.get(letter, middle)
         try:
-            sizes[letter] = tuple(torch.broadcast_shapes(known, middle)) if "#" in axes[k] else middle
+            sizes[letter] = (
+                tuple(torch.broadcast_shapes(known, middle)) if "#" in axes[k] else middle
+            )
         except RuntimeError:
             return False
         if "#" not in axes[k] and known != middle:
             return False
-        axes, shape = axes[:k] + axes[k + 1 :], shape[:k] + shape[end:]
+        axes = axes[:k] + axes[k + 1 :]
+        shape = shape[:k] + shape[end:]
     if len(axes) != len(shape):
         return False
     for axis, n in zip(axes, shape, strict=True):
@@ -117,20 +162,30 @@ def fits(axes: list[str], shape: tuple[int, ...], sizes: dict[str, Any]) -> bool
 
 
 def check_dense(name: str, value: Tensor, gradients: bool) -> None:
-    """Raise `BadArgument` if a tensor is sparse, nested or meta, or transformed by torch while `gradients` is false."""
+    """Raise `BadArgument` if a tensor is sparse, nested or meta, or transformed by torch while
+    `gradients` is false.
+    """
     if value.layout is not torch.strided or value.is_nested or value.is_meta:
         found = "no numbers (meta)" if value.is_meta else f"a layout of {value.layout}"
         raise BadArgument(name, found, "a dense tensor with numbers")
     if value.is_neg():
-        raise BadArgument(name, "a tensor with the negative bit", f"one without: {name}.resolve_neg()")
+        raise BadArgument(
+            name, "a tensor with the negative bit", f"one without: {name}.resolve_neg()"
+        )
     if is_tracked(value) and not gradients:
-        raise BadArgument(name, "a tensor that requires a gradient", f"a tensor without one: {name}.detach()")
+        raise BadArgument(
+            name, "a tensor that requires a gradient", f"a tensor without one: {name}.detach()"
+        )
     if not gradients and any(map(functorch.is_batchedtensor, _levels(value))):
-        raise BadArgument(name, "a tensor inside torch.vmap", "a plain tensor: the function is not differentiable")
+        raise BadArgument(
+            name, "a tensor inside torch.vmap", "a plain tensor: the function is not differentiable"
+        )
 
 
 def _levels(value: Tensor) -> list[Tensor]:
-    """Return a tensor and the tensors that it wraps, one for each transform of torch.func around the call."""
+    """Return a tensor and the tensors that it wraps, one for each transform of torch.func around
+    the call.
+    """
     levels = [value]
     while functorch.is_functorch_wrapped_tensor(levels[-1]):
         levels.append(functorch.get_unwrapped(levels[-1]))
@@ -138,20 +193,30 @@ def _levels(value: Tensor) -> list[Tensor]:
 
 
 def is_tracked(value: Tensor) -> bool:
-    """Return whether derivatives are taken by a tensor: by autograd, in forward mode, or by torch.func."""
+    """Return whether derivatives are taken by a tensor: by autograd, in forward mode, or by
+    torch.func.
+    """
     levels = _levels(value)
     if any(x.requires_grad or functorch.is_gradtrackingtensor(x) for x in levels):
         return True
-    return not functorch.is_batchedtensor(value) and forward_ad.unpack_dual(value).tangent is not None
+    return (
+        not functorch.is_batchedtensor(value) and forward_ad.unpack_dual(value).tangent is not None
+    )
 
 
 def is_known(value: Tensor) -> bool:
-    """Return whether Python may test the numbers of a tensor: not inside torch.vmap or torch.compile."""
-    return not (torch.compiler.is_compiling() or any(map(functorch.is_batchedtensor, _levels(value))))
+    """Return whether Python may test the numbers of a tensor: not inside torch.vmap or
+    torch.compile.
+    """
+    return not (
+        torch.compiler.is_compiling() or any(map(functorch.is_batchedtensor, _levels(value)))
+    )
 
 
 def show(value: Any) -> str:
-    """Return a text that shows a wrong argument: a number or text itself, the shape of a tensor, or the type."""
+    """Return a text that shows a wrong argument: a number or text itself, the shape of a tensor, or
+    the type.
+    """
     if isinstance(value, Tensor):
         return f"a tensor of shape {tuple(value.shape)} and {value.dtype}"
     if value is None or isinstance(value, str | int | float):
@@ -162,16 +227,21 @@ def show(value: Any) -> str:
 
 
 def is_rigid(a_from_b: Float[Tensor, "*b 4 4"]) -> Bool[Tensor, "*b"]:
-    """Return a mask of the matrices that are a right-handed rotation (up to float32 rounding) and a translation."""
+    """Return a mask of the matrices that are a right-handed rotation (up to float32 rounding) and a
+    translation.
+    """
     x, y, z = a_from_b[..., :3, :3].double().unbind(-2)
-    rotation, eye = torch.stack([x, y, z], -2), torch.eye(4, dtype=torch.float64, device=a_from_b.device)
+    rotation = torch.stack([x, y, z], -2)
+    eye = torch.eye(4, dtype=torch.float64, device=a_from_b.device)
     error = (rotation @ rotation.transpose(-1, -2) - eye[:3, :3]).abs().amax((-1, -2))
     right_handed = (torch.linalg.cross(x, y) * z).sum(-1) > 0
     return (error <= 1e-4) & right_handed & (a_from_b[..., 3, :] == eye[3]).all(-1)
 
 
 def check_moved(*args: Any, **kwargs: Any) -> None:
-    """Raise `BadArgument` for arguments that `Tensor.to` rejects, and for dtypes other than float32 and float64."""
+    """Raise `BadArgument` for arguments that `Tensor.to` rejects, and for dtypes other than float32
+    and float64.
+    """
     given = ", ".join([*map(repr, args), *(f"{key}={value!r}" for key, value in kwargs.items())])
     allowed = "a device, torch.float32 or torch.float64"
     try:
@@ -183,15 +253,23 @@ def check_moved(*args: Any, **kwargs: Any) -> None:
 
 
 def check_path(name: str, path: Path | str) -> None:
-    """Raise `BadArgument` for a path that no file can have: it has a NUL or a lone surrogate, or is too long."""
+    """Raise `BadArgument` for a path that no file can have: it has a NUL or a lone surrogate, or is
+    too long.
+    """
     try:
         raw = os.fsencode(path)
     except UnicodeEncodeError as error:
-        raise BadArgument(name, f"{show(str(path))}, with half a character", "a path of whole characters") from error
+        raise BadArgument(
+            name, f"{show(str(path))}, with half a character", "a path of whole characters"
+        ) from error
     if b"\0" in raw:
         raise BadArgument(name, f"{show(str(path))}, with a NUL", "a path without NUL")
     if len(raw) > PATH_BYTES:
-        raise BadArgument(name, f"a path of {len(raw)} bytes", f"a path of at most {PATH_BYTES} bytes")
+        raise BadArgument(
+            name, f"a path of {len(raw)} bytes", f"a path of at most {PATH_BYTES} bytes"
+        )
     longest = max(map(len, map(os.fsencode, Path(path).parts)), default=0)
     if longest > NAME_BYTES:
-        raise BadArgument(name, f"a name of {longest} bytes", f"a path with names of at most {NAME_BYTES} bytes")
+        raise BadArgument(
+            name, f"a name of {longest} bytes", f"a path with names of at most {NAME_BYTES} bytes"
+        )

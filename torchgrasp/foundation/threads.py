@@ -1,7 +1,7 @@
 """Calls that use one torch thread, and the CPU where no device is named.
 
-On busy cores several threads mostly wait for each other. A default device that a user sets must not move tensors that
-the library makes, such as random draws.
+On busy cores several threads mostly wait for each other. A default device that a user sets must not
+move tensors that the library makes, such as random draws.
 """
 
 import contextlib
@@ -17,12 +17,16 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 _lock = threading.Lock()
 _here = threading.local()  # `inside` is True in a thread that is within `one_thread`
 _state = {"calls": 0, "before": 1}
-"""How many threads are within `one_thread`, and the number of torch's threads before the first of them."""
+"""How many threads are within `one_thread`, and the number of torch's threads before the first of
+them.
+"""
 
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """Let torch use one thread, and the CPU by default, within the context; restore both afterwards."""
+    """Let torch use one thread, and the CPU by default, within the context; restore both
+    afterwards.
+    """
     if getattr(_here, "inside", False):
         yield
         return
@@ -33,7 +37,11 @@ def one_thread() -> Iterator[None]:
     _here.inside = True
     torch.set_num_threads(1)
     try:
-        with contextlib.nullcontext() if torch.get_default_device().type == "cpu" else torch.device("cpu"):
+        with (
+            contextlib.nullcontext()
+            if torch.get_default_device().type == "cpu"
+            else torch.device("cpu")
+        ):
             yield
     finally:
         with _lock:
@@ -43,7 +51,9 @@ def one_thread() -> Iterator[None]:
 
 
 def single_threaded(function: Function) -> Function:
-    """Return the function, which runs within `one_thread`; a generator, while it computes each item."""
+    """Return the function, which runs within `one_thread`; a generator, while it computes each
+    item.
+    """
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:

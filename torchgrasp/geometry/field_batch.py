@@ -1,4 +1,6 @@
-"""The distance fields of several objects as one: each row of points is asked in the field of its own object."""
+"""The distance fields of several objects as one: each row of points is asked in the field of its
+own object.
+"""
 
 import dataclasses
 from collections.abc import Sequence
@@ -8,16 +10,25 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.foundation.base import kept
-from torchgrasp.geometry.signed_distance import DistanceField, Grid, SignedDistanceField, corner_steps
+from torchgrasp.geometry.signed_distance import (
+    DistanceField,
+    Grid,
+    SignedDistanceField,
+    corner_steps,
+)
 
 
 @dataclasses.dataclass(frozen=True)
 class FieldBatch(DistanceField):
-    """The fields of c objects as one: row r of all points that a method is given belongs to field `owner[r]`."""
+    """The fields of c objects as one: row r of all points that a method is given belongs to field
+    `owner[r]`.
+    """
 
     nodes: Float[Tensor, "n"]  # the values of all fields, one after another
     places: Float[Tensor, "c 4"]  # origin and spacing [m] of the nodes of each field
-    steps: Int[Tensor, "c 14"]  # of each field: last nodes, strides on x and y, first value, steps to a cell's corners
+    steps: Int[
+        Tensor, "c 14"
+    ]  # of each field: last nodes, strides on x and y, first value, steps to a cell's corners
     owner: Int[Tensor, "r"]  # the field of each row
 
     @classmethod
@@ -25,8 +36,11 @@ class FieldBatch(DistanceField):
         """Join fields, with one row for each."""
         nodes = torch.cat([x.nodes for x in fields])
         shape = torch.tensor([x.values.shape for x in fields], device="cpu")
-        places = torch.stack([torch.cat([x.origin, x.origin.new_tensor([x.spacing])]) for x in fields])
-        counts, dy = shape.prod(1), shape[:, 2]
+        places = torch.stack(
+            [torch.cat([x.origin, x.origin.new_tensor([x.spacing])]) for x in fields]
+        )
+        counts = shape.prod(1)
+        dy = shape[:, 2]
         dx = shape[:, 1] * dy
         strides = torch.stack([dx, dy, counts.cumsum(0) - counts], 1)
         steps = torch.cat([shape - 1, strides, corner_steps(dx, dy).T], 1).to(nodes.device)
@@ -49,5 +63,6 @@ class FieldBatch(DistanceField):
     def _grid(self, points: Float[Tensor, "b *k 3"]) -> Grid:
         place, step = (x.view(len(x), *[1] * (points.ndim - 2), -1) for x in self._own)
         place = place.to(points)
-        stride, corners = (step[..., 3], step[..., 4]), step[..., 6:].movedim(-1, 0)
+        stride = (step[..., 3], step[..., 4])
+        corners = step[..., 6:].movedim(-1, 0)
         return Grid(place[..., :3], place[..., 3:], step[..., :3], stride, step[..., 5], corners)

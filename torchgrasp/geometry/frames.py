@@ -1,7 +1,8 @@
 """Rigid transforms, and the virtual frame of three contacts, Eqs. (15)-(17) of the paper.
 
-A transform `a_from_b` maps coordinates of frame b into frame a. Products therefore chain adjacent names:
-`obj_from_hand = obj_from_vf @ vf_from_hand`, Eq. (24) of the paper, with the virtual frame vf.
+A transform `a_from_b` maps coordinates of frame b into frame a. Products therefore chain adjacent
+names: `obj_from_hand = obj_from_vf @ vf_from_hand`, Eq. (24) of the paper, with the virtual frame
+vf.
 """
 
 import itertools
@@ -17,7 +18,9 @@ from torchgrasp.foundation.rules import is_known
 from torchgrasp.geometry.linalg import unit
 
 
-def rigid(rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 4 4"]:
+def rigid(
+    rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"]
+) -> Float[Tensor, "*b 4 4"]:
     """Return the homogeneous 4 x 4 transform with a given rotation and translation [m]."""
     top = torch.cat([rotation, translation[..., None]], dim=-1)
     bottom = torch.eye(4, dtype=top.dtype, device=top.device)[3]
@@ -30,12 +33,16 @@ def inverse(a_from_b: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
     return rigid(rotation, -(rotation @ a_from_b[..., :3, 3:])[..., 0])
 
 
-def apply(a_from_b: Float[Tensor, "*#b 4 4"], points: Float[Tensor, "*#b n 3"]) -> Float[Tensor, "*#b n 3"]:
+def apply(
+    a_from_b: Float[Tensor, "*#b 4 4"], points: Float[Tensor, "*#b n 3"]
+) -> Float[Tensor, "*#b n 3"]:
     """Map points from frame b to frame a by the rigid transform `a_from_b`."""
     return points @ a_from_b[..., :3, :3].transpose(-1, -2) + a_from_b[..., None, :3, 3]
 
 
-def rotate(a_from_b: Float[Tensor, "*#b 4 4"], directions: Float[Tensor, "*#b n 3"]) -> Float[Tensor, "*#b n 3"]:
+def rotate(
+    a_from_b: Float[Tensor, "*#b 4 4"], directions: Float[Tensor, "*#b n 3"]
+) -> Float[Tensor, "*#b n 3"]:
     """Rotate directions from frame b to frame a; the translation of `a_from_b` is ignored."""
     return directions @ a_from_b[..., :3, :3].transpose(-1, -2)
 
@@ -50,7 +57,9 @@ def skew(v: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
 def rotation_from_vector(v: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
     """Return the rotation by |v| radians about v (the exponential map), smooth at v = 0."""
     angle = torch.linalg.vector_norm(v, dim=-1)[..., None, None]
-    turn, half = skew(v), torch.sinc(angle / (2 * math.pi))  # Rodrigues: sin x / x, and (1 - cos x) / x^2 = half^2 / 2
+    # Rodrigues: sin x / x, and (1 - cos x) / x^2 = half^2 / 2
+    turn = skew(v)
+    half = torch.sinc(angle / (2 * math.pi))
     identity = torch.eye(3, dtype=v.dtype, device=v.device)
     return identity + torch.sinc(angle / math.pi) * turn + half * half / 2 * (turn @ turn)
 
@@ -79,35 +88,45 @@ def rotation_angle(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
 
 
 def subsets(count: int, size: int, device: torch.device) -> Int[Tensor, "k s"]:
-    """Return all subsets of `size` numbers out of 0 to `count` - 1, one row per subset, in lexical order."""
+    """Return all subsets of `size` numbers out of 0 to `count` - 1, one row per subset, in lexical
+    order.
+    """
     if size == count:
         return torch.arange(count, device=device)[None]
     return torch.tensor(list(itertools.combinations(range(count), size)), device=device)
 
 
 def degenerate(points: Float[Tensor, "*b f 3"]) -> Bool[Tensor, "*b"]:
-    """Return a mask of the contact sets that lie nearly on a line: even the largest contact triangle is too flat."""
-    # Least height of the largest contact triangle over its longest side: noise turns the frame of a flatter one
+    """Return a mask of the contact sets that lie nearly on a line: even the largest contact
+    triangle is too flat.
+    """
+    # Least height of the largest contact triangle over its longest side: noise turns the frame of a
+    # flatter one
     min_ratio = 1e-3
     corners = points[..., subsets(points.shape[-2], 3, points.device), :]  # (*b, k, 3, 3)
     sides = corners - corners.roll(1, dims=-2)
     longest = torch.linalg.vector_norm(sides, dim=-1).amax((-1, -2))
-    doubled_area = torch.linalg.vector_norm(torch.linalg.cross(sides[..., 0, :], sides[..., 1, :]), dim=-1).amax(-1)
+    doubled_area = torch.linalg.vector_norm(
+        torch.linalg.cross(sides[..., 0, :], sides[..., 1, :]), dim=-1
+    ).amax(-1)
     return ~(doubled_area > min_ratio * longest**2)
 
 
 def virtual_frame(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 4 4"]:
-    """Return the pose `a_from_vf` of the virtual frame of three contacts given in frame a, Eqs. (15)-(17) of the paper.
+    """Return the pose `a_from_vf` of the virtual frame of three contacts given in frame a, Eqs.
+    (15)-(17) of the paper.
 
-    The origin is the centroid of the contacts (Eq. 16). The x axis points from the first contact to the third. The z
-    axis is the normal of their plane. Contacts nearly on a line raise `DegenerateContacts`; inside torch.vmap, where
-    numbers are unknown, they give NaN.
+    The origin is the centroid of the contacts (Eq. 16). The x axis points from the first contact to
+    the third. The z axis is the normal of their plane. Contacts nearly on a line raise
+    `DegenerateContacts`; inside torch.vmap, where numbers are unknown, they give NaN.
     """
     flat = degenerate(points)
     if not is_known(flat):
         points = torch.where(flat[..., None, None], torch.nan, points)
     elif bool(flat.any()):
-        raise DegenerateContacts(f"{int(flat.sum())} of {flat.numel()} contact triples lie on a line or in a point")
+        raise DegenerateContacts(
+            f"{int(flat.sum())} of {flat.numel()} contact triples lie on a line or in a point"
+        )
     p1, p2, p3 = points.unbind(-2)
     x_axis = unit(p3 - p1)
     z_axis = unit(torch.linalg.cross(p2 - p1, x_axis))

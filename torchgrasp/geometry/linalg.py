@@ -1,4 +1,6 @@
-"""Linear algebra: Cholesky factors, which are checked but never repaired, Mahalanobis distances, farthest points."""
+"""Linear algebra: Cholesky factors, which are checked but never repaired, Mahalanobis distances,
+farthest points.
+"""
 
 import math
 from collections.abc import Callable
@@ -23,26 +25,40 @@ def unit(v: Float[Tensor, "*b d"]) -> Float[Tensor, "*b d"]:
 
 
 def unit_of_any(v: Float[Tensor, "*b d"]) -> Float[Tensor, "*b d"]:
-    """Return vectors of length 1 in the direction of `v`, even where squared lengths would overflow or underflow."""
+    """Return vectors of length 1 in the direction of `v`, even where squared lengths would overflow
+    or underflow.
+    """
     exponent = torch.frexp(v.abs().amax(-1, keepdim=True)).exponent - 1
-    return unit(v / torch.pow(torch.full_like(v[..., :1], 2.0), exponent))  # a power of two rounds nothing
+    return unit(
+        v / torch.pow(torch.full_like(v[..., :1], 2.0), exponent)
+    )  # a power of two rounds nothing
 
 
 def across(normal: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b 3"], Float[Tensor, "*b 3"]]:
-    """Return two unit vectors perpendicular to each unit normal: (first, second, normal) is a right-handed frame."""
+    """Return two unit vectors perpendicular to each unit normal: (first, second, normal) is a
+    right-handed frame.
+    """
     helper = torch.zeros_like(normal).scatter(-1, normal.abs().argmin(-1, keepdim=True), 1.0)
     first = unit(torch.linalg.cross(normal, helper))
     return first, torch.linalg.cross(normal, first)
 
 
 def number_components(pairs: np.ndarray, count: int) -> np.ndarray:
-    """Return the number, from 0, of the connected component of each of `count` nodes, given (e, 2) pairs of nodes."""
-    links = sparse.coo_array((np.ones(len(pairs), dtype=bool), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
+    """Return the number, from 0, of the connected component of each of `count` nodes, given (e, 2)
+    pairs of nodes.
+    """
+    links = sparse.coo_array(
+        (np.ones(len(pairs), dtype=bool), (pairs[:, 0], pairs[:, 1])), shape=(count, count)
+    )
     return sparse.csgraph.connected_components(links, directed=False)[1]
 
 
-def fibonacci_sphere(n: int, angle: float = math.pi * (1 + math.sqrt(5)), start: float = 0.5) -> Float[Tensor, "n 3"]:
-    """Return n unit vectors spread over the sphere, from +z to -z; vector k has the azimuth `angle` * (k + `start`)."""
+def fibonacci_sphere(
+    n: int, angle: float = math.pi * (1 + math.sqrt(5)), start: float = 0.5
+) -> Float[Tensor, "n 3"]:
+    """Return n unit vectors spread over the sphere, from +z to -z; vector k has the azimuth `angle`
+    * (k + `start`).
+    """
     k = torch.arange(n, dtype=torch.float64, device="cpu")
     z = 1 - (2 * k + 1) / n
     rotation = angle * (k + start)
@@ -55,17 +71,20 @@ def limit_norm(v: Float[Tensor, "*b d"], longest: float) -> Float[Tensor, "*b d"
     return v * (longest / torch.linalg.vector_norm(v, dim=-1, keepdim=True).clamp_min(longest))
 
 
-def solve_least_squares(rows: Float[Tensor, "n k"], values: Float[Tensor, "n"]) -> Float[Tensor, "k"]:
+def solve_least_squares(
+    rows: Float[Tensor, "n k"], values: Float[Tensor, "n"]
+) -> Float[Tensor, "k"]:
     """Return the shortest vector x that minimises |rows @ x - values|, by the pseudo-inverse."""
-    # On a CPU the column pivots of torch.linalg.lstsq are undefined: its last digits differ from call to call.
+    # On a CPU the column pivots of torch.linalg.lstsq are undefined: its last digits differ from
+    # call to call.
     return torch.linalg.pinv(rows) @ values
 
 
 def cholesky(matrix: Float[Tensor, "*b n n"], what: str, fix: str) -> Float[Tensor, "*b n n"]:
     """Return the lower Cholesky factor of a matrix, without added jitter.
 
-    An indefinite matrix raises `IndefiniteCovariance`; its message names the matrix by `what` and suggests the `fix`.
-    Inside torch.vmap, where numbers are unknown, its factor is NaN.
+    An indefinite matrix raises `IndefiniteCovariance`; its message names the matrix by `what` and
+    suggests the `fix`. Inside torch.vmap, where numbers are unknown, its factor is NaN.
     """
     factor, info = torch.linalg.cholesky_ex(matrix)
     if not is_known(matrix):
@@ -77,8 +96,12 @@ def cholesky(matrix: Float[Tensor, "*b n n"], what: str, fix: str) -> Float[Tens
     return factor
 
 
-def squared_mahalanobis(difference: Float[Tensor, "*b d"], factor: Float[Tensor, "*b d d"]) -> Float[Tensor, "*b"]:
-    """Return the squared Mahalanobis distance d^T S^-1 d of differences d; `factor` is the Cholesky factor of S."""
+def squared_mahalanobis(
+    difference: Float[Tensor, "*b d"], factor: Float[Tensor, "*b d d"]
+) -> Float[Tensor, "*b"]:
+    """Return the squared Mahalanobis distance d^T S^-1 d of differences d; `factor` is the Cholesky
+    factor of S.
+    """
     whitened = torch.linalg.solve_triangular(factor, difference[..., None], upper=False)[..., 0]
     return (whitened * whitened).sum(-1)
 
@@ -91,13 +114,17 @@ def farthest_points(
     distance: Callable[[Tensor, Tensor], Tensor] | None = None,
     before: Float[Tensor, "m *d"] | None = None,
 ) -> Int[Tensor, "picks"]:
-    """Return the indices of at most `count` points, each the farthest from the points before it, from `first` on.
+    """Return the indices of at most `count` points, each the farthest from the points before it,
+    from `first` on.
 
-    Distances whose relative difference is at most `tie` are equal: the first of equally far points is taken. Points in
-    `before` count as already picked and are not returned; `first` is then not used. `distance` is Euclidean by default.
+    Distances whose relative difference is at most `tie` are equal: the first of equally far points
+    is taken. Points in `before` count as already picked and are not returned; `first` is then not
+    used. `distance` is Euclidean by default.
     """
     every = points.detach().cpu()
-    x = np.ascontiguousarray(every.numpy().T)  # NumPy is an order of magnitude faster than torch for few points
+    x = np.ascontiguousarray(
+        every.numpy().T
+    )  # NumPy is an order of magnitude faster than torch for few points
 
     def gaps(one: Tensor) -> np.ndarray:
         if distance is not None:
@@ -105,7 +132,8 @@ def farthest_points(
         off = x - one.numpy()[:, None]
         return np.einsum("in,in->n", off, off)
 
-    picks, nearest = np.full(min(count, len(every)), first), np.full(len(every), np.inf, dtype=x.dtype)
+    picks = np.full(min(count, len(every)), first)
+    nearest = np.full(len(every), np.inf, dtype=x.dtype)
     for one in every[:0] if before is None else before.detach().cpu():
         np.minimum(nearest, gaps(one), out=nearest)
     for k in range(0 if before is not None and len(before) else 1, len(picks)):
@@ -121,6 +149,10 @@ def reflect(points: Float[Tensor, "*b 3"], plane: Float[Tensor, "*c 4"]) -> Floa
     return points - 2.0 * height * plane[..., :3]
 
 
-def reflect_directions(directions: Float[Tensor, "*b 3"], plane: Float[Tensor, "*c 4"]) -> Float[Tensor, "*d 3"]:
-    """Mirror directions across planes n.x = o, given as vectors (n, o) with unit normal n and offset o."""
+def reflect_directions(
+    directions: Float[Tensor, "*b 3"], plane: Float[Tensor, "*c 4"]
+) -> Float[Tensor, "*d 3"]:
+    """Mirror directions across planes n.x = o, given as vectors (n, o) with unit normal n and
+    offset o.
+    """
     return directions - 2.0 * (directions * plane[..., :3]).sum(-1, keepdim=True) * plane[..., :3]

@@ -23,27 +23,38 @@ from torchgrasp.foundation.limits import (
     PLY_PROPERTIES,
 )
 
-SUFFIXES = (".obj", ".off", ".ply", ".stl")  # formats whose memory is bounded by the size of the file
-_REFERENCE = re.compile(rb"/\S*")  # normal and texture of a corner in an .obj: two textures would open the surface
+SUFFIXES = (
+    ".obj",
+    ".off",
+    ".ply",
+    ".stl",
+)  # formats whose memory is bounded by the size of the file
+_REFERENCE = re.compile(
+    rb"/\S*"
+)  # normal and texture of a corner in an .obj: two textures would open the surface
 MESH_FILE = f"a mesh file ({', '.join(SUFFIXES)})"
 LEAST_VOLUME = 1e-12  # least volume [m^3] of a body
 
 
 def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
-    """Return a closed triangle mesh [m], read from a file or given, after checks; a bad mesh is never repaired.
+    """Return a closed triangle mesh [m], read from a file or given, after checks; a bad mesh is
+    never repaired.
 
-    Raises:
-        MeshError: the file is no .obj, .off, .ply or .stl file, has no faces, or has too many faces or bytes; or the
-            mesh has non-finite vertices, an open surface, faces that are not all turned outward, or no volume.
-        SuspiciousScale: the longest side of the bounding box is outside [5 mm, 2 m]; most often the unit is mm.
+    Raises: MeshError: the file is no .obj, .off, .ply or .stl file, has no faces, or has too many
+        faces or bytes; or the mesh has non-finite vertices, an open surface, faces that are not all
+        turned outward, or no volume. SuspiciousScale: the longest side of the bounding box is
+        outside [5 mm, 2 m]; most often the unit is mm.
     """
     name = "a mesh"
     if not isinstance(mesh, trimesh.Trimesh):
         if not is_file(mesh) or Path(mesh).suffix.lower() not in SUFFIXES:
             raise MeshError("mesh", f"{mesh}, which is no {'such ' * is_file(mesh)}file", MESH_FILE)
-        path, name = Path(mesh), str(mesh)
+        path = Path(mesh)
+        name = str(mesh)
         if path.stat().st_size > MESH_BYTES:
-            raise MeshError("mesh", f"{path} of {path.stat().st_size} bytes", f"at most {MESH_BYTES} bytes")
+            raise MeshError(
+                "mesh", f"{path} of {path.stat().st_size} bytes", f"at most {MESH_BYTES} bytes"
+            )
         try:
             loaded = load_triangles(read_bytes(path), path.suffix.lower())
         except Exception as error:  # the readers of trimesh raise whatever their format runs into
@@ -54,7 +65,9 @@ def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
     check_solid(mesh, name)
     extent = float(mesh.extents.max())
     if not MIN_EXTENT <= extent <= MAX_EXTENT:
-        raise SuspiciousScale("mesh", f"{name} of {extent:.4g} m", f"{MIN_EXTENT:g} m to {MAX_EXTENT:g} m: use metres")
+        raise SuspiciousScale(
+            "mesh", f"{name} of {extent:.4g} m", f"{MIN_EXTENT:g} m to {MAX_EXTENT:g} m: use metres"
+        )
     return mesh
 
 
@@ -73,40 +86,63 @@ def check_solid(mesh: "trimesh.Trimesh", name: str) -> None:
     with np.errstate(invalid="ignore", divide="ignore"):  # trimesh divides by the volume
         volume = mesh.volume
     if not (mesh.is_winding_consistent and volume > LEAST_VOLUME):
-        raise MeshError("mesh", f"{name} of volume {volume:.3g} m^3", "a positive volume, faces turned outward")
+        raise MeshError(
+            "mesh", f"{name} of volume {volume:.3g} m^3", "a positive volume, faces turned outward"
+        )
     if not np.linalg.eigvalsh(mesh.moment_inertia).min() > 0:  # a simulator cannot move it
-        raise MeshError("mesh", f"{name} without inertia, as of a body turned inward", "every face turned outward")
+        raise MeshError(
+            "mesh",
+            f"{name} without inertia, as of a body turned inward",
+            "every face turned outward",
+        )
 
 
-def closest_on_triangles(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return, for each point (n, 3), the closest point on its triangle (n, 3 corners, 3), and its feature.
+def closest_on_triangles(
+    points: np.ndarray, triangles: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return, for each point (n, 3), the closest point on its triangle (n, 3 corners, 3), and its
+    feature.
 
-    The feature is 0 inside the face, 1 to 3 for the sides ab, bc, ca, and 4 to 6 for the corners a, b, c.
+    The feature is 0 inside the face, 1 to 3 for the sides ab, bc, ca, and 4 to 6 for the corners a,
+    b, c.
     """
-    a, u, v = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    a = triangles[:, 0]
+    u = triangles[:, 1] - triangles[:, 0]
+    v = triangles[:, 2] - triangles[:, 0]
     w = points - a
     uu, vv, uv = (np.einsum("ij,ij->i", x, y) for x, y in ((u, u), (v, v), (u, v)))
-    uw, vw = np.einsum("ij,ij->i", u, w), np.einsum("ij,ij->i", v, w)
+    uw = np.einsum("ij,ij->i", u, w)
+    vw = np.einsum("ij,ij->i", v, w)
     span = np.maximum(uu * vv - uv * uv, 1e-40)
-    s, t = (vv * uw - uv * vw) / span, (uu * vw - uv * uw) / span
-    best, feature = a + s[:, None] * u + t[:, None] * v, np.zeros(len(points), dtype=int)
+    s = (vv * uw - uv * vw) / span
+    t = (uu * vw - uv * uw) / span
+    best = a + s[:, None] * u + t[:, None] * v
+    feature = np.zeros(len(points), dtype=int)
     out = np.nonzero((s < 0) | (t < 0) | (s + t > 1))[0]  # then the closest point lies on a side
     corner = triangles[out]
     side = np.roll(corner, -1, 1) - corner
-    along = np.einsum("ikj,ikj->ik", points[out, None] - corner, side) / np.einsum("ikj,ikj->ik", side, side)
+    along = np.einsum("ikj,ikj->ik", points[out, None] - corner, side) / np.einsum(
+        "ikj,ikj->ik", side, side
+    )
     along = np.clip(along, 0, 1)
     feet = corner + along[..., None] * side
     gap = points[out, None] - feet
-    k, rows = np.einsum("ikj,ikj->ik", gap, gap).argmin(1), np.arange(len(out))
-    best[out], along = feet[rows, k], along[rows, k]
+    k = np.einsum("ikj,ikj->ik", gap, gap).argmin(1)
+    rows = np.arange(len(out))
+    best[out] = feet[rows, k]
+    along = along[rows, k]
     feature[out] = np.where(along <= 0, 4 + k, np.where(along >= 1, 4 + (k + 1) % 3, 1 + k))
     return best, feature
 
 
-def clip_mesh(vertices: np.ndarray, faces: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return vertices and faces of the part of a mesh where a field is negative, and a mask of the vertices on the cut.
+def clip_mesh(
+    vertices: np.ndarray, faces: np.ndarray, values: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return vertices and faces of the part of a mesh where a field is negative, and a mask of the
+    vertices on the cut.
 
-    `values` (v,) is the field at the `vertices` (v, 3); it is linear within each of the `faces` (f, 3).
+    `values` (v,) is the field at the `vertices` (v, 3); it is linear within each of the `faces` (f,
+    3).
     """
     keep = values < 0
     count = keep[faces].sum(1)
@@ -115,7 +151,9 @@ def clip_mesh(vertices: np.ndarray, faces: np.ndarray, values: np.ndarray) -> tu
     ends: list[tuple[int, int]] = []
 
     def cross(a: int, b: int) -> int:
-        """Return the index of the new vertex at which the field is zero between the vertices a and b."""
+        """Return the index of the new vertex at which the field is zero between the vertices a and
+        b.
+        """
         key = (min(a, b), max(a, b))
         if key not in made:
             made[key] = len(vertices) + len(ends)
@@ -126,10 +164,12 @@ def clip_mesh(vertices: np.ndarray, faces: np.ndarray, values: np.ndarray) -> tu
         inside = keep[face]
         lone = int(np.argmax(inside) if inside.sum() == 1 else np.argmin(inside))
         a, b, c = (int(face[(lone + k) % 3]) for k in range(3))  # the winding stays
-        ab, ac = cross(a, b), cross(a, c)
+        ab = cross(a, b)
+        ac = cross(a, c)
         pieces.append(np.array([[a, ab, ac]] if inside.sum() == 1 else [[ab, b, c], [ab, c, ac]]))
     index = np.array(ends, dtype=np.int64).reshape(-1, 2)
-    start, end = values[index[:, 0]], values[index[:, 1]]
+    start = values[index[:, 0]]
+    end = values[index[:, 1]]
     share = (start / (start - end))[:, None]
     crossings = (1 - share) * vertices[index[:, 0]] + share * vertices[index[:, 1]]
     every = np.concatenate([vertices, crossings])
@@ -138,18 +178,24 @@ def clip_mesh(vertices: np.ndarray, faces: np.ndarray, values: np.ndarray) -> tu
 
 
 def load_triangles(data: bytes, suffix: str, **options: Any) -> Any:
-    """Return what `trimesh.load_mesh` reads from bytes; bad bytes and too many faces may raise any exception."""
+    """Return what `trimesh.load_mesh` reads from bytes; bad bytes and too many faces may raise any
+    exception.
+    """
     data = _geometry(data) if suffix == ".obj" else data
     if (faces := _count_faces(data, suffix)) > MESH_FACES:
         raise Malformed(f"a mesh of {faces} faces; at most {MESH_FACES}")
     # from memory and without a resolver: materials and textures beside it stay closed
     with _quiet(trimesh.util.log):
-        return trimesh.load_mesh(io.BytesIO(data), file_type=suffix[1:], skip_materials=True, **options)
+        return trimesh.load_mesh(
+            io.BytesIO(data), file_type=suffix[1:], skip_materials=True, **options
+        )
 
 
 @contextlib.contextmanager
 def _quiet(log: logging.Logger) -> Iterator[None]:
-    """Suppress the records that this thread sends to `log` in a `with` block; Python would print them on stderr."""
+    """Suppress the records that this thread sends to `log` in a `with` block; Python would print
+    them on stderr.
+    """
     here = threading.get_ident()
 
     def drop(record: logging.LogRecord) -> bool:
@@ -163,7 +209,9 @@ def _quiet(log: logging.Logger) -> Iterator[None]:
 
 
 def _count_faces(data: bytes, suffix: str) -> int:
-    """Return the number of faces that a file declares, or 0 for a format in which the file's size bounds the number."""
+    """Return the number of faces that a file declares, or 0 for a format in which the file's size
+    bounds the number.
+    """
     if suffix == ".obj":
         return data.count(b"\nf")
     if suffix == ".stl":
@@ -173,7 +221,9 @@ def _count_faces(data: bytes, suffix: str) -> int:
 
 
 def _read_header(data: bytes) -> int:
-    """Return the number of faces in the header of a .ply file; the header is read as leniently as trimesh reads it."""
+    """Return the number of faces in the header of a .ply file; the header is read as leniently as
+    trimesh reads it.
+    """
     properties = faces = 0
     for line in io.BytesIO(data[:PLY_HEADER_BYTES]):
         words = line.split()
@@ -190,7 +240,9 @@ def _read_header(data: bytes) -> int:
 
 
 def _geometry(data: bytes) -> bytes:
-    """Return only the vertex and face lines of an .obj file, because trimesh is slow with many groups or materials."""
+    """Return only the vertex and face lines of an .obj file, because trimesh is slow with many
+    groups or materials.
+    """
     lines = data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines()
     kept = (line for line in map(bytes.strip, lines) if line[:2] in (b"v ", b"f ", b"v\t", b"f\t"))
     return b"\n".join(line if line[:1] == b"v" else _REFERENCE.sub(b"", line) for line in kept)

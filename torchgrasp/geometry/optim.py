@@ -1,7 +1,7 @@
 """Levenberg-Marquardt for a batch of small problems; each problem has its own state and damping.
 
-`levenberg_marquardt` is the loop. A `Minimisation` defines steps and their acceptance. See Nocedal and Wright, Numerical
-Optimization, ch. 10.
+`levenberg_marquardt` is the loop. A `Minimisation` defines steps and their acceptance. See Nocedal
+and Wright, Numerical Optimization, ch. 10.
 """
 
 import abc
@@ -36,13 +36,17 @@ Model = TypeVar("Model", bound=Linearisation)
 
 
 class Minimisation(abc.ABC, Generic[State, Model]):
-    """A batch of minimisation problems: their costs, their steps, and the rule by which a step is accepted."""
+    """A batch of minimisation problems: their costs, their steps, and the rule by which a step is
+    accepted.
+    """
 
     first_damping: float = 1e-2
 
     @abc.abstractmethod
     def linearise(self, state: State, rows: Int[Tensor, "a"]) -> Model:
-        """Return the costs and linear models of the problems with the indices `rows`, at their states."""
+        """Return the costs and linear models of the problems with the indices `rows`, at their
+        states.
+        """
 
     @abc.abstractmethod
     def step(self, model: Model, damping: Damping) -> Steps:
@@ -54,7 +58,9 @@ class Minimisation(abc.ABC, Generic[State, Model]):
 
     @abc.abstractmethod
     def judge(self, model: Model, trial: Model, x: Step, damping: Damping) -> Verdict:
-        """Return which steps are accepted, and the next damping, given the models before and after the step."""
+        """Return which steps are accepted, and the next damping, given the models before and after
+        the step.
+        """
 
     def refuse(self, model: Model, trial: Model) -> Model:
         """Return the model to use after a rejected step: by default the model before the step."""
@@ -65,15 +71,20 @@ class Minimisation(abc.ABC, Generic[State, Model]):
 def levenberg_marquardt(
     problem: Minimisation[State, Model], state: State, steps: int
 ) -> tuple[State, Float[Tensor, "b"]]:
-    """Minimise every problem of a batch by damped Gauss-Newton steps; return final states and costs.
+    """Minimise every problem of a batch by damped Gauss-Newton steps; return final states and
+    costs.
 
-    Every problem takes at most `steps` steps, each with one evaluation. No gradient flows through the minimisation.
-    Problems that have ended leave the batch. An accelerator looks for them in few steps only, because the host waits.
+    Every problem takes at most `steps` steps, each with one evaluation. No gradient flows through
+    the minimisation. Problems that have ended leave the batch. An accelerator looks for them in few
+    steps only, because the host waits.
     """
-    whole, rows = state, torch.arange(len(state), device=next(iter(named_tensors(state).values())).device)
+    whole = state
+    rows = torch.arange(len(state), device=next(iter(named_tensors(state).values())).device)
     model = problem.linearise(state, rows)
-    costs, damping = model.cost, torch.full_like(model.cost, problem.first_damping)
-    going, every = torch.ones_like(rows, dtype=torch.bool), 1 if rows.device.type == "cpu" else 6
+    costs = model.cost
+    damping = torch.full_like(model.cost, problem.first_damping)
+    going = torch.ones_like(rows, dtype=torch.bool)
+    every = 1 if rows.device.type == "cpu" else 6
     for k in range(steps):
         x, taken = problem.step(model, damping)
         going = going & taken
@@ -82,16 +93,25 @@ def levenberg_marquardt(
             if not len(left):
                 break
             if len(left) < len(going):
-                whole, costs = put(whole, rows, state), costs.index_copy(0, rows, model.cost)
-                rows, state, model, x, damping = rows[left], state[left], model[left], x[left], damping[left]
+                whole = put(whole, rows, state)
+                costs = costs.index_copy(0, rows, model.cost)
+                rows = rows[left]
+                state = state[left]
+                model = model[left]
+                x = x[left]
+                damping = damping[left]
                 going = going[left]
         trial_state = problem.move(state, x, rows)
         trial = problem.linearise(trial_state, rows)
         accepted, after = problem.judge(model, trial, x, damping)
         refused = problem.refuse(model, trial)
         if every > 1:  # problems that have ended, but have not left, stay as they are
-            accepted, after, refused = accepted & going, torch.where(going, after, damping), pick(going, refused, model)
-        state, model, damping = pick(accepted, trial_state, state), pick(accepted, trial, refused), after
+            accepted = accepted & going
+            after = torch.where(going, after, damping)
+            refused = pick(going, refused, model)
+        state = pick(accepted, trial_state, state)
+        model = pick(accepted, trial, refused)
+        damping = after
     return put(whole, rows, state), costs.index_copy(0, rows, model.cost)
 
 
@@ -110,7 +130,9 @@ class LinearResiduals(Linearisation):
 class LeastSquares(Minimisation[State, LinearResiduals]):
     """A batch of least-squares problems: the cost is the sum of squared residuals."""
 
-    residuals: Callable[[State, Int[Tensor, "a"]], Residuals]  # with Jacobian, of the problems with given indices
+    residuals: Callable[
+        [State, Int[Tensor, "a"]], Residuals
+    ]  # with Jacobian, of the problems with given indices
     moved: Callable[[State, Float[Tensor, "a d"]], State]  # the states after given steps
     solved: float = SOLVED  # sum of squared residuals below which a problem is solved
     largest: float = 0.3  # largest change of a variable in one step
@@ -121,11 +143,15 @@ class LeastSquares(Minimisation[State, LinearResiduals]):
         return LinearResiduals(residual.square().sum(1), residual, jacobian)
 
     def step(self, model: LinearResiduals, damping: Damping) -> Steps:
-        """Return the damped step of each problem, zero if its matrix is singular, and whether the problem goes on."""
+        """Return the damped step of each problem, zero if its matrix is singular, and whether the
+        problem goes on.
+        """
         normal = model.jacobian.mT @ model.jacobian
         diagonal = normal.diagonal(dim1=1, dim2=2)
         # Relative damping alone would leave a joint that moves nothing undamped.
-        factor, info = torch.linalg.cholesky_ex(normal + torch.diag_embed(damping[:, None] * diagonal + 1e-3))
+        factor, info = torch.linalg.cholesky_ex(
+            normal + torch.diag_embed(damping[:, None] * diagonal + 1e-3)
+        )
         x = -torch.cholesky_solve(model.jacobian.mT @ model.residual[..., None], factor)[..., 0]
         taken = ~(model.cost < self.solved) & torch.isfinite(damping)
         # A GPU may factor a matrix with an infinite diagonal without complaint; its step is NaN.
@@ -136,10 +162,13 @@ class LeastSquares(Minimisation[State, LinearResiduals]):
         """Return the states of the problems after the steps `x`."""
         return self.moved(state, x)
 
-    def judge(self, model: LinearResiduals, trial: LinearResiduals, x: Step, damping: Damping) -> Verdict:
+    def judge(
+        self, model: LinearResiduals, trial: LinearResiduals, x: Step, damping: Damping
+    ) -> Verdict:
         """Accept a step that lowers the cost; stop a problem that has converged or is stuck."""
         lost = 30.0  # damping beyond which a refused step ends a row of `LeastSquares`
-        stalled = 0.02  # relative decrease of the sum of squares below which a row of `LeastSquares` has converged
+        # relative decrease of the sum of squares below which a row of `LeastSquares` has converged
+        stalled = 0.02
         better = trial.cost < model.cost
         rests = torch.where(better, trial.cost > (1 - stalled) * model.cost, damping > lost)
         after = torch.where(better, damping / 3, damping * 4).clamp(1e-6, 1e6)

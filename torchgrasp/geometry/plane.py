@@ -1,7 +1,7 @@
 """The table plane, and the upright frame in which the library computes.
 
-Results must not depend on the frame of the camera or the robot. So public functions transform their arguments into a
-frame that only scene and camera determine, and transform the results back.
+Results must not depend on the frame of the camera or the robot. So public functions transform their
+arguments into a frame that only scene and camera determine, and transform the results back.
 """
 
 import dataclasses
@@ -19,22 +19,23 @@ from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
 from torchgrasp.geometry.linalg import unit
 
 GRID = 2.0**-20  # spacing [m] of rounded points: far above the rounding errors of a transform
-POINTS, DIRECTIONS, POSES = (
-    ("points", "viewpoint", "vertices"),
-    ("normals", "approach", "witness", "frustum", "task_load", "task_twist", "task_forces"),
-    ("obj_from_hand", "obj_from_vf"),
-)
-"""Names of the fields that change with the coordinate frame, by kind; all other fields are invariant."""
+POINTS = ("points", "viewpoint", "vertices")
+DIRECTIONS = ("normals", "approach", "witness", "frustum", "task_load", "task_twist", "task_forces")
+POSES = ("obj_from_hand", "obj_from_vf")
+"""Names of the fields that change with the coordinate frame, by kind; all other fields are
+invariant.
+"""
 LEAST_TILT = 0.05  # least sine of the angle between the vertical and a camera that has an azimuth
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class Plane(Value):
-    """A table plane: the points p with normal . p = offset. Objects stand on the side of the normal.
+    """A table plane: the points p with normal . p = offset. Objects stand on the side of the
+    normal.
 
-    The unit `normal` points up; `offset` is the distance [m] of the plane from the origin along it. Raises
-    `BadArgument` if the normal is not of unit length, or a number is not finite.
+    The unit `normal` points up; `offset` is the distance [m] of the plane from the origin along it.
+    Raises `BadArgument` if the normal is not of unit length, or a number is not finite.
 
     >>> plane = Plane.horizontal(0.1)
     >>> plane.describe(), plane.height(torch.tensor([0.0, 0.0, 0.3]))
@@ -83,7 +84,9 @@ def read_plane(text: str) -> Plane:
 
 
 def as_plane(table: Plane | float | None) -> Plane | None:
-    """Return a table as a plane. It is given as a plane or as its height [m] along z; None means no table."""
+    """Return a table as a plane. It is given as a plane or as its height [m] along z; None means no
+    table.
+    """
     if table is None or isinstance(table, Plane):
         return table
     if isinstance(table, bool) or not isinstance(table, int | float) or not math.isfinite(table):
@@ -92,33 +95,49 @@ def as_plane(table: Plane | float | None) -> Plane | None:
 
 
 def upright_frame(
-    points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "*v 3"] | None = None, table: Plane | None = None
+    points: Float[Tensor, "n 3"],
+    viewpoint: Float[Tensor, "*v 3"] | None = None,
+    table: Plane | None = None,
 ) -> Float[Tensor, "4 4"]:
     """Return `obj_from_upright`: the pose of a frame that is fixed to points, camera and table.
 
-    The z axis is the table's normal. Without a table, z points to the camera; without both, z is the direction in which
-    the points spread least. The x axis is horizontal and points towards the camera. If the camera is straight above, x
-    points to the point farthest from the vertical through the points' centroid. The origin is on this vertical, on the
-    table if there is one. A table above most points is a `BadArgument`.
+    The z axis is the table's normal. Without a table, z points to the camera; without both, z is
+    the direction in which the points spread least. The x axis is horizontal and points towards the
+    camera. If the camera is straight above, x points to the point farthest from the vertical
+    through the points' centroid. The origin is on this vertical, on the table if there is one. A
+    table above most points is a `BadArgument`.
     """
     points = points.detach().cpu().double()
     centre = points.mean(0)
     offset = points - centre
-    eye = None if viewpoint is None else viewpoint.detach().cpu().double().reshape(-1, 3).mean(0) - centre
+    eye = (
+        None
+        if viewpoint is None
+        else viewpoint.detach().cpu().double().reshape(-1, 3).mean(0) - centre
+    )
     if table is not None:
         middle = float(table.height(points).median())
         if middle < -0.01:  # several errors of a calibration
-            raise BadArgument("table", f"a plane {-middle:.3g} m above the middle of the cloud", "one under the object")
+            raise BadArgument(
+                "table",
+                f"a plane {-middle:.3g} m above the middle of the cloud",
+                "one under the object",
+            )
         z = unit(table.normal.detach().cpu().double())
         centre = centre - table.height(centre) * z
     elif eye is not None and bool(eye.any()):
-        z, eye = unit(eye), None
+        z = unit(eye)
+        eye = None
     else:
         z = torch.linalg.svd(offset, full_matrices=False).Vh[2]
         z = z if float((offset @ z).pow(3).sum()) >= 0 else -z
     if eye is not None:
         level = eye - (eye @ z) * z
-        eye = level if torch.linalg.vector_norm(level) > LEAST_TILT * torch.linalg.vector_norm(eye) else None
+        eye = (
+            level
+            if torch.linalg.vector_norm(level) > LEAST_TILT * torch.linalg.vector_norm(eye)
+            else None
+        )
     if eye is None:
         level = offset - (offset @ z)[:, None] * z
         eye = level[torch.linalg.vector_norm(level, dim=1).argmax()]
@@ -126,23 +145,33 @@ def upright_frame(
     return rigid(torch.stack([x, torch.linalg.cross(z, x), z], -1), centre)
 
 
-def to_upright(points: Float[Tensor, "*b 3"], obj_from_upright: Float[Tensor, "4 4"]) -> Float[Tensor, "*b 3"]:
+def to_upright(
+    points: Float[Tensor, "*b 3"], obj_from_upright: Float[Tensor, "4 4"]
+) -> Float[Tensor, "*b 3"]:
     """Return points [m] in the upright frame, rounded to multiples of the fine step `GRID` [m]."""
-    return _round(apply(inverse(obj_from_upright).to(points.device), points.double().reshape(-1, 3))).reshape_as(points)
+    return _round(
+        apply(inverse(obj_from_upright).to(points.device), points.double().reshape(-1, 3))
+    ).reshape_as(points)
 
 
 def round_upright(value: SomeValue, obj_from_upright: Float[Tensor, "4 4"]) -> SomeValue:
-    """Return a value, such as a cloud, in the upright frame, in float64, each number rounded to multiples of `GRID`."""
+    """Return a value, such as a cloud, in the upright frame, in float64, each number rounded to
+    multiples of `GRID`.
+    """
     return map_tensors(_round, move(value.to(torch.float64), inverse(obj_from_upright)))
 
 
 def _round(x: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-    """Round to multiples of `GRID`, after adding a constant that keeps common float32 numbers off the midpoints."""
+    """Round to multiples of `GRID`, after adding a constant that keeps common float32 numbers off
+    the midpoints.
+    """
     return torch.round(x / GRID + 1 / math.pi) * GRID
 
 
 def move(value: SomeValue, b_from_a: Float[Tensor, "4 4"]) -> SomeValue:
-    """Return a value, such as a cloud or grasps, transformed from frame a to frame b, with lengths in metres."""
+    """Return a value, such as a cloud or grasps, transformed from frame a to frame b, with lengths
+    in metres.
+    """
 
     def moved(name: str, x: Any) -> Any:
         if isinstance(x, Value):

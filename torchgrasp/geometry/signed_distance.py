@@ -17,7 +17,9 @@ from torchgrasp.foundation.lazy import spatial, trimesh
 from torchgrasp.geometry.mesh import closest_on_triangles
 
 BAND = 0.026  # distance [m] within which every second node is exact: the reach of a palm's spheres
-NEAR, INWARD = 3, 5  # spacings outside and inside the surface within which every node is exact
+# spacings outside and inside the surface within which every node is exact
+NEAR = 3
+INWARD = 5
 FAR_SHARE = 8  # one of so many samples of the surface is used for nodes beyond the band
 FIELD_SPACING = 0.004  # spacing [m] of nodes with an error below that of an estimated surface
 
@@ -30,11 +32,15 @@ class Grid(NamedTuple):
     last: Int[Tensor, "*b 3"]  # node on each axis
     stride: Any  # number of values between neighbours on the x and on the y axis
     first: Any  # place of the first value
-    corners: Int[Tensor, "8 *b"]  # steps from the first corner of a cell to all corners, among the values
+    corners: Int[
+        Tensor, "8 *b"
+    ]  # steps from the first corner of a cell to all corners, among the values
 
 
 class DistanceField(Value, abc.ABC):
-    """Signed distances [m] at the `nodes` of a grid, or of the grids of several objects, one for each row of points."""
+    """Signed distances [m] at the `nodes` of a grid, or of the grids of several objects, one for
+    each row of points.
+    """
 
     nodes: Any  # Float[Tensor, "n"]
     spacing: Any  # [m], a number or that of each row
@@ -45,7 +51,9 @@ class DistanceField(Value, abc.ABC):
 
     @checked
     def nearest_node(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return the signed distance [m] of the grid node nearest to each point, outside the grid of a border node."""
+        """Return the signed distance [m] of the grid node nearest to each point, outside the grid
+        of a border node.
+        """
         grid = self._grid(points)
         node = torch.round((points - grid.origin) / grid.spacing).clamp_min_(0)
         node = torch.minimum(node, grid.last.to(points)).long()
@@ -57,7 +65,9 @@ class DistanceField(Value, abc.ABC):
         """Return the grid of the points."""
 
     @checked(gradients=True)
-    def query(self, points: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
+    def query(
+        self, points: Float[Tensor, "*b 3"]
+    ) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
         """Return the interpolated signed distance [m] at each point, and its gradient.
 
         Outside the grid, the distance [m] from the grid is added to the value at the border.
@@ -72,13 +82,18 @@ class DistanceField(Value, abc.ABC):
         z = [torch.lerp(corner[2 * i], corner[2 * i + 1], fz) for i in range(4)]
         y = [torch.lerp(z[0], z[1], fy), torch.lerp(z[2], z[3], fy)]
         slope_z = [corner[2 * i + 1] - corner[2 * i] for i in range(4)]
-        slope_z = torch.lerp(torch.lerp(slope_z[0], slope_z[1], fy), torch.lerp(slope_z[2], slope_z[3], fy), fx)
+        slope_z = torch.lerp(
+            torch.lerp(slope_z[0], slope_z[1], fy), torch.lerp(slope_z[2], slope_z[3], fy), fx
+        )
         slope_y = torch.lerp(z[1] - z[0], z[3] - z[2], fx)
         slope = torch.stack([y[1] - y[0], slope_y, slope_z], -1) / spacing
         beyond = (position - inside) * spacing
-        outside = (beyond != 0).any(-1, keepdim=True)  # the norm of a zero vector has no second derivative
+        outside = (beyond != 0).any(
+            -1, keepdim=True
+        )  # the norm of a zero vector has no second derivative
         length = torch.linalg.vector_norm(torch.where(outside, beyond, 1.0), dim=-1, keepdim=True)
-        away, outward = torch.where(outside, length, 0.0)[..., 0], beyond / length
+        away = torch.where(outside, length, 0.0)[..., 0]
+        outward = beyond / length
         gradient = torch.where(beyond != 0, 0.0, slope) + outward
         return torch.lerp(y[0], y[1], fx) + away, gradient
 
@@ -110,7 +125,9 @@ class SignedDistanceField(DistanceField):
 
     @kept
     def _cells(self) -> tuple[Int[Tensor, "3"], Int[Tensor, "8"]]:
-        """The last node along each axis, and the steps from the first corner of a cell to all corners in `values`."""
+        """The last node along each axis, and the steps from the first corner of a cell to all
+        corners in `values`.
+        """
         shape = torch.tensor(self.values.shape, device=self.values.device)
         return shape - 1, corner_steps(shape[1] * shape[2], shape[2])
 
@@ -121,7 +138,9 @@ class SignedDistanceField(DistanceField):
 
 
 def corner_steps(dx: Int[Tensor, "*b"], dy: Int[Tensor, "*b"]) -> Int[Tensor, "8 *b"]:
-    """Return the steps from the first corner of a cell to all eight corners, given the strides on the x and y axis."""
+    """Return the steps from the first corner of a cell to all eight corners, given the strides on
+    the x and y axis.
+    """
     corner = torch.arange(8, device=dx.device).view(-1, *[1] * dx.ndim)
     return corner // 4 * dx + corner // 2 % 2 * dy + corner % 2
 
@@ -133,13 +152,15 @@ def field_from_surface(
     spacing: Annotated[float, Range(0.0001, 0.1)] = 0.003,
     margin: Annotated[float, Range(0.0, 1.0)] = 0.08,
 ) -> SignedDistanceField:
-    """Return the signed distance field of a triangle mesh [m] with outward faces; the mesh may be open.
+    """Return the signed distance field of a triangle mesh [m] with outward faces; the mesh may be
+    open.
 
     The nodes are `spacing` [m] apart and reach to `margin` [m] around the mesh: at most 2e7 nodes.
     """
     check_tensor("vertices", vertices, (None, 3))
     surface = _Surface(vertices, faces)
-    low, high = vertices.amin(0).double() - margin, vertices.amax(0).double() + margin
+    low = vertices.amin(0).double() - margin
+    high = vertices.amax(0).double() + margin
     # the first nodes are every fourth of the finest
     counts = [4 * max(1, int(c)) + 1 for c in torch.ceil((high - low) / (4 * spacing)).tolist()]
     if np.prod(np.array(counts, dtype=float)) > 2e7:  # 160 MB
@@ -150,7 +171,8 @@ def field_from_surface(
     values = surface.distance(nodes.reshape(-1, 3), far=True).reshape(nodes.shape[:3])
     known = np.zeros(values.shape, dtype=bool)
     for step, inward, outward in ((2, np.inf, BAND), (1, INWARD * spacing, NEAR * spacing)):
-        before, values = known, _refine(values)
+        before = known
+        values = _refine(values)
         known = np.zeros(values.shape, dtype=bool)
         known[::2, ::2, ::2] = before
         near = np.nonzero((-inward < values) & (values < outward) & ~known)
@@ -161,21 +183,29 @@ def field_from_surface(
 
 
 def surface_distance(vertices: Tensor, faces: Tensor) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the signed distance [m] from a triangle mesh [m] with outward faces, as a function of points (n, 3)."""
+    """Return the signed distance [m] from a triangle mesh [m] with outward faces, as a function of
+    points (n, 3).
+    """
     return _Surface(vertices, faces).distance
 
 
 def _refine(values: np.ndarray) -> np.ndarray:
-    """Return signed distances on a grid twice as fine; new nodes have cubic distances and the previous node's sign."""
+    """Return signed distances on a grid twice as fine; new nodes have cubic distances and the
+    previous node's sign.
+    """
     # Far from an open mesh the sign jumps, where a cubic of signed distances would be wrong.
-    sign, distance = values < 0, np.abs(values)
+    sign = values < 0
+    distance = np.abs(values)
     for axis in range(3):
-        sign, distance = _upsample(sign, axis), _upsample(distance, axis)
+        sign = _upsample(sign, axis)
+        distance = _upsample(distance, axis)
     return np.where(sign, -distance, distance)
 
 
 def _upsample(values: np.ndarray, axis: int) -> np.ndarray:
-    """Return values with a new one between any two neighbours on an axis: cubic, or for signs the previous value."""
+    """Return values with a new one between any two neighbours on an axis: cubic, or for signs the
+    previous value.
+    """
     known = np.moveaxis(values, axis, 0)
     fine = np.empty((2 * len(known) - 1, *known.shape[1:]), dtype=known.dtype)
     fine[::2] = known
@@ -184,58 +214,93 @@ def _upsample(values: np.ndarray, axis: int) -> np.ndarray:
     else:
         padded = np.concatenate([2 * known[:1] - known[1:2], known, 2 * known[-1:] - known[-2:-1]])
         fine[1::2] = (9 * (known[:-1] + known[1:]) - padded[:-3] - padded[3:]) / 16
-    return np.ascontiguousarray(np.moveaxis(fine, 0, axis))  # queries would copy another layout each time
+    return np.ascontiguousarray(
+        np.moveaxis(fine, 0, axis)
+    )  # queries would copy another layout each time
 
 
 class _Surface:
-    """The triangles of a mesh with a search tree over surface samples, to find the distances of points."""
+    """The triangles of a mesh with a search tree over surface samples, to find the distances of
+    points.
+    """
 
     def __init__(self, vertices: Tensor, faces: Tensor):
         if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0 or faces.is_floating_point():
-            raise BadArgument("faces", f"{faces.dtype} of shape {tuple(faces.shape)}", "integers (f, 3) with f >= 1")
+            raise BadArgument(
+                "faces",
+                f"{faces.dtype} of shape {tuple(faces.shape)}",
+                "integers (f, 3) with f >= 1",
+            )
         if faces.min() < 0 or faces.max() >= len(vertices):
-            raise BadArgument("faces", f"faces {int(faces.min())}..{int(faces.max())}", f"0..{len(vertices) - 1}")
+            raise BadArgument(
+                "faces", f"faces {int(faces.min())}..{int(faces.max())}", f"0..{len(vertices) - 1}"
+            )
         corners = vertices.detach().cpu().double().numpy()[faces.cpu().numpy()]
-        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
-        corners, area = corners[area > 1e-14], area[area > 1e-14]
+        area = (
+            np.linalg.norm(
+                np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
+            )
+            / 2
+        )
+        corners = corners[area > 1e-14]
+        area = area[area > 1e-14]
         if len(area) == 0:
             raise BadArgument("faces", "faces without area", "a surface")
-        rng, count = np.random.default_rng(0), int(np.clip(area.sum() / 0.002**2, 2000, 40_000))
+        rng = np.random.default_rng(0)
+        count = int(np.clip(area.sum() / 0.002**2, 2000, 40_000))
         owner = np.repeat(np.arange(len(area)), rng.multinomial(count, area / area.sum()))
         u, v = np.sort(rng.random((2, len(owner))), axis=0)
         weights = np.stack([u, v - u, 1 - v], 1)
         samples = (corners[owner] * weights[:, :, None]).sum(1)
         self.owner = np.concatenate([np.arange(len(area)), owner])
-        self.triangles, self.normals = corners, _pseudonormals(corners)
+        self.triangles = corners
+        self.normals = _pseudonormals(corners)
         samples = np.concatenate([corners.mean(1), samples])
-        self.tree, self.few = spatial.KDTree(samples, leafsize=32), spatial.KDTree(samples[::FAR_SHARE], leafsize=32)
+        self.tree = spatial.KDTree(samples, leafsize=32)
+        self.few = spatial.KDTree(samples[::FAR_SHARE], leafsize=32)
 
     def distance(self, points: np.ndarray, far: bool = False) -> np.ndarray:
-        """Return the signed distances [m] of points (n, 3); `far` uses fewer samples, for distant points."""
-        parts, tree, owners = [], self.few if far else self.tree, self.owner[::FAR_SHARE] if far else self.owner
+        """Return the signed distances [m] of points (n, 3); `far` uses fewer samples, for distant
+        points.
+        """
+        parts = []
+        tree = self.few if far else self.tree
+        owners = self.owner[::FAR_SHARE] if far else self.owner
         for part in (points[k : k + 8192] for k in range(0, max(1, len(points)), 8192)):
             _, index = tree.query(part, k=1 if far else min(3, len(owners)))
             owner = owners[index.reshape(len(part), -1)]
-            feet, feature = closest_on_triangles(np.repeat(part, owner.shape[1], 0), self.triangles[owner.reshape(-1)])
+            feet, feature = closest_on_triangles(
+                np.repeat(part, owner.shape[1], 0), self.triangles[owner.reshape(-1)]
+            )
             gap = part[:, None] - feet.reshape(*owner.shape, 3)
             squared = (gap * gap).sum(-1)
-            rows, best = np.arange(len(part)), squared.argmin(1)
+            rows = np.arange(len(part))
+            best = squared.argmin(1)
             normal = self.normals[owner[rows, best], feature.reshape(owner.shape)[rows, best]]
-            parts.append(np.copysign(np.sqrt(squared[rows, best]), (gap[rows, best] * normal).sum(1)))
+            parts.append(
+                np.copysign(np.sqrt(squared[rows, best]), (gap[rows, best] * normal).sum(1))
+            )
         return np.concatenate(parts)
 
 
 def _pseudonormals(corners: np.ndarray) -> np.ndarray:
-    """Return pseudonormals (Baerentzen and Aanaes, 2005) of each triangle's face, 3 sides and 3 corners, (f, 7, 3)."""
+    """Return pseudonormals (Baerentzen and Aanaes, 2005) of each triangle's face, 3 sides and 3
+    corners, (f, 7, 3).
+    """
     face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     face /= np.linalg.norm(face, axis=1, keepdims=True)
     ids = trimesh.grouping.unique_rows(corners.reshape(-1, 3), digits=9)[1].reshape(-1, 3)
-    ahead, back = np.roll(corners, -1, 1) - corners, np.roll(corners, 1, 1) - corners
-    cosine = (ahead * back).sum(-1) / (np.linalg.norm(ahead, axis=-1) * np.linalg.norm(back, axis=-1))
+    ahead = np.roll(corners, -1, 1) - corners
+    back = np.roll(corners, 1, 1) - corners
+    cosine = (ahead * back).sum(-1) / (
+        np.linalg.norm(ahead, axis=-1) * np.linalg.norm(back, axis=-1)
+    )
     weighted = face[:, None] * np.arccos(np.clip(cosine, -1, 1))[..., None]
     at_corner = _sum_by(ids.reshape(-1), weighted.reshape(-1, 3))
     side = np.sort(np.stack([ids, np.roll(ids, -1, 1)], -1), -1)
-    side = np.unique(side[..., 0] * (ids.max() + 1) + side[..., 1], return_inverse=True)[1].reshape(-1, 3)
+    side = np.unique(side[..., 0] * (ids.max() + 1) + side[..., 1], return_inverse=True)[1].reshape(
+        -1, 3
+    )
     at_side = _sum_by(side.reshape(-1), np.repeat(face, 3, 0))
     return np.concatenate([face[:, None], at_side[side], at_corner[ids]], 1)
 

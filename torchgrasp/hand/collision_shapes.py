@@ -1,8 +1,10 @@
-"""Collision shapes of a hand's links: covering spheres, exact boxes, and the pairs of links that can collide.
+"""Collision shapes of a hand's links: covering spheres, exact boxes, and the pairs of links that
+can collide.
 
-Spheres give the clearance from object and table: each collision shape is cut into cells, with one sphere for each cell.
-No surface with a radius of curvature above 25 mm reaches a face between the spheres. Exact boxes and spheres are tested
-for self-collision; in this test a cylinder becomes a prism of twelve sides.
+Spheres give the clearance from object and table: each collision shape is cut into cells, with one
+sphere for each cell. No surface with a radius of curvature above 25 mm reaches a face between the
+spheres. Exact boxes and spheres are tested for self-collision; in this test a cylinder becomes a
+prism of twelve sides.
 """
 
 import dataclasses
@@ -25,15 +27,17 @@ from torchgrasp.hand.self_collision import SelfCollision
 from torchgrasp.hand.urdf import LinkShape, Mimic, Triple, Urdf
 
 MEETING_DISTANCE = 0.002  # links that come nearer than this [m] in some posture are a pair to test
-ALWAYS = 0.98  # links that overlap in a larger share of the postures overlap by construction: they are no pair to test
+# links that overlap in a larger share of the postures overlap by construction: they are no pair to
+# test
+ALWAYS = 0.98
 
 
 @dataclasses.dataclass(frozen=True)
 class CollisionSpheres(Value):
     """Spheres [m] that cover a hand's links, each with its centre in the frame of one link.
 
-    `finger` is the finger's index in grasp order, -1 for the palm, -2 for a finger that does not grasp. `touching`
-    marks the spheres of fingertips.
+    `finger` is the finger's index in grasp order, -1 for the palm, -2 for a finger that does not
+    grasp. `touching` marks the spheres of fingertips.
 
     >>> from torchgrasp import load_hand
     >>> load_hand("barrett").collision_spheres.center.shape
@@ -50,13 +54,16 @@ class CollisionSpheres(Value):
 def spheres_from_urdf(urdf: Urdf, spec: HandSpec) -> CollisionSpheres:
     """Return spheres that cover every collision shape of a URDF."""
     bulge = 0.004  # how far a sphere may stand out of a shape's faces [m], other than a fingertip's
-    # Edge of the cells of fingers and palm [m]; edges and corners stick farther out of the spheres of larger cells
-    finger_cell, palm_cell = 0.015, 0.022
+    # Edge of the cells of fingers and palm [m]; edges and corners stick farther out of the spheres
+    # of larger cells
+    finger_cell = 0.015
+    palm_cell = 0.022
     owner = {joint: i for i, f in enumerate(spec.fingers) for joint in f.joints}
     tips = [f.tip_link for f in spec.fingers]
     rows: list[tuple[int, Triple, float, int, bool]] = []
     for index, link in enumerate(urdf.links):
-        movers, touching = urdf.movers(link.name), link.name in tips
+        movers = urdf.movers(link.name)
+        touching = link.name in tips
         finger = owner.get(movers[0].name, -2) if movers else -1
         cell = palm_cell if finger == -1 else finger_cell
         for shape in link.shapes:
@@ -64,12 +71,16 @@ def spheres_from_urdf(urdf: Urdf, spec: HandSpec) -> CollisionSpheres:
             centers, radius = cover(shape, cell, 0.0 if touching else bulge)
             rows += [(index, center, radius, finger, touching) for center in centers]
     link_index, center, radius, finger, touching = zip(*rows, strict=True)
-    link_index, finger, touching = (torch.tensor(x, device="cpu") for x in (link_index, finger, touching))
+    link_index, finger, touching = (
+        torch.tensor(x, device="cpu") for x in (link_index, finger, touching)
+    )
     return CollisionSpheres(link_index, real(center), real(radius), finger, touching)
 
 
 def cover(shape: LinkShape, cell: float, bulge: float) -> tuple[list[Triple], float]:
-    """Return the centres and the radius [m] of spheres that cover a shape, one for each cell of about size `cell`."""
+    """Return the centres and the radius [m] of spheres that cover a shape, one for each cell of
+    about size `cell`.
+    """
     single_layer = 0.025  # a shape thinner than this [m] has one layer of cells across
     if shape.kind == "sphere":
         return [shape.xyz], shape.size[0]
@@ -87,7 +98,8 @@ def cover(shape: LinkShape, cell: float, bulge: float) -> tuple[list[Triple], fl
         reach = [max(0.0, s / 2 + bulge - radius) for s in size]
         center = [math.copysign(min(abs(c), r), c) for c, r in zip(center, reach, strict=True)]
         if shape.kind == "cylinder":
-            rim, out = max(0.0, shape.size[0] + bulge - radius), math.hypot(center[0], center[1])
+            rim = max(0.0, shape.size[0] + bulge - radius)
+            out = math.hypot(center[0], center[1])
             if out > rim:
                 center[:2] = [center[0] * rim / out, center[1] * rim / out]
         centers.append(center)
@@ -96,20 +108,38 @@ def cover(shape: LinkShape, cell: float, bulge: float) -> tuple[list[Triple], fl
 
 
 def self_collision_from_urdf(urdf: Urdf, pairs: Iterable[tuple[str, str]] | None) -> SelfCollision:
-    """Return the exact shapes of a URDF to test the `pairs` of links for collision, by default all but neighbours."""
+    """Return the exact shapes of a URDF to test the `pairs` of links for collision, by default all
+    but neighbours.
+    """
     names = [x.name for x in urdf.links]
-    tested = {frozenset(pair) for pair in (itertools.combinations(names, 2) if pairs is None else pairs)}
+    tested = {
+        frozenset(pair) for pair in (itertools.combinations(names, 2) if pairs is None else pairs)
+    }
     if pairs is None:
         tested -= {frozenset((j.parent, j.child)) for j in urdf.joints}
-    shapes = [(i, *part) for i, link in enumerate(urdf.links) for shape in link.shapes for part in _parts(shape)]
+    shapes = [
+        (i, *part)
+        for i, link in enumerate(urdf.links)
+        for shape in link.shapes
+        for part in _parts(shape)
+    ]
     link, rotation, center, half, radius = zip(*shapes, strict=True)
     places = {i: list(of) for i, of in itertools.groupby(range(len(shapes)), link.__getitem__)}
-    meeting = [(i, j) for i in places for j in places if j >= i and frozenset((names[i], names[j])) in tested]
+    meeting = [
+        (i, j)
+        for i in places
+        for j in places
+        if j >= i and frozenset((names[i], names[j])) in tested
+    ]
     if (many := sum(len(places[i]) * len(places[j]) for i, j in meeting)) > HAND_SHAPE_PAIRS:
         found = f"{many} pairs of shapes to test for collisions"
-        raise urdf.wrong(found, f"at most {HAND_SHAPE_PAIRS} pairs, where a cylinder counts as six shapes")
+        raise urdf.wrong(
+            found, f"at most {HAND_SHAPE_PAIRS} pairs, where a cylinder counts as six shapes"
+        )
     kinds: tuple[list[tuple[int, int]], ...] = ([], [], [])
-    for one, two in sorted((one, two) for i, j in meeting for one in places[i] for two in places[j] if two > one):
+    for one, two in sorted(
+        (one, two) for i, j in meeting for one in places[i] for two in places[j] if two > one
+    ):
         spheres = radius[one] > 0, radius[two] > 0
         kinds[sum(spheres)].append((two, one) if spheres == (False, True) else (one, two))
     return SelfCollision(
@@ -118,13 +148,17 @@ def self_collision_from_urdf(urdf: Urdf, pairs: Iterable[tuple[str, str]] | None
         center=real(center),
         half=real(half),
         radius=real(radius),
-        pairs=torch.tensor([*kinds[0], *kinds[1], *kinds[2]], dtype=torch.long, device="cpu").view(-1, 2),
+        pairs=torch.tensor([*kinds[0], *kinds[1], *kinds[2]], dtype=torch.long, device="cpu").view(
+            -1, 2
+        ),
         kinds=(len(kinds[0]), len(kinds[1]), len(kinds[2])),
     )
 
 
 def _parts(shape: LinkShape) -> list[tuple[Float[Tensor, "3 3"], Triple, Triple, float]]:
-    """Return rotation, centre, half sizes and radius [m] of each box or sphere of a shape; a cylinder is six boxes."""
+    """Return rotation, centre, half sizes and radius [m] of each box or sphere of a shape; a
+    cylinder is six boxes.
+    """
     rotation = rotation_from_rpy(shape.rpy)
     if shape.kind == "sphere":
         return [(rotation, shape.xyz, (0.0, 0.0, 0.0), shape.size[0])]
@@ -132,24 +166,38 @@ def _parts(shape: LinkShape) -> list[tuple[Float[Tensor, "3 3"], Triple, Triple,
         return [(rotation, shape.xyz, shape.half, 0.0)]
     boxes = 6
     step = math.pi / boxes
-    corner = 2 * shape.size[0] / (1 + math.cos(step / 2))  # as far outside the circle as the sides are inside
+    corner = (
+        2 * shape.size[0] / (1 + math.cos(step / 2))
+    )  # as far outside the circle as the sides are inside
     half = (corner * math.cos(step / 2), corner * math.sin(step / 2), shape.size[1] / 2)
-    return [(rotation @ rotation_from_rpy((0.0, 0.0, k * step)), shape.xyz, half, 0.0) for k in range(boxes)]
+    return [
+        (rotation @ rotation_from_rpy((0.0, 0.0, k * step)), shape.xyz, half, 0.0)
+        for k in range(boxes)
+    ]
 
 
-def collision_pairs(urdf: Urdf, coupling: Mapping[str, Mimic], n: int = 20_000, seed: int = 0) -> list[tuple[str, str]]:
-    """Return the pairs of links that collide in some of n random postures but not in nearly all, without neighbours."""
+def collision_pairs(
+    urdf: Urdf, coupling: Mapping[str, Mimic], n: int = 20_000, seed: int = 0
+) -> list[tuple[str, str]]:
+    """Return the pairs of links that collide in some of n random postures but not in nearly all,
+    without neighbours.
+    """
     check_whole("n", n, 1, 10**7)
-    tree, shapes = tree_from_urdf(urdf), self_collision_from_urdf(urdf, None)
+    tree = tree_from_urdf(urdf)
+    shapes = self_collision_from_urdf(urdf, None)
     if not len(shapes.pairs):
         return []
-    links, owner = torch.unique(shapes.link[shapes.pairs].sort(1).values, dim=0, return_inverse=True)
+    links, owner = torch.unique(
+        shapes.link[shapes.pairs].sort(1).values, dim=0, return_inverse=True
+    )
     met, near = torch.zeros(2, len(links), dtype=torch.float64, device=links.device)
     done = 0
     for look in draw_postures(urdf, coupling, n, seed).split(1000, 1):
         if not len(owner):
             break
-        chunks = [tree.frames(chunk) for chunk in look.split(max(1, 100_000 // len(owner)), 1)]  # bounds the memory
+        chunks = [
+            tree.frames(chunk) for chunk in look.split(max(1, 100_000 // len(owner)), 1)
+        ]  # bounds the memory
         if not done:
             _limit_near(urdf, shapes, chunks[0], look.shape[1], HAND_SEPARATIONS // 10)
         for frames in chunks:
@@ -160,29 +208,46 @@ def collision_pairs(urdf: Urdf, coupling: Mapping[str, Mimic], n: int = 20_000, 
             near += (least < MEETING_DISTANCE).sum(1)
         done += look.shape[1]
         met[met >= done] = torch.inf  # links that overlapped in every posture so far
-        settled = (met == torch.inf) | ((near > 0) & (met + (n - done) <= ALWAYS * n))  # whatever the rest shows
+        settled = (met == torch.inf) | (
+            (near > 0) & (met + (n - done) <= ALWAYS * n)
+        )  # whatever the rest shows
         kept = ~settled[owner]
-        shapes, owner = shapes.only(kept), owner[kept]
+        shapes = shapes.only(kept)
+        owner = owner[kept]
         _limit_near(urdf, shapes, chunks[0], n - done, HAND_SEPARATIONS)
-    return [(tree.link_names[i], tree.link_names[j]) for i, j in links[(near > 0) & (met <= ALWAYS * n)].tolist()]
+    return [
+        (tree.link_names[i], tree.link_names[j])
+        for i, j in links[(near > 0) & (met <= ALWAYS * n)].tolist()
+    ]
 
 
-def _limit_near(urdf: Urdf, shapes: SelfCollision, frames: Float[Tensor, "3 4 l n"], ahead: int, most: int) -> None:
-    """Raise `HandFileError` if `ahead` postures like those of `frames` need over `most` measured separations."""
+def _limit_near(
+    urdf: Urdf, shapes: SelfCollision, frames: Float[Tensor, "3 4 l n"], ahead: int, most: int
+) -> None:
+    """Raise `HandFileError` if `ahead` postures like those of `frames` need over `most` measured
+    separations.
+    """
     left = shapes.count_near(frames, MEETING_DISTANCE) * ahead // frames.shape[3]
     if left > most:
         found = f"{len(shapes.pairs)} pairs of shapes so near each other that {left} separations must be measured"
         raise urdf.wrong(found, f"at most {most} separations, by fewer shapes in one place")
 
 
-def draw_postures(urdf: Urdf, coupling: Mapping[str, Mimic], n: int, seed: int) -> Float[Tensor, "j n"]:
-    """Return random positions of all movable joints (j, n), uniform within the limits; coupled joints follow."""
+def draw_postures(
+    urdf: Urdf, coupling: Mapping[str, Mimic], n: int, seed: int
+) -> Float[Tensor, "j n"]:
+    """Return random positions of all movable joints (j, n), uniform within the limits; coupled
+    joints follow.
+    """
     movable = {j.name: j for j in urdf.movable}
     unknown = sorted(({*coupling} | {mimic.source for mimic in coupling.values()}) - set(movable))
     if unknown:
         raise BadArgument("coupling", unknown[0], f"joints of the URDF: {sorted(movable)}")
     share = np.random.default_rng(seed).random((len(movable), n))
-    drawn = {name: j.lower + (j.upper - j.lower) * share[k] for k, (name, j) in enumerate(movable.items())}
+    drawn = {
+        name: j.lower + (j.upper - j.lower) * share[k]
+        for k, (name, j) in enumerate(movable.items())
+    }
     for joint, mimic in coupling.items():
         drawn[joint] = mimic.ratio * drawn[mimic.source] + mimic.offset
     return torch.from_numpy(np.stack([drawn[name] for name in movable]))

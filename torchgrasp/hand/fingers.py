@@ -1,4 +1,6 @@
-"""The grasping fingers of a hand: actuated joints with the joints coupled to them, and fingertips with their pads."""
+"""The grasping fingers of a hand: actuated joints with the joints coupled to them, and fingertips
+with their pads.
+"""
 
 import dataclasses
 import math
@@ -13,11 +15,20 @@ from torchgrasp.foundation.checks import ANY, checked, is_known
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import real
 from torchgrasp.hand.hand_toml import HandSpec
-from torchgrasp.hand.kinematics import KinematicTree, map_directions, map_points, pose_in_carrier, tree_from_urdf
+from torchgrasp.hand.kinematics import (
+    KinematicTree,
+    map_directions,
+    map_points,
+    pose_in_carrier,
+    tree_from_urdf,
+)
 from torchgrasp.hand.urdf import Mimic, Urdf
 
-ROUND_PAD, FLAT_PAD = math.radians(60), math.radians(40)
-"""Half angles [rad] of the cone about the pad's axis in which a round and a flat fingertip may touch."""
+ROUND_PAD = math.radians(60)
+FLAT_PAD = math.radians(40)
+"""Half angles [rad] of the cone about the pad's axis in which a round and a flat fingertip may
+touch.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +57,8 @@ class ActuatedJoints(Value):
 
     @checked(gradients=True)
     def couple(self, joints: Annotated[Float[Tensor, "*b h"], ANY]) -> Float[Tensor, "*b j"]:
-        """Return the positions of all movable joints of the URDF, computed from those of the actuated joints.
+        """Return the positions of all movable joints of the URDF, computed from those of the
+        actuated joints.
 
         The input is not checked, because a check would wait for the GPU.
         """
@@ -54,7 +66,9 @@ class ActuatedJoints(Value):
 
     @checked(gradients=True)
     def check(self, joints: Tensor, name: str = "joints") -> None:
-        """Raise `BadArgument` for joints of a wrong count, dtype or device, for NaN and for infinity."""
+        """Raise `BadArgument` for joints of a wrong count, dtype or device, for NaN and for
+        infinity.
+        """
         if joints.ndim < 1 or joints.shape[-1] != len(self.names):
             allowed = f"{len(self.names)} joints in the last axis: {self.names}"
             raise BadArgument(name, f"shape {tuple(joints.shape)}", allowed)
@@ -65,31 +79,43 @@ class ActuatedJoints(Value):
 
     @checked(gradients=True)
     def check_limits(self, joints: Tensor, name: str = "joints") -> None:
-        """Raise `BadArgument` if `check` does, or if a joint is beyond its limits by more than float32 rounding."""
+        """Raise `BadArgument` if `check` does, or if a joint is beyond its limits by more than
+        float32 rounding.
+        """
         self.check(joints, name)
-        low, high = self.lower.to(joints) - 1e-6, self.upper.to(joints) + 1e-6
+        low = self.lower.to(joints) - 1e-6
+        high = self.upper.to(joints) + 1e-6
         self._refuse(name, joints, (joints < low) | (joints > high), None)
 
     def _refuse(self, name: str, joints: Tensor, wrong: Tensor, allowed: str | None) -> None:
-        """Raise `BadArgument` for the first joint marked as `wrong`; it names `allowed`, or else the joint's range."""
+        """Raise `BadArgument` for the first joint marked as `wrong`; it names `allowed`, or else
+        the joint's range.
+        """
         if not torch.compiler.is_compiling() and is_known(joints) and bool(wrong.any()):
             *batch, k = torch.nonzero(wrong)[0].tolist()
             limits = f"a number in [{self.lower[k].item():.6g}, {self.upper[k].item():.6g}]"
-            raise BadArgument(name, f"{joints[(*batch, k)].item():.6g} for {self.names[k]}", allowed or limits)
+            raise BadArgument(
+                name, f"{joints[(*batch, k)].item():.6g} for {self.names[k]}", allowed or limits
+            )
 
 
 def joints_from_files(spec: HandSpec, urdf: Urdf) -> ActuatedJoints:
-    """Return the actuated joints, with those that coupled joints follow; raise `HandFileError` for an empty range."""
+    """Return the actuated joints, with those that coupled joints follow; raise `HandFileError` for
+    an empty range.
+    """
     movable = {j.name: j for j in urdf.movable}
     own = [j for f in spec.fingers for j in f.joints]
     leaders = [spec.coupling[j].source for j in own if j in spec.coupling]
     names = tuple(dict.fromkeys([*(j for j in own if j not in spec.coupling), *leaders]))
-    limits = real([[movable[n].lower, movable[n].upper] for n in names]) + real([spec.limit_margin, -spec.limit_margin])
+    limits = real([[movable[n].lower, movable[n].upper] for n in names]) + real(
+        [spec.limit_margin, -spec.limit_margin]
+    )
     for name, (low, high) in zip(names, limits.tolist(), strict=True):
         if not low < high:
             found = f"limit_margin {spec.limit_margin:g}, which leaves [{low:g}, {high:g}] to joint {name}"
             raise spec.wrong(found, "a range with lower < upper")
-    coupling, offset = limits.new_zeros(len(movable), len(names)), limits.new_zeros(len(movable))
+    coupling = limits.new_zeros(len(movable), len(names))
+    offset = limits.new_zeros(len(movable))
     for row, joint in enumerate(movable):
         source, ratio, shift = spec.coupling.get(joint, Mimic(joint, 1.0, 0.0))
         if source in names:
@@ -98,7 +124,9 @@ def joints_from_files(spec: HandSpec, urdf: Urdf) -> ActuatedJoints:
         elif source in spec.parked or spec.option not in spec.options:
             offset[row] = ratio * spec.parked.get(source, movable[source].rest) + shift
         else:
-            raise spec.wrong(f"joint {joint}, which does neither", "every joint to grasp or to be parked")
+            raise spec.wrong(
+                f"joint {joint}, which does neither", "every joint to grasp or to be parked"
+            )
     return ActuatedJoints(names, limits[:, 0].clone(), limits[:, 1].clone(), coupling, offset)
 
 
@@ -106,9 +134,9 @@ def joints_from_files(spec: HandSpec, urdf: Urdf) -> ActuatedJoints:
 class Fingertips(Value):
     """The fingertips in grasp order: names, links, and the contact pad of each in its link's frame.
 
-    `index` is the index of each tip's link in the whole kinematic tree. Each tip is rigidly attached to a carrier, the
-    last link that a joint moves. `chains` is the part of the tree that leads to the carriers, and `carrier` is the
-    index of each carrier in this part.
+    `index` is the index of each tip's link in the whole kinematic tree. Each tip is rigidly
+    attached to a carrier, the last link that a joint moves. `chains` is the part of the tree that
+    leads to the carriers, and `carrier` is the index of each carrier in this part.
 
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("allegro")
@@ -132,20 +160,32 @@ class Fingertips(Value):
 
     @kept
     def cone(self) -> Float[Tensor, "f"]:
-        """The half angle [rad] of each pad's cone: the tip may touch only within this angle of the pad's axis."""
-        angles = self.radius.new_tensor([ROUND_PAD, FLAT_PAD], dtype=torch.float32)  # as when results were published
+        """The half angle [rad] of each pad's cone: the tip may touch only within this angle of the
+        pad's axis.
+        """
+        angles = self.radius.new_tensor(
+            [ROUND_PAD, FLAT_PAD], dtype=torch.float32
+        )  # as when results were published
         return torch.where(self.radius > 0, *angles).to(self.radius)
 
     @kept
-    def in_carriers(self) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"], Float[Tensor, "f 3"]]:
-        """Contact points [m], unit normals and centres [m] of the pads, each in the frame of the tip's carrier link."""
+    def in_carriers(
+        self,
+    ) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"], Float[Tensor, "f 3"]]:
+        """Contact points [m], unit normals and centres [m] of the pads, each in the frame of the
+        tip's carrier link.
+        """
         pose = self.carrier_from_tip
         contact, center = (map_points(pose, x)[..., 0].T for x in (self.contact, self.center))
         return contact, map_directions(pose, self.normal)[..., 0].T, center
 
     @checked(gradients=True)
-    def frames(self, values: Float[Tensor, "j n"]) -> tuple[Float[Tensor, "3 4 l n"], Float[Tensor, "3 4 f n"]]:
-        """Return the poses (3 x 4) of all links of `chains` and of the carriers, given all joint positions (j, n)."""
+    def frames(
+        self, values: Float[Tensor, "j n"]
+    ) -> tuple[Float[Tensor, "3 4 l n"], Float[Tensor, "3 4 f n"]]:
+        """Return the poses (3 x 4) of all links of `chains` and of the carriers, given all joint
+        positions (j, n).
+        """
         if len(values) != (every := len(self.chains.joint_names)):
             raise BadArgument("values", f"{len(values)} joints", f"all {every} joints of the URDF")
         frames = self.chains.frames(values)
@@ -153,8 +193,11 @@ class Fingertips(Value):
 
 
 def tips_from_files(spec: HandSpec, urdf: Urdf, chain: Any) -> Fingertips:
-    """Return the fingertips of the grasping fingers, as hand.toml and the URDF's chain describe them."""
-    links, tips = [x.name for x in urdf.links], tuple(f.tip_link for f in spec.fingers)
+    """Return the fingertips of the grasping fingers, as hand.toml and the URDF's chain describe
+    them.
+    """
+    links = [x.name for x in urdf.links]
+    tips = tuple(f.tip_link for f in spec.fingers)
     pads = zip(*(f.pad for f in spec.fingers), strict=True)
     contact, normal, center, radius = map(real, pads)
     carriers, poses = zip(*(pose_in_carrier(chain, tip) for tip in tips), strict=True)

@@ -17,12 +17,19 @@ from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import pytorch_kinematics
 from torchgrasp.hand.collision_shapes import CollisionSpheres
 from torchgrasp.hand.fingers import ActuatedJoints, Fingertips
-from torchgrasp.hand.kinematics import FreeMotion, KinematicTree, chain_poses, map_directions, map_points
+from torchgrasp.hand.kinematics import (
+    FreeMotion,
+    KinematicTree,
+    chain_poses,
+    map_directions,
+    map_points,
+)
 from torchgrasp.hand.self_collision import SelfCollision
 
 
 class Actuator(NamedTuple):
-    """Drive of one joint: greatest effort [N m] and velocity [rad/s], stiffness [N m/rad], damping [N m s/rad].
+    """Drive of one joint: greatest effort [N m] and velocity [rad/s], stiffness [N m/rad], damping
+    [N m s/rad].
 
     >>> from torchgrasp import load_hand
     >>> load_hand("barrett").actuators["f1_flex"].effort
@@ -36,7 +43,8 @@ class Actuator(NamedTuple):
 
 
 class HandSource(NamedTuple):
-    """The origin of a hand: its option or finger names, its URDF, one SHA-256 of its files, and all its options.
+    """The origin of a hand: its option or finger names, its URDF, one SHA-256 of its files, and all
+    its options.
 
     The files are the URDF and the description, `hand.toml`.
 
@@ -55,13 +63,14 @@ class HandSource(NamedTuple):
 class Hand(Value):
     """A robot hand with three to five grasping fingers, in grasp order.
 
-    Positions [m] are in the frame of the palm, the URDF's root link. `approach` is the direction out of the palm.
+    Positions [m] are in the frame of the palm, the URDF's root link. `approach` is the direction
+    out of the palm.
 
-    `chain` is the hand's model, a chain of pytorch-kinematics in which every movable joint is independent. `tree` and
-    `tips` are compiled from its tensors, so do not change it in place.
+    `chain` is the hand's model, a chain of pytorch-kinematics in which every movable joint is
+    independent. `tree` and `tips` are compiled from its tensors, so do not change it in place.
 
-    `joints` (.., h) are the actuated joints of the grasping fingers, in the order of `joint_names`. Every method raises
-    `BadArgument` for joints of a wrong count or dtype, and for NaN or infinity.
+    `joints` (.., h) are the actuated joints of the grasping fingers, in the order of `joint_names`.
+    Every method raises `BadArgument` for joints of a wrong count or dtype, and for NaN or infinity.
 
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("barrett")
@@ -91,7 +100,8 @@ class Hand(Value):
         return self.source.urdf_path
 
     def to(self, *args: Any, **kwargs: Any) -> "Hand":
-        """Return the hand on another device or in another floating dtype, with its chain; see `Value.to`.
+        """Return the hand on another device or in another floating dtype, with its chain; see
+        `Value.to`.
 
         A hand that is there already is returned itself, without a copy of its chain.
         """
@@ -104,10 +114,15 @@ class Hand(Value):
 
     @kept
     def motion(self) -> FreeMotion:
-        """Tables of how links, collision spheres, tip centres and pads move with the hand's pose and its joints."""
-        spheres, tips = self.collision_spheres, self.tips
+        """Tables of how links, collision spheres, tip centres and pads move with the hand's pose
+        and its joints.
+        """
+        spheres = self.collision_spheres
+        tips = self.tips
         points = (spheres.link_index, spheres.center, 1.0), (tips.index, tips.center, 1.0)
-        return FreeMotion.of(self.tree, self.actuated.coupling, [*points, (tips.index, tips.normal, 0.0)])
+        return FreeMotion.of(
+            self.tree, self.actuated.coupling, [*points, (tips.index, tips.normal, 0.0)]
+        )
 
     @functools.cached_property
     def derived(self) -> dict[Any, Any]:
@@ -146,29 +161,39 @@ class Hand(Value):
 
     @checked
     def require_three(self, argument: str, what: str) -> None:
-        """Raise `BadArgument` about an argument unless the hand has three fingertips, as in the paper."""
+        """Raise `BadArgument` about an argument unless the hand has three fingertips, as in the
+        paper.
+        """
         if len(self.tips) != 3:
-            raise BadArgument(argument, f"{what} for {len(self.tips)} fingertips", "three fingertips, as in the paper")
+            raise BadArgument(
+                argument,
+                f"{what} for {len(self.tips)} fingertips",
+                "three fingertips, as in the paper",
+            )
 
     @checked(gradients=True)
     def check_joints(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b h"]:
-        """Return `joints` if all are within their limits; otherwise raise `BadArgument` for the first that is not.
+        """Return `joints` if all are within their limits; otherwise raise `BadArgument` for the
+        first that is not.
 
         >>> from torchgrasp import load_hand
         >>> hand = load_hand("barrett")
         >>> hand.check_joints(hand.upper + 1)
         Traceback (most recent call last):
             ...
-        torchgrasp.foundation.errors.BadArgument: joints: expected a number in [0, 3.14159], got 4.14159 for spread
+        torchgrasp.foundation.errors.BadArgument: joints: expected a number in [0, 3.14159], got
+        4.14159 for spread
         """
         self.actuated.check_limits(joints)
         return joints
 
     @checked(gradients=True)
     def expand(self, joints: Float[Tensor, "*b h"]) -> dict[str, Float[Tensor, "*b"]]:
-        """Return the positions of all movable joints of the URDF by name, given the actuated joints.
+        """Return the positions of all movable joints of the URDF by name, given the actuated
+        joints.
 
-        A grasp of three fingers of the Allegro has twelve joints; here are also those of the finger that it leaves out.
+        A grasp of three fingers of the Allegro has twelve joints; here are also those of the finger
+        that it leaves out.
 
         >>> from torchgrasp import load_hand
         >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -179,31 +204,48 @@ class Hand(Value):
 
     @checked(gradients=True)
     def expand_joints(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b j"]:
-        """Return the positions of all movable joints, in the order of `tree.joint_names`, given the actuated joints."""
+        """Return the positions of all movable joints, in the order of `tree.joint_names`, given the
+        actuated joints.
+        """
         return self.actuated.expand(joints)
 
     @checked(gradients=True)
     def link_poses(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b l 4 4"]:
-        """Return the pose `hand_from_link` (4 x 4) of every link, in the order of `tree.link_names`."""
+        """Return the pose `hand_from_link` (4 x 4) of every link, in the order of
+        `tree.link_names`.
+        """
         values = self.expand_joints(joints)
         poses = self.tree.poses(values.reshape(-1, values.shape[-1]))
         return poses.reshape(*joints.shape[:-1], *poses.shape[1:])
 
     @checked(gradients=True)
     def fingertips(
-        self, joints: Float[Tensor, "*b h"], backend: Literal["torchgrasp", "pytorch_kinematics"] = "torchgrasp"
+        self,
+        joints: Float[Tensor, "*b h"],
+        backend: Literal["torchgrasp", "pytorch_kinematics"] = "torchgrasp",
     ) -> tuple[Float[Tensor, "*b f 3"], Float[Tensor, "*b f 3"]]:
-        """Return the contact points [m] and outward unit normals of the fingertip pads, in the palm's frame.
+        """Return the contact points [m] and outward unit normals of the fingertip pads, in the
+        palm's frame.
 
-        With `backend="pytorch_kinematics"` the hand's chain itself computes the poses of the fingertips.
+        With `backend="pytorch_kinematics"` the hand's chain itself computes the poses of the
+        fingertips.
         """
         if backend == "torchgrasp":
-            (_, frames), (contact, normal, _) = self.tips.frames(self._columns(joints)), self.tips.in_carriers
+            (_, frames), (contact, normal, _) = (
+                self.tips.frames(self._columns(joints)),
+                self.tips.in_carriers,
+            )
         else:
             poses = chain_poses(self.chain, self.tree.joint_names, self._columns(joints))
-            frames = poses[[self.chain.frame_to_idx[link] for link in self.tips.links], :, :3].permute(2, 3, 0, 1)
-            frames, contact, normal = frames.to(joints), self.tips.contact, self.tips.normal
-        return _rows(map_points(frames, contact), joints), _rows(map_directions(frames, normal), joints)
+            frames = poses[
+                [self.chain.frame_to_idx[link] for link in self.tips.links], :, :3
+            ].permute(2, 3, 0, 1)
+            frames = frames.to(joints)
+            contact = self.tips.contact
+            normal = self.tips.normal
+        return _rows(map_points(frames, contact), joints), _rows(
+            map_directions(frames, normal), joints
+        )
 
     @checked(gradients=True)
     def tip_centres(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b f 3"]:
@@ -215,9 +257,11 @@ class Hand(Value):
     def jacobian(
         self, joints: Float[Tensor, "*b h"], at: Float[Tensor, "*b f 3"] | None = None
     ) -> Float[Tensor, "*b f 3 h"]:
-        """Return the Jacobian [m/rad] of the fingertips' contact points with respect to the actuated joints.
+        """Return the Jacobian [m/rad] of the fingertips' contact points with respect to the
+        actuated joints.
 
-        `at` are points [m] fixed to the fingertips, such as where round tips touch; by default the contact points.
+        `at` are points [m] fixed to the fingertips, such as where round tips touch; by default the
+        contact points.
         """
         chains = self.tips.chains
         frames, carriers = self.tips.frames(self._columns(joints))
@@ -242,7 +286,8 @@ class Hand(Value):
     @checked(gradients=True)
     def sphere_centres(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b s 3"]:
         """Return the centres [m] of the `collision_spheres` in the palm's frame."""
-        spheres, frames = self.collision_spheres, self.tree.frames(self._columns(joints))
+        spheres = self.collision_spheres
+        frames = self.tree.frames(self._columns(joints))
         return _rows(map_points(frames.index_select(2, spheres.link_index), spheres.center), joints)
 
     @checked(gradients=True)
@@ -252,16 +297,20 @@ class Hand(Value):
         below: Annotated[float, Range(-math.inf, math.inf)] = math.inf,
         chunk: Count = 1000,
     ) -> Float[Tensor, "*b"]:
-        """Return the least signed separation [m] of the link pairs in hand.toml. It is negative if links overlap.
+        """Return the least signed separation [m] of the link pairs in hand.toml. It is negative if
+        links overlap.
 
-        A negative value is minus the shortest translation that separates two links. A positive value is a lower bound
-        of the distance, exact where a face is nearest. Separations above `below` [m] may be inexact lower bounds, which
-        is faster. `chunk` postures are computed at a time, which bounds the memory.
+        A negative value is minus the shortest translation that separates two links. A positive
+        value is a lower bound of the distance, exact where a face is nearest. Separations above
+        `below` [m] may be inexact lower bounds, which is faster. `chunk` postures are computed at a
+        time, which bounds the memory.
         """
         self.actuated.check(joints)
         rows = joints.reshape(-1, joints.shape[-1])
         frames = (self.tree.frames(self._columns(part)) for part in rows.split(chunk))
-        return torch.cat([self.self_collision.clearance(x, below) for x in frames]).reshape(joints.shape[:-1])
+        return torch.cat([self.self_collision.clearance(x, below) for x in frames]).reshape(
+            joints.shape[:-1]
+        )
 
     @property
     def self_pairs(self) -> tuple[tuple[str, str], ...]:
@@ -276,5 +325,9 @@ class Hand(Value):
 
 
 def _rows(columns: Tensor, joints: Float[Tensor, "*b h"]) -> Tensor:
-    """Return a tensor with reversed axes, so that postures come first, in the batch shape of `joints`."""
-    return columns.permute(tuple(range(columns.ndim))[::-1]).reshape(*joints.shape[:-1], *columns.shape[-2::-1])
+    """Return a tensor with reversed axes, so that postures come first, in the batch shape of
+    `joints`.
+    """
+    return columns.permute(tuple(range(columns.ndim))[::-1]).reshape(
+        *joints.shape[:-1], *columns.shape[-2::-1]
+    )

@@ -1,4 +1,6 @@
-"""Reader of hand.toml, which describes a hand's fingers, pads, coupled and fixed joints, and colliding links."""
+"""Reader of hand.toml, which describes a hand's fingers, pads, coupled and fixed joints, and
+colliding links.
+"""
 
 import dataclasses
 import functools
@@ -24,11 +26,14 @@ SUPPORTED = "three to five different fingers"  # fingers of a grasp, see `FINGER
 _DOTTED = re.compile(
     r"""(?<![\w"'-])(?:[\w-]+|"[^"\n]*"|'[^'\n]*')(?:[ \t]*\.[ \t]*(?:[\w-]+|"[^"\n]*"|'[^'\n]*')){16}"""
 )
-"""A key of more than 16 parts: the memory of the TOML reader grows with the square of their number."""
+"""A key of more than 16 parts: the memory of the TOML reader grows with the square of their number.
+"""
 
 
 class Pad(NamedTuple):
-    """The touching surface of a fingertip, in its link's frame [m]: a sphere about `center`, or a point (radius 0)."""
+    """The touching surface of a fingertip, in its link's frame [m]: a sphere about `center`, or a
+    point (radius 0).
+    """
 
     contact: Triple
     normal: Triple
@@ -37,7 +42,9 @@ class Pad(NamedTuple):
 
 
 class Finger(NamedTuple):
-    """A finger: its joints from the palm outward, the link of its tip, and the pad that touches objects."""
+    """A finger: its joints from the palm outward, the link of its tip, and the pad that touches
+    objects.
+    """
 
     name: str
     joints: tuple[str, ...]
@@ -47,11 +54,15 @@ class Finger(NamedTuple):
 
 Grasping = tuple[Finger, ...]  # the grasping fingers, three to five, in grasp order
 Fingers = str | int | tuple[str, ...]
-"""The grasping fingers: an option of hand.toml, a number of fingers, or names, also as "index,middle,thumb"."""
+"""The grasping fingers: an option of hand.toml, a number of fingers, or names, also as
+"index,middle,thumb".
+"""
 
 
 class Option(NamedTuple):
-    """An option of hand.toml: the grasping fingers, and the positions [rad] of parked joints, which stay fixed."""
+    """An option of hand.toml: the grasping fingers, and the positions [rad] of parked joints, which
+    stay fixed.
+    """
 
     fingers: Grasping
     parked: dict[str, float]
@@ -84,8 +95,11 @@ class HandSpec:
 
 
 def read_hand_toml(path: Path | str, fingers: Fingers = "default") -> HandSpec:
-    """Read and check a hand.toml; raise `HandFileError`, or `BadArgument` for fingers that the hand lacks."""
-    path, refuse = Path(path), functools.partial(HandFileError, "hand.toml")
+    """Read and check a hand.toml; raise `HandFileError`, or `BadArgument` for fingers that the hand
+    lacks.
+    """
+    path = Path(path)
+    refuse = functools.partial(HandFileError, "hand.toml")
     data = read_bounded(path, TOML_BYTES, "a hand.toml", refuse)
     try:
         text = data.decode("utf-8")
@@ -93,35 +107,64 @@ def read_hand_toml(path: Path | str, fingers: Fingers = "default") -> HandSpec:
             raise ValueError("a key of more than 16 parts")
         top = Field(path, "", tomllib.loads(text), refuse)
     except (ValueError, RecursionError) as error:
-        raise refuse(f"{path}: {error}", "valid TOML in UTF-8, with keys of at most 16 parts") from error
-    names, numbers = ("name", "urdf", "base_link"), ("approach", "limit_margin", "actuators")
-    table = _entries(top, (*names, *numbers, "options"), {"finger": [], "coupling": {}, "self_collision": {}})
+        raise refuse(
+            f"{path}: {error}", "valid TOML in UTF-8, with keys of at most 16 parts"
+        ) from error
+    names = ("name", "urdf", "base_link")
+    numbers = ("approach", "limit_margin", "actuators")
+    table = _entries(
+        top, (*names, *numbers, "options"), {"finger": [], "coupling": {}, "self_collision": {}}
+    )
     name, file, base_link = (_word(table[key]) for key in names)
     urdf = (path.parent / file).resolve()
     if urdf.parent != path.parent.resolve():
         raise table["urdf"].wrong("a file beside hand.toml")
-    approach, margin = _triple(table["approach"]), table["limit_margin"].number(0.0, 1.0)
+    approach = _triple(table["approach"])
+    margin = table["limit_margin"].number(0.0, 1.0)
     actuators = _entries(table["actuators"], ("kp", "kd"), {})
-    kp, kd = actuators["kp"].number(1e-6, 1e6), actuators["kd"].number(0.0, 1e6)
+    kp = actuators["kp"].number(1e-6, 1e6)
+    kd = actuators["kd"].number(0.0, 1e6)
     known = tuple(map(_finger, table["finger"].items()))
     if len({f.name for f in known}) < len(known):
         raise refuse(f"{path}: fingers {[f.name for f in known]}", "different names")
     options = {name: _option(field, known) for name, field in table["options"].entries().items()}
-    coupling, pairs = _coupling(table["coupling"]), _pairs(table["self_collision"])
+    coupling = _coupling(table["coupling"])
+    pairs = _pairs(table["self_collision"])
     option, (chosen, parked) = _choose(options, {f.name: f for f in known}, coupling, fingers)
     return HandSpec(
-        path, name, urdf, base_link, approach, margin, kp, kd, option, chosen, options, known, parked, coupling, pairs,
+        path,
+        name,
+        urdf,
+        base_link,
+        approach,
+        margin,
+        kp,
+        kd,
+        option,
+        chosen,
+        options,
+        known,
+        parked,
+        coupling,
+        pairs,
         data,
-    )  # fmt: skip
+    )
 
 
-def _entries(table: Field, required: Sequence[str], optional: Mapping[str, Any]) -> dict[str, Field]:
-    """Return the fields of a table, with defaults for optional keys; refuse unknown keys, which may be misspelt."""
+def _entries(
+    table: Field, required: Sequence[str], optional: Mapping[str, Any]
+) -> dict[str, Field]:
+    """Return the fields of a table, with defaults for optional keys; refuse unknown keys, which may
+    be misspelt.
+    """
     fields = table.entries()
     for key in sorted(fields.keys() - {*required, *optional}):
         raise fields[key].wrong(f"one of {sorted([*required, *optional])}")
     place = f"{table.place}." if table.place else ""
-    missing = {key: table._replace(place=place + key, value=optional.get(key)) for key in (*required, *optional)}
+    missing = {
+        key: table._replace(place=place + key, value=optional.get(key))
+        for key in (*required, *optional)
+    }
     return missing | fields
 
 
@@ -144,22 +187,30 @@ def _triple(field: Field) -> Triple:
 def _finger(field: Field) -> Finger:
     required = ("name", "joints", "tip_link", "contact", "normal", "tip")
     table = _entries(field, required, {"center": None, "radius": None})
-    contact, normal, kind = _triple(table["contact"]), _triple(table["normal"]), table["tip"].value
+    contact = _triple(table["contact"])
+    normal = _triple(table["normal"])
+    kind = table["tip"].value
     if kind not in ("sphere", "point"):
         raise table["tip"].wrong("'sphere' or 'point'")
     if abs(math.hypot(*normal) - 1) > 1e-6:
         raise table["normal"].wrong("a unit vector")
-    center, radius = contact, 0.0
+    center = contact
+    radius = 0.0
     if kind == "sphere":
-        center, radius = _triple(table["center"]), table["radius"].number(1e-4, 0.1)
-        if math.dist(contact, tuple(c + radius * n for c, n in zip(center, normal, strict=True))) > 1e-6:
+        center = _triple(table["center"])
+        radius = table["radius"].number(1e-4, 0.1)
+        if (
+            math.dist(contact, tuple(c + radius * n for c, n in zip(center, normal, strict=True)))
+            > 1e-6
+        ):
             raise table["contact"].wrong("center + radius * normal")
     pad = Pad(contact, normal, center, radius)
     return Finger(_word(table["name"]), _texts(table["joints"]), _word(table["tip_link"]), pad)
 
 
 def _option(field: Field, known: tuple[Finger, ...]) -> Option:
-    table, by_name = _entries(field, ("fingers",), {"parked": {}}), {f.name: f for f in known}
+    table = _entries(field, ("fingers",), {"parked": {}})
+    by_name = {f.name: f for f in known}
     names = _texts(table["fingers"])
     if not _is_graspable(names, by_name):
         raise table["fingers"].wrong(f"{SUPPORTED} of {sorted(by_name)}")
@@ -169,34 +220,59 @@ def _option(field: Field, known: tuple[Finger, ...]) -> Option:
 
 def _is_graspable(names: tuple[str, ...], known: Collection[str]) -> bool:
     """Return whether finger names are known, different, and of a supported number."""
-    return FINGERTIPS[0] <= len(names) <= FINGERTIPS[1] and len(set(names)) == len(names) and set(names) <= set(known)
+    return (
+        FINGERTIPS[0] <= len(names) <= FINGERTIPS[1]
+        and len(set(names)) == len(names)
+        and set(names) <= set(known)
+    )
 
 
 def _choose(
-    options: dict[str, Option], known: dict[str, Finger], coupling: dict[str, Mimic], wanted: Fingers
+    options: dict[str, Option],
+    known: dict[str, Finger],
+    coupling: dict[str, Mimic],
+    wanted: Fingers,
 ) -> tuple[str, Option]:
-    """Return name and content of the option for the wanted fingers. If none is declared, the name lists the fingers."""
+    """Return name and content of the option for the wanted fingers. If none is declared, the name
+    lists the fingers.
+    """
     declared = f"one of the options {sorted(options)}, their number of fingers, or {SUPPORTED} of {sorted(known)}"
     if isinstance(wanted, str) and wanted in options:
         return wanted, options[wanted]
     names = tuple(wanted.split(",")) if isinstance(wanted, str) else wanted
     for name, option in options.items():
-        if str(len(option.fingers)) == str(wanted) or tuple(f.name for f in option.fingers) == names:
+        if (
+            str(len(option.fingers)) == str(wanted)
+            or tuple(f.name for f in option.fingers) == names
+        ):
             return name, option
     if not isinstance(names, tuple) or not _is_graspable(names, known):
         raise BadArgument("fingers", repr(wanted), declared)
     fingers = tuple(known[name] for name in names)
     grasping = {joint for finger in fingers for joint in finger.joints}
-    moving = grasping | {coupling[joint].source for joint in grasping if joint in coupling} | set(coupling)
-    parked = {joint: value for option in reversed(options.values()) for joint, value in option.parked.items()}
-    return ",".join(names), Option(fingers, {joint: value for joint, value in parked.items() if joint not in moving})
+    moving = (
+        grasping
+        | {coupling[joint].source for joint in grasping if joint in coupling}
+        | set(coupling)
+    )
+    parked = {
+        joint: value
+        for option in reversed(options.values())
+        for joint, value in option.parked.items()
+    }
+    return ",".join(names), Option(
+        fingers, {joint: value for joint, value in parked.items() if joint not in moving}
+    )
 
 
 def _coupling(field: Field) -> dict[str, Mimic]:
-    coupling, joints = dict[str, Mimic](), field.entries()
+    coupling = dict[str, Mimic]()
+    joints = field.entries()
     for joint, row in joints.items():
         table = _entries(row, ("source", "ratio", "offset"), {})
-        coupling[joint] = Mimic(_word(table["source"]), table["ratio"].number(), table["offset"].number())
+        coupling[joint] = Mimic(
+            _word(table["source"]), table["ratio"].number(), table["offset"].number()
+        )
     for joint, mimic in coupling.items():
         if mimic.source in coupling:
             raise joints[joint].wrong("a source that is not coupled itself")

@@ -1,7 +1,8 @@
-"""Forward kinematics of a pytorch-kinematics chain, compiled from its tensors: level by level, all postures at once.
+"""Forward kinematics of a pytorch-kinematics chain, compiled from its tensors: level by level, all
+postures at once.
 
-The pose of a child link in its parent is `constant + sine sin q + cosine cos q + slide q`, where q is the position of
-the joint between them. The four tables are computed once.
+The pose of a child link in its parent is `constant + sine sin q + cosine cos q + slide q`, where q
+is the position of the joint between them. The four tables are computed once.
 """
 
 import dataclasses
@@ -23,15 +24,18 @@ from torchgrasp.hand.urdf import Urdf
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class KinematicTree(Value):
-    """The kinematic tree of a URDF, or a part of it, as tables; links and joints are in the order of the file.
+    """The kinematic tree of a URDF, or a part of it, as tables; links and joints are in the order
+    of the file.
 
-    `child[j]` is the link that joint j moves, or 0 if it is outside this part; `axis` is in that link's frame.
-    `prismatic` is 1 for a sliding joint, and `moves[l, j]` is 1 if joint j moves link l.
+    `child[j]` is the link that joint j moves, or 0 if it is outside this part; `axis` is in that
+    link's frame. `prismatic` is 1 for a sliding joint, and `moves[l, j]` is 1 if joint j moves link
+    l.
 
-    `tables` hold each link's pose in its parent: its constant part, and factors of sin q, cos q and q. In them, links
-    are sorted by level, the number of joints from the root; `level_sizes` counts the links of each level. `joint` is
-    the index of the joint that moves a link, 0 for a fixed link. `parent` is the index of a link's parent in the level
-    above. `places` are the indices of `link_names` among the sorted links.
+    `tables` hold each link's pose in its parent: its constant part, and factors of sin q, cos q and
+    q. In them, links are sorted by level, the number of joints from the root; `level_sizes` counts
+    the links of each level. `joint` is the index of the joint that moves a link, 0 for a fixed
+    link. `parent` is the index of a link's parent in the level above. `places` are the indices of
+    `link_names` among the sorted links.
 
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("barrett")
@@ -58,7 +62,8 @@ class KinematicTree(Value):
     def frames(
         self, values: Float[Tensor, "j n"], root: Float[Tensor, "3 4 n"] | None = None
     ) -> Float[Tensor, "3 4 l n"]:
-        """Return every link's pose (3 x 4) in the root's frame, given the joint positions (j, n) of n postures.
+        """Return every link's pose (3 x 4) in the root's frame, given the joint positions (j, n) of
+        n postures.
 
         If `root` gives the poses of the root in another frame, the link poses are in that frame.
         """
@@ -67,7 +72,8 @@ class KinematicTree(Value):
         local = torch.addcmul(local, cosine, values.cos().index_select(0, self.joint))
         if self.slides:
             local = torch.addcmul(local, slide, values.index_select(0, self.joint))
-        levels, parents = local.split(self.level_sizes, 2), self.parent.split(self.level_sizes)
+        levels = local.split(self.level_sizes, 2)
+        parents = self.parent.split(self.level_sizes)
         frames = [levels[0]] if root is None else [root[:, :, None]]
         for k in range(1, len(levels)):
             level = levels[k]
@@ -86,29 +92,42 @@ class KinematicTree(Value):
     def poses(self, values: Float[Tensor, "n j"]) -> Float[Tensor, "n l 4 4"]:
         """Return the pose `root_from_link` of every link, given all movable joints [rad or m]."""
         frames = self.frames(values.T.contiguous())
-        last = torch.eye(4, dtype=frames.dtype, device=frames.device)[3, :, None, None].expand(1, 4, *frames.shape[2:])
+        last = torch.eye(4, dtype=frames.dtype, device=frames.device)[3, :, None, None].expand(
+            1, 4, *frames.shape[2:]
+        )
         return torch.cat([frames, last]).permute(3, 2, 0, 1)
 
     @checked(gradients=True)
-    def joint_axes(self, poses: Float[Tensor, "*b l 4 4"]) -> tuple[Float[Tensor, "*b j 3"], Float[Tensor, "*b j 3"]]:
-        """Return the unit axis and a point [m] of every joint in the root's frame, given the link poses."""
-        child = poses.reshape(-1, *poses.shape[-3:])[..., :3, :].permute(2, 3, 1, 0).index_select(2, self.child)
-        axes, origins = (x.permute(2, 1, 0) for x in (map_directions(child, self.axis), child[:, 3]))
+    def joint_axes(
+        self, poses: Float[Tensor, "*b l 4 4"]
+    ) -> tuple[Float[Tensor, "*b j 3"], Float[Tensor, "*b j 3"]]:
+        """Return the unit axis and a point [m] of every joint in the root's frame, given the link
+        poses.
+        """
+        child = (
+            poses.reshape(-1, *poses.shape[-3:])[..., :3, :]
+            .permute(2, 3, 1, 0)
+            .index_select(2, self.child)
+        )
+        axes, origins = (
+            x.permute(2, 1, 0) for x in (map_directions(child, self.axis), child[:, 3])
+        )
         size = (*poses.shape[:-3], len(self.child), 3)
         return axes.reshape(size), origins.reshape(size)
 
 
 @dataclasses.dataclass(frozen=True)
 class FreeMotion(Value):
-    """Tables of how the links of a free-floating hand, and marker points fixed to the links, move in a small step.
+    """Tables of how the links of a free-floating hand, and marker points fixed to the links, move
+    in a small step.
 
-    The q motions are three translations along the root's axes, three rotations about them, and the joints that the
-    actuated joints move. `moves[l, q]` is 1 if motion q moves link l. `coupling` maps a step of pose (six numbers) and
-    actuated joints to the motions; None means the identity.
+    The q motions are three translations along the root's axes, three rotations about them, and the
+    joints that the actuated joints move. `moves[l, q]` is 1 if motion q moves link l. `coupling`
+    maps a step of pose (six numbers) and actuated joints to the motions; None means the identity.
 
-    `product` maps all link frames to all markers in one matrix product. The markers come in groups of `sizes`: first
-    the given groups, then the origins of all motions, all rotation axes, and all translation axes. One of the two axes
-    of a motion is zero.
+    `product` maps all link frames to all markers in one matrix product. The markers come in groups
+    of `sizes`: first the given groups, then the origins of all motions, all rotation axes, and all
+    translation axes. One of the two axes of a motion is zero.
     """
 
     product: Float[Tensor, "m k"]
@@ -123,17 +142,27 @@ class FreeMotion(Value):
         coupling: Float[Tensor, "j h"],
         markers: Sequence[tuple[Int[Tensor, "_"], Float[Tensor, "_ 3"], float]],
     ) -> "FreeMotion":
-        """Return the tables for groups of markers: link indices, coordinates, and 1 for points or 0 for directions."""
+        """Return the tables for groups of markers: link indices, coordinates, and 1 for points or 0
+        for directions.
+        """
         own = torch.nonzero((coupling != 0).any(1))[:, 0]
         eye = functools.partial(torch.eye, dtype=tree.axis.dtype, device=tree.axis.device)
-        axes, slides = eye(3), tree.prismatic[own]
+        axes = eye(3)
+        slides = tree.prismatic[own]
         root = torch.nonzero(tree.places == 0)[:, 0].expand(6)
         link = torch.cat([root, tree.child[own]])
         turning = torch.cat([0 * axes, axes, tree.axis[own] * (1 - slides[:, None])])
         sliding = torch.cat([axes, 0 * axes, tree.axis[own] * slides[:, None]])
-        groups = [*markers, (link, torch.zeros_like(turning), 1.0), (link, turning, 0.0), (link, sliding, 0.0)]
+        groups = [
+            *markers,
+            (link, torch.zeros_like(turning), 1.0),
+            (link, turning, 0.0),
+            (link, sliding, 0.0),
+        ]
         at = torch.cat([links for links, _, _ in groups])
-        local = [torch.cat([x, torch.full_like(x[:, :1], kind)], 1).to(axes) for _, x, kind in groups]
+        local = [
+            torch.cat([x, torch.full_like(x[:, :1], kind)], 1).to(axes) for _, x, kind in groups
+        ]
         product = axes.new_zeros(len(at), 4, len(tree.link_names))
         product[torch.arange(len(at), device=at.device), :, at] = torch.cat(local)
         moves = torch.cat([axes.new_ones(len(tree.moves), 6), tree.moves[:, own]], 1)
@@ -142,26 +171,44 @@ class FreeMotion(Value):
         return cls(product.flatten(1), tuple(len(x) for x in local), moves, None if same else whole)
 
     def place(self, frames: Float[Tensor, "3 4 l n"]) -> tuple[Float[Tensor, "3 p n"], ...]:
-        """Return the coordinates of each group of markers in the root's frame, given all link frames."""
-        return torch.bmm(self.product.to(frames).expand(3, -1, -1), frames.flatten(1, 2)).split(self.sizes, 1)
+        """Return the coordinates of each group of markers in the root's frame, given all link
+        frames.
+        """
+        return torch.bmm(self.product.to(frames).expand(3, -1, -1), frames.flatten(1, 2)).split(
+            self.sizes, 1
+        )
 
 
-def map_points(frames: Float[Tensor, "3 4 p n"], local: Float[Tensor, "p 3"]) -> Float[Tensor, "3 p n"]:
-    """Return points in the root's frame, given the link frames (3 x 4) and one point in each of them."""
+def map_points(
+    frames: Float[Tensor, "3 4 p n"], local: Float[Tensor, "p 3"]
+) -> Float[Tensor, "3 p n"]:
+    """Return points in the root's frame, given the link frames (3 x 4) and one point in each of
+    them.
+    """
     return map_directions(frames, local) + frames[:, 3]
 
 
-def map_directions(frames: Float[Tensor, "3 4 p n"], local: Float[Tensor, "p 3"]) -> Float[Tensor, "3 p n"]:
-    """Return directions in the root's frame, given the link frames (3 x 4) and one direction in each of them."""
+def map_directions(
+    frames: Float[Tensor, "3 4 p n"], local: Float[Tensor, "p 3"]
+) -> Float[Tensor, "3 p n"]:
+    """Return directions in the root's frame, given the link frames (3 x 4) and one direction in
+    each of them.
+    """
     x, y, z = local.to(frames)[:, :, None].unbind(1)
     return torch.addcmul(torch.addcmul(frames[:, 0] * x, frames[:, 1], y), frames[:, 2], z)
 
 
 def chain_from_urdf(urdf: Urdf) -> "pytorch_kinematics.Chain":
-    """Return a URDF as a pytorch-kinematics chain of independent joints, in float64: its own reader has float32."""
+    """Return a URDF as a pytorch-kinematics chain of independent joints, in float64: its own reader
+    has float32.
+    """
     frame = pytorch_kinematics.frame
     with torch.device("cpu"):  # the library makes some tensors on torch's default device
-        frames = {urdf.root: frame.Frame(urdf.root, frame.Link(urdf.root), frame.Joint(dtype=torch.float64))}
+        frames = {
+            urdf.root: frame.Frame(
+                urdf.root, frame.Link(urdf.root), frame.Joint(dtype=torch.float64)
+            )
+        }
         for j in urdf.joints:
             place = rigid(rotation_from_rpy(j.rpy), real(j.xyz))
             ranges = (j.lower, j.upper), (-j.velocity, j.velocity), (-j.effort, j.effort)
@@ -174,15 +221,27 @@ def chain_from_urdf(urdf: Urdf) -> "pytorch_kinematics.Chain":
         return pytorch_kinematics.Chain(frames[urdf.root], torch.float64)
 
 
-def tree_from_urdf(urdf: Urdf, chain: Any = None, ends: Collection[str] | None = None) -> KinematicTree:
-    """Return the kinematic tree of a URDF's chain, or the part of it to the links `ends`, in the order of the URDF."""
+def tree_from_urdf(
+    urdf: Urdf, chain: Any = None, ends: Collection[str] | None = None
+) -> KinematicTree:
+    """Return the kinematic tree of a URDF's chain, or the part of it to the links `ends`, in the
+    order of the URDF.
+    """
     model: Any = chain or chain_from_urdf(urdf)  # it declares no types
-    index, paths = model.frame_to_idx, [path.tolist() for path in model.parents_indices]
-    part = {k for name in (index if ends is None else (urdf.root, *ends)) for k in paths[index[name]]}
+    index = model.frame_to_idx
+    paths = [path.tolist() for path in model.parents_indices]
+    part = {
+        k for name in (index if ends is None else (urdf.root, *ends)) for k in paths[index[name]]
+    }
     at = [k for x in urdf.links if (k := index[x.name]) in part]
-    levels = [[k for k in at if len(paths[k]) == d] for d in range(1, 1 + max(len(paths[k]) for k in at))]
-    order, names = [k for level in levels for k in level], [j.name for j in urdf.movable]
-    moved, own, slides = model.get_joint_parameter_names(), model.joint_indices.tolist(), model.joint_type_indices == 2
+    levels = [
+        [k for k in at if len(paths[k]) == d] for d in range(1, 1 + max(len(paths[k]) for k in at))
+    ]
+    order = [k for level in levels for k in level]
+    names = [j.name for j in urdf.movable]
+    moved = model.get_joint_parameter_names()
+    own = model.joint_indices.tolist()
+    slides = model.joint_type_indices == 2
     joints = [moved.index(name) for name in names]
     frames = [own.index(k) for k in joints]
     new: Any = functools.partial(torch.tensor, device="cpu")
@@ -195,7 +254,13 @@ def tree_from_urdf(urdf: Urdf, chain: Any = None, ends: Collection[str] | None =
         moves=real([[float(k in paths[link]) for k in frames] for link in at]),
         tables=torch.stack([_tables(model, k) for k in order], -1)[..., None],
         joint=new([joints.index(own[k]) if own[k] >= 0 else 0 for k in order]),
-        parent=new([levels[d - 1].index(paths[k][-2]) if d else 0 for d, level in enumerate(levels) for k in level]),
+        parent=new(
+            [
+                levels[d - 1].index(paths[k][-2]) if d else 0
+                for d, level in enumerate(levels)
+                for k in level
+            ]
+        ),
         level_sizes=tuple(map(len, levels)),
         places=new([order.index(k) for k in at]),
         slides=bool(slides[at].any()),
@@ -205,16 +270,26 @@ def tree_from_urdf(urdf: Urdf, chain: Any = None, ends: Collection[str] | None =
 def chain_poses(
     chain: "pytorch_kinematics.Chain", names: Sequence[str], values: Float[Tensor, "j n"]
 ) -> Float[Tensor, "c n 4 4"]:
-    """Return the poses of a chain's frames by pytorch-kinematics, given the positions of all joints by `names`."""
+    """Return the poses of a chain's frames by pytorch-kinematics, given the positions of all joints
+    by `names`.
+    """
     if not (torch.compiler.is_compiling() or is_known(values)):
-        raise BadArgument("backend", "pytorch_kinematics inside torch.vmap", "torchgrasp: the other writes in place")
+        raise BadArgument(
+            "backend",
+            "pytorch_kinematics inside torch.vmap",
+            "torchgrasp: the other writes in place",
+        )
     columns = [names.index(name) for name in chain.get_joint_parameter_names()]
     # the library's analytical gradient has no second derivatives
     return chain.forward_kinematics_tensor(values[columns].T.to(chain.dtype), analytical_grad=False)
 
 
-def pose_in_carrier(chain: "pytorch_kinematics.Chain", link: str) -> tuple[str, Float[Tensor, "3 4"]]:
-    """Return a link's carrier (the nearest link, itself or above, that a joint moves), and the link's pose in it."""
+def pose_in_carrier(
+    chain: "pytorch_kinematics.Chain", link: str
+) -> tuple[str, Float[Tensor, "3 4"]]:
+    """Return a link's carrier (the nearest link, itself or above, that a joint moves), and the
+    link's pose in it.
+    """
     *above, carrier = chain.parents_indices[chain.frame_to_idx[link]].tolist()
     pose = _tables(chain, 0)[0]
     while above and chain.joint_indices[carrier] < 0:
@@ -225,16 +300,22 @@ def pose_in_carrier(chain: "pytorch_kinematics.Chain", link: str) -> tuple[str, 
 
 
 def _tables(chain: "pytorch_kinematics.Chain", frame: int) -> Float[Tensor, "4 3 4"]:
-    """Return four 3 x 4 tables: a frame's pose in its parent is their sum, weighted by 1, sin q, cos q and q."""
-    offset, kind, joint = chain.joint_offsets[frame], chain.joint_type_indices[frame], chain.joint_indices[frame]
+    """Return four 3 x 4 tables: a frame's pose in its parent is their sum, weighted by 1, sin q,
+    cos q and q.
+    """
+    offset = chain.joint_offsets[frame]
+    kind = chain.joint_type_indices[frame]
+    joint = chain.joint_indices[frame]
     tables = chain.identity.new_zeros(4, 3, 4)
     constant, sine, cosine, slide = tables
     constant[:] = (chain.identity if offset is None else offset)[0, :3]
-    rotation, axis = constant[:, :3].clone(), chain.axes[joint]
+    rotation = constant[:, :3].clone()
+    axis = chain.axes[joint]
     if kind == 2:
         slide[:, 3] = rotation @ axis
     elif kind == 1:  # Rodrigues: I + K sin q + K^2 (1 - cos q), K the cross product with the axis
         cross = skew(axis)
-        sine[:, :3], cosine[:, :3] = rotation @ cross, -rotation @ cross @ cross
+        sine[:, :3] = rotation @ cross
+        cosine[:, :3] = -rotation @ cross @ cross
         constant -= cosine
     return tables

@@ -16,7 +16,8 @@ from torchgrasp.values.planning import Grasps
 
 
 def hands_folder() -> Path:
-    """Return the folder of the shipped hands: inside the package, or beside it in a source checkout.
+    """Return the folder of the shipped hands: inside the package, or beside it in a source
+    checkout.
 
     >>> (hands_folder() / "allegro" / "hand.toml").is_file()
     True
@@ -30,7 +31,8 @@ def hands_folder() -> Path:
 def find_hand(name_or_path: str | Path) -> Path:
     """Return the folder of a hand, given a shipped hand's name, a folder or a hand.toml.
 
-    Raises `HandFileError` for no such hand, or a shipped name that is also a folder in the working directory.
+    Raises `HandFileError` for no such hand, or a shipped name that is also a folder in the working
+    directory.
 
     >>> find_hand("allegro").name
     'allegro'
@@ -41,12 +43,16 @@ def find_hand(name_or_path: str | Path) -> Path:
         here = Path(name_or_path)
         if (here / "hand.toml").is_file() and here.resolve() != (shipped / name_or_path).resolve():
             found = f"{name_or_path!r}, which is a shipped hand and a folder here"
-            raise HandFileError("hand", found, f"'./{name_or_path}' for the folder, or a folder of another name")
+            raise HandFileError(
+                "hand", found, f"'./{name_or_path}' for the folder, or a folder of another name"
+            )
         return shipped / name_or_path
     path = Path(name_or_path)
     folder = path.parent if path.name == "hand.toml" else path
     if not (folder / "hand.toml").is_file():
-        raise HandFileError("hand", f"{str(name_or_path)!r}", f"one of {names}, or a folder with a hand.toml")
+        raise HandFileError(
+            "hand", f"{str(name_or_path)!r}", f"one of {names}, or a folder with a hand.toml"
+        )
     return folder
 
 
@@ -54,15 +60,15 @@ def find_hand(name_or_path: str | Path) -> Path:
 def load_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
     """Load a hand from its hand.toml and URDF, with the chosen grasping fingers.
 
-    Args:
-        name_or_path: a shipped hand, such as "allegro", "barrett", "leap" or "shadow", or the folder of another hand.
-        fingers: the grasping fingers, as an option of hand.toml: "default", or for the Allegro "four" (all) or
-            "paper_literal" (index, middle and ring); or as a number, for the first option with so many fingers; or as
-            the names of three to five fingers in grasp order. Joints of other fingers are parked where an option parks
-            them, else at zero or the limit nearest to zero.
+    Args: name_or_path: a shipped hand, such as "allegro", "barrett", "leap" or "shadow", or the
+        folder of another hand. fingers: the grasping fingers, as an option of hand.toml: "default",
+        or for the Allegro "four" (all) or "paper_literal" (index, middle and ring); or as a number,
+        for the first option with so many fingers; or as the names of three to five fingers in grasp
+        order. Joints of other fingers are parked where an option parks them, else at zero or the
+        limit nearest to zero.
 
-    Raises `HandFileError` if a file is missing or malformed, or the two do not fit, and `BadArgument` for unknown
-    fingers.
+    Raises `HandFileError` if a file is missing or malformed, or the two do not fit, and
+    `BadArgument` for unknown fingers.
 
     >>> load_hand("allegro", ("index", "ring", "thumb")).finger_names
     ('index', 'ring', 'thumb')
@@ -102,15 +108,16 @@ def with_fingers(hand: Hand, fingers: Fingers) -> Hand:
 def hand_of(grasps: Grasps, hand: Hand | str | Path | None = None) -> Hand:
     """Return the hand with the fingers for which grasps were planned.
 
-    `grasps` may be loaded from a file. `hand` is the same hand with any fingers, its name or its folder; by default the
-    shipped hand that the grasps name. Raises the errors of `load_hand`, and `BadArgument` for grasps that name no hand,
-    another hand, or unknown fingers.
+    `grasps` may be loaded from a file. `hand` is the same hand with any fingers, its name or its
+    folder; by default the shipped hand that the grasps name. Raises the errors of `load_hand`, and
+    `BadArgument` for grasps that name no hand, another hand, or unknown fingers.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> hand_of(load_shipped_grasp("jug", "barrett")).name
     'barrett'
     """
-    name, names = grasps.meta.get("hand"), grasps.meta.get("finger_names")
+    name = grasps.meta.get("hand")
+    names = grasps.meta.get("finger_names")
     if name is None:
         raise BadArgument("grasps", "grasps without a hand in `meta`", "grasps of plan_grasps")
     fingers = "default" if names is None else tuple(names.split(","))
@@ -122,31 +129,52 @@ def hand_of(grasps: Grasps, hand: Hand | str | Path | None = None) -> Hand:
 
 
 def _check_names(spec: HandSpec, urdf: Urdf) -> None:
-    """Raise `HandFileError` for names that the URDF lacks, and for parked joints that also grasp or are coupled."""
-    movable, links = {j.name for j in urdf.movable}, {x.name for x in urdf.links}
+    """Raise `HandFileError` for names that the URDF lacks, and for parked joints that also grasp or
+    are coupled.
+    """
+    movable = {j.name for j in urdf.movable}
+    links = {x.name for x in urdf.links}
     if spec.base_link != urdf.root:
-        raise spec.wrong(f"base_link {spec.base_link!r}", f"the URDF's root {urdf.root!r} as base_link")
+        raise spec.wrong(
+            f"base_link {spec.base_link!r}", f"the URDF's root {urdf.root!r} as base_link"
+        )
     sources = {joint: mimic.source for joint, mimic in spec.coupling.items()}
-    joints = {j for f in spec.all_fingers for j in f.joints} | {*spec.parked, *sources, *sources.values()}
+    joints = {j for f in spec.all_fingers for j in f.joints} | {
+        *spec.parked,
+        *sources,
+        *sources.values(),
+    }
     named = {f.tip_link for f in spec.all_fingers} | {x for pair in spec.pairs or () for x in pair}
-    for kind, unknown, known in (("joint", joints - movable, movable), ("link", named - links, links)):
+    for kind, unknown, known in (
+        ("joint", joints - movable, movable),
+        ("link", named - links, links),
+    ):
         if unknown:
             raise spec.wrong(f"{kind} {min(unknown)!r}", f"one of {sorted(known)}")
     grasping = {j for f in spec.fingers for j in f.joints}
     moved = grasping | {sources[joint] for joint in grasping if joint in sources}
     both = set(spec.parked) & (moved | set(sources))
     if both:
-        raise spec.wrong(f"parked joint {min(both)!r}", "parked joints that neither grasp nor follow another joint")
+        raise spec.wrong(
+            f"parked joint {min(both)!r}",
+            "parked joints that neither grasp nor follow another joint",
+        )
 
 
 def _check_mimics_and_shapes(spec: HandSpec, urdf: Urdf) -> None:
-    """Raise `HandFileError` if couplings contradict the URDF, or if a tip or all other links lack collision shapes."""
+    """Raise `HandFileError` if couplings contradict the URDF, or if a tip or all other links lack
+    collision shapes.
+    """
     for joint in urdf.joints:
         if joint.mimic is not None and spec.coupling.get(joint.name) != joint.mimic:
             found = f"joint {joint.name} follows {spec.coupling.get(joint.name, 'nothing')}"
             raise spec.wrong(found, f"the coupling of the URDF: {joint.mimic}")
-    tips, bare = {f.tip_link for f in spec.fingers}, {x.name for x in urdf.links if not x.shapes}
+    tips = {f.tip_link for f in spec.fingers}
+    bare = {x.name for x in urdf.links if not x.shapes}
     if tips & bare:
-        raise urdf.wrong(f"link {min(tips & bare)} without collision shapes", "a collision shape for every fingertip")
+        raise urdf.wrong(
+            f"link {min(tips & bare)} without collision shapes",
+            "a collision shape for every fingertip",
+        )
     if len(tips | bare) == len(urdf.links):
         raise urdf.wrong("collision shapes of fingertips alone", "shapes for palm and fingers, too")

@@ -1,7 +1,8 @@
-"""The safety gate for URDF files: bounded XML without declarations, known elements and finite numbers only.
+"""The safety gate for URDF files: bounded XML without declarations, known elements and finite
+numbers only.
 
-The gate writes the XML anew from the elements listed below, so that other readers see nothing else. It opens no other
-file.
+The gate writes the XML anew from the elements listed below, so that other readers see nothing else.
+It opens no other file.
 """
 
 import math
@@ -17,7 +18,12 @@ IGNORED = {"material", "transmission", "gazebo", "ros2_control", "mujoco", "sens
 """Elements of a robot, besides links and joints, that are left out."""
 NUMBER = re.compile(r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9]+)?")
 """A decimal number; Python also reads 1_0, digits outside ASCII, and nan."""
-SIZES = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "length"), "mesh": ("scale",)}
+SIZES = {
+    "box": ("size",),
+    "sphere": ("radius",),
+    "cylinder": ("radius", "length"),
+    "mesh": ("scale",),
+}
 """The collision shapes of a URDF, and the attributes that hold the sizes of each."""
 PARTS = {
     "robot": ("link", "joint"),
@@ -28,7 +34,11 @@ PARTS = {
     "joint": ("origin", "parent", "child", "axis", "limit", "mimic"),
 }
 """The elements that are read, by the element around them. `<visual>` is left out, with its mesh."""
-REQUIRED = {"inertial": ("mass", "inertia"), "collision": ("geometry",), "joint": ("parent", "child")}
+REQUIRED = {
+    "inertial": ("mass", "inertia"),
+    "collision": ("geometry",),
+    "joint": ("parent", "child"),
+}
 """Elements that an element must have."""
 DEGREES = "(in degrees? 90 is 1.57 rad)"
 NO_XACRO = "a URDF without xacro (xacro FILE > hand.urdf)"
@@ -49,7 +59,9 @@ NUMBERS: dict[str, dict[str, tuple[int, str | None]]] = {
     "limit": {"lower": (1, ""), "upper": (1, ""), "effort": (1, "0"), "velocity": (1, "0")},
     "mimic": {"multiplier": (1, "1"), "offset": (1, "0")},
 }
-"""Attributes that are numbers: their count and default. None marks a required one, "" one that may be omitted."""
+"""Attributes that are numbers: their count and default. None marks a required one, "" one that may
+be omitted.
+"""
 
 
 class BoundedBuilder(ET.TreeBuilder):
@@ -61,7 +73,8 @@ class BoundedBuilder(ET.TreeBuilder):
 
     def start(self, tag: Any, attrs: Any) -> Any:
         """Count an element, and raise `HandFileError` for one too many."""
-        self.depth, self.count = self.depth + 1, self.count + 1
+        self.depth = self.depth + 1
+        self.count = self.count + 1
         if self.depth > XML_DEPTH or self.count > XML_ELEMENTS:
             allowed = f"at most {XML_ELEMENTS} elements, nested at most {XML_DEPTH} deep"
             raise HandFileError("urdf", "a larger XML tree", allowed)
@@ -74,38 +87,59 @@ class BoundedBuilder(ET.TreeBuilder):
 
 
 def parse_urdf(path: Path, data: bytes) -> ET.Element:
-    """Return the XML tree of a URDF with only links and joints, and with checked numbers, or raise `HandFileError`."""
-    # also within comments: a declaration may be hidden by a processing instruction that looks like a comment
+    """Return the XML tree of a URDF with only links and joints, and with checked numbers, or raise
+    `HandFileError`.
+    """
+    # also within comments: a declaration may be hidden by a processing instruction that looks like
+    # a comment
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data:
-        raise HandFileError("urdf", f"{path}: a DOCTYPE or ENTITY declaration", "a URDF without declarations")
+        raise HandFileError(
+            "urdf", f"{path}: a DOCTYPE or ENTITY declaration", "a URDF without declarations"
+        )
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise HandFileError("urdf", f"{path}: {error.reason} at byte {error.start}", "UTF-8 text") from error
+        raise HandFileError(
+            "urdf", f"{path}: {error.reason} at byte {error.start}", "UTF-8 text"
+        ) from error
     declared = re.match(r"""\s*<\?xml[^>]*encoding\s*=\s*["']([^"']*)""", text)
-    if "\0" in text or (declared and declared.group(1).lower() not in ("utf-8", "us-ascii", "ascii")):
+    if "\0" in text or (
+        declared and declared.group(1).lower() not in ("utf-8", "us-ascii", "ascii")
+    ):
         raise HandFileError("urdf", f"{path} in another encoding", "UTF-8 text")
     try:
         robot = ET.fromstring(data, ET.XMLParser(target=BoundedBuilder()))
     except (ET.ParseError, ValueError) as error:
         if isinstance(error, HandFileError):
             raise
-        raise HandFileError("urdf", f"{path}: {error}", NO_XACRO if "xacro:" in text else "well-formed XML") from error
+        raise HandFileError(
+            "urdf", f"{path}: {error}", NO_XACRO if "xacro:" in text else "well-formed XML"
+        ) from error
     if robot.tag != "robot":
         raise HandFileError("urdf", f"{path}: <{robot.tag}>", "<robot> as the root element")
     for element in robot:
-        if element.tag not in {"link", "joint"} | IGNORED and "xacro}" not in element.tag:  # named below
-            raise HandFileError("urdf", f"{path}: <{element.tag}>", f"<link>, <joint> or one of {sorted(IGNORED)}")
+        if (
+            element.tag not in {"link", "joint"} | IGNORED and "xacro}" not in element.tag
+        ):  # named below
+            raise HandFileError(
+                "urdf", f"{path}: <{element.tag}>", f"<link>, <joint> or one of {sorted(IGNORED)}"
+            )
     clean = _clean(path, "", robot)
     clean.set("name", robot.get("name") or "hand")
     return clean
 
 
 def _clean(path: Path, where: str, element: ET.Element) -> ET.Element:
-    """Return a copy of an element with its known parts; raise `HandFileError` for missing parts or bad numbers."""
+    """Return a copy of an element with its known parts; raise `HandFileError` for missing parts or
+    bad numbers.
+    """
     tag = str(element.tag)
     clean = ET.Element(tag)
-    where = "" if tag == "robot" else f"{where} {tag} {(element.get('name') or '')[:XML_LETTERS]}".strip()
+    where = (
+        ""
+        if tag == "robot"
+        else f"{where} {tag} {(element.get('name') or '')[:XML_LETTERS]}".strip()
+    )
     read = [element.get(key, "") for key in (*WORDS.get(tag, ()), *NUMBERS.get(tag, {}))]
     left = [x for x in read if "${" in x or "$(" in x] + [
         f"xacro:{str(part.tag).rpartition('}')[2]}" for part in element if "xacro}" in str(part.tag)
@@ -123,20 +157,26 @@ def _clean(path: Path, where: str, element: ET.Element) -> ET.Element:
         text = element.get(key, default)
         words = (text or "").split()
         words *= 3 if tag == "mesh" and len(words) == 1 else 1  # one scale for all axes
-        right = len(words) == count and all(NUMBER.fullmatch(w) and math.isfinite(float(w)) for w in words)
+        right = len(words) == count and all(
+            NUMBER.fullmatch(w) and math.isfinite(float(w)) for w in words
+        )
         if right and key == "rpy" and any(abs(float(w)) > 6.3 for w in words):  # over a full turn
             raise HandFileError("urdf", f"{path}: {where} rpy {text!r}", f"radians {DEGREES}")
         if right:
             clean.set(key, " ".join("0" if float(w) == 0 else w for w in words))  # no negative zero
         elif text != "" or key in element.attrib:
             allowed = f"{count} finite numbers" if count > 1 else "a finite number"
-            raise HandFileError("urdf", f"{path}: {where} {key} {(text or 'nothing')[:80]!r}", allowed)
+            raise HandFileError(
+                "urdf", f"{path}: {where} {key} {(text or 'nothing')[:80]!r}", allowed
+            )
     if tag == "geometry" and (len(element) != 1 or element[0].tag not in SIZES):
         found = f"{where} <{element[0].tag}>" if len(element) == 1 else f"{where} without one shape"
         raise HandFileError("urdf", f"{path}: {found}", "box, cylinder or sphere")
     kept = PARTS.get(tag, ())
     for need in REQUIRED.get(tag, ()):
         if element.find(need) is None:
-            raise HandFileError("urdf", f"{path}: {where} without <{need}>", f"a <{need}> in every <{tag}>")
+            raise HandFileError(
+                "urdf", f"{path}: {where} without <{need}>", f"a <{need}> in every <{tag}>"
+            )
     clean.extend([_clean(path, where, part) for part in element if part.tag in kept])
     return clean

@@ -15,17 +15,26 @@ from torchgrasp.foundation.checks import Range, checked, is_known
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.hand.kinematics import map_points
 
-Bound = Annotated[float, Range(-torch.inf, torch.inf, "a number")]  # largest separation [m] that is needed exactly
-Placed = tuple[Float[Tensor, "3 3 s n"], Float[Tensor, "3 s n"]]  # axes and centres of shapes in the palm's frame
+Bound = Annotated[
+    float, Range(-torch.inf, torch.inf, "a number")
+]  # largest separation [m] that is needed exactly
+Placed = tuple[
+    Float[Tensor, "3 3 s n"], Float[Tensor, "3 s n"]
+]  # axes and centres of shapes in the palm's frame
 Parts = list[tuple[int, slice]]
-"""Each kind of pair, named by its number of spheres, with the slice of this kind among pairs sorted by kind."""
+"""Each kind of pair, named by its number of spheres, with the slice of this kind among pairs sorted
+by kind.
+"""
 Push = Callable[[Int[Tensor, " c"]], tuple[Float[Tensor, "3 c"], Float[Tensor, "3 c"]]]
-"""Function of pair indices; it returns the directions in which second shapes leave the first, and contact points."""
+"""Function of pair indices; it returns the directions in which second shapes leave the first, and
+contact points.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
 class SelfCollision(Value):
-    """Boxes (`radius` 0) and spheres (`half` sizes 0) fixed to links [m], and the pairs of shapes to test.
+    """Boxes (`radius` 0) and spheres (`half` sizes 0) fixed to links [m], and the pairs of shapes
+    to test.
 
     `pairs` lists box-box pairs, then sphere-box, then sphere-sphere; `kinds` counts each kind.
 
@@ -45,8 +54,12 @@ class SelfCollision(Value):
     kinds: tuple[int, int, int]
 
     @checked(gradients=True)
-    def clearance(self, frames: Float[Tensor, "3 4 l n"], below: Bound = torch.inf) -> Float[Tensor, " n"]:
-        """Return each posture's least signed separation [m]: infinite if no pairs are tested, inexact above `below`."""
+    def clearance(
+        self, frames: Float[Tensor, "3 4 l n"], below: Bound = torch.inf
+    ) -> Float[Tensor, " n"]:
+        """Return each posture's least signed separation [m]: infinite if no pairs are tested,
+        inexact above `below`.
+        """
         least = frames.new_full(frames.shape[3:], torch.inf)
         if not len(self.pairs):
             return least
@@ -56,7 +69,9 @@ class SelfCollision(Value):
             inscribed = self.half.amin(1) + self.radius
             limit = (distance - self._sums(inscribed, distance)).amin(0).clamp_max(below)
             near = distance - self._sums(self._bounding, distance) <= limit
-            dense = not torch.compiler.is_compiling() and not is_known(near)  # torch.vmap cannot select entries
+            dense = not torch.compiler.is_compiling() and not is_known(
+                near
+            )  # torch.vmap cannot select entries
             every = torch.ones(near.shape, dtype=torch.bool, device=near.device) if dense else near
             pair, row, parts = self._choose(every)
         apart = self._separations(shapes, pair, row, parts)
@@ -65,7 +80,9 @@ class SelfCollision(Value):
 
     @checked
     def separations(self, frames: Float[Tensor, "3 4 l n"], below: Bound) -> Float[Tensor, "p n"]:
-        """Return each pair's signed separation [m] in each posture; above `below` it is that of bounding spheres."""
+        """Return each pair's signed separation [m] in each posture; above `below` it is that of
+        bounding spheres.
+        """
         shapes, apart, pair, row, parts = self._near(frames, below)
         return apart.index_put((pair, row), self._separations(shapes, pair, row, parts))
 
@@ -73,13 +90,15 @@ class SelfCollision(Value):
     def pushes(
         self, frames: Float[Tensor, "3 4 l n"], below: Bound
     ) -> tuple[Float[Tensor, "p n"], Int[Tensor, "p n"], Float[Tensor, "6 k"]]:
-        """Return the pairs' separations [m], the index of each pair's wrench, and the wrenches, one in each column.
+        """Return the pairs' separations [m], the index of each pair's wrench, and the wrenches, one
+        in each column.
 
-        A wrench is the derivative of a separation by a twist (translation, rotation) of the second shape. The last
-        wrench is zero, and belongs to separations above `below`.
+        A wrench is the derivative of a separation by a twist (translation, rotation) of the second
+        shape. The last wrench is zero, and belongs to separations above `below`.
         """
         shapes, apart, pair, row, parts = self._near(frames, below)
-        separation, wrench = apart.new_zeros(len(pair)), apart.new_zeros(6, len(pair) + 1)
+        separation = apart.new_zeros(len(pair))
+        wrench = apart.new_zeros(6, len(pair) + 1)
         for kind, at in parts:
             separation[at], push = self._of_kind(kind, shapes, pair[at], row[at])
             is_close = separation[at] < below
@@ -90,43 +109,61 @@ class SelfCollision(Value):
             if len(close):
                 force, point = push(close)
                 force = force * is_close[close].to(force)
-                wrench[:, at.start + close] = torch.cat([force, torch.linalg.cross(point, force, dim=0)])
+                wrench[:, at.start + close] = torch.cat(
+                    [force, torch.linalg.cross(point, force, dim=0)]
+                )
         number = torch.full_like(apart, len(pair), dtype=torch.long)
         number[pair, row] = torch.arange(len(pair), device=pair.device)
         return apart.index_put((pair, row), separation), number, wrench
 
     @checked(gradients=True)
     def count_near(self, frames: Float[Tensor, "3 4 l n"], below: Bound) -> int:
-        """Return the number of pairs, over all postures, whose bounding spheres are nearer than `below`."""
+        """Return the number of pairs, over all postures, whose bounding spheres are nearer than
+        `below`.
+        """
         return len(self._near(frames, below)[2])
 
     @checked
     def only(self, kept: Bool[Tensor, " p"]) -> "SelfCollision":
-        """Return the shapes with only the pairs in the mask `kept`; other pairs are no longer tested for collision."""
+        """Return the shapes with only the pairs in the mask `kept`; other pairs are no longer
+        tested for collision.
+        """
         one, two, three = (int(kind.sum()) for kind in kept.split(self.kinds))
         return dataclasses.replace(self, pairs=self.pairs[kept], kinds=(one, two, three))
 
     def link_pairs(self) -> list[tuple[int, int]]:
         """Return the link indices of each pair of links that is tested."""
-        return [(int(one), int(two)) for one, two in torch.unique(self.link[self.pairs].sort(1).values, dim=0)]
+        return [
+            (int(one), int(two))
+            for one, two in torch.unique(self.link[self.pairs].sort(1).values, dim=0)
+        ]
 
     def _place(self, frames: Float[Tensor, "3 4 l n"]) -> Placed:
         """Return the shapes' axes and centres in the palm's frame, given the link frames."""
         if frames.shape[2] < self._links:
             raise BadArgument("frames", f"{frames.shape[2]} links", f"at least {self._links} links")
-        links, rotation = frames.index_select(2, self.link), self.rotation.to(frames)[..., None]
-        axes = links[:, 0, None] * rotation[0] + links[:, 1, None] * rotation[1] + links[:, 2, None] * rotation[2]
+        links = frames.index_select(2, self.link)
+        rotation = self.rotation.to(frames)[..., None]
+        axes = (
+            links[:, 0, None] * rotation[0]
+            + links[:, 1, None] * rotation[1]
+            + links[:, 2, None] * rotation[2]
+        )
         return axes, map_points(links, self.center)
 
     def _near(
         self, frames: Float[Tensor, "3 4 l n"], below: float
     ) -> tuple[Placed, Float[Tensor, "p n"], Int[Tensor, " k"], Int[Tensor, " k"], Parts]:
-        """Return the placed shapes, the separations [m] of the bounding spheres of each pair, and the near ones.
+        """Return the placed shapes, the separations [m] of the bounding spheres of each pair, and
+        the near ones.
 
-        Two index vectors hold the pair and the posture of each separation that is less than `below`.
+        Two index vectors hold the pair and the posture of each separation that is less than
+        `below`.
         """
         if not torch.compiler.is_compiling() and not is_known(frames):
-            raise BadArgument("frames", "a tensor inside torch.vmap", "a plain batch; `clearance` takes both")
+            raise BadArgument(
+                "frames", "a tensor inside torch.vmap", "a plain batch; `clearance` takes both"
+            )
         shapes = self._place(frames)
         distance = self._distances(shapes[1])
         apart = distance - self._sums(self._bounding, distance)
@@ -139,7 +176,9 @@ class SelfCollision(Value):
 
     @cached_property
     def _links(self) -> int:
-        """The number of link frames to pass, so that every link with a collision shape is among them."""
+        """The number of link frames to pass, so that every link with a collision shape is among
+        them.
+        """
         return int(self.link.max()) + 1 if len(self.link) else 0
 
     @kept
@@ -151,30 +190,47 @@ class SelfCollision(Value):
         """Return for each pair of shapes the sum of their radii, given the `radius` of every shape."""
         return radius[self.pairs].sum(1, keepdim=True).to(like)
 
-    def _choose(self, near: Bool[Tensor, "p n"]) -> tuple[Int[Tensor, " k"], Int[Tensor, " k"], Parts]:
-        """Return the pairs and postures of a mask, sorted by pair, and the slice of each kind of pair."""
-        ends = torch.stack([part.sum() for part in near.split(self.kinds)]).cumsum(0).tolist()  # the only wait
+    def _choose(
+        self, near: Bool[Tensor, "p n"]
+    ) -> tuple[Int[Tensor, " k"], Int[Tensor, " k"], Parts]:
+        """Return the pairs and postures of a mask, sorted by pair, and the slice of each kind of
+        pair.
+        """
+        ends = (
+            torch.stack([part.sum() for part in near.split(self.kinds)]).cumsum(0).tolist()
+        )  # the only wait
         pair, row = torch.nonzero_static(near, size=ends[-1]).unbind(1)
         bounds = itertools.pairwise((0, *ends))
-        return pair, row, [(kind, slice(low, high)) for kind, (low, high) in enumerate(bounds) if high > low]
+        return (
+            pair,
+            row,
+            [(kind, slice(low, high)) for kind, (low, high) in enumerate(bounds) if high > low],
+        )
 
     def _separations(
         self, shapes: Placed, pair: Int[Tensor, " k"], row: Int[Tensor, " k"], parts: Parts
     ) -> Float[Tensor, " k"]:
-        """Return separations [m] of pairs of shapes; entry i is of pair `pair[i]` in posture `row[i]`."""
+        """Return separations [m] of pairs of shapes; entry i is of pair `pair[i]` in posture
+        `row[i]`.
+        """
         found = [self._of_kind(kind, shapes, pair[at], row[at])[0] for kind, at in parts]
         return torch.cat(found) if found else shapes[1].new_zeros(0)
 
     def _of_kind(
         self, kind: int, shapes: Placed, pair: Int[Tensor, " k"], row: Int[Tensor, " k"]
     ) -> tuple[Float[Tensor, " k"], Push]:
-        """Return the separations [m] of pairs of one kind, and a function that returns separating directions."""
+        """Return the separations [m] of pairs of one kind, and a function that returns separating
+        directions.
+        """
         (first, second), (one, two), place, gap = self._meet(shapes, pair, row)
         half, radius, bounding = (x.to(gap) for x in (self.half.T, self.radius, self._bounding))
         if kind == 1:
 
-            def from_box(at: Int[Tensor, " c"]) -> tuple[Float[Tensor, "3 c"], Float[Tensor, "3 c"]]:
-                local, axes = _inside(two[:, :, at], gap[:, at]), two[:, :, at]
+            def from_box(
+                at: Int[Tensor, " c"],
+            ) -> tuple[Float[Tensor, "3 c"], Float[Tensor, "3 c"]]:
+                local = _inside(two[:, :, at], gap[:, at])
+                axes = two[:, :, at]
                 out = local.abs() - half[:, second[at]]
                 inside = (torch.arange(3, device=out.device)[:, None] == out.argmax(0)).to(out)
                 slope = torch.where((out > 0).any(0), out.clamp_min(0), inside)
@@ -190,20 +246,30 @@ class SelfCollision(Value):
         along = boxes.along_axes()
         separation = along.amax(0)
 
-        def between_boxes(at: Int[Tensor, " c"]) -> tuple[Float[Tensor, "3 c"], Float[Tensor, "3 c"]]:
+        def between_boxes(
+            at: Int[Tensor, " c"],
+        ) -> tuple[Float[Tensor, "3 c"], Float[Tensor, "3 c"]]:
             push, arm = BoxPairs(*(x[..., at] for x in boxes)).push(along[:, at].argmax(0))
-            far, direct = apart[at] > separation[at], gap[:, at] / _length(gap[:, at])
+            far = apart[at] > separation[at]
+            direct = gap[:, at] / _length(gap[:, at])
             return torch.where(far, direct, push), place[:, at] + torch.where(far, 0.0, arm)
 
         return torch.maximum(apart, separation), between_boxes
 
     def _meet(
         self, shapes: Placed, pair: Int[Tensor, " k"], row: Int[Tensor, " k"]
-    ) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor], Float[Tensor, "3 k"], Float[Tensor, "3 k"]]:
-        """Return, for chosen pairs: shape indices, axes, centre of the second shape, and vector between the centres."""
-        rotation, center, n = shapes[0].flatten(2), shapes[1].flatten(1), shapes[1].shape[2]
+    ) -> tuple[
+        tuple[Tensor, Tensor], tuple[Tensor, Tensor], Float[Tensor, "3 k"], Float[Tensor, "3 k"]
+    ]:
+        """Return, for chosen pairs: shape indices, axes, centre of the second shape, and vector
+        between the centres.
+        """
+        rotation = shapes[0].flatten(2)
+        center = shapes[1].flatten(1)
+        n = shapes[1].shape[2]
         first, second = self.pairs[pair].unbind(1)
-        one, two = first * n + row, second * n + row
+        one = first * n + row
+        two = second * n + row
         place = center.index_select(1, two)
         axes = rotation.index_select(2, one), rotation.index_select(2, two)
         return (first, second), axes, place, place - center.index_select(1, one)
@@ -221,7 +287,9 @@ def _length(v: Float[Tensor, "3 *b"]) -> Float[Tensor, "*b"]:
 
 
 class BoxPairs(NamedTuple):
-    """Pairs of boxes: axes as columns of `a` and `b`, `gap` from the first centre to the second, half sizes [m]."""
+    """Pairs of boxes: axes as columns of `a` and `b`, `gap` from the first centre to the second,
+    half sizes [m].
+    """
 
     a: Float[Tensor, "3 3 k"]
     b: Float[Tensor, "3 3 k"]
@@ -230,19 +298,23 @@ class BoxPairs(NamedTuple):
     half_b: Float[Tensor, "3 k"]
 
     def along_axes(self) -> Float[Tensor, "15 k"]:
-        """Return the separations [m] along the 15 candidate axes of two boxes (Gottschalk et al., 1996).
+        """Return the separations [m] along the 15 candidate axes of two boxes (Gottschalk et al.,
+        1996).
 
-        The boxes' own axes come first. The largest separation is a lower bound of the distance; a negative one is minus
-        the shortest translation that separates the boxes.
+        The boxes' own axes come first. The largest separation is a lower bound of the distance; a
+        negative one is minus the shortest translation that separates the boxes.
         """
         a, b, gap, half_a, half_b = self
         rotation = (a[:, :, None] * b[:, None]).sum(0)  # b's axes in the frame of a
-        t, u = _inside(a, gap), _inside(b, gap)
+        t = _inside(a, gap)
+        u = _inside(b, gap)
         size = rotation.abs()
         by_a = t.abs() - half_a - (size * half_b).sum(1)
         by_b = u.abs() - half_b - (size * half_a[:, None]).sum(0)
         # axis i of a cross axis j of b; the other two axes of a box follow by rolling
-        next_t, last_t, next_a, last_a = (x.roll(k, 0)[:, None] for x in (t, half_a) for k in (-1, 1))
+        next_t, last_t, next_a, last_a = (
+            x.roll(k, 0)[:, None] for x in (t, half_a) for k in (-1, 1)
+        )
         along = last_t * rotation.roll(-1, 0) - next_t * rotation.roll(1, 0)
         reach = next_a * size.roll(1, 0) + last_a * size.roll(-1, 0)
         reach = reach + half_b.roll(-1, 0) * size.roll(1, 1) + half_b.roll(1, 0) * size.roll(-1, 1)
@@ -252,30 +324,47 @@ class BoxPairs(NamedTuple):
         return torch.cat([by_a, by_b, torch.where(crossing, by_edges, -torch.inf).flatten(0, 1)])
 
     def push(self, best: Int[Tensor, " k"]) -> tuple[Float[Tensor, "3 k"], Float[Tensor, "3 k"]]:
-        """Return the unit vector of axis `best` towards the second box, and the contact point from its centre [m]."""
+        """Return the unit vector of axis `best` towards the second box, and the contact point from
+        its centre [m].
+        """
         a, b, gap, half_a, half_b = self
         best = best[None]
-        edges, i = best >= 6, torch.where(best >= 6, (best - 6) // 3, best.clamp_max(2))
+        edges = best >= 6
+        i = torch.where(best >= 6, (best - 6) // 3, best.clamp_max(2))
         j = torch.where(edges, (best - 6) % 3, (best - 3).clamp(0, 2))
         along_a, along_b = (x.gather(1, at.expand(3, 1, -1))[:, 0] for x, at in ((a, i), (b, j)))
-        push = torch.where(edges, torch.linalg.cross(along_a, along_b, dim=0), torch.where(best < 3, along_a, along_b))
+        push = torch.where(
+            edges,
+            torch.linalg.cross(along_a, along_b, dim=0),
+            torch.where(best < 3, along_a, along_b),
+        )
         push = push / _length(push)
         push = torch.where((push * gap).sum(0) < 0, -push, push)
-        reach_a, reach_b = _inside(a, push).sign() * half_a, _inside(b, push).sign() * half_b
-        reach_a = reach_a.scatter(0, i, torch.where(edges, 0.0, reach_a.gather(0, i)))  # anywhere along an edge
+        reach_a = _inside(a, push).sign() * half_a
+        reach_b = _inside(b, push).sign() * half_b
+        reach_a = reach_a.scatter(
+            0, i, torch.where(edges, 0.0, reach_a.gather(0, i))
+        )  # anywhere along an edge
         reach_b = reach_b.scatter(0, j, torch.where(edges, 0.0, reach_b.gather(0, j)))
-        of_a, of_b = (a * reach_a).sum(1), -(b * reach_b).sum(1)
-        between, cosine = gap + of_b - of_a, (along_a * along_b).sum(0)
+        of_a = (a * reach_a).sum(1)
+        of_b = -(b * reach_b).sum(1)
+        between = gap + of_b - of_a
+        cosine = (along_a * along_b).sum(0)
         beyond = (between * along_b).sum(0) - cosine * (between * along_a).sum(0)
         crossed = of_b - beyond / (1 - cosine * cosine) * along_b
         return push, torch.where(edges, crossed, torch.where(best < 3, of_b, of_a - gap))
 
 
 def box_distance(points: Float[Tensor, "*b 3"], half: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-    """Return the signed distance [m] of points from boxes of `half` sizes around the origin, negative inside."""
+    """Return the signed distance [m] of points from boxes of `half` sizes around the origin,
+    negative inside.
+    """
     ox, oy, oz = (points.abs() - half).unbind(-1)
-    px, py, pz = ox.clamp_min(0), oy.clamp_min(0), oz.clamp_min(0)
+    px = ox.clamp_min(0)
+    py = oy.clamp_min(0)
+    pz = oz.clamp_min(0)
     squared = px * px + py * py + pz * pz
-    outside, inside = squared > 0, torch.maximum(torch.maximum(ox, oy), oz)
+    outside = squared > 0
+    inside = torch.maximum(torch.maximum(ox, oy), oz)
     # the root's derivative is infinite at 0; there the largest coordinate is the distance
     return torch.where(outside, torch.sqrt(torch.where(outside, squared, 1.0)), inside)

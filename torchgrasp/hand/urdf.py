@@ -1,4 +1,5 @@
-"""A URDF as values: the checked tree of links, joints and collision shapes. Mesh files are not opened.
+"""A URDF as values: the checked tree of links, joints and collision shapes. Mesh files are not
+opened.
 
 The gate in `safe_xml` checks a file's bytes; yourdfpy reads the checked elements alone.
 """
@@ -38,7 +39,8 @@ class Mimic(NamedTuple):
 class LinkShape:
     """A collision shape of a link: box, sphere, cylinder or mesh.
 
-    `size` is (x, y, z) of a box, (radius,) of a sphere, (radius, length) of a cylinder [m]; the scale of a mesh.
+    `size` is (x, y, z) of a box, (radius,) of a sphere, (radius, length) of a cylinder [m]; the
+    scale of a mesh.
     """
 
     kind: str
@@ -52,12 +54,18 @@ class LinkShape:
         """Half sizes [m] of the box around a box, sphere or cylinder."""
         if self.kind == "box":
             return self.size[0] / 2, self.size[1] / 2, self.size[2] / 2
-        return self.size[0], self.size[0], self.size[0] if self.kind == "sphere" else self.size[1] / 2
+        return (
+            self.size[0],
+            self.size[0],
+            self.size[0] if self.kind == "sphere" else self.size[1] / 2,
+        )
 
 
 @dataclasses.dataclass(frozen=True)
 class Link:
-    """A rigid link: mass [kg], centre [m] and inertia (xx, xy, xz, yy, yz, zz) [kg m2] about it, collision shapes."""
+    """A rigid link: mass [kg], centre [m] and inertia (xx, xy, xz, yy, yz, zz) [kg m2] about it,
+    collision shapes.
+    """
 
     name: str
     mass: float
@@ -68,7 +76,9 @@ class Link:
 
 @dataclasses.dataclass(frozen=True)
 class Joint:
-    """A joint at `xyz` [m], `rpy` [rad] in its parent; limits are 0 if it is fixed, infinite if the URDF has none."""
+    """A joint at `xyz` [m], `rpy` [rad] in its parent; limits are 0 if it is fixed, infinite if the
+    URDF has none.
+    """
 
     name: str
     kind: str
@@ -85,13 +95,17 @@ class Joint:
 
     @property
     def rest(self) -> float:
-        """The position of the joint if it does not take part in a grasp: zero, or the limit nearest to zero."""
+        """The position of the joint if it does not take part in a grasp: zero, or the limit nearest
+        to zero.
+        """
         return min(max(0.0, self.lower), self.upper)
 
 
 @dataclasses.dataclass(frozen=True)
 class Urdf:
-    """A checked URDF: `data` holds the bytes of the file, `xml` a copy with only the checked links and joints."""
+    """A checked URDF: `data` holds the bytes of the file, `xml` a copy with only the checked links
+    and joints.
+    """
 
     path: Path
     name: str
@@ -114,7 +128,8 @@ class Urdf:
     @checked
     def joints_above(self, link: str) -> tuple[Joint, ...]:
         """Return the joints on the way from a link to the root, nearest first."""
-        above, chain = {j.child: j for j in self.joints}, []
+        above = {j.child: j for j in self.joints}
+        chain = []
         while link in above:
             chain.append(above[link])
             link = above[link].parent
@@ -128,7 +143,9 @@ class Urdf:
 
 @checked
 def read_urdf(path: Path | str) -> Urdf:
-    """Read a URDF that the library can use as it is: without meshes, endless joints and chains of coupled joints."""
+    """Read a URDF that the library can use as it is: without meshes, endless joints and chains of
+    coupled joints.
+    """
     urdf = read_published(path)
     for link in urdf.links:
         if any(shape.kind == "mesh" for shape in link.shapes):
@@ -137,20 +154,32 @@ def read_urdf(path: Path | str) -> Urdf:
         if math.isinf(j.upper - j.lower):
             raise urdf.wrong(f"joint {j.name} without a limit", f"lower and upper limits {REPAIR}")
         if j.mimic and any(other.mimic for other in urdf.movable if other.name == j.mimic.source):
-            raise urdf.wrong(f"joint {j.name} that follows a coupled joint", f"an independent joint to follow {REPAIR}")
+            raise urdf.wrong(
+                f"joint {j.name} that follows a coupled joint",
+                f"an independent joint to follow {REPAIR}",
+            )
     return urdf
 
 
 def read_published(path: Path | str) -> Urdf:
-    """Read a URDF as its maker published it: meshes, joints without limits and chains of coupled joints are allowed."""
+    """Read a URDF as its maker published it: meshes, joints without limits and chains of coupled
+    joints are allowed.
+    """
     path = Path(path)
-    return _parse(path, read_bounded(path, URDF_BYTES, "a URDF file", functools.partial(HandFileError, "urdf")))
+    return _parse(
+        path,
+        read_bounded(path, URDF_BYTES, "a URDF file", functools.partial(HandFileError, "urdf")),
+    )
 
 
 @functools.lru_cache(maxsize=16)
 def _parse(path: Path, data: bytes) -> Urdf:
-    """Return a file's bytes as checked values; the latest files are kept, as many callers read the same hand again."""
-    clean = parse_urdf(path, data)  # links and joints alone, each with all of its names and with finite numbers
+    """Return a file's bytes as checked values; the latest files are kept, as many callers read the
+    same hand again.
+    """
+    clean = parse_urdf(
+        path, data
+    )  # links and joints alone, each with all of its names and with finite numbers
     xml = ET.tostring(clean)
     robot = yourdfpy.URDF.load(io.BytesIO(xml), build_scene_graph=False, load_meshes=False).robot
     links = tuple(_link(*pair) for pair in zip(robot.links, clean.findall("link"), strict=True))
@@ -163,28 +192,47 @@ def _parse(path: Path, data: bytes) -> Urdf:
 
 
 def _place(origin: Any, element: ET.Element | None) -> tuple[Triple, Triple]:
-    """Return translation [m] and fixed-axis angles [rad]; yourdfpy keeps a matrix, so the XML gives the angles."""
+    """Return translation [m] and fixed-axis angles [rad]; yourdfpy keeps a matrix, so the XML gives
+    the angles.
+    """
     if origin is None or element is None:
         return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    (x, y, z), (roll, pitch, yaw) = origin[:3, 3].tolist(), map(float, element.attrib["rpy"].split())
+    (x, y, z), (roll, pitch, yaw) = (
+        origin[:3, 3].tolist(),
+        map(float, element.attrib["rpy"].split()),
+    )
     return (x, y, z), (roll, pitch, yaw)
 
 
 def _link(link: Any, element: ET.Element) -> Link:
     """Return a link; its inertia is rotated into the link's axes."""
-    shapes = tuple(_shape(*pair) for pair in zip(link.collisions, element.findall("collision"), strict=True))
+    shapes = tuple(
+        _shape(*pair) for pair in zip(link.collisions, element.findall("collision"), strict=True)
+    )
     if (body := link.inertial) is None:
         return Link(link.name, 0.0, (0.0, 0.0, 0.0), (0.0,) * 6, shapes)
     com, rpy = _place(body.origin, element.find("inertial/origin"))
-    turn, inertia = body.origin[:3, :3] if any(rpy) else np.eye(3), body.inertia
-    return Link(link.name, body.mass, com, tuple((turn @ inertia @ turn.T)[np.triu_indices(3)].tolist()), shapes)
+    turn = body.origin[:3, :3] if any(rpy) else np.eye(3)
+    inertia = body.inertia
+    return Link(
+        link.name,
+        body.mass,
+        com,
+        tuple((turn @ inertia @ turn.T)[np.triu_indices(3)].tolist()),
+        shapes,
+    )
 
 
 def _shape(collision: Any, element: ET.Element) -> LinkShape:
-    kind, shape = next((kind, shape) for kind, shape in vars(collision.geometry).items() if shape is not None)
+    kind, shape = next(
+        (kind, shape) for kind, shape in vars(collision.geometry).items() if shape is not None
+    )
     size = [float(x) for key in SIZES[kind] for x in np.atleast_1d(getattr(shape, key))]
     return LinkShape(
-        kind, tuple(size), *_place(collision.origin, element.find("origin")), getattr(shape, "filename", "")
+        kind,
+        tuple(size),
+        *_place(collision.origin, element.find("origin")),
+        getattr(shape, "filename", ""),
     )
 
 
@@ -196,14 +244,30 @@ def _joint(joint: Any, element: ET.Element) -> Joint:
     x, y, z = joint.axis.tolist()
     length = math.sqrt(x * x + y * y + z * z)
     length = length if _is_unit(length) else 1.0  # refused later
-    low, high, effort, velocity = (getattr(joint.limit, key, None) for key in ("lower", "upper", "effort", "velocity"))
+    low, high, effort, velocity = (
+        getattr(joint.limit, key, None) for key in ("lower", "upper", "effort", "velocity")
+    )
     if joint.type == "continuous":
         low = high = None
-    mimic = None if joint.mimic is None else Mimic(joint.mimic.joint, joint.mimic.multiplier, joint.mimic.offset)
+    mimic = (
+        None
+        if joint.mimic is None
+        else Mimic(joint.mimic.joint, joint.mimic.multiplier, joint.mimic.offset)
+    )
     return Joint(
-        joint.name, joint.type, joint.parent, joint.child, xyz, rpy, (x / length, y / length, z / length),
-        -math.inf if low is None else low, math.inf if high is None else high, effort or 0.0, velocity or 0.0, mimic,
-    )  # fmt: skip
+        joint.name,
+        joint.type,
+        joint.parent,
+        joint.child,
+        xyz,
+        rpy,
+        (x / length, y / length, z / length),
+        -math.inf if low is None else low,
+        math.inf if high is None else high,
+        effort or 0.0,
+        velocity or 0.0,
+        mimic,
+    )
 
 
 def _is_unit(length: float) -> bool:
@@ -211,11 +275,17 @@ def _is_unit(length: float) -> bool:
 
 
 def _check_names(urdf: Urdf) -> None:
-    """Raise `HandFileError` for too many links, repeated names or children, and joints of unknown links."""
+    """Raise `HandFileError` for too many links, repeated names or children, and joints of unknown
+    links.
+    """
     if not 0 < len(urdf.links) <= HAND_LINKS:
         raise urdf.wrong(f"{len(urdf.links)} links", f"1 to {HAND_LINKS} links")
     names = [x.name for x in urdf.links]
-    lists = {"link": names, "joint": [j.name for j in urdf.joints], "child": [j.child for j in urdf.joints]}
+    lists = {
+        "link": names,
+        "joint": [j.name for j in urdf.joints],
+        "child": [j.child for j in urdf.joints],
+    }
     for what, listed in lists.items():
         twice = sorted(n for n, times in Counter(listed).items() if times > 1)
         if twice:
@@ -226,7 +296,9 @@ def _check_names(urdf: Urdf) -> None:
 
 
 def _check_shapes(urdf: Urdf) -> None:
-    """Raise `HandFileError` for too many shapes, and for sizes that are not positive or too large for a hand."""
+    """Raise `HandFileError` for too many shapes, and for sizes that are not positive or too large
+    for a hand.
+    """
     count = sum(len(link.shapes) for link in urdf.links)
     if count > HAND_SHAPES:
         raise urdf.wrong(f"{count} collision shapes", f"at most {HAND_SHAPES} collision shapes")
@@ -237,20 +309,28 @@ def _check_shapes(urdf: Urdf) -> None:
 
 
 def _check_joints(urdf: Urdf) -> None:
-    """Raise `HandFileError` for unknown types, wrong axes or limits, and cyclic couplings of joints."""
+    """Raise `HandFileError` for unknown types, wrong axes or limits, and cyclic couplings of
+    joints.
+    """
     movable = {j.name: j for j in urdf.movable}
     for j in urdf.movable:
         if j.kind not in ("revolute", "prismatic", "continuous"):
-            raise urdf.wrong(f"joint {j.name} of type {j.kind!r}", "revolute, prismatic, continuous or fixed")
+            raise urdf.wrong(
+                f"joint {j.name} of type {j.kind!r}", "revolute, prismatic, continuous or fixed"
+            )
         if not _is_unit(math.hypot(*j.axis)):
-            raise urdf.wrong(f"joint {j.name} with an axis of length {math.hypot(*j.axis):g}", "a unit axis")
+            raise urdf.wrong(
+                f"joint {j.name} with an axis of length {math.hypot(*j.axis):g}", "a unit axis"
+            )
         limits = f"joint {j.name} with limits {j.lower:g}, {j.upper:g}"
         if not j.lower < j.upper:
             swapped = ": are they swapped?" * (j.lower > j.upper)
             raise urdf.wrong(limits, f"limits with lower < upper{swapped}")
         if math.isinf(j.lower) != math.isinf(j.upper):
             raise urdf.wrong(limits, "both limits, or none (ROS takes 0 for the missing one)")
-        if j.kind == "revolute" and math.isfinite(j.lower) and max(-j.lower, j.upper) > 6.3:  # over a full turn
+        if (
+            j.kind == "revolute" and math.isfinite(j.lower) and max(-j.lower, j.upper) > 6.3
+        ):  # over a full turn
             raise urdf.wrong(limits, f"radians, at most a full turn either way {DEGREES}")
         if j.kind == "prismatic" and math.isfinite(j.lower) and max(-j.lower, j.upper) > MAX_EXTENT:
             raise urdf.wrong(limits, f"at most {MAX_EXTENT:g} m either way (in millimetres?)")
@@ -258,9 +338,13 @@ def _check_joints(urdf: Urdf) -> None:
         while mimic := movable[passed[-1]].mimic:
             follower = f"joint {passed[-1]} that follows"
             if mimic.source not in movable:
-                raise urdf.wrong(f"{follower} {mimic.source!r}", "a movable joint of the file to follow")
+                raise urdf.wrong(
+                    f"{follower} {mimic.source!r}", "a movable joint of the file to follow"
+                )
             if mimic.source in passed:
-                raise urdf.wrong(f"{follower} coupled joints in a circle", "an independent joint to follow")
+                raise urdf.wrong(
+                    f"{follower} coupled joints in a circle", "an independent joint to follow"
+                )
             passed.append(mimic.source)
 
 
@@ -269,8 +353,14 @@ def _check_tree(urdf: Urdf) -> str:
     known = {x.name for x in urdf.links}
     roots = sorted(known - {j.child for j in urdf.joints})
     if len(roots) != 1:
-        raise urdf.wrong(f"roots {roots}" if roots else "a cycle and no root", "exactly one root link")
-    reached, front, depth, deepest = {roots[0]}, [roots[0]], 0, 100  # pytorch-kinematics walks the tree by recursion
+        raise urdf.wrong(
+            f"roots {roots}" if roots else "a cycle and no root", "exactly one root link"
+        )
+    # pytorch-kinematics walks the tree by recursion
+    reached = {roots[0]}
+    front = [roots[0]]
+    depth = 0
+    deepest = 100
     while front:
         front = [j.child for j in urdf.joints if j.parent in front]
         reached |= set(front)
@@ -278,5 +368,7 @@ def _check_tree(urdf: Urdf) -> str:
     if len(reached) < len(known):
         raise urdf.wrong(f"a cycle around {sorted(known - reached)[0]!r}", "a tree")
     if depth > deepest:
-        raise urdf.wrong(f"{depth} links in a line", f"at most {deepest} links from the root to a tip")
+        raise urdf.wrong(
+            f"{depth} links in a line", f"at most {deepest} links from the root to a tip"
+        )
     return roots[0]

@@ -1,4 +1,6 @@
-"""Grasp solvers on fixed contacts, which refine initial guesses (seeds) in rounds; also the paper's COBYLA solver."""
+"""Grasp solvers on fixed contacts, which refine initial guesses (seeds) in rounds; also the paper's
+COBYLA solver.
+"""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -9,7 +11,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.foundation.base import Batch, at_once, join, lexical_order, map_tensors, rank_in_group
+from torchgrasp.foundation.base import (
+    Batch,
+    at_once,
+    join,
+    lexical_order,
+    map_tensors,
+    rank_in_group,
+)
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import Status
 from torchgrasp.geometry.frames import apply, degenerate, inverse, virtual_frame
@@ -29,21 +38,28 @@ from torchgrasp.ik.refine import ITERATIONS, grasp_residuals, refine, tip_target
 from torchgrasp.values.planning import Contacts, Grasps, IKSeeds
 
 Result = TypeVar("Result", bound=Batch)
-ANGLE = 0.01  # unit of the variables [rad]: a fingertip moves by about a millimetre, the unit of distances
+# unit of the variables [rad]: a fingertip moves by about a millimetre, the unit of distances
+ANGLE = 0.01
 FAR = 20.0  # clearance [mm] above which clearances are not distinguished
 
 
 def assign(contacts: Contacts, seeds: IKSeeds) -> Contacts:
-    """Return the contact set of each initial guess (seed), reordered so that contact i belongs to finger i."""
+    """Return the contact set of each initial guess (seed), reordered so that contact i belongs to
+    finger i.
+    """
     return map_tensors(lambda x: x[seeds.row[:, None], seeds.permutation], contacts)
 
 
 class Attempts(Generic[Result]):
-    """The results of all refined initial guesses (seeds); `unsolved` marks contact sets that no result `solves` yet."""
+    """The results of all refined initial guesses (seeds); `unsolved` marks contact sets that no
+    result `solves` yet.
+    """
 
     def __init__(self, unsolved: Bool[Tensor, "b"], solves: Callable[[Result], Bool[Tensor, "k"]]):
-        self.unsolved, self.solves = unsolved, solves
-        self.results, self.rows = list[Result](), list[Tensor]()
+        self.unsolved = unsolved
+        self.solves = solves
+        self.results = list[Result]()
+        self.rows = list[Tensor]()
 
     def add(self, results: Result, row: Int[Tensor, "k"]) -> None:
         """Add results; `row` holds the index of the contact set of each result."""
@@ -52,13 +68,21 @@ class Attempts(Generic[Result]):
         self.unsolved = self.unsolved.index_fill(0, row[self.solves(results)], False)
 
     def choose(self, seeds: IKSeeds, rank: Int[Tensor, "g"], first: int, count: int) -> IKSeeds:
-        """Return, of each unsolved contact set, the seeds whose `rank` is from `first` to `first + count - 1`."""
+        """Return, of each unsolved contact set, the seeds whose `rank` is from `first` to `first +
+        count - 1`.
+        """
         return seeds[(rank >= first) & (rank < first + count) & self.unsolved[seeds.row]]
 
     def refine(
-        self, seeds: IKSeeds, rank: Int[Tensor, "g"], counts: Sequence[int], refine: Callable[[IKSeeds], Result]
+        self,
+        seeds: IKSeeds,
+        rank: Int[Tensor, "g"],
+        counts: Sequence[int],
+        refine: Callable[[IKSeeds], Result],
     ) -> None:
-        """In round k, refine the next `counts[k]` seeds (by `rank`) of each unsolved contact set; add the results."""
+        """In round k, refine the next `counts[k]` seeds (by `rank`) of each unsolved contact set;
+        add the results.
+        """
         first = 0
         for count in counts:
             chosen = self.choose(seeds, rank, first, count)
@@ -67,8 +91,11 @@ class Attempts(Generic[Result]):
                 self.add(refine(chosen), chosen.row)
 
     def best(self, keys: Callable[[Result], tuple[Tensor, ...]]) -> tuple[Result, Int[Tensor, "t"]]:
-        """Return each contact set's best result, with the least key (in a tie the next key), and the set's index."""
-        results, row = join(self.results), torch.cat(self.rows)
+        """Return each contact set's best result, with the least key (in a tie the next key), and
+        the set's index.
+        """
+        results = join(self.results)
+        row = torch.cat(self.rows)
         first = rank_in_group(row, *keys(results)) == 0
         return results[first], row[first]
 
@@ -79,7 +106,9 @@ def executable(grasps: Grasps) -> Bool[Tensor, "g"]:
 
 
 def best_grasps(attempts: Attempts[Grasps]) -> tuple[Grasps, Int[Tensor, "t"]]:
-    """Return each contact set's best grasp, and the set's index: a success, else a failure on valid contacts."""
+    """Return each contact set's best grasp, and the set's index: a success, else a failure on valid
+    contacts.
+    """
 
     def keys(grasps: Grasps) -> tuple[Tensor, Tensor]:
         failed = ~executable(grasps)
@@ -93,35 +122,52 @@ def best_first(grasps: Grasps) -> Grasps:
     return grasps[lexical_order((~executable(grasps)).int(), -grasps.score)]
 
 
-def refine_on_contacts(problem: GraspProblem, seeds: IKSeeds, steps: int = ITERATIONS, cobyla: bool = False) -> Grasps:
-    """Refine each seed on its fixed contacts; return checked grasps. `cobyla` selects the paper's solver and checks."""
-    contacts, start = assign(problem.contacts, seeds), Configuration(seeds.joints, seeds.obj_from_hand)
-    own, status = problem.rows(seeds.row), torch.full_like(seeds.row, Status.OK)
+def refine_on_contacts(
+    problem: GraspProblem, seeds: IKSeeds, steps: int = ITERATIONS, cobyla: bool = False
+) -> Grasps:
+    """Refine each seed on its fixed contacts; return checked grasps. `cobyla` selects the paper's
+    solver and checks.
+    """
+    contacts = assign(problem.contacts, seeds)
+    start = Configuration(seeds.joints, seeds.obj_from_hand)
+    own = problem.rows(seeds.row)
+    status = torch.full_like(seeds.row, Status.OK)
     if cobyla:
         configuration = refine_by_cobyla(problem.hand, start, contacts, problem.world)
     else:
         configuration = refine(problem.hand, start, contacts, own.world, steps=steps)
-    candidates = GraspCandidates(configuration, contacts, own.certificate, seeds.permutation, status)
+    candidates = GraspCandidates(
+        configuration, contacts, own.certificate, seeds.permutation, status
+    )
     tolerance = PAPER_TOLERANCE if cobyla else TIP_TOLERANCE
     return check_candidates(own, candidates, rolling=not cobyla, tolerance=tolerance)
 
 
-def try_best_seeds(problem: GraspProblem, seeds: IKSeeds, steps: int = ITERATIONS) -> Attempts[Grasps]:
+def try_best_seeds(
+    problem: GraspProblem, seeds: IKSeeds, steps: int = ITERATIONS
+) -> Attempts[Grasps]:
     """Refine the first two seeds of each contact set onto fixed contacts, and return the results."""
     attempts = Attempts(torch.ones_like(problem.certificate.closed), executable)
-    attempts.refine(seeds, rank_in_group(seeds.row), (2,), partial(refine_on_contacts, problem, steps=steps))
+    attempts.refine(
+        seeds, rank_in_group(seeds.row), (2,), partial(refine_on_contacts, problem, steps=steps)
+    )
     return attempts
 
 
 def seed_costs(problem: GraspProblem, seeds: IKSeeds) -> Float[Tensor, "g"]:
-    """Return for each seed the sum of squared errors [mm2] of fingertips and clearances, before any refinement."""
+    """Return for each seed the sum of squared errors [mm2] of fingertips and clearances, before any
+    refinement.
+    """
     costs = [seeds.energy[:0]]
     for rows in torch.arange(len(seeds), device=seeds.row.device).split(at_once(seeds.row, 256)):
         part = seeds[rows]
-        start, contacts = Configuration(part.joints, part.obj_from_hand), assign(problem.contacts, part)
+        start = Configuration(part.joints, part.obj_from_hand)
+        contacts = assign(problem.contacts, part)
         target = tip_targets(problem.hand, contacts)
         world = problem.world.rows(part.row)
-        residual, _ = grasp_residuals(problem.hand, start, target, contacts.normals, world, tips_touch=True)
+        residual, _ = grasp_residuals(
+            problem.hand, start, target, contacts.normals, world, tips_touch=True
+        )
         costs.append(residual.square().sum(1))
     return torch.cat(costs)
 
@@ -139,27 +185,48 @@ def solve_contact_first(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
     return best_first(best_grasps(attempts)[0])
 
 
-def refine_by_cobyla(hand: Hand, start: Configuration, contacts: Contacts, world: CollisionWorld) -> Configuration:
-    """Move hand configurations onto three contacts each by SciPy's COBYLA; the poses in `start` are not used."""
+def refine_by_cobyla(
+    hand: Hand, start: Configuration, contacts: Contacts, world: CollisionWorld
+) -> Configuration:
+    """Move hand configurations onto three contacts each by SciPy's COBYLA; the poses in `start` are
+    not used.
+    """
     if not len(start):
         return start
-    rows = [CobylaRun(hand, q, p, world).solve() for q, p in zip(start.joints, contacts.points, strict=True)]
+    rows = [
+        CobylaRun(hand, q, p, world).solve()
+        for q, p in zip(start.joints, contacts.points, strict=True)
+    ]
     return join(rows).to(start.joints.dtype)
 
 
 class CobylaRun:
-    """One run of SciPy's COBYLA from initial `joints` [rad] onto three contact `points` [m]; caches the last values."""
+    """One run of SciPy's COBYLA from initial `joints` [rad] onto three contact `points` [m]; caches
+    the last values.
+    """
 
-    def __init__(self, hand: Hand, joints: Float[Tensor, "h"], points: Float[Tensor, "3 3"], world: CollisionWorld):
-        self.hand, self.world = hand, world
-        self.first, self.points = joints.double(), points.double()
+    def __init__(
+        self,
+        hand: Hand,
+        joints: Float[Tensor, "h"],
+        points: Float[Tensor, "3 3"],
+        world: CollisionWorld,
+    ):
+        self.hand = hand
+        self.world = world
+        self.first = joints.double()
+        self.points = points.double()
         spheres = hand.collision_spheres
         groups = [(spheres.finger == k) & ~spheres.touching for k in (-2, -1, 0, 1, 2)]
         self.groups = [torch.nonzero(group)[:, 0] for group in groups if bool(group.any())]
         self.last: tuple[bytes, float, np.ndarray] | None = None
 
-    def place(self, x: np.ndarray) -> tuple[Tensor, Float[Tensor, "3 4 l 1"], Float[Tensor, "4 4"], bool]:
-        """Return joints, link frames and hand pose, Eq. (24), at COBYLA's `x`, and whether the tips span a frame."""
+    def place(
+        self, x: np.ndarray
+    ) -> tuple[Tensor, Float[Tensor, "3 4 l 1"], Float[Tensor, "4 4"], bool]:
+        """Return joints, link frames and hand pose, Eq. (24), at COBYLA's `x`, and whether the tips
+        span a frame.
+        """
         step = ANGLE * torch.from_numpy(np.array(x, dtype=float)).to(self.points)
         joints = (self.first + step).clamp(self.hand.lower.to(step), self.hand.upper.to(step))
         frames = self.hand.tree.frames(self.hand.expand_joints(joints)[:, None].contiguous())
@@ -169,26 +236,39 @@ class CobylaRun:
         return joints, frames, virtual_frame(self.points) @ inverse(virtual_frame(tips)), True
 
     def tips(self, frames: Float[Tensor, "3 4 l 1"]) -> Float[Tensor, "3 3"]:
-        """Return the contact points [m] of the fingertips in the hand's frame, given the link frames."""
-        return map_points(frames.index_select(2, self.hand.tips.index), self.hand.tips.contact)[..., 0].T
+        """Return the contact points [m] of the fingertips in the hand's frame, given the link
+        frames.
+        """
+        return map_points(frames.index_select(2, self.hand.tips.index), self.hand.tips.contact)[
+            ..., 0
+        ].T
 
     def evaluate(self, x: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the sum of tip distances from contacts [mm], and the clearances less 0.5 mm, which must be >= 0."""
+        """Return the sum of tip distances from contacts [mm], and the clearances less 0.5 mm, which
+        must be >= 0.
+        """
         key = np.asarray(x).tobytes()
         if self.last is None or self.last[0] != key:
             _, frames, pose, framed = self.place(x)
-            error = torch.linalg.vector_norm(apply(pose, self.tips(frames)) - self.points, dim=-1).sum() / MILLIMETRE
+            error = (
+                torch.linalg.vector_norm(apply(pose, self.tips(frames)) - self.points, dim=-1).sum()
+                / MILLIMETRE
+            )
             room = (torch.stack(self.clearances(frames, pose)) / MILLIMETRE).clamp_max(FAR) - 0.5
             self.last = key, float(error) if framed else 1e3, room.cpu().numpy()
         return self.last[1:]
 
-    def clearances(self, frames: Float[Tensor, "3 4 l 1"], pose: Float[Tensor, "4 4"]) -> list[Float[Tensor, ""]]:
+    def clearances(
+        self, frames: Float[Tensor, "3 4 l 1"], pose: Float[Tensor, "4 4"]
+    ) -> list[Float[Tensor, ""]]:
         """Return least clearances [m] of the hand from itself and from the world.
 
-        They are in this order: between the hand's own links; from the object to the palm, to each finger and to each
-        fingertip; from the table to the hand; from obstacles to the hand. Those that the world lacks are left out.
+        They are in this order: between the hand's own links; from the object to the palm, to each
+        finger and to each fingertip; from the table to the hand; from obstacles to the hand. Those
+        that the world lacks are left out.
         """
-        spheres, radius = self.hand.collision_spheres, self.hand.collision_spheres.radius.to(pose)
+        spheres = self.hand.collision_spheres
+        radius = self.hand.collision_spheres.radius.to(pose)
         local = map_points(frames.index_select(2, spheres.link_index), spheres.center)[..., 0].T
         centres = apply(pose, local)
         found = [self.hand.self_collision.clearance(frames, FAR * MILLIMETRE)[0]]
@@ -197,17 +277,23 @@ class CobylaRun:
             found += [outside[group].amin() for group in self.groups]
             found += list((outside[spheres.touching] + TIP_PENETRATION).unbind())
         if self.world.plane is not None:
-            found.append((along(centres, self.world.plane) - radius).amin() - self.world.plane.offset)
+            found.append(
+                (along(centres, self.world.plane) - radius).amin() - self.world.plane.offset
+            )
         if self.world.obstacles is not None and self.world.guarded:
             found.append((self.world.obstacles.field.query(centres)[0] - radius).amin())
         return found
 
     def solve(self) -> Configuration:
-        """Return the configuration at which COBYLA stops; raises `DegenerateContacts` for contacts on a line."""
+        """Return the configuration at which COBYLA stops; raises `DegenerateContacts` for contacts
+        on a line.
+        """
         from scipy.optimize import NonlinearConstraint, minimize
 
         first = self.first.cpu().numpy()
-        limits = [(b.double().cpu().numpy() - first) / ANGLE for b in (self.hand.lower, self.hand.upper)]
+        limits = [
+            (b.double().cpu().numpy() - first) / ANGLE for b in (self.hand.lower, self.hand.upper)
+        ]
         solution = minimize(
             lambda x: self.evaluate(x)[0],
             np.zeros(self.hand.dof),
@@ -222,11 +308,14 @@ class CobylaRun:
 
 
 def solve_as_paper(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
-    """Find grasps as in the paper: return a checked grasp for each seed that was tried, best grasp first.
+    """Find grasps as in the paper: return a checked grasp for each seed that was tried, best grasp
+    first.
 
-    Seeds are tried ten at a time, in the order of their contact sets, until 10 grasps are executable or 300 were tried.
+    Seeds are tried ten at a time, in the order of their contact sets, until 10 grasps are
+    executable or 300 were tried.
     """
-    seeds, tried = problem.drop_unreachable(seeds), list[Grasps]()
+    seeds = problem.drop_unreachable(seeds)
+    tried = list[Grasps]()
     for first in range(0, max(min(len(seeds), 300), 1), 10):
         tried.append(refine_on_contacts(problem, seeds[first : first + 10], cobyla=True))
         if int(executable(join(tried)).sum()) >= 10:

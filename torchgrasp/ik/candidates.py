@@ -1,4 +1,6 @@
-"""The input of the grasp solvers, and the checks and scores that turn candidate configurations into grasps."""
+"""The input of the grasp solvers, and the checks and scores that turn candidate configurations into
+grasps.
+"""
 
 import dataclasses
 import math
@@ -23,23 +25,34 @@ from torchgrasp.ik.refine import open_hand, tip_targets
 from torchgrasp.values.planning import Certificate, Contacts, Grasps, IKSeeds
 
 Reachable = Callable[[Tensor], Tensor]
-"""A user's function that takes hand poses in the object's frame (k, 4, 4), and returns which an arm reaches (k,)."""
-PAPER_TOLERANCE = 10 * MILLIMETRE  # the paper's largest distance [m] of a tip from its contact: about a tip's radius
-TIP_TOLERANCE, TIP_PENETRATION = 1 * MILLIMETRE, 2 * MILLIMETRE
-"""Largest distance [m] of a tip from its contact, and largest depth [m] of a tip below the estimated surface."""
-ANGLE_TOLERANCE = math.radians(2)  # largest angle [rad] of a contact direction outside the pad's cone
+"""A user's function that takes hand poses in the object's frame (k, 4, 4), and returns which an arm
+reaches (k,).
+"""
+PAPER_TOLERANCE = (
+    10 * MILLIMETRE
+)  # the paper's largest distance [m] of a tip from its contact: about a tip's radius
+TIP_TOLERANCE = 1 * MILLIMETRE
+TIP_PENETRATION = 2 * MILLIMETRE
+"""Largest distance [m] of a tip from its contact, and largest depth [m] of a tip below the
+estimated surface.
+"""
+ANGLE_TOLERANCE = math.radians(
+    2
+)  # largest angle [rad] of a contact direction outside the pad's cone
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspProblem(Value):
-    """The input of a grasp solver: a hand, contact sets with certificates of force closure, and the collision world.
+    """The input of a grasp solver: a hand, contact sets with certificates of force closure, and the
+    collision world.
 
-    Contact sets of several objects have a centre each, and a world that knows the object of each row. Grasps near
-    `center`, the object's centre [m], score higher. The function `reachable` tells which hand poses an arm can reach;
-    without this function, every pose counts as reachable. A hand that `descends` may begin above its pose where its
-    opened links would be in the table (`opened_pose`). Raises `BadArgument` if the contacts lack `std_m`, the surface's
-    standard deviation, by which the pre-grasp opens.
+    Contact sets of several objects have a centre each, and a world that knows the object of each
+    row. Grasps near `center`, the object's centre [m], score higher. The function `reachable` tells
+    which hand poses an arm can reach; without this function, every pose counts as reachable. A hand
+    that `descends` may begin above its pose where its opened links would be in the table
+    (`opened_pose`). Raises `BadArgument` if the contacts lack `std_m`, the surface's standard
+    deviation, by which the pre-grasp opens.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -64,43 +77,67 @@ class GraspProblem(Value):
     def rows(self, index: Int[Tensor, "k"]) -> "GraspProblem":
         """Return the problem of some of the contact sets."""
         center = self.center if self.center.ndim == 1 else self.center[index]
-        contacts, certificate, world = self.contacts[index], self.certificate[index], self.world.rows(index)
-        return GraspProblem(self.hand, contacts, certificate, world, center, self.reachable, self.descends)
+        contacts = self.contacts[index]
+        certificate = self.certificate[index]
+        world = self.world.rows(index)
+        return GraspProblem(
+            self.hand, contacts, certificate, world, center, self.reachable, self.descends
+        )
 
     @checked
     def drop_unreachable(self, seeds: IKSeeds) -> IKSeeds:
         """Return the seeds whose hand poses the arm can reach."""
-        return seeds if self.reachable is None else seeds[ask_reachable(self.reachable, seeds.obj_from_hand)]
+        return (
+            seeds
+            if self.reachable is None
+            else seeds[ask_reachable(self.reachable, seeds.obj_from_hand)]
+        )
 
 
 def ask_reachable(reachable: Reachable, obj_from_hand: Float[Tensor, "k 4 4"]) -> Bool[Tensor, "k"]:
-    """Return a mask of the hand poses that the user's function accepts; raise `BadArgument` for a malformed answer."""
+    """Return a mask of the hand poses that the user's function accepts; raise `BadArgument` for a
+    malformed answer.
+    """
     if not len(obj_from_hand):
         return torch.zeros(0, dtype=torch.bool, device=obj_from_hand.device)
     answer = reachable(obj_from_hand)
-    if not isinstance(answer, Tensor) or answer.dtype != torch.bool or answer.shape != obj_from_hand.shape[:1]:
-        raise BadArgument("reachable", f"an answer of {show(answer)}", f"a tensor of {len(obj_from_hand)} booleans")
+    if (
+        not isinstance(answer, Tensor)
+        or answer.dtype != torch.bool
+        or answer.shape != obj_from_hand.shape[:1]
+    ):
+        raise BadArgument(
+            "reachable",
+            f"an answer of {show(answer)}",
+            f"a tensor of {len(obj_from_hand)} booleans",
+        )
     return answer.to(obj_from_hand.device)
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspCandidates(Batch):
-    """Hand configurations to check, with contacts, force closure certificates, and the `status` of contact planning."""
+    """Hand configurations to check, with contacts, force closure certificates, and the `status` of
+    contact planning.
+    """
 
     configuration: Annotated[Configuration, Rows("g")]
     contacts: Annotated[Contacts, Rows("g")]  # in the order of the fingers
     certificate: Annotated[Certificate, Rows("g")]
-    permutation: Int[Tensor, "g f"]  # finger i touches contact `permutation[:, i]` of the planned set
+    permutation: Int[
+        Tensor, "g f"
+    ]  # finger i touches contact `permutation[:, i]` of the planned set
     status: Int[Tensor, "g"]
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspErrors(Batch):
-    """Errors of g grasps: each tip's distance from its contact [m], and the contact's angle from the pad's axis [rad].
+    """Errors of g grasps: each tip's distance from its contact [m], and the contact's angle from
+    the pad's axis [rad].
 
-    `clearance` [m] is the least clearance of the links. `status` tells the first error out of tolerance.
+    `clearance` [m] is the least clearance of the links. `status` tells the first error out of
+    tolerance.
     """
 
     tip_error: Annotated[Float[Tensor, "g f"], ANY]
@@ -120,25 +157,33 @@ def measure_errors(
 ) -> GraspErrors:
     """Measure the errors and clearances of grasps; `status` tells the first error out of tolerance.
 
-    With `rolling`, round fingertips may roll on their contacts within the cones of their pads. Without `rolling`, as in
-    the paper, each pad must touch with its own contact point, in any direction. `tolerance` [m] is the largest allowed
-    distance of a tip from its contact. NaN is out of tolerance.
+    With `rolling`, round fingertips may roll on their contacts within the cones of their pads.
+    Without `rolling`, as in the paper, each pad must touch with its own contact point, in any
+    direction. `tolerance` [m] is the largest allowed distance of a tip from its contact. NaN is out
+    of tolerance.
     """
     spatial = SpatialJacobian.at(hand, configuration)
-    touching, target = hand.tips.contact, contacts.points
+    touching = hand.tips.contact
+    target = contacts.points
     if rolling:
-        touching, target = hand.tips.center, tip_targets(hand, contacts)
+        touching = hand.tips.center
+        target = tip_targets(hand, contacts)
     error = torch.linalg.vector_norm(spatial.points(hand.tips.index, touching) - target, dim=-1)
     pads = spatial.pads.permute(2, 1, 0)
-    angle = torch.acos((-(pads * contacts.normals).sum(-1)).clamp(-1.0, 1.0))  # from the inward normal
+    angle = torch.acos(
+        (-(pads * contacts.normals).sum(-1)).clamp(-1.0, 1.0)
+    )  # from the inward normal
     links, depth, table = link_clearance(spatial, world, tips_touch=True)
     between = hand.self_clearance(configuration.joints)
-    lower, upper = hand.lower.to(error), hand.upper.to(error)
+    lower = hand.lower.to(error)
+    upper = hand.upper.to(error)
     cone = hand.tips.cone.to(error) + ANGLE_TOLERANCE
     conditions = {
         Status.TIP_ERROR: (error <= tolerance).all(1),
         Status.NORMAL_ANGLE: (angle <= cone).all(1) | (not rolling),
-        Status.JOINT_LIMITS: ((configuration.joints >= lower - 1e-9) & (configuration.joints <= upper + 1e-9)).all(1),
+        Status.JOINT_LIMITS: (
+            (configuration.joints >= lower - 1e-9) & (configuration.joints <= upper + 1e-9)
+        ).all(1),
         Status.SELF_COLLISION: between >= 0,
         Status.OBJECT_COLLISION: (links >= 0) & (depth >= -TIP_PENETRATION),
         Status.TABLE_COLLISION: table >= 0,
@@ -152,25 +197,39 @@ def measure_errors(
 
 
 def is_clear(hand: Hand, configuration: Configuration, world: CollisionWorld) -> Bool[Tensor, "g"]:
-    """Return a mask of the configurations in which no link, tips included, touches object, table or another link."""
-    links, _, table = link_clearance(SpatialJacobian.at(hand, configuration), world, tips_touch=False)
+    """Return a mask of the configurations in which no link, tips included, touches object, table or
+    another link.
+    """
+    links, _, table = link_clearance(
+        SpatialJacobian.at(hand, configuration), world, tips_touch=False
+    )
     return (links >= 0) & (table >= 0) & (hand.self_clearance(configuration.joints) >= 0)
 
 
 @checked
 def check_candidates(
-    problem: GraspProblem, candidates: GraspCandidates, rolling: bool = True, tolerance: Length = TIP_TOLERANCE
+    problem: GraspProblem,
+    candidates: GraspCandidates,
+    rolling: bool = True,
+    tolerance: Length = TIP_TOLERANCE,
 ) -> Grasps:
-    """Return a grasp for each candidate, with pre-grasp, approach and the `Status` of the first check that it fails."""
-    hand, world = problem.hand, problem.world
-    configuration, contacts, certificate = candidates.configuration, candidates.contacts, candidates.certificate
+    """Return a grasp for each candidate, with pre-grasp, approach and the `Status` of the first
+    check that it fails.
+    """
+    hand = problem.hand
+    world = problem.world
+    configuration = candidates.configuration
+    contacts = candidates.contacts
+    certificate = candidates.certificate
     unproven = (candidates.status == Status.OK) & ~certificate.closed
     planned = torch.where(unproven, int(Status.NOT_CLOSED), candidates.status)
     errors = measure_errors(hand, configuration, contacts, world, rolling, tolerance)
 
     pregrasp = configuration.joints.clone()
     touching = torch.nonzero((planned == Status.OK) & (errors.status == Status.OK))[:, 0]
-    pregrasp[touching] = open_hand(hand, configuration[touching], contacts[touching], world.rows(touching))
+    pregrasp[touching] = open_hand(
+        hand, configuration[touching], contacts[touching], world.rows(touching)
+    )
     opened = Configuration(pregrasp, configuration.obj_from_hand)
     if problem.descends:
         raised = opened_pose(hand, pregrasp, opened.obj_from_hand, world.plane)
@@ -207,10 +266,17 @@ def check_candidates(
 
 
 def _keep_clear(
-    problem: GraspProblem, configuration: Configuration, opened: Configuration, approach: Tensor, status: Tensor
+    problem: GraspProblem,
+    configuration: Configuration,
+    opened: Configuration,
+    approach: Tensor,
+    status: Tensor,
 ) -> None:
-    """Change in place the `status` of grasps that collide with hard obstacles; soft ones change only the `approach`."""
-    hand, world = problem.hand, problem.world
+    """Change in place the `status` of grasps that collide with hard obstacles; soft ones change
+    only the `approach`.
+    """
+    hand = problem.hand
+    world = problem.world
     crowded = torch.nonzero(status == Status.NO_APPROACH)[:, 0]
     direction, clearance = find_approach(hand, opened[crowded], world.alone)
     pushed = crowded[clearance >= 0]
@@ -220,21 +286,27 @@ def _keep_clear(
         room = motion_clearance(hand, configuration[ready], opened[ready], world)
         status[ready[room < 0]] = int(Status.NEIGHBOUR_COLLISION)
     else:
-        status[pushed], approach[pushed] = int(Status.OK), direction[clearance >= 0]
+        status[pushed] = int(Status.OK)
+        approach[pushed] = direction[clearance >= 0]
 
 
 def centred_friction(contacts: Contacts) -> Float[Tensor, "g"]:
-    """Return the friction coefficient that each contact set needs if all forces point to the contacts' centroid."""
+    """Return the friction coefficient that each contact set needs if all forces point to the
+    contacts' centroid.
+    """
     inward = unit(contacts.points.mean(1, keepdim=True) - contacts.points)
     cosine = -(inward * contacts.normals).sum(-1)
     sine = torch.linalg.vector_norm(torch.linalg.cross(inward, contacts.normals), dim=-1)
     return (sine / cosine.clamp_min(1e-3)).amax(1)
 
 
-def score(contacts: Contacts, normal_angle: Float[Tensor, "g f"], center: Float[Tensor, "*g 3"]) -> Float[Tensor, "g"]:
+def score(
+    contacts: Contacts, normal_angle: Float[Tensor, "g f"], center: Float[Tensor, "*g 3"]
+) -> Float[Tensor, "g"]:
     """Return the geometric score of each grasp, at most 0; a higher score is better.
 
-    Three things lower it: the contacts' distance from `center` [m], the friction needed, and the angle off the pads.
+    Three things lower it: the contacts' distance from `center` [m], the friction needed, and the
+        angle off the pads.
     """
     offset = torch.linalg.vector_norm(contacts.points.mean(1) - center, dim=-1)
     return -(offset / 0.02 + centred_friction(contacts) + normal_angle.amax(1) / 0.8)

@@ -1,4 +1,6 @@
-"""The collision world, and clearances of a hand's links: from object, table, obstacles and each other."""
+"""The collision world, and clearances of a hand's links: from object, table, obstacles and each
+other.
+"""
 
 import dataclasses
 import math
@@ -27,14 +29,14 @@ HINGES = 8  # number of least clearances of each kind that enter one step
 @checked
 @dataclasses.dataclass(frozen=True)
 class Obstacles(Value):
-    """Regions of a scene that are probably occupied, given as grids of the distance [m] from these regions.
+    """Regions of a scene that are probably occupied, given as grids of the distance [m] from these
+    regions.
 
-    Args:
-        field: signed distances from the region that counts as occupied, negative inside.
-        distances: for each of the `levels`, the distances from the region that is occupied with at least this
-            probability; 0 inside, on the same grid.
-        levels: k probabilities, ascending.
-        hard: whether links must not touch the occupied region; otherwise a collision only lowers the predicted success.
+    Args: field: signed distances from the region that counts as occupied, negative inside.
+        distances: for each of the `levels`, the distances from the region that is occupied with at
+        least this probability; 0 inside, on the same grid. levels: k probabilities, ascending.
+        hard: whether links must not touch the occupied region; otherwise a collision only lowers
+        the predicted success.
 
     >>> from torchgrasp import load_scene
     >>> from torchgrasp.scene import estimate_occupancy
@@ -56,18 +58,30 @@ class Obstacles(Value):
 
         Voxels of probability `full`, in [0.01, 1], or more count as occupied.
         """
-        device, occupancy = occupancy.origin.device, settle(occupancy, torch.device("cpu"))  # SciPy's distances
-        probability, levels = occupancy.probability, sorted({0.1, 0.5, 0.8, full})
+        # SciPy's distances
+        device = occupancy.origin.device
+        occupancy = settle(occupancy, torch.device("cpu"))
+        probability = occupancy.probability
+        levels = sorted({0.1, 0.5, 0.8, full})
         if not bool((probability >= levels[0]).any()):
             return None
-        distances = torch.stack([distance_to(probability >= level, occupancy.spacing) for level in levels])
-        outside, inside = distances[levels.index(full)], distance_to(probability < full, occupancy.spacing)
+        distances = torch.stack(
+            [distance_to(probability >= level, occupancy.spacing) for level in levels]
+        )
+        outside = distances[levels.index(full)]
+        inside = distance_to(probability < full, occupancy.spacing)
         field = SignedDistanceField(occupancy.origin.double(), occupancy.spacing, outside - inside)
-        return cls(field, distances.float(), torch.tensor(levels, dtype=torch.float64, device="cpu"), hard).to(device)
+        return cls(
+            field, distances.float(), torch.tensor(levels, dtype=torch.float64, device="cpu"), hard
+        ).to(device)
 
     @checked
-    def likelihood(self, centres: Float[Tensor, "*b s 3"], radius: Float[Tensor, "s"]) -> Float[Tensor, "*b"]:
-        """Return for each set of s spheres [m] the largest occupancy probability of the regions that they touch."""
+    def likelihood(
+        self, centres: Float[Tensor, "*b s 3"], radius: Float[Tensor, "s"]
+    ) -> Float[Tensor, "*b"]:
+        """Return for each set of s spheres [m] the largest occupancy probability of the regions
+        that they touch.
+        """
         met = centres.new_zeros(centres.shape[:-2])
         levels = [*self.levels.tolist(), 1.0]
         for low, high, values in zip(levels, levels[1:], self.distances, strict=False):
@@ -77,11 +91,15 @@ class Obstacles(Value):
 
 
 def distance_to(region: Bool[Tensor, "x y z"], spacing: float) -> Float[Tensor, "x y z"]:
-    """Return the distance [m] of each voxel from a region: 0 inside, larger than the grid if the region is empty."""
+    """Return the distance [m] of each voxel from a region: 0 inside, larger than the grid if the
+    region is empty.
+    """
     from scipy.ndimage import distance_transform_edt
 
     if not bool(region.any()):
-        return torch.full(region.shape, spacing * sum(region.shape), dtype=torch.float64, device="cpu")
+        return torch.full(
+            region.shape, spacing * sum(region.shape), dtype=torch.float64, device="cpu"
+        )
     steps = torch.from_numpy(np.asarray(distance_transform_edt(~region.numpy())))
     return (spacing * (steps - 0.5)).clamp_min(0.0)
 
@@ -89,10 +107,11 @@ def distance_to(region: Bool[Tensor, "x y z"], spacing: float) -> Float[Tensor, 
 @checked
 @dataclasses.dataclass(frozen=True)
 class CollisionWorld(Value):
-    """The surroundings that a hand must not touch: the object's signed distance `field`, a table, and obstacles.
+    """The surroundings that a hand must not touch: the object's signed distance `field`, a table,
+    and obstacles.
 
-    The table is a plane, or a height [m] along z. A part of the surroundings that does not exist is None. Raises
-    `BadArgument` for a table that is neither a plane nor a height.
+    The table is a plane, or a height [m] along z. A part of the surroundings that does not exist is
+    None. Raises `BadArgument` for a table that is neither a plane nor a height.
 
     >>> CollisionWorld(table=0.02).plane.offset
     0.02
@@ -109,12 +128,18 @@ class CollisionWorld(Value):
     def plane(self) -> Plane | None:
         """The table as a plane, on the device of the distance fields, or None without a table."""
         plane = as_plane(self.table)
-        return plane if plane is None or not self.fields else settle(plane, self.fields[0].nodes.device)
+        return (
+            plane
+            if plane is None or not self.fields
+            else settle(plane, self.fields[0].nodes.device)
+        )
 
     @property
     def fields(self) -> tuple[DistanceField, ...]:
         """The distance fields of object and obstacles, if any."""
-        return tuple(x for x in (self.field, self.obstacles and self.obstacles.field) if x is not None)
+        return tuple(
+            x for x in (self.field, self.obstacles and self.obstacles.field) if x is not None
+        )
 
     @property
     def alone(self) -> "CollisionWorld":
@@ -123,7 +148,9 @@ class CollisionWorld(Value):
 
     @checked
     def rows(self, index: Int[Tensor, "k"]) -> "CollisionWorld":
-        """Return the surroundings of some of the rows of hands; a single object's are those of all rows."""
+        """Return the surroundings of some of the rows of hands; a single object's are those of all
+        rows.
+        """
         if self.field is None or isinstance(self.field, SignedDistanceField):
             return self
         return dataclasses.replace(self, field=self.field.rows(index))
@@ -135,40 +162,66 @@ class CollisionWorld(Value):
 
 
 def along(points: Float[Tensor, "*b 3"], plane: Plane) -> Float[Tensor, "*b"]:
-    """Return the coordinates [m] of points along the normal of a plane, before its offset is subtracted."""
+    """Return the coordinates [m] of points along the normal of a plane, before its offset is
+    subtracted.
+    """
     return points @ plane.normal.to(points)
 
 
 def collision_cost(
     centres: Float[Tensor, "*b s 3"], spheres: CollisionSpheres, world: CollisionWorld
 ) -> Float[Tensor, "*b"]:
-    """Return for each hand the sum of squares [mm2] of the clearance its spheres lack; tips may touch the object."""
-    radius, cost = spheres.radius.to(centres), centres.new_zeros(centres.shape[:-2])
+    """Return for each hand the sum of squares [mm2] of the clearance its spheres lack; tips may
+    touch the object.
+    """
+    radius = spheres.radius.to(centres)
+    cost = centres.new_zeros(centres.shape[:-2])
     for field in world.fields:
         deficit = CLEARANCE + radius - field.nearest_node(centres)
         deficit = deficit * ~spheres.touching if field is world.field else deficit
         cost = cost + deficit.clamp_min(0).square().sum(-1)
     if world.plane is not None:
-        deficit = world.plane.offset + CLEARANCE * ~spheres.touching + radius - along(centres, world.plane)
+        deficit = (
+            world.plane.offset
+            + CLEARANCE * ~spheres.touching
+            + radius
+            - along(centres, world.plane)
+        )
         cost = cost + deficit.clamp_min(0).square().sum(-1)
     return cost / MILLIMETRE**2
 
 
-def clearance_rows(spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool) -> list[ResidualRows]:
-    """Return residuals [mm]: the lack of the smallest clearances between links and from object, obstacles and table."""
-    pairs, moves = spatial.hand.self_collision, spatial.hand.motion.moves
+def clearance_rows(
+    spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool
+) -> list[ResidualRows]:
+    """Return residuals [mm]: the lack of the smallest clearances between links and from object,
+    obstacles and table.
+    """
+    pairs = spatial.hand.self_collision
+    moves = spatial.hand.motion.moves
     separation, number, wrench = pairs.pushes(spatial.obj_from_link, SELF_CLEARANCE)
-    separation, index = separation.T.topk(min(HINGES, len(pairs.pairs)), dim=1, largest=False, sorted=False)
+    separation, index = separation.T.topk(
+        min(HINGES, len(pairs.pairs)), dim=1, largest=False, sorted=False
+    )
     wrench = wrench.T[number.T.gather(1, index)] / -MILLIMETRE
     first, second = moves[pairs.link[pairs.pairs]].to(wrench).unbind(1)
-    between = ResidualRows((SELF_CLEARANCE - separation).clamp_min(0) / MILLIMETRE, wrench, (second - first)[index])
+    between = ResidualRows(
+        (SELF_CLEARANCE - separation).clamp_min(0) / MILLIMETRE, wrench, (second - first)[index]
+    )
     return [between, *sphere_rows(spatial, world, tips_touch)]
 
 
-def sphere_rows(spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool) -> list[ResidualRows]:
-    """Return the residuals of `clearance_rows` for the clearances of the links from object, obstacles and table."""
-    spheres, motion, centres = spatial.hand.collision_spheres, spatial.hand.motion, spatial.sphere_centres
-    radius, found = spheres.radius.to(centres), []
+def sphere_rows(
+    spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool
+) -> list[ResidualRows]:
+    """Return the residuals of `clearance_rows` for the clearances of the links from object,
+    obstacles and table.
+    """
+    spheres = spatial.hand.collision_spheres
+    motion = spatial.hand.motion
+    centres = spatial.sphere_centres
+    radius = spheres.radius.to(centres)
+    found = []
     for field in world.fields:
         coarse = field.nearest_node(centres) - radius
         if tips_touch and field is world.field:
@@ -176,31 +229,41 @@ def sphere_rows(spatial: SpatialJacobian, world: CollisionWorld, tips_touch: boo
         found.append(coarse)
     if world.plane is not None:
         height = along(centres, world.plane) - radius - world.plane.offset
-        found.append(height + CLEARANCE * spheres.touching if tips_touch else height)  # contacts tell how low tips are
+        found.append(
+            height + CLEARANCE * spheres.touching if tips_touch else height
+        )  # contacts tell how low tips are
     if not found:
         return []
-    coarse, index = torch.stack(found, 1).topk(min(HINGES, len(radius)), dim=2, largest=False, sorted=False)
+    coarse, index = torch.stack(found, 1).topk(
+        min(HINGES, len(radius)), dim=2, largest=False, sorted=False
+    )
     points = centres[torch.arange(len(centres), device=centres.device)[:, None, None], index]
-    clearance, direction = [], []
+    clearance = []
+    direction = []
     for k, field in enumerate(world.fields):
         distance, gradient = field.query(points[:, k])
-        clearance.append(distance - radius[index[:, k]] + torch.where(torch.isinf(coarse[:, k]), 1.0, 0.0))
+        clearance.append(
+            distance - radius[index[:, k]] + torch.where(torch.isinf(coarse[:, k]), 1.0, 0.0)
+        )
         direction.append(gradient)
     if world.plane is not None:
         clearance.append(coarse[:, -1])
         direction.append(world.plane.normal.to(centres).expand_as(points[:, -1]))
-    clearance, direction = torch.cat(clearance, 1), torch.cat(direction, 1)
+    clearance = torch.cat(clearance, 1)
+    direction = torch.cat(direction, 1)
     direction = direction * ((clearance < CLEARANCE).to(centres) / -MILLIMETRE)[..., None]
     wrench = torch.cat([direction, torch.linalg.cross(points.flatten(1, 2), direction)], -1)
     moves = motion.moves[spheres.link_index].to(centres)[index.flatten(1)]
     return [ResidualRows((CLEARANCE - clearance).clamp_min(0) / MILLIMETRE, wrench, moves)]
 
 
-def link_clearance(spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool) -> list[Float[Tensor, "g"]]:
+def link_clearance(
+    spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool
+) -> list[Float[Tensor, "g"]]:
     """Return three least clearances [m] of each hand.
 
-    They are of links from the object (tips are left out if `tips_touch`), of tips from the object, and of all links
-    from the table.
+    They are of links from the object (tips are left out if `tips_touch`), of tips from the object,
+    and of all links from the table.
     """
     spheres = spatial.hand.collision_spheres
     centres = spatial.sphere_centres

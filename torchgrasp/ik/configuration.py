@@ -1,7 +1,7 @@
 """Configurations of a free-floating hand, and Jacobians of points on its links.
 
-A Jacobian is built from wrenches: the derivative of a residual by a joint or pose motion is the product of a wrench
-about the object's origin and the twist of the motion.
+A Jacobian is built from wrenches: the derivative of a residual by a joint or pose motion is the
+product of a wrench about the object's origin and the twist of the motion.
 """
 
 import dataclasses
@@ -31,22 +31,31 @@ class Configuration(Batch):
 
     @checked(gradients=True)
     def integrate(self, hand: Hand, step: Float[Tensor, "g d"]) -> "Configuration":
-        """Return the configurations after a `step`: translation [m], then rotation vector [rad], then joints [rad].
+        """Return the configurations after a `step`: translation [m], then rotation vector [rad],
+        then joints [rad].
 
-        Translation and rotation vector are in the hand's axes. The joints are clamped to their limits.
+        Translation and rotation vector are in the hand's axes. The joints are clamped to their
+        limits.
         """
         if step.shape[1] != 6 + self.joints.shape[1]:
-            raise BadArgument("step", f"{step.shape[1]} numbers", f"6 of the pose and {self.joints.shape[1]} joints")
-        rotation, position = self.obj_from_hand[:, :3, :3], self.obj_from_hand[:, :3, 3]
+            raise BadArgument(
+                "step",
+                f"{step.shape[1]} numbers",
+                f"6 of the pose and {self.joints.shape[1]} joints",
+            )
+        rotation = self.obj_from_hand[:, :3, :3]
+        position = self.obj_from_hand[:, :3, 3]
         joints = (self.joints + step[:, 6:]).clamp(hand.lower.to(position), hand.upper.to(position))
         position = position + (rotation @ step[:, :3, None])[..., 0]
         return Configuration(joints, rigid(rotation @ rotation_from_vector(step[:, 3:6]), position))
 
 
 class ResidualRows(NamedTuple):
-    """Residuals of g configurations, with the factors of their derivatives by q motions of joints and hand pose.
+    """Residuals of g configurations, with the factors of their derivatives by q motions of joints
+    and hand pose.
 
-    The derivative by a motion is `wrench` times the twist of the motion where `moves` is 1, and 0 where `moves` is 0.
+    The derivative by a motion is `wrench` times the twist of the motion where `moves` is 1, and 0
+    where `moves` is 0.
     """
 
     residual: Float[Tensor, "g k"]
@@ -56,7 +65,9 @@ class ResidualRows(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class SpatialJacobian(Value):
-    """Link frames, sphere centres, tip centres, pad axes and motion twists of g hands, in the object's frame."""
+    """Link frames, sphere centres, tip centres, pad axes and motion twists of g hands, in the
+    object's frame.
+    """
 
     hand: Hand
     obj_from_link: Float[Tensor, "3 4 l g"]
@@ -67,15 +78,21 @@ class SpatialJacobian(Value):
 
     @classmethod
     def at(cls, hand: Hand, configuration: Configuration) -> "SpatialJacobian":
-        """Evaluate the forward kinematics of a hand at g configurations; the result can compute Jacobians."""
+        """Evaluate the forward kinematics of a hand at g configurations; the result can compute
+        Jacobians.
+        """
         root = configuration.obj_from_hand[:, :3].permute(1, 2, 0)
         frames = hand.tree.frames(hand.actuated.couple(configuration.joints).T.contiguous(), root)
         spheres, tips, pads, origins, turning, sliding = hand.motion.place(frames)
         twists = torch.cat([torch.linalg.cross(origins, turning, dim=0) + sliding, turning])
         return cls(hand, frames, spheres, tips, pads, twists)
 
-    def points(self, links: Int[Tensor, "k"], local: Float[Tensor, "k 3"]) -> Float[Tensor, "g k 3"]:
-        """Return the positions [m] in the object's frame of k points, each given in the frame of its link."""
+    def points(
+        self, links: Int[Tensor, "k"], local: Float[Tensor, "k 3"]
+    ) -> Float[Tensor, "g k 3"]:
+        """Return the positions [m] in the object's frame of k points, each given in the frame of
+        its link.
+        """
         return map_points(self.obj_from_link.index_select(2, links), local).permute(2, 1, 0)
 
     @property
@@ -83,14 +100,20 @@ class SpatialJacobian(Value):
         """Centres [m] of the hand's collision spheres."""
         return self.spheres.permute(2, 1, 0)
 
-    def jacobian(self, wrench: Float[Tensor, "g k 6"], moves: Float[Tensor, "*g k q"]) -> Float[Tensor, "g k d"]:
-        """Return the derivatives of k residuals by hand pose (6) and joints; the arguments are fields of `ResidualRows`."""
+    def jacobian(
+        self, wrench: Float[Tensor, "g k 6"], moves: Float[Tensor, "*g k q"]
+    ) -> Float[Tensor, "g k d"]:
+        """Return the derivatives of k residuals by hand pose (6) and joints; the arguments are
+        fields of `ResidualRows`.
+        """
         by_motion = (wrench @ self.twists.permute(2, 0, 1)) * moves
         coupling = self.hand.motion.coupling
         return by_motion if coupling is None else by_motion @ coupling.to(by_motion)
 
 
 def differentiate(spatial: SpatialJacobian, parts: Sequence[ResidualRows]) -> Residuals:
-    """Concatenate several groups of residuals; return them and their Jacobian by hand pose (6) and joints."""
+    """Concatenate several groups of residuals; return them and their Jacobian by hand pose (6) and
+    joints.
+    """
     residual, wrench, moves = (torch.cat(x, 1) for x in zip(*parts, strict=True))
     return residual, spatial.jacobian(wrench, moves)

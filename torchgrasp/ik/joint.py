@@ -1,8 +1,9 @@
-"""Contacts, hand pose and joints solved together: the contacts slide on the surface until the hand reaches them.
+"""Contacts, hand pose and joints solved together: the contacts slide on the surface until the hand
+reaches them.
 
-The contact problem (Eqs. 10-13 of the paper, with the margins of `ContactSpec`) and the hand's residuals form one
-least-squares problem. Its unknowns are pose, joints, contact points and tensions. A tension is the size of the pull
-between two contacts; the pulls give the contact forces.
+The contact problem (Eqs. 10-13 of the paper, with the margins of `ContactSpec`) and the hand's
+residuals form one least-squares problem. Its unknowns are pose, joints, contact points and
+tensions. A tension is the size of the pull between two contacts; the pulls give the contact forces.
 """
 
 import dataclasses
@@ -13,8 +14,18 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.contacts.certify import certify
-from torchgrasp.contacts.feasibility import FlatnessConstraint, check_feasibility, flatness_constraint
-from torchgrasp.contacts.problem import ContactProblem, ShapeLike, rows_of, triple_jet, triple_mean_jet
+from torchgrasp.contacts.feasibility import (
+    FlatnessConstraint,
+    check_feasibility,
+    flatness_constraint,
+)
+from torchgrasp.contacts.problem import (
+    ContactProblem,
+    ShapeLike,
+    rows_of,
+    triple_jet,
+    triple_mean_jet,
+)
 from torchgrasp.contacts.solver import equal_tensions, normalise_tensions, project
 from torchgrasp.foundation.base import Batch, at_once, rank_in_group, spread
 from torchgrasp.foundation.checks import checked
@@ -33,7 +44,9 @@ CONTACT_WEIGHT = 2.0  # weight of a millimetre of the contact problem: contacts 
 
 
 class SlidingStage(NamedTuple):
-    """A solver stage: its steps, whether contacts must be on flat surface, largest cost [mm2] of grasps that go on."""
+    """A solver stage: its steps, whether contacts must be on flat surface, largest cost [mm2] of
+    grasps that go on.
+    """
 
     steps: int
     flat: bool
@@ -50,7 +63,9 @@ STAGES = (
 
 @dataclasses.dataclass(frozen=True)
 class JointState(Batch):
-    """Hand configurations, normalised contact points, tensions of contact pairs, extrapolated surface variance."""
+    """Hand configurations, normalised contact points, tensions of contact pairs, extrapolated
+    surface variance.
+    """
 
     configuration: Configuration
     points: Float[Tensor, "g f 3"]
@@ -59,10 +74,15 @@ class JointState(Batch):
     variance_gradient: Float[Tensor, "g f 3"]
 
     def integrate(self, hand: Hand, step: Float[Tensor, "g d"]) -> "JointState":
-        """Return the state after a `step`: changes of hand pose, joints, contact points and tensions, concatenated."""
-        by_hand, by_points, by_tension = step.split([6 + hand.dof, self.points[0].numel(), self.tension.shape[1]], 1)
+        """Return the state after a `step`: changes of hand pose, joints, contact points and
+        tensions, concatenated.
+        """
+        by_hand, by_points, by_tension = step.split(
+            [6 + hand.dof, self.points[0].numel(), self.tension.shape[1]], 1
+        )
         motion = by_points.unflatten(1, self.points.shape[1:])
-        points, variance = self.points + motion, self.variance + (self.variance_gradient * motion).sum(-1)
+        points = self.points + motion
+        variance = self.variance + (self.variance_gradient * motion).sum(-1)
         tension = normalise_tensions(points, self.tension + by_tension)
         moved = self.configuration.integrate(hand, by_hand)
         return JointState(moved, points, tension, variance, self.variance_gradient)
@@ -70,7 +90,9 @@ class JointState(Batch):
 
 @dataclasses.dataclass(frozen=True)
 class JointProblem:
-    """The least-squares problem of hand and contacts together: hand, object shape, constraints, collision world."""
+    """The least-squares problem of hand and contacts together: hand, object shape, constraints,
+    collision world.
+    """
 
     hand: Hand
     shape: ShapeLike
@@ -79,34 +101,52 @@ class JointProblem:
 
     def rows(self, index: Int[Tensor, "k"]) -> "JointProblem":
         """Return the problems of some of the rows."""
-        shape, contact_problem = rows_of(self.shape, index), self.contact_problem.rows(index)
+        shape = rows_of(self.shape, index)
+        contact_problem = self.contact_problem.rows(index)
         return JointProblem(self.hand, shape, contact_problem, self.world.rows(index))
 
     def residuals(self, state: JointState, flat: FlatnessConstraint | None) -> Residuals:
-        """Return all residuals [mm] and their Jacobian with respect to hand pose, joints, contacts and tensions."""
-        hand, shape = self.hand, self.shape
-        mean, slope = triple_mean_jet(shape, state.points), state.variance_gradient
+        """Return all residuals [mm] and their Jacobian with respect to hand pose, joints, contacts
+        and tensions.
+        """
+        hand = self.hand
+        shape = self.shape
+        mean = triple_mean_jet(shape, state.points)
+        slope = state.variance_gradient
         jet = SurfaceJet(**vars(mean), variance=state.variance, variance_gradient=slope)
         spatial = SpatialJacobian.at(hand, state.configuration)
         contacts = Contacts(shape.metres(state.points), jet.normals)
         tips = tip_rows(spatial, tip_targets(hand, contacts), jet.normals)
-        of_hand, by_hand = differentiate(spatial, [tips, *clearance_rows(spatial, self.world, tips_touch=True)])
-        tips_by_points = self._tips_by_points(spatial, jet, tips.residual[:, 3 * len(hand.tips) :] > 0)
+        of_hand, by_hand = differentiate(
+            spatial, [tips, *clearance_rows(spatial, self.world, tips_touch=True)]
+        )
+        tips_by_points = self._tips_by_points(
+            spatial, jet, tips.residual[:, 3 * len(hand.tips) :] > 0
+        )
         contact, contact_by_x = self._contact_residuals(state, jet, flat)
 
-        rows, h, points = by_hand.shape[1], by_hand.shape[2], tips_by_points.shape[2]
+        rows = by_hand.shape[1]
+        h = by_hand.shape[2]
+        points = tips_by_points.shape[2]
         residual = torch.cat([of_hand, contact], 1)
         jacobian = residual.new_zeros(*residual.shape, h + contact_by_x.shape[2])
-        jacobian[:, :rows, :h], jacobian[:, rows:, h:] = by_hand, contact_by_x
+        jacobian[:, :rows, :h] = by_hand
+        jacobian[:, rows:, h:] = contact_by_x
         jacobian[:, : tips_by_points.shape[1], h : h + points] = tips_by_points
         return residual, jacobian
 
     def _tips_by_points(
         self, spatial: SpatialJacobian, jet: SurfaceJet, outside: Bool[Tensor, "g f"]
     ) -> Float[Tensor, "g 4*f 3*f"]:
-        """Return the derivatives of tip residuals by contact points; `outside` marks contacts outside pads' cones."""
-        hand, normals, normal_jacobian = self.hand, jet.normals, jet.normal_jacobian
-        identity, own = (torch.eye(k, dtype=normals.dtype, device=normals.device) for k in (3, len(hand.tips)))
+        """Return the derivatives of tip residuals by contact points; `outside` marks contacts
+        outside pads' cones.
+        """
+        hand = self.hand
+        normals = jet.normals
+        normal_jacobian = jet.normal_jacobian
+        identity, own = (
+            torch.eye(k, dtype=normals.dtype, device=normals.device) for k in (3, len(hand.tips))
+        )
         rolled = hand.tips.radius.to(normals)[:, None, None] * normal_jacobian
         target = spread(self.shape.scale, rolled) * identity + rolled
         pads = spatial.pads.permute(2, 1, 0)
@@ -115,10 +155,15 @@ class JointProblem:
         tilts = torch.einsum("giy,ij->gijy", tilt, own).flatten(2)
         return torch.cat([-TIP_WEIGHT / MILLIMETRE * tips, PAD_WEIGHT * tilts], 1)
 
-    def _contact_residuals(self, state: JointState, jet: SurfaceJet, flat: FlatnessConstraint | None) -> Residuals:
-        """Return the residuals [mm] of the contacts alone, and their Jacobian; a satisfied inequality gives 0."""
+    def _contact_residuals(
+        self, state: JointState, jet: SurfaceJet, flat: FlatnessConstraint | None
+    ) -> Residuals:
+        """Return the residuals [mm] of the contacts alone, and their Jacobian; a satisfied
+        inequality gives 0.
+        """
         rows = self.contact_problem.constraints(state.points, state.tension, jet)
-        bounds, bounds_by_x = rows.bounds, rows.bounds_by_x
+        bounds = rows.bounds
+        bounds_by_x = rows.bounds_by_x
         if flat is not None:
             bounds = torch.cat([bounds, flat.values(state.points)], 1)
             by_tension = flat.by_points.new_zeros(*flat.by_points.shape[:2], state.tension.shape[1])
@@ -132,23 +177,33 @@ class JointProblem:
     def solve(
         self, configuration: Configuration, points: Float[Tensor, "g f 3"]
     ) -> tuple[Configuration, Float[Tensor, "k f 3"], Int[Tensor, "k"]]:
-        """Optimise hands and contacts together; return configurations, contacts and indices of grasps of low cost."""
-        own, largest = self, self.contact_problem.spec.flatness
-        rows, tension = torch.arange(len(points), device=points.device), equal_tensions(points)
+        """Optimise hands and contacts together; return configurations, contacts and indices of
+        grasps of low cost.
+        """
+        own = self
+        largest = self.contact_problem.spec.flatness
+        rows = torch.arange(len(points), device=points.device)
+        tension = equal_tensions(points)
         for stage in STAGES:
-            flat, jet = None, triple_jet(own.shape, points)
+            flat = None
+            jet = triple_jet(own.shape, points)
             state = JointState(configuration, points, tension, jet.variance, jet.variance_gradient)
             if stage.flat and largest is not None:
                 flat = flatness_constraint(own.shape, points, largest, own.contact_problem.ring)
             sliding = LeastSquares(
-                lambda x, at, flat=flat, own=own: own.rows(at).residuals(x, None if flat is None else flat[at]),
+                lambda x, at, flat=flat, own=own: own.rows(at).residuals(
+                    x, None if flat is None else flat[at]
+                ),
                 lambda x, step: x.integrate(self.hand, step),
                 largest=HAND_STEP,
             )
             state, cost = levenberg_marquardt(sliding, state, stage.steps)
             kept = torch.nonzero(cost < stage.hopeless)[:, 0]
-            configuration, points, tension = state.configuration[kept], state.points[kept], state.tension[kept]
-            rows, own = rows[kept], own.rows(kept)
+            configuration = state.configuration[kept]
+            points = state.points[kept]
+            tension = state.tension[kept]
+            rows = rows[kept]
+            own = own.rows(kept)
             if not len(rows):
                 break
         return configuration, points, rows
@@ -157,28 +212,40 @@ class JointProblem:
 def solve_sliding(
     joint_problem: JointProblem, problem: GraspProblem, seeds: IKSeeds, attempts: Attempts[Grasps]
 ) -> None:
-    """Optimise hand and contacts together for each unsolved contact set, and add the checked grasps to `attempts`."""
-    chosen = attempts.choose(seeds, rank_in_group(seeds.row), 0, 2)  # of more, few find another grasp
-    size = min(at_once(chosen.row, 512), 2**15)  # the Jacobians of more do not fit into an accelerator
+    """Optimise hand and contacts together for each unsolved contact set, and add the checked grasps
+    to `attempts`.
+    """
+    chosen = attempts.choose(
+        seeds, rank_in_group(seeds.row), 0, 2
+    )  # of more, few find another grasp
+    size = min(
+        at_once(chosen.row, 512), 2**15
+    )  # the Jacobians of more do not fit into an accelerator
     for part in (chosen[k : k + size] for k in range(0, len(chosen), size)):
         own = joint_problem.rows(part.row)
         points = own.shape.normalise(assign(problem.contacts, part).points)
         start = Configuration(part.joints, part.obj_from_hand)
         configuration, points, left = own.solve(start, points)
-        kept, own = part[left], own.rows(left)
+        kept = part[left]
+        own = own.rows(left)
         on_surface = project(own.shape, points, 3)  # the solver leaves contacts within 0.1 mm
         plan = check_feasibility(own.shape, own.contact_problem, on_surface)
         certificate = certify(plan.contacts, own.contact_problem.spec)
-        candidates = GraspCandidates(configuration, plan.contacts, certificate, kept.permutation, plan.status)
+        candidates = GraspCandidates(
+            configuration, plan.contacts, certificate, kept.permutation, plan.status
+        )
         attempts.add(check_candidates(problem.rows(kept.row), candidates), kept.row)
 
 
 @checked
-def solve_joint(problem: GraspProblem, seeds: IKSeeds, shape: ShapeLike, spec: ContactSpec) -> Grasps:
-    """Optimise a hand posture for each contact set that has seeds; return the checked grasps, best first.
+def solve_joint(
+    problem: GraspProblem, seeds: IKSeeds, shape: ShapeLike, spec: ContactSpec
+) -> Grasps:
+    """Optimise a hand posture for each contact set that has seeds; return the checked grasps, best
+    first.
 
-    Seeds are tried in their order. If the hand cannot reach the contacts, they slide along the surface and are
-    certified anew. If they fail, the grasp has the `Status` of the contact planner.
+    Seeds are tried in their order. If the hand cannot reach the contacts, they slide along the
+    surface and are certified anew. If they fail, the grasp has the `Status` of the contact planner.
 
     >>> from torchgrasp import fit_shape, load_hand, load_object
     >>> from torchgrasp.ik import CollisionWorld, PostureLibrary, nearest_postures

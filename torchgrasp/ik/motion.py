@@ -1,4 +1,6 @@
-"""Clearance of a grasp's motion: the straight approach of the opened hand, the closing and the lift."""
+"""Clearance of a grasp's motion: the straight approach of the opened hand, the closing and the
+lift.
+"""
 
 import math
 
@@ -17,7 +19,9 @@ from torchgrasp.ik.configuration import Configuration, SpatialJacobian
 from torchgrasp.values.planning import Grasps
 
 APPROACH_DISTANCE = 0.1  # length [m] of the straight approach: about the depth of a hand
-COARSE_STEPS, FINE_STEPS = 8, 16  # positions on each candidate path, and on a chosen path
+# positions on each candidate path, and on a chosen path
+COARSE_STEPS = 8
+FINE_STEPS = 16
 UP = torch.tensor([0.0, 0.0, 1.0], device="cpu")
 Spheres = Float[Tensor, "g s 3"]
 
@@ -25,16 +29,21 @@ Spheres = Float[Tensor, "g s 3"]
 def find_approach(
     hand: Hand, opened: Configuration, world: CollisionWorld
 ) -> tuple[Float[Tensor, "g 3"], Float[Tensor, "g"]]:
-    """Return for each opened hand the direction of a straight approach, and the least clearance [m] on its path.
+    """Return for each opened hand the direction of a straight approach, and the least clearance [m]
+    on its path.
 
-    Candidate directions are tried by falling approximate clearance. The first direction without a collision is chosen;
-    if there is none, the direction of the largest clearance.
+    Candidate directions are tried by falling approximate clearance. The first direction without a
+    collision is chosen; if there is none, the direction of the largest clearance.
     """
     spheres = hand.collision_spheres
     centres = SpatialJacobian.at(hand, opened).sphere_centres
-    radius, candidates = spheres.radius.to(centres), approach_directions(hand, opened, world.plane)
-    coarse = torch.stack([_clearance(centres, radius, d, world, exact=False) for d in candidates.unbind(1)], 1)
-    chosen, clearance = candidates[:, 0].clone(), torch.full_like(coarse[:, 0], -math.inf)
+    radius = spheres.radius.to(centres)
+    candidates = approach_directions(hand, opened, world.plane)
+    coarse = torch.stack(
+        [_clearance(centres, radius, d, world, exact=False) for d in candidates.unbind(1)], 1
+    )
+    chosen = candidates[:, 0].clone()
+    clearance = torch.full_like(coarse[:, 0], -math.inf)
     for choice in torch.argsort(coarse, dim=1, descending=True, stable=True).unbind(1):
         touching = torch.nonzero(clearance < 0)[:, 0]
         if not len(touching):
@@ -49,11 +58,16 @@ def find_approach(
 
 @checked
 def opened_pose(
-    hand: Hand, joints: Float[Tensor, "g h"], obj_from_hand: Float[Tensor, "g 4 4"], table: Plane | None
+    hand: Hand,
+    joints: Float[Tensor, "g h"],
+    obj_from_hand: Float[Tensor, "g 4 4"],
+    table: Plane | None,
 ) -> Float[Tensor, "g 4 4"]:
-    """Return the pose in which an opened hand comes to its grasp: raised where links would be in the table.
+    """Return the pose in which an opened hand comes to its grasp: raised where links would be in
+    the table.
 
-    Coupled fingers that open may go down, too. A hand that would have to rise by more than 30 mm stays in the table.
+    Coupled fingers that open may go down, too. A hand that would have to rise by more than 30 mm
+    stays in the table.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -63,74 +77,119 @@ def opened_pose(
     """
     if table is None:
         return obj_from_hand
-    gap, most = 0.001, 0.03  # [m]: what rises clears the table by the gap
+    # [m]: what rises clears the table by the gap
+    gap = 0.001
+    most = 0.03
     centres = apply(obj_from_hand, hand.sphere_centres(joints))
-    lowest = (along(centres, table) - table.offset - hand.collision_spheres.radius.to(centres)).amin(1)
+    lowest = (
+        along(centres, table) - table.offset - hand.collision_spheres.radius.to(centres)
+    ).amin(1)
     rise = torch.where((lowest < 0) & (gap - lowest <= most), gap - lowest, 0.0)
     pose = obj_from_hand.clone()
     pose[:, :3, 3] += rise[:, None] * table.normal.to(pose)
     return pose
 
 
-def approach_directions(hand: Hand, opened: Configuration, table: Plane | None) -> Float[Tensor, "g k 3"]:
-    """Return k candidate approach directions in the object's frame: the hand's axis, tilted axes, down onto a table."""
+def approach_directions(
+    hand: Hand, opened: Configuration, table: Plane | None
+) -> Float[Tensor, "g k 3"]:
+    """Return k candidate approach directions in the object's frame: the hand's axis, tilted axes,
+    down onto a table.
+    """
     pose = opened.obj_from_hand
     axis = unit(hand.approach.to(pose))
     first, second = across(axis)
-    tilt, directions = math.radians(45), 8
+    tilt = math.radians(45)
+    directions = 8
     angle = torch.arange(directions, device="cpu").to(axis)[:, None] * (2 * math.pi / directions)
-    tilted = math.cos(tilt) * axis + math.sin(tilt) * (torch.cos(angle) * first + torch.sin(angle) * second)
+    tilted = math.cos(tilt) * axis + math.sin(tilt) * (
+        torch.cos(angle) * first + torch.sin(angle) * second
+    )
     directions = rotate(pose, torch.cat([axis[None], tilted]).expand(len(pose), -1, -1))
     if table is None:
         return directions
-    down = (0.0 - table.normal.to(pose)).expand(len(pose), 1, 3)  # minus alone would make negative zeros
+    down = (0.0 - table.normal.to(pose)).expand(
+        len(pose), 1, 3
+    )  # minus alone would make negative zeros
     return torch.cat([directions, down], 1)
 
 
 def _clearance(
-    centres: Spheres, radius: Float[Tensor, "s"], direction: Float[Tensor, "g 3"], world: CollisionWorld, exact: bool
+    centres: Spheres,
+    radius: Float[Tensor, "s"],
+    direction: Float[Tensor, "g 3"],
+    world: CollisionWorld,
+    exact: bool,
 ) -> Float[Tensor, "g"]:
-    """Return the least clearance [m] of a hand's spheres on its approach path, `exact` or by the nearest grid nodes."""
+    """Return the least clearance [m] of a hand's spheres on its approach path, `exact` or by the
+    nearest grid nodes.
+    """
     steps = FINE_STEPS if exact else COARSE_STEPS
-    back = torch.arange(1, steps + 1, dtype=centres.dtype, device=centres.device) * (APPROACH_DISTANCE / steps)
+    back = torch.arange(1, steps + 1, dtype=centres.dtype, device=centres.device) * (
+        APPROACH_DISTANCE / steps
+    )
     path = (centres[:, None] - back[:, None, None] * direction[:, None, None]).flatten(1, 2)
-    radius, least = radius.repeat(steps), torch.full_like(path[:, 0, 0], math.inf)
+    radius = radius.repeat(steps)
+    least = torch.full_like(path[:, 0, 0], math.inf)
     for field in world.fields:
         coarse = field.nearest_node(path) - radius
         near, first = coarse.min(1)
-        if exact:  # interpolate only spheres that may have the least clearance: nodes are up to 1.2 spacings away
-            near = field.query(path[torch.arange(len(path), device=path.device), first])[0] - radius[first]
-            row, sphere = torch.nonzero(coarse < near[:, None] + 1.2 * spread(field.spacing, coarse), as_tuple=True)
+        # interpolate only spheres that may have the least clearance: nodes are up to 1.2 spacings
+        # away
+        if exact:
+            near = (
+                field.query(path[torch.arange(len(path), device=path.device), first])[0]
+                - radius[first]
+            )
+            row, sphere = torch.nonzero(
+                coarse < near[:, None] + 1.2 * spread(field.spacing, coarse), as_tuple=True
+            )
             closer = field.rows(row).query(path[row, sphere])[0] - radius[sphere]
             near = near.scatter_reduce(0, row, closer, "amin")
         least = torch.minimum(least, near)
     if world.plane is not None:
-        least = torch.minimum(least, (along(path, world.plane) - radius).amin(1) - world.plane.offset)
+        least = torch.minimum(
+            least, (along(path, world.plane) - radius).amin(1) - world.plane.offset
+        )
     return least
 
 
 def motion_clearance(
     hand: Hand, closed: Configuration, opened: Configuration, world: CollisionWorld
 ) -> Float[Tensor, "g"]:
-    """Return the least clearance [m] of each hand from obstacles while the hand closes and is lifted."""
+    """Return the least clearance [m] of each hand from obstacles while the hand closes and is
+    lifted.
+    """
     assert world.obstacles is not None
     up = UP if world.plane is None else world.plane.normal
     centres = torch.cat([_closing(hand, opened, closed), _lift(hand, closed, up)], 1)
-    return (world.obstacles.field.query(centres)[0] - hand.collision_spheres.radius.to(centres)).flatten(1).amin(1)
+    return (
+        (world.obstacles.field.query(centres)[0] - hand.collision_spheres.radius.to(centres))
+        .flatten(1)
+        .amin(1)
+    )
 
 
 @checked
-def collision_probability(hand: Hand, grasps: Grasps, obstacles: Obstacles, table: Plane | None) -> Float[Tensor, "g"]:
-    """Return for each grasp the probability that the hand hits an obstacle during approach, closing and lift along z.
+def collision_probability(
+    hand: Hand, grasps: Grasps, obstacles: Obstacles, table: Plane | None
+) -> Float[Tensor, "g"]:
+    """Return for each grasp the probability that the hand hits an obstacle during approach, closing
+    and lift along z.
 
-    The hand comes to its opened pose above the `table`. The probability is the largest occupancy probability of the
-    voxels that the hand sweeps, because hidden voxels behind one object are occupied or free together.
+    The hand comes to its opened pose above the `table`. The probability is the largest occupancy
+    probability of the voxels that the hand sweeps, because hidden voxels behind one object are
+    occupied or free together.
     """
     closed = Configuration(grasps.joints, grasps.obj_from_hand)
     raised = opened_pose(hand, grasps.pregrasp, grasps.obj_from_hand, table)
     opened = Configuration(grasps.pregrasp, raised)
-    back = torch.arange(1, COARSE_STEPS + 1, device="cpu").to(raised) * (APPROACH_DISTANCE / COARSE_STEPS)
-    approach = _centres(hand, opened)[:, None] - back[:, None, None] * grasps.approach[:, None, None]
+    back = torch.arange(1, COARSE_STEPS + 1, device="cpu").to(raised) * (
+        APPROACH_DISTANCE / COARSE_STEPS
+    )
+    approach = (
+        _centres(hand, opened)[:, None] - back[:, None, None] * grasps.approach[:, None, None]
+    )
     centres = torch.cat([approach, _closing(hand, opened, closed), _lift(hand, closed, UP)], 1)
     radius = hand.collision_spheres.radius.to(centres).repeat(centres.shape[1])
     return obstacles.likelihood(centres.flatten(1, 2), radius)
@@ -138,20 +197,34 @@ def collision_probability(hand: Hand, grasps: Grasps, obstacles: Obstacles, tabl
 
 @checked
 def lift_clearance(vertices: Float[Tensor, "v 3"], obstacles: Obstacles) -> float:
-    """Return the least clearance [m] of the lifted object from obstacles; far below 0 if an obstacle lies on it."""
-    return float(obstacles.field.query(_lifted(vertices, UP))[0].min()) if len(vertices) else math.inf
+    """Return the least clearance [m] of the lifted object from obstacles; far below 0 if an
+    obstacle lies on it.
+    """
+    return (
+        float(obstacles.field.query(_lifted(vertices, UP))[0].min()) if len(vertices) else math.inf
+    )
 
 
 def _closing(hand: Hand, opened: Configuration, closed: Configuration) -> Float[Tensor, "g k s 3"]:
-    """Return the centres [m] of the collision spheres while a hand closes and goes down, at k equal steps."""
+    """Return the centres [m] of the collision spheres while a hand closes and goes down, at k equal
+    steps.
+    """
     shares = torch.linspace(0, 1, 6, device="cpu").tolist()
-    ends, poses = (opened.joints, closed.joints), (opened.obj_from_hand, closed.obj_from_hand)  # equal rotations
-    postures = [Configuration(torch.lerp(*ends, share), torch.lerp(*poses, share)) for share in shares]
+    # equal rotations
+    ends = (opened.joints, closed.joints)
+    poses = (opened.obj_from_hand, closed.obj_from_hand)
+    postures = [
+        Configuration(torch.lerp(*ends, share), torch.lerp(*poses, share)) for share in shares
+    ]
     return torch.stack([_centres(hand, posture) for posture in postures], 1)
 
 
-def _lift(hand: Hand, configuration: Configuration, up: Float[Tensor, "3"]) -> Float[Tensor, "g k s 3"]:
-    """Return the centres [m] of the collision spheres at k heights while the hand is lifted along `up`."""
+def _lift(
+    hand: Hand, configuration: Configuration, up: Float[Tensor, "3"]
+) -> Float[Tensor, "g k s 3"]:
+    """Return the centres [m] of the collision spheres at k heights while the hand is lifted along
+    `up`.
+    """
     return _lifted(_centres(hand, configuration), up).movedim(0, 1)
 
 

@@ -1,7 +1,9 @@
-"""Refinement of hand configurations onto contacts and away from collisions, by batched Levenberg-Marquardt.
+"""Refinement of hand configurations onto contacts and away from collisions, by batched
+Levenberg-Marquardt.
 
-The centre of a round fingertip is one radius away from its contact, so that the tip may roll. Fingertips of other
-shapes touch with a fixed point. The contact direction stays inside a cone about the pad's axis.
+The centre of a round fingertip is one radius away from its contact, so that the tip may roll.
+Fingertips of other shapes touch with a fixed point. The contact direction stays inside a cone about
+the pad's axis.
 """
 
 import torch
@@ -14,26 +16,45 @@ from torchgrasp.ik.clearance import CLEARANCE, MILLIMETRE, CollisionWorld, along
 from torchgrasp.ik.configuration import Configuration, ResidualRows, SpatialJacobian, differentiate
 from torchgrasp.values.planning import Contacts
 
-TIP_WEIGHT, PAD_WEIGHT = 2.0, 80.0  # weights of a millimetre at a tip, and of a cosine outside the pad's cone
+# weights of a millimetre at a tip, and of a cosine outside the pad's cone
+TIP_WEIGHT = 2.0
+PAD_WEIGHT = 80.0
 HAND_STEP = 0.6  # largest step of a pose or a joint [m or rad]
 ITERATIONS = 30  # most steps of one refinement
 
 
 def tip_targets(hand: Hand, contacts: Contacts) -> Float[Tensor, "g f 3"]:
-    """Return the positions [m] of the fingertip centres when the tips touch: one radius from the contacts."""
+    """Return the positions [m] of the fingertip centres when the tips touch: one radius from the
+    contacts.
+    """
     return contacts.points + hand.tips.radius.to(contacts.normals)[:, None] * contacts.normals
 
 
-def tip_rows(spatial: SpatialJacobian, target: Float[Tensor, "g f 3"], normals: Float[Tensor, "g f 3"]) -> ResidualRows:
-    """Return the fingertips' residuals: three for each tip's position error, then one for each contact direction."""
-    tips, motion, g = spatial.hand.tips, spatial.hand.motion, len(target)
-    centres, pads = spatial.tips.permute(2, 1, 0), spatial.pads.permute(2, 1, 0)
-    outside = tips.cone.cos().to(pads) + (pads * normals).sum(-1)  # the contact direction is the inward normal
+def tip_rows(
+    spatial: SpatialJacobian, target: Float[Tensor, "g f 3"], normals: Float[Tensor, "g f 3"]
+) -> ResidualRows:
+    """Return the fingertips' residuals: three for each tip's position error, then one for each
+    contact direction.
+    """
+    tips = spatial.hand.tips
+    motion = spatial.hand.motion
+    g = len(target)
+    centres = spatial.tips.permute(2, 1, 0)
+    pads = spatial.pads.permute(2, 1, 0)
+    outside = tips.cone.cos().to(pads) + (pads * normals).sum(
+        -1
+    )  # the contact direction is the inward normal
     weight = PAD_WEIGHT * (outside > 0).to(pads)
-    axes = torch.eye(3, dtype=pads.dtype, device=pads.device).expand(g, len(tips), 3, 3) * (TIP_WEIGHT / MILLIMETRE)
-    pulls = torch.cat([axes, torch.linalg.cross(centres[:, :, None].expand_as(axes), axes)], -1).flatten(1, 2)
+    axes = torch.eye(3, dtype=pads.dtype, device=pads.device).expand(g, len(tips), 3, 3) * (
+        TIP_WEIGHT / MILLIMETRE
+    )
+    pulls = torch.cat(
+        [axes, torch.linalg.cross(centres[:, :, None].expand_as(axes), axes)], -1
+    ).flatten(1, 2)
     turns = torch.linalg.cross(pads, normals) * weight[..., None]
-    residual = torch.cat([(TIP_WEIGHT / MILLIMETRE) * (centres - target).flatten(1), weight * outside], 1)
+    residual = torch.cat(
+        [(TIP_WEIGHT / MILLIMETRE) * (centres - target).flatten(1), weight * outside], 1
+    )
     wrench = torch.cat([pulls, torch.cat([torch.zeros_like(turns), turns], -1)], 1)
     moves = motion.moves[torch.cat([tips.index.repeat_interleave(3), tips.index])].to(pads)
     return ResidualRows(residual, wrench, moves.expand(g, -1, -1))
@@ -47,9 +68,11 @@ def grasp_residuals(
     world: CollisionWorld | None,
     tips_touch: bool,
 ) -> Residuals:
-    """Return the residuals of tip positions, pad directions and, with a `world`, clearances; and their Jacobian.
+    """Return the residuals of tip positions, pad directions and, with a `world`, clearances; and
+    their Jacobian.
 
-    `target` holds the wanted tip centres [m]. With `tips_touch` the fingertips may touch the object.
+    `target` holds the wanted tip centres [m]. With `tips_touch` the fingertips may touch the
+    object.
     """
     spatial = SpatialJacobian.at(hand, configuration)
     links = [] if world is None else clearance_rows(spatial, world, tips_touch)
@@ -64,11 +87,14 @@ def refine(
     solved: float = SOLVED,
     steps: int = ITERATIONS,
 ) -> Configuration:
-    """Move hand configurations until finger i touches contact i and, with a `world`, links are clear, if possible.
+    """Move hand configurations until finger i touches contact i and, with a `world`, links are
+    clear, if possible.
 
-    A configuration is done when its sum of squared residuals [mm2] is below `solved`, or after `steps` steps.
+    A configuration is done when its sum of squared residuals [mm2] is below `solved`, or after
+    `steps` steps.
     """
-    target, normals = tip_targets(hand, contacts), contacts.normals
+    target = tip_targets(hand, contacts)
+    normals = contacts.normals
 
     def evaluate(state: Configuration, rows: Int[Tensor, "a"]) -> Residuals:
         around = None if world is None else world.rows(rows)
@@ -78,22 +104,36 @@ def refine(
     return levenberg_marquardt(problem, configuration, steps)[0]
 
 
-def open_hand(hand: Hand, grasp: Configuration, contacts: Contacts, world: CollisionWorld) -> Float[Tensor, "g h"]:
-    """Return the joints [rad] of the opened hand: each tip moves off its contact along the normal; links keep clear."""
-    normals, gap = contacts.normals, 0.012 + 3.0 * contacts.require_std()
+def open_hand(
+    hand: Hand, grasp: Configuration, contacts: Contacts, world: CollisionWorld
+) -> Float[Tensor, "g h"]:
+    """Return the joints [rad] of the opened hand: each tip moves off its contact along the normal;
+    links keep clear.
+    """
+    normals = contacts.normals
+    gap = 0.012 + 3.0 * contacts.require_std()
     target = tip_targets(hand, contacts) + gap[..., None] * normals
     if world.plane is not None:
-        up, height = world.plane.normal.to(target), along(target, world.plane)[..., None]
+        up = world.plane.normal.to(target)
+        height = along(target, world.plane)[..., None]
         lowest = (world.plane.offset + CLEARANCE + hand.tips.radius.to(target))[:, None]
-        target = target - height * up + torch.maximum(height, lowest) * up  # exact where the table is horizontal
+        target = (
+            target - height * up + torch.maximum(height, lowest) * up
+        )  # exact where the table is horizontal
 
     def evaluate(state: Configuration, rows: Int[Tensor, "a"]) -> Residuals:
         around = world.rows(rows)
-        residual, jacobian = grasp_residuals(hand, state, target[rows], normals[rows], around, tips_touch=False)
+        residual, jacobian = grasp_residuals(
+            hand, state, target[rows], normals[rows], around, tips_touch=False
+        )
         return residual, jacobian[..., 6:]
 
     def integrate(state: Configuration, step: Float[Tensor, "a h"]) -> Configuration:
-        return state.integrate(hand, torch.cat([step.new_zeros(len(step), 6), step], 1))  # the pose is fixed
+        return state.integrate(
+            hand, torch.cat([step.new_zeros(len(step), 6), step], 1)
+        )  # the pose is fixed
 
-    problem = LeastSquares(evaluate, integrate, solved=1.0, largest=HAND_STEP)  # half a millimetre at a tip
+    problem = LeastSquares(
+        evaluate, integrate, solved=1.0, largest=HAND_STEP
+    )  # half a millimetre at a tip
     return levenberg_marquardt(problem, grasp, steps=12)[0].joints

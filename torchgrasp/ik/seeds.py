@@ -1,6 +1,8 @@
-"""Initial guesses (seeds) of hand pose and joints near contacts, from random postures or the learned model.
+"""Initial guesses (seeds) of hand pose and joints near contacts, from random postures or the
+learned model.
 
-One matrix product compares all contact sets with thousands of postures. Clearances rank the nearest postures.
+One matrix product compares all contact sets with thousands of postures. Clearances rank the nearest
+postures.
 """
 
 import dataclasses
@@ -10,7 +12,15 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.foundation.base import Value, at_once, check_device, check_whole, join, lexical_order, settle
+from torchgrasp.foundation.base import (
+    Value,
+    at_once,
+    check_device,
+    check_whole,
+    join,
+    lexical_order,
+    settle,
+)
 from torchgrasp.foundation.checks import Count, Positive, Seed, checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply, degenerate, inverse, rigid, rotate, virtual_frame
@@ -24,18 +34,27 @@ from torchgrasp.values.planning import Contacts, IKSeeds
 
 Wanted = Float[Tensor, "r p d"]
 Given = Float[Tensor, "s d"]
-LENGTH_SCALE, COSINE_SCALE = 0.01, 0.5  # distances of tip centres [m] and of pad axes that count the same
-CANDIDATES = 64  # nearest postures of a row whose clearances are measured; also the most seeds of a row
-ASSIGNMENTS = 6  # assignments of contacts to fingers in which a row is compared with the whole library
-WRONG_SIDE = 0.3  # mean cosine of the outward normals of tips and contacts above which a seed touches from inside
+# distances of tip centres [m] and of pad axes that count the same
+LENGTH_SCALE = 0.01
+COSINE_SCALE = 0.5
+CANDIDATES = (
+    64  # nearest postures of a row whose clearances are measured; also the most seeds of a row
+)
+ASSIGNMENTS = (
+    6  # assignments of contacts to fingers in which a row is compared with the whole library
+)
+# mean cosine of the outward normals of tips and contacts above which a seed touches from inside
+WRONG_SIDE = 0.3
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class PostureLibrary(Value):
-    """Random postures of a hand, prepared for quick comparison of their fingertips with contact sets.
+    """Random postures of a hand, prepared for quick comparison of their fingertips with contact
+    sets.
 
-    The fingertip centres [m] of each posture are given in a frame that they define themselves (`tips_frame`).
+    The fingertip centres [m] of each posture are given in a frame that they define themselves
+    (`tips_frame`).
 
     >>> from torchgrasp import load_hand
     >>> library = PostureLibrary.of(load_hand("barrett"), count=200)
@@ -52,16 +71,23 @@ class PostureLibrary(Value):
 
     def __post_init__(self) -> None:
         """Check that the postures fit the hand."""
-        f, spheres = len(self.hand.tips), len(self.hand.collision_spheres.radius)
+        f = len(self.hand.tips)
+        spheres = len(self.hand.collision_spheres.radius)
         wanted = (self.hand.dof, f, 6 * f, spheres)
         found = tuple(x.shape[1] for x in (self.joints, self.centres, self.feature, self.spheres))
         if found != wanted:
-            raise BadArgument("library", f"joints, tips, features and spheres {found}", f"{wanted}, as the hand has")
+            raise BadArgument(
+                "library",
+                f"joints, tips, features and spheres {found}",
+                f"{wanted}, as the hand has",
+            )
 
     @classmethod
     @checked
     def of(cls, hand: Hand, count: Count | None = None, seed: Seed = 0) -> "PostureLibrary":
-        """Draw random postures within limits and without self-collision; the hand caches the last library of a size."""
+        """Draw random postures within limits and without self-collision; the hand caches the last
+        library of a size.
+        """
         count = (5000 if len(hand.tips) == 3 else 20_000) if count is None else count
         found = hand.derived.get((PostureLibrary, count))
         if found is None or found[0] != seed:
@@ -71,16 +97,29 @@ class PostureLibrary(Value):
     @classmethod
     def _drawn(cls, hand: Hand, count: int, seed: int) -> "PostureLibrary":
         """Draw `count` random postures; postures whose fingertips lie on a line are left out."""
-        joints = sample_configurations(hand, count, seed).joints.to(hand.lower.device, torch.float64)
+        joints = sample_configurations(hand, count, seed).joints.to(
+            hand.lower.device, torch.float64
+        )
         joints = joints[~degenerate(triangle_of(hand.tip_centres(joints)))]
-        centres, (_, pads) = hand.tip_centres(joints), hand.fingertips(joints)
+        centres = hand.tip_centres(joints)
+        (_, pads) = hand.fingertips(joints)
         vf_from_hand = inverse(tips_frame(centres))
-        centres, pads = apply(vf_from_hand, centres), rotate(vf_from_hand, pads)
-        return cls(hand, joints, vf_from_hand, centres, feature(centres, pads), hand.sphere_centres(joints).float())
+        centres = apply(vf_from_hand, centres)
+        pads = rotate(vf_from_hand, pads)
+        return cls(
+            hand,
+            joints,
+            vf_from_hand,
+            centres,
+            feature(centres, pads),
+            hand.sphere_centres(joints).float(),
+        )
 
 
 def triangle_of(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 3 3"]:
-    """Return a triangle for three to five points: the first point, the centroid of the middle points, and the last."""
+    """Return a triangle for three to five points: the first point, the centroid of the middle
+    points, and the last.
+    """
     if points.shape[-2] == 3:
         return points
     between = points[..., 1:-1, :].mean(-2, keepdim=True)
@@ -90,13 +129,15 @@ def triangle_of(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 3 3"]:
 def tips_frame(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 4 4"]:
     """Return the frame of three to five points, with the origin at their centroid.
 
-    Its axes are those of the `virtual_frame` of three points: the given ones, or for more than three points the corners
-    of the triangle that `triangle_of` returns.
+    Its axes are those of the `virtual_frame` of three points: the given ones, or for more than
+    three points the corners of the triangle that `triangle_of` returns.
     """
     return rigid(virtual_frame(triangle_of(points))[..., :3, :3], points.mean(-2))
 
 
-def feature(centres: Float[Tensor, "*b f 3"], pads: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b d"]:
+def feature(
+    centres: Float[Tensor, "*b f 3"], pads: Float[Tensor, "*b f 3"]
+) -> Float[Tensor, "*b d"]:
     """Return the feature vector of a posture: tip centres and pad axes, each divided by its scale."""
     return torch.cat([centres / LENGTH_SCALE, pads / COSINE_SCALE], -1).flatten(-2).float()
 
@@ -109,13 +150,15 @@ def nearest_postures(
     n_seeds: Count = 8,
     reachable: Reachable | None = None,
 ) -> IKSeeds:
-    """Return the library postures that fit contact sets best, as initial guesses (seeds) placed on the contacts.
+    """Return the library postures that fit contact sets best, as initial guesses (seeds) placed on
+    the contacts.
 
-    Each contact set has at most `n_seeds` seeds, best first, or none if its contacts lie on a line. The seeds are in
-    the order of the contact sets; Eq. (24) gives their poses. `energy` is half the squared distance between the
-    features of posture and contacts. If the arm cannot reach a pose, the next posture takes its place. Raises
-    `BadArgument` for `n_seeds` that are not in [1, 64], or above six times the number of postures. Contacts on another
-    device than the library, or of another number than fingertips, are refused, too.
+    Each contact set has at most `n_seeds` seeds, best first, or none if its contacts lie on a line.
+    The seeds are in the order of the contact sets; Eq. (24) gives their poses. `energy` is half the
+    squared distance between the features of posture and contacts. If the arm cannot reach a pose,
+    the next posture takes its place. Raises `BadArgument` for `n_seeds` that are not in [1, 64], or
+    above six times the number of postures. Contacts on another device than the library, or of
+    another number than fingertips, are refused, too.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -123,14 +166,21 @@ def nearest_postures(
     >>> nearest_postures(library, contacts, CollisionWorld(), n_seeds=4).tip_error.max() < 0.05  # [m]
     tensor(True)
     """
-    given, f, device = library.feature, len(library.hand.tips), contacts.points.device
+    given = library.feature
+    f = len(library.hand.tips)
+    device = contacts.points.device
     if contacts.fingertips != f:
-        raise BadArgument("contacts", f"{contacts.fingertips} in a row", f"{f}, one for each fingertip of the hand")
+        raise BadArgument(
+            "contacts",
+            f"{contacts.fingertips} in a row",
+            f"{f}, one for each fingertip of the hand",
+        )
     permutations = torch.tensor(list(itertools.permutations(range(f))), device=device)
     candidates = min(CANDIDATES, min(ASSIGNMENTS, len(permutations)) * len(given))
     check_whole("n_seeds", n_seeds, 1, candidates)
     check_device("contacts", device, "the library", given.device)
-    radius, inward = library.hand.tips.radius.double(), -contacts.normals.double()[:, permutations]
+    radius = library.hand.tips.radius.double()
+    inward = -contacts.normals.double()[:, permutations]
     centres = contacts.points.double()[:, permutations] - radius[:, None] * inward  # (n, p, f, 3)
     framed = ~degenerate(triangle_of(centres))
     parts = []
@@ -138,13 +188,17 @@ def nearest_postures(
         obj_from_vf, wanted = _describe(centres[row], inward[row], framed[row])
         assignment = _likely_assignments(wanted, given, framed[row])
         at = torch.arange(len(row), device=device)[:, None]
-        obj_from_vf, wanted = obj_from_vf[at, assignment], wanted[at, assignment]
+        obj_from_vf = obj_from_vf[at, assignment]
+        wanted = wanted[at, assignment]
         energy = _energies(wanted, given, framed[row[:, None], assignment])
         energy, index = energy.flatten(1).topk(candidates, 1, largest=False)
-        order, sample = index // len(given), index % len(given)
+        order = index // len(given)
+        sample = index % len(given)
         obj_from_hand = obj_from_vf[at, order] @ library.vf_from_hand[sample]
         spheres = apply(obj_from_hand.float(), library.spheres[sample])
-        tips = 2 * energy * (TIP_WEIGHT * LENGTH_SCALE / MILLIMETRE) ** 2  # squared millimetres, weighed as in `refine`
+        tips = (
+            2 * energy * (TIP_WEIGHT * LENGTH_SCALE / MILLIMETRE) ** 2
+        )  # squared millimetres, weighed as in `refine`
         cost = tips + collision_cost(spheres, library.hand.collision_spheres, world.rows(row))
         if reachable is None:
             best = cost.topk(n_seeds, 1, largest=False).indices.flatten()
@@ -155,14 +209,20 @@ def nearest_postures(
             for some in (slice(n_seeds), slice(n_seeds, None)):
                 short = torch.nonzero(reached.sum(1) < n_seeds)[:, 0]
                 poses = obj_from_hand[short[:, None], best[short, some]]
-                reached[short, some] = ask_reachable(reachable, poses.flatten(0, 1)).reshape(poses.shape[:2])
+                reached[short, some] = ask_reachable(reachable, poses.flatten(0, 1)).reshape(
+                    poses.shape[:2]
+                )
             kept = reached & (reached.cumsum(1) <= n_seeds)
-            b, best = at.expand_as(best)[kept], best[kept]
-        order, sample = order[b, best], sample[b, best]
+            b = at.expand_as(best)[kept]
+            best = best[kept]
+        order = order[b, best]
+        sample = sample[b, best]
         chosen = assignment[b, order]
         gap = apply(obj_from_vf[b, order], library.centres[sample]) - centres[row[b], chosen]
-        tip_error, energy = torch.linalg.vector_norm(gap, dim=-1), energy[b, best].double()
-        joints, pose = library.joints[sample], obj_from_hand[b, best]
+        tip_error = torch.linalg.vector_norm(gap, dim=-1)
+        energy = energy[b, best].double()
+        joints = library.joints[sample]
+        pose = obj_from_hand[b, best]
         parts.append(IKSeeds(joints, pose, row[b], permutations[chosen], energy, tip_error))
     return join(parts).to(contacts.points.dtype)
 
@@ -170,7 +230,9 @@ def nearest_postures(
 def _describe(
     centres: Float[Tensor, "r p f 3"], inward: Float[Tensor, "r p f 3"], framed: Bool[Tensor, "r p"]
 ) -> tuple[Float[Tensor, "r p 4 4"], Wanted]:
-    """Return frame and features of r contact sets for p assignments to fingers, valid where `framed` is true."""
+    """Return frame and features of r contact sets for p assignments to fingers, valid where
+    `framed` is true.
+    """
     stand_in = torch.eye(3, dtype=centres.dtype, device=centres.device)
     triangle = torch.where(framed[..., None, None], triangle_of(centres), stand_in)
     obj_from_vf = rigid(virtual_frame(triangle)[..., :3, :3], centres.mean(-2))
@@ -179,13 +241,19 @@ def _describe(
 
 
 def _energies(wanted: Wanted, given: Given, framed: Bool[Tensor, "r p"]) -> Float[Tensor, "r p s"]:
-    """Return half the squared distance between the features of contacts and postures; infinite where not `framed`."""
+    """Return half the squared distance between the features of contacts and postures; infinite
+    where not `framed`.
+    """
     energy = wanted.square().sum(-1)[..., None] / 2 + given.square().sum(-1) / 2 - wanted @ given.T
     return torch.where(framed[..., None], energy, torch.inf)
 
 
-def _likely_assignments(wanted: Wanted, given: Given, framed: Bool[Tensor, "r p"]) -> Int[Tensor, "r a"]:
-    """Return the indices of the assignments of contacts to fingers with features nearest to one of 500 postures."""
+def _likely_assignments(
+    wanted: Wanted, given: Given, framed: Bool[Tensor, "r p"]
+) -> Int[Tensor, "r a"]:
+    """Return the indices of the assignments of contacts to fingers with features nearest to one of
+    500 postures.
+    """
     if wanted.shape[1] <= ASSIGNMENTS:
         return torch.arange(wanted.shape[1], device=wanted.device).expand(len(wanted), -1)
     nearest = _energies(wanted, given[:500], framed).amin(-1)
@@ -194,26 +262,35 @@ def _likely_assignments(wanted: Wanted, given: Given, framed: Bool[Tensor, "r p"
 
 @checked
 def query_mixture(
-    hand: Hand, contacts: Contacts, mixture: GraspMixture, n_seeds: Count = 8, max_energy: Positive = DEFAULT_ENERGY
+    hand: Hand,
+    contacts: Contacts,
+    mixture: GraspMixture,
+    n_seeds: Count = 8,
+    max_energy: Positive = DEFAULT_ENERGY,
 ) -> IKSeeds:
-    """Return initial guesses (seeds) for sets of three contacts from the learned model, Eqs. (21)-(24) of the paper.
+    """Return initial guesses (seeds) for sets of three contacts from the learned model, Eqs.
+    (21)-(24) of the paper.
 
-    An assignment of contacts to fingers is reachable if its energy (Eq. 21) is below `max_energy`. Each reachable
-    assignment gives `n_seeds` seeds: the mean joints given the contacts (Eq. 23), and the mean joints of the most
-    responsible components. The seeds of a contact set are sorted: seeds that touch the surface from outside come first,
-    then by tip error. A contact set without a reachable assignment has no seeds. A model of another hand, joint limits
-    or fingertips is a `BadArgument`.
+    An assignment of contacts to fingers is reachable if its energy (Eq. 21) is below `max_energy`.
+    Each reachable assignment gives `n_seeds` seeds: the mean joints given the contacts (Eq. 23),
+    and the mean joints of the most responsible components. The seeds of a contact set are sorted:
+    seeds that touch the surface from outside come first, then by tip error. A contact set without a
+    reachable assignment has no seeds. A model of another hand, joint limits or fingertips is a
+    `BadArgument`.
     """
     check_compatible(mixture.meta, mixture.joint_names, hand)
     check_whole("n_seeds", n_seeds, 1, len(mixture.weights) + 1)
-    hand, mixture = settle(hand, contacts.points.device), settle(mixture, contacts.points.device)
+    hand = settle(hand, contacts.points.device)
+    mixture = settle(mixture, contacts.points.device)
     firsts = range(0, max(len(contacts), 1), 256)  # their configurations stay in the cache
     parts = [_query(hand, contacts[k : k + 256], mixture, n_seeds, max_energy) for k in firsts]
     rows = torch.cat([part.row + k for part, k in zip(parts, firsts, strict=True)])
     return dataclasses.replace(join(parts), row=rows)
 
 
-def _query(hand: Hand, contacts: Contacts, mixture: GraspMixture, n_seeds: int, max_energy: float) -> IKSeeds:
+def _query(
+    hand: Hand, contacts: Contacts, mixture: GraspMixture, n_seeds: int, max_energy: float
+) -> IKSeeds:
     """Return the seeds of some of the contact sets, as `query_mixture` does for all."""
     code = encode((contacts.points.double(), contacts.normals.double()))
     energy = mixture.energy(code)
@@ -223,10 +300,13 @@ def _query(hand: Hand, contacts: Contacts, mixture: GraspMixture, n_seeds: int, 
     if n_seeds > 1:
         joints = torch.cat([joints, mixture.modes(q, n_seeds - 1)[0]], dim=1)
     joints = joints.clamp(hand.lower.to(joints), hand.upper.to(joints)).flatten(0, 1)
-    row, assignment = row.repeat_interleave(n_seeds), assignment.repeat_interleave(n_seeds)
+    row = row.repeat_interleave(n_seeds)
+    assignment = assignment.repeat_interleave(n_seeds)
     tips, tip_normals = hand.fingertips(joints)
     framed = ~degenerate(tips)
-    joints, row, assignment, tips, tip_normals = (x[framed] for x in (joints, row, assignment, tips, tip_normals))
+    joints, row, assignment, tips, tip_normals = (
+        x[framed] for x in (joints, row, assignment, tips, tip_normals)
+    )
     permutation = code.permutation[assignment]
     obj_from_hand = code.obj_from_vf[row, assignment] @ inverse(virtual_frame(tips))  # Eq. (24)
     points = contacts.points.double()[row[:, None], permutation]

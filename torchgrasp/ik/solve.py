@@ -35,9 +35,9 @@ EXACT = 1e-6  # sum of squared residuals [mm2] at which a seed is done
 class IKSolution(Batch):
     """A hand configuration for each contact set; finger i touches contact `permutation[:, i]`.
 
-    `tip_error` [m] is each tip's distance from its contact, `normal_angle` [rad] the contact's angle from the pad's
-    axis, and `clearance` [m] the least clearance of the links. `attempts` counts the initial guesses (seeds) that were
-    refined. A contact set without seeds has NaN.
+    `tip_error` [m] is each tip's distance from its contact, `normal_angle` [rad] the contact's
+    angle from the pad's axis, and `clearance` [m] the least clearance of the links. `attempts`
+    counts the initial guesses (seeds) that were refined. A contact set without seeds has NaN.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -66,23 +66,22 @@ def solve_ik(
     method: Method = "levenberg_marquardt",
     library: PostureLibrary | None = None,
 ) -> IKSolution:
-    """Return hand configurations that touch given contacts, in any assignment to fingers, without self-collision.
+    """Return hand configurations that touch given contacts, in any assignment to fingers, without
+    self-collision.
 
-    All arguments are moved to the contacts' device. Raises `BadArgument` for contacts that are not finite, or not one
-    for each fingertip, a mixture of another hand, or an unknown method. For more than three fingertips it refuses a
-    mixture and COBYLA.
+    All arguments are moved to the contacts' device. Raises `BadArgument` for contacts that are not
+    finite, or not one for each fingertip, a mixture of another hand, or an unknown method. For more
+    than three fingertips it refuses a mixture and COBYLA.
 
-    Args:
-        contacts: b contact sets, one contact for each fingertip; `std_m` and `variance` are not used.
-        mixture: the hand's learned model; without it, all initial guesses come from `library`.
-        world: object, table and obstacles that the links must not touch; by default, only self-collision counts.
-        method: "cobyla" is the paper's method (Sec. 6.3), which brings each tip's contact point to its contact and
-            ignores the contact directions.
-        library: the hand's random postures; by default they are drawn when they are needed.
+    Args: contacts: b contact sets, one contact for each fingertip; `std_m` and `variance` are not
+        used. mixture: the hand's learned model; without it, all initial guesses come from
+        `library`. world: object, table and obstacles that the links must not touch; by default,
+        only self-collision counts. method: "cobyla" is the paper's method (Sec. 6.3), which brings
+        each tip's contact point to its contact and ignores the contact directions. library: the
+        hand's random postures; by default they are drawn when they are needed.
 
-    Returns:
-        The best configuration for each contact set. With `Status.OK` every tip is within 1 mm of its contact, every
-        contact direction is inside its pad's cone, and every link is clear.
+    Returns: The best configuration for each contact set. With `Status.OK` every tip is within 1 mm
+        of its contact, every contact direction is inside its pad's cone, and every link is clear.
 
     >>> from torchgrasp.hand.load import load_hand
     >>> points = 0.05 * torch.eye(3)[None].double()
@@ -97,12 +96,15 @@ def solve_ik(
     if mixture is not None:
         hand.require_three("mixture", "a learned model")
     device = contacts.points.device
-    hand, world = settle(hand, device), settle(CollisionWorld() if world is None else world, device)
+    hand = settle(hand, device)
+    world = settle(CollisionWorld() if world is None else world, device)
     library = None if library is None else settle(library, device)
     refine_seeds = partial(_refine_seeds, hand, contacts, world, method)
 
     def library_seeds(some: Contacts) -> IKSeeds:
-        return nearest_postures(PostureLibrary.of(hand) if library is None else library, some, world, n_seeds=8)
+        return nearest_postures(
+            PostureLibrary.of(hand) if library is None else library, some, world, n_seeds=8
+        )
 
     def is_exact(solution: IKSolution) -> Bool[Tensor, "k"]:
         return (solution.status == Status.OK) & (solution.tip_error.amax(1) <= 5e-5)
@@ -111,7 +113,9 @@ def solve_ik(
     attempts.add(_no_solution(hand, contacts), torch.arange(len(contacts), device=device))
     sources = [(library_seeds, 8)]
     if mixture is not None:
-        learned_seeds = partial(query_mixture, hand, mixture=mixture, n_seeds=2)  # the mean and one component
+        learned_seeds = partial(
+            query_mixture, hand, mixture=mixture, n_seeds=2
+        )  # the mean and one component
         sources = [(learned_seeds, 4), *sources]
     for source, count in sources:
         rows = torch.nonzero(attempts.unsolved)[:, 0]
@@ -119,18 +123,28 @@ def solve_ik(
             seeds = source(contacts[rows])
             seeds = dataclasses.replace(seeds, row=rows[seeds.row])
             attempts.refine(seeds, rank_in_group(seeds.row), [1] * count, refine_seeds)
-    solution, row = attempts.best(lambda tried: ((tried.status != Status.OK).int(), tried.tip_error.amax(1)))
+    solution, row = attempts.best(
+        lambda tried: ((tried.status != Status.OK).int(), tried.tip_error.amax(1))
+    )
     counts = torch.bincount(torch.cat(attempts.rows), minlength=len(contacts)) - 1
     return dataclasses.replace(solution[row.argsort()], attempts=counts)
 
 
-def _refine_seeds(hand: Hand, contacts: Contacts, world: CollisionWorld, method: Method, seeds: IKSeeds) -> IKSolution:
-    """Refine seeds onto their contacts by the given method, and measure the resulting configurations."""
-    refined, rolling = refine_exactly, True
+def _refine_seeds(
+    hand: Hand, contacts: Contacts, world: CollisionWorld, method: Method, seeds: IKSeeds
+) -> IKSolution:
+    """Refine seeds onto their contacts by the given method, and measure the resulting
+    configurations.
+    """
+    refined = refine_exactly
+    rolling = True
     if method == "cobyla":
-        refined, rolling = refine_by_cobyla, False
+        refined = refine_by_cobyla
+        rolling = False
     parts = []
-    for part in (seeds[k : k + 512] for k in range(0, max(len(seeds), 1), 512)):  # temporaries stay in the cache
+    for part in (
+        seeds[k : k + 512] for k in range(0, max(len(seeds), 1), 512)
+    ):  # temporaries stay in the cache
         taken = assign(contacts, part)
         configuration = refined(hand, Configuration(part.joints, part.obj_from_hand), taken, world)
         errors = measure_errors(hand, configuration, taken, world, rolling)
@@ -140,16 +154,34 @@ def _refine_seeds(hand: Hand, contacts: Contacts, world: CollisionWorld, method:
     return join(parts)
 
 
-def refine_exactly(hand: Hand, start: Configuration, contacts: Contacts, world: CollisionWorld) -> Configuration:
-    """Refine configurations with a margin of clearance, then without; keep the second result where links stay clear."""
+def refine_exactly(
+    hand: Hand, start: Configuration, contacts: Contacts, world: CollisionWorld
+) -> Configuration:
+    """Refine configurations with a margin of clearance, then without; keep the second result where
+    links stay clear.
+    """
     refined = refine(hand, start, contacts, world, EXACT)
     settled = refine(hand, refined, contacts, None, EXACT)
-    return pick(measure_errors(hand, settled, contacts, world).status == Status.OK, settled, refined)
+    return pick(
+        measure_errors(hand, settled, contacts, world).status == Status.OK, settled, refined
+    )
 
 
 def _no_solution(hand: Hand, contacts: Contacts) -> IKSolution:
-    """Return the solution of contact sets without seeds: NaN, with status `OUT_OF_REACH` or `DEGENERATE`."""
-    b, f, nan = len(contacts), contacts.fingertips, contacts.points.new_full((), torch.nan)
-    status = torch.where(degenerate(contacts.points), int(Status.DEGENERATE), int(Status.OUT_OF_REACH))
-    placed = nan.expand(b, hand.dof), nan.expand(b, 4, 4), torch.arange(f, device=nan.device).expand(b, f)
-    return IKSolution(*placed, nan.expand(b, f), nan.expand(b, f), nan.expand(b), torch.zeros_like(status), status)
+    """Return the solution of contact sets without seeds: NaN, with status `OUT_OF_REACH` or
+    `DEGENERATE`.
+    """
+    b = len(contacts)
+    f = contacts.fingertips
+    nan = contacts.points.new_full((), torch.nan)
+    status = torch.where(
+        degenerate(contacts.points), int(Status.DEGENERATE), int(Status.OUT_OF_REACH)
+    )
+    placed = (
+        nan.expand(b, hand.dof),
+        nan.expand(b, 4, 4),
+        torch.arange(f, device=nan.device).expand(b, f),
+    )
+    return IKSolution(
+        *placed, nan.expand(b, f), nan.expand(b, f), nan.expand(b), torch.zeros_like(status), status
+    )

@@ -1,4 +1,6 @@
-"""Single changes of a planning request that could give grasps: to the hand, the constraints, or the world."""
+"""Single changes of a planning request that could give grasps: to the hand, the constraints, or the
+world.
+"""
 
 import dataclasses
 from collections.abc import Iterator
@@ -10,19 +12,28 @@ from torchgrasp.planner.problem import take_target
 from torchgrasp.planner.request import Request, finger_sets
 from torchgrasp.scene.scene import Scene
 
-FRICTIONS = (0.4, 0.8, 1.2)  # coefficients of friction that are tried: of smooth plastic, of rubber, of soft silicone
+FRICTIONS = (
+    0.4,
+    0.8,
+    1.2,
+)  # coefficients of friction that are tried: of smooth plastic, of rubber, of soft silicone
 UNKNOWN = frozenset({Status.OUT_OF_DOMAIN, Status.TOO_UNCERTAIN})
-AT_TABLE = frozenset({Status.BELOW_TABLE, Status.TABLE_COLLISION, Status.PREGRASP, Status.NO_APPROACH})
+AT_TABLE = frozenset(
+    {Status.BELOW_TABLE, Status.TABLE_COLLISION, Status.PREGRASP, Status.NO_APPROACH}
+)
 OPEN = frozenset({Status.NOT_CLOSED, Status.DEGENERATE})
-OF_HAND = frozenset(status for status in Status if Status.OUT_OF_REACH <= status <= Status.NO_APPROACH)
+OF_HAND = frozenset(
+    status for status in Status if Status.OUT_OF_REACH <= status <= Status.NO_APPROACH
+)
 
 
 @dataclasses.dataclass(frozen=True)
 class Change:
     """A planning request with one change, which `words` describe.
 
-    If `choice` is true the user can make the change; otherwise it is a change of the world, such as a higher friction.
-    `cures` are the failures that the change could prevent. If `refit` is true, the object's shape is estimated anew.
+    If `choice` is true the user can make the change; otherwise it is a change of the world, such as
+    a higher friction. `cures` are the failures that the change could prevent. If `refit` is true,
+    the object's shape is estimated anew.
     """
 
     words: str
@@ -38,7 +49,9 @@ def _with(request: Request, **fields: Any) -> Request:
 
 
 def list_changes(request: Request) -> list[Change]:
-    """Return all changes of a request, each of one setting, that could give grasps, but not more initial guesses."""
+    """Return all changes of a request, each of one setting, that could give grasps, but not more
+    initial guesses.
+    """
     kinds = (_regions, _surroundings, _fingers, _limits, _friction, _hands)
     return [change for kind in kinds for change in kind(request)]
 
@@ -50,18 +63,31 @@ def more_starts(request: Request) -> Change:
 
 
 def _regions(request: Request) -> Iterator[Change]:
-    """Yield changes that each give up what the user asks of contacts: a region to keep to or avoid, a task's loads."""
+    """Yield changes that each give up what the user asks of contacts: a region to keep to or avoid,
+    a task's loads.
+    """
     for name in ("keep", "avoid", "resist"):
         if getattr(request, name) is not None:
             cures = OPEN | OF_HAND | {Status.NOT_RESISTED if name == "resist" else Status.OUTSIDE}
-            yield Change(f"without {name}", True, cures, dataclasses.replace(request, **{name: None}))
+            yield Change(
+                f"without {name}", True, cures, dataclasses.replace(request, **{name: None})
+            )
 
 
 def _fingers(request: Request) -> Iterator[Change]:
-    """Yield a change to each other set of fingers of the hand; in a mode other than "joint", a change to "joint"."""
-    mode, fingers = request.mode, request.fingers
+    """Yield a change to each other set of fingers of the hand; in a mode other than "joint", a
+    change to "joint".
+    """
+    mode = request.mode
+    fingers = request.fingers
     if mode != "joint":
-        yield Change("with mode='joint'", True, OF_HAND | OPEN, dataclasses.replace(request, mode="joint"), refit=True)
+        yield Change(
+            "with mode='joint'",
+            True,
+            OF_HAND | OPEN,
+            dataclasses.replace(request, mode="joint"),
+            refit=True,
+        )
     elif fingers != "auto":
         present = finger_sets(request.hand, fingers)[0]
         for hand in finger_sets(request.hand, "auto"):
@@ -72,12 +98,15 @@ def _fingers(request: Request) -> Iterator[Change]:
 
 
 def _hands(request: Request) -> Iterator[Change]:
-    """Yield a change to each other shipped hand, except variants such as the left; in mode "joint", without an arm."""
+    """Yield a change to each other shipped hand, except variants such as the left; in mode "joint",
+    without an arm.
+    """
     if request.mode != "joint" or request.arm is not None:
         return
     names = sorted(path.parent.name for path in hands_folder().glob("*/hand.toml"))
     for name in names:
-        own, variant = f"{request.hand.name}_".startswith(f"{name}_"), any(name.startswith(f"{k}_") for k in names)
+        own = f"{request.hand.name}_".startswith(f"{name}_")
+        variant = any(name.startswith(f"{k}_") for k in names)
         if not own and not variant:
             other = dataclasses.replace(request, hand=load_hand(name), fingers=None)
             yield Change(f"with the {name} hand", True, OF_HAND, other)
@@ -85,7 +114,8 @@ def _hands(request: Request) -> Iterator[Change]:
 
 def _limits(request: Request) -> Iterator[Change]:
     """Yield changes that each relax one limit on contacts: to the default limit, or beyond it."""
-    spec, tips = request.contact_spec, float(request.hand.tips.radius.max())
+    spec = request.contact_spec
+    tips = float(request.hand.tips.radius.max())
     own = spec.for_fingertips(tips)
     if (wider := _next((0.03, 0.1), spec.max_variance)) is not None:
         words = f"with max_variance={wider:g} instead of {spec.max_variance:g} (contacts on a less certain surface)"
@@ -99,7 +129,9 @@ def _limits(request: Request) -> Iterator[Change]:
         words = f"with separation={nearer:.3g} instead of {least:.3g} m (fingertips nearer to each other)"
         yield Change(words, True, frozenset({Status.TOO_CLOSE}), _with(request, separation=nearer))
     if 0 < tips < own.fingertip_radius:
-        words = f"with tip_radius={tips:.3g}, the hand's own, instead of {own.fingertip_radius:.3g} m"
+        words = (
+            f"with tip_radius={tips:.3g}, the hand's own, instead of {own.fingertip_radius:.3g} m"
+        )
         cures = frozenset({Status.BELOW_TABLE, Status.TOO_CLOSE})
         yield Change(words, True, cures, _with(request, tip_radius=tips))
     if spec.friction > 0 and (wider := _next((0.5, 1.0), spec.friction_margin)) is not None:
@@ -113,7 +145,9 @@ def _next(limits: tuple[float, ...], present: float) -> float | None:
 
 
 def _friction(request: Request) -> Iterator[Change]:
-    """Yield changes to the next two of `FRICTIONS` that are clearly above the present friction coefficient."""
+    """Yield changes to the next two of `FRICTIONS` that are clearly above the present friction
+    coefficient.
+    """
     present = request.contact_spec.friction
     for friction in [f for f in FRICTIONS if f >= 1.4 * present][:2]:
         words = f"if the friction were {friction:g} instead of {present:g}"
@@ -121,19 +155,28 @@ def _friction(request: Request) -> Iterator[Change]:
 
 
 def _surroundings(request: Request) -> Iterator[Change]:
-    """Yield changes of the surroundings: another table, no neighbours, an arm that reaches every pose."""
-    cloud, spec = request.cloud, request.contact_spec
+    """Yield changes of the surroundings: another table, no neighbours, an arm that reaches every
+    pose.
+    """
+    cloud = request.cloud
+    spec = request.contact_spec
     if isinstance(cloud, Scene):
         crowded = OF_HAND | {Status.NEIGHBOUR_COLLISION, Status.BURIED}
         if not spec.contact_allowed:
             words = "with contact_allowed=True (links may push the neighbours)"
-            yield Change(words, True, crowded - {Status.BURIED}, _with(request, contact_allowed=True))
+            yield Change(
+                words, True, crowded - {Status.BURIED}, _with(request, contact_allowed=True)
+            )
         table = cloud.table if spec.table is None else spec.table
-        alone = dataclasses.replace(_with(request, table=table), cloud=take_target(cloud, request.seed))
+        alone = dataclasses.replace(
+            _with(request, table=table), cloud=take_target(cloud, request.seed)
+        )
         yield Change("if its neighbours were taken away first", False, crowded, alone, refit=True)
     elif spec.table is not None:
         words = "if no table were in the way, as on a narrow stand"
-        yield Change(words, False, AT_TABLE | {Status.TIP_ERROR}, _with(request, table=None), refit=True)
+        yield Change(
+            words, False, AT_TABLE | {Status.TIP_ERROR}, _with(request, table=None), refit=True
+        )
     else:
         lowest = float(cloud.points[:, 2].min())
         words = f"if it stood on a table at z = {lowest:.3f} m, its lowest point"
@@ -141,5 +184,8 @@ def _surroundings(request: Request) -> Iterator[Change]:
     if request.reachable is not None or request.arm is not None:
         cures = frozenset({Status.UNREACHABLE, Status.OUT_OF_REACH})
         yield Change(
-            "if the arm reached every pose", False, cures, dataclasses.replace(request, reachable=None, arm=None)
+            "if the arm reached every pose",
+            False,
+            cures,
+            dataclasses.replace(request, reachable=None, arm=None),
         )

@@ -50,16 +50,20 @@ class Losses(Value):
         return ", ".join(f"{n} {status.name.lower()}" for status, n in self.lost.items())
 
     def __str__(self) -> str:
-        return f"{self.stage}: {self.kept} of {self.given} {self.things}" + f" ({self.reasons})" * bool(self.lost)
+        return (
+            f"{self.stage}: {self.kept} of {self.given} {self.things}"
+            + f" ({self.reasons})" * bool(self.lost)
+        )
 
 
 @dataclasses.dataclass(frozen=True)
 class Funnel(Value):
     """The losses of each planning stage, from random initial guesses to executable grasps.
 
-    Stage "contacts" turns initial guesses into contact sets. Stage "postures" loses the contact sets that no hand
-    posture comes near; the hand tries the most promising of the others. Stage "grasps" turns them into executable
-    grasps; each failure is counted for the check that its best posture fails.
+    Stage "contacts" turns initial guesses into contact sets. Stage "postures" loses the contact
+    sets that no hand posture comes near; the hand tries the most promising of the others. Stage
+    "grasps" turns them into executable grasps; each failure is counted for the check that its best
+    posture fails.
     """
 
     stages: tuple[Losses, ...]
@@ -67,11 +71,15 @@ class Funnel(Value):
     @classmethod
     @checked
     def of(cls, plan: ContactPlan, closed: Certificate, seeds: IKSeeds, grasps: Grasps) -> "Funnel":
-        """Return the losses, counted in the results of the stages "plan", "certify", "query" and "refine"."""
+        """Return the losses, counted in the results of the stages "plan", "certify", "query" and
+        "refine".
+        """
         far = len(closed) - len(seeds.row.unique())
         stages = (
             Losses("contacts", "starts", len(plan), _failures(plan.status)),
-            Losses("postures", "contacts", far + len(grasps), {Status.OUT_OF_REACH: far} if far else {}),
+            Losses(
+                "postures", "contacts", far + len(grasps), {Status.OUT_OF_REACH: far} if far else {}
+            ),
             Losses("grasps", "postures", len(grasps), _failures(grasps.status)),
         )
         return cls(stages)
@@ -89,13 +97,22 @@ class Funnel(Value):
 
     @property
     def reason(self) -> Status:
-        """The most frequent reason why the stage `worst` lost things; `Status.OK` if it lost nothing."""
+        """The most frequent reason why the stage `worst` lost things; `Status.OK` if it lost
+        nothing.
+        """
         return next(iter(self.worst.lost), Status.OK)
 
     @checked
     def share(self, reasons: frozenset[Status]) -> float:
-        """Return the sum over the stages of the fraction that a stage lost for any of the given reasons."""
-        shares = (n / stage.given for stage in self.stages for status, n in stage.lost.items() if status in reasons)
+        """Return the sum over the stages of the fraction that a stage lost for any of the given
+        reasons.
+        """
+        shares = (
+            n / stage.given
+            for stage in self.stages
+            for status, n in stage.lost.items()
+            if status in reasons
+        )
         return sum(shares, 0.0)
 
     def __str__(self) -> str:
@@ -103,16 +120,19 @@ class Funnel(Value):
 
 
 def _failures(status: Int[Tensor, "b"]) -> dict[Status, int]:
-    """Return how often each status but OK occurs in `status`, as a dict with the most frequent first."""
+    """Return how often each status but OK occurs in `status`, as a dict with the most frequent
+    first.
+    """
     return {name: n for name, n in count_status(status).items() if name is not Status.OK}
 
 
 @dataclasses.dataclass(frozen=True)
 class Trial(Value):
-    """The result of planning with one change: the number of executable grasps, and their expected success.
+    """The result of planning with one change: the number of executable grasps, and their expected
+    success.
 
-    `words` describe the change. If `choice` is true the user can make it; otherwise it is a change of the world, such
-    as a higher friction.
+    `words` describe the change. If `choice` is true the user can make it; otherwise it is a change
+    of the world, such as a higher friction.
     """
 
     words: str
@@ -127,16 +147,18 @@ class Trial(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Explanation(Value):
-    """Why there is no grasp: where grasps were lost, and the results of single changes, the most helpful first.
+    """Why there is no grasp: where grasps were lost, and the results of single changes, the most
+    helpful first.
 
-    For each change, grasps were planned from `starts` initial guesses. `left` is the number of changes that the bound
-    on work left out. `str` gives one line for each stage, and a sentence about the best change.
+    For each change, grasps were planned from `starts` initial guesses. `left` is the number of
+    changes that the bound on work left out. `str` gives one line for each stage, and a sentence
+    about the best change.
 
     >>> funnel = Funnel((Losses("grasps", "postures", 40, {Status.TABLE_COLLISION: 40}),))
     >>> lower = Trial("if the table were 20 mm lower", choice=True, executable=9, expected=7.5, funnel=funnel)
     >>> print(Explanation(50, funnel, (lower,)))
-    grasps: 0 of 40 postures (40 table_collision)
-    What would help most (1 change tried): if the table were 20 mm lower: 9 executable grasps, from 50 starts.
+    grasps: 0 of 40 postures (40 table_collision) What would help most (1 change tried): if the
+    table were 20 mm lower: 9 executable grasps, from 50 starts.
     """
 
     starts: int
@@ -151,11 +173,16 @@ class Explanation(Value):
 
     @property
     def advice(self) -> str:
-        """A sentence about the best change and the user's best choice; if no change helps, about the worst stage."""
+        """A sentence about the best change and the user's best choice; if no change helps, about
+        the worst stage.
+        """
         if self.funnel.executable:
             return f"There is a grasp: {self.funnel.executable} of {self.starts} starts ended in an executable one."
         listed = len(self.trials) + self.left
-        tried = f"{len(self.trials)} of " * bool(self.left) + f"{listed} change{'s' * (listed != 1)} tried"
+        tried = (
+            f"{len(self.trials)} of " * bool(self.left)
+            + f"{listed} change{'s' * (listed != 1)} tried"
+        )
         helpful = [trial for trial in self.trials if trial.executable]
         if not helpful:
             lost = f"most {self.funnel.worst.things} are lost because {self.funnel.reason.sentence}"
@@ -179,21 +206,23 @@ def explain_empty(
     seed: Seed = 0,
     **options: Unpack[PlanOptions],
 ) -> Explanation:
-    """Explain why `plan_grasps` found no executable grasp, and find a single change that gives grasps.
+    """Explain why `plan_grasps` found no executable grasp, and find a single change that gives
+    grasps.
 
-    The changes are: no region, other fingers, another shipped hand, wider limits of contacts, higher friction, no
-    table, no neighbours, an arm that reaches everything. The search ends at a change that the user can choose and with
-    which the best fifth of the guesses is likely to succeed.
+    The changes are: no region, other fingers, another shipped hand, wider limits of contacts,
+    higher friction, no table, no neighbours, an arm that reaches everything. The search ends at a
+    change that the user can choose and with which the best fifth of the guesses is likely to
+    succeed.
 
-    The work is bounded, not the time, so that a seed always gives the same explanation. A plan has at most 20 initial
-    guesses and a small library of postures. Relaxed constraints are tried only where no contact set is found. At most
-    eight changes are tried, in the order of the losses that they could prevent; fewer with "auto" fingers. If no change
-    helps, a request of at most 80 guesses is tried with four times as many. Raises the errors of `plan_grasps`.
+    The work is bounded, not the time, so that a seed always gives the same explanation. A plan has
+    at most 20 initial guesses and a small library of postures. Relaxed constraints are tried only
+    where no contact set is found. At most eight changes are tried, in the order of the losses that
+    they could prevent; fewer with "auto" fingers. If no change helps, a request of at most 80
+    guesses is tried with four times as many. Raises the errors of `plan_grasps`.
 
-    Args:
-        cloud, hand, spec, starts, seed: as in `plan_grasps`.
-        options: the further arguments of `plan_grasps`. The `observer` is called with "funnel" and the `Funnel` of the
-            first plan, then with "change" and the `Trial` of each change. No change begins after `time_budget`.
+    Args: cloud, hand, spec, starts, seed: as in `plan_grasps`. options: the further arguments of
+        `plan_grasps`. The `observer` is called with "funnel" and the `Funnel` of the first plan,
+        then with "change" and the `Trial` of each change. No change begins after `time_budget`.
 
     >>> from torchgrasp import load_hand, load_object
     >>> spec = ContactSpec(friction=0.0, table=0.0)
@@ -206,10 +235,16 @@ def explain_empty(
     deadline = math.inf if request.time_budget is None else time.monotonic() + request.time_budget
     few = dataclasses.replace(request, starts=min(starts, starts_tried))
     funnel, _, problem = try_request(few, first=request.tell)
-    trials, left, plans = list[Trial](), 0, MOST_TRIALS - 2 * (len(few.hands) - 1)  # each set needs a library
+    # each set needs a library
+    trials = list[Trial]()
+    left = 0
+    plans = MOST_TRIALS - 2 * (len(few.hands) - 1)
     more = more_starts(request)
     for change in [] if funnel.executable else [*order_changes(list_changes(few), funnel), more]:
-        if any(x.executable if change is more else x.expected >= 0.8 and x.choice >= change.choice for x in trials):
+        if any(
+            x.executable if change is more else x.expected >= 0.8 and x.choice >= change.choice
+            for x in trials
+        ):
             continue  # little is left for this change
         plans -= len(change.request.hands)
         allowed = starts <= 4 * starts_tried if change is more else plans >= 0 or not trials
@@ -220,16 +255,22 @@ def explain_empty(
         trials.append(Trial(change.words, change.choice, found.executable, expected, found))
         request.tell("change", str(trials[-1]), trials[-1])
     trials.sort(
-        key=lambda trial: (-round(trial.expected, 1), -bool(trial.executable), not trial.choice, -trial.expected)
+        key=lambda trial: (
+            -round(trial.expected, 1),
+            -bool(trial.executable),
+            not trial.choice,
+            -trial.expected,
+        )
     )
     return Explanation(few.starts, funnel, tuple(trials), left)
 
 
 def order_changes(changes: list[Change], funnel: Funnel) -> list[Change]:
-    """Return the changes that could prevent the most losses, the most helpful first; drop the others.
+    """Return the changes that could prevent the most losses, the most helpful first; drop the
+    others.
 
-    A change counts fully for the failures that it prevents, and one fifth for other failures of the same stage, because
-    a failed contact set reports only one of its failures.
+    A change counts fully for the failures that it prevents, and one fifth for other failures of the
+    same stage, because a failed contact set reports only one of its failures.
     """
     contacts = frozenset(status for status in Status if status < Status.OUT_OF_REACH)
     weight = dict[int, float]()
@@ -247,23 +288,35 @@ def order_changes(changes: list[Change], funnel: Funnel) -> list[Change]:
 def try_request(
     request: Request, known: Problem | None = None, first: Observer | None = None
 ) -> tuple[Funnel, float, Problem]:
-    """Plan a request with a small library of postures; return the losses, the expected success, and the problem.
+    """Plan a request with a small library of postures; return the losses, the expected success, and
+    the problem.
 
-    The object of a `known` problem is used again. Several sets of fingers share the initial guesses. If no contact set
-    is found, the most relaxed constraints are tried, too. The success is that of the best fifth of the guesses. An
-    observer `first` hears "funnel" and the losses of the first plan.
+    The object of a `known` problem is used again. Several sets of fingers share the initial
+    guesses. If no contact set is found, the most relaxed constraints are tried, too. The success is
+    that of the best fifth of the guesses. An observer `first` hears "funnel" and the losses of the
+    first plan.
     """
     postures = 500  # more take seconds to draw for a hand that often collides with itself
-    told, hands, found = dict[str, Any](), request.hands, list[tuple[Funnel, float]]()
+    told = dict[str, Any]()
+    hands = request.hands
+    found = list[tuple[Funnel, float]]()
     starts = max(request.starts // len(hands), 1)
-    share = dataclasses.replace(request, starts=starts, observer=lambda stage, _, value: told.update({stage: value}))
+    share = dataclasses.replace(
+        request, starts=starts, observer=lambda stage, _, value: told.update({stage: value})
+    )
     problem = known or Problem.of(share, hands[0])
     for hand in hands:
         problem = problem.for_request(share, hand, postures)
-        specs = list(problem.given_spec.relaxed(problem.spec.ring_radius, float(hand.tips.radius.max())))[-1:]
-        relaxed = (problem.replace("flat", "drawn", given_spec=spec, descends=True) for spec in specs)
+        specs = list(
+            problem.given_spec.relaxed(problem.spec.ring_radius, float(hand.tips.radius.max()))
+        )[-1:]
+        relaxed = (
+            problem.replace("flat", "drawn", given_spec=spec, descends=True) for spec in specs
+        )
         for tried in itertools.chain((problem,), relaxed):
-            grasps = rank_together([batch for (batch,) in Planner(Stack.of([tried])).run(math.inf)], request.order)
+            grasps = rank_together(
+                [batch for (batch,) in Planner(Stack.of([tried])).run(math.inf)], request.order
+            )
             funnel = Funnel.of(told["plan"], told["certify"], told["query"], grasps)
             if not found and first is not None:
                 first("funnel", str(funnel.worst), funnel)

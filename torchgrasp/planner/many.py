@@ -29,14 +29,17 @@ Result = TypeVar("Result")
 def plan_many(clouds: Sequence[PointCloud], workers: int, given: dict[str, Any]) -> list[Grasps]:
     """Plan for each cloud on its device; a bad cloud does not affect the others.
 
-    `given` holds the other arguments of `Request`, common to all clouds. A worker process gives up a cloud after an
-    hour. Where an accelerator plans clouds at once, the worker processes estimate the shapes.
+    `given` holds the other arguments of `Request`, common to all clouds. A worker process gives up
+    a cloud after an hour. Where an accelerator plans clouds at once, the worker processes estimate
+    the shapes.
     """
     for name in ("shape", "observer", "reachable", "arm", "keep", "avoid"):
         if given.get(name) is not None:
             raise BadArgument(name, "one for many clouds", "None for many clouds")
     if given["spec"] is not None and given["spec"].region is not None:
-        raise BadArgument("spec", "a region for many clouds", "one without a region for many clouds")
+        raise BadArgument(
+            "spec", "a region for many clouds", "one without a region for many clouds"
+        )
     requests = [Request(cloud, **given) for cloud in clouds]
     hands = [request.hands for request in requests]  # wrong fingers are refused
     devices = {cloud.points.device for cloud in clouds}
@@ -51,10 +54,11 @@ def plan_many(clouds: Sequence[PointCloud], workers: int, given: dict[str, Any])
 def plan_stacks(
     requests: Sequence[Request], prepared: Iterator[Problem | Grasps], device: torch.device
 ) -> Iterator[Grasps]:
-    """Yield the grasps of prepared problems, which differ in their clouds alone, planned at once on a device.
+    """Yield the grasps of prepared problems, which differ in their clouds alone, planned at once on
+    a device.
 
-    The problems of the next stack are prepared while the device plans. A refused problem, which is an empty set of
-    grasps, stays as it is.
+    The problems of the next stack are prepared while the device plans. A refused problem, which is
+    an empty set of grasps, stays as it is.
     """
     most = 128  # clouds at once: of more the device would wait longer for the shapes
     budget = requests[0].time_budget if requests else None
@@ -69,22 +73,36 @@ def plan_stacks(
 
 @checked
 def _take(prepared: Iterator[Problem | Grasps], count: int) -> list[Problem | Grasps]:
-    """Return the next problems of an iterator; in any thread the library does not check its own calls."""
+    """Return the next problems of an iterator; in any thread the library does not check its own
+    calls.
+    """
     return list(itertools.islice(prepared, count))
 
 
-def estimate_shapes(requests: Sequence[Request], workers: int) -> Generator[Problem | Grasps, None, None]:
-    """Yield the planning problem of each request on the CPU, or an empty set of grasps for a bad cloud."""
-    return _each(_prepare, [dataclasses.replace(x, cloud=x.cloud.to("cpu")) for x in requests], workers)
+def estimate_shapes(
+    requests: Sequence[Request], workers: int
+) -> Generator[Problem | Grasps, None, None]:
+    """Yield the planning problem of each request on the CPU, or an empty set of grasps for a bad
+    cloud.
+    """
+    return _each(
+        _prepare, [dataclasses.replace(x, cloud=x.cloud.to("cpu")) for x in requests], workers
+    )
 
 
 def _plan_stack(
-    requests: Sequence[Request], prepared: Sequence[Problem | Grasps], device: torch.device, deadline: float
+    requests: Sequence[Request],
+    prepared: Sequence[Problem | Grasps],
+    device: torch.device,
+    deadline: float,
 ) -> Iterator[Grasps]:
     """Yield the grasps of prepared problems that are planned at once on a device."""
     hand = settle_hand(requests[0].hands[0], torch.device("cpu"))
     pairs = zip(prepared, requests, strict=True)
-    problems = [x if isinstance(x, Grasps) else x.replace(hand=hand, request=request) for x, request in pairs]
+    problems = [
+        x if isinstance(x, Grasps) else x.replace(hand=hand, request=request)
+        for x, request in pairs
+    ]
     planned = iter(plan_hands([x for x in problems if isinstance(x, Problem)], deadline, device))
     for x in problems:
         if isinstance(x, Grasps):
@@ -101,7 +119,9 @@ def _prepare(request: Request) -> Problem:
 
 
 def _or_refuse(function: Callable[[Request], Result], request: Request) -> Result | Grasps:
-    """Return a function of a request; if its cloud is bad, return an empty set of grasps with the reason in `meta`."""
+    """Return a function of a request; if its cloud is bad, return an empty set of grasps with the
+    reason in `meta`.
+    """
     try:
         return function(request)
     except MissingExtra:
@@ -125,21 +145,37 @@ def no_grasps(hand: Hand) -> Grasps:
     contacts = Contacts(none(f, 3), none(f, 3), none(f), none(f))
     certificate = Certificate(none(), none(), none(), none().bool(), none(6))
     return Grasps(
-        none(hand.dof), none(hand.dof), none(3), none(4, 4), contacts, none(f).long(), none(f), none(), none(f),
-        certificate, none(), none().long(), known=none().bool(), interval=none(2),
-    )  # fmt: skip
+        none(hand.dof),
+        none(hand.dof),
+        none(3),
+        none(4, 4),
+        contacts,
+        none(f).long(),
+        none(f),
+        none(),
+        none(f),
+        certificate,
+        none(),
+        none().long(),
+        known=none().bool(),
+        interval=none(2),
+    )
 
 
 def _each(
     function: Callable[[Request], Result], requests: Sequence[Request], workers: int
 ) -> Generator[Result | Grasps, None, None]:
-    """Yield a function's results for requests with the same hand, in worker processes if there are any."""
+    """Yield a function's results for requests with the same hand, in worker processes if there are
+    any.
+    """
     call = functools.partial(_or_refuse, function)
     if not workers or not requests:
         yield from map(call, requests)
         return
     hand = requests[0].hand
-    source = HandSource(hand.source.option, hand.source.urdf_path, hand.source.sha256)  # without the caches
+    source = HandSource(
+        hand.source.option, hand.source.urdf_path, hand.source.sha256
+    )  # without the caches
     tasks = ((call, source, pack(dict(vars(request), hand=None))) for request in requests)
     with contextlib.closing(run_tasks(_call, tasks, workers, 3600.0)) as results:
         for found in results:

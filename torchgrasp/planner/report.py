@@ -1,4 +1,6 @@
-"""What the planner tells an observer: each stage once, with the results of all batches, and the end of each batch."""
+"""What the planner tells an observer: each stage once, with the results of all batches, and the end
+of each batch.
+"""
 
 import dataclasses
 from typing import Any
@@ -14,31 +16,48 @@ from torchgrasp.values.planning import Grasps, format_success
 
 
 class Report:
-    """Reports progress to the observer: each stage once with the results of all batches, and the end of each batch."""
+    """Reports progress to the observer: each stage once with the results of all batches, and the
+    end of each batch.
+    """
 
     def __init__(self, problem: Problem, batches: int, planned: int) -> None:
-        """Take the number of all `batches`, and the number `planned` of those batches that plan new initial guesses."""
-        self.problem, self.batches, self.planned = problem, batches, planned
-        self.heard = problem.request.observer is not None  # without an observer nothing is stored or counted
+        """Take the number of all `batches`, and the number `planned` of those batches that plan new
+        initial guesses.
+        """
+        self.problem = problem
+        self.batches = batches
+        self.planned = planned
+        self.heard = (
+            problem.request.observer is not None
+        )  # without an observer nothing is stored or counted
         self.parts: dict[str, list[Any]] = {"plan": [], "certify": [], "query": []}
         self.ended = self.offered = self.closed = 0
 
     def shape(self) -> None:
-        """Report the estimated shape, and the fraction of its surface with a standard deviation below 4 mm."""
+        """Report the estimated shape, and the fraction of its surface with a standard deviation
+        below 4 mm.
+        """
         if not self.heard:
             return
-        shape, vertices = self.problem.shape, self.problem.surface.vertices
+        shape = self.problem.shape
+        vertices = self.problem.surface.vertices
         jet = shape.jet(shape.normalise(vertices[:: len(vertices) // 500 + 1]))
         std_m = shape.std_factor * shape.scale * surface_deviation(jet.variance, jet.gradient)
         certain = float((std_m < 0.004).double().mean())
-        self.problem.tell("shape", f"{len(shape.x)} points, {certain:.0%} of the surface certain to 4 mm", shape)
+        self.problem.tell(
+            "shape", f"{len(shape.x)} points, {certain:.0%} of the surface certain to 4 mm", shape
+        )
 
     def note(self, stage: str, value: Any, offered: int = 0) -> None:
-        """Store the result of one stage of one batch; `offered` is how many contact sets stage "certify" checked."""
+        """Store the result of one stage of one batch; `offered` is how many contact sets stage
+        "certify" checked.
+        """
         if not self.heard:
             return
         if stage == "query":  # rows are counted through all batches
-            value = dataclasses.replace(value, row=value.row + self.closed - len(self.parts["certify"][-1]))
+            value = dataclasses.replace(
+                value, row=value.row + self.closed - len(self.parts["certify"][-1])
+            )
         elif stage == "certify":
             self.offered, self.closed = self.offered + offered, self.closed + len(value)
         self.parts[stage].append(value)
@@ -46,7 +65,9 @@ class Report:
             self._tell(stage)
 
     def end_batch(self, grasps: Grasps, last: bool) -> None:
-        """Report that a batch has ended; if it is the `last` one, report the stages not yet reported, too."""
+        """Report that a batch has ended; if it is the `last` one, report the stages not yet
+        reported, too.
+        """
         if not self.heard:
             return
         self.ended += 1

@@ -28,11 +28,15 @@ Budget = Annotated[float, Range(1e-3, math.inf)]
 Promised = Annotated[float, Range(0.5, 0.99)]
 """A promised share of held grasps."""
 Observer = Callable[[str, str, Any], None]
-"""Function that is called after each stage with the stage's name, a line of text, and the stage's result."""
+"""Function that is called after each stage with the stage's name, a line of text, and the stage's
+result.
+"""
 
 
 Where = Callable[..., Any]
-"""A `Region`, or a function that returns the signed distance [m] of points (n, 3) [m], negative inside."""
+"""A `Region`, or a function that returns the signed distance [m] of points (n, 3) [m], negative
+inside.
+"""
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
@@ -53,7 +57,8 @@ class SceneOptions(TypedDict, total=False):
 
 
 class PlanOptions(SceneOptions, total=False):
-    """The types of the optional keyword arguments of `plan_grasps`, which explains them; `Request` has the defaults.
+    """The types of the optional keyword arguments of `plan_grasps`, which explains them; `Request`
+    has the defaults.
 
     >>> options: PlanOptions = {"fingers": 4, "ranking": "success"}  # plan_grasps(cloud, hand, **options)
     >>> sorted(options)
@@ -92,10 +97,14 @@ class Request:
     time_budget: Budget | None = None
 
     def __post_init__(self) -> None:
-        """Raise `BadArgument` for an arm of another hand, no load, and a promise that no trials support."""
+        """Raise `BadArgument` for an arm of another hand, no load, and a promise that no trials
+        support.
+        """
         if self.arm is not None and self.arm.hand_sha256 != self.hand.source.sha256:
             raise BadArgument(
-                "arm", "an arm with another hand", f"one that load_arm gave for the {self.hand.name} hand"
+                "arm",
+                "an arm with another hand",
+                f"one that load_arm gave for the {self.hand.name} hand",
             )
         if isinstance(self.resist, tuple) and not self.resist:
             raise BadArgument("resist", "no load", "at least one, or None")
@@ -109,7 +118,9 @@ class Request:
 
     @property
     def contact_spec(self) -> ContactSpec:
-        """The given constraints on contacts, in the given regions; by default the constraints of the planning mode."""
+        """The given constraints on contacts, in the given regions; by default the constraints of
+        the planning mode.
+        """
         spec = self.spec or (ContactSpec.paper() if self.mode == "paper" else ContactSpec())
         if self.keep is None and self.avoid is None:
             return spec
@@ -117,7 +128,9 @@ class Request:
 
     @property
     def order(self) -> Ranking:
-        """The criterion that ranks the grasps: the given one, or else the default of the planning mode."""
+        """The criterion that ranks the grasps: the given one, or else the default of the planning
+        mode.
+        """
         return self.ranking or ("variance" if self.mode == "paper" else "success")
 
     @property
@@ -138,36 +151,49 @@ class _Plain(str):
 
 
 def show_options(function: Function) -> Function:
-    """Return the function, whose signature names each option in place of `**options`, and each type in plain words."""
-    signature, hints = inspect.signature(function), typing.get_type_hints(function, include_extras=True)
+    """Return the function, whose signature names each option in place of `**options`, and each type
+    in plain words.
+    """
+    signature = inspect.signature(function)
+    hints = typing.get_type_hints(function, include_extras=True)
     inner = typing.get_type_hints(typing.get_args(hints.pop("options"))[0], include_extras=True)
     defaults = {field.name: field.default for field in dataclasses.fields(Request)}
     named = [one for one in signature.parameters.values() if one.name in hints]
-    named += [inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=defaults[name]) for name in inner]
-    parameters = [one.replace(annotation=_Plain(_shorten((hints | inner)[one.name]))) for one in named]
-    shown = signature.replace(parameters=parameters, return_annotation=_Plain(_shorten(hints["return"])))
+    named += [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=defaults[name])
+        for name in inner
+    ]
+    parameters = [
+        one.replace(annotation=_Plain(_shorten((hints | inner)[one.name]))) for one in named
+    ]
+    shown = signature.replace(
+        parameters=parameters, return_annotation=_Plain(_shorten(hints["return"]))
+    )
     setattr(function, "__signature__", shown)  # noqa: B010
     return function
 
 
 def _shorten(hint: Any) -> str:
     """Return a type as text, without the names of modules and without rules."""
-    origin, inside = typing.get_origin(hint), typing.get_args(hint)
+    origin = typing.get_origin(hint)
+    inside = typing.get_args(hint)
     if origin is Annotated:
         return inside[1].alias if isinstance(inside[1], Taken) else _shorten(inside[0])
     if origin in (typing.Union, types.UnionType):
         return " | ".join(map(_shorten, inside))
     if origin is Sequence:
         return f"Sequence[{_shorten(inside[0])}]"
-    return "None" if hint is type(None) else re.sub(r"\b(\w+\.)+", "", inspect.formatannotation(hint))
+    return (
+        "None" if hint is type(None) else re.sub(r"\b(\w+\.)+", "", inspect.formatannotation(hint))
+    )
 
 
 def finger_sets(hand: Hand, fingers: Fingers | None, mode: Mode = "joint") -> tuple[Hand, ...]:
     """Return one hand for each set of fingers to plan with.
 
-    "auto" gives all sets that the hand declares; a name or number gives that set; None gives the hand as it is. Raises
-    `BadArgument` for fingers that the hand does not have, and for more than three fingers, or "auto", in a mode other
-    than "joint".
+    "auto" gives all sets that the hand declares; a name or number gives that set; None gives the
+    hand as it is. Raises `BadArgument` for fingers that the hand does not have, and for more than
+    three fingers, or "auto", in a mode other than "joint".
     """
     if fingers == "auto":
         if mode != "joint":

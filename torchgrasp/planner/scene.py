@@ -28,9 +28,9 @@ from torchgrasp.values.specs import ContactSpec
 class ThingPlan(Value):
     """The executable grasps of one object in a scene, best first, or the reason why there are none.
 
-    `success` is the predicted probability that the best grasp succeeds: 0 without grasps, NaN if it is unknown.
-    `shape` is the estimated shape. If the image shows that the object cannot be grasped, `status` is the reason, and
-    nothing was planned.
+    `success` is the predicted probability that the best grasp succeeds: 0 without grasps, NaN if it
+    is unknown. `shape` is the estimated shape. If the image shows that the object cannot be
+    grasped, `status` is the reason, and nothing was planned.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> grasp = load_shipped_grasp("jug", "allegro")
@@ -49,7 +49,8 @@ class ThingPlan(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class ScenePlan(Value):
-    """The plans of all objects in a scene, most probable success first; objects without a grasp come last.
+    """The plans of all objects in a scene, most probable success first; objects without a grasp
+    come last.
 
     >>> empty = ThingPlan(1, success=0.0, reason="too flat")
     >>> ScenePlan((empty,)).best is None
@@ -79,26 +80,26 @@ def plan_scene(
 ) -> ScenePlan:
     """Plan grasps of the objects of a scene, and rank the objects by predicted success.
 
-    Nothing is planned for an object if its image shows that it cannot be grasped (`Status.FEW_PIXELS` to `TOO_VAGUE`).
-    Of the other objects, near and tall ones with free space around them are planned first. Objects that are larger than
-    all objects in our trials, or cut off by the image border, are planned last. Raises `BadArgument` for a scene
-    without objects, or an argument of the wrong type or range.
+    Nothing is planned for an object if its image shows that it cannot be grasped
+    (`Status.FEW_PIXELS` to `TOO_VAGUE`). Of the other objects, near and tall ones with free space
+    around them are planned first. Objects that are larger than all objects in our trials, or cut
+    off by the image border, are planned last. Raises `BadArgument` for a scene without objects, or
+    an argument of the wrong type or range.
 
-    Args:
-        scene: objects on a table, or a file of `save_scene`.
-        hand: from `load_hand`, or its name or folder.
-        spec: the constraints on contacts; `ContactSpec()` by default.
-        starts: number of random initial guesses of the contact planner for each object.
-        seed: random seed.
-        enough: predicted success of a grasp, in [0, 1], at which the remaining objects are not planned.
-        options: see `plan_grasps`; `fingers` "auto" chooses for each object. `hand_of` loads the hand of grasps.
+    Args: scene: objects on a table, or a file of `save_scene`. hand: from `load_hand`, or its name
+        or folder. spec: the constraints on contacts; `ContactSpec()` by default. starts: number of
+        random initial guesses of the contact planner for each object. seed: random seed. enough:
+        predicted success of a grasp, in [0, 1], at which the remaining objects are not planned.
+        options: see `plan_grasps`; `fingers` "auto" chooses for each object. `hand_of` loads the
+        hand of grasps.
 
     >>> from torchgrasp import load_hand, load_scene
     >>> plan = plan_scene(load_scene(), load_hand("barrett"), starts=30, enough=0.5)
     >>> plan.best.success > 0.5, plan.things[-1].reason
     (True, 'not tried: another object is easy enough')
     """
-    scene, hand = as_scene(scene, "scene"), as_hand(hand, "hand")
+    scene = as_scene(scene, "scene")
+    hand = as_hand(hand, "hand")
     if not scene.things:
         raise BadArgument("scene", "no object on the table", "a scene with at least one object")
     finger_sets(hand, options.get("fingers"))  # raises for unknown fingers
@@ -113,12 +114,20 @@ def plan_scene(
         else:
             plans.append(_plan_thing(dataclasses.replace(scene, target=label), plan))
     # known success (highest first), then unknown success (NaN), then no grasp
-    plans.sort(key=lambda x: (x.grasps is None, math.isnan(x.success), 0.0 if math.isnan(x.success) else -x.success))
+    plans.sort(
+        key=lambda x: (
+            x.grasps is None,
+            math.isnan(x.success),
+            0.0 if math.isnan(x.success) else -x.success,
+        )
+    )
     return ScenePlan(tuple(plans))
 
 
 def _plan_thing(scene: Scene, plan: Callable[..., Grasps]) -> ThingPlan:
-    """Plan grasps of a scene's target object with the function `plan`; without a grasp, return the reason."""
+    """Plan grasps of a scene's target object with the function `plan`; without a grasp, return the
+    reason.
+    """
     assert scene.target is not None
     stages: dict[str, Any] = {}
 
@@ -131,7 +140,9 @@ def _plan_thing(scene: Scene, plan: Callable[..., Grasps]) -> ThingPlan:
     try:
         grasps = plan(scene, observer=note)
     except GraspError as error:
-        return ThingPlan(scene.target, 0.0, reason=str(error), status=stages.get("vague", Status.OK))
+        return ThingPlan(
+            scene.target, 0.0, reason=str(error), status=stages.get("vague", Status.OK)
+        )
     good = grasps[grasps.status == Status.OK]
     if len(good):
         return ThingPlan(scene.target, float(good.success[0]), good, shape=stages["shape"])

@@ -1,4 +1,6 @@
-"""The planning problems of several clouds as one: their objects stacked, so that all their rows are solved at once."""
+"""The planning problems of several clouds as one: their objects stacked, so that all their rows are
+solved at once.
+"""
 
 import dataclasses
 from collections.abc import Iterator, Sequence
@@ -30,7 +32,8 @@ Owner = Int[Tensor, "b"]
 
 @dataclasses.dataclass(frozen=True)
 class Stack:
-    """The problems of c clouds, which share hand and request: the fields have one row for each cloud.
+    """The problems of c clouds, which share hand and request: the fields have one row for each
+    cloud.
 
     The fields of a single problem are its own values, which are those of all rows.
     """
@@ -44,7 +47,9 @@ class Stack:
 
     @classmethod
     def of(cls, problems: Sequence[Problem], device: torch.device | None = None) -> "Stack":
-        """Stack problems without scenes, moved to a device; a single problem stays as it is unless it is moved."""
+        """Stack problems without scenes, moved to a device; a single problem stays as it is unless
+        it is moved.
+        """
         first = problems[0]
         if len(problems) == 1 and device in (None, first.shape.device):
             constraints = ContactProblem.of(first.shape, first.spec)
@@ -55,13 +60,18 @@ class Stack:
         bodies = [problem.body for problem in problems]
         field = FieldBatch.of([body.field for body in bodies]).to(device)  # pyright: ignore[reportArgumentType]
         numbers = (
-            shape.scales.new_tensor([getattr(b, name) for b in bodies]) for name in ("size", "height", "breadth")
+            shape.scales.new_tensor([getattr(b, name) for b in bodies])
+            for name in ("size", "height", "breadth")
         )
-        body = EstimatedBody(shape, field, torch.stack([b.center for b in bodies]).to(device), *numbers)
+        body = EstimatedBody(
+            shape, field, torch.stack([b.center for b in bodies]).to(device), *numbers
+        )
         plane = first.spec.plane
         world = CollisionWorld(field, None if plane is None else plane.to(device))
         constraints = ContactProblem.of(shape, first.spec, rings)
-        return cls(tuple(problems), settle_hand(first.hand, device), shape, constraints, body, world)
+        return cls(
+            tuple(problems), settle_hand(first.hand, device), shape, constraints, body, world
+        )
 
     def __len__(self) -> int:
         """Return the number of clouds."""
@@ -93,7 +103,8 @@ class Stack:
     def plans(self) -> Iterator[tuple[ContactPlan, Owner]]:
         """Yield the plan of each batch that has new guesses, with the cloud of each row.
 
-        A single cloud is planned batch by batch. Several clouds are planned at once, before the first batch.
+        A single cloud is planned batch by batch. Several clouds are planned at once, before the
+        first batch.
         """
         sizes = [batch.starts for batch in self.first.batches if batch.starts]
         if len(self) == 1:
@@ -107,35 +118,59 @@ class Stack:
         owners = torch.arange(len(self)).repeat_interleave(first.shape[1])
         pairs = zip(first.flatten(0, 1).split(most), owners.split(most), strict=True)
         parts = [self._plan(*pair) for pair in pairs]
-        plan, owner = join([plan for plan, _ in parts]), torch.cat([owner for _, owner in parts])
+        plan = join([plan for plan, _ in parts])
+        owner = torch.cat([owner for _, owner in parts])
         index = torch.arange(len(owner), device=owner.device).view(first.shape[:2])
         for rows in index.split(sizes, 1):
             yield plan[rows.flatten()], owner[rows.flatten()]
 
-    def _plan(self, first: Float[Tensor, "b f 3"], owner: Tensor | None) -> tuple[ContactPlan, Owner]:
-        """Return the contact plan from initial guesses, and the cloud of each row; by default the first cloud."""
+    def _plan(
+        self, first: Float[Tensor, "b f 3"], owner: Tensor | None
+    ) -> tuple[ContactPlan, Owner]:
+        """Return the contact plan from initial guesses, and the cloud of each row; by default the
+        first cloud.
+        """
         device = self.body.center.device
-        owner = torch.zeros(len(first), dtype=torch.long, device=device) if owner is None else owner.to(device)
-        shape, constraints = rows_of(self.shape, owner), self.constraints.rows(owner)
+        owner = (
+            torch.zeros(len(first), dtype=torch.long, device=device)
+            if owner is None
+            else owner.to(device)
+        )
+        shape = rows_of(self.shape, owner)
+        constraints = self.constraints.rows(owner)
         return plan_chunk(shape, constraints, first.to(device), stages_for(self.first.spec)), owner
 
     def reach(self, contacts: Contacts, certificate: Certificate, owner: Owner) -> GraspProblem:
-        """Return the inverse kinematics problem of reaching contacts, with their certificate of force closure."""
-        center, one = self.body.rows(owner).center, self.first
+        """Return the inverse kinematics problem of reaching contacts, with their certificate of
+        force closure.
+        """
+        center = self.body.rows(owner).center
+        one = self.first
         return GraspProblem(
-            self.hand, contacts, certificate, self.world.rows(owner), center, one.reachable, one.descends
+            self.hand,
+            contacts,
+            certificate,
+            self.world.rows(owner),
+            center,
+            one.reachable,
+            one.descends,
         )
 
     def slide(self, owner: Owner) -> JointProblem:
         """Return the problem of hand and sliding contacts together, for rows of the given clouds."""
         world = self.world.rows(owner)
-        return JointProblem(self.hand, rows_of(self.shape, owner), self.constraints.rows(owner), world)
+        return JointProblem(
+            self.hand, rows_of(self.shape, owner), self.constraints.rows(owner), world
+        )
 
 
 def by_cloud(owner: Owner, clouds: int) -> list[Int[Tensor, "k"]]:
-    """Return the indices of the rows of each cloud, in their order; on the CPU for more than one cloud."""
+    """Return the indices of the rows of each cloud, in their order; on the CPU for more than one
+    cloud.
+    """
     if clouds == 1:
         return [torch.arange(len(owner), device=owner.device)]
     owner = owner.cpu()
-    order, count = torch.argsort(owner, stable=True), torch.bincount(owner, minlength=clouds)
+    order = torch.argsort(owner, stable=True)
+    count = torch.bincount(owner, minlength=clouds)
     return list(order.split(count.tolist()))

@@ -1,4 +1,6 @@
-"""The learned posture model: a Gaussian mixture over the joints of a hand and the codes of its fingertips (Sec. 4)."""
+"""The learned posture model: a Gaussian mixture over the joints of a hand and the codes of its
+fingertips (Sec. 4).
+"""
 
 from torchgrasp.posture_model.sample import HandSamples, SampleSpec
 from torchgrasp.posture_model.dataset import SampleFolder, load_samples, write_samples

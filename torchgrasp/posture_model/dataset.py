@@ -1,4 +1,6 @@
-"""Sampled hand postures on disk: a folder of chunk files, each drawn from (seed, chunk number), written atomically."""
+"""Sampled hand postures on disk: a folder of chunk files, each drawn from (seed, chunk number),
+written atomically.
+"""
 
 import dataclasses
 import json
@@ -12,7 +14,15 @@ from typing import Annotated
 
 from torch import Tensor
 
-from torchgrasp.files import Field, Recent, begin_folder, hold_folder, load_tensors, read_json, save_tensors
+from torchgrasp.files import (
+    Field,
+    Recent,
+    begin_folder,
+    hold_folder,
+    load_tensors,
+    read_json,
+    save_tensors,
+)
 from torchgrasp.foundation.base import check_whole, join
 from torchgrasp.foundation.checks import Count, Range, checked
 from torchgrasp.foundation.errors import BadArgument, ModelFileError, OutputError
@@ -28,17 +38,25 @@ from torchgrasp.posture_model.sample import (
 
 MANIFEST = "samples.json"  # file that describes the samples of a folder
 KEPT = 128  # chunks that stay in memory: all of a million postures, which take 200 MB
-META_KEYS = ("hand", "fingers", "hand_sha256", "hand_codes", "seed", "sampling")  # the keys of `SampleSpec.meta`
+META_KEYS = (
+    "hand",
+    "fingers",
+    "hand_sha256",
+    "hand_codes",
+    "seed",
+    "sampling",
+)  # the keys of `SampleSpec.meta`
 Chunk = Annotated[int, Range(0, 1_000_000)]
 
 
 @dataclasses.dataclass(frozen=True)
 class SampleFolder:
-    """A complete folder of `n` sampled postures in chunk files that are read on demand; `meta` is as in `HandSamples`.
+    """A complete folder of `n` sampled postures in chunk files that are read on demand; `meta` is
+    as in `HandSamples`.
 
     Iteration yields the chunks as `HandSamples`. By index the folder is a map-style dataset for
-    `torch.utils.data.DataLoader`: item i holds the joints (h,) and the code (6,) of posture i. Recent chunks stay in
-    memory.
+    `torch.utils.data.DataLoader`: item i holds the joints (h,) and the code (6,) of posture i.
+    Recent chunks stay in memory.
 
     >>> import tempfile
     >>> from torchgrasp import load_hand
@@ -52,13 +70,17 @@ class SampleFolder:
     n: int
     joint_names: tuple[str, ...]
     meta: dict[str, str]
-    recent: Recent[HandSamples] = dataclasses.field(default_factory=lambda: Recent(KEPT), repr=False, compare=False)
+    recent: Recent[HandSamples] = dataclasses.field(
+        default_factory=lambda: Recent(KEPT), repr=False, compare=False
+    )
 
     def __len__(self) -> int:
         return self.n
 
     def __getitem__(self, i: int) -> tuple[Tensor, Tensor]:
-        """Return joints and code of posture i; raises `IndexError` beyond the last, `ModelFileError` as `chunk`."""
+        """Return joints and code of posture i; raises `IndexError` beyond the last,
+        `ModelFileError` as `chunk`.
+        """
         chunk, row = divmod(range(self.n)[operator.index(i)], CHUNK_POSTURES)
         samples = self.recent.get(chunk, self.chunk)
         return samples.joints[row], samples.q[row]
@@ -68,7 +90,9 @@ class SampleFolder:
 
     @checked
     def chunk(self, i: Chunk) -> HandSamples:
-        """Read chunk i; raises `ModelFileError` if it is missing, damaged, or belongs to other samples."""
+        """Read chunk i; raises `ModelFileError` if it is missing, damaged, or belongs to other
+        samples.
+        """
         sizes = chunk_sizes(self.n)
         if i >= len(sizes):
             raise BadArgument("i", i, f"a chunk in [0, {len(sizes) - 1}]")
@@ -78,12 +102,16 @@ class SampleFolder:
         if shapes != (wanted := ((sizes[i], len(self.joint_names)), (sizes[i], 6))):
             raise ModelFileError("path", f"{path}: tensors of shapes {shapes}", f"shapes {wanted}")
         if {key: meta.get(key) for key in self.meta} != self.meta or meta.get("chunk") != str(i):
-            raise ModelFileError("path", f"{path}: the chunk of other samples", f"chunk {i} of {self.meta}")
+            raise ModelFileError(
+                "path", f"{path}: the chunk of other samples", f"chunk {i} of {self.meta}"
+            )
         return HandSamples(tensors["joints"], tensors["q"], self.joint_names, dict(self.meta))
 
     @checked
     def read(self, n: Count | None = None) -> HandSamples:
-        """Read the first `n` postures, or all by default, into memory. Raises `BadArgument` for n outside [1, len]."""
+        """Read the first `n` postures, or all by default, into memory. Raises `BadArgument` for n
+        outside [1, len].
+        """
         n = self.n if n is None else n
         check_whole("n", n, 1, self.n)
         return join([self.chunk(i) for i in range(len(chunk_sizes(n)))])[:n]
@@ -111,12 +139,14 @@ def write_samples(
     workers: Annotated[int, Range(1, 1024)] = 1,
     observer: Callable[[int], object] = lambda count: None,
 ) -> SampleFolder:
-    """Draw random postures of a hand as `sample_configurations` does, and write them to a folder, chunk by chunk.
+    """Draw random postures of a hand as `sample_configurations` does, and write them to a folder,
+    chunk by chunk.
 
-    The same call continues an interrupted run. `workers` threads draw at the same time. The observer is called with the
-    number of postures on disk at the start, then with the number of postures in each new chunk. Raises `BadArgument`
-    for workers outside [1, 1024], or a hand of which almost all postures collide, and `OutputError` if the folder holds
-    other samples, another run is writing it, or the disk is full.
+    The same call continues an interrupted run. `workers` threads draw at the same time. The
+    observer is called with the number of postures on disk at the start, then with the number of
+    postures in each new chunk. Raises `BadArgument` for workers outside [1, 1024], or a hand of
+    which almost all postures collide, and `OutputError` if the folder holds other samples, another
+    run is writing it, or the disk is full.
 
     >>> import tempfile
     >>> from torchgrasp import load_hand
@@ -124,7 +154,8 @@ def write_samples(
     >>> len(write_samples(load_hand("barrett"), SampleSpec(100), tempfile.mkdtemp()))
     100
     """
-    counts, meta = chunk_sizes(spec.n), spec.meta(hand)
+    counts = chunk_sizes(spec.n)
+    meta = spec.meta(hand)
     samples = SampleFolder(Path(folder), spec.n, hand.joint_names, meta)
     content = {"torchgrasp": "samples", "version": 1, "n": spec.n, "chunk": CHUNK_POSTURES}
     content |= {"joint_names": hand.joint_names, **meta}
@@ -137,9 +168,12 @@ def write_samples(
 
     with hold_folder(samples.folder):
         begin_folder(samples.folder / MANIFEST, json.dumps(content, indent=1) + "\n", "samples")
-        missing = [i for i in range(len(counts)) if not samples.holds(i)]  # a damaged chunk is drawn again
+        missing = [
+            i for i in range(len(counts)) if not samples.holds(i)
+        ]  # a damaged chunk is drawn again
         lacking = sum(counts[i] for i in missing)
-        needed, free = 8 * lacking * (hand.dof + 6), shutil.disk_usage(samples.folder).free
+        needed = 8 * lacking * (hand.dof + 6)
+        free = shutil.disk_usage(samples.folder).free
         if free < needed:
             raise OutputError("folder", f"{folder}, {free} bytes free", f"{needed} bytes")
         observer(spec.n - lacking)
@@ -147,7 +181,8 @@ def write_samples(
         try:
             for count in pool.map(write, missing):
                 observer(count)
-        finally:  # on an error or an interrupt, chunks under way are finished and the others never begun
+        # on an error or an interrupt, chunks under way are finished and the others never begun
+        finally:
             pool.shutdown(cancel_futures=True)
     return samples
 
@@ -164,7 +199,8 @@ def load_samples(folder: Path | str) -> SampleFolder:
     >>> load_samples(folder).read(50).joints.shape
     torch.Size([50, 4])
     """
-    folder, refuse = Path(folder), partial(ModelFileError, "folder")
+    folder = Path(folder)
+    refuse = partial(ModelFileError, "folder")
     manifest = read_json(folder / MANIFEST, refuse, "a folder written by write_samples", 2**20)
     samples = _parse_manifest(folder, manifest)
     chunks = len(chunk_sizes(samples.n))

@@ -1,8 +1,10 @@
-"""Expectation-maximisation of Gaussian mixtures (Eqs. 19-20), in one process or in each process that torchrun started.
+"""Expectation-maximisation of Gaussian mixtures (Eqs. 19-20), in one process or in each process
+that torchrun started.
 
-The log-density of a Gaussian is linear in the features [1, x_i, x_i x_j], so each step is one matrix product. Sums of
-the features, weighted by responsibilities, suffice for the maximisation and are small enough to add over processes. The
-data must have mean 0 and variance 1 in every column; otherwise differences of such sums would lose their digits.
+The log-density of a Gaussian is linear in the features [1, x_i, x_i x_j], so each step is one
+matrix product. Sums of the features, weighted by responsibilities, suffice for the maximisation and
+are small enough to add over processes. The data must have mean 0 and variance 1 in every column;
+otherwise differences of such sums would lose their digits.
 """
 
 import dataclasses
@@ -19,8 +21,12 @@ from torchgrasp.foundation.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.posture_model.gaussian import whitening_matrices
 
 CACHED_ROWS = 2048  # rows of one pass: their features and responsibilities stay in the cache
-SINGULAR_VARIANCE = 1e-12  # a conditional variance of this size is rounding, beside the data's variance of 1
-MAX_RESEEDS = 3  # a component that collapses more often shows that the data support fewer components
+SINGULAR_VARIANCE = (
+    1e-12  # a conditional variance of this size is rounding, beside the data's variance of 1
+)
+MAX_RESEEDS = (
+    3  # a component that collapses more often shows that the data support fewer components
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,7 +39,9 @@ class DataRows:
 
     @staticmethod
     def of(rows: Float[Tensor, "n d"], distributed: bool) -> "DataRows":
-        """Return the shard of this process; raises `BadArgument` if `distributed` is True without a process group."""
+        """Return the shard of this process; raises `BadArgument` if `distributed` is True without a
+        process group.
+        """
         if not distributed:
             return DataRows(rows)
         if not (torch.distributed.is_available() and torch.distributed.is_initialized()):
@@ -76,9 +84,10 @@ class Components(Value):
 class FitProgress(Value):
     """The state of a fit. The state and the data determine the next step.
 
-    `reseeded` counts how often each component collapsed and was placed anew; the likelihood may fall after that.
-    `log_likelihood` [nats] is the mean over the data before each step. `jumped`: the last step placed a component anew,
-    or the next step sees other rows. `rows` is the number of rows that the last step saw, or 0 before the first step.
+    `reseeded` counts how often each component collapsed and was placed anew; the likelihood may
+    fall after that. `log_likelihood` [nats] is the mean over the data before each step. `jumped`:
+    the last step placed a component anew, or the next step sees other rows. `rows` is the number of
+    rows that the last step saw, or 0 before the first step.
 
     >>> start = Components(torch.ones(1), torch.zeros(1, 2), torch.eye(2)[None])
     >>> FitProgress(start, torch.zeros(1, dtype=torch.int64), torch.zeros(0)).jumped
@@ -107,16 +116,21 @@ def expectation_maximisation(
     regularisation: float,
     observer: Callable[[FitProgress], None] = lambda progress: None,
 ) -> Fit:
-    """Fit a mixture by EM steps until a step raises the mean log-likelihood by less than `tolerance` [nats].
+    """Fit a mixture by EM steps until a step raises the mean log-likelihood by less than
+    `tolerance` [nats].
 
-    `iterations` bounds the number of steps, including the steps before `start`. `regularisation` is added to every
-    variance. Raises `IndefiniteCovariance` for an indefinite start, or a component that collapses too often.
+    `iterations` bounds the number of steps, including the steps before `start`. `regularisation` is
+    added to every variance. Raises `IndefiniteCovariance` for an indefinite start, or a component
+    that collapses too often.
     """
-    n, state = shard.count(), start
+    n = shard.count()
+    state = start
     while True:
         sums, log_likelihood = expectation(shard, state.components)
         history = torch.cat([state.log_likelihood, (log_likelihood / n)[None]])
-        converged = len(history) > 1 and not state.jumped and float(history[-1] - history[-2]) < tolerance
+        converged = (
+            len(history) > 1 and not state.jumped and float(history[-1] - history[-2]) < tolerance
+        )
         if converged or len(history) > iterations:
             return Fit(state.components, state.reseeded, history, state.jumped, n, converged)
         components, reseeded = maximisation(sums, n, regularisation, state.reseeded)
@@ -124,16 +138,27 @@ def expectation_maximisation(
         observer(state)
 
 
-def expectation(shard: DataRows, components: Components) -> tuple[Float[Tensor, "m f"], Float[Tensor, ""]]:
-    """Return for each component the features summed with its responsibilities, and the log-likelihood of all data."""
-    x, coefficients = shard.rows, coefficients_from_components(components)
-    sums, log_likelihood = torch.zeros_like(coefficients), x.new_zeros(())
-    at_once = min(CACHED_ROWS if x.device.type == "cpu" else 2**17, len(x) or 1)  # smaller passes leave a GPU idle
-    features, joint = x.new_empty(coefficients.shape[1], at_once), x.new_empty(len(coefficients), at_once)  # reused
+def expectation(
+    shard: DataRows, components: Components
+) -> tuple[Float[Tensor, "m f"], Float[Tensor, ""]]:
+    """Return for each component the features summed with its responsibilities, and the log-
+    likelihood of all data.
+    """
+    x = shard.rows
+    coefficients = coefficients_from_components(components)
+    sums = torch.zeros_like(coefficients)
+    log_likelihood = x.new_zeros(())
+    at_once = min(
+        CACHED_ROWS if x.device.type == "cpu" else 2**17, len(x) or 1
+    )  # smaller passes leave a GPU idle
+    # reused
+    features = x.new_empty(coefficients.shape[1], at_once)
+    joint = x.new_empty(len(coefficients), at_once)
     floor = math.log(torch.finfo(x.dtype).tiny) / 2  # far below rounding; denormal numbers are slow
     for rows in x.split(at_once):
         phi = features_from_data(rows, features[:, : len(rows)])
-        # log joint density (m, rows), then log-sum-exp written out: its exponentials are the responsibilities
+        # log joint density (m, rows), then log-sum-exp written out: its exponentials are the
+        # responsibilities
         responsibility = torch.mm(coefficients, phi, out=joint[:, : len(rows)])
         largest = responsibility.amax(0)
         density = responsibility.sub_(largest).clamp_(min=floor).exp_().sum(0)
@@ -143,8 +168,12 @@ def expectation(shard: DataRows, components: Components) -> tuple[Float[Tensor, 
     return statistics[:-1].reshape(sums.shape), statistics[-1]
 
 
-def features_from_data(x: Float[Tensor, "n d"], out: Float[Tensor, "f n"] | None = None) -> Float[Tensor, "f n"]:
-    """Return the features [1, x_i, x_i x_j (i <= j)] of each row as a column; `out` is the buffer to write into."""
+def features_from_data(
+    x: Float[Tensor, "n d"], out: Float[Tensor, "f n"] | None = None
+) -> Float[Tensor, "f n"]:
+    """Return the features [1, x_i, x_i x_j (i <= j)] of each row as a column; `out` is the buffer
+    to write into.
+    """
     n, d = x.shape
     out = x.new_empty(1 + d + d * (d + 1) // 2, n) if out is None else out
     out[0] = 1
@@ -155,28 +184,42 @@ def features_from_data(x: Float[Tensor, "n d"], out: Float[Tensor, "f n"] | None
 
 
 def coefficients_from_components(components: Components) -> Float[Tensor, "m f"]:
-    """Return for each component the coefficients of the features in log(weight) + log N(x | mean, covariance)."""
-    means, d = components.means, components.means.shape[1]
+    """Return for each component the coefficients of the features in log(weight) + log N(x | mean,
+    covariance).
+    """
+    means = components.means
+    d = components.means.shape[1]
     whitening = whitening_matrices(components.covariances)
     precision = whitening.transpose(-1, -2) @ whitening
     linear = (precision @ means[..., None])[..., 0]
     log_scale = whitening.diagonal(dim1=-2, dim2=-1).log().sum(-1)
-    constant = components.weights.log() - 0.5 * d * math.log(2 * math.pi) + log_scale - 0.5 * (linear * means).sum(-1)
+    constant = (
+        components.weights.log()
+        - 0.5 * d * math.log(2 * math.pi)
+        + log_scale
+        - 0.5 * (linear * means).sum(-1)
+    )
     i, j = torch.triu_indices(d, d, device=means.device)
-    quadratic = precision[:, i, j] * torch.where(i == j, -0.5, -1.0)  # a mixed product occurs twice in the square
+    quadratic = precision[:, i, j] * torch.where(
+        i == j, -0.5, -1.0
+    )  # a mixed product occurs twice in the square
     return torch.cat([constant[:, None], linear, quadratic], dim=1)
 
 
 def maximisation(
     sums: Float[Tensor, "m f"], n: int, regularisation: float, reseeded: Int[Tensor, "m"]
 ) -> tuple[Components, Int[Tensor, "m"]]:
-    """Return the maximum-likelihood components from the weighted sums, and how often each has collapsed.
+    """Return the maximum-likelihood components from the weighted sums, and how often each has
+    collapsed.
 
-    A component collapses if its covariance is singular or it has fewer than d + 1 rows. It is replaced by half of the
-    heaviest component, split across its longest axis. After `MAX_RESEEDS` times, `IndefiniteCovariance` is raised.
+    A component collapses if its covariance is singular or it has fewer than d + 1 rows. It is
+    replaced by half of the heaviest component, split across its longest axis. After `MAX_RESEEDS`
+    times, `IndefiniteCovariance` is raised.
     """
     components = components_from_sums(sums, n, regularisation)
-    weights, means, covariances = components.weights.clone(), components.means.clone(), components.covariances.clone()
+    weights = components.weights.clone()
+    means = components.means.clone()
+    covariances = components.covariances.clone()
     factor, info = torch.linalg.cholesky_ex(covariances)
     regular = (info == 0) & (factor.diagonal(dim1=-2, dim2=-1) ** 2 > SINGULAR_VARIANCE).all(-1)
     collapsed = (sums[:, 0] < means.shape[1] + 1) | ~regular
@@ -185,7 +228,11 @@ def maximisation(
     reseeded = reseeded + collapsed
     if bool(collapsed.all()) or int(reseeded.max()) > MAX_RESEEDS:
         k = int(reseeded.argmax())
-        smallest = float(torch.linalg.eigvalsh(covariances[k]).min()) if bool(covariances[k].isfinite().all()) else 0.0
+        smallest = (
+            float(torch.linalg.eigvalsh(covariances[k]).min())
+            if bool(covariances[k].isfinite().all())
+            else 0.0
+        )
         what = f"the covariance of component {k}, of {float(sums[k, 0]):.1f} rows, collapsed {int(reseeded[k])} times,"
         raise IndefiniteCovariance(what, smallest, "use fewer components or more samples")
     weights[collapsed] = 0
@@ -200,8 +247,12 @@ def maximisation(
 
 
 def components_from_sums(sums: Float[Tensor, "m f"], n: int, regularisation: float) -> Components:
-    """Return weights, means and covariances from the weighted sums of features; NaN for a component without data."""
-    d = round((math.sqrt(8 * sums.shape[1] + 1) - 3) / 2)  # from the number of features, 1 + d + d (d + 1) / 2
+    """Return weights, means and covariances from the weighted sums of features; NaN for a component
+    without data.
+    """
+    d = round(
+        (math.sqrt(8 * sums.shape[1] + 1) - 3) / 2
+    )  # from the number of features, 1 + d + d (d + 1) / 2
     count = sums[:, :1]
     means = sums[:, 1 : d + 1] / count
     i, j = torch.triu_indices(d, d, device=sums.device)
@@ -209,40 +260,59 @@ def components_from_sums(sums: Float[Tensor, "m f"], n: int, regularisation: flo
     second[:, i, j] = sums[:, d + 1 :] / count
     second[:, j, i] = second[:, i, j]
     ridge = regularisation * torch.eye(d, dtype=sums.dtype, device=sums.device)
-    return Components(count[:, 0] / n, means, second - means[:, :, None] * means[:, None, :] + ridge)
+    return Components(
+        count[:, 0] / n, means, second - means[:, :, None] * means[:, None, :] + ridge
+    )
 
 
 def start_components(shard: DataRows, m: int, seed: int, regularisation: float) -> FitProgress:
-    """Return the initial state of a fit: m components from k-means. Raises `BadArgument` for fewer distinct rows."""
+    """Return the initial state of a fit: m components from k-means. Raises `BadArgument` for fewer
+    distinct rows.
+    """
     generator = torch.Generator().manual_seed(seed)
     centres = _plus_plus(_subsample(shard, generator), m, generator)
     for _ in range(10):  # Lloyd's algorithm: EM follows, so the clusters need not converge
-        sums = _sums_of_clusters(shard, centres, lambda x: torch.cat([torch.ones_like(x[:, :1]), x], dim=1).T)
-        centres = torch.where(sums[:, :1] > 0, sums[:, 1:] / sums[:, :1], centres)  # a centre without data stays
+        sums = _sums_of_clusters(
+            shard, centres, lambda x: torch.cat([torch.ones_like(x[:, :1]), x], dim=1).T
+        )
+        centres = torch.where(
+            sums[:, :1] > 0, sums[:, 1:] / sums[:, :1], centres
+        )  # a centre without data stays
     sums = _sums_of_clusters(shard, centres, features_from_data)
     n = round(float(sums[:, 0].sum()))
-    components, reseeded = maximisation(sums, n, regularisation, torch.zeros(m, dtype=torch.long, device=sums.device))
+    components, reseeded = maximisation(
+        sums, n, regularisation, torch.zeros(m, dtype=torch.long, device=sums.device)
+    )
     return FitProgress(components, reseeded, sums.new_empty(0))
 
 
 def _subsample(shard: DataRows, generator: torch.Generator) -> Float[Tensor, "s d"]:
     """Return random data rows, drawn from all processes; every process gets the same rows."""
-    x, lengths = shard.rows, shard.lengths()
-    order = torch.randperm(int(lengths.sum()), generator=generator, device="cpu")  # for any number of processes
-    pick = order[:20_000].to(x.device) - lengths[: shard.rank].sum()  # some hundred for each component
+    x = shard.rows
+    lengths = shard.lengths()
+    order = torch.randperm(
+        int(lengths.sum()), generator=generator, device="cpu"
+    )  # for any number of processes
+    pick = (
+        order[:20_000].to(x.device) - lengths[: shard.rank].sum()
+    )  # some hundred for each component
     here = (pick >= 0) & (pick < len(x))
     pool = x.new_zeros(len(pick), x.shape[1])
     pool[here] = x[pick[here]]
     return shard.sum(pool)
 
 
-def _plus_plus(pool: Float[Tensor, "s d"], m: int, generator: torch.Generator) -> Float[Tensor, "m d"]:
+def _plus_plus(
+    pool: Float[Tensor, "s d"], m: int, generator: torch.Generator
+) -> Float[Tensor, "m d"]:
     """Return m initial cluster centres, drawn from the rows of `pool` by k-means++."""
     centres = pool[:1]
     squared = ((pool - centres) ** 2).sum(1)
     for k in range(1, m):
         if not bool((squared > 0).any()):
-            raise BadArgument("components", m, f"at most {k}, the number of different rows of the data")
+            raise BadArgument(
+                "components", m, f"at most {k}, the number of different rows of the data"
+            )
         pick = torch.multinomial(squared.cpu(), 1, generator=generator).to(pool.device)
         centres = torch.cat([centres, pool[pick]])
         squared = torch.minimum(squared, ((pool - pool[pick]) ** 2).sum(1))
@@ -250,9 +320,13 @@ def _plus_plus(pool: Float[Tensor, "s d"], m: int, generator: torch.Generator) -
 
 
 def _sums_of_clusters(
-    shard: DataRows, centres: Float[Tensor, "m d"], features: Callable[[Float[Tensor, "r d"]], Float[Tensor, "f r"]]
+    shard: DataRows,
+    centres: Float[Tensor, "m d"],
+    features: Callable[[Float[Tensor, "r d"]], Float[Tensor, "f r"]],
 ) -> Float[Tensor, "m f"]:
-    """Return for each cluster the sum of the features of its rows; a row belongs to the nearest centre."""
+    """Return for each cluster the sum of the features of its rows; a row belongs to the nearest
+    centre.
+    """
     sums = centres.new_zeros(len(centres), len(features(centres[:1])))
     for rows in shard.rows.split(CACHED_ROWS):
         nearest = (0.5 * (centres**2).sum(1) - rows @ centres.T).argmin(1)

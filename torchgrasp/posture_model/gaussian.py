@@ -1,4 +1,6 @@
-"""A Gaussian mixture over named dimensions: density, samples, marginals and conditionals (Eqs. 19-20)."""
+"""A Gaussian mixture over named dimensions: density, samples, marginals and conditionals (Eqs.
+19-20).
+"""
 
 import dataclasses
 import math
@@ -14,11 +16,15 @@ from torchgrasp.foundation.checks import Range, Seed, check_dense, checked, is_k
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.linalg import cholesky
 
-ROWS_PER_CHUNK = 8192  # rows evaluated together: this bounds the memory for rows x components x dimensions
+ROWS_PER_CHUNK = (
+    8192  # rows evaluated together: this bounds the memory for rows x components x dimensions
+)
 
 
 class of_parameters(kept[Kept]):
-    """A property of a mixture that is kept unless a parameter requires a gradient: an optimiser may change it."""
+    """A property of a mixture that is kept unless a parameter requires a gradient: an optimiser may
+    change it.
+    """
 
     def __get__(self, instance: Any, owner: Any = None) -> Any:
         """Return the value of the property."""
@@ -37,9 +43,9 @@ class of_parameters(kept[Kept]):
 class GaussianMixture(Value):
     """A mixture of m Gaussians over d named dimensions (Eqs. 19-20), evaluated in float64.
 
-    Densities are differentiable, to any order, in the points and in `weights`, `means` and `covariances`. Raises
-    `BadArgument` for inconsistent shapes, weights that are negative or do not sum to 1, an indefinite or asymmetric
-    covariance, or a repeated name.
+    Densities are differentiable, to any order, in the points and in `weights`, `means` and
+    `covariances`. Raises `BadArgument` for inconsistent shapes, weights that are negative or do not
+    sum to 1, an indefinite or asymmetric covariance, or a repeated name.
 
     >>> mixture = GaussianMixture(torch.ones(1), torch.zeros(1, 2), torch.eye(2)[None], ("a", "b"))
     >>> mixture.condition({"b": 3.0}).means
@@ -54,20 +60,32 @@ class GaussianMixture(Value):
     names: tuple[str, ...]
 
     def __post_init__(self) -> None:
-        d, weights, covariances = len(self.names), self.weights.detach(), self.covariances.detach()
+        d = len(self.names)
+        weights = self.weights.detach()
+        covariances = self.covariances.detach()
         if self.means.shape[1] != d:
-            raise BadArgument("names", f"{d} names of {self.means.shape[1]} dimensions", "one for each")
+            raise BadArgument(
+                "names", f"{d} names of {self.means.shape[1]} dimensions", "one for each"
+            )
         if d < 1 or len(set(self.names)) < d:
             raise BadArgument("names", self.names, "at least one, each once")
-        if is_known(weights) and not (bool((weights >= 0).all()) and abs(float(weights.double().sum()) - 1) <= 1e-6):
-            found = f"the least weight {weights.min()} and sum {float(weights.sum())}" if len(weights) else "no weights"
+        if is_known(weights) and not (
+            bool((weights >= 0).all()) and abs(float(weights.double().sum()) - 1) <= 1e-6
+        ):
+            found = (
+                f"the least weight {weights.min()} and sum {float(weights.sum())}"
+                if len(weights)
+                else "no weights"
+            )
             raise BadArgument("weights", found, "at least one, none negative, of sum 1 within 1e-6")
         if not is_known(covariances):
             return
         scale = covariances.diagonal(dim1=-2, dim2=-1).abs().sqrt()
         skewness = (covariances - covariances.mT).abs()
         if bool((skewness > 1e-6 * scale[:, :, None] * scale[:, None, :]).any()):
-            raise BadArgument("covariances", "an asymmetric matrix", "symmetric positive definite matrices")
+            raise BadArgument(
+                "covariances", "an asymmetric matrix", "symmetric positive definite matrices"
+            )
         info = torch.linalg.cholesky_ex(covariances.double()).info
         if bool((info != 0).any()):
             found = f"an indefinite matrix in component {int(info.nonzero()[0])}"
@@ -75,15 +93,21 @@ class GaussianMixture(Value):
 
     @checked(gradients=True)
     def log_prob(self, x: Float[Tensor, "*b d"]) -> Float[Tensor, "*b"]:
-        """Return the log-density of each row, Eq. (19); raises `BadArgument` for rows that do not have d numbers."""
+        """Return the log-density of each row, Eq. (19); raises `BadArgument` for rows that do not
+        have d numbers.
+        """
         if x.ndim < 1 or x.shape[-1] != len(self.names):
             raise BadArgument("x", f"shape {tuple(x.shape)}", f"rows of {len(self.names)} numbers")
         return map_rows(lambda rows: torch.logsumexp(self.log_joint(rows), -1), x)
 
     @checked(gradients=True)
     def log_joint(self, x: Float[Tensor, "n d"]) -> Float[Tensor, "n m"]:
-        """Return log(weight) + log N(x | mean, covariance), the log joint density, for every row x and component."""
-        return self.weights.double().log() + (self.whitening.log_scale - 0.5 * self.whitening.squared(x.double()))
+        """Return log(weight) + log N(x | mean, covariance), the log joint density, for every row x
+        and component.
+        """
+        return self.weights.double().log() + (
+            self.whitening.log_scale - 0.5 * self.whitening.squared(x.double())
+        )
 
     @checked
     def sample(self, n: Annotated[int, Range(0, 10**8)], seed: Seed = 0) -> Float[Tensor, "n d"]:
@@ -94,11 +118,17 @@ class GaussianMixture(Value):
         for name in ("weights", "means", "covariances"):
             check_dense(name, getattr(self, name), gradients=False)
         generator = torch.Generator().manual_seed(seed)
-        weights, means = self.weights.double().cpu(), self.means.double().cpu()
+        weights = self.weights.double().cpu()
+        means = self.means.double().cpu()
         draw = torch.rand(n, generator=generator, dtype=torch.float64, device="cpu")
-        # By rounding the sum of the weights may lie below a draw, which then belongs to the last component.
-        component = torch.searchsorted(weights.cumsum(0), draw, right=True).clamp(max=len(weights) - 1)
-        noise = torch.randn(n, len(self.names), generator=generator, dtype=torch.float64, device="cpu")
+        # By rounding the sum of the weights may lie below a draw, which then belongs to the last
+        # component.
+        component = torch.searchsorted(weights.cumsum(0), draw, right=True).clamp(
+            max=len(weights) - 1
+        )
+        noise = torch.randn(
+            n, len(self.names), generator=generator, dtype=torch.float64, device="cpu"
+        )
         factor = torch.linalg.cholesky(self.covariances.double().cpu())
         rows = means[component]
         for k in range(len(weights)):
@@ -107,17 +137,22 @@ class GaussianMixture(Value):
 
     @checked(gradients=True)
     def marginal(self, names: Sequence[str]) -> "GaussianMixture":
-        """Return the marginal mixture of the named dimensions, Eq. (22); raises `BadArgument` for an unknown name."""
+        """Return the marginal mixture of the named dimensions, Eq. (22); raises `BadArgument` for
+        an unknown name.
+        """
         index = self._index(names)
         block = self.covariances.double()[:, index][:, :, index]
-        return GaussianMixture(self.weights.double(), self.means.double()[:, index], block, tuple(names))
+        return GaussianMixture(
+            self.weights.double(), self.means.double()[:, index], block, tuple(names)
+        )
 
     @checked(gradients=True)
     def condition(self, given: dict[str, float]) -> "GaussianMixture":
-        """Return the mixture of the other dimensions, given the values of some by name, Eq. (23) of the paper.
+        """Return the mixture of the other dimensions, given the values of some by name, Eq. (23) of
+        the paper.
 
-        Components of weight 0 are left out, except inside torch.vmap. Raises `BadArgument` for unknown names or
-        non-finite values.
+        Components of weight 0 are left out, except inside torch.vmap. Raises `BadArgument` for
+        unknown names or non-finite values.
         """
         observed = self._index(tuple(given))
         rest = [i for i in range(len(self.names)) if i not in observed]
@@ -128,8 +163,11 @@ class GaussianMixture(Value):
             return self.marginal(self.names)
         part = self.marginal(tuple(given))
         weights = torch.softmax(part.log_joint(values[None])[0], 0)
-        means, covariances = self.means.double(), self.covariances.double()
-        cross = covariances[:, rest][:, :, observed] @ part.whitening.matrix.transpose(-1, -2)  # whitened
+        means = self.means.double()
+        covariances = self.covariances.double()
+        cross = covariances[:, rest][:, :, observed] @ part.whitening.matrix.transpose(
+            -1, -2
+        )  # whitened
         offset = part.whitening.matrix @ (values - part.means)[..., None]
         means = means[:, rest] + (cross @ offset)[..., 0]
         covariances = covariances[:, rest][:, :, rest] - cross @ cross.transpose(-1, -2)
@@ -151,21 +189,31 @@ class GaussianMixture(Value):
 
     @of_parameters
     def whitening(self) -> "Whitening":
-        """Each component's whitening matrix, whitened mean and log scale, which make densities quick to evaluate."""
-        means, d, matrix = self.means.double(), len(self.names), whitening_matrices(self.covariances.double())
-        log_scale = matrix.diagonal(dim1=-2, dim2=-1).log().sum(-1) - 0.5 * d * math.log(2 * math.pi)
+        """Each component's whitening matrix, whitened mean and log scale, which make densities
+        quick to evaluate.
+        """
+        means = self.means.double()
+        d = len(self.names)
+        matrix = whitening_matrices(self.covariances.double())
+        log_scale = matrix.diagonal(dim1=-2, dim2=-1).log().sum(-1) - 0.5 * d * math.log(
+            2 * math.pi
+        )
         return Whitening(matrix, (matrix @ means[..., None])[..., 0], log_scale)
 
     def _index(self, names: Sequence[str]) -> list[int]:
         unknown = [name for name in names if name not in self.names]
         if unknown or len(set(names)) < len(names):
-            raise BadArgument("names", unknown or tuple(names), f"some of {', '.join(self.names)}, each once")
+            raise BadArgument(
+                "names", unknown or tuple(names), f"some of {', '.join(self.names)}, each once"
+            )
         return [self.names.index(name) for name in names]
 
 
 @dataclasses.dataclass(frozen=True)
 class Whitening:
-    """m Gaussians in whitened form: `matrix` W with W^T W = covariance^-1, `means` W mean, and logs of normalisers."""
+    """m Gaussians in whitened form: `matrix` W with W^T W = covariance^-1, `means` W mean, and logs
+    of normalisers.
+    """
 
     matrix: Float[Tensor, "m d d"]
     means: Float[Tensor, "m d"]
@@ -178,14 +226,22 @@ class Whitening:
         return (whitened * whitened).sum(-1)
 
 
-def map_rows(function: Callable[[Float[Tensor, "n d"]], Tensor], x: Float[Tensor, "*b d"]) -> Tensor:
+def map_rows(
+    function: Callable[[Float[Tensor, "n d"]], Tensor], x: Float[Tensor, "*b d"]
+) -> Tensor:
     """Apply a function to all rows in float64, chunk by chunk; batch axes and dtype are as in `x`."""
-    y = torch.cat([function(rows) for rows in x.reshape(-1, x.shape[-1]).double().split(ROWS_PER_CHUNK)])
+    y = torch.cat(
+        [function(rows) for rows in x.reshape(-1, x.shape[-1]).double().split(ROWS_PER_CHUNK)]
+    )
     return y.reshape(x.shape[:-1] + y.shape[1:]).to(x.dtype)
 
 
 def whitening_matrices(covariances: Float[Tensor, "m d d"]) -> Float[Tensor, "m d d"]:
-    """Return for each covariance the lower-triangular W with W^T W = covariance^-1; raises `IndefiniteCovariance`."""
-    factor = cholesky(covariances, "a component's covariance", "use fewer components or more samples")
+    """Return for each covariance the lower-triangular W with W^T W = covariance^-1; raises
+    `IndefiniteCovariance`.
+    """
+    factor = cholesky(
+        covariances, "a component's covariance", "use fewer components or more samples"
+    )
     eye = torch.eye(factor.shape[-1], dtype=factor.dtype, device=factor.device)
     return torch.linalg.solve_triangular(factor, eye.expand_as(factor), upper=False)

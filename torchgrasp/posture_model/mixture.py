@@ -1,4 +1,6 @@
-"""The learned posture model of a hand: a Gaussian mixture over joints and contact codes (Eqs. 15-23)."""
+"""The learned posture model of a hand: a Gaussian mixture over joints and contact codes (Eqs.
+15-23).
+"""
 
 import dataclasses
 import itertools
@@ -21,37 +23,57 @@ from torchgrasp.posture_model.gaussian import GaussianMixture, map_rows, of_para
 from torchgrasp.values.planning import ContactCode, Contacts
 
 PERMUTATIONS: tuple[tuple[int, int, int], ...] = tuple(itertools.permutations(range(3)))  # pyright: ignore[reportAssignmentType]
-"""The six assignments of three contacts to three fingers: finger i touches contact `PERMUTATIONS[k][i]`."""
-CODE_NAMES = ("L1", "L2", "L3", "N1", "N2", "N3")  # the numbers of a code q = (L, N): three lengths [m], three cosines
+"""The six assignments of three contacts to three fingers: finger i touches contact
+`PERMUTATIONS[k][i]`.
+"""
+CODE_NAMES = (
+    "L1",
+    "L2",
+    "L3",
+    "N1",
+    "N2",
+    "N3",
+)  # the numbers of a code q = (L, N): three lengths [m], three cosines
 PAPER_ENERGY = 2.0
 """The paper's greatest energy f_i, Eq. (21), of a code that the hand reaches."""
 DEFAULT_ENERGY = 6.295793622
-"""The greatest energy of a reached code, by default: half the 95 % quantile of chi-square with 6 degrees of freedom."""
+"""The greatest energy of a reached code, by default: half the 95 % quantile of chi-square with 6
+degrees of freedom.
+"""
 
 
-def encode_fingertips(points: Float[Tensor, "*b f 3"], normals: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b q"]:
+def encode_fingertips(
+    points: Float[Tensor, "*b f 3"], normals: Float[Tensor, "*b f 3"]
+) -> Float[Tensor, "*b q"]:
     """Return the rigid-motion-invariant code q = (L, N) of points with unit normals, Eq. (18).
 
-    L_i is the distance [m] of point i from the centroid; N holds the cosines n1.n2, n1.n3, n2.n3 and so on. Fingertips
-    have the same code as the contacts that they touch. Mirror images have this code too: check every match.
+    L_i is the distance [m] of point i from the centroid; N holds the cosines n1.n2, n1.n3, n2.n3
+    and so on. Fingertips have the same code as the contacts that they touch. Mirror images have
+    this code too: check every match.
     """
     lengths = torch.linalg.vector_norm(points - points.mean(-2, keepdim=True), dim=-1)
-    cosines = torch.stack([(n * m).sum(-1) for n, m in itertools.combinations(normals.unbind(-2), 2)], dim=-1)
+    cosines = torch.stack(
+        [(n * m).sum(-1) for n, m in itertools.combinations(normals.unbind(-2), 2)], dim=-1
+    )
     return torch.cat([lengths, cosines], dim=-1)
 
 
 @checked(gradients=True)
 def encode(contacts: Contacts | tuple[Tensor, Tensor]) -> ContactCode:
-    """Return the codes of contact triples for all six assignments of contacts to fingers, Eqs. (15)-(18).
+    """Return the codes of contact triples for all six assignments of contacts to fingers, Eqs.
+    (15)-(18).
 
-    A code is three lengths [m] and three cosines, which no rigid motion changes. Points [m] and unit normals have shape
-    (b, 3, 3). Contacts on a line give NaN and `Status.DEGENERATE`. Codes and frames are differentiable in both. Raises
-    `BadArgument` for wrong shapes, numbers that are not finite, or normals whose length is not 1 within 1e-3.
+    A code is three lengths [m] and three cosines, which no rigid motion changes. Points [m] and
+    unit normals have shape (b, 3, 3). Contacts on a line give NaN and `Status.DEGENERATE`. Codes
+    and frames are differentiable in both. Raises `BadArgument` for wrong shapes, numbers that are
+    not finite, or normals whose length is not 1 within 1e-3.
 
     >>> encode((torch.eye(3)[None], torch.eye(3)[None])).q.shape
     torch.Size([1, 6, 6])
     """
-    points, normals = (contacts.points, contacts.normals) if isinstance(contacts, Contacts) else contacts
+    points, normals = (
+        (contacts.points, contacts.normals) if isinstance(contacts, Contacts) else contacts
+    )
     check_tensor("points", points, (None, 3, 3))
     check_tensor("normals", normals, (len(points), 3, 3))
     lengths = torch.linalg.vector_norm(normals, dim=-1)
@@ -59,11 +81,17 @@ def encode(contacts: Contacts | tuple[Tensor, Tensor]) -> ContactCode:
         worst = lengths.flatten()[(lengths - 1).abs().argmax()].item()
         raise BadArgument("normals", f"a normal of length {worst:.6g}", "unit vectors")
     order = torch.tensor(PERMUTATIONS, device=points.device)
-    ordered_points, ordered_normals = points[:, order], normals[:, order]  # (b, 6, 3, 3)
-    flat = degenerate(ordered_points).any(1)  # in any order: at the threshold rounding may distinguish them
+    # (b, 6, 3, 3)
+    ordered_points = points[:, order]
+    ordered_normals = normals[:, order]
+    flat = degenerate(ordered_points).any(
+        1
+    )  # in any order: at the threshold rounding may distinguish them
     bad = flat[:, None, None]
     # A degenerate row gets another triangle, so that one call frames all rows.
-    ordered_points = torch.where(bad[..., None], torch.eye(3, device="cpu").to(points), ordered_points)
+    ordered_points = torch.where(
+        bad[..., None], torch.eye(3, device="cpu").to(points), ordered_points
+    )
     return ContactCode(
         q=torch.where(bad, torch.nan, encode_fingertips(ordered_points, ordered_normals)),
         obj_from_vf=torch.where(bad[..., None], torch.nan, virtual_frame(ordered_points)),
@@ -73,20 +101,33 @@ def encode(contacts: Contacts | tuple[Tensor, Tensor]) -> ContactCode:
 
 
 def describe_compatibility(hand: Hand) -> dict[str, str]:
-    """Return metadata that identifies the hand of samples and models: name, fingers, hash of its files, some codes."""
+    """Return metadata that identifies the hand of samples and models: name, fingers, hash of its
+    files, some codes.
+    """
     codes = " ".join(f"{x:.7f}" for x in _probe_codes(hand).flatten().tolist())
-    return {"hand": hand.name, "fingers": hand.source.option, "hand_sha256": hand.source.sha256, "hand_codes": codes}
+    return {
+        "hand": hand.name,
+        "fingers": hand.source.option,
+        "hand_sha256": hand.source.sha256,
+        "hand_codes": codes,
+    }
 
 
 def check_compatible(meta: dict[str, str], joint_names: tuple[str, ...], hand: Hand) -> None:
-    """Raise `BadArgument` for a model of another hand, or of other fingers, joint limits or fingertips."""
+    """Raise `BadArgument` for a model of another hand, or of other fingers, joint limits or
+    fingertips.
+    """
     if joint_names != hand.joint_names:
-        raise BadArgument("mixture", f"joints {joint_names}", f"the joints {hand.joint_names} of the hand")
+        raise BadArgument(
+            "mixture", f"joints {joint_names}", f"the joints {hand.joint_names} of the hand"
+        )
     if "hand_codes" not in meta:
         return
     ours = _probe_codes(hand).flatten()
     try:
-        theirs = torch.tensor([float(x) for x in meta["hand_codes"].split()], dtype=torch.float64, device="cpu")
+        theirs = torch.tensor(
+            [float(x) for x in meta["hand_codes"].split()], dtype=torch.float64, device="cpu"
+        )
     except ValueError as error:
         raise BadArgument("mixture", f"hand_codes {meta['hand_codes']!r}", "numbers") from error
     same = theirs.shape == ours.shape and torch.allclose(theirs.to(ours), ours, rtol=0, atol=1e-5)
@@ -97,10 +138,15 @@ def check_compatible(meta: dict[str, str], joint_names: tuple[str, ...], hand: H
 
 
 def _probe_codes(hand: Hand) -> Float[Tensor, "3 q"]:
-    """Return the contact codes of three fixed postures, Eqs. (15)-(18) of the paper; they identify the hand."""
-    lower, upper = hand.lower.double(), hand.upper.double()
+    """Return the contact codes of three fixed postures, Eqs. (15)-(18) of the paper; they identify
+    the hand.
+    """
+    lower = hand.lower.double()
+    upper = hand.upper.double()
     share = torch.tensor([0.2, 0.5, 0.7], dtype=torch.float64, device=lower.device)
-    index = (torch.arange(hand.dof, device="cpu")[None] + torch.arange(3, device="cpu")[:, None]) % 3
+    index = (
+        torch.arange(hand.dof, device="cpu")[None] + torch.arange(3, device="cpu")[:, None]
+    ) % 3
     return encode_fingertips(*hand.fingertips(lower + share[index] * (upper - lower)))
 
 
@@ -109,10 +155,11 @@ def _probe_codes(hand: Hand) -> Float[Tensor, "3 q"]:
 class GraspMixture(GaussianMixture):
     """The learned mixture over the joints and contact codes of one hand (Eqs. 19-20).
 
-    The dimensions are the joints [rad], in the hand's order, then the contact code of `ContactCode`: distances L1 L2 L3
-    [m] of the contacts from their centroid, cosines N1 N2 N3 between their normals. A contact set has 6 codes, one for
-    each assignment to fingers. The names must end with `CODE_NAMES`. `regularisation`, relative to the samples'
-    variance, was added to every variance. `meta` describes hand, samples and fit.
+    The dimensions are the joints [rad], in the hand's order, then the contact code of
+    `ContactCode`: distances L1 L2 L3 [m] of the contacts from their centroid, cosines N1 N2 N3
+    between their normals. A contact set has 6 codes, one for each assignment to fingers. The names
+    must end with `CODE_NAMES`. `regularisation`, relative to the samples' variance, was added to
+    every variance. `meta` describes hand, samples and fit.
 
     >>> from torchgrasp import encode
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -127,7 +174,9 @@ class GraspMixture(GaussianMixture):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.names[-6:] != CODE_NAMES or len(self.names) < 7:
-            raise BadArgument("names", self.names, f"the joints' names, then {', '.join(CODE_NAMES)}")
+            raise BadArgument(
+                "names", self.names, f"the joints' names, then {', '.join(CODE_NAMES)}"
+            )
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -141,35 +190,46 @@ class GraspMixture(GaussianMixture):
 
     @of_parameters
     def _regression(self) -> Float[Tensor, "m h 6"]:
-        """The slope of each component's mean joints over the contact code: Sigma_(Theta,q) Sigma_q^-1 in Eq. (23)."""
+        """The slope of each component's mean joints over the contact code: Sigma_(Theta,q)
+        Sigma_q^-1 in Eq. (23).
+        """
         whitening = self._code.whitening.matrix
         return self.covariances[:, :-6, -6:].double() @ whitening.transpose(-1, -2) @ whitening
 
     @of_parameters
     def _stacked_regression(self) -> Float[Tensor, "k h"]:
-        """Matrices, stacked over components, that multiply (q, 1) to give each component's mean joints at a code q."""
+        """Matrices, stacked over components, that multiply (q, 1) to give each component's mean
+        joints at a code q.
+        """
         slope = self._regression
         at_zero = self.means[:, :-6].double() - (slope @ self.means[:, -6:, None].double())[..., 0]
         return torch.cat([slope.transpose(1, 2), at_zero[:, None]], 1).flatten(0, 1)
 
     @checked(gradients=True)
-    def energy(self, code: ContactCode | Annotated[Float[Tensor, "*b 6"], ANY]) -> Float[Tensor, "*b"]:
-        """Return half the squared Mahalanobis distance of each code from the nearest component, min f_i of Eq. (21).
+    def energy(
+        self, code: ContactCode | Annotated[Float[Tensor, "*b 6"], ANY]
+    ) -> Float[Tensor, "*b"]:
+        """Return half the squared Mahalanobis distance of each code from the nearest component, min
+        f_i of Eq. (21).
 
-        The hand probably reaches a code if this value is below `DEFAULT_ENERGY`, or the paper's `PAPER_ENERGY`. A code
-        that is not finite gives NaN. Where two components are equally near, the derivative is the mean of theirs.
+        The hand probably reaches a code if this value is below `DEFAULT_ENERGY`, or the paper's
+        `PAPER_ENERGY`. A code that is not finite gives NaN. Where two components are equally near,
+        the derivative is the mean of theirs.
         """
         whitening = self._code.whitening
         return _map_codes(lambda q: 0.5 * whitening.squared(q).amin(-1), code)
 
     @checked(gradients=True)
-    def joints(self, code: ContactCode | Annotated[Float[Tensor, "*b 6"], ANY]) -> Float[Tensor, "*b h"]:
+    def joints(
+        self, code: ContactCode | Annotated[Float[Tensor, "*b 6"], ANY]
+    ) -> Float[Tensor, "*b h"]:
         """Return the expected joint positions [rad] given each contact code, Eq. (23) of the paper.
 
-        The code describes a contact set by three lengths [m] and three cosines. The joints may exceed their limits. A
-        code that is not finite gives NaN.
+        The code describes a contact set by three lengths [m] and three cosines. The joints may
+        exceed their limits. A code that is not finite gives NaN.
         """
-        codes, regression = self._code, self._stacked_regression
+        codes = self._code
+        regression = self._stacked_regression
 
         def expect(q: Float[Tensor, "n 6"]) -> Float[Tensor, "n h"]:
             # sum_i h_i A_i (q, 1) as one matrix product
@@ -183,20 +243,24 @@ class GraspMixture(GaussianMixture):
     def modes(
         self, q: Annotated[Float[Tensor, "*b 6"], ANY], k: Count
     ) -> tuple[Float[Tensor, "*b k h"], Float[Tensor, "*b k"]]:
-        """Return mean joints [rad] and responsibilities of the k components most responsible for a contact code.
+        """Return mean joints [rad] and responsibilities of the k components most responsible for a
+        contact code.
 
-        The responsibilities are h_i in Eq. (23) of the paper, the largest first.
-        Use them where several postures have the same code: the expected joints may then be none of these postures.
+        The responsibilities are h_i in Eq. (23) of the paper, the largest first. Use them where
+        several postures have the same code: the expected joints may then be none of these postures.
         Raises `BadArgument` for k outside [1, m].
         """
         check_whole("k", k, 1, len(self.weights))
-        codes, regression = self._code, self._regression
+        codes = self._code
+        regression = self._regression
 
         def take(q: Float[Tensor, "n 6"]) -> Float[Tensor, "n k d"]:
             top = torch.log_softmax(codes.log_joint(q), -1).topk(k, dim=-1)  # free of underflow
             # the bracket of Eq. (23), the mean of the joints given the code in each component
             difference = q[:, None] - self.means[:, -6:].double()
-            means = self.means[:, :-6].double() + torch.einsum("mhc,nmc->nmh", regression, difference)
+            means = self.means[:, :-6].double() + torch.einsum(
+                "mhc,nmc->nmh", regression, difference
+            )
             index = top.indices[..., None].expand(-1, -1, len(self.joint_names))
             return torch.cat([means.gather(-2, index), top.values.exp()[..., None]], -1)
 
@@ -205,19 +269,28 @@ class GraspMixture(GaussianMixture):
 
     @checked
     def save(self, path: Path | str) -> Path:
-        """Write the mixture atomically as safetensors; `load_mixture` reads it. Raises `OutputError`.
+        """Write the mixture atomically as safetensors; `load_mixture` reads it. Raises
+        `OutputError`.
 
         >>> import tempfile
         >>> file = load_mixture("barrett").save(Path(tempfile.mkdtemp(), "mixture.safetensors"))
         >>> load_mixture(file).joint_names
         ('spread', 'f1_flex', 'f2_flex', 'f3_flex')
         """
-        tensors = {name: getattr(self, name).detach() for name in ("weights", "means", "covariances")}
-        meta = {**self.meta, "names": " ".join(self.names), "regularisation": repr(self.regularisation)}
+        tensors = {
+            name: getattr(self, name).detach() for name in ("weights", "means", "covariances")
+        }
+        meta = {
+            **self.meta,
+            "names": " ".join(self.names),
+            "regularisation": repr(self.regularisation),
+        }
         return save_tensors(path, "mixture", tensors, meta)
 
 
-def _map_codes(function: Callable[[Float[Tensor, "n 6"]], Tensor], code: ContactCode | Tensor) -> Tensor:
+def _map_codes(
+    function: Callable[[Float[Tensor, "n 6"]], Tensor], code: ContactCode | Tensor
+) -> Tensor:
     """Apply a function to all codes q; a code that is not finite gives NaN, and spoils no gradient."""
     q = code.q if isinstance(code, ContactCode) else code
     if q.ndim < 1 or q.shape[-1] != 6:
@@ -229,7 +302,8 @@ def _map_codes(function: Callable[[Float[Tensor, "n 6"]], Tensor], code: Contact
 
 @checked
 def load_mixture(name_or_path: Path | str) -> GraspMixture:
-    """Read the learned mixture of a hand, by the hand's name or folder, or by the path of a .safetensors file.
+    """Read the learned mixture of a hand, by the hand's name or folder, or by the path of a
+    .safetensors file.
 
     Raises `HandFileError` for an unknown hand, `ModelFileError` for a missing or malformed file.
 
@@ -239,17 +313,24 @@ def load_mixture(name_or_path: Path | str) -> GraspMixture:
     path = mixture_path(name_or_path)
     tensors, meta = load_tensors(path, "mixture", {"weights", "means", "covariances"})
     if any(t.dtype != torch.float64 for t in tensors.values()):
-        raise ModelFileError("path", f"{path}: {[str(t.dtype) for t in tensors.values()]}", "float64 tensors")
+        raise ModelFileError(
+            "path", f"{path}: {[str(t.dtype) for t in tensors.values()]}", "float64 tensors"
+        )
     try:
-        names, regularisation = tuple(meta.pop("names").split()), float(meta.pop("regularisation"))
+        names = tuple(meta.pop("names").split())
+        regularisation = float(meta.pop("regularisation"))
         rest = {k: v for k, v in meta.items() if k not in ("kind", "version")}
         return GraspMixture(**tensors, names=names, regularisation=regularisation, meta=rest)
     except (KeyError, AttributeError, TypeError, ValueError) as error:
-        raise ModelFileError("path", f"{path}: {error}", "a mixture that GraspMixture.save wrote") from error
+        raise ModelFileError(
+            "path", f"{path}: {error}", "a mixture that GraspMixture.save wrote"
+        ) from error
 
 
 def mixture_path(name_or_path: Path | str) -> Path:
-    """Return the path of a mixture: a .safetensors path unchanged, or mixture.safetensors in a hand's folder."""
+    """Return the path of a mixture: a .safetensors path unchanged, or mixture.safetensors in a
+    hand's folder.
+    """
     if Path(name_or_path).suffix == ".safetensors":
         return Path(name_or_path)
     return find_hand(name_or_path) / "mixture.safetensors"

@@ -1,6 +1,8 @@
-"""Random postures of a hand without self-collision: the training data of its learned model (Sec. 4.1).
+"""Random postures of a hand without self-collision: the training data of its learned model (Sec.
+4.1).
 
-Round fingertips roll, so "grasping" samples have contacts beside the middle of a pad, which must allow force closure.
+Round fingertips roll, so "grasping" samples have contacts beside the middle of a pad, which must
+allow force closure.
 """
 
 import dataclasses
@@ -25,20 +27,26 @@ from torchgrasp.posture_model.mixture import describe_compatibility, encode_fing
 from torchgrasp.values.specs import ContactSpec
 
 ROLL = math.radians(25)  # deviation [rad] of either tilt of a contact direction from the pad's axis
-BALANCES = 200  # directions in the three-dimensional space of internal forces that are tried: 0.25 rad apart
+# directions in the three-dimensional space of internal forces that are tried: 0.25 rad apart
+BALANCES = 200
 
 
 def roll_contacts(
     hand: Hand, joints: Float[Tensor, "n h"], generator: np.random.Generator
 ) -> tuple[Float[Tensor, "n 3 3"], Float[Tensor, "n 3 3"]]:
-    """Return random contact points [m] and outward normals of fingertips that touch beside the middle of their pads.
+    """Return random contact points [m] and outward normals of fingertips that touch beside the
+    middle of their pads.
 
-    Both tilts of a contact direction are Gaussian, truncated to the pad's cone. The contact of a round tip moves along.
+    Both tilts of a contact direction are Gaussian, truncated to the pad's cone. The contact of a
+    round tip moves along.
     """
     points, axes = hand.fingertips(joints)
-    cone, radius = hand.tips.cone.to(axes), hand.tips.radius.to(axes)
+    cone = hand.tips.cone.to(axes)
+    radius = hand.tips.radius.to(axes)
     share, turn = torch.from_numpy(generator.random((2, len(joints), 3))).to(axes)
-    angle = ROLL * torch.sqrt(-2 * torch.log1p(-share * -torch.expm1(-0.5 * (cone / ROLL) ** 2)))  # Rayleigh's law
+    angle = ROLL * torch.sqrt(
+        -2 * torch.log1p(-share * -torch.expm1(-0.5 * (cone / ROLL) ** 2))
+    )  # Rayleigh's law
     (first, second), turn = across(axes), 2 * math.pi * turn[..., None]
     tilt = torch.cos(turn) * first + torch.sin(turn) * second
     normals = torch.cos(angle)[..., None] * axes + torch.sin(angle)[..., None] * tilt
@@ -46,10 +54,11 @@ def roll_contacts(
 
 
 def can_close(points: Float[Tensor, "n f 3"], normals: Float[Tensor, "n f 3"]) -> Bool[Tensor, "n"]:
-    """Return a mask of the postures of which some three contacts can balance forces in the friction cones, Eq. (13).
+    """Return a mask of the postures of which some three contacts can balance forces in the friction
+    cones, Eq. (13).
 
-    The search tries a grid of forces along the triangle's sides and can miss marginal cases. `normals` point into the
-    object.
+    The search tries a grid of forces along the triangle's sides and can miss marginal cases.
+    `normals` point into the object.
     """
     closed = torch.zeros(len(points), dtype=torch.bool, device=points.device)
     for three in itertools.combinations(range(points.shape[1]), 3):
@@ -58,7 +67,9 @@ def can_close(points: Float[Tensor, "n f 3"], normals: Float[Tensor, "n f 3"]) -
     return closed
 
 
-def _close_triples(points: Float[Tensor, "n 3 3"], normals: Float[Tensor, "n 3 3"]) -> Bool[Tensor, "n"]:
+def _close_triples(
+    points: Float[Tensor, "n 3 3"], normals: Float[Tensor, "n 3 3"]
+) -> Bool[Tensor, "n"]:
     """Return a mask of the contact triples that can balance forces inside their friction cones."""
     spread = 1 + ContactSpec().friction ** 2
     t12, t13, t23 = fibonacci_sphere(BALANCES).to(points).T
@@ -72,21 +83,26 @@ def _close_triples(points: Float[Tensor, "n 3 3"], normals: Float[Tensor, "n 3 3
     return closed.any(1)
 
 
-CHUNK_POSTURES = 10_000  # free postures from one generator; another number gives a seed other postures
+CHUNK_POSTURES = (
+    10_000  # free postures from one generator; another number gives a seed other postures
+)
 BLOCK_POSTURES = 2_000  # postures that a generator draws at a time; fixed for the same reason
 MAX_SAMPLES = 10**8  # most postures of one set: a hundred times the paper's million (Sec. 6.3).
 Sampling = Literal["uniform", "grasping"]
 """Which of the random postures without self-collision are taken.
 
-* "uniform": all postures are taken, as in the paper. Their fingertips touch with the middle of their pads.
-* "grasping": postures are taken whose contacts, where the rolled fingertips touch, can have force closure.
+* "uniform": all postures are taken, as in the paper. Their fingertips touch with the middle of
+  their pads.
+* "grasping": postures are taken whose contacts, where the rolled fingertips touch, can have force
+  closure.
 """
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class HandSamples(Batch):
-    """Postures of one hand: `joints` [rad], fingertip codes `q` (lengths [m], cosines); `meta`: hand, seed, sampling.
+    """Postures of one hand: `joints` [rad], fingertip codes `q` (lengths [m], cosines); `meta`:
+    hand, seed, sampling.
 
     >>> from torchgrasp import load_hand
     >>> samples = sample_configurations(load_hand("barrett"), 50)
@@ -107,10 +123,11 @@ class HandSamples(Batch):
 @checked
 @dataclasses.dataclass(frozen=True)
 class SampleSpec(Value):
-    """The settings by which `n` postures without self-collision are drawn; `Sampling` lists the ways to draw.
+    """The settings by which `n` postures without self-collision are drawn; `Sampling` lists the
+    ways to draw.
 
-    Chunk i depends only on (seed, i), so a smaller set of samples is the beginning of a larger set. Raises
-    `BadArgument` for values out of range.
+    Chunk i depends only on (seed, i), so a smaller set of samples is the beginning of a larger set.
+    Raises `BadArgument` for values out of range.
 
     >>> from torchgrasp import load_hand
     >>> SampleSpec(1000, seed=7).meta(load_hand("barrett"))["seed"]
@@ -123,7 +140,9 @@ class SampleSpec(Value):
 
     @checked
     def meta(self, hand: Hand) -> dict[str, str]:
-        """Return metadata that identifies the samples: hand, seed and sampling, without the number of samples."""
+        """Return metadata that identifies the samples: hand, seed and sampling, without the number
+        of samples.
+        """
         return {**describe_compatibility(hand), "seed": str(self.seed), "sampling": self.sampling}
 
 
@@ -136,10 +155,12 @@ def sample_configurations(
     sampling: Sampling = "uniform",
     observer: Callable[[int], object] = lambda count: None,
 ) -> HandSamples:
-    """Draw random postures within the joint limits, and keep `n` postures free of self-collision (Sec. 6.3).
+    """Draw random postures within the joint limits, and keep `n` postures free of self-collision
+    (Sec. 6.3).
 
-    `SampleSpec` explains n, seed and sampling. The observer is called with the size of every new chunk. Raises
-    `BadArgument` for an argument out of range, or a hand that collides with itself in almost all postures.
+    `SampleSpec` explains n, seed and sampling. The observer is called with the size of every new
+    chunk. Raises `BadArgument` for an argument out of range, or a hand that collides with itself in
+    almost all postures.
 
     >>> from torchgrasp.hand.load import load_hand
     >>> sample_configurations(load_hand("barrett"), 100).q.shape
@@ -158,20 +179,32 @@ def sample_configurations(
 
 
 def chunk_sizes(n: int) -> list[int]:
-    """Split n postures into chunks of `CHUNK_POSTURES`, of which the last has the rest; return the sizes."""
+    """Split n postures into chunks of `CHUNK_POSTURES`, of which the last has the rest; return the
+    sizes.
+    """
     return [min(CHUNK_POSTURES, n - first) for first in range(0, n, CHUNK_POSTURES)]
 
 
-def draw_chunk(hand: Hand, spec: SampleSpec, i: int) -> tuple[Float[Tensor, "n h"], Float[Tensor, "n q"], int]:
-    """Return joints [rad] and codes of the postures of chunk i, and how many postures were drawn to find them."""
-    least_kept = 1e-3  # least share of postures that are kept, after ten blocks: another hand would draw for hours
-    count, parts, kept = chunk_sizes(spec.n)[i], [], 0
+def draw_chunk(
+    hand: Hand, spec: SampleSpec, i: int
+) -> tuple[Float[Tensor, "n h"], Float[Tensor, "n q"], int]:
+    """Return joints [rad] and codes of the postures of chunk i, and how many postures were drawn to
+    find them.
+    """
+    # least share of postures that are kept, after ten blocks: another hand would draw for hours
+    least_kept = 1e-3
+    count = chunk_sizes(spec.n)[i]
+    parts = []
+    kept = 0
     blocks = _draw_blocks(hand, np.random.default_rng((spec.seed, i)), spec.sampling)
     while kept < count:
         parts.append(next(blocks))
-        kept, drawn = kept + len(parts[-1][0]), BLOCK_POSTURES * len(parts)
+        kept = kept + len(parts[-1][0])
+        drawn = BLOCK_POSTURES * len(parts)
         if kept < least_kept * drawn and len(parts) >= 10:
-            raise BadArgument("hand", f"{kept} kept of {drawn} postures", "a hand that can move freely")
+            raise BadArgument(
+                "hand", f"{kept} kept of {drawn} postures", "a hand that can move freely"
+            )
     joints, q = (torch.cat(tensors)[:count] for tensors in zip(*parts, strict=True))
     return joints, q, BLOCK_POSTURES * len(parts)
 
@@ -179,8 +212,11 @@ def draw_chunk(hand: Hand, spec: SampleSpec, i: int) -> tuple[Float[Tensor, "n h
 def _draw_blocks(
     hand: Hand, generator: np.random.Generator, sampling: Sampling
 ) -> Iterator[tuple[Float[Tensor, "n h"], Float[Tensor, "n q"]]]:
-    """Yield blocks of random postures without self-collision, without end: joints [rad] and contact codes."""
-    lower, upper = hand.lower.double(), hand.upper.double()
+    """Yield blocks of random postures without self-collision, without end: joints [rad] and contact
+    codes.
+    """
+    lower = hand.lower.double()
+    upper = hand.upper.double()
     while True:
         uniform = torch.from_numpy(generator.random((BLOCK_POSTURES, hand.dof))).to(lower.device)
         joints = torch.lerp(lower, upper, uniform)

@@ -1,4 +1,6 @@
-"""Quality of a learned model: errors on held-out postures (Sec. 6.3), and the BIC by number of components (Fig. 6)."""
+"""Quality of a learned model: errors on held-out postures (Sec. 6.3), and the BIC by number of
+components (Fig. 6).
+"""
 
 import dataclasses
 from collections.abc import Callable
@@ -14,7 +16,11 @@ from torchgrasp.posture_model.em import start_components
 from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, PAPER_ENERGY, GraspMixture
 from torchgrasp.posture_model.sample import HandSamples
 from torchgrasp.posture_model.stepwise import growing_fits
-from torchgrasp.posture_model.training import MAX_REGULARISATION, information_criterion, standardised_rows
+from torchgrasp.posture_model.training import (
+    MAX_REGULARISATION,
+    information_criterion,
+    standardised_rows,
+)
 
 COMPARED_MODES = 4  # modes of which the nearest is compared: a code has a few postures at most
 
@@ -24,9 +30,15 @@ class MixtureScore(Value):
     """Errors with which a learned model predicts the joints of held-out postures from their codes."""
 
     joint_names: tuple[str, ...]
-    error: Float[Tensor, "h"]  # mean absolute error of each joint [rad], predicted by the conditional mean, Eq. (23)
-    deviation: Float[Tensor, "h"]  # standard deviation of the absolute error over the postures [rad]
-    nearest_mode: float  # mean absolute error [rad] of the best of the `COMPARED_MODES` likeliest modes
+    error: Float[
+        Tensor, "h"
+    ]  # mean absolute error of each joint [rad], predicted by the conditional mean, Eq. (23)
+    deviation: Float[
+        Tensor, "h"
+    ]  # standard deviation of the absolute error over the postures [rad]
+    nearest_mode: (
+        float  # mean absolute error [rad] of the best of the `COMPARED_MODES` likeliest modes
+    )
     paper_coverage: float  # share of codes of energy below `PAPER_ENERGY`
     default_coverage: float  # share of codes of energy below `DEFAULT_ENERGY`
     log_likelihood: float  # mean over the postures [nats]
@@ -38,9 +50,13 @@ class MixtureScore(Value):
         return float(self.error.mean())
 
     def __str__(self) -> str:
-        """Return a table of the errors (Table 5, Fig. 8) and the fraction of codes within reach (Eq. 21)."""
+        """Return a table of the errors (Table 5, Fig. 8) and the fraction of codes within reach
+        (Eq. 21).
+        """
         rows = zip(self.joint_names, self.error.tolist(), self.deviation.tolist(), strict=True)
-        joints = "\n".join(f"  {name:20s} {error:.3f} +- {deviation:.3f}" for name, error, deviation in rows)
+        joints = "\n".join(
+            f"  {name:20s} {error:.3f} +- {deviation:.3f}" for name, error, deviation in rows
+        )
         return (
             f"mean absolute error on {self.postures} held-out postures [rad]: Eq. (23) +- deviation over postures\n"
             f"{joints}\n  {'all joints':20s} {self.mean_error:.3f}; "
@@ -65,10 +81,13 @@ class MixtureScore(Value):
 def evaluate_mixture(mixture: GraspMixture, samples: HandSamples) -> MixtureScore:
     """Return the errors of a model on held-out postures; there must be at least two postures."""
     if samples.joint_names != mixture.joint_names:
-        raise BadArgument("samples", f"joints {samples.joint_names}", f"the mixture's {mixture.joint_names}")
+        raise BadArgument(
+            "samples", f"joints {samples.joint_names}", f"the mixture's {mixture.joint_names}"
+        )
     if len(samples) < 2:
         raise BadArgument("samples", f"{len(samples)} postures", "at least 2")
-    joints, q = samples.joints.double(), samples.q.double()
+    joints = samples.joints.double()
+    q = samples.q.double()
     error = (mixture.joints(q) - joints).abs()
     modes = mixture.modes(q, min(COMPARED_MODES, len(mixture.weights)))[0]
     energy = mixture.energy(q)
@@ -93,28 +112,41 @@ class BicCurve(Value):
 
     def __str__(self) -> str:
         """Return the BIC values as a table, with their minimum."""
-        rows = [f"  {m:3d} {b:14.0f}" for m, b in zip(self.components.tolist(), self.bic.tolist(), strict=True)]
+        rows = [
+            f"  {m:3d} {b:14.0f}"
+            for m, b in zip(self.components.tolist(), self.bic.tolist(), strict=True)
+        ]
         least = int(self.components[self.bic.argmin()])
-        end = ", the largest asked for: no minimum is seen" if least == int(self.components.max()) else ""
+        end = (
+            ", the largest asked for: no minimum is seen"
+            if least == int(self.components.max())
+            else ""
+        )
         return "\n".join(["    m            BIC", *rows, f"least at {least}{end}"])
 
 
 @checked
-def growing_bic(samples: HandSamples, most: Count = 64, observer: Callable[[int], object] = lambda m: None) -> BicCurve:
+def growing_bic(
+    samples: HandSamples, most: Count = 64, observer: Callable[[int], object] = lambda m: None
+) -> BicCurve:
     """Return the BIC of 1 to `most` Gaussians (Fig. 6 b, d). Each fit grows from the one before.
 
-    The heaviest Gaussian of a fit is split across its longest axis, and EM continues. The fits take no random number.
-    The criterion belongs to the given postures: more postures support more Gaussians. Codes of "uniform" samples are
-    exact functions of the joints, so the BIC falls without end. For "grasping" samples, whose fingertips roll, the BIC
-    has a minimum. The observer is called with each number of Gaussians. Raises errors as `fit_mixture`.
+    The heaviest Gaussian of a fit is split across its longest axis, and EM continues. The fits take
+    no random number. The criterion belongs to the given postures: more postures support more
+    Gaussians. Codes of "uniform" samples are exact functions of the joints, so the BIC falls
+    without end. For "grasping" samples, whose fingertips roll, the BIC has a minimum. The observer
+    is called with each number of Gaussians. Raises errors as `fit_mixture`.
 
     >>> numbers = torch.rand(500, 7, generator=torch.Generator().manual_seed(0))
     >>> growing_bic(HandSamples(numbers[:, :1], numbers[:, 1:], ("knuckle",)), most=3).components
     tensor([1, 2, 3])
     """
     shard, _, scale = standardised_rows(samples, most)
-    start, criterion = start_components(shard, 1, 0, MAX_REGULARISATION), []
-    for m, fit in zip(range(1, most + 1), growing_fits(shard, start, 100, 1e-3, MAX_REGULARISATION), strict=False):
+    start = start_components(shard, 1, 0, MAX_REGULARISATION)
+    criterion = []
+    for m, fit in zip(
+        range(1, most + 1), growing_fits(shard, start, 100, 1e-3, MAX_REGULARISATION), strict=False
+    ):
         log_likelihood = float(fit.log_likelihood[-1] - scale.log().sum())  # in the samples' units
         criterion.append(information_criterion(fit.components, len(samples), log_likelihood))
         observer(m)

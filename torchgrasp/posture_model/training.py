@@ -14,7 +14,13 @@ from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.foundation.base import check_whole
 from torchgrasp.foundation.checks import Count, Fraction, Range, Seed, checked
 from torchgrasp.foundation.errors import BadArgument, ModelFileError
-from torchgrasp.posture_model.em import Components, DataRows, FitProgress, expectation_maximisation, start_components
+from torchgrasp.posture_model.em import (
+    Components,
+    DataRows,
+    FitProgress,
+    expectation_maximisation,
+    start_components,
+)
 from torchgrasp.posture_model.mixture import CODE_NAMES, GraspMixture
 from torchgrasp.posture_model.sample import HandSamples
 from torchgrasp.posture_model.stepwise import Subsets, fit_subsets, halves, likeliest_fit
@@ -25,9 +31,11 @@ TRIAL_STEPS = 20  # steps of EM before starts are compared; a whole fit takes so
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
-    """The checkpoint file of one fit; without a `path` there is none. Process 0 writes it, all processes read it.
+    """The checkpoint file of one fit; without a `path` there is none. Process 0 writes it, all
+    processes read it.
 
-    `centre` and `scale`, the data's mean and standard deviation, identify the data; `settings` identify the fit.
+    `centre` and `scale`, the data's mean and standard deviation, identify the data; `settings`
+    identify the fit.
     """
 
     path: Path | None
@@ -46,39 +54,61 @@ class Checkpoint:
         save_tensors(self.path, "em", tensors, meta)
 
     def load(self) -> FitProgress | None:
-        """Return the saved state, or None without a file; raises `ModelFileError`, or `BadArgument` for another fit."""
+        """Return the saved state, or None without a file; raises `ModelFileError`, or `BadArgument`
+        for another fit.
+        """
         progress = self._read(self.path) if self.path and self.path.exists() else None
         steps = len(progress.log_likelihood) if progress else 0
-        # Processes at different steps would wait for each other for ever. Equal steps have no variance.
-        total, squares = self.shard.sum(torch.tensor([steps, steps**2], device=self.centre.device)).tolist()
+        # Processes at different steps would wait for each other for ever. Equal steps have no
+        # variance.
+        total, squares = self.shard.sum(
+            torch.tensor([steps, steps**2], device=self.centre.device)
+        ).tolist()
         if squares * self.shard.processes != total**2:
             found = "a file that some processes see and others do not"
             raise BadArgument("checkpoint", found, "a file for all of them")
         return progress
 
     def _read(self, path: Path) -> FitProgress:
-        """Read the progress of an EM fit from a checkpoint; raise an error if it is not of this fit."""
-        m, d = int(self.settings["components"]), len(self.centre)
+        """Read the progress of an EM fit from a checkpoint; raise an error if it is not of this
+        fit.
+        """
+        m = int(self.settings["components"])
+        d = len(self.centre)
         shapes = {"weights": (m,), "means": (m, d), "covariances": (m, d, d), "reseeded": (m,)}
         shapes |= {"log_likelihood": (-1,), "centre": (d,), "scale": (d,)}
         tensors, meta = load_tensors(path, "em", set(shapes))
         other = {k: meta.get(k) for k, v in self.settings.items() if meta.get(k) != v}
         for name, ours in (("centre", self.centre), ("scale", self.scale)):
             saved = tensors[name].to(ours)
-            if saved.shape != ours.shape or not torch.allclose(saved, ours, rtol=1e-9, atol=1e-12):  # order of the sum
+            if saved.shape != ours.shape or not torch.allclose(
+                saved, ours, rtol=1e-9, atol=1e-12
+            ):  # order of the sum
                 other[name] = "of other data"
         if other:
-            allowed = f"a new file, or the checkpoint of this fit: {self.settings} and the same data"
+            allowed = (
+                f"a new file, or the checkpoint of this fit: {self.settings} and the same data"
+            )
             raise BadArgument("checkpoint", f"{path}: {other}", allowed)
         for name, shape in shapes.items():
-            t, dtype = tensors[name], torch.int64 if name == "reseeded" else torch.float64
+            t = tensors[name]
+            dtype = torch.int64 if name == "reseeded" else torch.float64
             if (shape != (-1,) and t.shape != shape) or t.dtype != dtype:
-                raise ModelFileError("checkpoint", f"{path}: {name} {tuple(t.shape)} {t.dtype}", str(shape))
+                raise ModelFileError(
+                    "checkpoint", f"{path}: {name} {tuple(t.shape)} {t.dtype}", str(shape)
+                )
         sizes = {str(size): size for size in halves(int(self.settings["rows"]))}
         if (step_rows := meta.get("step_rows", "")) not in sizes:
-            raise ModelFileError("checkpoint", f"{path}: a step on {step_rows!r} rows", f"one of {list(sizes)}")
+            raise ModelFileError(
+                "checkpoint", f"{path}: a step on {step_rows!r} rows", f"one of {list(sizes)}"
+            )
         components = Components(tensors["weights"], tensors["means"], tensors["covariances"])
-        state = tensors["reseeded"], tensors["log_likelihood"], meta.get("jumped") == "True", sizes[step_rows]
+        state = (
+            tensors["reseeded"],
+            tensors["log_likelihood"],
+            meta.get("jumped") == "True",
+            sizes[step_rows],
+        )
         return FitProgress(components, *state).to(self.centre.device)
 
 
@@ -97,27 +127,27 @@ def fit_mixture(
     distributed: bool = False,
     observer: Callable[[FitProgress], None] = lambda progress: None,
 ) -> GraspMixture:
-    """Fit the mixture of Eqs. (19)-(20) to sampled postures by expectation-maximisation, initialised by k-means.
+    """Fit the mixture of Eqs. (19)-(20) to sampled postures by expectation-maximisation,
+    initialised by k-means.
 
-    The mixture's `meta` reports iterations, convergence, collapsed components, mean log-likelihood and the Bayesian
-    information criterion (BIC). Codes are exact functions of the joints, so the BIC keeps falling with more components:
-    use its elbow, not its minimum. Raises `BadArgument` for too few samples, a joint that does not vary, a number out
-    of range, or another fit's checkpoint. A checkpoint that is damaged or cannot be written is a `ModelFileError` or
-    `OutputError`. A component that collapsed more than three times is an `IndefiniteCovariance`.
+    The mixture's `meta` reports iterations, convergence, collapsed components, mean log-likelihood
+    and the Bayesian information criterion (BIC). Codes are exact functions of the joints, so the
+    BIC keeps falling with more components: use its elbow, not its minimum. Raises `BadArgument` for
+    too few samples, a joint that does not vary, a number out of range, or another fit's checkpoint.
+    A checkpoint that is damaged or cannot be written is a `ModelFileError` or `OutputError`. A
+    component that collapsed more than three times is an `IndefiniteCovariance`.
 
-    Args:
-        samples: joints [rad] and fingertip codes of postures of one hand.
-        components: number m of Gaussians.
-        iterations: largest number of steps.
-        tolerance: stop when a step raises the mean log-likelihood by less [nats].
-        regularisation: variance added to every dimension of a component, relative to its variance over all samples.
-        starts: number of k-means initialisations, with consecutive seeds. After a few steps of each, the fit of the
-            greatest likelihood continues.
-        subset: least number of rows of nested random subsets, each half of the next. EM fits one after the other, and
-            all rows at last. Every start is fitted to the smaller subsets. By default, EM sees all rows in each step.
-        checkpoint: file that stores the fit after every step. A fit that continues from it gives the same bits.
-        distributed: whether `samples` are only the part of this process under torchrun. All processes must see the same
-            checkpoint.
+    Args: samples: joints [rad] and fingertip codes of postures of one hand. components: number m of
+        Gaussians. iterations: largest number of steps. tolerance: stop when a step raises the mean
+        log-likelihood by less [nats]. regularisation: variance added to every dimension of a
+        component, relative to its variance over all samples. starts: number of k-means
+        initialisations, with consecutive seeds. After a few steps of each, the fit of the greatest
+        likelihood continues. subset: least number of rows of nested random subsets, each half of
+        the next. EM fits one after the other, and all rows at last. Every start is fitted to the
+        smaller subsets. By default, EM sees all rows in each step. checkpoint: file that stores the
+        fit after every step. A fit that continues from it gives the same bits. distributed: whether
+        `samples` are only the part of this process under torchrun. All processes must see the same
+        checkpoint.
 
     >>> import torch
     >>> numbers = torch.rand(500, 7, generator=torch.Generator().manual_seed(0))
@@ -127,14 +157,25 @@ def fit_mixture(
     shard, centre, scale = standardised_rows(samples, components, distributed)
     if subset is not None and subset < (least := components * (len(scale) + 2)):
         raise BadArgument("subset", subset, f"at least {least}")
-    n, subsets = shard.count(), Subsets.of(shard, subset, seed)
-    fixed = {"rows": n, "components": components, "seed": seed, "starts": starts, "regularisation": regularisation}
+    n = shard.count()
+    subsets = Subsets.of(shard, subset, seed)
+    fixed = {
+        "rows": n,
+        "components": components,
+        "seed": seed,
+        "starts": starts,
+        "regularisation": regularisation,
+    }
     settings = {name: str(value) for name, value in (fixed | {"subset": subset}).items()}
-    saved = Checkpoint(None if checkpoint is None else Path(checkpoint), shard, centre, scale, settings)
+    saved = Checkpoint(
+        None if checkpoint is None else Path(checkpoint), shard, centre, scale, settings
+    )
     start = saved.load()
     if start is None:
         first = subsets.take(subsets.sizes[0])
-        begun = [start_components(first, components, seed + k, regularisation) for k in range(starts)]
+        begun = [
+            start_components(first, components, seed + k, regularisation) for k in range(starts)
+        ]
         if subset is None:
             start = _likeliest(shard, begun, regularisation)
         else:
@@ -159,8 +200,11 @@ def fit_mixture(
     }
     report |= {} if subset is None else {"fit_subset": str(subset)}
     names = (*samples.joint_names, *CODE_NAMES)
-    means, covariances = fit.components.means * scale + centre, fit.components.covariances * scale[:, None] * scale
-    return GraspMixture(fit.components.weights, means, covariances, names, regularisation, samples.meta | report)
+    means = fit.components.means * scale + centre
+    covariances = fit.components.covariances * scale[:, None] * scale
+    return GraspMixture(
+        fit.components.weights, means, covariances, names, regularisation, samples.meta | report
+    )
 
 
 def information_criterion(components: Components, n: int, log_likelihood: float) -> float:
@@ -173,30 +217,47 @@ def information_criterion(components: Components, n: int, log_likelihood: float)
 def standardised_rows(
     samples: HandSamples, components: int, distributed: bool = False
 ) -> tuple[DataRows, Float[Tensor, "d"], Float[Tensor, "d"]]:
-    """Return rows of mean 0 and variance 1, and the original means and deviations; refuse too few samples."""
+    """Return rows of mean 0 and variance 1, and the original means and deviations; refuse too few
+    samples.
+    """
     if samples.q.shape[1] != len(CODE_NAMES):
-        raise BadArgument("samples", f"codes of {samples.q.shape[1]} numbers", "codes of three fingertips: six numbers")
-    shard = DataRows.of(samples.rows().double(), distributed)  # a copy, which is standardised in place
-    n, least = shard.count(), shard.rows.shape[1] + 2  # fewer samples leave the covariance of d dimensions singular
+        raise BadArgument(
+            "samples",
+            f"codes of {samples.q.shape[1]} numbers",
+            "codes of three fingertips: six numbers",
+        )
+    shard = DataRows.of(
+        samples.rows().double(), distributed
+    )  # a copy, which is standardised in place
+    # fewer samples leave the covariance of d dimensions singular
+    n = shard.count()
+    least = shard.rows.shape[1] + 2
     if n < least:
         raise BadArgument("samples", f"{n} samples", f"at least {least}")
     check_whole("components", components, 1, n // least)
-    x, names = shard.rows, (*samples.joint_names, *CODE_NAMES)
+    x = shard.rows
+    names = (*samples.joint_names, *CODE_NAMES)
     centre = shard.sum(x.sum(0)) / n
     x.sub_(centre)
     scale = (shard.sum(x.square().sum(0)) / n).sqrt()
     constant = (scale <= 1e-9 * (1 + centre.abs())).tolist()
     if any(constant):
         found = ", ".join(name for name, c in zip(names, constant, strict=True) if c)
-        raise BadArgument("samples", f"no variation in {found}", "samples that vary in every dimension")
+        raise BadArgument(
+            "samples", f"no variation in {found}", "samples that vary in every dimension"
+        )
     x.div_(scale)
     return shard, centre, scale
 
 
 def _likeliest(shard: DataRows, starts: list[FitProgress], regularisation: float) -> FitProgress:
-    """Run `TRIAL_STEPS` EM steps from each initial state; return the result of the greatest likelihood."""
+    """Run `TRIAL_STEPS` EM steps from each initial state; return the result of the greatest
+    likelihood.
+    """
     if len(starts) == 1:
         return starts[0]
-    fits = [expectation_maximisation(shard, start, TRIAL_STEPS, 0.0, regularisation) for start in starts]
+    fits = [
+        expectation_maximisation(shard, start, TRIAL_STEPS, 0.0, regularisation) for start in starts
+    ]
     best = max(fits, key=lambda fit: float(fit.log_likelihood[-1]))
     return FitProgress(best.components, best.reseeded, best.log_likelihood[:-1], best.jumped)

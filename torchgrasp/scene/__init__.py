@@ -1,4 +1,6 @@
-"""Scenes: objects on a table as one camera saw them, with the free and the hidden space around them."""
+"""Scenes: objects on a table as one camera saw them, with the free and the hidden space around
+them.
+"""
 
 from torchgrasp.scene.occupancy import Occupancy, estimate_occupancy
 

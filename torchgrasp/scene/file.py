@@ -18,11 +18,12 @@ from torchgrasp.scene.scene import Scene
 def read_scene(path: Path | str) -> Scene:
     """Read a scene from the arrays in a .npz file, with the checks of `Scene.from_depth`.
 
-    The file has `depth` (h, w) [m, or whole mm] and `intrinsics` (3, 3) or (4,). Optional are `camera_pose` (4, 4), the
-    objects' `labels` or the target's `mask` (h, w), the label `target`, the `table` (4,) as normal and offset, and
-    `given`, the labels that the user made. If `given` is missing, the user made all labels, unless there is a table, as
-    in scenes that the library saved. Raises the errors of `Scene.from_depth`, and `CloudFileError` for no such file, or
-    malformed content.
+    The file has `depth` (h, w) [m, or whole mm] and `intrinsics` (3, 3) or (4,). Optional are
+    `camera_pose` (4, 4), the objects' `labels` or the target's `mask` (h, w), the label `target`,
+    the `table` (4,) as normal and offset, and `given`, the labels that the user made. If `given` is
+    missing, the user made all labels, unless there is a table, as in scenes that the library saved.
+    Raises the errors of `Scene.from_depth`, and `CloudFileError` for no such file, or malformed
+    content.
 
     >>> import tempfile
     >>> from torchgrasp import load_scene
@@ -31,11 +32,14 @@ def read_scene(path: Path | str) -> Scene:
     """
     arrays = read_arrays(Path(path))
     table, pose, target = (arrays.pop(name, None) for name in ("table", "camera_pose", "target"))
-    others, bounded = arrays.pop("others", np.empty((0, 4))), bool(arrays.pop("bounded", True))
+    others = arrays.pop("others", np.empty((0, 4)))
+    bounded = bool(arrays.pop("bounded", True))
     given = arrays.pop("given", [] if table is not None and "labels" in arrays else None)
     rows = [] if table is None else [table, *others]
     plane, *rest = [Plane(torch.tensor(row[:3]), float(row[3])) for row in rows] or [None]
-    scene = Scene.from_depth(arrays.pop("depth"), arrays.pop("intrinsics"), pose, **arrays, table=plane)
+    scene = Scene.from_depth(
+        arrays.pop("depth"), arrays.pop("intrinsics"), pose, **arrays, table=plane
+    )
     own = scene.given if given is None else tuple(label for label in scene.things if label in given)
     image = dataclasses.replace(scene.image, bounded=bounded)
     scene = dataclasses.replace(scene, image=image, others=(*rest, *scene.others), given=own)
@@ -44,7 +48,8 @@ def read_scene(path: Path | str) -> Scene:
 
 @checked
 def save_scene(scene: Scene, path: Path | str) -> Path:
-    """Write a scene as .npz, atomically: depth in float32, labels, camera, table and target; `read_scene` reads it.
+    """Write a scene as .npz, atomically: depth in float32, labels, camera, table and target;
+    `read_scene` reads it.
 
     Raises `OutputError`, and `BadArgument` for another suffix.
 
@@ -68,7 +73,9 @@ def save_scene(scene: Scene, path: Path | str) -> Path:
     if scene.table is not None:
         arrays["table"] = np.array([*scene.table.normal.tolist(), scene.table.offset])
     if scene.others:
-        arrays["others"] = np.array([[*plane.normal.tolist(), plane.offset] for plane in scene.others])
+        arrays["others"] = np.array(
+            [[*plane.normal.tolist(), plane.offset] for plane in scene.others]
+        )
     if scene.target is not None:
         arrays["target"] = np.array(scene.target)
     return write_file(path, lambda file: np.savez_compressed(file, **arrays))  # pyright: ignore[reportArgumentType]

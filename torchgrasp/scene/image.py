@@ -39,23 +39,34 @@ class DepthImage(Value):
 
     @property
     def frustum(self) -> Float[Tensor, "4 3"] | None:
-        """Inward normals of the sides of the camera's view, in the frame `obj`; None if the image has no border."""
+        """Inward normals of the sides of the camera's view, in the frame `obj`; None if the image
+        has no border.
+        """
         if not self.bounded:
             return None
-        return rotate(self.obj_from_camera.double(), frustum_of_image(self.intrinsics.double(), self.depth.shape))
+        return rotate(
+            self.obj_from_camera.double(),
+            frustum_of_image(self.intrinsics.double(), self.depth.shape),
+        )
 
     @checked
     def to_upright(self, obj_from_upright: Pose) -> "DepthImage":
         """Return the image with the camera's pose given in an upright frame and rounded."""
-        pose = inverse(obj_from_upright.double()).to(self.obj_from_camera.device) @ self.obj_from_camera.double()
+        pose = (
+            inverse(obj_from_upright.double()).to(self.obj_from_camera.device)
+            @ self.obj_from_camera.double()
+        )
         return dataclasses.replace(self, obj_from_camera=torch.round(pose / GRID**1.5) * GRID**1.5)
 
     def points(self) -> Float[Tensor, "h w 3"]:
         """Return the point [m] of every pixel; the camera's position where nothing was measured."""
-        z, k = self.depth.double(), self.intrinsics.double()
+        z = self.depth.double()
+        k = self.intrinsics.double()
         row = torch.arange(z.shape[0], dtype=z.dtype, device=z.device)[:, None]
         column = torch.arange(z.shape[1], dtype=z.dtype, device=z.device)
-        camera = torch.stack([z * (column - k[0, 2]) / k[0, 0], z * (row - k[1, 2]) / k[1, 1], z], -1)
+        camera = torch.stack(
+            [z * (column - k[0, 2]) / k[0, 0], z * (row - k[1, 2]) / k[1, 1], z], -1
+        )
         return apply(self.obj_from_camera.double(), camera.reshape(-1, 3)).reshape(*z.shape, 3)
 
     def at_border(self, pixels: Int[Tensor, "n 2"]) -> bool:
@@ -65,7 +76,9 @@ class DepthImage(Value):
         return self.bounded and int(reaching.sum()) >= 5  # fewer are noise
 
     def without_speckle(self) -> "DepthImage":
-        """Return the image in which each depth is the median of the measured depths in its 3 x 3 square of pixels."""
+        """Return the image in which each depth is the median of the measured depths in its 3 x 3
+        square of pixels.
+        """
         depth = self.depth.numpy()
         padded = np.pad(np.where(depth > 0, depth, np.nan), 1, constant_values=np.nan)
         squares = np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).reshape(*depth.shape, 9)
@@ -79,26 +92,41 @@ class DepthImage(Value):
 def read_image(
     depth: Array, intrinsics: object, camera_pose: Array | None, depth_unit: float | None = None
 ) -> DepthImage:
-    """Return a checked depth image in float64 [m]; without a camera pose, its frame is the camera's own."""
+    """Return a checked depth image in float64 [m]; without a camera pose, its frame is the camera's
+    own.
+    """
     z, k, _ = read_depth(depth, intrinsics, depth_unit=depth_unit)
-    pose = torch.eye(4, dtype=torch.float64) if camera_pose is None else read_camera_pose(camera_pose).cpu()
+    pose = (
+        torch.eye(4, dtype=torch.float64)
+        if camera_pose is None
+        else read_camera_pose(camera_pose).cpu()
+    )
     if int((z > 0).sum()) < LEAST_PIXELS:
-        raise BadArgument("depth", f"{int((z > 0).sum())} measured pixels", f"at least {LEAST_PIXELS}")
+        raise BadArgument(
+            "depth", f"{int((z > 0).sum())} measured pixels", f"at least {LEAST_PIXELS}"
+        )
     return DepthImage(z.cpu(), k.cpu(), pose)
 
 
 def label_radii(points: Float[Tensor, "h w 3"], labels: Int[Tensor, "h w"]) -> Float[Tensor, "k"]:
-    """Return, for each label, the root mean square distance [m] of the label's points from their mean."""
-    label, own = labels.reshape(-1), points.reshape(-1, 3)
+    """Return, for each label, the root mean square distance [m] of the label's points from their
+    mean.
+    """
+    label = labels.reshape(-1)
+    own = points.reshape(-1, 3)
     count = torch.bincount(label).clamp_min(1)
     mean = torch.stack([torch.bincount(label, weights=x) / count for x in own.unbind(-1)], -1)
     return (torch.bincount(label, weights=(own - mean[label]).square().sum(-1)) / count).sqrt()
 
 
-def image_of_cloud(points: Points, viewpoint: Vector, up: Vector) -> tuple[DepthImage, Int[Tensor, "n 2"]]:
-    """Return the depth image that a pinhole camera at the viewpoint takes of a cloud, and each point's row and column.
+def image_of_cloud(
+    points: Points, viewpoint: Vector, up: Vector
+) -> tuple[DepthImage, Int[Tensor, "n 2"]]:
+    """Return the depth image that a pinhole camera at the viewpoint takes of a cloud, and each
+    point's row and column.
 
-    The upright camera looks at the middle of the points. A pixel covers about two points and keeps the nearest.
+    The upright camera looks at the middle of the points. A pixel covers about two points and keeps
+    the nearest.
     """
     forward = unit(unit(points - viewpoint).mean(0))
     down = -up + (up @ forward) * forward
@@ -108,10 +136,19 @@ def image_of_cloud(points: Points, viewpoint: Vector, up: Vector) -> tuple[Depth
     down = unit(down)
     pose = rigid(torch.stack([torch.linalg.cross(down, forward), down, forward], -1), viewpoint)
     camera = apply(inverse(pose), points)
-    flat, widest = camera[:, :2] / camera[:, 2:], 75.0  # [deg]
-    if not bool((camera[:, 2] > 0).all()) or float(flat.norm(dim=-1).max()) > math.tan(math.radians(widest)):
-        raise BadArgument("cloud", "points all around the camera", f"a view within {widest:g} degrees of its middle")
-    low, high = flat.amin(0), flat.amax(0)
+    # [deg]
+    flat = camera[:, :2] / camera[:, 2:]
+    widest = 75.0
+    if not bool((camera[:, 2] > 0).all()) or float(flat.norm(dim=-1).max()) > math.tan(
+        math.radians(widest)
+    ):
+        raise BadArgument(
+            "cloud",
+            "points all around the camera",
+            f"a view within {widest:g} degrees of its middle",
+        )
+    low = flat.amin(0)
+    high = flat.amax(0)
     extent = (high - low).clamp_min(1e-6)
     cells = ((flat - low) / extent * 63.999).long()
     filled = len((cells[:, 0] * 64 + cells[:, 1]).unique()) / 64**2
@@ -120,7 +157,9 @@ def image_of_cloud(points: Points, viewpoint: Vector, up: Vector) -> tuple[Depth
     width, height = (int(side) + 1 for side in (extent / pixel).tolist())
     middle = (low + high) / 2
     centre = torch.tensor([(width - 1) / 2, (height - 1) / 2], dtype=points.dtype) - middle / pixel
-    k = torch.tensor([[1 / pixel, 0, centre[0]], [0, 1 / pixel, centre[1]], [0, 0, 1]], dtype=torch.float64)
+    k = torch.tensor(
+        [[1 / pixel, 0, centre[0]], [0, 1 / pixel, centre[1]], [0, 0, 1]], dtype=torch.float64
+    )
     column, row = torch.round(flat / pixel + centre).long().unbind(-1)
     pixels = torch.stack([row.clamp(0, height - 1), column.clamp(0, width - 1)], -1)
     depth = torch.full((height * width,), torch.inf, dtype=torch.float64)
@@ -130,7 +169,9 @@ def image_of_cloud(points: Points, viewpoint: Vector, up: Vector) -> tuple[Depth
 
 
 def read_arrays(path: Path) -> dict[str, Any]:
-    """Return the arrays in a scene's .npz file by name, converted to the types and shapes that a scene needs."""
+    """Return the arrays in a scene's .npz file by name, converted to the types and shapes that a
+    scene needs.
+    """
     typed = {
         "table": (float, 4),
         "others": (float, (-1, 4)),

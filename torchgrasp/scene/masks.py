@@ -17,16 +17,19 @@ from torchgrasp.scene.image import LEAST_PIXELS, DepthImage
 from torchgrasp.scene.segment import count_labels, rests_on, segment
 
 MOST_LABELS = 1000  # more values are those of a photograph
-MASK_SHARE = 0.05  # least share of a mask's pixels on the target: a third of a box drawn around an object are
+# least share of a mask's pixels on the target: a third of a box drawn around an object are
+MASK_SHARE = 0.05
 
 
 def read_labels(labels: Any, shape: tuple[int, ...], name: str = "labels") -> Int[Tensor, "..."]:
-    """Return checked labels of the depth's or the cloud's shape: whole numbers >= 0, where 0 means no object.
+    """Return checked labels of the depth's or the cloud's shape: whole numbers >= 0, where 0 means
+    no object.
 
-    The labels are numbers of any type in the given shape, or with one more axis of length 1; a picture (h, w, 3 or 4)
-    with a colour for each object, where black and transparent mean no object; a list of masks, where a smaller mask
-    lies above a larger one; a mask as COCO's run lengths {"size": [h, w], "counts": ...}, or in a dict as its
-    "segmentation"; or a dict with a list of "annotations".
+    The labels are numbers of any type in the given shape, or with one more axis of length 1; a
+    picture (h, w, 3 or 4) with a colour for each object, where black and transparent mean no
+    object; a list of masks, where a smaller mask lies above a larger one; a mask as COCO's run
+    lengths {"size": [h, w], "counts": ...}, or in a dict as its "segmentation"; or a dict with a
+    list of "annotations".
     """
     if isinstance(labels, Mapping) and "annotations" in labels:
         labels = labels["annotations"]
@@ -34,25 +37,33 @@ def read_labels(labels: Any, shape: tuple[int, ...], name: str = "labels") -> In
     if masks is None:
         read = _read_one(labels, shape, name)
         if (count := len(read.unique())) > MOST_LABELS + 1:
-            raise BadArgument(name, f"{count} values, as of a photograph", f"at most {MOST_LABELS} objects")
+            raise BadArgument(
+                name, f"{count} values, as of a photograph", f"at most {MOST_LABELS} objects"
+            )
         return read
     if len(masks) > MOST_LABELS:
         raise BadArgument(name, f"{len(masks)} masks", f"at most {MOST_LABELS}")
-    stack, size = torch.zeros(shape, dtype=torch.long), torch.zeros(shape, dtype=torch.long)
+    stack = torch.zeros(shape, dtype=torch.long)
+    size = torch.zeros(shape, dtype=torch.long)
     for k, mask in enumerate(masks, start=1):
         inside = _read_one(mask, shape, name) > 0
         own = int(inside.sum())
         above = inside & ((stack == 0) | (own <= size))
-        stack[above], size[above] = k, own
+        stack[above] = k
+        size[above] = own
     return stack
 
 
 def _masks(labels: Any, shape: tuple[int, ...]) -> Any:
-    """Return several masks, given as a list or as an array (k, h, w) or (k, 1, h, w); None for anything else."""
+    """Return several masks, given as a list or as an array (k, h, w) or (k, 1, h, w); None for
+    anything else.
+    """
     if isinstance(labels, Tensor | np.ndarray):
         several = len(shape) == 2 and tuple(labels.shape[1:]) in (shape, (1, *shape))
         return labels.reshape(-1, *shape) if several else None
-    with contextlib.suppress(ValueError, TypeError, KeyError):  # of rows of different length, and of other types
+    with contextlib.suppress(
+        ValueError, TypeError, KeyError
+    ):  # of rows of different length, and of other types
         if len(labels) and (isinstance(labels[0], Mapping) or np.ndim(labels[0]) >= 2):
             return labels
     return None
@@ -72,46 +83,70 @@ def _read_one(labels: Any, shape: tuple[int, ...], name: str) -> Int[Tensor, "..
     except (TypeError, ValueError, OverflowError) as error:
         raise BadArgument(name, type(labels).__name__, whole) from error
     if read.shape == (*shape, 1):
-        read, numbers = read[..., 0], numbers[..., 0]
+        read = read[..., 0]
+        numbers = numbers[..., 0]
     if len(shape) == 2 and read.shape in ((*shape, 3), (*shape, 4)) and exact:
         colour = numbers[..., :3] * (numbers[..., 3:] > 0) if read.shape[-1] == 4 else numbers
         packed = torch.from_numpy(np.abs(colour) @ np.array([1 << 32, 1 << 16, 1]))
-        return torch.cat([packed.new_zeros(1), packed.reshape(-1)]).unique(return_inverse=True)[1][1:].reshape(shape)
+        return (
+            torch.cat([packed.new_zeros(1), packed.reshape(-1)])
+            .unique(return_inverse=True)[1][1:]
+            .reshape(shape)
+        )
     if read.shape != tuple(shape) or not exact:
         raise BadArgument(name, f"shape {read.shape}, {read.dtype}", whole)
     if (numbers < 0).any():
-        raise BadArgument(name, int(numbers.min()), "labels >= 0; 0 is the table and all that is no object")
+        raise BadArgument(
+            name, int(numbers.min()), "labels >= 0; 0 is the table and all that is no object"
+        )
     return torch.from_numpy(numbers)
 
 
 def read_mask(mask: Any, shape: tuple[int, ...]) -> Bool[Tensor, "..."]:
-    """Return the boolean mask of one object, in any form that `read_labels` takes; refuse none and several objects."""
+    """Return the boolean mask of one object, in any form that `read_labels` takes; refuse none and
+    several objects.
+    """
     labels = read_labels(mask, shape, "mask")
     found = labels[labels > 0].unique()
     if not len(found):
         raise BadArgument("mask", "no pixel inside", "a mask that is not 0 at the object's pixels")
     if len(found) > 1:
-        raise BadArgument("mask", f"{len(found)} values beside 0", "one object; give several objects as labels")
+        raise BadArgument(
+            "mask", f"{len(found)} values beside 0", "one object; give several objects as labels"
+        )
     return labels > 0
 
 
 def _runs(mask: Mapping[str, Any], shape: tuple[int, ...], name: str) -> Bool[Tensor, "h w"]:
-    """Return the mask that COCO's run lengths describe, column by column; the lengths are numbers or text."""
+    """Return the mask that COCO's run lengths describe, column by column; the lengths are numbers
+    or text.
+    """
     allowed = f'a dict with "size" {list(shape)} and "counts", whose sum is {int(np.prod(shape))}'
     try:
-        size, counts = [int(side) for side in mask["size"]], mask["counts"]
+        size = [int(side) for side in mask["size"]]
+        counts = mask["counts"]
         if isinstance(counts, str | bytes):
             counts = _run_lengths(counts.encode("ascii") if isinstance(counts, str) else counts)
         runs = np.asarray(counts, dtype=np.int64)
-        if size != list(shape) or ((runs < 0) | (runs > np.prod(shape))).any() or runs.sum() != np.prod(shape):
+        if (
+            size != list(shape)
+            or ((runs < 0) | (runs > np.prod(shape))).any()
+            or runs.sum() != np.prod(shape)
+        ):
             raise ValueError(f"size {size}, sum {runs.sum()}")
     except (KeyError, IndexError, TypeError, ValueError, OverflowError) as error:
-        raise BadArgument(name, f"{type(error).__name__} ({error}) in run lengths", allowed) from error
-    return torch.from_numpy(np.repeat(np.arange(len(runs)) % 2 == 1, runs).reshape(shape[::-1]).T.copy())
+        raise BadArgument(
+            name, f"{type(error).__name__} ({error}) in run lengths", allowed
+        ) from error
+    return torch.from_numpy(
+        np.repeat(np.arange(len(runs)) % 2 == 1, runs).reshape(shape[::-1]).T.copy()
+    )
 
 
 def _run_lengths(text: bytes) -> list[int]:
-    """Return run lengths from COCO's text, 5 bits a letter; from the fourth on, it holds run i minus run i - 2."""
+    """Return run lengths from COCO's text, 5 bits a letter; from the fourth on, it holds run i
+    minus run i - 2.
+    """
     runs: list[int] = []
     value = shift = 0
     for letter in text:
@@ -128,31 +163,42 @@ def _run_lengths(text: bytes) -> list[int]:
 
 
 def label_image(
-    image: DepthImage, support: SupportPlane, labels: Int[Tensor, "h w"] | None, mask: Bool[Tensor, "h w"] | None
+    image: DepthImage,
+    support: SupportPlane,
+    labels: Int[Tensor, "h w"] | None,
+    mask: Bool[Tensor, "h w"] | None,
 ) -> tuple[Int[Tensor, "h w"], tuple[str, ...]]:
-    """Return each pixel's label and notes; labels come from given labels, a given mask, or else from segmentation.
+    """Return each pixel's label and notes; labels come from given labels, a given mask, or else
+    from segmentation.
 
-    Given labels lose pixels on the table and flying pixels. A mask becomes label 1, and loses strips of neighbouring
-    objects, too. Pixels of the mask's object just outside of the mask get label 0. A note tells of each mask that loses
-    a twentieth of its pixels or more. A mask that loses nearly all is a `BadArgument`.
+    Given labels lose pixels on the table and flying pixels. A mask becomes label 1, and loses
+    strips of neighbouring objects, too. Pixels of the mask's object just outside of the mask get
+    label 0. A note tells of each mask that loses a twentieth of its pixels or more. A mask that
+    loses nearly all is a `BadArgument`.
     """
     if labels is not None:
         kept = torch.where(rests_on(image, support.plane), labels, 0)
         if not bool((kept > 0).any()):
-            raise BadArgument("labels", "none that rises above the table", "labels of objects on the table")
+            raise BadArgument(
+                "labels", "none that rises above the table", "labels of objects on the table"
+            )
         names, own = labels.unique(return_inverse=True)
         lost, seen = (
             torch.bincount(own[pixels], minlength=len(names)).tolist()
             for pixels in (_on_support(image, support) & (kept == 0), image.depth > 0)
         )
         counts = zip(names.tolist(), lost, seen, strict=True)
-        return kept, tuple(note for k, *count in counts if k > 0 for note in _removed(f"mask {k}", *count))
+        return kept, tuple(
+            note for k, *count in counts if k > 0 for note in _removed(f"mask {k}", *count)
+        )
     objects = segment(image, support)
     if mask is None:
         return objects, ()
     inside = mask & rests_on(image, support.plane)
-    pieces, length = torch.where(inside, objects, 0), int(objects.max()) + 1
-    whole, part = count_labels(objects, length), count_labels(pieces, length)
+    pieces = torch.where(inside, objects, 0)
+    length = int(objects.max()) + 1
+    whole = count_labels(objects, length)
+    part = count_labels(pieces, length)
     belongs = (part >= 0.5 * whole) | (part >= 0.3 * max(1, int(inside.sum())))
     belongs[0] = True
     target = inside & belongs[objects]
@@ -162,10 +208,16 @@ def label_image(
         least = f"at least {LEAST_PIXELS}, and a {1 / MASK_SHARE:.0f}th: this target is the table"
         raise BadArgument("mask", found, least)
     rest = _beside(objects, target, mask, belongs)
-    _, number = torch.cat([torch.zeros(1, dtype=torch.long), rest.reshape(-1)]).unique(return_inverse=True)
+    _, number = torch.cat([torch.zeros(1, dtype=torch.long), rest.reshape(-1)]).unique(
+        return_inverse=True
+    )
     rest = number[1:].reshape(rest.shape)
-    low, strips = mask & ~inside & _on_support(image, support), inside & ~target
-    notes = [*_removed("mask", int(low.sum()), seen), *_removed("mask", int(strips.sum()), seen, "another object")]
+    low = mask & ~inside & _on_support(image, support)
+    strips = inside & ~target
+    notes = [
+        *_removed("mask", int(low.sum()), seen),
+        *_removed("mask", int(strips.sum()), seen, "another object"),
+    ]
     return torch.where(target, 1, torch.where(rest > 0, rest + 1, 0)), tuple(notes)
 
 
@@ -179,17 +231,22 @@ def label_again(
 ) -> Int[Tensor, "h w"]:
     """Return the label of each pixel after another support has replaced the former table.
 
-    Labels that the user gave lose pixels on the support, and gain pixels of their objects that the former table hid.
-    Other objects are segmented again, and each keeps the label of most of its former pixels. The label `first` is
-    assigned before the others.
+    Labels that the user gave lose pixels on the support, and gain pixels of their objects that the
+    former table hid. Other objects are segmented again, and each keeps the label of most of its
+    former pixels. The label `first` is assigned before the others.
     """
     own = torch.isin(labels, torch.tensor(given, dtype=torch.long))
     kept = torch.where(own & rests_on(image, support.plane), labels, 0)
-    found, seen = segment(image, support), rests_on(image, former)
-    width, (names, row) = int(found.max()) + 1, labels.unique(return_inverse=True)
-    shared = count_labels((row * width + found)[seen], len(names) * width).reshape(len(names), width)
+    found = segment(image, support)
+    seen = rests_on(image, former)
+    width = int(found.max()) + 1
+    (names, row) = labels.unique(return_inverse=True)
+    shared = count_labels((row * width + found)[seen], len(names) * width).reshape(
+        len(names), width
+    )
     shared[:, 0] = 0
-    number, belongs = torch.arange(width) + names[-1], torch.zeros(width, dtype=torch.bool)
+    number = torch.arange(width) + names[-1]
+    belongs = torch.zeros(width, dtype=torch.bool)
     for k in sorted(range(len(names)), key=lambda k: int(names[k]) != first):
         if int(names[k]) in given:
             mine = 2 * shared[k] > shared.sum(0)
@@ -205,8 +262,12 @@ def label_again(
 
 
 def _beside(objects: Tensor, target: Tensor, mask: Tensor, belongs: Tensor) -> Int[Tensor, "h w"]:
-    """Return labels without the target, strips of its object around `mask`, and specks: these become 0."""
-    about = torch.from_numpy(ndimage.binary_dilation(mask.numpy(), iterations=4))  # masks are off by a few pixels
+    """Return labels without the target, strips of its object around `mask`, and specks: these
+    become 0.
+    """
+    about = torch.from_numpy(
+        ndimage.binary_dilation(mask.numpy(), iterations=4)
+    )  # masks are off by a few pixels
     rest = torch.where(target | (about & belongs[objects]), 0, objects)
     few = count_labels(rest, len(belongs)) < LEAST_PIXELS
     return torch.where(few[rest], 0, rest)
@@ -218,5 +279,11 @@ def _on_support(image: DepthImage, support: SupportPlane) -> Bool[Tensor, "h w"]
 
 
 def _removed(mask: str, count: int, seen: int, where: str = "the support") -> list[str]:
-    """Return a list with one sentence that `count` of `seen` pixels were removed from a mask; empty if they are few."""
-    return [f"{mask}: {count} of {seen} pixels lie on {where} and were removed"] if count > 0.05 * seen else []
+    """Return a list with one sentence that `count` of `seen` pixels were removed from a mask; empty
+    if they are few.
+    """
+    return (
+        [f"{mask}: {count} of {seen} pixels lie on {where} and were removed"]
+        if count > 0.05 * seen
+        else []
+    )

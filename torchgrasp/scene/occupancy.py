@@ -1,7 +1,9 @@
-"""Estimation of obstacles: the probability that each place around the target is full of something else.
+"""Estimation of obstacles: the probability that each place around the target is full of something
+else.
 
-Space in front of a measured depth is free. Behind an object's visible surface, a model estimates the probability from
-the object's visible size and the place behind the surface. `scripts/train.py occupancy` fits the model.
+Space in front of a measured depth is free. Behind an object's visible surface, a model estimates
+the probability from the object's visible size and the place behind the surface. `scripts/train.py
+occupancy` fits the model.
 """
 
 import dataclasses
@@ -25,17 +27,23 @@ from torchgrasp.scene.image import DepthImage
 from torchgrasp.scene.scene import Scene
 
 SPACING = 0.005  # spacing [m] of the voxels: a third of a finger's width
-SIDEWAYS, ABOVE = 0.25, 0.04  # how far [m] voxels extend around the target's points, and above everything
-NOISE = 0.004  # space this far [m] in front of a measured depth is free: three standard deviations of the noise
+# how far [m] voxels extend around the target's points, and above everything
+SIDEWAYS = 0.25
+ABOVE = 0.04
+# space this far [m] in front of a measured depth is free: three standard deviations of the noise
+NOISE = 0.004
 LOW = 0.01  # height [m] above the table below which unlabelled pixels show the table
 MODEL = Path(__file__).with_name("occupancy.json")
-"""File with the knots and weights of the occupancy model, and with the data to which they were fitted."""
+"""File with the knots and weights of the occupancy model, and with the data to which they were
+fitted.
+"""
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class Occupancy(Value):
-    """The probability that each voxel is full of something that is neither the target nor the table.
+    """The probability that each voxel is full of something that is neither the target nor the
+    table.
 
     The centre of voxel (i, j, k) is at `origin` + (i, j, k) * `spacing` [m].
 
@@ -51,16 +59,19 @@ class Occupancy(Value):
     @property
     def centres(self) -> Float[Tensor, "x y z 3"]:
         """The centres [m] of the voxels."""
-        steps = [torch.arange(n, dtype=torch.float64) * self.spacing for n in self.probability.shape]
+        steps = [
+            torch.arange(n, dtype=torch.float64) * self.spacing for n in self.probability.shape
+        ]
         return torch.stack(torch.meshgrid(*steps, indexing="ij"), -1) + self.origin.double()
 
 
 @dataclasses.dataclass(frozen=True)
 class Shadows(Value):
-    """A depth image [m] with small gaps filled, and `owner`: the object that hides the space behind each pixel.
+    """A depth image [m] with small gaps filled, and `owner`: the object that hides the space behind
+    each pixel.
 
-    `owner` is 0 for the table, -1 where nothing was measured, an object's label, or another negative number for each
-    object without label. `points` [m] are NaN where nothing was measured.
+    `owner` is 0 for the table, -1 where nothing was measured, an object's label, or another
+    negative number for each object without label. `points` [m] are NaN where nothing was measured.
     """
 
     image: DepthImage
@@ -69,25 +80,34 @@ class Shadows(Value):
     points: Float[Tensor, "h w 3"]
 
     def look(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], Int[Tensor, "n"]]:
-        """Return how far [m] each point lies behind the measured depth, along its ray, and the owner of its pixel."""
+        """Return how far [m] each point lies behind the measured depth, along its ray, and the
+        owner of its pixel.
+        """
         camera = apply(inverse(self.image.obj_from_camera.double()), points.double())
         x, y, z = camera.unbind(-1)
         (fx, _, cx), (_, fy, cy), _ = self.image.intrinsics.tolist()
         ahead = z > 0
         safe = torch.where(ahead, z, 1.0)
-        column, row = torch.round(fx * x / safe + cx).long(), torch.round(fy * y / safe + cy).long()
+        column = torch.round(fx * x / safe + cx).long()
+        row = torch.round(fy * y / safe + cy).long()
         height, width = self.depth.shape
         seen = ahead & (column >= 0) & (column < width) & (row >= 0) & (row < height)
         pixel = torch.where(seen, row * width + column, 0)
         owner = torch.where(seen, self.owner.reshape(-1)[pixel], -1)
-        behind = (z - self.depth.reshape(-1)[pixel]) * torch.linalg.vector_norm(camera, dim=-1) / safe
+        behind = (
+            (z - self.depth.reshape(-1)[pixel]) * torch.linalg.vector_norm(camera, dim=-1) / safe
+        )
         return behind, owner
 
 
 def cast_shadows(scene: Scene, target: int) -> Shadows:
-    """Return which object hides the space behind each pixel; the scene is in the upright frame of the target."""
-    image, (row, column) = scene.image, scene.pixels.unbind(-1)
-    depth, owner = image.depth.double(), torch.full(image.depth.shape, -1, dtype=torch.int64)
+    """Return which object hides the space behind each pixel; the scene is in the upright frame of
+    the target.
+    """
+    image = scene.image
+    (row, column) = scene.pixels.unbind(-1)
+    depth = image.depth.double()
+    owner = torch.full(image.depth.shape, -1, dtype=torch.int64)
     points = depth.new_full((*depth.shape, 3), torch.nan)
     points[row, column] = scene.points.double()
     owner[row, column] = scene.labels
@@ -95,39 +115,51 @@ def cast_shadows(scene: Scene, target: int) -> Shadows:
     if scene.table is not None:
         loose = (owner == 0) & (points[..., 2] > LOW)
         gap, nearest = find_nearest(own)
-        # Masks are off by some pixels: unlabelled pixels near the target's, in the image and in depth, are its own.
+        # Masks are off by some pixels: unlabelled pixels near the target's, in the image and in
+        # depth, are its own.
         rim = loose & (gap <= 6) & ((depth - depth.reshape(-1)[nearest]).abs() <= 0.02)
         numbered: Any = ndimage.label((loose & ~rim).numpy())
         parts = torch.from_numpy(numbered[0]).long()
         large = (torch.bincount(parts.reshape(-1)) >= 20)[parts]  # fewer are flying pixels
-        owner = torch.where(rim, target, torch.where(loose, torch.where(large, -1 - parts, -1), owner))
+        owner = torch.where(
+            rim, target, torch.where(loose, torch.where(large, -1 - parts, -1), owner)
+        )
     gap, nearest = find_nearest(owner != -1)
-    depth, owner = (torch.where(gap <= 8, x.reshape(-1)[nearest], x) for x in (depth, owner))  # rims and dropouts
+    depth, owner = (
+        torch.where(gap <= 8, x.reshape(-1)[nearest], x) for x in (depth, owner)
+    )  # rims and dropouts
     return Shadows(image, depth, owner, points)
 
 
 def find_nearest(pixels: Bool[Tensor, "h w"]) -> tuple[Float[Tensor, "h w"], Int[Tensor, "h w"]]:
-    """Return each pixel's distance [px] to the nearest pixel of a mask, and the flat index of that nearest pixel."""
+    """Return each pixel's distance [px] to the nearest pixel of a mask, and the flat index of that
+    nearest pixel.
+    """
     found: Any = ndimage.distance_transform_edt(~pixels.numpy(), return_indices=True)
     row, column = torch.from_numpy(found[1]).long()
     return torch.from_numpy(found[0]), row * pixels.shape[1] + column
 
 
-def shadow_features(shadows: Shadows, owner: int, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 6"]:
-    """Return the features from which the model estimates whether points [m] in the shadow of an object are full.
+def shadow_features(
+    shadows: Shadows, owner: int, points: Float[Tensor, "n 3"]
+) -> Float[Tensor, "n 6"]:
+    """Return the features from which the model estimates whether points [m] in the shadow of an
+    object are full.
 
     The features are, in order:
 
     * The depth of the point behind the object's surface, over the object's width.
     * The depth [m] of the point below the object's visible points in the same vertical column.
-    * Two distances [m] of the mirrored point behind the measured depth, for two guesses of the object's middle.
+    * Two distances [m] of the mirrored point behind the measured depth, for two guesses of the
+      object's middle.
     * The point's distance from the object's front, over the object's visible depth.
     * The point's distance from the object's middle, over the object's width.
     """
     own = shadows.points[(shadows.owner == owner) & torch.isfinite(shadows.points[..., 2])]
     toward = unit(shadows.image.obj_from_camera[:2, 3].double() - own[:, :2].mean(0))
     axes = torch.stack([toward, torch.stack([-toward[1], toward[0]])], -1)
-    seen, level = own[:, :2] @ axes, points[:, :2].double() @ axes
+    seen = own[:, :2] @ axes
+    level = points[:, :2].double() @ axes
     low, high = torch.quantile(seen, seen.new_tensor([0.02, 0.98]), dim=0)
     (deep, wide), front = (high - low + SPACING).tolist(), high[0]
 
@@ -140,7 +172,9 @@ def shadow_features(shadows: Shadows, owner: int, points: Float[Tensor, "n 3"]) 
 
     top = own.new_full((int(count[0] * count[1]),), -1.0)
     top.scatter_reduce_(0, column(own[:, :2]), own[:, 2], "amax")
-    top = torch.from_numpy(ndimage.maximum_filter(top.reshape(count.tolist()).numpy(), 3)).reshape(-1)
+    top = torch.from_numpy(ndimage.maximum_filter(top.reshape(count.tolist()).numpy(), 3)).reshape(
+        -1
+    )
 
     def mirrored(size: float) -> Float[Tensor, "n"]:
         middle = axes @ torch.stack([front - size / 2, (low[1] + high[1]) / 2])
@@ -155,13 +189,18 @@ def shadow_features(shadows: Shadows, owner: int, points: Float[Tensor, "n 3"]) 
 
 @functools.cache
 def load_occupancy_model() -> dict[str, Any]:
-    """Return the model's knots and weights for each kind of space: behind the target or an object, or unseen."""
+    """Return the model's knots and weights for each kind of space: behind the target or an object,
+    or unseen.
+    """
     return json.loads(MODEL.read_text("utf-8"))
 
 
 def probability(kind: str, features: Float[Tensor, "n f"]) -> Float[Tensor, "n"]:
-    """Return the probability that places of a kind are full; log-odds sum a piecewise linear function of each."""
-    model, odds = load_occupancy_model()[kind], torch.full_like(features[:, 0], load_occupancy_model()[kind]["bias"])
+    """Return the probability that places of a kind are full; log-odds sum a piecewise linear
+    function of each.
+    """
+    model = load_occupancy_model()[kind]
+    odds = torch.full_like(features[:, 0], load_occupancy_model()[kind]["bias"])
     for x, knots, values in zip(features.unbind(-1), model["knots"], model["values"], strict=True):
         odds += torch.from_numpy(np.interp(x.numpy(), knots, values)).to(odds)
     return torch.sigmoid(odds).clamp_min(0.002)
@@ -169,36 +208,48 @@ def probability(kind: str, features: Float[Tensor, "n f"]) -> Float[Tensor, "n"]
 
 @checked
 def estimate_occupancy(scene: Scene, target: int) -> Occupancy:
-    """Return the probability that each voxel around the target is full of something other than target and table.
+    """Return the probability that each voxel around the target is full of something other than
+    target and table.
 
-    The scene must be in its upright frame, with z up. Space in front of a measured depth is free. Behind an object, a
-    model estimates the probability. Behind the target and outside the image, it is a rough guess from depth and height.
-    All work is on the CPU. Raises `BadArgument` for a target without points.
+    The scene must be in its upright frame, with z up. Space in front of a measured depth is free.
+    Behind an object, a model estimates the probability. Behind the target and outside the image, it
+    is a rough guess from depth and height. All work is on the CPU. Raises `BadArgument` for a
+    target without points.
 
     >>> from torchgrasp import load_scene
     >>> found = estimate_occupancy(load_scene(), target=1)
     >>> bool((found.probability > 0.5).any()), bool((found.probability < 0.01).any())
     (True, True)
     """
-    device, scene = scene.points.device, settle(scene, torch.device("cpu"))
+    device = scene.points.device
+    scene = settle(scene, torch.device("cpu"))
     if not bool(scene.rows_of(target).any()):
         raise BadArgument("target", target, f"one of the labels {scene.things}")
-    things = (scene.labels > 0) if scene.table is None else (scene.points[:, 2] > LOW) | scene.rows_of(target)
-    points, others = scene.points[scene.rows_of(target)].double(), scene.points[things].double()
-    low, high = points.amin(0) - SIDEWAYS, points.amax(0) + SIDEWAYS
+    things = (
+        (scene.labels > 0)
+        if scene.table is None
+        else (scene.points[:, 2] > LOW) | scene.rows_of(target)
+    )
+    points = scene.points[scene.rows_of(target)].double()
+    others = scene.points[things].double()
+    low = points.amin(0) - SIDEWAYS
+    high = points.amax(0) + SIDEWAYS
     near = ((others >= low) & (others <= high))[:, :2].all(1)
     low[2] = 0.0 if scene.table is not None else float(others[near, 2].min())
     high[2] = float(others[near, 2].max()) + ABOVE
     origin = (torch.floor(low / SPACING) + 0.5) * SPACING
     shape = torch.ceil((high - origin) / SPACING).long().tolist()
     empty = Occupancy(origin, SPACING, torch.zeros(shape, dtype=torch.float64))
-    centres, shadows = empty.centres.reshape(-1, 3), cast_shadows(scene, target)
+    centres = empty.centres.reshape(-1, 3)
+    shadows = cast_shadows(scene, target)
     behind, owner = shadows.look(centres)
     hidden = torch.nonzero((owner == -1) | ((owner != 0) & (behind > -NOISE)))[:, 0]
-    whose, full = owner[hidden], empty.probability.reshape(-1)
+    whose = owner[hidden]
+    full = empty.probability.reshape(-1)
     for thing in whose.unique().tolist():
         rows = hidden[whose == thing]
-        where, depth = centres[rows], behind[rows]
+        where = centres[rows]
+        depth = behind[rows]
         if thing == -1:
             full[rows] = probability("unseen", where[:, 2:])
         elif thing == target:

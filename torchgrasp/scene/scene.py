@@ -29,16 +29,13 @@ from torchgrasp.values.planning import PointCloud
 class Scene(Value):
     """Objects on a table, as one camera saw them, in the given frame ("obj").
 
-    Args:
-        points: every measured point [m].
-        labels: 1, 2, ... for the objects, 0 for the table and everything else.
-        image: the camera's depth image, which shows free space and hidden space.
-        pixels: row and column of each point in the image.
-        table: the plane that the objects stand on, or None if it is unknown.
-        target: label of the object to be grasped, or None if none is chosen.
-        others: other planes that objects could stand on, the more plausible first.
-        notes: a sentence for each given mask or label from which pixels were removed.
-        given: labels whose pixels the user gave, as labels or as a mask; the library found the other objects.
+    Args: points: every measured point [m]. labels: 1, 2, ... for the objects, 0 for the table and
+        everything else. image: the camera's depth image, which shows free space and hidden space.
+        pixels: row and column of each point in the image. table: the plane that the objects stand
+        on, or None if it is unknown. target: label of the object to be grasped, or None if none is
+        chosen. others: other planes that objects could stand on, the more plausible first. notes: a
+        sentence for each given mask or label from which pixels were removed. given: labels whose
+        pixels the user gave, as labels or as a mask; the library found the other objects.
 
     >>> from torchgrasp import load_scene
     >>> target = load_scene().select([394, 312])  # a clicked pixel: column, row
@@ -73,40 +70,49 @@ class Scene(Value):
     ) -> "Scene":
         """Return the scene in a pinhole camera's depth image.
 
-        Pixels on the table and flying pixels at rims get the label 0. Without labels the objects are the connected
-        components above the table.
+        Pixels on the table and flying pixels at rims get the label 0. Without labels the objects
+        are the connected components above the table.
 
-        Args:
-            depth: (h, w), as `cloud_from_depth` takes it: floats in metres, or integers in millimetres.
-            intrinsics: (3, 3), (fx, fy, cx, cy) [pixels], or another form that `cloud_from_depth` takes.
-            camera_pose: obj_from_camera (4, 4), rigid; without it results are in the camera's frame.
-            mask: (h, w), not 0 at the target, accurate to a few pixels; or in another form that `labels` allows.
-            labels: (h, w) of whole numbers, where 0 means no object; a picture with a colour for each object; a list of
-                masks; or COCO's run lengths.
-            point: a place on the target, as a pixel (u, v) or a point (x, y, z) [m].
-            table: a plane, or its height z [m]; by default it is fitted.
-            up: (3,), against gravity, for the fit; None allows any direction.
-            depth_unit: metres of one count of the depth, as `cloud_from_depth` takes it.
+        Args: depth: (h, w), as `cloud_from_depth` takes it: floats in metres, or integers in
+            millimetres. intrinsics: (3, 3), (fx, fy, cx, cy) [pixels], or another form that
+            `cloud_from_depth` takes. camera_pose: obj_from_camera (4, 4), rigid; without it results
+            are in the camera's frame. mask: (h, w), not 0 at the target, accurate to a few pixels;
+            or in another form that `labels` allows. labels: (h, w) of whole numbers, where 0 means
+            no object; a picture with a colour for each object; a list of masks; or COCO's run
+            lengths. point: a place on the target, as a pixel (u, v) or a point (x, y, z) [m].
+            table: a plane, or its height z [m]; by default it is fitted. up: (3,), against gravity,
+            for the fit; None allows any direction. depth_unit: metres of one count of the depth, as
+            `cloud_from_depth` takes it.
 
-        Raises:
-            BadArgument: what `cloud_from_depth` refuses; mask or labels of another size; a target that is the table; a
-                point where nothing was measured; a camera below the table; a pose or a unit that the view contradicts.
-            NoSupport: no plane is found on which objects stand.
+        Raises: BadArgument: what `cloud_from_depth` refuses; mask or labels of another size; a
+            target that is the table; a point where nothing was measured; a camera below the table;
+            a pose or a unit that the view contradicts. NoSupport: no plane is found on which
+            objects stand.
         """
         if sum(given is not None for given in (mask, labels, point)) > 1 and mask is not None:
             raise BadArgument("mask", "a mask beside labels or a point", "one of them")
         image = read_image(depth, intrinsics, camera_pose, depth_unit)
         inside = None if mask is None else read_mask(mask, tuple(image.depth.shape))
         given = None if labels is None else read_labels(labels, tuple(image.depth.shape))
-        points, measured = image.points(), image.depth > 0
-        supports = find_plausible(points[measured], image.obj_from_camera, table, up, depth_unit is not None)
+        points = image.points()
+        measured = image.depth > 0
+        supports = find_plausible(
+            points[measured], image.obj_from_camera, table, up, depth_unit is not None
+        )
         found, notes = label_image(image, supports[0], given, inside)
         if table is None and depth_unit is None:
-            notes += check_sizes(points[measured], found[measured], image.obj_from_camera, supports[0].plane)
-        planes, pixels = tuple(support.plane for support in supports), torch.nonzero(measured)
+            notes += check_sizes(
+                points[measured], found[measured], image.obj_from_camera, supports[0].plane
+            )
+        planes = tuple(support.plane for support in supports)
+        pixels = torch.nonzero(measured)
         target = None if mask is None else 1
-        scene = cls(points[measured], found[measured], image, pixels, planes[0], target, planes[1:], notes)
-        scene = dataclasses.replace(scene, given=scene.things if given is not None else () if inside is None else (1,))
+        scene = cls(
+            points[measured], found[measured], image, pixels, planes[0], target, planes[1:], notes
+        )
+        scene = dataclasses.replace(
+            scene, given=scene.things if given is not None else () if inside is None else (1,)
+        )
         return scene if point is None else scene.select(point)
 
     @classmethod
@@ -124,8 +130,8 @@ class Scene(Value):
     ) -> "Scene":
         """Return the scene in a cloud of one view, projected to a pinhole image at its viewpoint.
 
-        Raises `BadArgument` for no viewpoint, or several, and labels or a mask of another size, and the errors of
-        `from_depth`.
+        Raises `BadArgument` for no viewpoint, or several, and labels or a mask of another size, and
+        the errors of `from_depth`.
 
         Args:
             cloud: everything that the camera saw [m], with its viewpoint.
@@ -145,16 +151,21 @@ class Scene(Value):
         if cloud.viewpoint is None or cloud.viewpoint.ndim != 1:
             found = "none" if cloud.viewpoint is None else "one for each point"
             raise BadArgument("viewpoint", found, "the position of the one camera")
-        points, viewpoint = cloud.points.detach().cpu().double(), cloud.viewpoint.detach().cpu().double()
+        points = cloud.points.detach().cpu().double()
+        viewpoint = cloud.viewpoint.detach().cpu().double()
         given = None if labels is None else read_labels(labels, (len(points),))
-        inside = None if mask is None else read_labels(torch.as_tensor(mask).long(), (len(points),)) > 0
+        inside = (
+            None if mask is None else read_labels(torch.as_tensor(mask).long(), (len(points),)) > 0
+        )
         if box is not None:
             corners = torch.as_tensor(np.asarray(box), dtype=torch.float64)
             if corners.shape != (2, 3):
                 raise BadArgument("box", f"shape {tuple(corners.shape)}", "two corners (2, 3)")
             inside = ((points >= corners.amin(0)) & (points <= corners.amax(0))).all(-1)
         if inside is not None and not bool(inside.any()):
-            raise BadArgument("mask" if box is None else "box", "no point inside", "one that holds the target")
+            raise BadArgument(
+                "mask" if box is None else "box", "no point inside", "one that holds the target"
+            )
         supports = find_table(points, viewpoint, table, up)
         planes = tuple(support.plane for support in supports)
         image, pixels = image_of_cloud(points, viewpoint, planes[0].normal.double())
@@ -173,15 +184,18 @@ class Scene(Value):
         own = torch.where(front, found[row, column], 0)
         target = None if inside is None else 1
         scene = cls(points, own, image, pixels, planes[0], target, planes[1:], notes)
-        scene = dataclasses.replace(scene, given=scene.things if given is not None else () if inside is None else (1,))
+        scene = dataclasses.replace(
+            scene, given=scene.things if given is not None else () if inside is None else (1,)
+        )
         return scene if point is None else scene.select(point)
 
     @checked
     def select(self, target: int | Sequence[float | int] | Tensor | np.ndarray) -> "Scene":
         """Return the scene with another target.
 
-        The target is a label, a pixel (u, v) of the image, or a point (x, y, z) [m]. Raises `BadArgument` for no such
-        label, for a place where nothing was measured, or for a place on the table.
+        The target is a label, a pixel (u, v) of the image, or a point (x, y, z) [m]. Raises
+        `BadArgument` for no such label, for a place where nothing was measured, or for a place on
+        the table.
         """
         if isinstance(target, int) and not isinstance(target, bool):
             if target not in self.things:
@@ -191,22 +205,30 @@ class Scene(Value):
         if place.shape not in ((2,), (3,)) or not bool(torch.isfinite(place).all()):
             raise BadArgument("point", repr(target), "a pixel (u, v) or a point (x, y, z)")
         if len(place) == 2:
-            distance, reach = torch.linalg.vector_norm(self.pixels.double() - place.flip(0), dim=-1), 3.0  # pixels
+            # pixels
+            distance = torch.linalg.vector_norm(self.pixels.double() - place.flip(0), dim=-1)
+            reach = 3.0
             text = f"pixel ({place[0]:g}, {place[1]:g})"
         else:
-            distance, reach = torch.linalg.vector_norm(self.points.double() - place, dim=-1), 0.01  # [m]
+            # [m]
+            distance = torch.linalg.vector_norm(self.points.double() - place, dim=-1)
+            reach = 0.01
             text = f"point ({', '.join(f'{x:.3f}' for x in place.tolist())}) m"
         nearest = int(distance.argmin())
         if float(distance[nearest]) > reach:
             raise BadArgument("point", f"nothing measured at {text}", "a place on an object")
         label = int(self.labels[nearest])
         if label == 0:
-            raise BadArgument("point", f"{text} on the table, or on no object", "a place on an object")
+            raise BadArgument(
+                "point", f"{text} on the table, or on no object", "a place on an object"
+            )
         return dataclasses.replace(self, target=label)
 
     @property
     def advice(self) -> tuple[str, ...]:
-        """Problems of the scene, a sentence each: several supports, objects that touch, a target that is cut off."""
+        """Problems of the scene, a sentence each: several supports, objects that touch, a target
+        that is cut off.
+        """
         found = [
             f"objects could also stand on another plane ({plane.describe()}); give it as the table to choose it"
             for plane in self.others
@@ -215,12 +237,16 @@ class Scene(Value):
         for a, b in find_touching(self.image, labels):
             if a in self.given and b in self.given:
                 continue
-            found.append(f"objects {a} and {b} touch, and their border is a guess: give a mask of the one to grasp")
+            found.append(
+                f"objects {a} and {b} touch, and their border is a guess: give a mask of the one to grasp"
+            )
         parts = cut_creases(self.image, labels)
         for k in (k for k in self.things if k not in self.given):
             sizes = parts[labels == k].unique(return_counts=True)[1]
             if int((sizes > 0.1 * sizes.sum()).sum()) > 1:
-                found.append(f"object {k} has a crease: if it is several objects, give a mask of the one to grasp")
+                found.append(
+                    f"object {k} has a crease: if it is several objects, give a mask of the one to grasp"
+                )
         if self.image.at_border(self.pixels[self.rows_of()]):
             fix = "its other part is unknown; turn the camera to it"
             found.append(f"the target is cut off at the border of the image: {fix}")
@@ -240,13 +266,21 @@ class Scene(Value):
 
     @property
     def noise(self) -> SensorNoise | None:
-        """The camera's noise, estimated from the table; None if no table is known or too few pixels show it."""
+        """The camera's noise, estimated from the table; None if no table is known or too few pixels
+        show it.
+        """
         if self.table is None:
             return None
-        image, rows = self.image, self.pixels[self.labels == 0]
+        image = self.image
+        rows = self.pixels[self.labels == 0]
         on_table = torch.zeros(image.depth.shape, dtype=torch.bool)
         on_table[rows[:, 0], rows[:, 1]] = True
-        return estimate_noise(image.depth, image.intrinsics, self.table.moved(inverse(image.obj_from_camera)), on_table)
+        return estimate_noise(
+            image.depth,
+            image.intrinsics,
+            self.table.moved(inverse(image.obj_from_camera)),
+            on_table,
+        )
 
     @property
     def viewpoint(self) -> Float[Tensor, "3"]:
@@ -260,17 +294,25 @@ class Scene(Value):
 
     @checked
     def rows_of(self, label: int | None = None) -> Bool[Tensor, "n"]:
-        """Return a mask of the points of an object, by default the target; it is all False if there is no target."""
+        """Return a mask of the points of an object, by default the target; it is all False if there
+        is no target.
+        """
         label = self.target if label is None else label
-        return torch.zeros_like(self.labels, dtype=torch.bool) if label is None else self.labels == label
+        return (
+            torch.zeros_like(self.labels, dtype=torch.bool)
+            if label is None
+            else self.labels == label
+        )
 
     @checked
     def cloud(self, label: int | None = None) -> PointCloud:
         """Return the points of an object, by default the target, with the camera as viewpoint.
 
-        Raises `BadArgument` for a label without points or no target, and `TooFewPoints` for fewer than 4 points.
+        Raises `BadArgument` for a label without points or no target, and `TooFewPoints` for fewer
+        than 4 points.
         """
-        rows, frustum = self.rows_of(label), self.image.frustum
+        rows = self.rows_of(label)
+        frustum = self.image.frustum
         if not bool(rows.any()):
             found = f"{label if label is not None else self.target}, of which no point is seen"
             raise BadArgument("label", found, f"one of {list(self.things)}")
@@ -279,7 +321,9 @@ class Scene(Value):
 
     @checked
     def to_upright(self, obj_from_upright: Pose) -> "Scene":
-        """Return the scene in an upright frame, where the table is the plane z = 0; coordinates are rounded."""
+        """Return the scene in an upright frame, where the table is the plane z = 0; coordinates are
+        rounded.
+        """
         obj_from_upright = obj_from_upright.double()
         return dataclasses.replace(
             self,

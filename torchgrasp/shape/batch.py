@@ -1,7 +1,9 @@
-"""The shapes of many clouds as one: each row of contacts or of hands belongs to the shape of its own cloud.
+"""The shapes of many clouds as one: each row of contacts or of hands belongs to the shape of its
+own cloud.
 
-Stages that work on rows ask a shape for values at the rows' points, and go on with the shape's `rows`. A `ShapeGP` is
-the shape of all its rows. A `ShapeBatch` stacks the observations of c clouds, and knows the cloud of each row.
+Stages that work on rows ask a shape for values at the rows' points, and go on with the shape's
+`rows`. A `ShapeGP` is the shape of all its rows. A `ShapeBatch` stacks the observations of c
+clouds, and knows the cloud of each row.
 """
 
 import dataclasses
@@ -27,12 +29,9 @@ Evaluate = Callable[[Tensor, Tensor], tuple[Tensor, ...]]
 class Walls(Value):
     """The posteriors of w surfaces with thin-plate kernels; missing observations have the weight 0.
 
-    Args:
-        x: observed points, those with normals first.
-        a: weight of each observed distance.
-        b: weight of each observed normal, of the first `near` points.
-        whitener: rows of covariances with all observations (distances, then normals by component), times this matrix,
-            are white.
+    Args: x: observed points, those with normals first. a: weight of each observed distance. b:
+        weight of each observed normal, of the first `near` points. whitener: rows of covariances
+        with all observations (distances, then normals by component), times this matrix, are white.
         psi: length of each kernel.
     """
 
@@ -44,7 +43,9 @@ class Walls(Value):
 
     @classmethod
     def of(cls, shapes: Sequence[ShapeGP], device: torch.device) -> "Walls":
-        """Stack the posteriors of shapes, each of one surface, on a device, which inverts the Cholesky factors."""
+        """Stack the posteriors of shapes, each of one surface, on a device, which inverts the
+        Cholesky factors.
+        """
         near = max(shape.n_oriented for shape in shapes)
         n = near + max(len(shape.x) - shape.n_oriented for shape in shapes)
         x, a, b = (shapes[0].x.new_zeros(len(shapes), *size) for size in ((n, 3), (n,), (near, 3)))
@@ -52,27 +53,45 @@ class Walls(Value):
         place_of = torch.zeros(len(shapes), n + 3 * near, dtype=torch.long, device=x.device)
         for w, shape in enumerate(shapes):
             oriented = torch.arange(shape.n_oriented, device=x.device)
-            place = torch.cat([oriented, near + torch.arange(len(shape.x) - len(oriented), device=x.device)])
+            place = torch.cat(
+                [oriented, near + torch.arange(len(shape.x) - len(oriented), device=x.device)]
+            )
             rows = torch.cat([place, *(n + k * near + oriented for k in range(3))])
             x[w, place], a[w, place], b[w, oriented], _ = shape.weighted
             factor[w, : len(rows), : len(rows)] = shape.factor.to(device)
-            missing = torch.ones(len(place_of[w]), dtype=torch.bool, device=x.device).index_fill(0, rows, False)
+            missing = torch.ones(len(place_of[w]), dtype=torch.bool, device=x.device).index_fill(
+                0, rows, False
+            )
             place_of[w] = torch.cat([shape.ordered(rows), torch.nonzero(missing)[:, 0]])
-        psi, counts = (x.new_tensor(y) for y in zip(*((s.psi, len(s.factor)) for s in shapes), strict=True))
+        psi, counts = (
+            x.new_tensor(y) for y in zip(*((s.psi, len(s.factor)) for s in shapes), strict=True)
+        )
         x, a, b, psi, place_of = (y.to(device) for y in (x, a, b, psi, place_of))
-        known = torch.arange(n + 3 * near, device=device) < counts.to(device)[:, None]  # no column for what is missing
-        inverse = torch.linalg.solve_triangular(factor.mT, torch.diag_embed(known.to(factor)), upper=True)
-        whitener = torch.empty_like(inverse).scatter_(1, place_of[..., None].expand_as(inverse), inverse)
+        known = (
+            torch.arange(n + 3 * near, device=device) < counts.to(device)[:, None]
+        )  # no column for what is missing
+        inverse = torch.linalg.solve_triangular(
+            factor.mT, torch.diag_embed(known.to(factor)), upper=True
+        )
+        whitener = torch.empty_like(inverse).scatter_(
+            1, place_of[..., None].expand_as(inverse), inverse
+        )
         return cls(x, a, b, whitener, psi)
 
     def weighted(self, wall: Int[Tensor, "q"]) -> Weighted:
         """Return the observations and weights of the surface of each query point."""
         psi = self.psi[wall, None]
-        kernel = Kernel(partial(thin_plate, psi=psi), closed_form=partial(differentiate_thin_plate, psi))
+        kernel = Kernel(
+            partial(thin_plate, psi=psi), closed_form=partial(differentiate_thin_plate, psi)
+        )
         return Weighted(self.x[wall], self.a[wall], self.b[wall], kernel)
 
-    def whiten(self, wall: Int[Tensor, "q"], rows: Float[Tensor, "q rows"]) -> Float[Tensor, "q rows"]:
-        """Return rows of covariances with the observations of each row's surface, whitened; see `Posterior.whiten`."""
+    def whiten(
+        self, wall: Int[Tensor, "q"], rows: Float[Tensor, "q rows"]
+    ) -> Float[Tensor, "q rows"]:
+        """Return rows of covariances with the observations of each row's surface, whitened; see
+        `Posterior.whiten`.
+        """
         return self._together(wall, rows, lambda own, matrix: (own @ matrix,))[0]
 
     def explain(
@@ -89,29 +108,34 @@ class Walls(Value):
     def _together(
         self, wall: Int[Tensor, "q"], rows: Float[Tensor, "q rows"], function: Evaluate
     ) -> tuple[Tensor, ...]:
-        """Return a function of the rows of each surface, (w, m, rows), and the surfaces' whiteners, for all rows."""
-        matrix, group = self.whitener, wall
+        """Return a function of the rows of each surface, (w, m, rows), and the surfaces' whiteners,
+        for all rows.
+        """
+        matrix = self.whitener
+        group = wall
         if rows.device.type == "cpu":  # few surfaces have rows in a small chunk
             found, group = torch.unique(wall, return_inverse=True)
             matrix = matrix[found]
         slot = rank_in_group(group)
-        padded = rows.new_zeros(len(matrix), int(torch.bincount(group, minlength=1).max()), rows.shape[1])
+        padded = rows.new_zeros(
+            len(matrix), int(torch.bincount(group, minlength=1).max()), rows.shape[1]
+        )
         padded[group, slot] = rows
         return tuple(x[group, slot] for x in function(padded, matrix))
 
 
 @dataclasses.dataclass(frozen=True)
 class ShapeBatch(Value):
-    """The shapes of c clouds: row r of all points that a method is given belongs to cloud `owner[r]`.
+    """The shapes of c clouds: row r of all points that a method is given belongs to cloud
+    `owner[r]`.
 
     Numbers of a shape, such as its `scale`, are tensors with one number for each row.
 
-    Args:
-        surfaces: the posteriors of all surfaces: one for each cloud, then the inner ones of open vessels.
-        wall: the indices of each cloud's outer and inner surface, which are the same if the object is not hollow.
-        centers, scales, radii, factors: center [m], scale [m], domain radius and factor of deviations of each cloud.
-        owner: the cloud of each row.
-        hollow: whether any object is hollow.
+    Args: surfaces: the posteriors of all surfaces: one for each cloud, then the inner ones of open
+        vessels. wall: the indices of each cloud's outer and inner surface, which are the same if
+        the object is not hollow. centers, scales, radii, factors: center [m], scale [m], domain
+        radius and factor of deviations of each cloud. owner: the cloud of each row. hollow: whether
+        any object is hollow.
     """
 
     surfaces: Walls
@@ -125,17 +149,27 @@ class ShapeBatch(Value):
 
     @classmethod
     def of(cls, shapes: Sequence[ShapeGP], device: torch.device | None = None) -> "ShapeBatch":
-        """Stack shapes, with one row for each, on a device, by default theirs; refuse another kernel by name."""
+        """Stack shapes, with one row for each, on a device, by default theirs; refuse another
+        kernel by name.
+        """
         for shape in shapes:
             form = shape.kernel.closed_form
             if not (isinstance(form, partial) and form.func is differentiate_thin_plate):
                 raise BadArgument("shapes", "a shape with another kernel", "thin-plate kernels")
-        outer, inner = [s.walls[0] for s in shapes], [s.walls[1] for s in shapes if len(s.walls) > 1]
-        own, device = torch.arange(len(shapes), device="cpu"), shapes[0].device if device is None else device
+        outer = [s.walls[0] for s in shapes]
+        inner = [s.walls[1] for s in shapes if len(s.walls) > 1]
+        own = torch.arange(len(shapes), device="cpu")
+        device = shapes[0].device if device is None else device
         second = torch.tensor([len(s.walls) > 1 for s in shapes], device="cpu")
-        wall = torch.stack([own, torch.where(second, len(shapes) - 1 + second.cumsum(0), own)], 1).to(device)
-        numbers = [[getattr(s, name) for s in shapes] for name in ("scale", "domain_radius", "std_factor")]
-        scales, radii, factors = (torch.tensor(x, dtype=torch.float64, device=device) for x in numbers)
+        wall = torch.stack(
+            [own, torch.where(second, len(shapes) - 1 + second.cumsum(0), own)], 1
+        ).to(device)
+        numbers = [
+            [getattr(s, name) for s in shapes] for name in ("scale", "domain_radius", "std_factor")
+        ]
+        scales, radii, factors = (
+            torch.tensor(x, dtype=torch.float64, device=device) for x in numbers
+        )
         centers = torch.stack([s.center for s in shapes]).double().to(device)
         surfaces = Walls.of([*outer, *inner], device)
         return cls(surfaces, wall, centers, scales, radii, factors, own.to(device), bool(inner))
@@ -162,7 +196,9 @@ class ShapeBatch(Value):
 
     @cached_property
     def walls(self) -> "tuple[ShapeBatch, ...]":
-        """The outer surfaces and, if any object is hollow, the inner ones, each as shapes of one surface."""
+        """The outer surfaces and, if any object is hollow, the inner ones, each as shapes of one
+        surface.
+        """
         if not self.hollow:
             return (self,)
         sides = [self.wall[:, side, None].expand(-1, 2) for side in (0, 1)]
@@ -182,37 +218,54 @@ class ShapeBatch(Value):
         return x * spread(self.scale, x) + spread(self.centers[self.owner], x, 1)
 
     def wall_at(self, x: Float[Tensor, "q 3"]) -> Bool[Tensor, "q walls"]:
-        """Return a mask (points, walls): which of the `walls` is the surface at each normalised point."""
+        """Return a mask (points, walls): which of the `walls` is the surface at each normalised
+        point.
+        """
         if not self.hollow:
             return torch.ones(len(x), 1, dtype=torch.bool, device=x.device)
         own = self._surface_at(x) == self._wall(x)[:, 0]
         return torch.stack([own, ~own], 1)
 
-    def mean_and_gradient(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q"], Float[Tensor, "q 3"]]:
+    def mean_and_gradient(
+        self, x: Float[Tensor, "q 3"]
+    ) -> tuple[Float[Tensor, "q"], Float[Tensor, "q 3"]]:
         """Return the mean signed distance and its gradient at normalised points."""
-        return self._evaluate(lambda part, wall: evaluate_mean(self.surfaces.weighted(wall), part, gradient=True), x)  # pyright: ignore
+        return self._evaluate(
+            lambda part, wall: evaluate_mean(self.surfaces.weighted(wall), part, gradient=True), x
+        )  # pyright: ignore
 
     def mean_jet(self, x: Float[Tensor, "q 3"]) -> MeanJet:
         """Return the mean distance with first and second derivatives at normalised points."""
-        found = self._evaluate(lambda part, wall: evaluate_mean_jet(self.surfaces.weighted(wall), part)[0], x)
+        found = self._evaluate(
+            lambda part, wall: evaluate_mean_jet(self.surfaces.weighted(wall), part)[0], x
+        )
         return MeanJet(*found)
 
     def jet(self, x: Float[Tensor, "q 3"]) -> SurfaceJet:
         """Return mean and variance of the distance with their derivatives at normalised points."""
 
         def evaluate(part: Tensor, wall: Tensor) -> tuple[Tensor, ...]:
-            return evaluate_jet(self.surfaces.weighted(wall), part, partial(self.surfaces.explain, wall))
+            return evaluate_jet(
+                self.surfaces.weighted(wall), part, partial(self.surfaces.explain, wall)
+            )
 
         return SurfaceJet(*self._evaluate(evaluate, x))
 
-    def estimate(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q 4"], Float[Tensor, "q 4 4"]]:
-        """Return mean and covariance of distance and gradient at normalised points, Eqs. (7)-(8) of the paper."""
+    def estimate(
+        self, x: Float[Tensor, "q 3"]
+    ) -> tuple[Float[Tensor, "q 4"], Float[Tensor, "q 4 4"]]:
+        """Return mean and covariance of distance and gradient at normalised points, Eqs. (7)-(8) of
+        the paper.
+        """
 
         def evaluate(part: Tensor, wall: Tensor) -> tuple[Tensor, Tensor]:
-            of, zero = self.surfaces.weighted(wall), torch.zeros_like(part)
+            of = self.surfaces.weighted(wall)
+            zero = torch.zeros_like(part)
             rows = cross_covariance(of.kernel, part, of.x, of.b.shape[1]).transpose(0, 1)
             weights = torch.cat([of.a, of.b.mT.flatten(1)], 1)
-            whitened = self.surfaces.whiten(wall.repeat_interleave(4), rows.flatten(0, 1)).view_as(rows)
+            whitened = self.surfaces.whiten(wall.repeat_interleave(4), rows.flatten(0, 1)).view_as(
+                rows
+            )
             prior = cross_covariance(of.kernel, zero, zero[:, None], 1).transpose(0, 1)
             return (rows @ weights[..., None])[..., 0], prior - whitened @ whitened.mT
 
@@ -223,7 +276,9 @@ class ShapeBatch(Value):
         return self.wall[self.owner].repeat_interleave(len(x) // max(len(self.owner), 1), 0)
 
     def _surface_at(self, x: Float[Tensor, "q 3"]) -> Int[Tensor, "q"]:
-        """Return the surface that applies at each point: of a hollow object the one with the greater mean distance."""
+        """Return the surface that applies at each point: of a hollow object the one with the
+        greater mean distance.
+        """
         outer, inner = self._wall(x).unbind(1)
         if not self.hollow:
             return outer
@@ -231,9 +286,13 @@ class ShapeBatch(Value):
         def mean(part: Tensor, wall: Tensor) -> tuple[Tensor, ...]:
             return evaluate_mean(self.surfaces.weighted(wall), part, gradient=False)
 
-        return torch.where(self._evaluate(mean, x, inner)[0] > self._evaluate(mean, x, outer)[0], inner, outer)
+        return torch.where(
+            self._evaluate(mean, x, inner)[0] > self._evaluate(mean, x, outer)[0], inner, outer
+        )
 
-    def _evaluate(self, evaluate: Evaluate, x: Float[Tensor, "q 3"], wall: Tensor | None = None) -> tuple[Tensor, ...]:
+    def _evaluate(
+        self, evaluate: Evaluate, x: Float[Tensor, "q 3"], wall: Tensor | None = None
+    ) -> tuple[Tensor, ...]:
         """Return the results of a function of points and surfaces, for chunks of points, joined."""
         wall = self._surface_at(x) if wall is None else wall
         size = at_once(x, 256)

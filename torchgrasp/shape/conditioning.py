@@ -1,7 +1,8 @@
-"""The posterior given observations, Eqs. (7)-(8) of the paper: all at once, added later, or the most informative.
+"""The posterior given observations, Eqs. (7)-(8) of the paper: all at once, added later, or the
+most informative.
 
-Each function builds one Cholesky factor L of K + noise, the covariance of the observed numbers. Further observations
-append rows to L.
+Each function builds one Cholesky factor L of K + noise, the covariance of the observed numbers.
+Further observations append rows to L.
 """
 
 import dataclasses
@@ -25,19 +26,25 @@ def posterior_given(observations: Observations, kernel: Kernel) -> Posterior:
     """Return the posterior given observations, by one Cholesky factorisation of their covariance."""
     observations = observations.with_normals_first()
     y, noise = observations.rows()
-    matrix = gram(kernel, observations.x, int(observations.has_normal.sum())) + torch.diag_embed(noise)
+    matrix = gram(kernel, observations.x, int(observations.has_normal.sum())) + torch.diag_embed(
+        noise
+    )
     factor = cholesky(matrix, "the covariance K + sigma^2 I", kernel.remedy)
     weights = torch.cholesky_solve(y[:, None], factor)[:, 0]
     return Posterior(observations.x, observations.has_normal, weights, factor, None, kernel)
 
 
 def check_kernel(posterior: Posterior, least_noise: float) -> None:
-    """Raise `IndefiniteCovariance` if observations are farther apart than the kernel allows and K is indefinite."""
+    """Raise `IndefiniteCovariance` if observations are farther apart than the kernel allows and K
+    is indefinite.
+    """
     kernel = posterior.kernel
     posterior = map_tensors(torch.detach, posterior)
     if longest_distance(posterior.x) > kernel.diameter:
         matrix = gram(kernel, posterior.x, posterior.n_oriented)
-        matrix.diagonal().add_(least_noise**2)  # greater noise of some observations can hide an indefinite K
+        matrix.diagonal().add_(
+            least_noise**2
+        )  # greater noise of some observations can hide an indefinite K
         cholesky(matrix, "the covariance K", kernel.remedy)
 
 
@@ -47,12 +54,15 @@ def longest_distance(x: Float[Tensor, "n 3"]) -> float:
     return float(torch.cdist(x, x, compute_mode="donot_use_mm_for_euclid_dist").max())
 
 
-def append_observations(old: Posterior, new: Observations, shared: Float[Tensor, "n c"] | None = None) -> Posterior:
-    """Return the posterior given the old and the `new` observations; it equals conditioning on all at once.
+def append_observations(
+    old: Posterior, new: Observations, shared: Float[Tensor, "n c"] | None = None
+) -> Posterior:
+    """Return the posterior given the old and the `new` observations; it equals conditioning on all
+    at once.
 
-    The Cholesky factor L of the covariance K + noise grows by the rows [B^T, C] with B = L^-1 K(old, new). C is the
-    factor of K(new, new) + noise - B^T B. `shared` are correlated errors of the new distances,
-    normalised, one column for each independent cause.
+    The Cholesky factor L of the covariance K + noise grows by the rows [B^T, C] with B = L^-1
+    K(old, new). C is the factor of K(new, new) + noise - B^T B. `shared` are correlated errors of
+    the new distances, normalised, one column for each independent cause.
     """
     kernel = old.kernel
     if shared is not None:
@@ -66,17 +76,24 @@ def append_observations(old: Posterior, new: Observations, shared: Float[Tensor,
         own[: len(new.x), : len(new.x)] += shared @ shared.T
     before = torch.linalg.solve_triangular(old.factor, old.ordered(cross), upper=False)
     corner = cholesky(own - before.T @ before, "the covariance of new observations", kernel.remedy)
-    factor = torch.cat([torch.cat([old.factor, torch.zeros_like(before)], 1), torch.cat([before.T, corner], 1)])
+    factor = torch.cat(
+        [torch.cat([old.factor, torch.zeros_like(before)], 1), torch.cat([before.T, corner], 1)]
+    )
 
-    # L^-1 y of the old rows is L^T times their weights; the observed numbers themselves need not be kept.
+    # L^-1 y of the old rows is L^T times their weights; the observed numbers themselves need not be
+    # kept.
     whitened = old.factor.T @ old.ordered(old.weights)
-    rest = torch.linalg.solve_triangular(corner, (y - before.T @ whitened)[:, None], upper=False)[:, 0]
+    rest = torch.linalg.solve_triangular(corner, (y - before.T @ whitened)[:, None], upper=False)[
+        :, 0
+    ]
     return _extend(old, new, factor, torch.cat([whitened, rest]))
 
 
 @dataclasses.dataclass(frozen=True)
 class Selection(Value):
-    """The indices of the picked candidates, in the order of picking, and the posterior that includes them."""
+    """The indices of the picked candidates, in the order of picking, and the posterior that
+    includes them.
+    """
 
     picks: Int[Tensor, "picks"]
     posterior: Posterior
@@ -90,15 +107,21 @@ def select_points(
     criterion: Criterion = "variance",
     stop: float = -math.inf,
 ) -> Selection:
-    """Pick at most `budget` candidates to observe, each the most informative given `known` and earlier picks.
+    """Pick at most `budget` candidates to observe, each the most informative given `known` and
+    earlier picks.
 
-    All candidates have normals. Each pick appends four rows to the Cholesky factor. The selection ends when no
-    candidate's variance exceeds `stop`.
+    All candidates have normals. Each pick appends four rows to the Cholesky factor. The selection
+    ends when no candidate's variance exceeds `stop`.
     """
-    x, start = candidates.x, posterior_given(known, kernel)
-    n, budget = len(x), min(budget, len(x))
-    old, rows = len(start.factor), len(start.factor) + 4 * budget
-    factor = x.new_zeros(rows, rows).T  # by columns, as the solver wants it: it copies any other matrix
+    x = candidates.x
+    start = posterior_given(known, kernel)
+    n = len(x)
+    budget = min(budget, len(x))
+    old = len(start.factor)
+    rows = len(start.factor) + 4 * budget
+    factor = x.new_zeros(
+        rows, rows
+    ).T  # by columns, as the solver wants it: it copies any other matrix
     factor[:old, :old] = start.factor
     with_known = start.cross(x)
     whitened = x.new_empty(rows, n + 1)  # L^-1 [K(observed, distances of candidates), y]
@@ -117,29 +140,42 @@ def select_points(
         if stop > -math.inf and float((free + variance).max()) <= stop:
             break
         p = torch.argmax(free + _score(criterion, variance, error), keepdim=True)
-        end, new = old + 4 * count, slice(old + 4 * count, old + 4 * count + 4)
+        end = old + 4 * count
+        new = slice(old + 4 * count, old + 4 * count + 4)
         # (d, w) of the pick with (d, w) of every candidate; rows of the factor go pick by pick
         with_all = cross_covariance(kernel, x[p], x, n).view(4, 4, n)
         with_picks = with_all[:, :, picks[:count]].permute(2, 1, 0).reshape(4 * count, 4)
         cross = torch.cat([with_known[:, p].squeeze(1).T, with_picks])
         before = torch.linalg.solve_triangular(factor[:end, :end], cross, upper=False)
         own = prior + torch.diag(noise[p][0])
-        corner = cholesky(own - before.T @ before, "the covariance of a picked point", kernel.remedy)
-        left = torch.cat([with_all[:, 0], values[p].T], 1).addmm_(before.T, whitened[:end], alpha=-1.0)
-        factor[new, :end], factor[new, new] = before.T, corner
+        corner = cholesky(
+            own - before.T @ before, "the covariance of a picked point", kernel.remedy
+        )
+        left = torch.cat([with_all[:, 0], values[p].T], 1).addmm_(
+            before.T, whitened[:end], alpha=-1.0
+        )
+        factor[new, :end] = before.T
+        factor[new, new] = corner
         whitened[new] = torch.linalg.solve_triangular(corner, left, upper=False)
         variance -= (whitened[new, :n] ** 2).sum(0)
         error += whitened[new, n] @ whitened[new, :n]
         picks[count] = p[0]
         free.index_fill_(0, p, -math.inf)
         count += 1
-    picks, rows = picks[:count], old + 4 * count
+    picks = picks[:count]
+    rows = old + 4 * count
     by_pick = torch.arange(4 * count, device=x.device).reshape(4, count).T.flatten()
-    return Selection(picks, _extend(start, candidates[picks], factor[:rows, :rows], whitened[:rows, n], by_pick))
+    return Selection(
+        picks, _extend(start, candidates[picks], factor[:rows, :rows], whitened[:rows, n], by_pick)
+    )
 
 
-def _score(criterion: Criterion, variance: Float[Tensor, "n"], error: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
-    """Return a score of each candidate point: the higher, the more an observation of the point would tell."""
+def _score(
+    criterion: Criterion, variance: Float[Tensor, "n"], error: Float[Tensor, "n"]
+) -> Float[Tensor, "n"]:
+    """Return a score of each candidate point: the higher, the more an observation of the point
+    would tell.
+    """
     if criterion == "variance":
         return variance
     if criterion == "error":
@@ -154,19 +190,36 @@ def _extend(
     whitened: Float[Tensor, "rows"],
     new_order: Int[Tensor, "fresh"] | None = None,
 ) -> Posterior:
-    """Return the posterior given `new` observations too, from the grown Cholesky factor L and `whitened` = L^-1 y.
+    """Return the posterior given `new` observations too, from the grown Cholesky factor L and
+    `whitened` = L^-1 y.
 
-    `new_order` gives, for each new row of L, its place in `new.rows()`; by default, the order is the same.
+    `new_order` gives, for each new row of L, its place in `new.rows()`; by default, the order is
+    the same.
     """
-    n, has = len(posterior.x), torch.cat([posterior.has_normal, new.has_normal])
+    n = len(posterior.x)
+    has = torch.cat([posterior.has_normal, new.has_normal])
     points = torch.argsort(~has, stable=True)
-    place, near = torch.argsort(points), int(has.sum())
-    # Rows of the old and of the new observations after joining: distances of all points, then normals by component
+    place = torch.argsort(points)
+    near = int(has.sum())
+    # Rows of the old and of the new observations after joining: distances of all points, then
+    # normals by component
     row = [
         torch.cat([at] + [len(has) + c * near + mine for c in range(3)])
-        for at, mine in ((x, x[own]) for x, own in ((place[:n], posterior.has_normal), (place[n:], new.has_normal)))
+        for at, mine in (
+            (x, x[own])
+            for x, own in ((place[:n], posterior.has_normal), (place[n:], new.has_normal))
+        )
     ]
-    order = torch.cat([posterior.ordered(row[0]), row[1] if new_order is None else row[1][new_order]])
+    order = torch.cat(
+        [posterior.ordered(row[0]), row[1] if new_order is None else row[1][new_order]]
+    )
     solved = torch.linalg.solve_triangular(factor.T, whitened[:, None], upper=True)[:, 0]
     weights = solved[torch.argsort(order)]
-    return Posterior(torch.cat([posterior.x, new.x])[points], has[points], weights, factor, order, posterior.kernel)
+    return Posterior(
+        torch.cat([posterior.x, new.x])[points],
+        has[points],
+        weights,
+        factor,
+        order,
+        posterior.kernel,
+    )

@@ -25,7 +25,9 @@ class Normalisation(Value):
 
     @checked(gradients=True)
     def normalise(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-        """Return points [m], given in the cloud's frame, in the normalised frame (centred and scaled)."""
+        """Return points [m], given in the cloud's frame, in the normalised frame (centred and
+        scaled).
+        """
         return (points - self.center.to(points)) / self.scale
 
     @checked(gradients=True)
@@ -54,7 +56,9 @@ class Observations(Batch):
     normal_noise: Float[Tensor, "n"]
 
     def rows(self) -> tuple[Float[Tensor, "rows"], Float[Tensor, "rows"]]:
-        """Return all observed values and the variances of their noise: first distances, then normals by component."""
+        """Return all observed values and the variances of their noise: first distances, then
+        normals by component.
+        """
         y = torch.cat([self.distance, self.normal[self.has_normal].T.reshape(-1)])
         noise = torch.cat([self.distance_noise, self.normal_noise[self.has_normal].repeat(3)])
         return y, noise * noise
@@ -62,20 +66,28 @@ class Observations(Batch):
     @property
     def least_noise(self) -> float:
         """The least standard deviation of the noise of all observed values."""
-        return float(torch.cat([self.distance_noise, self.normal_noise[self.has_normal]]).detach().min())
+        return float(
+            torch.cat([self.distance_noise, self.normal_noise[self.has_normal]]).detach().min()
+        )
 
     def with_normals_first(self) -> "Observations":
         """Return the observations in another order: first those with normals."""
         return self[torch.argsort(~self.has_normal, stable=True)]
 
 
-def on_surface(x: Points, normals: Points, noise: Float[Tensor, "n"], normal_noise: float) -> Observations:
+def on_surface(
+    x: Points, normals: Points, noise: Float[Tensor, "n"], normal_noise: float
+) -> Observations:
     """Return observations of points on the surface (distance 0) with their normals."""
     yes = torch.ones(len(x), dtype=torch.bool, device=x.device)
-    return Observations(x, torch.zeros_like(noise), normals, yes, noise, torch.full_like(noise, normal_noise))
+    return Observations(
+        x, torch.zeros_like(noise), normals, yes, noise, torch.full_like(noise, normal_noise)
+    )
 
 
-def off_surface(x: Float[Tensor, "n 3"], distance: Float[Tensor, "n"], noise: float) -> Observations:
+def off_surface(
+    x: Float[Tensor, "n 3"], distance: Float[Tensor, "n"], noise: float
+) -> Observations:
     """Return observations of signed distances at points off the surface, without normals."""
     no = torch.zeros(len(x), dtype=torch.bool, device=x.device)
     sigma = torch.full_like(distance, noise)
@@ -86,7 +98,8 @@ def off_surface(x: Float[Tensor, "n 3"], distance: Float[Tensor, "n"], noise: fl
 class MeanJet(Batch):
     """The posterior mean of the signed distance at points, with its gradient and Hessian.
 
-    The derivatives are by normalised coordinates (centred and scaled). Gradients need not have unit length.
+    The derivatives are by normalised coordinates (centred and scaled). Gradients need not have unit
+    length.
     """
 
     distance: Float[Tensor, "*b"]
@@ -100,8 +113,11 @@ class MeanJet(Batch):
 
     @property
     def normal_jacobian(self) -> Float[Tensor, "*b 3 3"]:
-        """The derivatives of the normals by the points, (1 - n n^T) H / |g|, with normal n, Hessian H, gradient g."""
-        n, steep = self.normals, torch.linalg.vector_norm(self.gradient, dim=-1)[..., None, None]
+        """The derivatives of the normals by the points, (1 - n n^T) H / |g|, with normal n, Hessian
+        H, gradient g.
+        """
+        n = self.normals
+        steep = torch.linalg.vector_norm(self.gradient, dim=-1)[..., None, None]
         return (self.hessian - n[..., :, None] * (n[..., None, :] @ self.hessian)) / steep
 
 
@@ -115,9 +131,11 @@ class SurfaceJet(MeanJet):
 
 @dataclasses.dataclass(frozen=True)
 class JointEstimate(Value):
-    """The joint posterior of distance and gradient (d, w) at k points, normalised, ordered by point.
+    """The joint posterior of distance and gradient (d, w) at k points, normalised, ordered by
+    point.
 
-    The gradient w need not have unit length. Points i and j have the block `covariance.reshape(k, 4, k, 4)[i, :, j]`.
+    The gradient w need not have unit length. Points i and j have the block `covariance.reshape(k,
+    4, k, 4)[i, :, j]`.
     """
 
     mean: Float[Tensor, "k 4"]
@@ -126,7 +144,9 @@ class JointEstimate(Value):
 
 @dataclasses.dataclass(frozen=True)
 class ShapeDerivatives(Value):
-    """Derivatives of a `ShapeEstimate` by the query point, per metre: `normal[i, j]` is d normal_i / d point_j."""
+    """Derivatives of a `ShapeEstimate` by the query point, per metre: `normal[i, j]` is d normal_i
+    / d point_j.
+    """
 
     distance: Float[Tensor, "*b 3"]
     normal: Float[Tensor, "*b 3 3"]
@@ -134,6 +154,10 @@ class ShapeDerivatives(Value):
     std_m: Float[Tensor, "*b 3"]
 
 
-def surface_deviation(variance: Float[Tensor, "*b"], gradient: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-    """Return the standard deviation of the surface along its normal, linearised from the distance's variance."""
+def surface_deviation(
+    variance: Float[Tensor, "*b"], gradient: Float[Tensor, "*b 3"]
+) -> Float[Tensor, "*b"]:
+    """Return the standard deviation of the surface along its normal, linearised from the distance's
+    variance.
+    """
     return variance.sqrt() / torch.linalg.vector_norm(gradient, dim=-1)

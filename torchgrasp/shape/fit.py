@@ -63,36 +63,36 @@ def fit_shape(
     kernel: KernelName | Kernel = "thin_plate",
     criterion: Criterion = "variance",
 ) -> ShapeGP:
-    """Return the Gaussian process posterior of an object's shape given a partial cloud, Eqs. (2)-(9) of the paper.
+    """Return the Gaussian process posterior of an object's shape given a partial cloud, Eqs.
+    (2)-(9) of the paper.
 
-    With `support` "camera" the cloud is cleaned and signed distances are true to scale. The object's outline and the
-    mirrored cloud are added as noisier observations. The shape is kept out of free space and of the table.
+    With `support` "camera" the cloud is cleaned and signed distances are true to scale. The
+    object's outline and the mirrored cloud are added as noisier observations. The shape is kept out
+    of free space and of the table.
 
-    With "paper", as in Sec. 3.1, the cloud's centre is observed at distance -1, and 20 random points around it at +1.
+    With "paper", as in Sec. 3.1, the cloud's centre is observed at distance -1, and 20 random
+    points around it at +1.
 
-    Args:
-        cloud: points [m] of one object from one view or several (`merge_clouds`), as in `plan_grasps`. Normals, if
-            they are given, tell whether the points cover the whole surface. Walls thinner than the cloud's spacing
-            merge, but an open vessel seen from above on a `table` becomes a `HollowShape` with two surfaces.
-        noise: standard deviation of an observed signed distance, in radii of the object. If `support` is "paper",
-            also of a normal.
-        budget: number of observed points: 1 inside, 20 outside, the rest the most informative of the cloud. The default
-            is 85 for "camera", which does not count points of the outline and mirrored points, and 70 for "paper".
-            "sure", the paper's rule, adds points until no point's variance exceeds `noise`, at most 1000.
-        psi_scale: ratio of the kernel's length psi to the longest distance between observed points; below 1.34 the
-            covariance may be indefinite.
-        support: observations besides the cloud's points, "camera" or "paper"; see above.
-        seed: random seed.
-        table: the table's plane, or its height [m] along z; only "camera" uses it.
-        kernel: "thin_plate", "matern52" or "rbf", whose length psi sets (`kernel_by_name`); or your own `Kernel` of
-            normalised distances.
-        criterion: what is greatest at the most informative point: the "variance" of its distance, the "error"
+    Args: cloud: points [m] of one object from one view or several (`merge_clouds`), as in
+        `plan_grasps`. Normals, if they are given, tell whether the points cover the whole surface.
+        Walls thinner than the cloud's spacing merge, but an open vessel seen from above on a
+        `table` becomes a `HollowShape` with two surfaces. noise: standard deviation of an observed
+        signed distance, in radii of the object. If `support` is "paper", also of a normal. budget:
+        number of observed points: 1 inside, 20 outside, the rest the most informative of the cloud.
+        The default is 85 for "camera", which does not count points of the outline and mirrored
+        points, and 70 for "paper". "sure", the paper's rule, adds points until no point's variance
+        exceeds `noise`, at most 1000. psi_scale: ratio of the kernel's length psi to the longest
+        distance between observed points; below 1.34 the covariance may be indefinite. support:
+        observations besides the cloud's points, "camera" or "paper"; see above. seed: random seed.
+        table: the table's plane, or its height [m] along z; only "camera" uses it. kernel:
+        "thin_plate", "matern52" or "rbf", whose length psi sets (`kernel_by_name`); or your own
+        `Kernel` of normalised distances. criterion: what is greatest at the most informative point:
+        the "variance" of its distance, the "error"
             |mean distance|, or "both", |error| + 2 sqrt(variance).
 
-    Raises:
-        BadArgument: an argument out of range; a table above the object's foot; a cloud that `prepare_cloud` refuses; a
-            view that is not wholly in front of its camera; for "camera" a whole surface without normals.
-        TooFewPoints: too few points are left; see `prepare_cloud`.
+    Raises: BadArgument: an argument out of range; a table above the object's foot; a cloud that
+        `prepare_cloud` refuses; a view that is not wholly in front of its camera; for "camera" a
+        whole surface without normals. TooFewPoints: too few points are left; see `prepare_cloud`.
         IndefiniteCovariance: `psi_scale` is too small, or the kernel too long for the noise.
 
     >>> from torchgrasp.geometry.linalg import unit
@@ -102,11 +102,16 @@ def fit_shape(
     """
     cloud = as_cloud(cloud, "cloud")
     if isinstance(kernel, Kernel) and not is_plain(kernel.profile(cloud.points.new_zeros(()))):
-        raise BadArgument("kernel", "a profile with tensors that require a gradient", "numbers: use `condition`")
-    plane, cloud = as_plane(table), remove_duplicates(cloud)
+        raise BadArgument(
+            "kernel", "a profile with tensors that require a gradient", "numbers: use `condition`"
+        )
+    plane = as_plane(table)
+    cloud = remove_duplicates(cloud)
     frame = upright_frame(cloud.points, cloud.viewpoint, plane)
     options = FitOptions(noise, budget, psi_scale, support, kernel, criterion)
-    return fit_upright(round_upright(cloud, frame), seed, None if plane is None else 0.0, options).moved(frame)
+    return fit_upright(
+        round_upright(cloud, frame), seed, None if plane is None else 0.0, options
+    ).moved(frame)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,15 +127,21 @@ class FitOptions:
 
 
 def fit_upright(cloud: PointCloud, seed: int, table: float | None, options: FitOptions) -> ShapeGP:
-    """Fit the shape to a cloud without duplicates in a frame whose z axis is up; `table` is the table's height [m]."""
+    """Fit the shape to a cloud without duplicates in a frame whose z axis is up; `table` is the
+    table's height [m].
+    """
     if table is not None:
         check_foot(cloud, Plane.horizontal(table))
     if len(cloud) < FEW_POINTS:
         few = f"{len(cloud)} points, where a shape needs {FEW_POINTS}"
         _warn(FewPoints, f"{few}: the shape is a guess; give more points")
     elif is_flat(cloud.points):
-        _warn(Flat, "the points lie in one plane, to their noise: the thickness is a guess; give a view of two sides")
-    generator, noise = torch.Generator("cpu").manual_seed(seed), options.noise
+        _warn(
+            Flat,
+            "the points lie in one plane, to their noise: the thickness is a guess; give a view of two sides",
+        )
+    generator = torch.Generator("cpu").manual_seed(seed)
+    noise = options.noise
     up = None if table is None else torch.tensor([0.0, 0.0, 1.0], dtype=torch.float32, device="cpu")
     seen = prepare_cloud(cloud, generator, clean=options.support == "camera", up=up)
     if options.support == "paper":
@@ -151,24 +162,38 @@ def fit_upright(cloud: PointCloud, seed: int, table: float | None, options: FitO
 
 
 def _fit_surface(seen: PreparedCloud, support: ExtraObservations, options: FitOptions) -> ShapeGP:
-    """Return the posterior of one surface, in the upright frame, given the cloud and the additional observations."""
-    cloud, points, normals = seen.cloud, seen.points, seen.normals
+    """Return the posterior of one surface, in the upright frame, given the cloud and the additional
+    observations.
+    """
+    cloud = seen.cloud
+    points = seen.points
+    normals = seen.normals
     if support.rows is not None:
-        points, normals = points[support.rows], normals[support.rows]
+        points = points[support.rows]
+        normals = normals[support.rows]
         cloud = PointCloud(points.to(cloud.points), normals.to(cloud.points))
     x = support.frame.normalise(points)
-    candidates = on_surface(x, normals, torch.full_like(x[:, 0], options.noise), support.normal_noise)
+    candidates = on_surface(
+        x, normals, torch.full_like(x[:, 0], options.noise), support.normal_noise
+    )
 
-    # The kernel's length is that of all candidates, so that one factor grows from the first to the last.
+    # The kernel's length is that of all candidates, so that one factor grows from the first to the
+    # last.
     every = join([support.anchors, candidates, *(part for part, _ in support.parts)])
     psi = options.psi_scale * longest_distance(every.x)
-    kernel = kernel_by_name(options.kernel, psi) if isinstance(options.kernel, str) else options.kernel
-    usual, stop = 85 if options.support == "camera" else 70, -math.inf
+    kernel = (
+        kernel_by_name(options.kernel, psi) if isinstance(options.kernel, str) else options.kernel
+    )
+    usual = 85 if options.support == "camera" else 70
+    stop = -math.inf
     budget = options.budget or usual
     if budget == "sure":
-        budget, stop = MAX_BUDGET, options.noise
+        budget = MAX_BUDGET
+        stop = options.noise
     budget = max(budget - len(support.anchors), 1)
-    posterior = select_points(candidates, support.anchors, kernel, budget, options.criterion, stop).posterior
+    posterior = select_points(
+        candidates, support.anchors, kernel, budget, options.criterion, stop
+    ).posterior
     for part, shared in support.parts:
         posterior = append_observations(posterior, part, shared)
     check_kernel(posterior, every.least_noise)
@@ -196,20 +221,18 @@ def condition(
 ) -> ShapeGP:
     """Return the posterior of a shape given normalised observations, Eqs. (7)-(9) of the paper.
 
-    The posterior is differentiable, to any order, in all tensors of the observations, in the frame's centre and in
-    tensors that the kernel's profile uses. The length psi of a kernel by name and the domain's radius are constants.
-    Raises `BadArgument` for an unknown kernel or points inside torch.vmap, and `IndefiniteCovariance` if psi is too
-    small for these observations.
+    The posterior is differentiable, to any order, in all tensors of the observations, in the
+    frame's centre and in tensors that the kernel's profile uses. The length psi of a kernel by name
+    and the domain's radius are constants. Raises `BadArgument` for an unknown kernel or points
+    inside torch.vmap, and `IndefiniteCovariance` if psi is too small for these observations.
 
-    Args:
-        observations: signed distances and normals at points, with their noise, all normalised. torch.vmap may map over
-            distances, normals and noise. Then `IndefiniteCovariance` is not raised, and the estimate is NaN.
-        normalisation: centre and scale of the normalised frame.
-        cloud: the points that the camera saw [m].
-        psi_scale: ratio of the kernel's length psi to the longest distance between observed points; the paper's value 1
-            makes the covariance indefinite.
-        std_factor: ratio of the surface's true deviations to the posterior's standard deviations.
-        kernel: a name (see `kernel_by_name`), or any `Kernel` of normalised distances.
+    Args: observations: signed distances and normals at points, with their noise, all normalised.
+        torch.vmap may map over distances, normals and noise. Then `IndefiniteCovariance` is not
+        raised, and the estimate is NaN. normalisation: centre and scale of the normalised frame.
+        cloud: the points that the camera saw [m]. psi_scale: ratio of the kernel's length psi to
+        the longest distance between observed points; the paper's value 1 makes the covariance
+        indefinite. std_factor: ratio of the surface's true deviations to the posterior's standard
+        deviations. kernel: a name (see `kernel_by_name`), or any `Kernel` of normalised distances.
 
     >>> x, noise = torch.cat([torch.eye(3), -torch.eye(3)]).double() / 2, torch.full((6,), 0.01).double()
     >>> seen = Observations(x, 0 * noise, 2 * x, noise > 0, noise, noise)
@@ -231,19 +254,29 @@ def condition(
 
 
 def _warn_of_ambiguity(cloud: PointCloud, outline: Outlines, on_table: bool) -> None:
-    """Warn if the image border cuts the object off, the view has a gap, or two bodies stand on the table."""
+    """Warn if the image border cuts the object off, the view has a gap, or two bodies stand on the
+    table.
+    """
     if outline.cut:
-        _warn(CutOff, "the border of the image cuts the object off: the part beyond it is a guess; turn the camera")
+        _warn(
+            CutOff,
+            "the border of the image cuts the object off: the part beyond it is a guess; turn the camera",
+        )
     if outline.gap > 0.025:  # [m]; a narrower gap, such as a handle's, does not mislead a fingertip
         width = f"a gap of {1e3 * outline.gap:.0f} mm in the view"
-        _warn(Gap, f"{width}: a hole, or a patch that was not measured; the surface there is a guess")
+        _warn(
+            Gap, f"{width}: a hole, or a patch that was not measured; the surface there is a guess"
+        )
     if on_table:
         points = cloud.points.double().cpu()
         spacing = float(nearest(points, 2)[0][:, -1].median())
         body = find_second_body(points, torch.tensor([0.0, 0.0, 1.0]).to(points), spacing)
         if body is not None:
             share = float(body.double().mean())
-            _warn(TwoBodies, f"two bodies that stand apart, the second of {share:.0%} of the points: give one of them")
+            _warn(
+                TwoBodies,
+                f"two bodies that stand apart, the second of {share:.0%} of the points: give one of them",
+            )
 
 
 def _warn(kind: type[Warning], sentence: str) -> None:
@@ -251,5 +284,9 @@ def _warn(kind: type[Warning], sentence: str) -> None:
     frames: list[FrameType] = [frame := sys._getframe()]
     while (frame := frame.f_back) is not None:
         frames.append(frame)
-    own = [level for level, x in enumerate(frames, 1) if x.f_globals.get("__name__", "").startswith("torchgrasp.")]
+    own = [
+        level
+        for level, x in enumerate(frames, 1)
+        if x.f_globals.get("__name__", "").startswith("torchgrasp.")
+    ]
     warnings.warn(sentence, kind, stacklevel=own[-1] + 1)

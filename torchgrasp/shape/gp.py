@@ -1,4 +1,6 @@
-"""The shape as a Gaussian process over signed distance and normal, with an interface in metres; Eqs. (1), (7)-(9)."""
+"""The shape as a Gaussian process over signed distance and normal, with an interface in metres;
+Eqs. (1), (7)-(9).
+"""
 
 import dataclasses
 from typing import Annotated, Any
@@ -8,7 +10,16 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.foundation.base import Value
-from torchgrasp.foundation.checks import Pose, Positive, Range, Seed, check_moved, check_tensor, checked, is_known
+from torchgrasp.foundation.checks import (
+    Pose,
+    Positive,
+    Range,
+    Seed,
+    check_moved,
+    check_tensor,
+    checked,
+    is_known,
+)
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply
 from torchgrasp.geometry.linalg import cholesky, unit, unit_of_any
@@ -25,24 +36,26 @@ from torchgrasp.shape.estimate import (
 from torchgrasp.shape.posterior import Posterior, symmetric_root
 from torchgrasp.values.planning import PointCloud, ShapeEstimate
 
-MAX_JOINT = 1000  # most points of one joint posterior: its memory grows with the square of their number
+MAX_JOINT = (
+    1000  # most points of one joint posterior: its memory grows with the square of their number
+)
 
 
 @dataclasses.dataclass(frozen=True)
 class ShapeGP(Posterior, Normalisation):
-    """The posterior of an object's signed distance function, Eq. (1) of the paper, given observations; see `fit_shape`.
+    """The posterior of an object's signed distance function, Eq. (1) of the paper, given
+    observations; see `fit_shape`.
 
-    All methods but `update` are differentiable in the points to any order, and twice at observed points, where the thin
-    plate's normals have one derivative only. `update` refuses points that require a gradient.
+    All methods but `update` are differentiable in the points to any order, and twice at observed
+    points, where the thin plate's normals have one derivative only. `update` refuses points that
+    require a gradient.
 
-    Args:
-        psi: the kernel's length psi, normalised.
-        domain_radius: radius, normalised, of the ball in which the posterior is valid.
-        std_factor: ratio of the surface's true deviations to the posterior's standard deviations, calibrated on known
-            objects.
-        cloud: the points that the camera saw, after cleaning.
-        kind: how the hidden side was completed: "ball", "revolution", "mirrored", "vessel", "guess" (from the outline
-            alone), "cut off" (by the image border), or "whole" (no hidden side).
+    Args: psi: the kernel's length psi, normalised. domain_radius: radius, normalised, of the ball
+        in which the posterior is valid. std_factor: ratio of the surface's true deviations to the
+        posterior's standard deviations, calibrated on known objects. cloud: the points that the
+        camera saw, after cleaning. kind: how the hidden side was completed: "ball", "revolution",
+        "mirrored", "vessel", "guess" (from the outline alone), "cut off" (by the image border), or
+        "whole" (no hidden side).
 
     >>> from torchgrasp import fit_shape, load_object
     >>> view = load_object("jug").view
@@ -60,9 +73,16 @@ class ShapeGP(Posterior, Normalisation):
     @classmethod
     @checked(gradients=True)
     def of(
-        cls, posterior: Posterior, frame: Normalisation, cloud: PointCloud, psi: Positive, std_factor: Positive = 1.0
+        cls,
+        posterior: Posterior,
+        frame: Normalisation,
+        cloud: PointCloud,
+        psi: Positive,
+        std_factor: Positive = 1.0,
     ) -> "ShapeGP":
-        """Return the shape of a posterior in a normalised frame; its domain follows from kernel and observations."""
+        """Return the shape of a posterior in a normalised frame; its domain follows from kernel and
+        observations.
+        """
         # Far from all observations the posterior has no information.
         reach = 1.25 * float(torch.linalg.vector_norm(posterior.x.detach(), dim=-1).max())
         radius = min(posterior.kernel.diameter / 2.0, reach)
@@ -70,7 +90,9 @@ class ShapeGP(Posterior, Normalisation):
         return cls(**fields, psi=psi, domain_radius=radius, std_factor=std_factor, cloud=cloud)
 
     def to(self, *args: Any, **kwargs: Any) -> "ShapeGP":
-        """Return the shape on another device, always in float64, which its condition number requires."""
+        """Return the shape on another device, always in float64, which its condition number
+        requires.
+        """
         check_moved(*args, **kwargs)
         device = torch.empty(0, device=self.x.device).to(*args, **kwargs).device
         return super().to(device)
@@ -82,12 +104,16 @@ class ShapeGP(Posterior, Normalisation):
 
     @property
     def walls(self) -> "tuple[ShapeGP, ...]":
-        """The surfaces that enclose the material, each a shape; an object that is not hollow has only one."""
+        """The surfaces that enclose the material, each a shape; an object that is not hollow has
+        only one.
+        """
         return (self,)
 
     @checked(gradients=True)
     def wall_at(self, x: Float[Tensor, "q 3"]) -> Bool[Tensor, "q walls"]:
-        """Return a mask (points, walls): which of the `walls` is the surface at each normalised point."""
+        """Return a mask (points, walls): which of the `walls` is the surface at each normalised
+        point.
+        """
         return torch.ones(len(x), 1, dtype=torch.bool, device=x.device)
 
     @checked(gradients=True)
@@ -97,14 +123,17 @@ class ShapeGP(Posterior, Normalisation):
 
     @checked(gradients=True)
     def predict(self, points: Float[Tensor, "*b 3"]) -> ShapeEstimate:
-        """Return signed distance, normal and covariance at points [m] in the cloud's frame, Eqs. (7)-(8) of the paper.
+        """Return signed distance, normal and covariance at points [m] in the cloud's frame, Eqs.
+        (7)-(8) of the paper.
 
-        Distance, variance and covariance are normalised by `scale` [m]. The estimate has the dtype of `points`, and is
-        differentiable in the points to any order. Inside torch.vmap the domain is not checked.
+        Distance, variance and covariance are normalised by `scale` [m]. The estimate has the dtype
+        of `points`, and is differentiable in the points to any order. Inside torch.vmap the domain
+        is not checked.
 
-        Outside the domain, within its diameter of the centre, the distance grows outward from that at the nearest point
-        of the domain, with slope 1. Covariance and `std_m` are there the prior's. Raises `BadArgument` for numbers that
-        are not finite, or a point farther outside, where a thin plate's variance is negative.
+        Outside the domain, within its diameter of the centre, the distance grows outward from that
+        at the nearest point of the domain, with slope 1. Covariance and `std_m` are there the
+        prior's. Raises `BadArgument` for numbers that are not finite, or a point farther outside,
+        where a thin plate's variance is negative.
 
         >>> from torchgrasp import fit_shape, load_object
         >>> shape = fit_shape(load_object("jug").view)
@@ -122,8 +151,8 @@ class ShapeGP(Posterior, Normalisation):
     def differentiate(self, points: Float[Tensor, "*b 3"]) -> ShapeDerivatives:
         """Return the derivatives of the results of `predict` by the query points, per metre.
 
-        Raises `BadArgument` for numbers that are not finite, or a point outside the domain: at its edge the deviation
-        jumps.
+        Raises `BadArgument` for numbers that are not finite, or a point outside the domain: at its
+        edge the deviation jumps.
 
         >>> from torchgrasp import fit_shape, load_object
         >>> view = load_object("jug").view
@@ -136,7 +165,9 @@ class ShapeGP(Posterior, Normalisation):
         steeper = normal.transpose(1, 2) @ jet.hessian  # the derivative of the slope
         along = normal @ steeper
         std = surface_deviation(jet.variance, jet.gradient)[:, None]
-        relative = jet.variance_gradient / (2 * jet.variance[:, None]) - steeper[:, 0] / length[:, 0]
+        relative = (
+            jet.variance_gradient / (2 * jet.variance[:, None]) - steeper[:, 0] / length[:, 0]
+        )
         return ShapeDerivatives(
             distance=_reshape(jet.gradient / self.scale, points),
             normal=_reshape((jet.hessian - along) / (length * self.scale), points),
@@ -146,7 +177,8 @@ class ShapeGP(Posterior, Normalisation):
 
     @checked(gradients=True)
     def joint(self, points: Float[Tensor, "k 3"]) -> JointEstimate:
-        """Return the joint posterior of distance and gradient, in normalised units, at up to 1000 points [m].
+        """Return the joint posterior of distance and gradient, in normalised units, at up to 1000
+        points [m].
 
         Raises the errors of `differentiate`, and `BadArgument` for more points.
         """
@@ -159,17 +191,23 @@ class ShapeGP(Posterior, Normalisation):
     def sample(
         self, points: Float[Tensor, "k 3"], n: Annotated[int, Range(0, 1_000_000)], seed: Seed = 0
     ) -> Float[Tensor, "n k 4"]:
-        """Draw n joint samples of distance and gradient, in normalised units, at up to 1000 points [m].
+        """Draw n joint samples of distance and gradient, in normalised units, at up to 1000 points
+        [m].
 
         Samples of one seed are differentiable in the points twice, unless points coincide.
 
         Raises the errors of `joint`.
         """
-        joint, prior = self.joint(points.double()), float(self.prior_block()[0, 0].detach())
+        joint = self.joint(points.double())
+        prior = float(self.prior_block()[0, 0].detach())
         root = symmetric_root(joint.covariance, prior, "query points within the domain")
         generator = torch.Generator("cpu").manual_seed(seed)
-        with torch._C._DisableFuncTorch():  # the draws are the same for all that torch.vmap maps over
-            draws = torch.randn(n, len(root), dtype=torch.float64, device="cpu", generator=generator).to(self.device)
+        with (
+            torch._C._DisableFuncTorch()
+        ):  # the draws are the same for all that torch.vmap maps over
+            draws = torch.randn(
+                n, len(root), dtype=torch.float64, device="cpu", generator=generator
+            ).to(self.device)
         return (joint.mean + (draws @ root).reshape(n, *joint.mean.shape)).to(points)
 
     @checked
@@ -181,9 +219,11 @@ class ShapeGP(Posterior, Normalisation):
         noise: Positive = 0.001,
         normal_noise: Positive = 0.05,
     ) -> "ShapeGP":
-        """Return the shape given further surface points too, such as a finger's touch or a second view.
+        """Return the shape given further surface points too, such as a finger's touch or a second
+        view.
 
-        The result equals the posterior of all observations at once. Kernel, domain and `cloud` do not change.
+        The result equals the posterior of all observations at once. Kernel, domain and `cloud` do
+        not change.
 
         Args:
             points: surface points [m] in the cloud's frame.
@@ -205,17 +245,22 @@ class ShapeGP(Posterior, Normalisation):
             direction = unit_of_any(normals.to(x))
             check_tensor("normals", direction, (len(x), 3))  # a normal of length 0 has become NaN
         new = on_surface(x, direction, torch.full_like(x[:, 0], noise / self.scale), normal_noise)
-        return self.append(dataclasses.replace(new, has_normal=new.has_normal & (normals is not None)))
+        return self.append(
+            dataclasses.replace(new, has_normal=new.has_normal & (normals is not None))
+        )
 
     @checked
     def append(self, new: Observations) -> "ShapeGP":
-        """Return the shape given further observations in the normalised frame; kernel and domain do not change."""
+        """Return the shape given further observations in the normalised frame; kernel and domain do
+        not change.
+        """
         return dataclasses.replace(self, **common_fields(append_observations(self, new), Posterior))
 
     @checked
     def moved(self, b_from_a: Pose) -> "ShapeGP":
         """Return the shape transformed from frame a to frame b [m]."""
-        rotation, n = b_from_a[:3, :3].to(self.x), len(self.x)
+        rotation = b_from_a[:3, :3].to(self.x)
+        n = len(self.x)
 
         def turn(rows: Float[Tensor, "rows c"]) -> Float[Tensor, "rows c"]:
             normals = rows[n:].reshape(3, self.n_oriented * rows.shape[1])
@@ -228,14 +273,19 @@ class ShapeGP(Posterior, Normalisation):
             x=self.x @ rotation.T,
             center=apply(b_from_a.to(self.center), self.center[None])[0],
             weights=turn(self.weights[:, None])[:, 0],
-            factor=cholesky(turn(turn(covariance).T), "the covariance of the observations", self.kernel.remedy),
+            factor=cholesky(
+                turn(turn(covariance).T), "the covariance of the observations", self.kernel.remedy
+            ),
             order=None,
             cloud=move(self.cloud, b_from_a),
         )
 
     def _queries(self, points: Float[Tensor, "*b 3"], reach: float = 1.0) -> Float[Tensor, "q 3"]:
-        """Return query points [m] as normalised points (q, 3); raise `BadArgument` beyond `reach` radii of domain."""
-        flat, radius = points.reshape(-1, 3), reach * self.domain_radius
+        """Return query points [m] as normalised points (q, 3); raise `BadArgument` beyond `reach`
+        radii of domain.
+        """
+        flat = points.reshape(-1, 3)
+        radius = reach * self.domain_radius
         x = self.normalise(flat.double().to(self.device))
         away = torch.linalg.vector_norm(x.detach(), dim=-1)
         outside = away > radius
@@ -248,23 +298,31 @@ class ShapeGP(Posterior, Normalisation):
             raise BadArgument("points", f"{found}, {distance}", allowed)
         return x
 
-    def _estimate_or_prior(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q 4"], Float[Tensor, "q 4 4"]]:
-        """Return the results of `estimate`; outside the domain a growing distance with the prior's covariance.
+    def _estimate_or_prior(
+        self, x: Float[Tensor, "q 3"]
+    ) -> tuple[Float[Tensor, "q 4"], Float[Tensor, "q 4 4"]]:
+        """Return the results of `estimate`; outside the domain a growing distance with the prior's
+        covariance.
 
-        The gradient there has length 1. A prior's variance is positive everywhere. Within the domain's diameter of the
-        centre a ball of the domain's size holds both, and in such a ball the kernel is a covariance.
+        The gradient there has length 1. A prior's variance is positive everywhere. Within the
+        domain's diameter of the centre a ball of the domain's size holds both, and in such a ball
+        the kernel is a covariance.
         """
         outside = (torch.linalg.vector_norm(x.detach(), dim=-1) > self.domain_radius)[:, None]
         if not (is_known(outside) and bool(outside.any())):
             return self.estimate(x)
-        outward = unit(torch.where(outside, x, 1.0))  # with finite derivatives at points inside, too
+        outward = unit(
+            torch.where(outside, x, 1.0)
+        )  # with finite derivatives at points inside, too
         nearest = torch.where(outside, self.domain_radius * outward, x)
         mean, spread = self.estimate(nearest)
         away = ((x - nearest) * outward).sum(-1, keepdim=True)
         slope = (mean[:, 1:] * outward).sum(-1, keepdim=True)
         across = self.domain_radius / (self.domain_radius + away) * (mean[:, 1:] - slope * outward)
         grown = torch.cat([mean[:, :1] + away, unit(outward + across)], 1)
-        return torch.where(outside, grown, mean), torch.where(outside[..., None], self.prior_block(), spread)
+        return torch.where(outside, grown, mean), torch.where(
+            outside[..., None], self.prior_block(), spread
+        )
 
 
 def _reshape(rows: Float[Tensor, "q *c"], points: Float[Tensor, "*b 3"]) -> Tensor:

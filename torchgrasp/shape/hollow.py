@@ -1,4 +1,6 @@
-"""The shape of an open vessel: an outer body from which the space inside the inner surface is cut out."""
+"""The shape of an open vessel: an outer body from which the space inside the inner surface is cut
+out.
+"""
 
 import dataclasses
 from collections.abc import Callable
@@ -23,11 +25,13 @@ Found = TypeVar("Found")
 
 @dataclasses.dataclass(frozen=True)
 class HollowShape(ShapeGP):
-    """The shape of an open vessel: the material between an outer and an inner surface, each a Gaussian process.
+    """The shape of an open vessel: the material between an outer and an inner surface, each a
+    Gaussian process.
 
-    A single smooth field cannot change its sign twice within a thin wall. At every point the surface with the greater
-    mean distance gives distance, normal and covariance. Errors of the two surfaces are independent. The signed distance
-    of the `inner` surface is positive in the vessel's cavity and negative around the cavity.
+    A single smooth field cannot change its sign twice within a thin wall. At every point the
+    surface with the greater mean distance gives distance, normal and covariance. Errors of the two
+    surfaces are independent. The signed distance of the `inner` surface is positive in the vessel's
+    cavity and negative around the cavity.
 
     >>> import trimesh
     >>> from torchgrasp import fit_shape
@@ -42,9 +46,13 @@ class HollowShape(ShapeGP):
     @classmethod
     @checked(gradients=True)
     def join(cls, outer: ShapeGP, inner: ShapeGP, cloud: PointCloud) -> "HollowShape":
-        """Return the vessel with two surfaces that share a normalised frame; `cloud` holds the seen points of both."""
+        """Return the vessel with two surfaces that share a normalised frame; `cloud` holds the seen
+        points of both.
+        """
         radius = min(outer.domain_radius, inner.domain_radius)
-        return cls(**common_fields(outer, ShapeGP) | {"cloud": cloud, "domain_radius": radius}, inner=inner)
+        return cls(
+            **common_fields(outer, ShapeGP) | {"cloud": cloud, "domain_radius": radius}, inner=inner
+        )
 
     @cached_property
     def outer(self) -> ShapeGP:
@@ -58,7 +66,9 @@ class HollowShape(ShapeGP):
 
     @checked(gradients=True)
     def wall_at(self, x: Float[Tensor, "q 3"]) -> Bool[Tensor, "q walls"]:
-        """Return a mask (points, 2): whether the outer or the inner surface applies at each normalised point."""
+        """Return a mask (points, 2): whether the outer or the inner surface applies at each
+        normalised point.
+        """
         inner = self.inner.mean(x) > self.outer.mean(x)
         return torch.stack([~inner, inner], 1)
 
@@ -68,20 +78,26 @@ class HollowShape(ShapeGP):
         return torch.maximum(self.outer.mean(x), self.inner.mean(x))
 
     @checked(gradients=True)
-    def mean_and_gradient(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q"], Float[Tensor, "q 3"]]:
+    def mean_and_gradient(
+        self, x: Float[Tensor, "q 3"]
+    ) -> tuple[Float[Tensor, "q"], Float[Tensor, "q 3"]]:
         """Return the mean signed distance and its gradient at normalised points."""
         (a, slope_a), (b, slope_b) = (wall.mean_and_gradient(x) for wall in self.walls)
         return torch.maximum(a, b), torch.where((b > a)[:, None], slope_b, slope_a)
 
     @checked(gradients=True)
-    def estimate(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q 4"], Float[Tensor, "q 4 4"]]:
+    def estimate(
+        self, x: Float[Tensor, "q 3"]
+    ) -> tuple[Float[Tensor, "q 4"], Float[Tensor, "q 4 4"]]:
         """Return mean and covariance of distance and gradient (d, w) at normalised points."""
         parts, merge = self._by_wall(x, lambda wall, own: wall.estimate(own))
         return tuple(map(merge, *parts))  # pyright: ignore[reportReturnType]
 
     @checked(gradients=True)
     def jet(self, x: Float[Tensor, "q 3"]) -> SurfaceJet:
-        """Return mean and variance of the signed distance with their derivatives, at normalised points."""
+        """Return mean and variance of the signed distance with their derivatives, at normalised
+        points.
+        """
         parts, merge = self._by_wall(x, lambda wall, own: wall.jet(own))
         return map_tensors(merge, *parts)
 
@@ -94,14 +110,17 @@ class HollowShape(ShapeGP):
     @checked(gradients=True)
     def joint_at(self, x: Float[Tensor, "k 3"]) -> JointEstimate:
         """Return the joint posterior of distance and gradient (d, w) at normalised points."""
-        parts, owner = [wall.joint_at(x) for wall in self.walls], self.wall_at(x)
+        parts = [wall.joint_at(x) for wall in self.walls]
+        owner = self.wall_at(x)
         mean = torch.where(owner[:, 1:], parts[1].mean, parts[0].mean)
         own = [rows[:, None] & rows for rows in owner.repeat_interleave(4, 0).T]
         return JointEstimate(mean, parts[0].covariance * own[0] + parts[1].covariance * own[1])
 
     @checked
     def append(self, new: Observations) -> "HollowShape":
-        """Return the shape given further normalised observations; each changes the surface that applies there."""
+        """Return the shape given further normalised observations; each changes the surface that
+        applies there.
+        """
         outer, inner = self.wall_at(new.x).T
         return self.join(self.outer.append(new[outer]), self.inner.append(new[inner]), self.cloud)
 
@@ -114,24 +133,30 @@ class HollowShape(ShapeGP):
     def _by_wall(
         self, x: Float[Tensor, "q 3"], evaluate: Callable[[ShapeGP, Tensor], Found]
     ) -> tuple[list[Found], Callable[..., Tensor]]:
-        """Evaluate each wall at the points where it applies; also return a function that merges results in order."""
+        """Evaluate each wall at the points where it applies; also return a function that merges
+        results in order.
+        """
         if not (self._is_plain(x) and self.inner._is_plain(x)):
             inner = self.wall_at(x)[:, 1]
             walls = [evaluate(wall, x) for wall in self.walls]
             return walls, lambda a, b: torch.where(inner.reshape(-1, *[1] * (a.ndim - 1)), b, a)
         rows = [torch.nonzero(own)[:, 0] for own in self.wall_at(x).T]
         back = torch.argsort(torch.cat(rows))
-        return [evaluate(w, x[own]) for w, own in zip(self.walls, rows, strict=True)], lambda *y: torch.cat(y)[back]
+        return [
+            evaluate(w, x[own]) for w, own in zip(self.walls, rows, strict=True)
+        ], lambda *y: torch.cat(y)[back]
 
 
 def tie_walls(shape: HollowShape, middle: Middle) -> HollowShape:
     """Return the vessel after adding observations that give its wall the known thickness.
 
-    Two independent surfaces might touch, which tears holes into the wall. In the wall's middle the signed distances
-    from both surfaces must sum to minus the thickness. Where they do not, the less certain surface gets an observed
-    distance that follows from the more certain one.
+    Two independent surfaces might touch, which tears holes into the wall. In the wall's middle the
+    signed distances from both surfaces must sum to minus the thickness. Where they do not, the less
+    certain surface gets an observed distance that follows from the more certain one.
     """
-    x, thickness, noise = middle.x, middle.thickness, 0.0007 / shape.scale
+    x = middle.x
+    thickness = middle.thickness
+    noise = 0.0007 / shape.scale
     for _ in range(3):
         distance = torch.stack([wall.mean(x) for wall in shape.walls])
         short = distance.sum(0) + thickness
@@ -143,7 +168,9 @@ def tie_walls(shape: HollowShape, middle: Middle) -> HollowShape:
         rows = rows[farthest_points(x[rows], 24, tie=TIE)]
         variance = torch.stack([wall.estimate(x[rows])[1][:, 0, 0] for wall in shape.walls])
         walls = []
-        for wall, own, other, beyond in zip(shape.walls, variance, variance.flip(0), distance.flip(0), strict=True):
+        for wall, own, other, beyond in zip(
+            shape.walls, variance, variance.flip(0), distance.flip(0), strict=True
+        ):
             known = off_surface(x[rows], -thickness - beyond[rows], noise)
             spread = torch.sqrt(shape.std_factor**2 * other + noise**2)
             known = dataclasses.replace(known, distance_noise=spread)[own >= other]

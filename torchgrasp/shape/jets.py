@@ -1,4 +1,6 @@
-"""Mean and variance of the distance at many points, with their derivatives, in closed form; see `Posterior.jet`."""
+"""Mean and variance of the distance at many points, with their derivatives, in closed form; see
+`Posterior.jet`.
+"""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -11,7 +13,8 @@ from torchgrasp.shape.kernel import Kernel, separations
 
 
 class Weighted(NamedTuple):
-    """What the posterior mean needs: observed points, those with normals first, their weights, and the kernel.
+    """What the posterior mean needs: observed points, those with normals first, their weights, and
+    the kernel.
 
     With a leading axis q each of q query points has a posterior of its own.
     """
@@ -22,15 +25,21 @@ class Weighted(NamedTuple):
     kernel: Kernel
 
 
-Explain = Callable[[Tensor], tuple[Tensor, Tensor]]  # `Posterior.explain`, for the points of a chunk
+Explain = Callable[
+    [Tensor], tuple[Tensor, Tensor]
+]  # `Posterior.explain`, for the points of a chunk
 Values = Float[Tensor, "q n"]
 Kernels = tuple[list[Tensor], Values, Values, Float[Tensor, "q near"]]
-"""Components of the differences from the observed points, k, k', and k'' for the points with normals."""
+"""Components of the differences from the observed points, k, k', and k'' for the points with
+normals.
+"""
 
 
 def evaluate_mean(of: Weighted, x: Float[Tensor, "q 3"], gradient: bool) -> tuple[Tensor, ...]:
     """Return the mean distance and, if asked for, its gradient at some points."""
-    near, together = of.b.shape[-2], of.x.ndim == 2  # the points with normals come first
+    # the points with normals come first
+    near = of.b.shape[-2]
+    together = of.x.ndim == 2
     if together:
         distances = torch.cdist(x, of.x, compute_mode="donot_use_mm_for_euclid_dist")
     else:
@@ -45,13 +54,16 @@ def evaluate_mean(of: Weighted, x: Float[Tensor, "q 3"], gradient: bool) -> tupl
     return distance, _sum_differences(c, x, of.x) - _times(first[:, :near], of.b)
 
 
-def evaluate_mean_jet(of: Weighted, x: Float[Tensor, "q 3"]) -> tuple[tuple[Tensor, Tensor, Tensor], Kernels]:
+def evaluate_mean_jet(
+    of: Weighted, x: Float[Tensor, "q 3"]
+) -> tuple[tuple[Tensor, Tensor, Tensor], Kernels]:
     """Return the fields of `MeanJet` at some points, and kernel values that the variance needs."""
     known, a, b, kernel = of
     near = b.shape[-2]  # the points with normals come first
     d, r = separations(x, known)
     k, first, second, third = kernel.derivatives(r, 4)
-    near_first, near_second = first[:, :near], second[:, :near]
+    near_first = first[:, :near]
+    near_second = second[:, :near]
     offset = (known[..., :near, :] * b).sum(-1)
     along = torch.addmm(offset, x, b.T, beta=-1.0) if b.ndim == 2 else _times(x, b.mT) - offset
     c = torch.mul(first, a)
@@ -60,7 +72,10 @@ def evaluate_mean_jet(of: Weighted, x: Float[Tensor, "q 3"]) -> tuple[tuple[Tens
     outer[:, :near].addcmul_(third[:, :near], along, value=-1.0)
     distance = _dot(k, a) - (near_first * along).sum(1)
     gradient = _sum_differences(c, x, known) - _times(near_first, b)
-    rows = [0.5 * _sum_differences(outer * part, x, known) - _times(near_second * part[:, :near], b) for part in d]
+    rows = [
+        0.5 * _sum_differences(outer * part, x, known) - _times(near_second * part[:, :near], b)
+        for part in d
+    ]
     half = torch.stack(rows, 1)
     hessian = half + half.mT
     hessian.diagonal(dim1=1, dim2=2).add_(c.sum(1, keepdim=True))
@@ -70,23 +85,32 @@ def evaluate_mean_jet(of: Weighted, x: Float[Tensor, "q 3"]) -> tuple[tuple[Tens
 def evaluate_jet(of: Weighted, x: Float[Tensor, "q 3"], explain: Explain) -> tuple[Tensor, ...]:
     """Return the fields of `SurfaceJet` at some points; `explain` is that of their posterior."""
     mean, (d, k, first, near_second) = evaluate_mean_jet(of, x)
-    n, near = of.x.shape[-2], near_second.shape[1]
-    near_d, near_first = [part[:, :near] for part in d], first[:, :near]
+    n = of.x.shape[-2]
+    near = near_second.shape[1]
+    near_d = [part[:, :near] for part in d]
+    near_first = first[:, :near]
     explained, solved = explain(distance_rows(d, k, first, near))
-    s, u = solved[:, :n], solved[:, n:].unflatten(1, (3, near)).unbind(1)
+    s = solved[:, :n]
+    u = solved[:, n:].unflatten(1, (3, near)).unbind(1)
     along = (near_d[0] * u[0]).addcmul_(near_d[1], u[1]).addcmul_(near_d[2], u[2])
     c = first * s
     c[:, :near].addcmul_(near_second, along, value=-1.0)
-    slope = _sum_differences(c, x, of.x) - torch.stack([(near_first * part).sum(1) for part in u], 1)
+    slope = _sum_differences(c, x, of.x) - torch.stack(
+        [(near_first * part).sum(1) for part in u], 1
+    )
     return *mean, of.kernel.profile(x.new_zeros(len(x), 1))[:, 0] - explained, -2.0 * slope
 
 
 def distance_rows(d: list[Tensor], k: Values, first: Values, near: int) -> Float[Tensor, "q rows"]:
-    """Return the covariance of distances with all observations: k, then -k' d for each component of the normals."""
+    """Return the covariance of distances with all observations: k, then -k' d for each component of
+    the normals.
+    """
     return torch.cat([k, *(-(part[:, :near] * first[:, :near]) for part in d)], 1)
 
 
-def _sum_differences(c: Values, x: Float[Tensor, "q 3"], y: Float[Tensor, "*q n 3"]) -> Float[Tensor, "q 3"]:
+def _sum_differences(
+    c: Values, x: Float[Tensor, "q 3"], y: Float[Tensor, "*q n 3"]
+) -> Float[Tensor, "q 3"]:
     """Return sum_j c_j (x - y_j) for each point x, by a matrix product."""
     return x * c.sum(1, keepdim=True) - _times(c, y)
 

@@ -1,6 +1,8 @@
-"""Radial kernels k(r), and the covariances of signed distances and normals that follow, Eqs. (2)-(6) of the paper.
+"""Radial kernels k(r), and the covariances of signed distances and normals that follow, Eqs.
+(2)-(6) of the paper.
 
-Autograd of the scalar profile k(r) defines all derivatives. A kernel may add a closed form, which plain tensors take.
+Autograd of the scalar profile k(r) defines all derivatives. A kernel may add a closed form, which
+plain tensors take.
 """
 
 import dataclasses
@@ -16,10 +18,13 @@ from torch import Tensor
 from torchgrasp.foundation.checks import LEAST, Positive, Range, checked, is_known, is_tracked
 
 Profile = Callable[[Tensor], Tensor]
-"""A radial kernel k(r), elementwise, smooth where r > 0 and four times so at 0 from the right, with k'(0) = 0."""
+"""A radial kernel k(r), elementwise, smooth where r > 0 and four times so at 0 from the right, with
+k'(0) = 0.
+"""
 KernelName = Literal["thin_plate", "matern52", "rbf"]
 Orders = Annotated[int, Range(1, 4)]  # how many of k and its derivatives
-NEAR_ZERO = 1e-4  # below it k(r) is taken as its Taylor polynomial of degree 4, as k'(r) / r is 0 / 0 at r = 0
+# below it k(r) is taken as its Taylor polynomial of degree 4, as k'(r) / r is 0 / 0 at r = 0
+NEAR_ZERO = 1e-4
 
 
 @checked
@@ -27,16 +32,15 @@ NEAR_ZERO = 1e-4  # below it k(r) is taken as its Taylor polynomial of degree 4,
 class Kernel:
     """A radial kernel k(r) of normalised distances r, with its derivatives by r^2 / 2.
 
-    Each derivative is (1/r) d/dr of the one before: k, k'/r, (k'/r)'/r, and so on; they are not k', k'', k'''.
-    Autograd of the profile defines them. Gradients also reach tensors that the profile itself uses, such as a length.
+    Each derivative is (1/r) d/dr of the one before: k, k'/r, (k'/r)'/r, and so on; they are not k',
+    k'', k'''. Autograd of the profile defines them. Gradients also reach tensors that the profile
+    itself uses, such as a length.
 
-    Args:
-        profile: the function k(r).
-        diameter: diameter of the ball, normalised, within which k is a covariance; infinite if it is a covariance
-            everywhere.
-        remedy: fix that the error suggests if the covariance is not positive definite.
-        closed_form: function of `r` and `count` that returns these derivatives faster, or False. It serves plain
-            tensors; where a gradient is needed, the profile's derivatives are taken by autograd.
+    Args: profile: the function k(r). diameter: diameter of the ball, normalised, within which k is
+        a covariance; infinite if it is a covariance everywhere. remedy: fix that the error suggests
+        if the covariance is not positive definite. closed_form: function of `r` and `count` that
+        returns these derivatives faster, or False. It serves plain tensors; where a gradient is
+        needed, the profile's derivatives are taken by autograd.
 
     >>> kernel = Kernel(lambda r: (1 + r) * torch.exp(-r))
     >>> [round(float(s), 4) for s in kernel.derivatives(torch.ones(1, dtype=torch.float64), 4)]
@@ -50,26 +54,34 @@ class Kernel:
 
     @checked(gradients=True)
     def derivatives(self, r: Float[Tensor, "*s"], count: Orders) -> tuple[Float[Tensor, "*s"], ...]:
-        """Return the first `count` (1 to 4) of k and its derivatives by r^2 / 2, elementwise; see `differentiate`."""
+        """Return the first `count` (1 to 4) of k and its derivatives by r^2 / 2, elementwise; see
+        `differentiate`.
+        """
         if self.closed_form and is_plain(r):
             return self.closed_form(r, count)
         return differentiate(self.profile, r * r / 2, count)
 
 
 def is_plain(*tensors: Tensor) -> bool:
-    """Return whether torch neither differentiates the tensors nor maps over them, so that buffers may be reused."""
+    """Return whether torch neither differentiates the tensors nor maps over them, so that buffers
+    may be reused.
+    """
     return all(is_known(x) and not is_tracked(x) for x in tensors)
 
 
-def differentiate(profile: Profile, u: Float[Tensor, "*s"], count: int) -> tuple[Float[Tensor, "*s"], ...]:
+def differentiate(
+    profile: Profile, u: Float[Tensor, "*s"], count: int
+) -> tuple[Float[Tensor, "*s"], ...]:
     """Return k and its derivatives by u = r^2 / 2, by autograd, `count` in all, at most 4.
 
-    They are differentiable by u to any order, but at r = 0 only those up to (d/du)^2 k are right. Higher ones, and
-    infinite ones, count as 0 there: covariances and their second derivatives multiply them by a power of r.
+    They are differentiable by u to any order, but at r = 0 only those up to (d/du)^2 k are right.
+    Higher ones, and infinite ones, count as 0 there: covariances and their second derivatives
+    multiply them by a power of r.
     """
     near = u < NEAR_ZERO**2 / 2
     r = torch.sqrt(2.0 * torch.where(near, NEAR_ZERO**2 / 2, u))
-    values, inverse = _differentiate_by_distance(profile, r, count - 1), 1.0 / r
+    values = _differentiate_by_distance(profile, r, count - 1)
+    inverse = 1.0 / r
     if count > 1:
         values[1] = values[1] * inverse
     if count > 2:
@@ -79,8 +91,12 @@ def differentiate(profile: Profile, u: Float[Tensor, "*s"], count: int) -> tuple
     if is_known(near) and not bool(near.any()):
         return tuple(values)
     k, _, second, third, fourth = _differentiate_by_distance(profile, u.new_zeros(()), 4)
-    apart = 2.0 * u > torch.finfo(u.dtype).eps ** 1.5  # closer points coincide: rounding of `third` would dominate
-    r = torch.where(apart, torch.sqrt(2.0 * torch.where(apart, u, 1.0)), 0.0)  # its gradient is finite at 0, too
+    apart = (
+        2.0 * u > torch.finfo(u.dtype).eps ** 1.5
+    )  # closer points coincide: rounding of `third` would dominate
+    r = torch.where(
+        apart, torch.sqrt(2.0 * torch.where(apart, u, 1.0)), 0.0
+    )  # its gradient is finite at 0, too
     inverse = torch.where(apart, 1.0 / torch.where(apart, r, 1.0), 0.0)
     series = (
         k + u * (second + u * fourth / 6.0) + r**3 * third / 6.0,
@@ -92,7 +108,9 @@ def differentiate(profile: Profile, u: Float[Tensor, "*s"], count: int) -> tuple
 
 
 def _differentiate_by_distance(profile: Profile, r: Tensor, order: int) -> list[Tensor]:
-    """Return the profile k(r) and its derivatives by r up to an order, elementwise and differentiable."""
+    """Return the profile k(r) and its derivatives by r up to an order, elementwise and
+    differentiable.
+    """
     if not order:
         return [profile(r)]
 
@@ -105,8 +123,11 @@ def _differentiate_by_distance(profile: Profile, r: Tensor, order: int) -> list[
 
 
 def thin_plate(r: Float[Tensor, "*s"], psi: float | Float[Tensor, "*p"]) -> Float[Tensor, "*s"]:
-    """Return 2 r^3 - 3 psi r^2 + psi^3, Eq. (6) of the paper: it is a covariance in a ball of diameter 3/4 psi."""
-    # Not factored as (psi - r)^2 (psi + 2 r): its derivative would cancel at r -> 0, where normals need it.
+    """Return 2 r^3 - 3 psi r^2 + psi^3, Eq. (6) of the paper: it is a covariance in a ball of
+    diameter 3/4 psi.
+    """
+    # Not factored as (psi - r)^2 (psi + 2 r): its derivative would cancel at r -> 0, where normals
+    # need it.
     return r * r * (2.0 * r - 3.0 * psi) + psi**3
 
 
@@ -126,7 +147,9 @@ def thin_plate_kernel(psi: Positive, closed_form: bool = True) -> Kernel:
 
 
 def differentiate_thin_plate(psi: float | Tensor, r: Tensor, count: int) -> tuple[Tensor, ...]:
-    """Return k and its derivatives by r^2 / 2 of the thin plate kernel in closed form, `count` in all."""
+    """Return k and its derivatives by r^2 / 2 of the thin plate kernel in closed form, `count` in
+    all.
+    """
     values = [(2.0 * r).sub_(3.0 * psi).mul_(r).mul_(r).add_(psi**3), (6.0 * r).sub_(6.0 * psi)]
     if count > 2:
         inverse = torch.reciprocal(r).masked_fill_(r == 0, 0.0)
@@ -152,7 +175,11 @@ def matern52_kernel(length: Positive, variance: Positive = 1.0) -> Kernel:
     def closed_form(r: Tensor, count: int) -> tuple[Tensor, ...]:
         fall = torch.exp(-scale * r) * (variance / 3.0)
         inverse = torch.reciprocal(r).masked_fill(r == 0, 0.0)
-        orders = -(scale**2) * (1.0 + scale * r) * fall, scale**4 * fall, -(scale**5) * inverse * fall
+        orders = (
+            -(scale**2) * (1.0 + scale * r) * fall,
+            scale**4 * fall,
+            -(scale**5) * inverse * fall,
+        )
         return profile(r), *orders[: count - 1]
 
     return Kernel(profile, closed_form=closed_form)
@@ -178,7 +205,9 @@ def rbf_kernel(length: Positive, variance: Positive = 1.0) -> Kernel:
 
 @checked
 def kernel_by_name(name: KernelName, psi: Positive) -> Kernel:
-    """Return a kernel by name; all have the prior variance psi^3 of the distance and 6 psi of a gradient component."""
+    """Return a kernel by name; all have the prior variance psi^3 of the distance and 6 psi of a
+    gradient component.
+    """
     if name == "thin_plate":
         return thin_plate_kernel(psi)
     if name == "matern52":
@@ -189,11 +218,12 @@ def kernel_by_name(name: KernelName, psi: Positive) -> Kernel:
 def cross_covariance(
     kernel: Kernel, x: Float[Tensor, "q 3"], y: Float[Tensor, "*q n 3"], n_oriented: int
 ) -> Float[Tensor, "4 q rows"]:
-    """Return the covariance of distance and gradient at x with the observations at y, Eqs. (2)-(5) of the paper.
+    """Return the covariance of distance and gradient at x with the observations at y, Eqs. (2)-(5)
+    of the paper.
 
-    The blocks are k, k' d, -k' d^T and -k' I - k'' d d^T with d = x - y and derivatives by r^2 / 2. The columns are the
-    distances at all y, then each gradient component at the first `n_oriented`, which have normals. With a leading axis,
-    `y` holds the observations of each x.
+    The blocks are k, k' d, -k' d^T and -k' I - k'' d d^T with d = x - y and derivatives by r^2 / 2.
+    The columns are the distances at all y, then each gradient component at the first `n_oriented`,
+    which have normals. With a leading axis, `y` holds the observations of each x.
     """
     if not (kernel.closed_form and is_plain(x, y)):
         return _differentiable_cross_covariance(kernel, x, y, n_oriented)
@@ -206,7 +236,9 @@ def cross_covariance(
         torch.mul(first, d[m], out=out[m + 1, :, :n])
     if not n_oriented:
         return out
-    d, first, second = [part[:, :n_oriented] for part in d], -first[:, :n_oriented], -second[:, :n_oriented]
+    d = [part[:, :n_oriented] for part in d]
+    first = -first[:, :n_oriented]
+    second = -second[:, :n_oriented]
     for m in range(3):
         columns = slice(n + m * n_oriented, n + (m + 1) * n_oriented)
         torch.mul(first, d[m], out=out[0, :, columns])
@@ -222,19 +254,30 @@ def cross_covariance(
 def _differentiable_cross_covariance(
     kernel: Kernel, x: Float[Tensor, "q 3"], y: Float[Tensor, "n 3"], n_oriented: int
 ) -> Float[Tensor, "4 q rows"]:
-    """Return the result of `cross_covariance` by operations without side effects, differentiable to any order."""
+    """Return the result of `cross_covariance` by operations without side effects, differentiable to
+    any order.
+    """
     d = x[:, None] - y
     k, first, second = (f[..., None] for f in differentiate(kernel.profile, (d * d).sum(-1) / 2, 3))
-    near, slope = d[:, :n_oriented], -first[:, :n_oriented]
+    near = d[:, :n_oriented]
+    slope = -first[:, :n_oriented]
     one = torch.eye(3, dtype=x.dtype, device=x.device)
-    bent = slope[..., None] * one - second[:, :n_oriented, :, None] * near[..., :, None] * near[..., None, :]
+    bent = (
+        slope[..., None] * one
+        - second[:, :n_oriented, :, None] * near[..., :, None] * near[..., None, :]
+    )
     with_distances = torch.cat([k, first * d], -1).permute(2, 0, 1)
-    with_normals = torch.cat([(slope * near)[..., None, :], bent], -2).permute(2, 0, 3, 1).flatten(2)
+    with_normals = (
+        torch.cat([(slope * near)[..., None, :], bent], -2).permute(2, 0, 3, 1).flatten(2)
+    )
     return torch.cat([with_distances, with_normals], -1)
 
 
-def separations(x: Float[Tensor, "q 3"], y: Float[Tensor, "*q n 3"]) -> tuple[list[Tensor], Float[Tensor, "q n"]]:
-    """Return the three components of x - y for all pairs, and the distances |x - y|, without cancellation.
+def separations(
+    x: Float[Tensor, "q 3"], y: Float[Tensor, "*q n 3"]
+) -> tuple[list[Tensor], Float[Tensor, "q n"]]:
+    """Return the three components of x - y for all pairs, and the distances |x - y|, without
+    cancellation.
 
     With a leading axis, `y` holds the points that each x is compared with.
     """
@@ -243,9 +286,15 @@ def separations(x: Float[Tensor, "q 3"], y: Float[Tensor, "*q n 3"]) -> tuple[li
 
 
 def covariance_rows(
-    kernel: Kernel, x: Float[Tensor, "n 3"], n_oriented: int, y: Float[Tensor, "m 3"], other_oriented: int
+    kernel: Kernel,
+    x: Float[Tensor, "n 3"],
+    n_oriented: int,
+    y: Float[Tensor, "m 3"],
+    other_oriented: int,
 ) -> Float[Tensor, "rows columns"]:
-    """Return the covariance of observations at x and y; the first `n_oriented` and `other_oriented` have normals."""
+    """Return the covariance of observations at x and y; the first `n_oriented` and `other_oriented`
+    have normals.
+    """
     block = cross_covariance(kernel, x, y, other_oriented)
     if n_oriented == len(x):
         return block.flatten(0, 1)

@@ -1,4 +1,6 @@
-"""The Gaussian process posterior in the normalised frame: mean, derivatives, covariances; Eqs. (7)-(8) of the paper."""
+"""The Gaussian process posterior in the normalised frame: mean, derivatives, covariances; Eqs.
+(7)-(8) of the paper.
+"""
 
 import dataclasses
 from functools import cached_property, partial
@@ -11,29 +13,51 @@ from torchgrasp.foundation.base import Value, at_once, in_chunks
 from torchgrasp.foundation.checks import checked, is_known
 from torchgrasp.foundation.errors import IndefiniteCovariance
 from torchgrasp.shape.estimate import JointEstimate, MeanJet, SurfaceJet
-from torchgrasp.shape.jets import Weighted, distance_rows, evaluate_jet, evaluate_mean, evaluate_mean_jet
-from torchgrasp.shape.kernel import Kernel, cross_covariance, differentiate, gram, is_plain, separations
+from torchgrasp.shape.jets import (
+    Weighted,
+    distance_rows,
+    evaluate_jet,
+    evaluate_mean,
+    evaluate_mean_jet,
+)
+from torchgrasp.shape.kernel import (
+    Kernel,
+    cross_covariance,
+    differentiate,
+    gram,
+    is_plain,
+    separations,
+)
 
 
 @dataclasses.dataclass(frozen=True)
 class Posterior(Value):
     """A Gaussian process given observed distances and normals, in normalised units and float64.
 
-    (d, w) are the signed distance and its gradient. All methods are differentiable, to any order, in the points and in
-    the tensors of the posterior. Plain tensors take faster formulas, which reuse buffers.
+    (d, w) are the signed distance and its gradient. All methods are differentiable, to any order,
+    in the points and in the tensors of the posterior. Plain tensors take faster formulas, which
+    reuse buffers.
     """
 
     x: Float[Tensor, "n 3"]  # observed points, those with normals first
     has_normal: Bool[Tensor, "n"]
-    weights: Float[Tensor, "rows"]  # (K + noise)^-1 y of the observed y: all distances, then the normals by component
-    factor: Float[Tensor, "rows rows"]  # lower Cholesky factor of K + noise; rows of later observations come last
+    weights: Float[
+        Tensor, "rows"
+    ]  # (K + noise)^-1 y of the observed y: all distances, then the normals by component
+    factor: Float[
+        Tensor, "rows rows"
+    ]  # lower Cholesky factor of K + noise; rows of later observations come last
     order: Int[Tensor, "rows"] | None  # row in `weights` of each row of `factor`; None if the same
     kernel: Kernel
 
     @cached_property
     def whiteners(self) -> list[Float[Tensor, "columns width"]]:
-        """The inverse L^-T of the transposed Cholesky factor, in blocks of columns without the zeros below them."""
-        rows, tile = len(self.factor), 24  # matrix products are fastest with a multiple of so many columns
+        """The inverse L^-T of the transposed Cholesky factor, in blocks of columns without the
+        zeros below them.
+        """
+        # matrix products are fastest with a multiple of so many columns
+        rows = len(self.factor)
+        tile = 24
         one = torch.eye(rows, dtype=self.x.dtype, device=self.x.device)
         inverse = torch.linalg.solve_triangular(self.factor, one, upper=False)
         width = max(tile * round(rows / (4 * tile)), tile)
@@ -54,21 +78,32 @@ class Posterior(Value):
         """Return the mean signed distance at normalised points."""
         if not self._is_plain(x):
             return self.distance_rows(x) @ self.weights
-        return in_chunks(lambda part: evaluate_mean(self.weighted, part, gradient=False), x, 2048)[0]
+        return in_chunks(lambda part: evaluate_mean(self.weighted, part, gradient=False), x, 2048)[
+            0
+        ]
 
     @checked(gradients=True)
-    def mean_and_gradient(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q"], Float[Tensor, "q 3"]]:
+    def mean_and_gradient(
+        self, x: Float[Tensor, "q 3"]
+    ) -> tuple[Float[Tensor, "q"], Float[Tensor, "q 3"]]:
         """Return the mean signed distance and its gradient at normalised points; see `jet`."""
         if not self._is_plain(x):
             distance, *slope = (self.cross(x) @ self.weights).unbind(0)
             return distance, torch.stack(slope, -1)
-        found = in_chunks(lambda part: evaluate_mean(self.weighted, part, gradient=True), x, at_once(x, 512))
+        found = in_chunks(
+            lambda part: evaluate_mean(self.weighted, part, gradient=True), x, at_once(x, 512)
+        )
         return found  # pyright: ignore[reportReturnType]
 
     @checked(gradients=True)
-    def estimate(self, x: Float[Tensor, "q 3"]) -> tuple[Float[Tensor, "q 4"], Float[Tensor, "q 4 4"]]:
-        """Return mean and covariance of distance and gradient at normalised points, Eqs. (7)-(8) of the paper."""
-        prior, rows = self.prior_block(), len(self.factor)
+    def estimate(
+        self, x: Float[Tensor, "q 3"]
+    ) -> tuple[Float[Tensor, "q 4"], Float[Tensor, "q 4 4"]]:
+        """Return mean and covariance of distance and gradient at normalised points, Eqs. (7)-(8) of
+        the paper.
+        """
+        prior = self.prior_block()
+        rows = len(self.factor)
 
         def evaluate(x: Tensor) -> tuple[Tensor, Tensor]:
             cross = self.cross(x)
@@ -85,27 +120,34 @@ class Posterior(Value):
                         spread[:, p, m] -= explained
             return mean, spread
 
-        # On a CPU the temporaries of a chunk stay in the cache. On an accelerator they take at most 128 MiB.
+        # On a CPU the temporaries of a chunk stay in the cache. On an accelerator they take at most
+        # 128 MiB.
         size = 256 if x.device.type == "cpu" else max(2**27 // (32 * rows), 64)
         return in_chunks(evaluate, x, size)  # pyright: ignore[reportReturnType]
 
     @checked(gradients=True)
     def jet(self, x: Float[Tensor, "q 3"]) -> SurfaceJet:
-        """Return mean and variance of the distance with their derivatives at normalised points, in closed form.
+        """Return mean and variance of the distance with their derivatives at normalised points, in
+        closed form.
 
-        The mean is sum_j (a_j k - k' d.b_j), with d = x - x_j and k' = dk / d(|d|^2 / 2). Here a_j is the weight of the
-        distance at the observed point x_j, and b_j that of its normal. The variance is k0 - k*^T A k*: k0 is the prior
-        variance, k* the covariance of the point with the data, and A the inverse covariance of the data. Its gradient
-        is -2 times the gradient of a mean with the weights A k*.
+        The mean is sum_j (a_j k - k' d.b_j), with d = x - x_j and k' = dk / d(|d|^2 / 2). Here a_j
+        is the weight of the distance at the observed point x_j, and b_j that of its normal. The
+        variance is k0 - k*^T A k*: k0 is the prior variance, k* the covariance of the point with
+        the data, and A the inverse covariance of the data. Its gradient is -2 times the gradient of
+        a mean with the weights A k*.
         """
         size = at_once(x, 256)
         if not self._is_plain(x):
             return SurfaceJet(*in_chunks(partial(_differentiable_jet, self), x, size))
-        return SurfaceJet(*in_chunks(lambda part: evaluate_jet(self.weighted, part, self.explain), x, size))
+        return SurfaceJet(
+            *in_chunks(lambda part: evaluate_jet(self.weighted, part, self.explain), x, size)
+        )
 
     @checked(gradients=True)
     def mean_jet(self, x: Float[Tensor, "q 3"]) -> MeanJet:
-        """Return the mean distance with first and second derivatives at normalised points, at less cost than `jet`."""
+        """Return the mean distance with first and second derivatives at normalised points, at less
+        cost than `jet`.
+        """
         size = at_once(x, 256)
         if not self._is_plain(x):
             return MeanJet(*in_chunks(partial(_differentiable_jet, self), x, size)[:3])
@@ -113,7 +155,9 @@ class Posterior(Value):
 
     @checked(gradients=True)
     def joint_at(self, x: Float[Tensor, "k 3"]) -> JointEstimate:
-        """Return the joint posterior of distance and gradient at k normalised points, Eqs. (7)-(8) of the paper."""
+        """Return the joint posterior of distance and gradient at k normalised points, Eqs. (7)-(8)
+        of the paper.
+        """
         k = len(x)
         cross = self.cross(x)
         mean = (cross @ self.weights).T
@@ -124,13 +168,17 @@ class Posterior(Value):
         return JointEstimate(mean, prior - whitened.T @ whitened)
 
     def prior_block(self) -> Float[Tensor, "4 4"]:
-        """Return the prior covariance (4, 4) of signed distance and gradient, the same at every point."""
+        """Return the prior covariance (4, 4) of signed distance and gradient, the same at every
+        point.
+        """
         here = self.x.new_zeros(1, 3)
         return cross_covariance(self.kernel, here, here, 1)[:, 0]
 
     @checked(gradients=True)
     def distance_rows(self, x: Float[Tensor, "q 3"]) -> Float[Tensor, "q rows"]:
-        """Return the covariance of the distances at normalised points with all observations, one row per point."""
+        """Return the covariance of the distances at normalised points with all observations, one
+        row per point.
+        """
         if not self._is_plain(x):
             d = x[:, None] - self.x
             k, first = differentiate(self.kernel.profile, (d * d).sum(-1) / 2, 2)
@@ -151,12 +199,18 @@ class Posterior(Value):
         return torch.cat([rows[:, : len(block)] @ block for block in self.whiteners], 1)
 
     @checked
-    def explain(self, rows: Float[Tensor, "q rows"]) -> tuple[Float[Tensor, "q"], Float[Tensor, "q rows"]]:
-        """Return the variance k A k that observations explain, and k A, for rows k of covariances with them.
+    def explain(
+        self, rows: Float[Tensor, "q rows"]
+    ) -> tuple[Float[Tensor, "q"], Float[Tensor, "q rows"]]:
+        """Return the variance k A k that observations explain, and k A, for rows k of covariances
+        with them.
 
-        A is the inverse covariance of the observations. With the whitened row, the variance is a sum of squares.
+        A is the inverse covariance of the observations. With the whitened row, the variance is a
+        sum of squares.
         """
-        whitened, solved, first = self.whiten(rows), torch.zeros_like(rows), 0
+        whitened = self.whiten(rows)
+        solved = torch.zeros_like(rows)
+        first = 0
         for block in self.whiteners:
             solved[:, : len(block)].addmm_(whitened[:, first : first + block.shape[1]], block.T)
             first += block.shape[1]
@@ -166,7 +220,9 @@ class Posterior(Value):
 
     @checked(gradients=True)
     def cross(self, x: Float[Tensor, "q 3"]) -> Float[Tensor, "4 q rows"]:
-        """Return the covariance of distance and gradient (d, w) at normalised points with all observations."""
+        """Return the covariance of distance and gradient (d, w) at normalised points with all
+        observations.
+        """
         return cross_covariance(self.kernel, x, self.x, self.n_oriented)
 
     def _is_plain(self, x: Tensor) -> bool:
@@ -177,7 +233,9 @@ class Posterior(Value):
     def weighted(self) -> Weighted:
         """The observed points with the posterior weights of their distances and normals."""
         n = len(self.x)
-        return Weighted(self.x, self.weights[:n], self.weights[n:].reshape(3, self.n_oriented).T, self.kernel)
+        return Weighted(
+            self.x, self.weights[:n], self.weights[n:].reshape(3, self.n_oriented).T, self.kernel
+        )
 
 
 def _differentiable_jet(posterior: Posterior, x: Float[Tensor, "q 3"]) -> tuple[Tensor, ...]:
@@ -185,7 +243,11 @@ def _differentiable_jet(posterior: Posterior, x: Float[Tensor, "q 3"]) -> tuple[
 
     def total(x: Tensor) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]:
         mean, spread = posterior.estimate(x)
-        return (mean[:, 1:].sum(0), spread[:, 0, 0].sum(0)), (mean[:, 0], mean[:, 1:], spread[:, 0, 0])
+        return (mean[:, 1:].sum(0), spread[:, 0, 0].sum(0)), (
+            mean[:, 0],
+            mean[:, 1:],
+            spread[:, 0, 0],
+        )
 
     (hessian, slope), (distance, gradient, variance) = torch.func.jacrev(total, has_aux=True)(x)
     return distance, gradient, hessian.transpose(0, 1), variance, slope
@@ -194,23 +256,33 @@ def _differentiable_jet(posterior: Posterior, x: Float[Tensor, "q 3"]) -> tuple[
 def combined_covariance(
     posterior: Posterior, x: Float[Tensor, "b g p 3"], weights: Float[Tensor, "#b #g m p"]
 ) -> Float[Tensor, "b v v"]:
-    """Return the covariance of weighted sums of distances: m sums for each of g groups of p points, so v = g m sums."""
+    """Return the covariance of weighted sums of distances: m sums for each of g groups of p points,
+    so v = g m sums.
+    """
     (b, g, p), rows = x.shape[:3], len(posterior.factor)
-    v, points = g * weights.shape[2], x.flatten(1, 2)
+    v = g * weights.shape[2]
+    points = x.flatten(1, 2)
     cross = posterior.distance_rows(points.flatten(0, 1)).view(b, g, p, rows)
-    whitened = posterior.whiten((weights @ cross).view(b * v, rows)).view(b, v, rows)  # the sums: they are fewer
-    prior = posterior.kernel.profile(torch.linalg.vector_norm(points[:, :, None] - points[:, None], dim=-1))
+    whitened = posterior.whiten((weights @ cross).view(b * v, rows)).view(
+        b, v, rows
+    )  # the sums: they are fewer
+    prior = posterior.kernel.profile(
+        torch.linalg.vector_norm(points[:, :, None] - points[:, None], dim=-1)
+    )
     prior = weights @ prior.view(b, g, p, g * p)  # (b, g, m, g p)
     prior = weights @ prior.view(b, v, g, p).permute(0, 2, 3, 1)  # (b, g, m, v)
     return torch.baddbmm(prior.reshape(b, v, v), whitened, whitened.mT, alpha=-1.0)
 
 
-def symmetric_root(covariance: Float[Tensor, "*b k k"], prior: float, fix: str) -> Float[Tensor, "*b k k"]:
+def symmetric_root(
+    covariance: Float[Tensor, "*b k k"], prior: float, fix: str
+) -> Float[Tensor, "*b k k"]:
     """Return the symmetric square root of covariance matrices, unique even with equal eigenvalues.
 
-    Rounding may turn eigenvalues of zero, as of coinciding points, slightly negative; they count as zero. More negative
-    ones, relative to the `prior` variance, raise `IndefiniteCovariance`, whose message ends with `fix`. The root is
-    differentiable twice where all eigenvalues are positive, and its gradient is NaN elsewhere.
+    Rounding may turn eigenvalues of zero, as of coinciding points, slightly negative; they count as
+    zero. More negative ones, relative to the `prior` variance, raise `IndefiniteCovariance`, whose
+    message ends with `fix`. The root is differentiable twice where all eigenvalues are positive,
+    and its gradient is NaN elsewhere.
     """
     values, vectors = torch.linalg.eigh(covariance.detach())
     if is_known(values) and values.numel() and not float(values.min()) >= -1e-8 * prior:

@@ -1,4 +1,6 @@
-"""The estimated surface, the zero level of the mean distance, Eq. (9) of the paper, as a mesh or a distance field."""
+"""The estimated surface, the zero level of the mean distance, Eq. (9) of the paper, as a mesh or a
+distance field.
+"""
 
 import dataclasses
 import itertools
@@ -17,21 +19,29 @@ from torchgrasp.foundation.lazy import ndimage, spatial, trimesh
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.linalg import Points, limit_norm, number_components, unit
 from torchgrasp.geometry.mesh import clip_mesh
-from torchgrasp.geometry.signed_distance import FIELD_SPACING, SignedDistanceField, field_from_surface
+from torchgrasp.geometry.signed_distance import (
+    FIELD_SPACING,
+    SignedDistanceField,
+    field_from_surface,
+)
 from torchgrasp.shape.estimate import surface_deviation
 from torchgrasp.shape.gp import ShapeGP
 
 RESOLUTION = 48  # cells along the domain's diameter
-COARSE, STEEPER = 4, 1.3
-"""Side [cells] of the first blocks of the grid, and the greatest assumed ratio of the mean's slope within a block to
-the slope between its corners. Blocks that the zero level cannot reach are not refined."""
+COARSE = 4
+STEEPER = 1.3
+"""Side [cells] of the first blocks of the grid, and the greatest assumed ratio of the mean's slope
+within a block to the slope between its corners. Blocks that the zero level cannot reach are not
+refined.
+"""
 LEAST_SHARE = 0.02  # least share of the cloud nearest to a sheet of the zero level that is kept
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class Surface(Value):
-    """A triangle mesh of the surface [m]; faces are turned outward, and the mesh is open where it leaves the domain.
+    """A triangle mesh of the surface [m]; faces are turned outward, and the mesh is open where it
+    leaves the domain.
 
     Normals are unit gradients of the mean; `std_m` [m] is the surface's standard deviation.
 
@@ -53,12 +63,15 @@ class Surface(Value):
 
 @checked
 @single_threaded
-def extract_surface(shape: ShapeGP, resolution: Annotated[int, Range(8, 256)] = RESOLUTION) -> Surface:
-    """Return the surface, where the mean distance is zero (Eq. 9 of the paper), by marching cubes and Newton steps.
+def extract_surface(
+    shape: ShapeGP, resolution: Annotated[int, Range(8, 256)] = RESOLUTION
+) -> Surface:
+    """Return the surface, where the mean distance is zero (Eq. 9 of the paper), by marching cubes
+    and Newton steps.
 
-    `resolution` is the number of cells along the domain's diameter. Separate pieces are left out if they are nearest to
-    less than 2 % of the cloud. Raises `BadArgument` for a resolution outside [8, 256], or a mean distance that is
-    nowhere zero.
+    `resolution` is the number of cells along the domain's diameter. Separate pieces are left out if
+    they are nearest to less than 2 % of the cloud. Raises `BadArgument` for a resolution outside
+    [8, 256], or a mean distance that is nowhere zero.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> surface = extract_surface(fit_shape(load_object("jug").view, table=0.0), resolution=24)
@@ -88,45 +101,74 @@ def extract_mesh(shape: ShapeGP) -> Mesh:
 
 
 def collision_field(shape: ShapeGP, mesh: Mesh) -> SignedDistanceField:
-    """Return the signed distance field of a shape's `extract_mesh`, with nodes as close as thin bodies need."""
-    thick = float((mesh.vertices.amax(0) - mesh.vertices.amin(0)).min()) > 0.04 and len(shape.walls) == 1
+    """Return the signed distance field of a shape's `extract_mesh`, with nodes as close as thin
+    bodies need.
+    """
+    thick = (
+        float((mesh.vertices.amax(0) - mesh.vertices.amin(0)).min()) > 0.04
+        and len(shape.walls) == 1
+    )
     return field_from_surface(mesh.vertices, mesh.faces, spacing=0.004 if thick else 0.003)
 
 
-def _trace_walls(shape: ShapeGP, resolution: int) -> list[tuple[Float[Tensor, "v 3"], Int[Tensor, "f 3"]]]:
-    """Return vertices (normalised) and faces of each wall; the indices in faces count the vertices of all walls."""
+def _trace_walls(
+    shape: ShapeGP, resolution: int
+) -> list[tuple[Float[Tensor, "v 3"], Int[Tensor, "f 3"]]]:
+    """Return vertices (normalised) and faces of each wall; the indices in faces count the vertices
+    of all walls.
+    """
     walls = [_trace_wall(shape, i, resolution) for i in range(len(shape.walls))]
     before = [0, *itertools.accumulate(len(x) for x, _ in walls)]
     return [(x, faces + n) for (x, faces), n in zip(walls, before, strict=False)]
 
 
-def _trace_wall(whole: ShapeGP, number: int, resolution: int) -> tuple[Float[Tensor, "v 3"], Int[Tensor, "f 3"]]:
-    """Return vertices (normalised) and faces of one wall, cut off where the wall leaves the material."""
+def _trace_wall(
+    whole: ShapeGP, number: int, resolution: int
+) -> tuple[Float[Tensor, "v 3"], Int[Tensor, "f 3"]]:
+    """Return vertices (normalised) and faces of one wall, cut off where the wall leaves the
+    material.
+    """
     from skimage.measure import marching_cubes
 
-    shape, others = whole.walls[number], [wall for i, wall in enumerate(whole.walls) if i != number]
-    radius, device = whole.domain_radius, shape.x.device
+    shape = whole.walls[number]
+    others = [wall for i, wall in enumerate(whole.walls) if i != number]
+    radius = whole.domain_radius
+    device = shape.x.device
     step = 2.0 * radius / resolution
     volume = _grid(shape, radius, step, COARSE * math.ceil(resolution / COARSE))
     if not (np.nanmin(volume) < 0.0 < np.nanmax(volume)):
-        raise BadArgument("shape", "a mean that is nowhere zero", "a shape with a surface inside its domain")
-    # Cells that touch the outside of the ball are left out by the mask, so no wall is built along its boundary.
+        raise BadArgument(
+            "shape", "a mean that is nowhere zero", "a shape with a surface inside its domain"
+        )
+    # Cells that touch the outside of the ball are left out by the mask, so no wall is built along
+    # its boundary.
     corners, faces, _, _ = marching_cubes(
-        np.nan_to_num(volume, nan=1.0), 0.0, mask=~np.isnan(volume), spacing=(step,) * 3, gradient_direction="ascent"
+        np.nan_to_num(volume, nan=1.0),
+        0.0,
+        mask=~np.isnan(volume),
+        spacing=(step,) * 3,
+        gradient_direction="ascent",
     )
-    used, faces = np.unique(faces[_carry_cloud(corners - radius, faces, shape)], return_inverse=True)
+    used, faces = np.unique(
+        faces[_carry_cloud(corners - radius, faces, shape)], return_inverse=True
+    )
     x = torch.from_numpy(corners[used].astype(np.float64) - radius).to(device)
     faces = torch.from_numpy(faces.reshape(-1, 3).astype(np.int64)).to(device)
-    normals, rows = torch.zeros_like(x), torch.arange(len(x), device=device)
+    normals = torch.zeros_like(x)
+    rows = torch.arange(len(x), device=device)
     for _ in range(3):
         value, gradient = shape.mean_and_gradient(x[rows])
         motion = newton_step(value, gradient, step, 1e-12)
-        x[rows], normals[rows] = x[rows] + motion, gradient
+        x[rows] = x[rows] + motion
+        normals[rows] = gradient
         rows = rows[torch.linalg.vector_norm(motion, dim=-1) > 1e-4]
     if others:  # the cut turns triangles around, so they are wound after it
         value = torch.stack([wall.mean(x) for wall in others]).amax(0)
-        vertices, triangles, _ = clip_mesh(x.cpu().numpy(), faces.cpu().numpy(), value.cpu().numpy())
-        x, faces = torch.from_numpy(vertices).to(x), torch.from_numpy(triangles).to(faces)
+        vertices, triangles, _ = clip_mesh(
+            x.cpu().numpy(), faces.cpu().numpy(), value.cpu().numpy()
+        )
+        x = torch.from_numpy(vertices).to(x)
+        faces = torch.from_numpy(triangles).to(faces)
         normals = shape.mean_and_gradient(x)[1]
     a, b, c = x[faces].unbind(1)
     across = torch.linalg.cross(b - a, c - a)
@@ -135,25 +177,45 @@ def _trace_wall(whole: ShapeGP, number: int, resolution: int) -> tuple[Float[Ten
 
 
 def _grid(shape: ShapeGP, radius: float, step: float, cells: int) -> np.ndarray:
-    """Return the mean signed distance at the nodes of a cubic grid, which starts at -radius; NaN outside the ball.
+    """Return the mean signed distance at the nodes of a cubic grid, which starts at -radius; NaN
+    outside the ball.
 
-    Every node of a block is evaluated if the surface may cross the block; other nodes copy a node of a coarser grid.
+    Every node of a block is evaluated if the surface may cross the block; other nodes copy a node
+    of a coarser grid.
     """
     line = -radius + step * torch.arange(cells + 1, dtype=torch.float64, device=shape.x.device)
 
     def mean(stride: int, nodes: tuple[np.ndarray, ...]) -> np.ndarray:
-        x = torch.stack([line[stride * torch.tensor(axis, device=line.device)] for axis in nodes], -1)
+        x = torch.stack(
+            [line[stride * torch.tensor(axis, device=line.device)] for axis in nodes], -1
+        )
         return shape.mean(x).cpu().numpy()
 
-    count, stride = cells // COARSE + 1, COARSE
-    values = mean(stride, tuple(np.indices((count, count, count)).reshape(3, -1))).reshape((count,) * 3)
-    steepest = STEEPER * max(float(np.abs(np.diff(values, axis=axis)).max()) for axis in range(3)) / (stride * step)
+    count = cells // COARSE + 1
+    stride = COARSE
+    values = mean(stride, tuple(np.indices((count, count, count)).reshape(3, -1))).reshape(
+        (count,) * 3
+    )
+    steepest = (
+        STEEPER
+        * max(float(np.abs(np.diff(values, axis=axis)).max()) for axis in range(3))
+        / (stride * step)
+    )
     while stride > 1:
-        least = ndimage.minimum_filter(np.abs(values), 2, origin=-1)[:-1, :-1, :-1]  # over the corners of each cell
-        near = (least < steepest * math.sqrt(0.75) * stride * step).repeat(2, 0).repeat(2, 1).repeat(2, 2)
+        least = ndimage.minimum_filter(np.abs(values), 2, origin=-1)[
+            :-1, :-1, :-1
+        ]  # over the corners of each cell
+        near = (
+            (least < steepest * math.sqrt(0.75) * stride * step)
+            .repeat(2, 0)
+            .repeat(2, 1)
+            .repeat(2, 2)
+        )
         stride //= 2
         values = values.repeat(2, 0).repeat(2, 1).repeat(2, 2)[:-1, :-1, :-1]
-        wanted = np.nonzero(ndimage.maximum_filter(np.pad(near, ((0, 1),) * 3), 2))  # the corners of those cells
+        wanted = np.nonzero(
+            ndimage.maximum_filter(np.pad(near, ((0, 1),) * 3), 2)
+        )  # the corners of those cells
         values[wanted] = mean(stride, wanted)
     squares = (line * line).cpu().numpy()
     distance = squares[:, None, None] + squares[:, None] + squares
@@ -161,14 +223,18 @@ def _grid(shape: ShapeGP, radius: float, step: float, cells: int) -> np.ndarray:
     return values
 
 
-def newton_step(value: Float[Tensor, "n"], gradient: Points, longest: float, least_slope: float = 0.0) -> Points:
+def newton_step(
+    value: Float[Tensor, "n"], gradient: Points, longest: float, least_slope: float = 0.0
+) -> Points:
     """Return the Newton steps along the gradients to the zero level, each at most `longest` long."""
     step = -value / (gradient * gradient).sum(-1).clamp_min(least_slope)
     return limit_norm(step[:, None] * gradient, longest)
 
 
 def _carry_cloud(corners: np.ndarray, faces: np.ndarray, shape: ShapeGP) -> np.ndarray:
-    """Return a mask of the faces in connected pieces to which enough points of the cloud are nearest."""
+    """Return a mask of the faces in connected pieces to which enough points of the cloud are
+    nearest.
+    """
     label = number_components(np.concatenate([faces[:, :2], faces[:, 1:]]), len(corners))
     cloud = shape.normalise(shape.cloud.points.to(shape.x)).cpu().numpy()
     _, nearest = spatial.KDTree(corners).query(cloud)
@@ -178,8 +244,11 @@ def _carry_cloud(corners: np.ndarray, faces: np.ndarray, shape: ShapeGP) -> np.n
 
 @checked
 @single_threaded
-def surface_field(shape: ShapeGP, spacing: Annotated[float, Range(0.001, 0.02)] = FIELD_SPACING) -> SignedDistanceField:
-    """Return the signed distance field of a shape's estimated surface, to locate the object by touch.
+def surface_field(
+    shape: ShapeGP, spacing: Annotated[float, Range(0.001, 0.02)] = FIELD_SPACING
+) -> SignedDistanceField:
+    """Return the signed distance field of a shape's estimated surface, to locate the object by
+    touch.
 
     The nodes are `spacing` [m] apart.
 

@@ -5,4 +5,11 @@ from torchgrasp.sim.simulated_scene import SimulatedScene
 from torchgrasp.sim.scene_spec import Neighbour, SceneSpec
 from torchgrasp.sim.simulated_hand import SimulatedHand, open_scene
 
-__all__ = ["Neighbour", "SimulatedScene", "SceneSpec", "SimulatedHand", "convex_parts", "open_scene"]
+__all__ = [
+    "Neighbour",
+    "SimulatedScene",
+    "SceneSpec",
+    "SimulatedHand",
+    "convex_parts",
+    "open_scene",
+]

@@ -1,6 +1,7 @@
 """Convex parts of a mesh for the simulator, decomposed once and cached.
 
-Simulators replace a mesh by its convex hull, which would make a jug solid. CoACD cuts the mesh into convex parts.
+Simulators replace a mesh by its convex hull, which would make a jug solid. CoACD cuts the mesh into
+convex parts.
 """
 
 import hashlib
@@ -26,12 +27,15 @@ _log = logging.getLogger(__name__)
 
 
 @checked
-def convex_parts(mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None = None) -> "list[trimesh.Trimesh]":
+def convex_parts(
+    mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None = None
+) -> "list[trimesh.Trimesh]":
     """Return convex parts that together fill a closed mesh; a single part if the mesh is convex.
 
-    The parts are cached in the folder `cache`, by default `$XDG_CACHE_HOME/torchgrasp` or `~/.cache/torchgrasp`. If the
-    folder cannot be written, a warning is logged. Raises the errors of `read_mesh`, and `MeshError` for a mesh that
-    takes too much time or memory to cut. Without CoACD a mesh that is not convex raises `MissingExtra`.
+    The parts are cached in the folder `cache`, by default `$XDG_CACHE_HOME/torchgrasp` or
+    `~/.cache/torchgrasp`. If the folder cannot be written, a warning is logged. Raises the errors
+    of `read_mesh`, and `MeshError` for a mesh that takes too much time or memory to cut. Without
+    CoACD a mesh that is not convex raises `MissingExtra`.
 
     >>> import trimesh
     >>> len(convex_parts(trimesh.creation.box((0.1, 0.1, 0.1))))
@@ -41,7 +45,9 @@ def convex_parts(mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None 
     if mesh.is_convex:
         return [hull(mesh.vertices)]
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    path = (home / "torchgrasp" if cache is None else Path(cache)) / f"{_fingerprint(mesh)}.safetensors"
+    path = (
+        home / "torchgrasp" if cache is None else Path(cache)
+    ) / f"{_fingerprint(mesh)}.safetensors"
     parts = list[trimesh.Trimesh]()
     if path.is_file():
         try:
@@ -61,20 +67,26 @@ def convex_parts(mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None 
 def read_solid(
     mesh: "trimesh.Trimesh | Path | str", parts: "Sequence[trimesh.Trimesh] | None"
 ) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh]]":
-    """Read a closed mesh; return it and its convex parts: the given `parts`, or else a convex decomposition."""
+    """Read a closed mesh; return it and its convex parts: the given `parts`, or else a convex
+    decomposition.
+    """
     mesh = read_mesh(mesh)
     return mesh, convex_parts(mesh) if parts is None else check_parts(parts)
 
 
 def hull(corners: np.ndarray) -> "trimesh.Trimesh":
-    """Return the convex hull of points; the points are rounded if the mesh of the hull would not be closed."""
+    """Return the convex hull of points; the points are rounded if the mesh of the hull would not be
+    closed.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         body = trimesh.convex.convex_hull(corners)
         return body if body.is_watertight else trimesh.convex.convex_hull(np.round(corners, 6))
 
 
 def check_parts(parts: "Sequence[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":
-    """Return the caller's parts as a list; raise `MeshError` if one is not convex, or for none or too many parts."""
+    """Return the caller's parts as a list; raise `MeshError` if one is not convex, or for none or
+    too many parts.
+    """
     max_parts = 1000  # most parts that a caller may give
     if len(parts) > max_parts:
         raise MeshError("parts", f"{len(parts)} parts", f"at most {max_parts}")
@@ -88,7 +100,9 @@ def check_parts(parts: "Sequence[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":
 
 
 def _fingerprint(mesh: "trimesh.Trimesh") -> str:
-    """Return the cache's key for a mesh: a SHA-256 of the mesh and of the settings with which it is cut."""
+    """Return the cache's key for a mesh: a SHA-256 of the mesh and of the settings with which it is
+    cut.
+    """
     digest = hashlib.sha256(f"coacd 0.05 {sorted(_SEARCH.items())}".encode())
     digest.update(np.ascontiguousarray(mesh.vertices, dtype="<f8").tobytes())
     digest.update(np.ascontiguousarray(mesh.faces, dtype="<i8").tobytes())
@@ -98,22 +112,30 @@ def _fingerprint(mesh: "trimesh.Trimesh") -> str:
 def _save(parts: "list[trimesh.Trimesh]", path: Path) -> None:
     """Write the vertices of all parts to a cache file."""
     tensors = {
-        "vertices": torch.cat([torch.from_numpy(np.array(p.vertices, dtype=np.float64)) for p in parts]),
+        "vertices": torch.cat(
+            [torch.from_numpy(np.array(p.vertices, dtype=np.float64)) for p in parts]
+        ),
         "counts": torch.tensor([len(p.vertices) for p in parts]),
     }
     save_tensors(path, "parts", tensors, {})
 
 
 def _load(path: Path, mesh: "trimesh.Trimesh") -> "list[trimesh.Trimesh]":
-    """Read the parts of a cache file as hulls of their vertices; raise an error for vertices far outside the mesh."""
+    """Read the parts of a cache file as hulls of their vertices; raise an error for vertices far
+    outside the mesh.
+    """
     from scipy.spatial import QhullError
 
     tensors, _ = load_tensors(path, "parts", {"vertices", "counts"})
     try:
-        outside = (tensors["vertices"] - torch.tensor(mesh.bounds.mean(0))).abs() > torch.tensor(mesh.extents)
+        outside = (tensors["vertices"] - torch.tensor(mesh.bounds.mean(0))).abs() > torch.tensor(
+            mesh.extents
+        )
         if bool(outside.any()):
             raise RuntimeError("corners far outside the mesh")
         corners = torch.split(tensors["vertices"], tensors["counts"].tolist())
         return [hull(c.numpy()) for c in corners]
     except (QhullError, RuntimeError) as error:
-        raise ModelFileError("path", f"{path}: {error}", "corners of bodies with a volume") from error
+        raise ModelFileError(
+            "path", f"{path}: {error}", "corners of bodies with a volume"
+        ) from error

@@ -1,7 +1,7 @@
 """Cut meshes into convex parts by CoACD, in a separate process with limits of time and memory.
 
-CoACD itself has no limits and delays signals. The process runs this file, which needs only numpy and CoACD, and ends
-with its parent process.
+CoACD itself has no limits and delays signals. The process runs this file, which needs only numpy
+and CoACD, and ends with its parent process.
 """
 
 import importlib.util
@@ -19,16 +19,23 @@ import numpy as np
 if TYPE_CHECKING:
     import trimesh
 
-SECONDS, SECONDS_PER_FACE = 60.0, 0.005  # processor time [s] that a mesh may take, and further time [s] for each face
+# processor time [s] that a mesh may take, and further time [s] for each face
+SECONDS = 60.0
+SECONDS_PER_FACE = 0.005
 
 
-def decompose(mesh: "trimesh.Trimesh", search: dict[str, Any]) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return vertices and faces of each convex part of a mesh by CoACD with given settings, within time and memory."""
+def decompose(
+    mesh: "trimesh.Trimesh", search: dict[str, Any]
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return vertices and faces of each convex part of a mesh by CoACD with given settings, within
+    time and memory.
+    """
     from torchgrasp.foundation.errors import MeshError, MissingExtra
 
     if importlib.util.find_spec("coacd") is None:
         raise MissingExtra("coacd", "sim")
-    seconds, gibibytes = int(SECONDS + SECONDS_PER_FACE * len(mesh.faces)), 4
+    seconds = int(SECONDS + SECONDS_PER_FACE * len(mesh.faces))
+    gibibytes = 4
     asked = json.dumps({"seconds": seconds, "memory": gibibytes << 30, "search": search})
     buffer = io.BytesIO()
     np.savez(buffer, vertices=mesh.vertices, faces=mesh.faces)
@@ -50,7 +57,9 @@ def decompose(mesh: "trimesh.Trimesh", search: dict[str, Any]) -> list[tuple[np.
 
 
 def main(asked: dict[str, Any]) -> None:
-    """Read a mesh from stdin, cut it within the time and memory of `asked`, and write its convex parts to stdout."""
+    """Read a mesh from stdin, cut it within the time and memory of `asked`, and write its convex
+    parts to stdout.
+    """
     threading.Thread(target=_end_with_parent, args=(os.getppid(),), daemon=True).start()
     _limit(asked["seconds"], asked["memory"])
     import coacd
@@ -59,9 +68,18 @@ def main(asked: dict[str, Any]) -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # CoACD prints here
     coacd.set_log_level("off")
     given = np.load(io.BytesIO(sys.stdin.buffer.read()), allow_pickle=False)
-    parts = coacd.run_coacd(coacd.Mesh(given["vertices"], given["faces"]), seed=0, **asked["search"])
+    parts = coacd.run_coacd(
+        coacd.Mesh(given["vertices"], given["faces"]), seed=0, **asked["search"]
+    )
     buffer = io.BytesIO()
-    np.savez(buffer, **{f"{name}{k}": x for k, part in enumerate(parts) for name, x in zip("vf", part, strict=True)})
+    np.savez(
+        buffer,
+        **{
+            f"{name}{k}": x
+            for k, part in enumerate(parts)
+            for name, x in zip("vf", part, strict=True)
+        },
+    )
     with os.fdopen(out, "wb") as pipe:
         pipe.write(buffer.getvalue())
 
@@ -74,7 +92,9 @@ def _end_with_parent(parent: int) -> None:
 
 
 def _limit(seconds: int, memory: int) -> None:
-    """Limit CPU time [s] and address space [bytes], if the system can; otherwise the parent's timeout applies."""
+    """Limit CPU time [s] and address space [bytes], if the system can; otherwise the parent's
+    timeout applies.
+    """
     try:
         import resource
     except ImportError:  # Windows

@@ -14,15 +14,16 @@ from torchgrasp.hand.urdf import Joint, Link, Urdf
 from torchgrasp.sim.scene_spec import ARMATURE, MOUNT_DRIVE, SceneSpec, pair_masks
 from torchgrasp.sim.simulated_scene import STILL, SimulatedScene
 
-OBJECT, NEIGHBOUR = "torchgrasp_object", "torchgrasp_neighbour_{}"
+OBJECT = "torchgrasp_object"
+NEIGHBOUR = "torchgrasp_neighbour_{}"
 """Names of the object (its body and its free joint), and of the neighbours, which are numbered."""
 
 
 class MujocoScene(SimulatedScene):
     """A simulated scene in MuJoCo: table, object and hand.
 
-    A step runs the second half of MuJoCo's step (forces to state) before its first half (state to poses and contacts),
-    so that poses are current between steps.
+    A step runs the second half of MuJoCo's step (forces to state) before its first half (state to
+    poses and contacts), so that poses are current between steps.
     """
 
     def __init__(self, spec: SceneSpec) -> None:
@@ -32,7 +33,9 @@ class MujocoScene(SimulatedScene):
         try:
             self.model = model = mujoco.MjModel.from_xml_string(text)
         except ValueError as error:
-            raise HandFileError("urdf", f"{spec.urdf_path}: {error}", "a hand that MuJoCo can simulate") from error
+            raise HandFileError(
+                "urdf", f"{spec.urdf_path}: {error}", "a hand that MuJoCo can simulate"
+            ) from error
         self.data = mujoco.MjData(model)
         self.body = model.body(OBJECT).id
         urdf = spec.urdf
@@ -43,18 +46,24 @@ class MujocoScene(SimulatedScene):
         self.root = model.body(urdf.root).id
         self.tips = [model.body(name).id for name in spec.tip_links]
         self.neighbours = [model.body(NEIGHBOUR.format(k)).id for k in range(len(spec.neighbours))]
-        self._body_of, self._wrench = model.geom_bodyid.tolist(), np.zeros(6)
+        self._body_of = model.geom_bodyid.tolist()
+        self._wrench = np.zeros(6)
         parents = model.body_parentid.tolist()
-        self._map_contacts([0], (parents[tip] if model.body_jntnum[tip] == 0 else None for tip in self.tips))
+        self._map_contacts(
+            [0], (parents[tip] if model.body_jntnum[tip] == 0 else None for tip in self.tips)
+        )
         self._begin()
 
     def _write(self, spec: SceneSpec) -> str:
-        """Return the scene's model; a scene in which something else carries the hand returns another."""
+        """Return the scene's model; a scene in which something else carries the hand returns
+        another.
+        """
         return scene_mjcf(spec)
 
     def _begin(self) -> None:
         """Set joints and mount to the start, with their targets."""
-        data, spec = self.data, self.spec
+        data = self.data
+        spec = self.spec
         data.qpos[self._positions] = [spec.joints[name] for name in self.joint_names]
         self.drive(data.qpos[self._positions])
         for slide in spec.slides:
@@ -64,7 +73,9 @@ class MujocoScene(SimulatedScene):
 
     def restart(self, spec: SceneSpec) -> None:
         """Change to the start of another scene, which differs in joints and pose of the hand alone."""
-        self.spec, model, pose = spec, self.model, spec.world_from_hand
+        self.spec = spec
+        model = self.model
+        pose = spec.world_from_hand
         model.body_pos[self.root] = pose[:3, 3]
         self._mujoco.mju_mat2Quat(model.body_quat[self.root], pose[:3, :3].ravel())
         self._mujoco.mj_setConst(model, self.data)
@@ -72,7 +83,9 @@ class MujocoScene(SimulatedScene):
         self._begin()
 
     def _advance(self) -> Iterator[tuple[int, int, tuple[int, np.ndarray, np.ndarray]]]:
-        """Advance by one timestep; yield each pair of bodies that touch, with number, axes and place of the contact."""
+        """Advance by one timestep; yield each pair of bodies that touch, with number, axes and
+        place of the contact.
+        """
         if self._diverged():
             return
         self._mujoco.mj_step2(self.model, self.data)
@@ -96,18 +109,25 @@ class MujocoScene(SimulatedScene):
             self.data.qpos[:] = self.data.xpos[:] = np.nan
         return diverged
 
-    def _read(self, contact: tuple[int, np.ndarray, np.ndarray], sign: float) -> list[tuple[float, list[float]]]:
+    def _read(
+        self, contact: tuple[int, np.ndarray, np.ndarray], sign: float
+    ) -> list[tuple[float, list[float]]]:
         """Return size and numbers of MuJoCo's contact point, as a list of one."""
-        k, axes, place = contact  # the axes in rows; the first points from the first body to the second
+        k, axes, place = (
+            contact  # the axes in rows; the first points from the first body to the second
+        )
         wrench = self._wrench
         self._mujoco.mj_contactForce(self.model, self.data, k, wrench)
         size = max(float(wrench[0]), 0.0) * self.timestep
         force = (wrench[:3] @ axes.reshape(3, 3)).tolist()
-        impulse, moment = [sign * size * x for x in axes[:3].tolist()], [size * x for x in place.tolist()]
+        impulse = [sign * size * x for x in axes[:3].tolist()]
+        moment = [size * x for x in place.tolist()]
         return [(size, [*impulse, *moment, size, *(sign * x for x in force)])]
 
     def keep(self) -> "Callable[[], MujocoScene]":
-        """Return a function that opens scenes in the present state of this one; they share its model."""
+        """Return a function that opens scenes in the present state of this one; they share its
+        model.
+        """
         kept = copy.copy(self.data)
 
         def reopen() -> MujocoScene:
@@ -136,7 +156,9 @@ class MujocoScene(SimulatedScene):
         return self.data.qpos[self._positions]
 
     def jacobian(self, points: np.ndarray) -> np.ndarray:
-        """Return the Jacobian (f, 3, j) [m/rad] of one point (world's frame) per fingertip for the driven joints."""
+        """Return the Jacobian (f, 3, j) [m/rad] of one point (world's frame) per fingertip for the
+        driven joints.
+        """
         jacobian = np.zeros((len(self.tips), 3, self.model.nv))
         for rows, point, tip in zip(jacobian, points, self.tips, strict=True):
             self._mujoco.mj_jac(self.model, self.data, rows, None, point, tip)
@@ -145,7 +167,9 @@ class MujocoScene(SimulatedScene):
     def penetration(self) -> float:
         """Return the largest depth [m] by which the hand penetrates another body or itself."""
         deepest = 0.0
-        for (first, second), distance in zip(self.data.contact.geom, self.data.contact.dist, strict=True):
+        for (first, second), distance in zip(
+            self.data.contact.geom, self.data.contact.dist, strict=True
+        ):
             if not {self._body_of[first], self._body_of[second]} <= self._place_of.keys():
                 deepest = max(deepest, -float(distance))
         return deepest
@@ -153,12 +177,16 @@ class MujocoScene(SimulatedScene):
     def _pose(self, body: int) -> np.ndarray:
         """Return the pose (4, 4) of a body in the world's frame, given its index."""
         pose = np.zeros((4, 4))
-        pose[:3, :3], pose[:3, 3], pose[3, 3] = self.data.xmat[body].reshape(3, 3), self.data.xpos[body], 1.0
+        pose[:3, :3] = self.data.xmat[body].reshape(3, 3)
+        pose[:3, 3] = self.data.xpos[body]
+        pose[3, 3] = 1.0
         return pose
 
     def _move_mount(self, joint: str, target: float, speed: float) -> None:
         """Set target [m] and target speed [m/s] of a joint of the mount."""
-        self.data.ctrl[self.model.actuator(joint).id] = target + speed * MOUNT_DRIVE.kd / MOUNT_DRIVE.kp
+        self.data.ctrl[self.model.actuator(joint).id] = (
+            target + speed * MOUNT_DRIVE.kd / MOUNT_DRIVE.kp
+        )
 
 
 def import_mujoco() -> Any:
@@ -174,12 +202,16 @@ def import_mujoco() -> Any:
 
 
 def scene_mjcf(spec: SceneSpec) -> str:
-    """Return MuJoCo's XML model of a scene (MJCF), with all joints at zero and a position servo for each joint."""
+    """Return MuJoCo's XML model of a scene (MJCF), with all joints at zero and a position servo for
+    each joint.
+    """
     spec.check_drives([joint.name for joint in spec.urdf.movable])
     names = [OBJECT, *(NEIGHBOUR.format(k) for k in range(len(spec.neighbours)))]
     bodies = list(zip(names, (spec.body, *spec.neighbours), spec.hulls, strict=True))
     masks = pair_masks(spec.self_pairs, first=3)  # three bits are of hand, bodies and table
-    return render_mjcf("scene.xml", spec=spec, bodies=bodies, masks=masks, nested=nest_links(spec.urdf))
+    return render_mjcf(
+        "scene.xml", spec=spec, bodies=bodies, masks=masks, nested=nest_links(spec.urdf)
+    )
 
 
 def render_mjcf(template: str, **values: Any) -> str:
@@ -194,15 +226,25 @@ def render_mjcf(template: str, **values: Any) -> str:
 
 
 def nest_links(urdf: Urdf) -> list[tuple[Link, Joint | None, int]]:
-    """Return all links from the root down, each with its joint and the number of bodies that end with it."""
-    links, waiting = {link.name: link for link in urdf.links}, [(0, urdf.root, None)]
+    """Return all links from the root down, each with its joint and the number of bodies that end
+    with it.
+    """
+    links = {link.name: link for link in urdf.links}
+    waiting = [(0, urdf.root, None)]
     found: list[tuple[int, str, Joint | None]] = []
     while waiting:
         found.append(waiting.pop())
         depth, name, _ = found[-1]
-        waiting += [(depth + 1, joint.child, joint) for joint in reversed(urdf.joints) if joint.parent == name]
+        waiting += [
+            (depth + 1, joint.child, joint)
+            for joint in reversed(urdf.joints)
+            if joint.parent == name
+        ]
     depths = [*(depth for depth, _, _ in found[1:]), 0]
-    return [(links[name], joint, depth - after + 1) for (depth, name, joint), after in zip(found, depths, strict=True)]
+    return [
+        (links[name], joint, depth - after + 1)
+        for (depth, name, joint), after in zip(found, depths, strict=True)
+    ]
 
 
 def format_numbers(numbers: Iterable[float | int]) -> str:

@@ -1,15 +1,19 @@
-"""What a scene in SAPIEN is made of: the world, the table, bodies of convex parts, and the hand on its mount.
+"""What a scene in SAPIEN is made of: the world, the table, bodies of convex parts, and the hand on
+its mount.
 
 Settings that differ from SAPIEN's defaults:
 
-* Joints get an armature (inertia of the motor): without it the implicit drives lose torque in a contact.
-* The hand's links feel no gravity, and collide with each other only in the pairs that the scene names.
+* Joints get an armature (inertia of the motor): without it the implicit drives lose torque in a
+  contact.
+* The hand's links feel no gravity, and collide with each other only in the pairs that the scene
+  names.
 * Sleeping is off, because a sleeping body keeps stale contacts.
 * The object's inertia is set with its mass.
 * Penetrations are resolved at 1 m/s at most.
-* The solver is PGS: with TGS a held object creeps, far inside the friction cones. Only TGS knows contact patches; with
-  32 iterations a step the object creeps slower than with 10.
-* Convex parts are cooked at a larger scale, and the foot of a finely faceted part is a shape of its own.
+* The solver is PGS: with TGS a held object creeps, far inside the friction cones. Only TGS knows
+  contact patches; with 32 iterations a step the object creeps slower than with 10.
+* Convex parts are cooked at a larger scale, and the foot of a finely faceted part is a shape of its
+  own.
 """
 
 import math
@@ -21,14 +25,27 @@ import numpy as np
 
 from torchgrasp.files import temporary_folder, write_file
 from torchgrasp.foundation.errors import MissingExtra
-from torchgrasp.sim.scene_spec import ARMATURE, MOUNT_DRIVE, Body, SceneSpec, mounted_urdf, pair_masks
+from torchgrasp.sim.scene_spec import (
+    ARMATURE,
+    MOUNT_DRIVE,
+    Body,
+    SceneSpec,
+    mounted_urdf,
+    pair_masks,
+)
 
 
-def open_world(sapien: Any, physx: Any, gravity: float, timestep: float, patches: bool = False) -> tuple[Any, Any]:
+def open_world(
+    sapien: Any, physx: Any, gravity: float, timestep: float, patches: bool = False
+) -> tuple[Any, Any]:
     """Return an empty physics system and its scene, with given gravity [m/s^2] and timestep [s]."""
-    physx.set_scene_config(gravity=np.array([0, 0, -gravity], np.float32), enable_tgs=patches, enable_pcm=True)
+    physx.set_scene_config(
+        gravity=np.array([0, 0, -gravity], np.float32), enable_tgs=patches, enable_pcm=True
+    )
     physx.set_shape_config(contact_offset=0.002, rest_offset=0.0)
-    physx.set_body_config(solver_position_iterations=32, solver_velocity_iterations=1, sleep_threshold=0.0)
+    physx.set_body_config(
+        solver_position_iterations=32, solver_velocity_iterations=1, sleep_threshold=0.0
+    )
     system = physx.PhysxCpuSystem()
     scene = sapien.Scene([system])
     scene.timestep = timestep
@@ -36,7 +53,9 @@ def open_world(sapien: Any, physx: Any, gravity: float, timestep: float, patches
 
 
 def place(sapien: Any, scene: Any, name: str, body: Any, height: float = 0.0) -> None:
-    """Add an entity with one body to the scene, with the body's origin at a `height` [m] on the world's z axis."""
+    """Add an entity with one body to the scene, with the body's origin at a `height` [m] on the
+    world's z axis.
+    """
     entity = sapien.Entity()
     entity.name = name
     entity.add_component(body)
@@ -45,17 +64,26 @@ def place(sapien: Any, scene: Any, name: str, body: Any, height: float = 0.0) ->
 
 
 def table(sapien: Any, physx: Any, material: Any) -> Any:
-    """Return the body of the table, a half space; on a box, a rocking object gains energy until it falls over."""
-    body, top = physx.PhysxRigidStaticComponent(), physx.PhysxCollisionShapePlane(material)
-    top.set_local_pose(sapien.Pose(q=[math.sqrt(0.5), 0.0, -math.sqrt(0.5), 0.0]))  # its normal is its x axis
+    """Return the body of the table, a half space; on a box, a rocking object gains energy until it
+    falls over.
+    """
+    body = physx.PhysxRigidStaticComponent()
+    top = physx.PhysxCollisionShapePlane(material)
+    top.set_local_pose(
+        sapien.Pose(q=[math.sqrt(0.5), 0.0, -math.sqrt(0.5), 0.0])
+    )  # its normal is its x axis
     body.attach(top)
     return body
 
 
-def rigid_body(sapien: Any, physx: Any, material: Any, spec: Body, hulls: Iterable[np.ndarray], patch: float) -> Any:
-    """Return a dynamic body of uniform density, made of convex hulls; `patch` [m] is the radius of contact patches.
+def rigid_body(
+    sapien: Any, physx: Any, material: Any, spec: Body, hulls: Iterable[np.ndarray], patch: float
+) -> Any:
+    """Return a dynamic body of uniform density, made of convex hulls; `patch` [m] is the radius of
+    contact patches.
 
-    PhysX drops vertices within 0.7 mm of the hull of the others. Therefore it gets hulls a hundred times as large.
+    PhysX drops vertices within 0.7 mm of the hull of the others. Therefore it gets hulls a hundred
+    times as large.
     """
     scale = 0.01
     body = physx.PhysxRigidDynamicComponent()
@@ -67,7 +95,8 @@ def rigid_body(sapien: Any, physx: Any, material: Any, spec: Body, hulls: Iterab
     moments, axes = np.linalg.eigh(spec.inertia)
     axes = axes * np.array([1.0, 1.0, np.sign(np.linalg.det(axes))])
     frame = np.eye(4)
-    frame[:3, :3], frame[:3, 3] = axes, spec.mesh.center_mass
+    frame[:3, :3] = axes
+    frame[:3, 3] = spec.mesh.center_mass
     body.mass = spec.mass
     body.cmass_local_pose = sapien.Pose(frame)
     body.inertia = moments.astype(np.float32)
@@ -77,8 +106,12 @@ def rigid_body(sapien: Any, physx: Any, material: Any, spec: Body, hulls: Iterab
 
 
 def split_hull(hull: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield the vertices of a convex hull; then of its foot, a pyramid, if PhysX keeps not all vertices of the hull."""
-    most, lowest = 129, 100  # PhysX keeps 255 faces: as many as 129 vertices have
+    """Yield the vertices of a convex hull; then of its foot, a pyramid, if PhysX keeps not all
+    vertices of the hull.
+    """
+    # PhysX keeps 255 faces: as many as 129 vertices have
+    most = 129
+    lowest = 100
     yield hull
     if len(hull) > most:
         yield np.vstack([hull[hull[:, 2].argsort(kind="stable")[:lowest]], hull.mean(0)])
@@ -97,9 +130,11 @@ def mounted_hand(scene: Any, material: Any, spec: SceneSpec) -> Any:
     for joint in hand.active_joints:
         joint.set_friction(0.0)
         if joint.name in slides:
-            drive, position = MOUNT_DRIVE, slides[joint.name].start
+            drive = MOUNT_DRIVE
+            position = slides[joint.name].start
         else:
-            drive, position = spec.drives[joint.name], float(spec.joints[joint.name])
+            drive = spec.drives[joint.name]
+            position = float(spec.joints[joint.name])
             joint.set_armature(np.array([ARMATURE], np.float32))
         joint.set_drive_properties(drive.kp, drive.kd, force_limit=drive.effort)
         joint.set_drive_target(position)
@@ -118,7 +153,9 @@ def mounted_hand(scene: Any, material: Any, spec: SceneSpec) -> Any:
 
 
 def import_sapien() -> tuple[Any, Any]:
-    """Import and return SAPIEN and its physics; its warning about missing Vulkan, which physics can lack, is hidden."""
+    """Import and return SAPIEN and its physics; its warning about missing Vulkan, which physics can
+    lack, is hidden.
+    """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

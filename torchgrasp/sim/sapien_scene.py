@@ -6,7 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from torchgrasp.sim.sapien_bodies import import_sapien, mounted_hand, open_world, place, rigid_body, table
+from torchgrasp.sim.sapien_bodies import (
+    import_sapien,
+    mounted_hand,
+    open_world,
+    place,
+    rigid_body,
+    table,
+)
 from torchgrasp.sim.scene_spec import WRIST_JOINT, SceneSpec
 from torchgrasp.sim.simulated_scene import STILL, SimulatedScene, StepContacts
 
@@ -29,14 +36,20 @@ class SapienScene(SimulatedScene):
         super().__init__(spec)
         self._calls: list[tuple[Callable[..., Any], tuple[Any, ...]]] = []
         sapien, physx = import_sapien()
-        self.system, self.scene = open_world(sapien, physx, spec.gravity, spec.timestep, spec.patch > 0.0)
+        self.system, self.scene = open_world(
+            sapien, physx, spec.gravity, spec.timestep, spec.patch > 0.0
+        )
         slick = physx.PhysxMaterial(spec.body_friction, spec.body_friction, 0.0)
-        both = 2 * spec.friction - spec.body_friction  # PhysX averages the coefficients of two bodies
+        both = (
+            2 * spec.friction - spec.body_friction
+        )  # PhysX averages the coefficients of two bodies
         grip = physx.PhysxMaterial(both, both, 0.0)
         if spec.table:
             place(sapien, self.scene, "table", table(sapien, physx, slick), spec.table_height)
         solids = zip((spec.body, *spec.neighbours), spec.hulls, strict=True)
-        bodies = [rigid_body(sapien, physx, slick, body, hulls, spec.patch) for body, hulls in solids]
+        bodies = [
+            rigid_body(sapien, physx, slick, body, hulls, spec.patch) for body, hulls in solids
+        ]
         for k, body in enumerate(bodies):
             place(sapien, self.scene, "neighbour" if k else "object", body)
         self.body, *self.neighbours = bodies
@@ -50,8 +63,11 @@ class SapienScene(SimulatedScene):
         self.pull(STILL)
 
     def _map_joints(self, spec: SceneSpec) -> None:
-        """Sort the joints of hand and mount; store the frames of the driven joints and the tips that they move."""
-        active, slides = self.hand.active_joints, {slide.name for slide in spec.slides}
+        """Sort the joints of hand and mount; store the frames of the driven joints and the tips
+        that they move.
+        """
+        active = self.hand.active_joints
+        slides = {slide.name for slide in spec.slides}
         self._mount = {j.name: j for j in active if j.name in slides}
         self._places = [k for k, j in enumerate(active) if j.name not in slides]
         self._driven = [active[k] for k in self._places]
@@ -70,7 +86,8 @@ class SapienScene(SimulatedScene):
     def keep(self) -> "Callable[[], SapienScene]":
         """Return a function that opens scenes in the present state of this one.
 
-        It repeats all calls in a fresh scene, because PhysX packs its bodies, but not the state of its contacts.
+        It repeats all calls in a fresh scene, because PhysX packs its bodies, but not the state of
+        its contacts.
         """
         calls = tuple(self._calls)
 
@@ -101,7 +118,9 @@ class SapienScene(SimulatedScene):
             yield *contact.bodies, contact
 
     def _read(self, contact: Any, sign: float) -> Iterator[tuple[float, list[float]]]:
-        """Yield size and numbers of each point that presses; SAPIEN reports the impulse on the first body."""
+        """Yield size and numbers of each point that presses; SAPIEN reports the impulse on the
+        first body.
+        """
         for point in contact.points:
             impulse = point.impulse
             squared = impulse.dot(impulse)
@@ -110,9 +129,11 @@ class SapienScene(SimulatedScene):
                 yield size, [*(-sign * impulse).tolist(), *(size * point.position).tolist(), size]
 
     def step(self) -> StepContacts:
-        """Advance by one timestep and return the sums of the contacts, with forces measured at the tips' base joints.
+        """Advance by one timestep and return the sums of the contacts, with forces measured at the
+        tips' base joints.
 
-        SAPIEN reports contacts without friction, but the complete wrench at each link's joint, in the joint's frame.
+        SAPIEN reports contacts without friction, but the complete wrench at each link's joint, in
+        the joint's frame.
         """
         contacts = super().step()
         touching = [i for i, weight in enumerate(contacts.weight.tolist()) if weight > 0.0]
@@ -132,7 +153,8 @@ class SapienScene(SimulatedScene):
     @_noted
     def pull(self, force: np.ndarray, torque: np.ndarray = STILL) -> None:
         """Apply a force [N] and a torque [N m] to the object, in this and all later steps."""
-        self._force, self._torque = np.asarray(force, np.float32), np.asarray(torque, np.float32)
+        self._force = np.asarray(force, np.float32)
+        self._torque = np.asarray(torque, np.float32)
         self._pulled = bool(self._force.any() or self._torque.any())
 
     @_noted
@@ -147,26 +169,40 @@ class SapienScene(SimulatedScene):
         return np.asarray(self.hand.get_qpos(), float)[self._places]
 
     def jacobian(self, points: np.ndarray) -> np.ndarray:
-        """Return the Jacobian (f, 3, j) [m/rad] of one point (world's frame) per fingertip for the driven joints."""
+        """Return the Jacobian (f, 3, j) [m/rad] of one point (world's frame) per fingertip for the
+        driven joints.
+        """
         poses = [link.entity_pose.to_transformation_matrix() for link in self._children]
         frames = np.array(poses, float) @ self._frames
-        axes, arms = frames[:, :3, 0], points[:, None, :] - frames[:, :3, 3]
-        following, last = [1, 2, 0], [2, 0, 1]  # coordinates of a cross product; np.cross takes much longer
-        turned = axes.take(following, -1) * arms.take(last, -1) - axes.take(last, -1) * arms.take(following, -1)
+        axes = frames[:, :3, 0]
+        arms = points[:, None, :] - frames[:, :3, 3]
+        # coordinates of a cross product; np.cross takes much longer
+        following = [1, 2, 0]
+        last = [2, 0, 1]
+        turned = axes.take(following, -1) * arms.take(last, -1) - axes.take(last, -1) * arms.take(
+            following, -1
+        )
         columns = np.where(self._slides[:, None], axes, turned) * self._moves[..., None]
         return columns.transpose(0, 2, 1)
 
     @_noted
     def penetration(self) -> float:
-        """Return the largest depth [m] by which the hand penetrates a body or itself, after a step without gravity."""
+        """Return the largest depth [m] by which the hand penetrates a body or itself, after a step
+        without gravity.
+        """
         bodies = [self.body, *self.neighbours]
         for body in bodies:
             body.disable_gravity = True
         self.scene.step()
         for body in bodies:
             body.disable_gravity = False
-        touching = [c for c in self.system.get_contacts() if not set(c.bodies) <= self._place_of.keys()]
-        return max((float(-point.separation) for contact in touching for point in contact.points), default=0.0)
+        touching = [
+            c for c in self.system.get_contacts() if not set(c.bodies) <= self._place_of.keys()
+        ]
+        return max(
+            (float(-point.separation) for contact in touching for point in contact.points),
+            default=0.0,
+        )
 
     def _pose(self, body: Any) -> np.ndarray:
         """Return the pose (4, 4) of a body in the world's frame."""

@@ -18,9 +18,13 @@ from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.hand.hand import Actuator
 from torchgrasp.hand.urdf import Urdf, read_urdf
 
-ARMATURE = 1e-3  # inertia [kg m^2] that each motor's rotor adds to its joint; PhysX's implicit drives need it
-LIFT_JOINT, APPROACH_JOINT = "torchgrasp_lift", "torchgrasp_approach"
-"""Names of the mount's prismatic joints along the world's z axis, and along the approach; at 0 the approach ends."""
+# inertia [kg m^2] that each motor's rotor adds to its joint; PhysX's implicit drives need it
+ARMATURE = 1e-3
+LIFT_JOINT = "torchgrasp_lift"
+APPROACH_JOINT = "torchgrasp_approach"
+"""Names of the mount's prismatic joints along the world's z axis, and along the approach; at 0 the
+approach ends.
+"""
 SHIFT_JOINTS = ("torchgrasp_shift_x", "torchgrasp_shift_y", "torchgrasp_shift_z")
 """Names of the prismatic joints of a mount that yields, along the world's axes."""
 
@@ -30,8 +34,8 @@ SHIFT_JOINTS = ("torchgrasp_shift_x", "torchgrasp_shift_y", "torchgrasp_shift_z"
 class Neighbour:
     """Another body on the simulated table, beside the object to grasp.
 
-    The closed `mesh` [m] is in the frame of the grasp. `parts` are by default its `convex_parts`, and the `mass` [kg]
-    follows from `TrialSpec.mass` or `TrialSpec.density`, as for the object.
+    The closed `mesh` [m] is in the frame of the grasp. `parts` are by default its `convex_parts`,
+    and the `mass` [kg] follows from `TrialSpec.mass` or `TrialSpec.density`, as for the object.
     """
 
     mesh: "trimesh.Trimesh"
@@ -58,28 +62,20 @@ class Body:
 class SceneSpec:
     """Parameters of a simulated scene: a hand on its mount, the object, the table and neighbours.
 
-    Args:
-        urdf_path: URDF of the hand.
-        world_from_hand: pose of the hand (4, 4).
-        joints: start position of every joint of the URDF by name [rad].
-        drives: motor of every joint of the URDF by name.
-        tip_links: names of the links of the f fingertips, in the order of the grasp's contacts.
-        mesh: closed mesh of the object, which gives table height, centre of mass and inertia.
-        parts: convex bodies that make up the object.
-        mass: mass of the object [kg].
-        friction: friction coefficient of every contact.
-        table_friction: friction coefficient of bodies with the table and each other; by default `friction`.
-        gravity: gravity [m/s^2].
-        timestep: timestep of the simulator [s].
-        travel: largest height [m] of a lift.
-        approach: displacement [m] from the hand's start to the pose `world_from_hand`.
-        table: whether there is a table.
-        patch: radius [m] of a fingertip's contact patch; torsional friction is friction x force x patch.
-        height: height of the table [m]; by default the lowest point of the mesh.
-        neighbours: other bodies on the table.
-        self_pairs: pairs of the hand's links that collide with each other.
-        yields: largest displacement [m] of the mount along each axis of the world; 0 if the mount is stiff.
-        start: displacement [m] of a mount that yields at the beginning.
+    Args: urdf_path: URDF of the hand. world_from_hand: pose of the hand (4, 4). joints: start
+        position of every joint of the URDF by name [rad]. drives: motor of every joint of the URDF
+        by name. tip_links: names of the links of the f fingertips, in the order of the grasp's
+        contacts. mesh: closed mesh of the object, which gives table height, centre of mass and
+        inertia. parts: convex bodies that make up the object. mass: mass of the object [kg].
+        friction: friction coefficient of every contact. table_friction: friction coefficient of
+        bodies with the table and each other; by default `friction`. gravity: gravity [m/s^2].
+        timestep: timestep of the simulator [s]. travel: largest height [m] of a lift. approach:
+        displacement [m] from the hand's start to the pose `world_from_hand`. table: whether there
+        is a table. patch: radius [m] of a fingertip's contact patch; torsional friction is friction
+        x force x patch. height: height of the table [m]; by default the lowest point of the mesh.
+        neighbours: other bodies on the table. self_pairs: pairs of the hand's links that collide
+        with each other. yields: largest displacement [m] of the mount along each axis of the world;
+        0 if the mount is stiff. start: displacement [m] of a mount that yields at the beginning.
         mount: the prismatic joints of the mount, instead of those that lift, approach and yield.
     """
 
@@ -113,7 +109,9 @@ class SceneSpec:
 
     @functools.cached_property
     def slides(self) -> list["Slide"]:
-        """The prismatic joints of the mount, which carries the hand; in order from the world to the hand."""
+        """The prismatic joints of the mount, which carries the hand; in order from the world to the
+        hand.
+        """
         if self.mount is not None:
             return list(self.mount)
         slides = [Slide(LIFT_JOINT, (0.0, 0.0, 1.0), -0.01, self.travel + 0.05, 0.0)]
@@ -123,7 +121,8 @@ class SceneSpec:
             axis = (x / length, y / length, z / length)
             slides.append(Slide(APPROACH_JOINT, axis, -length - 0.01, 0.01, -length))
         if self.yields > 0:
-            most, axes = self.yields + 0.01, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+            most = self.yields + 0.01
+            axes = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
             each = zip(SHIFT_JOINTS, axes, self.start, strict=True)
             slides += [Slide(name, axis, -most, most, start) for name, axis, start in each]
         return slides
@@ -145,12 +144,16 @@ class SceneSpec:
 
     @property
     def hulls(self) -> list[list[np.ndarray]]:
-        """The vertices (v, 3) of the convex parts of the object and each neighbour; nearly on the table they lie on it.
+        """The vertices (v, 3) of the convex parts of the object and each neighbour; nearly on the
+        table they lie on it.
 
         On the facets of a scanned round body, the body would roll away before it is touched.
         """
         near = 3e-4  # [m]
-        found = [[np.array(x.vertices, dtype=float) for x in body.parts] for body in (self.body, *self.neighbours)]
+        found = [
+            [np.array(x.vertices, dtype=float) for x in body.parts]
+            for body in (self.body, *self.neighbours)
+        ]
         for vertices in itertools.chain(*found) if self.table else ():
             vertices[vertices[:, 2] < self.table_height + near, 2] = self.table_height
         return found
@@ -160,7 +163,9 @@ class SceneSpec:
         """Raise `BadArgument` if a joint in `names` has no initial position or no drive."""
         missing = [name for name in names if name not in self.joints or name not in self.drives]
         if missing:
-            raise BadArgument("joints", f"no position or drive for {missing}", "one for every joint of the URDF")
+            raise BadArgument(
+                "joints", f"no position or drive for {missing}", "one for every joint of the URDF"
+            )
 
 
 MOUNT_DRIVE = Actuator(effort=1e4, velocity=10.0, kp=1e4, kd=1e3)
@@ -170,7 +175,9 @@ WRIST_JOINT = "torchgrasp_wrist"  # name of the fixed joint between mount and ha
 
 
 class Slide(NamedTuple):
-    """A prismatic joint of the mount: name, unit axis in the world's frame, limits [m] and start position [m]."""
+    """A prismatic joint of the mount: name, unit axis in the world's frame, limits [m] and start
+    position [m].
+    """
 
     name: str
     axis: tuple[float, float, float]
@@ -182,8 +189,9 @@ class Slide(NamedTuple):
 def mounted_urdf(spec: SceneSpec) -> str:
     """Return the URDF of the hand on its mount, as XML text.
 
-    `<visual>` elements are left out, because they need a render device. `<mimic>` elements are left out, because
-    SAPIEN's mimic joints transmit wrong forces; coupled joints get their own targets instead.
+    `<visual>` elements are left out, because they need a render device. `<mimic>` elements are left
+    out, because SAPIEN's mimic joints transmit wrong forces; coupled joints get their own targets
+    instead.
     """
     urdf = spec.urdf
     robot = ET.fromstring(urdf.xml)
@@ -191,14 +199,20 @@ def mounted_urdf(spec: SceneSpec) -> str:
         for mimic in joint.findall("mimic"):
             joint.remove(mimic)
     angles = euler_from_rotation(spec.world_from_hand[:3, :3])
-    known = {"slides": spec.slides, "root": urdf.root, "place": spec.world_from_hand[:3, 3], "angles": angles}
+    known = {
+        "slides": spec.slides,
+        "root": urdf.root,
+        "place": spec.world_from_hand[:3, 3],
+        "angles": angles,
+    }
     path = Path(__file__).parent / "templates" / "mount.xml.jinja"
     robot[:0] = list(ET.fromstring(render(path, **known, wrist=WRIST_JOINT)))
     return ET.tostring(robot, encoding="unicode")
 
 
 def euler_from_rotation(rotation: np.ndarray) -> tuple[float, float, float]:
-    """Return the roll, pitch and yaw [rad] of a rotation, as in URDF: R = Rz(yaw) Ry(pitch) Rx(roll).
+    """Return the roll, pitch and yaw [rad] of a rotation, as in URDF: R = Rz(yaw) Ry(pitch)
+    Rx(roll).
 
     At a pitch of 90 degrees only yaw - roll is determined; roll is then 0.
     """
@@ -212,10 +226,12 @@ def euler_from_rotation(rotation: np.ndarray) -> tuple[float, float, float]:
 
 
 def pair_masks(pairs: Iterable[tuple[str, str]], first: int) -> dict[str, tuple[int, int]]:
-    """Return for each link in `pairs` two bit masks: its collision group, and the groups that it collides with.
+    """Return for each link in `pairs` two bit masks: its collision group, and the groups that it
+    collides with.
 
-    Two links collide if the group of one shares a bit with the mask of the other, as in PhysX and MuJoCo. Only one link
-    of each pair needs its own bit; bits from number `first` are free. `HandFileError` is raised if they do not suffice.
+    Two links collide if the group of one shares a bit with the mask of the other, as in PhysX and
+    MuJoCo. Only one link of each pair needs its own bit; bits from number `first` are free.
+    `HandFileError` is raised if they do not suffice.
     """
     bits = 31  # MuJoCo's masks are signed numbers of 32 bits
     left = [tuple(pair) for pair in pairs]

@@ -19,8 +19,8 @@ from torchgrasp.values.specs import Simulator
 def open_scene(spec: SceneSpec, simulator: Simulator = "sapien") -> SimulatedScene:
     """Return a fresh scene of a simulator, at its initial state.
 
-    Raises `BadArgument` for an unknown simulator, or a joint of the hand without a position or drive. A bad URDF is a
-    `HandFileError`, a simulator that is not installed a `MissingExtra`.
+    Raises `BadArgument` for an unknown simulator, or a joint of the hand without a position or
+    drive. A bad URDF is a `HandFileError`, a simulator that is not installed a `MissingExtra`.
 
     >>> from torchgrasp import load_hand, load_object
     >>> jug, hand = load_object("jug"), load_hand("barrett")
@@ -39,56 +39,77 @@ def open_scene(spec: SceneSpec, simulator: Simulator = "sapien") -> SimulatedSce
 
 
 class SimulatedHand:
-    """The simulated hand for a controller: it takes targets, and returns observations of joints and fingertip sensors.
+    """The simulated hand for a controller: it takes targets, and returns observations of joints and
+    fingertip sensors.
 
-    `truth` holds the contacts of the last tick. `force` (f,) are the true normal forces [N], averaged over the tick,
-    `pushes` (f, 3) the full forces. `finger` (f,) tells which fingers touched the object in the last step. `steps`
-    counts steps of the simulator. `sent` (j,) are the targets of the last tick [rad], in the scene's order of joints.
-    `first_touch` is the step of each fingertip's first contact, infinite before it. Three attributes are about the
-    hand's other contacts, with entries for neighbours, table top and target, in this order: `first_stray` is the step
-    of the first contact, `stray` the sum of the impulses [N s], `most_stray` the largest force [N] over a tick. The
-    scene is at its initial state. `control_rate` [Hz] is the rate of ticks. The generator draws the noise of the
-    fingertips; without one there is no noise.
+    `truth` holds the contacts of the last tick. `force` (f,) are the true normal forces [N],
+    averaged over the tick, `pushes` (f, 3) the full forces. `finger` (f,) tells which fingers
+    touched the object in the last step. `steps` counts steps of the simulator. `sent` (j,) are the
+    targets of the last tick [rad], in the scene's order of joints. `first_touch` is the step of
+    each fingertip's first contact, infinite before it. Three attributes are about the hand's other
+    contacts, with entries for neighbours, table top and target, in this order: `first_stray` is the
+    step of the first contact, `stray` the sum of the impulses [N s], `most_stray` the largest force
+    [N] over a tick. The scene is at its initial state. `control_rate` [Hz] is the rate of ticks.
+    The generator draws the noise of the fingertips; without one there is no noise.
     """
 
     def __init__(
-        self, scene: SimulatedScene, reference: ClosingReference, control_rate: float, generator: torch.Generator | None
+        self,
+        scene: SimulatedScene,
+        reference: ClosingReference,
+        control_rate: float,
+        generator: torch.Generator | None,
     ) -> None:
-        self.scene, self.reference = scene, reference
+        self.scene = scene
+        self.reference = reference
         self.substeps = max(1, round(1 / (control_rate * scene.timestep)))
         self.period = self.substeps * scene.timestep
         fingers = len(reference.hand.tips)
-        self.steps, self.first_touch = 0, [float("inf")] * fingers
-        self.first_stray, self.stray, self.most_stray = np.full(3, np.inf), np.zeros(3), np.zeros(3)
+        self.steps = 0
+        self.first_touch = [float("inf")] * fingers
+        self.first_stray = np.full(3, np.inf)
+        self.stray = np.zeros(3)
+        self.most_stray = np.zeros(3)
         self._palm: np.ndarray | None = None
         self.pushes = np.zeros((fingers, 3))
-        self.force, self.finger = np.zeros(fingers), np.zeros(fingers, dtype=bool)
+        self.force = np.zeros(fingers)
+        self.finger = np.zeros(fingers, dtype=bool)
         self.sensor = FingertipSensor(reference, generator)
         nothing = torch.full((fingers, 3), torch.nan, dtype=torch.float64)
         zero = torch.zeros(fingers, dtype=torch.float64)
         self.truth = TipContact(zero, torch.zeros_like(nothing), nothing, nothing, sliding=zero)
         self._poses: np.ndarray | None = None
         self.sent = scene.joints()
-        names, centres = reference.hand.tree.joint_names, reference.hand.tips.center.double()
-        self._centres = torch.cat([centres, torch.ones(fingers, 1, dtype=torch.float64)], dim=-1).numpy()
+        names = reference.hand.tree.joint_names
+        centres = reference.hand.tips.center.double()
+        self._centres = torch.cat(
+            [centres, torch.ones(fingers, 1, dtype=torch.float64)], dim=-1
+        ).numpy()
         self._to_scene = np.array([names.index(name) for name in scene.joint_names])
         self._from_scene = np.array([scene.joint_names.index(name) for name in names])
 
     @checked
     def tick(self, targets: Targets) -> Observation:
-        """Drive joints and palm towards their targets for one control period; return the observation at its end."""
+        """Drive joints and palm towards their targets for one control period; return the
+        observation at its end.
+        """
         if len(targets.joints) != len(self._to_scene):
-            raise BadArgument("targets", f"{len(targets.joints)} joints", f"all {len(self._to_scene)} of the URDF")
+            raise BadArgument(
+                "targets", f"{len(targets.joints)} joints", f"all {len(self._to_scene)} of the URDF"
+            )
         self.sent = targets.joints.numpy()[self._to_scene]
         self.scene.drive(self.sent)
         palm = targets.palm.numpy()
-        last = palm if self._palm is None else self._palm  # the scene begins where the palm is first sent
+        last = (
+            palm if self._palm is None else self._palm
+        )  # the scene begins where the palm is first sent
         if palm.any() or last.any():
             rotation = self.scene.hand_pose()[:3, :3]
             self.scene.shift(rotation @ palm, rotation @ (palm - last) / self.period)
         self._palm = palm
         impulse, moment, self.pushes = np.zeros((3, *self.pushes.shape))
-        weight, before = np.zeros(len(self.force)), self.stray.copy()
+        weight = np.zeros(len(self.force))
+        before = self.stray.copy()
         for _ in range(self.substeps):
             step = self.scene.step()
             self.steps += 1
@@ -99,7 +120,9 @@ class SimulatedHand:
             self.finger = step.finger
             if math.inf in self.first_touch:
                 touches = zip(self.first_touch, step.weight.tolist(), strict=True)
-                self.first_touch = [self.steps if at > self.steps and size > 0.0 else at for at, size in touches]
+                self.first_touch = [
+                    self.steps if at > self.steps and size > 0.0 else at for at, size in touches
+                ]
             if any(step.stray.tolist()):
                 self.first_stray[(step.stray > 0) & np.isinf(self.first_stray)] = self.steps
                 self.stray += step.stray
@@ -113,7 +136,9 @@ class SimulatedHand:
         self.steps += ticks * self.substeps
 
     def unbalanced(self) -> float:
-        """Return the size of the sum of all fingertip forces over the sum of their sizes; NaN without any forces."""
+        """Return the size of the sum of all fingertip forces over the sum of their sizes; NaN
+        without any forces.
+        """
         sizes = float(np.linalg.norm(self.pushes, axis=-1).sum())
         return float(np.linalg.norm(self.pushes.sum(0))) / sizes if sizes > 0.0 else math.nan
 
@@ -123,9 +148,13 @@ class SimulatedHand:
         return max(1, round(seconds / self.period))
 
     def _observe(self, impulse: np.ndarray, moment: np.ndarray, weight: np.ndarray) -> Observation:
-        """Return what the hand measures at the end of a tick, given sums over the tick as in `StepContacts`."""
-        world_from_hand, tips = self.scene.hand_pose(), self.scene.tip_poses()
-        rotation, origin = world_from_hand[:3, :3], world_from_hand[:3, 3]
+        """Return what the hand measures at the end of a tick, given sums over the tick as in
+        `StepContacts`.
+        """
+        world_from_hand = self.scene.hand_pose()
+        tips = self.scene.tip_poses()
+        rotation = world_from_hand[:3, :3]
+        origin = world_from_hand[:3, 3]
         centres = (tips @ self._centres[:, :, None])[:, :3, 0]
         sizes = np.linalg.norm(impulse, axis=-1)
         self.force = sizes / self.period
@@ -136,7 +165,9 @@ class SimulatedHand:
         places = torch.from_numpy((np.concatenate([points, centres]) - origin) @ rotation)
         f = len(self.force)
         sliding = torch.from_numpy(self._sliding(tips, points, normals))
-        self.truth = TipContact(torch.from_numpy(self.force), vectors[:f], places[:f], vectors[f:], sliding)
+        self.truth = TipContact(
+            torch.from_numpy(self.force), vectors[:f], places[:f], vectors[f:], sliding
+        )
         joints = self.scene.joints()[self._from_scene]
         jacobian = self.scene.jacobian(centres).take(self._from_scene, -1)
         turned = torch.from_numpy(rotation.T @ jacobian)
@@ -144,15 +175,19 @@ class SimulatedHand:
         return Observation(torch.from_numpy(joints), places[f:], turned, tactile)
 
     def _sliding(self, tips: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Return the speed [m/s] of each tip along the object's surface since the last tick; 0 without contact."""
-        poses, before = np.array([*tips, self.scene.object_pose()]), self._poses
+        """Return the speed [m/s] of each tip along the object's surface since the last tick; 0
+        without contact.
+        """
+        poses = np.array([*tips, self.scene.object_pose()])
+        before = self._poses
         self._poses = poses
         if before is None or np.isnan(points).all():
             return np.zeros(len(tips))
         here = np.ones((len(points), 4))
         here[:, :3] = points
         then = before @ np.linalg.inv(poses)
-        on_tip, on_object = (then[:-1] @ here[:, :, None])[:, :3, 0], (here @ then[-1].T)[:, :3]
+        on_tip = (then[:-1] @ here[:, :, None])[:, :3, 0]
+        on_object = (here @ then[-1].T)[:, :3]
         moved = on_object - on_tip
         along = moved - (moved * normals).sum(-1, keepdims=True) * normals
         speed = np.linalg.norm(along, axis=-1) / self.period

@@ -1,6 +1,7 @@
 """A simulated scene for one trial: table, object and a hand on a mount.
 
-Every trial opens a fresh scene: only then are two runs bitwise equal. The world's frame is the frame of the grasp.
+Every trial opens a fresh scene: only then are two runs bitwise equal. The world's frame is the
+    frame of the grasp.
 """
 
 import abc
@@ -16,7 +17,9 @@ from torchgrasp.sim.scene_spec import APPROACH_JOINT, LIFT_JOINT, SHIFT_JOINTS, 
 
 STILL = np.zeros(3)  # no force, no torque
 NEIGHBOURS, TABLETOP, TARGET = range(3)
-"""Indices into `StepContacts.stray`, which sums contacts of the hand other than those of fingers with the object."""
+"""Indices into `StepContacts.stray`, which sums contacts of the hand other than those of fingers
+with the object.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,18 +28,24 @@ class StepContacts:
 
     impulse: np.ndarray  # normal impulse on the object (f, 3) [N s], without friction
     moment: np.ndarray  # contact points weighted by the size of their impulse (f, 3) [N s m]
-    weight: np.ndarray  # sum of the impulse sizes (f,) [N s]; `moment / weight` is the mean contact point
-    finger: np.ndarray  # whether each finger touches (f,), with its tip or with the link that carries the tip
+    weight: (
+        np.ndarray
+    )  # sum of the impulse sizes (f,) [N s]; `moment / weight` is the mean contact point
+    finger: (
+        np.ndarray
+    )  # whether each finger touches (f,), with its tip or with the link that carries the tip
     force: np.ndarray  # of each fingertip on the object (f, 3) [N], friction included
-    stray: np.ndarray  # sums of other impulses (3,) [N s]: hand on neighbours, hand on table, links on object
+    stray: (
+        np.ndarray
+    )  # sums of other impulses (3,) [N s]: hand on neighbours, hand on table, links on object
 
 
 class SimulatedScene(abc.ABC):
     """The interface of a simulated scene: table, object, neighbours and hand.
 
-    Arrays are in the world's axes; joints are in the order of `joint_names`. `centre` [m] is the object's centre of
-    mass in its own frame, `timestep` is in seconds. A simulator's subclass sets `joint_names` and the handles of
-    bodies, and calls `_map_contacts`.
+    Arrays are in the world's axes; joints are in the order of `joint_names`. `centre` [m] is the
+    object's centre of mass in its own frame, `timestep` is in seconds. A simulator's subclass sets
+    `joint_names` and the handles of bodies, and calls `_map_contacts`.
     """
 
     joint_names: tuple[str, ...]
@@ -46,12 +55,16 @@ class SimulatedScene(abc.ABC):
     neighbours: list[Any]
 
     def __init__(self, spec: SceneSpec) -> None:
-        self.spec, self.timestep, self.centre = spec, spec.timestep, np.asarray(spec.mesh.center_mass, float)
+        self.spec = spec
+        self.timestep = spec.timestep
+        self.centre = np.asarray(spec.mesh.center_mass, float)
 
     def _map_contacts(self, tables: Iterable[Any], carriers: Iterable[Any]) -> None:
-        """Store which index into `StepContacts.stray` belongs to each body, and which finger to each link.
+        """Store which index into `StepContacts.stray` belongs to each body, and which finger to
+        each link.
 
-        `tables` are the table's bodies. `carriers` holds for each fingertip the link that carries it rigidly, or None.
+        `tables` are the table's bodies. `carriers` holds for each fingertip the link that carries
+        it rigidly, or None.
         """
         self._place_of = {self.body: TARGET} | dict.fromkeys(self.neighbours, NEIGHBOURS)
         self._place_of |= dict.fromkeys(tables, TABLETOP)
@@ -62,11 +75,15 @@ class SimulatedScene(abc.ABC):
 
     def step(self) -> StepContacts:
         """Advance by one timestep and return the hand's contacts during it, summed per finger."""
-        sums, finger, stray = [[0.0] * 10 for _ in self.tips], [False] * len(self.tips), [0.0] * 3
+        sums = [[0.0] * 10 for _ in self.tips]
+        finger = [False] * len(self.tips)
+        stray = [0.0] * 3
         for first, second, contact in self._advance():
             if (first in self._place_of) == (second in self._place_of):
                 continue
-            link, other, sign = (second, first, -1.0) if first in self._place_of else (first, second, 1.0)
+            link, other, sign = (
+                (second, first, -1.0) if first in self._place_of else (first, second, 1.0)
+            )
             touching = self._finger_of.get(link) if other == self.body else None
             if touching is None:
                 stray[self._place_of[other]] += sum(size for size, _ in self._read(contact, sign))
@@ -75,11 +92,20 @@ class SimulatedScene(abc.ABC):
                 if size > 0.0:
                     finger[touching] = True
                     if link == self.tips[touching]:
-                        row = sums[touching]  # of Python's numbers, which are faster than short arrays
+                        row = sums[
+                            touching
+                        ]  # of Python's numbers, which are faster than short arrays
                         for column, number in enumerate(numbers):
                             row[column] += number
         found = np.array(sums)
-        return StepContacts(found[:, :3], found[:, 3:6], found[:, 6], np.array(finger), found[:, 7:], np.array(stray))
+        return StepContacts(
+            found[:, :3],
+            found[:, 3:6],
+            found[:, 6],
+            np.array(finger),
+            found[:, 7:],
+            np.array(stray),
+        )
 
     @abc.abstractmethod
     def skip(self, steps: int) -> None:
@@ -87,19 +113,24 @@ class SimulatedScene(abc.ABC):
 
     @abc.abstractmethod
     def _advance(self) -> Iterable[tuple[Any, Any, Any]]:
-        """Advance by one timestep; yield each pair of bodies that touch, with an argument of `_read`."""
+        """Advance by one timestep; yield each pair of bodies that touch, with an argument of
+        `_read`.
+        """
 
     @abc.abstractmethod
     def _read(self, contact: Any, sign: float) -> Iterable[tuple[float, Iterable[float]]]:
-        """Yield size [N s] and numbers of each point of a contact; points with an impulse of zero may be left out.
+        """Yield size [N s] and numbers of each point of a contact; points with an impulse of zero
+        may be left out.
 
-        The numbers are normal impulse (3,) [N s], place times size (3,) [N s m], size, and force (3,) [N] if known:
-        on the second body, or on the first if the `sign` is -1.
+        The numbers are normal impulse (3,) [N s], place times size (3,) [N s m], size, and force
+        (3,) [N] if known: on the second body, or on the first if the `sign` is -1.
         """
 
     @abc.abstractmethod
     def keep(self) -> "Callable[[], SimulatedScene]":
-        """Return a function that opens scenes in the present state of this one, which go on bitwise as this one."""
+        """Return a function that opens scenes in the present state of this one, which go on bitwise
+        as this one.
+        """
 
     @abc.abstractmethod
     def drive(self, targets: np.ndarray) -> None:
@@ -107,11 +138,15 @@ class SimulatedScene(abc.ABC):
 
     @abc.abstractmethod
     def pull(self, force: np.ndarray, torque: np.ndarray = STILL) -> None:
-        """Apply a force [N] at the object's mass centre and a torque [N m], in this and all later steps."""
+        """Apply a force [N] at the object's mass centre and a torque [N m], in this and all later
+        steps.
+        """
 
     @abc.abstractmethod
     def displace(self, shift: np.ndarray) -> None:
-        """Move the object by a displacement (3,) [m], as a person who pushes the object while the hand approaches."""
+        """Move the object by a displacement (3,) [m], as a person who pushes the object while the
+        hand approaches.
+        """
 
     @abc.abstractmethod
     def joints(self) -> np.ndarray:
@@ -119,15 +154,21 @@ class SimulatedScene(abc.ABC):
 
     @abc.abstractmethod
     def jacobian(self, points: np.ndarray) -> np.ndarray:
-        """Return the Jacobian (f, 3, j) [m/rad] of one point (world's frame) per fingertip for the driven joints."""
+        """Return the Jacobian (f, 3, j) [m/rad] of one point (world's frame) per fingertip for the
+        driven joints.
+        """
 
     @abc.abstractmethod
     def penetration(self) -> float:
-        """Return the largest depth [m] by which the hand, at the start, penetrates another body or itself."""
+        """Return the largest depth [m] by which the hand, at the start, penetrates another body or
+        itself.
+        """
 
     @abc.abstractmethod
     def _pose(self, body: Any) -> np.ndarray:
-        """Return the pose (4, 4) of a body in the world's frame, given the simulator's handle of the body."""
+        """Return the pose (4, 4) of a body in the world's frame, given the simulator's handle of
+        the body.
+        """
 
     @abc.abstractmethod
     def _move_mount(self, joint: str, target: float, speed: float) -> None:
@@ -140,15 +181,21 @@ class SimulatedScene(abc.ABC):
 
     @checked
     def approach(self, left: float, speed: float = 0.0) -> None:
-        """Set how far [m] before the end of its approach the hand shall be (`left`), and its target speed [m/s]."""
+        """Set how far [m] before the end of its approach the hand shall be (`left`), and its target
+        speed [m/s].
+        """
         self._move_mount(APPROACH_JOINT, -left, speed)
 
     @checked
     def shift(self, displacement: np.ndarray, velocity: np.ndarray = STILL) -> None:
-        """Set the hand's target displacement (3,) [m] from its path and velocity (3,) [m/s], if the mount yields."""
+        """Set the hand's target displacement (3,) [m] from its path and velocity (3,) [m/s], if the
+        mount yields.
+        """
         for name, vector in (("displacement", displacement), ("velocity", velocity)):
             if vector.shape != (3,) or vector.dtype.kind not in "iuf":
-                raise BadArgument(name, f"shape {vector.shape} of {vector.dtype}", "shape (3,) of numbers")
+                raise BadArgument(
+                    name, f"shape {vector.shape} of {vector.dtype}", "shape (3,) of numbers"
+                )
         for joint, target, speed in zip(SHIFT_JOINTS, displacement, velocity, strict=True):
             self._move_mount(joint, target, speed)
 
@@ -161,7 +208,9 @@ class SimulatedScene(abc.ABC):
         return self._pose(self.body)
 
     def hand_pose(self) -> np.ndarray:
-        """Return the pose (4, 4) of the hand's root link in the world's frame; it is valid after the first step."""
+        """Return the pose (4, 4) of the hand's root link in the world's frame; it is valid after
+        the first step.
+        """
         return self._pose(self.root)
 
     def tip_poses(self) -> np.ndarray:

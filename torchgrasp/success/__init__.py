@@ -1,4 +1,6 @@
-"""Predicted success: what decides whether a grasp holds its task, a model that reads it, and the order of grasps."""
+"""Predicted success: what decides whether a grasp holds its task, a model that reads it, and the
+order of grasps.
+"""
 
 from torchgrasp.success.reasons import Cost
 from torchgrasp.success.task import TaskWrenches

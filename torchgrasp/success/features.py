@@ -1,4 +1,6 @@
-"""What decides whether a grasp holds its task: numbers that physics names, one column each, in SI units."""
+"""What decides whether a grasp holds its task: numbers that physics names, one column each, in SI
+units.
+"""
 
 from collections.abc import Sequence
 
@@ -20,13 +22,26 @@ from torchgrasp.values.planning import Contacts, Grasps
 
 CAUSES: dict[str, dict[str, str]] = {
     "load": {"force needed": "N", "force to spare": "1", "offset": "m"},
-    "moved": {"force to spare if moved": "1", "force to spare if moved and slippery": "1", "carried if moved": "1"},
+    "moved": {
+        "force to spare if moved": "1",
+        "force to spare if moved and slippery": "1",
+        "carried if moved": "1",
+    },
     "surface": {"deviation": "m", "tilt": "rad"},
     "object": {"size": "m", "height": "m", "breadth": "m"},
-    "task": {"friction": "1", "mass": "kg", "force": "N", "lifted": "1", "displaced": "1", "open loop": "1"},
+    "task": {
+        "friction": "1",
+        "mass": "kg",
+        "force": "N",
+        "lifted": "1",
+        "displaced": "1",
+        "open loop": "1",
+    },
 }
 """The features with their units, by what they tell about."""
-FEATURES = tuple(name for names in CAUSES.values() for name in names)  # all features, in the order of the columns
+FEATURES = tuple(
+    name for names in CAUSES.values() for name in names
+)  # all features, in the order of the columns
 GRIP = 15.0  # greatest force [N] that a hand which grips as the load asks for may need
 
 
@@ -35,19 +50,25 @@ def measure_grasps(
 ) -> Float[Tensor, "g k"]:
     """Return the `FEATURES` of each grasp for a task, at the friction coefficient `friction`.
 
-    Body and grasps are in an upright frame; `body` may be that of each grasp. `lifted` tells whether the task is a lift
-    or pulls. A force to spare is the logarithm of the fingers' strength over the force needed. "force needed", "force
-    to spare" and "slippery" are at half the friction.
+    Body and grasps are in an upright frame; `body` may be that of each grasp. `lifted` tells
+    whether the task is a lift or pulls. A force to spare is the logarithm of the fingers' strength
+    over the force needed. "force needed", "force to spare" and "slippery" are at half the friction.
     """
-    contacts, g, center = grasps.contacts, len(grasps), body.center
-    points, normals = contacts.points.to(center), contacts.normals.to(center)
-    forces, pressing = least_friction_forces(points, normals, strongest=1.0), task.pressing(lifted)
+    contacts = grasps.contacts
+    g = len(grasps)
+    center = body.center
+    points = contacts.points.to(center)
+    normals = contacts.normals.to(center)
+    forces = least_friction_forces(points, normals, strongest=1.0)
+    pressing = task.pressing(lifted)
     greatest = greatest_force(hand, grasps, forces).to(points).nan_to_num(0.0)
     strength = torch.minimum(greatest, greatest.new_tensor(pressing or GRIP))
     needed = _force_for(contacts, forces, center, (0.5 * friction,), task.mass, lifted)[0]
     moved = touch_moved(hand, body.field, grasps, forces)
     everywhere = center if center.ndim == 1 else center.repeat(len(moved.touched), 1)
-    there = _force_for(moved.contacts, moved.forces, everywhere, (friction, 0.5 * friction), task.mass, lifted)
+    there = _force_for(
+        moved.contacts, moved.forces, everywhere, (friction, 0.5 * friction), task.mass, lifted
+    )
     there = there.unflatten(1, moved.touched.shape).where(moved.touched, 1e3)
     spare, slippery = torch.log(strength.clamp_min(1e-3) / there)
     found: dict[str, Tensor | float] = {
@@ -70,27 +91,46 @@ def measure_grasps(
         "open loop": float(task.closing == "open_loop"),
     }
     assert tuple(found) == FEATURES
-    columns = [x.to(points) if isinstance(x, Tensor) else points.new_full((g,), x) for x in found.values()]
+    columns = [
+        x.to(points) if isinstance(x, Tensor) else points.new_full((g,), x) for x in found.values()
+    ]
     return torch.stack(columns, -1)
 
 
 def _force_for(
-    contacts: Contacts, forces: Float[Tensor, "g f 3"], center: Float[Tensor, "*b 3"], frictions: Sequence[float],
-    mass: float, lifted: bool,
-) -> Float[Tensor, "m g"]:  # fmt: skip
-    """Return the force [N] of the strongest finger with which no contact slides under the load, for each friction."""
+    contacts: Contacts,
+    forces: Float[Tensor, "g f 3"],
+    center: Float[Tensor, "*b 3"],
+    frictions: Sequence[float],
+    mass: float,
+    lifted: bool,
+) -> Float[Tensor, "m g"]:
+    """Return the force [N] of the strongest finger with which no contact slides under the load, for
+    each friction.
+    """
     weight, pull = (9.81 * mass, 0.0) if lifted else (0.0, 10.0 * mass)
     load = center.new_tensor([0.0, 0.0, -weight])
-    return carrying_force(contacts, forces, center, frictions, load, pull).clamp(1e-3, 1e3)  # infinite: no force does
+    return carrying_force(contacts, forces, center, frictions, load, pull).clamp(
+        1e-3, 1e3
+    )  # infinite: no force does
 
 
-def _normal_deviation(shape: ShapeGP | ShapeBatch, points: Float[Tensor, "g f 3"]) -> Float[Tensor, "g f"]:
-    """Return the standard deviation [rad] of the surface's normal at each contact, about the axis of largest one."""
+def _normal_deviation(
+    shape: ShapeGP | ShapeBatch, points: Float[Tensor, "g f 3"]
+) -> Float[Tensor, "g f"]:
+    """Return the standard deviation [rad] of the surface's normal at each contact, about the axis
+    of largest one.
+    """
     mean, covariance = shape.estimate(shape.normalise(points).flatten(0, 1))
-    normal, slope = unit(mean[:, 1:]), torch.linalg.vector_norm(mean[:, 1:], dim=-1)
+    normal = unit(mean[:, 1:])
+    slope = torch.linalg.vector_norm(mean[:, 1:], dim=-1)
     tangents = torch.stack(across(normal), -1)
     tangential = tangents.mT @ covariance[:, 1:, 1:] @ tangents
     one, other = tangential.diagonal(dim1=1, dim2=2).unbind(1)
-    largest = ((one + other) / 2 + torch.hypot((one - other) / 2, tangential[:, 0, 1])).clamp_min(0).sqrt()
+    largest = (
+        ((one + other) / 2 + torch.hypot((one - other) / 2, tangential[:, 0, 1]))
+        .clamp_min(0)
+        .sqrt()
+    )
     largest, slope = (x.view(points.shape[:2]) for x in (largest, slope))
     return spread(shape.std_factor, largest) * largest / slope

@@ -1,4 +1,6 @@
-"""How a grasp carries a load: the forces that it needs, the arm of the load, and the fingers that press."""
+"""How a grasp carries a load: the forces that it needs, the arm of the load, and the fingers that
+press.
+"""
 
 from collections.abc import Sequence
 
@@ -13,22 +15,29 @@ from torchgrasp.geometry.linalg import unit
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values.planning import Contacts, Grasps, IKSeeds
 
-CARRYING = 2.07  # log-odds of success that a lift loses for each factor e on the force that carries the load
+# log-odds of success that a lift loses for each factor e on the force that carries the load
+CARRYING = 2.07
 
 
 def lever_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "*b 3"]) -> Float[Tensor, "b"]:
-    """Return the distance of `center` [m], where the load acts, from the longest side of the contacts' triangle.
+    """Return the distance of `center` [m], where the load acts, from the longest side of the
+    contacts' triangle.
 
-    The distance is divided by the triangle's height over this side, about which the object turns most easily. For more
-    than three contacts, the triangle of the smallest ratio counts.
+    The distance is divided by the triangle's height over this side, about which the object turns
+    most easily. For more than three contacts, the triangle of the smallest ratio counts.
     """
     if points.shape[1] > 3:
         triples = subsets(points.shape[1], 3, points.device)
         each = center if center.ndim == 1 else center.repeat_interleave(len(triples), 0)
-        return lever_arm(points[:, triples].flatten(0, 1), each).unflatten(0, (len(points), len(triples))).amin(1)
+        return (
+            lever_arm(points[:, triples].flatten(0, 1), each)
+            .unflatten(0, (len(points), len(triples)))
+            .amin(1)
+        )
     sides = points.roll(-1, dims=1) - points
     longest = torch.linalg.vector_norm(sides, dim=-1).argmax(1)[:, None, None].expand(-1, 1, 3)
-    along, foot = unit(sides.gather(1, longest)[:, 0]), points.gather(1, longest)[:, 0]
+    along = unit(sides.gather(1, longest)[:, 0])
+    foot = points.gather(1, longest)[:, 0]
     opposite = points.gather(1, (longest + 2) % 3)[:, 0]
     arm = torch.linalg.vector_norm(torch.linalg.cross(along, center - foot), dim=-1)
     height = torch.linalg.vector_norm(torch.linalg.cross(along, opposite - foot), dim=-1)
@@ -36,22 +45,31 @@ def lever_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "*b 3"]) -> 
 
 
 def carrying_force(
-    contacts: Contacts, forces: Float[Tensor, "b f 3"], center: Float[Tensor, "*b 3"], frictions: Sequence[float],
-    load: Float[Tensor, "3"], push: float = 0.0,
-) -> Float[Tensor, "m b"]:  # fmt: skip
-    """Return for each of m friction coefficients the least factor s on balanced forces f_0 at which all contacts stick.
+    contacts: Contacts,
+    forces: Float[Tensor, "b f 3"],
+    center: Float[Tensor, "*b 3"],
+    frictions: Sequence[float],
+    load: Float[Tensor, "3"],
+    push: float = 0.0,
+) -> Float[Tensor, "m b"]:
+    """Return for each of m friction coefficients the least factor s on balanced forces f_0 at which
+    all contacts stick.
 
-    Load and push of any direction [N] act at `center`; w is their wrench. Equal springs share it, with the grasp map G:
+    Load and push of any direction [N] act at `center`; w is their wrench. Equal springs share it,
+    with the grasp map G:
 
         f = s f_0 - G^+ w,    y . f >= 0 for all edges y of the cones dual to the friction cones.
 
     The factor is infinite if the forces do not stick at all, as where no forces balance.
     """
-    points, normals = contacts.points.to(forces), contacts.normals.to(forces)
+    points = contacts.points.to(forces)
+    normals = contacts.normals.to(forces)
     edges = cone_edges(normals, tangents(points, normals), 1.0, edges=32)
     moment = skew(center.to(forces) - points.mean(1))  # maps a force at `center` to its torque
     eye = torch.eye(3).to(forces).expand_as(moment)
-    shared = (torch.linalg.pinv(grasp_map(points)) @ torch.cat([eye, moment], 1)).unflatten(1, points.shape[1:])
+    shared = (torch.linalg.pinv(grasp_map(points)) @ torch.cat([eye, moment], 1)).unflatten(
+        1, points.shape[1:]
+    )
     found = list[Tensor]()
     for friction in frictions:
         dual = edges + (1 - friction) * normals[:, :, None]
@@ -62,14 +80,22 @@ def carrying_force(
     return torch.stack(found)
 
 
-def greatest_force(hand: Hand, grasps: Grasps, forces: Float[Tensor, "g f 3"]) -> Float[Tensor, "g"]:
-    """Return the factor on balanced contact forces at which the first drive gives its greatest torque; NaN for NaN."""
+def greatest_force(
+    hand: Hand, grasps: Grasps, forces: Float[Tensor, "g f 3"]
+) -> Float[Tensor, "g"]:
+    """Return the factor on balanced contact forces at which the first drive gives its greatest
+    torque; NaN for NaN.
+    """
     jacobian, pushes, effort = _levers(hand, grasps, grasps.contacts, forces)
     return (effort / torch.einsum("gfih,gfi->gh", jacobian, pushes).abs()).amin(1)
 
 
-def strength_of(hand: Hand, held: Grasps | IKSeeds, contacts: Contacts, most: float) -> Float[Tensor, "g f"]:
-    """Return the greatest normal force [N] of each fingertip alone, by its drives, of at most `most` [N]."""
+def strength_of(
+    hand: Hand, held: Grasps | IKSeeds, contacts: Contacts, most: float
+) -> Float[Tensor, "g f"]:
+    """Return the greatest normal force [N] of each fingertip alone, by its drives, of at most
+    `most` [N].
+    """
     jacobian, pushes, effort = _levers(hand, held, contacts, -contacts.normals)
     alone = (effort / torch.einsum("gfih,gfi->gfh", jacobian, pushes).abs()).amin(2)
     return alone.nan_to_num(0.0).clamp(0.0, most)  # a contact that is unknown has no strength
@@ -78,7 +104,9 @@ def strength_of(hand: Hand, held: Grasps | IKSeeds, contacts: Contacts, most: fl
 def _levers(
     hand: Hand, held: Grasps | IKSeeds, contacts: Contacts, forces: Float[Tensor, "g f 3"]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the Jacobians (g, f, 3, h) of the contacts, forces in the hand's frame, and the drives' efforts (h,)."""
+    """Return the Jacobians (g, f, 3, h) of the contacts, forces in the hand's frame, and the
+    drives' efforts (h,).
+    """
     joints = held.joints
     hand_from_obj = inverse(held.obj_from_hand.to(joints))
     jacobian = hand.jacobian(joints, apply(hand_from_obj, contacts.points.to(joints)))
@@ -89,12 +117,18 @@ def _levers(
 def log_odds_about(
     grasps: Grasps, centers: Float[Tensor, "c 3"], friction: float, weight: Sequence[float]
 ) -> Float[Tensor, "g c"]:
-    """Return the log-odds of success of grasps for other centres of mass [m] than the first, for which they are ranked.
+    """Return the log-odds of success of grasps for other centres of mass [m] than the first, for
+    which they are ranked.
 
     Only the force that carries the load, in the direction `weight`, depends on the centre.
     """
-    points, normals = grasps.contacts.points.to(centers), grasps.contacts.normals.to(centers)
-    forces, load = least_friction_forces(points, normals, strongest=1.0), centers.new_tensor(weight)
-    carried = [carrying_force(grasps.contacts, forces, center, (0.5 * friction,), load)[0] for center in centers]
+    points = grasps.contacts.points.to(centers)
+    normals = grasps.contacts.normals.to(centers)
+    forces = least_friction_forces(points, normals, strongest=1.0)
+    load = centers.new_tensor(weight)
+    carried = [
+        carrying_force(grasps.contacts, forces, center, (0.5 * friction,), load)[0]
+        for center in centers
+    ]
     logs = torch.log(torch.stack(carried, -1).clamp(0.3, 100.0))
     return grasps.score.to(centers)[:, None] - CARRYING * (logs - logs[:, :1])

@@ -1,6 +1,8 @@
-"""The model of success: boosted trees that give a grasp's log-odds of success, and how well they have kept their word.
+"""The model of success: boosted trees that give a grasp's log-odds of success, and how well they
+have kept their word.
 
-`scripts/train.py success` fits the model to trials of authored bodies. Trials of other families calibrate it.
+`scripts/train.py success` fits the model to trials of authored bodies. Trials of other families
+calibrate it.
 """
 
 import dataclasses
@@ -14,7 +16,8 @@ from torch import Tensor
 from torchgrasp.files import read_value
 from torchgrasp.foundation.base import Value
 
-MODEL, KIND = Path(__file__).with_name("model.safetensors"), "success-model"
+MODEL = Path(__file__).with_name("model.safetensors")
+KIND = "success-model"
 """The shipped model, and the kind of its file."""
 
 
@@ -23,18 +26,26 @@ class SuccessModel(Value):
     """Boosted trees: t trees of m nodes, of which the first is the root. A leaf is its own child."""
 
     feature: Int[Tensor, "t m"]  # the feature that a node reads
-    threshold: Float[Tensor, "t m"]  # a grasp goes to the first child where the feature is at most this
+    threshold: Float[
+        Tensor, "t m"
+    ]  # a grasp goes to the first child where the feature is at most this
     children: Int[Tensor, "t m 2"]
     value: Float[Tensor, "t m"]  # the log-odds that a leaf adds; 0 in other nodes
     start: Float[Tensor, ""]  # log-odds without any tree
     range: Float[Tensor, "k 2"]  # least and greatest value of each feature in the trials
     usual: Float[Tensor, "k"]  # the median of each feature among grasps that held
-    bands: Float[Tensor, "n 3"]  # log-odds in ascending order, each with the least and greatest share that held there
-    kept: Float[Tensor, "r 3"]  # trials of the best grasp for a task: log-odds, 1 if it held, the number of the family
+    bands: Float[
+        Tensor, "n 3"
+    ]  # log-odds in ascending order, each with the least and greatest share that held there
+    kept: Float[
+        Tensor, "r 3"
+    ]  # trials of the best grasp for a task: log-odds, 1 if it held, the number of the family
 
     def log_odds(self, features: Float[Tensor, "g k"]) -> Float[Tensor, "g"]:
         """Return the log-odds of success of grasps with the given `FEATURES`."""
-        node = torch.zeros(len(features), len(self.feature), dtype=torch.int64, device=features.device)
+        node = torch.zeros(
+            len(features), len(self.feature), dtype=torch.int64, device=features.device
+        )
         trees = torch.arange(len(self.feature), device=features.device)
         rows = torch.arange(len(features), device=features.device)[:, None]
         for _ in range(self.depth):
@@ -45,15 +56,25 @@ class SuccessModel(Value):
     @functools.cached_property
     def depth(self) -> int:
         """The number of steps from the root to the deepest leaf."""
-        reached, depth = torch.zeros(len(self.feature), 1, dtype=torch.int64, device=self.feature.device), 0
+        reached = torch.zeros(len(self.feature), 1, dtype=torch.int64, device=self.feature.device)
+        depth = 0
         trees = torch.arange(len(self.feature), device=self.feature.device)[:, None]
-        while bool(((below := self.children[trees, reached].flatten(1)) != reached.repeat_interleave(2, 1)).any()):
-            reached, depth = below, depth + 1
+        while bool(
+            (
+                (below := self.children[trees, reached].flatten(1))
+                != reached.repeat_interleave(2, 1)
+            ).any()
+        ):
+            reached = below
+            depth = depth + 1
         return depth
 
     def interval(self, log_odds: Float[Tensor, "*g"]) -> Float[Tensor, "*g 2"]:
-        """Return the bounds of the share of grasps with these log-odds that held, by linear interpolation."""
-        at, low_high = self.bands[:, 0].contiguous(), self.bands[:, 1:]
+        """Return the bounds of the share of grasps with these log-odds that held, by linear
+        interpolation.
+        """
+        at = self.bands[:, 0].contiguous()
+        low_high = self.bands[:, 1:]
         upper = torch.searchsorted(at, log_odds.to(at).contiguous()).clamp(1, len(at) - 1)
         share = ((log_odds - at[upper - 1]) / (at[upper] - at[upper - 1])).clamp(0, 1)[..., None]
         return torch.lerp(low_high[upper - 1], low_high[upper], share)

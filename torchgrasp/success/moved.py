@@ -17,9 +17,11 @@ Sets = Float[Tensor, "d g f 3"]
 
 
 class MovedContacts(NamedTuple):
-    """Contact sets of g grasps after each of d displacements, one after another, with balanced `forces`.
+    """Contact sets of g grasps after each of d displacements, one after another, with balanced
+    `forces`.
 
-    The strongest force pushes with 1 N. `touched` tells whether all fingers touch the object, and can press it.
+    The strongest force pushes with 1 N. `touched` tells whether all fingers touch the object, and
+    can press it.
     """
 
     contacts: Contacts
@@ -27,25 +29,35 @@ class MovedContacts(NamedTuple):
     touched: Bool[Tensor, "d g"]
 
 
-def touch_moved(hand: Hand, field: DistanceField, grasps: Grasps, forces: Float[Tensor, "g f 3"]) -> MovedContacts:
-    """Return where the fingers touch the object if the object is displaced, by distances that a hand still finds.
+def touch_moved(
+    hand: Hand, field: DistanceField, grasps: Grasps, forces: Float[Tensor, "g f 3"]
+) -> MovedContacts:
+    """Return where the fingers touch the object if the object is displaced, by distances that a
+    hand still finds.
 
-    The displacements fill a ball of 20 mm, in the axes of the hand. Each fingertip moves on along the line from its
-    pre-grasp to its planned pose until it touches the surface, given by `field`. Balanced `forces` at the planned
-    contacts tell how the fingers share their pushes.
+    The displacements fill a ball of 20 mm, in the axes of the hand. Each fingertip moves on along
+    the line from its pre-grasp to its planned pose until it touches the surface, given by `field`.
+    Balanced `forces` at the planned contacts tell how the fingers share their pushes.
     """
-    count, radius = 16, 0.02  # displacements; the greatest [m]
-    sizes = (torch.arange(count, dtype=torch.float64, device="cpu") * 0.618 % 1.0) ** (1 / 3)  # even in the ball
+    # displacements; the greatest [m]
+    count = 16
+    radius = 0.02
+    sizes = (torch.arange(count, dtype=torch.float64, device="cpu") * 0.618 % 1.0) ** (
+        1 / 3
+    )  # even in the ball
     moved = radius * (sizes[:, None] * fibonacci_sphere(count)).to(forces)
     pose = grasps.obj_from_hand.to(forces)
-    before, after = (apply(pose, hand.tip_centres(q).to(forces)) for q in (grasps.pregrasp, grasps.joints))
+    before, after = (
+        apply(pose, hand.tip_centres(q).to(forces)) for q in (grasps.pregrasp, grasps.joints)
+    )
     path = after - before
     way = path / torch.linalg.vector_norm(path, dim=-1, keepdim=True).clamp_min(1e-6)
     start = before - rotate(pose, moved[None]).transpose(0, 1)[:, :, None]
     points, normals, found = trace(field, start, way.expand_as(start), hand.tips.radius.to(forces))
     pairs = internal_forces(grasps.contacts.points.to(forces)).flatten(2).mT
     weights = (torch.linalg.pinv(pairs) @ forces.nan_to_num(0.0).flatten(1)[..., None])[..., 0]
-    points, normals = points.flatten(0, 1), normals.flatten(0, 1)
+    points = points.flatten(0, 1)
+    normals = normals.flatten(0, 1)
     pressed = forces_near(points, normals, weights.repeat(count, 1))
     push = -(pressed * normals).sum(-1).amax(-1)
     touched = found.all(-1) & torch.isfinite(push).view(found.shape[:2])
@@ -55,17 +67,25 @@ def touch_moved(hand: Hand, field: DistanceField, grasps: Grasps, forces: Float[
 def trace(
     field: DistanceField, start: Sets, way: Sets, radius: Float[Tensor, "f"]
 ) -> tuple[Sets, Sets, Bool[Tensor, "d g f"]]:
-    """Return where balls that move from `start` [m] along a `way` first touch a surface, its normals, and whether.
+    """Return where balls that move from `start` [m] along a `way` first touch a surface, its
+    normals, and whether.
 
     This is sphere tracing: a ball moves on by its distance from the surface, up to 120 mm in all.
     """
-    close, least, length = 3e-4, 2e-4, 0.12  # [m]: distance of a touch; least step; longest way
-    travelled, shape = torch.zeros_like(start[..., 0]).flatten(0, 1), start.shape[:-1]
+    # [m]: distance of a touch; least step; longest way
+    close = 3e-4
+    least = 2e-4
+    length = 0.12
+    travelled = torch.zeros_like(start[..., 0]).flatten(0, 1)
+    shape = start.shape[:-1]
     field = field.rows(torch.arange(start.shape[1], device=start.device).repeat(len(start)))
-    start, way = start.flatten(0, 1), way.flatten(0, 1)
+    start = start.flatten(0, 1)
+    way = way.flatten(0, 1)
     for _ in range(24):
         gap = field.query(start + travelled[..., None] * way)[0] - radius
-        travelled = torch.where(gap < close, travelled, travelled + gap.clamp_min(least)).clamp_max(length)
+        travelled = torch.where(gap < close, travelled, travelled + gap.clamp_min(least)).clamp_max(
+            length
+        )
     distance, gradient = field.query(start + travelled[..., None] * way)
     normals = gradient / torch.linalg.vector_norm(gradient, dim=-1, keepdim=True).clamp_min(1e-9)
     points = start + travelled[..., None] * way - distance[..., None] * normals

@@ -1,4 +1,6 @@
-"""The order of grasps: by predicted success for a task, or by the variance at the contacts as in the paper."""
+"""The order of grasps: by predicted success for a task, or by the variance at the contacts as in
+the paper.
+"""
 
 import dataclasses
 import math
@@ -19,43 +21,60 @@ DOMAIN = ("deviation", "size", "height", "friction", "mass", "force")
 
 
 def is_covered(features: Float[Tensor, "g k"]) -> Bool[Tensor, "g"]:
-    """Return a mask of the grasps whose predicted success is supported by trials: `DOMAIN` is in their range."""
+    """Return a mask of the grasps whose predicted success is supported by trials: `DOMAIN` is in
+    their range.
+    """
     rows = [FEATURES.index(name) for name in DOMAIN]
     least, most = load_success_model(features.device).range[rows].T
     return ((features[:, rows] >= least) & (features[:, rows] <= most)).all(1)
 
 
 def largest_known() -> float:
-    """Return the largest half size [m] (from centre to surface) of objects for which success is predicted."""
+    """Return the largest half size [m] (from centre to surface) of objects for which success is
+    predicted.
+    """
     return float(load_success_model().range[FEATURES.index("size"), 1])
 
 
 def grade(grasps: Grasps, log_odds: Float[Tensor, "k"], known: Bool[Tensor, "k"]) -> Grasps:
-    """Return grasps with score, interval and `known` of the k executable ones by their log-odds of success."""
-    good, score = torch.nonzero(grasps.status == Status.OK)[:, 0], grasps.score.clone()
+    """Return grasps with score, interval and `known` of the k executable ones by their log-odds of
+    success.
+    """
+    good = torch.nonzero(grasps.status == Status.OK)[:, 0]
+    score = grasps.score.clone()
     score[good] = log_odds.to(score)
-    interval, supported = torch.zeros_like(score)[:, None].repeat(1, 2), torch.ones_like(score, dtype=torch.bool)
+    interval = torch.zeros_like(score)[:, None].repeat(1, 2)
+    supported = torch.ones_like(score, dtype=torch.bool)
     bounds = (
-        load_success_model(log_odds.device).interval(log_odds).where(known[:, None], log_odds.new_tensor([0.0, 1.0]))
+        load_success_model(log_odds.device)
+        .interval(log_odds)
+        .where(known[:, None], log_odds.new_tensor([0.0, 1.0]))
     )
-    interval[good], supported[good] = bounds.to(score), known
+    interval[good] = bounds.to(score)
+    supported[good] = known
     return dataclasses.replace(grasps, score=score, interval=interval, known=supported)
 
 
 def keep_promise(grasps: Grasps, share: float) -> Grasps:
-    """Return grasps, in which executable ones of which a `share` may not hold have the status `NO_PROMISE`."""
+    """Return grasps, in which executable ones of which a `share` may not hold have the status
+    `NO_PROMISE`.
+    """
     promise = find_promise(share)
     least = math.inf if promise is None else promise.least
     sure = grasps.score >= least if grasps.known is None else (grasps.score >= least) & grasps.known
     broken = (grasps.status == Status.OK) & ~sure
-    return dataclasses.replace(grasps, status=grasps.status.masked_fill(broken, int(Status.NO_PROMISE)))
+    return dataclasses.replace(
+        grasps, status=grasps.status.masked_fill(broken, int(Status.NO_PROMISE))
+    )
 
 
 def by_success(grasps: Grasps, *groups: Int[Tensor, "g"]) -> Grasps:
-    """Sort grasps by the `groups`, in each: executable ones with a known success, other executable ones, failed ones.
+    """Sort grasps by the `groups`, in each: executable ones with a known success, other executable
+    ones, failed ones.
 
-    Among these the score falls; the greater margin of the certificate decides between equal scores. With an arm, grasps
-    of the same success in whole percents, as it is printed, are sorted by falling product of the numbers in `ease`.
+    Among these the score falls; the greater margin of the certificate decides between equal scores.
+    With an arm, grasps of the same success in whole percents, as it is printed, are sorted by
+    falling product of the numbers in `ease`.
     """
     late = 2 * (grasps.status != Status.OK).int()
     late = late if grasps.known is None else late + (~grasps.known & (late == 0)).int()
@@ -66,7 +85,13 @@ def by_success(grasps: Grasps, *groups: Int[Tensor, "g"]) -> Grasps:
 
 
 def rank_by_variance(grasps: Grasps) -> Grasps:
-    """Sort grasps: executable grasps first, then by increasing sum of the surface variances at contacts (Sec. 6.5)."""
+    """Sort grasps: executable grasps first, then by increasing sum of the surface variances at
+    contacts (Sec. 6.5).
+    """
     if grasps.contacts.variance is None:
-        raise BadArgument("grasps.contacts.variance", "None", "the variance of the surface at each contact")
-    return grasps[lexical_order((grasps.status != Status.OK).int(), grasps.contacts.variance.sum(1))]
+        raise BadArgument(
+            "grasps.contacts.variance", "None", "the variance of the surface at each contact"
+        )
+    return grasps[
+        lexical_order((grasps.status != Status.OK).int(), grasps.contacts.variance.sum(1))
+    ]

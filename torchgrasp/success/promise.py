@@ -1,14 +1,16 @@
-"""A promise: of the grasps that are returned, at least a given share holds, on objects of families that nobody tried.
+"""A promise: of the grasps that are returned, at least a given share holds, on objects of families
+that nobody tried.
 
-Grasps are returned whose log-odds of success are at least a bound. Families of bodies that the model was not fitted on
-choose the bound, by conformal risk control (Angelopoulos et al., 2024). Let l_f be the mean of 1[returned] (1[failed] -
-alpha) over the trials of family f, with alpha = 1 - promise. Returned grasps fail more often than promised if and only
-if E l > 0. A new family has a loss of at most 1 - alpha. So the least bound is taken at which
+Grasps are returned whose log-odds of success are at least a bound. Families of bodies that the
+model was not fitted on choose the bound, by conformal risk control (Angelopoulos et al., 2024). Let
+l_f be the mean of 1[returned] (1[failed] - alpha) over the trials of family f, with alpha = 1 -
+promise. Returned grasps fail more often than promised if and only if E l > 0. A new family has a
+loss of at most 1 - alpha. So the least bound is taken at which
 
     sum_f l_f + (1 - alpha) <= 0.
 
-For a loss that falls with the bound, the promise then holds in the mean over n families and a new one, whatever n is.
-This loss falls but for noise.
+For a loss that falls with the bound, the promise then holds in the mean over n families and a new
+one, whatever n is. This loss falls but for noise.
 """
 
 import functools
@@ -22,7 +24,9 @@ from torchgrasp.success.model import load_success_model
 
 
 class Promise(NamedTuple):
-    """A promise that trials support: the least log-odds of a returned grasp, and the numbers of trials and families."""
+    """A promise that trials support: the least log-odds of a returned grasp, and the numbers of
+    trials and families.
+    """
 
     least: float
     trials: int
@@ -31,7 +35,9 @@ class Promise(NamedTuple):
 
 @functools.cache
 def find_promise(share: float) -> Promise | None:
-    """Return the promise that a `share` of the returned grasps holds; None if the trials support no bound."""
+    """Return the promise that a `share` of the returned grasps holds; None if the trials support no
+    bound.
+    """
     log_odds, held, family = load_success_model().kept.unbind(1)
     least = least_log_odds(log_odds, held > 0, family.long(), share)
     return None if least is None else Promise(least, len(log_odds), len(family.unique()))
@@ -52,7 +58,8 @@ def least_log_odds(
     if not len(log_odds):
         return None
     number = family.unique(return_inverse=True)[1]
-    count, risk = torch.bincount(number).to(log_odds), (~held).to(log_odds) - (1 - share)
+    count = torch.bincount(number).to(log_odds)
+    risk = (~held).to(log_odds) - (1 - share)
     bounds = torch.linspace(float(log_odds.min()), float(log_odds.max()), 200, dtype=log_odds.dtype)
     weighted = risk / count[number]  # its sum is that of the means of all families
     kept = torch.where(log_odds >= bounds[:, None], weighted, 0.0).sum(1) + share <= 0

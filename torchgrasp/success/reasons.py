@@ -28,7 +28,9 @@ SENTENCES = {
 
 
 class Cost(NamedTuple):
-    """A cause that lowers the log-odds of success by `log_odds`, compared to grasps that held, and a sentence on it."""
+    """A cause that lowers the log-odds of success by `log_odds`, compared to grasps that held, and
+    a sentence on it.
+    """
 
     cause: str
     log_odds: float
@@ -36,13 +38,17 @@ class Cost(NamedTuple):
 
 
 @checked
-def explain_success(grasps: Grasps, hand: Hand, shape: ShapeGP, task: GraspTask | None = None) -> tuple[Cost, ...]:
-    """Return at most three causes that lower the predicted success of the first grasp most, the greatest first.
+def explain_success(
+    grasps: Grasps, hand: Hand, shape: ShapeGP, task: GraspTask | None = None
+) -> tuple[Cost, ...]:
+    """Return at most three causes that lower the predicted success of the first grasp most, the
+    greatest first.
 
-    The cost of a cause is what the log-odds of success gain if its `CAUSES` take their median among grasps that held.
+    The cost of a cause is what the log-odds of success gain if its `CAUSES` take their median among
+    grasps that held.
 
-    The `shape` is in the frame of the grasps. The `task` is by default `GraspTask()`. Raises `BadArgument` for no
-    grasps, or grasps of another planner.
+    The `shape` is in the frame of the grasps. The `task` is by default `GraspTask()`. Raises
+    `BadArgument` for no grasps, or grasps of another planner.
 
     >>> from torchgrasp import fit_shape, load_hand, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -52,31 +58,49 @@ def explain_success(grasps: Grasps, hand: Hand, shape: ShapeGP, task: GraspTask 
     ('task', True)
     """
     if not len(grasps) or "friction" not in grasps.meta:
-        raise BadArgument("grasps", f"{len(grasps)} grasps, planned for no friction", "grasps of plan_grasps")
+        raise BadArgument(
+            "grasps", f"{len(grasps)} grasps, planned for no friction", "grasps of plan_grasps"
+        )
     features = measure_again(grasps[0], hand, shape, GraspTask() if task is None else task)
     model = load_success_model(features.device)
-    first, told = 0, list[Cost]()
+    first = 0
+    told = list[Cost]()
     units = [pair for names in CAUSES.values() for pair in names.items()]
-    values = {name: _say(float(x), unit) for (name, unit), x in zip(units, features[0].tolist(), strict=True)}
+    values = {
+        name: _say(float(x), unit)
+        for (name, unit), x in zip(units, features[0].tolist(), strict=True)
+    }
     for cause, names in CAUSES.items():
         usual = features.clone()
         usual[:, first : first + len(names)] = model.usual[first : first + len(names)]
         gain = float(model.log_odds(usual) - model.log_odds(features))
         told.append(Cost(cause, gain, SENTENCES[cause].format_map(values)))
         first += len(names)
-    return tuple(cost for cost in sorted(told, key=lambda cost: -cost.log_odds)[:3] if cost.log_odds > 0)
+    return tuple(
+        cost for cost in sorted(told, key=lambda cost: -cost.log_odds)[:3] if cost.log_odds > 0
+    )
 
 
 def measure_again(grasps: Grasps, hand: Hand, shape: ShapeGP, task: GraspTask) -> torch.Tensor:
-    """Return the features of planned grasps, whose metadata name the table and the friction, for any task."""
+    """Return the features of planned grasps, whose metadata name the table and the friction, for
+    any task.
+    """
     frame = inverse(upright_frame(shape.cloud.points, shape.cloud.viewpoint, grasps.table))
-    upright, shape = move(grasps, frame), shape.moved(frame)
-    hand, friction = hand.to(grasps.joints.device, grasps.joints.dtype), float(grasps.meta["friction"])
-    return measure_grasps(hand, EstimatedBody.of(shape), upright, friction, task, task.lifts(grasps.table))
+    upright = move(grasps, frame)
+    shape = shape.moved(frame)
+    hand = hand.to(grasps.joints.device, grasps.joints.dtype)
+    friction = float(grasps.meta["friction"])
+    return measure_grasps(
+        hand, EstimatedBody.of(shape), upright, friction, task, task.lifts(grasps.table)
+    )
 
 
 def _say(value: float, unit: str) -> str:
     """Return a number with its unit as text: millimetres and degrees for metres and radians."""
     scales = {"m": (1000.0, " mm"), "rad": (math.degrees(1.0), " degrees"), "1": (1.0, "")}
     factor, shown = scales.get(unit, (1.0, f" {unit}"))
-    return f"{value * factor:.2g}{shown}" if abs(value * factor) < 10 else f"{value * factor:.0f}{shown}"
+    return (
+        f"{value * factor:.2g}{shown}"
+        if abs(value * factor) < 10
+        else f"{value * factor:.0f}{shown}"
+    )

@@ -21,14 +21,13 @@ from torchgrasp.geometry.plane import Plane
 class GraspTask(Value):
     """What a grasp must do. The predicted success is that of this task.
 
-    Args:
-        mass: of the object [kg].
-        force: normal force [N] of the strongest finger. None: the hand that lifts grips as the felt load asks for, and
-            one that is pulled at presses with 4 N.
-        lift: whether the object is lifted off its table. Otherwise it floats, and is pulled along six directions with a
-            force of 10 m/s^2 times its mass. None means a lift if the planner knows the table, but not in open loop.
-        closing: how the hand closes, see `TrialSpec`.
-        displaced: whether the object may be elsewhere: up to 30 mm along the table, or 5 mm and 5 degrees if it floats.
+    Args: mass: of the object [kg]. force: normal force [N] of the strongest finger. None: the hand
+        that lifts grips as the felt load asks for, and one that is pulled at presses with 4 N.
+        lift: whether the object is lifted off its table. Otherwise it floats, and is pulled along
+        six directions with a force of 10 m/s^2 times its mass. None means a lift if the planner
+        knows the table, but not in open loop. closing: how the hand closes, see `TrialSpec`.
+        displaced: whether the object may be elsewhere: up to 30 mm along the table, or 5 mm and 5
+        degrees if it floats.
 
     Raises `BadArgument` for a number outside its range, or a lift in open loop.
 
@@ -54,21 +53,27 @@ class GraspTask(Value):
 
     @checked
     def pressing(self, lifted: bool) -> float:
-        """Return the normal force [N] of the strongest finger; 0 where the hand grips as the felt load asks for."""
+        """Return the normal force [N] of the strongest finger; 0 where the hand grips as the felt
+        load asks for.
+        """
         return self.force or (0.0 if lifted else 4.0)
 
     @checked
     def lifts(self, table: Plane | None) -> bool:
-        """Return whether the object is lifted: as `lift` says, or else if there is a table and no open loop."""
+        """Return whether the object is lifted: as `lift` says, or else if there is a table and no
+        open loop.
+        """
         return table is not None and self.closing != "open_loop" if self.lift is None else self.lift
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class TaskWrenches(Value):
-    """The loads of an object in a task, each a force [N], weight included, and a torque [N m], in the cloud's frame.
+    """The loads of an object in a task, each a force [N], weight included, and a torque [N m], in
+    the cloud's frame.
 
-    Torques are about `point` [m], by default the estimated centre. Raises `BadArgument` for no load, or one of zeros.
+    Torques are about `point` [m], by default the estimated centre. Raises `BadArgument` for no
+    load, or one of zeros.
 
     >>> unscrew = TaskWrenches(torch.tensor([[0.0, 0.0, -2.5, 0.0, 0.0, 0.1], [0.0, 0.0, -2.5, 0.0, 0.0, -0.1]]))
     """
@@ -78,12 +83,15 @@ class TaskWrenches(Value):
 
     def __post_init__(self) -> None:
         if not len(self.wrenches) or not bool(self.wrenches.any(1).all()):
-            raise BadArgument("wrenches", f"{len(self.wrenches)} wrenches, or one of zeros", "loads of the object")
+            raise BadArgument(
+                "wrenches", f"{len(self.wrenches)} wrenches, or one of zeros", "loads of the object"
+            )
 
 
 TaskName = Literal["lift", "pour", "push"]
 Resist = TaskName | tuple[TaskName, ...] | TaskWrenches
-"""What grasps must resist: `TaskWrenches`, or names of loads at the estimated centre. Without a table z points up.
+"""What grasps must resist: `TaskWrenches`, or names of loads at the estimated centre. Without a
+table z points up.
 
 * "lift": the weight.
 * "pour": the weight while the object is tilted by up to 120 degrees about any horizontal axis.
@@ -92,22 +100,40 @@ Resist = TaskName | tuple[TaskName, ...] | TaskWrenches
 
 
 def loads_of(
-    resist: Resist, mass: float, center: Float[Tensor, "3"], upright_from_obj: Float[Tensor, "4 4"], table: bool
+    resist: Resist,
+    mass: float,
+    center: Float[Tensor, "3"],
+    upright_from_obj: Float[Tensor, "4 4"],
+    table: bool,
 ) -> Float[Tensor, "w 6"]:
-    """Return the wrenches of a task about the origin of the upright frame, for a `center` [m] in this frame."""
+    """Return the wrenches of a task about the origin of the upright frame, for a `center` [m] in
+    this frame.
+    """
     if isinstance(resist, TaskWrenches):
         vectors = rotate(upright_from_obj, resist.wrenches.to(center).reshape(-1, 3))
         force, torque = vectors.reshape(-1, 6).split(3, -1)
-        point = center if resist.point is None else apply(upright_from_obj, resist.point.to(center)[None])[0]
+        point = (
+            center
+            if resist.point is None
+            else apply(upright_from_obj, resist.point.to(center)[None])[0]
+        )
     else:
         axes = torch.eye(3, dtype=torch.float64)
         corners = torch.tensor([*itertools.product((-1.0, 1.0), repeat=3)]) / math.sqrt(3)
-        around = 1.24 * torch.cat([corners, axes, -axes])  # mixtures of these vectors fill the unit ball
+        around = 1.24 * torch.cat(
+            [corners, axes, -axes]
+        )  # mixtures of these vectors fill the unit ball
         weight = torch.tensor([[0.0, 0.0, -9.81 * mass]], dtype=torch.float64)
-        # Without the vector that points up, mixtures fill the ball up to 120 degrees from straight down.
-        loads = {"lift": weight, "pour": 9.81 * mass * around[around[:, 2] < 1.2], "push": weight + 2.5 * around}
+        # Without the vector that points up, mixtures fill the ball up to 120 degrees from straight
+        # down.
+        loads = {
+            "lift": weight,
+            "pour": 9.81 * mass * around[around[:, 2] < 1.2],
+            "push": weight + 2.5 * around,
+        }
         names = (resist,) if isinstance(resist, str) else resist
         force = torch.cat([loads[name] for name in names]).to(center)
         force = force if table else force @ upright_from_obj[:3, :3].T
-        torque, point = torch.zeros_like(force), center
+        torque = torch.zeros_like(force)
+        point = center
     return torch.cat([force, torque + torch.linalg.cross(point.expand_as(force), force)], -1)

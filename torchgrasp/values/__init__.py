@@ -1,1 +1,3 @@
-"""The values that pass between folders: clouds, contacts, grasps; closings; and the options of users."""
+"""The values that pass between folders: clouds, contacts, grasps; closings; and the options of
+users.
+"""

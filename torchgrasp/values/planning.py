@@ -1,10 +1,12 @@
-"""The values that the stages of planning exchange, in the order of the stages. Options are in `torchgrasp.values.specs`.
+"""The values that the stages of planning exchange, in the order of the stages. Options are in
+`torchgrasp.values.specs`.
 
-A value is a frozen dataclass of tensors: it never changes, and `.to()` returns a new one. Lengths are in metres.
-Positions are in the frame of the cloud ("obj") unless stated otherwise. `a_from_b` maps coordinates of frame b into a.
+A value is a frozen dataclass of tensors: it never changes, and `.to()` returns a new one. Lengths
+are in metres. Positions are in the frame of the cloud ("obj") unless stated otherwise. `a_from_b`
+maps coordinates of frame b into a.
 
-Letters in shapes: n points, b batch rows, g grasps, f fingertips (three to five), e friction-cone edges, h actuated
-joints, t time steps.
+Letters in shapes: n points, b batch rows, g grasps, f fingertips (three to five), e friction-cone
+edges, h actuated joints, t time steps.
 """
 
 import dataclasses
@@ -27,15 +29,13 @@ from torchgrasp.geometry.plane import Plane, read_plane
 class PointCloud(Value):
     """The measured surface points of one object, with optional normals and camera positions.
 
-    Args:
-        points: surface points [m], at least 4.
-        normals: outward normals of any length, or None.
+    Args: points: surface points [m], at least 4. normals: outward normals of any length, or None.
         viewpoint: position of the camera [m], or of each point's camera; None if it is unknown.
-        frustum: inward unit normals of the four sides of the camera's view, or of each point's camera; None if unknown.
-            An object that reaches a side is cut off there.
+        frustum: inward unit normals of the four sides of the camera's view, or of each point's
+        camera; None if unknown. An object that reaches a side is cut off there.
 
-    Raises `BadArgument` for a wrong shape or dtype or numbers that are not finite, `TooFewPoints` for fewer than 4
-    points.
+    Raises `BadArgument` for a wrong shape or dtype or numbers that are not finite, `TooFewPoints`
+    for fewer than 4 points.
 
     >>> import torch
     >>> cloud = PointCloud(torch.rand(100, 3), viewpoint=torch.eye(3)[:2].repeat_interleave(50, 0))
@@ -61,7 +61,9 @@ class PointCloud(Value):
 
         The `rows` are a mask, or indices in the wanted order.
         """
-        normals, eye, frustum = self.normals, self.viewpoint, self.frustum
+        normals = self.normals
+        eye = self.viewpoint
+        frustum = self.frustum
         chosen = read_rows(rows, len(self))
         return PointCloud(
             points=self.points[chosen],
@@ -87,11 +89,13 @@ class PointCloud(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class ShapeEstimate(Value):
-    """The estimated shape at query points: posterior of signed distance and normal (Eqs. 7-8 of the paper).
+    """The estimated shape at query points: posterior of signed distance and normal (Eqs. 7-8 of the
+    paper).
 
-    `distance`, its `variance`, and the `covariance` of distance and gradient are in the normalised units of the paper:
-    one unit is `shape.scale` metres. `normal` is the unit gradient of the mean distance. `std_m` [m] is the calibrated
-    standard deviation of the surface: that of the distance, divided by the slope of the mean.
+    `distance`, its `variance`, and the `covariance` of distance and gradient are in the normalised
+    units of the paper: one unit is `shape.scale` metres. `normal` is the unit gradient of the mean
+    distance. `std_m` [m] is the calibrated standard deviation of the surface: that of the distance,
+    divided by the slope of the mean.
     """
 
     distance: Float[Tensor, "*b"]
@@ -104,10 +108,12 @@ class ShapeEstimate(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class Contacts(Batch):
-    """Contact sets of three to five contacts, one for each fingertip: `points` [m] and outward unit `normals`.
+    """Contact sets of three to five contacts, one for each fingertip: `points` [m] and outward unit
+    `normals`.
 
-    `variance` (Eq. 12, normalised units) and `std_m` [m] are the uncertainty of the surface at the contacts, or None if
-    it is unknown, as for contacts of another planner. All tensors have one dtype.
+    `variance` (Eq. 12, normalised units) and `std_m` [m] are the uncertainty of the surface at the
+    contacts, or None if it is unknown, as for contacts of another planner. All tensors have one
+    dtype.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> contacts = load_shipped_grasp("jug", "allegro").contacts
@@ -121,7 +127,11 @@ class Contacts(Batch):
     std_m: Annotated[Float[Tensor, "b f"], ANY] | None = None
 
     def __post_init__(self) -> None:
-        found = {str(x.dtype) for x in (self.points, self.normals, self.variance, self.std_m) if x is not None}
+        found = {
+            str(x.dtype)
+            for x in (self.points, self.normals, self.variance, self.std_m)
+            if x is not None
+        }
         if len(found) > 1:
             raise BadArgument("contacts", " beside ".join(sorted(found)), "one dtype for all")
 
@@ -133,7 +143,11 @@ class Contacts(Batch):
     def require_std(self) -> Float[Tensor, "b f"]:
         """Return `std_m`; raise `BadArgument` if the contacts have none."""
         if self.std_m is None:
-            raise BadArgument("contacts.std_m", "None", "the standard deviation [m] of the surface at each contact")
+            raise BadArgument(
+                "contacts.std_m",
+                "None",
+                "the standard deviation [m] of the surface at each contact",
+            )
         return self.std_m
 
 
@@ -142,8 +156,9 @@ class Contacts(Batch):
 class ContactPlan(Batch):
     """Planned contact sets, one for each initial guess, in the order of the guesses.
 
-    `coefficients` are phi of Eq. (13) of the paper: weights of the edges of the friction cones at which the forces
-    balance. `quality` is Eq. (14), the distance [m] of the contacts' centroid from the cloud's centre; less is better.
+    `coefficients` are phi of Eq. (13) of the paper: weights of the edges of the friction cones at
+    which the forces balance. `quality` is Eq. (14), the distance [m] of the contacts' centroid from
+    the cloud's centre; less is better.
     """
 
     contacts: Annotated[Contacts, Rows("b")]
@@ -155,17 +170,21 @@ class ContactPlan(Batch):
 @checked
 @dataclasses.dataclass(frozen=True)
 class Certificate(Batch):
-    """The proof that contact sets have frictional form closure (Eq. 13), or that they have not; `certify` makes it.
+    """The proof that contact sets have frictional form closure (Eq. 13), or that they have not;
+    `certify` makes it.
 
-    The columns of W are the wrenches along the edges of the friction cones, with torques divided by the radius of the
-    contacts; phi are their coefficients. `margin` is the largest s with W phi = 0, sum phi = 1, phi >= s. `rank_ratio`
-    is the smallest over the largest singular value of W. `residual` is the largest |W phi|. `closed`, which means force
-    closure, needs margin > 0 and full rank, because coincident or collinear contacts satisfy Eq. (13) too. `witness` is
-    a unit wrench w with w . v >= -margin for every column v of W. Without force closure no contact force opposes w.
+    The columns of W are the wrenches along the edges of the friction cones, with torques divided by
+    the radius of the contacts; phi are their coefficients. `margin` is the largest s with W phi =
+    0, sum phi = 1, phi >= s. `rank_ratio` is the smallest over the largest singular value of W.
+    `residual` is the largest |W phi|. `closed`, which means force closure, needs margin > 0 and
+    full rank, because coincident or collinear contacts satisfy Eq. (13) too. `witness` is a unit
+    wrench w with w . v >= -margin for every column v of W. Without force closure no contact force
+    opposes w.
 
-    With `resist`, contacts resist `task_margin` times the `task_load` t, of the task's wrenches [N, N m] the worst,
-    about their centroid. `task_forces` [N], of normal forces up to `task_strength` [N], balance so much of it.
-    `task_twist` y with y . t = -1 proves that no such forces balance more: none have a greater power along y.
+    With `resist`, contacts resist `task_margin` times the `task_load` t, of the task's wrenches [N,
+    N m] the worst, about their centroid. `task_forces` [N], of normal forces up to `task_strength`
+    [N], balance so much of it. `task_twist` y with y . t = -1 proves that no such forces balance
+    more: none have a greater power along y.
     """
 
     margin: Annotated[Float[Tensor, "b"], ANY]
@@ -183,11 +202,13 @@ class Certificate(Batch):
 @checked
 @dataclasses.dataclass(frozen=True)
 class ContactCode(Value):
-    """The code q of sets of three contacts, the same in every frame; one for each of six finger assignments (Eq. 18).
+    """The code q of sets of three contacts, the same in every frame; one for each of six finger
+    assignments (Eq. 18).
 
-    q holds the distances [m] of the contacts from their centroid, then the cosines between their normals.
-    `obj_from_vf` is the pose of a frame that the contacts define. In assignment k finger i touches contact
-    `permutation[k, i]`. Contact sets on a line or in a point have NaN and a `status` other than OK.
+    q holds the distances [m] of the contacts from their centroid, then the cosines between their
+    normals. `obj_from_vf` is the pose of a frame that the contacts define. In assignment k finger i
+    touches contact `permutation[k, i]`. Contact sets on a line or in a point have NaN and a
+    `status` other than OK.
     """
 
     q: Annotated[Float[Tensor, "b 6 6"], ANY]
@@ -199,11 +220,13 @@ class ContactCode(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class IKSeeds(Batch):
-    """Initial guesses for inverse kinematics: postures whose fingertips are placed on contacts (Eq. 24 of the paper).
+    """Initial guesses for inverse kinematics: postures whose fingertips are placed on contacts (Eq.
+    24 of the paper).
 
-    `row` is the index of the contact set, `permutation` the contact of each finger. `energy` is the misfit of the
-    posture, the least f_i of Eq. (21) or half the squared feature distance of a library posture; less is better.
-    `tip_error` [m] is the distance of each fingertip from its contact.
+    `row` is the index of the contact set, `permutation` the contact of each finger. `energy` is the
+    misfit of the posture, the least f_i of Eq. (21) or half the squared feature distance of a
+    library posture; less is better. `tip_error` [m] is the distance of each fingertip from its
+    contact.
     """
 
     joints: Float[Tensor, "g h"]
@@ -219,17 +242,20 @@ class IKSeeds(Batch):
 class Grasps(Batch):
     """Grasps: hand configurations with their contacts, certificates and checks, best first.
 
-    Finger i touches contact i. `pregrasp` are the joints of the opened hand, which is at the same pose or, where its
-    links would be in the table, above it (`ik.opened_pose`). `approach` is the unit direction in which the opened hand
-    moves straight there. `clearance` [m] is the least distance of the links from the estimated surface, from each other
-    and from the table; fingertips may touch the surface. `normal_angle` [rad] is the angle between pad axis and contact
-    direction. `score` is the log-odds of the predicted success, which ranks the grasps; `interval` bounds the share of
-    such grasps that held in trials (95 % over families). `known` tells for which grasps trials support the prediction;
-    None means for all. `meta` holds names, units, hashes and the seed as text. With an arm, `arm` are its joints [rad],
-    and `ease` its least joint margin and manipulability on the way (`torchgrasp.arm`).
+    Finger i touches contact i. `pregrasp` are the joints of the opened hand, which is at the same
+    pose or, where its links would be in the table, above it (`ik.opened_pose`). `approach` is the
+    unit direction in which the opened hand moves straight there. `clearance` [m] is the least
+    distance of the links from the estimated surface, from each other and from the table; fingertips
+    may touch the surface. `normal_angle` [rad] is the angle between pad axis and contact direction.
+    `score` is the log-odds of the predicted success, which ranks the grasps; `interval` bounds the
+    share of such grasps that held in trials (95 % over families). `known` tells for which grasps
+    trials support the prediction; None means for all. `meta` holds names, units, hashes and the
+    seed as text. With an arm, `arm` are its joints [rad], and `ease` its least joint margin and
+    manipulability on the way (`torchgrasp.arm`).
 
-    Each index keeps the batch axis: `grasps[0]` is a batch of one, and `grasps[0].joints[0]` are its joints. For all
-    joints of the hand see `Hand.expand`, for a 3D page `torchgrasp.app.report.show_grasps`.
+    Each index keeps the batch axis: `grasps[0]` is a batch of one, and `grasps[0].joints[0]` are
+    its joints. For all joints of the hand see `Hand.expand`, for a 3D page
+    `torchgrasp.app.report.show_grasps`.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> grasp = load_shipped_grasp("jug", "barrett")
@@ -257,14 +283,18 @@ class Grasps(Batch):
 
     @property
     def success(self) -> Float[Tensor, "g"]:
-        """The predicted probability that each planned grasp holds; 0 if it cannot be executed, NaN if it is unknown."""
+        """The predicted probability that each planned grasp holds; 0 if it cannot be executed, NaN
+        if it is unknown.
+        """
         likely = torch.sigmoid(self.score)
         likely = likely if self.known is None else torch.where(self.known, likely, torch.nan)
         return torch.where(self.status == Status.OK, likely, 0.0)
 
     @property
     def best(self) -> "Grasps":
-        """The first executable grasp, a batch of one. Raises `FailedRows` with the reasons if there is none."""
+        """The first executable grasp, a batch of one. Raises `FailedRows` with the reasons if there
+        is none.
+        """
         good = self.status == Status.OK
         if not len(self):
             raise FailedRows(self.meta.get("refused", "there is no grasp: explain_empty tells why"))
@@ -273,20 +303,30 @@ class Grasps(Batch):
     def _about(self) -> list[str]:
         good = self[self.status == Status.OK]
         best = [f"best predicted success {format_success(good)}"] if len(good) else []
-        return [f"{len(good)} of {len(self)} executable", *best, f"hand {self.meta.get('hand', 'unknown')}"]
+        return [
+            f"{len(good)} of {len(self)} executable",
+            *best,
+            f"hand {self.meta.get('hand', 'unknown')}",
+        ]
 
     @property
     def table(self) -> Plane | None:
-        """The table that the planner was given, in the frame of the grasps; None if it had none, or is unknown."""
+        """The table that the planner was given, in the frame of the grasps; None if it had none, or
+        is unknown.
+        """
         return None if (text := self.meta.get("table", "none")) == "none" else read_plane(text)
 
     @checked
     def save(self, path: Path | str) -> None:
-        """Write the grasps as a safetensors file, atomically; `load_grasps` reads it. Raises `OutputError`."""
+        """Write the grasps as a safetensors file, atomically; `load_grasps` reads it. Raises
+        `OutputError`.
+        """
         save_tensors(path, "grasps", named_tensors(self), self.meta)
 
 
 def format_success(success: "Grasps | float") -> str:
-    """Return a predicted success as a percentage, or "unknown" for NaN; of grasps, the success of the first."""
+    """Return a predicted success as a percentage, or "unknown" for NaN; of grasps, the success of
+    the first.
+    """
     number = float(success.success[0]) if isinstance(success, Grasps) else success
     return "unknown" if number != number else f"{number:.0%}"

@@ -13,36 +13,41 @@ from torchgrasp.values.closing import ClosingOptions, SensorModel, choose_option
 
 Simulator = Literal["sapien", "mujoco"]
 """The simulators."""
-TIP_RADIUS, SEPARATION = 0.012, 0.026
-"""Default radius [m] of a fingertip, and least distance [m] between two. Wider links lie behind smaller fingertips."""
+TIP_RADIUS = 0.012
+SEPARATION = 0.026
+"""Default radius [m] of a fingertip, and least distance [m] between two. Wider links lie behind
+smaller fingertips.
+"""
 FLAT_RADII = (0.008, 0.006, 0.004, 0.003)
-"""Radii [m] within which the surface at a contact must be flat; the largest that the object allows is used."""
+"""Radii [m] within which the surface at a contact must be flat; the largest that the object allows
+is used.
+"""
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class ContactSpec(Value):
-    """The constraints on three to five contacts (Eqs. 10-14). `ContactSpec.paper()` returns those of the paper.
+    """The constraints on three to five contacts (Eqs. 10-14). `ContactSpec.paper()` returns those
+    of the paper.
 
-    The estimated surface differs from the true one, so the defaults keep larger margins than the paper: a lower
-    friction, a flat surface, and a distance between fingertips.
+    The estimated surface differs from the true one, so the defaults keep larger margins than the
+    paper: a lower friction, a flat surface, and a distance between fingertips.
 
-    Args:
-        friction: coefficient of friction between fingertip and object at execution.
-        edges: number of edges of the linearised friction cone, at least 3.
-        max_variance: largest variance of the surface at a contact, S_thresh of Eq. (12), in normalised units.
-        friction_margin: contacts are planned and certified with `friction * friction_margin`.
-        separation: least distance between the centres of two fingertips [m]; by default their diameter plus 2 mm.
-            Contacts on opposite sides of a thin object may be closer.
-        flatness: largest angle [rad] between the normals at a contact and on a ring around it; None checks nothing.
-        flat_radius: radius [m] of the ring; by default the largest of `FLAT_RADII` that the object allows.
-        table: the table's `Plane` in the cloud's frame, or its height [m] along z; None means no table.
-        tip_radius: radius [m] of the fingertips, which may rest on the table; 0 means points. By default the hand's.
-        start_radius: normalised radius of the sphere on which initial guesses are drawn (Sec. 6.2; the paper: 0.1).
-        fingertips: number of contacts, one for each fingertip: 3, 4 or 5.
-        contact_allowed: whether links may touch and push the target's neighbours; collisions then only lower the
-            predicted success.
-        region: function of points (n, 3) [m], such as a `Region`, that is negative where contacts may be.
+    Args: friction: coefficient of friction between fingertip and object at execution. edges: number
+        of edges of the linearised friction cone, at least 3. max_variance: largest variance of the
+        surface at a contact, S_thresh of Eq. (12), in normalised units. friction_margin: contacts
+        are planned and certified with `friction * friction_margin`. separation: least distance
+        between the centres of two fingertips [m]; by default their diameter plus 2 mm. Contacts on
+        opposite sides of a thin object may be closer. flatness: largest angle [rad] between the
+        normals at a contact and on a ring around it; None checks nothing. flat_radius: radius [m]
+        of the ring; by default the largest of `FLAT_RADII` that the object allows. table: the
+        table's `Plane` in the cloud's frame, or its height [m] along z; None means no table.
+        tip_radius: radius [m] of the fingertips, which may rest on the table; 0 means points. By
+        default the hand's. start_radius: normalised radius of the sphere on which initial guesses
+        are drawn (Sec. 6.2; the paper: 0.1). fingertips: number of contacts, one for each
+        fingertip: 3, 4 or 5. contact_allowed: whether links may touch and push the target's
+        neighbours; collisions then only lower the predicted success. region: function of points (n,
+        3) [m], such as a `Region`, that is negative where contacts may be.
 
     Raises `BadArgument` for a number outside its range.
 
@@ -92,10 +97,11 @@ class ContactSpec(Value):
 
     @property
     def least_height(self) -> float:
-        """The least height [m] of an object that fingertips on the table can touch: on its wall, or on its upper rim.
+        """The least height [m] of an object that fingertips on the table can touch: on its wall, or
+        on its upper rim.
 
-        A rim of radius q and a fingertip of radius r touch with a normal of slope s if h = (r + q)(1 - s). Rims count
-        unless `flat_radius` is given; q is the least of `FLAT_RADII`.
+        A rim of radius q and a fingertip of radius r touch with a normal of slope s if h = (r +
+        q)(1 - s). Rims count unless `flat_radius` is given; q is the least of `FLAT_RADII`.
         """
         if self.flat_radius is not None:
             return self.fingertip_radius + self.flat_radius
@@ -104,59 +110,91 @@ class ContactSpec(Value):
 
     @checked
     def for_fingertips(self, radius: float) -> "ContactSpec":
-        """Return the spec with `tip_radius` set to a radius [m], at least `TIP_RADIUS`, unless it is set already.
+        """Return the spec with `tip_radius` set to a radius [m], at least `TIP_RADIUS`, unless it
+        is set already.
 
         >>> wide, points = ContactSpec().for_fingertips(0.015), ContactSpec(tip_radius=0.0).for_fingertips(0.015)
         >>> wide.tip_radius, points.tip_radius
         (0.015, 0.0)
         """
-        return self if self.tip_radius is not None else dataclasses.replace(self, tip_radius=max(radius, TIP_RADIUS))
+        return (
+            self
+            if self.tip_radius is not None
+            else dataclasses.replace(self, tip_radius=max(radius, TIP_RADIUS))
+        )
 
     @checked
     def relaxed(self, below: Length, radius: Length) -> "Iterator[ContactSpec]":
-        """Yield specs for an object without grasps: flat areas smaller than `below` [m], then the object's upper rim.
+        """Yield specs for an object without grasps: flat areas smaller than `below` [m], then the
+        object's upper rim.
 
-        A fingertip on the table touches the rim of a low object with an inclined normal. The estimated rim is rounder
-        than the true one, so its normals are steeper. Therefore the margins of friction and of the fingertips' `radius`
-        [m] are spent step by step. A given `flat_radius` is kept: then there are no such specs.
+        A fingertip on the table touches the rim of a low object with an inclined normal. The
+        estimated rim is rounder than the true one, so its normals are steeper. Therefore the
+        margins of friction and of the fingertips' `radius` [m] are spent step by step. A given
+        `flat_radius` is kept: then there are no such specs.
 
         >>> [round(spec.planned_friction, 1) for spec in ContactSpec(table=0.0).relaxed(0.003, 0.0096)]
         [0.4, 0.6, 0.8]
         """
         if self.flatness is None or self.flat_radius is not None:
             return
-        yield from (dataclasses.replace(self, flat_radius=flat) for flat in FLAT_RADII if flat < below)
-        rim, widest = 0.001, self.for_fingertips(radius).fingertip_radius  # radius [m] that is flat on a rim
+        yield from (
+            dataclasses.replace(self, flat_radius=flat) for flat in FLAT_RADII if flat < below
+        )
+        # radius [m] that is flat on a rim
+        rim = 0.001
+        widest = self.for_fingertips(radius).fingertip_radius
         for spent in (0.0, 0.5, 1.0) if self.table is not None else ():
-            tips = widest + spent * (radius - widest) if self.tip_radius is None and radius > 0 else self.tip_radius
+            tips = (
+                widest + spent * (radius - widest)
+                if self.tip_radius is None and radius > 0
+                else self.tip_radius
+            )
             margin = self.friction_margin + spent * (1 - self.friction_margin)
-            yield dataclasses.replace(self, flat_radius=rim, tip_radius=tips, friction_margin=margin)
+            yield dataclasses.replace(
+                self, flat_radius=rim, tip_radius=tips, friction_margin=margin
+            )
 
     @classmethod
     @checked
     def paper(
-        cls, friction: float = 0.8, edges: int = 8, max_variance: float = 0.03, table: Plane | float | None = None
+        cls,
+        friction: float = 0.8,
+        edges: int = 8,
+        max_variance: float = 0.03,
+        table: Plane | float | None = None,
     ) -> "ContactSpec":
-        """Return the paper's constraints: full friction, contacts above the table, no least separation or flatness.
+        """Return the paper's constraints: full friction, contacts above the table, no least
+        separation or flatness.
 
         >>> ContactSpec.paper(friction=0.8).planned_friction, ContactSpec.paper().flatness
         (0.8, None)
         """
-        spec = cls(friction, edges, max_variance, friction_margin=1.0, flatness=None, table=table, start_radius=0.1)
+        spec = cls(
+            friction,
+            edges,
+            max_variance,
+            friction_margin=1.0,
+            flatness=None,
+            table=table,
+            start_radius=0.1,
+        )
         return dataclasses.replace(spec, separation=0.0, tip_radius=0.0)
 
 
 Mode = Literal["joint", "contact_first", "paper"]
 """How planned contacts become grasps.
 
-* "joint": the hand starts from random postures near each contact set. If none succeeds, the contacts move along the
-  surface with the hand.
+* "joint": the hand starts from random postures near each contact set. If none succeeds, the
+  contacts move along the surface with the hand.
 * "contact_first": initial postures of the learned model are refined onto fixed contacts.
-* "paper": the paper's method (docs/paper.md): initial postures of the model by Eqs. 21-24, refined by COBYLA, and the
-  paper's shape, contacts and ranking.
+* "paper": the paper's method (docs/paper.md): initial postures of the model by Eqs. 21-24, refined
+  by COBYLA, and the paper's shape, contacts and ranking.
 """
 Ranking = Literal["success", "variance"]
-"""Which grasp is the best: the one with the highest predicted success, or the least sum of variances (the paper's)."""
+"""Which grasp is the best: the one with the highest predicted success, or the least sum of
+variances (the paper's).
+"""
 ClosingMode = Literal["open_loop", "position", "paper_position", "fixed", "paper", "uncertainty"]
 """How a hand closes; `TrialSpec` explains the modes."""
 HoldingMode = Literal["force", "grip", "impedance", "position", "law"]
@@ -166,47 +204,43 @@ HoldingMode = Literal["force", "grip", "impedance", "position", "law"]
 @checked
 @dataclasses.dataclass(frozen=True)
 class TrialSpec(Value):
-    """Parameters of a simulated trial: close the hand on the true object, lift it off the table, hold it.
+    """Parameters of a simulated trial: close the hand on the true object, lift it off the table,
+    hold it.
 
-    The controller does not know `mass`, `density`, `friction`, `gravity`, `patch` and the numbers of the simulator.
-    Raises `BadArgument` for a number outside its range, an unknown closing, holding or simulator, options of a closing
-    that has none, a sensor or force that the closing cannot use, or a control period below one timestep.
+    The controller does not know `mass`, `density`, `friction`, `gravity`, `patch` and the numbers
+    of the simulator. Raises `BadArgument` for a number outside its range, an unknown closing,
+    holding or simulator, options of a closing that has none, a sensor or force that the closing
+    cannot use, or a control period below one timestep.
 
-    Args:
-        closing: how the hand closes. "paper": Eqs. 25-28 as written, with forces of the hand's stability model.
-            "uncertainty": such a law with the calibrated deviation and components (`ClosingOptions`). "fixed": the same
-            with equal gains. "paper_position": PI position control to the contacts until 0.5 N, the paper's baseline.
-            "position": PI control to goals behind the contacts. "open_loop": joint motion from pre-grasp to grasp to
-            squeeze.
-        holding: how the closed hand presses: "force" (balanced forces), "grip" (the forces that the felt load and a
-            push of 2.5 N need), "impedance" (the grasp is a spring in the hand), "position" (joint targets are kept) or
-            "law" (Eq. 25 continues). In open loop the squeeze is kept. None means "grip", or "force" if `force` is
-            given, the closing is not "uncertainty" or "fixed", or a fingertip is not tactile.
-        options: components of the closing "uncertainty" or "fixed"; by default all components.
-        sensor: sensors of the fingertips; the controller knows their kind.
-        max_force: largest normal force [N] of a fingertip; None means no limit.
-        mass: mass of the object [kg].
-        friction: coefficient of friction of every contact.
-        table_friction: coefficient of friction between object and table; by default `friction`.
-        gravity: gravity [m/s^2].
-        approach: length [m] of the straight path to the pre-grasp; 0 means that the hand starts there.
-        lift_height: height of the lift [m].
-        hold_time: time [s] after the lift.
-        shake: amplitude [m] of a vertical sinusoid of 5 Hz during the hold.
-        push: force [N] at the object's centre of mass during the hold, in the world's axes, whose z axis points up.
-        force: normal force of the strongest finger [N] in the closing and in the holding "force"; None means 4 N, or
-            `max_force` if it is less.
-        noise: whether the sensor is noisy; for a tactile sensor 0.1 N normal, 0.3 N tangential and 1.5 mm of position.
-        timestep: timestep of the simulator [s].
-        control_rate: rate of the controller [Hz].
-        simulator: "sapien" or "mujoco".
-        density: density of the object [kg/m^3]; it replaces `mass` unless None.
-        patch: radius [m] of the contact patch of a fingertip; torsional friction is friction x force x patch. With 0
-            the contacts are hard points, as in the paper.
-        kp: stiffness of all joint drives [N m/rad]; by default the hand's own.
-        overlap: largest overlap [m] of hand and object at the start; the object's convex parts bulge a little.
-        table: whether the object stands on a table.
-        self_collision: whether links of the hand collide with each other, in the pairs that the hand names.
+    Args: closing: how the hand closes. "paper": Eqs. 25-28 as written, with forces of the hand's
+        stability model. "uncertainty": such a law with the calibrated deviation and components
+        (`ClosingOptions`). "fixed": the same with equal gains. "paper_position": PI position
+        control to the contacts until 0.5 N, the paper's baseline. "position": PI control to goals
+        behind the contacts. "open_loop": joint motion from pre-grasp to grasp to squeeze. holding:
+        how the closed hand presses: "force" (balanced forces), "grip" (the forces that the felt
+        load and a push of 2.5 N need), "impedance" (the grasp is a spring in the hand), "position"
+        (joint targets are kept) or "law" (Eq. 25 continues). In open loop the squeeze is kept. None
+        means "grip", or "force" if `force` is given, the closing is not "uncertainty" or "fixed",
+        or a fingertip is not tactile. options: components of the closing "uncertainty" or "fixed";
+        by default all components. sensor: sensors of the fingertips; the controller knows their
+        kind. max_force: largest normal force [N] of a fingertip; None means no limit. mass: mass of
+        the object [kg]. friction: coefficient of friction of every contact. table_friction:
+        coefficient of friction between object and table; by default `friction`. gravity: gravity
+        [m/s^2]. approach: length [m] of the straight path to the pre-grasp; 0 means that the hand
+        starts there. lift_height: height of the lift [m]. hold_time: time [s] after the lift.
+        shake: amplitude [m] of a vertical sinusoid of 5 Hz during the hold. push: force [N] at the
+        object's centre of mass during the hold, in the world's axes, whose z axis points up. force:
+        normal force of the strongest finger [N] in the closing and in the holding "force"; None
+        means 4 N, or `max_force` if it is less. noise: whether the sensor is noisy; for a tactile
+        sensor 0.1 N normal, 0.3 N tangential and 1.5 mm of position. timestep: timestep of the
+        simulator [s]. control_rate: rate of the controller [Hz]. simulator: "sapien" or "mujoco".
+        density: density of the object [kg/m^3]; it replaces `mass` unless None. patch: radius [m]
+        of the contact patch of a fingertip; torsional friction is friction x force x patch. With 0
+        the contacts are hard points, as in the paper. kp: stiffness of all joint drives [N m/rad];
+        by default the hand's own. overlap: largest overlap [m] of hand and object at the start; the
+        object's convex parts bulge a little. table: whether the object stands on a table.
+        self_collision: whether links of the hand collide with each other, in the pairs that the
+        hand names.
 
     >>> TrialSpec(mass=0.3).pressing, TrialSpec(force=6.0).pressing
     ('grip', 'force')
@@ -244,7 +278,9 @@ class TrialSpec(Value):
         if self.max_force is not None and self.force is not None and self.force > self.max_force:
             raise BadArgument("force", self.force, f"at most max_force, {self.max_force:g}")
         if self.table_friction is not None and self.table_friction > self.friction:
-            raise BadArgument("table_friction", self.table_friction, f"at most friction, {self.friction:g}")
+            raise BadArgument(
+                "table_friction", self.table_friction, f"at most friction, {self.friction:g}"
+            )
         if not all(abs(x) <= 1000.0 for x in self.push):
             raise BadArgument("push", self.push, "at most 1000 N along each axis")
         if not self.control_rate * self.timestep < 1 + 1e-9:
@@ -269,15 +305,23 @@ class TrialSpec(Value):
 
 
 def default_holding(sensor: SensorModel, closing: ClosingMode) -> HoldingMode:
-    """Return the holding "grip", or "force" after closings without tactile fingertips or without `ClosingOptions`."""
+    """Return the holding "grip", or "force" after closings without tactile fingertips or without
+    `ClosingOptions`.
+    """
     return "grip" if sensor.full and closing in ("fixed", "uncertainty") else "force"
 
 
 def check_modes(sensor: SensorModel, closing: str, holding: str) -> None:
-    """Raise `BadArgument` if the closing and holding modes do not combine, or need more than the sensor measures."""
+    """Raise `BadArgument` if the closing and holding modes do not combine, or need more than the
+    sensor measures.
+    """
     if holding == "law" and closing not in ("fixed", "uncertainty", "paper"):
-        raise BadArgument("holding", f"'law' after {closing!r}", "another holding, or a closing under Eq. (25)")
-    poor = f"one of kind {sensor.kind!r}" + (f" with {', '.join(sensor.dead)} dead" if sensor.dead else "")
+        raise BadArgument(
+            "holding", f"'law' after {closing!r}", "another holding, or a closing under Eq. (25)"
+        )
+    poor = f"one of kind {sensor.kind!r}" + (
+        f" with {', '.join(sensor.dead)} dead" if sensor.dead else ""
+    )
     allowed = "kind 'tactile' with no finger dead for {}"
     if not sensor.full and closing in ("position", "paper_position", "paper"):
         raise BadArgument("sensor", poor, allowed.format(f"closing {closing!r}"))

@@ -1,7 +1,9 @@
-"""Lifts by an Allegro hand on a UR5e, beside lifts by the same hand without an arm; what the arm adds to planning.
+"""Lifts by an Allegro hand on a UR5e, beside lifts by the same hand without an arm; what the arm
+adds to planning.
 
-The arm's joints have position drives with the gains and efforts of MuJoCo Menagerie's model of the UR5e. Its base
-stands on the table. What the mount of a hand without an arm would do, the arm's joints do by inverse kinematics.
+The arm's joints have position drives with the gains and efforts of MuJoCo Menagerie's model of the
+UR5e. Its base stands on the table. What the mount of a hand without an arm would do, the arm's
+joints do by inverse kinematics.
 """
 
 import dataclasses
@@ -22,25 +24,37 @@ from torchgrasp.evaluation.lift import run_lift
 from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, Truth
 from torchgrasp.hand.hand import Actuator
 from torchgrasp.sim.convex_parts import convex_parts
-from torchgrasp.sim.mujoco_scene import MujocoScene, format_numbers, nest_links, render_mjcf, scene_mjcf
+from torchgrasp.sim.mujoco_scene import (
+    MujocoScene,
+    format_numbers,
+    nest_links,
+    render_mjcf,
+    scene_mjcf,
+)
 from torchgrasp.sim.scene_spec import SceneSpec
 from torchgrasp.values.closing import ClosureResult
 
 TRIAL = TrialSpec(mass=0.249, table_friction=0.2, lift_height=0.1, approach=0.1, simulator="mujoco")
 """A lift as of protocol "table-lift", by as much as the planner checks the way of the arm."""
 DRIVES = {150.0: (2000.0, 400.0), 28.0: (500.0, 100.0)}
-"""Stiffness [N m/rad] and damping [N m s/rad] of the UR5e's joints by their effort [N m], of MuJoCo Menagerie."""
+"""Stiffness [N m/rad] and damping [N m s/rad] of the UR5e's joints by their effort [N m], of MuJoCo
+Menagerie.
+"""
 ROTOR = 0.1
 """Inertia [kg m2] of the rotors at the joints, of the same."""
-LEAST, SLOWEST = 0.95, 1.5
-"""Bars: share of the lifts without an arm that succeed with it; processor time of a plan over that without an arm."""
+LEAST = 0.95
+SLOWEST = 1.5
+"""Bars: share of the lifts without an arm that succeed with it; processor time of a plan over that
+without an arm.
+"""
 
 
 class ArmScene(MujocoScene):
     """A scene in which an arm carries the hand; `posture` (n, 1) [rad] is that of the grasp."""
 
     def __init__(self, spec: SceneSpec, arm: Arm, posture: torch.Tensor) -> None:
-        self.arm, self.posture = arm, posture
+        self.arm = arm
+        self.posture = posture
         self.mount = {slide.name: (np.array(slide.axis), slide.start, 0.0) for slide in spec.slides}
         self.aimed = False
         super().__init__(spec)
@@ -48,47 +62,69 @@ class ArmScene(MujocoScene):
     def _write(self, spec: SceneSpec) -> str:
         """Return the model of the scene with the hand on the arm instead of its mount."""
         root = ET.fromstring(scene_mjcf(spec))
-        world, actuator = root.find("worldbody"), root.find("actuator")
+        world = root.find("worldbody")
+        actuator = root.find("actuator")
         assert world is not None and actuator is not None
         bodies = {body.get("name"): body for body in root.iter("body")}
         world.remove(bodies[spec.slides[0].name])
         for servo in [servo for servo in actuator if servo.get("name") in self.mount]:
             actuator.remove(servo)
-        joints = {j.name: Actuator(j.effort, j.velocity, *DRIVES[j.effort]) for j in self.arm.urdf.movable}
-        parts = {"nested": nest_links(self.arm.urdf), "pose": self.arm.obj_from_base.numpy(), "order": [*joints]}
+        joints = {
+            j.name: Actuator(j.effort, j.velocity, *DRIVES[j.effort]) for j in self.arm.urdf.movable
+        }
+        parts = {
+            "nested": nest_links(self.arm.urdf),
+            "pose": self.arm.obj_from_base.numpy(),
+            "order": [*joints],
+        }
         model = ET.fromstring(render_mjcf("robot.xml", name="arm", **parts, drives=joints))
-        base, servos = model.find("worldbody/body"), model.find("actuator")
+        base = model.find("worldbody/body")
+        servos = model.find("actuator")
         assert base is not None and servos is not None
         for joint in base.iter("joint"):
             joint.set("armature", str(ROTOR))
         world.append(base)
         actuator.extend(servos)
-        hand, place = bodies[spec.urdf.root], self.arm.tip_from_hand.numpy()
-        hand.attrib |= {"pos": format_numbers(place[:3, 3]), "xyaxes": format_numbers(place[:3, :2].T.ravel())}
-        next(body for body in base.iter("body") if body.get("name") == self.arm.urdf.links[-1].name).append(hand)
+        hand = bodies[spec.urdf.root]
+        place = self.arm.tip_from_hand.numpy()
+        hand.attrib |= {
+            "pos": format_numbers(place[:3, 3]),
+            "xyaxes": format_numbers(place[:3, :2].T.ravel()),
+        }
+        next(
+            body for body in base.iter("body") if body.get("name") == self.arm.urdf.links[-1].name
+        ).append(hand)
         return ET.tostring(root, encoding="unicode")
 
     def _begin(self) -> None:
         """Set the hand's joints, and the arm's to the start of the approach, with their targets."""
-        model, data = self.model, self.data
+        model = self.model
+        data = self.data
         data.qpos[self._positions] = [self.spec.joints[name] for name in self.joint_names]
         self.drive(data.qpos[self._positions])
         self.servos = [model.actuator(name).id for name in self.arm.joint_names]
-        self.gains = np.array([model.actuator_biasprm[k, 2] / model.actuator_biasprm[k, 1] for k in self.servos])
+        self.gains = np.array(
+            [model.actuator_biasprm[k, 2] / model.actuator_biasprm[k, 1] for k in self.servos]
+        )
         start = {name: at for name, (_, at, _) in self.mount.items()}
         for share in np.linspace(0, 1, 9):  # along the approach, as the arm came
             for name, at in start.items():
                 self._move_mount(name, share * at, 0.0)
             self._aim()
-        data.qpos[[model.joint(name).qposadr[0] for name in self.arm.joint_names]] = self.posture[:, 0]
+        data.qpos[[model.joint(name).qposadr[0] for name in self.arm.joint_names]] = self.posture[
+            :, 0
+        ]
         self._mujoco.mj_step1(model, data)
 
     def _move_mount(self, joint: str, target: float, speed: float) -> None:
         """Set target [m] and target speed [m/s] of what would be a joint of the mount."""
-        self.mount[joint], self.aimed = (self.mount[joint][0], target, speed), False
+        self.mount[joint] = (self.mount[joint][0], target, speed)
+        self.aimed = False
 
     def _aim(self) -> None:
-        """Set the targets of the arm's joints, which lead by what their damping takes at the target speed."""
+        """Set the targets of the arm's joints, which lead by what their damping takes at the target
+        speed.
+        """
         if self.aimed:
             return
         pose = torch.from_numpy(self.spec.world_from_hand.copy())[None]
@@ -132,7 +168,9 @@ def lift_with_arm(trial: GraspTrial, arm: Arm, spec: TrialSpec = TRIAL) -> Closu
 
 @dataclasses.dataclass(frozen=True)
 class Lifts:
-    """The lifts of a grasp without and with the arm: their statuses, and whether the object rose by half the lift."""
+    """The lifts of a grasp without and with the arm: their statuses, and whether the object rose by
+    half the lift.
+    """
 
     object: str
     free: str
@@ -143,41 +181,66 @@ class Lifts:
 
 @bench("close/arm", objects=True)
 def arm(o: Options) -> list[Row]:
-    """Plan each object's first view with and without the arm; lift the best grasps of the plan with it both ways."""
-    hand, lifts, seconds, empty = load_hand("allegro"), list[Lifts](), np.zeros(2), list[str]()
+    """Plan each object's first view with and without the arm; lift the best grasps of the plan with
+    it both ways.
+    """
+    hand = load_hand("allegro")
+    lifts = list[Lifts]()
+    seconds = np.zeros(2)
+    empty = list[str]()
     carried = ur5e(hand)
     for folder in o.objects:
         for name, view in dict(list_views(folder, only=o.names)[::-1]).items():
-            cloud, spec = read_view(folder, name, view), ContactSpec(table=0.0)
+            cloud = read_view(folder, name, view)
+            spec = ContactSpec(table=0.0)
             plain, alone = timed(lambda: plan_grasps(cloud, hand, spec, o.starts, o.seed))  # noqa: B023
-            found, more = timed(lambda: plan_grasps(cloud, hand, spec, o.starts, o.seed, arm=carried))  # noqa: B023
+            found, more = timed(
+                lambda: plan_grasps(cloud, hand, spec, o.starts, o.seed, arm=carried)  # noqa: B023
+            )
             seconds += more, alone
             counts = [int((x.status == Status.OK).sum()) for x in (plain, found)]
-            print(f"{name}: {counts[0]} grasps in {alone:.1f} s, with the arm {counts[1]} in {more:.1f} s", flush=True)
+            print(
+                f"{name}: {counts[0]} grasps in {alone:.1f} s, with the arm {counts[1]} in {more:.1f} s",
+                flush=True,
+            )
             good = found[found.status == Status.OK][: o.grasps]
             empty += [name] * (len(good) == 0)
             mesh = read_object_mesh(folder, name)
             parts = convex_parts(mesh)
             for grasp in good:
-                lifts.append(_lift(name, GraspTrial(hand, grasp, Truth(mesh, parts), o.seed), carried))
+                lifts.append(
+                    _lift(name, GraspTrial(hand, grasp, Truth(mesh, parts), o.seed), carried)
+                )
                 print(lifts[-1], flush=True)
     risen = [(x.free_risen, x.carried_risen) for x in lifts]
     held = [(x.free == "OK", x.carried == "OK") for x in lifts]
     rows = [_share("risen", risen, lifts), _share("held without slip", held, lifts)]
     ratio = float(seconds[0] / seconds[1])
     words = f"{ratio:.2f} ({seconds[0]:.0f} s, without {seconds[1]:.0f} s); no grasp: {', '.join(empty) or 'none'}"
-    return [*rows, Row("time of a plan with the arm", f"<= {SLOWEST}", words, ratio <= SLOWEST, {"ratio": ratio})]
+    return [
+        *rows,
+        Row(
+            "time of a plan with the arm",
+            f"<= {SLOWEST}",
+            words,
+            ratio <= SLOWEST,
+            {"ratio": ratio},
+        ),
+    ]
 
 
 def _share(what: str, pairs: list[tuple[bool, bool]], lifts: list[Lifts]) -> Row:
     """Return how many of the grasps that succeed without the arm do so with it."""
     free, carried, both = (sum(map(of, pairs)) for of in (lambda x: x[0], lambda x: x[1], all))
     words = f"{both} of {free} that do so without the arm; of all {len(pairs)}: {carried} with it, {free} without"
-    return Row(f"{what} with the arm", f">= {LEAST:.0%}", words, both >= LEAST * free, {"lifts": lifts})
+    return Row(
+        f"{what} with the arm", f">= {LEAST:.0%}", words, both >= LEAST * free, {"lifts": lifts}
+    )
 
 
 def _lift(name: str, trial: GraspTrial, arm: Arm) -> Lifts:
     """Lift a grasp both ways."""
-    free, carried = run_lift(TrialDriver(trial, TRIAL)), lift_with_arm(trial, arm)
+    free = run_lift(TrialDriver(trial, TRIAL))
+    carried = lift_with_arm(trial, arm)
     risen = [bool(x.rise >= TRIAL.lift_height / 2) for x in (free, carried)]
     return Lifts(name, free.status.name, carried.status.name, *risen)

@@ -1,4 +1,6 @@
-"""What campaigns of lifts share: objects, views, plans and kept files, so that a stopped campaign goes on."""
+"""What campaigns of lifts share: objects, views, plans and kept files, so that a stopped campaign
+goes on.
+"""
 
 import functools
 import json
@@ -38,12 +40,22 @@ class Solid(NamedTuple):
 def table_spec(o: Options) -> TableSpec:
     """Return the campaign of lifts that some options ask for, of one object of each family."""
     return TableSpec(
-        o.out, o.objects, hands=o.hands, only=o.names, own=False, representatives=True, grasps=o.grasps,
-        starts=o.starts, workers=o.workers, seed=o.seed,
-    )  # fmt: skip
+        o.out,
+        o.objects,
+        hands=o.hands,
+        only=o.names,
+        own=False,
+        representatives=True,
+        grasps=o.grasps,
+        starts=o.starts,
+        workers=o.workers,
+        seed=o.seed,
+    )
 
 
-def run_all(work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], workers: int) -> Iterator[Any]:
+def run_all(
+    work: Callable[..., Any], tasks: Sequence[tuple[Any, ...]], workers: int
+) -> Iterator[Any]:
     """Yield the result of each task; a task that fails ends the campaign."""
     for task, found in zip(tasks, run_tasks(work, tasks, workers, CELL_SECONDS), strict=True):
         if isinstance(found, Status):
@@ -61,7 +73,8 @@ def keep(path: Path, make: Callable[[], Any]) -> Any:
 @functools.lru_cache(maxsize=2)
 def read_solid(subject: Subject) -> Solid:
     """Return the true object."""
-    folder, name = folder_of(subject), subject.name
+    folder = folder_of(subject)
+    name = subject.name
     mesh = read_object_mesh(folder, name)
     mass = household_mass(float(mesh.volume), read_entry(folder, name).mass)
     return Solid(mesh, convex_parts(mesh), mass, list_views(folder, only=[name])[0][1])
@@ -76,14 +89,21 @@ def folder_of(subject: Subject) -> Path:
 def plan_view(
     spec: TableSpec, subject: Subject, hand: str, friction: float, seen: Perturbation = RIGHT
 ) -> list[Grasps]:
-    """Return the executable grasps of the first view, kept or planned; none where planning is refused."""
+    """Return the executable grasps of the first view, kept or planned; none where planning is
+    refused.
+    """
     view = read_solid(subject).view
-    path = spec.kept("plans", f"{hand}_{subject.label}_{view}", friction, seen).with_suffix(".safetensors")
+    path = spec.kept("plans", f"{hand}_{subject.label}_{view}", friction, seen).with_suffix(
+        ".safetensors"
+    )
     if not path.is_file():
-        cloud, seed = read_view(folder_of(subject), subject.name, view), seed_of(spec.seed, subject.label, view)
+        cloud = read_view(folder_of(subject), subject.name, view)
+        seed = seed_of(spec.seed, subject.label, view)
         cloud, table = perturb_view(cloud, seen, seed)
         try:
-            grasps = plan_grasps(cloud, load_hand(hand), ContactSpec(friction, table=table), spec.starts, spec.seed)
+            grasps = plan_grasps(
+                cloud, load_hand(hand), ContactSpec(friction, table=table), spec.starts, spec.seed
+            )
         except GraspError as error:
             print(f"{subject.name}, {hand}: {error}", flush=True)
             return []
@@ -93,7 +113,9 @@ def plan_view(
 
 
 @functools.lru_cache(maxsize=2)
-def fit_view(spec: TableSpec, subject: Subject, seen: Perturbation = RIGHT) -> tuple[ShapeGP, SignedDistanceField]:
+def fit_view(
+    spec: TableSpec, subject: Subject, seen: Perturbation = RIGHT
+) -> tuple[ShapeGP, SignedDistanceField]:
     """Return the shape of the first view, and its surface, with which touches are compared."""
     view = read_solid(subject).view
     cloud = read_view(folder_of(subject), subject.name, view)

@@ -1,4 +1,6 @@
-"""Conditions of closing trials: errors of the object, its shape, the controller and the tactile sensors."""
+"""Conditions of closing trials: errors of the object, its shape, the controller and the tactile
+sensors.
+"""
 
 import dataclasses
 import math
@@ -20,8 +22,9 @@ from torchgrasp.values.planning import Grasps
 class Condition(NamedTuple):
     """What is wrong: how far [m] the object is from where it was seen, and how far it turned [rad].
 
-    `unknown` things weigh what they weigh, and have a friction between 0.3 and 1. `afloat` they are pulled at. `drawn`
-    ones have a shape of the posterior's (`draw_solid`): the deviations are what they say.
+    `unknown` things weigh what they weigh, and have a friction between 0.3 and 1. `afloat` they are
+    pulled at. `drawn` ones have a shape of the posterior's (`draw_solid`): the deviations are what
+    they say.
     """
 
     distance: float = 0.0
@@ -52,14 +55,19 @@ CONDITIONS = {
     "afloat, friction 0.3": Condition(afloat="dexgraspbench-hard"),
     "afloat, 10 mm": Condition(0.01, afloat="dexgraspbench"),
 }
-"""By name. On a table the object is moved along it and turns about the vertical; afloat in any direction."""
+"""By name. On a table the object is moved along it and turns about the vertical; afloat in any
+direction.
+"""
 
 BARS = {"5 mm": (0.97, 2.0), "10 mm": (0.92, 4.0), "20 mm": (0.80, 8.0)}
-"""Least share held, and largest median motion [mm] of the object before the lift: the project's own."""
+"""Least share held, and largest median motion [mm] of the object before the lift: the project's
+own.
+"""
 
 
 class Law(NamedTuple):
-    """How the hand closes; `swapped` exchanges the deviations of the most and the least certain finger.
+    """How the hand closes; `swapped` exchanges the deviations of the most and the least certain
+    finger.
 
     `dead` are the fingers, in grasp order, whose sensor is.
     """
@@ -122,7 +130,8 @@ def swap_deviations(grasp: Grasps) -> Grasps:
 
 
 ANCHORS = 600
-"""Vertices whose displacements are drawn jointly; about 8 mm lie between them on a thing of 15 cm."""
+"""Vertices whose displacements are drawn jointly; about 8 mm lie between them on a thing of 15 cm.
+"""
 NEIGHBOURS = 12
 """Anchors from which the displacement of a vertex is interpolated."""
 GROUND = 0.01
@@ -130,7 +139,8 @@ GROUND = 0.01
 
 
 def draw_solid(shape: ShapeGP, seed: int) -> trimesh.Trimesh:
-    """Return a closed mesh whose surface deviates from the mean as the posterior says, with its correlations.
+    """Return a closed mesh whose surface deviates from the mean as the posterior says, with its
+    correlations.
 
     Vertices move along their normals by a joint sample with deviations `std_m`.
 
@@ -146,9 +156,13 @@ def draw_solid(shape: ShapeGP, seed: int) -> trimesh.Trimesh:
     covariance = combined_covariance(shape, x, x.new_ones(1, 1, 1, 1))[0]
     prior = float(shape.prior_block()[0, 0])
     root = symmetric_root(covariance, prior, "anchors within the domain")
-    draw = root @ torch.randn(len(anchors), generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    draw = root @ torch.randn(
+        len(anchors), generator=torch.Generator().manual_seed(seed), dtype=torch.float64
+    )
     moved = surface.std_m[anchors] * draw / covariance.diagonal().sqrt()
-    field = RBFInterpolator(surface.vertices[anchors].numpy(), moved.numpy(), NEIGHBOURS, kernel="linear")
+    field = RBFInterpolator(
+        surface.vertices[anchors].numpy(), moved.numpy(), NEIGHBOURS, kernel="linear"
+    )
     height = surface.vertices[:, 2] - surface.vertices[:, 2].min()
     length = torch.from_numpy(field(surface.vertices.numpy())) * (height / GROUND).clamp(max=1.0)
     mesh.vertices = (surface.vertices + length[:, None] * surface.normals).numpy()

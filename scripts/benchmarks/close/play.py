@@ -1,7 +1,9 @@
-"""Exported folders, played in other simulators: how often the verdict is that of our own trial of the same motion.
+"""Exported folders, played in other simulators: how often the verdict is that of our own trial of
+the same motion.
 
-The best grasps of one view of each object are lifted in open loop, in place, under protocol "table-lift" with the
-masses of `MASSES` in turn, some of which are too heavy. `scripts/beside` makes the simulators' environments.
+The best grasps of one view of each object are lifted in open loop, in place, under protocol
+"table-lift" with the masses of `MASSES` in turn, some of which are too heavy. `scripts/beside`
+makes the simulators' environments.
 """
 
 import dataclasses
@@ -55,7 +57,9 @@ for folder, numbers in json.loads(sys.argv[1]):
 
 
 class Played(NamedTuple):
-    """A grasp, by folder and number, and how far the object rose [m], and whether that is half of the lift."""
+    """A grasp, by folder and number, and how far the object rose [m], and whether that is half of
+    the lift.
+    """
 
     folder: str
     grasp: int
@@ -64,7 +68,9 @@ class Played(NamedTuple):
 
 
 def play_all(environment: str, folders: Iterable[tuple[Path, int]]) -> list[Played]:
-    """Play the first grasps of each folder with its own script in an environment, below the project's root."""
+    """Play the first grasps of each folder with its own script in an environment, below the
+    project's root.
+    """
     tasks = [(str(folder), [str(k) for k in range(number)]) for folder, number in folders]
     python = ROOT / environment / "bin" / "python"
     kept = {name: text for name, text in os.environ.items() if name != "PYTHONPATH"}
@@ -79,25 +85,35 @@ def play_all(environment: str, folders: Iterable[tuple[Path, int]]) -> list[Play
 
 @bench("close/play", objects=True)
 def play(o: Options) -> list[Row]:
-    """Try and export the best grasps of each object, play them in each simulator, and compare the verdicts."""
+    """Try and export the best grasps of each object, play them in each simulator, and compare the
+    verdicts.
+    """
     units: dict[tuple[str, int], str] = {}
     own: dict[str, dict[tuple[str, int], bool]] = {name: {} for name in TRIALS}
     folders: dict[str, list[tuple[Path, int]]] = {player: [] for player, _ in PLAYERS.values()}
-    for hand, objects, (k, mass) in itertools.product(map(load_hand, o.hands), o.objects, enumerate(MASSES)):
+    for hand, objects, (k, mass) in itertools.product(
+        map(load_hand, o.hands), o.objects, enumerate(MASSES)
+    ):
         names = [name for name, _ in list_views(objects, only=o.names, most=1)][k :: len(MASSES)]
-        shelf, out = o.out / "play" / f"{hand.name}_{objects.name}_{mass}", o.out / "play" / "folders"
+        shelf = o.out / "play" / f"{hand.name}_{objects.name}_{mass}"
+        out = o.out / "play" / "folders"
         for name, changes in TRIALS.items() if names else ():
-            protocol = dataclasses.replace(PROTOCOLS["table-lift"], tries=1).with_trial(mass=mass, **changes)
+            protocol = dataclasses.replace(PROTOCOLS["table-lift"], tries=1).with_trial(
+                mass=mass, **changes
+            )
             if protocol.trial.closing == "open_loop":
                 protocol = protocol.with_trial(force=pressing_force(protocol.trial, mass))
             kept = any(shelf.glob("*/*.safetensors"))
-            spec = EvaluationSpec(o.grasps, starts=o.starts, only=tuple(names), seed=o.seed, views=1, planned=kept)
+            spec = EvaluationSpec(
+                o.grasps, starts=o.starts, only=tuple(names), seed=o.seed, views=1, planned=kept
+            )
             for score in evaluate(objects, hand, protocol, spec, folder=shelf, workers=o.workers):
                 label = f"{hand.name}_{score.object}"
                 units |= {(label, x.rank): score.unit for x in score.attempts}
                 own[name] |= {(label, x.rank): x.passed for x in score.attempts}
         for file in sorted(shelf.glob("*/*.safetensors")):
-            grasps, mesh = load_grasps(file)[: o.grasps], read_object_mesh(objects, file.parent.name)
+            grasps = load_grasps(file)[: o.grasps]
+            mesh = read_object_mesh(objects, file.parent.name)
             for player, places in folders.items() if len(grasps) else ():
                 place = out / player / f"{hand.name}_{file.parent.name}"
                 trial = dataclasses.replace(PROTOCOLS["table-lift"].trial, mass=mass)
@@ -105,19 +121,35 @@ def play(o: Options) -> list[Row]:
                 places.append((place, len(grasps)))
     rows = []
     for name, (player, environment) in PLAYERS.items():
-        played = {(Path(x.folder).name, x.grasp): x.held for x in play_all(environment, folders[player])}
-        rows += [_row(f"{name}, {trial}", played, held, units, trial) for trial, held in own.items()]
+        played = {
+            (Path(x.folder).name, x.grasp): x.held for x in play_all(environment, folders[player])
+        }
+        rows += [
+            _row(f"{name}, {trial}", played, held, units, trial) for trial, held in own.items()
+        ]
     return rows
 
 
 def _row(
-    what: str, played: dict[tuple[str, int], bool], own: dict[tuple[str, int], bool], units: dict, trial: str
+    what: str,
+    played: dict[tuple[str, int], bool],
+    own: dict[tuple[str, int], bool],
+    units: dict,
+    trial: str,
 ) -> Row:
-    """Return how often a simulator and a trial of ours have the same verdict, and how many each lifts."""
+    """Return how often a simulator and a trial of ours have the same verdict, and how many each
+    lifts.
+    """
     same = share_over(count_by((units[key], played[key] == own[key]) for key in own))
     differ = [(*key, own[key], played[key]) for key in own if own[key] != played[key]]
     words = f"{len(own) - len(differ)} of {len(own)}: {format_share(same)}; "
     words += f"lifted {sum(played.values())}, by our trial {sum(own.values())}"
     judged = trial == next(iter(TRIALS))
     met = (len(own) - len(differ)) / len(own) >= LEAST_SAME if judged else None
-    return Row(what, f">= {LEAST_SAME:.0%}" if judged else "-", words, met, {"same": same, "differ": differ})
+    return Row(
+        what,
+        f">= {LEAST_SAME:.0%}" if judged else "-",
+        words,
+        met,
+        {"same": same, "differ": differ},
+    )

@@ -1,7 +1,8 @@
-"""Whether predicted success is true, whether the best grasp is the best, and whether a promise is kept.
+"""Whether predicted success is true, whether the best grasp is the best, and whether a promise is
+kept.
 
-Objects that the model of success was not fitted on are planned on at three frictions, each with a mass of its own. The
-20 best grasps and some that follow are pulled at by protocol "dexgraspbench".
+Objects that the model of success was not fitted on are planned on at three frictions, each with a
+mass of its own. The 20 best grasps and some that follow are pulled at by protocol "dexgraspbench".
 """
 
 import dataclasses
@@ -30,9 +31,11 @@ from torchgrasp.success.model import MODEL
 from torchgrasp.success.promise import find_promise
 from torchgrasp.values.specs import ContactSpec
 
-FRICTIONS, MASSES = (0.3, 0.6, 0.8), (0.05, 0.1, 0.25)
+FRICTIONS = (0.3, 0.6, 0.8)
+MASSES = (0.05, 0.1, 0.25)
 """Coefficients of friction, and masses [kg] that take turns with them."""
-BEST, OTHERS = 20, 4
+BEST = 20
+OTHERS = 4
 """Best grasps that are tried of each plan, and grasps tried of those that follow."""
 SHARE = 0.9
 """Share of held grasps that is promised."""
@@ -41,7 +44,8 @@ ENOUGH = 100
 
 
 class Cell(NamedTuple):
-    """One plan: object, family, group, hand, friction, mass [kg], executable grasps, and what was tried.
+    """One plan: object, family, group, hand, friction, mass [kg], executable grasps, and what was
+    tried.
 
     `tried` holds the rank, the predicted success, and whether the grasp passed.
     """
@@ -63,12 +67,16 @@ class Cell(NamedTuple):
 
 @bench("close/success", objects=True)
 def success(o: Options) -> list[Row]:
-    """Pull at grasps of objects that the model was not fitted on, and judge their prediction, order and promise."""
+    """Pull at grasps of objects that the model was not fitted on, and judge their prediction, order
+    and promise.
+    """
     spec = dataclasses.replace(table_spec(o), representatives=False)
     named = list(enumerate(subjects(spec)))
     tasks = [
         (spec, subject, hand, friction, MASSES[(i + j) % len(MASSES)], o.simulator)
-        for (i, subject), hand, (j, friction) in itertools.product(named, o.hands, enumerate(FRICTIONS))
+        for (i, subject), hand, (j, friction) in itertools.product(
+            named, o.hands, enumerate(FRICTIONS)
+        )
     ]
     cells = [Cell(*found) for found in run_all(try_object, tasks, spec.workers)]
     planned = [cell for cell in cells if cell.tried]
@@ -95,70 +103,128 @@ def pull_at(
     spec: TableSpec, subject: Subject, hand: str, friction: float, mass: float, simulator: str
 ) -> tuple[int, list[tuple[int, float, bool]]]:
     """Return the number of executable grasps of a plan, and what became of those that were tried."""
-    base, model, solid = PROTOCOLS["dexgraspbench"], load_hand(hand), read_solid(subject)
+    base = PROTOCOLS["dexgraspbench"]
+    model = load_hand(hand)
+    solid = read_solid(subject)
     patch = base.trial.patch * base.trial.friction / friction
     protocol = base.with_trial(friction=friction, mass=mass, patch=patch, simulator=simulator)
     cloud = read_view(folder_of(subject), subject.name, solid.view)
     contacts = ContactSpec(friction, table=Plane.horizontal(0.0))
     grasps = plan_grasps(cloud, model, contacts, spec.starts, spec.seed, task=protocol.task)
     good = grasps[grasps.status == Status.OK]
-    rest = [BEST + k for k in choose_rows(len(good) - BEST, OTHERS, "spread")] if len(good) > BEST else []
+    rest = (
+        [BEST + k for k in choose_rows(len(good) - BEST, OTHERS, "spread")]
+        if len(good) > BEST
+        else []
+    )
     tried = list[tuple[int, float, bool]]()
     for rank in (*range(min(BEST, len(good))), *rest):
-        trial = GraspTrial(model, good[rank], Truth(solid.mesh, solid.parts), seed_of(spec.seed, subject.label, rank))
-        tried.append((rank, float(torch.sigmoid(good.score[rank])), run_protocol(trial, protocol, rank).passed))
+        trial = GraspTrial(
+            model,
+            good[rank],
+            Truth(solid.mesh, solid.parts),
+            seed_of(spec.seed, subject.label, rank),
+        )
+        tried.append(
+            (
+                rank,
+                float(torch.sigmoid(good.score[rank])),
+                run_protocol(trial, protocol, rank).passed,
+            )
+        )
     return len(good), tried
 
 
 def judge_predictions(cells: list[Cell]) -> list[Row]:
-    """Return the area under the curve, and the errors of calibration of all trials and of each group."""
+    """Return the area under the curve, and the errors of calibration of all trials and of each
+    group.
+    """
     groups = {"all": cells, **group_cells(cells)}
     rows = list[Row]()
     for name, mine in groups.items():
         trials = [(cell.family, *x) for cell in mine for x in cell.tried]
         if len(trials) < ENOUGH:
             continue
-        said, bar = judge_trials(trials), 0.04 if name == "all" else 0.08
+        said = judge_trials(trials)
+        bar = 0.04 if name == "all" else 0.08
         text = f"{said['error']:.3f} of {len(trials)}: predicted {said['predicted']:.2f}, passed {said['passed']:.2f}"
-        rows.append(Row(f"calibration error, {name}", f"<= {bar}", text, said["error"] <= bar, said))
+        rows.append(
+            Row(f"calibration error, {name}", f"<= {bar}", text, said["error"] <= bar, said)
+        )
     every = judge_trials([(cell.family, *x) for cell in cells for x in cell.tried])
     best = judge_trials([(cell.family, *x) for cell in cells for x in cell.best])
     for name, said, bar in (("20 best", best, 0.8), ("all ranks", every, 0.88)):
-        rows.append(Row(f"area under the curve, {name}", f">= {bar}", f"{said['auc']:.3f}", said["auc"] >= bar, {}))
+        rows.append(
+            Row(
+                f"area under the curve, {name}",
+                f">= {bar}",
+                f"{said['auc']:.3f}",
+                said["auc"] >= bar,
+                {},
+            )
+        )
     bins = [f"{x.predicted:.2f}: {format_share(x.passed)}" for x in every["bins"]]
     return [*rows, Row("predicted and passed", "-", "; ".join(bins), None, {})]
 
 
 def judge_trials(trials: Iterable[tuple[str, int, float, bool]]) -> dict[str, Any]:
-    """Return what `score.judge` says of trials: family, rank, prediction, and whether the grasp passed."""
+    """Return what `score.judge` says of trials: family, rank, prediction, and whether the grasp
+    passed.
+    """
     units, _, predicted, passed = zip(*trials, strict=True)
     return score.judge(torch.tensor(predicted, dtype=torch.float64), torch.tensor(passed), units)
 
 
 def judge_order(cells: list[Cell]) -> list[Row]:
-    """Return how much more often the best grasp passes than the mean of the 20 best, and how often by group."""
-    gains = [(c.family, 100 * (c.best[0][2] - sum(x[2] for x in c.best) / len(c.best))) for c in cells]
-    gain, rows = mean_over(gains), list[Row]()
+    """Return how much more often the best grasp passes than the mean of the 20 best, and how often
+    by group.
+    """
+    gains = [
+        (c.family, 100 * (c.best[0][2] - sum(x[2] for x in c.best) / len(c.best))) for c in cells
+    ]
+    gain = mean_over(gains)
+    rows = list[Row]()
     text = f"{gain.value:+.1f} [{gain.low:.1f}, {gain.high:.1f}] points of {gain.total} plans"
-    rows.append(Row("best one over the mean of 20 best", ">= +6 points", text, gain.value >= 6 and gain.low > 0, {}))
+    rows.append(
+        Row(
+            "best one over the mean of 20 best",
+            ">= +6 points",
+            text,
+            gain.value >= 6 and gain.low > 0,
+            {},
+        )
+    )
     bars = {"solid": (95, 99), "shell": (90, 97), "thin": (80, 90)}
     for name, (one, two) in bars.items():
         mine = [cell for cell in cells if cell.group == name]
         first = share_of(mine, lambda cell: cell.best[0][2])
         both = share_of(mine, lambda cell: any(x[2] for x in cell.best[:2]))
-        rows += [bar_row(f"best one, {name}", one, first), bar_row(f"within two tries, {name}", two, both)]
+        rows += [
+            bar_row(f"best one, {name}", one, first),
+            bar_row(f"within two tries, {name}", two, both),
+        ]
     return rows
 
 
 def judge_promise(cells: list[Cell]) -> list[Row]:
-    """Return how often the best grasp passes where the promise returns it, and how often the promise is refused."""
+    """Return how often the best grasp passes where the promise returns it, and how often the
+    promise is refused.
+    """
     promise = find_promise(SHARE)
     if promise is None:
         return [Row(f"promise {SHARE:g}", "a bound", "the trials support none", False, {})]
     least = float(torch.sigmoid(torch.tensor(promise.least)))
     kept = [cell for cell in cells if cell.best[0][1] >= least]
     refused = 100 * (1 - len(kept) / len(cells))
-    rows = [Row(f"promise {SHARE:g}: views refused", "<= 15 %", f"{refused:.1f} %", refused <= 15, {"least": least})]
+    rows = [
+        Row(
+            f"promise {SHARE:g}: views refused",
+            "<= 15 %",
+            f"{refused:.1f} %",
+            refused <= 15,
+            {"least": least},
+        )
+    ]
     for name, mine in {"all": kept, **group_cells(kept)}.items():
         found = share_of(mine, lambda cell: cell.best[0][2])
         rows.append(bar_row(f"promise {SHARE:g}: held of returned, {name}", 100 * SHARE, found))
@@ -168,11 +234,17 @@ def judge_promise(cells: list[Cell]) -> list[Row]:
 def group_cells(cells: list[Cell]) -> dict[str, list[Cell]]:
     """Return the plans by group of objects, by friction, by mass and by hand."""
     keys: tuple[Callable[[Cell], str], ...] = (
-        lambda cell: cell.group, lambda cell: f"friction {cell.friction:g}", lambda cell: f"{cell.mass:g} kg",
+        lambda cell: cell.group,
+        lambda cell: f"friction {cell.friction:g}",
+        lambda cell: f"{cell.mass:g} kg",
         lambda cell: cell.hand,
-    )  # fmt: skip
+    )
     names = [sorted({key(cell) for cell in cells}) for key in keys]
-    return {n: [c for c in cells if key(c) == n] for key, some in zip(keys, names, strict=True) for n in some}
+    return {
+        n: [c for c in cells if key(c) == n]
+        for key, some in zip(keys, names, strict=True)
+        for n in some
+    }
 
 
 def share_of(cells: list[Cell], held: Callable[[Cell], bool]) -> Share:
@@ -182,4 +254,10 @@ def share_of(cells: list[Cell], held: Callable[[Cell], bool]) -> Share:
 
 def bar_row(what: str, bar: float, found: Share) -> Row:
     """Return a row for a share of plans."""
-    return Row(what, f">= {bar:g} %", format_share(found), 100 * found.value >= bar if found.total else None, {})
+    return Row(
+        what,
+        f">= {bar:g} %",
+        format_share(found),
+        100 * found.value >= bar if found.total else None,
+        {},
+    )

@@ -1,6 +1,8 @@
-"""Lifts of a quarter of a kilogram off a slippery table, in place, moved after the view, and pushed in the air.
+"""Lifts of a quarter of a kilogram off a slippery table, in place, moved after the view, and pushed
+in the air.
 
-The best grasp of one view of each object is lifted under protocol "table-lift". An object without a grasp fails.
+The best grasp of one view of each object is lifted under protocol "table-lift". An object without a
+grasp fails.
 """
 
 import dataclasses
@@ -13,7 +15,15 @@ from paper.tables6_7 import format_points
 
 from benchmarks.common import Options, Row, bench
 from torchgrasp.app.report.evaluation_page import list_causes
-from torchgrasp.evaluation import PROTOCOLS, EvaluationSpec, PoseNoise, Protocol, ViewScore, evaluate, summarise
+from torchgrasp.evaluation import (
+    PROTOCOLS,
+    EvaluationSpec,
+    PoseNoise,
+    Protocol,
+    ViewScore,
+    evaluate,
+    summarise,
+)
 from torchgrasp.evaluation.intervals import contrast_over, count_by, format_share, share_over
 from torchgrasp.evaluation.protocols import draw_slide, seed_of
 from torchgrasp.hand.hand import Hand
@@ -25,23 +35,35 @@ BARS: dict[str, tuple[dict[str, Any], float, float]] = {
     "in place": ({}, 0.97, 0.92),
     "moved by up to 3 cm": ({"noise": PoseNoise(0.03)}, 0.93, 0.0),
     "moved by up to 5 cm": ({"noise": PoseNoise(0.05)}, 0.85, 0.0),
-    "moved by up to 5 cm in the approach": ({"noise": PoseNoise(0.05), "displaced": "approach"}, 0.85, 0.0),
+    "moved by up to 5 cm in the approach": (
+        {"noise": PoseNoise(0.05), "displaced": "approach"},
+        0.85,
+        0.0,
+    ),
     "moved by up to 3 cm, seen again": ({"noise": PoseNoise(0.03), "relook": True}, 0.93, 0.0),
     "moved by up to 5 cm, seen again": ({"noise": PoseNoise(0.05), "relook": True}, 0.85, 0.0),
     "pushed with 2.5 N": ({"push": 2.5}, 0.95, 0.0),
 }
-"""Conditions by name: changes of the protocol, and the project's bars for the shares risen and held without slip."""
+"""Conditions by name: changes of the protocol, and the project's bars for the shares risen and held
+without slip.
+"""
 
 HANDS = {"barrett": 0.92, "leap": 0.95, "shadow": 0.95}
-"""Bars of other hands for the share risen in place; none was set for the share held without slip."""
+"""Bars of other hands for the share risen in place; none was set for the share held without slip.
+"""
 
 DISTANCES = {(0, 15): None, (15, 30): None, (30, 45): None, (45, 60): 0.75, (60, 75): None}
-"""Distances [mm] by which results of moved objects are told, and the project's bar for the share that rose."""
+"""Distances [mm] by which results of moved objects are told, and the project's bar for the share
+that rose.
+"""
 
 SIMULATORS = "both simulators"
-"""The condition that lifts in place with both simulators; `--grasps` gives the number of grasps of each view."""
+"""The condition that lifts in place with both simulators; `--grasps` gives the number of grasps of
+each view.
+"""
 
-LEAST_AGREED, MOST_APART = 0.95, 0.02
+LEAST_AGREED = 0.95
+MOST_APART = 0.02
 """Bars of the simulators: share of equal verdicts, and difference of the shares held."""
 
 
@@ -51,31 +73,48 @@ def table_lift(o: Options) -> list[Row]:
     names = o.conditions or (*BARS, SIMULATORS)
     rows = list[Row]()
     for hand in map(load_hand, o.hands):
-        lift = functools.cache(functools.partial(_lift, o, hand))  # one condition is a part of another
+        lift = functools.cache(
+            functools.partial(_lift, o, hand)
+        )  # one condition is a part of another
         for name in names:
             if name == SIMULATORS:
-                rows += _agree(hand.name, lift(BASE, "sapien", o.grasps), lift(BASE, "mujoco", o.grasps))
+                rows += _agree(
+                    hand.name, lift(BASE, "sapien", o.grasps), lift(BASE, "mujoco", o.grasps)
+                )
                 continue
             changes, least, strict = BARS[name]
             if name == "in place" and hand.name in HANDS:
-                least, strict = HANDS[hand.name], 0.0
+                least = HANDS[hand.name]
+                strict = 0.0
             protocol = dataclasses.replace(BASE, **changes)
             scores = lift(protocol, o.simulator, 1)
             what = f"{hand.name}, {name}"
-            found = [_row(what, scores, least, strict), *_by_distance(what, scores, protocol.noise, o.seed)]
+            found = [
+                _row(what, scores, least, strict),
+                *_by_distance(what, scores, protocol.noise, o.seed),
+            ]
             print(*found, sep="\n", flush=True)
             rows += found
     return rows
 
 
-def _lift(o: Options, hand: Hand, protocol: Protocol, simulator: str, grasps: int) -> list[ViewScore]:
-    """Return the scores of the objects under a protocol, with saved grasps, or with new ones that are then kept."""
-    noise, tries = dataclasses.replace(protocol.noise, draws=o.draws), o.tries or protocol.tries
-    protocol = dataclasses.replace(protocol, noise=noise, tries=tries).with_trial(simulator=simulator)
+def _lift(
+    o: Options, hand: Hand, protocol: Protocol, simulator: str, grasps: int
+) -> list[ViewScore]:
+    """Return the scores of the objects under a protocol, with saved grasps, or with new ones that
+    are then kept.
+    """
+    noise = dataclasses.replace(protocol.noise, draws=o.draws)
+    tries = o.tries or protocol.tries
+    protocol = dataclasses.replace(protocol, noise=noise, tries=tries).with_trial(
+        simulator=simulator
+    )
     found = []
     for folder in o.objects:
         shelf = o.planned or o.out / "table-lift" / f"{hand.name}_{folder.name}"
-        spec = EvaluationSpec(grasps, starts=o.starts, only=o.names, seed=o.seed, views=1, planned=_kept(shelf))
+        spec = EvaluationSpec(
+            grasps, starts=o.starts, only=o.names, seed=o.seed, views=1, planned=_kept(shelf)
+        )
         found += evaluate(folder, hand, protocol, spec, folder=shelf, workers=o.workers)
     return found
 
@@ -87,23 +126,44 @@ def _kept(shelf: Path) -> bool:
 
 def _row(what: str, scores: Sequence[ViewScore], least: float, strict: float) -> Row:
     """Return the shares that rose and that were held without slip, refusals, and causes."""
-    risen, held = summarise(scores), summarise([_strict(score) for score in scores])
+    risen = summarise(scores)
+    held = summarise([_strict(score) for score in scores])
     words = [format_share(risen["top1"]), f"without slip {format_share(held['top1'])}"]
-    words += [f"by the first grasp and further ones {risen['tries']}", f"{risen['refused']} of {len(scores)} refused"]
+    words += [
+        f"by the first grasp and further ones {risen['tries']}",
+        f"{risen['refused']} of {len(scores)} refused",
+    ]
     words += [f"{cause} {text}" for cause, text in list_causes(risen)]
     bar = f">= {least:.0%}" + (f", without slip >= {strict:.0%}" if strict else "")
     met = risen["top1"].value >= least and held["top1"].value >= strict
-    lost = [(x.object, a.draw, a.status.name, a.cause, a.size) for x in scores for a in x.attempts if not a.held]
-    numbers = {"risen": risen["top1"], "held": held["top1"], "causes": risen["causes"], "not held": lost}
+    lost = [
+        (x.object, a.draw, a.status.name, a.cause, a.size)
+        for x in scores
+        for a in x.attempts
+        if not a.held
+    ]
+    numbers = {
+        "risen": risen["top1"],
+        "held": held["top1"],
+        "causes": risen["causes"],
+        "not held": lost,
+    }
     return Row(what, bar, "; ".join(words), met, numbers)
 
 
-def _by_distance(what: str, scores: Sequence[ViewScore], noise: PoseNoise, seed: int) -> Iterator[Row]:
-    """Yield the share that rose of the objects that were moved by a distance, for each bin of distances."""
+def _by_distance(
+    what: str, scores: Sequence[ViewScore], noise: PoseNoise, seed: int
+) -> Iterator[Row]:
+    """Yield the share that rose of the objects that were moved by a distance, for each bin of
+    distances.
+    """
     if not noise.translation:
         return
     tried = [(score, x) for score in scores for x in score.attempts]
-    slides = [draw_slide(noise, seed_of(seed, score.object, score.view, x.rank, x.draw)) for score, x in tried]
+    slides = [
+        draw_slide(noise, seed_of(seed, score.object, score.view, x.rank, x.draw))
+        for score, x in tried
+    ]
     moved = [1e3 * float(slide.norm()) for slide in slides]
     for (low, high), least in DISTANCES.items():
         mine = [at for at, distance in zip(tried, moved, strict=True) if low <= distance < high]
@@ -111,25 +171,45 @@ def _by_distance(what: str, scores: Sequence[ViewScore], noise: PoseNoise, seed:
             share = share_over(count_by((score.unit, x.passed) for score, x in mine))
             met = None if least is None else share.value >= least
             bar = "" if least is None else f">= {least:.0%}"
-            yield Row(f"{what}, {low} to {high} mm", bar, format_share(share), met, {"share": share})
+            yield Row(
+                f"{what}, {low} to {high} mm", bar, format_share(share), met, {"share": share}
+            )
 
 
 def _strict(score: ViewScore) -> ViewScore:
     """Return a score in which only trials without slip have passed."""
-    return dataclasses.replace(score, attempts=tuple(dataclasses.replace(x, passed=x.held) for x in score.attempts))
+    return dataclasses.replace(
+        score, attempts=tuple(dataclasses.replace(x, passed=x.held) for x in score.attempts)
+    )
 
 
 def _agree(hand: str, first: Sequence[ViewScore], second: Sequence[ViewScore]) -> Iterator[Row]:
-    """Yield how often two simulators agree that an object has risen, and that it is held without slip."""
-    kinds = {"risen": (first, second), "without slip": (list(map(_strict, first)), list(map(_strict, second)))}
+    """Yield how often two simulators agree that an object has risen, and that it is held without
+    slip.
+    """
+    kinds = {
+        "risen": (first, second),
+        "without slip": (list(map(_strict, first)), list(map(_strict, second))),
+    }
     for kind, both in kinds.items():
-        one, other = ({(x.object, a.rank, a.draw): (x.unit, a.passed) for x in s for a in x.attempts} for s in both)
+        one, other = (
+            {(x.object, a.rank, a.draw): (x.unit, a.passed) for x in s for a in x.attempts}
+            for s in both
+        )
         keys = sorted(one.keys() & other.keys())
         same = share_over(count_by((one[key][0], one[key][1] == other[key][1]) for key in keys))
         there, here = (count_by(some[key] for key in keys) for some in (one, other))
         apart = contrast_over([here, there], [1.0, -1.0])
         words = f"{format_share(same)}; {share_over(there).value:.1%} in SAPIEN, MuJoCo {format_points(apart)}"
-        differ = [(*key, one[key][1], other[key][1]) for key in keys if one[key][1] != other[key][1]]
+        differ = [
+            (*key, one[key][1], other[key][1]) for key in keys if one[key][1] != other[key][1]
+        ]
         met = same.value >= LEAST_AGREED and abs(apart.value) <= MOST_APART
         bar = f">= {LEAST_AGREED:.0%}, within {100 * MOST_APART:.0f} points"
-        yield Row(f"{hand}, same verdict, {kind}", bar, words, met, {"same": same, "apart": apart, "differ": differ})
+        yield Row(
+            f"{hand}, same verdict, {kind}",
+            bar,
+            words,
+            met,
+            {"same": same, "apart": apart, "differ": differ},
+        )

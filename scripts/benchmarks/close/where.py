@@ -1,8 +1,10 @@
-"""What it costs to be told where to hold: the best grasp of a free plan beside the best with all contacts in a region.
+"""What it costs to be told where to hold: the best grasp of a free plan beside the best with all
+contacts in a region.
 
-The region is chosen from the cloud before planning. It is the upper half of the cloud's bounding box for every second
-object, and for the others the half of its longer horizontal side with fewer points, as a handle or a neck has. Both
-reach over the unseen depth. The objects lie where they were seen. An object without a grasp fails.
+The region is chosen from the cloud before planning. It is the upper half of the cloud's bounding
+box for every second object, and for the others the half of its longer horizontal side with fewer
+points, as a handle or a neck has. Both reach over the unseen depth. The objects lie where they were
+seen. An object without a grasp fails.
 """
 
 import dataclasses
@@ -29,16 +31,21 @@ OBJECTS = 24
 @bench("close/where", objects=True)
 def where(o: Options) -> list[Row]:
     """Close the best grasp of a free plan, and the best one in a region."""
-    spec, rows = table_spec(o), list[Row]()
+    spec = table_spec(o)
+    rows = list[Row]()
     for hand in spec.hands:
-        tasks = [(spec, subject, hand, k % 2 == 0, o.simulator) for k, subject in enumerate(subjects(spec)[:OBJECTS])]
+        tasks = [
+            (spec, subject, hand, k % 2 == 0, o.simulator)
+            for k, subject in enumerate(subjects(spec)[:OBJECTS])
+        ]
         rows += _rows(hand, [Found(**found) for found in run_all(compare, tasks, spec.workers)])
     return rows
 
 
 @dataclasses.dataclass(frozen=True)
 class Found:
-    """What became of one object: its region, and of both plans the executable grasps, verdict and seconds.
+    """What became of one object: its region, and of both plans the executable grasps, verdict and
+    seconds.
 
     `contacts` and `inside` count the contacts of all executable grasps of the kept plan.
     """
@@ -56,29 +63,44 @@ class Found:
         return self.status[kept] == Status.OK.name
 
 
-def compare(spec: TableSpec, subject: Subject, hand: str, upper: bool, simulator: str) -> dict[str, Any]:
+def compare(
+    spec: TableSpec, subject: Subject, hand: str, upper: bool, simulator: str
+) -> dict[str, Any]:
     """Return the fields of `Found` for one object; a kept result is read."""
     path = spec.kept("where", f"{hand}_{subject.label}", upper, simulator).with_suffix(".json")
     return keep(path, lambda: dataclasses.asdict(_compare(spec, subject, hand, upper, simulator)))
 
 
-def _compare(spec: TableSpec, subject: Subject, hand_name: str, upper: bool, simulator: str) -> Found:
+def _compare(
+    spec: TableSpec, subject: Subject, hand_name: str, upper: bool, simulator: str
+) -> Found:
     """Plan free and in the region, and close both best grasps."""
-    solid, hand = read_solid(subject), load_hand(hand_name)
+    solid = read_solid(subject)
+    hand = load_hand(hand_name)
     trial = dataclasses.replace(PROTOCOLS["household"].trial, simulator=simulator, mass=solid.mass)
     cloud = read_view(folder_of(subject), subject.name, solid.view)
     region = half_of(cloud, upper)
-    executable, status, seconds, contacts = list[int](), list[str](), list[float](), torch.zeros(0, 3)
+    executable = list[int]()
+    status = list[str]()
+    seconds = list[float]()
+    contacts = torch.zeros(0, 3)
     for chosen in (None, region):
         began = time.process_time()
-        grasps = plan_grasps(cloud, hand, ContactSpec(trial.friction, table=0.0), spec.starts, spec.seed, keep=chosen)
+        grasps = plan_grasps(
+            cloud, hand, ContactSpec(trial.friction, table=0.0), spec.starts, spec.seed, keep=chosen
+        )
         seconds.append(time.process_time() - began)
         good = grasps[grasps.status == Status.OK]
         contacts = good.contacts.points.reshape(-1, 3)
         executable.append(len(good))
-        seed, felt = seed_of(spec.seed, subject.label), fit_view(spec, subject)[1]
+        seed = seed_of(spec.seed, subject.label)
+        felt = fit_view(spec, subject)[1]
         given: dict[str, Any] = {"parts": solid.parts, "surface": felt}
-        done = close_hand(good[0], hand, solid.mesh, trial, seed, **given).status.name if len(good) else "NO_GRASP"
+        done = (
+            close_hand(good[0], hand, solid.mesh, trial, seed, **given).status.name
+            if len(good)
+            else "NO_GRASP"
+        )
         status.append(done)
     inside = int((region(contacts) < 0).sum()) if len(contacts) else 0
     told = "upper half" if upper else "end"
@@ -87,11 +109,15 @@ def _compare(spec: TableSpec, subject: Subject, hand_name: str, upper: bool, sim
 
 
 def half_of(cloud: PointCloud, upper: bool) -> Region:
-    """Return the upper half of a cloud's bounding box over its table, or the half of its length with fewer points."""
+    """Return the upper half of a cloud's bounding box over its table, or the half of its length
+    with fewer points.
+    """
     points = cloud.points.double()
-    low, high = points.amin(0), points.amax(0)
+    low = points.amin(0)
+    high = points.amax(0)
     depth = high - low  # the unseen side is at most as deep as the object is wide
-    low, high = low - depth.max(), high + depth.max()
+    low = low - depth.max()
+    high = high + depth.max()
     axis = 2 if upper else int(depth[:2].argmax())
     middle = (points[:, axis].amin() + points[:, axis].amax()) / 2
     if upper or float((points[:, axis] > middle).double().mean()) < 0.5:
@@ -104,7 +130,8 @@ def half_of(cloud: PointCloud, upper: bool) -> Region:
 def _rows(hand: str, found: Sequence[Found]) -> list[Row]:
     """Return the shares that held, their difference, and the contacts in the region."""
     free, kept = (count_by((x.family, x.held(k)) for x in found) for k in (False, True))
-    shares, change = (share_over(free), share_over(kept)), contrast_over([kept, free], [1.0, -1.0])
+    shares = (share_over(free), share_over(kept))
+    change = contrast_over([kept, free], [1.0, -1.0])
     each = {
         name: f"{sum(x.held(False) for x in mine)} and {sum(x.held(True) for x in mine)} of {len(mine)}"
         for name in ("upper half", "end")
@@ -113,10 +140,22 @@ def _rows(hand: str, found: Sequence[Found]) -> list[Row]:
     text = f"free {format_share(shares[0])}, kept {format_share(shares[1])}: {format_points(change)}; free and kept by "
     text += "; ".join(f"{name}: {counts}" for name, counts in each.items())
     lost = {x.family: x.status for x in found if not (x.held(False) and x.held(True))}
-    inside, contacts = sum(x.inside for x in found), sum(x.contacts for x in found)
-    grasps, seconds = ([sum(getattr(x, name)[k] for x in found) for k in (0, 1)] for name in ("executable", "seconds"))
+    inside = sum(x.inside for x in found)
+    contacts = sum(x.contacts for x in found)
+    grasps, seconds = (
+        [sum(getattr(x, name)[k] for x in found) for k in (0, 1)]
+        for name in ("executable", "seconds")
+    )
     more = f"{grasps[0]} executable grasps free, {grasps[1]} kept; {seconds[0]:.0f} and {seconds[1]:.0f} s of planning"
     return [
-        Row(f"held, {hand}", "within 3 points of free", text, change.value >= -0.03, {"lost": lost}),
-        Row(f"contacts inside, {hand}", "100 %", f"{inside} of {contacts}; {more}", inside == contacts > 0, {}),
+        Row(
+            f"held, {hand}", "within 3 points of free", text, change.value >= -0.03, {"lost": lost}
+        ),
+        Row(
+            f"contacts inside, {hand}",
+            "100 %",
+            f"{inside} of {contacts}; {more}",
+            inside == contacts > 0,
+            {},
+        ),
     ]

@@ -1,4 +1,6 @@
-"""Plans of many clouds at once beside plans of each alone: the same grasps, and how many of them a second."""
+"""Plans of many clouds at once beside plans of each alone: the same grasps, and how many of them a
+second.
+"""
 
 import time
 from collections.abc import Callable
@@ -27,14 +29,26 @@ POINTS = 1000
 
 @bench("gpu/clouds")
 def plan_clouds(o: Options) -> list[Row]:
-    """Plan batches of clouds at once, on a GPU if there is one; the smallest batch also on the cores of the CPU."""
+    """Plan batches of clouds at once, on a GPU if there is one; the smallest batch also on the
+    cores of the CPU.
+    """
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    hand, workers, rows = load_hand(o.hands[0]), max(o.workers, 1), list[Row]()
+    hand = load_hand(o.hands[0])
+    workers = max(o.workers, 1)
+    rows = list[Row]()
     packed = run_tasks(see_view, [(k,) for k in range(max(o.batches))], workers, 600.0)
     seen: list[PointCloud] = [unpack(x) for x in packed]
     requests = [Request(cloud, hand, SPEC, o.starts) for cloud in seen]
     problems, shaped = timed(lambda: list(estimate_shapes(requests, workers)))
-    rows.append(Row(f"shapes of {len(seen)} clouds, {workers} processes", "-", f"{shaped:.1f} s", None, {"s": shaped}))
+    rows.append(
+        Row(
+            f"shapes of {len(seen)} clouds, {workers} processes",
+            "-",
+            f"{shaped:.1f} s",
+            None,
+            {"s": shaped},
+        )
+    )
     plan_at_once(requests[:2], problems[:2], device)  # what a process keeps is made before
     call = partial(plan_grasps, hand=hand, spec=SPEC, starts=o.starts, workers=workers)
     for count in sorted(o.batches):
@@ -54,12 +68,18 @@ def see_view(k: int) -> Any:
     """Return a view of a shipped object with few points, packed, for another process."""
     torch.set_num_threads(1)
     cloud = views(1, k)[0]
-    rows = torch.randperm(len(cloud), generator=torch.Generator().manual_seed(k))[:POINTS].sort().values
+    rows = (
+        torch.randperm(len(cloud), generator=torch.Generator().manual_seed(k))[:POINTS]
+        .sort()
+        .values
+    )
     return pack(cloud.select(rows))
 
 
 @checked
-def plan_at_once(requests: list[Request], problems: list[Problem | Grasps], device: torch.device) -> list[Grasps]:
+def plan_at_once(
+    requests: list[Request], problems: list[Problem | Grasps], device: torch.device
+) -> list[Grasps]:
     """Return the grasps of problems with known shapes, planned at once on a device."""
     return list(plan_stacks(requests, iter(problems), device))
 
@@ -87,12 +107,21 @@ def compare(what: str, alone: list[Grasps], together: list[Grasps]) -> Row:
     """Return the row of a batch: the rows with the same status, and with the same joints and pose."""
     pairs = [(one, other.to("cpu")) for one, other in zip(alone, together, strict=True)]
     every = sum(len(one) for one, _ in pairs)
-    status = sum(int((one.status == other.status).sum()) for one, other in pairs if len(one) == len(other))
+    status = sum(
+        int((one.status == other.status).sum()) for one, other in pairs if len(one) == len(other)
+    )
     same = sum(
-        int((torch.cdist(numbers(one), numbers(other), p=torch.inf).amin(1) < SAME).sum()) for one, other in pairs
+        int((torch.cdist(numbers(one), numbers(other), p=torch.inf).amin(1) < SAME).sum())
+        for one, other in pairs
     )
     text = f"status in {status} of {every} rows, joints and pose in {same}"
-    return Row(what, "the same in all rows", text, status == every, {"rows": every, "status": status, "same": same})
+    return Row(
+        what,
+        "the same in all rows",
+        text,
+        status == every,
+        {"rows": every, "status": status, "same": same},
+    )
 
 
 def numbers(grasps: Grasps) -> Tensor:

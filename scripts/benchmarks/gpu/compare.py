@@ -1,4 +1,6 @@
-"""Every kernel of the chain on a GPU beside the CPU: times, memory, and by how much the results differ."""
+"""Every kernel of the chain on a GPU beside the CPU: times, memory, and by how much the results
+differ.
+"""
 
 import dataclasses
 import statistics
@@ -16,7 +18,9 @@ from torchgrasp.foundation.base import Value, named_tensors
 
 @dataclasses.dataclass(frozen=True)
 class Timing:
-    """Median seconds of one size on the CPU by its threads, and on the GPU with its peak of memory [MiB]."""
+    """Median seconds of one size on the CPU by its threads, and on the GPU with its peak of memory
+    [MiB].
+    """
 
     size: int
     cpu: dict[int, float]
@@ -43,7 +47,9 @@ def bench_kernel(kernel: Kernel, device: torch.device, threads: Sequence[int]) -
     lines = []
     for t in timings:
         times = ", ".join(f"{count} threads {1e3 * s:.3g} ms" for count, s in t.cpu.items())
-        lines.append(f"{t.size}: {times}, GPU {1e3 * t.gpu:.3g} ms, {t.peak_mib:.0f} MiB, error {t.error:.1e}")
+        lines.append(
+            f"{t.size}: {times}, GPU {1e3 * t.gpu:.3g} ms, {t.peak_mib:.0f} MiB, error {t.error:.1e}"
+        )
     return Row(
         f"{kernel.name} by {kernel.what}; the GPU is faster from {', '.join(map(str, faster.values()))} on",
         f"results differ by at most {kernel.tolerance:g}",
@@ -71,7 +77,8 @@ def relative_error(one: Any, other: Any) -> float:
     """
     worst = 0.0
     for a, b in zip(tensors_of(one), tensors_of(other), strict=True):
-        a, b = a.double().cpu(), b.double().cpu()
+        a = a.double().cpu()
+        b = b.double().cpu()
         if a.shape != b.shape or not torch.equal(torch.isfinite(a), torch.isfinite(b)):
             return float("inf")
         finite = torch.isfinite(a)
@@ -82,7 +89,9 @@ def relative_error(one: Any, other: Any) -> float:
 
 
 def median_seconds(action: Callable[[], object], wait: Callable[[], None]) -> float:
-    """Return the median wall time of an action [s], after one that is not counted; `wait` ends each."""
+    """Return the median wall time of an action [s], after one that is not counted; `wait` ends
+    each.
+    """
     times: list[float] = []
     count = 5
     while len(times) <= count:
@@ -115,7 +124,9 @@ def compare(kernel: Kernel, size: int, device: torch.device, threads: Sequence[i
 
 
 def overtakes(timings: Sequence[Timing], threads: int) -> int | None:
-    """Return the least size from which on the GPU is the faster one; None: at none that was measured."""
+    """Return the least size from which on the GPU is the faster one; None: at none that was
+    measured.
+    """
     least = None
     for timing in sorted(timings, key=lambda t: t.size, reverse=True):
         if timing.gpu >= timing.cpu[threads]:

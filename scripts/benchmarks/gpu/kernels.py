@@ -42,7 +42,8 @@ from torchgrasp.values.planning import PointCloud
 class Kernel:
     """A function of arguments that `prepare` makes on the CPU for a size, in units of `what`.
 
-    `tolerance` bounds the relative error of its result, or with `agree` what that returns of both results.
+    `tolerance` bounds the relative error of its result, or with `agree` what that returns of both
+    results.
     """
 
     name: str
@@ -90,14 +91,20 @@ def prepare_condition(n: int) -> Prepared:
     """Condition on n points with normals: a Cholesky factor of 4 n rows."""
     x, normals = random_view(n, torch.Generator().manual_seed(0))
     seen = on_surface(x, normals, torch.full_like(x[:, 0], 0.01), 0.05)
-    return condition, (seen, Normalisation(torch.zeros(3, dtype=torch.float64), 1.0), PointCloud(x, normals))
+    return condition, (
+        seen,
+        Normalisation(torch.zeros(3, dtype=torch.float64), 1.0),
+        PointCloud(x, normals),
+    )
 
 
 def prepare_predict(n: int) -> Prepared:
     """Predict mean, normal and covariance at n points near the surface."""
     view = load_object("jug").view.points.double()
     points = view[torch.arange(n) % len(view)]
-    noise = 0.002 * torch.randn(n, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    noise = 0.002 * torch.randn(
+        n, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
     return lambda shape, x: shape.predict(x), (jug(), points + noise)
 
 
@@ -105,7 +112,9 @@ def prepare_certify(n: int) -> Prepared:
     """Certify random triples."""
     generator = torch.Generator().manual_seed(0)
     points = torch.randn(n, 3, 3, generator=generator, dtype=torch.float64)
-    normals = unit(unit(points) + 0.4 * torch.randn(n, 3, 3, generator=generator, dtype=torch.float64))
+    normals = unit(
+        unit(points) + 0.4 * torch.randn(n, 3, 3, generator=generator, dtype=torch.float64)
+    )
     return lambda contacts: certify(contacts, SPEC).margin, (Contacts(0.04 * points, normals),)
 
 
@@ -132,12 +141,19 @@ def prepare_em(rows: int) -> Prepared:
 
 
 def share_apart(one: Any, other: Any) -> float:
-    """Return the difference of the shares of successful rows: single rows of a descent may part by rounding."""
-    return abs(float((one.status == Status.OK).double().mean()) - float((other.status == Status.OK).double().mean()))
+    """Return the difference of the shares of successful rows: single rows of a descent may part by
+    rounding.
+    """
+    return abs(
+        float((one.status == Status.OK).double().mean())
+        - float((other.status == Status.OK).double().mean())
+    )
 
 
 def tips_apart(one: Configuration, other: Configuration) -> float:
-    """Return by how much the share of hands that reached their contacts differs: by joints that moved 1 mrad apart."""
+    """Return by how much the share of hands that reached their contacts differs: by joints that
+    moved 1 mrad apart.
+    """
     moved = (one.joints - other.joints.cpu()).abs().amax(1)
     return float((moved > 1e-3).double().mean())
 
@@ -161,32 +177,81 @@ def kernels(quick: bool) -> list[Kernel]:
 
     library = cache(partial(PostureLibrary.of, hand))
     found = [
-        Kernel("fit_shape", "view of 1000 points", (1,), lambda _: (
-            lambda cloud, points: fit_shape(cloud, table=0.0).predict(points).distance,
-            (load_object("jug").view, load_object("jug").view.points[:100]),
-        ), 1e-6),
+        Kernel(
+            "fit_shape",
+            "view of 1000 points",
+            (1,),
+            lambda _: (
+                lambda cloud, points: fit_shape(cloud, table=0.0).predict(points).distance,
+                (load_object("jug").view, load_object("jug").view.points[:100]),
+            ),
+            1e-6,
+        ),
         Kernel("condition", "points with normals", (70, 300, 1000, 3000), prepare_condition, 1e-6),
         Kernel("predict", "points", (100, 1000, 10_000, 100_000), prepare_predict, 1e-6),
-        Kernel("extract_surface", "shape", (1,), lambda _: (lambda s: extract_surface(s).vertices, (jug(),)), 1e-4),
-        Kernel("plan_contacts", "starts", (25, 100, 500, 2000), lambda n: (
-            lambda shape: plan_contacts(shape, SPEC, n), (jug(),)), 0.02, share_apart),
+        Kernel(
+            "extract_surface",
+            "shape",
+            (1,),
+            lambda _: (lambda s: extract_surface(s).vertices, (jug(),)),
+            1e-4,
+        ),
+        Kernel(
+            "plan_contacts",
+            "starts",
+            (25, 100, 500, 2000),
+            lambda n: (lambda shape: plan_contacts(shape, SPEC, n), (jug(),)),
+            0.02,
+            share_apart,
+        ),
         Kernel("certify", "triples", (100, 1000, 10_000), prepare_certify, 1e-9),
-        Kernel("closure_probability", "triples", (10, 100, 1000), lambda n: (
-            lambda shape, contacts: closure_probability(shape, contacts, SPEC, 600).probability,
-            (jug(), triples(n))), 1e-2),
-        Kernel("Hand.fingertips", "postures", (10, 1000, 100_000, 1_000_000), lambda n: (
-            lambda hand, joints: hand.fingertips(joints), (hand, joints_of(n))), 1e-9),
-        Kernel("Hand.jacobian", "postures", (10, 1000, 100_000), lambda n: (
-            lambda hand, joints: hand.jacobian(joints), (hand, joints_of(n))), 1e-9),
-        Kernel("Hand.self_clearance", "postures", (1000, 10_000, 100_000), lambda n: (
-            separate, (hand, joints_of(n))), 1e-9),
-        Kernel("nearest_postures", "triples", (10, 100, 1000), lambda n: (
-            lambda library, contacts: nearest_postures(library, contacts, CollisionWorld()).tip_error,
-            (library(), triples(n))), 1e-3),
+        Kernel(
+            "closure_probability",
+            "triples",
+            (10, 100, 1000),
+            lambda n: (
+                lambda shape, contacts: closure_probability(shape, contacts, SPEC, 600).probability,
+                (jug(), triples(n)),
+            ),
+            1e-2,
+        ),
+        Kernel(
+            "Hand.fingertips",
+            "postures",
+            (10, 1000, 100_000, 1_000_000),
+            lambda n: (lambda hand, joints: hand.fingertips(joints), (hand, joints_of(n))),
+            1e-9,
+        ),
+        Kernel(
+            "Hand.jacobian",
+            "postures",
+            (10, 1000, 100_000),
+            lambda n: (lambda hand, joints: hand.jacobian(joints), (hand, joints_of(n))),
+            1e-9,
+        ),
+        Kernel(
+            "Hand.self_clearance",
+            "postures",
+            (1000, 10_000, 100_000),
+            lambda n: (separate, (hand, joints_of(n))),
+            1e-9,
+        ),
+        Kernel(
+            "nearest_postures",
+            "triples",
+            (10, 100, 1000),
+            lambda n: (
+                lambda library, contacts: (
+                    nearest_postures(library, contacts, CollisionWorld()).tip_error
+                ),
+                (library(), triples(n)),
+            ),
+            1e-3,
+        ),
         Kernel("refine", "seeds", (10, 100, 1000), seeds_of, 0.05, tips_apart),
         Kernel("EM step", "rows", (10_000, 100_000, 400_000), prepare_em, 1e-9),
         Kernel("plan_grasps", "starts", (100, 1000), whole_chain, 0.05, share_apart),
-    ]  # fmt: skip
+    ]
     if not quick:
         return found
     return [Kernel(k.name, k.what, k.sizes[:2], k.prepare, k.tolerance, k.agree) for k in found]

@@ -1,4 +1,5 @@
-"""What a plan asks of a GPU, counted without one: kernel launches, waits of the host and uploads, by stage and line.
+"""What a plan asks of a GPU, counted without one: kernel launches, waits of the host and uploads,
+by stage and line.
 
 The planner runs on the pretended device of `tests/devices`, which computes on the CPU.
 """
@@ -34,29 +35,43 @@ STAGES = {
 @bench("gpu/launches")
 def count_launches(o: Options) -> list[Row]:
     """Count what plans of batches of clouds ask of a GPU for each cloud."""
-    hand, found = load_hand(o.hands[0]), dict[int, Launches]()
+    hand = load_hand(o.hands[0])
+    found = dict[int, Launches]()
     count_plans(hand, [see(OBJECTS[0], 0)], 20)  # what a process keeps is made before
     for size in o.batches:
         found[size] = count_plans(hand, views(size), o.starts)
     rows = [batch_row(size, counted, hand, o.starts) for size, counted in found.items()]
     for stage in STAGES:
-        texts = {size: say([n.by_stage(kind)[stage] / size for kind in KINDS]) for size, n in found.items()}
+        texts = {
+            size: say([n.by_stage(kind)[stage] / size for kind in KINDS])
+            for size, n in found.items()
+        }
         rows.append(
-            Row(f"stage {stage}", "-", "; ".join(f"batch {b}: {x}" for b, x in texts.items()), None, {"batches": texts})
+            Row(
+                f"stage {stage}",
+                "-",
+                "; ".join(f"batch {b}: {x}" for b, x in texts.items()),
+                None,
+                {"batches": texts},
+            )
         )
     size, last = list(found.items())[-1]
     return rows + [lines_row(kind, last.most(kind, 10), size) for kind in KINDS]
 
 
 def views(count: int, first: int = 0) -> list[PointCloud]:
-    """Return views of the shipped objects: first the shipped ones, then from other sides; number 0 is of the jug."""
+    """Return views of the shipped objects: first the shipped ones, then from other sides; number 0
+    is of the jug.
+    """
     names = ("jug", *(name for name in OBJECTS if name != "jug"))
     return [see(names[k % len(names)], k // len(names)) for k in range(first, first + count)]
 
 
 def count_plans(hand: Hand, clouds: list[PointCloud], starts: int) -> Launches:
     """Return the counts of one call that plans grasps on clouds on the pretended device."""
-    stages = {function: stage for stage, functions in STAGES.items() for function in functions.split()}
+    stages = {
+        function: stage for stage, functions in STAGES.items() for function in functions.split()
+    }
     with pretend():
         there = [cloud.to(DEVICE) for cloud in clouds]
         with Launches(stages) as counted:
@@ -73,7 +88,11 @@ def batch_row(size: int, counted: Launches, hand: Hand, starts: int) -> Row:
     """Return the row of a batch of clouds that are planned at once."""
     each = {kind: counted.total(kind) / size for kind in KINDS}
     return Row(
-        f"{size} clouds at once; {hand.name}, {starts} starts; for each cloud", "-", say(each.values()), None, each
+        f"{size} clouds at once; {hand.name}, {starts} starts; for each cloud",
+        "-",
+        say(each.values()),
+        None,
+        each,
     )
 
 

@@ -1,4 +1,6 @@
-"""Six-way pulls in MuJoCo Warp beside MuJoCo on the CPU: trials a second, and how many verdicts are the same."""
+"""Six-way pulls in MuJoCo Warp beside MuJoCo on the CPU: trials a second, and how many verdicts are
+the same.
+"""
 
 import dataclasses
 import time
@@ -18,7 +20,10 @@ from torchgrasp.evaluation.trial import TrialDriver
 from torchgrasp.foundation.jobs import run_tasks
 
 CASES = {
-    f"{name}{', pose error' if error else ''}": (PROTOCOLS[name].with_trial(simulator="mujoco"), error)
+    f"{name}{', pose error' if error else ''}": (
+        PROTOCOLS[name].with_trial(simulator="mujoco"),
+        error,
+    )
     for name in ("dexgraspbench", "dexgraspbench-hard")
     for error in (False, True)
 }
@@ -39,11 +44,15 @@ class Tried(NamedTuple):
 
 @bench("gpu/pulls")
 def pull_all(o: Options) -> list[Row]:
-    """Pull at 1000 grasps times the scale at once, on a GPU if there is one, and at each alone on the CPU's cores."""
+    """Pull at 1000 grasps times the scale at once, on a GPU if there is one, and at each alone on
+    the CPU's cores.
+    """
     views = min(VIEWS, o.times(1000))
     tasks = [(k, o.hands[0], o.times(1000) // views, o.starts, o.seed) for k in range(views)]
     lists = run_tasks(try_view, tasks, o.workers, LIMIT)
-    tried, spent = clocked(lambda: [x for found in lists if not isinstance(found, Status) for x in found])
+    tried, spent = clocked(
+        lambda: [x for found in lists if not isinstance(found, Status) for x in found]
+    )
     print(f"{len(tried)} trials planned and tried on the CPU in {spent:.1f} s", flush=True)
     drivers, built = clocked(lambda: make_drivers(tried, o.hands[0]))
     device = "cuda" if torch.cuda.is_available() else "cpu"
@@ -75,19 +84,27 @@ def clocked(function: Callable[[], Any]) -> tuple[Any, float]:
 def make_drivers(tried: list[Tried], hand: str) -> list[TrialDriver]:
     """Return the drivers of the trials, which share one hand."""
     shared = load_hand(hand)
-    return [TrialDriver(dataclasses.replace(x.trial, hand=shared), CASES[x.case][0].trial) for x in tried]
+    return [
+        TrialDriver(dataclasses.replace(x.trial, hand=shared), CASES[x.case][0].trial)
+        for x in tried
+    ]
 
 
 def try_view(k: int, hand: str, count: int, starts: int, seed: int) -> list[Tried]:
     """Plan grasps on view k, and try some of them, spread over all ranks, in MuJoCo on the CPU."""
-    loaded, name, names = load_hand(hand), OBJECTS[k % len(OBJECTS)], list(CASES)
+    loaded = load_hand(hand)
+    name = OBJECTS[k % len(OBJECTS)]
+    names = list(CASES)
     shipped = load_object(name)
-    grasps = plan_grasps(see(name, k // len(OBJECTS)), loaded, ContactSpec(friction=0.8, table=0.0), starts)
+    grasps = plan_grasps(
+        see(name, k // len(OBJECTS)), loaded, ContactSpec(friction=0.8, table=0.0), starts
+    )
     ranks = torch.nonzero(grasps.status == Status.OK)[:, 0].tolist()
     errors = draw_hand_errors(POSE_NOISE, count, seed_of(seed, "pulls", k))
     tried = list[Tried]()
     for j in range(count if ranks else 0):
-        case, rank = names[(j + k) % len(names)], ranks[j * len(ranks) // count]
+        case = names[(j + k) % len(names)]
+        rank = ranks[j * len(ranks) // count]
         protocol, erring = CASES[case]
         truth = Truth(shipped.mesh, shipped.parts, errors[j] if erring else None)
         trial = GraspTrial(loaded, grasps[rank : rank + 1], truth)
@@ -96,23 +113,40 @@ def try_view(k: int, hand: str, count: int, starts: int, seed: int) -> list[Trie
 
 
 def same_row(case: str, tried: list[Tried], here: list[PullResult]) -> Row:
-    """Return the row that compares the trials of a case: verdict, status and the end of single pulls."""
-    pairs = [(x.result, found) for x, found in zip(tried, here, strict=True) if case in ("all", x.case)]
-    same, status = (sum(getattr(one, x) == getattr(two, x) for one, two in pairs) for x in ("passed", "status"))
+    """Return the row that compares the trials of a case: verdict, status and the end of single
+    pulls.
+    """
+    pairs = [
+        (x.result, found) for x, found in zip(tried, here, strict=True) if case in ("all", x.case)
+    ]
+    same, status = (
+        sum(getattr(one, x) == getattr(two, x) for one, two in pairs) for x in ("passed", "status")
+    )
     ends = [(held(one, d), held(two, d)) for one, two in pairs for d in range(len(DIRECTIONS))]
     ends = [pair for pair in ends if None not in pair]
-    equal, passed = sum(one == two for one, two in ends), [sum(pair[k].passed for pair in pairs) for k in (0, 1)]
+    equal = sum(one == two for one, two in ends)
+    passed = [sum(pair[k].passed for pair in pairs) for k in (0, 1)]
     text = (
         f"verdict of {same} of {len(pairs)}, status of {status}; the end of {equal} of {len(ends)} single pulls; "
         f"{passed[0]} pass on the CPU, {passed[1]} here"
     )
-    numbers = {"trials": len(pairs), "same": same, "status": status, "pulls": [equal, len(ends)], "passed": passed}
-    bar, met = (">= 97 % of the verdicts", same >= 0.97 * len(pairs)) if case == "all" else ("-", None)
+    numbers = {
+        "trials": len(pairs),
+        "same": same,
+        "status": status,
+        "pulls": [equal, len(ends)],
+        "passed": passed,
+    }
+    bar, met = (
+        (">= 97 % of the verdicts", same >= 0.97 * len(pairs)) if case == "all" else ("-", None)
+    )
     return Row(f"the same as in MuJoCo on the CPU: {case}", bar, text, met, numbers)
 
 
 def held(result: PullResult, direction: int) -> bool | None:
-    """Return whether the object stayed in the hand in a direction; None if the direction was not tried."""
+    """Return whether the object stayed in the hand in a direction; None if the direction was not
+    tried.
+    """
     if result.status in (Status.START_OVERLAP, Status.EJECTED) or direction >= result.directions:
         return None
     return result.passed or direction < result.directions - 1

@@ -1,4 +1,6 @@
-"""What a campaign of a million views costs: rates of a few views measured here, and from them a plan on paper."""
+"""What a campaign of a million views costs: rates of a few views measured here, and from them a
+plan on paper.
+"""
 
 import dataclasses
 import json
@@ -23,12 +25,19 @@ from torchgrasp.foundation.errors import ModelFileError
 from torchgrasp.foundation.limits import JSON_BYTES
 from torchgrasp.sim.convex_parts import convex_parts
 
-MILLION, HOUR, DAY, YEAR = 1_000_000, 3600.0, 24 * 3600.0, 365.25 * 24 * 3600.0
-CORES, GPUS = (64, 1024), (1, 8, 64)
+MILLION = 1_000_000
+HOUR = 3600.0
+DAY = 24 * 3600.0
+YEAR = 365.25 * 24 * 3600.0
+CORES = (64, 1024)
+GPUS = (1, 8, 64)
 BESIDE = 16  # cores beside each GPU, as in the machines that were lent
 TRIED = 20  # grasps of a view that a campaign tries by default
-DEATHS = 1e-3  # deaths of a worker in an hour: a guess, a machine of 64 workers dies twice a month or so
-FAILURES = 4  # deaths of one job's workers in one call, by Dask's default, until the row says `WORKER_DIED`
+DEATHS = (
+    1e-3  # deaths of a worker in an hour: a guess, a machine of 64 workers dies twice a month or so
+)
+# deaths of one job's workers in one call, by Dask's default, until the row says `WORKER_DIED`
+FAILURES = 4
 FOLDER = 10_000  # objects of a folder in the plan, one campaign each
 CARD_BYTES = 256 * 1024**2  # largest card that `read_shards` opens
 JOBS_IN_SHARD = 64
@@ -62,7 +71,9 @@ class Rates(NamedTuple):
         return self.tries * self.trial + self.parts + self.rest + self.reads * self.parse
 
     def views_per_hour(self, cores: int, gpus: int = 0, clouds: float = 0.0) -> float:
-        """Return the views of an hour on some cores, if they plan, or GPUs that plan so many clouds a second do."""
+        """Return the views of an hour on some cores, if they plan, or GPUs that plan so many clouds
+        a second do.
+        """
         if not gpus:
             return HOUR * cores / (self.tried + self.plan)
         return HOUR * min(gpus * clouds, cores / self.tried)
@@ -70,13 +81,18 @@ class Rates(NamedTuple):
 
 @bench("load/campaign", objects=True)
 def campaign(o: Options) -> list[Row]:
-    """Plan and try a few views here; print views an hour on other machines, bytes, faults and limits."""
+    """Plan and try a few views here; print views an hour on other machines, bytes, faults and
+    limits.
+    """
     rates, measured = measure(o)
     rows = [measured]
     for cores in CORES:
-        rows.append(_fleet(f"{cores} cores, which plan and try", rates, rates.views_per_hour(cores), cores))
+        rows.append(
+            _fleet(f"{cores} cores, which plan and try", rates, rates.views_per_hour(cores), cores)
+        )
     for gpus in GPUS:
-        cores, what = BESIDE * gpus, f"{gpus} GPUs that plan, {BESIDE * gpus} cores that try"
+        cores = BESIDE * gpus
+        what = f"{gpus} GPUs that plan, {BESIDE * gpus} cores that try"
         bound = rates.views_per_hour(cores, gpus, float("inf"))
         if o.gpu_rate is None:
             text = f"not measured: --gpu-rate; the cores try {bound:.0f} views an hour at most"
@@ -84,13 +100,23 @@ def campaign(o: Options) -> list[Row]:
             continue
         found = rates.views_per_hour(cores, gpus, o.gpu_rate)
         need = o.gpu_rate * rates.tried
-        rows.append(_fleet(what, rates, found, cores, f"; a GPU of {o.gpu_rate:g} clouds/s feeds {need:.0f} cores"))
+        rows.append(
+            _fleet(
+                what,
+                rates,
+                found,
+                cores,
+                f"; a GPU of {o.gpu_rate:g} clouds/s feeds {need:.0f} cores",
+            )
+        )
     return [*rows, *plan(rates)]
 
 
 def measure(o: Options) -> tuple[Rates, Row]:
     """Run the jobs of a campaign on the views asked for, one after another, and return their means."""
-    hand, protocol, spec = load_hand(o.hands[0]), PROTOCOLS["tabletop"], EvaluationSpec(o.grasps, "spread", o.starts)
+    hand = load_hand(o.hands[0])
+    protocol = PROTOCOLS["tabletop"]
+    spec = EvaluationSpec(o.grasps, "spread", o.starts)
     protocol = protocol.with_trial(simulator=o.simulator)
     meta = {"campaign": "0" * 64, "versions": json.dumps(cluster.versions())}
     views = [
@@ -99,12 +125,21 @@ def measure(o: Options) -> tuple[Rates, Row]:
         for name, view in list_views(folder, only=o.names, most=1)
     ]
     spent = dict.fromkeys(("plan", "try", "parts", "reads", "job"), 0.0)
-    found, sizes, status = [], [], []
-    with tempfile.TemporaryDirectory() as made, mock.patch.dict(os.environ, {"XDG_CACHE_HOME": made}):
+    found = []
+    sizes = []
+    status = []
+    with (
+        tempfile.TemporaryDirectory() as made,
+        mock.patch.dict(os.environ, {"XDG_CACHE_HOME": made}),
+    ):
         with (
             mock.patch.object(cluster, "plan_view", _clocked(cluster.plan_view, spent, "plan")),
             mock.patch.object(cluster, "try_grasp", _clocked(cluster.try_grasp, spent, "try")),
-            mock.patch.object(manifest, "_read_fields", _clocked(manifest._read_fields, spent, "reads", count=True)),
+            mock.patch.object(
+                manifest,
+                "_read_fields",
+                _clocked(manifest._read_fields, spent, "reads", count=True),
+            ),
         ):
             for view in views:
                 began = sum(os.times()[:4])  # of this process and of CoACD's
@@ -112,21 +147,35 @@ def measure(o: Options) -> tuple[Rates, Row]:
                 spent["parts"] += sum(os.times()[:4]) - began
                 spent["reads"] -= 1  # that of this line
                 began = time.process_time()
-                file = write_file(Path(made) / "job.safetensors", cluster.run_job(view, protocol, spec, meta))
+                file = write_file(
+                    Path(made) / "job.safetensors", cluster.run_job(view, protocol, spec, meta)
+                )
                 spent["job"] += time.process_time() - began
                 (row,), records = load_shard(file, meta)
                 found.append(row)
                 sizes.append((file.stat().st_size, records.grasps))
                 status.append(row.status.name)
         entry, parse, bare, index = _sizes(Path(made))
-    n, tries = len(views), sum(row.grasps for row in found)
+    n = len(views)
+    tries = sum(row.grasps for row in found)
     of_grasps = [sum(x.numel() * x.element_size() for x in _tensors(grasps)) for _, grasps in sizes]
-    grasp, record = sum(of_grasps) / max(1, tries), sum(size for size, _ in sizes) / n - sum(of_grasps) / n
+    grasp = sum(of_grasps) / max(1, tries)
+    record = sum(size for size, _ in sizes) / n - sum(of_grasps) / n
     rates = Rates(
-        spent["plan"] / n, spent["try"] / max(1, tries), sum(min(TRIED, row.executable) for row in found) / n,
-        spent["parts"] / n, (spent["job"] - spent["plan"] - spent["try"]) / n,
-        sum(row.executable for row in found) / n, record, grasp, bare, index, spent["reads"] / n, entry, parse,
-    )  # fmt: skip
+        spent["plan"] / n,
+        spent["try"] / max(1, tries),
+        sum(min(TRIED, row.executable) for row in found) / n,
+        spent["parts"] / n,
+        (spent["job"] - spent["plan"] - spent["try"]) / n,
+        sum(row.executable for row in found) / n,
+        record,
+        grasp,
+        bare,
+        index,
+        spent["reads"] / n,
+        entry,
+        parse,
+    )
     counts = ", ".join(f"{status.count(name)} {name.lower()}" for name in dict.fromkeys(status))
     text = (
         f"plan {rates.plan:.2f} s, try {rates.trial:.2f} s of {tries} tries, convex parts {rates.parts:.1f} s once an"
@@ -139,8 +188,10 @@ def measure(o: Options) -> tuple[Rates, Row]:
 
 def plan(rates: Rates) -> list[Row]:
     """Return the plan for a million objects of one view each: storage, indices, limits and faults."""
-    shards, folders = -(-MILLION // JOBS_IN_SHARD), -(-MILLION // FOLDER)
-    most_objects, most_jobs = JSON_BYTES / rates.entry, CARD_BYTES / rates.row
+    shards = -(-MILLION // JOBS_IN_SHARD)
+    folders = -(-MILLION // FOLDER)
+    most_objects = JSON_BYTES / rates.entry
+    most_jobs = CARD_BYTES / rates.row
     seconds = rates.tried + rates.plan
     chance = DEATHS * seconds / HOUR
 
@@ -198,7 +249,8 @@ def _fleet(what: str, rates: Rates, views: float, cores: int, more: str = "") ->
 
 
 def _sizes(made: Path) -> tuple[float, float, float, float]:
-    """Return the bytes of an object in a manifest, the seconds to read one of `FOLDER` objects, and bytes of a row.
+    """Return the bytes of an object in a manifest, the seconds to read one of `FOLDER` objects, and
+    bytes of a row.
 
     A row has bytes in the card, and in the memory of a reader.
     """
@@ -212,10 +264,15 @@ def _sizes(made: Path) -> tuple[float, float, float, float]:
     began = time.process_time()
     manifest.read_entry(path.parent, "object-000000")
     parse = time.process_time() - began
-    row = cluster.JobRow("object-000000", "view0", family="family-0000", group="solid", executable=100, points=1000)
+    row = cluster.JobRow(
+        "object-000000", "view0", family="family-0000", group="solid", executable=100, points=1000
+    )
     bare = {name: x for name, x in row.as_json().items() if name != "meta"}
     texts = [format_json(bare | {"object": f"object-{k:06}"}) for k in range(FOLDER)]
-    fields = [Field(path, "jobs", json.loads(text), lambda *words: ModelFileError("folder", *words)) for text in texts]
+    fields = [
+        Field(path, "jobs", json.loads(text), lambda *words: ModelFileError("folder", *words))
+        for text in texts
+    ]
     tracemalloc.start()
     kept = [read_row(field, bare=True) for field in fields]
     index = tracemalloc.get_traced_memory()[0] / len(kept)

@@ -1,4 +1,6 @@
-"""Memory, open files and threads over many plans and trials in one process; the memory of large inputs."""
+"""Memory, open files and threads over many plans and trials in one process; the memory of large
+inputs.
+"""
 
 import gc
 import os
@@ -28,8 +30,16 @@ from torchgrasp.geometry.linalg import unit
 
 SPEC = ContactSpec(table=0.0)
 STARTS = 16
-"""Of a plan that is repeated: one wave, since three take half as long again and hold the same things."""
-TRIAL = {"approach": 0.02, "lift_height": 0.05, "hold_time": 0.1, "timestep": 1 / 250, "control_rate": 50.0}
+"""Of a plan that is repeated: one wave, since three take half as long again and hold the same
+things.
+"""
+TRIAL = {
+    "approach": 0.02,
+    "lift_height": 0.05,
+    "hold_time": 0.1,
+    "timestep": 1 / 250,
+    "control_rate": 50.0,
+}
 """Of a trial that is repeated: the whole chain in a third of the usual ticks."""
 WARM = 0.2
 """Share of the calls after which memory must no longer grow: pools and caches have filled."""
@@ -42,16 +52,25 @@ GROWTH = 0.05
 @bench("load/plans")
 def plans(o: Options) -> list[Row]:
     """Plan again and again in one process."""
-    hand, n = o.hands[0], o.times(500)
-    model, views = load_hand(hand), [load_object(name).view for name in list_objects()]
-    return [_repeated("plans", n, lambda k: plan_grasps(views[k % len(views)], model, SPEC, STARTS, seed=k))]
+    hand = o.hands[0]
+    n = o.times(500)
+    model = load_hand(hand)
+    views = [load_object(name).view for name in list_objects()]
+    return [
+        _repeated(
+            "plans", n, lambda k: plan_grasps(views[k % len(views)], model, SPEC, STARTS, seed=k)
+        )
+    ]
 
 
 @bench("load/trials")
 def trials(o: Options) -> list[Row]:
     """Close and lift again and again in one process."""
-    hand, n, simulator = o.hands[0], o.times(2000), o.simulator
-    model, jug = load_hand(hand), load_object("jug")
+    hand = o.hands[0]
+    n = o.times(2000)
+    simulator = o.simulator
+    model = load_hand(hand)
+    jug = load_object("jug")
     grasps = plan_grasps(jug.view, model, SPEC, STARTS)
     grasps = grasps[grasps.status == Status.OK]
     spec = TrialSpec(simulator=simulator, **TRIAL)
@@ -72,7 +91,8 @@ def _repeated(what: str, n: int, once: Callable[[int], object]) -> Row:
             gc.collect()
             read.append((k + 1, resident_mib(), _count("fd"), _count("task")))
     warm = [row for row in read if row[0] >= WARM * n]
-    calls, memory = np.array([row[0] for row in warm]), np.array([row[1] for row in warm])
+    calls = np.array([row[0] for row in warm])
+    memory = np.array([row[1] for row in warm])
     slope = float(np.polyfit(calls, memory, 1)[0])
     growth = slope * (n - WARM * n) / memory[0]
     more = [warm[-1][i] - warm[0][i] for i in (2, 3)]
@@ -81,19 +101,38 @@ def _repeated(what: str, n: int, once: Callable[[int], object]) -> Row:
         f"{memory[0]:.0f} MiB after {WARM:.0%}, then {growth:+.1%} ({1024 * slope:+.1f} KiB a call),"
         f" {more[0]:+d} files, {more[1]:+d} threads; {seconds:.2f} s each"
     )
-    numbers = {"read": read, "slope_kib": 1024 * slope, "growth": growth, "files": more[0], "threads": more[1]}
+    numbers = {
+        "read": read,
+        "slope_kib": 1024 * slope,
+        "growth": growth,
+        "files": more[0],
+        "threads": more[1],
+    }
     sound = growth <= GROWTH and more == [0, 0]
-    return Row(f"{n} {what} in one process", f"at most +{GROWTH:.0%}, no file, no thread", measured, sound, numbers)
+    return Row(
+        f"{n} {what} in one process",
+        f"at most +{GROWTH:.0%}, no file, no thread",
+        measured,
+        sound,
+        numbers,
+    )
 
 
 @bench("load/points")
 def points(o: Options) -> list[Row]:
     """Plan on one cloud of many points, beside one of 1 % of them."""
-    hand, n = o.hands[0], max(100_000, o.times(2_000_000))
-    model, rows = load_hand(hand), []
+    hand = o.hands[0]
+    n = max(100_000, o.times(2_000_000))
+    model = load_hand(hand)
+    rows = []
     for count in (n // 100, n):
         cloud = _egg(count)
-        rows.append(_peak(f"a cloud of {len(cloud):,} points", lambda: plan_grasps(cloud, model, SPEC, STARTS)))  # noqa: B023
+        rows.append(
+            _peak(
+                f"a cloud of {len(cloud):,} points",
+                lambda: plan_grasps(cloud, model, SPEC, STARTS),  # noqa: B023
+            )
+        )
     return rows
 
 
@@ -112,20 +151,27 @@ def _peak(what: str, action: Callable[[], object]) -> Row:
     """Call once; return time, and the memory that it took at most."""
     gc.collect()
     Path("/proc/self/clear_refs").write_text("5")  # the peak starts anew
-    before, began = resident_mib(), time.process_time()
+    before = resident_mib()
+    began = time.process_time()
     action()
-    seconds, most = time.process_time() - began, (peak_mib() or 0.0) - before
-    return Row(what, "-", f"{seconds:.1f} s, {most:.0f} MiB more", None, {"seconds": seconds, "mib": most})
+    seconds = time.process_time() - began
+    most = (peak_mib() or 0.0) - before
+    return Row(
+        what, "-", f"{seconds:.1f} s, {most:.0f} MiB more", None, {"seconds": seconds, "mib": most}
+    )
 
 
 def _egg(n: int) -> PointCloud:
-    """One side of an ellipsoid of 60 x 60 x 120 mm on the table, from a camera 0.5 m away, noise 0.5 mm."""
+    """One side of an ellipsoid of 60 x 60 x 120 mm on the table, from a camera 0.5 m away, noise
+    0.5 mm.
+    """
     generator = torch.Generator().manual_seed(0)
 
     def draw() -> Tensor:
         return torch.randn(2 * n, 3, generator=generator, dtype=torch.float64)
 
-    axes, eye = torch.tensor([0.03, 0.03, 0.06]).double(), torch.tensor([0.5, 0.0, 0.3]).double()
+    axes = torch.tensor([0.03, 0.03, 0.06]).double()
+    eye = torch.tensor([0.5, 0.0, 0.3]).double()
     on = unit(draw())
     points = on * axes + torch.tensor([0.0, 0.0, 0.06]).double()
     seen = (on / axes * (eye - points)).sum(1) > 0

@@ -1,4 +1,6 @@
-"""The scheduler of a campaign on a thousand workers, of which one in a hundred dies: files, time and memory."""
+"""The scheduler of a campaign on a thousand workers, of which one in a hundred dies: files, time
+and memory.
+"""
 
 import dataclasses
 import functools
@@ -27,35 +29,59 @@ from torchgrasp.foundation.errors import Status
 from torchgrasp.foundation.jobs import run_as_they_end
 from torchgrasp.hand.hand import Hand
 
-WORKERS, JOBS, DYING = 1000, 10, 0.01
+WORKERS = 1000
+JOBS = 10
+DYING = 0.01
 """Workers, jobs for each of them, and the share of workers that die, evenly over the run."""
 POINTS = 1000  # of a job's cloud, all that it writes
 LIMIT = 600.0  # of a job [s]; none takes so long
 MILLION = 1_000_000
 ASKED = {
-    "torchgrasp": "campaign", "version": 1, "licence": "unknown", "jobs_in_shard": 64, "device": "cpu",
-    "hand": {"name": "none", "option": "", "sha256": "0" * 64, "joint_names": "", "finger_names": ""},
-    "protocol": {"name": "none", "noise": {"draws": 1}, "trial": {"simulator": "none", "friction": 0.5}},
-    "trials": {"grasps": 1, "ranks": "best", "starts": 1, "seed": 0}, "versions": {"torchgrasp": "0"},
-}  # fmt: skip
+    "torchgrasp": "campaign",
+    "version": 1,
+    "licence": "unknown",
+    "jobs_in_shard": 64,
+    "device": "cpu",
+    "hand": {
+        "name": "none",
+        "option": "",
+        "sha256": "0" * 64,
+        "joint_names": "",
+        "finger_names": "",
+    },
+    "protocol": {
+        "name": "none",
+        "noise": {"draws": 1},
+        "trial": {"simulator": "none", "friction": 0.5},
+    },
+    "trials": {"grasps": 1, "ranks": "best", "starts": 1, "seed": 0},
+    "versions": {"torchgrasp": "0"},
+}
 
 
 @bench("load/scheduler")
 def scheduler(o: Options) -> list[Row]:
-    """Run jobs without work by `carry_out` on the real scheduler, and alone in this process; compare the files."""
+    """Run jobs without work by `carry_out` on the real scheduler, and alone in this process;
+    compare the files.
+    """
     workers = max(4, o.times(WORKERS))
-    jobs, dying = JOBS * workers, max(1, round(DYING * workers))
+    jobs = JOBS * workers
+    dying = max(1, round(DYING * workers))
     rows = tuple(JobRow(f"thing{j:06}", "view0") for j in range(jobs))
     campaign = Campaign(ASKED, rows, lambda row: empty_shard(row, barrett(), 1))
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
         _, alone = timed(lambda: carry_out(campaign, folder / "alone", _here(campaign)))
-        told, held, memory = list[JobRow](), list[int](), list[float]()
+        told = list[JobRow]()
+        held = list[int]()
+        memory = list[float]()
         with swarm(workers) as cluster:
             FATAL.update({(2 * k + 1) * jobs // (2 * dying): cluster for k in range(dying)})
 
             def work(numbers: Sequence[int]) -> Generator[tuple[int, bytes | Status], None, None]:
-                return run_on_cluster(stub, _tasks(campaign, numbers), cluster.scheduler_address, LIMIT)
+                return run_on_cluster(
+                    stub, _tasks(campaign, numbers), cluster.scheduler_address, LIMIT
+                )
 
             def tell(row: JobRow) -> None:
                 told.append(row)
@@ -65,37 +91,58 @@ def scheduler(o: Options) -> list[Row]:
 
             began = time.process_time()
             carry_out(campaign, folder / "out", work, tell)
-            together, left = time.process_time() - began, len(cluster.scheduler.workers)
+            together = time.process_time() - began
+            left = len(cluster.scheduler.workers)
         same = contents(folder / "out") == contents(folder / "alone")
     once = sorted(row.object for row in told) == [row.object for row in rows]
     again = len(BEGAN) - len({number for number, _ in BEGAN})
-    numbers = {"workers": workers, "left": left, "jobs": jobs, "again": again, "alone": alone, "together": together}
+    numbers = {
+        "workers": workers,
+        "left": left,
+        "jobs": jobs,
+        "again": again,
+        "alone": alone,
+        "together": together,
+    }
     died = f"{workers - left} of {workers} workers died, each in the middle of a job; {again} jobs began again"
     each = f"{1e3 * together / jobs:.1f} ms of one processor with client, scheduler, workers and folder"
     return [
         Row(
-            f"{jobs} jobs on {workers} workers, {dying} dying", "each file once, bytes as without deaths",
-            f"{died}; every job was told and written once: {once}; equal bytes: {same}", once and same, numbers,
+            f"{jobs} jobs on {workers} workers, {dying} dying",
+            "each file once, bytes as without deaths",
+            f"{died}; every job was told and written once: {once}; equal bytes: {same}",
+            once and same,
+            numbers,
         ),
         Row(
-            "overhead of a job", "-",
-            f"{each}, {1e3 * alone / jobs:.1f} ms without Dask: {jobs / together:.0f} jobs a second at most", None,
+            "overhead of a job",
+            "-",
+            f"{each}, {1e3 * alone / jobs:.1f} ms without Dask: {jobs / together:.0f} jobs a second at most",
+            None,
             {"together": together / jobs, "alone": alone / jobs},
         ),
         Row(
-            "growth of memory between a tenth of the jobs and all", "-",
-            f"{memory[-1] - memory[0]:+.0f} MiB; at most {max(held)} tasks at once", None,
+            "growth of memory between a tenth of the jobs and all",
+            "-",
+            f"{memory[-1] - memory[0]:+.0f} MiB; at most {max(held)} tasks at once",
+            None,
             {"memory": memory, "held": max(held)},
         ),
-    ]  # fmt: skip
+    ]
 
 
 @bench("load/waiting")
 def waiting(o: Options) -> list[Row]:
-    """Submit jobs to a scheduler without workers; count the memory of Python objects in client and scheduler."""
-    count, spec, protocol = max(100, o.times(OUTSTANDING)), EvaluationSpec(), PROTOCOLS["tabletop"]
+    """Submit jobs to a scheduler without workers; count the memory of Python objects in client and
+    scheduler.
+    """
+    count = max(100, o.times(OUTSTANDING))
+    spec = EvaluationSpec()
+    protocol = PROTOCOLS["tabletop"]
     meta = {"campaign": "0" * 64, "versions": json.dumps(versions())}
-    views = [ObjectView(Path("objects"), f"thing{j:06}", "view0", barrett().source) for j in range(count)]
+    views = [
+        ObjectView(Path("objects"), f"thing{j:06}", "view0", barrett().source) for j in range(count)
+    ]
     with swarm(0) as cluster, Client(cluster, set_as_default=False) as client:
         gc.collect()
         tracemalloc.start()
@@ -146,4 +193,8 @@ def _here(campaign: Campaign) -> Any:
 
 def contents(folder: Path) -> dict[str, bytes]:
     """Return every file below a folder by its path."""
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }

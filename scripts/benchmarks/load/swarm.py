@@ -1,4 +1,6 @@
-"""A Dask cluster whose many workers live in this process, so that some can die while the real scheduler looks on."""
+"""A Dask cluster whose many workers live in this process, so that some can die while the real
+scheduler looks on.
+"""
 
 import contextlib
 from collections.abc import Iterator
@@ -15,12 +17,16 @@ QUIET = {
     "distributed.admin.system-monitor.interval": "10 minutes",
     "distributed.worker.profile.enabled": False,
 }
-"""Every worker looks after its process many times a second; a thousand of them in one process would do nothing else."""
+"""Every worker looks after its process many times a second; a thousand of them in one process would
+do nothing else.
+"""
 BEGAN: list[tuple[int, str]] = []
 """Number of each job that a worker began, in order, and the worker's address."""
 FATAL: dict[int, LocalCluster] = {}
 """Jobs in the middle of which their worker dies once, and its cluster."""
-THREADS = 4  # that do the jobs of all workers: a thread for each would mostly wait for Python's lock
+THREADS = (
+    4  # that do the jobs of all workers: a thread for each would mostly wait for Python's lock
+)
 
 
 class SharedThreadPoolExecutor(ThreadPoolExecutor):
@@ -38,17 +44,26 @@ def swarm(workers: int) -> Iterator[LocalCluster]:
     with (
         dask.config.set(QUIET),
         LocalCluster(
-            n_workers=workers, threads_per_worker=1, processes=False, dashboard_address=None, silence_logs=60,
-            memory_limit=0, executor=pool,
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=False,
+            dashboard_address=None,
+            silence_logs=60,
+            memory_limit=0,
+            executor=pool,
         ) as cluster,
-        Client(cluster, set_as_default=True),  # for the workers, which else share the client of one that may die
-    ):  # fmt: skip
+        Client(
+            cluster, set_as_default=True
+        ),  # for the workers, which else share the client of one that may die
+    ):
         yield cluster
     ThreadPoolExecutor.shutdown(pool, cancel_futures=True)
 
 
 def begin(number: int) -> str:
-    """Write down that a job began, and kill its worker if that is its fate; return the worker's address."""
+    """Write down that a job began, and kill its worker if that is its fate; return the worker's
+    address.
+    """
     address = get_worker().address
     BEGAN.append((number, address))
     if number in FATAL:
@@ -57,7 +72,9 @@ def begin(number: int) -> str:
 
 
 def kill(cluster: LocalCluster, address: str) -> None:
-    """Cut the line of a worker to the scheduler, as the end of its process does; results that it had are lost."""
+    """Cut the line of a worker to the scheduler, as the end of its process does; results that it
+    had are lost.
+    """
 
     async def cut() -> None:
         (worker,) = (worker for worker in cluster.workers.values() if worker.address == address)

@@ -1,7 +1,7 @@
 """Verdicts on closure in rational arithmetic: what is proven here is not subject to rounding.
 
-The wrenches are written anew from Eq. (13) and rounded to multiples of 2^-60, which is finer than their own rounding;
-from there on all is exact. A proof needs no trust in who proposes it.
+The wrenches are written anew from Eq. (13) and rounded to multiples of 2^-60, which is finer than
+their own rounding; from there on all is exact. A proof needs no trust in who proposes it.
 """
 
 from fractions import Fraction
@@ -10,17 +10,20 @@ from itertools import combinations
 import numpy as np
 
 GRID = 60
-"""Wrenches are integers over 2 to this power, witnesses and coefficients over 2 to the power of 50."""
+"""Wrenches are integers over 2 to this power, witnesses and coefficients over 2 to the power of 50.
+"""
 TOLERANCES = ("primal_feasibility_tolerance", "dual_feasibility_tolerance")
 NEAR_BASIS = 10
 """The largest coefficients of HiGHS among which a feasible basis is sought."""
 
 
-def wrench_matrix(points: np.ndarray, normals: np.ndarray, friction: float, edges: int) -> np.ndarray:
+def wrench_matrix(
+    points: np.ndarray, normals: np.ndarray, friction: float, edges: int
+) -> np.ndarray:
     """Return the m x 6 wrenches of contacts with outward normals, from the definition, as integers.
 
-    The first edge of each cone leans along the plane of three contacts that it leans most against, as the library's
-    does. Torques are about the centre, over the root-mean-square distance from it.
+    The first edge of each cone leans along the plane of three contacts that it leans most against,
+    as the library's does. Torques are about the centre, over the root-mean-square distance from it.
     """
     arm = points - points.mean(0)
     arm = arm / np.sqrt((arm**2).sum() / len(points))
@@ -40,7 +43,8 @@ def wrench_matrix(points: np.ndarray, normals: np.ndarray, friction: float, edge
 def proves_margin_below(wrench: np.ndarray, witness: np.ndarray, bound: Fraction) -> bool:
     """Tell whether a wrench proves that no balance has a margin of `bound`.
 
-    With g the products of the witness with the wrenches, 0 = sum phi g >= s sum g + (1 - m s) min g for phi >= s.
+    With g the products of the witness with the wrenches, 0 = sum phi g >= s sum g + (1 - m s) min g
+    for phi >= s.
     """
     product = wrench @ _integers(witness, 50)
     least = min(product)
@@ -48,7 +52,9 @@ def proves_margin_below(wrench: np.ndarray, witness: np.ndarray, bound: Fraction
 
 
 def proves_margin_above(wrench: np.ndarray, phi: np.ndarray, bound: Fraction) -> bool:
-    """Tell whether coefficients near `phi` balance exactly with a margin above `bound`, by six of full rank."""
+    """Tell whether coefficients near `phi` balance exactly with a margin above `bound`, by six of
+    full rank.
+    """
     m = len(wrench)
     integers = _integers(phi, 50)
     base = sorted(range(m), key=lambda k: -phi[k])[:6]
@@ -61,7 +67,8 @@ def proves_margin_above(wrench: np.ndarray, phi: np.ndarray, bound: Fraction) ->
 
 
 def exact_margin(wrench: np.ndarray) -> Fraction:
-    """Return the largest s of W phi = 0, sum phi = 1, phi >= s as a fraction: a simplex method begun where HiGHS ends.
+    """Return the largest s of W phi = 0, sum phi = 1, phi >= s as a fraction: a simplex method
+    begun where HiGHS ends.
 
     Raises:
         ArithmeticError: no coefficients balance, or the basis of HiGHS is not feasible.
@@ -72,25 +79,42 @@ def exact_margin(wrench: np.ndarray) -> Fraction:
     matrix = wrench.astype(np.float64) / 2.0**GRID
     # phi = s + psi: seven equations in psi >= 0 and s.
     equations = np.zeros((7, m + 1))
-    equations[:6, :m], equations[:6, m] = matrix.T, matrix.sum(0)
-    equations[6, :m], equations[6, m] = 1.0, m
-    objective, right = np.r_[np.zeros(m), -1.0], np.r_[np.zeros(6), 1.0]
-    bounds, strict = [(0, None)] * m + [(None, None)], dict.fromkeys(TOLERANCES, 1e-10)
-    solution = linprog(objective, A_eq=equations, b_eq=right, bounds=bounds, method="highs", options=strict)
+    equations[:6, :m] = matrix.T
+    equations[:6, m] = matrix.sum(0)
+    equations[6, :m] = 1.0
+    equations[6, m] = m
+    objective = np.r_[np.zeros(m), -1.0]
+    right = np.r_[np.zeros(6), 1.0]
+    bounds = [(0, None)] * m + [(None, None)]
+    strict = dict.fromkeys(TOLERANCES, 1e-10)
+    solution = linprog(
+        objective, A_eq=equations, b_eq=right, bounds=bounds, method="highs", options=strict
+    )
     if solution.x is None:
         raise ArithmeticError("no coefficients balance")
     whole = np.zeros((7, m + 1), dtype=object)
-    whole[:6, :m], whole[:6, m] = wrench.T, [sum(column) for column in wrench.T]
-    whole[6, :m], whole[6, m] = 1, m
+    whole[:6, :m] = wrench.T
+    whole[:6, m] = [sum(column) for column in wrench.T]
+    whole[6, :m] = 1
+    whole[6, m] = m
     last = np.array([0] * 6 + [1], dtype=object)
-    largest = sorted(range(m), key=lambda k: -solution.x[k])[:NEAR_BASIS]  # of equal ones, not every six are a basis
-    columns = next(([*six, m] for six in combinations(largest, 6) if _feasible(whole[:, [*six, m]], last)), None)
+    largest = sorted(range(m), key=lambda k: -solution.x[k])[
+        :NEAR_BASIS
+    ]  # of equal ones, not every six are a basis
+    columns = next(
+        ([*six, m] for six in combinations(largest, 6) if _feasible(whole[:, [*six, m]], last)),
+        None,
+    )
     if columns is None:
         raise ArithmeticError("the basis is not feasible")
     while True:
-        primal, dual = solve(whole[:, columns], last), solve(whole[:, columns].T, last)
+        primal = solve(whole[:, columns], last)
+        dual = solve(whole[:, columns].T, last)
         assert primal is not None and dual is not None
-        entering = next((k for k in range(m) if sum(y * a for y, a in zip(dual, whole[:, k], strict=True)) < 0), None)
+        entering = next(
+            (k for k in range(m) if sum(y * a for y, a in zip(dual, whole[:, k], strict=True)) < 0),
+            None,
+        )
         if entering is None:
             return primal[6]
         change = solve(whole[:, columns], whole[:, entering])
@@ -100,13 +124,17 @@ def exact_margin(wrench: np.ndarray) -> Fraction:
 
 
 def _feasible(basis: np.ndarray, right: np.ndarray) -> bool:
-    """Tell whether a basis has a solution without negative coefficients; the margin, its last unknown, is free."""
+    """Tell whether a basis has a solution without negative coefficients; the margin, its last
+    unknown, is free.
+    """
     values = solve(basis, right)
     return values is not None and min(values[:-1]) >= 0
 
 
 def solve(matrix: np.ndarray, right: np.ndarray) -> list[Fraction] | None:
-    """Solve a system of integers exactly, by elimination without fractions (Bareiss); None where it is singular."""
+    """Solve a system of integers exactly, by elimination without fractions (Bareiss); None where it
+    is singular.
+    """
     n = len(matrix)
     rows = [[*map(int, matrix[i]), int(right[i])] for i in range(n)]
     last = 1
@@ -117,7 +145,10 @@ def solve(matrix: np.ndarray, right: np.ndarray) -> list[Fraction] | None:
         rows[k], rows[at] = rows[at], rows[k]
         for i in range(n):
             if i != k:
-                rows[i] = [(rows[k][k] * x - rows[i][k] * y) // last for x, y in zip(rows[i], rows[k], strict=True)]
+                rows[i] = [
+                    (rows[k][k] * x - rows[i][k] * y) // last
+                    for x, y in zip(rows[i], rows[k], strict=True)
+                ]
         last = rows[k][k]
     return [Fraction(rows[i][n], rows[i][i]) for i in range(n)]
 

@@ -1,8 +1,8 @@
 """How many starts become grasps that a hand can take, and what one costs, in both modes.
 
-A start is certified when its planned contacts are (default specification with a table, LP margin and rank). The cost of
-a grasp is the processor's time of planning, certificates, seeds and solving; the shape and its distance field are
-given.
+A start is certified when its planned contacts are (default specification with a table, LP margin
+and rank). The cost of a grasp is the processor's time of planning, certificates, seeds and solving;
+the shape and its distance field are given.
 """
 
 import time
@@ -14,7 +14,16 @@ from tqdm import tqdm
 
 from benchmarks.common import Options, Row, bench
 from benchmarks.ground_truth import read_views
-from torchgrasp import ContactSpec, PointCloud, Status, certify, fit_shape, load_hand, load_mixture, plan_contacts
+from torchgrasp import (
+    ContactSpec,
+    PointCloud,
+    Status,
+    certify,
+    fit_shape,
+    load_hand,
+    load_mixture,
+    plan_contacts,
+)
 from torchgrasp.foundation.base import count_status
 from torchgrasp.geometry.signed_distance import field_from_surface
 from torchgrasp.ik.attempts import solve_contact_first
@@ -26,13 +35,17 @@ from torchgrasp.shape.surface import extract_surface
 
 SPEC = ContactSpec(table=0.0)
 BARS = {("allegro", "contact_first"): (0.60, torch.inf), ("allegro", "joint"): (0.85, 20.0)}
-"""Least mean share of certified starts that become executable, and most milliseconds of one of these grasps."""
+"""Least mean share of certified starts that become executable, and most milliseconds of one of
+these grasps.
+"""
 
 
 @bench("plan/executable", objects=True)
 def executable(o: Options) -> list[Row]:
     """Count the executable grasps of each hand and mode on the first view of each object."""
-    first = {name: cloud for name, _, cloud, _ in reversed(list(read_views(o.objects[0], views=o.views)))}
+    first = {
+        name: cloud for name, _, cloud, _ in reversed(list(read_views(o.objects[0], views=o.views)))
+    }
     results: dict[tuple[str, str], dict[str, dict[str, Any]]] = {}
     for name, cloud in tqdm(first.items(), desc="executable", disable=None, leave=False):
         for key, found in solve_view(cloud, o.hands, o.starts, o.seed).items():
@@ -44,14 +57,16 @@ def solve_view(
     cloud: PointCloud, hands: Sequence[str], starts: int, seed: int
 ) -> dict[tuple[str, str], dict[str, Any]]:
     """Return what became of the starts on one view, by hand and mode."""
-    shape, found = fit_shape(cloud, seed=seed, table=SPEC.table), {}
+    shape = fit_shape(cloud, seed=seed, table=SPEC.table)
+    found = {}
     surface = extract_surface(shape)
     world = CollisionWorld(field_from_surface(surface.vertices, surface.faces), SPEC.plane)
     began = time.process_time()
     plan = plan_contacts(shape, SPEC, starts, seed)
     certificate = certify(plan.contacts, SPEC)
     closed = (plan.status == Status.OK) & certificate.closed
-    contacts, certificate = plan.contacts[closed], certificate[closed]
+    contacts = plan.contacts[closed]
+    certificate = certificate[closed]
     planned = time.process_time() - began
     for name in hands:
         hand = load_hand(name)
@@ -60,12 +75,21 @@ def solve_view(
             began = time.process_time()
             if mode == "joint":
                 library = PostureLibrary.of(hand, seed=seed)
-                grasps = solve_joint(problem, nearest_postures(library, contacts, world), shape, SPEC)
+                grasps = solve_joint(
+                    problem, nearest_postures(library, contacts, world), shape, SPEC
+                )
             else:
-                grasps = solve_contact_first(problem, query_mixture(hand, contacts, load_mixture(name)))
+                grasps = solve_contact_first(
+                    problem, query_mixture(hand, contacts, load_mixture(name))
+                )
             counts = {status.name: count for status, count in count_status(grasps.status).items()}
-            good, milliseconds = counts.get("OK", 0), 1e3 * (planned + time.process_time() - began)
-            told = {"certified": len(contacts), "executable": good, "share": good / max(len(contacts), 1)}
+            good = counts.get("OK", 0)
+            milliseconds = 1e3 * (planned + time.process_time() - began)
+            told = {
+                "certified": len(contacts),
+                "executable": good,
+                "share": good / max(len(contacts), 1),
+            }
             found[name, mode] = told | {"ms": milliseconds / max(good, 1), "statuses": counts}
     return found
 
@@ -73,10 +97,13 @@ def solve_view(
 def _row(hand: str, mode: str, objects: dict[str, dict[str, Any]], starts: int) -> Row:
     """Return the row of one hand and mode: means over the objects, and each object's own numbers."""
     share, cost, certified, good = (
-        sum(o[key] for o in objects.values()) / len(objects) for key in ("share", "ms", "certified", "executable")
+        sum(o[key] for o in objects.values()) / len(objects)
+        for key in ("share", "ms", "certified", "executable")
     )
     least, most = BARS.get((hand, mode), (0.0, torch.inf))
-    each = ", ".join(f"{n} {o['share']:.2f} ({o['executable']}, {o['ms']:.0f} ms)" for n, o in objects.items())
+    each = ", ".join(
+        f"{n} {o['share']:.2f} ({o['executable']}, {o['ms']:.0f} ms)" for n, o in objects.items()
+    )
     counts = f"of {starts} starts {certified:.0f} certified, {good:.0f} executable"
     return Row(
         f"certified starts that become executable grasps, {hand}, {mode}, mean of {len(objects)} objects",

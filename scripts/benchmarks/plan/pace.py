@@ -19,7 +19,9 @@ RATE = 110.0
 
 
 class Pace(NamedTuple):
-    """CPU seconds until the first grasp, until fifty and until all, NaN if there are none, and the number of grasps."""
+    """CPU seconds until the first grasp, until fifty and until all, NaN if there are none, and the
+    number of grasps.
+    """
 
     first: float
     fifty: float
@@ -29,22 +31,33 @@ class Pace(NamedTuple):
 
 @bench("plan/pace", objects=True)
 def keep_pace(o: Options) -> list[Row]:
-    """Plan on one view of each object at each friction, and time the batches; the first plan is not counted."""
+    """Plan on one view of each object at each friction, and time the batches; the first plan is not
+    counted.
+    """
     rows = list[Row]()
     for name in o.hands:
         hand = load_hand(name)
         plan_view(load_object("jug").view, hand, FRICTIONS[0], o)
         views = read_views(o.objects[0], views=o.views)
         seen = {one: cloud for one, _, cloud, _ in views if not o.names or one in o.names}
-        found = [plan_view(seen[x], hand, f, o) for x in tqdm(seen, disable=None, leave=False) for f in FRICTIONS]
+        found = [
+            plan_view(seen[x], hand, f, o)
+            for x in tqdm(seen, disable=None, leave=False)
+            for f in FRICTIONS
+        ]
         rows += rows_of(name, len(seen), found)
     return rows
 
 
 def plan_view(cloud: PointCloud, hand: Hand, friction: float, o: Options) -> Pace:
     """Stream the grasps of a view, and return when they came."""
-    began, count, first, fifty = time.process_time(), 0, math.nan, math.nan
-    for grasps in stream_grasps(cloud, hand, ContactSpec(friction=friction, table=0.0), o.starts, o.seed):
+    began = time.process_time()
+    count = 0
+    first = math.nan
+    fifty = math.nan
+    for grasps in stream_grasps(
+        cloud, hand, ContactSpec(friction=friction, table=0.0), o.starts, o.seed
+    ):
         now = time.process_time() - began
         first = first if count else now
         fifty = now if count < 50 <= count + len(grasps) else fifty
@@ -61,7 +74,8 @@ def rows_of(hand: str, objects: int, found: list[Pace]) -> list[Row]:
         "fifty": np.nanmedian(fifty),
         "all": np.median(every),
     }
-    what, known = f"{hand}, {objects} objects, friction {' and '.join(map(str, FRICTIONS))}", hand == "allegro"
+    what = f"{hand}, {objects} objects, friction {' and '.join(map(str, FRICTIONS))}"
+    known = hand == "allegro"
     rows = [
         Row(
             f"{what}: {name}",
@@ -72,7 +86,8 @@ def rows_of(hand: str, objects: int, found: list[Pace]) -> list[Row]:
         )
         for name, x in times.items()
     ]
-    rate, empty = count.sum() / every.sum(), int((count == 0).sum())
+    rate = count.sum() / every.sum()
+    empty = int((count == 0).sum())
     text = f"{rate:.0f} for each CPU second; {empty} of {len(found)} plans have none"
     return [
         *rows,

@@ -1,4 +1,6 @@
-"""What certificates on the estimated surface are worth on the true one, by specification; the mesh only judges."""
+"""What certificates on the estimated surface are worth on the true one, by specification; the mesh
+only judges.
+"""
 
 import dataclasses
 from typing import Any
@@ -36,7 +38,9 @@ CHANGED = {
 @bench("plan/truth", objects=True)
 def truth(o: Options) -> list[Row]:
     """Compare the default specification and shape with the paper's, on every view."""
-    views, starts, seed = list(read_views(o.objects[0], views=o.views)), o.starts, o.seed
+    views = list(read_views(o.objects[0], views=o.views))
+    starts = o.starts
+    seed = o.seed
     held: dict[str, dict[str, float]] = {"default": {}, "paper": {}}
     okay: dict[str, list[float]] = {name: [] for name in held}
     for name, view, cloud, mesh in tqdm(views, desc="truth", disable=None, leave=False):
@@ -66,8 +70,13 @@ def truth(o: Options) -> list[Row]:
 @bench("plan/fields", objects=True)
 def fields(o: Options) -> list[Row]:
     """Change one field of the default specification at a time."""
-    views, starts, seed = list(read_views(o.objects[0], views=o.views)), max(o.starts // 5, 1), o.seed
-    results: dict[str, list[tuple[float, float]]] = {"default": [], **{name: [] for name in CHANGED}}
+    views = list(read_views(o.objects[0], views=o.views))
+    starts = max(o.starts // 5, 1)
+    seed = o.seed
+    results: dict[str, list[tuple[float, float]]] = {
+        "default": [],
+        **{name: [] for name in CHANGED},
+    }
     for _, _, cloud, mesh in tqdm(views, desc="fields", disable=None, leave=False):
         shape = fit_shape(cloud, table=0.0)
         for label, spec in {"default": DEFAULT, **CHANGED}.items():
@@ -75,32 +84,42 @@ def fields(o: Options) -> list[Row]:
             if survived is not None:
                 results[label].append((share, survived))
     mean = {
-        label: [sum(column) / len(column) for column in zip(*pairs, strict=True)] for label, pairs in results.items()
+        label: [sum(column) / len(column) for column in zip(*pairs, strict=True)]
+        for label, pairs in results.items()
     }
     row = Row(
         f"one field of the specification changed: certified of the starts, and of these closed at friction {FRICTION}",
         "none",
-        "; ".join(f"{label} {share:.0%} {survived:.3f}" for label, (share, survived) in mean.items()),
+        "; ".join(
+            f"{label} {share:.0%} {survived:.3f}" for label, (share, survived) in mean.items()
+        ),
         None,
         {"found": results},
     )
     return [row]
 
 
-def survive(shape: ShapeGP, spec: ContactSpec, mesh: Any, starts: int, seed: int) -> tuple[float, float | None]:
-    """Return the share of starts that are certified, and of these the share closed where they touch the true surface.
+def survive(
+    shape: ShapeGP, spec: ContactSpec, mesh: Any, starts: int, seed: int
+) -> tuple[float, float | None]:
+    """Return the share of starts that are certified, and of these the share closed where they touch
+    the true surface.
 
     It is None where nothing is certified.
     """
     plan = plan_contacts(shape, spec, starts, seed)
     good = plan[plan.status == Status.OK].contacts
-    return len(good) / starts, float(closed_on_mesh(good, mesh).double().mean()) if len(good) else None
+    return len(good) / starts, float(closed_on_mesh(good, mesh).double().mean()) if len(
+        good
+    ) else None
 
 
 def closed_on_mesh(contacts: Contacts, mesh: Any) -> Tensor:
-    """Tell which contacts are closed at the nearest points of the true surface, with its normals there.
+    """Tell which contacts are closed at the nearest points of the true surface, with its normals
+    there.
 
-    The nearest points are those on the fingers' side: on a wall thinner than the error the other side may be nearer.
+    The nearest points are those on the fingers' side: on a wall thinner than the error the other
+    side may be nearer.
     """
     points, facing = (part.flatten(0, 1).double() for part in (contacts.points, contacts.normals))
     points, normals = (x.view(contacts.points.shape) for x in nearest_on_mesh(mesh, points, facing))

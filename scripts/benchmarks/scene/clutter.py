@@ -1,4 +1,6 @@
-"""Grasps among neighbours, in simulation: objects are dropped, seen, planned on and lifted, one or all of them."""
+"""Grasps among neighbours, in simulation: objects are dropped, seen, planned on and lifted, one or
+all of them.
+"""
 
 import dataclasses
 import math
@@ -58,8 +60,9 @@ class Clutter:
 class Try:
     """The outcome of one grasp among neighbours.
 
-    `moved` [m] is the largest motion of a neighbour's centre, `toppled` counts neighbours tilted by more than 30
-    degrees. `early` lists what the hand touched before a fingertip touched the target. `motion` is of every object.
+    `moved` [m] is the largest motion of a neighbour's centre, `toppled` counts neighbours tilted by
+    more than 30 degrees. `early` lists what the hand touched before a fingertip touched the target.
+    `motion` is of every object.
     """
 
     name: str
@@ -72,7 +75,9 @@ class Try:
 
 @dataclasses.dataclass(frozen=True)
 class SceneScore:
-    """The tries at a scene in their order, the names of the objects left, and why no more was tried."""
+    """The tries at a scene in their order, the names of the objects left, and why no more was
+    tried.
+    """
 
     names: tuple[str, ...]
     tries: tuple[Try, ...] = ()
@@ -83,9 +88,15 @@ class SceneScore:
 
 @bench("scene/clutter")
 def clutter(o: Options) -> list[Row]:
-    """Lift the easiest object of dropped scenes, with exact masks and with masks of 4 pixels more or less."""
+    """Lift the easiest object of dropped scenes, with exact masks and with masks of 4 pixels more
+    or less.
+    """
     objects = o.objects[0] if o.objects else None
-    asked = [Clutter(objects, hand, mask_error=k, starts=o.starts, seed=o.seed) for hand in o.hands for k in (0, 4, -4)]
+    asked = [
+        Clutter(objects, hand, mask_error=k, starts=o.starts, seed=o.seed)
+        for hand in o.hands
+        for k in (0, 4, -4)
+    ]
     return [row for one in asked for row in bench_clutter(one, o.times(20), o.workers)]
 
 
@@ -101,52 +112,81 @@ def bench_clutter(asked: Clutter, scenes: int, workers: int) -> list[Row]:
     """Drop scenes, plan on an image of each, execute the easiest grasp, and sum up."""
     load_hand(asked.hand)
     scores = []
-    for k, found in enumerate(run_tasks(run_scene, [(asked, k) for k in range(scenes)], workers, 1800.0)):
+    for k, found in enumerate(
+        run_tasks(run_scene, [(asked, k) for k in range(scenes)], workers, 1800.0)
+    ):
         score = SceneScore((), reason=found.sentence) if isinstance(found, Status) else found
-        tried = ", ".join(f"{one.name} {one.status.name.lower()}" for one in score.tries) or score.reason
-        print(f"{k:5} {sum(one.status is Status.OK for one in score.tries)}/{len(score.names)} {tried}", flush=True)
+        tried = (
+            ", ".join(f"{one.name} {one.status.name.lower()}" for one in score.tries)
+            or score.reason
+        )
+        print(
+            f"{k:5} {sum(one.status is Status.OK for one in score.tries)}/{len(score.names)} {tried}",
+            flush=True,
+        )
         scores.append(score)
     what = f"scenes of {asked.count[0]} to {asked.count[1]} objects, masks {asked.mask_error:+d} px, {asked.hand}"
     numbers = summarise_scenes(scores)
     shares = {name: x for name, x in numbers.items() if isinstance(x, Share)}
     if not asked.clear:
         shares = {name: x for name, x in shares.items() if "cleared" not in name}
-    return [Row(f"{name}, {what}", "-", format_share(x, "scenes"), None, numbers) for name, x in shares.items()]
+    return [
+        Row(f"{name}, {what}", "-", format_share(x, "scenes"), None, numbers)
+        for name, x in shares.items()
+    ]
 
 
 def run_scene(asked: Clutter, index: int) -> SceneScore:
     """Drop one scene and lift from it."""
-    hand, seed = load_hand(asked.hand), int(np.random.SeedSequence((asked.seed, index)).generate_state(1)[0])
+    hand = load_hand(asked.hand)
+    seed = int(np.random.SeedSequence((asked.seed, index)).generate_state(1)[0])
     trial = TrialSpec()
 
     def plan(scene: Scene, seed: int) -> ScenePlan:
-        return plan_scene(scene, hand, ContactSpec(friction=trial.friction), asked.starts, seed, enough=asked.enough)
+        return plan_scene(
+            scene,
+            hand,
+            ContactSpec(friction=trial.friction),
+            asked.starts,
+            seed,
+            enough=asked.enough,
+        )
 
-    placed, most = drop(asked.objects, asked.count, seed), None if asked.clear else 1
+    placed = drop(asked.objects, asked.count, seed)
+    most = None if asked.clear else 1
     return clear_scene(placed, hand, plan, trial, seed, mask_error=asked.mask_error, most=most)
 
 
 def summarise_scenes(scores: Sequence[SceneScore]) -> dict[str, Any]:
-    """Return shares with intervals over scenes, counts of failures, and the mean CPU seconds of planning.
+    """Return shares with intervals over scenes, counts of failures, and the mean CPU seconds of
+    planning.
 
-    "lifted" and "planned" are of scenes and their first try, "moved" (a neighbour by more than 20 mm), "toppled" and
-    "early" of all tries, "cleared" of all objects.
+    "lifted" and "planned" are of scenes and their first try, "moved" (a neighbour by more than 20
+    mm), "toppled" and "early" of all tries, "cleared" of all objects.
     """
 
     def share(outcomes: Callable[[SceneScore], list[bool]]) -> Share:
-        return share_over(count_by((str(k), x) for k, score in enumerate(scores) for x in outcomes(score)))
+        return share_over(
+            count_by((str(k), x) for k, score in enumerate(scores) for x in outcomes(score))
+        )
 
     def taken(score: SceneScore) -> int:
         return sum(one.status is Status.OK for one in score.tries)
 
-    failures = Counter(one.status.name for score in scores for one in score.tries if one.status is not Status.OK)
+    failures = Counter(
+        one.status.name for score in scores for one in score.tries if one.status is not Status.OK
+    )
     failures["NO_GRASP"] += sum(not score.tries for score in scores)
     return {
-        "lifted at the first try": share(lambda score: [bool(score.tries) and score.tries[0].status is Status.OK]),
+        "lifted at the first try": share(
+            lambda score: [bool(score.tries) and score.tries[0].status is Status.OK]
+        ),
         "planned": share(lambda score: [bool(score.tries)]),
         "moved a neighbour": share(lambda score: [one.moved > 0.02 for one in score.tries]),
         "toppled a neighbour": share(lambda score: [one.toppled > 0 for one in score.tries]),
-        "early": share(lambda score: [bool({"neighbour", "table"} & {*one.early}) for one in score.tries]),
+        "early": share(
+            lambda score: [bool({"neighbour", "table"} & {*one.early}) for one in score.tries]
+        ),
         "cleared": share(lambda score: [k < taken(score) for k in range(len(score.names))]),
         "tables cleared": share(lambda score: [bool(score.names) and not score.left]),
         "failures": dict(failures.most_common()),
@@ -158,16 +198,21 @@ def look(placed: PlacedScene, seed: int = 0, mask_error: int = 0) -> Scene:
     """Return a noisy depth image of a scene with true masks; object k has label k + 1."""
     depth, labels = render_depth(placed.meshes, placed.camera_pose, seed=seed)
     labels = change_masks(labels, mask_error)
-    return Scene.from_depth(depth, INTRINSICS, placed.camera_pose, labels=labels, up=(0.0, 0.0, 1.0))
+    return Scene.from_depth(
+        depth, INTRINSICS, placed.camera_pose, labels=labels, up=(0.0, 0.0, 1.0)
+    )
 
 
 def change_masks(labels: Int[Tensor, "h w"], pixels: int) -> Int[Tensor, "h w"]:
-    """Return labels whose every mask is grown by some pixels, or shrunk; the lowest label wins a pixel."""
+    """Return labels whose every mask is grown by some pixels, or shrunk; the lowest label wins a
+    pixel.
+    """
     from scipy.ndimage import grey_dilation, grey_erosion
 
     if not pixels:
         return labels
-    window, changed = (2 * abs(pixels) + 1,) * 2, torch.zeros_like(labels)
+    window = (2 * abs(pixels) + 1,) * 2
+    changed = torch.zeros_like(labels)
     for label in sorted(set(labels.unique().tolist()) - {0}, reverse=True):
         mask = (labels == label).numpy().astype(np.uint8)
         mask = grey_dilation(mask, size=window) if pixels > 0 else grey_erosion(mask, size=window)
@@ -175,8 +220,12 @@ def change_masks(labels: Int[Tensor, "h w"], pixels: int) -> Int[Tensor, "h w"]:
     return changed
 
 
-def run_scene_trial(placed: PlacedScene, label: int, grasp: Grasps, hand: Hand, spec: TrialSpec, seed: int = 0) -> Try:
-    """Execute a grasp of the object with a label, with all other objects present and as heavy as the target."""
+def run_scene_trial(
+    placed: PlacedScene, label: int, grasp: Grasps, hand: Hand, spec: TrialSpec, seed: int = 0
+) -> Try:
+    """Execute a grasp of the object with a label, with all other objects present and as heavy as
+    the target.
+    """
     k = label - 1
     others = [i for i in range(len(placed)) if i != k]
     around = [Neighbour(placed.meshes[i], placed.parts[i]) for i in others]
@@ -184,7 +233,8 @@ def run_scene_trial(placed: PlacedScene, label: int, grasp: Grasps, hand: Hand, 
     trial = GraspTrial(hand, grasp, truth, seed)
     closure = lift_grasp(trial, spec)
     motion = torch.zeros(len(placed), 4, 4, dtype=torch.float64)
-    motion[others], motion[k] = closure.disturbance.neighbour_pose[-1], closure.object_pose[-1]
+    motion[others] = closure.disturbance.neighbour_pose[-1]
+    motion[k] = closure.object_pose[-1]
     centres = torch.from_numpy(placed.centres())[others]
     shift = (motion[others, :3, :3] @ centres[..., None])[..., 0] + motion[others, :3, 3] - centres
     up = motion[others, 2, 2].clamp(-1.0, 1.0)
@@ -209,10 +259,15 @@ def clear_scene(
     mask_error: int = 0,
     most: int | None = None,
 ) -> SceneScore:
-    """Lift the easiest object of a scene and look again, until no grasp is left or after `most` tries."""
-    names, left, failed = placed.names, list(range(len(placed))), [0] * len(placed)
+    """Lift the easiest object of a scene and look again, until no grasp is left or after `most`
+    tries.
+    """
+    names = placed.names
+    left = list(range(len(placed)))
+    failed = [0] * len(placed)
     tries: list[Try] = []
-    spent, reason = 0.0, ""
+    spent = 0.0
+    reason = ""
     generator = torch.Generator().manual_seed(seed)
     most = TRIES * len(placed) if most is None else most
     while left and len(tries) < most:
@@ -233,7 +288,9 @@ def clear_scene(
         grasping = hand_of(grasps, hand) if grasps.meta else hand
         result = run_scene_trial(placed, label, grasps[0], grasping, spec, seed + len(tries))
         tries.append(result)
-        keep = [i for i in range(len(placed)) if not (result.status is Status.OK and i == label - 1)]
+        keep = [
+            i for i in range(len(placed)) if not (result.status is Status.OK and i == label - 1)
+        ]
         failed[left[label - 1]] += 1
         left = [left[i] for i in keep]
         if left and len(tries) < most:
@@ -241,7 +298,9 @@ def clear_scene(
     return SceneScore(names, tuple(tries), tuple(names[i] for i in left), reason, spent)
 
 
-def _look_again(placed: PlacedScene, result: Try, keep: Sequence[int], generator: torch.Generator) -> PlacedScene:
+def _look_again(
+    placed: PlacedScene, result: Try, keep: Sequence[int], generator: torch.Generator
+) -> PlacedScene:
     """Return the objects that are left, at rest after a try, before another camera."""
     motion = torch.from_numpy(result.motion)
     rest = torch.eye(4, dtype=torch.float64).expand_as(motion)

@@ -27,9 +27,11 @@ from torchgrasp.values.specs import TrialSpec
 
 MASS = 0.1
 """Mass [kg] of every dropped object, as of `TrialSpec`."""
-SPREAD, REGION = 0.13, 0.25
+SPREAD = 0.13
+REGION = 0.25
 """Radii [m] within which objects are dropped, and within which their centres must come to rest."""
-DROP_TIME, REST_TIME = 1.0, 3.0
+DROP_TIME = 1.0
+REST_TIME = 3.0
 """Longest times [s] until the next object is dropped, and until all objects must be still."""
 CORNERS = 120
 """Most corners of a convex part. PhysX keeps 255 faces and changes a part that has more."""
@@ -53,20 +55,32 @@ class PlacedScene:
 
 
 class SettlingTable:
-    """A table z = 0 and bodies that fall on it. Damping of rotation [1/s] stands for rolling resistance."""
+    """A table z = 0 and bodies that fall on it. Damping of rotation [1/s] stands for rolling
+    resistance.
+    """
 
     def __init__(self, damping: float = 2.0, timestep: float = 1 / 240) -> None:
         self._sapien, self._physx = import_sapien()
-        self._system, self._scene = open_world(self._sapien, self._physx, 9.81, timestep, patches=True)
+        self._system, self._scene = open_world(
+            self._sapien, self._physx, 9.81, timestep, patches=True
+        )
         self._material = self._physx.PhysxMaterial(0.8, 0.8, 0.0)
         place(self._sapien, self._scene, "table", table(self._sapien, self._physx, self._material))
-        self._damping, self._timestep = damping, timestep
+        self._damping = damping
+        self._timestep = timestep
         self._bodies: list[Any] = []
 
     def add(self, body: Body, pose: np.ndarray) -> None:
         """Add a body at rest at a pose (4, 4) of its mesh's frame."""
         self._bodies.append(
-            rigid_body(self._sapien, self._physx, self._material, body, [x.vertices for x in body.parts], 0.005)
+            rigid_body(
+                self._sapien,
+                self._physx,
+                self._material,
+                body,
+                [x.vertices for x in body.parts],
+                0.005,
+            )
         )
         self._bodies[-1].angular_damping = self._damping
         place(self._sapien, self._scene, "neighbour", self._bodies[-1])
@@ -80,7 +94,9 @@ class SettlingTable:
 
     def poses(self) -> np.ndarray:
         """Return the poses (m, 4, 4) of the bodies."""
-        return np.array([body.entity_pose.to_transformation_matrix() for body in self._bodies], float)
+        return np.array(
+            [body.entity_pose.to_transformation_matrix() for body in self._bodies], float
+        )
 
     def wait(self, seconds: float) -> None:
         """Simulate some seconds."""
@@ -93,22 +109,23 @@ class SettlingTable:
         for _ in range(round(seconds / 0.1)):
             self.wait(0.1)
             poses = self.poses()
-            change, before = np.abs(poses - before), poses
+            change = np.abs(poses - before)
+            before = poses
             if change[:, :3, 3].max() < 5e-4 and change[:, :3, :3].max() < 0.01:
                 return True
         return False
 
 
 def drop(objects: Path | None, count: tuple[int, int], seed: int) -> PlacedScene:
-    """Drop objects on a table, one after another, and wait until they rest; equal seeds give equal bits.
+    """Drop objects on a table, one after another, and wait until they rest; equal seeds give equal
+    bits.
 
-    An object falls upright, turned at random and slightly tilted, from just above what lies below it. An object that
-    rolls away is dropped again.
+    An object falls upright, turned at random and slightly tilted, from just above what lies below
+    it. An object that rolls away is dropped again.
 
-    Args:
-        objects: folder of NAME/mesh.ply [m], with or without manifest.json; None: the library's own objects.
-        count: least and largest number of objects; some are dropped twice where there are too few.
-        seed: of every random number.
+    Args: objects: folder of NAME/mesh.ply [m], with or without manifest.json; None: the library's
+        own objects. count: least and largest number of objects; some are dropped twice where there
+        are too few. seed: of every random number.
 
     Raises:
         BadArgument: no objects, or no scene comes to rest in view.
@@ -118,7 +135,9 @@ def drop(objects: Path | None, count: tuple[int, int], seed: int) -> PlacedScene
     known = object_names(objects)
     for _ in range(50):
         n = int(torch.randint(low, high + 1, (1,), generator=generator))
-        order = torch.cat([torch.randperm(len(known), generator=generator) for _ in range(-(-n // len(known)))])
+        order = torch.cat(
+            [torch.randperm(len(known), generator=generator) for _ in range(-(-n // len(known)))]
+        )
         names = tuple(known[i] for i in order[:n])
         bodies = [_read_body(objects, name) for name in names]
         poses = _fall(bodies, generator)
@@ -127,7 +146,9 @@ def drop(objects: Path | None, count: tuple[int, int], seed: int) -> PlacedScene
         scene = aim(_moved(names, bodies, poses, torch.eye(4, dtype=torch.float64)), generator)
         if scene is not None and _is_steady(scene):
             return scene
-    raise BadArgument("objects", f"{objects}, of which no scene comes to rest in view", "smaller objects")
+    raise BadArgument(
+        "objects", f"{objects}, of which no scene comes to rest in view", "smaller objects"
+    )
 
 
 def object_names(objects: Path | None) -> list[str]:
@@ -141,7 +162,9 @@ def object_names(objects: Path | None) -> list[str]:
 
 
 def settle(placed: PlacedScene, motion: Float[Tensor, "n 4 4"], keep: Sequence[int]) -> PlacedScene:
-    """Return some objects of a scene at rest again, after motions of all objects in the world frame."""
+    """Return some objects of a scene at rest again, after motions of all objects in the world
+    frame.
+    """
     bodies = [Body(placed.meshes[k], placed.parts[k], MASS) for k in keep]
     table = SettlingTable()
     for k, body in zip(keep, bodies, strict=True):
@@ -151,7 +174,9 @@ def settle(placed: PlacedScene, motion: Float[Tensor, "n 4 4"], keep: Sequence[i
 
 
 def aim(placed: PlacedScene, generator: torch.Generator) -> PlacedScene | None:
-    """Return the scene with a random camera whose image has all objects; None: no such camera was found."""
+    """Return the scene with a random camera whose image has all objects; None: no such camera was
+    found.
+    """
     vertices = torch.from_numpy(np.concatenate([mesh.vertices for mesh in placed.meshes]))
     middle = (vertices.amin(0) + vertices.amax(0)) / 2
     for _ in range(20):
@@ -165,9 +190,15 @@ def aim(placed: PlacedScene, generator: torch.Generator) -> PlacedScene | None:
 
 
 def _is_steady(placed: PlacedScene) -> bool:
-    """Return whether the objects also stay in a trial: in another frame, with its timestep, without damping."""
-    turn = rigid(rotation_from_vector(torch.tensor([0.0, 0.0, 1.0])).double(), torch.zeros(3).double()).numpy()
-    bodies = [Body(mesh, parts, MASS) for mesh, parts in zip(placed.meshes, placed.parts, strict=True)]
+    """Return whether the objects also stay in a trial: in another frame, with its timestep, without
+    damping.
+    """
+    turn = rigid(
+        rotation_from_vector(torch.tensor([0.0, 0.0, 1.0])).double(), torch.zeros(3).double()
+    ).numpy()
+    bodies = [
+        Body(mesh, parts, MASS) for mesh, parts in zip(placed.meshes, placed.parts, strict=True)
+    ]
     turned = _moved(placed.names, bodies, np.repeat(turn[None], len(bodies), 0), placed.camera_pose)
     table = SettlingTable(damping=0.0, timestep=TrialSpec().timestep)
     for mesh, parts in zip(turned.meshes, turned.parts, strict=True):
@@ -186,13 +217,17 @@ def _moved(
     """Return bodies at their poses."""
     pairs = list(zip(bodies, poses, strict=True))
     meshes = tuple(body.mesh.copy().apply_transform(pose) for body, pose in pairs)
-    parts = tuple(tuple(part.copy().apply_transform(pose) for part in body.parts) for body, pose in pairs)
+    parts = tuple(
+        tuple(part.copy().apply_transform(pose) for part in body.parts) for body, pose in pairs
+    )
     return PlacedScene(names, meshes, parts, camera_pose)
 
 
 def _fall(bodies: list[Body], generator: torch.Generator) -> np.ndarray | None:
     """Drop bodies one after another; return their poses at rest, or None."""
-    table, waiting, placed = SettlingTable(), list(range(len(bodies))), 0
+    table = SettlingTable()
+    waiting = list(range(len(bodies)))
+    placed = 0
     for _ in range(3 * len(bodies)):
         k = waiting.pop(0)
         pose = _above(bodies, table, k, generator)
@@ -205,24 +240,36 @@ def _fall(bodies: list[Body], generator: torch.Generator) -> np.ndarray | None:
         poses = table.poses()
         pairs = zip(bodies[:placed], poses, strict=True)
         centres = [pose[:3, :3] @ body.mesh.center_mass + pose[:3, 3] for body, pose in pairs]
-        waiting += [i for i, c in enumerate(centres) if not math.hypot(c[0], c[1]) < REGION and i not in waiting]
+        waiting += [
+            i
+            for i, c in enumerate(centres)
+            if not math.hypot(c[0], c[1]) < REGION and i not in waiting
+        ]
         if not waiting:
             return poses if still else None
     return None
 
 
-def _above(bodies: list[Body], table: SettlingTable, k: int, generator: torch.Generator) -> np.ndarray:
+def _above(
+    bodies: list[Body], table: SettlingTable, k: int, generator: torch.Generator
+) -> np.ndarray:
     """Return a random pose of a body 5 mm above the bodies below it, tilted by at most 10 degrees."""
     draws = torch.rand(5, generator=generator, dtype=torch.float64).tolist()
-    tilt, lean, turn, share, angle = (2 * math.pi * x if i in (1, 2, 4) else x for i, x in enumerate(draws))
-    leaning = torch.tensor([math.cos(lean), math.sin(lean), 0.0], dtype=torch.float64) * (math.radians(10) * tilt)
+    tilt, lean, turn, share, angle = (
+        2 * math.pi * x if i in (1, 2, 4) else x for i, x in enumerate(draws)
+    )
+    leaning = torch.tensor([math.cos(lean), math.sin(lean), 0.0], dtype=torch.float64) * (
+        math.radians(10) * tilt
+    )
     turning = torch.tensor([0.0, 0.0, turn], dtype=torch.float64)
     rotation = rotation_from_vector(leaning) @ rotation_from_vector(turning)
     corners = np.asarray(bodies[k].mesh.vertices) @ rotation.numpy().T
     middle = (corners.min(0) + corners.max(0)) / 2
     distance = SPREAD * math.sqrt(share)
-    x, y = distance * math.cos(angle) - middle[0], distance * math.sin(angle) - middle[1]
-    low, high = corners.min(0)[:2] + np.array([x, y]), corners.max(0)[:2] + np.array([x, y])
+    x = distance * math.cos(angle) - middle[0]
+    y = distance * math.sin(angle) - middle[1]
+    low = corners.min(0)[:2] + np.array([x, y])
+    high = corners.max(0)[:2] + np.array([x, y])
     top = 0.0
     for i, pose in enumerate(table.poses()):
         lying = np.asarray(bodies[i].mesh.vertices) @ pose[:3, :3].T + pose[:3, 3]
@@ -239,7 +286,9 @@ def _read_body(objects: Path | None, name: str) -> Body:
         known = load_object(name)
         return Body(known.mesh, [_coarse(part) for part in known.parts], MASS)
     scaled = (Path(objects) / "manifest.json").is_file()
-    mesh = read_object_mesh(objects, name) if scaled else read_mesh(Path(objects) / name / "mesh.ply")
+    mesh = (
+        read_object_mesh(objects, name) if scaled else read_mesh(Path(objects) / name / "mesh.ply")
+    )
     return Body(mesh, [_coarse(part) for part in convex_parts(mesh)], MASS)
 
 

@@ -24,11 +24,15 @@ TABLES = ("apart", "apart", "crowded", "boxes", "close")
 EMPTY = ("lone", "lone", "apart", "boxes")
 """Kinds of scenes without a table, in turn."""
 LEAST_SEEN = 500
-"""Measured pixels of an object that can be clicked: smaller ones are hidden, or too far to be grasped."""
+"""Measured pixels of an object that can be clicked: smaller ones are hidden, or too far to be
+grasped.
+"""
 
 
 def read_plane(picture: Picture) -> Plane | None:
-    """Return the plane in the world frame that is fitted in the camera's frame; None where it is refused."""
+    """Return the plane in the world frame that is fitted in the camera's frame; None where it is
+    refused.
+    """
     try:
         table = Scene.from_depth(picture.depth, INTRINSICS).table
     except NoSupport:
@@ -39,7 +43,9 @@ def read_plane(picture: Picture) -> Plane | None:
 @bench("scene/plane", objects=True)
 def plane(o: Options) -> list[Row]:
     """Measure the plane of scenes with a table, and how often a plane is found without a table."""
-    meshes, scenes, seed = read_meshes(o.objects[0]), o.times(300), o.seed
+    meshes = read_meshes(o.objects[0])
+    scenes = o.times(300)
+    seed = o.seed
     errors: list[tuple[float, float]] = []
     refused = 0
     for i in tqdm(range(scenes), desc="plane", disable=None, leave=False):
@@ -55,7 +61,8 @@ def plane(o: Options) -> list[Row]:
     accepted = [
         i
         for i in tqdm(range(empty), desc="no table", disable=None, leave=False)
-        if read_plane(take_picture(meshes, seed + i, EMPTY[i % len(EMPTY)], table=False)) is not None
+        if read_plane(take_picture(meshes, seed + i, EMPTY[i % len(EMPTY)], table=False))
+        is not None
     ]
     wrong = len(errors) - good + len(accepted)
     return [
@@ -76,8 +83,12 @@ def plane(o: Options) -> list[Row]:
     ]
 
 
-def choose_pixel(picture: Picture, generator: torch.Generator) -> tuple[int, tuple[int, int]] | None:
-    """Return a random object that is seen whole in the picture, and a random pixel (u, v) within it; None: none is."""
+def choose_pixel(
+    picture: Picture, generator: torch.Generator
+) -> tuple[int, tuple[int, int]] | None:
+    """Return a random object that is seen whole in the picture, and a random pixel (u, v) within
+    it; None: none is.
+    """
     from scipy.ndimage import binary_erosion
 
     measured = picture.depth > 0
@@ -85,7 +96,9 @@ def choose_pixel(picture: Picture, generator: torch.Generator) -> tuple[int, tup
     for k in picture.labels.unique().tolist():
         mine = picture.labels == k
         cut = mine[0].any() | mine[-1].any() | mine[:, 0].any() | mine[:, -1].any()
-        inner = torch.nonzero(torch.from_numpy(binary_erosion(mine.numpy(), iterations=2)) & measured)
+        inner = torch.nonzero(
+            torch.from_numpy(binary_erosion(mine.numpy(), iterations=2)) & measured
+        )
         if k and not cut and int((mine & measured).sum()) >= LEAST_SEEN and len(inner):
             choices.append((k, inner))
     if not choices:
@@ -97,10 +110,16 @@ def choose_pixel(picture: Picture, generator: torch.Generator) -> tuple[int, tup
 
 @bench("scene/click", objects=True)
 def click(o: Options) -> list[Row]:
-    """Measure the points of the object at a clicked pixel: the share that is found, and the share of other points."""
-    meshes, scenes, seed = read_meshes(o.objects[0]), o.times(300), o.seed
+    """Measure the points of the object at a clicked pixel: the share that is found, and the share
+    of other points.
+    """
+    meshes = read_meshes(o.objects[0])
+    scenes = o.times(300)
+    seed = o.seed
     generator = torch.Generator().manual_seed(seed)
-    rows, seconds, pictures = [], [], (take_picture(meshes, seed + i, "apart") for i in itertools.count(1))
+    rows = []
+    seconds = []
+    pictures = (take_picture(meshes, seed + i, "apart") for i in itertools.count(1))
     with tqdm(total=scenes, desc="click", disable=None, leave=False) as progress:
         while len(rows) < scenes:
             picture = next(pictures)
@@ -111,7 +130,8 @@ def click(o: Options) -> list[Row]:
                 seconds.append(spent)
                 progress.update()
     share, others = zip(*rows, strict=True)
-    mean_share, mean_others = sum(share) / scenes, sum(others) / scenes
+    mean_share = sum(share) / scenes
+    mean_others = sum(others) / scenes
     both = sum(s >= 0.95 and o <= 0.02 for s, o in zip(share, others, strict=True)) / scenes
     return [
         Row(
@@ -132,7 +152,9 @@ def click(o: Options) -> list[Row]:
 
 
 def click_on(picture: Picture, label: int, pixel: tuple[int, int]) -> tuple[float, float, float]:
-    """Return which share of the object's points is found, the share of other points, and the CPU time [s]."""
+    """Return which share of the object's points is found, the share of other points, and the CPU
+    time [s].
+    """
     began = time.process_time()
     try:
         found = Scene.from_depth(picture.depth, INTRINSICS, picture.camera_pose, point=pixel)
@@ -149,9 +171,10 @@ def click_on(picture: Picture, label: int, pixel: tuple[int, int]) -> tuple[floa
 class Understood:
     """What `Scene.from_depth` understood of a room.
 
-    `degrees` and `mm` are the errors of the table; infinite where no table is found. `offered` tells whether one of the
-    supports is right. `lone` has the fate of each lone thing: "one", "split", "joined" or "missed". `extra` has the
-    furniture's name and the number of pixels of each other object of more than 100 pixels.
+    `degrees` and `mm` are the errors of the table; infinite where no table is found. `offered`
+    tells whether one of the supports is right. `lone` has the fate of each lone thing: "one",
+    "split", "joined" or "missed". `extra` has the furniture's name and the number of pixels of each
+    other object of more than 100 pixels.
     """
 
     degrees: float
@@ -194,7 +217,9 @@ def _table_error(plane: Plane, room: Room) -> tuple[float, float]:
     """Return the errors of a table [degrees, mm], at the middle of the room's things."""
     true = room.table_in_camera
     middle = torch.linalg.inv(room.camera_pose)[:3, 3]
-    return math.degrees(math.acos(min(1.0, float(plane.normal @ true.normal)))), 1e3 * abs(float(plane.height(middle)))
+    return math.degrees(math.acos(min(1.0, float(plane.normal @ true.normal)))), 1e3 * abs(
+        float(plane.height(middle))
+    )
 
 
 def _fate(labels: Int[Tensor, "h w"], true: Tensor) -> str:
@@ -210,15 +235,24 @@ def _fate(labels: Int[Tensor, "h w"], true: Tensor) -> str:
 
 @bench("scene/rooms")
 def look_around(o: Options) -> list[Row]:
-    """Measure what is understood of rooms with edges, floors, walls, bins, shelves and boards, by four cameras."""
+    """Measure what is understood of rooms with edges, floors, walls, bins, shelves and boards, by
+    four cameras.
+    """
     scenes = range(o.seed, o.seed + o.times(len(KINDS) * 8))
-    seen = [(room, understand(room)) for room in map(rooms, tqdm(scenes, desc="rooms", disable=None, leave=False))]
+    seen = [
+        (room, understand(room))
+        for room in map(rooms, tqdm(scenes, desc="rooms", disable=None, leave=False))
+    ]
     fates = Counter(fate for _, one in seen for fate in one.lone.values())
     wrong = [f"{room.kind} {room.sensor}" for room, one in seen if not one.right]
     extra = Counter(part for _, one in seen for part, _ in one.extra)
     seconds = sorted(one.seconds for _, one in seen)
-    median, offered = seconds[len(seconds) // 2], sum(one.offered for _, one in seen)
-    found = {i: (room.kind, room.sensor, dataclasses.asdict(one)) for i, (room, one) in zip(scenes, seen, strict=True)}
+    median = seconds[len(seconds) // 2]
+    offered = sum(one.offered for _, one in seen)
+    found = {
+        i: (room.kind, room.sensor, dataclasses.asdict(one))
+        for i, (room, one) in zip(scenes, seen, strict=True)
+    }
     return [
         Row(
             f"table, {len(seen)} rendered rooms, RealSense, Kinect v1, Azure Kinect, Zivid",

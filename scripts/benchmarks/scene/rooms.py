@@ -1,4 +1,6 @@
-"""Rooms: things on tables with edges, holes, floors and walls, in bins, on shelves and on tilted boards."""
+"""Rooms: things on tables with edges, holes, floors and walls, in bins, on shelves and on tilted
+boards.
+"""
 
 import dataclasses
 import math
@@ -48,7 +50,9 @@ class Room:
         return self.table.moved(torch.linalg.inv(self.camera_pose))
 
     def lone(self, least: int = 400) -> tuple[int, ...]:
-        """Return the labels of things that stand alone in the picture, whole and with enough measured pixels."""
+        """Return the labels of things that stand alone in the picture, whole and with enough
+        measured pixels.
+        """
         from scipy.ndimage import binary_dilation
 
         found = []
@@ -57,12 +61,18 @@ class Room:
             about = torch.from_numpy(binary_dilation(mine.numpy(), iterations=CLEARANCE))
             cut = mine[:2].any() | mine[-2:].any() | mine[:, :2].any() | mine[:, -2:].any()
             others = about & (self.labels > 0) & ~mine
-            if int((mine & (self.depth > 0)).sum()) >= least and not bool(cut) and not bool(others.any()):
+            if (
+                int((mine & (self.depth > 0)).sum()) >= least
+                and not bool(cut)
+                and not bool(others.any())
+            ):
                 found.append(k)
         return tuple(found)
 
 
-def rooms(seed: int, kind: str | None = None, sensor: SensorName | None = None, things: int | None = None) -> Room:
+def rooms(
+    seed: int, kind: str | None = None, sensor: SensorName | None = None, things: int | None = None
+) -> Room:
     """Return a random room.
 
     Args:
@@ -81,9 +91,13 @@ def rooms(seed: int, kind: str | None = None, sensor: SensorName | None = None, 
     turn[:3, :3] = rotation_from_vector(torch.tensor(tilt, dtype=torch.float64)).numpy()
     placed = [mesh.apply_transform(turn) for mesh in placed]
     level = {"floor", "wall"}  # parts that a tilted board does not take along
-    parts = [(name, mesh if name in level else mesh.apply_transform(turn)) for name, mesh in furniture]
+    parts = [
+        (name, mesh if name in level else mesh.apply_transform(turn)) for name, mesh in furniture
+    ]
     pose = _camera(rng, *view)
-    depth, labels = render_depth([*placed, *(mesh for _, mesh in parts)], pose, table=None, noise=sensor, seed=seed)
+    depth, labels = render_depth(
+        [*placed, *(mesh for _, mesh in parts)], pose, table=None, noise=sensor, seed=seed
+    )
     count = len(placed)
     normal = torch.from_numpy(turn[:3, 2].copy())
     return Room(
@@ -102,12 +116,14 @@ def rooms(seed: int, kind: str | None = None, sensor: SensorName | None = None, 
 
 
 Furniture = tuple[list[tuple[str, trimesh.Trimesh]], float, tuple, tuple[float, float, float]]
-"""Named parts, the radius [m] of the circle that things stand in, the view (azimuths, elevations [deg], distances [m])
-and the tilt of the support about the origin as a rotation vector."""
+"""Named parts, the radius [m] of the circle that things stand in, the view (azimuths, elevations
+[deg], distances [m]) and the tilt of the support about the origin as a rotation vector.
+"""
 
 
 def _round(rng: np.random.Generator) -> Furniture:
-    radius, high = rng.uniform(0.25, 0.45), rng.uniform(0.4, 0.75)
+    radius = rng.uniform(0.25, 0.45)
+    high = rng.uniform(0.4, 0.75)
     top = trimesh.creation.cylinder(radius, 0.02, sections=64).apply_translation([0, 0, -0.01])
     leg = _box([0.06, 0.06, high - 0.02], [0, 0, -high / 2 - 0.01])
     chair = _box([0.4, 0.4, 0.05], [-0.9, rng.uniform(-0.5, 0.5), -0.3])
@@ -120,28 +136,45 @@ def _round(rng: np.random.Generator) -> Furniture:
 
 
 def _rectangular(rng: np.random.Generator) -> Furniture:
-    long, wide, high = rng.uniform(0.6, 1.2), rng.uniform(0.4, 0.6), rng.uniform(0.4, 0.75)
+    long = rng.uniform(0.6, 1.2)
+    wide = rng.uniform(0.4, 0.6)
+    high = rng.uniform(0.4, 0.75)
     top = _box([wide, long, 0.03], [0, 0, -0.015])
     parts = [("table", top), ("floor", _floor(-high)), ("wall", _wall(-rng.uniform(0.8, 1.4)))]
     return parts, wide / 2 - 0.03, ((-45, 45), (25, 50), (0.7, 1.1)), (0.0, 0.0, 0.0)
 
 
 def _holes(rng: np.random.Generator) -> Furniture:
-    step, hole = 0.1, 0.03
+    step = 0.1
+    hole = 0.03
     cells = np.arange(-4, 5) * step
     strips = [_box([step - hole, 0.9, 0.01], [x + step / 2, 0, -0.005]) for x in cells[:-1]]
-    bars = [_box([hole, step - hole, 0.01], [x, y + step / 2, -0.005]) for x in cells for y in cells[:-1]]
+    bars = [
+        _box([hole, step - hole, 0.01], [x, y + step / 2, -0.005])
+        for x in cells
+        for y in cells[:-1]
+    ]
     top = _join(*strips, *bars)
-    return [("table", top), ("floor", _floor(-0.5))], 0.25, ((0, 360), (35, 55), (0.6, 0.9)), (0.0, 0.0, 0.0)
+    return (
+        [("table", top), ("floor", _floor(-0.5))],
+        0.25,
+        ((0, 360), (35, 55), (0.6, 0.9)),
+        (0.0, 0.0, 0.0),
+    )
 
 
 def _wall_table(rng: np.random.Generator) -> Furniture:
-    parts = [("table", _box([0.7, 1.4, 0.03], [0, 0, -0.015])), ("wall", _wall(-rng.uniform(0.25, 0.34)))]
+    parts = [
+        ("table", _box([0.7, 1.4, 0.03], [0, 0, -0.015])),
+        ("wall", _wall(-rng.uniform(0.25, 0.34))),
+    ]
     return parts, 0.22, ((-35, 35), (25, 45), (0.6, 0.9)), (0.0, 0.0, 0.0)
 
 
 def _bin(rng: np.random.Generator) -> Furniture:
-    long, wide, high = rng.uniform(0.45, 0.6), rng.uniform(0.35, 0.45), rng.uniform(0.08, 0.16)
+    long = rng.uniform(0.45, 0.6)
+    wide = rng.uniform(0.35, 0.45)
+    high = rng.uniform(0.08, 0.16)
     sides = [_box([0.01, long, high], [x * wide / 2, 0, high / 2]) for x in (-1, 1)]
     sides += [_box([wide, 0.01, high], [0, y * long / 2, high / 2]) for y in (-1, 1)]
     parts = [("table", _box([wide, long, 0.01], [0, 0, -0.005])), ("bin", _join(*sides))]
@@ -151,15 +184,26 @@ def _bin(rng: np.random.Generator) -> Furniture:
 
 def _shelf(rng: np.random.Generator) -> Furniture:
     gap = rng.uniform(0.35, 0.45)
-    parts = [("table", _box([0.35, 0.9, 0.02], [0, 0, -0.01])), ("board", _box([0.35, 0.9, 0.02], [0, 0, gap + 0.01]))]
-    parts += [("wall", _wall(-0.18)), ("side", _box([0.35, 0.02, gap], [0, 0.44, gap / 2])), ("floor", _floor(-0.6))]
+    parts = [
+        ("table", _box([0.35, 0.9, 0.02], [0, 0, -0.01])),
+        ("board", _box([0.35, 0.9, 0.02], [0, 0, gap + 0.01])),
+    ]
+    parts += [
+        ("wall", _wall(-0.18)),
+        ("side", _box([0.35, 0.02, gap], [0, 0.44, gap / 2])),
+        ("floor", _floor(-0.6)),
+    ]
     return parts, 0.15, ((-30, 30), (15, 25), (0.6, 0.9)), (0.0, 0.0, 0.0)
 
 
 def _board(rng: np.random.Generator) -> Furniture:
-    angle, way = math.radians(rng.uniform(8, 20)), rng.uniform(0, 2 * math.pi)
+    angle = math.radians(rng.uniform(8, 20))
+    way = rng.uniform(0, 2 * math.pi)
     tilt = (angle * math.cos(way), angle * math.sin(way), 0.0)
-    parts = [("table", _box([0.55, 0.75, 0.015], [0, 0, -0.0075])), ("floor", _floor(-rng.uniform(0.2, 0.6)))]
+    parts = [
+        ("table", _box([0.55, 0.75, 0.015], [0, 0, -0.0075])),
+        ("floor", _floor(-rng.uniform(0.2, 0.6))),
+    ]
     return parts, 0.24, ((0, 360), (35, 55), (0.6, 0.9)), tilt
 
 
@@ -169,7 +213,10 @@ def _ground(rng: np.random.Generator) -> Furniture:
 
 
 def _above(rng: np.random.Generator) -> Furniture:
-    parts = [("table", _box([0.9, 0.9, 0.03], [0, 0, -0.015])), ("floor", _floor(-rng.uniform(0.4, 0.75)))]
+    parts = [
+        ("table", _box([0.9, 0.9, 0.03], [0, 0, -0.015])),
+        ("floor", _floor(-rng.uniform(0.4, 0.75))),
+    ]
     return parts, 0.22, ((0, 360), (78, 89), (0.6, 0.9)), (0.0, 0.0, 0.0)
 
 
@@ -184,8 +231,9 @@ KINDS: dict[str, Callable[[np.random.Generator], Furniture]] = {
     "ground": _ground,
     "above": _above,
 }
-"""Kinds of rooms: a round or rectangular table over a floor, a plate with holes, a table at a wall, a bin, a shelf, a
-tilted board, the ground itself, and a table from above."""
+"""Kinds of rooms: a round or rectangular table over a floor, a plate with holes, a table at a wall,
+a bin, a shelf, a tilted board, the ground itself, and a table from above.
+"""
 
 
 def _box(size: list[float], centre: list[float]) -> trimesh.Trimesh:
@@ -206,9 +254,13 @@ def _wall(x: float) -> trimesh.Trimesh:
     return _box([0.02, 4, 3], [x - 0.01, 0, 0.5])
 
 
-def _camera(rng: np.random.Generator, azimuths: tuple, elevations: tuple, distances: tuple) -> Float[Tensor, "4 4"]:
+def _camera(
+    rng: np.random.Generator, azimuths: tuple, elevations: tuple, distances: tuple
+) -> Float[Tensor, "4 4"]:
     middle = torch.tensor([*rng.uniform(-0.04, 0.04, 2), 0.03], dtype=torch.float64)
-    return look_at(rng.uniform(*azimuths), rng.uniform(*elevations), rng.uniform(*distances), middle)
+    return look_at(
+        rng.uniform(*azimuths), rng.uniform(*elevations), rng.uniform(*distances), middle
+    )
 
 
 def _things(
@@ -224,7 +276,9 @@ def _things(
         except BadArgument:
             count = max(1, count - 1)
             continue
-        return names, [mesh.apply_transform(pose.numpy()) for mesh, pose in zip(meshes, poses, strict=True)]
+        return names, [
+            mesh.apply_transform(pose.numpy()) for mesh, pose in zip(meshes, poses, strict=True)
+        ]
 
 
 def _brick(rng: np.random.Generator) -> trimesh.Trimesh:
@@ -233,7 +287,8 @@ def _brick(rng: np.random.Generator) -> trimesh.Trimesh:
 
 
 def _tin(rng: np.random.Generator) -> trimesh.Trimesh:
-    radius, high = rng.uniform(0.025, 0.045), rng.uniform(0.05, 0.14)
+    radius = rng.uniform(0.025, 0.045)
+    high = rng.uniform(0.05, 0.14)
     return trimesh.creation.cylinder(radius, high, sections=48).apply_translation([0, 0, high / 2])
 
 
@@ -244,18 +299,33 @@ def _ball(rng: np.random.Generator) -> trimesh.Trimesh:
 
 def _vessel(bottom: float, top: float, high: float, wall: float = 0.004) -> trimesh.Trimesh:
     """Return an open vessel with straight sides; its inside is seen from above."""
-    profile = [[0, 0], [bottom, 0], [top, high], [top - wall, high], [bottom - wall, wall], [0, wall]]
+    profile = [
+        [0, 0],
+        [bottom, 0],
+        [top, high],
+        [top - wall, high],
+        [bottom - wall, wall],
+        [0, wall],
+    ]
     return trimesh.creation.revolve(np.array(profile), sections=64)
 
 
 def _mug(rng: np.random.Generator) -> trimesh.Trimesh:
-    radius, high = rng.uniform(0.035, 0.045), rng.uniform(0.08, 0.11)
+    radius = rng.uniform(0.035, 0.045)
+    high = rng.uniform(0.08, 0.11)
     handle = trimesh.creation.torus(0.5 * high - 0.01, 0.006).apply_transform(
-        rigid(rotation_from_vector(torch.tensor([math.pi / 2, 0.0, 0.0]).double()), torch.zeros(3).double()).numpy()
+        rigid(
+            rotation_from_vector(torch.tensor([math.pi / 2, 0.0, 0.0]).double()),
+            torch.zeros(3).double(),
+        ).numpy()
     )
-    handle = handle.slice_plane([0, 0, 0], [1, 0, 0]).apply_translation([radius - 0.003, 0, high / 2])
+    handle = handle.slice_plane([0, 0, 0], [1, 0, 0]).apply_translation(
+        [radius - 0.003, 0, high / 2]
+    )
     mug = _join(_vessel(radius, radius, high), handle)
-    return mug.apply_transform(trimesh.transformations.rotation_matrix(rng.uniform(0, 2 * math.pi), [0, 0, 1]))
+    return mug.apply_transform(
+        trimesh.transformations.rotation_matrix(rng.uniform(0, 2 * math.pi), [0, 0, 1])
+    )
 
 
 def _bowl(rng: np.random.Generator) -> trimesh.Trimesh:
@@ -269,8 +339,16 @@ def _glass(rng: np.random.Generator) -> trimesh.Trimesh:
 
 
 def _bottle(rng: np.random.Generator) -> trimesh.Trimesh:
-    radius, high = rng.uniform(0.03, 0.042), rng.uniform(0.16, 0.24)
-    profile = [[0, 0], [radius, 0], [radius, 0.6 * high], [0.013, 0.8 * high], [0.013, high], [0, high]]
+    radius = rng.uniform(0.03, 0.042)
+    high = rng.uniform(0.16, 0.24)
+    profile = [
+        [0, 0],
+        [radius, 0],
+        [radius, 0.6 * high],
+        [0.013, 0.8 * high],
+        [0.013, high],
+        [0, high],
+    ]
     return trimesh.creation.revolve(np.array(profile), sections=48)
 
 
@@ -280,7 +358,8 @@ def _ring(rng: np.random.Generator) -> trimesh.Trimesh:
 
 
 def _bridge(rng: np.random.Generator) -> trimesh.Trimesh:
-    span, high = rng.uniform(0.07, 0.1), rng.uniform(0.06, 0.09)
+    span = rng.uniform(0.07, 0.1)
+    high = rng.uniform(0.06, 0.09)
     legs = [_box([0.02, 0.04, high], [x * span / 2, 0, high / 2]) for x in (-1, 1)]
     return _join(*legs, _box([span + 0.02, 0.04, 0.02], [0, 0, high - 0.01]))
 

@@ -1,4 +1,6 @@
-"""Segmentation of rendered things: a lone vessel, handle or ring is one object, two things apart are two."""
+"""Segmentation of rendered things: a lone vessel, handle or ring is one object, two things apart
+are two.
+"""
 
 import math
 
@@ -21,7 +23,9 @@ LONE = ("cup", "bowl", "mug", "ring", "standing ring")
 
 def make(kind: str, rng: np.random.Generator) -> trimesh.Trimesh:
     """Return a random vessel, ring, box or cylinder [m] that stands on z = 0."""
-    wall, radius, height = rng.uniform(0.002, 0.005), rng.uniform(0.03, 0.06), rng.uniform(0.05, 0.12)
+    wall = rng.uniform(0.002, 0.005)
+    radius = rng.uniform(0.03, 0.06)
+    height = rng.uniform(0.05, 0.12)
     if kind == "box":
         mesh = trimesh.creation.box(rng.uniform(0.03, 0.12, 3))
     elif kind == "cylinder":
@@ -42,8 +46,12 @@ def make(kind: str, rng: np.random.Generator) -> trimesh.Trimesh:
             handle = trimesh.creation.torus(0.28 * height, rng.uniform(0.003, 0.006))
             handle.apply_transform(trimesh.transformations.rotation_matrix(math.pi / 2, [1, 0, 0]))
             handle = handle.apply_translation([0.9 * radius, 0, height / 2])
-            mesh = trimesh.util.concatenate([mesh, handle.slice_plane([0.85 * radius, 0, 0], [1, 0, 0])])
-    mesh.apply_transform(trimesh.transformations.rotation_matrix(rng.uniform(0, 2 * math.pi), [0, 0, 1]))
+            mesh = trimesh.util.concatenate(
+                [mesh, handle.slice_plane([0.85 * radius, 0, 0], [1, 0, 0])]
+            )
+    mesh.apply_transform(
+        trimesh.transformations.rotation_matrix(rng.uniform(0, 2 * math.pi), [0, 0, 1])
+    )
     return mesh.apply_translation([0, 0, -mesh.bounds[0, 2]])
 
 
@@ -54,7 +62,8 @@ def pair(rng: np.random.Generator, azimuth: float) -> list[trimesh.Trimesh]:
     behind = math.radians(azimuth) + math.pi + rng.uniform(-0.5, 0.5)
     angle = behind if rng.uniform() < 0.5 else rng.uniform(0, 2 * math.pi)
     direction = np.array([math.cos(angle), math.sin(angle), 0.0])
-    gap, corners = rng.uniform(0.015, 0.04), [mesh.convex_hull.sample(800, seed=0) for mesh in (first, second)]
+    gap = rng.uniform(0.015, 0.04)
+    corners = [mesh.convex_hull.sample(800, seed=0) for mesh in (first, second)]
     from scipy.spatial import KDTree
 
     tree = KDTree(corners[0][:, :2])
@@ -66,8 +75,11 @@ def pair(rng: np.random.Generator, azimuth: float) -> list[trimesh.Trimesh]:
 
 
 def agrees(image: DepthImage, labels: Int[Tensor, "h w"]) -> bool:
-    """Return whether each thing of at least 300 seen pixels has a label of its own, and there is no other label."""
-    found, true = segment(image, SupportPlane(Plane.horizontal(0.0))), torch.where(image.depth > 0, labels, 0)
+    """Return whether each thing of at least 300 seen pixels has a label of its own, and there is no
+    other label.
+    """
+    found = segment(image, SupportPlane(Plane.horizontal(0.0)))
+    true = torch.where(image.depth > 0, labels, 0)
     mine: list[int] = []
     for k in range(1, int(true.max()) + 1):
         own = found[(true == k) & (found > 0)]
@@ -81,7 +93,9 @@ def agrees(image: DepthImage, labels: Int[Tensor, "h w"]) -> bool:
 
 def scene(kind: str, rng: np.random.Generator) -> tuple[DepthImage, Int[Tensor, "h w"]]:
     """Return a noisy image of a random thing, or of a pair, on the table, and the true labels."""
-    azimuth, elevation, distance = rng.uniform(0, 360), rng.uniform(15, 70), rng.uniform(0.5, 0.9)
+    azimuth = rng.uniform(0, 360)
+    elevation = rng.uniform(15, 70)
+    distance = rng.uniform(0.5, 0.9)
     meshes = pair(rng, azimuth) if kind == "pair" else [make(kind, rng)]
     middle = torch.from_numpy(trimesh.util.concatenate(meshes).bounds.mean(0))
     pose = look_at(azimuth, elevation, distance, middle)
@@ -99,6 +113,10 @@ def whole(o: Options) -> list[Row]:
     ):
         total = o.times(count)
         steps = tqdm(range(total), desc=name, disable=None, leave=False)
-        right = sum(agrees(*scene(kinds[k % len(kinds)], np.random.default_rng((o.seed, k)))) for k in steps)
-        rows.append(Row(name, f"{bar:.0%}", f"{right} of {total}", right >= bar * total, {"right": right}))
+        right = sum(
+            agrees(*scene(kinds[k % len(kinds)], np.random.default_rng((o.seed, k)))) for k in steps
+        )
+        rows.append(
+            Row(name, f"{bar:.0%}", f"{right} of {total}", right >= bar * total, {"right": right})
+        )
     return rows

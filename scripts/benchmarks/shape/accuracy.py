@@ -30,13 +30,18 @@ RESOLUTION = 56
 """Cells of the grid of the estimated surface along the domain's diameter."""
 SAMPLES = 3000
 """Points on the true and on the estimated surface."""
-EDGE_RADIUS, EDGE_ANGLES = 0.008, (25.0, 120.0)
-"""At an edge normals within 8 mm differ by 25 to 120 degrees; by more they are of two sides of a wall."""
+EDGE_RADIUS = 0.008
+EDGE_ANGLES = (25.0, 120.0)
+"""At an edge normals within 8 mm differ by 25 to 120 degrees; by more they are of two sides of a
+wall.
+"""
 TABLE_FACE = 0.002
 """Height [m] over the lowest point within which downward surface is the face on the table."""
 
 Row = dict[str, Any]
-"""Numbers by name: lengths in mm, angles in degrees, shares in [0, 1], NaN where nothing was measured."""
+"""Numbers by name: lengths in mm, angles in degrees, shares in [0, 1], NaN where nothing was
+measured.
+"""
 
 
 def measure_accuracy(objects: Path, camera: bool = True, table: bool = True) -> list[Row]:
@@ -51,7 +56,8 @@ def measure_accuracy(objects: Path, camera: bool = True, table: bool = True) -> 
         BadArgument: no manifest, or no object to measure.
     """
     return [
-        {"object": name, "view": view} | measure_shape(fit_shape(cloud, table=0.0 if table else None), mesh, cloud)
+        {"object": name, "view": view}
+        | measure_shape(fit_shape(cloud, table=0.0 if table else None), mesh, cloud)
         for name, view, cloud, mesh in read_views(objects, camera)
     ]
 
@@ -69,12 +75,15 @@ def measure_shape(shape: ShapeGP, mesh: "trimesh.Trimesh", cloud: PointCloud, se
 
     * "median_mm", "p90_mm": distance between true and estimated surface.
     * "normal_deg": median angle between their normals.
-    * "flat_deg", "edge_deg": the same off and at edges, where true normals within 8 mm differ by over 25 degrees.
-    * "within_1", "_2", "_3": share of the true surface within k std_m. Surface outside the domain is missed.
+    * "flat_deg", "edge_deg": the same off and at edges, where true normals within 8 mm differ by
+      over 25 degrees.
+    * "within_1", "_2", "_3": share of the true surface within k std_m. Surface outside the domain
+      is missed.
     * "raw_1", "_2", "_3": the same with the paper's own deviation, sqrt(variance).
     * "share": share of the estimated surface that is sure.
 
-    "chamfer_mm" is the mean distance from each whole surface to the other, averaged over the two (L1).
+    "chamfer_mm" is the mean distance from each whole surface to the other, averaged over the two
+    (L1).
 
     Args:
         shape: the posterior [m].
@@ -82,14 +91,21 @@ def measure_shape(shape: ShapeGP, mesh: "trimesh.Trimesh", cloud: PointCloud, se
         cloud: what the camera saw, before cleaning.
         seed: of the samples.
     """
-    generator, surface = np.random.default_rng(seed), extract_surface(shape, RESOLUTION).mesh()
+    generator = np.random.default_rng(seed)
+    surface = extract_surface(shape, RESOLUTION).mesh()
     points, normals = sample_mesh(mesh, SAMPLES, generator)
     ours, _ = sample_mesh(surface, SAMPLES, generator)
     ways = ((surface, points), (mesh, ours))
     chamfer = sum(float((nearest_on_mesh(m, p)[0] - p).norm(dim=-1).mean()) for m, p in ways) / 2
     face_on_table = (points[:, 2] < float(mesh.bounds[0, 2]) + TABLE_FACE) & (normals[:, 2] < -0.7)
-    row = _measure_true_surface(shape, surface, points[~face_on_table], normals[~face_on_table], cloud)
-    return row | {"chamfer_mm": 1e3 * chamfer} | _measure_sure_surface(shape, ours[shape.contains(ours)], mesh)
+    row = _measure_true_surface(
+        shape, surface, points[~face_on_table], normals[~face_on_table], cloud
+    )
+    return (
+        row
+        | {"chamfer_mm": 1e3 * chamfer}
+        | _measure_sure_surface(shape, ours[shape.contains(ours)], mesh)
+    )
 
 
 def _measure_true_surface(
@@ -99,11 +115,14 @@ def _measure_true_surface(
     normals: Float[Tensor, "n 3"],
     cloud: PointCloud,
 ) -> Row:
-    """Return the numbers of the seen and of the hidden part of the true surface, given by points and normals."""
+    """Return the numbers of the seen and of the hidden part of the true surface, given by points
+    and normals.
+    """
     from scipy.spatial import KDTree
 
     far = torch.from_numpy(KDTree(cloud.points.numpy()).query(points.numpy())[0]) > HIDDEN
-    edge, (feet, _) = find_edges(points, normals), nearest_on_mesh(surface, points)
+    edge = find_edges(points, normals)
+    (feet, _) = nearest_on_mesh(surface, points)
     error = torch.linalg.vector_norm(feet - points, dim=-1)
     # The surface may reach a little over the domain, where `predict` knows the prior alone.
     angle = _angle(unit(shape.jet(shape.normalise(feet)).gradient), normals)
@@ -114,7 +133,10 @@ def _measure_true_surface(
     ratio[inside] = estimate.distance.abs() / (shape.std_factor * estimate.variance.sqrt())
     row: Row = {}
     for name, where in (("seen", ~far), ("hidden", far)):
-        row |= {f"{name}_{key}": 1e3 * _quantile(error[where], q) for key, q in (("median_mm", 0.5), ("p90_mm", 0.9))}
+        row |= {
+            f"{name}_{key}": 1e3 * _quantile(error[where], q)
+            for key, q in (("median_mm", 0.5), ("p90_mm", 0.9))
+        }
         parts = {"normal_deg": where, "flat_deg": where & ~edge, "edge_deg": where & edge}
         row |= {f"{name}_{key}": _quantile(angle[part], 0.5) for key, part in parts.items()}
         row |= {f"{name}_within_{k}": _share(ratio[where] <= k) for k in (1, 2, 3)}
@@ -122,8 +144,12 @@ def _measure_true_surface(
     return row
 
 
-def _measure_sure_surface(shape: ShapeGP, points: Float[Tensor, "n 3"], mesh: "trimesh.Trimesh") -> Row:
-    """Return the numbers of the part of the estimated surface that is sure, given points of all of it."""
+def _measure_sure_surface(
+    shape: ShapeGP, points: Float[Tensor, "n 3"], mesh: "trimesh.Trimesh"
+) -> Row:
+    """Return the numbers of the part of the estimated surface that is sure, given points of all of
+    it.
+    """
     estimate = shape.predict(points)
     sure = estimate.variance < SURE_VARIANCE
     feet, true_normal = nearest_on_mesh(mesh, points[sure])
@@ -136,7 +162,9 @@ def _measure_sure_surface(shape: ShapeGP, points: Float[Tensor, "n 3"], mesh: "t
 def format_table(rows: Sequence[Row]) -> str:
     """Return rows of `measure_accuracy` as a table with means."""
     within = ("hidden 1 2 3 sd", "seen 1 2 3 sd", "paper's 1 2 3 sd")
-    table: list[tuple[str, ...]] = [("object", "view", "seen mm", "hidden mm  deg", *within, "sure mm  deg")]
+    table: list[tuple[str, ...]] = [
+        ("object", "view", "seen mm", "hidden mm  deg", *within, "sure mm  deg")
+    ]
 
     def line(name: str, view: str, r: Row) -> tuple[str, ...]:
         return (
@@ -144,7 +172,10 @@ def format_table(rows: Sequence[Row]) -> str:
             view,
             f"{r['seen_median_mm']:.1f}/{r['seen_p90_mm']:.1f}",
             f"{r['hidden_median_mm']:.1f}/{r['hidden_p90_mm']:.1f}  {r['hidden_normal_deg']:.0f}",
-            *(" ".join(f"{r[f'{kind}_{k}']:.2f}" for k in (1, 2, 3)) for kind in ("hidden_within", "seen_within")),
+            *(
+                " ".join(f"{r[f'{kind}_{k}']:.2f}" for k in (1, 2, 3))
+                for kind in ("hidden_within", "seen_within")
+            ),
             " ".join(f"{r[f'hidden_raw_{k}']:.2f}" for k in (1, 2, 3)),
             f"{r['sure_median_mm']:.1f}  {r['sure_normal_deg']:.0f}",
         )
@@ -180,7 +211,9 @@ def format_groups(rows: Sequence[Row]) -> str:
         for key, digits in columns.values():
             scale = 100 if "within" in key else 1
             found = mean_over((str(row["family"]), scale * row[key]) for row in mine)
-            cells.append(f"{found.value:.{digits}f} [{found.low:.{digits}f}, {found.high:.{digits}f}]")
+            cells.append(
+                f"{found.value:.{digits}f} [{found.low:.{digits}f}, {found.high:.{digits}f}]"
+            )
         table.append((group or "-", str(len(mine)), *cells))
     return format_columns(table, left=(0,))
 
@@ -189,12 +222,18 @@ def mean_row(rows: Sequence[Row]) -> Row:
     """Return the mean of every number of the first row over the rows that measured it."""
     numbers = [key for key, value in rows[0].items() if isinstance(value, float)]
     table = {key: np.array([row.get(key, np.nan) for row in rows]) for key in numbers}
-    return {key: float(v[np.isfinite(v)].mean()) if np.isfinite(v).any() else float("nan") for key, v in table.items()}
+    return {
+        key: float(v[np.isfinite(v)].mean()) if np.isfinite(v).any() else float("nan")
+        for key, v in table.items()
+    }
 
 
 def find_edges(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
-    """Tell at which samples of a surface others nearby are turned away, but not to the other side of a wall."""
-    close, angle = torch.cdist(points, points) < EDGE_RADIUS, normals @ normals.T
+    """Tell at which samples of a surface others nearby are turned away, but not to the other side
+    of a wall.
+    """
+    close = torch.cdist(points, points) < EDGE_RADIUS
+    angle = normals @ normals.T
     low, high = (math.cos(math.radians(degrees)) for degrees in EDGE_ANGLES)
     return (close & (angle < low) & (angle > high)).any(-1)
 

@@ -20,14 +20,21 @@ from torchgrasp.shape.fit import fit_shape
 
 @bench("shape/objects", objects=True)
 def objects(o: Options) -> list[Row]:
-    """Measure surface, coverage, closure and time of the fit on noisy views of a folder, the table given."""
-    objects, only = o.objects[0], o.views
-    views, papers = _measure(objects, only, "camera"), _measure(objects, only, "paper")
+    """Measure surface, coverage, closure and time of the fit on noisy views of a folder, the table
+    given.
+    """
+    objects = o.objects[0]
+    only = o.views
+    views = _measure(objects, only, "camera")
+    papers = _measure(objects, only, "paper")
     seconds = _time_fits(objects, only)
     print(format_table(views), format_groups(views), sep="\n")
-    ours, paper = mean_row(views), mean_row(papers)
-    middle, least = statistics.median(seconds), min(view["hidden_within_2"] for view in views)
-    one, two = ours["hidden_within_1"], ours["hidden_within_2"]
+    ours = mean_row(views)
+    paper = mean_row(papers)
+    middle = statistics.median(seconds)
+    least = min(view["hidden_within_2"] for view in views)
+    one = ours["hidden_within_1"]
+    two = ours["hidden_within_2"]
     return [
         _mean_errors(ours, paper, len(views)),
         *_walls(views),
@@ -60,11 +67,17 @@ def objects(o: Options) -> list[Row]:
 def _measure(objects: Path, only: Sequence[str], support: Literal["camera", "paper"]) -> list[View]:
     """Return errors, and coverage of every view, with its object's family and group."""
     views = []
-    for name, view, cloud, mesh in tqdm(list(read_views(objects, views=only)), desc=support, disable=None, leave=False):
+    for name, view, cloud, mesh in tqdm(
+        list(read_views(objects, views=only)), desc=support, disable=None, leave=False
+    ):
         found = fit_shape(cloud, support=support, table=0.0)
         entry = read_entry(objects, name)
         told = {"object": name, "view": view, "family": entry.family, "group": entry.group}
-        walls = measure_walls(found, mesh, cloud) if told["group"] == "shell" and support == "camera" else {}
+        walls = (
+            measure_walls(found, mesh, cloud)
+            if told["group"] == "shell" and support == "camera"
+            else {}
+        )
         views.append(told | measure_shape(found, mesh, cloud) | walls)
     return views
 
@@ -101,9 +114,14 @@ def _time_fits(objects: Path, only: Sequence[str]) -> list[float]:
 
 
 def _mean_errors(ours: View, paper: View, views: int) -> Row:
-    """Return the row of the hidden surface's error, mean over views, with the paper's points beside it."""
+    """Return the row of the hidden surface's error, mean over views, with the paper's points beside
+    it.
+    """
     keys = ("hidden_median_mm", "hidden_p90_mm", "hidden_normal_deg")
-    text = ["{:.1f} / {:.1f} mm, {:.1f} degrees".format(*(r[key] for key in keys)) for r in (ours, paper)]
+    text = [
+        "{:.1f} / {:.1f} mm, {:.1f} degrees".format(*(r[key] for key in keys))
+        for r in (ours, paper)
+    ]
     return Row(
         f"hidden surface, {views} noisy views, true -> GP median / p90 and normals",
         "<= 2.6 / 13.3 mm, <= 15 degrees",

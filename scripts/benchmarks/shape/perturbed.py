@@ -1,4 +1,6 @@
-"""What a shape loses by what a robot does not know: each error of its calibration and its camera, and all together."""
+"""What a shape loses by what a robot does not know: each error of its calibration and its camera,
+and all together.
+"""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -33,7 +35,8 @@ def weaker(o: Options) -> list[Row]:
 
 
 def bench_weaker(objects: Path, views: tuple[str, ...], seed: int) -> list[Row]:
-    """Return a row for each group and factor: the hidden surface's errors, and their change over nothing wrong.
+    """Return a row for each group and factor: the hidden surface's errors, and their change over
+    nothing wrong.
 
     The truth stays where it is, so an error of the camera's pose counts as an error of the surface.
     """
@@ -49,7 +52,9 @@ def bench_weaker(objects: Path, views: tuple[str, ...], seed: int) -> list[Row]:
 def _measure(objects: Path, views: tuple[str, ...], factor: str, seed: int) -> Iterator[View]:
     """Yield the errors of every view with one factor wrong, with its object, family and group."""
     perturbation = find_perturbation(factor)
-    for name, view, cloud, mesh in tqdm(list(read_views(objects, views=views)), desc=factor, disable=None, leave=False):
+    for name, view, cloud, mesh in tqdm(
+        list(read_views(objects, views=views)), desc=factor, disable=None, leave=False
+    ):
         seen, table = perturb_view(cloud, perturbation, seed_of(seed, name, view))
         entry = read_entry(objects, name)
         told = {"object": name, "family": entry.family, "group": entry.group}
@@ -63,11 +68,18 @@ def _of(found: list[View], group: str) -> list[View]:
 
 def _row(what: str, found: list[View], clean: list[View]) -> Row:
     """Return means over views, and their changes with intervals over families."""
-    cells, numbers = [], {}
+    cells = []
+    numbers = {}
     for key, (name, factor, form) in COLUMNS.items():
         mean = mean_over((str(view["family"]), factor * view[key]) for view in found)
         pairs = zip(found, clean, strict=True)
-        change = mean_over((str(view["family"]), factor * (view[key] - before[key])) for view, before in pairs)
-        cells.append(f"{name} {form.format(mean.value)} ({change.value:+.1f} [{change.low:+.1f}, {change.high:+.1f}])")
+        change = mean_over(
+            (str(view["family"]), factor * (view[key] - before[key])) for view, before in pairs
+        )
+        cells.append(
+            f"{name} {form.format(mean.value)} ({change.value:+.1f} [{change.low:+.1f}, {change.high:+.1f}])"
+        )
         numbers[key] = {"mean": mean.value, "change": list(change[:3])}
-    return Row(f"hidden surface of {len(found)} views, {what}", "-", "; ".join(cells), None, numbers)
+    return Row(
+        f"hidden surface of {len(found)} views, {what}", "-", "; ".join(cells), None, numbers
+    )

@@ -41,14 +41,19 @@ def assert_same_links(hand, published, above=""):
     """Compare the poses of all links that both have with yourdfpy's of the published file."""
     robot = yourdfpy.URDF.load(str(published), load_meshes=False)
     joints = random_joints(hand, 20)
-    poses, every = hand.link_poses(joints), hand.expand(joints)
+    poses = hand.link_poses(joints)
+    every = hand.expand(joints)
     shared = [name for name in hand.tree.link_names if name in robot.link_map]
     assert len(shared) > 9
     for row in range(len(joints)):
-        robot.update_cfg([float(every[n][row]) if n in every else 0.0 for n in robot.actuated_joint_names])
+        robot.update_cfg(
+            [float(every[n][row]) if n in every else 0.0 for n in robot.actuated_joint_names]
+        )
         for name in shared:
             truth = robot.get_transform(name, above or robot.base_link)
-            np.testing.assert_allclose(poses[row, hand.tree.link_names.index(name)], truth, atol=1e-9)
+            np.testing.assert_allclose(
+                poses[row, hand.tree.link_names.index(name)], truth, atol=1e-9
+            )
 
 
 def mesh_claw(claw, name="package://claw/meshes/{}.stl"):
@@ -83,12 +88,18 @@ def test_a_mesh_that_ends_a_finger_gets_a_ball_on_its_surface(claw):
     """The tip is a bar of 16 x 14 x 40 mm with a round end, in the frame of its last joint."""
     bar = trimesh.util.concatenate(
         [
-            trimesh.creation.box((0.014, 0.016, 0.033), trimesh.transformations.translation_matrix((0, 0, 0.0165))),
+            trimesh.creation.box(
+                (0.014, 0.016, 0.033), trimesh.transformations.translation_matrix((0, 0, 0.0165))
+            ),
             trimesh.creation.icosphere(4, 0.007).apply_translation((0, 0, 0.033)),
         ]
     )
     bar.export(claw.parent / "far.obj")
-    change(claw, ('<box size="0.014 0.018 0.04"/>', '<mesh filename="far.obj"/>'), ('xyz="0 0 0.022"', 'xyz="0 0 0"'))
+    change(
+        claw,
+        ('<box size="0.014 0.018 0.04"/>', '<mesh filename="far.obj"/>'),
+        ('xyz="0 0 0.022"', 'xyz="0 0 0"'),
+    )
     text = claw.read_text()
     for name in ("left", "right", "thumb"):  # no link of its own for the tip
         start = text.index(f'<joint name="{name}_end"')
@@ -113,15 +124,21 @@ def within(points, boxes):
     inside = np.zeros(len(points), dtype=bool)
     for shape in boxes:
         pose = trimesh.transformations.compose_matrix(angles=shape.rpy, translate=shape.xyz)
-        inside |= (np.abs((points - pose[:3, 3]) @ pose[:3, :3]) <= np.array(shape.size) / 2 + 1e-5).all(1)
+        inside |= (
+            np.abs((points - pose[:3, 3]) @ pose[:3, :3]) <= np.array(shape.size) / 2 + 1e-5
+        ).all(1)
     return inside
 
 
 def test_fitted_boxes_hold_all_points_and_little_else():
     """An L of two bars, 20 x 20 x 100 mm: one box would have twice its volume."""
     bars = [
-        trimesh.creation.box((0.02, 0.02, 0.1), trimesh.transformations.translation_matrix((0, 0, 0.05))),
-        trimesh.creation.box((0.1, 0.02, 0.02), trimesh.transformations.translation_matrix((0.06, 0, 0.01))),
+        trimesh.creation.box(
+            (0.02, 0.02, 0.1), trimesh.transformations.translation_matrix((0, 0, 0.05))
+        ),
+        trimesh.creation.box(
+            (0.1, 0.02, 0.02), trimesh.transformations.translation_matrix((0.06, 0, 0.01))
+        ),
     ]
     points = np.concatenate([trimesh.sample.sample_surface(bar, 4000, seed=0)[0] for bar in bars])
     shapes = fit_shapes(points)
@@ -136,15 +153,23 @@ def test_fitted_boxes_hold_all_points_and_little_else():
 
 @pytest.mark.parametrize("thickness", [0.0, 1e-8, 1e-6, 1e-4])
 def test_flat_bodies_in_any_pose_are_covered(thickness):
-    turn = trimesh.transformations.random_rotation_matrix(np.random.default_rng(1).random(3))[:3, :3]
+    turn = trimesh.transformations.random_rotation_matrix(np.random.default_rng(1).random(3))[
+        :3, :3
+    ]
     points = np.random.default_rng(0).uniform(-1, 1, (2000, 3)) * [0.02, 0.03, thickness] @ turn.T
     assert within(points, fit_shapes(points)).all()
 
 
 def test_frames_wrist_and_masses(claw):
-    """A frame above, one below, one in between, an inertia of no body, no mass: the same hand, in the root's frame."""
+    """A frame above, one below, one in between, an inertia of no body, no mass: the same hand, in
+    the root's frame.
+    """
     limit = '<limit lower="-1" upper="1" effort="1" velocity="1"/>'
-    text = claw.read_text().replace('<mass value="0.04"/>', '<mass value="0"/>').replace('ixx="0.0003"', 'ixx="9"')
+    text = (
+        claw.read_text()
+        .replace('<mass value="0.04"/>', '<mass value="0"/>')
+        .replace('ixx="0.0003"', 'ixx="9"')
+    )
     frames = (
         '<link name="world"/><link name="flange"/><link name="eye"/>'
         '<joint name="w" type="fixed"><parent link="world"/><child link="flange"/>'
@@ -183,7 +208,10 @@ def test_followers_limits_and_drives(claw):
     """A chain of followers, a limit passed by rounding, joints without limits or drives."""
     change(
         claw,
-        ('<mimic joint="right_bend" multiplier="-0.7" offset="0.1"/>', '<mimic joint="left_follow" multiplier="2"/>'),
+        (
+            '<mimic joint="right_bend" multiplier="-0.7" offset="0.1"/>',
+            '<mimic joint="left_follow" multiplier="2"/>',
+        ),
         ('lower="-0.9" upper="0.5"', 'lower="-0.80997" upper="2.5"'),
         ('name="thumb_swivel" type="revolute"', 'name="thumb_swivel" type="continuous"'),
         ('effort="1.5"', 'effort="0"'),
@@ -192,7 +220,12 @@ def test_followers_limits_and_drives(claw):
     start = text.index('name="right_follow"')
     claw.write_text(text[:start] + text[start:].replace('lower="-0.80997"', 'lower="-2"', 1))
     hand, told = made(claw)
-    for words in ("follows a follower", "left_bend is limited to [-0.5, 1.29996", "thumb_swivel", "without effort"):
+    for words in (
+        "follows a follower",
+        "left_bend is limited to [-0.5, 1.29996",
+        "thumb_swivel",
+        "without effort",
+    ):
         assert words in told, words
     joints = random_joints(hand, 5)
     every = hand.expand(joints)
@@ -201,16 +234,24 @@ def test_followers_limits_and_drives(claw):
 
 
 def test_a_joint_may_follow_one_of_another_finger(claw):
-    """A fourth finger's swivel turns the left finger, too: it moves, though its own finger is parked."""
+    """A fourth finger's swivel turns the left finger, too: it moves, though its own finger is
+    parked.
+    """
     start = claw.read_text().index('<link name="left_root">')
     text = claw.read_text()
     left = text[start : text.index('<link name="right_root">')]
-    ring = left.replace("left_", "ring_").replace('xyz="-0.045 -0.03 0.015"', 'xyz="-0.045 -0.09 0.015"')
+    ring = left.replace("left_", "ring_").replace(
+        'xyz="-0.045 -0.03 0.015"', 'xyz="-0.045 -0.09 0.015"'
+    )
     text = text.replace(END, ring + END)
     old = '<joint name="left_swivel" type="revolute">'
-    claw.write_text(text.replace(old, old + '<mimic joint="ring_swivel" multiplier="-1" offset="0"/>'))
+    claw.write_text(
+        text.replace(old, old + '<mimic joint="ring_swivel" multiplier="-1" offset="0"/>')
+    )
     (claw.parent / "hand.toml").write_text(
-        new_hand(claw, Wish(tips=("left_tip", "right_tip", "thumb_tip", "ring_tip")), file="claw.urdf").toml
+        new_hand(
+            claw, Wish(tips=("left_tip", "right_tip", "thumb_tip", "ring_tip")), file="claw.urdf"
+        ).toml
     )
     hand = check_hand(claw.parent)
     assert "ring_swivel" in hand.joint_names and "ring_bend" not in hand.joint_names
@@ -225,7 +266,9 @@ def test_fingers_may_slide(claw):
     """A gripper whose fingers slide towards each other."""
     change(claw, ('type="revolute"><parent link="base"', 'type="prismatic"><parent link="base"'))
     change(
-        claw, ('lower="-0.5" upper="0.5"', 'lower="-0.01" upper="0.02"'), ('<axis xyz="0 0 1"/>', '<axis xyz="1 0 0"/>')
+        claw,
+        ('lower="-0.5" upper="0.5"', 'lower="-0.01" upper="0.02"'),
+        ('<axis xyz="0 0 1"/>', '<axis xyz="1 0 0"/>'),
     )
     draft = new_hand(claw)
     (claw.parent / "hand.toml").write_text(draft.toml)
@@ -233,14 +276,32 @@ def test_fingers_may_slide(claw):
 
 
 ELSEWHERE = [
-    "../secret.stl", "/etc/secret.stl", "file:///etc/secret.stl", "http://localhost/x.stl", "package://../secret.stl",
-    "package://claw/../../secret.stl", "a\\..\\x.stl", "x.dae", "none.stl", "package://", "link.stl", "folder.stl",
-]  # fmt: skip
+    "../secret.stl",
+    "/etc/secret.stl",
+    "file:///etc/secret.stl",
+    "http://localhost/x.stl",
+    "package://../secret.stl",
+    "package://claw/../../secret.stl",
+    "a\\..\\x.stl",
+    "x.dae",
+    "none.stl",
+    "package://",
+    "link.stl",
+    "folder.stl",
+]
 WHY = {
-    "none.stl": "missing", "package://claw/none.stl": "missing", "Box.STL": "called box.stl there", "x.fbx": "format",
-    "package://claw/Box.stl": "called box.stl there", "/etc/box.stl": "absolute", "file:///box.stl": "address",
-    "a\\box.stl": "slashes", "../secret.stl": "outside", "link.stl": "symbolic link", "large.stl": "more than 50 MiB",
-}  # fmt: skip
+    "none.stl": "missing",
+    "package://claw/none.stl": "missing",
+    "Box.STL": "called box.stl there",
+    "x.fbx": "format",
+    "package://claw/Box.stl": "called box.stl there",
+    "/etc/box.stl": "absolute",
+    "file:///box.stl": "address",
+    "a\\box.stl": "slashes",
+    "../secret.stl": "outside",
+    "link.stl": "symbolic link",
+    "large.stl": "more than 50 MiB",
+}
 BROKEN = {
     "empty": (b"", "stl"),
     "words": (b"solid x\nhello\n", "stl"),
@@ -248,7 +309,10 @@ BROKEN = {
     "many faces": (b"v 0 0 0\nv 1 0 0\nv 0 1 0\n" + b"f 1 2 3\n" * 500_001, "obj"),
     "not a number": (b"v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "obj"),
     "a missing corner": (b"v 0 0 0\nf 1 2 3\n", "obj"),
-    "many declared": (b"ply\nformat ascii 1.0\nelement vertex 3\nelement face 99999999999\nend_header\n", "ply"),
+    "many declared": (
+        b"ply\nformat ascii 1.0\nelement vertex 3\nelement face 99999999999\nend_header\n",
+        "ply",
+    ),
     "scaled twice": (trimesh.creation.box((1e-4, 1e-4, 1e-4)).export(file_type="stl"), "stl"),
     "in millimetres": (trimesh.creation.box((9000, 9000, 9000)).export(file_type="stl"), "stl"),
 }
@@ -262,7 +326,9 @@ def test_a_mesh_that_is_broken_or_elsewhere_is_refused_by_name(claw, name):
     (claw.parent / "folder.stl").mkdir()
     data, kind = BROKEN.get(name, (b"", ""))
     (claw.parent / f"tip.{kind}").write_bytes(data)
-    change(claw, ('<sphere radius="0.011"/>', f'<mesh filename="{f"tip.{kind}" if kind else name}"/>'))
+    change(
+        claw, ('<sphere radius="0.011"/>', f'<mesh filename="{f"tip.{kind}" if kind else name}"/>')
+    )
     with pytest.raises(HandFileError, match="mesh"):
         new_hand(claw)
 
@@ -288,12 +354,16 @@ def test_too_many_bytes_of_meshes_are_refused(claw, monkeypatch):
 
 def test_what_a_mesh_names_is_not_opened(claw, tmp_path):
     """Materials and textures of an .obj are files of anybody's choice."""
-    tip = "mtllib ../../secret.mtl\nusemtl x\n" + trimesh.creation.icosphere(3, 0.011).export(file_type="obj")
+    tip = "mtllib ../../secret.mtl\nusemtl x\n" + trimesh.creation.icosphere(3, 0.011).export(
+        file_type="obj"
+    )
     (claw.parent / "tip.obj").write_text(tip)
     (tmp_path / "secret.mtl").write_text("newmtl x\nmap_Kd /etc/passwd\n")
     change(claw, ('<sphere radius="0.011"/>', '<mesh filename="tip.obj"/>'))
     opened = []
-    sys.addaudithook(lambda event, arguments: opened.append(str(arguments[0])) if event == "open" else None)
+    sys.addaudithook(
+        lambda event, arguments: opened.append(str(arguments[0])) if event == "open" else None
+    )
     new_hand(claw)
     assert not [path for path in opened if "secret" in path or "passwd" in path]
 
@@ -301,7 +371,9 @@ def test_what_a_mesh_names_is_not_opened(claw, tmp_path):
 def test_a_mimic_in_a_circle_and_too_many_shapes_are_refused(claw):
     good = claw.read_text()
     claw.write_text(
-        good.replace('joint="left_bend"', 'joint="right_follow"').replace('joint="right_bend"', 'joint="left_follow"')
+        good.replace('joint="left_bend"', 'joint="right_follow"').replace(
+            'joint="right_bend"', 'joint="left_follow"'
+        )
     )
     with pytest.raises(HandFileError, match="circle"):
         new_hand(claw)
@@ -312,7 +384,9 @@ def test_a_mimic_in_a_circle_and_too_many_shapes_are_refused(claw):
 
 
 def test_the_clean_copy_reads_as_the_same_values(claw):
-    (claw.parent / "far.stl").write_bytes(trimesh.creation.box((0.014, 0.018, 0.04)).export(file_type="stl"))
+    (claw.parent / "far.stl").write_bytes(
+        trimesh.creation.box((0.014, 0.018, 0.04)).export(file_type="stl")
+    )
     change(claw, ('<box size="0.014 0.018 0.04"/>', '<mesh filename="far.stl"/>'))
     first = new_hand(claw)
     (claw.parent / "hand.urdf").write_text(first.urdf)

@@ -1,4 +1,6 @@
-"""Meshes of hands in .dae and .glb files: their geometry is read as placed and scaled, and nothing else is."""
+"""Meshes of hands in .dae and .glb files: their geometry is read as placed and scaled, and nothing
+else is.
+"""
 
 import importlib.util
 import json
@@ -23,7 +25,8 @@ def scene(kind, size=(16.0, 20.0, 56.0)):
     """A box beside the origin, moved there by a node of the scene."""
     parts = trimesh.Scene()
     parts.add_geometry(
-        trimesh.creation.box(size), transform=trimesh.transformations.translation_matrix((1.0, 2.0, 3.0))
+        trimesh.creation.box(size),
+        transform=trimesh.transformations.translation_matrix((1.0, 2.0, 3.0)),
     )
     return parts.export(file_type=kind)
 
@@ -47,10 +50,16 @@ def test_a_scene_becomes_the_shape_that_it_shows(claw, kind):
     np.testing.assert_allclose(near[0].xyz, (0.001, 0.002, 0.033), atol=1e-6)
 
 
-@pytest.mark.parametrize(("unit", "scale"), [("0.001", "1 1 1"), ("1", "0.001"), ("0.01", "0.1 0.1 0.1")])
+@pytest.mark.parametrize(
+    ("unit", "scale"), [("0.001", "1 1 1"), ("1", "0.001"), ("0.01", "0.1 0.1 0.1")]
+)
 def test_the_unit_of_a_dae_and_one_scale_for_all_axes_count(claw, unit, scale):
     text = re.sub(r'meter="[^"]*"', f'meter="{unit}"', dae())
-    text = text if "<unit" in text else text.replace("</asset>", f'<unit name="u" meter="{unit}"/></asset>')
+    text = (
+        text
+        if "<unit" in text
+        else text.replace("</asset>", f'<unit name="u" meter="{unit}"/></asset>')
+    )
     (claw.parent / "near.dae").write_text(text)
     mesh = f'<mesh filename="near.dae" scale="{scale}"/>'
     change(claw, ('<box size="0.016 0.02 0.056"/>', mesh))
@@ -60,10 +69,14 @@ def test_the_unit_of_a_dae_and_one_scale_for_all_axes_count(claw, unit, scale):
 
 def test_what_a_dae_holds_beside_its_geometry_is_not_read(claw):
     image = "<library_images><image id='i'><init_from>file:///etc/passwd</init_from></image></library_images>"
-    (claw.parent / "near.dae").write_text(dae().replace("<library_geometries>", image + "<library_geometries>"))
+    (claw.parent / "near.dae").write_text(
+        dae().replace("<library_geometries>", image + "<library_geometries>")
+    )
     change(claw, ('<box size="0.016 0.02 0.056"/>', '<mesh filename="near.dae" scale="0.001"/>'))
     opened = []
-    sys.addaudithook(lambda event, arguments: opened.append(str(arguments[0])) if event == "open" else None)
+    sys.addaudithook(
+        lambda event, arguments: opened.append(str(arguments[0])) if event == "open" else None
+    )
     new_hand(claw)
     assert not [path for path in opened if "passwd" in path]
 
@@ -76,7 +89,11 @@ def glb(**changed):
     text = json.dumps(header | {key: make(header) for key, make in changed.items()}).encode()
     text += b" " * (-len(text) % 4)
     rest = data[20 + length :]
-    return struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest
+    return (
+        struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A)
+        + text
+        + rest
+    )
 
 
 @pytest.mark.parametrize(
@@ -85,9 +102,18 @@ def glb(**changed):
         (b"solid", "no header of a .glb"),
         (glb(extensionsRequired=lambda h: ["KHR_draco_mesh_compression"]), "compressed.*draco"),
         (glb(skins=lambda h: [{"joints": [0]}]), "skins"),
-        (glb(accessors=lambda h: [{"count": 9, "type": "VEC3", "componentType": 5126}]), "compressed"),
-        (glb(bufferViews=lambda h: 60 * h["bufferViews"]), "corners"),  # the same bytes again and again
-        (glb(nodes=lambda h: [{"children": [1] * 500_001}, {"mesh": 0}]), "corners"),  # one mesh in many places
+        (
+            glb(accessors=lambda h: [{"count": 9, "type": "VEC3", "componentType": 5126}]),
+            "compressed",
+        ),
+        (
+            glb(bufferViews=lambda h: 60 * h["bufferViews"]),
+            "corners",
+        ),  # the same bytes again and again
+        (
+            glb(nodes=lambda h: [{"children": [1] * 500_001}, {"mesh": 0}]),
+            "corners",
+        ),  # one mesh in many places
     ],
 )
 def test_a_glb_that_needs_more_than_its_bytes_is_told(data, words):
@@ -101,7 +127,11 @@ def test_a_glb_that_needs_more_than_its_bytes_is_told(data, words):
         ("<library_geometries>", "<!DOCTYPE x><library_geometries>", "DOCTYPE"),
         ("<instance_geometry", "<instance_controller/><instance_geometry", "<instance_controller>"),
         ("<instance_geometry", "<instance_node url='#a'/><instance_geometry", "<instance_node>"),
-        ("</library_geometries>", "<geometry/>" * 50_001 + "</library_geometries>", "a larger XML tree"),
+        (
+            "</library_geometries>",
+            "<geometry/>" * 50_001 + "</library_geometries>",
+            "a larger XML tree",
+        ),
     ],
 )
 def test_a_dae_of_more_than_plain_geometry_is_told(old, new, words):
@@ -112,7 +142,9 @@ def test_a_dae_of_more_than_plain_geometry_is_told(old, new, words):
 
 def test_one_geometry_in_too_many_places_is_told():
     text = dae()
-    placed = re.search(r"<instance_geometry.*?</instance_geometry>|<instance_geometry[^>]*/>", text, re.DOTALL)
+    placed = re.search(
+        r"<instance_geometry.*?</instance_geometry>|<instance_geometry[^>]*/>", text, re.DOTALL
+    )
     assert placed is not None
     indices = len(re.search(r"<p>(.*?)</p>", text).group(1).split())  # pyright: ignore[reportOptionalMemberAccess]
     one = re.sub(r"<bind_material>.*</bind_material>", "", placed.group(), flags=re.DOTALL)

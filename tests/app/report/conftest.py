@@ -1,4 +1,6 @@
-"""A run made of simple solids: a box that was seen, three contacts on it, a hand beside it, a closure that lifts it."""
+"""A run made of simple solids: a box that was seen, three contacts on it, a hand beside it, a
+closure that lifts it.
+"""
 
 import math
 from pathlib import Path
@@ -27,7 +29,11 @@ def run() -> Run:
     faces = torch.tensor(body.faces.copy(), dtype=torch.int64)
     surface = Surface(vertices, faces, normals, 0.002 + 0.1 * vertices[:, 0].abs())
     angles = torch.tensor([0.0, 2.0, 4.0], dtype=F64)
-    out = torch.stack([angles.cos(), angles.sin(), torch.zeros(3, dtype=F64)], -1).expand(2, 3, 3).clone()
+    out = (
+        torch.stack([angles.cos(), angles.sin(), torch.zeros(3, dtype=F64)], -1)
+        .expand(2, 3, 3)
+        .clone()
+    )
     small = torch.full((2, 3), 1e-3, dtype=F64)
     contacts = Contacts(0.03 * out, out, std_m=small)
     one = torch.ones(2, dtype=F64)
@@ -36,12 +42,28 @@ def run() -> Run:
     pose[:, 2, 3] = 0.1
     certificate = Certificate(0.02 * one, 0.3 * one, 1e-12 * one, one > 0, torch.zeros(2, 6))
     status = torch.tensor([Status.OK, Status.TIP_ERROR])
-    meta = {"hand": "allegro", "seed": "7", "units": "metre, radian", "note": "<script>alert(1)</script>"}
+    meta = {
+        "hand": "allegro",
+        "seed": "7",
+        "units": "metre, radian",
+        "note": "<script>alert(1)</script>",
+    }
     order = torch.tensor([[0, 1, 2], [2, 1, 0]])
     grasps = Grasps(
-        joints, joints, out[:, 0], pose, contacts, order, small, 0.004 * one, math.pi * small, certificate, one, status,
+        joints,
+        joints,
+        out[:, 0],
+        pose,
+        contacts,
+        order,
+        small,
+        0.004 * one,
+        math.pi * small,
+        certificate,
+        one,
+        status,
         meta,
-    )  # fmt: skip
+    )
     steps = 5
     time = torch.linspace(0, 1, steps, dtype=F64)
     lifted = torch.eye(4, dtype=F64).repeat(steps, 1, 1)
@@ -66,7 +88,10 @@ def run() -> Run:
         slip=ObjectMotion(0.001, 0.0),
         start_overlap=0.0,
         disturbance=Disturbance(
-            torch.full((3,), math.inf), *torch.zeros(2, 3), torch.zeros(3, dtype=torch.bool), lifted[:, None]
+            torch.full((3,), math.inf),
+            *torch.zeros(2, 3),
+            torch.zeros(3, dtype=torch.bool),
+            lifted[:, None],
         ),
         trace=ClosingTrace(
             *torch.zeros(3, steps, 3, 3, dtype=F64),
@@ -84,4 +109,16 @@ def run() -> Run:
     plan = ContactPlan(contacts, torch.ones(2, 3, 8, dtype=F64), one, failed)
     stages = (("cloud", "321 points", 0.1), ("shape", "a <b>bold</b> claim", 1.25))
     source = Path("clouds/<odd> & 'quoted'.ply")
-    return Run("ball", source, cloud, hand, ContactSpec(table=-0.03), surface, grasps, stages, plan, body, closure)
+    return Run(
+        "ball",
+        source,
+        cloud,
+        hand,
+        ContactSpec(table=-0.03),
+        surface,
+        grasps,
+        stages,
+        plan,
+        body,
+        closure,
+    )

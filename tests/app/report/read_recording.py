@@ -1,4 +1,5 @@
-"""Reads a recording as others do: python read_recording.py FILE OUT, in the environment .beside/rerun.
+"""Reads a recording as others do: python read_recording.py FILE OUT, in the environment
+.beside/rerun.
 
 OUT gets, for each entity, the timelines and their values, and the rows of each component, as JSON.
 """
@@ -13,7 +14,8 @@ def read_entities(path: str) -> dict[str, dict[str, list[object]]]:
 
     found: dict[str, dict[str, list[object]]] = {}
     for chunk in RrdReader(path).store().stream():
-        batch, entity = chunk.to_record_batch(), found.setdefault(chunk.entity_path, {})
+        batch = chunk.to_record_batch()
+        entity = found.setdefault(chunk.entity_path, {})
         for name, column in zip(batch.schema.names, batch.columns, strict=True):
             values = column.to_pylist()
             if name in chunk.timeline_names:

@@ -13,7 +13,12 @@ from PIL import Image
 from torchgrasp.app.report.viewer import write_viewer
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
-OPTIONS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-background-networking"]
+OPTIONS = [
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--disable-background-networking",
+]
 PATIENCE = 120_000
 """Longest wait for a picture [ms]: a busy machine draws without a GPU."""
 
@@ -22,7 +27,9 @@ pytestmark = [pytest.mark.browser, pytest.mark.skipif(CHROMIUM is None, reason="
 
 @pytest.fixture(scope="module")
 def path(run, tmp_path_factory):
-    two = dataclasses.replace(run, grasps=run.grasps[torch.tensor([0, 0])], object_name="<b>jug</b>")
+    two = dataclasses.replace(
+        run, grasps=run.grasps[torch.tensor([0, 0])], object_name="<b>jug</b>"
+    )
     two.grasps.obj_from_hand[1, 0, 3] += 0.05
     return write_viewer(tmp_path_factory.mktemp("page") / "view.html", two)
 
@@ -43,8 +50,12 @@ class Visit:
         self.context = browser.new_context(viewport={"width": 780, "height": 520}, offline=True)
         self.page = self.context.new_page()
         self.page.set_default_timeout(PATIENCE)
-        self.said, self.asked = [], []
-        self.page.on("console", lambda message: self.said.append(message.text) if message.type == "error" else None)
+        self.said = []
+        self.asked = []
+        self.page.on(
+            "console",
+            lambda message: self.said.append(message.text) if message.type == "error" else None,
+        )
         self.page.on("pageerror", lambda error: self.said.append(str(error)))
         self.page.on("request", lambda request: self.asked.append(request.url))
         self.page.goto(address)
@@ -54,7 +65,9 @@ class Visit:
         return self.page.evaluate("({ ...document.body.dataset })")
 
     def wait(self, condition):
-        """Wait until an expression is true; playwright's own way would evaluate text in the page, which refuses it."""
+        """Wait until an expression is true; playwright's own way would evaluate text in the page,
+        which refuses it.
+        """
         end = time.monotonic() + PATIENCE / 1000
         while not self.page.evaluate(condition):
             assert time.monotonic() < end, condition
@@ -66,7 +79,9 @@ class Visit:
 
     def until_drawn(self):
         """Wait for the next frame: the page turns within it."""
-        self.page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+        self.page.evaluate(
+            "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
+        )
         return self.picture()
 
     def middle(self):
@@ -104,10 +119,14 @@ def covered(picture):
 
 def test_the_page_is_whole_and_asks_for_nothing_else(visit):
     picture = visit.until_drawn()
-    assert visit.asked[0].startswith("file://") and all(url.startswith(("file://", "data:")) for url in visit.asked)
+    assert visit.asked[0].startswith("file://") and all(
+        url.startswith(("file://", "data:")) for url in visit.asked
+    )
     for name in ("legend", "sigma", "postures", "play", "tick", "plot", "grasps", "home"):
         assert visit.page.locator(f"#{name}").count() == 1
-    assert visit.page.locator("h1").text_content() == "Grasps of the <b>jug</b> with the allegro hand"
+    assert (
+        visit.page.locator("h1").text_content() == "Grasps of the <b>jug</b> with the allegro hand"
+    )
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 200 and covered(picture) > 0.1
 
 
@@ -168,7 +187,10 @@ def test_the_list_is_stepped_through_by_mouse_and_keys(visit):
     visit.page.keyboard.press("ArrowDown")
     assert visit.state()["grasp"] == "2"  # the last
     visit.page.keyboard.press("ArrowUp")
-    assert visit.state()["grasp"] == "1" and visit.page.locator("#grasps tr.on td").first.text_content() == "1"
+    assert (
+        visit.state()["grasp"] == "1"
+        and visit.page.locator("#grasps tr.on td").first.text_content() == "1"
+    )
 
 
 def test_layers_are_switched(visit):
@@ -181,31 +203,37 @@ def test_layers_are_switched(visit):
 
 
 def test_the_chosen_grasp_is_replayed_and_said_to_be_simulated_or_planned(visit):
-    slider, said = visit.page.locator("#tick"), visit.page.locator("#caption")
+    slider = visit.page.locator("#tick")
+    said = visit.page.locator("#caption")
     slider.focus()
     slider.press("End")
     assert (
-        visit.state()["tick"] == "4" and "Grasp 1 of 2, simulated on the true object: the end." in said.text_content()
+        visit.state()["tick"] == "4"
+        and "Grasp 1 of 2, simulated on the true object: the end." in said.text_content()
     )
     visit.page.locator("#grasps tbody tr").nth(1).click()
     low = visit.until_drawn()
     slider.focus()
     slider.press("End")
     assert visit.state()["grasp"] == "2" and visit.state()["tick"] == "110"
-    assert "Grasp 2 of 2, its planned motion: lift. Only grasp 1 was simulated." in said.text_content()
+    assert (
+        "Grasp 2 of 2, its planned motion: lift. Only grasp 1 was simulated." in said.text_content()
+    )
     assert differ(low, visit.until_drawn()) > 0.02
     slider.press("Home")
     assert "its planned motion: approach" in said.text_content()
 
 
 def test_what_is_ticked_is_drawn_and_nothing_else(visit):
-    slider, seen = visit.page.locator("#tick"), set()
+    slider = visit.page.locator("#tick")
+    seen = set()
     for _ in range(2):
         boxes = visit.page.locator("#panel label:visible input[type=checkbox]:checked")
         for name in boxes.evaluate_all("all => all.map((x) => x.parentElement.textContent)"):
             if name == "contacts" and visit.state()["tick"]:
                 continue  # this film has no forces
-            box, first = visit.page.get_by_label(name, exact=True), visit.until_drawn()
+            box = visit.page.get_by_label(name, exact=True)
+            first = visit.until_drawn()
             box.click()
             changed = (np.abs(first - visit.until_drawn()).max(-1) > 10).sum()
             assert changed > 20 and not box.is_checked(), (name, changed)
@@ -213,7 +241,16 @@ def test_what_is_ticked_is_drawn_and_nothing_else(visit):
             box.click()
         slider.focus()
         slider.press("End")
-    assert seen == {"cloud", "surface", "hand", "contacts", "table", "axes", "camera", "true object"}
+    assert seen == {
+        "cloud",
+        "surface",
+        "hand",
+        "contacts",
+        "table",
+        "axes",
+        "camera",
+        "true object",
+    }
     assert not visit.page.get_by_label("shell", exact=True).is_checked()
     visit.page.get_by_label("shell", exact=True).check()
     assert visit.state()["sigma"] == "2"
@@ -239,7 +276,12 @@ def pcd(kind):
     head = (head + f"VIEWPOINT 0 0 0 1 0 0 0\nPOINTS 10\nDATA {kind}\n").encode()
     if kind == "ascii":
         return head + "".join(f"7 {x} {y} {z}\n" for x, y, z in ROWS).encode()
-    return head + np.array([(7, tuple(row)) for row in ROWS], [("rgb", "<u4"), ("point", "<f8", 3)]).tobytes()
+    return (
+        head
+        + np.array(
+            [(7, tuple(row)) for row in ROWS], [("rgb", "<u4"), ("point", "<f8", 3)]
+        ).tobytes()
+    )
 
 
 def test_clouds_of_all_formats_are_opened_and_wrong_ones_are_told(visit):
@@ -252,7 +294,9 @@ def test_clouds_of_all_formats_are_opened_and_wrong_ones_are_told(visit):
         "e.pcd": pcd("binary"),
         "f.xyz": "\n".join(lines).encode(),
         "g.pts": "\n".join(["10", *lines]).encode(),
-        "h.csv": ("x,y,z,r\n" + "\n".join(line.replace(" ", ",") + ",1" for line in lines)).encode(),
+        "h.csv": (
+            "x,y,z,r\n" + "\n".join(line.replace(" ", ",") + ",1" for line in lines)
+        ).encode(),
     }
     heard = visit.page.locator("#heard")
     for name, data in files.items():
@@ -304,7 +348,10 @@ def test_the_replay_moves_by_its_slider_and_plays_to_the_end(visit):
 
 
 def test_the_address_names_a_state_and_what_it_cannot_mean_is_told(browser, path):
-    for state, expected in {"grasp=2": {"grasp": "2"}, "sigma=3&tick=4": {"sigma": "3", "tick": "4"}}.items():
+    for state, expected in {
+        "grasp=2": {"grasp": "2"},
+        "sigma=3&tick=4": {"sigma": "3", "tick": "4"},
+    }.items():
         other = Visit(browser, f"{path.as_uri()}#{state}")
         assert expected.items() <= other.state().items() and other.said == []
         other.context.close()

@@ -1,4 +1,6 @@
-"""A ball in three fingertips that rise: where the film says that it was lost is where it was made to be lost."""
+"""A ball in three fingertips that rise: where the film says that it was lost is where it was made
+to be lost.
+"""
 
 import dataclasses
 import io
@@ -15,14 +17,17 @@ from torchgrasp.app.report.run_data import explain_loss, find_loss, moments_of, 
 from torchgrasp.foundation.errors import Status
 from torchgrasp.values.closing import ClosingTrace
 
-F64, TICKS = torch.float64, 100
+F64 = torch.float64
+TICKS = 100
 NAMES = ("index", "middle", "thumb")
 CENTRE = torch.zeros(3, dtype=F64)
 
 
 @pytest.fixture
 def closing(run):
-    """Touches at 0.2, 0.3 and 0.4 s, pressed at 0.5 s, then a rise of 0.2 m/s with the object, held to the end."""
+    """Touches at 0.2, 0.3 and 0.4 s, pressed at 0.5 s, then a rise of 0.2 m/s with the object, held
+    to the end.
+    """
     rise = 0.2 * (torch.arange(TICKS, dtype=F64) / 100 - 0.5).clamp(min=0.0)
     lifted = torch.eye(4, dtype=F64).repeat(TICKS, 1, 1)
     lifted[:, 2, 3] = rise
@@ -58,10 +63,13 @@ def lost(closing, status, **changes):
 
 def slipping(closing, begin):
     """Leave the object behind from a tick on; the third finger slides, and lets go 20 ticks later."""
-    pose, trace = closing.object_pose.clone(), closing.trace
+    pose = closing.object_pose.clone()
+    trace = closing.trace
     pose[begin:, 2, 3] = pose[begin, 2, 3]
-    sliding, normals = trace.sliding.clone(), trace.normals.clone()
-    sliding[begin:, 2], normals[begin + 20 :] = 0.2, math.nan
+    sliding = trace.sliding.clone()
+    normals = trace.normals.clone()
+    sliding[begin:, 2] = 0.2
+    normals[begin + 20 :] = math.nan
     trace = dataclasses.replace(trace, sliding=sliding, normals=normals)
     return lost(closing, Status.NOT_LIFTED, object_pose=pose, trace=trace)
 
@@ -80,13 +88,17 @@ def test_what_slides_out_is_lost_where_it_has_slipped_too_far(closing):
     out = slipping(closing, 60)
     assert abs(find_loss(out, CENTRE) - 70) <= 1
     why = explain_loss(out, CENTRE, NAMES)
-    assert "while the hand rose: thumb slid first, from 0.60 s on, under 0.3 N across at 1.0 N of normal force" in why
+    assert (
+        "while the hand rose: thumb slid first, from 0.60 s on, under 0.3 N across at 1.0 N of normal force"
+        in why
+    )
     assert [m.name for m in moments_of(out, CENTRE, NAMES)][-2:] == ["lost", "the end"]
 
 
 def test_what_nobody_touches_is_lost_at_the_last_touch(closing):
     normals = closing.trace.normals.clone()
-    normals[63:, 1], normals[66:, 0] = math.nan, math.nan
+    normals[63:, 1] = math.nan
+    normals[66:, 0] = math.nan
     out = lost(closing, Status.DROPPED, trace=dataclasses.replace(closing.trace, normals=normals))
     assert find_loss(out, CENTRE) == 66
     assert "middle let go first, at 0.63 s" in explain_loss(out, CENTRE, NAMES)
@@ -139,10 +151,13 @@ def test_the_film_shows_the_loss_in_its_colour_and_the_object_falling_behind(run
         sand = (tile[..., 0] > tile[..., 2] + 25) & (tile[..., 0] < tile[..., 1] + 45)
         return np.nonzero(sand)[0].max()
 
-    # The camera stands in the world: what is held rises in the picture, and what was lost stays where it is.
+    # The camera stands in the world: what is held rises in the picture, and what was lost stays
+    # where it is.
     assert height(held, 5, 4) < height(held, 5, 3) - 10
     assert abs(height(gone, 6, 5) - height(gone, 6, 4)) < 2
-    assert "index, thumb, middle. The object was held." in describe_film(run.mesh, run.hand, closing)
+    assert "index, thumb, middle. The object was held." in describe_film(
+        run.mesh, run.hand, closing
+    )
     assert "Lost at 0.7" in describe_film(run.mesh, run.hand, out)
     again = describe_film(run.mesh, run.hand, dataclasses.replace(closing, stops=1, attempts=2))
     assert "held. On its way the hand touched something once. The hand closed 2 times." in again
@@ -150,7 +165,8 @@ def test_the_film_shows_the_loss_in_its_colour_and_the_object_falling_behind(run
 
 def test_the_last_of_several_closings_is_a_moment_where_the_law_acts_again(closing):
     blend = torch.full((TICKS, 3), math.nan, dtype=F64)
-    blend[11:30, 0], blend[42:48] = 0.5, 0.5
+    blend[11:30, 0] = 0.5
+    blend[42:48] = 0.5
     trace = dataclasses.replace(closing.trace, blend=blend)
     again = moments_of(dataclasses.replace(closing, trace=trace, attempts=2), CENTRE, NAMES)
     assert [m.tick for m in again if m.name == "closing 2 begins"] == [42]
@@ -160,14 +176,21 @@ def test_the_last_of_several_closings_is_a_moment_where_the_law_acts_again(closi
 
 def test_a_shadow_lies_below_what_throws_it():
     """Straight below a square at a height, the table is dark within its outline alone."""
-    square = np.array([[-0.02, -0.02, 0.1], [0.02, -0.02, 0.1], [0.02, 0.02, 0.1], [-0.02, 0.02, 0.1]])
-    faces, around = np.array([[0, 1, 2], [0, 2, 3]]), np.array([[-0.1, -0.1, 0.0], [0.1, 0.1, 0.1]])
+    square = np.array(
+        [[-0.02, -0.02, 0.1], [0.02, -0.02, 0.1], [0.02, 0.02, 0.1], [-0.02, 0.02, 0.1]]
+    )
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    around = np.array([[-0.1, -0.1, 0.0], [0.1, 0.1, 0.1]])
     canvas = Canvas()
     canvas.add_table(around, 0.0, [(square, faces)])
-    camera = Camera(np.array([0.0, 0.0, 1.0]), np.eye(3), math.atan(0.1) * 2)  # from above, 0.1 m to each side
+    camera = Camera(
+        np.array([0.0, 0.0, 1.0]), np.eye(3), math.atan(0.1) * 2
+    )  # from above, 0.1 m to each side
     dark = near(canvas.render(camera, (200, 200)).astype(int), SHADOW)
     rows, columns = np.nonzero(dark)
-    assert [rows.min(), rows.max(), columns.min(), columns.max()] == pytest.approx([80, 119, 80, 119], abs=1)
+    assert [rows.min(), rows.max(), columns.min(), columns.max()] == pytest.approx(
+        [80, 119, 80, 119], abs=1
+    )
     assert dark.sum() == pytest.approx(40 * 40, rel=0.06)
 
 
@@ -181,7 +204,9 @@ def test_a_closing_without_the_law_has_no_panel_of_lambda(run, closing):
 def test_trials_that_ended_at_once_or_diverged_have_a_film(run, closing):
     names = ("time", "forces", "object_pose", "hand_pose", "joints", "targets")
     first = {name: getattr(closing, name)[:1] for name in names}
-    trace = ClosingTrace(*(getattr(closing.trace, f.name)[:1] for f in dataclasses.fields(ClosingTrace)))
+    trace = ClosingTrace(
+        *(getattr(closing.trace, f.name)[:1] for f in dataclasses.fields(ClosingTrace))
+    )
     none = torch.full((3,), math.nan, dtype=F64)
     stuck = lost(closing, Status.START_OVERLAP, **first, trace=trace, phases=none, contact_order=())
     joints = closing.joints.clone()
@@ -192,10 +217,16 @@ def test_trials_that_ended_at_once_or_diverged_have_a_film(run, closing):
 
 
 def test_the_plots_have_the_forces_and_motions_of_the_closing(run, closing):
-    plots = {title.split(" [")[0]: lines for title, _, lines in _list_plots(run.mesh, run.hand, closing)}
-    for (values, _, label), force in zip(plots["normal force"], closing.forces.numpy().T, strict=True):
+    plots = {
+        title.split(" [")[0]: lines for title, _, lines in _list_plots(run.mesh, run.hand, closing)
+    }
+    for (values, _, label), force in zip(
+        plots["normal force"], closing.forces.numpy().T, strict=True
+    ):
         np.testing.assert_array_equal(values, force)
         assert label.split(". ")[1] in run.hand.tips.names
     moved = {label: values for values, _, label in plots["motion"]}
-    np.testing.assert_allclose(moved["object from its place"], 1e3 * closing.object_pose[:, 2, 3], atol=1e-9)
+    np.testing.assert_allclose(
+        moved["object from its place"], 1e3 * closing.object_pose[:, 2, 3], atol=1e-9
+    )
     assert np.isnan(moved["object in the hand since pressed"][:50]).all()

@@ -16,7 +16,9 @@ from torchgrasp.foundation.errors import OutputError, Status
 from torchgrasp.planner.explain import Explanation, Funnel, Losses, Trial
 from torchgrasp.values.specs import ContactSpec
 
-PNG = base64.b64decode("iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAQAAAC1HAwCAAAAC0lEQVR42mNkYAAAAAYAAjCB0C8AAAAASUVORK5CYII=")
+PNG = base64.b64decode(
+    "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAQAAAC1HAwCAAAAC0lEQVR42mNkYAAAAAYAAjCB0C8AAAAASUVORK5CYII="
+)
 
 
 class Reader(HTMLParser):
@@ -24,7 +26,8 @@ class Reader(HTMLParser):
 
     def __init__(self):
         super().__init__()
-        self.tags, self.words = [], []
+        self.tags = []
+        self.words = []
 
     def handle_starttag(self, tag, attrs):
         self.tags.append((tag, dict(attrs)))
@@ -46,13 +49,27 @@ def test_page_is_self_contained_and_escapes_every_text(run):
     sources = [value for _, attrs in tags for key, value in attrs.items() if key in ("src", "href")]
     assert sources and all(s.startswith("data:image/png;base64,") for s in sources)
     assert base64.b64decode(sources[0].split(",")[1]) == PNG
-    for text in ("<odd> & 'quoted'.ply", "a <b>bold</b> claim", "<script>alert(1)</script>", "a 'caption' <b>"):
+    for text in (
+        "<odd> & 'quoted'.ply",
+        "a <b>bold</b> claim",
+        "<script>alert(1)</script>",
+        "a 'caption' <b>",
+    ):
         assert text in words
 
 
 def test_page_shows_stages_grasps_statuses_seed_and_units(run):
     _, words = read(format_page(run, {}))
-    for text in ("321 points", "1.2", "1.4", Status.TIP_ERROR.sentence, "tip_error", "seed", "7", "metre, radian"):
+    for text in (
+        "321 points",
+        "1.2",
+        "1.4",
+        Status.TIP_ERROR.sentence,
+        "tip_error",
+        "seed",
+        "7",
+        "metre, radian",
+    ):
         assert text in words
     assert verdict(run) in words
 
@@ -79,7 +96,10 @@ def test_grasp_rows_are_in_millimetres_and_degrees(run):
 
 
 def test_verdicts(run):
-    assert verdict(run) == "The allegro hand held the ball: lifted 0.10 m, moved 3 mm and 2 deg in the hand."
+    assert (
+        verdict(run)
+        == "The allegro hand held the ball: lifted 0.10 m, moved 3 mm and 2 deg in the hand."
+    )
     dropped = dataclasses.replace(run.closure, held=False, status=Status.DROPPED)
     sentence = closing_sentence(dataclasses.replace(run, closure=dropped))
     assert sentence.endswith(f"did not hold the ball: {Status.DROPPED.sentence}.")
@@ -90,8 +110,12 @@ def test_verdicts(run):
     unplanned = dataclasses.replace(none, grasps=run.grasps[:0])
     assert f"2 of 2 starts: {Status.NOT_CLOSED.sentence}" in refusal(unplanned)
     top = float(run.surface.vertices[:, 2].max())
-    flat, high = (dataclasses.replace(unplanned, spec=ContactSpec(table=top - h)) for h in (0.0051, 0.0066))
-    assert refusal(flat).endswith("it is 5 mm high, and this hand needs 6 mm.") and "high" not in refusal(high)
+    flat, high = (
+        dataclasses.replace(unplanned, spec=ContactSpec(table=top - h)) for h in (0.0051, 0.0066)
+    )
+    assert refusal(flat).endswith(
+        "it is 5 mm high, and this hand needs 6 mm."
+    ) and "high" not in refusal(high)
     assert Status.OUT_OF_REACH.sentence in refusal(dataclasses.replace(unplanned, plan=None))
     _, words = read(format_page(none, {}))
     assert "Best grasps" not in words
@@ -99,9 +123,13 @@ def test_verdicts(run):
 
 def test_a_run_without_a_grasp_tells_what_would_help(run):
     lost = Losses("contacts", "starts", 9, {Status.NOT_FLAT: 6, Status.TOO_CLOSE: 3})
-    trial = Trial("with <wider> limits", True, 4, 0.15, Funnel((dataclasses.replace(lost, lost={}),)))
+    trial = Trial(
+        "with <wider> limits", True, 4, 0.15, Funnel((dataclasses.replace(lost, lost={}),))
+    )
     explanation = Explanation(9, Funnel((lost,)), (trial,))
-    none = dataclasses.replace(run, closure=None, mesh=None, grasps=run.grasps[1], explanation=explanation)
+    none = dataclasses.replace(
+        run, closure=None, mesh=None, grasps=run.grasps[1], explanation=explanation
+    )
     assert verdict(none) == f"{refusal(none)} {explanation.advice}" and str(trial) in verdict(none)
     tags, words = read(format_page(none, {}))
     assert "wider" not in {tag for tag, _ in tags}
@@ -109,13 +137,27 @@ def test_a_run_without_a_grasp_tells_what_would_help(run):
         assert text in words
 
 
-def test_the_page_of_an_evaluation_shows_shares_objects_and_reasons_and_no_text_becomes_html(tmp_path):
+def test_the_page_of_an_evaluation_shows_shares_objects_and_reasons_and_no_text_becomes_html(
+    tmp_path,
+):
     page = format_evaluation("Grasps <now>", {"protocol": "quick"}, SCORES)
-    for text in ("Grasps &lt;now&gt;", "25.0%", "an &lt;open&gt; surface", "1 / 2", "bad_object", "quick"):
+    for text in (
+        "Grasps &lt;now&gt;",
+        "25.0%",
+        "an &lt;open&gt; surface",
+        "1 / 2",
+        "bad_object",
+        "quick",
+    ):
         assert text in page
     assert "<open>" not in page and "<script" not in page and " src=" not in page
     assert page.count("<svg") == 3 + 3  # three shares and three objects
-    assert write_evaluation(tmp_path / "page.html", "Grasps <now>", {"protocol": "quick"}, SCORES).read_text() == page
+    assert (
+        write_evaluation(
+            tmp_path / "page.html", "Grasps <now>", {"protocol": "quick"}, SCORES
+        ).read_text()
+        == page
+    )
 
 
 def test_a_bar_ends_where_the_interval_does():

@@ -1,4 +1,6 @@
-"""Recordings are written and read back by Rerun itself, in its environment, and compared with the run."""
+"""Recordings are written and read back by Rerun itself, in its environment, and compared with the
+run.
+"""
 
 import json
 import os
@@ -28,28 +30,41 @@ def recorded(run, tmp_path_factory):
         pytest.skip("scripts/beside rerun makes the environment of the viewer")
     folder = tmp_path_factory.mktemp("recording")
     ask = "import sysconfig; print(sysconfig.get_path('purelib'))"
-    place = subprocess.run([PYTHON, "-c", ask], capture_output=True, text=True, check=True).stdout.strip()
+    place = subprocess.run(
+        [PYTHON, "-c", ask], capture_output=True, text=True, check=True
+    ).stdout.strip()
     sys.path.append(place)
     try:
         path = write_recording(folder / "run.rrd", run)
     finally:
         sys.path.remove(place)
-    subprocess.run([PYTHON, READER, path, folder / "read.json"], check=True, env=os.environ | {"PYTHONPATH": ""})
+    subprocess.run(
+        [PYTHON, READER, path, folder / "read.json"],
+        check=True,
+        env=os.environ | {"PYTHONPATH": ""},
+    )
     return json.loads((folder / "read.json").read_text())
 
 
 def poses_of(entity):
     """The poses of an entity, by its translations and quaternions xyzw."""
     poses = np.tile(np.eye(4), (len(entity["Transform3D:translation"]), 1, 1))
-    poses[:, :3, :3] = Rotation.from_quat(np.array(entity["Transform3D:quaternion"])[:, 0]).as_matrix()
+    poses[:, :3, :3] = Rotation.from_quat(
+        np.array(entity["Transform3D:quaternion"])[:, 0]
+    ).as_matrix()
     poses[:, :3, 3] = np.array(entity["Transform3D:translation"])[:, 0]
     return poses
 
 
 def test_the_plan_is_in_the_frame_of_the_cloud(run, recorded):
-    np.testing.assert_allclose(recorded["/world/obj/cloud"]["Points3D:positions"][0], run.cloud.points, atol=1e-6)
-    surface, contacts = recorded["/world/obj/surface"], recorded["/world/obj/contacts"]
-    np.testing.assert_allclose(surface["Mesh3D:vertex_positions"][0], run.surface.vertices, atol=1e-6)
+    np.testing.assert_allclose(
+        recorded["/world/obj/cloud"]["Points3D:positions"][0], run.cloud.points, atol=1e-6
+    )
+    surface = recorded["/world/obj/surface"]
+    contacts = recorded["/world/obj/contacts"]
+    np.testing.assert_allclose(
+        surface["Mesh3D:vertex_positions"][0], run.surface.vertices, atol=1e-6
+    )
     assert len(set(surface["Mesh3D:vertex_colors"][0])) > 20
     best = run.executable[0].contacts
     np.testing.assert_allclose(contacts["Arrows3D:origins"][0], best.points[0], atol=1e-6)
@@ -57,7 +72,9 @@ def test_the_plan_is_in_the_frame_of_the_cloud(run, recorded):
     assert contacts["Arrows3D:labels"][0] == list(run.hand.tips.names)
     upright = run.upright().cloud.points.numpy()
     (frame,) = poses_of(recorded["/world/obj"])
-    np.testing.assert_allclose(run.cloud.points.numpy() @ frame[:3, :3].T + frame[:3, 3], upright, atol=1e-6)
+    np.testing.assert_allclose(
+        run.cloud.points.numpy() @ frame[:3, :3].T + frame[:3, 3], upright, atol=1e-6
+    )
 
 
 def test_the_hand_goes_through_its_postures(run, recorded):
@@ -68,7 +85,8 @@ def test_the_hand_goes_through_its_postures(run, recorded):
 
 
 def test_the_closing_is_on_a_timeline_of_seconds(run, recorded):
-    closure, hand = run.closure, run.hand
+    closure = run.closure
+    hand = run.hand
     time = closure.time.tolist()
     body = recorded["/world/obj/closing/object"]
     assert body["time of Transform3D"] == pytest.approx(time) and body["time of Mesh3D"] == [0.0]
@@ -81,11 +99,15 @@ def test_the_closing_is_on_a_timeline_of_seconds(run, recorded):
         np.testing.assert_allclose(seen, links[:, hand.tree.link_names.index(name)], atol=1e-6)
     for finger, name in enumerate(hand.tips.names):
         curve = recorded[f"/force/{name}"]
-        np.testing.assert_allclose(np.ravel(curve["Scalars:scalars"]), closure.forces[:, finger], atol=1e-9)
+        np.testing.assert_allclose(
+            np.ravel(curve["Scalars:scalars"]), closure.forces[:, finger], atol=1e-9
+        )
         assert curve["time of Scalars"] == pytest.approx(time)
     forces = recorded["/world/obj/closing/forces"]
     assert [len(arrows) for arrows in forces["Arrows3D:vectors"]] == [3] * len(time)
-    np.testing.assert_allclose(forces["Arrows3D:origins"][3], closure.hand_pose[3, :3, 3].expand(3, 3), atol=1e-6)
+    np.testing.assert_allclose(
+        forces["Arrows3D:origins"][3], closure.hand_pose[3, :3, 3].expand(3, 3), atol=1e-6
+    )
     assert [text for (text,) in recorded["/moments"]["TextLog:text"]][-1] == "the end"
 
 

@@ -1,4 +1,6 @@
-"""Pictures of a run, a scene and a hand; the picture of a scene shows what each pixel was taken for."""
+"""Pictures of a run, a scene and a hand; the picture of a scene shows what each pixel was taken
+for.
+"""
 
 import dataclasses
 import io
@@ -49,7 +51,9 @@ def test_stills_have_their_size_show_something_and_are_reproducible(run):
 
 def test_fingers_are_drawn_in_three_hues(run):
     pixels = decode(draw_grasp(run.surface, run.hand, run.grasps, facing(run.grasps)))
-    red, green, blue = pixels[..., 0], pixels[..., 1], pixels[..., 2]
+    red = pixels[..., 0]
+    green = pixels[..., 1]
+    blue = pixels[..., 2]
     assert ((blue > red + 0.24) & (blue > green + 0.12)).sum() > 500
     assert ((red > blue + 0.35) & (red > green + 0.2)).sum() > 500
     assert ((green > red + 0.24) & (green > blue + 0.02)).sum() > 500
@@ -63,10 +67,15 @@ def scene():
 def test_neighbours_are_drawn_and_the_target_is_not_drawn_twice(run, scene):
     lone = dataclasses.replace(scene, labels=torch.where(scene.labels == 4, 4, 0))
     grasp = run.executable[:1]
-    among, alone = (decode(draw_among(s, run.surface, run.hand, grasp, (1.0, 0.5, 0.5))) for s in (scene, lone))
+    among, alone = (
+        decode(draw_among(s, run.surface, run.hand, grasp, (1.0, 0.5, 0.5))) for s in (scene, lone)
+    )
     for color in OBJECTS[:3]:
         hue = np.array(rgb(color)) / max(rgb(color))
-        like = [(np.abs(p / p.max(2, keepdims=True).clip(1e-6) - hue).max(2) < 0.05).sum() for p in (among, alone)]
+        like = [
+            (np.abs(p / p.max(2, keepdims=True).clip(1e-6) - hue).max(2) < 0.05).sum()
+            for p in (among, alone)
+        ]
         assert like[0] > like[1] + 50
 
 
@@ -90,13 +99,18 @@ def test_every_fingertip_belongs_to_its_finger_and_the_palm_to_none():
 def test_solids_follow_the_pose_rigidly_whatever_the_order_of_the_joints_and_lie_at_the_tip():
     hand = load_hand("allegro")
     middle = ((hand.lower + hand.upper) / 2).double()
-    joints, names, here = hand.expand_joints(middle), hand.tree.joint_names, torch.eye(4, dtype=torch.float64)
-    there, shift = here.clone(), [0.1, -0.2, 0.3]
+    joints = hand.expand_joints(middle)
+    names = hand.tree.joint_names
+    here = torch.eye(4, dtype=torch.float64)
+    there = here.clone()
+    shift = [0.1, -0.2, 0.3]
     there[:3, 3] = torch.tensor(shift)
     solids, moved = (solids_from_hand(hand, joints, names, place) for place in (here, there))
     turned = solids_from_hand(hand, joints.flip(0), names[::-1], here)
     for a, b, c in zip(solids, moved, turned, strict=True):
-        np.testing.assert_allclose(b.vertices - a.vertices, np.tile(shift, (len(a.vertices), 1)), atol=1e-12)
+        np.testing.assert_allclose(
+            b.vertices - a.vertices, np.tile(shift, (len(a.vertices), 1)), atol=1e-12
+        )
         np.testing.assert_array_equal(a.vertices, c.vertices)
     centre = hand.tip_centres(middle)[0].numpy()
     middles = [(s.vertices.min(0) + s.vertices.max(0)) / 2 for s in solids if s.finger == 0]
@@ -121,7 +135,9 @@ def paint(values: dict[str, float], rest: float) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def painted():
-    """A camera 0.8 m above a table, which sees a box, a wall, a hole in the measurement, and the floor."""
+    """A camera 0.8 m above a table, which sees a box, a wall, a hole in the measurement, and the
+    floor.
+    """
     depth = paint({"box": 0.7, "wall": 0.5, "hole": 0.0, "floor": 1.2}, 0.8)
     labels = paint({"box": 1}, 0).astype(int)
     table = Plane(torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64), -0.8)
@@ -131,7 +147,9 @@ def painted():
 def test_every_pixel_has_its_kind(painted):
     kinds, labels = sort_pixels(painted)
     names = np.array(list(KINDS))[kinds]
-    assert (names[PARTS["hole"]] == "not measured").all() and (names[PARTS["wall"]] == "obstacle").all()
+    assert (names[PARTS["hole"]] == "not measured").all() and (
+        names[PARTS["wall"]] == "obstacle"
+    ).all()
     assert (names[PARTS["floor"]] == "not on the support").all() and labels[45:75, 35:65].min() == 1
     assert (names[0:30, 0:130] == "support, in squares of 10 cm").all() and not labels[0:30].any()
 
@@ -140,7 +158,9 @@ def test_objects_have_their_colours_and_unmeasured_pixels_are_black(painted):
     pixels = decode(encode_scene(painted))
     assert pixels.shape[1] == 1200 and pixels.shape[0] > 900  # a legend below
     scale = 1200 / SHAPE[1]
-    body, hole, top = (pixels[int(r * scale), int(c * scale)] for r, c in ((46, 36), (100, 40), (10, 15)))
+    body, hole, top = (
+        pixels[int(r * scale), int(c * scale)] for r, c in ((46, 36), (100, 40), (10, 15))
+    )
     assert np.abs(body / body.max() - np.array(rgb(OBJECTS[0])) / max(rgb(OBJECTS[0]))).max() < 0.03
     assert hole.max() < 0.1 < 0.6 < top.min()
 
@@ -152,4 +172,7 @@ def test_only_a_target_has_a_white_rim(painted):
 
 
 def test_the_picture_is_written_and_reproducible(painted, tmp_path):
-    assert draw_scene(painted, tmp_path / "a.png").read_bytes() == draw_scene(painted, tmp_path / "b.png").read_bytes()
+    assert (
+        draw_scene(painted, tmp_path / "a.png").read_bytes()
+        == draw_scene(painted, tmp_path / "b.png").read_bytes()
+    )

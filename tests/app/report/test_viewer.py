@@ -34,18 +34,23 @@ def unpack(buffer):
 
 
 def data_of(page):
-    (text,) = re.findall(r'<script type="application/json" id="data">(.*?)</script>', page, re.DOTALL)
+    (text,) = re.findall(
+        r'<script type="application/json" id="data">(.*?)</script>', page, re.DOTALL
+    )
     return json.loads(text)
 
 
 def posed(pieces, poses):
     """The points of all pieces of a hand at the poses of its links, worked out as the page does."""
-    parts = [unpack(p["points"]) @ poses[p["link"], :3, :3].T + poses[p["link"], :3, 3] for p in pieces]
+    parts = [
+        unpack(p["points"]) @ poses[p["link"], :3, :3].T + poses[p["link"], :3, 3] for p in pieces
+    ]
     return np.concatenate(parts)
 
 
 def test_buffers_hold_the_surface_the_cloud_and_the_contacts_of_the_run(run):
-    seen, upright = data_of(format_viewer(run)), run.upright()
+    seen = data_of(format_viewer(run))
+    upright = run.upright()
     for name, expected in (
         ("points", upright.surface.vertices),
         ("normals", upright.surface.normals),
@@ -58,44 +63,67 @@ def test_buffers_hold_the_surface_the_cloud_and_the_contacts_of_the_run(run):
     np.testing.assert_allclose(unpack(seen["grasps"]["points"]), best.contacts.points, atol=1e-7)
     np.testing.assert_allclose(unpack(seen["grasps"]["normals"]), best.contacts.normals, atol=1e-7)
     assert seen["grasps"]["rows"] == [["1", "73%", "0.0200", "4.0", "1.0"]]
-    colors, std = unpack(seen["surface"]["colors"]), unpack(seen["surface"]["std"])
-    darkest, brightest = colors[std.argmin()].astype(int), colors[std.argmax()].astype(int)
-    assert brightest.sum() > darkest.sum() + 100 and seen["surface"]["ramp"][-1] == brightest.tolist()
+    colors = unpack(seen["surface"]["colors"])
+    std = unpack(seen["surface"]["std"])
+    darkest = colors[std.argmin()].astype(int)
+    brightest = colors[std.argmax()].astype(int)
+    assert (
+        brightest.sum() > darkest.sum() + 100 and seen["surface"]["ramp"][-1] == brightest.tolist()
+    )
 
 
 def test_the_hand_stands_where_the_stills_draw_it_and_approaches_along_its_path(run):
-    upright, seen = run.upright(), describe(run)
-    poses, best = unpack(seen["grasps"]["links"]).astype(float)[0], upright.executable
+    upright = run.upright()
+    seen = describe(run)
+    poses = unpack(seen["grasps"]["links"]).astype(float)[0]
+    best = upright.executable
     joints = run.hand.expand_joints(best.joints[0].double())
     solids = solids_from_hand(run.hand, joints, run.hand.tree.joint_names, best.obj_from_hand[0])
     expected = np.concatenate([s.vertices for s in solids])
-    np.testing.assert_allclose(posed(seen["hand"], poses[POSTURES.index("grasp")]), expected, atol=1e-6)
-    approach, pregrasp = (posed(seen["hand"], poses[POSTURES.index(name)]) for name in ("approach", "pre-grasp"))
+    np.testing.assert_allclose(
+        posed(seen["hand"], poses[POSTURES.index("grasp")]), expected, atol=1e-6
+    )
+    approach, pregrasp = (
+        posed(seen["hand"], poses[POSTURES.index(name)]) for name in ("approach", "pre-grasp")
+    )
     step = APPROACH_DISTANCE * best.approach[0].numpy()
-    np.testing.assert_allclose(pregrasp - approach, np.broadcast_to(step, approach.shape), atol=1e-6)
+    np.testing.assert_allclose(
+        pregrasp - approach, np.broadcast_to(step, approach.shape), atol=1e-6
+    )
     squeezed = posed(seen["hand"], poses[POSTURES.index("squeeze")])
     assert 1e-4 < np.abs(squeezed - expected).max() < 0.1
 
 
 def test_the_replay_moves_the_true_object_as_the_closure_did(run):
-    replay, closure = describe(run)["replay"], run.upright().closure
+    replay = describe(run)["replay"]
+    closure = run.upright().closure
     ticks = unpack(replay["ticks"]).tolist()
     np.testing.assert_allclose(unpack(replay["object"]), closure.object_pose[ticks], atol=1e-7)
     np.testing.assert_allclose(unpack(replay["forces"]), closure.forces, atol=1e-6)
-    first, last = (posed(describe(run)["hand"], unpack(replay["links"])[k].astype(float)) for k in (0, -1))
-    np.testing.assert_allclose(last - first, np.broadcast_to([0.0, 0.0, 0.1], first.shape), atol=1e-6)
+    first, last = (
+        posed(describe(run)["hand"], unpack(replay["links"])[k].astype(float)) for k in (0, -1)
+    )
+    np.testing.assert_allclose(
+        last - first, np.broadcast_to([0.0, 0.0, 0.1], first.shape), atol=1e-6
+    )
 
 
 def test_the_film_says_which_grasp_it_is_and_names_its_moments(run):
     replay = describe(run)["replay"]
-    assert replay["grasp"] == 1 and replay["story"].startswith("In the order of touch: index, middle, thumb.")
+    assert replay["grasp"] == 1 and replay["story"].startswith(
+        "In the order of touch: index, middle, thumb."
+    )
     assert [tick for tick, _ in replay["moments"]] == sorted(tick for tick, _ in replay["moments"])
     assert replay["moments"][-1] == (4, "the end")
 
 
 def test_forces_stand_at_the_contacts_in_the_frame_of_the_page(run):
-    """Turned by a right angle about z and lifted: what the hand feels along its x acts along the page's y."""
-    turned = torch.tensor([[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0.2], [0, 0, 0, 1]], dtype=torch.float64)
+    """Turned by a right angle about z and lifted: what the hand feels along its x acts along the
+    page's y.
+    """
+    turned = torch.tensor(
+        [[0.0, -1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0.2], [0, 0, 0, 1]], dtype=torch.float64
+    )
     trace = dataclasses.replace(
         run.closure.trace,
         points=torch.tensor([0.1, 0.0, 0.0]).double().expand(5, 3, 3),
@@ -104,7 +132,8 @@ def test_forces_stand_at_the_contacts_in_the_frame_of_the_page(run):
     closure = dataclasses.replace(run.closure, hand_pose=turned.expand(5, 4, 4), trace=trace)
     frame = np.array(describe(run)["frame"])
     replay = describe(dataclasses.replace(run, closure=closure))["replay"]
-    point, force = frame @ [0.0, 0.1, 0.2, 1.0], frame[:3, :3] @ [0.0, 2.0, 1.0]
+    point = frame @ [0.0, 0.1, 0.2, 1.0]
+    force = frame[:3, :3] @ [0.0, 2.0, 1.0]
     np.testing.assert_allclose(unpack(replay["touches"])[3, 1], point[:3], atol=1e-6)
     np.testing.assert_allclose(unpack(replay["pushes"])[3, 1], force, atol=1e-6)
 
@@ -112,7 +141,9 @@ def test_forces_stand_at_the_contacts_in_the_frame_of_the_page(run):
 def test_sensors_and_the_frame_of_the_file_are_where_the_cloud_says(run):
     seen = describe(run)
     frame = np.array(seen["frame"])
-    np.testing.assert_allclose(seen["sensors"], [frame[:3, :3] @ [0.5, 0.1, 0.3] + frame[:3, 3]], atol=1e-9)
+    np.testing.assert_allclose(
+        seen["sensors"], [frame[:3, :3] @ [0.5, 0.1, 0.3] + frame[:3, 3]], atol=1e-9
+    )
     points = run.cloud.points.numpy() @ frame[:3, :3].T + frame[:3, 3]
     np.testing.assert_allclose(unpack(seen["cloud"]), points, atol=1e-6)
     blind = dataclasses.replace(run, cloud=dataclasses.replace(run.cloud, viewpoint=None))
@@ -123,16 +154,27 @@ def test_a_long_run_is_thinned_to_what_a_page_holds(run):
     ticks = 1000
     rows = torch.arange(ticks) % len(run.closure.time)
     long = {
-        name: getattr(run.closure, name)[rows] for name in ("forces", "object_pose", "hand_pose", "joints", "targets")
+        name: getattr(run.closure, name)[rows]
+        for name in ("forces", "object_pose", "hand_pose", "joints", "targets")
     }
-    trace = ClosingTrace(*(getattr(run.closure.trace, f.name)[rows] for f in dataclasses.fields(ClosingTrace)))
-    closure = dataclasses.replace(run.closure, time=torch.arange(ticks).double(), trace=trace, **long)
+    trace = ClosingTrace(
+        *(getattr(run.closure.trace, f.name)[rows] for f in dataclasses.fields(ClosingTrace))
+    )
+    closure = dataclasses.replace(
+        run.closure, time=torch.arange(ticks).double(), trace=trace, **long
+    )
     many = run.grasps[torch.zeros(50, dtype=torch.int64)]
     fine = trimesh.creation.icosphere(subdivisions=6, radius=0.03)
     page = format_viewer(dataclasses.replace(run, closure=closure, grasps=many, mesh=fine))
     seen = data_of(page)
-    assert seen["replay"]["ticks"]["shape"] == [MOST_TICKS] and unpack(seen["replay"]["ticks"])[-1] == ticks - 1
-    assert seen["replay"]["forces"]["shape"] == [ticks, 3] and len(seen["grasps"]["rows"]) == MOST_GRASPS
+    assert (
+        seen["replay"]["ticks"]["shape"] == [MOST_TICKS]
+        and unpack(seen["replay"]["ticks"])[-1] == ticks - 1
+    )
+    assert (
+        seen["replay"]["forces"]["shape"] == [ticks, 3]
+        and len(seen["grasps"]["rows"]) == MOST_GRASPS
+    )
     assert seen["replay"]["faces"]["shape"][0] <= MOST_FACES < len(fine.faces)
     assert len(page) < 8 * 2**20
 
@@ -155,7 +197,11 @@ def test_the_page_loads_nothing_and_runs_its_own_scripts_alone(run):
     assert not re.findall(r"https?://|\bimport\(|@import|<b>jug", rest)
     assert re.findall(r'(?:src|href)="([^"]*)"', rest) == ["data:,"]
     (policy,) = re.findall(r'http-equiv="Content-Security-Policy" content="([^"]*)"', page)
-    assert policy.startswith("default-src 'none';") and "unsafe-eval" not in policy and "connect-src" not in policy
+    assert (
+        policy.startswith("default-src 'none';")
+        and "unsafe-eval" not in policy
+        and "connect-src" not in policy
+    )
     scripts = re.findall(r"<script>(.*?)</script>", page, re.DOTALL)
     for script in scripts:
         digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
@@ -200,8 +246,14 @@ def test_rounded_shapes_fill_their_shape_but_for_the_edges(kind, size):
 
 def test_solids_of_links_are_those_of_the_hand_at_rest(run):
     hand = run.hand
-    poses = hand.tree.poses(torch.zeros(1, len(hand.tree.joint_names), dtype=torch.float64))[0].numpy()
-    solids = solids_from_hand(hand, torch.zeros(len(hand.tree.joint_names)), hand.tree.joint_names, torch.eye(4))
+    poses = hand.tree.poses(torch.zeros(1, len(hand.tree.joint_names), dtype=torch.float64))[
+        0
+    ].numpy()
+    solids = solids_from_hand(
+        hand, torch.zeros(len(hand.tree.joint_names)), hand.tree.joint_names, torch.eye(4)
+    )
     for here, there in zip(solids_of_links(hand), solids, strict=True):
         pose = poses[here.link]
-        np.testing.assert_allclose(here.vertices @ pose[:3, :3].T + pose[:3, 3], there.vertices, atol=1e-12)
+        np.testing.assert_allclose(
+            here.vertices @ pose[:3, :3].T + pose[:3, 3], there.vertices, atol=1e-12
+        )

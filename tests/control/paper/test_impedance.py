@@ -1,4 +1,6 @@
-"""The impedance of a held object: wrenches that restore, forces that balance, what the drives make of both."""
+"""The impedance of a held object: wrenches that restore, forces that balance, what the drives make
+of both.
+"""
 
 import pytest
 import torch
@@ -20,7 +22,9 @@ from torchgrasp.geometry.frames import rigid, rotation_from_vector, virtual_fram
 
 
 def triangles(count: int, seed: int = 0) -> torch.Tensor:
-    return 0.05 * torch.randn(count, 3, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return 0.05 * torch.randn(
+        count, 3, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
+    )
 
 
 def wrench_of(points: torch.Tensor, forces: torch.Tensor) -> torch.Tensor:
@@ -42,7 +46,9 @@ def test_shared_forces_are_the_smallest_for_the_wrench_and_spring_forces_balance
     wrench = torch.randn(20, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     forces = shared_forces(points, wrench, torch.full((20,), 1e9).double())
     assert torch.allclose(wrench_of(points, forces), wrench, atol=1e-9)
-    assert torch.allclose((grasp_map(points) @ forces.flatten(-2)[..., None])[..., 0], wrench, atol=1e-9)
+    assert torch.allclose(
+        (grasp_map(points) @ forces.flatten(-2)[..., None])[..., 0], wrench, atol=1e-9
+    )
     for k in range(20):
         least = torch.linalg.lstsq(grasp_map(points[k]), wrench[k], driver="gelsd").solution
         assert float(forces[k].norm()) <= float(least.norm()) * (1 + 1e-9)
@@ -60,7 +66,9 @@ def test_shared_forces_are_the_smallest_for_the_wrench_and_spring_forces_balance
 def test_restoring_wrench_is_the_gradient_of_an_energy():
     """A turn by v about the origin changes the energy by -torque . v, a shift by d by -force . d."""
     points = triangles(1)[0]
-    rest = virtual_frame(points @ rotation_from_vector(real([0.3, -0.2, 0.1])).T + real([0.004, -0.002, 0.001]))
+    rest = virtual_frame(
+        points @ rotation_from_vector(real([0.3, -0.2, 0.1])).T + real([0.004, -0.002, 0.001])
+    )
     centre = points.mean(0)
     wrench = restoring_wrench(virtual_frame(points), rest)
 
@@ -87,9 +95,12 @@ def test_impedance_at_rest_presses_with_the_desired_forces():
 def test_impedance_restores_a_moved_grasp_in_any_frame_and_keeps_its_own_for_tips_on_a_line():
     seen = observation(0.0, contact=TOUCHING, reading=(2.0, 2.0, 4.0))
     hold = Impedance(reference(), seen, torch.zeros(9).double())
-    tips, rest = seen.tips, hold.forces(seen.tips)
+    tips = seen.tips
+    rest = hold.forces(seen.tips)
     shift = real([0.0, 0.001, 0.0])
-    assert torch.allclose((hold.forces(tips + shift) - rest).sum(0), -TRANSLATION_STIFFNESS * shift, atol=1e-9)
+    assert torch.allclose(
+        (hold.forces(tips + shift) - rest).sum(0), -TRANSLATION_STIFFNESS * shift, atol=1e-9
+    )
     turn = rotation_from_vector(real([0.0, 0.0, 0.05]))
     centre = tips.mean(0)
     there = (tips - centre) @ turn.T + centre
@@ -119,8 +130,12 @@ def test_impedance_firms_an_unstable_grasp_only():
         def log_odds(self, state: torch.Tensor) -> torch.Tensor:
             return state[6:].exp().sum() - 5.0
 
-        def preferred_forces(self, tips: torch.Tensor, force: float | None = None) -> PreferredForces:
-            return PreferredForces(torch.ones(3).double(), torch.eye(3).double(), torch.full((3,), 300.0).double())
+        def preferred_forces(
+            self, tips: torch.Tensor, force: float | None = None
+        ) -> PreferredForces:
+            return PreferredForces(
+                torch.ones(3).double(), torch.eye(3).double(), torch.full((3,), 300.0).double()
+            )
 
     def held(reading: tuple[float, float, float], **options) -> Impedance:
         seen = observation(0.0, contact=TOUCHING, reading=reading)
@@ -129,17 +144,22 @@ def test_impedance_firms_an_unstable_grasp_only():
             hold(seen, PERIOD)
         return hold
 
-    firm, weak = held((2.0, 2.0, 4.0), stability=Model()), held((1.0, 1.0, 2.0), stability=Model())
+    firm = held((2.0, 2.0, 4.0), stability=Model())
+    weak = held((1.0, 1.0, 2.0), stability=Model())
     assert firm.raised == 1.0
     assert weak.raised == pytest.approx(2.0, rel=0.01)
     assert weak.springs.tolist() == pytest.approx([300.0] * 3, rel=0.01)
-    assert weak.forces(observation(0.0).tips).norm() > 1.9 * firm.forces(observation(0.0).tips).norm()
+    assert (
+        weak.forces(observation(0.0).tips).norm() > 1.9 * firm.forces(observation(0.0).tips).norm()
+    )
     kept = held((1.0, 1.0, 2.0), springs=torch.full((3,), 50.0).double())
     assert (kept.raised, kept.springs.tolist()) == (1.0, [50.0] * 3)
 
 
 def test_impedance_drives_coupled_joints_by_their_actuator():
-    """Three actuators move three joints each: the generalised torque is C^T J^T f whatever their stiffness."""
+    """Three actuators move three joints each: the generalised torque is C^T J^T f whatever their
+    stiffness.
+    """
     coupling = torch.kron(torch.eye(3), torch.tensor([[1.0], [0.5], [0.25]])).double()
     body = reference(coupling)
     joints = 0.01 * torch.randn(9, generator=torch.Generator().manual_seed(2)).double()

@@ -1,4 +1,6 @@
-"""The commands that write, on little work: what is slow in them is done once, before any fault, and repeated."""
+"""The commands that write, on little work: what is slow in them is done once, before any fault, and
+repeated.
+"""
 
 import dataclasses
 import functools
@@ -36,7 +38,16 @@ def sample(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
     """Three chunks of postures."""
     monkeypatch.setattr("torchgrasp.posture_model.sample.CHUNK_POSTURES", 40)
     monkeypatch.setattr("torchgrasp.posture_model.dataset.CHUNK_POSTURES", 40)
-    return lambda out: ["hand", "sample", "--hand", "barrett", "--n", "100", "--out", str(out / "samples")]
+    return lambda out: [
+        "hand",
+        "sample",
+        "--hand",
+        "barrett",
+        "--n",
+        "100",
+        "--out",
+        str(out / "samples"),
+    ]
 
 
 def train(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
@@ -70,11 +81,22 @@ def grasp(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
         return grasps
 
     monkeypatch.setattr(grasp_command, "plan_grasps", repeat)
-    surface = extract_surface(next(value for stage, _, value in told if stage == "shape"), resolution=16)
+    surface = extract_surface(
+        next(value for stage, _, value in told if stage == "shape"), resolution=16
+    )
     monkeypatch.setattr(grasp_command, "extract_surface", lambda shape: surface)
     monkeypatch.setattr(page, "draw_pictures", lambda run: {})
     view = str(DATA / "cylinder" / "view.ply")
-    return lambda out: ["grasp", view, "--hand", "barrett", "--starts", "8", "--out", str(out / "grasps")]
+    return lambda out: [
+        "grasp",
+        view,
+        "--hand",
+        "barrett",
+        "--starts",
+        "8",
+        "--out",
+        str(out / "grasps"),
+    ]
 
 
 def evaluate(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
@@ -87,14 +109,26 @@ def evaluate(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
         grasps.save(view.file(shelf))
         return dataclasses.replace(view.score, executable=len(grasps))
 
-    def try_grasp(view: Any, shelf: Path, protocol: Any, spec: EvaluationSpec, row: int, draw: int) -> ProtocolResult:
+    def try_grasp(
+        view: Any, shelf: Path, protocol: Any, spec: EvaluationSpec, row: int, draw: int
+    ) -> ProtocolResult:
         score = float(load_grasps(view.file(shelf))[row].score[0])
         return ProtocolResult(row, draw, True, Status.OK, 0.0, 0.0, score, 0.0, 0.0)
 
     monkeypatch.setattr(evaluate_command, "import_simulator", lambda name: None)
     monkeypatch.setattr(campaign, "_plan", plan)
     monkeypatch.setattr(campaign, "_try", try_grasp)
-    words = ["evaluate", "--objects", str(folder), "--hand", "barrett", "--grasps", "2", "--workers", "0"]
+    words = [
+        "evaluate",
+        "--objects",
+        str(folder),
+        "--hand",
+        "barrett",
+        "--grasps",
+        "2",
+        "--workers",
+        "0",
+    ]
     return lambda out: [*words, "--out", str(out / "evaluation")]
 
 
@@ -104,15 +138,35 @@ def gather(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Command:
     objects = {"cup": {"views": views}, "jug": {"views": {"front": views["left"]}}, "loose": 5}
     (folder / "manifest.json").write_text(json.dumps({"objects": objects}))
 
-    def work(view: ObjectView, protocol: Protocol, spec: EvaluationSpec, meta: dict[str, str], *plan: object) -> bytes:
+    def work(
+        view: ObjectView,
+        protocol: Protocol,
+        spec: EvaluationSpec,
+        meta: dict[str, str],
+        *plan: object,
+    ) -> bytes:
         found = records(torch.Generator().manual_seed(len(view.view)), 4, 2, protocol.noise.draws)
-        row = JobRow(view.object, view.view, executable=2, points=4, grasps=2, passed=int(found.passed.sum()))
+        row = JobRow(
+            view.object, view.view, executable=2, points=4, grasps=2, passed=int(found.passed.sum())
+        )
         return pack_shard(Shard((row,), found), meta)
 
     monkeypatch.setattr("torchgrasp.campaign.campaign.run_job", work)
     monkeypatch.setattr(evaluate_command, "import_simulator", lambda name: None)
     words = ["campaign", str(folder), "--hand", "barrett", "--jobs-in-shard", "2", "--workers", "0"]
-    return lambda out: [*words, "--out", str(out / "campaign"), "--parquet", str(out / "campaign" / "parquet")]
+    return lambda out: [
+        *words,
+        "--out",
+        str(out / "campaign"),
+        "--parquet",
+        str(out / "campaign" / "parquet"),
+    ]
 
 
-COMMANDS = {"sample": sample, "train": train, "grasp": grasp, "evaluate": evaluate, "campaign": gather}
+COMMANDS = {
+    "sample": sample,
+    "train": train,
+    "grasp": grasp,
+    "evaluate": evaluate,
+    "campaign": gather,
+}

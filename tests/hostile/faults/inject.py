@@ -1,4 +1,6 @@
-"""A forked child runs a command, and at its n-th call that changes the disk something happens to it."""
+"""A forked child runs a command, and at its n-th call that changes the disk something happens to
+it.
+"""
 
 import contextlib
 import io
@@ -61,7 +63,9 @@ def run(words: list[str], happen: Happening | None = None, at: int = -1) -> Ende
     child = os.fork()
     if child == 0:
         os.close(ours)
-        signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background processes ignore it
+        signal.signal(
+            signal.SIGINT, signal.default_int_handler
+        )  # a shell's background processes ignore it
         calls: list[str] = []
         _watch(calls, happen, at)
         time.perf_counter = time.process_time = lambda: 0.0

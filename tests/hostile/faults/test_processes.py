@@ -1,4 +1,5 @@
-"""Commands as processes of their own: killed at random moments, or left by a worker that dies or never answers.
+"""Commands as processes of their own: killed at random moments, or left by a worker that dies or
+never answers.
 
 20 kills of each command at its real work run with `--hypothesis-profile=long`.
 """
@@ -65,8 +66,8 @@ if __name__ == "__main__":
 """
 """`evaluate` without planning and simulation; here is what its workers do.
 
-The worker of the first grasp of "left" waits to be killed. The second grasp of "left" kills its worker. The second
-grasp of "right" hangs.
+The worker of the first grasp of "left" waits to be killed. The second grasp of "left" kills its
+worker. The second grasp of "right" hangs.
 """
 
 
@@ -78,21 +79,65 @@ def objects(folder: Path, *views: str, workers: str = "2") -> list[str]:
         shutil.copy(DATA / "cylinder" / "view.ply", folder / "cup" / f"{view}_noisy.ply")
     entry = {"views": {view: {"T_object_camera": POSE} for view in views}}
     (folder / "manifest.json").write_text(json.dumps({"objects": {"cup": entry}}))
-    return ["evaluate", "--objects", str(folder), "--hand", "barrett", "--workers", workers, "--out"]
+    return [
+        "evaluate",
+        "--objects",
+        str(folder),
+        "--hand",
+        "barrett",
+        "--workers",
+        workers,
+        "--out",
+    ]
 
 
 def words(name: str, folder: Path) -> list[str]:
     """Return the words of a command but for its output."""
     if name == "evaluate":
-        return [*objects(folder / "objects", "left", "right")[:-1], "--grasps", "2", "--starts", "5", "--out"]
+        return [
+            *objects(folder / "objects", "left", "right")[:-1],
+            "--grasps",
+            "2",
+            "--starts",
+            "5",
+            "--out",
+        ]
     if name == "campaign":
         place = objects(folder / "objects", "front", "left", "right")[2]
         sizes = ["--grasps", "1", "--starts", "5", "--jobs-in-shard", "2", "--workers", "2"]
-        return ["campaign", place, "--hand", "barrett", "--protocol", "dexgraspbench", *sizes, "--out"]
+        return [
+            "campaign",
+            place,
+            "--hand",
+            "barrett",
+            "--protocol",
+            "dexgraspbench",
+            *sizes,
+            "--out",
+        ]
     return {
-        "grasp": ["grasp", str(DATA / "cylinder" / "view.ply"), "--hand", "barrett", "--starts", "8", "--out"],
+        "grasp": [
+            "grasp",
+            str(DATA / "cylinder" / "view.ply"),
+            "--hand",
+            "barrett",
+            "--starts",
+            "8",
+            "--out",
+        ],
         "sample": ["hand", "sample", "--hand", "barrett", "--n", "1500", "--workers", "2", "--out"],
-        "train": ["hand", "train", "barrett", "--n", "2000", "--held-out", "100", "--components", "3", "--out"],
+        "train": [
+            "hand",
+            "train",
+            "barrett",
+            "--n",
+            "2000",
+            "--held-out",
+            "100",
+            "--components",
+            "3",
+            "--out",
+        ],
     }[name]
 
 
@@ -108,7 +153,9 @@ def descendants(pid: int) -> list[int]:
     children: dict[int, list[int]] = {}
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
-            children.setdefault(int(stat.read_text().rpartition(")")[2].split()[1]), []).append(int(stat.parent.name))
+            children.setdefault(int(stat.read_text().rpartition(")")[2].split()[1]), []).append(
+                int(stat.parent.name)
+            )
         except OSError:  # it has just ended
             continue
     found = [pid]
@@ -127,14 +174,20 @@ def gone(processes: list[int]) -> bool:
 @pytest.mark.promise("F1")
 @pytest.mark.parametrize(
     "name",
-    ["sample", "grasp", "train", *(pytest.param(name, marks=pytest.mark.sim) for name in ("evaluate", "campaign"))],
+    [
+        "sample",
+        "grasp",
+        "train",
+        *(pytest.param(name, marks=pytest.mark.sim) for name in ("evaluate", "campaign")),
+    ],
 )
 def test_a_process_killed_at_random_moments_is_continued_to_the_same_bytes(
     name: str, tmp_path: Path, request: pytest.FixtureRequest
 ):
     if request.config.getoption("--hypothesis-profile") != "long":
         pytest.skip("takes minutes")
-    given, draw = words(name, tmp_path), random.Random(name)
+    given = words(name, tmp_path)
+    draw = random.Random(name)
 
     def command(out: Path) -> list[str]:
         model = name == "train"
@@ -145,7 +198,8 @@ def test_a_process_killed_at_random_moments_is_continued_to_the_same_bytes(
     first = start(REAL, tmp_path, command(tmp_path / "whole"))
     said = first.communicate()
     assert first.returncode == 0, said
-    lasts, whole = time.monotonic() - began, contents(tmp_path / "whole")
+    lasts = time.monotonic() - began
+    whole = contents(tmp_path / "whole")
     killed = attempts = 0
     while killed < 20:
         out = tmp_path / f"out{attempts}"
@@ -168,7 +222,11 @@ def test_a_process_killed_at_random_moments_is_continued_to_the_same_bytes(
 @pytest.mark.promise("F4", "F5")
 def test_a_worker_that_is_lost_costs_its_own_row_and_the_row_says_so(tmp_path: Path):
     pytest.importorskip("pebble")
-    run = start(STUB, tmp_path, [*objects(tmp_path / "objects", "left", "right", workers="1"), str(tmp_path / "out")])
+    run = start(
+        STUB,
+        tmp_path,
+        [*objects(tmp_path / "objects", "left", "right", workers="1"), str(tmp_path / "out")],
+    )
     worker = None
     while worker is None and run.poll() is None:
         worker = next((tmp_path / "objects").glob("*.worker"), None)
@@ -178,15 +236,24 @@ def test_a_worker_that_is_lost_costs_its_own_row_and_the_row_says_so(tmp_path: P
     said = run.communicate()
     assert run.returncode == 0, said
     views = json.loads((tmp_path / "out" / "evaluate.json").read_text())["views"]
-    found = {(view["view"], row["rank"]): row["status"] for view in views for row in view["attempts"]}
+    found = {
+        (view["view"], row["rank"]): row["status"] for view in views for row in view["attempts"]
+    }
     # A death from outside is forgiven.
-    assert found == {("left", 0): "OK", ("left", 1): "WORKER_DIED", ("right", 0): "OK", ("right", 1): "TIMED_OUT"}
+    assert found == {
+        ("left", 0): "OK",
+        ("left", 1): "WORKER_DIED",
+        ("right", 0): "OK",
+        ("right", 1): "TIMED_OUT",
+    }
 
 
 @pytest.mark.promise("F6")
 def test_no_worker_outlives_an_evaluation_that_is_killed(tmp_path: Path):
     pytest.importorskip("pebble")
-    run = start(STUB, tmp_path, [*objects(tmp_path / "objects", "left", "right"), str(tmp_path / "out")])
+    run = start(
+        STUB, tmp_path, [*objects(tmp_path / "objects", "left", "right"), str(tmp_path / "out")]
+    )
     while run.poll() is None and not list((tmp_path / "objects").glob("*.worker")):
         time.sleep(0.05)
     below = descendants(run.pid)

@@ -37,9 +37,12 @@ def saved(path: Path, read: Callable[[Path], object]) -> Case:
 def clouds(folder: Path) -> list[Case]:
     """Return clouds in every format and encoding."""
     rng = np.random.default_rng(0)
-    points, normals = rng.uniform(-0.04, 0.04, (12, 3)), rng.normal(size=(12, 3))
+    points = rng.uniform(-0.04, 0.04, (12, 3))
+    normals = rng.normal(size=(12, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    cloud = PointCloud(torch.from_numpy(points), torch.from_numpy(normals), torch.tensor([0.1, -0.2, 0.7]).double())
+    cloud = PointCloud(
+        torch.from_numpy(points), torch.from_numpy(normals), torch.tensor([0.1, -0.2, 0.7]).double()
+    )
     save_cloud(cloud, folder / "saved.npz"), save_cloud(cloud, folder / "saved.ply")
     trimesh.PointCloud(points).export(folder / "ascii.ply", encoding="ascii")
     trimesh.creation.icosahedron().apply_scale(0.05).export(folder / "mesh.ply")
@@ -52,7 +55,10 @@ def clouds(folder: Path) -> list[Case]:
     (folder / "ascii.pcd").write_text(f"{head}ascii\n{text}\n")
     (folder / "binary.pcd").write_bytes(f"{head}binary\n".encode() + rows.tobytes())
     plain = rows.T.tobytes()
-    packed = b"".join(bytes([len(part) - 1]) + part for part in (plain[i : i + 32] for i in range(0, len(plain), 32)))
+    packed = b"".join(
+        bytes([len(part) - 1]) + part
+        for part in (plain[i : i + 32] for i in range(0, len(plain), 32))
+    )
     sizes = struct.pack("<II", len(packed), len(plain))
     (folder / "packed.pcd").write_bytes(f"{head}binary_compressed\n".encode() + sizes + packed)
     return [saved(path, read_cloud) for path in sorted(folder.iterdir())]
@@ -65,7 +71,9 @@ def meshes(folder: Path) -> list[Case]:
         ball.export(folder / name)
     ball.export(folder / "text.stl", file_type="stl_ascii")
     ball.export(folder / "text.ply", encoding="ascii")
-    (folder / "named.obj").write_text("mtllib a.mtl\nusemtl a\no b\ng c\n" + (folder / "a.obj").read_text())
+    (folder / "named.obj").write_text(
+        "mtllib a.mtl\nusemtl a\no b\ng c\n" + (folder / "a.obj").read_text()
+    )
     return [saved(path, read_mesh) for path in sorted(folder.iterdir())]
 
 
@@ -74,8 +82,14 @@ def images(folder: Path) -> list[Case]:
     from PIL import Image
 
     depth = np.full((6, 8), 0.5)
-    pose, camera = np.eye(4), np.array([8.0, 8.0, 4.0, 3.0])
-    scene = {"depth": depth, "intrinsics": camera, "camera_pose": pose, "labels": np.ones((6, 8), int)}
+    pose = np.eye(4)
+    camera = np.array([8.0, 8.0, 4.0, 3.0])
+    scene = {
+        "depth": depth,
+        "intrinsics": camera,
+        "camera_pose": pose,
+        "labels": np.ones((6, 8), int),
+    }
     np.savez(folder / "scene.npz", **scene, table=[0.0, 0.0, -1.0, -0.6])
     np.savez(folder / "depth.npz", depth=depth)
     np.save(folder / "depth.npy", depth), np.save(folder / "pose.npy", pose)
@@ -86,15 +100,23 @@ def images(folder: Path) -> list[Case]:
 
     def read(path: Path) -> None:
         given = {"depth": depth, "mask": None, "pose": pose}
-        given[path.stem] = read_pose("pose", path) if path.stem == "pose" else read_image_file(path.stem, path)
+        given[path.stem] = (
+            read_pose("pose", path) if path.stem == "pose" else read_image_file(path.stem, path)
+        )
         cloud_from_depth(given["depth"], camera, given["mask"], given["pose"])
 
-    return [saved(path, read_scene if path.stem == "scene" else read) for path in sorted(folder.iterdir())]
+    return [
+        saved(path, read_scene if path.stem == "scene" else read)
+        for path in sorted(folder.iterdir())
+    ]
 
 
 def urdfs(folder: Path) -> list[Case]:
     """Return a clean URDF, read as it stands; the hand of `folder` is the claw of the tests."""
-    return [saved(folder / "claw.urdf", read_urdf), saved(folder / "claw.urdf", lambda x: load_hand(x.parent))]
+    return [
+        saved(folder / "claw.urdf", read_urdf),
+        saved(folder / "claw.urdf", lambda x: load_hand(x.parent)),
+    ]
 
 
 def published(folder: Path) -> list[Case]:
@@ -103,7 +125,10 @@ def published(folder: Path) -> list[Case]:
     trimesh.creation.icosahedron().apply_scale(0.011).export(folder / "tip.stl")
     mesh = '<mesh filename="package://claw/tip.stl" scale="1 1 1"/>'
     (folder / "claw.urdf").write_text(text.replace('<sphere radius="0.011"/>', mesh, 1))
-    return [saved(folder / name, lambda x: new_hand(x.parent / "claw.urdf")) for name in ("claw.urdf", "tip.stl")]
+    return [
+        saved(folder / name, lambda x: new_hand(x.parent / "claw.urdf"))
+        for name in ("claw.urdf", "tip.stl")
+    ]
 
 
 def tomls(folder: Path) -> list[Case]:
@@ -112,8 +137,15 @@ def tomls(folder: Path) -> list[Case]:
 
 def manifests(folder: Path) -> list[Case]:
     pose = {"T_object_camera": np.eye(4).tolist()}
-    cup = {"views": {"front": pose, "back": pose}, "suggested_scale": 0.5, "family": "cups", "mass_kg": 0.2}
-    (folder / "manifest.json").write_text(json.dumps({"objects": {"cup": cup | {"group": "shell"}, "jug": cup}}))
+    cup = {
+        "views": {"front": pose, "back": pose},
+        "suggested_scale": 0.5,
+        "family": "cups",
+        "mass_kg": 0.2,
+    }
+    (folder / "manifest.json").write_text(
+        json.dumps({"objects": {"cup": cup | {"group": "shell"}, "jug": cup}})
+    )
 
     def read(path: Path) -> None:
         for name in read_entries(path.parent):
@@ -125,10 +157,13 @@ def manifests(folder: Path) -> list[Case]:
 
 def foreign(folder: Path) -> list[Case]:
     """Return grasps in the formats that `torchgrasp import` reads."""
-    hand, grasp = load_hand("barrett"), load_shipped_grasp("jug", "barrett")
+    hand = load_hand("barrett")
+    grasp = load_shipped_grasp("jug", "barrett")
     (folder / "own.json").write_text(format_grasps(hand, grasp))
     row = np.concatenate([[0.0, 0.0, 0.1, 1.0, 0.0, 0.0, 0.0], grasp.joints[0].numpy()])
-    (folder / "multi.json").write_text(json.dumps({"pose": [row[:7].tolist()] * 2, "dofs": [row[7:].tolist()] * 2}))
+    (folder / "multi.json").write_text(
+        json.dumps({"pose": [row[:7].tolist()] * 2, "dofs": [row[7:].tolist()] * 2})
+    )
     np.savez(folder / "bench.npz", grasp_qpos=row[None], pregrasp_qpos=row[None])
 
     def read(path: Path) -> None:

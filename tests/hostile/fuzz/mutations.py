@@ -1,4 +1,6 @@
-"""Mutations of good files: bits, bytes, spans and words; and the limits under which the mutated files are read."""
+"""Mutations of good files: bits, bytes, spans and words; and the limits under which the mutated
+files are read.
+"""
 
 import contextlib
 import re
@@ -10,12 +12,52 @@ from pathlib import Path
 from hypothesis import strategies as st
 
 WORDS = [
-    b"", b"0", b"-1", b"1e999", b"-0.0", b"NaN", b"inf", b"1" * 400, b"2147483648", b"18446744073709551616", b"1e-320",
-    b"0x10", b"1_0", b"true", b"null", b'""', b'"x"', b"'", b"[]", b"{}", b"[" * 300, b"]", b'{"a":' * 300, b"../../x",
-    b"/etc/passwd", b"\x00", b"\xff\xfe", b"\xed\xa0\x80", b"\xd9\xa1", b"\r\n", b"#", b"<!DOCTYPE r [", b"&#0;", b"</",
-    b"2", b"0.001", b"-0.5", b"1000", b"<link>" * 80, b"a.b.c", b"f4", b"float8_e4m3fn", b"list",
-    b"double", b"x" * 5000,
-]  # fmt: skip
+    b"",
+    b"0",
+    b"-1",
+    b"1e999",
+    b"-0.0",
+    b"NaN",
+    b"inf",
+    b"1" * 400,
+    b"2147483648",
+    b"18446744073709551616",
+    b"1e-320",
+    b"0x10",
+    b"1_0",
+    b"true",
+    b"null",
+    b'""',
+    b'"x"',
+    b"'",
+    b"[]",
+    b"{}",
+    b"[" * 300,
+    b"]",
+    b'{"a":' * 300,
+    b"../../x",
+    b"/etc/passwd",
+    b"\x00",
+    b"\xff\xfe",
+    b"\xed\xa0\x80",
+    b"\xd9\xa1",
+    b"\r\n",
+    b"#",
+    b"<!DOCTYPE r [",
+    b"&#0;",
+    b"</",
+    b"2",
+    b"0.001",
+    b"-0.5",
+    b"1000",
+    b"<link>" * 80,
+    b"a.b.c",
+    b"f4",
+    b"float8_e4m3fn",
+    b"list",
+    b"double",
+    b"x" * 5000,
+]
 """What stands in a file by mistake or by malice."""
 MOST_BYTES = 200_000
 """A mutated file is no longer, so that its size is no reason for the time of its reader."""
@@ -62,10 +104,14 @@ def repeat(data: bytearray, at: int, what: int) -> None:
 def number(data: bytearray, at: int, what: int) -> None:
     """Write a huge or negative binary number of 1, 2, 4 or 8 bytes."""
     size = 1 << (what % 4)
-    data[at : at + size] = (b"\xff" * size, b"\x7f" + b"\xff" * (size - 1), b"\x00" * size)[what // 4 % 3]
+    data[at : at + size] = (b"\xff" * size, b"\x7f" + b"\xff" * (size - 1), b"\x00" * size)[
+        what // 4 % 3
+    ]
 
 
-EDITS = {edit.__name__: edit for edit in (flip, put, cut, end, insert, replace, copy, repeat, number)}
+EDITS = {
+    edit.__name__: edit for edit in (flip, put, cut, end, insert, replace, copy, repeat, number)
+}
 
 
 def mutated(data: bytes, edits: list[Edit]) -> bytes:
@@ -78,12 +124,17 @@ def mutated(data: bytes, edits: list[Edit]) -> bytes:
 
 
 def edits() -> st.SearchStrategy[list[Edit]]:
-    """Return a strategy of one to three edits; words come most often, since they reach the farthest."""
+    """Return a strategy of one to three edits; words come most often, since they reach the
+    farthest.
+    """
     kinds = st.sampled_from([*EDITS, "replace", "replace", "replace"])
-    return st.lists(st.tuples(kinds, st.integers(0, 2**16 - 1), st.integers(0, 255)), min_size=1, max_size=3)
+    return st.lists(
+        st.tuples(kinds, st.integers(0, 2**16 - 1), st.integers(0, 255)), min_size=1, max_size=3
+    )
 
 
-SECONDS, BYTES = 5.0, 2**30
+SECONDS = 5.0
+BYTES = 2**30
 """What a small file may cost at most."""
 
 
@@ -93,7 +144,8 @@ class TooSlow(Exception):
 
 @contextlib.contextmanager
 def limited(most: int = BYTES) -> Iterator[None]:
-    """Raise `TooSlow` after `SECONDS` of the processor, and `MemoryError` beyond `most` bytes more than there are.
+    """Raise `TooSlow` after `SECONDS` of the processor, and `MemoryError` beyond `most` bytes more
+    than there are.
 
     Only Linux has both limits; elsewhere there are none.
     """

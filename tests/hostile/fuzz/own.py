@@ -24,13 +24,30 @@ from torchgrasp.values.planning import Certificate, Contacts, Grasps
 
 def models(folder: Path) -> list[Case]:
     """Return grasps, mixtures, a stability model and a chunk of samples, small where they can be."""
-    one, two = torch.ones(2), torch.ones(2, 3)
-    contacts = Contacts(torch.rand(2, 3, 3), torch.eye(3).expand(2, 3, 3).contiguous(), torch.rand(2, 3))
+    one = torch.ones(2)
+    two = torch.ones(2, 3)
+    contacts = Contacts(
+        torch.rand(2, 3, 3), torch.eye(3).expand(2, 3, 3).contiguous(), torch.rand(2, 3)
+    )
     certificate = Certificate(one, one, one, one > 0, torch.ones(2, 6))
-    pose, status = torch.eye(4).repeat(2, 1, 1), torch.zeros(2, dtype=torch.int64)
-    direction, order = torch.eye(3)[:2], torch.arange(3).repeat(2, 1)
+    pose = torch.eye(4).repeat(2, 1, 1)
+    status = torch.zeros(2, dtype=torch.int64)
+    direction = torch.eye(3)[:2]
+    order = torch.arange(3).repeat(2, 1)
     Grasps(
-        two, two, direction, pose, contacts, order, two, one, two, certificate, one, status, {"hand": "barrett"}
+        two,
+        two,
+        direction,
+        pose,
+        contacts,
+        order,
+        two,
+        one,
+        two,
+        certificate,
+        one,
+        status,
+        {"hand": "barrett"},
     ).save(folder / "grasps.safetensors")
     half = torch.full((1, 7), 0.5, dtype=torch.float64)
     eye = torch.eye(7, dtype=torch.float64)[None]
@@ -43,7 +60,9 @@ def models(folder: Path) -> list[Case]:
         saved(folder / "grasps.safetensors", load_grasps),
         saved(folder / "mixture.safetensors", load_mixture),
         saved(folder / "stability.safetensors", lambda x: load_stability(hand, x)),
-        saved(folder / "samples" / "chunk-000000.safetensors", lambda x: load_samples(x.parent).read()),
+        saved(
+            folder / "samples" / "chunk-000000.safetensors", lambda x: load_samples(x.parent).read()
+        ),
     ]
 
 
@@ -65,7 +84,9 @@ def samples(folder: Path) -> list[Case]:
 
 
 def shards(folder: Path) -> list[Case]:
-    """Return what a campaign left: its card, a shard, and what was asked, which is compared when it is continued."""
+    """Return what a campaign left: its card, a shard, and what was asked, which is compared when it
+    is continued.
+    """
     asked = campaign(3)
     carry_out(asked, folder, work_on(asked, 0))
 

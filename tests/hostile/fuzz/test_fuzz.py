@@ -17,7 +17,9 @@ KINDS = {make.__name__: make for make in (*strange.MAKERS, *own.MAKERS)}
 MOST_LETTERS = 2000
 """Longest message of an error: it shows a part of what was found."""
 SLOWNESS = {"published": 10}
-"""Kinds that are read so many times slower than others, and tried so many times less often: mending takes 20 ms."""
+"""Kinds that are read so many times slower than others, and tried so many times less often: mending
+takes 20 ms.
+"""
 
 
 @pytest.mark.promise("H5")
@@ -36,7 +38,8 @@ def test_mutated_files_are_read_or_refused_by_name(kind, tmp_path, claw):
     @settings(max_examples=settings.default.max_examples // SLOWNESS.get(kind, 1))
     @given(st.sampled_from(range(len(cases))), edits())
     def check(number, changes):
-        case, told = cases[number], ""
+        case = cases[number]
+        told = ""
         content = mutated(case.good, changes)
         case.path.write_bytes(content)
         try:

@@ -1,4 +1,6 @@
-"""Bodies of revolution whose axis is known in closed form, turned at random; and bodies that have none."""
+"""Bodies of revolution whose axis is known in closed form, turned at random; and bodies that have
+none.
+"""
 
 import math
 
@@ -19,10 +21,14 @@ Z = real([0.0, 0.0, 1.0])
 
 
 def _seen(points: Tensor, normals: Tensor, camera: Tensor = CAMERA) -> PointCloud:
-    """What a camera sees of a nearly convex surface, 1000 points at most, with noise of 3 degrees and 0.4 mm."""
+    """What a camera sees of a nearly convex surface, 1000 points at most, with noise of 3 degrees
+    and 0.4 mm.
+    """
     facing = torch.nn.functional.normalize(camera - points, dim=1)
     rows = torch.nonzero((facing * normals).sum(1) > 0.15)[:, 0][:1000]
-    noise = torch.randn(2, len(rows), 3, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
+    noise = torch.randn(
+        2, len(rows), 3, dtype=torch.float64, generator=torch.Generator().manual_seed(5)
+    )
     normals = torch.nn.functional.normalize(normals[rows] + 0.05 * noise[0], dim=1)
     return PointCloud(points[rows] + 0.0004 * noise[1], normals, camera)
 
@@ -30,15 +36,18 @@ def _seen(points: Tensor, normals: Tensor, camera: Tensor = CAMERA) -> PointClou
 def _turned_profile(radius: float, slope: float, bend: float, height: float = 0.1) -> PointCloud:
     """A side of radius r + slope z + bend sin(2 pi z / h), with a flat top."""
     draws = torch.rand(6000, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
-    angle, z = 2 * math.pi * draws[:4500, 0], height * draws[:4500, 1]
+    angle = 2 * math.pi * draws[:4500, 0]
+    z = height * draws[:4500, 1]
     wave = 2 * math.pi / height
     r = radius + slope * z + bend * torch.sin(wave * z)
     out = torch.stack([angle.cos(), angle.sin(), 0 * angle], 1)
     rise = slope + bend * wave * torch.cos(wave * z)
     side_normals = torch.nn.functional.normalize(out - rise[:, None] * Z, dim=1)
-    turn, share = 2 * math.pi * draws[4500:, 0], draws[4500:, 1].sqrt() * (radius + slope * height)
+    turn = 2 * math.pi * draws[4500:, 0]
+    share = draws[4500:, 1].sqrt() * (radius + slope * height)
     top = torch.stack([share * turn.cos(), share * turn.sin(), torch.full_like(turn, height)], 1)
-    points, normals = torch.cat([r[:, None] * out + z[:, None] * Z, top]), torch.cat([side_normals, Z.expand(1500, 3)])
+    points = torch.cat([r[:, None] * out + z[:, None] * Z, top])
+    normals = torch.cat([side_normals, Z.expand(1500, 3)])
     mixed = torch.randperm(6000, generator=torch.Generator().manual_seed(6))
     return _seen(points[mixed], normals[mixed])
 
@@ -64,7 +73,8 @@ def test_axis_of_a_turned_body_is_found(body: str, seed: int):
 
 
 def test_a_handle_is_no_part_of_the_body_and_half_a_cylinder_on_a_table_is_none():
-    can, generator = BODIES["can"], torch.Generator().manual_seed(7)
+    can = BODIES["can"]
+    generator = torch.Generator().manual_seed(7)
     draws = torch.rand(150, 2, dtype=torch.float64, generator=generator)
     angle = math.pi * (draws[:, 0] - 0.5)
     normals = torch.stack([angle.cos(), angle.sin(), 0 * angle], 1)
@@ -73,9 +83,13 @@ def test_a_handle_is_no_part_of_the_body_and_half_a_cylinder_on_a_table_is_none(
     jug = PointCloud(torch.cat([can.points, rod]), torch.cat([can.normals, normals]), CAMERA)
     found = find_axis(SymmetryScorer.of(move(jug, random_motion(3)), None))
     assert found is not None
-    assert found[1].body[: len(can)].double().mean() > 0.9 and found[1].body[len(can) :].double().mean() < 0.1
+    assert (
+        found[1].body[: len(can)].double().mean() > 0.9
+        and found[1].body[len(can) :].double().mean() < 0.1
+    )
     draws = torch.rand(4000, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(10))
-    angle, along = math.pi * draws[:, 0], 0.12 * (draws[:, 1] - 0.5)
+    angle = math.pi * draws[:, 0]
+    along = 0.12 * (draws[:, 1] - 0.5)
     normals = torch.stack([angle.cos(), 0 * angle, angle.sin()], 1)
     points = 0.04 * normals + torch.stack([0 * angle, along, 0 * angle], 1)
     loaf = _seen(points, normals, camera=real([0.02, 0.0, 0.6]))
@@ -84,10 +98,16 @@ def test_a_handle_is_no_part_of_the_body_and_half_a_cylinder_on_a_table_is_none(
 
 
 def _seen_box(half: tuple[float, float, float]) -> PointCloud:
-    draws = torch.rand(12000, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(8)) * 2 - 1
-    size, axis = real(half), torch.arange(12000) % 3
+    draws = (
+        torch.rand(12000, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(8)) * 2
+        - 1
+    )
+    size = real(half)
+    axis = torch.arange(12000) % 3
     normals = torch.zeros(12000, 3, dtype=torch.float64)
-    normals[torch.arange(12000), axis] = torch.where(torch.arange(12000) % 2 == 0, 1.0, -1.0).double()
+    normals[torch.arange(12000), axis] = torch.where(
+        torch.arange(12000) % 2 == 0, 1.0, -1.0
+    ).double()
     points = torch.where(normals != 0, normals, draws) * size
     return _seen(points + half[2] * Z, normals)
 
@@ -95,9 +115,13 @@ def _seen_box(half: tuple[float, float, float]) -> PointCloud:
 def _seen_half_torus() -> PointCloud:
     """Half of a ring of 12 mm thickness about an axis through its empty middle, as a bent pipe."""
     draws = torch.rand(12000, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(9))
-    around, across = math.pi * draws[:, 0], 2 * math.pi * draws[:, 1]
+    around = math.pi * draws[:, 0]
+    across = 2 * math.pi * draws[:, 1]
     ring = torch.stack([0 * around, around.cos(), around.sin()], 1)
-    normals = across.cos()[:, None] * ring + across.sin()[:, None] * torch.tensor([1.0, 0.0, 0.0]).double()
+    normals = (
+        across.cos()[:, None] * ring
+        + across.sin()[:, None] * torch.tensor([1.0, 0.0, 0.0]).double()
+    )
     return _seen(0.05 * ring + 0.012 * normals, normals)
 
 
@@ -114,7 +138,8 @@ def test_hidden_side_lies_on_the_body_without_a_table(body: str):
     assert found.kind == "revolution"
     local = (found.points - motion[:3, 3]) @ motion[:3, :3]
     side = (local[:, 2] > 0.01) & (local[:, 2] < 0.09)
-    z, radius = local[side, 2], torch.linalg.vector_norm(local[side, :2], dim=1)
+    z = local[side, 2]
+    radius = torch.linalg.vector_norm(local[side, :2], dim=1)
     bend = 0.006 * torch.sin(2 * math.pi * z / 0.1) if body == "vase" else 0.0
     truth = 0.04 - 0.25 * z if body == "cone" else 0.03 + bend
     away = local[side] @ CAMERA < 0
@@ -123,11 +148,16 @@ def test_hidden_side_lies_on_the_body_without_a_table(body: str):
 
 
 def test_fit_without_a_table_moves_with_the_cloud():
-    motion, can = random_motion(6), BODIES["can"]
-    still, moved = fit_shape(can), fit_shape(move(can, motion))
+    motion = random_motion(6)
+    can = BODIES["can"]
+    still = fit_shape(can)
+    moved = fit_shape(move(can, motion))
     assert still.kind == moved.kind == "revolution"
-    probes = 0.03 * torch.nn.functional.normalize(torch.randn(50, 3, generator=torch.Generator().manual_seed(1)), dim=1)
+    probes = 0.03 * torch.nn.functional.normalize(
+        torch.randn(50, 3, generator=torch.Generator().manual_seed(1)), dim=1
+    )
     probes = probes.double() + 0.05 * Z
-    a, b = still.predict(probes), moved.predict(apply(motion, probes))
+    a = still.predict(probes)
+    b = moved.predict(apply(motion, probes))
     near(b.distance, a.distance, 1e-4)
     torch.testing.assert_close(b.std_m, a.std_m, atol=1e-5, rtol=1e-2)

@@ -31,7 +31,9 @@ CAMERA = real([0.45, 0.0, 0.3])
 def _seen_box(half: tuple[float, float, float], camera: Tensor) -> PointCloud:
     """The seen faces of a box that stands on z = 0, with exact normals."""
     rng = torch.Generator().manual_seed(2)
-    size, points, normals = real(half), [], []
+    size = real(half)
+    points = []
+    normals = []
     for axis in range(3):
         for sign in (-1.0, 1.0):
             area = float(size.prod() / size[axis])
@@ -41,7 +43,8 @@ def _seen_box(half: tuple[float, float, float], camera: Tensor) -> PointCloud:
             n[:, axis] = sign
             points.append(p + real([0.0, 0.0, half[2]]))
             normals.append(n)
-    p, n = torch.cat(points), torch.cat(normals)
+    p = torch.cat(points)
+    n = torch.cat(normals)
     seen = ((camera - p) * n).sum(-1) > 0.1 * torch.linalg.vector_norm(camera - p, dim=-1)
     return PointCloud(p[seen], n[seen], camera)
 
@@ -50,7 +53,9 @@ def _angles(found: Tensor, wanted: Tensor) -> Tensor:
     return torch.rad2deg(torch.arccos((found * wanted).sum(-1).clamp(-1, 1)))
 
 
-def test_hidden_half_of_a_cylinder_is_found_and_respects_cloud_outline_and_table(seen_cylinder: PointCloud):
+def test_hidden_half_of_a_cylinder_is_found_and_respects_cloud_outline_and_table(
+    seen_cylinder: PointCloud,
+):
     found = complete_cloud(seen_cylinder, table=0.0)
     side = found.points[:, 2] < 0.11
     error = torch.linalg.vector_norm(found.points[side, :2], dim=-1) - 0.03
@@ -81,7 +86,9 @@ def test_back_of_a_box_is_found_and_no_point_is_spent_on_the_face_on_the_table()
     assert not ((found.points[:, 2] < 0.003) & (found.normals[:, 2] < -0.9)).any()
 
 
-def test_hidden_half_is_found_without_a_table_wherever_the_object_is(seen_cylinder: PointCloud, motion: Tensor):
+def test_hidden_half_is_found_without_a_table_wherever_the_object_is(
+    seen_cylinder: PointCloud, motion: Tensor
+):
     found = complete_cloud(seen_cylinder)
     error = torch.linalg.vector_norm(found.points[:, :2], dim=-1) - 0.03
     assert (found.points[:, 0] < -0.01).sum() > 10
@@ -89,7 +96,9 @@ def test_hidden_half_is_found_without_a_table_wherever_the_object_is(seen_cylind
     assert seen_cylinder.normals is not None
     camera = apply(motion, CAMERA[None])[0]
     found = complete_cloud(
-        PointCloud(apply(motion, seen_cylinder.points), rotate(motion, seen_cylinder.normals), camera)
+        PointCloud(
+            apply(motion, seen_cylinder.points), rotate(motion, seen_cylinder.normals), camera
+        )
     )
     back = (found.points - motion[:3, 3]) @ motion[:3, :3]
     error = torch.linalg.vector_norm(back[:, :2], dim=-1) - 0.03
@@ -97,7 +106,9 @@ def test_hidden_half_is_found_without_a_table_wherever_the_object_is(seen_cylind
     assert error[back[:, 2] < 0.11].abs().median() < 0.003
 
 
-def test_noise_covers_the_error_grows_without_symmetry_and_is_shared_by_neighbours(seen_cylinder: PointCloud):
+def test_noise_covers_the_error_grows_without_symmetry_and_is_shared_by_neighbours(
+    seen_cylinder: PointCloud,
+):
     found = complete_cloud(seen_cylinder, table=0.0)
     side = found.points[:, 2] < 0.11
     error = (torch.linalg.vector_norm(found.points[side, :2], dim=-1) - 0.03).abs()
@@ -118,7 +129,9 @@ def test_noise_covers_the_error_grows_without_symmetry_and_is_shared_by_neighbou
 
 @pytest.mark.parametrize("table", [0.0, None])
 def test_shared_errors_are_those_of_a_moved_plane(seen_cylinder: PointCloud, table: float | None):
-    """A plane's shift moves all its points along its normal, a turn those further away more: the rank stays small."""
+    """A plane's shift moves all its points along its normal, a turn those further away more: the
+    rank stays small.
+    """
     found = complete_cloud(seen_cylinder, table=table)
     free = 2 if table is not None else 3  # a shift and one or two turns
     values = torch.linalg.svdvals(found.shared)
@@ -134,15 +147,23 @@ def test_shared_errors_are_the_second_moment_of_the_mixture_of_planes():
     by_plane = found.shared.reshape(len(found.points), len(found.planes), -1)
     checked = 0
     for k, plane in enumerate(found.planes):
-        # Points of this plane alone, mirrored once, since an image of an image has errors of two planes.
-        mine = (by_plane[:, k].abs().sum(-1) > 0) & (by_plane.abs().sum((1, 2)) == by_plane[:, k].abs().sum(-1))
-        sources, normals = reflect(found.points[mine], plane), found.normals[mine]
+        # Points of this plane alone, mirrored once, since an image of an image has errors of two
+        # planes.
+        mine = (by_plane[:, k].abs().sum(-1) > 0) & (
+            by_plane.abs().sum((1, 2)) == by_plane[:, k].abs().sum(-1)
+        )
+        sources = reflect(found.points[mine], plane)
+        normals = found.normals[mine]
         steps = torch.linspace(-1, 1, NEARBY, dtype=torch.float64)
-        moment, total = torch.zeros(len(sources), len(sources), dtype=torch.float64), 0.0
-        for other in planes_near(scorer, plane, NEARBY_ANGLE * steps, NEARBY_SHIFT * scorer.size * steps):
+        moment = torch.zeros(len(sources), len(sources), dtype=torch.float64)
+        total = 0.0
+        for other in planes_near(
+            scorer, plane, NEARBY_ANGLE * steps, NEARBY_SHIFT * scorer.size * steps
+        ):
             chance = math.exp(float(scorer.score(other[None])[0]) / TEMPERATURE)
             moved = ((reflect(sources, other) - found.points[mine]) * normals).sum(1)
-            moment, total = moment + chance * moved[:, None] * moved, total + chance
+            moment = moment + chance * moved[:, None] * moved
+            total = total + chance
         torch.testing.assert_close(
             (found.shared @ found.shared.T)[mine][:, mine], moment / total, atol=1e-12, rtol=1e-9
         )
@@ -177,7 +198,8 @@ def test_silhouette_of_a_ball_is_its_circle():
     p = 0.04 * p / torch.linalg.vector_norm(p, dim=-1, keepdim=True)
     camera = real([0.0, 0.5, 0.0])
     outline = silhouette(PointCloud(p[((camera - p) * p).sum(-1) > 0], None, camera))
-    # The tangent cone touches the ball on a circle of radius r sqrt(1 - (r/d)^2) at distance d - r^2/d.
+    # The tangent cone touches the ball on a circle of radius r sqrt(1 - (r/d)^2) at distance d -
+    # r^2/d.
     ring = 0.04 * math.sqrt(1 - 0.08**2)
     assert len(outline.rim) == 16
     assert (torch.linalg.vector_norm(outline.rim[:, [0, 2]], dim=-1) - ring).abs().max() < 0.0025
@@ -192,7 +214,9 @@ def test_silhouette_of_a_ball_is_its_circle():
 
 @pytest.mark.parametrize("turn", [45.0, 60.0])
 def test_the_back_of_a_box_follows_from_a_plane_at_right_angles(turn: float):
-    """Its own score is small: the images of the broad side are hidden, and only the narrow side and the top match."""
+    """Its own score is small: the images of the broad side are hidden, and only the narrow side and
+    the top match.
+    """
     camera = 0.6 * real([math.cos(math.radians(turn)), math.sin(math.radians(turn)), 0.4])
     half = (0.025, 0.05, 0.07)
     found = complete_cloud(_seen_box(half, camera), table=0.0)
@@ -200,7 +224,9 @@ def test_the_back_of_a_box_follows_from_a_plane_at_right_angles(turn: float):
     assert (upright[:, :3] @ upright[:, :3].T).abs().min() < math.cos(math.radians(85.0))
     back = (found.normals[:, 0] < -0.9) & (found.points[:, 1].abs() < 0.04)
     assert back.sum() >= 5
-    assert (found.points[back, 0] + half[0]).abs().max() < 0.004  # the far side, 50 mm behind the broad one
+    assert (
+        found.points[back, 0] + half[0]
+    ).abs().max() < 0.004  # the far side, 50 mm behind the broad one
 
 
 def test_the_underside_of_a_lying_rod_is_mirrored_from_its_top():
@@ -208,10 +234,13 @@ def test_the_underside_of_a_lying_rod_is_mirrored_from_its_top():
     angle = 2 * math.pi * torch.rand(6000, generator=rng, dtype=torch.float64)
     along = 0.15 * (torch.rand(6000, generator=rng, dtype=torch.float64) - 0.5)
     normals = torch.stack([angle.cos(), torch.zeros_like(angle), angle.sin()], 1)
-    axis, radius = real([0.0, 0.0, 0.02]), 0.02
+    axis = real([0.0, 0.0, 0.02])
+    radius = 0.02
     points = radius * normals + axis + along[:, None] * real([0.0, 1.0, 0.0])
     camera = real([0.5, 0.0, 0.3])
-    seen = ((camera - points) * normals).sum(1) > 0.1 * torch.linalg.vector_norm(camera - points, dim=1)
+    seen = ((camera - points) * normals).sum(1) > 0.1 * torch.linalg.vector_norm(
+        camera - points, dim=1
+    )
     found = complete_cloud(PointCloud(points[seen], normals[seen], camera), table=0.0)
     under = found.normals[:, 2] < -0.5
     assert under.sum() >= 5
@@ -222,33 +251,43 @@ def test_the_underside_of_a_lying_rod_is_mirrored_from_its_top():
 @pytest.mark.filterwarnings("ignore::torchgrasp.foundation.errors.Flat")
 @pytest.mark.parametrize("depth", [0.03, 0.05, 0.08])
 def test_a_box_that_shows_one_face_does_not_know_its_depth(depth: float):
-    """Mirror planes of any depth hide their images, so their scores are equal: the back lies anywhere behind."""
+    """Mirror planes of any depth hide their images, so their scores are equal: the back lies
+    anywhere behind.
+    """
     camera = real([0.5, 0.0, 0.06])
     cloud = _seen_box((depth / 2, 0.04, 0.06), camera)
     assert cloud.normals is not None and (cloud.normals[:, 0] == 1).all()
     shape = fit_shape(cloud, table=0.0)
-    y, z = torch.linspace(-0.03, 0.03, 7, dtype=torch.float64), torch.linspace(0.02, 0.1, 7, dtype=torch.float64)
+    y = torch.linspace(-0.03, 0.03, 7, dtype=torch.float64)
+    z = torch.linspace(0.02, 0.1, 7, dtype=torch.float64)
     back = torch.cartesian_prod(real([-depth / 2]), y, z)
     found = shape.predict(back)
-    assert (found.distance.abs() <= 2 * shape.std_factor * found.variance.sqrt()).double().mean() > 0.9
+    assert (
+        found.distance.abs() <= 2 * shape.std_factor * found.variance.sqrt()
+    ).double().mean() > 0.9
     assert found.std_m.median() > 0.01
 
 
 @pytest.mark.filterwarnings("ignore::torchgrasp.foundation.errors.Gap")
 @pytest.mark.parametrize("azimuth", [15.0, 70.0])
-def test_a_frame_of_thin_bars_is_as_deep_as_the_bars_are_wide_and_its_rings_are_open(azimuth: float):
-    upright, rings = trimesh.transformations.rotation_matrix(math.pi / 2, [0, 1, 0]), []
+def test_a_frame_of_thin_bars_is_as_deep_as_the_bars_are_wide_and_its_rings_are_open(
+    azimuth: float,
+):
+    upright = trimesh.transformations.rotation_matrix(math.pi / 2, [0, 1, 0])
+    rings = []
     for side in (-0.028, 0.028):
         ring = trimesh.creation.torus(0.022, 0.0025, 48, 16).apply_transform(upright)
         rings.append(ring.apply_translation([0.0, side, 0.0245]))
         ends = [[0.0, 1.8 * side, 0.0245], [-0.09, 1.8 * side, 0.0245]]
         rings.append(trimesh.creation.cylinder(0.0025, segment=ends, sections=16))
-    frame, volume = trimesh.util.concatenate(rings), sum(float(part.volume) for part in rings)
+    frame = trimesh.util.concatenate(rings)
+    volume = sum(float(part.volume) for part in rings)
     view = partial_view(frame, look_at(azimuth, 40.0, target=frame), seed=0)
     shape = fit_shape(view, table=0.0)
     assert extract_surface(shape).mesh().volume < 3.5 * volume
     points, faces = trimesh.sample.sample_surface(frame, 500, seed=0)
-    truth, normals = torch.from_numpy(np.asarray(points)), torch.from_numpy(frame.face_normals[faces])
+    truth = torch.from_numpy(np.asarray(points))
+    normals = torch.from_numpy(frame.face_normals[faces])
     far = shape.predict(truth[((view.viewpoint - truth) * normals).sum(-1) < 0])
     error = (far.distance * shape.scale).abs()
     assert error.median() < 0.0012 and (error < 2 * far.std_m).double().mean() > 0.9

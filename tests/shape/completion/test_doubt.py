@@ -1,4 +1,6 @@
-"""What a view does not tell: it warns where the view is cut off, flat, sparse, has a gap, or shows two bodies."""
+"""What a view does not tell: it warns where the view is cut off, flat, sparse, has a gap, or shows
+two bodies.
+"""
 
 import dataclasses
 import math
@@ -36,25 +38,32 @@ CAN = on_table(trimesh.creation.cylinder(0.04, 0.14))
 
 
 def cut_view(mesh, beyond):
-    """A view of which the image ends at a plane through the camera and x = y = 0 there, `beyond` m to the side."""
+    """A view of which the image ends at a plane through the camera and x = y = 0 there, `beyond` m
+    to the side.
+    """
     whole = partial_view(mesh, look_at(0.0, 20.0, target=mesh), n=1000, noise=False)
     ray = real([0.0, beyond, 0.07]) - whole.viewpoint
     side = real([0.0, -1.0, 0.0])
     side = side - (side @ ray) / (ray @ ray) * ray
     sides = torch.stack([side, ray, ray, ray])
     inside = (whole.points - whole.viewpoint) @ side > 0
-    return dataclasses.replace(whole.select(inside), frustum=sides / sides.norm(dim=1, keepdim=True))
+    return dataclasses.replace(
+        whole.select(inside), frustum=sides / sides.norm(dim=1, keepdim=True)
+    )
 
 
 def test_beyond_the_border_of_the_image_the_shape_is_told_to_be_a_guess():
-    cloud, truth = cut_view(CAN, 0.01), surface(CAN)
+    cloud = cut_view(CAN, 0.01)
+    truth = surface(CAN)
     with pytest.warns(CutOff, match="cuts the object off"):
         told = fit_shape(cloud, table=0.0)
     untold = fit_shape(dataclasses.replace(cloud, frustum=None), table=0.0)
     shares = []
     for shape in (told, untold):
         estimate = shape.predict(truth[truth[:, 1] > 0.013])
-        shares.append(float(((estimate.distance * shape.scale).abs() < 2 * estimate.std_m).double().mean()))
+        shares.append(
+            float(((estimate.distance * shape.scale).abs() < 2 * estimate.std_m).double().mean())
+        )
     assert shares[0] > 0.8 > 0.5 > shares[1]
     seen = told.predict(cloud.points)
     assert float((seen.distance * told.scale).abs().median()) < 0.001
@@ -67,7 +76,8 @@ def test_a_depth_image_that_ends_on_the_object_cuts_it_off_and_a_whole_one_does_
         whole = partial_view(BOX, pose, n=600)
         shape = fit_shape(whole, table=0.0)
     assert whole.frustum is not None and shape.std_factor < 1.0
-    size, focal = 120, 300.0
+    size = 120
+    focal = 300.0
     v, u = torch.meshgrid(torch.arange(size).double(), torch.arange(size).double(), indexing="ij")
     ball = 0.5 + 0.0 * u
     radius = torch.hypot(u - 20, v - 60) / focal * 0.5
@@ -109,7 +119,8 @@ def test_a_gap_that_is_far_wider_than_the_bars_around_it_is_a_hole_and_a_gap_in_
     ring = on_table(trimesh.creation.torus(0.04, 0.004))
     hole = silhouettes(partial_view(ring, look_at(30.0, 60.0, target=ring), n=1000))
     assert 0.020 < float(hole.hull_distance(real([0.0, 0.0, 0.004]))) < 0.036 and hole.gap > 0.04
-    view, face = partial_view(BOX, look_at(30.0, 25.0, target=BOX), n=1000), real([0.04, 0.0, 0.06])
+    view = partial_view(BOX, look_at(30.0, 25.0, target=BOX), n=1000)
+    face = real([0.04, 0.0, 0.06])
     patch = silhouettes(view.select(torch.linalg.vector_norm(view.points - face, dim=1) > 0.02))
     assert float(patch.hull_distance(face)) < -0.02 and patch.gap > 0.025
 
@@ -142,5 +153,7 @@ def test_a_warning_names_the_line_of_the_caller(tmp_path):
     ]
     script = tmp_path / "script.py"
     script.write_text("\n".join(lines))
-    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, env=os.environ | PATH)
+    done = subprocess.run(
+        [sys.executable, str(script)], capture_output=True, text=True, env=os.environ | PATH
+    )
     assert f"{script}:5: TwoBodies: two bodies" in done.stderr

@@ -19,9 +19,12 @@ def _fruit(axes: tuple[float, float, float], noise: float = 0.0005) -> PointClou
     axis = real(axes)
     center = real([0.01, -0.02, axes[2]])
     direction = fibonacci_sphere(3000)
-    points, normals = center + axis * direction, unit(direction / axis)
+    points = center + axis * direction
+    normals = unit(direction / axis)
     generator = torch.Generator().manual_seed(5)
-    seen = ((CAMERA - points) * normals).sum(1) > 0.15 * torch.linalg.vector_norm(CAMERA - points, dim=1)
+    seen = ((CAMERA - points) * normals).sum(1) > 0.15 * torch.linalg.vector_norm(
+        CAMERA - points, dim=1
+    )
     points = points + noise * torch.randn(points.shape, dtype=torch.float64, generator=generator)
     return PointCloud(points[seen], normals[seen], CAMERA)
 
@@ -41,7 +44,9 @@ def _off(points: Tensor, axes: tuple[float, float, float]) -> Tensor:
 
 @pytest.mark.parametrize("table", [0.0, None])
 @pytest.mark.parametrize("axes", [(0.03, 0.03, 0.03), (0.035, 0.03, 0.03), (0.025, 0.025, 0.023)])
-def test_the_whole_ellipsoid_is_found_and_its_error_is_foreseen(axes: tuple[float, float, float], table: float | None):
+def test_the_whole_ellipsoid_is_found_and_its_error_is_foreseen(
+    axes: tuple[float, float, float], table: float | None
+):
     found = _find(_fruit(axes), table)
     assert found is not None and found.misfit < 0.001
     off = _off(found.points, axes).abs()

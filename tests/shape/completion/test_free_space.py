@@ -17,7 +17,8 @@ def test_free_space_is_free_and_its_least_distance_is_a_lower_bound(seen_cylinde
     assert seen_cylinder.viewpoint is not None
     outline = silhouettes(seen_cylinder)
     x, least = free_space(outline, Normalisation(CENTER, 0.07), table=0.0)
-    points, least = 0.07 * x + CENTER, 0.07 * least
+    points = 0.07 * x + CENTER
+    least = 0.07 * least
     assert len(x) > 100 and torch.linalg.vector_norm(x, dim=-1).max() < 1.15
     beside = torch.linalg.vector_norm(points[:, :2], dim=-1) - 0.03
     apart = torch.stack([beside, -points[:, 2], points[:, 2] - 0.12]).amax(0)
@@ -28,7 +29,9 @@ def test_free_space_is_free_and_its_least_distance_is_a_lower_bound(seen_cylinde
     assert len(above) < len(x)
 
 
-def test_a_shape_that_respects_free_space_does_not_violate_it_and_a_blown_up_one_does(seen_cylinder: PointCloud):
+def test_a_shape_that_respects_free_space_does_not_violate_it_and_a_blown_up_one_does(
+    seen_cylinder: PointCloud,
+):
     assert seen_cylinder.viewpoint is not None
     shape = fit_shape(seen_cylinder, table=0.0)
     x = shape.normalise(_ring(0.045))
@@ -40,15 +43,22 @@ def test_a_shape_that_respects_free_space_does_not_violate_it_and_a_blown_up_one
 
 def _ring(radius: float) -> torch.Tensor:
     angle = torch.arange(40, dtype=torch.float64) * 2 * math.pi / 40
-    return torch.stack([radius * angle.cos(), radius * angle.sin(), torch.full_like(angle, 0.06)], -1)
+    return torch.stack(
+        [radius * angle.cos(), radius * angle.sin(), torch.full_like(angle, 0.06)], -1
+    )
 
 
 @pytest.mark.filterwarnings("ignore::torchgrasp.foundation.errors.Flat")
 def test_a_slab_seen_face_on_stays_within_its_outline(generator: torch.Generator):
     """Nothing is seen of its sides; without free space the far side swells beyond the outline."""
-    p = torch.rand(1000, 3, generator=generator, dtype=torch.float64) * torch.tensor([0.0, 0.05, 0.17]).double()
+    p = (
+        torch.rand(1000, 3, generator=generator, dtype=torch.float64)
+        * torch.tensor([0.0, 0.05, 0.17]).double()
+    )
     camera = torch.tensor([0.6, 0.025, 0.2], dtype=torch.float64)
-    shape = fit_shape(PointCloud(p + torch.tensor([0.04, 0.0, 0.0]).double(), None, camera), table=0.0)
+    shape = fit_shape(
+        PointCloud(p + torch.tensor([0.04, 0.0, 0.0]).double(), None, camera), table=0.0
+    )
     depth = torch.linspace(-0.03, 0.03, 7, dtype=torch.float64)
     height = torch.linspace(0.03, 0.14, 7, dtype=torch.float64)
     x, z = torch.cartesian_prod(depth, height).T

@@ -1,4 +1,6 @@
-"""Bodies of revolution: the axis is found beside a handle, and a handle is not mirrored to where the body hides it."""
+"""Bodies of revolution: the axis is found beside a handle, and a handle is not mirrored to where
+the body hides it.
+"""
 
 import math
 
@@ -16,20 +18,26 @@ ARM = 0.05
 
 
 def _rod(azimuth: float) -> tuple[Tensor, Tensor]:
-    """Points and normals of an upright rod of 6 mm radius beside a body at the origin, seen from +x."""
+    """Points and normals of an upright rod of 6 mm radius beside a body at the origin, seen from
+    +x.
+    """
     generator = torch.Generator().manual_seed(1)
     draws = torch.rand(250, 2, dtype=torch.float64, generator=generator)
     angle = math.pi * (draws[:, 0] - 0.5)
     normals = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], 1)
     center = real([ARM * math.cos(azimuth), ARM * math.sin(azimuth), 0.03])
-    return center + 0.006 * normals + torch.stack([0 * angle, 0 * angle, 0.06 * draws[:, 1]], 1), normals
+    return center + 0.006 * normals + torch.stack(
+        [0 * angle, 0 * angle, 0.06 * draws[:, 1]], 1
+    ), normals
 
 
 def _jug(cylinder: PointCloud, azimuth: float) -> PointCloud:
     """A cylinder with a rod as its handle."""
     points, normals = _rod(azimuth)
     assert cylinder.normals is not None
-    return PointCloud(torch.cat([cylinder.points, points]), torch.cat([cylinder.normals, normals]), CAMERA)
+    return PointCloud(
+        torch.cat([cylinder.points, points]), torch.cat([cylinder.normals, normals]), CAMERA
+    )
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.7])
@@ -50,18 +58,26 @@ def test_axis_is_found_beside_a_handle_and_through_noise(seen_cylinder: PointClo
 def test_boxes_and_walls_are_no_bodies_of_revolution():
     generator = torch.Generator().manual_seed(2)
     face = torch.rand(400, 3, dtype=torch.float64, generator=generator) - 0.5
-    front, side = face.clone(), face.clone()
-    front[:, 0], side[:, 1] = 0.5, 0.5
+    front = face.clone()
+    side = face.clone()
+    front[:, 0] = 0.5
+    side[:, 1] = 0.5
     x, y, _ = torch.eye(3, dtype=torch.float64)
     assert find_revolution(0.08 * front, x.expand(400, 3)) is None
     both = torch.cat([x.expand(400, 3), y.expand(400, 3)])
     assert find_revolution(0.08 * torch.cat([front, side]), both) is None
-    assert find_revolution(0.08 * face, torch.tensor([0.0, 0.0, 1.0]).double().expand(400, 3)) is None
+    assert (
+        find_revolution(0.08 * face, torch.tensor([0.0, 0.0, 1.0]).double().expand(400, 3)) is None
+    )
 
 
 @pytest.mark.parametrize("azimuth", [1.1, 1.5, -1.9])
-def test_a_handle_is_not_mirrored_to_where_the_body_hides_it(seen_cylinder: PointCloud, azimuth: float):
-    """Any plane through the axis explains the body; mirrored across most of them the handle lies hidden behind it."""
+def test_a_handle_is_not_mirrored_to_where_the_body_hides_it(
+    seen_cylinder: PointCloud, azimuth: float
+):
+    """Any plane through the axis explains the body; mirrored across most of them the handle lies
+    hidden behind it.
+    """
     jug = _jug(seen_cylinder, azimuth)
     found = complete_cloud(jug, table=0.0)
     level = found.points[found.points[:, 2] < 0.11, :2]

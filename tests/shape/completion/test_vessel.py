@@ -39,7 +39,8 @@ def test_inner_points_are_those_within_the_cup_and_a_frame_does_not_matter():
     seen = _prepared(cup_view(0.003))
     assert seen.normals is not None
     shift = real([0.3, -0.2, 0.4])
-    one, two = find_vessel(seen.points, seen.normals), find_vessel(seen.points + shift, seen.normals)
+    one = find_vessel(seen.points, seen.normals)
+    two = find_vessel(seen.points + shift, seen.normals)
     assert one is not None and two is not None and torch.equal(one.inner, two.inner)
     near(two.center, one.center + shift[:2], 1e-9)
     radius = torch.linalg.vector_norm(seen.points[:, :2], dim=1)
@@ -51,9 +52,11 @@ def test_closed_bodies_are_no_vessels(seen_cylinder: PointCloud):
     assert _find(seen_cylinder) is None
     generator = torch.Generator().manual_seed(2)
     points = torch.rand(600, 3, dtype=torch.float64, generator=generator)
-    points[:300, 0], points[300:, 1] = 1.0, 1.0
+    points[:300, 0] = 1.0
+    points[300:, 1] = 1.0
     normals = torch.zeros_like(points)
-    normals[:300, 0], normals[300:, 1] = 1.0, 1.0
+    normals[:300, 0] = 1.0
+    normals[300:, 1] = 1.0
     assert find_vessel(0.08 * points, normals) is None
 
 
@@ -71,7 +74,8 @@ def test_hidden_walls_lie_on_the_cup_and_where_nothing_was_seen():
     assert vessel is not None
     outer, inner = complete_walls(seen, vessel, silhouettes(seen), table=0.0)
     for wall, radius, sign in ((outer, RADIUS, 1.0), (inner, RADIUS - 0.003, -1.0)):
-        points, normals = wall.hidden.points, wall.hidden.normals
+        points = wall.hidden.points
+        normals = wall.hidden.normals
         side = normals[:, 2].abs() < 0.3
         level = torch.linalg.vector_norm(points[side, :2], dim=1)
         assert (level - radius).abs().median() < 0.0008 and (level - radius).abs().max() < 0.003

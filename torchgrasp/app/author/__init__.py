@@ -1,4 +1,6 @@
-"""Authoring of hand files from published URDFs: repairs, fitted shapes, guessed fingertip pads, a first hand.toml."""
+"""Authoring of hand files from published URDFs: repairs, fitted shapes, guessed fingertip pads, a
+first hand.toml.
+"""
 
 from torchgrasp.app.author.draft import Draft, Wish, clean_arm, draft_hand, new_hand
 

@@ -1,7 +1,8 @@
-"""A first hand.toml for a URDF, and a clean copy of the URDF: fingers, pads, coupling, pairs of links.
+"""A first hand.toml for a URDF, and a clean copy of the URDF: fingers, pads, coupling, pairs of
+links.
 
-A published URDF is repaired (`repair`), its meshes are replaced by simple shapes (`fit_shapes`), and the fingertip pads
-are guessed (`pads`). Every guess is marked in the text.
+A published URDF is repaired (`repair`), its meshes are replaced by simple shapes (`fit_shapes`),
+and the fingertip pads are guessed (`pads`). Every guess is marked in the text.
 """
 
 import functools
@@ -18,7 +19,13 @@ from torch import Tensor
 
 from torchgrasp.app.author.fit_shapes import ball_tip, replace_meshes, shape_points
 from torchgrasp.app.author.pads import guess_pads, is_primitive, order_by_facing, palm_of
-from torchgrasp.app.author.repair import fix_wrist, keep_below, merge_frames, repair_bodies, repair_joints
+from torchgrasp.app.author.repair import (
+    fix_wrist,
+    keep_below,
+    merge_frames,
+    repair_bodies,
+    repair_joints,
+)
 from torchgrasp.files import render
 from torchgrasp.foundation.base import FINGERTIPS
 from torchgrasp.foundation.checks import Seed, checked
@@ -28,11 +35,16 @@ from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.kinematics import tree_from_urdf
 from torchgrasp.hand.urdf import REPAIR, SIZES, Mimic, Triple, Urdf, read_published
 
-OPTIONS = {"default": 3, "four": 4, "five": 5}  # sets of fingers that a draft declares if the hand has as many
+OPTIONS = {
+    "default": 3,
+    "four": 4,
+    "five": 5,
+}  # sets of fingers that a draft declares if the hand has as many
 
 
 class Draft(NamedTuple):
-    """A first hand.toml, the clean URDF that it refers to, and a sentence for each repair of the URDF.
+    """A first hand.toml, the clean URDF that it refers to, and a sentence for each repair of the
+    URDF.
 
     `urdf` is empty if the published URDF is clean.
 
@@ -46,7 +58,8 @@ class Draft(NamedTuple):
 
 
 class Wish(NamedTuple):
-    """The user's choices for a new hand: fingertip links, name, first link of the hand on an arm, folder of meshes.
+    """The user's choices for a new hand: fingertip links, name, first link of the hand on an arm,
+    folder of meshes.
 
     >>> Wish(tips=("thumb_tip", "index_tip", "ring_tip"), name="mine").root
     ''
@@ -59,14 +72,18 @@ class Wish(NamedTuple):
 
 
 @checked
-def draft_hand(path: Path | str, tips: Sequence[str] = (), name: str | None = None, seed: Seed = 0) -> str:
-    """Return the text of a hand.toml for a clean URDF, to be reviewed by the user and checked by `check_hand`.
+def draft_hand(
+    path: Path | str, tips: Sequence[str] = (), name: str | None = None, seed: Seed = 0
+) -> str:
+    """Return the text of a hand.toml for a clean URDF, to be reviewed by the user and checked by
+    `check_hand`.
 
-    `tips` are the links of the fingertips in grasp order, first the three of option "default"; "four" and "five" add
-    the next ones. By default they are the last links of the branches, in the order in which their pads best face each
-    other. The hand has the `name` of the robot by default. Raises `HandFileError` for a URDF that is missing or
-    malformed, or needs repair by `new_hand`. Raises `BadArgument` for fewer than three tips, more than five, or a tip
-    without a collision shape or a movable joint.
+    `tips` are the links of the fingertips in grasp order, first the three of option "default";
+    "four" and "five" add the next ones. By default they are the last links of the branches, in the
+    order in which their pads best face each other. The hand has the `name` of the robot by default.
+    Raises `HandFileError` for a URDF that is missing or malformed, or needs repair by `new_hand`.
+    Raises `BadArgument` for fewer than three tips, more than five, or a tip without a collision
+    shape or a movable joint.
 
     >>> from torchgrasp.hand.load import find_hand
     >>> text = draft_hand(find_hand("barrett") / "hand.urdf")
@@ -80,10 +97,17 @@ def draft_hand(path: Path | str, tips: Sequence[str] = (), name: str | None = No
 
 
 @checked
-def new_hand(path: Path | str, wish: Wish = Wish(), seed: Seed = 0, file: str = "hand.urdf") -> Draft:  # noqa: B008
-    """Repair a published URDF, and draft a hand.toml for the clean copy, which the user saves as `file`.
+def new_hand(
+    path: Path | str,
+    wish: Wish = Wish(),
+    seed: Seed = 0,
+    file: str = "hand.urdf",  # noqa: B008
+) -> Draft:
+    """Repair a published URDF, and draft a hand.toml for the clean copy, which the user saves as
+    `file`.
 
-    Raises the errors of `draft_hand`, and `HandFileError` for a hostile mesh, or a URDF that cannot be repaired.
+    Raises the errors of `draft_hand`, and `HandFileError` for a hostile mesh, or a URDF that cannot
+    be repaired.
 
     >>> from torchgrasp import load_hand
     >>> draft = new_hand(load_hand("barrett").urdf_path, Wish(name="mine"))
@@ -106,10 +130,13 @@ def new_hand(path: Path | str, wish: Wish = Wish(), seed: Seed = 0, file: str = 
     order = list(range(len(tips)))
     if not wish.tips:
         order = order_by_facing(frames[:, :, :-1], guess.pads)
-    sets = {name: [tips[k] for k in sorted(order[:n])] for name, n in OPTIONS.items() if n <= len(tips)}
+    sets = {
+        name: [tips[k] for k in sorted(order[:n])] for name, n in OPTIONS.items() if n <= len(tips)
+    }
     simple = {x.name for x in urdf.links if is_primitive(x)}
     clean, fitted = replace_meshes(urdf, points)
-    chosen, balls = dict[str, Pad](), list[str]()
+    chosen = dict[str, Pad]()
+    balls = list[str]()
     for tip, pad, outward in zip(tips, guess.pads, guess.outward, strict=True):
         if tip not in simple:
             balls.append(f"{tip} {1e3 * pad.radius:.1f} mm")
@@ -120,15 +147,18 @@ def new_hand(path: Path | str, wish: Wish = Wish(), seed: Seed = 0, file: str = 
         repairs.append(f"fingertips touch with a ball in their end, of radius: {', '.join(balls)}")
     names = wish.name or urdf.name, file if repairs else published.path.name
     toml = _toml_text(clean, chosen, sets, guess.approach, names, seed)
-    return Draft(toml, _render("hand.urdf", urdf=clean, sizes=SIZES) if repairs else "", tuple(repairs))
+    return Draft(
+        toml, _render("hand.urdf", urdf=clean, sizes=SIZES) if repairs else "", tuple(repairs)
+    )
 
 
 @checked
 def clean_arm(path: Path | str, meshes: Path | str | None = None) -> str:
-    """Return the URDF of a published arm with boxes and cylinders instead of meshes, as `load_arm` needs it.
+    """Return the URDF of a published arm with boxes and cylinders instead of meshes, as `load_arm`
+    needs it.
 
-    The meshes lie below the folder `meshes`, by default that of the URDF. A joint without limits gets half a turn
-    either way. Raises the errors of `new_hand`.
+    The meshes lie below the folder `meshes`, by default that of the URDF. A joint without limits
+    gets half a turn either way. Raises the errors of `new_hand`.
 
     >>> from torchgrasp import load_hand
     >>> clean_arm(load_hand("barrett").urdf_path).splitlines()[0]
@@ -140,14 +170,19 @@ def clean_arm(path: Path | str, meshes: Path | str | None = None) -> str:
 
 
 def _frames(urdf: Urdf, links: tuple[str, ...], seed: int) -> Float[Tensor, "3 4 _ n"]:
-    """Return the poses (3 x 4) of some links in random postures, computed in chunks to bound the memory."""
-    tree, at = tree_from_urdf(urdf), [[x.name for x in urdf.links].index(link) for link in links]
+    """Return the poses (3 x 4) of some links in random postures, computed in chunks to bound the
+    memory.
+    """
+    tree = tree_from_urdf(urdf)
+    at = [[x.name for x in urdf.links].index(link) for link in links]
     values = draw_postures(urdf, _coupling(urdf), 20_000, seed)
     return torch.cat([tree.frames(part)[:, :, at] for part in values.split(1000, 1)], -1)
 
 
 def _checked_tips(urdf: Urdf, tips: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the given fingertip links, else those found; raise `BadArgument` if their number or a link is unusable."""
+    """Return the given fingertip links, else those found; raise `BadArgument` if their number or a
+    link is unusable.
+    """
     ends = fingertip_links(urdf)
     chosen = tips or ends
     if not FINGERTIPS[0] <= len(chosen) <= FINGERTIPS[1] or len(set(chosen)) < len(chosen):
@@ -156,7 +191,9 @@ def _checked_tips(urdf: Urdf, tips: tuple[str, ...]) -> tuple[str, ...]:
     shaped = {x.name for x in urdf.links if x.shapes}
     for tip in chosen:
         if tip not in shaped or not urdf.movers(tip):
-            raise BadArgument("tips", tip, f"links with a collision shape that joints move, such as {list(ends)}")
+            raise BadArgument(
+                "tips", tip, f"links with a collision shape that joints move, such as {list(ends)}"
+            )
     return chosen
 
 
@@ -165,13 +202,22 @@ def _coupling(urdf: Urdf) -> dict[str, Mimic]:
 
 
 def _gains(urdf: Urdf) -> tuple[float, float]:
-    """Return stiffness [N m/rad] and damping [N m s/rad] for the drives, similar to those of the shipped hands."""
-    rotor = 1e-3  # inertia [kg m2] that simulations add to each joint; the damping is at least critical with it
+    """Return stiffness [N m/rad] and damping [N m s/rad] for the drives, similar to those of the
+    shipped hands.
+    """
+    # inertia [kg m2] that simulations add to each joint; the damping is at least critical with it
+    rotor = 1e-3
     free = [j for j in urdf.movable if j.mimic is None]
     kp = min(4.0 * min(j.effort for j in free), 10.0)
-    poses = tree_from_urdf(urdf).poses(torch.zeros(1, len(urdf.movable), dtype=torch.float64))[0].numpy()
+    poses = (
+        tree_from_urdf(urdf)
+        .poses(torch.zeros(1, len(urdf.movable), dtype=torch.float64))[0]
+        .numpy()
+    )
     names = [x.name for x in urdf.links]
-    centres = np.array([p[:3, :3] @ x.com + p[:3, 3] for p, x in zip(poses, urdf.links, strict=True)])
+    centres = np.array(
+        [p[:3, :3] @ x.com + p[:3, 3] for p, x in zip(poses, urdf.links, strict=True)]
+    )
     heaviest = 0.0
     for j in free:
         if j.kind == "prismatic":
@@ -179,25 +225,49 @@ def _gains(urdf: Urdf) -> tuple[float, float]:
         pose = poses[names.index(j.child)]
         moved = [k for k, name in enumerate(names) if j in urdf.joints_above(name)]
         arms = np.cross(pose[:3, :3] @ j.axis, centres[moved] - pose[:3, 3])
-        heaviest = max(heaviest, float(np.array([urdf.links[k].mass for k in moved]) @ (arms**2).sum(1)))
+        heaviest = max(
+            heaviest, float(np.array([urdf.links[k].mass for k in moved]) @ (arms**2).sum(1))
+        )
     return kp, max(0.03 * kp, 2 * np.sqrt(kp * (heaviest + rotor)))
 
 
 def _toml_text(
-    urdf: Urdf, pads: dict[str, Pad], sets: dict[str, list[str]], approach: Triple, names: tuple[str, str], seed: int
+    urdf: Urdf,
+    pads: dict[str, Pad],
+    sets: dict[str, list[str]],
+    approach: Triple,
+    names: tuple[str, str],
+    seed: int,
 ) -> str:
-    """Return the text of a hand.toml from pads by tip, sets of tips by option, and the names of hand and URDF file."""
-    coupling, (kp, kd) = _coupling(urdf), _gains(urdf)
+    """Return the text of a hand.toml from pads by tip, sets of tips by option, and the names of
+    hand and URDF file.
+    """
+    coupling = _coupling(urdf)
+    (kp, kd) = _gains(urdf)
     chains = {tip: [j.name for j in urdf.movers(tip)[::-1]] for tip in pads}
     called = {tip: tip.removesuffix("_tip") for tip in pads}
     options = {
-        option: ([called[tip] for tip in tips], _parked(urdf, {joint for tip in tips for joint in chains[tip]}))
+        option: (
+            [called[tip] for tip in tips],
+            _parked(urdf, {joint for tip in tips for joint in chains[tip]}),
+        )
         for option, tips in sets.items()
     }
     return _render(
-        "hand.toml", name=names[0], file=names[1], urdf=urdf, approach=approach, kp=kp, kd=kd, coupling=coupling,
-        options=options, pads=pads, names=called, chains=chains, pairs=collision_pairs(urdf, coupling, seed=seed),
-    )  # fmt: skip
+        "hand.toml",
+        name=names[0],
+        file=names[1],
+        urdf=urdf,
+        approach=approach,
+        kp=kp,
+        kd=kd,
+        coupling=coupling,
+        options=options,
+        pads=pads,
+        names=called,
+        chains=chains,
+        pairs=collision_pairs(urdf, coupling, seed=seed),
+    )
 
 
 def _render(template: str, **values: Any) -> str:
@@ -207,20 +277,31 @@ def _render(template: str, **values: Any) -> str:
 
 
 def _quoted(value: str | float | Sequence[float]) -> str:
-    """Return the quoted value of an XML attribute, a text or numbers; negative zero is written as zero."""
-    return quoteattr(value if isinstance(value, str) else " ".join(f"{x + 0.0!r}" for x in np.ravel(value).tolist()))
+    """Return the quoted value of an XML attribute, a text or numbers; negative zero is written as
+    zero.
+    """
+    return quoteattr(
+        value
+        if isinstance(value, str)
+        else " ".join(f"{x + 0.0!r}" for x in np.ravel(value).tolist())
+    )
 
 
 def _parked(urdf: Urdf, grasping: set[str]) -> dict[str, float]:
-    """Return the positions at which joints that do not take part in grasping are parked: zero, or the nearest limit."""
+    """Return the positions at which joints that do not take part in grasping are parked: zero, or
+    the nearest limit.
+    """
     coupling = _coupling(urdf)
     moved = grasping | {coupling[j].source for j in grasping if j in coupling}
     return {j.name: j.rest for j in urdf.movable if j.name not in coupling and j.name not in moved}
 
 
 def fingertip_links(urdf: Urdf) -> tuple[str, ...]:
-    """Return the fingertip links: the last link with a collision shape on every branch that joints move."""
-    parents, shaped = {j.parent for j in urdf.joints}, {x.name for x in urdf.links if x.shapes}
+    """Return the fingertip links: the last link with a collision shape on every branch that joints
+    move.
+    """
+    parents = {j.parent for j in urdf.joints}
+    shaped = {x.name for x in urdf.links if x.shapes}
     ends = []
     for link in (x.name for x in urdf.links if x.name not in parents):
         ends += [x for x in (link, *(j.parent for j in urdf.joints_above(link))) if x in shaped][:1]

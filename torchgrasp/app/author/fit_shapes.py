@@ -1,6 +1,7 @@
 """Replacement of the meshes in a published hand by boxes, cylinders and balls.
 
-A mesh is sampled by points, which get a bounding box. A box is cut in two where this saves most volume.
+A mesh is sampled by points, which get a bounding box. A box is cut in two where this saves most
+volume.
 """
 
 import dataclasses
@@ -23,26 +24,38 @@ from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.urdf import LinkShape, Urdf
 
 MESH_KINDS = (".stl", ".obj", ".ply", ".dae", ".glb")
-SAVING, SAVING_TIP = 0.12, 0.04
-"""A box of a link or of a fingertip is cut in two if the cut saves this share of the volume of all boxes."""
+SAVING = 0.12
+SAVING_TIP = 0.04
+"""A box of a link or of a fingertip is cut in two if the cut saves this share of the volume of all
+boxes.
+"""
 Points = Float[np.ndarray, "_ 3"]  # points, of any count in each use
 Corners = tuple[np.ndarray, np.ndarray]
 
 
 def mesh_file(urdf: Urdf, name: str, folder: Path) -> Path:
-    """Return the path of a mesh that a URDF names, also by `package://`; raise `HandFileError`, which says why not."""
-    base, here, called = folder.resolve(), urdf.path.resolve().parent, f"mesh {name[:80]!r}"
+    """Return the path of a mesh that a URDF names, also by `package://`; raise `HandFileError`,
+    which says why not.
+    """
+    base = folder.resolve()
+    here = urdf.path.resolve().parent
+    called = f"mesh {name[:80]!r}"
     path = PurePosixPath(name.removeprefix("package://"))
     if ":" in str(path) or "\\" in name or path.is_absolute():
         raise urdf.wrong(
-            f"{called}, an absolute path or an address", f"a path inside {folder} with slashes, as a/b.stl"
+            f"{called}, an absolute path or an address",
+            f"a path inside {folder} with slashes, as a/b.stl",
         )
     if path.suffix.lower() not in MESH_KINDS:
         raise urdf.wrong(f"{called} of another format", f"a mesh ({', '.join(MESH_KINDS)})")
-    # the files of a package may lie anywhere in the folder: the first parts of the path may be left out
+    # the files of a package may lie anywhere in the folder: the first parts of the path may be left
+    # out
     package = name.startswith("package://")
     roots = (here, *(x for x in here.parents if package and x.is_relative_to(base)), base)
-    places, why = [x.joinpath(*path.parts[k:]) for k in range(len(path.parts) if package else 1) for x in roots], ""
+    places = [
+        x.joinpath(*path.parts[k:]) for k in range(len(path.parts) if package else 1) for x in roots
+    ]
+    why = ""
     for spot in places:
         try:
             file = spot.resolve()
@@ -53,32 +66,49 @@ def mesh_file(urdf: Urdf, name: str, folder: Path) -> Path:
             elif file.is_file():
                 return file
             else:
-                alike = [x.name for x in file.parent.iterdir() if x.name.lower() == file.name.lower()]
+                alike = [
+                    x.name for x in file.parent.iterdir() if x.name.lower() == file.name.lower()
+                ]
                 why = why or (f"called {alike[0]} there" if alike and alike[0] != file.name else "")
-        except (OSError, RuntimeError, ValueError):  # no such folder, a loop of links, or a name that no system takes
+        except (
+            OSError,
+            RuntimeError,
+            ValueError,
+        ):  # no such folder, a loop of links, or a name that no system takes
             continue
-    raise urdf.wrong(f"{called}, {why or 'missing'}", f"a file inside {folder} (--meshes names another folder)")
+    raise urdf.wrong(
+        f"{called}, {why or 'missing'}", f"a file inside {folder} (--meshes names another folder)"
+    )
 
 
 def shape_points(urdf: Urdf, folder: Path) -> dict[str, tuple[Points, ...]]:
-    """Return points [m] on each shape of every link, in the link's frame; raise `HandFileError` for unusable meshes."""
+    """Return points [m] on each shape of every link, in the link's frame; raise `HandFileError` for
+    unusable meshes.
+    """
     names = {shape.file for link in urdf.links for shape in link.shapes if shape.kind == "mesh"}
     size = sum(mesh_file(urdf, name, folder).stat().st_size for name in names)
     if size > HAND_MESH_BYTES:
-        raise urdf.wrong(f"meshes of {size} bytes", f"meshes of at most {HAND_MESH_BYTES >> 20} MiB in all")
+        raise urdf.wrong(
+            f"meshes of {size} bytes", f"meshes of at most {HAND_MESH_BYTES >> 20} MiB in all"
+        )
     meshes = {name: _read_points(urdf, name, folder) for name in sorted(names)}
     found = {}
     for link in urdf.links:
         parts = []
         for shape in link.shapes:
-            local = meshes[shape.file] * shape.size if shape.kind == "mesh" else _primitive_points(shape)
+            local = (
+                meshes[shape.file] * shape.size
+                if shape.kind == "mesh"
+                else _primitive_points(shape)
+            )
             reach = float(np.abs(local).max())
             if not reach <= MAX_EXTENT:
                 wanted = f"shapes that reach at most {MAX_EXTENT:g} m; a mesh in millimetres needs a scale of 0.001"
                 raise urdf.wrong(f"mesh {shape.file!r} that reaches {reach:.3g} m", wanted)
             if shape.kind == "mesh" and reach < 5e-4:  # thinner than a fingernail
                 raise urdf.wrong(
-                    f"mesh {shape.file!r} that reaches {1e3 * reach:.3g} mm", "metres: scaled twice, or by 0?"
+                    f"mesh {shape.file!r} that reaches {1e3 * reach:.3g} mm",
+                    "metres: scaled twice, or by 0?",
                 )
             pose = pose_of(shape)
             parts.append(local @ pose[:3, :3].T + pose[:3, 3])
@@ -87,21 +117,30 @@ def shape_points(urdf: Urdf, folder: Path) -> dict[str, tuple[Points, ...]]:
 
 
 def replace_meshes(urdf: Urdf, points: Mapping[str, tuple[Points, ...]]) -> tuple[Urdf, list[str]]:
-    """Replace every mesh by a few boxes or a cylinder around its points; also return a sentence with the counts."""
-    links, count, made = [], 0, 0
+    """Replace every mesh by a few boxes or a cylinder around its points; also return a sentence
+    with the counts.
+    """
+    links = []
+    count = 0
+    made = 0
     for link in urdf.links:
         shapes: list[LinkShape] = []
         for shape, on_it in zip(link.shapes, points[link.name], strict=True):
             fitted = fit_shapes(on_it) if shape.kind == "mesh" else [shape]
-            count, made = count + (shape.kind == "mesh"), made + (len(fitted) if shape.kind == "mesh" else 0)
+            count = count + (shape.kind == "mesh")
+            made = made + (len(fitted) if shape.kind == "mesh" else 0)
             shapes += fitted
         links.append(dataclasses.replace(link, shapes=tuple(shapes)))
-    done = [f"{count} collision meshes became {made} boxes or cylinders around them"] if count else []
+    done = (
+        [f"{count} collision meshes became {made} boxes or cylinders around them"] if count else []
+    )
     return dataclasses.replace(urdf, links=tuple(links)), done
 
 
 def ball_tip(urdf: Urdf, tip: str, ball: Pad, outward: np.ndarray, points: Points) -> Urdf:
-    """Replace the shapes of a tip by a ball at its end, towards `outward`, and on a long tip boxes up to the ball."""
+    """Replace the shapes of a tip by a ball at its end, towards `outward`, and on a long tip boxes
+    up to the ball.
+    """
     link = next(x for x in urdf.links if x.name == tip)
     reach = (points - np.array(ball.center)) @ outward
     shapes = [LinkShape("sphere", (ball.radius,), ball.center, (0.0, 0.0, 0.0))]
@@ -119,7 +158,8 @@ def _read_points(urdf: Urdf, name: str, folder: Path) -> Points:
     path = mesh_file(urdf, name, folder)
     data = read_bounded(path, MESH_BYTES, "a mesh", functools.partial(HandFileError, "urdf"))
     allowed = f"a triangle mesh of at most {MESH_FACES} faces"
-    suffix, scale = path.suffix.lower(), 1.0
+    suffix = path.suffix.lower()
+    scale = 1.0
     try:
         if suffix == ".dae":
             data, scale = clean_dae(data)
@@ -132,7 +172,9 @@ def _read_points(urdf: Urdf, name: str, folder: Path) -> Points:
         raise urdf.wrong(f"mesh {name!r}: {explain(error)}", allowed) from error
     sound = isinstance(mesh, trimesh.Trimesh) and 0 < len(mesh.faces) <= MESH_FACES
     if not sound or not np.isfinite(mesh.vertices).all():
-        raise urdf.wrong(f"mesh {name!r} without faces, or with vertices that are not finite", allowed)
+        raise urdf.wrong(
+            f"mesh {name!r} without faces, or with vertices that are not finite", allowed
+        )
     return scale * _sample(mesh)
 
 
@@ -154,13 +196,17 @@ def _sample(mesh: "trimesh.Trimesh") -> Points:
 
 def fit_shapes(points: Points) -> list[LinkShape]:
     """Return a few boxes, or a cylinder, that cover the points on a body."""
-    round_share = 0.9  # a cylinder replaces boxes if its volume is less than this share of their volume
+    round_share = (
+        0.9  # a cylinder replaces boxes if its volume is less than this share of their volume
+    )
     turn = _axes(points)
     local = points @ turn
     boxes = _cut(local, 3 if float(np.ptp(local, axis=0).max()) < 0.08 else 8, SAVING)
     volume = sum(float(np.prod(high - low)) for low, high in boxes)
-    low, high = local.min(0), local.max(0)
-    middle, sides = (low + high) / 2, high - low
+    low = local.min(0)
+    high = local.max(0)
+    middle = (low + high) / 2
+    sides = high - low
     for axis in range(3):
         radius = float(np.linalg.norm(np.delete(local - middle, axis, 1), axis=1).max())
         if math.pi * radius**2 * sides[axis] < round_share * volume:
@@ -170,9 +216,15 @@ def fit_shapes(points: Points) -> list[LinkShape]:
 
 
 def _axes(points: Points) -> Float[np.ndarray, "3 3"]:
-    """Return the axes of the fitted boxes as columns: the axes of the link, unless rotated axes fit much better."""
-    turned_share = 0.85  # a box is turned out of the link's axes if its volume falls below this share
-    if np.linalg.matrix_rank(points - points.mean(0), tol=1e-7 * math.sqrt(len(points))) < 3:  # a flat body has no hull
+    """Return the axes of the fitted boxes as columns: the axes of the link, unless rotated axes fit
+    much better.
+    """
+    turned_share = (
+        0.85  # a box is turned out of the link's axes if its volume falls below this share
+    )
+    if (
+        np.linalg.matrix_rank(points - points.mean(0), tol=1e-7 * math.sqrt(len(points))) < 3
+    ):  # a flat body has no hull
         return np.eye(3)
     turned, sizes = trimesh.bounds.oriented_bounds(points)
     straight = np.prod(np.ptp(points, axis=0))
@@ -181,11 +233,15 @@ def _axes(points: Points) -> Float[np.ndarray, "3 3"]:
 
 def _boxes(corners: list[Corners], axes: np.ndarray) -> list[LinkShape]:
     """Return collision boxes, given their lower and upper corners along the columns of `axes`."""
-    return [_shape("box", tuple(high - low), axes, axes @ (low + high) / 2) for low, high in corners]
+    return [
+        _shape("box", tuple(high - low), axes, axes @ (low + high) / 2) for low, high in corners
+    ]
 
 
 def _cut(points: Points, most: int, saving: float) -> list[Corners]:
-    """Return corners of at most `most` boxes that cover the points; each cut saves the share `saving` of the volume."""
+    """Return corners of at most `most` boxes that cover the points; each cut saves the share
+    `saving` of the volume.
+    """
     cells = [(points.min(0), points.max(0), points)]
     while len(cells) < most:
         total = sum(float(np.prod(high - low)) for low, high, _ in cells)
@@ -198,7 +254,9 @@ def _cut(points: Points, most: int, saving: float) -> list[Corners]:
 
 
 def _halves(low: np.ndarray, high: np.ndarray, points: Points) -> list[tuple[float, list]]:
-    """Return each way to cut a box in two across an axis: the saved volume and both parts, each over 8 mm thick."""
+    """Return each way to cut a box in two across an axis: the saved volume and both parts, each
+    over 8 mm thick.
+    """
     found = []
     for axis in range(3):
         for at in np.linspace(low[axis], high[axis], 12)[1:-1]:
@@ -218,10 +276,15 @@ def _halves(low: np.ndarray, high: np.ndarray, points: Points) -> list[tuple[flo
 
 
 def _shape(kind: str, size: tuple[float, ...], turn: np.ndarray, center: np.ndarray) -> LinkShape:
-    """Return a collision shape of a kind, size, rotation and centre; all numbers are rounded to 1e-6."""
+    """Return a collision shape of a kind, size, rotation and centre; all numbers are rounded to
+    1e-6.
+    """
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = turn, center
+    pose[:3, :3] = turn
+    pose[:3, 3] = center
     xyz, rpy = place(pose)
     x, y, z = (round(v, 6) for v in xyz)
     roll, pitch, yaw = (round(v, 6) for v in rpy)
-    return LinkShape(kind, tuple(max(round(float(v), 6), 1e-4) for v in size), (x, y, z), (roll, pitch, yaw))
+    return LinkShape(
+        kind, tuple(max(round(float(v), 6), 1e-4) for v in size), (x, y, z), (roll, pitch, yaw)
+    )

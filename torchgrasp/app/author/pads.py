@@ -1,7 +1,8 @@
 """Guesses of fingertip pads: their contact points and normals.
 
-A URDF does not define pads. The guessed pad faces the direction in which the finger's last joint bends: the side with
-most of the joint's range or, for a symmetric range, towards the other fingertips.
+A URDF does not define pads. The guessed pad faces the direction in which the finger's last joint
+bends: the side with most of the joint's range or, for a symmetric range, towards the other
+fingertips.
 """
 
 import itertools
@@ -22,7 +23,9 @@ from torchgrasp.hand.kinematics import chain_from_urdf, map_directions, map_poin
 from torchgrasp.hand.urdf import Joint, Link, LinkShape, Triple, Urdf
 
 TILT = math.radians(30)
-"""Angle [rad] by which the contact of a round tip is turned from the direction of motion to the finger's end."""
+"""Angle [rad] by which the contact of a round tip is turned from the direction of motion to the
+finger's end.
+"""
 SHORT_ARM = 1e-3  # a joint whose axis passes a tip nearer than this [m] does not move it
 BESIDE = 0.003  # distance [m] from a ray or a plane within which points of a surface count
 Vector = Float[np.ndarray, "3"]
@@ -30,7 +33,9 @@ Points = Float[np.ndarray, "_ 3"]  # points, of any count in each use
 
 
 class Guess(NamedTuple):
-    """A guess at fingertip pads, the direction of each finger in its tip's frame, and the palm's outward direction."""
+    """A guess at fingertip pads, the direction of each finger in its tip's frame, and the palm's
+    outward direction.
+    """
 
     pads: tuple[Pad, ...]
     outward: tuple[Vector, ...]
@@ -38,9 +43,14 @@ class Guess(NamedTuple):
 
 
 def guess_pads(
-    urdf: Urdf, frames: Float[Tensor, "3 4 _ n"], tips: Sequence[str], surfaces: Mapping[str, Points]
+    urdf: Urdf,
+    frames: Float[Tensor, "3 4 _ n"],
+    tips: Sequence[str],
+    surfaces: Mapping[str, Points],
 ) -> Guess:
-    """Guess pads and the way out of the palm from poses of the tips, then the palm, and points on each link [m]."""
+    """Guess pads and the way out of the palm from poses of the tips, then the palm, and points on
+    each link [m].
+    """
     links = {x.name: i for i, x in enumerate(urdf.links)}
     cores = [_core(urdf, urdf.links[links[tip]], surfaces) for tip in tips]
     tip_frames = frames[:, :, :-1]
@@ -49,19 +59,29 @@ def guess_pads(
     spread = torch.linalg.vector_norm(centres[:, :3] - middle, dim=0).sum(0)
     # the fingers meet in the postures with the nearest fingertips
     near = spread.topk(max(1, int(0.1 * len(spread))), largest=False).indices
-    inward = (tip_frames[:, :3] * (middle - centres)[:, None])[..., near].sum(0).mean(-1).T.numpy()  # tips' frames
-    pads, ends = [], []
+    inward = (
+        (tip_frames[:, :3] * (middle - centres)[:, None])[..., near].sum(0).mean(-1).T.numpy()
+    )  # tips' frames
+    pads = []
+    ends = []
     for tip, core, closing in zip(tips, cores, inward, strict=True):
         joint, motion, outward = _motion(urdf, tip, core)
         middle_of_range = (joint.lower + joint.upper) / 2
         one_sided = abs(middle_of_range) > 0.1 * (joint.upper - joint.lower)
         bending = math.copysign(1.0, middle_of_range if one_sided else motion @ closing)
-        link, way = urdf.links[links[tip]], bending * motion
+        link = urdf.links[links[tip]]
+        way = bending * motion
         single = is_primitive(link)
         ends.append(outward)
-        pads.append(_pad(link.shapes[0], core, way, outward) if single else _ball(surfaces[tip], way, outward))
+        pads.append(
+            _pad(link.shapes[0], core, way, outward)
+            if single
+            else _ball(surfaces[tip], way, outward)
+        )
     points = surfaces.get(palm_of(urdf, tips), np.zeros((1, 3)))
-    palm_centre = map_points(frames[:, :, -1:, :1], torch.tensor((points.min(0) + points.max(0))[None] / 2))
+    palm_centre = map_points(
+        frames[:, :, -1:, :1], torch.tensor((points.min(0) + points.max(0))[None] / 2)
+    )
     out = (middle[:, 0, near].mean(1) - palm_centre[:, 0, 0]).numpy()
     axis = int(np.abs(out).argmax())
     return Guess(tuple(pads), tuple(ends), _triple(np.sign(out[axis]) * np.eye(3)[axis]))
@@ -74,12 +94,19 @@ def palm_of(urdf: Urdf, tips: Sequence[str]) -> str:
 
 
 def order_by_facing(frames: Float[Tensor, "3 4 f n"], pads: Sequence[Pad]) -> list[int]:
-    """Return the tips in order, as indices: three whose pads face each other in most postures, then the next best."""
-    contacts, normals = (torch.tensor([getattr(p, k) for p in pads]).double() for k in ("contact", "normal"))
-    points, directions = map_points(frames, contacts), map_directions(frames, normals)
+    """Return the tips in order, as indices: three whose pads face each other in most postures, then
+    the next best.
+    """
+    contacts, normals = (
+        torch.tensor([getattr(p, k) for p in pads]).double() for k in ("contact", "normal")
+    )
+    points = map_points(frames, contacts)
+    directions = map_directions(frames, normals)
 
     def share(tips: tuple[int, ...]) -> float:
-        """Return the fraction of postures in which the pads of these tips all face the centroid of their contacts."""
+        """Return the fraction of postures in which the pads of these tips all face the centroid of
+        their contacts.
+        """
         inward = points[:, tips].mean(1, keepdim=True) - points[:, tips]
         length = torch.linalg.vector_norm(inward, dim=0)
         facing = (directions[:, tips] * inward).sum(0) / length.clamp_min(1e-9)
@@ -98,14 +125,17 @@ def is_primitive(link: Link) -> bool:
 
 
 def _ball(points: Points, motion: Vector, outward: Vector) -> Pad:
-    """Return a spherical pad at a finger's end: part of a ball that touches the finger's surface from inside."""
+    """Return a spherical pad at a finger's end: part of a ball that touches the finger's surface
+    from inside.
+    """
     axes = np.stack([motion, outward, np.cross(motion, outward)], 1)
     local = points @ axes
     end = local[:, 1].max()
     near = local[local[:, 1] > end - 0.015]  # half the thickness of the finger's end is the radius
     radius = round(float(np.clip(np.ptp(near[:, [0, 2]], axis=0).min() / 2, 0.003, 0.013)), 4)
     ring = local[np.abs(local[:, 1] - (end - radius)) < BESIDE]
-    low, high = ring.min(0), ring.max(0)
+    low = ring.min(0)
+    high = ring.max(0)
     core = axes @ [(low[0] + high[0]) / 2, end - radius, (low[2] + high[2]) / 2]
     normal = math.cos(TILT) * motion + math.sin(TILT) * outward
     along = (points - core) @ normal
@@ -117,48 +147,65 @@ def _ball(points: Points, motion: Vector, outward: Vector) -> Pad:
 
 
 def _motion(urdf: Urdf, tip: str, core: Vector) -> tuple[Joint, Vector, Vector]:
-    """Return the last joint that moves a tip, and in the tip's frame its motion and the direction from joint to tip."""
+    """Return the last joint that moves a tip, and in the tip's frame its motion and the direction
+    from joint to tip.
+    """
     tip_from_above = np.eye(4)
     for joint in urdf.joints_above(tip):
         if joint.kind != "fixed":
-            axis, arm = tip_from_above[:3, :3] @ np.array(joint.axis), core - tip_from_above[:3, 3]
+            axis = tip_from_above[:3, :3] @ np.array(joint.axis)
+            arm = core - tip_from_above[:3, 3]
             motion = axis if joint.kind == "prismatic" else np.cross(axis, arm)
             length = float(np.linalg.norm(motion))
             if length > SHORT_ARM:
                 arm = arm - (arm @ axis) * axis
                 return joint, motion / length, arm / max(float(np.linalg.norm(arm)), SHORT_ARM)
-        above_from_link = rigid(rotation_from_rpy(joint.rpy), torch.tensor(joint.xyz, dtype=torch.float64))
+        above_from_link = rigid(
+            rotation_from_rpy(joint.rpy), torch.tensor(joint.xyz, dtype=torch.float64)
+        )
         tip_from_above = tip_from_above @ np.linalg.inv(above_from_link.numpy())
     raise BadArgument("tips", tip, "links that a joint moves")
 
 
 def _core(urdf: Urdf, link: Link, surfaces: Mapping[str, Points]) -> Vector:
-    """Return a point near the far end of a tip, in its frame: half its thickness before the end of a simple shape."""
+    """Return a point near the far end of a tip, in its frame: half its thickness before the end of
+    a simple shape.
+    """
     if not is_primitive(link):
-        points, pose = surfaces[link.name], pose_in_carrier(chain_from_urdf(urdf), link.name)[1].numpy()
+        points = surfaces[link.name]
+        pose = pose_in_carrier(chain_from_urdf(urdf), link.name)[1].numpy()
         reach = np.linalg.norm(points @ pose[:, :3].T + pose[:, 3], axis=1)
         return points[reach > reach.max() - BESIDE].mean(0)
     shape = link.shapes[0]
-    center, half = np.array(shape.xyz), np.array(shape.half)
-    rotation, long = rotation_from_rpy(shape.rpy).numpy(), int(half.argmax())
+    center = np.array(shape.xyz)
+    half = np.array(shape.half)
+    rotation = rotation_from_rpy(shape.rpy).numpy()
+    long = int(half.argmax())
     inset = half[long] - np.delete(half, long).min()
     return center + math.copysign(inset, rotation[:, long] @ center) * rotation[:, long]
 
 
 def _pad(shape: LinkShape, core: Vector, motion: Vector, outward: Vector) -> Pad:
-    """Return the pad of a tip that is one simple shape, on the side of its motion; on a sphere nearer to its end."""
+    """Return the pad of a tip that is one simple shape, on the side of its motion; on a sphere
+    nearer to its end.
+    """
     if shape.kind == "sphere":
-        normal, radius = math.cos(TILT) * motion + math.sin(TILT) * outward, shape.size[0]
-        center, normal = np.array(shape.xyz), normal / np.linalg.norm(normal)
+        normal = math.cos(TILT) * motion + math.sin(TILT) * outward
+        radius = shape.size[0]
+        center = np.array(shape.xyz)
+        normal = normal / np.linalg.norm(normal)
         return Pad(_triple(center + radius * normal), _triple(normal), _triple(center), radius)
-    rotation, half = rotation_from_rpy(shape.rpy).numpy(), np.array(shape.half)
+    rotation = rotation_from_rpy(shape.rpy).numpy()
+    half = np.array(shape.half)
     side = rotation.T @ motion
     side[int(half.argmax())] = 0.0  # the pad is beside the tip, not at its end
     if shape.kind == "box":
         face = int(np.abs(side).argmax())
-        side, depth = np.sign(side[face]) * np.eye(3)[face], half[face]
+        side = np.sign(side[face]) * np.eye(3)[face]
+        depth = half[face]
     else:
-        side, depth = side / np.linalg.norm(side), shape.size[0]
+        side = side / np.linalg.norm(side)
+        depth = shape.size[0]
     contact = core + depth * (rotation @ side)
     return Pad(_triple(contact), _triple(rotation @ side), _triple(contact), 0.0)
 

@@ -13,7 +13,9 @@ from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.hand.urdf import Joint, Link, LinkShape, Mimic, Triple, Urdf
 
-EFFORT, VELOCITY = 1.0, 3.0  # drive [N m, rad/s] of a joint for which the URDF declares none, typical of small hands
+# drive [N m, rad/s] of a joint for which the URDF declares none, typical of small hands
+EFFORT = 1.0
+VELOCITY = 3.0
 Step = tuple[Urdf, list[str]]
 
 
@@ -24,16 +26,21 @@ def pose_of(part: Joint | LinkShape) -> np.ndarray:
 
 def place(pose: np.ndarray) -> tuple[Triple, Triple]:
     """Return translation [m] and fixed-axis angles [rad] of a 4 x 4 pose."""
-    # the smaller of the two triples, rounded to the digits of a rotation, so that short numbers remain short
+    # the smaller of the two triples, rounded to the digits of a rotation, so that short numbers
+    # remain short
     one = [float(angle) for angle in trimesh.transformations.euler_from_matrix(pose)]
     two = [math.copysign(math.pi, angle) - angle for angle in one]
     angles = min((one, (-two[0], two[1], -two[2])), key=lambda triple: sum(map(abs, triple)))
-    x, y, z, roll, pitch, yaw = (float(x) + 0.0 for x in [*pose[:3, 3], *(round(angle, 15) for angle in angles)])
+    x, y, z, roll, pitch, yaw = (
+        float(x) + 0.0 for x in [*pose[:3, 3], *(round(angle, 15) for angle in angles)]
+    )
     return (x, y, z), (roll, pitch, yaw)
 
 
 def keep_below(urdf: Urdf, root: str) -> Step:
-    """Return the URDF with only the link `root` and the links below it, such as the hand on an arm; also report it."""
+    """Return the URDF with only the link `root` and the links below it, such as the hand on an arm;
+    also report it.
+    """
     names = {x.name for x in urdf.links}
     if root not in names:
         raise BadArgument("root", repr(root), f"a link of {urdf.path}: {sorted(names)}")
@@ -44,33 +51,48 @@ def keep_below(urdf: Urdf, root: str) -> Step:
     inside = {j.name for j in joints}
     for j in joints:
         if j.mimic and j.mimic.source not in inside:
-            raise urdf.wrong(f"joint {j.name} that follows {j.mimic.source!r} above {root!r}", "a root above both")
+            raise urdf.wrong(
+                f"joint {j.name} that follows {j.mimic.source!r} above {root!r}",
+                "a root above both",
+            )
     links = tuple(x for x in urdf.links if x.name in kept)
     done = f"{len(names) - len(kept)} links that are not below {root} are left out"
     return dataclasses.replace(urdf, root=root, links=links, joints=joints), [done]
 
 
 def merge_frames(urdf: Urdf) -> tuple[Urdf, list[str], dict[str, str]]:
-    """Merge massless links into the links to which they are fixed; last links of a branch with shapes are kept.
+    """Merge massless links into the links to which they are fixed; last links of a branch with
+    shapes are kept.
 
-    Also return a sentence about the repair, and a dict from each merged link to the link that took it over.
+    Also return a sentence about the repair, and a dict from each merged link to the link that took
+    it over.
     """
     taken: dict[str, str] = {}
     while True:
-        links, parents = {x.name: x for x in urdf.links}, {j.parent for j in urdf.joints}
+        links = {x.name: x for x in urdf.links}
+        parents = {j.parent for j in urdf.joints}
         for j in (j for j in urdf.joints if j.kind == "fixed"):
-            child, parent = links[j.child], links[j.parent]
+            child = links[j.child]
+            parent = links[j.parent]
             bare_root = j.parent == urdf.root and not (parent.mass > 0 or parent.shapes)
             frame = not child.mass > 0 and (j.child in parents or not child.shapes)
             if frame or bare_root:
                 break
         else:
-            return urdf, [f"frames without mass are merged into others: {', '.join(taken)}"] if taken else [], taken
+            return (
+                urdf,
+                [f"frames without mass are merged into others: {', '.join(taken)}"]
+                if taken
+                else [],
+                taken,
+            )
         moved = _moved(child, pose_of(j))
         merged = dataclasses.replace(
             moved if bare_root else parent, name=parent.name, shapes=parent.shapes + moved.shapes
         )
-        below = tuple(_under(x, j) if x.parent == child.name else x for x in urdf.joints if x is not j)
+        below = tuple(
+            _under(x, j) if x.parent == child.name else x for x in urdf.joints if x is not j
+        )
         kept = tuple(merged if x is parent else x for x in urdf.links if x is not child)
         taken = {name: parent.name if to == child.name else to for name, to in taken.items()}
         taken[child.name] = parent.name
@@ -78,27 +100,46 @@ def merge_frames(urdf: Urdf) -> tuple[Urdf, list[str], dict[str, str]]:
 
 
 def _under(joint: Joint, above: Joint) -> Joint:
-    """Return a joint attached to the parent of a frame that is merged away, with its origin adjusted."""
+    """Return a joint attached to the parent of a frame that is merged away, with its origin
+    adjusted.
+    """
     xyz, rpy = place(pose_of(above) @ pose_of(joint))
     return dataclasses.replace(joint, parent=above.parent, xyz=xyz, rpy=rpy)
 
 
 def _moved(link: Link, pose: np.ndarray) -> Link:
-    """Return a link with its mass centre, inertia and shapes in another frame; `pose` maps the link's frame to it."""
-    turn, shapes = pose[:3, :3], []
+    """Return a link with its mass centre, inertia and shapes in another frame; `pose` maps the
+    link's frame to it.
+    """
+    turn = pose[:3, :3]
+    shapes = []
     for shape in link.shapes:
         xyz, rpy = place(pose @ pose_of(shape))
         shapes.append(dataclasses.replace(shape, xyz=xyz, rpy=rpy))
     x, y, z = (turn @ link.com + pose[:3, 3]).tolist()
-    return Link(link.name, link.mass, (x, y, z), _triangle(turn @ _matrix(link.inertia) @ turn.T), tuple(shapes))
+    return Link(
+        link.name,
+        link.mass,
+        (x, y, z),
+        _triangle(turn @ _matrix(link.inertia) @ turn.T),
+        tuple(shapes),
+    )
 
 
 def fix_wrist(urdf: Urdf, tips: Sequence[str]) -> Step:
-    """Fix the wrist joints, which move all fingertips; more than three such joints are an arm, which is cut off."""
-    common = [j for j in urdf.movers(tips[0]) if all(j in urdf.movers(tip) for tip in tips)] if len(tips) > 2 else []
+    """Fix the wrist joints, which move all fingertips; more than three such joints are an arm,
+    which is cut off.
+    """
+    common = (
+        [j for j in urdf.movers(tips[0]) if all(j in urdf.movers(tip) for tip in tips)]
+        if len(tips) > 2
+        else []
+    )
     if len(common) > 3:
         urdf, done = keep_below(urdf, common[0].child)
-        return urdf, [f"{len(common)} joints above {urdf.root} move all fingertips, an arm: {done[0]}"]
+        return urdf, [
+            f"{len(common)} joints above {urdf.root} move all fingertips, an arm: {done[0]}"
+        ]
     if not common:
         return urdf, []
     at = {j.name: j.rest for j in common}
@@ -107,7 +148,9 @@ def fix_wrist(urdf: Urdf, tips: Sequence[str]) -> Step:
             at[j.name] = j.mimic.ratio * at[j.mimic.source] + j.mimic.offset
     joints = tuple(_fixed(j, at[j.name]) if j.name in at else j for j in urdf.joints)
     places = ", ".join(f"{name} at {value:.4g}" for name, value in at.items())
-    return dataclasses.replace(urdf, joints=joints), [f"joints that move all fingertips, a wrist, are fixed: {places}"]
+    return dataclasses.replace(urdf, joints=joints), [
+        f"joints that move all fingertips, a wrist, are fixed: {places}"
+    ]
 
 
 def _fixed(joint: Joint, value: float) -> Joint:
@@ -119,58 +162,93 @@ def _fixed(joint: Joint, value: float) -> Joint:
 
 
 def repair_joints(urdf: Urdf) -> Step:
-    """Add missing position, effort and velocity limits; make coupled joints follow independent ones within limits."""
+    """Add missing position, effort and velocity limits; make coupled joints follow independent ones
+    within limits.
+    """
     joints = {j.name: j for j in urdf.joints}
-    done = _add_limits(urdf, joints) + _add_drives(joints) + _follow_directly(joints) + _limit_leaders(urdf, joints)
+    done = (
+        _add_limits(urdf, joints)
+        + _add_drives(joints)
+        + _follow_directly(joints)
+        + _limit_leaders(urdf, joints)
+    )
     return dataclasses.replace(urdf, joints=tuple(joints.values())), done
 
 
 def _add_limits(urdf: Urdf, joints: dict[str, Joint]) -> list[str]:
-    """Limit endless revolute joints to half a turn either way; raise `HandFileError` for endless sliding joints."""
+    """Limit endless revolute joints to half a turn either way; raise `HandFileError` for endless
+    sliding joints.
+    """
     endless = [j for j in urdf.movable if math.isinf(j.upper - j.lower)]
     for j in endless:
         if j.kind == "prismatic":
-            raise urdf.wrong(f"joint {j.name} without a limit", "lower and upper limits of a sliding joint")
+            raise urdf.wrong(
+                f"joint {j.name} without a limit", "lower and upper limits of a sliding joint"
+            )
         joints[j.name] = dataclasses.replace(j, kind="revolute", lower=-math.pi, upper=math.pi)
-    return [f"joint {j.name} has no limits: they are set to half a turn either way" for j in endless]
+    return [
+        f"joint {j.name} has no limits: they are set to half a turn either way" for j in endless
+    ]
 
 
 def _add_drives(joints: dict[str, Joint]) -> list[str]:
     """Give joints without an effort or velocity limit the limits typical of small hands."""
-    idle = [j for j in joints.values() if j.kind != "fixed" and not (j.effort > 0 and j.velocity > 0)]
+    idle = [
+        j for j in joints.values() if j.kind != "fixed" and not (j.effort > 0 and j.velocity > 0)
+    ]
     for j in idle:
-        effort, velocity = (x if x > 0 else usual for x, usual in ((j.effort, EFFORT), (j.velocity, VELOCITY)))
+        effort, velocity = (
+            x if x > 0 else usual for x, usual in ((j.effort, EFFORT), (j.velocity, VELOCITY))
+        )
         joints[j.name] = dataclasses.replace(j, effort=effort, velocity=velocity)
     names = ", ".join(j.name for j in idle)
-    return [f"{names} without effort or velocity get {EFFORT:g} N m, {VELOCITY:g} rad/s"] if idle else []
+    return (
+        [f"{names} without effort or velocity get {EFFORT:g} N m, {VELOCITY:g} rad/s"]
+        if idle
+        else []
+    )
 
 
 def _follow_directly(joints: dict[str, Joint]) -> list[str]:
-    """Make joints coupled to a coupled joint follow the independent joint at the start of the chain."""
+    """Make joints coupled to a coupled joint follow the independent joint at the start of the
+    chain.
+    """
     done = []
     for name, j in joints.items():
         mimic = j.mimic
         while mimic and (above := joints[mimic.source].mimic):
-            mimic = Mimic(above.source, mimic.ratio * above.ratio, mimic.ratio * above.offset + mimic.offset)
+            mimic = Mimic(
+                above.source, mimic.ratio * above.ratio, mimic.ratio * above.offset + mimic.offset
+            )
         if mimic and mimic != j.mimic:
-            done.append(f"joint {name} follows a follower of {mimic.source}: it follows {mimic.source} directly")
+            done.append(
+                f"joint {name} follows a follower of {mimic.source}: it follows {mimic.source} directly"
+            )
             joints[name] = dataclasses.replace(j, mimic=mimic)
     return done
 
 
 def _limit_leaders(urdf: Urdf, joints: dict[str, Joint]) -> list[str]:
-    """Limit each independent joint to positions at which the joints coupled to it are within their limits."""
+    """Limit each independent joint to positions at which the joints coupled to it are within their
+    limits.
+    """
     done = []
     for name, j in joints.items():
         if (mimic := j.mimic) is None:
             continue
         if not mimic.ratio:
-            raise urdf.wrong(f"joint {name} that follows with a ratio of 0", "a fixed joint, or another ratio")
+            raise urdf.wrong(
+                f"joint {name} that follows with a ratio of 0", "a fixed joint, or another ratio"
+            )
         leader = joints[mimic.source]
         ends = sorted((end - mimic.offset) / mimic.ratio for end in (j.lower, j.upper))
-        low, high = max(leader.lower, ends[0]), min(leader.upper, ends[1])
+        low = max(leader.lower, ends[0])
+        high = min(leader.upper, ends[1])
         if not low < high:
-            raise urdf.wrong(f"joint {name} that follows {leader.name} outside its own limits", "limits that overlap")
+            raise urdf.wrong(
+                f"joint {name} that follows {leader.name} outside its own limits",
+                "limits that overlap",
+            )
         if (low, high) != (leader.lower, leader.upper):
             joints[leader.name] = dataclasses.replace(leader, lower=low, upper=high)
             done.append(
@@ -183,16 +261,26 @@ def _limit_leaders(urdf: Urdf, joints: dict[str, Joint]) -> list[str]:
 def repair_bodies(urdf: Urdf, surfaces: Mapping[str, np.ndarray]) -> Step:
     """Replace missing or impossible masses and inertias; `surfaces` are points (n, 3) on each link."""
     # Least mass [kg] and edge [m] of a body without mass, so that simulators remain stable
-    least_mass, least_size = 1e-3, 5e-3
-    far_out = 2.0  # farthest mass centre and radius of gyration, in half diagonals of the bounding box
-    links, weightless, absurd = [], list[str](), list[str]()
+    least_mass = 1e-3
+    least_size = 5e-3
+    far_out = (
+        2.0  # farthest mass centre and radius of gyration, in half diagonals of the bounding box
+    )
+    links = []
+    weightless = list[str]()
+    absurd = list[str]()
     for link in urdf.links:
         points = surfaces.get(link.name, np.zeros((1, 3)))
-        low, high = points.min(0), points.max(0)
+        low = points.min(0)
+        high = points.max(0)
         size = np.maximum(high - low, least_size)
-        reach, middle, mass = float(np.linalg.norm(size)) / 2, (low + high) / 2, link.mass
+        reach = float(np.linalg.norm(size)) / 2
+        middle = (low + high) / 2
+        mass = link.mass
         if not mass > 0:
-            mass = max(least_mass, 500.0 * float(np.prod(high - low)))  # half of the box is filled with 1000 kg/m3
+            mass = max(
+                least_mass, 500.0 * float(np.prod(high - low))
+            )  # half of the box is filled with 1000 kg/m3
             weightless.append(f"{link.name} ({1e3 * mass:.3g} g)")
         principal = np.linalg.eigvalsh(_matrix(link.inertia))
         sound = principal[0] > 0 and principal[0] + principal[1] >= principal[2] * (1 - 1e-6)
@@ -207,7 +295,9 @@ def repair_bodies(urdf: Urdf, surfaces: Mapping[str, np.ndarray]) -> Step:
         links.append(link)
     done = []
     if weightless:
-        done.append(f"links without mass get the mass of half their bounding box: {', '.join(weightless)}")
+        done.append(
+            f"links without mass get the mass of half their bounding box: {', '.join(weightless)}"
+        )
     if absurd:
         done.append(
             f"{', '.join(absurd)} with an inertia or mass centre that is impossible for their size and mass get those "

@@ -1,4 +1,6 @@
-"""Checks of .dae and .glb meshes, so that trimesh reads plain geometry in bounded memory, and no other file."""
+"""Checks of .dae and .glb meshes, so that trimesh reads plain geometry in bounded memory, and no
+other file.
+"""
 
 import importlib.util
 import json
@@ -11,9 +13,11 @@ from torchgrasp.hand.safe_xml import BoundedBuilder
 
 
 def clean_dae(data: bytes) -> tuple[bytes, float]:
-    """Return a COLLADA file with its geometry alone, and its unit [m]; its axes stay as they are, as in ROS.
+    """Return a COLLADA file with its geometry alone, and its unit [m]; its axes stay as they are,
+    as in ROS.
 
-    Raises `Malformed` for declarations, skins and nodes that repeat others, and `MissingExtra` without pycollada.
+    Raises `Malformed` for declarations, skins and nodes that repeat others, and `MissingExtra`
+    without pycollada.
     """
     if importlib.util.find_spec("collada") is None:
         raise MissingExtra("pycollada", "meshes")
@@ -30,14 +34,21 @@ def clean_dae(data: bytes) -> tuple[bytes, float]:
             kind = part.tag.removeprefix(space)
             if kind in ("instance_controller", "instance_node"):
                 raise Malformed(f"<{kind}>, where plain geometry should be")
-            library = kind.startswith("library_") and kind not in ("library_geometries", "library_visual_scenes")
+            library = kind.startswith("library_") and kind not in (
+                "library_geometries",
+                "library_visual_scenes",
+            )
             if library or kind in ("bind_material", "extra", "instance_camera", "instance_light"):
                 element.remove(part)
     sizes = {
-        f"#{geometry.get('id')}": sum(len((p.text or "").split()) for p in geometry.iter(f"{space}p"))
+        f"#{geometry.get('id')}": sum(
+            len((p.text or "").split()) for p in geometry.iter(f"{space}p")
+        )
         for geometry in root.iter(f"{space}geometry")
     }
-    used = sum(sizes.get(instance.get("url", ""), 0) for instance in root.iter(f"{space}instance_geometry"))
+    used = sum(
+        sizes.get(instance.get("url", ""), 0) for instance in root.iter(f"{space}instance_geometry")
+    )
     if used > (most := 12 * MESH_FACES):  # three corners of a face, each of up to four indices
         raise Malformed(f"{used} indices of corners; at most {most}")
     unit = root.find(f"{space}asset/{space}unit")
@@ -45,21 +56,33 @@ def clean_dae(data: bytes) -> tuple[bytes, float]:
 
 
 def check_glb(data: bytes) -> None:
-    """Raise `Malformed` for a .glb file with skins, with compressed or shared geometry, or with too much of it."""
+    """Raise `Malformed` for a .glb file with skins, with compressed or shared geometry, or with too
+    much of it.
+    """
     if data[:4] != b"glTF":
         raise Malformed("no header of a .glb file")
     scene = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
-    accessors, nodes = scene.get("accessors", []), scene.get("nodes", [])
+    accessors = scene.get("accessors", [])
+    nodes = scene.get("nodes", [])
     packed = [name for name in scene.get("extensionsRequired", []) if "mesh" in name.lower()]
     if packed or scene.get("skins") or any("bufferView" not in accessor for accessor in accessors):
         raise Malformed(f"compressed geometry or skins {' '.join(packed)[:200]}".strip())
     sizes = [
-        sum(accessors[part.get("indices", part["attributes"]["POSITION"])]["count"] for part in mesh["primitives"])
+        sum(
+            accessors[part.get("indices", part["attributes"]["POSITION"])]["count"]
+            for part in mesh["primitives"]
+        )
         for mesh in scene.get("meshes", [])
     ]
-    used = [i for part in (*scene.get("scenes", []), *nodes) for i in part.get("nodes", part.get("children", []))]
+    used = [
+        i
+        for part in (*scene.get("scenes", []), *nodes)
+        for i in part.get("nodes", part.get("children", []))
+    ]
     count = sum(sizes[nodes[i]["mesh"]] for i in used if "mesh" in nodes[i])
     stored = sum(view["byteLength"] for view in scene.get("bufferViews", []))
     numbers = sum(accessor["count"] for accessor in accessors)
-    if max(count, numbers) > 12 * MESH_FACES or stored > len(data):  # corners of faces, of up to four attributes
+    if max(count, numbers) > 12 * MESH_FACES or stored > len(
+        data
+    ):  # corners of faces, of up to four attributes
         raise Malformed(f"{count} corners of {numbers} numbers in {stored} bytes")

@@ -1,6 +1,7 @@
 """The command line `torchgrasp`.
 
-Exit codes: 0 done, 1 no executable grasp or object not held, 2 bad input, 130 interrupted, 143 terminated.
+Exit codes: 0 done, 1 no executable grasp or object not held, 2 bad input, 130 interrupted, 143
+    terminated.
 """
 
 import contextlib
@@ -27,7 +28,10 @@ __all__ = ["main", "run_and_exit"]
 CHAPTERS: dict[str, dict[str, Callable[..., Command | int]]] = {
     "Plan grasps": {"grasp": grasp.Grasp, "view": look.OpenPage, "objects": look.Objects},
     "Exchange grasps with other programs": {"export": export.Export, "import": export.Import},
-    "Try many grasps in simulation": {"evaluate": evaluate.Evaluate, "campaign": evaluate.RunCampaign},
+    "Try many grasps in simulation": {
+        "evaluate": evaluate.Evaluate,
+        "campaign": evaluate.RunCampaign,
+    },
     "Point clouds and shapes": {
         "cloud check": clouds.CloudCheck,
         "cloud cut": clouds.CloudCut,
@@ -74,7 +78,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     0
     """
     given = list(sys.argv[1:] if arguments is None else arguments)
-    # The batches are small: a second thread costs more than it gains, and one gives the same bits on any machine.
+    # The batches are small: a second thread costs more than it gains, and one gives the same bits
+    # on any machine.
     torch.set_num_threads(1)
     with _open_streams():
         return _guard(given)
@@ -83,7 +88,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def run_and_exit() -> NoReturn:
     """Run the command line of this process, and end the process.
 
-    The first SIGINT or SIGTERM ends the command cleanly. Later signals are ignored, so that the command can clean up.
+    The first SIGINT or SIGTERM ends the command cleanly. Later signals are ignored, so that the
+    command can clean up.
 
     >>> import subprocess
     >>> code = "from torchgrasp.app.cli import run_and_exit; run_and_exit()"
@@ -98,7 +104,11 @@ def run_and_exit() -> NoReturn:
             ending = True
             raise _Terminated if sign == signal.SIGTERM else KeyboardInterrupt
 
-    signs = [sign for sign in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(sign) is not signal.SIG_IGN]
+    signs = [
+        sign
+        for sign in (signal.SIGINT, signal.SIGTERM)
+        if signal.getsignal(sign) is not signal.SIG_IGN
+    ]
     for sign in signs:
         signal.signal(sign, end)
     try:
@@ -127,7 +137,9 @@ def _guard(given: list[str]) -> int:
     except BrokenPipeError:  # the reader of stdout is gone, so nobody reads a message
         _drop_stdout()
         return 1
-    except OSError as error:  # readers and writers of files raise GraspError: this is a full disk behind stdout
+    except (
+        OSError
+    ) as error:  # readers and writers of files raise GraspError: this is a full disk behind stdout
         print(f"torchgrasp: {error}", file=sys.stderr)
         _drop_stdout()
         return 2
@@ -136,7 +148,13 @@ def _guard(given: list[str]) -> int:
 def _run(given: list[str]) -> int:
     """Run the command that the arguments name; return its exit code."""
     if given in ([], ["--version"], ["--help"], ["-h"]):
-        print(START if not given else f"torchgrasp {__version__}" if given == ["--version"] else format_help())
+        print(
+            START
+            if not given
+            else f"torchgrasp {__version__}"
+            if given == ["--version"]
+            else format_help()
+        )
         return 0
     names = {name.split()[0] for name in COMMANDS}
     if given[0] not in names and not given[0].startswith("-"):
@@ -154,8 +172,11 @@ def _run(given: list[str]) -> int:
 
 
 def _parser() -> SubcommandApp:
-    """Return the argument parser of all commands; commands of two words are grouped by the first word."""
-    top, groups = SubcommandApp(), dict[str, SubcommandApp]()
+    """Return the argument parser of all commands; commands of two words are grouped by the first
+    word.
+    """
+    top = SubcommandApp()
+    groups = dict[str, SubcommandApp]()
     for name, command in COMMANDS.items():
         group, _, last = name.rpartition(" ")
         if group and group not in groups:
@@ -169,9 +190,14 @@ def format_help() -> str:
     """Return the help text: all commands in chapters, each with its first sentence."""
     lines = ["torchgrasp: dexterous fingertip grasps from a partial point cloud", ""]
     for chapter, commands in CHAPTERS.items():
-        firsts = {name: (command.__doc__ or "").split("\n\n")[0].split() for name, command in commands.items()}
+        firsts = {
+            name: (command.__doc__ or "").split("\n\n")[0].split()
+            for name, command in commands.items()
+        }
         lines += [chapter, *(f"  {name:15}{' '.join(words)}" for name, words in firsts.items()), ""]
-    return "\n".join([*lines, "Options of a command: torchgrasp COMMAND --help. Version: torchgrasp --version."])
+    return "\n".join(
+        [*lines, "Options of a command: torchgrasp COMMAND --help. Version: torchgrasp --version."]
+    )
 
 
 def _sentence(error: GraspError) -> str:
@@ -187,13 +213,19 @@ def _sentence(error: GraspError) -> str:
 
 @contextlib.contextmanager
 def _open_streams() -> Iterator[None]:
-    """Replace missing standard streams by the null device, so that no other file gets their descriptors."""
+    """Replace missing standard streams by the null device, so that no other file gets their
+    descriptors.
+    """
     with contextlib.ExitStack() as stack:
         if None in (sys.stdin, sys.stdout, sys.stderr):
-            while (free := os.open(os.devnull, os.O_RDWR)) <= 2:  # descriptors of the standard streams
+            while (
+                free := os.open(os.devnull, os.O_RDWR)
+            ) <= 2:  # descriptors of the standard streams
                 pass
             os.close(free)
-        nowhere = stack.enter_context(open(os.devnull, "w")) if None in (sys.stdout, sys.stderr) else None
+        nowhere = (
+            stack.enter_context(open(os.devnull, "w")) if None in (sys.stdout, sys.stderr) else None
+        )
         if sys.stdout is None:
             stack.enter_context(contextlib.redirect_stdout(nowhere))
         if sys.stderr is None:
@@ -203,27 +235,37 @@ def _open_streams() -> Iterator[None]:
 
 def _drop_stdout() -> None:
     """Redirect stdout to the null device, because Python would try to flush it at the end."""
-    with contextlib.suppress(OSError, ValueError, AttributeError):  # stdout may be closed, or no file
+    with contextlib.suppress(
+        OSError, ValueError, AttributeError
+    ):  # stdout may be closed, or no file
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # pyright: ignore[reportOptionalMemberAccess]
 
 
 class _WithoutMarkup:
-    """An output stream that removes markup such as [bold] from the text, where tyro would print it literally."""
+    """An output stream that removes markup such as [bold] from the text, where tyro would print it
+    literally.
+    """
 
     def __init__(self, stream: Any) -> None:
         self.stream = stream
 
     def write(self, text: str) -> int:
-        """Write the text with its markup removed. If the text is framed, the right border stays aligned."""
+        """Write the text with its markup removed. If the text is framed, the right border stays
+        aligned.
+        """
         plain = rf"\1\2{' ' * len('[bold][/bold]')}\3"
-        return self.stream.write(re.sub(r"\[bold\](.*?)\[/bold\](.*?)( │?)$", plain, text, flags=re.MULTILINE))
+        return self.stream.write(
+            re.sub(r"\[bold\](.*?)\[/bold\](.*?)( │?)$", plain, text, flags=re.MULTILINE)
+        )
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.stream, name)
 
 
 class _Terminated(KeyboardInterrupt):
-    """Raised on SIGTERM, which ends a command like SIGINT: workers stop, and no half-written file is left."""
+    """Raised on SIGTERM, which ends a command like SIGINT: workers stop, and no half-written file
+    is left.
+    """
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *_: object) -> None:

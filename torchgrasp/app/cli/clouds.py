@@ -1,4 +1,6 @@
-"""The commands `torchgrasp cloud` and `shape`: check, cut, thin and render clouds; write the estimated surface."""
+"""The commands `torchgrasp cloud` and `shape`: check, cut, thin and render clouds; write the
+estimated surface.
+"""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -7,7 +9,15 @@ import torch
 
 from torchgrasp import cloud as clouds
 from torchgrasp.app.cli import inputs
-from torchgrasp.app.cli.command import Command, arguments, naming, nested, option, positional, required
+from torchgrasp.app.cli.command import (
+    Command,
+    arguments,
+    naming,
+    nested,
+    option,
+    positional,
+    required,
+)
 from torchgrasp.cloud.neighbours import draw_rows
 from torchgrasp.cloud.prepare import prepare_cloud
 from torchgrasp.data import write_objects
@@ -24,7 +34,9 @@ from torchgrasp.values.planning import PointCloud
 
 @arguments(points="file", normals="file")
 class CloudCheck(Command):
-    """Report on a point cloud, with advice for a better one. The exit code is 1 if `torchgrasp grasp` refuses it."""
+    """Report on a point cloud, with advice for a better one. The exit code is 1 if `torchgrasp
+    grasp` refuses it.
+    """
 
     file: Path = positional(inputs.CLOUD_HELP)
     view: inputs.CloudOptions = nested(inputs.CloudOptions())
@@ -48,7 +60,9 @@ class CloudCheck(Command):
 
 
 def _no_view(cloud: PointCloud) -> BadArgument | None:
-    """Return the error of `fit_shape` for a cloud that no single camera can see, or None if one camera can see it."""
+    """Return the error of `fit_shape` for a cloud that no single camera can see, or None if one
+    camera can see it.
+    """
     some = cloud.select(draw_rows(len(cloud), 20_000))  # more points give no more certainty
     try:
         seen = prepare_cloud(some, torch.Generator().manual_seed(0))
@@ -61,15 +75,22 @@ def _no_view(cloud: PointCloud) -> BadArgument | None:
 
 @arguments(points="cloud", path="out")
 class CloudCut(Command):
-    """Write the points of one object in a scene, without the points of the table, and the plane of the table."""
+    """Write the points of one object in a scene, without the points of the table, and the plane of
+    the table.
+    """
 
-    cloud: Path = positional("point cloud of a scene of any size (.ply, .pcd, .npy, .npz, or text as .xyz, .csv, .pts)")
+    cloud: Path = positional(
+        "point cloud of a scene of any size (.ply, .pcd, .npy, .npz, or text as .xyz, .csv, .pts)"
+    )
     out: Path = required(inputs.OUT_CLOUD_HELP)
     view: inputs.ViewOptions = nested(inputs.ViewOptions())
     point: tuple[float, float, float] | None = option(
-        None, "a point on or near the object; points farther than 0.5 m away are left out. By default the largest"
+        None,
+        "a point on or near the object; points farther than 0.5 m away are left out. By default the largest",
     )
-    box: tuple[float, float, float, float, float, float] | None = option(None, "two corners of a box to cut first")
+    box: tuple[float, float, float, float, float, float] | None = option(
+        None, "two corners of a box to cut first"
+    )
     gap: float = option(0.02, "least distance between two objects [m]")
 
     def run(self) -> int:
@@ -77,8 +98,16 @@ class CloudCut(Command):
         if not 0.001 <= self.gap <= 1.0:
             raise BadArgument("--gap", self.gap, "a number of metres in [0.001, 1]")
         file = self.view.read("CLOUD", self.cloud, whole=True)
-        near = None if self.point is None else check_tensor("--point", torch.tensor(self.point).double(), (3,))
-        box = None if self.box is None else check_tensor("--box", torch.tensor(self.box).double(), (6,)).reshape(2, 3)
+        near = (
+            None
+            if self.point is None
+            else check_tensor("--point", torch.tensor(self.point).double(), (3,))
+        )
+        box = (
+            None
+            if self.box is None
+            else check_tensor("--box", torch.tensor(self.box).double(), (6,)).reshape(2, 3)
+        )
         up = self.view.vertical
         up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64) if up is None else up
         thing, plane = clouds.cut_object(file.cloud, up, near, box, self.gap)
@@ -88,7 +117,9 @@ class CloudCut(Command):
             print("note    no plane was found under the object")
         else:
             x, y, z = plane.normal.tolist()
-            print(f"table   --table {x:.5f} {y:.5f} {z:.5f} {plane.offset:.5f} ({self.out} holds it)")
+            print(
+                f"table   --table {x:.5f} {y:.5f} {z:.5f} {plane.offset:.5f} ({self.out} holds it)"
+            )
         print(f"{len(thing)} of {len(file.cloud)} points, {self.out}")
         return 0
 
@@ -109,7 +140,9 @@ class CloudThin(Command):
         less = clouds.remove_outliers(some)
         clouds.save_cloud(less, self.out, file.table)
         inputs.print_notes(file.notes)
-        print(f"{len(less)} of {len(file.cloud)} points, {len(some) - len(less)} outliers removed, {self.out}")
+        print(
+            f"{len(less)} of {len(file.cloud)} points, {len(some) - len(less)} outliers removed, {self.out}"
+        )
         return 0
 
 
@@ -119,7 +152,9 @@ class CloudRender(Command):
 
     mesh: Path = positional("closed mesh of an object [m], z up (.ply, .obj, .stl, ...)")
     out: Path = required(f"{inputs.OUT_CLOUD_HELP}, with the viewpoint")
-    azimuth: float = option(30.0, "direction of the camera from the mesh, from x towards y [degrees]")
+    azimuth: float = option(
+        30.0, "direction of the camera from the mesh, from x towards y [degrees]"
+    )
     elevation: float = option(30.0, "elevation of the camera above the horizontal [degrees]")
     distance: float = option(0.5, "distance of the camera from the centre of the mesh [m]")
     points: int = option(1000, "number of points; fewer if fewer pixels see the object")
@@ -140,17 +175,23 @@ class CloudRender(Command):
 
 @arguments(mesh="meshes", path="out")
 class CloudViews(Command):
-    """Make a folder of objects for trials from a folder of meshes: a noisy depth camera sees each mesh."""
+    """Make a folder of objects for trials from a folder of meshes: a noisy depth camera sees each
+    mesh.
+    """
 
     meshes: Path = positional("folder of closed meshes [m], z up (.ply, .stl, .obj, .off)")
-    out: Path = required("folder to write: manifest.json, and for each object mesh.ply and its views")
+    out: Path = required(
+        "folder to write: manifest.json, and for each object mesh.ply and its views"
+    )
     views: Annotated[int, Range(1, 1000)] = option(3, "views of each object, from random sides")
     seed: Seed = option(0, inputs.SEED_HELP)
 
     def run(self) -> int:
         """Render views of all meshes and write the folder of objects; return the exit code."""
         names = write_objects(self.meshes, self.out, self.views, self.seed)
-        print(f"{len(names)} objects with {self.views} view{'s' * (self.views != 1)} each: {self.out}")
+        print(
+            f"{len(names)} objects with {self.views} view{'s' * (self.views != 1)} each: {self.out}"
+        )
         return 0
 
 
@@ -159,7 +200,9 @@ class ShapeSurface(Command):
     """Write the estimated surface of an object, coloured by its standard deviation."""
 
     cloud: Path = positional(inputs.CLOUD_HELP)
-    out: Path = required('mesh to write: .ply, with the standard deviation of each vertex as "std_m" [m], or .glb')
+    out: Path = required(
+        'mesh to write: .ply, with the standard deviation of each vertex as "std_m" [m], or .glb'
+    )
     view: inputs.CloudOptions = nested(inputs.CloudOptions())
     support: Literal["camera", "paper"] = option(
         "camera", "observations of the hidden side: from the camera, or the paper's points"
@@ -177,7 +220,8 @@ class ShapeSurface(Command):
         estimate = extract_surface(shape, self.resolution)
         save_surface(estimate, self.out)
         inputs.print_notes(file.notes)
-        middle, most = 1e3 * float(estimate.std_m.median()), 1e3 * largest_std(estimate)
+        middle = 1e3 * float(estimate.std_m.median())
+        most = 1e3 * largest_std(estimate)
         print(f"{len(estimate.vertices)} vertices, {len(estimate.faces)} faces, {self.out}")
         print(f"standard deviation: median {middle:.1f} mm, {most:.1f} mm where it is yellow")
         return 0

@@ -1,4 +1,6 @@
-"""Commands as frozen dataclasses: a field is a command-line argument with default and help; `run` does the work."""
+"""Commands as frozen dataclasses: a field is a command-line argument with default and help; `run`
+does the work.
+"""
 
 import contextlib
 import dataclasses
@@ -19,7 +21,9 @@ T = TypeVar("T")
 
 
 class Command:
-    """Base of all commands; `names` maps the names of arguments in the library's errors to fields of the command."""
+    """Base of all commands; `names` maps the names of arguments in the library's errors to fields
+    of the command.
+    """
 
     names: ClassVar[dict[str, str]] = {}
 
@@ -49,7 +53,9 @@ def nested(default: Any) -> Any:
 
 
 def arguments(**names: str) -> Callable[[type[T]], type[T]]:
-    """Return a decorator of a command's class; `names` maps arguments in the library's errors to its fields."""
+    """Return a decorator of a command's class; `names` maps arguments in the library's errors to
+    its fields.
+    """
 
     def make(cls: type[T]) -> type[T]:
         made: Any = dataclasses.dataclass(frozen=True, kw_only=True)(cls)
@@ -61,12 +67,16 @@ def arguments(**names: str) -> Callable[[type[T]], type[T]]:
 
 
 def _annotate(field: dataclasses.Field) -> Any:
-    """Return the annotation of a field with its help text; the defaults None, False and () are not shown."""
+    """Return the annotation of a field with its help text; the defaults None, False and () are not
+    shown.
+    """
     if field.metadata.get("nested"):
         return Annotated[field.type, tyro.conf.arg(name="")]
     text = field.metadata["help"]
     if field.metadata.get("positional"):
-        return Annotated[tyro.conf.Positional[field.type], tyro.conf.arg(help=text, metavar=field.name.upper())]
+        return Annotated[
+            tyro.conf.Positional[field.type], tyro.conf.arg(help=text, metavar=field.name.upper())
+        ]
     if not any(field.default is empty for empty in (None, False, ())):
         return Annotated[field.type, tyro.conf.arg(help=text)]
     kinds = [kind for kind in get_args(field.type) if kind is not type(None)]
@@ -82,12 +92,18 @@ def _metavar(kind: Any) -> str:
     if get_origin(kind) is Literal:
         return f"{{{','.join(map(str, parts))}}}"
     if get_origin(kind) is tuple:
-        return f"{_metavar(parts[0])} [{_metavar(parts[0])} ...]" if ... in parts else " ".join(map(_metavar, parts))
+        return (
+            f"{_metavar(parts[0])} [{_metavar(parts[0])} ...]"
+            if ... in parts
+            else " ".join(map(_metavar, parts))
+        )
     return "PATH" if kind is Path else kind.__name__.upper()
 
 
 def execute(command: Command) -> int:
-    """Check paths and number ranges of a command's arguments, then run it; errors name the command-line options."""
+    """Check paths and number ranges of a command's arguments, then run it; errors name the command-
+    line options.
+    """
     fields = {f.name: f for f in dataclasses.fields(command) if "help" in f.metadata}  # pyright: ignore[reportArgumentType]
     options = {
         name: name.upper() if field.metadata.get("positional") else f"--{name.replace('_', '-')}"
@@ -106,7 +122,9 @@ def execute(command: Command) -> int:
 
 @contextlib.contextmanager
 def naming(**options: str) -> Iterator[None]:
-    """In errors raised within the context, replace argument names by the names of command-line options."""
+    """In errors raised within the context, replace argument names by the names of command-line
+    options.
+    """
     try:
         yield
     except BadArgument as error:
@@ -117,7 +135,9 @@ def naming(**options: str) -> Iterator[None]:
 
 
 class StageProgress:
-    """Progress output: a line for each finished stage, and on a terminal a bar that names the current stage."""
+    """Progress output: a line for each finished stage, and on a terminal a bar that names the
+    current stage.
+    """
 
     def __init__(self, *names: str) -> None:
         self.next = dict(zip(names, (*names[1:], "done"), strict=True))
@@ -127,7 +147,9 @@ class StageProgress:
         self.bar = make_bar(len(names), "stage", desc=names[0], delay=1)
 
     def end(self, name: str, message: str, value: Any = None) -> None:
-        """Print that the stage `name` has ended, and keep its `value` (result); the bar then shows the next stage."""
+        """Print that the stage `name` has ended, and keep its `value` (result); the bar then shows
+        the next stage.
+        """
         now = time.perf_counter()
         self.stages.append((name, message, now - self.began))
         self.values[name] = value

@@ -1,4 +1,6 @@
-"""Hands by their name in the package robot_descriptions, which downloads the repository of their maker once."""
+"""Hands by their name in the package robot_descriptions, which downloads the repository of their
+maker once.
+"""
 
 import importlib
 import importlib.util
@@ -7,10 +9,14 @@ from pathlib import Path
 from torchgrasp.foundation.errors import BadArgument, MissingExtra
 
 
-def locate_urdf(name: Path, meshes: Path | None, out: Path | None) -> tuple[Path, Path | None, Path | None]:
-    """Return the URDF, the folder of its meshes and the folder to write, from arguments that may name a description.
+def locate_urdf(
+    name: Path, meshes: Path | None, out: Path | None
+) -> tuple[Path, Path | None, Path | None]:
+    """Return the URDF, the folder of its meshes and the folder to write, from arguments that may
+    name a description.
 
-    Raises `BadArgument` for a name without a URDF, or where the download fails; `MissingExtra` without the package.
+    Raises `BadArgument` for a name without a URDF, or where the download fails; `MissingExtra`
+    without the package.
     """
     if name.exists() or name.suffix or not str(name).isidentifier():
         return name, meshes, out
@@ -18,15 +24,21 @@ def locate_urdf(name: Path, meshes: Path | None, out: Path | None) -> tuple[Path
         raise MissingExtra("robot_descriptions", "robots")
     module = f"robot_descriptions.{str(name).removesuffix('_description')}_description"
     if importlib.util.find_spec(module) is None:
-        raise BadArgument("urdf", name, "a URDF file, or a name of robot_descriptions such as allegro_hand")
+        raise BadArgument(
+            "urdf", name, "a URDF file, or a name of robot_descriptions such as allegro_hand"
+        )
     try:
         found = vars(importlib.import_module(module))
     except Exception as error:  # git raises its own
         wanted = "a network, or a clone in the folder $ROBOT_DESCRIPTIONS_CACHE"
-        raise BadArgument("urdf", f"{name}, which cannot be downloaded ({error})"[:300], wanted) from error
+        raise BadArgument(
+            "urdf", f"{name}, which cannot be downloaded ({error})"[:300], wanted
+        ) from error
     others = {key: value for key, value in found.items() if key.startswith("URDF_PATH_")}
     if "URDF_PATH" not in found:
-        raise BadArgument("urdf", f"{name} without a URDF", "a description with a URDF, not with MJCF or xacro")
+        raise BadArgument(
+            "urdf", f"{name} without a URDF", "a description with a URDF, not with MJCF or xacro"
+        )
     for key, path in others.items():
         print(f"note: {name} also has {key}: {path}")
     return Path(found["URDF_PATH"]), meshes or Path(found["REPOSITORY_PATH"]), out or Path(name)

@@ -1,4 +1,6 @@
-"""The commands `torchgrasp doctor` and `torchgrasp selftest`: is the installation complete, and does it work?"""
+"""The commands `torchgrasp doctor` and `torchgrasp selftest`: is the installation complete, and
+does it work?
+"""
 
 import importlib.metadata
 import importlib.util
@@ -20,7 +22,10 @@ from torchgrasp.values.specs import Simulator
 
 CORE = ("torch", "numpy", "scipy", "trimesh", "pytorch-kinematics", "yourdfpy", "safetensors")
 """Packages that every command needs."""
-SIMULATORS: dict[Simulator, str] = {"sapien": "sim", "mujoco": "mujoco"}  # simulators, and the extra that installs each
+SIMULATORS: dict[Simulator, str] = {
+    "sapien": "sim",
+    "mujoco": "mujoco",
+}  # simulators, and the extra that installs each
 
 
 class Finding(NamedTuple):
@@ -35,8 +40,9 @@ class Finding(NamedTuple):
 class Doctor(Command):
     """List installed and missing packages, with the command that installs each.
 
-    The exit code is 1 if a simulator or a package is missing, even though planning needs no simulator. A missing Dask,
-    which only `campaign --scheduler` needs, does not change the exit code.
+    The exit code is 1 if a simulator or a package is missing, even though planning needs no
+    simulator. A missing Dask, which only `campaign --scheduler` needs, does not change the exit
+    code.
     """
 
     def run(self) -> int:
@@ -59,21 +65,28 @@ def find_parts() -> list[Finding]:
     dask = _package("distributed", "pip install 'torchgrasp[cluster]'")
     return [
         Finding("torchgrasp", f"{__version__}, hands: {hands}"),
-        Finding("Python", f"{platform.python_version()} on {platform.system()} {platform.machine()}, {sys.executable}"),
+        Finding(
+            "Python",
+            f"{platform.python_version()} on {platform.system()} {platform.machine()}, {sys.executable}",
+        ),
         *(_package(name) for name in CORE),
         Finding("processor", f"{os.cpu_count()} cores; a command uses one, and --workers N uses N"),
         Finding("GPU", gpu),
         *(_simulator(name) for name in SIMULATORS),
         *(_package(name, "pip install 'torchgrasp[sim]'") for name in ("coacd", "pebble")),
-        dask if not dask.fix else Finding(dask.part, f"none; `torchgrasp campaign --scheduler` needs it: {dask.fix}"),
+        dask
+        if not dask.fix
+        else Finding(dask.part, f"none; `torchgrasp campaign --scheduler` needs it: {dask.fix}"),
     ]
 
 
 @arguments()
 class Selftest(Command):
-    """Lift shipped grasps in each installed simulator, and compare the verdicts with the known ones.
+    """Lift shipped grasps in each installed simulator, and compare the verdicts with the known
+    ones.
 
-    The exit code is 0 if all verdicts are right, and 1 if one is wrong or no simulator is installed.
+    The exit code is 0 if all verdicts are right, and 1 if one is wrong or no simulator is
+    installed.
     """
 
     def run(self) -> int:
@@ -84,7 +97,9 @@ class Selftest(Command):
         for name, fix in faults.items():
             if fix:
                 print(f"{name}: {fix}")
-        found: dict[Simulator, list[GoldenResult]] = {name: [] for name in SIMULATORS if not faults[name]}
+        found: dict[Simulator, list[GoldenResult]] = {
+            name: [] for name in SIMULATORS if not faults[name]
+        }
         if not found:
             return 1
         with make_bar(len(GOLDEN) * len(found), "lift") as bar:
@@ -93,12 +108,18 @@ class Selftest(Command):
                 for result in run_golden(name):
                     results.append(result)
                     bar.update()
-                right, seconds = sum(x.right for x in results), time.perf_counter() - begin
+                right = sum(x.right for x in results)
+                seconds = time.perf_counter() - begin
                 bar.write(f"{name:8}{seconds:6.1f} s  {right} of {len(GOLDEN)} verdicts right")
-        rows, words = [("object", "hand", "expected", *found)], {True: "held", False: "lost"}
+        rows = [("object", "hand", "expected", *found)]
+        words = {True: "held", False: "lost"}
         for k, case in enumerate(GOLDEN):
-            verdicts = [f"{words[x[k].held]}{'' if x[k].right else ' (wrong)'}" for x in found.values()]
-            rows.append((f"{case.object}, {case.mass:g} kg", case.hand, words[case.held], *verdicts))
+            verdicts = [
+                f"{words[x[k].held]}{'' if x[k].right else ' (wrong)'}" for x in found.values()
+            ]
+            rows.append(
+                (f"{case.object}, {case.mass:g} kg", case.hand, words[case.held], *verdicts)
+            )
         print(f"\n{format_columns(rows, left=range(len(rows[0])))}")
         return 0 if all(x.right for results in found.values() for x in results) else 1
 
@@ -117,5 +138,9 @@ def _simulator(name: Simulator) -> Finding:
         import_simulator(name)
     except (MissingExtra, BadArgument) as error:
         missing = isinstance(error, MissingExtra)
-        return Finding(name, "missing" if missing else "cannot be loaded", str(error).partition(": ")[2] or str(error))
+        return Finding(
+            name,
+            "missing" if missing else "cannot be loaded",
+            str(error).partition(": ")[2] or str(error),
+        )
     return Finding(name, importlib.metadata.version(name))

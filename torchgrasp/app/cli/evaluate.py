@@ -1,4 +1,6 @@
-"""The commands `torchgrasp evaluate` and `campaign`: grasps tried in simulation, for statistics or a data set."""
+"""The commands `torchgrasp evaluate` and `campaign`: grasps tried in simulation, for statistics or
+a data set.
+"""
 
 import dataclasses
 import sys
@@ -6,9 +8,29 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from torchgrasp import evaluation
-from torchgrasp.app.cli.command import Command, arguments, make_bar, naming, option, positional, required
-from torchgrasp.app.cli.inputs import FINGERS_HELP, HAND_HELP, SEED_HELP, STARTS_HELP, import_simulator, load_fingers
-from torchgrasp.app.report.evaluation_page import SHARE_NAMES, list_causes, list_figures, write_evaluation
+from torchgrasp.app.cli.command import (
+    Command,
+    arguments,
+    make_bar,
+    naming,
+    option,
+    positional,
+    required,
+)
+from torchgrasp.app.cli.inputs import (
+    FINGERS_HELP,
+    HAND_HELP,
+    SEED_HELP,
+    STARTS_HELP,
+    import_simulator,
+    load_fingers,
+)
+from torchgrasp.app.report.evaluation_page import (
+    SHARE_NAMES,
+    list_causes,
+    list_figures,
+    write_evaluation,
+)
 from torchgrasp.campaign import CampaignSpec, run_campaign
 from torchgrasp.campaign.folder import FAILED
 from torchgrasp.data import JobRow, read_entries, write_parquet
@@ -18,16 +40,32 @@ from torchgrasp.evaluation.protocols import find_protocol
 from torchgrasp.evaluation.summary import ViewScore, summarise
 from torchgrasp.evaluation.sweep import evaluate
 from torchgrasp.evaluation.views import EvaluationSpec, Ranks
-from torchgrasp.files import check_begun, format_columns, format_json, format_line, hold_folder, write_file
+from torchgrasp.files import (
+    check_begun,
+    format_columns,
+    format_json,
+    format_line,
+    hold_folder,
+    write_file,
+)
 from torchgrasp.foundation.checks import Count, Range, Seed
 from torchgrasp.foundation.errors import BadArgument, DatasetError, Status
 from torchgrasp.values.specs import ClosingMode, HoldingMode, Simulator
 
-OBJECTS_HELP = "folder with manifest.json, and for each object mesh.ply and noisy views; see docs/data.md"
+OBJECTS_HELP = (
+    "folder with manifest.json, and for each object mesh.ply and noisy views; see docs/data.md"
+)
 PROTOCOL_HELP = "the test that decides on success; see torchgrasp.evaluation.protocols"
 Protocol = Literal[
-    "multidex", "dexgraspbench", "dexgraspbench-hard", "pose-noise", "paper", "tabletop", "household", "table-lift"
-]  # fmt: skip
+    "multidex",
+    "dexgraspbench",
+    "dexgraspbench-hard",
+    "pose-noise",
+    "paper",
+    "tabletop",
+    "household",
+    "table-lift",
+]
 
 
 @arguments(folder="out", path="out")
@@ -37,17 +75,23 @@ class _Trials(Command):
     hand: str = required(HAND_HELP)
     out: Path = required("folder of the results; no other run may use it at the same time")
     fingers: str = option("default", FINGERS_HELP)
-    closing: ClosingMode | None = option(None, "how the hand closes; by default as the protocol says")
+    closing: ClosingMode | None = option(
+        None, "how the hand closes; by default as the protocol says"
+    )
     simulator: Simulator = option("sapien", "physics simulator")
     grasps: int = option(20, "most grasps that are tried of each view")
-    ranks: Ranks = option("best", "the grasps that are tried: the best, or grasps spread over all ranks")
+    ranks: Ranks = option(
+        "best", "the grasps that are tried: the best, or grasps spread over all ranks"
+    )
     starts: Count = option(1000, STARTS_HELP)
     only: tuple[str, ...] = option((), "names of objects to use; by default all")
     views: int | None = option(None, "most views of each object; by default all")
     seed: Seed = option(0, SEED_HELP)
 
     def trial(self, **changes: Any) -> dict[str, Any]:
-        """Return the options of the simulated trial that the user set, by name; `changes` are further options."""
+        """Return the options of the simulated trial that the user set, by name; `changes` are
+        further options.
+        """
         changes |= {"closing": self.closing, "simulator": self.simulator}
         return {name: value for name, value in changes.items() if value is not None}
 
@@ -56,38 +100,56 @@ class _Trials(Command):
 class Evaluate(_Trials):
     """Plan on each noisy view of a folder's objects, and test the best grasps in simulation.
 
-    Prints a line for each view, then success rates with 95 % intervals over families of objects. Writes evaluate.json,
-    evaluate.html, and a folder of grasps.
+    Prints a line for each view, then success rates with 95 % intervals over families of objects.
+    Writes evaluate.json, evaluate.html, and a folder of grasps.
     """
 
     objects: Path = required(OBJECTS_HELP)
-    fingers: str = option("default", f'{FINGERS_HELP}; "auto" takes for each view the most likely option to succeed')
+    fingers: str = option(
+        "default", f'{FINGERS_HELP}; "auto" takes for each view the most likely option to succeed'
+    )
     protocol: Protocol = option("dexgraspbench", PROTOCOL_HELP)
     holding: HoldingMode | None = option(
-        None, 'how the hand presses after closing; by default as the protocol says, or "force" with --force'
+        None,
+        'how the hand presses after closing; by default as the protocol says, or "force" with --force',
     )
-    force: float | None = option(None, "normal force of the strongest finger [N]; by default as the protocol says")
+    force: float | None = option(
+        None, "normal force of the strongest finger [N]; by default as the protocol says"
+    )
     displaced: float | None = option(
-        None, "lifts: most that the object is displaced on each axis of the table [m]; by default as the protocol says"
+        None,
+        "lifts: most that the object is displaced on each axis of the table [m]; by default as the protocol says",
     )
     during: bool = option(False, "displace the object halfway through the approach, not before it")
-    relook: bool = option(False, "lifts: a camera looks at the displaced object once more, before the approach")
-    push: float | None = option(None, "lifts: size of a force in a random direction on the lifted object [N]")
+    relook: bool = option(
+        False, "lifts: a camera looks at the displaced object once more, before the approach"
+    )
+    push: float | None = option(
+        None, "lifts: size of a force in a random direction on the lifted object [N]"
+    )
     draws: Count | None = option(
-        None, "trials of each grasp, with other displacements, pushes and noise; by default as the protocol says"
+        None,
+        "trials of each grasp, with other displacements, pushes and noise; by default as the protocol says",
     )
     complete: bool = option(False, "plan on the whole cloud instead of each view")
-    planned: Path | None = option(None, 'folder "grasps" of an earlier run, whose grasps are tested')
+    planned: Path | None = option(
+        None, 'folder "grasps" of an earlier run, whose grasps are tested'
+    )
     workers: int = option(1, "processes; the results do not depend on their number")
 
     def disturbed(self, test: evaluation.Protocol) -> evaluation.Protocol:
         """Return a protocol with the displacements, pushes and draws that the user set."""
-        noise = test.noise if self.draws is None else dataclasses.replace(test.noise, draws=self.draws)
+        noise = (
+            test.noise if self.draws is None else dataclasses.replace(test.noise, draws=self.draws)
+        )
         if self.displaced is not None:
             if test.pull is not None:
-                raise BadArgument("--displaced", self.displaced, f"a protocol that lifts, not {test.name}")
+                raise BadArgument(
+                    "--displaced", self.displaced, f"a protocol that lifts, not {test.name}"
+                )
             noise = dataclasses.replace(noise, translation=self.displaced, rotation=0.0)
-        push, relook = test.push if self.push is None else self.push, self.relook or test.relook
+        push = test.push if self.push is None else self.push
+        relook = self.relook or test.relook
         when = "approach" if self.during else test.displaced
         return dataclasses.replace(test, noise=noise, push=push, relook=relook, displaced=when)
 
@@ -96,11 +158,20 @@ class Evaluate(_Trials):
         import_simulator(self.simulator)
         hand, among = load_fingers(self.hand, self.fingers)
         test = self.disturbed(find_protocol(self.protocol))
-        test = test.with_trial(**self.trial(force=self.force, holding=self.holding or (self.force and "force")))
+        test = test.with_trial(
+            **self.trial(force=self.force, holding=self.holding or (self.force and "force"))
+        )
         spec = EvaluationSpec(
-            self.grasps, self.ranks, self.starts, self.complete, self.only, self.planned is not None, self.seed,
-            self.views, among,
-        )  # fmt: skip
+            self.grasps,
+            self.ranks,
+            self.starts,
+            self.complete,
+            self.only,
+            self.planned is not None,
+            self.seed,
+            self.views,
+            among,
+        )
         scores = []
         with hold_folder(self.out):
             folder = self.planned or self.out / "grasps"
@@ -115,10 +186,18 @@ class Evaluate(_Trials):
                     scores.append(score)
             summary = summarise(scores)
             print_summary(self.protocol, spec.tried, summary)
-            asked: dict[str, Any] = {"hand": self.hand, "tried": spec.tried, "hand_sha256": hand.source.sha256}
+            asked: dict[str, Any] = {
+                "hand": self.hand,
+                "tried": spec.tried,
+                "hand_sha256": hand.source.sha256,
+            }
             asked |= dataclasses.asdict(spec) | {"fingers": among or hand.source.option}
             asked["protocol"] = dataclasses.asdict(test)
-            content = {"asked": asked, "summary": summary, "views": [dataclasses.asdict(score) for score in scores]}
+            content = {
+                "asked": asked,
+                "summary": summary,
+                "views": [dataclasses.asdict(score) for score in scores],
+            }
             write_file(self.out / "evaluate.json", format_json(content))
             title = f"Grasps of the {self.hand} hand under {self.protocol}"
             write_evaluation(self.out / "evaluate.html", title, asked, scores)
@@ -126,7 +205,9 @@ class Evaluate(_Trials):
 
 
 def list_names(objects: Path, spec: EvaluationSpec) -> list[tuple[str, str]]:
-    """Return pairs of object name and view name for all views; an object without views has the view name ""."""
+    """Return pairs of object name and view name for all views; an object without views has the view
+    name "".
+    """
     names = []
     for name, entry in read_entries(objects, spec.only).items():
         bad = isinstance(entry, DatasetError)  # a bad entry is refused when it is evaluated
@@ -136,9 +217,13 @@ def list_names(objects: Path, spec: EvaluationSpec) -> list[tuple[str, str]]:
 
 
 def print_score(score: ViewScore, widths: tuple[int, int] = (12, 6)) -> None:
-    """Print one line with the result of a view; `widths` are the column widths of the names of object and view."""
+    """Print one line with the result of a view; `widths` are the column widths of the names of
+    object and view.
+    """
     failed = [attempt.status for attempt in score.attempts if not attempt.passed]
-    reasons = ", ".join(f"{failed.count(status)} {status.name.lower()}" for status in dict.fromkeys(failed))
+    reasons = ", ".join(
+        f"{failed.count(status)} {status.name.lower()}" for status in dict.fromkeys(failed)
+    )
     reasons = reasons if score.attempts else score.note or score.refusal.sentence
     passed = f"{sum(attempt.passed for attempt in score.attempts)}/{len(score.attempts)}"
     cells = (score.object, score.view, score.executable, passed, reasons)
@@ -146,40 +231,55 @@ def print_score(score: ViewScore, widths: tuple[int, int] = (12, 6)) -> None:
 
 
 def print_summary(protocol: str, tried: str, summary: dict[str, Any]) -> None:
-    """Print the success rates of all objects and of each group, failures by stage and cause, and means and times."""
+    """Print the success rates of all objects and of each group, failures by stage and cause, and
+    means and times.
+    """
     rows = [(text, format_share(summary[key])) for key, text in SHARE_NAMES.items()]
     for name, group in summary["by_group"].items():
         rows += [(f"{name}: {text}", format_share(group[key])) for key, text in SHARE_NAMES.items()]
     if len(summary["fingers"]) > 1:
-        rows.append(("views by fingers", "; ".join(f"{n} {names}" for names, n in summary["fingers"].items())))
+        rows.append(
+            (
+                "views by fingers",
+                "; ".join(f"{n} {names}" for names, n in summary["fingers"].items()),
+            )
+        )
     for stage, reasons in summary["failures"].items():
-        rows.append((f"failed in {stage}", ", ".join(f"{n} {name.lower()}" for name, n in reasons.items())))
+        rows.append(
+            (f"failed in {stage}", ", ".join(f"{n} {name.lower()}" for name, n in reasons.items()))
+        )
     rows += [(f"not held: {name}", text) for name, text in list_causes(summary)]
     print(f"\n{protocol}, {tried}\n{format_columns([*rows, *list_figures(summary)], left={0, 1})}")
 
 
 @arguments()
 class RunCampaign(_Trials):
-    """Write a data set: for each view its cloud, grasps, proofs of closure, predicted and simulated success.
+    """Write a data set: for each view its cloud, grasps, proofs of closure, predicted and simulated
+    success.
 
-    Prints a line for each job, one object and view. Writes shards of safetensors with README.md and card.json, which
-    torchgrasp.data.read_shards reads. The same command continues a run that was interrupted or killed, and tries
-    failed jobs again: worker_died, timed_out, and broken, an error of the library. The exit code is 1 while failed jobs
-    are left.
+    Prints a line for each job, one object and view. Writes shards of safetensors with README.md and
+    card.json, which torchgrasp.data.read_shards reads. The same command continues a run that was
+    interrupted or killed, and tries failed jobs again: worker_died, timed_out, and broken, an error
+    of the library. The exit code is 1 while failed jobs are left.
     """
 
     objects: Path = positional(OBJECTS_HELP)
     protocol: Protocol = option("tabletop", PROTOCOL_HELP)
     licence: str = option("unknown", "licence of the data set, for its card, as CC-BY-4.0")
-    parquet: Path | None = option(None, "folder for the same data as Parquet, for `datasets.load_dataset`")
+    parquet: Path | None = option(
+        None, "folder for the same data as Parquet, for `datasets.load_dataset`"
+    )
     jobs_in_shard: int = option(64, "number of jobs whose records share a file")
     workers: Annotated[int, Range(0, 1024)] = option(
         1, "processes here, 0: this one; the data do not depend on their number"
     )
     device: Literal["cpu", "cuda"] = option(
-        "cpu", 'with "cuda" the workers of --scheduler that have the resource "GPU" plan on all views of a file at once'
+        "cpu",
+        'with "cuda" the workers of --scheduler that have the resource "GPU" plan on all views of a file at once',
     )
-    scheduler: str | None = option(None, "Dask scheduler, as tcp://10.0.0.1:8786, whose workers do the jobs instead")
+    scheduler: str | None = option(
+        None, "Dask scheduler, as tcp://10.0.0.1:8786, whose workers do the jobs instead"
+    )
 
     def run(self) -> int:
         """Run the campaign and print its counts; return the exit code."""
@@ -191,10 +291,16 @@ class RunCampaign(_Trials):
         if self.fingers == "auto":
             raise BadArgument("--fingers", "auto", "one set of fingers for all records")
         hand, _ = load_fingers(self.hand, self.fingers)
-        trials = EvaluationSpec(self.grasps, self.ranks, self.starts, only=self.only, seed=self.seed, views=self.views)
+        trials = EvaluationSpec(
+            self.grasps, self.ranks, self.starts, only=self.only, seed=self.seed, views=self.views
+        )
         test = find_protocol(self.protocol).with_trial(**self.trial())
         spec = CampaignSpec(test, trials, self.licence, self.jobs_in_shard, self.device)
-        source, name = (self.workers, "--workers") if self.scheduler is None else (self.scheduler, "--scheduler")
+        source, name = (
+            (self.workers, "--workers")
+            if self.scheduler is None
+            else (self.scheduler, "--scheduler")
+        )
         with naming(workers=name), make_bar(len(list_names(self.objects, trials)), "job") as bar:
 
             def show(row: JobRow) -> None:
@@ -206,8 +312,12 @@ class RunCampaign(_Trials):
 
             data = run_campaign(self.objects, hand, self.out, spec, source, show)
         counts = data.card["counts"]
-        print(f"{counts['jobs']} jobs: {', '.join(f'{n} {name.lower()}' for name, n in counts['status'].items())}")
-        print(f"{len(data)} grasps, {counts['passed']} of {counts['tries']} tries passed: {self.out}")
+        print(
+            f"{counts['jobs']} jobs: {', '.join(f'{n} {name.lower()}' for name, n in counts['status'].items())}"
+        )
+        print(
+            f"{len(data)} grasps, {counts['passed']} of {counts['tries']} tries passed: {self.out}"
+        )
         if self.parquet is not None:
             with naming(folder="--parquet", path="--parquet", data="OBJECTS"):
                 write_parquet(data, self.parquet)
@@ -215,5 +325,7 @@ class RunCampaign(_Trials):
         if failed:
             reasons = ", ".join(sorted({row.status.name.lower() for row in failed}))
             jobs = "1 job" if len(failed) == 1 else f"{len(failed)} jobs"
-            print(f"{jobs} failed by no fault of the object ({reasons}): the same command tries again")
+            print(
+                f"{jobs} failed by no fault of the object ({reasons}): the same command tries again"
+            )
         return 1 if failed else 0

@@ -1,4 +1,6 @@
-"""The commands `torchgrasp export` and `torchgrasp import`: grasps in the formats of other programs."""
+"""The commands `torchgrasp export` and `torchgrasp import`: grasps in the formats of other
+programs.
+"""
 
 import functools
 import inspect
@@ -38,22 +40,42 @@ TEXTS: dict[str, Callable[..., str]] = {
 
 
 @arguments(
-    path="out", folder="out", object_path="object", name="hand", fingers="grasps", object_id="object", mesh="object"
+    path="out",
+    folder="out",
+    object_path="object",
+    name="hand",
+    fingers="grasps",
+    object_id="object",
+    mesh="object",
 )
 class Export(Command):
-    """Write the best executable grasps of a file for other programs, with frames and the order of joints."""
+    """Write the best executable grasps of a file for other programs, with frames and the order of
+    joints.
+    """
 
-    grasps: Path = positional("grasps.safetensors of `torchgrasp grasp`, or a file of the folder grasps of `evaluate`")
+    grasps: Path = positional(
+        "grasps.safetensors of `torchgrasp grasp`, or a file of the folder grasps of `evaluate`"
+    )
     out: Path = required("file to write; for dexgraspbench, play-... and usd a folder")
     format: Literal[
-        "json", "mujoco", "moveit", "ros2", "dexgraspbench", "graspgen", "glb",
-        "play-mujoco", "play-maniskill", "play-isaaclab", "play-newton", "usd",
+        "json",
+        "mujoco",
+        "moveit",
+        "ros2",
+        "dexgraspbench",
+        "graspgen",
+        "glb",
+        "play-mujoco",
+        "play-maniskill",
+        "play-isaaclab",
+        "play-newton",
+        "usd",
     ] = option(
         "json",
         "json: frames, units, forces and torques. mujoco: the hand as a model with keyframes. moveit: a list of "
         "moveit_msgs/Grasp in YAML. ros2: a JointTrajectory each. dexgraspbench, graspgen: files of these projects. "
         "glb: hand and object at the best grasp, for slides. play-..., usd: hand, object, motion, and a script to play",
-    )  # fmt: skip
+    )
     hand: str | None = option(None, "name or folder of the hand; by default the name in the file")
     most: Count = option(20, "number of grasps, the best first")
     force: float | None = option(
@@ -61,7 +83,8 @@ class Export(Command):
         "normal force of the strongest finger [N] in the squeeze; by default 4, in play-... and usd as --mass needs",
     )
     kp: float | None = option(
-        None, "stiffness of the joints under position control [N m/rad]; by default the hand's, or the bench's"
+        None,
+        "stiffness of the joints under position control [N m/rad]; by default the hand's, or the bench's",
     )
     object: str | None = option(
         None,
@@ -71,7 +94,8 @@ class Export(Command):
     mass: float | None = option(None, "play-..., usd: mass of the object [kg]; by default 0.1")
     friction: float | None = option(None, "play-..., usd: coefficient of friction; by default 0.8")
     rename: tuple[str, ...] = option(
-        (), "json, moveit, ros2: the robot's joints, as URDF=ROBOT ..., in its order, or a .json file of such an object"
+        (),
+        "json, moveit, ros2: the robot's joints, as URDF=ROBOT ..., in its order, or a .json file of such an object",
     )
     flange: tuple[float, float, float, float, float, float, float] | None = option(
         None,
@@ -80,17 +104,24 @@ class Export(Command):
 
     def run(self) -> int:
         """Load the grasps and write them in the chosen format; return the exit code."""
-        plays, shown = self.format == "usd" or self.format.startswith("play-"), self.grasps.with_name("surface.ply")
+        plays = self.format == "usd" or self.format.startswith("play-")
+        shown = self.grasps.with_name("surface.ply")
         named = plays or self.format in ("dexgraspbench", "graspgen", "glb")
         found = (plays or self.format == "glb") and shown.is_file()
         if named and self.object is None and not found:
             raise BadArgument("--object", None, f"a path with --format {self.format}")
         with naming(path="--flange"):
             flange = None if self.flange is None else read_poses(np.array([self.flange]), "wxyz")[0]
-        robot = {"rename": read_names(self.rename), "flange": flange, "object_id": None if named else self.object}
+        robot = {
+            "rename": read_names(self.rename),
+            "flange": flange,
+            "object_id": None if named else self.object,
+        }
         robot = {name: x for name, x in robot.items() if x is not None}
         trial: dict[str, Any] = {
-            name: x for name, x in (("mass", self.mass), ("friction", self.friction)) if x is not None
+            name: x
+            for name, x in (("mass", self.mass), ("friction", self.friction))
+            if x is not None
         }
         texts = inspect.signature(TEXTS[self.format]).parameters if self.format in TEXTS else ()
         taken = trial if plays else texts
@@ -103,7 +134,8 @@ class Export(Command):
             found = f"{hand.name}, whose files are not those that were planned with"
             raise BadArgument("--hand", found, "the same hand")
         best = planned[planned.status == Status.OK][: 1 if self.format == "glb" else self.most]
-        force, body = 4.0 if self.force is None else self.force, Path(self.object or shown)
+        force = 4.0 if self.force is None else self.force
+        body = Path(self.object or shown)
         with naming(hand="--format"):
             if plays and len(best):
                 player: Any = self.format.removeprefix("play-")
@@ -111,7 +143,9 @@ class Export(Command):
                 formats.save_play(hand, best, self.out, player, body, spec)
             elif self.format == "dexgraspbench":
                 stiffness = {} if self.kp is None else {"kp": self.kp}
-                formats.save_dexgraspbench(hand, best, self.out, str(self.object), force, **stiffness)
+                formats.save_dexgraspbench(
+                    hand, best, self.out, str(self.object), force, **stiffness
+                )
             elif self.format == "glb":
                 if len(best):
                     write_glb(self.out, hand, best[0], read_mesh(body))
@@ -124,36 +158,49 @@ class Export(Command):
 
 
 def read_names(words: Sequence[str]) -> dict[str, str] | None:
-    """Return names of joints, given as texts URDF=ROBOT or as the path of a .json file with an object of them."""
+    """Return names of joints, given as texts URDF=ROBOT or as the path of a .json file with an
+    object of them.
+    """
     if len(words) != 1 or "=" in words[0]:
         pairs = [(joint, name) for joint, _, name in (word.partition("=") for word in words)]
         if len(names := dict(pairs)) < len(pairs):
             raise BadArgument("rename", " ".join(words), "each joint once")
         return names or None
-    file = read_json(Path(words[0]), functools.partial(ModelFileError, "rename"), "URDF=ROBOT, or a JSON file of names")
+    file = read_json(
+        Path(words[0]),
+        functools.partial(ModelFileError, "rename"),
+        "URDF=ROBOT, or a JSON file of names",
+    )
     return {joint: name.text() for joint, name in file.entries().items()}
 
 
 @arguments(order="joints", pregrasp="file", obj_from_hand="file", std_m="std")
 class Import(Command):
-    """Read grasps of another program, prove which have force closure, and write them as grasps.safetensors.
+    """Read grasps of another program, prove which have force closure, and write them as
+    grasps.safetensors.
 
-    `torchgrasp export` and `torchgrasp evaluate --planned` accept the file. The input is JSON of `torchgrasp export`,
-    JSON with "pose" and "dofs" (MultiGripperGrasp), or .npz with DexGraspBench's names.
+    `torchgrasp export` and `torchgrasp evaluate --planned` accept the file. The input is JSON of
+    `torchgrasp export`, JSON with "pose" and "dofs" (MultiGripperGrasp), or .npz with
+    DexGraspBench's names.
     """
 
     file: Path = positional("the grasps, in the frame of the object")
     hand: str = required(HAND_HELP)
     out: Path = required("file to write")
     fingers: str = option("default", FINGERS_HELP)
-    joints: tuple[str, ...] = option((), "names of the joints in the order of the file, where the file has no names")
+    joints: tuple[str, ...] = option(
+        (), "names of the joints in the order of the file, where the file has no names"
+    )
     quaternion: Quaternion = option("wxyz", "order of the numbers of a rotation in the file")
     unit: Unit = option("m", "unit of the positions in the file")
     cloud: Path | None = option(
-        None, "the view for which the grasps are, for `torchgrasp evaluate --planned`; the contacts must lie on it"
+        None,
+        "the view for which the grasps are, for `torchgrasp evaluate --planned`; the contacts must lie on it",
     )
     friction: float = option(0.8, "coefficient of friction of the certificates")
-    std: float = option(0.003, "standard deviation of the surface [m] that a closing assumes at each contact")
+    std: float = option(
+        0.003, "standard deviation of the surface [m] that a closing assumes at each contact"
+    )
 
     def run(self) -> int:
         """Read the grasps of another program, certify and write them; return the exit code."""
@@ -165,7 +212,9 @@ class Import(Command):
             self._check(hand, grasps, cloud)
             grasps.meta["cloud_sha256"] = digest(cloud)
         elif len(grasps) and (far := float(grasps.obj_from_hand[:, :3, 3].abs().max())) > 10:
-            raise BadArgument("FILE", f"a hand {far:.0f} m off", "hands within 10 m of the object's frame: --unit")
+            raise BadArgument(
+                "FILE", f"a hand {far:.0f} m off", "hands within 10 m of the object's frame: --unit"
+            )
         with naming(path="--out"):
             grasps.save(self.out)
         closed = int((grasps.status == Status.OK).sum())
@@ -183,7 +232,9 @@ class Import(Command):
             return formats.grasps_from_joints(hand, joints, poses, opened, spec, self.std)
 
     def _check(self, hand: Hand, grasps: Grasps, cloud: PointCloud) -> None:
-        """Refuse grasps that are not on the cloud; the error names options that put them there, if any do."""
+        """Refuse grasps that are not on the cloud; the error names options that put them there, if
+        any do.
+        """
         error = _contradiction(grasps, cloud)
         if error is None:
             return
@@ -197,7 +248,14 @@ class Import(Command):
 def _contradiction(grasps: Grasps, cloud: PointCloud) -> BadArgument | None:
     """Return the error to raise if grasps are not on the cloud, else None."""
     try:
-        check_agreement("FILE", grasps.contacts.points.reshape(-1, 3), "the contacts", cloud, slack=0.03, share=0.5)
+        check_agreement(
+            "FILE",
+            grasps.contacts.points.reshape(-1, 3),
+            "the contacts",
+            cloud,
+            slack=0.03,
+            share=0.5,
+        )
     except BadArgument as error:
         return error
     return None

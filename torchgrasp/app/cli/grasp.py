@@ -6,7 +6,15 @@ from pathlib import Path
 from typing import Any, Literal
 
 from torchgrasp.app.cli import inputs
-from torchgrasp.app.cli.command import Command, StageProgress, arguments, naming, nested, option, positional
+from torchgrasp.app.cli.command import (
+    Command,
+    StageProgress,
+    arguments,
+    naming,
+    nested,
+    option,
+    positional,
+)
 from torchgrasp.app.report.page import grasp_columns, grasp_rows, write_report
 from torchgrasp.app.report.recording import import_rerun, write_recording
 from torchgrasp.app.report.run_data import Run, verdict
@@ -48,12 +56,14 @@ Among = Literal["auto"] | None
 
 @arguments(points="cloud", normals="cloud", path="out", target="label")
 class Grasp(Command):
-    """Plan grasps of an object in a partial cloud or a scene; with a mesh, also close the hand in simulation.
+    """Plan grasps of an object in a partial cloud or a scene; with a mesh, also close the hand in
+    simulation.
 
-    Writes grasps.safetensors, surface.ply, report.html and the 3D page view.html into the output folder. If no grasp is
-    executable, one setting at a time is changed, and the change that helps most is named. The cloud is checked as by
-    `cloud check`. It is refused if the camera is below the table or contradicts the points, or if the unit is wrong. A
-    cloud with two bodies, with the table or with another plane is refused, too. Other findings are printed as advice.
+    Writes grasps.safetensors, surface.ply, report.html and the 3D page view.html into the output
+    folder. If no grasp is executable, one setting at a time is changed, and the change that helps
+    most is named. The cloud is checked as by `cloud check`. It is refused if the camera is below
+    the table or contradicts the points, or if the unit is wrong. A cloud with two bodies, with the
+    table or with another plane is refused, too. Other findings are printed as advice.
     """
 
     cloud: Path = positional(
@@ -61,33 +71,55 @@ class Grasp(Command):
         "shipped object, as jug"
     )
     hand: str = option("allegro", inputs.HAND_HELP)
-    out: Path | None = option(None, "folder of the results; by default out/ and the name of the object")
-    mesh: Path | None = option(
-        None, "true mesh of the object [m] in the frame of the cloud, for the simulator; a shipped object has one"
+    out: Path | None = option(
+        None, "folder of the results; by default out/ and the name of the object"
     )
-    close: bool = option(False, 'close the best grasp on the mesh, lift it and hold it (needs the extra "sim")')
+    mesh: Path | None = option(
+        None,
+        "true mesh of the object [m] in the frame of the cloud, for the simulator; a shipped object has one",
+    )
+    close: bool = option(
+        False, 'close the best grasp on the mesh, lift it and hold it (needs the extra "sim")'
+    )
     seed: Seed = option(0, "random seed; the same seed gives the same grasps")
     starts: Count = option(1000, inputs.STARTS_HELP)
-    time_budget: float | None = option(None, "seconds after which no batch of planning begins; by default no limit")
+    time_budget: float | None = option(
+        None, "seconds after which no batch of planning begins; by default no limit"
+    )
     view: inputs.CloudOptions = nested(inputs.CloudOptions())
     friction: float = option(0.8, "coefficient of friction between fingertips and object")
-    mass: float = option(0.25, "mass [kg] for which success is predicted, and with which the simulator lifts")
-    promise: float | None = option(None, "share of the grasps that must hold, such as 0.9; others are not returned")
+    mass: float = option(
+        0.25, "mass [kg] for which success is predicted, and with which the simulator lifts"
+    )
+    promise: float | None = option(
+        None, "share of the grasps that must hold, such as 0.9; others are not returned"
+    )
     fingers: str = option(
-        "default", f'{inputs.FINGERS_HELP}; "auto" tries the options of the hand and takes the most likely to succeed'
+        "default",
+        f'{inputs.FINGERS_HELP}; "auto" tries the options of the hand and takes the most likely to succeed',
     )
     mode: Mode = option(
-        "joint", "contacts, pose and joints together; contacts first, then the learned model; or the paper as written"
+        "joint",
+        "contacts, pose and joints together; contacts first, then the learned model; or the paper as written",
     )
-    label: int | None = option(None, "label of the object to grasp in a scene; by default the easiest")
-    point: tuple[float, float] | None = option(None, "column and row of a pixel on the object to grasp in a scene")
+    label: int | None = option(
+        None, "label of the object to grasp in a scene; by default the easiest"
+    )
+    point: tuple[float, float] | None = option(
+        None, "column and row of a pixel on the object to grasp in a scene"
+    )
     keep: str | None = option(
-        None, 'where contacts may be: a closed mesh, or a box as "X0 Y0 Z0 X1 Y1 Z1" [m] in the frame of the cloud'
+        None,
+        'where contacts may be: a closed mesh, or a box as "X0 Y0 Z0 X1 Y1 Z1" [m] in the frame of the cloud',
     )
     avoid: str | None = option(None, "where no contact may be: a mesh or a box, as in --keep")
-    resist: tuple[TaskName, ...] = option((), "loads of --mass that the contacts must resist with the hand's strength")
+    resist: tuple[TaskName, ...] = option(
+        (), "loads of --mass that the contacts must resist with the hand's strength"
+    )
     no_report: bool = option(False, "write the grasps without the pages")
-    rerun: bool = option(False, 'also write run.rrd, a recording of plan and closing (needs the extra "rerun")')
+    rerun: bool = option(
+        False, 'also write run.rrd, a recording of plan and closing (needs the extra "rerun")'
+    )
 
     def run(self) -> int:
         """Plan grasps, close on the object if asked, and write the results; return the exit code."""
@@ -100,7 +132,11 @@ class Grasp(Command):
         self._check_choice(scene)
         _ = self._where  # refused before any work
         hand, among = inputs.load_fingers(self.hand, self.fingers)
-        return self._grasp_scene(path, out, hand, among) if scene else self._grasp_cloud(path, out, hand, among)
+        return (
+            self._grasp_scene(path, out, hand, among)
+            if scene
+            else self._grasp_cloud(path, out, hand, among)
+        )
 
     def _check_choice(self, scene: bool) -> None:
         """Raise `BadArgument` for options of a scene with a cloud, or of a cloud with a scene."""
@@ -122,64 +158,117 @@ class Grasp(Command):
         mesh = self._true_mesh(path)
         file = self.view.read("CLOUD", path)
         view = self.view.with_table_of(file)
-        cloud, table = file.cloud, view.plane(file.cloud)
+        cloud = file.cloud
+        table = view.plane(file.cloud)
         plane = as_plane(table)
-        spec = (ContactSpec.paper if self.mode == "paper" else ContactSpec)(friction=self.friction, table=table)
+        spec = (ContactSpec.paper if self.mode == "paper" else ContactSpec)(
+            friction=self.friction, table=table
+        )
         true_mesh, parts = (None, None) if mesh is None else read_true_mesh(mesh)
         inputs.print_notes(file.notes, view.judge(cloud, table))
         if true_mesh is not None:
             check_mesh(cloud, true_mesh, "--mesh")
-            if plane is not None and view.table is None:  # the robot guesses its height, which the true mesh tells
-                plane = dataclasses.replace(plane, offset=float((true_mesh.vertices @ plane.normal.numpy()).min()))
+            if (
+                plane is not None and view.table is None
+            ):  # the robot guesses its height, which the true mesh tells
+                plane = dataclasses.replace(
+                    plane, offset=float((true_mesh.vertices @ plane.normal.numpy()).min())
+                )
             elif plane is not None:
                 check_stand(true_mesh, plane, "--mesh")
-        progress = StageProgress(*["fingers"] * (among is not None), *STAGES, *["closing"] * self.close, "report")
+        progress = StageProgress(
+            *["fingers"] * (among is not None), *STAGES, *["closing"] * self.close, "report"
+        )
         with progress.bar, inputs.holding("--out", out):
             origin = "no table" if table is None else inputs.describe_table(table)
             origin += " (lowest point)" * (table is not None and view.table is None)
             camera = "camera known" if cloud.viewpoint is not None else "camera estimated"
             progress.end("cloud", f"{len(cloud)} points, {camera}, {origin}")
-            options = {"fingers": among, "mode": self.mode, "observer": progress.end, **self._task()}
-            grasps = plan_grasps(cloud, hand, spec, self.starts, self.seed, **options, time_budget=self.time_budget)
+            options = {
+                "fingers": among,
+                "mode": self.mode,
+                "observer": progress.end,
+                **self._task(),
+            }
+            grasps = plan_grasps(
+                cloud, hand, spec, self.starts, self.seed, **options, time_budget=self.time_budget
+            )
             explanation = None
             if not bool((grasps.status == Status.OK).any()):
                 explanation = explain_empty(cloud, hand, spec, self.starts, self.seed, **options)
-            hand, name = hand_of(grasps, hand), inputs.object_name(path if mesh is None else mesh)
-            surface, plan = extract_surface(progress.values["shape"]), progress.values["plan"]
+            hand = hand_of(grasps, hand)
+            name = inputs.object_name(path if mesh is None else mesh)
+            surface = extract_surface(progress.values["shape"])
+            plan = progress.values["plan"]
             stages = tuple(progress.stages)
             costs = self._costs(grasps, hand, progress.values["shape"])
             run = Run(
-                name, path, cloud, hand, spec, surface, grasps, stages, plan, explanation=explanation, costs=costs
+                name,
+                path,
+                cloud,
+                hand,
+                spec,
+                surface,
+                grasps,
+                stages,
+                plan,
+                explanation=explanation,
+                costs=costs,
             )
             if self.close and true_mesh is not None and len(run.executable):
                 felt = field_from_surface(surface.vertices, surface.faces, FIELD_SPACING)
                 trial = TrialSpec(friction=self.friction, mass=self.mass)
                 options = {"parts": parts, "table": plane, "surface": felt}
-                closure = close_hand(run.executable[0], hand, true_mesh, trial, seed=self.seed, **options)
-                progress.end("closing", f"{closure.time[-1]:.1f} s simulated, {closure.status.name.lower()}")
-                run = dataclasses.replace(run, stages=tuple(progress.stages), mesh=true_mesh, closure=closure)
+                closure = close_hand(
+                    run.executable[0], hand, true_mesh, trial, seed=self.seed, **options
+                )
+                progress.end(
+                    "closing", f"{closure.time[-1]:.1f} s simulated, {closure.status.name.lower()}"
+                )
+                run = dataclasses.replace(
+                    run, stages=tuple(progress.stages), mesh=true_mesh, closure=closure
+                )
             progress.end("report", self._write(out, run))
         executable = print_grasps(run)
-        return 0 if (run.closure is not None and run.closure.held if self.close else executable) else 1
+        return (
+            0 if (run.closure is not None and run.closure.held if self.close else executable) else 1
+        )
 
     def _costs(self, grasps: Grasps, hand: Hand, shape: ShapeGP) -> tuple[str, ...]:
         """Return what lowers the predicted success of the best executable grasp most, in sentences."""
         best = grasps[grasps.status == Status.OK][:1]
-        return tuple(x.sentence for grasp in best for x in explain_success(grasp, hand, shape, GraspTask(self.mass)))
+        return tuple(
+            x.sentence
+            for grasp in best
+            for x in explain_success(grasp, hand, shape, GraspTask(self.mass))
+        )
 
     def _task(self) -> dict[str, Any]:
         """Return the options of the planner that say what the grasps must do."""
-        return {"task": GraspTask(self.mass), "promise": self.promise, "resist": self.resist or None, **self._where}
+        return {
+            "task": GraspTask(self.mass),
+            "promise": self.promise,
+            "resist": self.resist or None,
+            **self._where,
+        }
 
     @functools.cached_property
     def _where(self) -> dict[str, Region | None]:
         """The regions of --keep and --avoid."""
-        return {name: inputs.read_region(f"--{name}", getattr(self, name)) for name in ("keep", "avoid")}
+        return {
+            name: inputs.read_region(f"--{name}", getattr(self, name)) for name in ("keep", "avoid")
+        }
 
     def _true_mesh(self, path: Path) -> Path | None:
-        """Return the path of the true mesh, or None if there is none; raise `BadArgument` if --close has no mesh."""
+        """Return the path of the true mesh, or None if there is none; raise `BadArgument` if
+        --close has no mesh.
+        """
         shipped = path != self.cloud  # the cloud is given by name
-        mesh = path.with_name("mesh.ply") if shipped and self.close and self.mesh is None else self.mesh
+        mesh = (
+            path.with_name("mesh.ply")
+            if shipped and self.close and self.mesh is None
+            else self.mesh
+        )
         if self.close:
             if mesh is None:
                 raise BadArgument("--close", "no --mesh", "--close together with --mesh")
@@ -187,9 +276,15 @@ class Grasp(Command):
         return mesh
 
     def _grasp_scene(self, path: Path, out: Path, hand: Hand, among: Among) -> int:
-        """Plan for the chosen object of a scene, or the easiest object, and write the results; return the exit code."""
-        spec, choice = ContactSpec(friction=self.friction), self.point if self.label is None else self.label
-        names = {name: f"CLOUD: {name}" for name in ("depth", "intrinsics", "mask", "labels", "camera_pose", "table")}
+        """Plan for the chosen object of a scene, or the easiest object, and write the results;
+        return the exit code.
+        """
+        spec = ContactSpec(friction=self.friction)
+        choice = self.point if self.label is None else self.label
+        names = {
+            name: f"CLOUD: {name}"
+            for name in ("depth", "intrinsics", "mask", "labels", "camera_pose", "table")
+        }
         with naming(path="CLOUD", points="CLOUD", target="--label", point="--point", **names):
             scene = read_scene(path)
         with naming(table="--table", up="--up", target="--label", point="--point"):
@@ -197,9 +292,16 @@ class Grasp(Command):
             scene = scene if choice is None else scene.select(choice)
         progress = StageProgress("scene", *["fingers"] * (among is not None), *STAGES, "report")
         with progress.bar, inputs.holding("--out", out):
-            progress.end("scene", f"{len(scene.things)} objects, labels {', '.join(map(str, scene.things))}")
-            judged = Status.OK if scene.target is None else judge_things(scene, hand, spec)[scene.target]
-            for sentence in (*scene.advice, *([judged.sentence] if judged is not Status.OK else [])):
+            progress.end(
+                "scene", f"{len(scene.things)} objects, labels {', '.join(map(str, scene.things))}"
+            )
+            judged = (
+                Status.OK if scene.target is None else judge_things(scene, hand, spec)[scene.target]
+            )
+            for sentence in (
+                *scene.advice,
+                *([judged.sentence] if judged is not Status.OK else []),
+            ):
                 print(f"advice  {sentence}")
             options = {"fingers": among, "observer": progress.end, **self._task()}
             explanation = None
@@ -207,42 +309,84 @@ class Grasp(Command):
                 grasps = plan_grasps(scene, hand, spec, self.starts, self.seed, **options)
                 shape = progress.values["shape"]
                 if not bool((grasps.status == Status.OK).any()):
-                    explanation = explain_empty(scene, hand, spec, self.starts, self.seed, **options)
+                    explanation = explain_empty(
+                        scene, hand, spec, self.starts, self.seed, **options
+                    )
             else:
                 best = self._find_easiest(scene, hand, spec, among, progress)
                 if best is None:
                     return 1
                 scene, grasps, shape = best
-            spec, hand = dataclasses.replace(spec, table=scene.table), hand_of(grasps, hand)
-            cloud, name, surface = take_target(scene, self.seed), f"object {scene.target}", extract_surface(shape)
-            stages, plan = tuple(progress.stages), progress.values.get("plan")
+            spec = dataclasses.replace(spec, table=scene.table)
+            hand = hand_of(grasps, hand)
+            cloud = take_target(scene, self.seed)
+            name = f"object {scene.target}"
+            surface = extract_surface(shape)
+            stages = tuple(progress.stages)
+            plan = progress.values.get("plan")
             told = explanation, self._costs(grasps, hand, shape)
-            run = Run(name, path, cloud, hand, spec, surface, grasps, stages, plan, None, None, scene, *told)
+            run = Run(
+                name,
+                path,
+                cloud,
+                hand,
+                spec,
+                surface,
+                grasps,
+                stages,
+                plan,
+                None,
+                None,
+                scene,
+                *told,
+            )
             progress.end("report", self._write(out, run))
         return 0 if print_grasps(run) else 1
 
     def _with_table(self, scene: Scene, chosen: bool) -> Scene:
-        """Return the scene with the table of --table or --up; raise `BadArgument` if the target is then lost."""
+        """Return the scene with the table of --table or --up; raise `BadArgument` if the target is
+        then lost.
+        """
         if (self.view.table is None and self.view.up is None) or scene.table is None:
             return scene
-        image, name = scene.image, "--up" if self.view.table is None else "--table"
+        image = scene.image
+        name = "--up" if self.view.table is None else "--table"
         table = None if self.view.table is None else self.view.plane(PointCloud(scene.points))
-        supports = find_plausible(scene.points, image.obj_from_camera, table, self.view.vertical, known_unit=True)
-        labels = label_again(image, scene.table, supports[0], scene.pixel_labels, scene.given, scene.target or 0)
+        supports = find_plausible(
+            scene.points, image.obj_from_camera, table, self.view.vertical, known_unit=True
+        )
+        labels = label_again(
+            image, scene.table, supports[0], scene.pixel_labels, scene.given, scene.target or 0
+        )
         labels = labels[tuple(scene.pixels.T)]
-        planes, target = tuple(support.plane for support in supports), None if chosen else scene.target
-        again = dataclasses.replace(scene, labels=labels, table=planes[0], others=planes[1:], target=target)
+        planes = tuple(support.plane for support in supports)
+        target = None if chosen else scene.target
+        again = dataclasses.replace(
+            scene, labels=labels, table=planes[0], others=planes[1:], target=target
+        )
         if not again.things or target not in (None, *again.things):
             lost = f"object {target}, the target," if again.things else "every object"
             wanted = "one that keeps the target, or another target by --label or --point"
-            raise BadArgument(name, f"a table ({planes[0].describe()}) with which {lost} is lost", wanted)
-        old, new, given = set(scene.things), set(again.things), set(scene.given)
-        said = {"kept, but for pixels of the table": new & given, "found again": new - given, "lost": old - new}
-        inputs.print_notes(tuple(f"objects {how}: {str(sorted(some))[1:-1]}" for how, some in said.items() if some))
+            raise BadArgument(
+                name, f"a table ({planes[0].describe()}) with which {lost} is lost", wanted
+            )
+        old = set(scene.things)
+        new = set(again.things)
+        given = set(scene.given)
+        said = {
+            "kept, but for pixels of the table": new & given,
+            "found again": new - given,
+            "lost": old - new,
+        }
+        inputs.print_notes(
+            tuple(f"objects {how}: {str(sorted(some))[1:-1]}" for how, some in said.items() if some)
+        )
         return again
 
     def _write(self, out: Path, run: Run) -> str:
-        """Write grasps and estimated surface of a run, its HTML pages unless --no-report, and its recording."""
+        """Write grasps and estimated surface of a run, its HTML pages unless --no-report, and its
+        recording.
+        """
         paths = [out / "grasps.safetensors"]
         run.grasps.save(paths[0])
         if len(run.executable):
@@ -253,21 +397,45 @@ class Grasp(Command):
             paths.append(write_recording(out / "run.rrd", run))
         return ", ".join(map(str, paths))
 
-    def _find_easiest(self, scene: Scene, hand: Hand, spec: ContactSpec, among: Among, progress: StageProgress):
-        """Plan for the objects of a scene until one is easy; return the scene with it as target, grasps and shape."""
+    def _find_easiest(
+        self, scene: Scene, hand: Hand, spec: ContactSpec, among: Among, progress: StageProgress
+    ):
+        """Plan for the objects of a scene until one is easy; return the scene with it as target,
+        grasps and shape.
+        """
         # An object with this predicted success is easy enough: the others are not tried.
-        plan = plan_scene(scene, hand, spec, self.starts, self.seed, fingers=among, enough=0.9, **self._task())
+        plan = plan_scene(
+            scene, hand, spec, self.starts, self.seed, fingers=among, enough=0.9, **self._task()
+        )
         for thing in plan.things:
-            text = thing.reason or f"{0 if thing.grasps is None else len(thing.grasps)} executable grasps"
-            print(format_line((f"object {thing.label}", format_success(thing.success), text), (-10, 7, -1)), flush=True)
-        progress.end("objects", f"{sum(thing.grasps is not None for thing in plan.things)} with a grasp")
+            text = (
+                thing.reason
+                or f"{0 if thing.grasps is None else len(thing.grasps)} executable grasps"
+            )
+            print(
+                format_line(
+                    (f"object {thing.label}", format_success(thing.success), text), (-10, 7, -1)
+                ),
+                flush=True,
+            )
+        progress.end(
+            "objects", f"{sum(thing.grasps is not None for thing in plan.things)} with a grasp"
+        )
         if plan.best is None or plan.best.grasps is None or plan.best.shape is None:
             help = "With --label or --point, changes that would help are tried for one of them."
-            return print(f"The {hand.name} hand has no executable grasp of any object in the scene.\n{help}")
+            return print(
+                f"The {hand.name} hand has no executable grasp of any object in the scene.\n{help}"
+            )
         return dataclasses.replace(scene, target=plan.best.label), plan.best.grasps, plan.best.shape
 
 
-STAGES = ("shape", "plan", "certify", "query", "refine")  # stages of planning, as the planner reports them
+STAGES = (
+    "shape",
+    "plan",
+    "certify",
+    "query",
+    "refine",
+)  # stages of planning, as the planner reports them
 
 
 def print_grasps(run: Run) -> bool:
@@ -283,7 +451,8 @@ def print_grasps(run: Run) -> bool:
 def read_true_mesh(path: Path) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh] | None]":
     """Read the closed mesh of --mesh; for a shipped object also return its convex parts."""
     with naming(path="--mesh", mesh="--mesh"):
-        mesh, digest = read_mesh(path), sha256(path)
+        mesh = read_mesh(path)
+        digest = sha256(path)
     for name in list_objects():
         if sha256(DATA / name / "mesh.ply") == digest:
             return mesh, load_object(name).parts

@@ -1,4 +1,6 @@
-"""The commands `torchgrasp hand new`, `check`, `sample` and `train`: from a published URDF to a hand that grasps."""
+"""The commands `torchgrasp hand new`, `check`, `sample` and `train`: from a published URDF to a
+hand that grasps.
+"""
 
 import dataclasses
 import time
@@ -9,9 +11,24 @@ import torch
 from tqdm import tqdm
 
 from torchgrasp.app.author.draft import Wish, new_hand
-from torchgrasp.app.cli.command import Command, arguments, make_bar, naming, option, positional, required
+from torchgrasp.app.cli.command import (
+    Command,
+    arguments,
+    make_bar,
+    naming,
+    option,
+    positional,
+    required,
+)
 from torchgrasp.app.cli.described import locate_urdf
-from torchgrasp.app.cli.inputs import FINGERS_HELP, HAND_HELP, SEED_HELP, check_folder, holding, load_fingers
+from torchgrasp.app.cli.inputs import (
+    FINGERS_HELP,
+    HAND_HELP,
+    SEED_HELP,
+    check_folder,
+    holding,
+    load_fingers,
+)
 from torchgrasp.app.report.stills import draw_hand, opposed_posture
 from torchgrasp.data.shipped import load_object
 from torchgrasp.files import format_columns, hold_file, render, temporary_folder, write_file
@@ -35,9 +52,13 @@ TRIAL_STARTS = 100  # initial guesses with which a hand is tried on a shipped ob
 
 @arguments()
 class HandNew(Command):
-    """Write a first hand.toml for a published URDF, and a clean copy of the URDF where it needs repair."""
+    """Write a first hand.toml for a published URDF, and a clean copy of the URDF where it needs
+    repair.
+    """
 
-    urdf: Path = positional("file of the hand, with or without meshes, or its name in robot_descriptions")
+    urdf: Path = positional(
+        "file of the hand, with or without meshes, or its name in robot_descriptions"
+    )
     tips: tuple[str, ...] = option(
         (),
         'links of three to five fingertips in grasp order, first the three of option "default"; "four" and "five" add '
@@ -54,14 +75,24 @@ class HandNew(Command):
         urdf, meshes, out = locate_urdf(self.urdf, self.meshes, self.out)
         folder = urdf.parent if out is None else out
         check_folder(folder)
-        clean = "hand.urdf" if (folder / "hand.urdf").resolve() != urdf.resolve() else "hand_clean.urdf"
-        draft = new_hand(urdf, Wish(self.tips, self.name or "", self.root, meshes), self.seed, clean)
+        clean = (
+            "hand.urdf" if (folder / "hand.urdf").resolve() != urdf.resolve() else "hand_clean.urdf"
+        )
+        draft = new_hand(
+            urdf, Wish(self.tips, self.name or "", self.root, meshes), self.seed, clean
+        )
         texts = {"hand.toml": draft.toml}
         if draft.urdf or out is not None:
-            texts[clean if draft.urdf else urdf.name] = draft.urdf or urdf.read_text(encoding="utf-8")
+            texts[clean if draft.urdf else urdf.name] = draft.urdf or urdf.read_text(
+                encoding="utf-8"
+            )
         for file in texts:
             if (folder / file).exists():
-                raise OutputError("URDF", f"{folder / file}, which exists", "a folder without this file, as by --out")
+                raise OutputError(
+                    "URDF",
+                    f"{folder / file}, which exists",
+                    "a folder without this file, as by --out",
+                )
         with temporary_folder() as trial:
             for file, text in ({urdf.name: urdf.read_text(encoding="utf-8")} | texts).items():
                 write_file(trial / file, text)
@@ -77,20 +108,27 @@ class HandNew(Command):
             print(f"written: {folder / file}")
         print(f"out of the palm: {[round(x, 2) for x in hand.approach.tolist()]}")
         print(sets)
-        place = folder if folder.is_absolute() else f"./{folder}"  # a plain name may be that of a shipped hand
+        place = (
+            folder if folder.is_absolute() else f"./{folder}"
+        )  # a plain name may be that of a shipped hand
         print(f"look over the lines of hand.toml marked CHECK, then: torchgrasp hand check {place}")
         return 0
 
 
 @arguments(path="out")
 class HandCheck(Command):
-    """List every fault of a hand; if there is none, describe and draw the hand, and plan on a shipped object."""
+    """List every fault of a hand; if there is none, describe and draw the hand, and plan on a
+    shipped object.
+    """
 
     hand: str = positional(HAND_HELP)
     fingers: str = option(
-        "auto", f'{FINGERS_HELP}; "auto" describes the default, and tries every set that hand.toml declares'
+        "auto",
+        f'{FINGERS_HELP}; "auto" describes the default, and tries every set that hand.toml declares',
     )
-    out: Path = option(Path("hand.png"), "picture to write (.png): the pads, the frame of the palm, the limits")
+    out: Path = option(
+        Path("hand.png"), "picture to write (.png): the pads, the frame of the palm, the limits"
+    )
 
     def run(self) -> int:
         """Check, describe and draw the hand, and plan on a shipped object; return the exit code."""
@@ -105,7 +143,9 @@ class HandCheck(Command):
             joints = random_joints(sound, 5000)
             bar.write(f"{describe(sound, joints)}\n{describe_sets(sound)}")
             model = find_hand(self.hand) / "mixture.safetensors"
-            missing = f"none; only the modes of the paper need one: torchgrasp hand train {self.hand}"
+            missing = (
+                f"none; only the modes of the paper need one: torchgrasp hand train {self.hand}"
+            )
             bar.write(f"learned model: {model if model.exists() else missing}")
             hands = finger_sets(sound, "auto" if self.fingers == "auto" else None)
             bar.total = 1 + 2 * len(hands)
@@ -128,10 +168,14 @@ class HandCheck(Command):
 
 
 def print_faults(hand: str | Path, fingers: str = "default") -> bool:
-    """Print every fault of a hand, for the given fingers and all declared sets; return whether there is any."""
+    """Print every fault of a hand, for the given fingers and all declared sets; return whether
+    there is any.
+    """
     try:
         options = read_hand_toml(find_hand(hand) / "hand.toml", fingers).options
-        faults: list[GraspError] = [fault for some in (fingers, *options) for fault in find_faults(hand, some)]
+        faults: list[GraspError] = [
+            fault for some in (fingers, *options) for fault in find_faults(hand, some)
+        ]
     except BadArgument as error:
         if error.argument == "fingers":
             raise
@@ -148,10 +192,17 @@ def describe_sets(hand: Hand) -> str:
 
 
 def find_warnings(hand: Hand, joints: torch.Tensor) -> list[str]:
-    """Return warnings about a hand without faults, each with its fix, from random postures (n, h) [rad]."""
-    # Least shares of random postures that are free, face a pad to the others, and can hold an object; three fingers
-    least_free, least_facing, least_closing = 0.2, 0.02, 0.001
-    warnings, free, named = [], hand.self_clearance(joints) > 0, f"[options.{hand.source.option}]"
+    """Return warnings about a hand without faults, each with its fix, from random postures (n, h)
+    [rad].
+    """
+    # Least shares of random postures that are free, face a pad to the others, and can hold an
+    # object; three fingers
+    least_free = 0.2
+    least_facing = 0.02
+    least_closing = 0.001
+    warnings = []
+    free = hand.self_clearance(joints) > 0
+    named = f"[options.{hand.source.option}]"
     share = float(free.double().mean())
     if share < least_free ** (len(hand.tips) / 3):
         one, two = most_met(hand, joints[:500])
@@ -161,7 +212,11 @@ def find_warnings(hand: Hand, joints: torch.Tensor) -> list[str]:
         )
     points, normals = hand.fingertips(joints[free])
     inward = points.mean(1, keepdim=True) - points
-    facing = ((normals * inward).sum(-1) / torch.linalg.vector_norm(inward, dim=-1) > 0.5).double().mean(0)
+    facing = (
+        ((normals * inward).sum(-1) / torch.linalg.vector_norm(inward, dim=-1) > 0.5)
+        .double()
+        .mean(0)
+    )
     for name, seen in zip(hand.finger_names, facing.tolist(), strict=True):
         if seen < least_facing:
             warnings.append(
@@ -182,7 +237,11 @@ def _try_objects(hand: Hand, bar: tqdm) -> bool:
         count = count_status(grasps.status)
         good = count.get(Status.OK, 0)
         lost = ", ".join(f"{number} {status.name.lower()}" for status, number in count.items())
-        found = f"{good} of {len(grasps)} grasps executable" if good else f"no executable grasp ({lost})"
+        found = (
+            f"{good} of {len(grasps)} grasps executable"
+            if good
+            else f"no executable grasp ({lost})"
+        )
         bar.write(f"{hand.source.option} on the shipped {name}: {found}")
         if good:
             return True
@@ -190,7 +249,9 @@ def _try_objects(hand: Hand, bar: tqdm) -> bool:
 
 
 def describe(hand: Hand, joints: torch.Tensor) -> str:
-    """Return a text about a hand: its joints, its fingers, and statistics of random postures (n, h) [rad]."""
+    """Return a text about a hand: its joints, its fingers, and statistics of random postures (n, h)
+    [rad].
+    """
     points, normals = hand.fingertips(joints)
     free = hand.self_clearance(joints) > 0
     found = {
@@ -204,13 +265,17 @@ def describe(hand: Hand, joints: torch.Tensor) -> str:
 
 @arguments(folder="out", path="out")
 class HandSample(Command):
-    """Write random postures without self-collision, with their fingertip codes; continue an unfinished folder."""
+    """Write random postures without self-collision, with their fingertip codes; continue an
+    unfinished folder.
+    """
 
     hand: str = required(HAND_HELP)
     out: Path = required("folder to write")
     n: int = option(1_000_000, "number of postures; the paper has 1,000,000")
     fingers: str = option("default", FINGERS_HELP)
-    sampling: Sampling = option("uniform", "uniform as in the paper; grasping: postures that can hold an object")
+    sampling: Sampling = option(
+        "uniform", "uniform as in the paper; grasping: postures that can hold an object"
+    )
     workers: int = option(1, "threads that sample")
     seed: Seed = option(0, SEED_HELP)
 
@@ -219,23 +284,43 @@ class HandSample(Command):
         hand, _ = load_fingers(self.hand, self.fingers)
         begin = time.perf_counter()
         with make_bar(self.n, "posture", unit_scale=True) as bar:
-            write_samples(hand, SampleSpec(self.n, self.seed, self.sampling), self.out, self.workers, bar.update)
-        print(f"{self.n} {self.sampling} postures of {hand.name} in {self.out}, {time.perf_counter() - begin:.0f} s")
+            write_samples(
+                hand,
+                SampleSpec(self.n, self.seed, self.sampling),
+                self.out,
+                self.workers,
+                bar.update,
+            )
+        print(
+            f"{self.n} {self.sampling} postures of {hand.name} in {self.out}, {time.perf_counter() - begin:.0f} s"
+        )
         return 0
 
 
 @arguments()
 class HandTrain(Command):
-    """Learn the posture model of a hand: check, sample, fit, evaluate and write. Only the paper's modes need it."""
+    """Learn the posture model of a hand: check, sample, fit, evaluate and write. Only the paper's
+    modes need it.
+    """
 
     hand: str = positional(HAND_HELP)
-    n: Annotated[int, Range(1, 10**8)] = option(200_000, "postures to learn from, all of which can hold an object")
-    components: int | None = option(None, "Gaussians; by default the number with the least BIC among 1 to 64")
+    n: Annotated[int, Range(1, 10**8)] = option(
+        200_000, "postures to learn from, all of which can hold an object"
+    )
+    components: int | None = option(
+        None, "Gaussians; by default the number with the least BIC among 1 to 64"
+    )
     seed: Seed = option(0, "random seed of postures and of the first start")
-    held_out: Annotated[int, Range(2, 10**7)] = option(20_000, "further postures for the evaluation")
+    held_out: Annotated[int, Range(2, 10**7)] = option(
+        20_000, "further postures for the evaluation"
+    )
     workers: int = option(1, "threads that sample")
-    checkpoint: Path | None = option(None, "file that holds the fit after every step; a killed fit continues from it")
-    out: Path | None = option(None, "file to write; by default mixture.safetensors in the hand's folder")
+    checkpoint: Path | None = option(
+        None, "file that holds the fit after every step; a killed fit continues from it"
+    )
+    out: Path | None = option(
+        None, "file to write; by default mixture.safetensors in the hand's folder"
+    )
 
     def run(self) -> int:
         """Sample postures, fit and evaluate the model, and write it; return the exit code."""
@@ -244,9 +329,12 @@ class HandTrain(Command):
         hand = check_hand(self.hand)
         out = self.out or mixture_path(self.hand)
         with holding("--out", out, hold_file), holding("--checkpoint", self.checkpoint, hold_file):
-            begin, count = time.perf_counter(), self.n + self.held_out
+            begin = time.perf_counter()
+            count = self.n + self.held_out
             with make_bar(count, "posture", unit_scale=True, desc="postures") as bar:
-                samples = sample_configurations(hand, count, self.seed, self.workers, "grasping", bar.update)
+                samples = sample_configurations(
+                    hand, count, self.seed, self.workers, "grasping", bar.update
+                )
             print(f"{hand.name}: {len(samples)} postures in {time.perf_counter() - begin:.0f} s")
             begin = time.perf_counter()
             components = self.components or choose_components(hand, self.seed, self.workers)
@@ -256,18 +344,28 @@ class HandTrain(Command):
                     bar.update()
                     bar.set_postfix(log_likelihood=f"{float(progress.log_likelihood[-1]):.4f}")
 
-                # The tolerance is a mean log-likelihood [nats]. With fewer postures a Gaussian starts by chance.
+                # The tolerance is a mean log-likelihood [nats]. With fewer postures a Gaussian
+                # starts by chance.
                 mixture = fit_mixture(
-                    samples[: self.n], components, self.seed, tolerance=1e-3, starts=5,
-                    subset=300 * components, checkpoint=self.checkpoint, observer=show,
-                )  # fmt: skip
-            meta, spent = mixture.meta, time.perf_counter() - begin
+                    samples[: self.n],
+                    components,
+                    self.seed,
+                    tolerance=1e-3,
+                    starts=5,
+                    subset=300 * components,
+                    checkpoint=self.checkpoint,
+                    observer=show,
+                )
+            meta = mixture.meta
+            spent = time.perf_counter() - begin
             print(
                 f"{len(mixture.weights)} components in {meta['iterations']} steps (converged: {meta['converged']}, "
                 f"components placed anew: {meta['reseeded']}), {spent:.0f} s, "
                 f"added relative variance {mixture.regularisation:g}"
             )
-            print(f"log-likelihood of a posture: {meta['log_likelihood']} fitted; BIC {meta['bic']}")
+            print(
+                f"log-likelihood of a posture: {meta['log_likelihood']} fitted; BIC {meta['bic']}"
+            )
             score = evaluate_mixture(mixture, samples[self.n :])
             print(score)
             with naming(path="--out"):
@@ -277,7 +375,9 @@ class HandTrain(Command):
 
 
 def choose_components(hand: Hand, seed: int, workers: int) -> int:
-    """Return the number of Gaussians with the least BIC on separate random postures; print the BIC curve."""
+    """Return the number of Gaussians with the least BIC on separate random postures; print the BIC
+    curve.
+    """
     most = 64  # the paper's figure ends at 60
     apart = sample_configurations(hand, 40_000, seed + 1, workers, "grasping")
     with make_bar(most, "fit", desc="components") as bar:

@@ -1,4 +1,6 @@
-"""Arguments that several commands share: reading of cloud files, the table, the hand, and output folders."""
+"""Arguments that several commands share: reading of cloud files, the table, the hand, and output
+folders.
+"""
 
 import contextlib
 import importlib
@@ -45,12 +47,17 @@ class ViewOptions:
     """Options for reading the file of a cloud: camera, normals, unit, vertical."""
 
     viewpoint: tuple[float, float, float] | None = option(
-        None, "position of the camera [m] in the frame of the cloud; by default the file's, else an estimate"
+        None,
+        "position of the camera [m] in the frame of the cloud; by default the file's, else an estimate",
     )
     no_viewpoint: bool = option(False, "estimate the camera's position instead of using the file's")
     no_normals: bool = option(False, "fit normals instead of using the file's")
-    unit: Literal["m", "cm", "mm"] = option("m", "unit of the numbers in the file; options and results are in metres")
-    up: tuple[float, float, float] | None = option(None, "vertical direction, of any length; by default z")
+    unit: Literal["m", "cm", "mm"] = option(
+        "m", "unit of the numbers in the file; options and results are in metres"
+    )
+    up: tuple[float, float, float] | None = option(
+        None, "vertical direction, of any length; by default z"
+    )
     camera_pose: Path | None = option(
         None,
         "file with frame_from_camera, 4 x 4 (.npy or .txt), for a cloud in the camera's frame (x right, y down, z "
@@ -68,27 +75,40 @@ class ViewOptions:
         return unit(vector)
 
     def read(self, name: str, path: Path, whole: bool = False) -> CloudFile:
-        """Read the cloud file of the argument `name`; `whole` accepts scenes of any size and keeps all points."""
+        """Read the cloud file of the argument `name`; `whole` accepts scenes of any size and keeps
+        all points.
+        """
         if self.viewpoint is not None and (self.no_viewpoint or self.camera_pose is not None):
-            raise BadArgument("--viewpoint", "--no-viewpoint or --camera-pose beside it", "one of them")
+            raise BadArgument(
+                "--viewpoint", "--no-viewpoint or --camera-pose beside it", "one of them"
+            )
         with naming(path=name, points=name, normals=name, viewpoint="--viewpoint"):
             file = read_cloud_file(path, self.viewpoint, self.unit)
-            cloud, notes, table = file.cloud, file.notes, file.table
+            cloud = file.cloud
+            notes = file.notes
+            table = file.table
             if self.no_viewpoint:
                 cloud = PointCloud(cloud.points, cloud.normals)
             if self.no_normals:
                 cloud = PointCloud(cloud.points, None, cloud.viewpoint, cloud.frustum)
             if self.camera_pose is not None:
                 pose = read_pose("--camera-pose", self.camera_pose)
-                cloud, table = _move(name, cloud, pose), table and table.moved(pose)
+                cloud = _move(name, cloud, pose)
+                table = table and table.moved(pose)
                 notes = tuple(note for note in notes if "default viewpoint" not in note)
             if not whole:
                 check_cloud(cloud)
                 if len(cloud) > MOST_POINTS:
-                    notes = (*notes, f"{MOST_POINTS} of {len(cloud)} points, drawn at random, are used")
+                    notes = (
+                        *notes,
+                        f"{MOST_POINTS} of {len(cloud)} points, drawn at random, are used",
+                    )
                     cloud = cloud.select(draw_rows(len(cloud), MOST_POINTS))
         if table is not None:
-            notes = (*notes, f"the file holds a {describe_table(table)}, which --table or --no-table replaces")
+            notes = (
+                *notes,
+                f"the file holds a {describe_table(table)}, which --table or --no-table replaces",
+            )
         return CloudFile(cloud, notes, table)
 
 
@@ -104,20 +124,27 @@ class CloudOptions(ViewOptions):
     no_table: bool = option(False, "there is no table")
 
     def with_table_of(self, file: CloudFile) -> "CloudOptions":
-        """Return the options with the table that a file holds, unless the user gave --table or --no-table."""
+        """Return the options with the table that a file holds, unless the user gave --table or
+        --no-table.
+        """
         if file.table is None or self.table is not None or self.no_table:
             return self
         known: Any = {**vars(self), "table": (*file.table.normal.tolist(), file.table.offset)}
         return CloudOptions(**known)
 
     def plane(self, cloud: PointCloud) -> Plane | float | None:
-        """Return the table as a plane or a height [m] along z, by default at the lowest point; None means no table."""
+        """Return the table as a plane or a height [m] along z, by default at the lowest point; None
+        means no table.
+        """
         table = self.table
         if table is not None and self.no_table:
-            raise BadArgument("--table", f"{' '.join(f'{x:g}' for x in table)} and --no-table", "one of the two")
+            raise BadArgument(
+                "--table", f"{' '.join(f'{x:g}' for x in table)} and --no-table", "one of the two"
+            )
         if self.no_table:
             return None
-        up, given = self.vertical, None if table is None else read_table(table)
+        up = self.vertical
+        given = None if table is None else read_table(table)
         if isinstance(given, Plane):
             return given
         if given is None:
@@ -127,10 +154,16 @@ class CloudOptions(ViewOptions):
 
     def given_vertical(self, plane: Plane | None) -> Tensor | None:
         """Return the unit vector of --up, else the normal of --table, or None if neither is given."""
-        return self.vertical if self.up is not None or self.table is None or plane is None else plane.normal
+        return (
+            self.vertical
+            if self.up is not None or self.table is None or plane is None
+            else plane.normal
+        )
 
     def judge(self, cloud: PointCloud, table: Plane | float | None) -> tuple[Advice, ...]:
-        """Return advice on the quality of a cloud; raise `BadArgument` if no grasp should be planned on it."""
+        """Return advice on the quality of a cloud; raise `BadArgument` if no grasp should be
+        planned on it.
+        """
         plane = as_plane(table)
         up = self.given_vertical(plane)
         with naming(points="CLOUD", normals="CLOUD"):
@@ -144,7 +177,9 @@ class CloudOptions(ViewOptions):
 def read_table(table: tuple[float, ...]) -> Plane | float:
     """Return the table as a plane from four numbers, or as a height [m] from one number."""
     if len(table) not in (1, 4):
-        raise BadArgument("--table", f"{len(table)} numbers", "a height, or four: a normal and its distance")
+        raise BadArgument(
+            "--table", f"{len(table)} numbers", "a height, or four: a normal and its distance"
+        )
     numbers = check_tensor("--table", torch.tensor(table, dtype=torch.float64), (len(table),))
     if len(numbers) == 1:
         return float(numbers[0])
@@ -155,9 +190,13 @@ def read_table(table: tuple[float, ...]) -> Plane | float:
 
 
 def _move(name: str, cloud: PointCloud, pose: Tensor) -> PointCloud:
-    """Return a cloud moved from the camera's frame to the pose's frame; raise `BadArgument` if it is in another."""
+    """Return a cloud moved from the camera's frame to the pose's frame; raise `BadArgument` if it
+    is in another.
+    """
     widest = 1.5  # tangent of half an angle of view wider than that of depth cameras
-    unseen = float((cloud.points[:, :2].abs().amax(1) >= widest * cloud.points[:, 2]).double().mean())
+    unseen = float(
+        (cloud.points[:, :2].abs().amax(1) >= widest * cloud.points[:, 2]).double().mean()
+    )
     if unseen > 0.01:
         allowed = "a cloud in the camera's frame (z forward) for --camera-pose; in another frame, --viewpoint X Y Z"
         raise BadArgument(name, f"{unseen:.0%} of the points out of a camera's sight", allowed)
@@ -167,14 +206,20 @@ def _move(name: str, cloud: PointCloud, pose: Tensor) -> PointCloud:
 
 
 def read_region(name: str, text: str | None) -> Region | None:
-    """Return the box of six numbers in the text of option `name`, or the mesh that it names; None for None."""
+    """Return the box of six numbers in the text of option `name`, or the mesh that it names; None
+    for None.
+    """
     with naming(mesh=name, low=name, high=name):
         try:
-            numbers = torch.tensor([float(word) for word in (text or "").split()], dtype=torch.float64)
+            numbers = torch.tensor(
+                [float(word) for word in (text or "").split()], dtype=torch.float64
+            )
         except ValueError:
             return Region.mesh(Path(str(text)))
         if text is not None and len(numbers) != 6:
-            raise BadArgument("mesh", repr(text), "six numbers of a box, or the file of a closed mesh")
+            raise BadArgument(
+                "mesh", repr(text), "six numbers of a box, or the file of a closed mesh"
+            )
         return None if text is None else Region.box(numbers[:3], numbers[3:])
 
 
@@ -184,7 +229,9 @@ def find_cloud(path: Path, name: str = "CLOUD") -> Path:
     if path.exists() or path.suffix or len(path.parts) != 1:
         return path
     if str(path) not in names:
-        raise BadArgument(name, f"{str(path)!r}", f"a file, or one of the shipped objects {', '.join(names)}")
+        raise BadArgument(
+            name, f"{str(path)!r}", f"a file, or one of the shipped objects {', '.join(names)}"
+        )
     return DATA / path / "view.ply"
 
 
@@ -205,7 +252,9 @@ def check_folder(path: Path) -> None:
         with tempfile.TemporaryFile(dir=path):
             pass
     except OSError as error:
-        raise OutputError("--out", f"{path} ({error.strerror or error})", "a folder that can be written") from error
+        raise OutputError(
+            "--out", f"{path} ({error.strerror or error})", "a folder that can be written"
+        ) from error
     finally:
         with contextlib.suppress(OSError):  # an empty folder may stay
             for folder in reversed(made):
@@ -216,7 +265,9 @@ def check_folder(path: Path) -> None:
 def holding(
     name: str, path: Path | None, hold: Callable[[Path], AbstractContextManager[None]] = hold_folder
 ) -> Iterator[None]:
-    """Lock the folder or file of the option `name` against other runs within the context. None locks nothing."""
+    """Lock the folder or file of the option `name` against other runs within the context. None
+    locks nothing.
+    """
     with contextlib.ExitStack() as held:
         if path is not None:
             with naming(folder=name, path=name):
@@ -225,7 +276,9 @@ def holding(
 
 
 def load_fingers(hand: str, fingers: str) -> tuple[Hand, Literal["auto"] | None]:
-    """Load the hand of --hand with --fingers; also return "auto" if all sets of fingers are to be tried."""
+    """Load the hand of --hand with --fingers; also return "auto" if all sets of fingers are to be
+    tried.
+    """
     with naming(hand="--hand", name="--hand", name_or_path="--hand", fingers="--fingers"):
         return (load_hand(hand), "auto") if fingers == "auto" else (load_hand(hand, fingers), None)
 
@@ -239,10 +292,14 @@ def describe_table(table: Plane | float) -> str:
 
 
 def object_name(path: Path) -> str:
-    """Return a name for the object of a file: the name of the file, or of its folder for a generic file name."""
+    """Return a name for the object of a file: the name of the file, or of its folder for a generic
+    file name.
+    """
     if re.fullmatch(r"(mesh|view\d*)(_noisy)?", path.stem):
         return path.resolve().parent.name or "object"
-    return f"object in {path.name}" if path.stem in ("cloud", "model", "points", "scan") else path.stem
+    return (
+        f"object in {path.name}" if path.stem in ("cloud", "model", "points", "scan") else path.stem
+    )
 
 
 def import_simulator(name: Simulator = "sapien") -> None:
@@ -254,5 +311,9 @@ def import_simulator(name: Simulator = "sapien") -> None:
             warnings.simplefilter("ignore")  # a missing Vulkan does not concern physics
             importlib.import_module(name)
     except ImportError as error:
-        allowed = "a simulator with its system libraries (Debian and Ubuntu: apt-get install libx11-6)"
-        raise BadArgument("--close", f"a {name} that cannot be loaded ({error})", allowed) from error
+        allowed = (
+            "a simulator with its system libraries (Debian and Ubuntu: apt-get install libx11-6)"
+        )
+        raise BadArgument(
+            "--close", f"a {name} that cannot be loaded ({error})", allowed
+        ) from error

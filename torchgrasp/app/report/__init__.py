@@ -9,6 +9,12 @@ from torchgrasp.app.report.scene_picture import draw_scene
 from torchgrasp.app.report.viewer import show_grasps, write_viewer
 
 __all__ = [
-    "Run", "draw_scene", "show_grasps", "write_evaluation", "write_glb", "write_recording", "write_report",
+    "Run",
+    "draw_scene",
+    "show_grasps",
+    "write_evaluation",
+    "write_glb",
+    "write_recording",
+    "write_report",
     "write_viewer",
-]  # fmt: skip
+]

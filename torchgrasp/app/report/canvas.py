@@ -1,4 +1,6 @@
-"""Common colours of all pictures, and a canvas that renders its triangles to pixels in NumPy, without OpenGL."""
+"""Common colours of all pictures, and a canvas that renders its triangles to pixels in NumPy,
+without OpenGL.
+"""
 
 import io
 from collections.abc import Sequence
@@ -12,19 +14,39 @@ from torchgrasp.foundation.lazy import Image, ImageDraw, ImageFont, matplotlib, 
 Points = Float[np.ndarray, "n 3"]
 Color = tuple[float, float, float]
 Direction = tuple[float, float, float]
-FINGERS = ("#2f6db5", "#23967f", "#e0762f", "#8a4f9e", "#c23b55")  # colours of the fingers, in grasp order
+FINGERS = (
+    "#2f6db5",
+    "#23967f",
+    "#e0762f",
+    "#8a4f9e",
+    "#c23b55",
+)  # colours of the fingers, in grasp order
 AXES = ("#d62728", "#2ca02c", "#1f4fd8")  # colours of x, y and z of a frame
-HAND, OBJECT, TABLE, SHADOW = "#a9b0ba", "#e9d7b3", "#eceae4", "#c9c6bd"
-"""Colours of the palm with parked fingers, of the object, of the table, and of shadows on the table."""
+HAND = "#a9b0ba"
+OBJECT = "#e9d7b3"
+TABLE = "#eceae4"
+SHADOW = "#c9c6bd"
+"""Colours of the palm with parked fingers, of the object, of the table, and of shadows on the
+table.
+"""
 OBJECTS = ("#e8743b", "#3f83d9", "#57a84f", "#b65fae", "#e0b92f", "#35aaa3", "#dd6b78", "#8474c9")
-"""Colours of the objects of a scene in the order of their labels; after the last colour the first follows."""
-PAPER, INK, GRID, ALARM = "#fcfcfa", "#22262b", "#dcdad3", "#c2452d"
-"""Colours of the background, of lines with text, of grid lines, and of the moment at which an object was lost."""
+"""Colours of the objects of a scene in the order of their labels; after the last colour the first
+follows.
+"""
+PAPER = "#fcfcfa"
+INK = "#22262b"
+GRID = "#dcdad3"
+ALARM = "#c2452d"
+"""Colours of the background, of lines with text, of grid lines, and of the moment at which an
+object was lost.
+"""
 SIZE = (720, 576)  # width and height of a still [pixels]: twice its size on a page of three columns
 
 
 class Triangles(NamedTuple):
-    """Triangles by their corners [m], with a normal and a colour in [0, 1] at each; unlit triangles get no shading."""
+    """Triangles by their corners [m], with a normal and a colour in [0, 1] at each; unlit triangles
+    get no shading.
+    """
 
     corners: Float[np.ndarray, "t 3 3"]
     normals: Float[np.ndarray, "t 3 3"]
@@ -33,7 +55,9 @@ class Triangles(NamedTuple):
 
 
 class Camera(NamedTuple):
-    """A pinhole camera: the rows of `frame` are right, up and back; `angle` is the vertical field of view [rad]."""
+    """A pinhole camera: the rows of `frame` are right, up and back; `angle` is the vertical field
+    of view [rad].
+    """
 
     position: Float[np.ndarray, "3"]
     frame: Float[np.ndarray, "3 3"]
@@ -56,37 +80,56 @@ class Canvas:
         transparent: bool = False,
         lit: bool = True,
     ) -> None:
-        """Add a mesh with one colour, or a colour for each vertex; without `normals`, strong bends look sharp."""
+        """Add a mesh with one colour, or a colour for each vertex; without `normals`, strong bends
+        look sharp.
+        """
         corners = vertices[faces]
         bent = sharp_normals(vertices, faces) if normals is None else normals[faces]
-        shade = np.broadcast_to(rgb(color), corners.shape) if isinstance(color, str) else color[faces]
+        shade = (
+            np.broadcast_to(rgb(color), corners.shape) if isinstance(color, str) else color[faces]
+        )
         triangles = Triangles(corners, bent, shade, np.full(len(corners), lit))
         (self.transparent if transparent else self.solid).append(triangles)
 
     def add_points(self, points: Points, colors: Points) -> None:
         """Add points as small balls, each in its colour."""
-        ball = trimesh.creation.icosphere(subdivisions=0, radius=0.006 * float(np.linalg.norm(np.ptp(points, axis=0))))
-        n, k = len(points), len(ball.vertices)  # too small on the page for its faces to show
+        ball = trimesh.creation.icosphere(
+            subdivisions=0, radius=0.006 * float(np.linalg.norm(np.ptp(points, axis=0)))
+        )
+        # too small on the page for its faces to show
+        n = len(points)
+        k = len(ball.vertices)
         faces = (k * np.arange(n)[:, None, None] + ball.faces).reshape(-1, 3)
         vertices = (points[:, None] + ball.vertices).reshape(-1, 3)
         self.add_mesh(vertices, faces, np.repeat(colors, k, 0), np.tile(ball.vertices, (n, 1)))
 
-    def add_arrows(self, points: Points, directions: Points, length: float, colors: tuple[str, ...]) -> None:
-        """Add arrows of one length [m] in unit directions, each with its colour and a small ball at its start."""
+    def add_arrows(
+        self, points: Points, directions: Points, length: float, colors: tuple[str, ...]
+    ) -> None:
+        """Add arrows of one length [m] in unit directions, each with its colour and a small ball at
+        its start.
+        """
         head = trimesh.creation.cone(radius=0.1, height=0.35, sections=8)
         head.apply_translation([0.0, 0.0, 0.65])
-        shaft = trimesh.creation.cylinder(radius=0.035, segment=[[0.0, 0.0, 0.0], [0.0, 0.0, 0.75]], sections=8)
+        shaft = trimesh.creation.cylinder(
+            radius=0.035, segment=[[0.0, 0.0, 0.0], [0.0, 0.0, 0.75]], sections=8
+        )
         for start, direction, color in zip(points, directions, colors, strict=True):
             turn = np.asarray(trimesh.geometry.align_vectors([0.0, 0.0, 1.0], direction))[:3, :3]
             for part in (trimesh.creation.icosphere(subdivisions=1, radius=0.13), shaft, head):
                 self.add_mesh(length * part.vertices @ turn.T + start, part.faces, color)
 
     def add_table(
-        self, corners: Points, height: float | None, shadows: Sequence[tuple[np.ndarray, np.ndarray]] = ()
+        self,
+        corners: Points,
+        height: float | None,
+        shadows: Sequence[tuple[np.ndarray, np.ndarray]] = (),
     ) -> None:
-        """Add an unshaded round table top at `height` [m], centred on `corners` in x and y. None adds nothing.
+        """Add an unshaded round table top at `height` [m], centred on `corners` in x and y. None
+        adds nothing.
 
-        The `shadows` are meshes, by vertices and faces, whose outlines darken the table straight below them.
+        The `shadows` are meshes, by vertices and faces, whose outlines darken the table straight
+        below them.
         """
         if height is None:
             return
@@ -100,23 +143,35 @@ class Canvas:
 
     def render(self, camera: Camera, size: tuple[int, int] = SIZE) -> UInt8[np.ndarray, "h w 3"]:
         """Return the picture that a camera sees, as pixels."""
-        return render(concatenate(self.solid), concatenate(self.transparent), camera, size, rgb(PAPER))
+        return render(
+            concatenate(self.solid), concatenate(self.transparent), camera, size, rgb(PAPER)
+        )
 
-    def render_png(self, corners: Points, direction: Direction, bar: tuple[str, float, str] | None = None) -> bytes:
-        """Return a PNG that shows all `corners` [m]; `bar` is title, largest value and colour map of a bar below."""
+    def render_png(
+        self, corners: Points, direction: Direction, bar: tuple[str, float, str] | None = None
+    ) -> bytes:
+        """Return a PNG that shows all `corners` [m]; `bar` is title, largest value and colour map
+        of a bar below.
+        """
         image = Image.fromarray(self.render(frame_camera(corners, direction, 0.09 if bar else 0.0)))
         if bar:
             draw_bar(image, *bar)
         return encode_png(image)
 
 
-def frame_camera(corners: Points, direction: Direction, drop: float = 0.0, size: tuple[int, int] = SIZE) -> Camera:
-    """Return a camera in `direction` that sees all `corners`; the lowest fraction `drop` of its picture stays empty."""
+def frame_camera(
+    corners: Points, direction: Direction, drop: float = 0.0, size: tuple[int, int] = SIZE
+) -> Camera:
+    """Return a camera in `direction` that sees all `corners`; the lowest fraction `drop` of its
+    picture stays empty.
+    """
     angle = np.deg2rad(24.0)  # a long lens distorts little
     x, y, z = direction
     flat = float(np.hypot(x, y))
     if flat < 1e-9:
-        x, y, flat = 1.0, -0.8, float(np.hypot(1.0, -0.8))
+        x = 1.0
+        y = -0.8
+        flat = float(np.hypot(1.0, -0.8))
     # A camera that looks straight down, or up from below the table, shows little.
     back = np.array([x, y, np.clip(z, 0.27 * flat, 0.84 * flat)])
     back /= np.linalg.norm(back)
@@ -124,7 +179,8 @@ def frame_camera(corners: Points, direction: Direction, drop: float = 0.0, size:
     right /= np.linalg.norm(right)
     frame = np.stack([right, np.cross(back, right), back])
     local = corners @ frame.T
-    middle, half = (local.min(0) + local.max(0)) / 2, np.ptp(local, axis=0) / 2
+    middle = (local.min(0) + local.max(0)) / 2
+    half = np.ptp(local, axis=0) / 2
     # The nearest corners look largest, so the distance is counted from them.
     reach = max(half[1] / (1.0 - 1.5 * drop), half[0] * size[1] / size[0]) / np.tan(angle / 2)
     distance = half[2] + 1.12 * reach
@@ -132,11 +188,19 @@ def frame_camera(corners: Points, direction: Direction, drop: float = 0.0, size:
     return Camera(center + back * distance, frame, float(angle))
 
 
-def sharp_normals(vertices: Float[np.ndarray, "v 3"], faces: np.ndarray) -> Float[np.ndarray, "f 3 3"]:
-    """Return a normal for each corner of each face; faces that bend by less than 40 degrees are one smooth surface."""
-    smooth = trimesh.graph.smooth_shade(trimesh.Trimesh(vertices, faces), np.deg2rad(40.0), facet_minarea=None)
+def sharp_normals(
+    vertices: Float[np.ndarray, "v 3"], faces: np.ndarray
+) -> Float[np.ndarray, "f 3 3"]:
+    """Return a normal for each corner of each face; faces that bend by less than 40 degrees are one
+    smooth surface.
+    """
+    smooth = trimesh.graph.smooth_shade(
+        trimesh.Trimesh(vertices, faces), np.deg2rad(40.0), facet_minarea=None
+    )
     normals = np.empty((len(faces), 3, 3))
-    normals[np.concatenate(smooth.metadata["original_components"])] = smooth.vertex_normals[smooth.faces]
+    normals[np.concatenate(smooth.metadata["original_components"])] = smooth.vertex_normals[
+        smooth.faces
+    ]
     return normals
 
 
@@ -148,15 +212,23 @@ def concatenate(parts: list[Triangles]) -> Triangles:
 
 
 def render(
-    solid: Triangles, transparent: Triangles, camera: Camera, size: tuple[int, int], background: Color
+    solid: Triangles,
+    transparent: Triangles,
+    camera: Camera,
+    size: tuple[int, int],
+    background: Color,
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the pixels of a picture of opaque triangles; over them lies the nearest layer of transparent triangles."""
+    """Return the pixels of a picture of opaque triangles; over them lies the nearest layer of
+    transparent triangles.
+    """
     samples = 2  # samples of a pixel along each axis; the mean of the samples gives smooth edges
-    width, height = size[0] * samples, size[1] * samples
+    width = size[0] * samples
+    height = size[1] * samples
     image = np.tile(np.array(background, dtype=np.float32), (height * width, 1))
     near = np.zeros(height * width)
     sample, inverse_distance, color = _cast(solid, camera, width, height)
-    image[sample], near[sample] = color, inverse_distance
+    image[sample] = color
+    near[sample] = inverse_distance
     sample, inverse_distance, color = _cast(transparent, camera, width, height)
     front = inverse_distance > near[sample]
     image[sample[front]] += 0.5 * (color[front] - image[sample[front]])
@@ -167,25 +239,39 @@ def render(
 def _cast(
     triangles: Triangles, camera: Camera, width: int, height: int
 ) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, " k"], Float[np.ndarray, "k 3"]]:
-    """Return indices of the samples that triangles cover, with inverse distance and colour of the nearest one."""
+    """Return indices of the samples that triangles cover, with inverse distance and colour of the
+    nearest one.
+    """
     local = (triangles.corners - camera.position) @ camera.frame.T
     near = 1.0 / np.maximum(-local[..., 2], 1e-6)  # the scene is framed in front of the camera
     focal = height / 2 / np.tan(camera.angle / 2)
-    x, y = width / 2 + focal * local[..., 0] * near, height / 2 - focal * local[..., 1] * near
-    # A value that is linear in space is, divided by its distance, linear on the screen: a x + b y + c.
+    x = width / 2 + focal * local[..., 0] * near
+    y = height / 2 - focal * local[..., 1] * near
+    # A value that is linear in space is, divided by its distance, linear on the screen: a x + b y +
+    # c.
     values = np.concatenate([near[..., None], _shade(triangles, camera) * near[..., None]], -1)
     screen = np.stack([x, y, np.ones_like(x)], -1)
     seen = np.abs(np.linalg.det(screen)) > 1e-9  # a triangle seen from its edge covers nothing
-    weights, y = np.linalg.inv(screen[seen]), y[seen]  # of the corners, as functions of x, y and 1
+    # of the corners, as functions of x, y and 1
+    weights = np.linalg.inv(screen[seen])
+    y = y[seen]
     planes = weights @ values[seen]
 
-    # Sample centres lie at integers + 0.5; in each row a triangle covers those where no weight is negative.
-    owner, row = _ranges(*(np.clip(np.ceil(end - 0.5), 0, height).astype(np.int64) for end in (y.min(1), y.max(1))))
-    slope, rest = weights[owner, 0], weights[owner, 1] * (row + 0.5)[:, None] + weights[owner, 2]
+    # Sample centres lie at integers + 0.5; in each row a triangle covers those where no weight is
+    # negative.
+    owner, row = _ranges(
+        *(np.clip(np.ceil(end - 0.5), 0, height).astype(np.int64) for end in (y.min(1), y.max(1)))
+    )
+    slope = weights[owner, 0]
+    rest = weights[owner, 1] * (row + 0.5)[:, None] + weights[owner, 2]
     zero = -rest / np.where(slope == 0.0, 1.0, slope)
-    begin, end = np.where(slope > 0.0, zero, -np.inf).max(1), np.where(slope < 0.0, zero, np.inf).min(1)
-    tie = 1e-6  # triangles that share an edge both cover a centre on it, so that no crack is left between them
-    begin, end = (np.clip(np.ceil(e - 0.5), 0, width).astype(np.int64) for e in (begin - tie, end + tie))
+    begin = np.where(slope > 0.0, zero, -np.inf).max(1)
+    end = np.where(slope < 0.0, zero, np.inf).min(1)
+    # triangles that share an edge both cover a centre on it, so that no crack is left between them
+    tie = 1e-6
+    begin, end = (
+        np.clip(np.ceil(e - 0.5), 0, width).astype(np.int64) for e in (begin - tie, end + tie)
+    )
     span, column = _ranges(begin, end)
 
     flat = planes[owner, 1] * (row + 0.5)[:, None] + planes[owner, 2]  # b y + c
@@ -194,13 +280,19 @@ def _cast(
     nearest = np.zeros(height * width)
     np.maximum.at(nearest, sample, near)
     first = np.flatnonzero(near == nearest[sample])
-    span, column, near = span[first], column[first], near[first]
+    span = span[first]
+    column = column[first]
+    near = near[first]
     color = planes[owner[span], 0, 1:] * (column + 0.5)[:, None] + flat[span, 1:]
     return sample[first], near, color / near[:, None]
 
 
-def _ranges(begin: np.ndarray, end: np.ndarray) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
-    """List all integers in the ranges [begin, end): return the index of each one's range, and the integers."""
+def _ranges(
+    begin: np.ndarray, end: np.ndarray
+) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"]]:
+    """List all integers in the ranges [begin, end): return the index of each one's range, and the
+    integers.
+    """
     counts = np.maximum(end - begin, 0)
     owner = np.repeat(np.arange(len(begin)), counts)
     start = np.cumsum(counts) - counts
@@ -209,16 +301,29 @@ def _ranges(begin: np.ndarray, end: np.ndarray) -> tuple[Int[np.ndarray, " k"], 
 
 def _shade(triangles: Triangles, camera: Camera) -> Float[np.ndarray, "t 3 3"]:
     """Return the colours of the corners, lit by two lamps fixed to the camera."""
-    ambient, key_strength, fill_strength, shine_strength = 0.52, 0.50, 0.22, 0.08  # chosen by eye, as are the lamps
-    key, fill = (np.array(lamp) / np.linalg.norm(lamp) for lamp in ((-0.45, 0.65, 0.62), (0.70, 0.10, 0.60)))
+    # chosen by eye, as are the lamps
+    ambient = 0.52
+    key_strength = 0.50
+    fill_strength = 0.22
+    shine_strength = 0.08
+    key, fill = (
+        np.array(lamp) / np.linalg.norm(lamp) for lamp in ((-0.45, 0.65, 0.62), (0.70, 0.10, 0.60))
+    )
     normal = triangles.normals @ camera.frame.T
     normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
     normal = np.where(normal[..., 2].sum(1)[:, None, None] < 0.0, -normal, normal)
     half = key + np.array([0.0, 0.0, 1.0])
-    light = ambient + key_strength * np.maximum(normal @ key, 0.0) + fill_strength * np.maximum(normal @ fill, 0.0)
+    light = (
+        ambient
+        + key_strength * np.maximum(normal @ key, 0.0)
+        + fill_strength * np.maximum(normal @ fill, 0.0)
+    )
     shine = shine_strength * np.maximum(normal @ (half / np.linalg.norm(half)), 0.0) ** 40
     lit = triangles.lit[:, None]
-    return triangles.colors * np.where(lit, light, 1.0)[..., None] + np.where(lit, shine, 0.0)[..., None]
+    return (
+        triangles.colors * np.where(lit, light, 1.0)[..., None]
+        + np.where(lit, shine, 0.0)[..., None]
+    )
 
 
 def rgb(color: str) -> Color:
@@ -233,7 +338,9 @@ def map_colors(values: Float[np.ndarray, " n"], name: str) -> Points:
 
 
 def color_std(std_m: Float[np.ndarray, " n"]) -> tuple[Points, float]:
-    """Return the colours of standard deviations [m], and the one that has the last colour: all but a hundredth."""
+    """Return the colours of standard deviations [m], and the one that has the last colour: all but
+    a hundredth.
+    """
     most = max(float(np.quantile(std_m, 0.99)), 1e-6) if len(std_m) else 1e-6
     return map_colors(std_m / most, "viridis"), most
 
@@ -241,13 +348,19 @@ def color_std(std_m: Float[np.ndarray, " n"]) -> tuple[Points, float]:
 def draw_bar(image: Any, title: str, most: float, colors: str) -> None:
     """Draw a titled colour bar from 0 to `most` at the bottom of a picture."""
     width, height = image.size
-    left, right, top, bottom = width // 5, width - width // 5, height - 24, height - 10
+    left = width // 5
+    right = width - width // 5
+    top = height - 24
+    bottom = height - 10
     ramp = map_colors(np.linspace(0.0, 1.0, right - left), colors)
     strip = (255 * np.broadcast_to(ramp, (bottom - top, *ramp.shape)) + 0.5).astype(np.uint8)
     image.paste(Image.fromarray(strip), (left, top))
-    draw, font = ImageDraw.Draw(image), ImageFont.load_default(20)
+    draw = ImageDraw.Draw(image)
+    font = ImageFont.load_default(20)
     for i in range(4):
-        draw.text((left + i * (right - left) / 3, top - 4), f"{most * i / 3:.1f}", INK, font, anchor="ms")
+        draw.text(
+            (left + i * (right - left) / 3, top - 4), f"{most * i / 3:.1f}", INK, font, anchor="ms"
+        )
     draw.text(((left + right) / 2, top - 29), title, INK, font, anchor="ms")
 
 

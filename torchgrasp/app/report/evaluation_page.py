@@ -20,8 +20,11 @@ SHARE_NAMES: dict[str, str] = NAMES["shares"]
 
 
 @checked
-def write_evaluation(path: Path | str, title: str, asked: Mapping[str, object], scores: Sequence[ViewScore]) -> Path:
-    """Write the HTML page with a title, an evaluation's settings by name, and the results of `evaluate`, atomically.
+def write_evaluation(
+    path: Path | str, title: str, asked: Mapping[str, object], scores: Sequence[ViewScore]
+) -> Path:
+    """Write the HTML page with a title, an evaluation's settings by name, and the results of
+    `evaluate`, atomically.
 
     Returns the path. Raises `OutputError` if the file cannot be written.
 
@@ -39,7 +42,8 @@ def format_evaluation(title: str, asked: Mapping[str, object], scores: Sequence[
     summary = summarise(scores)
     groups = {"": summary} | {f"{group}: ": some for group, some in summary["by_group"].items()}
     most = max((n for reasons in summary["failures"].values() for n in reasons.values()), default=1)
-    success, views = summary["success"], sorted({score.view for score in scores})
+    success = summary["success"]
+    views = sorted({score.view for score in scores})
     return render(
         "evaluation.html",
         title=title,
@@ -50,7 +54,10 @@ def format_evaluation(title: str, asked: Mapping[str, object], scores: Sequence[
             for group, some in groups.items()
             for key, name in SHARE_NAMES.items()
         ],
-        heads=[*("object", "pass", "with its 95 % interval", "interval", "of", "best-ranked"), *views],
+        heads=[
+            *("object", "pass", "with its 95 % interval", "interval", "of", "best-ranked"),
+            *views,
+        ],
         objects=_object_rows(scores, views, summary["by_object"]),
         failures=[
             (stage, name.lower(), str(n), n / most, Status[name].sentence)
@@ -60,7 +67,8 @@ def format_evaluation(title: str, asked: Mapping[str, object], scores: Sequence[
         causes=[(name, text, CAUSES[name][1]) for name, text in list_causes(summary)],
         notes=[(score.object, score.view, score.note) for score in scores if score.note],
         figures=list_figures(summary),
-        success=success and (
+        success=success
+        and (
             f"Predicted {success['predicted']:.0%}, passed {success['passed']:.0%}; expected calibration error "
             f"{success['error']:.2f}, Brier skill {success['skill']:.2f}, area under the curve {success['auc']:.2f}."
         ),
@@ -69,11 +77,13 @@ def format_evaluation(title: str, asked: Mapping[str, object], scores: Sequence[
             for x in (success["bins"] if success else ())
         ],
         asked=[(name.replace("_", " "), str(value)) for name, value in asked.items()],
-    )  # fmt: skip
+    )
 
 
 def _share_cells(share: Share, digits: int) -> tuple[Any, ...]:
-    """Return table cells for a success rate: value, the share itself, which is drawn, interval and number of trials."""
+    """Return table cells for a success rate: value, the share itself, which is drawn, interval and
+    number of trials.
+    """
     value, low, high = ("-" if math.isnan(x) else f"{x:.{digits}%}" for x in share[:3])
     return value, share, f"{low} to {high}" if share.units > 1 else "-", str(share.total)
 
@@ -95,7 +105,9 @@ def _object_rows(
 
 
 def list_causes(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return table rows with each cause of objects not held: its name; its count, in all and by group, and its size."""
+    """Return table rows with each cause of objects not held: its name; its count, in all and by
+    group, and its size.
+    """
     rows = []
     for name, found in summary["causes"].items():
         groups = ", ".join(f"{n} {group}" for group, n in found["by_group"].items() if group)

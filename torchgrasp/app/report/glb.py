@@ -1,4 +1,6 @@
-"""A grasp as one GLB file, with the links of the hand and the object as coloured parts, for slides and 3D viewers."""
+"""A grasp as one GLB file, with the links of the hand and the object as coloured parts, for slides
+and 3D viewers.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -18,12 +20,16 @@ from torchgrasp.values.planning import Grasps
 
 
 @checked
-def write_glb(path: Path | str, hand: Hand, grasp: Grasps, body: "Surface | trimesh.Trimesh") -> Path:
-    """Write a hand at a single grasp with the object as one GLB file (binary glTF 2.0, metres, y up), atomically.
+def write_glb(
+    path: Path | str, hand: Hand, grasp: Grasps, body: "Surface | trimesh.Trimesh"
+) -> Path:
+    """Write a hand at a single grasp with the object as one GLB file (binary glTF 2.0, metres, y
+    up), atomically.
 
-    The nodes have the names of the hand's links, in the colours of their fingers, and "object". The `body` is a mesh
-    [m] in the frame of the grasp, or the estimated surface, which is coloured by its standard deviation. Returns the
-    path. Raises `BadArgument` if there is not exactly one grasp, `OutputError` if the file cannot be written.
+    The nodes have the names of the hand's links, in the colours of their fingers, and "object". The
+    `body` is a mesh [m] in the frame of the grasp, or the estimated surface, which is coloured by
+    its standard deviation. Returns the path. Raises `BadArgument` if there is not exactly one
+    grasp, `OutputError` if the file cannot be written.
 
     >>> import tempfile
     >>> from torchgrasp import load_hand, load_object
@@ -39,24 +45,37 @@ def write_glb(path: Path | str, hand: Hand, grasp: Grasps, body: "Surface | trim
     y_up[:3, :3] = spatial.transform.Rotation.align_vectors([[0.0, 1.0, 0.0]], [up])[0].as_matrix()
     scene = trimesh.Scene()
     scene.add_geometry(_solid(body), geom_name="object", node_name="object", transform=y_up)
-    joints, names = hand.expand_joints(grasp.joints.double()), hand.tree.joint_names
+    joints = hand.expand_joints(grasp.joints.double())
+    names = hand.tree.joint_names
     poses = link_poses(hand, joints, names, grasp.obj_from_hand)[0].cpu().numpy()
     for name, solid in solids_by_link(hand).items():
-        points, faces, normals = solid.vertices, solid.faces, solid.normals
-        shape = trimesh.Trimesh(points, faces, vertex_normals=normals, visual=_paint(solid.color), process=False)
-        scene.add_geometry(shape, geom_name=name, node_name=name, transform=y_up @ poses[solid.link])
+        points = solid.vertices
+        faces = solid.faces
+        normals = solid.normals
+        shape = trimesh.Trimesh(
+            points, faces, vertex_normals=normals, visual=_paint(solid.color), process=False
+        )
+        scene.add_geometry(
+            shape, geom_name=name, node_name=name, transform=y_up @ poses[solid.link]
+        )
     data = scene.export(file_type="glb", include_normals=True, tree_postprocessor=_soften)
     assert isinstance(data, bytes)
     return write_file(path, data)
 
 
 def _solid(body: "Surface | trimesh.Trimesh") -> "trimesh.Trimesh":
-    """Return the object as a mesh: in one colour, or an estimated surface by its standard deviation."""
+    """Return the object as a mesh: in one colour, or an estimated surface by its standard
+    deviation.
+    """
     if not isinstance(body, Surface):
         return trimesh.Trimesh(body.vertices, body.faces, visual=_paint(OBJECT), process=False)
-    normals, colors = to_array(body.normals), np.uint8(255 * _linear(color_std(to_array(body.std_m))[0]))
-    points, faces = to_array(body.vertices), body.faces.cpu().numpy()
-    return trimesh.Trimesh(points, faces, vertex_normals=normals, vertex_colors=colors, process=False)
+    normals = to_array(body.normals)
+    colors = np.uint8(255 * _linear(color_std(to_array(body.std_m))[0]))
+    points = to_array(body.vertices)
+    faces = body.faces.cpu().numpy()
+    return trimesh.Trimesh(
+        points, faces, vertex_normals=normals, vertex_colors=colors, process=False
+    )
 
 
 def _paint(color: str) -> Any:
@@ -64,7 +83,9 @@ def _paint(color: str) -> Any:
     from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
 
-    return TextureVisuals(material=PBRMaterial(baseColorFactor=[*_linear(np.array(rgb(color))), 1.0]))
+    return TextureVisuals(
+        material=PBRMaterial(baseColorFactor=[*_linear(np.array(rgb(color))), 1.0])
+    )
 
 
 def _linear(colors: np.ndarray) -> np.ndarray:
@@ -78,6 +99,8 @@ def _soften(tree: dict[str, Any]) -> None:
     materials = tree.setdefault("materials", [])
     for material in materials:
         material["pbrMetallicRoughness"].update(matt)
-    for part in (part for mesh in tree["meshes"] for part in mesh["primitives"] if "material" not in part):
+    for part in (
+        part for mesh in tree["meshes"] for part in mesh["primitives"] if "material" not in part
+    ):
         part["material"] = len(materials)
         materials.append({"pbrMetallicRoughness": dict(matt)})

@@ -17,16 +17,26 @@ from torchgrasp.values.planning import Grasps, format_success
 
 TEMPLATES = Path(__file__).with_name("templates")  # of all pages
 Sections = dict[str, list[tuple[str, bytes]]]
-GRASP_COLUMNS = ("rank", "success", "tip error mm", "clearance mm", "pad angle deg", "closure margin", "surface std mm")
-"""Titles of the columns of a table of grasps; errors, angles and standard deviations are those of the worst finger."""
+GRASP_COLUMNS = (
+    "rank",
+    "success",
+    "tip error mm",
+    "clearance mm",
+    "pad angle deg",
+    "closure margin",
+    "surface std mm",
+)
+"""Titles of the columns of a table of grasps; errors, angles and standard deviations are those of
+the worst finger.
+"""
 
 
 @checked
 def write_report(path: Path | str, run: Run, view: str = "") -> Path:
     """Write the report of a run, with its pictures, as one HTML file, atomically.
 
-    `view` is the file name of the 3D page that `write_viewer` wrote beside the report, for a link. Returns the path.
-    Raises `OutputError` if the file cannot be written.
+    `view` is the file name of the 3D page that `write_viewer` wrote beside the report, for a link.
+    Returns the path. Raises `OutputError` if the file cannot be written.
 
     >>> import tempfile
     >>> from torchgrasp import ContactSpec, fit_shape, load_hand, load_object
@@ -45,17 +55,32 @@ def draw_pictures(run: Run) -> Sections:
     """Draw all pictures of a run; return captions and PNGs by section."""
     run = run.upright()
     table = None if run.spec.table is None else 0.0
-    view, best = stills.view_of(run.cloud), run.executable
+    view = stills.view_of(run.cloud)
+    best = run.executable
     behind = stills.rotated(view, 180.0)
     sections = {
         "Seen and unseen": [
-            ("The cloud from the camera's side, coloured by height.", stills.draw_cloud(run.cloud, table)),
-            ("The estimated surface from the camera's side.", stills.draw_surface(run.surface, view, table)),
-            ("The same from behind, where nothing was seen.", stills.draw_surface(run.surface, behind, table)),
+            (
+                "The cloud from the camera's side, coloured by height.",
+                stills.draw_cloud(run.cloud, table),
+            ),
+            (
+                "The estimated surface from the camera's side.",
+                stills.draw_surface(run.surface, view, table),
+            ),
+            (
+                "The same from behind, where nothing was seen.",
+                stills.draw_surface(run.surface, behind, table),
+            ),
         ]
     }
     if run.scene is not None:
-        seen = [("What was found in the depth image; the target has a white rim.", encode_scene(run.scene))]
+        seen = [
+            (
+                "What was found in the depth image; the target has a white rim.",
+                encode_scene(run.scene),
+            )
+        ]
         if len(best):
             among = stills.draw_among(run.scene, run.surface, run.hand, best[0], view)
             seen.append(("The best grasp among the measured points of the other objects.", among))
@@ -64,21 +89,35 @@ def draw_pictures(run: Run) -> Sections:
         front = stills.facing(best)
         aside = stills.rotated(front, 60.0)
         sections["The best grasp"] = [
-            ("Contacts with outward normals.", stills.draw_contacts(run.surface, best.contacts[0], front, table)),
-            ("The hand on the estimated surface.", stills.draw_grasp(run.surface, run.hand, best[0], front, table)),
-            ("The same from another side.", stills.draw_grasp(run.surface, run.hand, best[0], aside, table)),
+            (
+                "Contacts with outward normals.",
+                stills.draw_contacts(run.surface, best.contacts[0], front, table),
+            ),
+            (
+                "The hand on the estimated surface.",
+                stills.draw_grasp(run.surface, run.hand, best[0], front, table),
+            ),
+            (
+                "The same from another side.",
+                stills.draw_grasp(run.surface, run.hand, best[0], aside, table),
+            ),
         ]
     if run.closure is not None and run.mesh is not None:
         side = stills.rotated(stills.facing(best), 20.0) if len(best) else view
         sections["Closing on the true object"] = [
-            (describe_film(run.mesh, run.hand, run.closure), draw_film(run.mesh, run.hand, run.closure, side))
+            (
+                describe_film(run.mesh, run.hand, run.closure),
+                draw_film(run.mesh, run.hand, run.closure, side),
+            )
         ]
     return sections
 
 
 def format_page(run: Run, pictures: Sections, view: str = "") -> str:
     """Return the HTML report of a run, with a link to its 3D page `view`."""
-    funnel, trials = (run.explanation.funnel.stages, run.explanation.trials) if run.explanation else ((), ())
+    funnel, trials = (
+        (run.explanation.funnel.stages, run.explanation.trials) if run.explanation else ((), ())
+    )
     outcomes = []
     if run.plan is not None:
         outcomes.append(("Outcome of every initial guess", run.plan.status))
@@ -109,11 +148,13 @@ def format_page(run: Run, pictures: Sections, view: str = "") -> str:
             for name, status in outcomes
         ],
         facts=[(name.replace("_", " "), value) for name, value in sorted(run.grasps.meta.items())],
-    )  # fmt: skip
+    )
 
 
 def grasp_columns(grasps: Grasps) -> tuple[str, ...]:
-    """Return the titles of the columns of `grasp_rows`: `GRASP_COLUMNS`, and what of the task's loads is resisted."""
+    """Return the titles of the columns of `grasp_rows`: `GRASP_COLUMNS`, and what of the task's
+    loads is resisted.
+    """
     return (*GRASP_COLUMNS, *["task margin"] * (grasps.certificate.task_margin is not None))
 
 
@@ -127,7 +168,9 @@ def grasp_rows(grasps: Grasps, most: int = 10) -> list[tuple[str, ...]]:
             f"{1e3 * float(grasp.clearance[0]):.1f}",
             f"{math.degrees(float(grasp.normal_angle[0].max())):.0f}",
             f"{float(grasp.certificate.margin[0]):.4f}",
-            "" if grasp.contacts.std_m is None else f"{1e3 * float(grasp.contacts.std_m[0].max()):.1f}",
+            ""
+            if grasp.contacts.std_m is None
+            else f"{1e3 * float(grasp.contacts.std_m[0].max()):.1f}",
             *("" if (task := grasp.certificate.task_margin) is None else [f"{float(task[0]):.2f}"]),
         )
         for rank, grasp in enumerate(grasps[:most], 1)
@@ -135,5 +178,7 @@ def grasp_rows(grasps: Grasps, most: int = 10) -> list[tuple[str, ...]]:
 
 
 def render(template: str, **values: Any) -> str:
-    """Return a page from a template and values; values of type `markupsafe.Markup` are inserted as HTML."""
+    """Return a page from a template and values; values of type `markupsafe.Markup` are inserted as
+    HTML.
+    """
     return files.render(TEMPLATES / template, **values)

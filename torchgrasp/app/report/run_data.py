@@ -76,7 +76,9 @@ class Run:
     def upright(self) -> "Run":
         """Return the run in the upright frame of its cloud and table, where z is up."""
         obj_from_upright = upright_frame(self.cloud.points, self.cloud.viewpoint, self.spec.plane)
-        upright_from_obj, mesh, closure = inverse(obj_from_upright), self.mesh, self.closure
+        upright_from_obj = inverse(obj_from_upright)
+        mesh = self.mesh
+        closure = self.closure
         if mesh is not None:
             mesh = mesh.copy().apply_transform(upright_from_obj.numpy())
         if closure is not None:
@@ -96,7 +98,8 @@ class Run:
 
 def verdict(run: Run) -> str:
     """Return the result of a run in one sentence."""
-    hand, name = run.hand.name, run.object_name
+    hand = run.hand.name
+    name = run.object_name
     if run.closure is not None:
         return closing_sentence(run)
     if count := len(run.executable):
@@ -105,9 +108,12 @@ def verdict(run: Run) -> str:
 
 
 def closing_sentence(run: Run) -> str:
-    """Return a sentence that says whether the object was held, how far it rose, and how it moved in the hand."""
+    """Return a sentence that says whether the object was held, how far it rose, and how it moved in
+    the hand.
+    """
     upright = run.upright()
-    closure, mesh = upright.closure, upright.mesh
+    closure = upright.closure
+    mesh = upright.mesh
     assert closure is not None and mesh is not None
     if not closure.held:
         return f"The {run.hand.name} hand did not hold the {run.object_name}: {closure.status.sentence}."
@@ -124,12 +130,16 @@ def refusal(run: Run) -> str:
     """Return a sentence that says why no grasp is executable: each reason with its count."""
     head = f"The {run.hand.name} hand has no executable grasp of the {run.object_name}"
     if len(run.grasps):
-        failed, total = run.grasps.status, f"{len(run.grasps)} postures"
+        failed = run.grasps.status
+        total = f"{len(run.grasps)} postures"
     elif run.plan is not None and not bool((run.plan.status == Status.OK).any()):
-        failed, total = run.plan.status, f"{len(run.plan)} starts"
+        failed = run.plan.status
+        total = f"{len(run.plan)} starts"
     else:
         return f"{head}: {Status.OUT_OF_REACH.sentence}."
-    reasons = "; ".join(f"{n} of {total}: {status.sentence}" for status, n in count_status(failed).items())
+    reasons = "; ".join(
+        f"{n} of {total}: {status.sentence}" for status, n in count_status(failed).items()
+    )
     return f"{head} ({reasons}){_too_low(run)}."
 
 
@@ -138,8 +148,11 @@ def _too_low(run: Run) -> str:
     spec = run.spec.for_fingertips(float(run.hand.tips.radius.max()))
     if spec.plane is None or not len(run.surface.vertices):
         return ""
-    height, needed = float(spec.plane.height(run.surface.vertices).max()), spec.least_height
-    return f": it is {1e3 * height:.0f} mm high, and this hand needs {1e3 * needed:.0f} mm" * (height < needed)
+    height = float(spec.plane.height(run.surface.vertices).max())
+    needed = spec.least_height
+    return f": it is {1e3 * height:.0f} mm high, and this hand needs {1e3 * needed:.0f} mm" * (
+        height < needed
+    )
 
 
 class Moment(NamedTuple):
@@ -160,22 +173,29 @@ def touching(closure: ClosureResult) -> Bool[Tensor, "t f"]:
 
 
 def first_touches(closure: ClosureResult) -> list[int]:
-    """Return the control tick at which each finger first touched the object, in the order of these touches."""
+    """Return the control tick at which each finger first touched the object, in the order of these
+    touches.
+    """
     touched = touching(closure)
     return [int(touched[:, finger].int().argmax()) for finger in closure.contact_order]
 
 
 def find_loss(closure: ClosureResult, centre: Float[Tensor, "3"]) -> int | None:
-    """Return the tick at which the object was pushed away, put down, let go or slipped too far; None if it was held."""
+    """Return the tick at which the object was pushed away, put down, let go or slipped too far;
+    None if it was held.
+    """
     if closure.held:
         return None
-    last, pressed = len(closure.time) - 1, tick_of(closure, 2)
+    last = len(closure.time) - 1
+    pressed = tick_of(closure, 2)
     if closure.status in (Status.START_OVERLAP, Status.UNSTABLE):
         return last
     if closure.status is Status.TOO_HEAVY:
         return int(closure.hand_pose[:, 2, 3].argmax())
     if closure.status is Status.EJECTED:
-        world = apply(closure.object_pose.double(), centre.double().expand(len(closure.time), 1, 3))[:, 0]
+        world = apply(
+            closure.object_pose.double(), centre.double().expand(len(closure.time), 1, 3)
+        )[:, 0]
         away = torch.linalg.vector_norm(world - world[0], dim=-1) > PUSHED_DISTANCE
         return int(away.int().argmax()) if bool(away.any()) else last
     distance, angle = moved_in_hand(closure, centre)
@@ -186,15 +206,29 @@ def find_loss(closure: ClosureResult, centre: Float[Tensor, "3"]) -> int | None:
     return min(let_go, int(gone.int().argmax()) if bool(gone.any()) else last)
 
 
-def explain_loss(closure: ClosureResult, centre: Float[Tensor, "3"], fingers: tuple[str, ...]) -> str:
-    """Return a sentence on when and in which phase the object was lost, and which finger failed first; "" if held."""
+def explain_loss(
+    closure: ClosureResult, centre: Float[Tensor, "3"], fingers: tuple[str, ...]
+) -> str:
+    """Return a sentence on when and in which phase the object was lost, and which finger failed
+    first; "" if held.
+    """
     tick = find_loss(closure, centre)
     if tick is None:
         return ""
-    pressed, rises = tick_of(closure, 2), bool(closure.phases[2].isfinite())
-    time, start = float(closure.time[tick]), float(closure.time[pressed])
-    phase = "closed" if not rises or tick <= pressed else "rose" if time < start + LIFT_TIME else "held it"
-    never = " and ".join(name for finger, name in enumerate(fingers) if finger not in closure.contact_order)
+    pressed = tick_of(closure, 2)
+    rises = bool(closure.phases[2].isfinite())
+    time = float(closure.time[tick])
+    start = float(closure.time[pressed])
+    phase = (
+        "closed"
+        if not rises or tick <= pressed
+        else "rose"
+        if time < start + LIFT_TIME
+        else "held it"
+    )
+    never = " and ".join(
+        name for finger, name in enumerate(fingers) if finger not in closure.contact_order
+    )
     reason = f"{never} never touched the object" if never else _first_to_go(closure, tick, fingers)
     if closure.status in (Status.START_OVERLAP, Status.UNSTABLE, Status.TOO_HEAVY) or not reason:
         reason = closure.status.sentence
@@ -203,40 +237,54 @@ def explain_loss(closure: ClosureResult, centre: Float[Tensor, "3"], fingers: tu
 
 
 def _first_to_go(closure: ClosureResult, tick: int, fingers: tuple[str, ...]) -> str:
-    """Return a text that names the finger that first slid or let go for good before a tick; "" if none did."""
-    touched, sliding = touching(closure)[: tick + 1], closure.trace.sliding[: tick + 1].nan_to_num(0.0)
+    """Return a text that names the finger that first slid or let go for good before a tick; "" if
+    none did.
+    """
+    touched = touching(closure)[: tick + 1]
+    sliding = closure.trace.sliding[: tick + 1].nan_to_num(0.0)
     firm = touched & (sliding < 0.01)  # [m/s]: fingertips that stick creep more slowly
-    # The first tick after which each finger was never firm again; the finger with the earliest gave way first.
+    # The first tick after which each finger was never firm again; the finger with the earliest gave
+    # way first.
     since = [int(torch.nonzero(column)[-1]) + 1 if bool(column.any()) else 0 for column in firm.T]
     finger = min(range(len(since)), key=since.__getitem__)
     begin = since[finger]
     if begin > tick:
         return ""
-    name, time = fingers[finger], float(closure.time[begin])
+    name = fingers[finger]
+    time = float(closure.time[begin])
     if not bool(touched[begin, finger]):
         return f"{name} let go first, at {time:.2f} s"
-    force, normal = closure.trace.forces[begin, finger], closure.trace.normals[begin, finger]
+    force = closure.trace.forces[begin, finger]
+    normal = closure.trace.normals[begin, finger]
     press = float((force @ normal).abs())
     across = float(torch.linalg.vector_norm(force - (force @ normal) * normal))
     return f"{name} slid first, from {time:.2f} s on, under {across:.1f} N across at {press:.1f} N of normal force"
 
 
-def moments_of(closure: ClosureResult, centre: Float[Tensor, "3"], fingers: tuple[str, ...]) -> list[Moment]:
+def moments_of(
+    closure: ClosureResult, centre: Float[Tensor, "3"], fingers: tuple[str, ...]
+) -> list[Moment]:
     """Return the key moments that the film strip of a closing shows, in order."""
     found = [Moment(tick_of(closure, 0), "open hand")]
     if closure.contact_order:
-        found.append(Moment(first_touches(closure)[0], f"{fingers[closure.contact_order[0]]} touches first"))
+        found.append(
+            Moment(first_touches(closure)[0], f"{fingers[closure.contact_order[0]]} touches first")
+        )
     acts = torch.cat([torch.zeros(1, dtype=torch.bool), closure.trace.blend.isfinite().any(1)])
     begins = torch.nonzero(acts[1:] & ~acts[:-1])[:, 0]  # of the closings
     if closure.attempts == len(begins) > 1:
         found.append(Moment(int(begins[-1]), f"closing {len(begins)} begins"))
     all_touch = len(closure.contact_order) == len(fingers)
     ends = ((1, "all touch" if all_touch else "the closing ends"), (2, "pressed"))
-    found += [Moment(tick_of(closure, k), name) for k, name in ends if bool(closure.phases[k].isfinite())]
+    found += [
+        Moment(tick_of(closure, k), name) for k, name in ends if bool(closure.phases[k].isfinite())
+    ]
     lost = find_loss(closure, centre)
     if lost is not None:
         found.append(Moment(lost, LOST))
     found.append(Moment(len(closure.time) - 1, "the end"))
-    found.sort(key=lambda moment: (moment.tick, moment.name == LOST))  # of two at one tick, the later is kept
+    found.sort(
+        key=lambda moment: (moment.tick, moment.name == LOST)
+    )  # of two at one tick, the later is kept
     later = [*(moment.tick for moment in found[1:]), len(closure.time)]
     return [m for m, tick in zip(found, later, strict=True) if m.tick < tick]

@@ -28,7 +28,8 @@ KINDS = {
 
 @checked
 def draw_scene(scene: Scene, path: Path | str) -> Path:
-    """Write a picture of a scene as PNG: the support, numbered objects, obstacles, unmeasured pixels and a legend.
+    """Write a picture of a scene as PNG: the support, numbered objects, obstacles, unmeasured
+    pixels and a legend.
 
     Raises `OutputError` if the file cannot be written.
 
@@ -47,12 +48,24 @@ def encode_scene(scene: Scene) -> bytes:
     palette = np.stack([rgb(color) for color in (*KINDS.values(), *OBJECTS)])
     color = palette[np.where(labels > 0, len(KINDS) + (labels - 1) % len(OBJECTS), kinds)]
     row, column = np.mgrid[:h, :w]
-    color[(labels == 0) & (kinds == 4) & ((row + column) // max(2, w // 160) % 2 == 0)] *= 0.8  # hatched
+    color[(labels == 0) & (kinds == 4) & ((row + column) // max(2, w // 160) % 2 == 0)] *= (
+        0.8  # hatched
+    )
     light = _light(scene)
-    color *= np.where(labels > 0, light, 0.6 + 0.4 * light)[..., None]  # relief matters most on objects
+    color *= np.where(labels > 0, light, 0.6 + 0.4 * light)[
+        ..., None
+    ]  # relief matters most on objects
     if scene.table is not None:
-        color *= 1 - 0.25 * np.where((labels == 0) & (kinds == 2), _squares(scene.image, scene.table), 0.0)[..., None]
-    whole = np.where(kinds > 0, labels, ndimage.maximum_filter(labels, 5))  # single missing pixels have no rim
+        color *= (
+            1
+            - 0.25
+            * np.where((labels == 0) & (kinds == 2), _squares(scene.image, scene.table), 0.0)[
+                ..., None
+            ]
+        )
+    whole = np.where(
+        kinds > 0, labels, ndimage.maximum_filter(labels, 5)
+    )  # single missing pixels have no rim
     color[_rim(whole, 3) & (labels > 0)] *= 0.5
     color[(labels == 0) & (kinds == 0)] = rgb(KINDS["not measured"])
     if scene.target is not None:
@@ -65,9 +78,13 @@ def encode_scene(scene: Scene) -> bytes:
 
 
 def sort_pixels(scene: Scene) -> tuple[Int[np.ndarray, "h w"], Int[np.ndarray, "h w"]]:
-    """Return each pixel's index in `KINDS` and its object's label. The index counts only where the label is 0."""
-    image, labels = scene.image, scene.pixel_labels.cpu().numpy()
-    points, measured = image.points(), image.depth.numpy() > 0
+    """Return each pixel's index in `KINDS` and its object's label. The index counts only where the
+    label is 0.
+    """
+    image = scene.image
+    labels = scene.pixel_labels.cpu().numpy()
+    points = image.points()
+    measured = image.depth.numpy() > 0
     kinds = measured.astype(int)
     near = 3 * assume_noise(points.reshape(-1, 3), scene.viewpoint).reshape(labels.shape).numpy()
     if scene.table is not None:
@@ -79,9 +96,14 @@ def sort_pixels(scene: Scene) -> tuple[Int[np.ndarray, "h w"], Int[np.ndarray, "
 
 
 def _squares(image: DepthImage, table: Plane) -> Float[np.ndarray, "h w"]:
-    """Return for each pixel, in [0, 1], how well it lies on the lines of a 10 cm grid in the table plane."""
-    flat = DepthImage(torch.ones_like(image.depth), image.intrinsics, image.obj_from_camera).points()
-    camera, normal = image.obj_from_camera[:3, 3].double(), table.normal.double()
+    """Return for each pixel, in [0, 1], how well it lies on the lines of a 10 cm grid in the table
+    plane.
+    """
+    flat = DepthImage(
+        torch.ones_like(image.depth), image.intrinsics, image.obj_from_camera
+    ).points()
+    camera = image.obj_from_camera[:3, 3].double()
+    normal = table.normal.double()
     rays = flat - camera
     reach = -table.height(camera) / (rays @ normal).clamp(max=-1e-6)
     place = camera + reach[..., None] * rays
@@ -97,11 +119,17 @@ def _squares(image: DepthImage, table: Plane) -> Float[np.ndarray, "h w"]:
 
 
 def _light(scene: Scene) -> Float[np.ndarray, "h w"]:
-    """Return the brightness of each pixel: higher for faces towards the sky and the camera, lower far away."""
-    depth, seen = scene.image.depth.double().numpy(), scene.image.depth.numpy() > 0
-    smooth, weight = ndimage.gaussian_filter(depth, 1.5), ndimage.gaussian_filter(seen.astype(float), 1.5)
+    """Return the brightness of each pixel: higher for faces towards the sky and the camera, lower
+    far away.
+    """
+    depth = scene.image.depth.double().numpy()
+    seen = scene.image.depth.numpy() > 0
+    smooth = ndimage.gaussian_filter(depth, 1.5)
+    weight = ndimage.gaussian_filter(seen.astype(float), 1.5)
     smooth = np.where(weight > 0, smooth / weight.clip(1e-6), 1.0).clip(1e-3)
-    down, right = (slope * float(scene.image.intrinsics[0, 0]) / smooth for slope in np.gradient(smooth))
+    down, right = (
+        slope * float(scene.image.intrinsics[0, 0]) / smooth for slope in np.gradient(smooth)
+    )
     sky = np.array([0.0, -1.0, 0.0])
     if scene.table is not None:
         sky = (scene.image.obj_from_camera[:3, :3].double().T @ scene.table.normal.double()).numpy()
@@ -125,7 +153,8 @@ def _number(picture: object, labels: Int[np.ndarray, "h w"], scale: float) -> No
     pen = ImageDraw.Draw(picture)
     for label in np.unique(labels[labels > 0]).tolist():
         row, column = np.nonzero(labels == label)
-        top, left = int(row.min()), int(column.min())
+        top = int(row.min())
+        left = int(column.min())
         body = np.pad(labels[top : row.max() + 1, left : column.max() + 1] == label, 1)
         inside = np.asarray(ndimage.distance_transform_edt(body))
         row, column = divmod(int(inside.argmax()), inside.shape[1])
@@ -135,20 +164,31 @@ def _number(picture: object, labels: Int[np.ndarray, "h w"], scale: float) -> No
 
 
 def _with_legend(picture: object, scene: Scene, kinds: Int[np.ndarray, "h w"]) -> object:
-    """Return the picture with a legend below it: kinds of pixels, then height and distance of each object."""
+    """Return the picture with a legend below it: kinds of pixels, then height and distance of each
+    object.
+    """
     assert isinstance(picture, Image.Image)
-    shown = [(name, color) for k, (name, color) in enumerate(KINDS.items()) if (kinds == k).mean() > 0.002]
-    entries = [*shown[::-1], *((_describe(scene, k), OBJECTS[(k - 1) % len(OBJECTS)]) for k in scene.things[:12])]
+    shown = [
+        (name, color)
+        for k, (name, color) in enumerate(KINDS.items())
+        if (kinds == k).mean() > 0.002
+    ]
+    entries = [
+        *shown[::-1],
+        *((_describe(scene, k), OBJECTS[(k - 1) % len(OBJECTS)]) for k in scene.things[:12]),
+    ]
     if len(scene.things) > 12:
         entries.append((f"and {len(scene.things) - 12} more objects", PAPER))
-    font, row_height = ImageFont.load_default(24), 40
+    font = ImageFont.load_default(24)
+    row_height = 40
     column_width = 70 + max(int(font.getlength(words)) for words, _ in entries)
     rows = -(-len(entries) // max(1, picture.width // column_width))
     sheet = Image.new("RGB", (picture.width, picture.height + row_height * rows + 24), PAPER)
     sheet.paste(picture, (0, 0))
     pen = ImageDraw.Draw(sheet)
     for k, (words, color) in enumerate(entries):
-        x, y = 16 + k // rows * column_width, picture.height + 12 + k % rows * row_height
+        x = 16 + k // rows * column_width
+        y = picture.height + 12 + k % rows * row_height
         pen.rounded_rectangle((x, y + 8, x + 28, y + 32), 5, color, GRID)
         pen.text((x + 40, y + 20), words, INK, font, anchor="lm")
     return sheet
@@ -158,5 +198,9 @@ def _describe(scene: Scene, label: int) -> str:
     """Return the legend text of an object: its label, its height, and its distance from the camera."""
     points = scene.points[scene.rows_of(label)].double()
     distance = float((points - scene.viewpoint).norm(dim=-1).median())
-    high = "" if scene.table is None else f"{1e3 * float(scene.table.height(points).quantile(0.98)):.0f} mm high, "
+    high = (
+        ""
+        if scene.table is None
+        else f"{1e3 * float(scene.table.height(points).quantile(0.98)):.0f} mm high, "
+    )
     return f"{label}{' (target)' * (label == scene.target)}: {high}{distance:.2f} m away"

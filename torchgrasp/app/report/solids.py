@@ -24,7 +24,9 @@ class Solid(NamedTuple):
     faces: np.ndarray
     normals: Float[np.ndarray, "v 3"]
     link: int
-    finger: int  # `PARKED` if the link belongs to no grasping finger, such as the palm, or to several
+    finger: (
+        int  # `PARKED` if the link belongs to no grasping finger, such as the palm, or to several
+    )
 
     @property
     def color(self) -> str:
@@ -44,29 +46,45 @@ def solids_of_links(hand: Hand) -> list[Solid]:
 
 
 def solids_by_link(hand: Hand) -> dict[str, Solid]:
-    """Return by link name the collision shapes of each link that has some, as one mesh in the frame of the link."""
-    found, solids = {}, solids_of_links(hand)
+    """Return by link name the collision shapes of each link that has some, as one mesh in the frame
+    of the link.
+    """
+    found = {}
+    solids = solids_of_links(hand)
     for link, name in enumerate(hand.tree.link_names):
         if mine := [solid for solid in solids if solid.link == link]:
             starts = np.cumsum([0, *(len(s.vertices) for s in mine)])
-            faces = np.concatenate([s.faces + start for s, start in zip(mine, starts, strict=False)])
-            points, normals = np.concatenate([s.vertices for s in mine]), np.concatenate([s.normals for s in mine])
+            faces = np.concatenate(
+                [s.faces + start for s, start in zip(mine, starts, strict=False)]
+            )
+            points = np.concatenate([s.vertices for s in mine])
+            normals = np.concatenate([s.normals for s in mine])
             found[name] = Solid(points, faces, normals, link, mine[0].finger)
     return found
 
 
 def link_poses(
-    hand: Hand, joints: Float[Tensor, "n j"], names: tuple[str, ...], obj_from_hand: Float[Tensor, "n 4 4"]
+    hand: Hand,
+    joints: Float[Tensor, "n j"],
+    names: tuple[str, ...],
+    obj_from_hand: Float[Tensor, "n 4 4"],
 ) -> Float[Tensor, "n l 4 4"]:
-    """Return the poses of all links in the object's frame; `names` are the names of the `joints` [rad]."""
+    """Return the poses of all links in the object's frame; `names` are the names of the `joints`
+    [rad].
+    """
     values = joints[:, [names.index(n) for n in hand.tree.joint_names]].double()
     return obj_from_hand.double()[:, None] @ hand.tree.poses(values)
 
 
 def solids_from_hand(
-    hand: Hand, joints: Float[Tensor, " j"], names: tuple[str, ...], obj_from_hand: Float[Tensor, "4 4"]
+    hand: Hand,
+    joints: Float[Tensor, " j"],
+    names: tuple[str, ...],
+    obj_from_hand: Float[Tensor, "4 4"],
 ) -> list[Solid]:
-    """Return the collision shapes of a hand as meshes in the object's frame; `names` name the `joints` [rad]."""
+    """Return the collision shapes of a hand as meshes in the object's frame; `names` name the
+    `joints` [rad].
+    """
     poses = link_poses(hand, joints[None], names, obj_from_hand[None])[0].cpu().numpy()
     return [
         solid._replace(
@@ -78,33 +96,57 @@ def solids_from_hand(
 
 
 def finger_of_links(hand: Hand) -> dict[str, int]:
-    """Return by link name the index of the finger that the link belongs to; `PARKED` for no finger or several."""
+    """Return by link name the index of the finger that the link belongs to; `PARKED` for no finger
+    or several.
+    """
     moves = hand.tree.moves.bool().cpu()
     finger_of = {}
     for mine, name in zip(moves, hand.tree.link_names, strict=True):
-        owners = [f for f in range(len(hand.tips)) if bool(mine.any()) and bool(moves[hand.tips.index[f]][mine].all())]
+        owners = [
+            f
+            for f in range(len(hand.tips))
+            if bool(mine.any()) and bool(moves[hand.tips.index[f]][mine].all())
+        ]
         finger_of[name] = owners[0] if len(owners) == 1 else PARKED
     return finger_of
 
 
 @functools.lru_cache(maxsize=512)  # a hand is drawn many times
 def round_shape(shape: LinkShape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return vertices, faces and vertex normals of a collision shape with rounded edges, in its link's frame."""
-    ball = np.asarray(trimesh.creation.icosphere(subdivisions=3 if shape.kind == "sphere" else 1, radius=1.0).vertices)
+    """Return vertices, faces and vertex normals of a collision shape with rounded edges, in its
+    link's frame.
+    """
+    ball = np.asarray(
+        trimesh.creation.icosphere(
+            subdivisions=3 if shape.kind == "sphere" else 1, radius=1.0
+        ).vertices
+    )
     radius = min(EDGE, min(shape.half) / 2)  # thin plates stay plates
     if shape.kind == "sphere":
-        radius, centres = shape.size[0], np.zeros((1, 3))
+        radius = shape.size[0]
+        centres = np.zeros((1, 3))
     elif shape.kind == "box":
-        centres = np.array(list(itertools.product((-1.0, 1.0), repeat=3))) * (np.array(shape.half) - radius)
+        centres = np.array(list(itertools.product((-1.0, 1.0), repeat=3))) * (
+            np.array(shape.half) - radius
+        )
     else:
-        tilt, turn = np.meshgrid(np.linspace(-np.pi / 2, np.pi / 2, 7), np.linspace(0, 2 * np.pi, 40, endpoint=False))
-        ball = np.stack([np.cos(tilt) * np.cos(turn), np.cos(tilt) * np.sin(turn), np.sin(tilt)], -1)
-        rim, up = (shape.size[0] - radius) * ball[:, 3], np.array([0.0, 0.0, shape.size[1] / 2 - radius])
-        ball, centres = ball.reshape(-1, 3), np.concatenate([rim - up, rim + up])
-    points, normals = (centres[:, None] + radius * ball).reshape(-1, 3), np.tile(ball, (len(centres), 1))
+        tilt, turn = np.meshgrid(
+            np.linspace(-np.pi / 2, np.pi / 2, 7), np.linspace(0, 2 * np.pi, 40, endpoint=False)
+        )
+        ball = np.stack(
+            [np.cos(tilt) * np.cos(turn), np.cos(tilt) * np.sin(turn), np.sin(tilt)], -1
+        )
+        rim = (shape.size[0] - radius) * ball[:, 3]
+        up = np.array([0.0, 0.0, shape.size[1] / 2 - radius])
+        ball = ball.reshape(-1, 3)
+        centres = np.concatenate([rim - up, rim + up])
+    points = (centres[:, None] + radius * ball).reshape(-1, 3)
+    normals = np.tile(ball, (len(centres), 1))
     hull = spatial.ConvexHull(points)
     kept, faces = np.unique(hull.simplices, return_inverse=True)
-    points, normals, faces = points[kept], normals[kept], faces.reshape(-1, 3)
+    points = points[kept]
+    normals = normals[kept]
+    faces = faces.reshape(-1, 3)
     a, b, c = points[faces].transpose(1, 0, 2)
     inward = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(1) < 0.0
     faces[inward] = faces[inward, ::-1]

@@ -19,7 +19,9 @@ from torchgrasp.values.planning import Contacts, Grasps, PointCloud
 
 
 def draw_cloud(cloud: PointCloud, table: float | None = None) -> bytes:
-    """Return a PNG of a cloud from its camera, coloured by height; `table` is the height [m] of the table."""
+    """Return a PNG of a cloud from its camera, coloured by height; `table` is the height [m] of the
+    table.
+    """
     points = _thinned(to_array(cloud.points), 3000)
     height = points[:, 2] - points[:, 2].min()
     canvas = paint.Canvas()
@@ -29,50 +31,76 @@ def draw_cloud(cloud: PointCloud, table: float | None = None) -> bytes:
 
 
 def draw_surface(surface: Surface, direction: Direction, table: float | None = None) -> bytes:
-    """Return a PNG of the estimated surface seen from `direction`, coloured by its standard deviation [mm]."""
-    vertices, faces = to_array(surface.vertices), surface.faces.cpu().numpy()
+    """Return a PNG of the estimated surface seen from `direction`, coloured by its standard
+    deviation [mm].
+    """
+    vertices = to_array(surface.vertices)
+    faces = surface.faces.cpu().numpy()
     colors, most = paint.color_std(to_array(surface.std_m))
     canvas = paint.Canvas()
     canvas.add_mesh(vertices, faces, colors, to_array(surface.normals))
     canvas.add_table(vertices, table)
-    return canvas.render_png(vertices, direction, bar=("standard deviation of the surface [mm]", 1e3 * most, "viridis"))
+    return canvas.render_png(
+        vertices, direction, bar=("standard deviation of the surface [mm]", 1e3 * most, "viridis")
+    )
 
 
-def draw_contacts(surface: Surface, contacts: Contacts, direction: Direction, table: float | None = None) -> bytes:
+def draw_contacts(
+    surface: Surface, contacts: Contacts, direction: Direction, table: float | None = None
+) -> bytes:
     """Return a PNG of the contacts of the first grasp, with normals, on the estimated surface."""
     vertices = to_array(surface.vertices)
     canvas = paint.Canvas()
-    canvas.add_mesh(vertices, surface.faces.cpu().numpy(), paint.OBJECT, to_array(surface.normals), transparent=True)
+    canvas.add_mesh(
+        vertices,
+        surface.faces.cpu().numpy(),
+        paint.OBJECT,
+        to_array(surface.normals),
+        transparent=True,
+    )
     _add_contacts(canvas, contacts)
     canvas.add_table(vertices, table)
     return canvas.render_png(vertices, direction)
 
 
-def draw_grasp(surface: Surface, hand: Hand, grasp: Grasps, direction: Direction, table: float | None = None) -> bytes:
+def draw_grasp(
+    surface: Surface, hand: Hand, grasp: Grasps, direction: Direction, table: float | None = None
+) -> bytes:
     """Return a PNG of the hand of the first grasp on the estimated surface, seen from `direction`."""
     canvas, corners = _grasp(surface, hand, grasp)
     canvas.add_table(corners, table)
     return canvas.render_png(corners, direction)
 
 
-def draw_among(scene: Scene, surface: Surface, hand: Hand, grasp: Grasps, direction: Direction) -> bytes:
-    """Return a PNG of the hand of the first grasp on the target, among the measured points of other objects."""
+def draw_among(
+    scene: Scene, surface: Surface, hand: Hand, grasp: Grasps, direction: Direction
+) -> bytes:
+    """Return a PNG of the hand of the first grasp on the target, among the measured points of other
+    objects.
+    """
     canvas, corners = _grasp(surface, hand, grasp)
     others = (scene.labels > 0) & ~scene.rows_of()
-    points, labels = to_array(scene.points[others]), scene.labels[others].cpu().numpy()
+    points = to_array(scene.points[others])
+    labels = scene.labels[others].cpu().numpy()
     corners = np.concatenate([corners, points])
     if len(points):
         palette = np.stack([paint.rgb(name) for name in paint.OBJECTS])
-        canvas.add_points(_thinned(points, 4000), palette[(_thinned(labels, 4000) - 1) % len(palette)])
+        canvas.add_points(
+            _thinned(points, 4000), palette[(_thinned(labels, 4000) - 1) % len(palette)]
+        )
     canvas.add_table(corners, None if scene.table is None else 0.0)
     return canvas.render_png(corners, direction)
 
 
 def draw_hand(hand: Hand, joints: Float[Tensor, "h"]) -> bytes:
-    """Return a PNG of a hand with pad normals and palm axes at a posture and both limits, and of the joint ranges."""
+    """Return a PNG of a hand with pad normals and palm axes at a posture and both limits, and of
+    the joint ranges.
+    """
     from matplotlib.figure import Figure
 
-    eye, bars = (1.0, -0.9, 0.5), 0.3 * (hand.dof + 2)  # height of the ranges [inches], 0.3 for each joint
+    # height of the ranges [inches], 0.3 for each joint
+    eye = (1.0, -0.9, 0.5)
+    bars = 0.3 * (hand.dof + 2)
     views = [
         ("a posture with the pads face to face", joints, eye),
         ("the same from another side", joints, rotated(eye, 110.0)),
@@ -99,28 +127,44 @@ def draw_hand(hand: Hand, joints: Float[Tensor, "h"]) -> bytes:
 
 
 def draw_posture(hand: Hand, joints: Float[Tensor, "h"], eye: Direction) -> bytes:
-    """Return a PNG of a hand at a posture [rad], with its fingertip normals and the axes of its palm."""
-    solids = solids_from_hand(hand, hand.expand_joints(joints), hand.tree.joint_names, torch.eye(4).to(joints))
+    """Return a PNG of a hand at a posture [rad], with its fingertip normals and the axes of its
+    palm.
+    """
+    solids = solids_from_hand(
+        hand, hand.expand_joints(joints), hand.tree.joint_names, torch.eye(4).to(joints)
+    )
     points, normals = (x.cpu().numpy() for x in hand.fingertips(joints[None].double()))
-    arrow, axis = 0.03, 0.6 * float(np.linalg.norm(np.ptp(solids[0].vertices, axis=0)))
+    arrow = 0.03
+    axis = 0.6 * float(np.linalg.norm(np.ptp(solids[0].vertices, axis=0)))
     canvas = paint.Canvas()
     add_solids(canvas, solids)
     canvas.add_arrows(points[0], normals[0], arrow, paint.FINGERS[: len(hand.tips)])
     canvas.add_arrows(np.zeros((3, 3)), np.eye(3), axis, paint.AXES)
-    corners = [points[0], points[0] + arrow * normals[0], axis * np.eye(3), *(s.vertices for s in solids)]
+    corners = [
+        points[0],
+        points[0] + arrow * normals[0],
+        axis * np.eye(3),
+        *(s.vertices for s in solids),
+    ]
     return canvas.render_png(np.concatenate(corners), eye)
 
 
 def opposed_posture(hand: Hand, joints: Float[Tensor, "n h"]) -> Float[Tensor, "h"]:
-    """Return that of n postures in which the fingertip pads face each other best, without collision if possible."""
+    """Return that of n postures in which the fingertip pads face each other best, without collision
+    if possible.
+    """
     points, normals = hand.fingertips(joints)
     inward = points.mean(1, keepdim=True) - points
-    facing = (normals * unit(inward)).sum(-1).amin(1) - 10.0 * torch.linalg.vector_norm(inward, dim=-1).amax(1)
+    facing = (normals * unit(inward)).sum(-1).amin(1) - 10.0 * torch.linalg.vector_norm(
+        inward, dim=-1
+    ).amax(1)
     return joints[(facing + (hand.self_clearance(joints) > 0).to(facing) * 10.0).argmax()]
 
 
 def view_of(cloud: PointCloud) -> Direction:
-    """Return the direction from a cloud to its camera, or a fixed direction if the camera is unknown."""
+    """Return the direction from a cloud to its camera, or a fixed direction if the camera is
+    unknown.
+    """
     first = cloud.split_views()[0].viewpoint
     if first is None:
         return (1.0, -0.8, 0.6)
@@ -129,11 +173,16 @@ def view_of(cloud: PointCloud) -> Direction:
 
 
 def facing(grasp: Grasps) -> Direction:
-    """Return a viewing direction across the contact normals, from which all fingers of the first grasp are visible."""
+    """Return a viewing direction across the contact normals, from which all fingers of the first
+    grasp are visible.
+    """
     normals = grasp.contacts.normals[0, :, :2].detach().cpu().double()
     press = torch.linalg.eigh(normals.T @ normals).eigenvectors[:, 1]
     across = torch.stack([-press[1], press[0]])
-    from_palm = grasp.contacts.points[0].mean(0).cpu().double() - grasp.obj_from_hand[0, :3, 3].cpu().double()
+    from_palm = (
+        grasp.contacts.points[0].mean(0).cpu().double()
+        - grasp.obj_from_hand[0, :3, 3].cpu().double()
+    )
     x, y = (across if float(across @ from_palm[:2]) >= 0.0 else -across).tolist()
     return (x, y, 0.4)
 
@@ -141,7 +190,8 @@ def facing(grasp: Grasps) -> Direction:
 def rotated(direction: Direction, degrees: float) -> Direction:
     """Return a direction, rotated by an angle [degrees] about the z axis."""
     x, y, z = direction
-    c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
+    c = np.cos(np.deg2rad(degrees))
+    s = np.sin(np.deg2rad(degrees))
     return (float(c * x - s * y), float(s * x + c * y), z)
 
 
@@ -150,9 +200,14 @@ def to_array(value: Float[Tensor, "*b"]) -> np.ndarray:
     return value.detach().cpu().double().numpy()
 
 
-def _grasp(surface: Surface, hand: Hand, grasp: Grasps) -> tuple[paint.Canvas, Float[np.ndarray, "n 3"]]:
-    """Return a canvas with the surface and the first grasp's hand and contacts, and the points that must be in view."""
-    joints, vertices = hand.expand_joints(grasp.joints[0].double()), to_array(surface.vertices)
+def _grasp(
+    surface: Surface, hand: Hand, grasp: Grasps
+) -> tuple[paint.Canvas, Float[np.ndarray, "n 3"]]:
+    """Return a canvas with the surface and the first grasp's hand and contacts, and the points that
+    must be in view.
+    """
+    joints = hand.expand_joints(grasp.joints[0].double())
+    vertices = to_array(surface.vertices)
     solids = solids_from_hand(hand, joints, hand.tree.joint_names, grasp.obj_from_hand[0])
     canvas = paint.Canvas()
     canvas.add_mesh(vertices, surface.faces.cpu().numpy(), paint.OBJECT, to_array(surface.normals))
@@ -162,8 +217,11 @@ def _grasp(surface: Surface, hand: Hand, grasp: Grasps) -> tuple[paint.Canvas, F
 
 
 def _add_contacts(canvas: paint.Canvas, contacts: Contacts) -> None:
-    """Add an arrow along the normal of each contact of the first grasp, in the colour of its finger."""
-    points, normals = to_array(contacts.points[0]), to_array(contacts.normals[0])
+    """Add an arrow along the normal of each contact of the first grasp, in the colour of its
+    finger.
+    """
+    points = to_array(contacts.points[0])
+    normals = to_array(contacts.normals[0])
     canvas.add_arrows(points, normals, 0.045, paint.FINGERS[: len(points)])
 
 
@@ -174,10 +232,15 @@ def add_solids(canvas: paint.Canvas, solids: list[Solid]) -> None:
 
 
 def _joint_colors(hand: Hand) -> list[str]:
-    """Return the colour of each actuated joint: the colour of its finger, or the palm if it moves several fingers."""
+    """Return the colour of each actuated joint: the colour of its finger, or the palm if it moves
+    several fingers.
+    """
     finger_of_link = finger_of_links(hand)
     finger_of_joint = [finger_of_link[hand.tree.link_names[k]] for k in hand.tree.child.tolist()]
-    moved = [{finger_of_joint[j] for j in torch.nonzero(row)[:, 0].tolist()} for row in hand.actuated.coupling.T]
+    moved = [
+        {finger_of_joint[j] for j in torch.nonzero(row)[:, 0].tolist()}
+        for row in hand.actuated.coupling.T
+    ]
     colors = {PARKED: paint.HAND, **dict(enumerate(paint.FINGERS))}
     return [colors[min(fingers)] if len(fingers) == 1 else paint.HAND for fingers in moved]
 

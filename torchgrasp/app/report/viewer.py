@@ -1,4 +1,6 @@
-"""An interactive 3D page of one run in one HTML file: shape, contacts, postures, and the replayed closing."""
+"""An interactive 3D page of one run in one HTML file: shape, contacts, postures, and the replayed
+closing.
+"""
 
 import base64
 import functools
@@ -39,8 +41,12 @@ from torchgrasp.values.planning import Grasps
 from torchgrasp.values.specs import ContactSpec
 
 VIEW = "view.html"  # name of the page beside the report
-MOST_GRASPS, MOST_FACES, MOST_TICKS = 20, 40_000, 120
-"""Largest numbers of grasps, faces of a mesh and ticks of a replay, so that a page has a few megabytes."""
+MOST_GRASPS = 20
+MOST_FACES = 40_000
+MOST_TICKS = 120
+"""Largest numbers of grasps, faces of a mesh and ticks of a replay, so that a page has a few
+megabytes.
+"""
 POSTURES = ("approach", "pre-grasp", "grasp", "squeeze")
 """Postures of the hand in the order of its motion; the last is the target of its drives."""
 
@@ -49,10 +55,11 @@ POSTURES = ("approach", "pre-grasp", "grasp", "squeeze")
 def write_viewer(path: Path | str, run: Run) -> Path:
     """Write a run as a 3D page in one HTML file, atomically. The page needs WebGL, but no network.
 
-    The page shows the cloud, the surface by its standard deviation, a shell at k standard deviations, contacts, four
-    postures of the hand for each of the best 20 grasps, and their motion with the lift. The closing, with its forces,
-    is the film of the first grasp. The address may name a state, as in `view.html#grasp=3&posture=squeeze&sigma=2` or
-    `view.html#tick=50`. Returns the path. Raises `OutputError` if the file cannot be written.
+    The page shows the cloud, the surface by its standard deviation, a shell at k standard
+    deviations, contacts, four postures of the hand for each of the best 20 grasps, and their motion
+    with the lift. The closing, with its forces, is the film of the first grasp. The address may
+    name a state, as in `view.html#grasp=3&posture=squeeze&sigma=2` or `view.html#tick=50`. Returns
+    the path. Raises `OutputError` if the file cannot be written.
 
     >>> import tempfile
     >>> from torchgrasp import ContactSpec, fit_shape, load_hand, load_object
@@ -68,19 +75,24 @@ def write_viewer(path: Path | str, run: Run) -> Path:
 
 
 @checked
-def show_grasps(cloud: CloudLike, grasps: Grasps, hand: HandLike | None = None, browser: bool = True) -> Path:
+def show_grasps(
+    cloud: CloudLike, grasps: Grasps, hand: HandLike | None = None, browser: bool = True
+) -> Path:
     """Write the 3D page of grasps to a temporary file, open it in the browser, and return its path.
 
-    `cloud` is that of the plan, as in `plan_grasps`; the page's surface is estimated anew. `hand` is needed for grasps
-    of a hand that is not shipped. Without a `browser` the page is only written.
+    `cloud` is that of the plan, as in `plan_grasps`; the page's surface is estimated anew. `hand`
+    is needed for grasps of a hand that is not shipped. Without a `browser` the page is only
+    written.
 
     >>> from torchgrasp import load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> show_grasps(load_object("jug"), load_shipped_grasp("jug", "barrett"), browser=False).name
     'view.html'
     """
-    cloud, table = as_cloud(cloud, "cloud"), grasps.table
-    surface, spec = extract_surface(fit_shape(cloud, table=table)), ContactSpec(table=table)
+    cloud = as_cloud(cloud, "cloud")
+    table = grasps.table
+    surface = extract_surface(fit_shape(cloud, table=table))
+    spec = ContactSpec(table=table)
     path = Path(tempfile.mkdtemp(), "view.html")
     write_viewer(path, Run("object", path, cloud, hand_of(grasps, hand), spec, surface, grasps))
     if browser:
@@ -90,19 +102,27 @@ def show_grasps(cloud: CloudLike, grasps: Grasps, hand: HandLike | None = None, 
 
 def format_viewer(run: Run) -> str:
     """Return the 3D page of a run as HTML."""
-    contents, folder = describe(run), Path(__file__).with_name("templates")
+    contents = describe(run)
+    folder = Path(__file__).with_name("templates")
     # The files are one function, so that no name of theirs meets a name of the library.
-    parts = "".join((folder / name).read_text(encoding="utf-8") for name in ("scene.js", "cloud.js", "panel.js"))
+    parts = "".join(
+        (folder / name).read_text(encoding="utf-8") for name in ("scene.js", "cloud.js", "panel.js")
+    )
     # "<" would end the block of data early; within JSON it is only in texts.
     data = json.dumps(contents, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
     scripts = (three(), f'(() => {{\n"use strict";\n{parts}}})();\n')
-    digests = [base64.b64encode(hashlib.sha256(x.encode("utf-8")).digest()).decode("ascii") for x in scripts]
+    digests = [
+        base64.b64encode(hashlib.sha256(x.encode("utf-8")).digest()).decode("ascii")
+        for x in scripts
+    ]
     return render("view.html", title=contents["title"], data=data, scripts=scripts, digests=digests)
 
 
 @functools.cache
 def three() -> str:
-    """Return the JavaScript of the library three.js with its mouse controls, from the package trimesh."""
+    """Return the JavaScript of the library three.js with its mouse controls, from the package
+    trimesh.
+    """
     archive = resources.files("trimesh") / "resources" / "templates" / "viewer.zip"
     with archive.open("rb") as file, zipfile.ZipFile(file) as opened:
         template = opened.read("viewer.html.template").decode("utf-8")
@@ -117,8 +137,10 @@ def three() -> str:
 def describe(run: Run) -> dict[str, Any]:
     """Return the contents of the 3D page as a dictionary for JSON, in an upright frame."""
     frame = inverse(upright_frame(run.cloud.points, run.cloud.viewpoint, run.spec.plane))
-    sentence, run = verdict(run), run.upright()
-    best, scene = run.executable[:MOST_GRASPS], run.scene
+    sentence = verdict(run)
+    run = run.upright()
+    best = run.executable[:MOST_GRASPS]
+    scene = run.scene
     x, y, z = facing(best[0]) if len(best) else view_of(run.cloud)
     eye = np.array([x, y, max(z, 0.35 * float(np.hypot(x, y)))])  # raised to look from above
     return {
@@ -128,12 +150,16 @@ def describe(run: Run) -> dict[str, Any]:
         "good": bool(run.closure.held if run.closure is not None else len(best) > 0),
         "eye": (eye / np.linalg.norm(eye)).tolist(),
         "frame": frame.tolist(),
-        "sensors": [v.viewpoint.tolist() for v in run.cloud.split_views() if v.viewpoint is not None],
+        "sensors": [
+            v.viewpoint.tolist() for v in run.cloud.split_views() if v.viewpoint is not None
+        ],
         "table": None if run.spec.table is None else TABLE,
         "object": OBJECT,
         "fingers": [list(pair) for pair in zip(run.hand.tips.names, FINGERS, strict=False)],
         "cloud": _points(run.cloud.points),
-        "others": None if scene is None else _points(scene.points[(scene.labels > 0) & ~scene.rows_of()]),
+        "others": None
+        if scene is None
+        else _points(scene.points[(scene.labels > 0) & ~scene.rows_of()]),
         "surface": _surface(run),
         "hand": [
             {
@@ -157,8 +183,11 @@ def _points(points: Float[Tensor, "n 3"]) -> dict[str, object]:
 
 
 def _surface(run: Run) -> dict[str, object]:
-    """Return the estimated surface with standard deviations and colours, as a dict of arrays made by `pack`."""
-    surface, std_m = run.surface, to_array(run.surface.std_m)
+    """Return the estimated surface with standard deviations and colours, as a dict of arrays made
+    by `pack`.
+    """
+    surface = run.surface
+    std_m = to_array(run.surface.std_m)
     kept, faces = thin_mesh(to_array(surface.vertices), surface.faces.cpu().numpy(), MOST_FACES)
     colors, most = color_std(std_m)
     return {
@@ -168,14 +197,24 @@ def _surface(run: Run) -> dict[str, object]:
         "std": pack(std_m[kept]),
         "colors": pack(np.round(255 * colors[kept]), "u1"),
         "most_mm": 1e3 * most,
-        "ramp": np.round(255 * map_colors(np.linspace(0.0, 1.0, 17), "viridis")).astype(int).tolist(),
+        "ramp": np.round(255 * map_colors(np.linspace(0.0, 1.0, 17), "viridis"))
+        .astype(int)
+        .tolist(),
     }
 
 
 def _grasps(hand: Hand, grasps: Grasps) -> dict[str, object]:
-    """Return the table rows of grasps, their contacts, and all link poses in each of the `POSTURES`."""
+    """Return the table rows of grasps, their contacts, and all link poses in each of the
+    `POSTURES`.
+    """
     heads = grasp_columns(grasps)
-    columns = (0, 1, 5, 3, *range(6, len(heads)))  # rank, success, margin, clearance, standard deviation, task margin
+    columns = (
+        0,
+        1,
+        5,
+        3,
+        *range(6, len(heads)),
+    )  # rank, success, margin, clearance, standard deviation, task margin
     return {
         "heads": [heads[k] for k in columns],
         "rows": [[row[k] for k in columns] for row in grasp_rows(grasps, MOST_GRASPS)],
@@ -187,7 +226,8 @@ def _grasps(hand: Hand, grasps: Grasps) -> dict[str, object]:
 
 def pose_postures(hand: Hand, grasps: Grasps) -> Float[Tensor, "g p l 4 4"]:
     """Return the poses of all links in the object's frame, in each of the `POSTURES` of each grasp."""
-    pose, opened = grasps.obj_from_hand.double(), grasps.pregrasp.double()
+    pose = grasps.obj_from_hand.double()
+    opened = grasps.pregrasp.double()
     raised = opened_pose(hand, opened, pose, grasps.table)
     away = raised.clone()
     away[:, :3, 3] -= APPROACH_DISTANCE * grasps.approach.double()
@@ -198,14 +238,22 @@ def pose_postures(hand: Hand, grasps: Grasps) -> Float[Tensor, "g p l 4 4"]:
 
 
 def _replay(run: Run, closure: ClosureResult) -> dict[str, object]:
-    """Return the data of the replayed closing: mesh, poses of object and links at some ticks, forces at all ticks."""
+    """Return the data of the replayed closing: mesh, poses of object and links at some ticks,
+    forces at all ticks.
+    """
     assert run.mesh is not None
-    centre, names = torch.tensor(np.array(run.mesh.center_mass), dtype=torch.float64), run.hand.tips.names
+    centre = torch.tensor(np.array(run.mesh.center_mass), dtype=torch.float64)
+    names = run.hand.tips.names
     ticks = thin_rows(len(closure.time), MOST_TICKS)
     kept, faces = thin_mesh(np.asarray(run.mesh.vertices), np.asarray(run.mesh.faces), MOST_FACES)
-    links = link_poses(run.hand, closure.joints[ticks], closure.joint_names, closure.hand_pose[ticks])
-    hand_pose, trace = closure.hand_pose[ticks].double(), closure.trace
-    moments = [(int(np.abs(ticks - m.tick).argmin()), m.name) for m in moments_of(closure, centre, names)]
+    links = link_poses(
+        run.hand, closure.joints[ticks], closure.joint_names, closure.hand_pose[ticks]
+    )
+    hand_pose = closure.hand_pose[ticks].double()
+    trace = closure.trace
+    moments = [
+        (int(np.abs(ticks - m.tick).argmin()), m.name) for m in moments_of(closure, centre, names)
+    ]
     return {
         "grasp": 1,  # the first is the one that was closed
         "story": describe_film(run.mesh, run.hand, closure),
@@ -223,19 +271,30 @@ def _replay(run: Run, closure: ClosureResult) -> dict[str, object]:
 
 
 def pack(values: np.ndarray, kind: str = "f4") -> dict[str, object]:
-    """Return an array for JSON: its number format (f4, u4 or u1, little-endian), shape, and bytes in base64."""
+    """Return an array for JSON: its number format (f4, u4 or u1, little-endian), shape, and bytes
+    in base64.
+    """
     data = np.ascontiguousarray(values).astype(f"<{kind}").tobytes()
-    return {"kind": kind, "shape": list(values.shape), "data": base64.b64encode(data).decode("ascii")}
+    return {
+        "kind": kind,
+        "shape": list(values.shape),
+        "data": base64.b64encode(data).decode("ascii"),
+    }
 
 
 def thin_mesh(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], most: int
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, "g 3"]]:
-    """Return the indices of the vertices to keep, one in each cell of a grid, and at most `most` faces between them."""
-    kept, thinned = np.arange(len(vertices)), faces
+    """Return the indices of the vertices to keep, one in each cell of a grid, and at most `most`
+    faces between them.
+    """
+    kept = np.arange(len(vertices))
+    thinned = faces
     cell = float(np.linalg.norm(np.ptp(vertices, axis=0))) / 256 if len(vertices) else 0.0
     while len(thinned) > most:
-        _, kept, group = np.unique(np.round(vertices / cell), axis=0, return_index=True, return_inverse=True)
+        _, kept, group = np.unique(
+            np.round(vertices / cell), axis=0, return_index=True, return_inverse=True
+        )
         thinned = group.reshape(-1)[faces]
         a, b, c = thinned.T
         thinned = thinned[(a != b) & (b != c) & (c != a)]
@@ -245,4 +304,8 @@ def thin_mesh(
 
 def thin_rows(count: int, most: int) -> Int[np.ndarray, " k"]:
     """Return the indices of at most `most` rows, evenly spread from the first to the last."""
-    return np.arange(count) if count <= most else np.round(np.linspace(0, count - 1, most)).astype(np.int64)
+    return (
+        np.arange(count)
+        if count <= most
+        else np.round(np.linspace(0, count - 1, most)).astype(np.int64)
+    )

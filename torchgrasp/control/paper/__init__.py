@@ -1,1 +1,3 @@
-"""Baselines: the paper's control law, position control, object impedance, learned stability. Not public."""
+"""Baselines: the paper's control law, position control, object impedance, learned stability. Not
+public.
+"""

@@ -1,4 +1,6 @@
-"""Baseline closing controllers: the paper's law (Eqs. 25-28), position control and open loop; impedance hold."""
+"""Baseline closing controllers: the paper's law (Eqs. 25-28), position control and open loop;
+impedance hold.
+"""
 
 import math
 
@@ -8,7 +10,14 @@ from torch import Tensor
 
 from torchgrasp.contacts.balance import grasp_map, internal_forces
 from torchgrasp.control.holding import RAMP, held_forces, regulate
-from torchgrasp.control.law import MAX_SPEED, POSITION_RATE, blend, damped_inverse, joint_step, tip_velocity
+from torchgrasp.control.law import (
+    MAX_SPEED,
+    POSITION_RATE,
+    blend,
+    damped_inverse,
+    joint_step,
+    tip_velocity,
+)
 from torchgrasp.control.paper.stability import StabilityModel, lengths_of, state_of
 from torchgrasp.control.reference import ClosingReference, next_target
 from torchgrasp.control.tactile import NOISE, STILL, Observation, low_pass
@@ -20,23 +29,29 @@ Rows = Float[Tensor, "*b 3 3"]
 SETTLED = 0.1  # time [s] for which a closing's end must hold before the closing is done
 POSE_TIME = 0.4  # time [s] from pre-grasp to grasp in open loop, and again from grasp to squeeze
 STOP_FORCE = 0.5  # force [N] at which the position controller stops a finger (Sec. 6.5).
-TRANSLATION_STIFFNESS, ROTATION_STIFFNESS = 1200.0, 4.0  # stiffness of the virtual frame [N/m, N m/rad]
-GRASP_STIFFNESS = 100.0  # stiffness [N/m] of the spring along each side of the triangle of fingertips
+# stiffness of the virtual frame [N/m, N m/rad]
+TRANSLATION_STIFFNESS = 1200.0
+ROTATION_STIFFNESS = 4.0
+GRASP_STIFFNESS = (
+    100.0  # stiffness [N/m] of the spring along each side of the triangle of fingertips
+)
 
 
 class PaperClosing:
-    """The paper's control law, d theta = J^-1 [(1 - lambda) K_P (x_d - x_c) + lambda C_F (f_d - f_c)], Eqs. (25)-(28).
+    """The paper's control law, d theta = J^-1 [(1 - lambda) K_P (x_d - x_c) + lambda C_F (f_d -
+    f_c)], Eqs. (25)-(28).
 
-    The gains are those of `ClosingReference.as_printed`. A damped inverse replaces J^-1; speed is bounded.
-    No joint target is so far ahead of its joint that the drive would exceed its torque limit. The closing ends when
-    all fingers touch, the share of force control (lambda, Eq. 26) is at least 0.5 in each, and the forces have been
-    steady for `SETTLED` seconds.
+    The gains are those of `ClosingReference.as_printed`. A damped inverse replaces J^-1; speed is
+    bounded. No joint target is so far ahead of its joint that the drive would exceed its torque
+    limit. The closing ends when all fingers touch, the share of force control (lambda, Eq. 26) is
+    at least 0.5 in each, and the forces have been steady for `SETTLED` seconds.
     """
 
     palm = STILL
 
     def __init__(self, reference: ClosingReference) -> None:
-        self.reference, self.target = reference.as_printed(), reference.pregrasp
+        self.reference = reference.as_printed()
+        self.target = reference.pregrasp
         self.lead = strongest_lead(reference)
         self.share = torch.zeros_like(reference.normals[:, 0])
         self.settled = Settled(reference)
@@ -52,22 +67,29 @@ class PaperClosing:
 
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
         """Return the targets [rad] of all joints for the next tick, `period` [s] later."""
-        reference, gains, normals = self.reference, self.reference.gains, self.reference.normals
+        reference = self.reference
+        gains = self.reference.gains
+        normals = self.reference.normals
         error = gains.target - reference.contact_points(observation.tips)
         self.share = blend(error, gains.covariance)
         self.settled.update(observation, observation.tactile.contact, self.share, period)
         desired = -(gains.desired_force * normals).sum(-1)
         force_error = -(desired - observation.tactile.reading)[:, None] * normals
-        velocity = tip_velocity(error, force_error, self.share, gains.position_gain, gains.force_gain, together=True)
+        velocity = tip_velocity(
+            error, force_error, self.share, gains.position_gain, gains.force_gain, together=True
+        )
         self.target = next_target(reference, self.target, velocity, observation, self.lead, period)
         return reference.expand(self.target)
 
 
 class Settled:
-    """The `time` [s] for which all fingers have touched near their planned contacts with steady forces."""
+    """The `time` [s] for which all fingers have touched near their planned contacts with steady
+    forces.
+    """
 
     def __init__(self, reference: ClosingReference) -> None:
-        self.time, self.steady = 0.0, torch.zeros_like(reference.normals[:, 0])
+        self.time = 0.0
+        self.steady = torch.zeros_like(reference.normals[:, 0])
 
     def update(
         self,
@@ -77,29 +99,40 @@ class Settled:
         period: float,
         pressing: bool = True,
     ) -> None:
-        """Add a tick to `time` if all fingers touch and, with `pressing`, press steadily; otherwise set `time` to 0."""
+        """Add a tick to `time` if all fingers touch and, with `pressing`, press steadily; otherwise
+        set `time` to 0.
+        """
         average = observation.tactile.average
         settled = bool(touching.all())
         if pressing:
-            settled = settled and bool((share >= 0.5).all() & ((average - self.steady).abs() < NOISE).all())
+            settled = settled and bool(
+                (share >= 0.5).all() & ((average - self.steady).abs() < NOISE).all()
+            )
         self.time = self.time + period if settled else 0.0
         if not settled:
             self.steady = average
 
 
 def strongest_lead(reference: ClosingReference) -> Float[Tensor, " h"]:
-    """Return how far [rad] each joint's target is ahead of the joint at the largest torque of its drive."""
+    """Return how far [rad] each joint's target is ahead of the joint at the largest torque of its
+    drive.
+    """
     hand = reference.hand
-    effort = torch.tensor([hand.actuators[name].effort for name in hand.tree.joint_names], dtype=torch.float64)
-    leads = (effort / reference.kp)[:, None] / hand.actuated.coupling.abs()  # infinite where nothing is driven
+    effort = torch.tensor(
+        [hand.actuators[name].effort for name in hand.tree.joint_names], dtype=torch.float64
+    )
+    leads = (effort / reference.kp)[
+        :, None
+    ] / hand.actuated.coupling.abs()  # infinite where nothing is driven
     return leads.amin(0)
 
 
 class PositionClosing:
-    """The paper's baseline (Table 7): a PI position controller for each fingertip, stopped at `STOP_FORCE`.
+    """The paper's baseline (Table 7): a PI position controller for each fingertip, stopped at
+    `STOP_FORCE`.
 
-    The goal lies `depth` [m] behind the planned contact, inside the object. With the paper's depth of 0 a finger may
-    stop before it touches.
+    The goal lies `depth` [m] behind the planned contact, inside the object. With the paper's depth
+    of 0 a finger may stop before it touches.
     """
 
     palm = STILL
@@ -114,7 +147,10 @@ class PositionClosing:
 
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
         """Return the targets [rad] of all joints for the next tick, `period` [s] later."""
-        reference, stop_distance, integral_rate = self.reference, 1e-3, 2.0  # [m], [1/s^2]
+        # [m], [1/s^2]
+        reference = self.reference
+        stop_distance = 1e-3
+        integral_rate = 2.0
         error = self.aim - reference.contact_points(observation.tips)
         arrived = torch.linalg.vector_norm(error, dim=-1) < stop_distance
         self.stopped = self.stopped | arrived | (observation.tactile.reading >= STOP_FORCE)
@@ -128,7 +164,9 @@ class PositionClosing:
 
 
 class OpenLoopClosing:
-    """Move the joints from the pre-grasp to the grasp, and on to targets that press, without any sensor."""
+    """Move the joints from the pre-grasp to the grasp, and on to targets that press, without any
+    sensor.
+    """
 
     palm = STILL
 
@@ -136,14 +174,17 @@ class OpenLoopClosing:
         self.reference = reference
         poses = (reference.pregrasp, reference.joints, reference.squeeze)
         self.poses = torch.stack([reference.expand(pose) for pose in poses])
-        self.time, self.done = 0.0, False
+        self.time = 0.0
+        self.done = False
 
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
         """Return the targets [rad] of all joints for the next tick, `period` [s] later."""
         return self.advance(period)
 
     def advance(self, period: float) -> Float[Tensor, "*n j"]:
-        """Return the targets [rad] for the next tick of one hand, or of n hands if `poses` are those of n."""
+        """Return the targets [rad] for the next tick of one hand, or of n hands if `poses` are
+        those of n.
+        """
         self.time += period
         progress = min(self.time / POSE_TIME, 2.0)
         self.done = self.time >= 2 * POSE_TIME - 0.5 * period
@@ -151,28 +192,42 @@ class OpenLoopClosing:
         return torch.lerp(self.poses[first], self.poses[first + 1], progress - first)
 
 
-def restoring_wrench(hand_from_vf: Float[Tensor, "*b 4 4"], rest: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 6"]:
-    """Return the force [N] and torque [N m] of a spring that pulls the fingertips' frame back to its `rest` pose.
+def restoring_wrench(
+    hand_from_vf: Float[Tensor, "*b 4 4"], rest: Float[Tensor, "*b 4 4"]
+) -> Float[Tensor, "*b 6"]:
+    """Return the force [N] and torque [N m] of a spring that pulls the fingertips' frame back to
+    its `rest` pose.
 
-    `hand_from_vf` is the virtual frame of three fingertips, with its origin at their centroid (Eq. 18 of the paper).
-    The torque grows with the sine of the rotation error.
+    `hand_from_vf` is the virtual frame of three fingertips, with its origin at their centroid (Eq.
+    18 of the paper). The torque grows with the sine of the rotation error.
     """
-    axes, desired = hand_from_vf[..., :3, :3].mT, rest[..., :3, :3].mT
+    axes = hand_from_vf[..., :3, :3].mT
+    desired = rest[..., :3, :3].mT
     error = 0.5 * torch.linalg.cross(axes, desired).sum(-2)
     force = TRANSLATION_STIFFNESS * (rest[..., :3, 3] - hand_from_vf[..., :3, 3])
     return torch.cat([force, ROTATION_STIFFNESS * error], -1)
 
 
 def shared_forces(points: Rows, wrench: Float[Tensor, "*b 6"], most: Float[Tensor, "*b"]) -> Rows:
-    """Return the smallest fingertip forces [N] that exert a wrench, all scaled down if one would exceed `most` [N]."""
-    forces = (torch.linalg.pinv(grasp_map(points)) @ wrench[..., None])[..., 0].unflatten(-1, (3, 3))
+    """Return the smallest fingertip forces [N] that exert a wrench, all scaled down if one would
+    exceed `most` [N].
+    """
+    forces = (torch.linalg.pinv(grasp_map(points)) @ wrench[..., None])[..., 0].unflatten(
+        -1, (3, 3)
+    )
     largest = torch.linalg.vector_norm(forces, dim=-1).amax(-1)
     return forces * (most / torch.maximum(largest, most))[..., None, None]
 
 
-def spring_forces(points: Rows, lengths: Float[Tensor, "*b 3"], stiffness: Float[Tensor, "*b 3"]) -> Rows:
-    """Return the forces [N] of springs along the sides of the triangle of fingertips, with rest `lengths` [m]."""
-    return torch.einsum("...k,...kci->...ci", stiffness * (side_lengths(points) - lengths), internal_forces(points))
+def spring_forces(
+    points: Rows, lengths: Float[Tensor, "*b 3"], stiffness: Float[Tensor, "*b 3"]
+) -> Rows:
+    """Return the forces [N] of springs along the sides of the triangle of fingertips, with rest
+    `lengths` [m].
+    """
+    return torch.einsum(
+        "...k,...kci->...ci", stiffness * (side_lengths(points) - lengths), internal_forces(points)
+    )
 
 
 def side_lengths(points: Rows) -> Float[Tensor, "*b 3"]:
@@ -181,12 +236,14 @@ def side_lengths(points: Rows) -> Float[Tensor, "*b 3"]:
 
 
 class Impedance:
-    """Hold the object as if springs held three fingertips together and in their place (object-level impedance).
+    """Hold the object as if springs held three fingertips together and in their place (object-level
+    impedance).
 
-    The joint targets are q + J^T f / kp for fingertip forces f. At rest f are the desired forces, balanced at the
-    sensed contacts. Joint motions that leave the fingertips at rest are suppressed. Springs of stiffness `springs`
-    [N/m], by default `GRASP_STIFFNESS`, act along the sides of the triangle of fingertips. If a `stability` model is
-    given and judges the grasp unstable, forces and stiffness are raised and stay so.
+    The joint targets are q + J^T f / kp for fingertip forces f. At rest f are the desired forces,
+    balanced at the sensed contacts. Joint motions that leave the fingertips at rest are suppressed.
+    Springs of stiffness `springs` [N/m], by default `GRASP_STIFFNESS`, act along the sides of the
+    triangle of fingertips. If a `stability` model is given and judges the grasp unstable, forces
+    and stiffness are raised and stay so.
     """
 
     def __init__(
@@ -197,23 +254,32 @@ class Impedance:
         springs: Float[Tensor, "3"] | None = None,
         stability: StabilityModel | None = None,
     ) -> None:
-        self.reference, self.stability, self.coupling = reference, stability, reference.hand.actuated.coupling
-        self.springs = torch.full((3,), GRASP_STIFFNESS).to(observation.tips) if springs is None else springs
+        self.reference = reference
+        self.stability = stability
+        self.coupling = reference.hand.actuated.coupling
+        self.springs = (
+            torch.full((3,), GRASP_STIFFNESS).to(observation.tips) if springs is None else springs
+        )
         self.stiffness = (self.coupling**2 * reference.kp[:, None]).sum(0)
         forces, self.strength = held_forces(reference, observation)
         self.frame = rigid(torch.eye(3).to(observation.tips), observation.tips.mean(0))
-        self.rest, self.lengths = self._frame(observation.tips), side_lengths(observation.tips)
+        self.rest = self._frame(observation.tips)
+        self.lengths = side_lengths(observation.tips)
         self.desired = forces @ self.rest[:3, :3]  # in the virtual frame
         self.posture = self._actuated(observation.joints)
         self.lead = self._actuated(start) - self.posture
-        self.factor, self.raised, self.time = 1.0, 1.0, 0.0
+        self.factor = 1.0
+        self.raised = 1.0
+        self.time = 0.0
         self.reading = observation.tactile.reading
 
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
         """Return the targets [rad] of all joints for the next tick, `period` [s] later."""
         self.time += period
         share = min(self.time / RAMP, 1.0)
-        self.reading = self.reading + low_pass(2.0, period) * (observation.tactile.reading - self.reading)
+        self.reading = self.reading + low_pass(2.0, period) * (
+            observation.tactile.reading - self.reading
+        )
         if share == 1.0:
             self.factor = regulate(self.factor, observation, self.raised * self.strength, period)
             self._adapt(observation, period)
@@ -225,19 +291,26 @@ class Impedance:
         return self.reference.expand(posture + drift + self.lead + share * (lead - self.lead))
 
     def _adapt(self, observation: Observation, period: float) -> None:
-        """If the grasp is unstable, raise its forces; move its stiffness to that of stable grasps as wide as it."""
-        if self.stability is None or self.time < RAMP + 0.3:  # the filtered readings must have followed the forces
+        """If the grasp is unstable, raise its forces; move its stiffness to that of stable grasps
+        as wide as it.
+        """
+        if (
+            self.stability is None or self.time < RAMP + 0.3
+        ):  # the filtered readings must have followed the forces
             return
         state = state_of(self.springs, lengths_of(observation.tips), self.reading)
         if float(self.stability.log_odds(state)) > math.log(3):
             return
-        preferred, share = self.stability.preferred_forces(observation.tips), min(8.0 * period, 1.0)
+        preferred = self.stability.preferred_forces(observation.tips)
+        share = min(8.0 * period, 1.0)
         self.raised += share * (2.0 - self.raised)
         self.springs = self.springs * (preferred.springs / self.springs) ** share
 
     @checked
     def forces(self, tips: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
-        """Return the forces [N] of the fingertips on the object, given the centres `tips` [m] of the fingertips."""
+        """Return the forces [N] of the fingertips on the object, given the centres `tips` [m] of
+        the fingertips.
+        """
         frame = self._frame(tips)
         desired = self.raised * self.factor * self.desired @ frame[:3, :3].T
         most = torch.linalg.vector_norm(desired, dim=-1).amax()  # the wrench lifts no finger
@@ -245,12 +318,16 @@ class Impedance:
         return desired + springs + shared_forces(tips, restoring_wrench(frame, self.rest), most)
 
     def _frame(self, tips: Float[Tensor, "3 3"]) -> Float[Tensor, "4 4"]:
-        """Return the frame of the triangle of fingertips, or the last valid frame if the tips are on a line."""
+        """Return the frame of the triangle of fingertips, or the last valid frame if the tips are
+        on a line.
+        """
         if not bool(degenerate(tips)):
             self.frame = virtual_frame(tips)
         return self.frame
 
     def _actuated(self, joints: Float[Tensor, " j"]) -> Float[Tensor, " h"]:
-        """Return the actuated joints [rad] that best explain given positions of all joints, weighted by stiffness."""
+        """Return the actuated joints [rad] that best explain given positions of all joints,
+        weighted by stiffness.
+        """
         weighted = self.coupling * self.reference.kp[:, None]
         return weighted.T @ (joints - self.reference.hand.actuated.offset) / self.stiffness

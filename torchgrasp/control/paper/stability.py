@@ -1,8 +1,10 @@
-"""The learned stability model, from the paper's reference [6]: Gaussian mixtures over stiffness, size and forces.
+"""The learned stability model, from the paper's reference [6]: Gaussian mixtures over stiffness,
+size and forces.
 
-`scripts/train.py stability` fits two mixtures to simulated pulls, of stable and of unstable grasps. The first gives the
-forces of stable grasps and Sigma_fd of Eq. (28). Both give the probability of stability by Bayes' rule: the density of
-stable grasps alone, as in [6], is low for rare objects, too.
+`scripts/train.py stability` fits two mixtures to simulated pulls, of stable and of unstable grasps.
+The first gives the forces of stable grasps and Sigma_fd of Eq. (28). Both give the probability of
+stability by Bayes' rule: the density of stable grasps alone, as in [6], is low for rare objects,
+too.
 """
 
 import dataclasses
@@ -23,19 +25,27 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.posture_model.gaussian import GaussianMixture
 from torchgrasp.posture_model.mixture import check_compatible
 
-STIFFNESS, LENGTHS, FORCES = ("logK1", "logK2", "logK3"), ("logL1", "logL2", "logL3"), ("logF1", "logF2", "logF3")
-"""Logarithms of spring stiffness [N/m], of the tips' distances from their virtual frame [m], of normal forces [N]."""
+STIFFNESS = ("logK1", "logK2", "logK3")
+LENGTHS = ("logL1", "logL2", "logL3")
+FORCES = ("logF1", "logF2", "logF3")
+"""Logarithms of spring stiffness [N/m], of the tips' distances from their virtual frame [m], of
+normal forces [N].
+"""
 NAMES = (*STIFFNESS, *LENGTHS, *FORCES)  # components of the state of a grasp
 LEAST_FORCE = 0.05  # least normal force [N] of a finger in a state
 FILE = "stability.safetensors"  # name of the model in the hand's folder
-PARTS = [(kind, part) for kind in ("stable", "others") for part in ("weights", "means", "covariances")]
+PARTS = [
+    (kind, part) for kind in ("stable", "others") for part in ("weights", "means", "covariances")
+]
 """Tensors of a model file."""
 
 
 def state_of(
     springs: Float[Tensor, "*b 3"], lengths: Float[Tensor, "*b 3"], forces: Float[Tensor, "*b 3"]
 ) -> Float[Tensor, "*b 9"]:
-    """Return a grasp's state: logarithms of spring stiffness [N/m], distances [m] of tips to centroid, forces [N]."""
+    """Return a grasp's state: logarithms of spring stiffness [N/m], distances [m] of tips to
+    centroid, forces [N].
+    """
     return torch.cat([springs, lengths, forces.clamp_min(LEAST_FORCE)], -1).log()
 
 
@@ -47,7 +57,9 @@ def lengths_of(tips: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
 @checked
 @dataclasses.dataclass(frozen=True)
 class PreferredForces(Value):
-    """Typical normal forces [N] of stable grasps, their covariance [N^2], and the typical spring stiffness [N/m]."""
+    """Typical normal forces [N] of stable grasps, their covariance [N^2], and the typical spring
+    stiffness [N/m].
+    """
 
     forces: Float[Tensor, "3"]
     covariance: Float[Tensor, "3 3"]
@@ -61,8 +73,12 @@ class StabilityModel(Value):
 
     stable: GaussianMixture  # density of the states of stable grasps
     others: GaussianMixture  # density of the states of all other grasps
-    share: Annotated[float, Range(LEAST, 1 - 2**-53, "a number in (0, 1)")]  # of stable trials: the prior
-    meta: dict[str, str] = dataclasses.field(default_factory=dict[str, str])  # hand, bodies, trials, seed, scores
+    share: Annotated[
+        float, Range(LEAST, 1 - 2**-53, "a number in (0, 1)")
+    ]  # of stable trials: the prior
+    meta: dict[str, str] = dataclasses.field(
+        default_factory=dict[str, str]
+    )  # hand, bodies, trials, seed, scores
 
     def __post_init__(self) -> None:
         for mixture in (self.stable, self.others):
@@ -70,62 +86,91 @@ class StabilityModel(Value):
                 raise BadArgument("names", mixture.names, ", ".join(NAMES))
 
     @checked
-    def preferred_forces(self, tips: Float[Tensor, "3 3"], force: Positive | None = None) -> PreferredForces:
-        """Return the typical forces and stiffness of stable grasps whose fingertips are as far apart as the `tips` [m].
+    def preferred_forces(
+        self, tips: Float[Tensor, "3 3"], force: Positive | None = None
+    ) -> PreferredForces:
+        """Return the typical forces and stiffness of stable grasps whose fingertips are as far
+        apart as the `tips` [m].
 
-        `force` [N] is the normal force of the finger that presses hardest; by default the model chooses it.
+        `force` [N] is the normal force of the finger that presses hardest; by default the model
+        chooses it.
         """
         lengths = lengths_of(tips.double())
-        given = dict(zip(LENGTHS, lengths.log().tolist(), strict=True))
+        given: dict[str, float] = dict(zip(LENGTHS, lengths.log().tolist(), strict=True))
         rest = self.stable.condition(given)
-        mean, covariance = rest.marginal(FORCES).mean(), rest.marginal(FORCES).covariance()
+        mean = rest.marginal(FORCES).mean()
+        covariance = rest.marginal(FORCES).covariance()
         if force is not None:
             hardest = int(mean.argmax())
             given[FORCES[hardest]] = math.log(force)
             others = [i for i in range(3) if i != hardest]
             rest = self.stable.condition(given)
             part = rest.marginal([FORCES[i] for i in others])
-            mean, covariance = torch.full_like(mean, math.log(force)), torch.zeros_like(covariance)
+            mean = torch.full_like(mean, math.log(force))
+            covariance = torch.zeros_like(covariance)
             mean[others] = part.mean()
             covariance[[[i] for i in others], others] = part.covariance()
         forces = mean.exp()
-        return PreferredForces(forces, forces[:, None] * covariance * forces, rest.marginal(STIFFNESS).mean().exp())
+        return PreferredForces(
+            forces, forces[:, None] * covariance * forces, rest.marginal(STIFFNESS).mean().exp()
+        )
 
     @checked(gradients=True)
     def log_odds(self, state: Float[Tensor, "*b 9"]) -> Float[Tensor, "*b"]:
-        """Return the log-odds that a grasp of given `state` is stable, by Bayes' rule on stiffness and forces."""
+        """Return the log-odds that a grasp of given `state` is stable, by Bayes' rule on stiffness
+        and forces.
+        """
         stable, others = self._without_lengths
         judged = torch.cat([state[..., :3], state[..., 6:]], -1)
-        return stable.log_prob(judged) - others.log_prob(judged) + math.log(self.share / (1 - self.share))
+        return (
+            stable.log_prob(judged)
+            - others.log_prob(judged)
+            + math.log(self.share / (1 - self.share))
+        )
 
     @functools.cached_property
     def _without_lengths(self) -> tuple[GaussianMixture, GaussianMixture]:
-        """The models of stable and of other grasps over stiffness and forces, without fingertip distances."""
-        return self.stable.marginal((*STIFFNESS, *FORCES)), self.others.marginal((*STIFFNESS, *FORCES))
+        """The models of stable and of other grasps over stiffness and forces, without fingertip
+        distances.
+        """
+        return self.stable.marginal((*STIFFNESS, *FORCES)), self.others.marginal(
+            (*STIFFNESS, *FORCES)
+        )
 
     @checked
     def save(self, path: Path | str) -> Path:
-        """Write the model to a safetensors file, atomically, and return its path; `load_stability` reads the file."""
+        """Write the model to a safetensors file, atomically, and return its path; `load_stability`
+        reads the file.
+        """
         tensors = {f"{kind}.{part}": getattr(getattr(self, kind), part) for kind, part in PARTS}
         return save_tensors(path, "stability", tensors, {**self.meta, "share": repr(self.share)})
 
 
 @checked
 def load_stability(hand: Hand, path: Path | str | None = None) -> StabilityModel | None:
-    """Read the stability model of a hand from `path`, or from `FILE` in its folder; None if that does not exist."""
+    """Read the stability model of a hand from `path`, or from `FILE` in its folder; None if that
+    does not exist.
+    """
     if path is None:
         path = hand.urdf_path.parent / FILE
         if not path.is_file():
             return None
     tensors, meta = load_tensors(path, "stability", {f"{kind}.{part}" for kind, part in PARTS})
     try:
-        joints, share = tuple(meta["joint_names"].split(",")), float(meta.pop("share"))
+        joints = tuple(meta["joint_names"].split(","))
+        share = float(meta.pop("share"))
         stable, others = (
-            GaussianMixture(tensors[f"{k}.weights"], tensors[f"{k}.means"], tensors[f"{k}.covariances"], NAMES)
+            GaussianMixture(
+                tensors[f"{k}.weights"], tensors[f"{k}.means"], tensors[f"{k}.covariances"], NAMES
+            )
             for k in ("stable", "others")
         )
-        model = StabilityModel(stable, others, share, {k: v for k, v in meta.items() if k not in ("kind", "version")})
+        model = StabilityModel(
+            stable, others, share, {k: v for k, v in meta.items() if k not in ("kind", "version")}
+        )
     except (KeyError, AttributeError, ValueError) as error:
-        raise ModelFileError("path", f"{path}: {error}", "a model that StabilityModel.save wrote") from error
+        raise ModelFileError(
+            "path", f"{path}: {error}", "a model that StabilityModel.save wrote"
+        ) from error
     check_compatible(meta, joints, hand)
     return model

@@ -1,1 +1,3 @@
-"""Completion of the side that the camera did not see: silhouettes, symmetry, axes, ellipsoids, vessels. Not public."""
+"""Completion of the side that the camera did not see: silhouettes, symmetry, axes, ellipsoids,
+vessels. Not public.
+"""

@@ -1,7 +1,8 @@
 """Balls and fruit: an ellipsoid, nearly a ball, is fitted to the whole cloud.
 
-Every plane through the centre of a ball is a mirror plane, so mirror planes do not determine its depth. The ellipsoid
-does: the fit uses normals, outline and table, and its covariance gives the uncertainty.
+Every plane through the centre of a ball is a mirror plane, so mirror planes do not determine its
+depth. The ellipsoid does: the fit uses normals, outline and table, and its covariance gives the
+uncertainty.
 """
 
 import dataclasses
@@ -16,12 +17,21 @@ from torchgrasp.foundation.lazy import optimize
 from torchgrasp.geometry.linalg import Points, farthest_points, fibonacci_sphere, unit
 from torchgrasp.shape.completion.silhouette import TIE, Outlines
 
-INDEPENDENT, INDEPENDENT_RIM = 60, 8  # points of the cloud and the outline that count as independent
-POINT_NOISE, SLOPE_NOISE, RIM_NOISE, TABLE_NOISE = 0.001, 0.15, 0.002, 0.001
+# points of the cloud and the outline that count as independent
+INDEPENDENT = 60
+INDEPENDENT_RIM = 8
+POINT_NOISE = 0.001
+SLOPE_NOISE = 0.15
+RIM_NOISE = 0.002
+TABLE_NOISE = 0.001
 """Standard deviations of a point [m], of its normal, of the outline [m] and of the table [m]."""
 ELONGATION = 0.03  # standard deviation of the logarithm of an axis over the mean axis
-MAX_MISFIT, MAX_RELATIVE_MISFIT = 0.00165, 0.052  # greatest RMS distance of the cloud, in metres and in mean radii
-FORWARD = float(np.sqrt(np.finfo(float).eps))  # step of the finite differences, over a parameter or 1
+# greatest RMS distance of the cloud, in metres and in mean radii
+MAX_MISFIT = 0.00165
+MAX_RELATIVE_MISFIT = 0.052
+FORWARD = float(
+    np.sqrt(np.finfo(float).eps)
+)  # step of the finite differences, over a parameter or 1
 UPPER = np.triu_indices(3)  # entries of a symmetric matrix that are parameters
 
 
@@ -31,11 +41,15 @@ class Ellipsoid:
 
     points: Float[Tensor, "n 3"]
     normals: Float[Tensor, "n 3"]
-    deviations: Float[Tensor, "n 9"]  # standard deviations [m] along the normals, one column per independent error
+    deviations: Float[
+        Tensor, "n 9"
+    ]  # standard deviations [m] along the normals, one column per independent error
     misfit: float  # RMS distance [m] of the cloud from the ellipsoid
 
 
-def find_ellipsoid(points: Points, normals: Points, outline: Outlines, table: float | None) -> Ellipsoid | None:
+def find_ellipsoid(
+    points: Points, normals: Points, outline: Outlines, table: float | None
+) -> Ellipsoid | None:
     """Return the ellipsoid, nearly a ball, that fits the whole cloud, or None if there is none.
 
     The body may have a flat foot: the ellipsoid may reach below the table, but not float above it.
@@ -64,7 +78,8 @@ def find_ellipsoid(points: Points, normals: Points, outline: Outlines, table: fl
 class _Fit:
     """The least-squares fit of an ellipsoid with 9 parameters.
 
-    They are its centre [m], and 6 entries of the logarithm of the symmetric matrix that maps the unit ball to it.
+    They are its centre [m], and 6 entries of the logarithm of the symmetric matrix that maps the
+    unit ball to it.
     """
 
     points: np.ndarray
@@ -77,23 +92,32 @@ class _Fit:
         rows = np.concatenate([2 * self.points, np.ones_like(self.points[:, :1])], 1)
         ball = np.linalg.lstsq(rows, (self.points**2).sum(1), rcond=None)[0]
         longest = np.ptp(self.points, axis=0).max()
-        radius = np.log(np.clip(np.sqrt(max(ball[3] + ball[:3] @ ball[:3], 0.0)), longest / 4, longest))
+        radius = np.log(
+            np.clip(np.sqrt(max(ball[3] + ball[:3] @ ball[:3], 0.0)), longest / 4, longest)
+        )
         start = np.concatenate([ball[:3], radius * np.eye(3)[UPPER]])
         jacobian: Any = self.jacobian  # of which SciPy's annotations do not know
         options: Any = {"x_scale": "jac", "loss": "soft_l1", "max_nfev": 40}
-        found = optimize.least_squares(lambda x: self.residuals(x[None])[0], start, jacobian, **options)
+        found = optimize.least_squares(
+            lambda x: self.residuals(x[None])[0], start, jacobian, **options
+        )
         return found.x, np.linalg.inv(found.jac.T @ found.jac)
 
     def jacobian(self, parameters: np.ndarray) -> np.ndarray:
-        """Return the derivatives of the residuals by finite differences, all parameters in one evaluation."""
+        """Return the derivatives of the residuals by finite differences, all parameters in one
+        evaluation.
+        """
         step = FORWARD * np.maximum(1.0, np.abs(parameters))
         found = self.residuals(np.concatenate([parameters[None], parameters + np.diag(step)]))
         return ((found[1:] - found[0]) / step[:, None]).T
 
     def residuals(self, parameters: np.ndarray) -> np.ndarray:
-        """Return residuals of points, normals, outline, table and prior over their deviations, a row per ellipsoid."""
+        """Return residuals of points, normals, outline, table and prior over their deviations, a
+        row per ellipsoid.
+        """
         distance, normal = self.distance_and_normal(parameters)
-        share, k = np.sqrt(len(self.points) / INDEPENDENT), len(parameters)
+        share = np.sqrt(len(self.points) / INDEPENDENT)
+        k = len(parameters)
         shape = _symmetric(parameters[:, 3:])
         mean = np.trace(shape, axis1=1, axis2=2)[:, None, None] / 3
         parts = [
@@ -102,7 +126,9 @@ class _Fit:
             ((shape - np.eye(3) * mean) / ELONGATION).reshape(k, -1),
         ]
         for view in self.outline.views:
-            across = view.rim_normals.numpy()  # the camera lies in the tangent planes of the outline
+            across = (
+                view.rim_normals.numpy()
+            )  # the camera lies in the tangent planes of the outline
             beyond = _support(parameters, across) - across @ view.viewpoint.numpy()
             parts.append(beyond / (RIM_NOISE * np.sqrt(max(len(across), 1) / INDEPENDENT_RIM)))
         if self.table is not None:
@@ -111,7 +137,9 @@ class _Fit:
         return np.concatenate(parts, 1)
 
     def distance_and_normal(self, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the first-order distance [m] of the points from k ellipsoids, and the ellipsoids' normals there."""
+        """Return the first-order distance [m] of the points from k ellipsoids, and the ellipsoids'
+        normals there.
+        """
         inverse = _exponential(-parameters[:, 3:])
         local = (self.points - parameters[:, None, :3]) @ inverse
         length = _length(local)

@@ -15,8 +15,12 @@ from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import across, farthest_points, unit
 from torchgrasp.values.planning import PointCloud
 
-GROW, SHRINK = 2.0, 1.65  # the outline is a union of discs about the pixels, then shrunk [pixel spacings]
-FRONT_MARGIN = 0.002  # a point may be this far [m] in front of the visible surface: noise of the camera
+# the outline is a union of discs about the pixels, then shrunk [pixel spacings]
+GROW = 2.0
+SHRINK = 1.65
+FRONT_MARGIN = (
+    0.002  # a point may be this far [m] in front of the visible surface: noise of the camera
+)
 MAX_BEHIND = 0.2  # greatest share of points behind others in a single view
 TIE = 2e-9  # relative difference of squared distances by rounding: the frame must not decide
 
@@ -30,11 +34,15 @@ class Silhouette(Value):
     corner: Float[Tensor, "2"]  # first node of the raster, at depth 1
     cell: float  # spacing of the nodes, at depth 1
     outside: Float[Tensor, "h w"]  # signed distance to the outline at depth 1, positive outside
-    depth: Float[Tensor, "h w"]  # at each node, the depth [m] of the visible pixel nearest to the node
+    depth: Float[
+        Tensor, "h w"
+    ]  # at each node, the depth [m] of the visible pixel nearest to the node
     rim: Float[Tensor, "k 3"]  # points of the outline [m] at the visible depth
     rim_normals: Float[Tensor, "k 3"]  # at the rim points, perpendicular to the camera rays
-    cut: bool  # whether the object reaches the border of the image; points beyond do not count as outside
-    gap: float  # width [m] of the widest area within the outline without measurements, perhaps a hole, or 0
+    # whether the object reaches the border of the image; points beyond do not count as outside
+    cut: bool
+    # width [m] of the widest area within the outline without measurements, perhaps a hole, or 0
+    gap: float
 
     @checked(gradients=True)
     def hull_distance(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
@@ -44,7 +52,9 @@ class Silhouette(Value):
 
     @checked(gradients=True)
     def violation(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return how far [m] points are outside the outline or in front of the visible surface; 0 if hidden."""
+        """Return how far [m] points are outside the outline or in front of the visible surface; 0
+        if hidden.
+        """
         outside, visible, depth = self._look_up(points)
         in_front = (visible - depth - FRONT_MARGIN).clamp_min(0)
         return torch.where(outside > 0, outside * depth, in_front)
@@ -52,16 +62,25 @@ class Silhouette(Value):
     @checked
     def moved(self, b_from_a: Pose) -> "Silhouette":
         """Return the silhouette transformed from frame a to frame b."""
-        viewpoint, rim = apply(b_from_a, self.viewpoint[None])[0], apply(b_from_a, self.rim)
-        axes, rim_normals = rotate(b_from_a, self.axes), rotate(b_from_a, self.rim_normals)
-        return dataclasses.replace(self, viewpoint=viewpoint, axes=axes, rim=rim, rim_normals=rim_normals)
+        viewpoint = apply(b_from_a, self.viewpoint[None])[0]
+        rim = apply(b_from_a, self.rim)
+        axes = rotate(b_from_a, self.axes)
+        rim_normals = rotate(b_from_a, self.rim_normals)
+        return dataclasses.replace(
+            self, viewpoint=viewpoint, axes=axes, rim=rim, rim_normals=rim_normals
+        )
 
     def _look_up(self, points: Float[Tensor, "*b 3"]) -> tuple[Tensor, Tensor, Tensor]:
-        """Return each point's distance to the outline at depth 1, the depth [m] seen there, and its own depth [m]."""
+        """Return each point's distance to the outline at depth 1, the depth [m] seen there, and its
+        own depth [m].
+        """
         local = (points - self.viewpoint) @ self.axes.T
         depth = local[..., 2].clamp_min(1e-9)  # behind the camera is far outside
         position = (local[..., :2] / depth[..., None] - self.corner) / self.cell
-        limit = torch.tensor(self.outside.shape, dtype=position.dtype, device=position.device).flip(0) - 1
+        limit = (
+            torch.tensor(self.outside.shape, dtype=position.dtype, device=position.device).flip(0)
+            - 1
+        )
         clamped = torch.minimum(position.clamp_min(0), limit)
         column, row = torch.round(clamped).long().unbind(-1)
         beyond = torch.linalg.vector_norm(position - clamped, dim=-1) * self.cell
@@ -101,22 +120,30 @@ class Outlines(Value):
 
     @checked(gradients=True)
     def hull_distance(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return the signed distance [m] of points to the visual hull of all views, positive outside."""
+        """Return the signed distance [m] of points to the visual hull of all views, positive
+        outside.
+        """
         return torch.stack([view.hull_distance(points) for view in self.views]).amax(0)
 
     @checked(gradients=True)
     def violation(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return the worst violation [m] of any view: how far points lie outside the outline or before the surface."""
+        """Return the worst violation [m] of any view: how far points lie outside the outline or
+        before the surface.
+        """
         return torch.stack([view.violation(points) for view in self.views]).amax(0)
 
     def hides(self, points: Float[Tensor, "*b 3"]) -> Bool[Tensor, "*b"]:
-        """Return a mask of the points that may be on the hidden side: no view excludes them, within a tolerance."""
+        """Return a mask of the points that may be on the hidden side: no view excludes them, within
+        a tolerance.
+        """
         return (self.hull_distance(points) < 0.001) & (self.violation(points) < FRONT_MARGIN)
 
 
 @checked
 def silhouettes(cloud: PointCloud) -> Outlines:
-    """Return the silhouette of every view of a cloud; refuse a view without camera, or of both sides of the object."""
+    """Return the silhouette of every view of a cloud; refuse a view without camera, or of both
+    sides of the object.
+    """
     views = cloud.split_views()
     for view in views:
         if view.viewpoint is None:
@@ -128,24 +155,30 @@ def silhouettes(cloud: PointCloud) -> Outlines:
 def silhouette(view: PointCloud) -> Silhouette:
     """Return the silhouette of one view, whose points must all lie in front of the camera.
 
-    A gap within the outline is a hole if it is far wider than the surface around it, as in a frame of bars. Other gaps
-    do not count as free space, because a mirror-like patch is not measured either.
+    A gap within the outline is a hole if it is far wider than the surface around it, as in a frame
+    of bars. Other gaps do not count as free space, because a mirror-like patch is not measured
+    either.
     """
     assert view.viewpoint is not None
     axes, pixels, depths = (t.numpy() for t in _project(view.points, view.viewpoint))
     distance, _ = spatial.KDTree(pixels).query(pixels, k=min(5, len(pixels)))
     spacing = float(np.median(distance[:, -1]))
-    low, high = pixels.min(0), pixels.max(0)
+    low = pixels.min(0)
+    high = pixels.max(0)
     extent = float((high - low).max())
     cell = max(spacing / 4.0, extent / 320)
     margin = int(np.ceil(GROW * spacing / cell)) + int(0.25 * extent / cell) + 2
     shape = tuple(np.ceil((high - low) / cell).astype(int)[::-1] + 2 * margin + 1)
     corner = low - margin * cell
     column, row = np.round((pixels - corner) / cell).astype(int).T
-    order = np.argsort(-depths)  # of pixels that share a cell the nearest to the camera is written last
+    order = np.argsort(
+        -depths
+    )  # of pixels that share a cell the nearest to the camera is written last
     raster = np.zeros(shape)
     raster[row[order], column[order]] = depths[order]
-    nearest = np.asarray(ndimage.distance_transform_edt(raster == 0, return_distances=False, return_indices=True))
+    nearest = np.asarray(
+        ndimage.distance_transform_edt(raster == 0, return_distances=False, return_indices=True)
+    )
     measured = _distance(raster == 0) * cell <= GROW * spacing
     grown = np.asarray(ndimage.binary_fill_holes(measured))
     gaps = grown & ~measured
@@ -159,10 +192,14 @@ def silhouette(view: PointCloud) -> Silhouette:
     seen = ~unseen if not unseen.any() else _distance(~unseen) * cell > GROW * spacing
     rim, rim_normals = _rim(outside, seen, corner, cell, pixels, depths)
     depth = np.where(unseen, 0.0, raster[tuple(nearest)])  # nothing is in front of what is not seen
-    images, gap = (torch.from_numpy(outside), torch.from_numpy(depth)), gap * float(np.median(depths))
-    origin, axes = view.viewpoint.double().cpu(), torch.from_numpy(axes)
+    images = (torch.from_numpy(outside), torch.from_numpy(depth))
+    gap = gap * float(np.median(depths))
+    origin = view.viewpoint.double().cpu()
+    axes = torch.from_numpy(axes)
     edge = torch.from_numpy(rim) @ axes + origin, torch.from_numpy(rim_normals) @ axes
-    return Silhouette(origin, axes, torch.from_numpy(corner), cell, *images, *edge, bool(unseen.any()), gap)
+    return Silhouette(
+        origin, axes, torch.from_numpy(corner), cell, *images, *edge, bool(unseen.any()), gap
+    )
 
 
 def _find_holes(gaps: np.ndarray, measured: np.ndarray, grown: float) -> np.ndarray:
@@ -171,8 +208,11 @@ def _find_holes(gaps: np.ndarray, measured: np.ndarray, grown: float) -> np.ndar
     The surface is the mask `measured`, which was grown by so many cells.
     """
     number, count = ndimage.label(gaps)  # pyright: ignore[reportGeneralTypeIssues]
-    wide, holes = _distance(measured), np.zeros_like(gaps)
-    for k, radius in enumerate(ndimage.maximum(_distance(gaps), number, range(1, count + 1)) + grown, start=1):
+    wide = _distance(measured)
+    holes = np.zeros_like(gaps)
+    for k, radius in enumerate(
+        ndimage.maximum(_distance(gaps), number, range(1, count + 1)) + grown, start=1
+    ):
         if radius > 2 * grown:  # a narrower gap lies between sparse points
             around = measured & (_distance(number != k) < 2 * radius)
             holes |= (number == k) & (2 * (wide[around].max() - grown) < radius)
@@ -180,9 +220,16 @@ def _find_holes(gaps: np.ndarray, measured: np.ndarray, grown: float) -> np.ndar
 
 
 def _beyond_image(
-    frustum: Tensor | None, axes: np.ndarray, corner: np.ndarray, cell: float, mask: np.ndarray, margin: float
+    frustum: Tensor | None,
+    axes: np.ndarray,
+    corner: np.ndarray,
+    cell: float,
+    mask: np.ndarray,
+    margin: float,
 ) -> np.ndarray:
-    """Return which cells lie beyond an image border that the mask of the object reaches, or within `margin` of it."""
+    """Return which cells lie beyond an image border that the mask of the object reaches, or within
+    `margin` of it.
+    """
     beyond = np.zeros(mask.shape, dtype=bool)
     if frustum is None:
         return beyond
@@ -201,23 +248,32 @@ def _check_view(points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]) -> 
     behind = int(((points - viewpoint) @ forward <= 0).sum())
     if behind:
         found = f"{viewpoint.tolist()} m, with {behind} of {len(points)} points beside or behind it"
-        raise BadArgument("viewpoint", found, "the position of a camera that has the whole cloud in front of it")
+        raise BadArgument(
+            "viewpoint", found, "the position of a camera that has the whole cloud in front of it"
+        )
     _, pixels, depth = _project(points, viewpoint)
     apart, index = spatial.KDTree(pixels.numpy()).query(pixels.numpy(), k=min(6, len(pixels)))
-    deeper = depth[:, None] - depth[torch.from_numpy(index)] - torch.from_numpy(apart) * depth[:, None]
+    deeper = (
+        depth[:, None] - depth[torch.from_numpy(index)] - torch.from_numpy(apart) * depth[:, None]
+    )
     points = points.double().cpu()
     radius = torch.linalg.vector_norm(points - (points.amax(0) + points.amin(0)) / 2, dim=-1).max()
     share = float((deeper.amax(1) > 0.3 * radius).double().mean())
     if share > MAX_BEHIND:
         found = f"{share:.0%} of the points behind others, which no camera sees at once"
-        raise BadArgument("cloud", found, "a single view, the viewpoint of each point, or outward normals")
+        raise BadArgument(
+            "cloud", found, "a single view, the viewpoint of each point, or outward normals"
+        )
 
 
 def _project(
     points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]
 ) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "n 2"], Float[Tensor, "n"]]:
-    """Return the axes of a camera that faces the points, and the points' image positions at depth 1 and depths [m]."""
-    points, viewpoint = points.double().cpu(), viewpoint.double().cpu()
+    """Return the axes of a camera that faces the points, and the points' image positions at depth 1
+    and depths [m].
+    """
+    points = points.double().cpu()
+    viewpoint = viewpoint.double().cpu()
     forward = unit((points.amax(0) + points.amin(0)) / 2 - viewpoint)
     axes = torch.stack([*across(forward), forward])  # right, down, forward
     local = (points - viewpoint) @ axes.T
@@ -230,9 +286,16 @@ def _distance(mask: np.ndarray) -> np.ndarray:
 
 
 def _rim(
-    outside: np.ndarray, seen: np.ndarray, corner: np.ndarray, cell: float, pixels: np.ndarray, depths: np.ndarray
+    outside: np.ndarray,
+    seen: np.ndarray,
+    corner: np.ndarray,
+    cell: float,
+    pixels: np.ndarray,
+    depths: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return 16 evenly spread points of the outline at the depth of nearby pixels, and their surface normals."""
+    """Return 16 evenly spread points of the outline at the depth of nearby pixels, and their
+    surface normals.
+    """
     row, column = np.nonzero(seen & (np.abs(outside) <= 0.75 * cell))
     smooth = ndimage.gaussian_filter(outside, 3.0)
     slope = np.stack([np.gradient(smooth, axis=axis)[row, column] for axis in (1, 0)], -1)
@@ -241,10 +304,12 @@ def _rim(
     if len(position) == 0:
         return np.zeros((0, 3)), np.zeros((0, 3))
     picks = farthest_points(torch.from_numpy(position), 16, tie=TIE).numpy()
-    position, slope = position[picks], slope[picks]
+    position = position[picks]
+    slope = slope[picks]
     _, index = spatial.KDTree(pixels).query(position, k=min(4, len(pixels)))
     depth = np.median(depths[index].reshape(len(position), -1), axis=-1)
     ray = np.concatenate([position, np.ones((len(position), 1))], -1)
-    # The cone's normal is perpendicular to the ray and to the outline's tangent, and leans with the slope.
+    # The cone's normal is perpendicular to the ray and to the outline's tangent, and leans with the
+    # slope.
     across = np.concatenate([slope, -(slope * position).sum(-1, keepdims=True)], -1)
     return ray * depth[:, None], across / np.linalg.norm(across, axis=-1, keepdims=True)

@@ -1,4 +1,6 @@
-"""Open vessels: an outer and an inner wall about a vertical axis; the camera sees the inner wall through the mouth."""
+"""Open vessels: an outer and an inner wall about a vertical axis; the camera sees the inner wall
+through the mouth.
+"""
 
 import dataclasses
 import math
@@ -15,11 +17,23 @@ from torchgrasp.shape.completion.complete import NEW, merge_hidden
 from torchgrasp.shape.completion.silhouette import TIE, Outlines
 from torchgrasp.values.planning import PointCloud
 
-LEVEL = 0.5  # least length of the horizontal part of a wall's normals: others are of rim, floor and noise
-BODY_SHARE, INNER_SHARE, OUTER_SHARE = 0.65, 0.09, 0.07  # least shares: of the walls on the body, of either wall
-USUAL, SPREAD, THICKNESS_ERROR = 0.0035, 0.0015, 0.0012  # usual thickness [m], its deviation, and that of a fit
-RIM = 0.003  # points so near [m] below the rim belong to no wall: their normals depend on both walls
-CENTER_ERROR, FORM_ERROR, FLOOR_ERROR = 0.0006, 0.001, 0.003  # deviations [m] of axis, form and unseen floor
+# least length of the horizontal part of a wall's normals: others are of rim, floor and noise
+LEVEL = 0.5
+# least shares: of the walls on the body, of either wall
+BODY_SHARE = 0.65
+INNER_SHARE = 0.09
+OUTER_SHARE = 0.07
+# usual thickness [m], its deviation, and that of a fit
+USUAL = 0.0035
+SPREAD = 0.0015
+THICKNESS_ERROR = 0.0012
+RIM = (
+    0.003  # points so near [m] below the rim belong to no wall: their normals depend on both walls
+)
+# deviations [m] of axis, form and unseen floor
+CENTER_ERROR = 0.0006
+FORM_ERROR = 0.001
+FLOOR_ERROR = 0.003
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,21 +51,28 @@ class Vessel(Value):
 def find_vessel(points: Points, normals: Points) -> Vessel | None:
     """Return the open vessel that a cloud shows, or None if it shows no vessel.
 
-    Normals of an inner wall point to the axis. Both walls are fitted at once: the outer radius is a cubic polynomial of
-    the height, and the inner radius is less by the thickness over the length of the normal's horizontal part. Robust
-    weights (Cauchy) ignore handles.
+    Normals of an inner wall point to the axis. Both walls are fitted at once: the outer radius is a
+    cubic polynomial of the height, and the inner radius is less by the thickness over the length of
+    the normal's horizontal part. Robust weights (Cauchy) ignore handles.
     """
     slope = torch.linalg.vector_norm(normals[:, :2], dim=1)
     level = normals[:, :2] / slope[:, None].clamp_min(1e-9)
-    middle, spread = points[:, 2].mean(), points[:, 2].std().clamp_min(1e-6)
-    exponents, top = torch.arange(4, device=points.device).to(points), 0.98  # noise lifts some points above the rim
+    middle = points[:, 2].mean()
+    spread = points[:, 2].std().clamp_min(1e-6)
+    # noise lifts some points above the rim
+    exponents = torch.arange(4, device=points.device).to(points)
+    top = 0.98
     powers = ((points[:, 2:] - middle) / spread) ** exponents
     below = points[:, 2] < points[:, 2].quantile(top) - 0.002
     center = fit_axis(points, normals)
-    miss, found, radius, facing = torch.zeros_like(slope), torch.zeros_like(slope), slope, slope
+    miss = torch.zeros_like(slope)
+    found = torch.zeros_like(slope)
+    radius = slope
+    facing = slope
     for k in range(30):
         arm = points[:, :2] - center
-        radius, out = torch.linalg.vector_norm(arm, dim=1), unit(arm)
+        radius = torch.linalg.vector_norm(arm, dim=1)
+        out = unit(arm)
         facing = (out * level).sum(1)
         wall = below & (slope > LEVEL) & (facing.abs() > LEVEL)
         scale = 0.006 * (1.0 + 4.0 * 0.8**k)  # miss [m] of half the weight
@@ -61,7 +82,8 @@ def find_vessel(points: Points, normals: Points) -> Vessel | None:
         if not bool((weight > 0).sum() > 2 * terms.shape[1]):
             return None
         found = solve_least_squares(weight * terms, weight[:, 0] * radius)
-        miss, center = radius - terms @ found, center + found[-2:]
+        miss = radius - terms @ found
+        center = center + found[-2:]
     thickness = float(found[4])
 
     wall = (slope > LEVEL) & (facing.abs() > LEVEL)
@@ -71,11 +93,20 @@ def find_vessel(points: Points, normals: Points) -> Vessel | None:
         return None
     rim = float(points[body, 2].quantile(top))
     mouth = float(((rim - middle) / spread) ** exponents @ found[:4])
-    floor = 0.7  # vertical part of a normal from which a point inside the mouth belongs to the floor
+    floor = (
+        0.7  # vertical part of a normal from which a point inside the mouth belongs to the floor
+    )
     inward = ((facing < 0) & (slope > 1.0 - floor)) | (normals[:, 2] > floor)
     inner = inward & (radius < mouth) & (points[:, 2] < rim - RIM)
-    shares = ((body & inner).double().mean(), (body & ~inner).double().mean(), body.sum() / wall.sum())
-    enough = all(float(s) > least for s, least in zip(shares, (INNER_SHARE, OUTER_SHARE, BODY_SHARE), strict=True))
+    shares = (
+        (body & inner).double().mean(),
+        (body & ~inner).double().mean(),
+        body.sum() / wall.sum(),
+    )
+    enough = all(
+        float(s) > least
+        for s, least in zip(shares, (INNER_SHARE, OUTER_SHARE, BODY_SHARE), strict=True)
+    )
     # The recess of a lid is no cavity: the inside must be seen 12 mm below the rim.
     if not enough or not math.isfinite(mouth) or float(rim - points[inner, 2].min()) < 0.012:
         return None
@@ -88,8 +119,8 @@ def find_vessel(points: Points, normals: Points) -> Vessel | None:
 class HiddenWall(Batch):
     """Estimated points of a wall that the camera did not see [m], with outward normals.
 
-    The columns of `shared` are errors along the normals [m] for one standard deviation of the axis position (two
-    columns), the wall's thickness and the floor's height.
+    The columns of `shared` are errors along the normals [m] for one standard deviation of the axis
+    position (two columns), the wall's thickness and the floor's height.
     """
 
     points: Float[Tensor, "m 3"]
@@ -99,30 +130,50 @@ class HiddenWall(Batch):
 
 @dataclasses.dataclass(frozen=True)
 class Wall(Value):
-    """One wall of a vessel: `seen` is the mask of its cloud points, `hidden` holds estimated points."""
+    """One wall of a vessel: `seen` is the mask of its cloud points, `hidden` holds estimated
+    points.
+    """
 
     seen: Bool[Tensor, "n"]
     hidden: HiddenWall
 
 
-def complete_walls(cloud: PointCloud, vessel: Vessel, outline: Outlines, table: float) -> tuple[Wall, Wall]:
+def complete_walls(
+    cloud: PointCloud, vessel: Vessel, outline: Outlines, table: float
+) -> tuple[Wall, Wall]:
     """Return the outer and the inner wall of a vessel on a table of height `table` [m].
 
-    The other side of a seen wall is one thickness away. Parts seen on neither side are estimated by rotating the seen
-    parts about the axis.
+    The other side of a seen wall is one thickness away. Parts seen on neither side are estimated by
+    rotating the seen parts about the axis.
     """
-    points, normals = cloud.points, cloud.normals
+    points = cloud.points
+    normals = cloud.normals
     assert normals is not None
-    every = HiddenWall(points, normals, torch.zeros(len(points), 4, dtype=points.dtype, device="cpu"))
-    outside, inside = every[vessel.body & ~vessel.inner], every[vessel.body & vessel.inner]
+    every = HiddenWall(
+        points, normals, torch.zeros(len(points), 4, dtype=points.dtype, device="cpu")
+    )
+    outside = every[vessel.body & ~vessel.inner]
+    inside = every[vessel.body & vessel.inner]
     seen_floor = vessel.inner & (normals[:, 2] > 0.9)
     has_floor = int(seen_floor.sum()) > 10
     floor = float(points[seen_floor, 2].median()) if has_floor else table + vessel.thickness
 
-    outer = _merge(points[~vessel.inner], outline, [_across(inside, vessel), _turn(outside, vessel)], vessel, table)
-    parts = [_across(outside, vessel), _turn(inside, vessel), _across(_turn(outside, vessel), vessel)]
+    outer = _merge(
+        points[~vessel.inner],
+        outline,
+        [_across(inside, vessel), _turn(outside, vessel)],
+        vessel,
+        table,
+    )
+    parts = [
+        _across(outside, vessel),
+        _turn(inside, vessel),
+        _across(_turn(outside, vessel), vessel),
+    ]
     if not has_floor:
-        radius = float(torch.linalg.vector_norm(points[vessel.inner, :2] - vessel.center, dim=1).min())
+        radius = float(
+            torch.linalg.vector_norm(points[vessel.inner, :2] - vessel.center, dim=1).min()
+        )
         parts.append(_disc(vessel, floor, radius, ((0.0, 1), (0.4, 5), (0.75, 8))))
     inner = _merge(points[vessel.inner], outline, parts, vessel, floor)
     return Wall(~vessel.inner, outer), Wall(vessel.inner, inner)
@@ -134,27 +185,37 @@ def lid(vessel: Vessel) -> HiddenWall:
 
 
 def _across(wall: HiddenWall, vessel: Vessel) -> HiddenWall:
-    """Return the points and normals of the opposite face of a vessel's wall, one wall thickness away."""
+    """Return the points and normals of the opposite face of a vessel's wall, one wall thickness
+    away.
+    """
     shared = wall.shared.clone()
     shared[:, 2] += THICKNESS_ERROR
     return HiddenWall(wall.points - vessel.thickness * wall.normals, -wall.normals, shared)
 
 
 def _turn(wall: HiddenWall, vessel: Vessel) -> HiddenWall:
-    """Return 80 points of a wall, rotated about the axis by 23 angles, with the errors of the axis position."""
+    """Return 80 points of a wall, rotated about the axis by 23 angles, with the errors of the axis
+    position.
+    """
     wall = wall[farthest_points(wall.points, 80, tie=TIE)]
     turn = rotations_about_z(24)
     axis = torch.cat([vessel.center, torch.zeros(1, dtype=torch.float64, device="cpu")])
     points = (wall.points - axis) @ turn.mT + axis
     normals = wall.normals @ turn.mT
-    moved = CENTER_ERROR * (torch.eye(3, dtype=torch.float64, device="cpu") - turn)[:, None]  # of points, with the axis
+    moved = (
+        CENTER_ERROR * (torch.eye(3, dtype=torch.float64, device="cpu") - turn)[:, None]
+    )  # of points, with the axis
     shared = wall.shared.expand(len(turn), -1, -1).clone()
     shared[..., :2] += (normals[..., None, :] @ moved)[..., 0, :2]
     return HiddenWall(points.flatten(0, 1), normals.flatten(0, 1), shared.flatten(0, 1))
 
 
-def _disc(vessel: Vessel, height: float, radius: float, rings: tuple[tuple[float, int], ...]) -> HiddenWall:
-    """Return points at one height, normals up, on rings about the axis: each (share of `radius`, number of points)."""
+def _disc(
+    vessel: Vessel, height: float, radius: float, rings: tuple[tuple[float, int], ...]
+) -> HiddenWall:
+    """Return points at one height, normals up, on rings about the axis: each (share of `radius`,
+    number of points).
+    """
     places = []
     for share, count in rings:
         angle = torch.arange(count, dtype=torch.float64, device="cpu") * (2 * math.pi / count)
@@ -167,13 +228,23 @@ def _disc(vessel: Vessel, height: float, radius: float, rings: tuple[tuple[float
     return HiddenWall(points, up, shared)
 
 
-def _merge(seen: Points, outline: Outlines, parts: list[HiddenWall], vessel: Vessel, least: float) -> HiddenWall:
-    """Return the hidden points of the parts, between rim and `least` height, apart from seen and earlier points."""
+def _merge(
+    seen: Points, outline: Outlines, parts: list[HiddenWall], vessel: Vessel, least: float
+) -> HiddenWall:
+    """Return the hidden points of the parts, between rim and `least` height, apart from seen and
+    earlier points.
+    """
     tree = spatial.KDTree(seen.numpy())
 
     def allowed(part: HiddenWall) -> Bool[Tensor, "n"]:
         within = (part.points[:, 2] < vessel.rim - RIM) & (part.points[:, 2] >= least)
-        return within & outline.hides(part.points) & torch.from_numpy(tree.query(part.points.numpy())[0] > NEW)
+        return (
+            within
+            & outline.hides(part.points)
+            & torch.from_numpy(tree.query(part.points.numpy())[0] > NEW)
+        )
 
-    merged = merge_hidden(parts[0][:0], parts, allowed, lambda points: farthest_points(points, 4 * 50, tie=TIE))
+    merged = merge_hidden(
+        parts[0][:0], parts, allowed, lambda points: farthest_points(points, 4 * 50, tie=TIE)
+    )
     return merged[farthest_points(merged.points, 50, tie=TIE)]
