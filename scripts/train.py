@@ -3,17 +3,16 @@
 
 `torchgrasp hand train` learns the posture model of a hand.
 
-python scripts/train.py stability allegro --workers 2             which pulled grasps hold, for the
-impedance control python scripts/train.py paper_model allegro                       the posture
-model of mode "paper" python scripts/train.py success                                   the
-predicted success that ranks grasps python scripts/train.py occupancy DIR
-how likely hidden places of a scene are full python scripts/train.py bands DIR
-how far off hidden sides are python scripts/train.py household DIR
-bodies of a household, with views, for any bench python scripts/train.py trials DIR
-grasps on these bodies, each tried with its own task python scripts/train.py objects
-meshes, convex parts and views of the own objects python scripts/train.py scene
-the depth image of the shipped scene python scripts/train.py golden
-grasps with known verdicts, for torchgrasp selftest
+* stability HAND: which pulled grasps hold, for the impedance control
+* paper_model HAND: the posture model of mode "paper"
+* success: the predicted success that ranks grasps
+* occupancy DIR: how likely hidden places of a scene are full
+* bands DIR: how far off hidden sides are
+* household DIR: bodies of a household, with views, for any bench
+* trials DIR: grasps on these bodies, each tried with its own task
+* objects: meshes, convex parts and views of the own objects
+* scene: the depth image of the shipped scene
+* golden: grasps with known verdicts, for torchgrasp selftest
 """
 
 import sys

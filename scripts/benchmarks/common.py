@@ -1,6 +1,4 @@
-"""What every benchmark needs: options, a registry, rows with a target, results as files, a clock
-and random views.
-"""
+"""What every benchmark needs: options, a registry, rows with a target, results as files, a clock."""
 
 import dataclasses
 import importlib
@@ -17,11 +15,9 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar
 
 import torch
-from torch import Tensor
 
 from torchgrasp.evaluation.intervals import Share, contrast_over
 from torchgrasp.files import write_file
-from torchgrasp.geometry.linalg import unit
 
 ROOT = Path(__file__).resolve().parents[2]
 Result = TypeVar("Result")
@@ -43,22 +39,28 @@ def mean_over(values: Iterable[tuple[str, float]]) -> Share:
 class Options:
     """Options of all benches; a bench uses those that it needs.
 
-    Args: only: benches of the subject; by default all. objects: folders with manifest.json and a
-        folder for each object. Benches that need objects are left out without one. names: objects
-        to keep; by default all. views: names of the views that are measured, as view0; by default
-        all. hands: names of hands. conditions: of close/misplaced and close/sensors, or
-        perturbations of close/perturb; by default all. laws: controllers of close/misplaced; by
-        default all. grasps: grasps of each view, the best or spread over all ranks. starts: random
-        starts of the contact planner. batches: numbers of clouds of gpu/clouds and gpu/launches.
-        gpu_rate: clouds that one GPU plans in a second, for load/campaign; gpu/clouds measures it.
-        By default unknown. scale: factor of the numbers of random samples, scenes, frames, plans
-        and trials. draws: trials of each grasp of close/table-lift, with other displacements,
-        pushes and noise. tries: largest number of grasps that a trial of close/table-lift tries; by
-        default as the protocol says. planned: folder OBJECT/VIEW.safetensors with grasps for
-        close/table-lift; by default they are planned and kept. simulator: of load/trials,
-        load/campaign and close/table-lift. workers: processes that share the trials. threads: of
-        torch. seed: of every random number. out: folder of the results as JSON, of kept plans and
-        trials, and of the tables. publish: write the tables to docs/results instead.
+    Args:
+        only: benches of the subject; by default all.
+        objects: folders with manifest.json and a folder for each object. Benches that need objects
+            are left out without one.
+        names: objects to keep; by default all.
+        views: names of the views that are measured, as view0; by default all.
+        hands: names of hands.
+        conditions: of close/table-lift, or perturbations of close/perturb; by default all.
+        grasps: grasps of each view, the best or spread over all ranks.
+        starts: random starts of the contact planner.
+        batches: numbers of clouds of gpu/clouds and gpu/launches.
+        scale: factor of the numbers of random samples, scenes, frames, plans and trials.
+        draws: trials of each grasp of close/table-lift, with other displacements and noise.
+        tries: most grasps that a trial of close/table-lift tries; by default as the protocol says.
+        planned: folder OBJECT/VIEW.safetensors with grasps for close/table-lift; by default they
+            are planned and kept.
+        simulator: of close/table-lift.
+        workers: processes that share the trials.
+        threads: of torch.
+        seed: of every random number.
+        out: folder of the results as JSON, of kept plans and trials, and of the tables.
+        publish: write the tables to docs/results instead.
     """
 
     only: tuple[str, ...] = ()
@@ -67,11 +69,9 @@ class Options:
     views: tuple[str, ...] = ()
     hands: tuple[str, ...] = ("allegro", "barrett")
     conditions: tuple[str, ...] = ()
-    laws: tuple[str, ...] = ()
     grasps: int = 1
     starts: int = 1000
     batches: tuple[int, ...] = (1, 4, 16)
-    gpu_rate: float | None = None
     scale: float = 1.0
     draws: int = 5
     tries: int | None = None
@@ -111,7 +111,7 @@ class Bench(NamedTuple):
 
 
 BENCHES: dict[str, Bench] = {}
-"""All benches by name, as "close/misplaced"."""
+"""All benches by name, as "close/table-lift"."""
 
 
 def bench(name: str, objects: bool = False) -> Callable[[Callable[[Options], list[Row]]], Callable]:
@@ -216,75 +216,3 @@ def timed(action: Callable[[], Result]) -> tuple[Result, float]:
     """Return the result of an action, and the processor's time that it took [s]."""
     began = time.process_time()
     return action(), time.process_time() - began
-
-
-def peak_mib() -> float | None:
-    """Return the peak of this process's resident memory [MiB], where the system tells it."""
-    status = Path("/proc/self/status")
-    if not status.exists():
-        return None
-    line = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
-    return int(line.split()[1]) / 1024
-
-
-BODIES = ("ellipsoid", "box", "cylinder", "torus")
-
-
-def random_view(
-    n: int, generator: torch.Generator, body: str | None = None
-) -> tuple[Tensor, Tensor]:
-    """Return n points and outward normals of the side of a random body that faces a random camera.
-
-    The points lie within the unit ball about the origin, the largest norm being 1, with a noise of
-    0.002.
-
-    Args:
-        n: number of points.
-        generator: of every draw.
-        body: one of `BODIES`; a random one by default.
-    """
-    if body is None:
-        body = BODIES[int(torch.randint(len(BODIES), (1,), generator=generator))]
-    axes = 0.2 + 0.8 * torch.rand(3, generator=generator, dtype=torch.float64)
-    view = unit(torch.randn(3, generator=generator, dtype=torch.float64))
-    points = normals = torch.empty(0, 3, dtype=torch.float64)
-    while len(points) < n:
-        more, outward = _surface(body, 4 * n, axes, generator)
-        facing = outward @ view > 0.05
-        points = torch.cat([points, more[facing]])[:n]
-        normals = torch.cat([normals, outward[facing]])[:n]
-    points = points + 0.002 * torch.randn(points.shape, generator=generator, dtype=torch.float64)
-    points = points - (points.amin(0) + points.amax(0)) / 2
-    return points / torch.linalg.vector_norm(points, dim=-1).max(), normals
-
-
-def _surface(body: str, m: int, axes: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Return points and outward normals all over a body with the given half axes."""
-    ball = unit(torch.randn(m, 3, generator=generator, dtype=torch.float64))
-    if body == "ellipsoid":
-        return ball * axes, unit(ball / axes)
-    if body == "box":
-        inside = (2 * torch.rand(m, 3, generator=generator, dtype=torch.float64) - 1) * axes
-        area = axes.prod() / axes
-        face = torch.multinomial(area, m, replacement=True, generator=generator)
-        normals = torch.eye(3, dtype=torch.float64)[face]
-        sign = torch.sign(ball[:, :1])
-        return torch.where(normals > 0, sign * axes, inside), normals * sign
-    angle = 2 * torch.pi * torch.rand(m, generator=generator, dtype=torch.float64)
-    if body == "cylinder":
-        around = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], -1)
-        height = (2 * torch.rand(m, generator=generator, dtype=torch.float64) - 1) * axes[2]
-        side = torch.stack([axes[0] * around[:, 0], axes[0] * around[:, 1], height], -1)
-        share = 2 * axes[2] / (2 * axes[2] + axes[0])  # of the side in the whole surface
-        radius = axes[0] * torch.rand(m, generator=generator, dtype=torch.float64).sqrt()
-        up = torch.sign(ball[:, 2])
-        cap = torch.stack([radius * around[:, 0], radius * around[:, 1], up * axes[2]], -1)
-        lid = torch.stack([torch.zeros_like(up), torch.zeros_like(up), up], -1)
-        on_side = (torch.rand(m, generator=generator, dtype=torch.float64) < share)[:, None]
-        return torch.where(on_side, side, cap), torch.where(on_side, around, lid)
-    around = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], -1)
-    turn = 2 * torch.pi * torch.rand(m, generator=generator, dtype=torch.float64)
-    normals = (
-        turn.cos()[:, None] * around + turn.sin()[:, None] * torch.eye(3, dtype=torch.float64)[2]
-    )
-    return around + 0.35 * axes[0] * normals, normals

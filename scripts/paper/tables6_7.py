@@ -72,12 +72,7 @@ def table6(spec: Asked) -> None:
     Args:
         spec: what the table is made of.
     """
-    judge_table6(spec, run_cells(spec, ROWS6))
-
-
-def judge_table6(spec: TableSpec, cells: Iterator[tuple[Cell, ...]]) -> None:
-    """Print and write Table 6 of the cells of its rows."""
-    rows = gather(cells)
+    rows = gather(run_cells(spec, ROWS6))
     numbers = report(rows)
     fall = contrast_over([count_held(row) for row in rows], line_weights(THRESHOLDS))
     found = "excludes zero" if fall.low > 0 or fall.high < 0 else "does not exclude zero"
@@ -96,12 +91,7 @@ def table7(spec: Asked) -> None:
     Args:
         spec: what the table is made of.
     """
-    judge_table7(spec, run_cells(spec, ROWS7))
-
-
-def judge_table7(spec: TableSpec, cells: Iterator[tuple[Cell, ...]]) -> None:
-    """Print and write Table 7 of the cells of its rows."""
-    rows = gather(cells)
+    rows = gather(run_cells(spec, ROWS7))
     numbers = report(rows)
     held = {row[0].row: count_held(row) for row in rows}
     alike = [f"{closing}, {FORCE}" for closing in OWN]

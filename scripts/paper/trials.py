@@ -1,5 +1,4 @@
-"""Campaigns of lifts behind Tables 6 and 7 and the ladder: planned once, kept as files, resumed
-where they stopped.
+"""Campaigns of lifts behind Tables 6 and 7: planned once, kept as files, resumed where they stopped.
 
 A row says how grasps are planned, which of them come first, and how the hand closes and holds. Rows
 share plans where they are the same. Every lift draws the object's pose on its table, unknown to the

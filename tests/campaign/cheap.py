@@ -121,7 +121,7 @@ def seen_job(
     number: int, row: JobRow, meta: dict[str, str], plans: list[int] | None = None
 ) -> bytes:
     """Do a job on a worker in this process; with plans, it is the job that has the number's plan."""
-    from benchmarks.load.swarm import begin  # not at the top: other workers need no Dask
+    from tests.campaign.swarm import begin  # not at the top: other workers need no Dask
 
     begin(number)
     return cheap_job(number if plans is None else plans[number % len(plans)], row, meta)
@@ -129,7 +129,7 @@ def seen_job(
 
 def seen_plan(numbers: list[int]) -> list[int]:
     """Return the numbers of jobs as their plans."""
-    from benchmarks.load.swarm import begin
+    from tests.campaign.swarm import begin
 
     begin(-1 - numbers[0])
     return numbers

@@ -13,7 +13,6 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-from benchmarks.load.swarm import BEGAN, FATAL, outstanding, swarm
 
 from tests.campaign.cheap import (
     campaign,
@@ -26,6 +25,7 @@ from tests.campaign.cheap import (
     work_on,
 )
 from tests.campaign.conftest import QUICK
+from tests.campaign.swarm import BEGAN, FATAL, outstanding, swarm
 from tests.make import same_bits
 from torchgrasp import load_hand
 from torchgrasp.campaign import campaign as run_module

@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -159,18 +158,6 @@ def object_names(objects: Path | None) -> list[str]:
     if not names:
         raise BadArgument("objects", str(objects), "a folder with NAME/mesh.ply in it")
     return names
-
-
-def settle(placed: PlacedScene, motion: Float[Tensor, "n 4 4"], keep: Sequence[int]) -> PlacedScene:
-    """Return some objects of a scene at rest again, after motions of all objects in the world
-    frame.
-    """
-    bodies = [Body(placed.meshes[k], placed.parts[k], MASS) for k in keep]
-    table = SettlingTable()
-    for k, body in zip(keep, bodies, strict=True):
-        table.add(body, motion[k].numpy())
-    table.settle(REST_TIME)
-    return _moved(tuple(placed.names[k] for k in keep), bodies, table.poses(), placed.camera_pose)
 
 
 def aim(placed: PlacedScene, generator: torch.Generator) -> PlacedScene | None:

@@ -1,1 +1,0 @@
-"""The hands and their posture models, beside their bars."""

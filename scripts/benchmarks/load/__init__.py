@@ -1,1 +1,0 @@
-"""Many calls in one process, and one call on much."""

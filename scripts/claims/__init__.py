@@ -1,1 +1,0 @@
-"""Figures of README and guides that `scripts/reproduce.py claims` runs again; `table.py` runs them."""
