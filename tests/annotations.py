@@ -20,7 +20,7 @@ from jaxtyping._storage import pop_shape_memo, push_shape_memo
 by_jaxtyping = jaxtyping.jaxtyped
 CHECKS: dict[CodeType, FunctionType] = {}
 """A function with a check, by the code of the function."""
-CALLS = 10  # of a function that are checked in each test
+CALLS = 3  # of a function that are checked in each test
 LEFT: dict[CodeType, int] = {}
 """Number of calls that are still to be checked in this test, by the code of the function, if not
 `CALLS`.
