@@ -2,8 +2,10 @@
 """Hashes of what the library computes, to show that a change of the code leaves every bit as it
 was.
 
-    .venv/bin/python scripts/golden.py --save before.json     # at the old commit .venv/bin/python
-    scripts/golden.py --against before.json  # after the change: exit code 1 where a hash differs
+    .venv/bin/python scripts/golden.py --save before.json      # at the old commit
+    .venv/bin/python scripts/golden.py --against before.json   # after the change
+
+The exit code is 1 where a hash differs.
 
 Hashes depend on the processor and on the versions of the packages. Compare files of one machine
 only.

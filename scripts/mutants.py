@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """Mutation tests: change one operator or number of the library, and see whether a test notices.
 
-    .venv/bin/python -m pip install cosmic-ray==8.7.0 .venv/bin/python scripts/mutants.py --folders
-    shape plan control posture_model --each 50 --out mutants.json
+    .venv/bin/python -m pip install cosmic-ray==8.7.0
+    .venv/bin/python scripts/mutants.py --folders shape contacts --each 50 --out mutants.json
 
 Cosmic Ray makes the mutants. Each runs in a copy of the repository: first the test file of the
 mutated module, then the other tests of its folder. A mutant that no test notices has survived. It
@@ -106,7 +106,7 @@ def main() -> int:
     """Try a sample of the mutants of each folder; print the survivors."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument(
-        "--folders", nargs="+", default=["shape", "plan", "control", "posture_model"]
+        "--folders", nargs="+", default=["shape", "contacts", "control", "posture_model"]
     )
     parser.add_argument(
         "--each", type=int, default=50, help="mutants of each folder, drawn at random"

@@ -1,8 +1,10 @@
 #!/usr/bin/env python3
-"""Which tuned numbers matter: each number at module level is moved by 20 %, and plans and closings
-are compared.
+"""Which tuned numbers matter: each number is moved by 20 %, and plans and closings are compared.
 
     .venv/bin/python scripts/sensitivity.py --objects DIR --out sensitivity.json
+
+Numbers are the constants of modules, and the fields of options values: frozen dataclasses whose
+names end in Numbers or Layout, with their default instances.
 
 A number whose change alters no plan and no closing has no effect on these objects. It is removed,
 or its reason is a case that these objects do not have. The first case that differs ends the search,
@@ -26,15 +28,20 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
-PLANNED = ("geometry", "cloud", "scene", "shape", "plan", "ik", "planner", "posture_model", "hand")
+PLANNED = (
+    *("geometry", "hand", "cloud", "scene", "posture_model", "shape", "contacts", "ik"),
+    *("success", "planner"),
+)
 CLOSED = ("control", "sim", "evaluation")
 """Folders whose numbers act on plans, and on closings."""
-SENSITIVITY = """Each number at module level is moved by 20 %, up and then down, on plans, a scene and closings.
+OPTIONS = ("Numbers", "Layout")
+"""Ends of the names of options values."""
+SENSITIVITY = """Each constant and each field of an options value is moved by 20 %, up and then down, on plans, a scene and closings.
 A number without effect here is a tolerance, a bound of memory or of a file, or serves a case that is not here."""
 
 
 class Number(NamedTuple):
-    """A number at module level: its module, its name and, in a tuple of names, its place."""
+    """A number of the source: its module, the name of its constant or field, and its place."""
 
     module: str
     name: str
@@ -50,14 +57,24 @@ def is_number(node: ast.expr) -> bool:
 
 
 def numbers_of(path: Path) -> Iterator[Number]:
-    """Yield the numbers at module level of a file."""
+    """Yield the numbers of a file: of its constants, and of the fields of its options values."""
     module = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
-    for statement in ast.parse(path.read_text()).body:
+    for owner, statement in statements_of(ast.parse(path.read_text())):
         if isinstance(statement, ast.Assign | ast.AnnAssign) and statement.value is not None:
             target = statement.targets[0] if isinstance(statement, ast.Assign) else statement.target
             for node in ast.walk(statement.value):
-                if is_number(node) and isinstance(node, ast.Constant) and node.value:
-                    yield Number(module, ast.unparse(target), node.lineno, node.col_offset)
+                if isinstance(node, ast.Constant) and is_number(node) and node.value:
+                    name = owner + ast.unparse(target)
+                    yield Number(module, name, node.lineno, node.col_offset)
+
+
+def statements_of(tree: ast.Module) -> Iterator[tuple[str, ast.stmt]]:
+    """Yield the statements of a module and of its options values, each with its owner's name."""
+    for statement in tree.body:
+        yield "", statement
+        if isinstance(statement, ast.ClassDef) and statement.name.endswith(OPTIONS):
+            for inner in statement.body:
+                yield f"{statement.name}.", inner
 
 
 class Moved(importlib.machinery.SourceFileLoader):
@@ -126,7 +143,7 @@ def cases(
             yield f"plan {name}", lambda name=name: plan_object(objects, name)
         yield "contact first", lambda: golden.plan("cylinder", 2, "barrett", "contact_first")
         yield "paper", lambda: golden.plan("jug", 0, "barrett", "paper")
-    if number is None or folder in (*CLOSED, "ik", "plan", "geometry", "shape"):
+    if number is None or folder in (*CLOSED, "contacts", "geometry", "hand", "ik", "shape"):
         for how in (
             "guarded, grip",
             "uncertainty",
@@ -287,13 +304,17 @@ def write_page(done: dict[str, str]) -> None:
 
 
 def reason_of(module: str, line: int) -> str:
-    """Return the comment behind the number at a line, or the docstring below it."""
+    """Return the comment behind or above the number at a line, or the docstring below it."""
     path = ROOT / "torchgrasp" / Path(*module.split("."))
     source = (
         (path / "__init__.py" if path.is_dir() else path.with_suffix(".py")).read_text().split("\n")
     )
     _, mark, comment = source[line - 1].partition("  # ")
-    return (comment if mark else source[line].strip('"')).replace("|", "/")
+    below = source[line].strip()
+    above = source[line - 2].strip()
+    if not mark:
+        comment = above[2:] if above.startswith("# ") else below.strip('"')
+    return comment.replace("|", "/")
 
 
 if __name__ == "__main__":

@@ -1,98 +1,166 @@
 #!/usr/bin/env python
-"""Count what a reader of the library meets, folder by folder: lines, files, numbers at module
-level, public names.
+"""Count how the library is built: tokens, packed assignments, numbers in function bodies, names
+that occur twice.
 
-python scripts/survey.py            the counts, and sentences of docstrings that are long
+python scripts/survey.py            the counts, folder by folder, and the names
 """
 
 import argparse
 import ast
-import re
+import io
 import sys
+import tokenize
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
-MOST_WORDS = 30
-"""Words of a sentence; longer ones are listed."""
+PLAIN = {0.0, 1.0, 2.0, 0.5, 3.0, 4.0, 10.0, 100.0, 1000.0, 180.0, 90.0, 360.0, 9.81}
+"""Numbers with a point that a function body may have: neutral ones, units and gravity."""
+FEW = range(-4, 11)
+"""Whole numbers that a function body may have: axes, rows and small counts."""
+COUNTED = {tokenize.NAME, tokenize.OP, tokenize.NUMBER}
+"""Tokens that are counted. Text, comments and line ends are free."""
 
 
-def main() -> int:
-    """Print the counts and the long sentences."""
-    counts = defaultdict(lambda: [0, 0, 0, 0])
-    public = set[str]()
-    long: list[str] = []
-    for path in sorted((ROOT / "torchgrasp").rglob("*.py")):
-        text = path.read_text()
-        inner = path.relative_to(ROOT / "torchgrasp")
-        tree = ast.parse(text)
-        count = counts["/".join(inner.parts[:-1]) or "torchgrasp"]
-        names = exported(tree)
-        for k, n in enumerate((len(text.splitlines()), 1, sum(numbers(tree)), len(names))):
-            count[k] += n
-        public |= names
-        long += [
-            f"{path.relative_to(ROOT)}:{line}: {sentence}"
-            for line, sentence in long_sentences(tree)
-        ]
-    total = [sum(count[k] for count in counts.values()) for k in range(3)]
-    print(f"{'folder':24}{'lines':>8}{'files':>8}{'numbers':>8}{'public':>8}")
-    for name, count in [*sorted(counts.items()), ("all, names once", [*total, len(public)])]:
-        print(f"{name:24}" + "".join(f"{n:8}" for n in count))
-    print(f"\n{len(long)} sentences of more than {MOST_WORDS} words", *long, sep="\n  ")
-    return 0
+class Counts(NamedTuple):
+    """The counts of a file or a folder. A line has code; packed assignments have tuples on both
+    sides.
+    """
+
+    files: int = 0
+    tokens: int = 0
+    lines: int = 0
+    assignments: int = 0
+    packed: int = 0
+    numbers: int = 0
+
+    def plus(self, other: "Counts") -> "Counts":
+        """Return the sum of two counts.
+
+        >>> Counts(1, 20, 3).plus(Counts(1, 30, 4)).tokens
+        50
+        """
+        return Counts(*(a + b for a, b in zip(self, other, strict=True)))
 
 
-def exported(tree: ast.Module) -> set[str]:
-    """Return the names in `__all__`."""
-    lists = [
-        n.value
-        for n in tree.body
-        if isinstance(n, ast.Assign) and ast.unparse(n.targets[0]) == "__all__"
+def count(source: str) -> Counts:
+    """Return the counts of the source of a file.
+
+    >>> count("a, b = 1, 2").packed
+    1
+    """
+    tree = ast.parse(source)
+    tokens = sum(
+        token.type in COUNTED for token in tokenize.generate_tokens(io.StringIO(source).readline)
+    )
+    assignments = [node for node in ast.walk(tree) if isinstance(node, ast.Assign)]
+    packed = [
+        node
+        for node in assignments
+        if isinstance(node.targets[0], ast.Tuple) and isinstance(node.value, ast.Tuple)
     ]
-    return {name for names in lists for name in ast.literal_eval(names)}
+    numbers = sum(1 for _ in numbers_in_bodies(tree))
+    return Counts(1, tokens, count_lines(source, tree), len(assignments), len(packed), numbers)
 
 
-def numbers(tree: ast.Module) -> Iterator[int]:
-    """Yield how many names each assignment of numbers at module level has."""
-    for node in tree.body:
-        if (
-            isinstance(node, ast.Assign | ast.AnnAssign)
-            and node.value is not None
-            and is_number(node.value)
-        ):
-            target = node.targets[0] if isinstance(node, ast.Assign) else node.target
-            yield len(target.elts) if isinstance(target, ast.Tuple) else 1
-
-
-def is_number(node: ast.expr) -> bool:
-    """Tell whether an expression is a number, a tuple of numbers, or arithmetic with one."""
-    match node:
-        case ast.Constant(value=value):
-            return type(value) in (int, float)
-        case ast.UnaryOp(operand=operand):
-            return is_number(operand)
-        case ast.BinOp(left=left, right=right):
-            return is_number(left) or is_number(right)
-        case ast.Tuple(elts=elements) | ast.List(elts=elements):
-            return bool(elements) and all(map(is_number, elements))
-    return False
-
-
-def long_sentences(tree: ast.Module) -> Iterator[tuple[int, str]]:
-    """Yield line and text of the long sentences of docstrings, without examples."""
+def count_lines(source: str, tree: ast.Module) -> int:
+    """Return how many lines have code: no docstring, no comment, nothing empty."""
+    told: set[int] = set()
     for node in ast.walk(tree):
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
-            prose = re.split(r"\n\s*>>>", ast.get_docstring(node) or "")[0]
-            for block in re.split(r"\n\s*\n|\n\s*(?=\w+: |\* )", prose):
-                for sentence in re.split(r"(?<=[.!?;])\s+", " ".join(block.split())):
-                    if len(re.findall(r"[A-Za-z][A-Za-z'-]*", sentence)) > MOST_WORDS:
-                        yield getattr(node, "lineno", 1), sentence
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+            if isinstance(node.value.value, str):
+                told |= set(range(node.lineno, (node.end_lineno or node.lineno) + 1))
+    lines = enumerate(source.splitlines(), start=1)
+    return sum(
+        bool(line.strip()) and not line.strip().startswith("#") and number not in told
+        for number, line in lines
+    )
+
+
+def numbers_in_bodies(tree: ast.Module) -> Iterator[ast.Constant]:
+    """Yield the numbers in function bodies that belong in an options value."""
+    for function in ast.walk(tree):
+        if not isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef):
+            continue
+        for statement in function.body:
+            if isinstance(statement, ast.FunctionDef | ast.ClassDef):
+                continue  # counted by itself
+            for node in ast.walk(statement):
+                if isinstance(node, ast.Constant) and is_tuned(node.value):
+                    yield node
+
+
+def is_tuned(value: object) -> bool:
+    """Tell whether a value is a number that needs a name.
+
+    >>> is_tuned(0.35), is_tuned(0.5), is_tuned(3), is_tuned(True)
+    (True, False, False, False)
+    """
+    if type(value) is float:
+        return abs(value) not in PLAIN
+    return type(value) is int and value not in FEW
+
+
+def twice(places: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
+    """Return the names that occur at several places.
+
+    >>> twice([("Row", "a.py"), ("Row", "b.py"), ("Cell", "a.py")])
+    {'Row': ['a.py', 'b.py']}
+    """
+    found = defaultdict(list)
+    for name, place in places:
+        found[name].append(place)
+    return {name: some for name, some in found.items() if len(some) > 1}
+
+
+def exported(tree: ast.Module) -> Iterator[str]:
+    """Yield the names in `__all__`."""
+    for node in tree.body:
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
+            yield from ast.literal_eval(node.value)
+
+
+def report(package: Path) -> str:
+    """Return the counts of a package by its folders, and the names that occur twice."""
+    folders = defaultdict(Counts)
+    files = list[tuple[str, str]]()
+    classes = list[tuple[str, str]]()
+    public = list[tuple[str, str]]()
+    for path in sorted(package.rglob("*.py")):
+        source = path.read_text()
+        place = path.relative_to(package).as_posix()
+        folder, slash, _ = place.partition("/")
+        tree = ast.parse(source)
+        name = folder if slash else package.name
+        folders[name] = folders[name].plus(count(source))
+        files += [(path.name, place)] if path.name != "__init__.py" else []
+        classes += [(node.name, place) for node in tree.body if isinstance(node, ast.ClassDef)]
+        public += [(name, place) for name in exported(tree)]
+    everything = Counts()
+    for found in folders.values():
+        everything = everything.plus(found)
+    heads = ("files", "tokens", "lines", "a line", "assigned", "packed", "numbers")
+    lines = [f"{'folder':16}" + "".join(f"{head:>10}" for head in heads)]
+    for name, found in [*sorted(folders.items()), ("all", everything)]:
+        rate = f"{found.tokens / max(found.lines, 1):.1f}"
+        cells = (*found[:3], rate, *found[3:])
+        lines.append(f"{name:16}" + "".join(f"{cell:>10}" for cell in cells))
+    for what, places in (
+        ("file names that occur twice", files),
+        ("class names that occur twice", classes),
+        ("public names in two lists", public),
+    ):
+        found = twice(places)
+        lines += ["", f"{len(found)} {what}"]
+        lines += [f"  {name}: {', '.join(some)}" for name, some in found.items()]
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":
     argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     ).parse_args()
-    sys.exit(main())
+    print(report(ROOT / "torchgrasp"))
+    sys.exit(0)
