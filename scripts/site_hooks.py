@@ -16,6 +16,7 @@ OUTSIDE = {
     "SECURITY.md": "SECURITY.md",
     "LICENSE": "LICENSE.md",
     "hands/README.md": "hands_README.md",
+    "examples/ros2/README.md": "examples_ros2.md",
     **{
         f"examples/{path.name}": f"examples_{path.stem}.md"
         for path in sorted((ROOT / "examples").iterdir())

@@ -56,9 +56,12 @@ def nearest_on_mesh(
 
     Only the triangles of the nearest samples are tried, for speed.
 
-    Args: mesh: the surface. points: [m]. facing: outward directions. The nearest point whose normal
-        is less than 90 degrees from it is returned: a finger outside of a wall does not touch its
-        inside. NaN where no sample nearby is turned so.
+    Args:
+        mesh: the surface.
+        points: [m].
+        facing: outward directions. The nearest point whose normal is less than 90 degrees from it
+            is returned: a finger outside of a wall does not touch its inside. NaN where no sample
+            nearby is turned so.
     """
     from scipy.spatial import KDTree
 

@@ -33,13 +33,16 @@ BESIDE = 0.02
 class Perturbation:
     """The errors of one factor or of several; the default has none.
 
-    Args: mass: whether the object has its own mass (`household_mass`) instead of the trial's.
+    Args:
+        mass: whether the object has its own mass (`household_mass`) instead of the trial's.
         friction: range of the true friction, unknown to the planner; None: the trial's friction.
-        table: error of the table's height [m], up or down. up: error of the table's normal [rad],
-        about the point below the cloud. camera: errors of the camera's pose: translation [m], and
-        rotation [rad] about the camera. mask: share of the cloud's points on the table, and share
-        of the object's points lost at its rim. depth: standard deviation of additional noise along
-        the camera's rays [m]. pose: of the object, which moves after the image was taken.
+        table: error of the table's height [m], up or down.
+        up: error of the table's normal [rad], about the point below the cloud.
+        camera: errors of the camera's pose: translation [m], and rotation [rad] about the camera.
+        mask: share of the cloud's points on the table, and share of the object's points lost at its
+            rim.
+        depth: standard deviation of additional noise along the camera's rays [m].
+        pose: of the object, which moves after the image was taken.
     """
 
     mass: bool = False

@@ -57,8 +57,10 @@ def cross_validate(
         observer: called after each fit with its number of components and its fold.
         fit: iterations, tolerance and regularisation of `fit_mixture`.
 
-    Raises: BadArgument: no number to try, folds outside [2, half the samples], or what
-        `fit_mixture` refuses. IndefiniteCovariance: as `fit_mixture`.
+    Raises:
+        BadArgument: no number to try, folds outside [2, half the samples], or what `fit_mixture`
+            refuses.
+        IndefiniteCovariance: as `fit_mixture`.
     """
     if not components:
         raise BadArgument("components", "none", "at least one number")

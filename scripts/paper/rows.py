@@ -61,14 +61,21 @@ class TableSpec(Value):
     """What a table is made of. A campaign that is stopped goes on where it was, if it is called
     again alike.
 
-    Args: out: folder of the results, and of the plans and cells that are kept. After a change of
-        the code, take another. objects: folders of objects with noisy views, besides the library's
-        own. hands: by name. only: names of objects to keep; by default all. own: whether the
-        library's own objects take part. representatives: take one object of each family, the first
-        by name. finished: make the table of the objects that an earlier call has finished, and run
-        nothing. views: views of each object. grasps: grasps of each view. draws: lifts of each
-        grasp, with an error of the pose each. starts: of the contact planner. workers: processes;
-        the results do not depend on their number. seed: of every random draw.
+    Args:
+        out: folder of the results, and of the plans and cells that are kept. After a change of the
+            code, take another.
+        objects: folders of objects with noisy views, besides the library's own.
+        hands: by name.
+        only: names of objects to keep; by default all.
+        own: whether the library's own objects take part.
+        representatives: take one object of each family, the first by name.
+        finished: make the table of the objects that an earlier call has finished, and run nothing.
+        views: views of each object.
+        grasps: grasps of each view.
+        draws: lifts of each grasp, with an error of the pose each.
+        starts: of the contact planner.
+        workers: processes; the results do not depend on their number.
+        seed: of every random draw.
     """
 
     out: Path

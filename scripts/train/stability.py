@@ -309,11 +309,15 @@ def stability(
 ) -> None:
     """Learn which grasps of a hand are stable from simulated pulls.
 
-    Args: hand: name of a shipped hand, or the folder of another. trials: of each body. components:
-        Gaussians of each mixture; default: 1 to 3, whichever is likeliest on bodies left out. seed:
-        of every draw. workers: processes that run trials. keep: file in which the trials are kept,
-        and from which they are taken where it exists. out: file to write; default:
-        stability.safetensors in the hand's folder.
+    Args:
+        hand: name of a shipped hand, or the folder of another.
+        trials: of each body.
+        components: Gaussians of each mixture; default: 1 to 3, whichever is likeliest on bodies
+            left out.
+        seed: of every draw.
+        workers: processes that run trials.
+        keep: file in which the trials are kept, and from which they are taken where it exists.
+        out: file to write; default: stability.safetensors in the hand's folder.
     """
     torch.set_num_threads(1)  # small products: further threads only spin
     robot = load_hand(hand)

@@ -57,9 +57,12 @@ def success(
     """Fit the model of predicted success to data sets of trials, judge it on families left out, and
     write it.
 
-    Args: folders: of `scripts/train.py trials`. best: of the same with `--best`, after a fit to the
-        same folders; without one the model makes no promise. workers: processes that measure the
-        grasps; the features are kept in the folders. model: file of the model.
+    Args:
+        folders: of `scripts/train.py trials`.
+        best: of the same with `--best`, after a fit to the same folders; without one the model
+            makes no promise.
+        workers: processes that measure the grasps; the features are kept in the folders.
+        model: file of the model.
     """
     torch.set_num_threads(1)
     trials = read_trials(list_hands(folders), workers)

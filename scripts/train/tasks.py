@@ -38,12 +38,15 @@ ASIDE = PoseNoise(0.03)
 class Task(Value):
     """One trial's task.
 
-    Args: lift: whether the object is lifted off a table and held without slip; otherwise it floats
-        and is pulled at. closing: "uncertainty" or "open_loop". friction: at the fingertips; that
-        of the table is in the same proportion to it as in protocol "table-lift". mass: of the
-        object [kg]; the pulls press with 10 m/s^2 times the mass. force: of the strongest finger
-        [N]; None: the hand grips as the felt load asks for. errs: whether the object is not where
-        the planner saw it.
+    Args:
+        lift: whether the object is lifted off a table and held without slip; otherwise it floats
+            and is pulled at.
+        closing: "uncertainty" or "open_loop".
+        friction: at the fingertips; that of the table is in the same proportion to it as in
+            protocol "table-lift".
+        mass: of the object [kg]; the pulls press with 10 m/s^2 times the mass.
+        force: of the strongest finger [N]; None: the hand grips as the felt load asks for.
+        errs: whether the object is not where the planner saw it.
     """
 
     lift: bool

@@ -101,11 +101,14 @@ def trials(
 ) -> None:
     """Try grasps of all hands on household bodies; what is in the folder is not run again.
 
-    Args: folder: of the data sets, one for each hand. bodies: number of bodies; they are shared
-        among the hands. workers: number of processes, or the address of a Dask scheduler. hands:
-        whose share is tried. first: number of the first body, so that more bodies can follow in a
-        folder of their own. best: try the best grasp for ordinary tasks, on bodies of the families
-        that calibrate the model.
+    Args:
+        folder: of the data sets, one for each hand.
+        bodies: number of bodies; they are shared among the hands.
+        workers: number of processes, or the address of a Dask scheduler.
+        hands: whose share is tried.
+        first: number of the first body, so that more bodies can follow in a folder of their own.
+        best: try the best grasp for ordinary tasks, on bodies of the families that calibrate the
+            model.
     """
     for hand in hands:
         counts = run_trials(hand, bodies, folder, workers, first=first, best=best).card["counts"]

@@ -122,9 +122,11 @@ def drop(objects: Path | None, count: tuple[int, int], seed: int) -> PlacedScene
     An object falls upright, turned at random and slightly tilted, from just above what lies below
     it. An object that rolls away is dropped again.
 
-    Args: objects: folder of NAME/mesh.ply [m], with or without manifest.json; None: the library's
-        own objects. count: least and largest number of objects; some are dropped twice where there
-        are too few. seed: of every random number.
+    Args:
+        objects: folder of NAME/mesh.ply [m], with or without manifest.json; None: the library's own
+            objects.
+        count: least and largest number of objects; some are dropped twice where there are too few.
+        seed: of every random number.
 
     Raises:
         BadArgument: no objects, or no scene comes to rest in view.
