@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 from torchgrasp.app.report.canvas import ALARM, SHADOW, Camera, Canvas, rgb
-from torchgrasp.app.report.film import STILL, TITLE, WIDTH, _list_plots, describe_film, draw_film
+from torchgrasp.app.report.film import FILM, _list_plots, describe_film, draw_film
 from torchgrasp.app.report.run_data import explain_loss, find_loss, moments_of, moved_in_hand
 from torchgrasp.foundation.errors import Status
 from torchgrasp.values.closing import ClosingTrace
@@ -141,13 +141,15 @@ def test_the_film_shows_the_loss_in_its_colour_and_the_object_falling_behind(run
     held = picture(draw_film(run.mesh, run.hand, closing, (1.0, 0.0, 0.3)))
     out = slipping(closing, 60)
     gone = picture(draw_film(run.mesh, run.hand, out, (1.0, 0.0, 0.3)))
-    assert held.shape == gone.shape and held.shape[1] == WIDTH
-    assert not near(held[:TITLE], ALARM).any() and near(gone[:TITLE], ALARM).any()
-    assert near(gone[STILL:], ALARM).sum() > near(held[STILL:], ALARM).sum() + 300
+    assert held.shape == gone.shape and held.shape[1] == FILM.width
+    assert not near(held[: FILM.title], ALARM).any() and near(gone[: FILM.title], ALARM).any()
+    assert near(gone[FILM.still :], ALARM).sum() > near(held[FILM.still :], ALARM).sum() + 300
 
     def height(film, count, k):
         """The lowest row of the sand-coloured object in a still; the hand may hide its upper part."""
-        tile = film[TITLE:STILL, k * WIDTH // count : (k + 1) * WIDTH // count]
+        tile = film[
+            FILM.title : FILM.still, k * FILM.width // count : (k + 1) * FILM.width // count
+        ]
         sand = (tile[..., 0] > tile[..., 2] + 25) & (tile[..., 0] < tile[..., 1] + 45)
         return np.nonzero(sand)[0].max()
 

@@ -12,11 +12,9 @@ import trimesh
 from torchgrasp.app.report.page import format_page
 from torchgrasp.app.report.solids import EDGE, round_shape, solids_from_hand, solids_of_links
 from torchgrasp.app.report.viewer import (
-    MOST_FACES,
-    MOST_GRASPS,
-    MOST_TICKS,
     POSTURES,
     VIEW,
+    VIEWER,
     describe,
     format_viewer,
     thin_mesh,
@@ -168,14 +166,14 @@ def test_a_long_run_is_thinned_to_what_a_page_holds(run):
     page = format_viewer(dataclasses.replace(run, closure=closure, grasps=many, mesh=fine))
     seen = data_of(page)
     assert (
-        seen["replay"]["ticks"]["shape"] == [MOST_TICKS]
+        seen["replay"]["ticks"]["shape"] == [VIEWER.ticks]
         and unpack(seen["replay"]["ticks"])[-1] == ticks - 1
     )
     assert (
         seen["replay"]["forces"]["shape"] == [ticks, 3]
-        and len(seen["grasps"]["rows"]) == MOST_GRASPS
+        and len(seen["grasps"]["rows"]) == VIEWER.grasps
     )
-    assert seen["replay"]["faces"]["shape"][0] <= MOST_FACES < len(fine.faces)
+    assert seen["replay"]["faces"]["shape"][0] <= VIEWER.faces < len(fine.faces)
     assert len(page) < 8 * 2**20
 
 

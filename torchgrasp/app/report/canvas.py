@@ -2,6 +2,7 @@
 without OpenGL.
 """
 
+import dataclasses
 import io
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -41,6 +42,96 @@ ALARM = "#c2452d"
 object was lost.
 """
 SIZE = (720, 576)  # width and height of a still [pixels]: twice its size on a page of three columns
+FULL = 255  # largest value of a colour part in a byte
+
+
+@dataclasses.dataclass(frozen=True)
+class MarkShapes:
+    """Sizes of points, arrows and the table in a picture, chosen by eye."""
+
+    point_radius: float = 0.006  # share of the diagonal of all points
+    # parts of an arrow, in lengths of the arrow; the shaft ends inside the head
+    head_radius: float = 0.1
+    head_length: float = 0.35
+    head_start: float = 0.65
+    shaft_radius: float = 0.035
+    shaft_length: float = 0.75
+    ball_radius: float = 0.13
+    arrow_sections: int = 8  # sides of head and shaft
+    table_radius: float = 0.55  # share of the diagonal of all corners seen from above
+    table_rim: float = 0.02  # added to the radius [m], so that a small object has a table, too
+    table_sections: int = 120  # corners of the round table top
+    table_thickness: float = 1e-4  # [m]
+    # depths below the true height [m]: the object hides shadows, and shadows hide the table
+    table_depth: float = 1e-3
+    shadow_depth: float = 5e-4
+
+
+@dataclasses.dataclass(frozen=True)
+class Framing:
+    """Where a camera stands that shows a set of corners."""
+
+    angle: float = 24.0  # vertical field of view [degrees]: a long lens distorts little
+    # least and greatest rise for each metre along the ground: straight down, or up from below the
+    # table, a camera shows little
+    lowest: float = 0.27
+    highest: float = 0.84
+    margin: float = 1.12  # distance beyond the nearest at which all corners are in view
+    level: float = 1e-9  # a direction with less of x and y [m] is vertical
+    fallback: tuple[float, float] = (1.0, -0.8)  # x and y instead of a vertical direction
+    bar_drop: float = 0.09  # share of the picture that stays empty below for a colour bar
+    squeeze: float = 1.5  # loss of height for each empty share: the share, and half of it above
+
+
+@dataclasses.dataclass(frozen=True)
+class RasterNumbers:
+    """How triangles become pixels."""
+
+    samples: int = 2  # along each axis of a pixel; their mean gives smooth edges
+    opacity: float = 0.5  # of transparent triangles
+    nearest: float = 1e-6  # least distance from the camera [m]; the scene is framed in front of it
+    thinnest: float = 1e-9  # twice the least area [pixels]: seen from its edge, a triangle is thin
+    # Triangles that share an edge both cover a centre within this distance [pixels] of it, so that
+    # no crack is left between them.
+    tie: float = 1e-6
+
+
+@dataclasses.dataclass(frozen=True)
+class Lamps:
+    """Two lamps fixed to the camera, chosen by eye; directions are right, up and back."""
+
+    ambient: float = 0.52
+    key_strength: float = 0.50
+    fill_strength: float = 0.22
+    shine_strength: float = 0.08
+    key: Direction = (-0.45, 0.65, 0.62)
+    fill: Direction = (0.70, 0.10, 0.60)
+    shininess: int = 40  # exponent: larger makes the highlight smaller
+    least_normal: float = 1e-12  # a face without area has a normal of length 0
+
+
+@dataclasses.dataclass(frozen=True)
+class BarLayout:
+    """Layout of a colour bar at the bottom of a picture [pixels]."""
+
+    side: int = 5  # the bar leaves one such part of the width free on each side
+    top: int = 24  # of the strip, from the bottom of the picture
+    bottom: int = 10
+    font: int = 20
+    labels: int = 4  # numbers above the strip
+    label_rise: int = 4  # of the numbers and of the title above the strip
+    title_rise: int = 29
+
+
+MARKS = MarkShapes()
+FRAMING = Framing()
+RASTER = RasterNumbers()
+LAMPS = Lamps()
+BAR = BarLayout()
+SMOOTH_BEND = 40.0  # faces that bend by less [degrees] look like one smooth surface
+STD_QUANTILE = 0.99  # of the standard deviations that a colour map spans: few outliers
+LEAST_STD = 1e-6  # least span of a colour map of standard deviations [m]
+PNG_LEVEL = 4  # of compression: higher is slower and hardly smaller
 
 
 class Triangles(NamedTuple):
@@ -93,10 +184,9 @@ class Canvas:
 
     def add_points(self, points: Points, colors: Points) -> None:
         """Add points as small balls, each in its colour."""
-        ball = trimesh.creation.icosphere(
-            subdivisions=0, radius=0.006 * float(np.linalg.norm(np.ptp(points, axis=0)))
-        )
-        # too small on the page for its faces to show
+        # so small on the page that the faces of the balls do not show
+        radius = MARKS.point_radius * float(np.linalg.norm(np.ptp(points, axis=0)))
+        ball = trimesh.creation.icosphere(subdivisions=0, radius=radius)
         n = len(points)
         k = len(ball.vertices)
         faces = (k * np.arange(n)[:, None, None] + ball.faces).reshape(-1, 3)
@@ -109,14 +199,20 @@ class Canvas:
         """Add arrows of one length [m] in unit directions, each with its colour and a small ball at
         its start.
         """
-        head = trimesh.creation.cone(radius=0.1, height=0.35, sections=8)
-        head.apply_translation([0.0, 0.0, 0.65])
-        shaft = trimesh.creation.cylinder(
-            radius=0.035, segment=[[0.0, 0.0, 0.0], [0.0, 0.0, 0.75]], sections=8
+        sections = MARKS.arrow_sections
+        head = trimesh.creation.cone(
+            radius=MARKS.head_radius, height=MARKS.head_length, sections=sections
         )
+        head.apply_translation([0.0, 0.0, MARKS.head_start])
+        shaft = trimesh.creation.cylinder(
+            radius=MARKS.shaft_radius,
+            segment=[[0.0, 0.0, 0.0], [0.0, 0.0, MARKS.shaft_length]],
+            sections=sections,
+        )
+        ball = trimesh.creation.icosphere(subdivisions=1, radius=MARKS.ball_radius)
         for start, direction, color in zip(points, directions, colors, strict=True):
             turn = np.asarray(trimesh.geometry.align_vectors([0.0, 0.0, 1.0], direction))[:3, :3]
-            for part in (trimesh.creation.icosphere(subdivisions=1, radius=0.13), shaft, head):
+            for part in (ball, shaft, head):
                 self.add_mesh(length * part.vertices @ turn.T + start, part.faces, color)
 
     def add_table(
@@ -133,13 +229,18 @@ class Canvas:
         """
         if height is None:
             return
-        radius = 0.55 * float(np.linalg.norm(np.ptp(corners[:, :2], axis=0))) + 0.02
-        top = trimesh.creation.cylinder(radius, 1e-4, sections=120)
-        center = np.append((corners[:, :2].min(0) + corners[:, :2].max(0)) / 2, height - 1e-3)
+        across = corners[:, :2]
+        radius = MARKS.table_radius * float(np.linalg.norm(np.ptp(across, axis=0)))
+        top = trimesh.creation.cylinder(
+            radius + MARKS.table_rim, MARKS.table_thickness, sections=MARKS.table_sections
+        )
+        center = np.append((across.min(0) + across.max(0)) / 2, height - MARKS.table_depth)
         self.add_mesh(top.vertices + center, top.faces, TABLE, lit=False)
         for vertices, faces in shadows:
-            flat = np.column_stack([vertices[:, :2], np.full(len(vertices), height - 5e-4)])
-            self.add_mesh(flat, faces, SHADOW, np.tile([0.0, 0.0, 1.0], (len(flat), 1)), lit=False)
+            level = np.full(len(vertices), height - MARKS.shadow_depth)
+            flat = np.column_stack([vertices[:, :2], level])
+            up = np.tile([0.0, 0.0, 1.0], (len(flat), 1))
+            self.add_mesh(flat, faces, SHADOW, up, lit=False)
 
     def render(self, camera: Camera, size: tuple[int, int] = SIZE) -> UInt8[np.ndarray, "h w 3"]:
         """Return the picture that a camera sees, as pixels."""
@@ -153,7 +254,8 @@ class Canvas:
         """Return a PNG that shows all `corners` [m]; `bar` is title, largest value and colour map
         of a bar below.
         """
-        image = Image.fromarray(self.render(frame_camera(corners, direction, 0.09 if bar else 0.0)))
+        camera = frame_camera(corners, direction, FRAMING.bar_drop if bar else 0.0)
+        image = Image.fromarray(self.render(camera))
         if bar:
             draw_bar(image, *bar)
         return encode_png(image)
@@ -165,15 +267,13 @@ def frame_camera(
     """Return a camera in `direction` that sees all `corners`; the lowest fraction `drop` of its
     picture stays empty.
     """
-    angle = np.deg2rad(24.0)  # a long lens distorts little
+    tangent = np.tan(np.deg2rad(FRAMING.angle) / 2)
     x, y, z = direction
     flat = float(np.hypot(x, y))
-    if flat < 1e-9:
-        x = 1.0
-        y = -0.8
-        flat = float(np.hypot(1.0, -0.8))
-    # A camera that looks straight down, or up from below the table, shows little.
-    back = np.array([x, y, np.clip(z, 0.27 * flat, 0.84 * flat)])
+    if flat < FRAMING.level:
+        x, y = FRAMING.fallback
+        flat = float(np.hypot(x, y))
+    back = np.array([x, y, np.clip(z, FRAMING.lowest * flat, FRAMING.highest * flat)])
     back /= np.linalg.norm(back)
     right = np.cross([0.0, 0.0, 1.0], back)
     right /= np.linalg.norm(right)
@@ -182,25 +282,23 @@ def frame_camera(
     middle = (local.min(0) + local.max(0)) / 2
     half = np.ptp(local, axis=0) / 2
     # The nearest corners look largest, so the distance is counted from them.
-    reach = max(half[1] / (1.0 - 1.5 * drop), half[0] * size[1] / size[0]) / np.tan(angle / 2)
-    distance = half[2] + 1.12 * reach
-    center = middle @ frame - frame[1] * drop * distance * np.tan(angle / 2)
-    return Camera(center + back * distance, frame, float(angle))
+    high = half[1] / (1.0 - FRAMING.squeeze * drop)
+    wide = half[0] * size[1] / size[0]
+    distance = half[2] + FRAMING.margin * (max(high, wide) / tangent)
+    center = middle @ frame - frame[1] * drop * distance * tangent
+    return Camera(center + back * distance, frame, float(np.deg2rad(FRAMING.angle)))
 
 
 def sharp_normals(
     vertices: Float[np.ndarray, "v 3"], faces: np.ndarray
 ) -> Float[np.ndarray, "f 3 3"]:
-    """Return a normal for each corner of each face; faces that bend by less than 40 degrees are one
-    smooth surface.
-    """
-    smooth = trimesh.graph.smooth_shade(
-        trimesh.Trimesh(vertices, faces), np.deg2rad(40.0), facet_minarea=None
-    )
+    """Return a normal for each corner of each face; only edges with a strong bend look sharp."""
+    mesh = trimesh.Trimesh(vertices, faces)
+    smooth = trimesh.graph.smooth_shade(mesh, np.deg2rad(SMOOTH_BEND), facet_minarea=None)
+    # the surface was split at its sharp edges, which changed the order of the faces
+    order = np.concatenate(smooth.metadata["original_components"])
     normals = np.empty((len(faces), 3, 3))
-    normals[np.concatenate(smooth.metadata["original_components"])] = smooth.vertex_normals[
-        smooth.faces
-    ]
+    normals[order] = smooth.vertex_normals[smooth.faces]
     return normals
 
 
@@ -221,7 +319,7 @@ def render(
     """Return the pixels of a picture of opaque triangles; over them lies the nearest layer of
     transparent triangles.
     """
-    samples = 2  # samples of a pixel along each axis; the mean of the samples gives smooth edges
+    samples = RASTER.samples
     width = size[0] * samples
     height = size[1] * samples
     image = np.tile(np.array(background, dtype=np.float32), (height * width, 1))
@@ -231,9 +329,9 @@ def render(
     near[sample] = inverse_distance
     sample, inverse_distance, color = _cast(transparent, camera, width, height)
     front = inverse_distance > near[sample]
-    image[sample[front]] += 0.5 * (color[front] - image[sample[front]])
+    image[sample[front]] += RASTER.opacity * (color[front] - image[sample[front]])
     pixels = image.reshape(size[1], samples, size[0], samples, 3).mean((1, 3))
-    return (255.0 * np.clip(pixels, 0.0, 1.0) + 0.5).astype(np.uint8)
+    return (FULL * np.clip(pixels, 0.0, 1.0) + 0.5).astype(np.uint8)
 
 
 def _cast(
@@ -243,36 +341,31 @@ def _cast(
     nearest one.
     """
     local = (triangles.corners - camera.position) @ camera.frame.T
-    near = 1.0 / np.maximum(-local[..., 2], 1e-6)  # the scene is framed in front of the camera
+    near = 1.0 / np.maximum(-local[..., 2], RASTER.nearest)
     focal = height / 2 / np.tan(camera.angle / 2)
     x = width / 2 + focal * local[..., 0] * near
     y = height / 2 - focal * local[..., 1] * near
-    # A value that is linear in space is, divided by its distance, linear on the screen: a x + b y +
-    # c.
+    # A value that is linear in space is, divided by its distance, linear on the screen:
+    # a x + b y + c.
     values = np.concatenate([near[..., None], _shade(triangles, camera) * near[..., None]], -1)
     screen = np.stack([x, y, np.ones_like(x)], -1)
-    seen = np.abs(np.linalg.det(screen)) > 1e-9  # a triangle seen from its edge covers nothing
-    # of the corners, as functions of x, y and 1
+    seen = np.abs(np.linalg.det(screen)) > RASTER.thinnest
+    # weights of the corners, as functions of x, y and 1: (t, 3, 3)
     weights = np.linalg.inv(screen[seen])
     y = y[seen]
     planes = weights @ values[seen]
 
     # Sample centres lie at integers + 0.5; in each row a triangle covers those where no weight is
     # negative.
-    owner, row = _ranges(
-        *(np.clip(np.ceil(end - 0.5), 0, height).astype(np.int64) for end in (y.min(1), y.max(1)))
-    )
+    owner, row = _ranges(*(_first_centre(end, height) for end in (y.min(1), y.max(1))))
     slope = weights[owner, 0]
     rest = weights[owner, 1] * (row + 0.5)[:, None] + weights[owner, 2]
     zero = -rest / np.where(slope == 0.0, 1.0, slope)
     begin = np.where(slope > 0.0, zero, -np.inf).max(1)
     end = np.where(slope < 0.0, zero, np.inf).min(1)
-    # triangles that share an edge both cover a centre on it, so that no crack is left between them
-    tie = 1e-6
-    begin, end = (
-        np.clip(np.ceil(e - 0.5), 0, width).astype(np.int64) for e in (begin - tie, end + tie)
+    span, column = _ranges(
+        _first_centre(begin - RASTER.tie, width), _first_centre(end + RASTER.tie, width)
     )
-    span, column = _ranges(begin, end)
 
     flat = planes[owner, 1] * (row + 0.5)[:, None] + planes[owner, 2]  # b y + c
     near = planes[owner, 0, 0][span] * (column + 0.5) + flat[span, 0]
@@ -285,6 +378,11 @@ def _cast(
     near = near[first]
     color = planes[owner[span], 0, 1:] * (column + 0.5)[:, None] + flat[span, 1:]
     return sample[first], near, color / near[:, None]
+
+
+def _first_centre(place: np.ndarray, most: int) -> Int[np.ndarray, " n"]:
+    """Return the index of the first sample centre at or after each place, from 0 to `most`."""
+    return np.clip(np.ceil(place - 0.5), 0, most).astype(np.int64)
 
 
 def _ranges(
@@ -301,34 +399,29 @@ def _ranges(
 
 def _shade(triangles: Triangles, camera: Camera) -> Float[np.ndarray, "t 3 3"]:
     """Return the colours of the corners, lit by two lamps fixed to the camera."""
-    # chosen by eye, as are the lamps
-    ambient = 0.52
-    key_strength = 0.50
-    fill_strength = 0.22
-    shine_strength = 0.08
-    key, fill = (
-        np.array(lamp) / np.linalg.norm(lamp) for lamp in ((-0.45, 0.65, 0.62), (0.70, 0.10, 0.60))
-    )
+    key = np.array(LAMPS.key) / np.linalg.norm(LAMPS.key)
+    fill = np.array(LAMPS.fill) / np.linalg.norm(LAMPS.fill)
     normal = triangles.normals @ camera.frame.T
-    normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    normal = normal / np.maximum(length, LAMPS.least_normal)
+    # a triangle has no back: seen from there, its normals are reversed
     normal = np.where(normal[..., 2].sum(1)[:, None, None] < 0.0, -normal, normal)
-    half = key + np.array([0.0, 0.0, 1.0])
     light = (
-        ambient
-        + key_strength * np.maximum(normal @ key, 0.0)
-        + fill_strength * np.maximum(normal @ fill, 0.0)
+        LAMPS.ambient
+        + LAMPS.key_strength * np.maximum(normal @ key, 0.0)
+        + LAMPS.fill_strength * np.maximum(normal @ fill, 0.0)
     )
-    shine = shine_strength * np.maximum(normal @ (half / np.linalg.norm(half)), 0.0) ** 40
+    half = key + np.array([0.0, 0.0, 1.0])
+    mirrored = np.maximum(normal @ (half / np.linalg.norm(half)), 0.0)
+    shine = LAMPS.shine_strength * mirrored**LAMPS.shininess
     lit = triangles.lit[:, None]
-    return (
-        triangles.colors * np.where(lit, light, 1.0)[..., None]
-        + np.where(lit, shine, 0.0)[..., None]
-    )
+    matt = triangles.colors * np.where(lit, light, 1.0)[..., None]
+    return matt + np.where(lit, shine, 0.0)[..., None]
 
 
 def rgb(color: str) -> Color:
     """Return the red, green and blue parts, each in [0, 1], of a colour written as "#rrggbb"."""
-    red, green, blue = (x / 255 for x in bytes.fromhex(color[1:]))
+    red, green, blue = (x / FULL for x in bytes.fromhex(color[1:]))
     return red, green, blue
 
 
@@ -341,33 +434,34 @@ def color_std(std_m: Float[np.ndarray, " n"]) -> tuple[Points, float]:
     """Return the colours of standard deviations [m], and the one that has the last colour: all but
     a hundredth.
     """
-    most = max(float(np.quantile(std_m, 0.99)), 1e-6) if len(std_m) else 1e-6
+    highest = float(np.quantile(std_m, STD_QUANTILE)) if len(std_m) else 0.0
+    most = max(highest, LEAST_STD)
     return map_colors(std_m / most, "viridis"), most
 
 
 def draw_bar(image: Any, title: str, most: float, colors: str) -> None:
     """Draw a titled colour bar from 0 to `most` at the bottom of a picture."""
     width, height = image.size
-    left = width // 5
-    right = width - width // 5
-    top = height - 24
-    bottom = height - 10
+    left = width // BAR.side
+    right = width - left
+    top = height - BAR.top
+    bottom = height - BAR.bottom
     ramp = map_colors(np.linspace(0.0, 1.0, right - left), colors)
-    strip = (255 * np.broadcast_to(ramp, (bottom - top, *ramp.shape)) + 0.5).astype(np.uint8)
+    strip = (FULL * np.broadcast_to(ramp, (bottom - top, *ramp.shape)) + 0.5).astype(np.uint8)
     image.paste(Image.fromarray(strip), (left, top))
     draw = ImageDraw.Draw(image)
-    font = ImageFont.load_default(20)
-    for i in range(4):
-        draw.text(
-            (left + i * (right - left) / 3, top - 4), f"{most * i / 3:.1f}", INK, font, anchor="ms"
-        )
-    draw.text(((left + right) / 2, top - 29), title, INK, font, anchor="ms")
+    font = ImageFont.load_default(BAR.font)
+    gaps = BAR.labels - 1
+    for i in range(BAR.labels):
+        place = (left + i * (right - left) / gaps, top - BAR.label_rise)
+        draw.text(place, f"{most * i / gaps:.1f}", INK, font, anchor="ms")
+    draw.text(((left + right) / 2, top - BAR.title_rise), title, INK, font, anchor="ms")
 
 
 def encode_png(image: Any) -> bytes:
     """Return the bytes of a PNG of a Pillow image."""
     buffer = io.BytesIO()
-    image.save(buffer, format="PNG", compress_level=4)
+    image.save(buffer, format="PNG", compress_level=PNG_LEVEL)
     return buffer.getvalue()
 
 

@@ -2,6 +2,7 @@
 time.
 """
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -18,11 +19,61 @@ from torchgrasp.geometry.frames import apply
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values.closing import ClosureResult
 
-WIDTH = 1680
-STILL = 340
-TITLE = 44
-"""Width of the strip, height of its stills with titles, and height of a title [pixels]."""
+
+@dataclasses.dataclass(frozen=True)
+class FilmLayout:
+    """Layout of a film strip: stills in a row, and plots below them [pixels; fonts in points]."""
+
+    dpi: int = 100
+    width: int = 1680
+    still: int = 340  # height of a still with its title
+    title: int = 44  # height of this title
+    title_left: float = 0.04  # place of the title, as a share of the still's width
+    font: int = 14
+    small_font: int = 12  # of the titles of many stills, so that they fit
+    many: int = 6
+    tall_plot: int = 200  # height of a plot with a legend
+    plot: int = 110
+    plot_gap: int = 50  # above each plot, for its title
+    plots_top: int = 62  # between stills and plots, for the letters of the moments
+    plots_bottom: int = 60  # for the axis of time
+    bottom: int = 76  # height beside stills, plots and their gaps
+    left: float = 0.05  # ends of the plots, as shares of the width
+    right: float = 0.985
+    letter_rise: int = 30  # of a letter above the first plot [points]
+    touch: int = 12  # size of the mark at a finger's first touch [points]
+    far: float = 0.25  # an object this far from its first place [m] is lost, and is not framed
+
+
+@dataclasses.dataclass(frozen=True)
+class PlotStyle:
+    """Look of the plots in a film strip [points], and the least ends of their axes."""
+
+    font: int = 13
+    title_gap: int = 9
+    ticks: int = 3  # most intervals of the vertical axis
+    line: float = 1.8
+    wide: float = 4.0  # of the hand's height, which a held object would cover
+    handle: float = 1.2  # length of a line in the legend, in font sizes
+    legend_top: float = 0.96  # lower end of the legend, as a share of the plot's height
+    room: float = 1.1  # upper end of an axis, in largest values
+    least_time: float = 0.1  # [s]
+    least_force: float = 1.0  # [N]
+    least_motion: float = 20.0  # [mm]
+    most_sliding: float = 100.0  # [mm/s]: a lost object slides faster
+
+
+FILM = FilmLayout()
+PLOTS = PlotStyle()
 LETTERS = "abcdefgh"  # names of the moments in stills and plots
+HAND_HEIGHT = "hand above its lowest"  # name of the line
+MOTION_COLORS = {
+    HAND_HEIGHT: "#9aa2ac",
+    "object from its place": "#b5792a",
+    "object in the hand since pressed": "#8a4f9e",
+    "its turn in the hand [deg]": "#c77cba",
+}
+"""Colours of the lines of the plot of motion, by name."""
 
 
 def draw_film(
@@ -37,50 +88,58 @@ def draw_film(
     plots = _list_plots(mesh, hand, closure)
     time = to_array(closure.time)
     count = len(moments)
-    heights = [200 if title.endswith(":") else 110 for title, *_ in plots]
-    height = STILL + sum(heights) + 50 * len(plots) + 76
-    figure = Figure((WIDTH / 100, height / 100), dpi=100, facecolor=paint.PAPER)
+    heights = [FILM.tall_plot if title.endswith(":") else FILM.plot for title, *_ in plots]
+    height = FILM.still + sum(heights) + FILM.plot_gap * len(plots) + FILM.bottom
+    size = FILM.width / FILM.dpi, height / FILM.dpi
+    figure = Figure(size, dpi=FILM.dpi, facecolor=paint.PAPER)
     stills = _draw_stills(mesh, hand, closure, [m.tick for m in moments], direction)
+    font = FILM.font if count < FILM.many else FILM.small_font
+    bottom = 1 - FILM.still / height
+    shown = (FILM.still - FILM.title) / height
     for k, (still, moment) in enumerate(zip(stills, moments, strict=True)):
-        axis = figure.add_axes((k / count, 1 - STILL / height, 1 / count, (STILL - TITLE) / height))
+        axis = figure.add_axes((k / count, bottom, 1 / count, shown))
         axis.imshow(still, aspect="auto")
         axis.set_axis_off()
         title = f"{LETTERS[k]}  {float(closure.time[moment.tick]):.2f} s  {moment.name}"
-        axis.set_title(
-            title, loc="left", x=0.04, color=moment.color, fontsize=14 if count < 6 else 12
-        )
+        axis.set_title(title, loc="left", x=FILM.title_left, color=moment.color, fontsize=font)
 
     figure.subplots_adjust(
-        0.05, 60 / height, 0.985, 1 - (STILL + 62) / height, hspace=50 / float(np.mean(heights))
+        FILM.left,
+        FILM.plots_bottom / height,
+        FILM.right,
+        1 - (FILM.still + FILM.plots_top) / height,
+        hspace=FILM.plot_gap / float(np.mean(heights)),
     )
     axes = figure.subplots(len(plots), sharex=True, squeeze=False, height_ratios=heights)[:, 0]
     for axis, plot in zip(axes, plots, strict=True):
         _draw_plot(axis, time, *plot)
     for finger, tick in zip(closure.contact_order, first_touches(closure), strict=True):
-        axes[0].plot(
-            time[tick],
-            0.0,
-            "^",
-            color=paint.FINGERS[finger],
-            markersize=12,
-            clip_on=False,
-            zorder=3,
-        )
+        color = paint.FINGERS[finger]
+        # in front of the axis, which is drawn in layer 2
+        look = {"color": color, "markersize": FILM.touch, "clip_on": False, "zorder": 3}
+        axes[0].plot(time[tick], 0.0, "^", **look)
     for letter, moment in zip(LETTERS, moments, strict=False):
         at = float(closure.time[moment.tick])
         color = moment.color
+        wide = 2 if color == paint.ALARM else 1
         for axis in axes:
-            axis.axvline(at, color=color, linewidth=2 if color == paint.ALARM else 1, clip_on=False)
-        place = {"xy": (at, 1.0), "xycoords": axes[0].get_xaxis_transform(), "ha": "center"}
+            axis.axvline(at, color=color, linewidth=wide, clip_on=False)
         axes[0].annotate(
-            letter, xytext=(0, 30), textcoords="offset points", color=color, fontsize=14, **place
+            letter,
+            (at, 1.0),
+            xycoords=axes[0].get_xaxis_transform(),
+            xytext=(0, FILM.letter_rise),
+            textcoords="offset points",
+            ha="center",
+            color=color,
+            fontsize=FILM.font,
         )
-    axes[-1].set_xlabel("time [s]", fontsize=13, color=paint.INK)
+    axes[-1].set_xlabel("time [s]", fontsize=PLOTS.font, color=paint.INK)
     return paint.encode_figure(figure)
 
 
 def describe_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult) -> str:
-    """Return the caption of a film strip: the order of touch, and when and why the object was lost."""
+    """Return the caption of a film strip: the order of touch, when and why the object was lost."""
 
     def times(count: int) -> str:
         return "once" if count == 1 else f"{count} times"
@@ -107,9 +166,9 @@ def _draw_stills(
     direction: Direction,
 ) -> list[np.ndarray]:
     """Return pictures of the hand and the object at the given ticks, all at the same scale."""
-    finite = torch.nonzero(
-        closure.joints.isfinite().all(-1) & closure.object_pose.isfinite().all(-1).all(-1)
-    )[:, 0]
+    known = closure.joints.isfinite().all(-1) & closure.object_pose.isfinite().all(-1).all(-1)
+    finite = torch.nonzero(known)[:, 0]
+    # of a simulation that diverged, the last state before
     at = torch.stack([finite[finite <= tick][-1] for tick in ticks])
     vertices = torch.tensor(np.array(mesh.vertices), dtype=torch.float64)
     faces = np.asarray(mesh.faces)
@@ -119,12 +178,10 @@ def _draw_stills(
         for t in at
     ]
     table = float(apply(closure.object_pose[0].double(), vertices)[:, 2].min())
-    near = [
-        x for x in places if np.abs(x - places[0]).mean(0).max() < 0.25
-    ]  # a lost object is not framed
+    near = [x for x in places if np.abs(x - places[0]).mean(0).max() < FILM.far]
     seen = np.concatenate([*near, *(s.vertices for solids in hands for s in solids)])
-    size = WIDTH // len(ticks), STILL - TITLE
-    # it stands still: the lift is seen
+    size = FILM.width // len(ticks), FILM.still - FILM.title
+    # one camera for all pictures: the lift is seen
     camera = paint.frame_camera(seen, direction, size=size)
     pictures = []
     for place, solids in zip(places, hands, strict=True):
@@ -140,25 +197,26 @@ def _draw_plot(axis: Any, time: np.ndarray, title: str, top: float, lines: list[
     """Draw lines over time in one plot from 0 to `top`, with a legend if the title ends with a
     colon.
     """
-    axis.set(xlim=(time[0], max(time[-1], time[0] + 0.1)), ylim=(0.0, top), facecolor=paint.PAPER)
-    axis.set_title(title, loc="left", color=paint.INK, fontsize=13, pad=9)
+    end = max(time[-1], time[0] + PLOTS.least_time)
+    axis.set(xlim=(time[0], end), ylim=(0.0, top), facecolor=paint.PAPER)
+    axis.set_title(title, loc="left", color=paint.INK, fontsize=PLOTS.font, pad=PLOTS.title_gap)
     axis.grid(axis="y", color=paint.GRID)
-    axis.locator_params(axis="y", nbins=3)
+    axis.locator_params(axis="y", nbins=PLOTS.ticks)
     axis.spines[["top", "right"]].set_visible(False)
-    axis.tick_params(labelsize=13, labelcolor=paint.INK, color=paint.INK)
+    axis.tick_params(labelsize=PLOTS.font, labelcolor=paint.INK, color=paint.INK)
     for values, color, label in lines:
-        wide = (
-            4.0 if label == "hand above its lowest" else 1.8
-        )  # a held object would cover this line
+        wide = PLOTS.wide if label == HAND_HEIGHT else PLOTS.line
         axis.plot(time, values, color=color, label=label, linewidth=wide)
     if title.endswith(":"):
-        style = {"labelcolor": "linecolor", "fontsize": 13, "handlelength": 1.2, "frameon": False}
         axis.legend(
             loc="lower right",
-            bbox_to_anchor=(1.0, 0.96),
+            bbox_to_anchor=(1.0, PLOTS.legend_top),
             ncols=len(lines),
             borderaxespad=0.0,
-            **style,
+            labelcolor="linecolor",
+            fontsize=PLOTS.font,
+            handlelength=PLOTS.handle,
+            frameon=False,
         )
 
 
@@ -175,12 +233,10 @@ def _list_plots(
     ]
     distance, turn = moved_in_hand(closure, _centre(mesh))
     before = torch.arange(len(closure.time)) < tick_of(closure, 2)
-    slip, degrees = (
-        to_array(x.masked_fill(before, torch.nan)) for x in (1e3 * distance, torch.rad2deg(turn))
-    )
-    centres = apply(closure.object_pose.double(), _centre(mesh).expand(len(closure.time), 1, 3))[
-        :, 0
-    ]
+    slip = to_array((1e3 * distance).masked_fill(before, torch.nan))
+    degrees = to_array(torch.rad2deg(turn).masked_fill(before, torch.nan))
+    middle = _centre(mesh).expand(len(closure.time), 1, 3)
+    centres = apply(closure.object_pose.double(), middle)[:, 0]  # (t, 3)
     moved = 1e3 * to_array(torch.linalg.vector_norm(centres - centres[0], dim=-1))
     height = 1e3 * to_array(closure.hand_pose[:, 2, 3])
     height = height - np.nanmin(height)
@@ -191,27 +247,14 @@ def _list_plots(
     def of_fingers(values: np.ndarray) -> list[Any]:
         return list(zip(values.T, paint.FINGERS, ranks, strict=False))
 
-    return [
-        (
-            "normal force [N], in the order of touch:",
-            max(1.0, 1.1 * float(np.nanmax(forces))),
-            of_fingers(forces),
-        ),
-        *[("lambda: 0 by position, 1 by force", 1.0, of_fingers(blend))]
-        * bool(np.isfinite(blend).any()),
-        (
-            "sliding of the fingertips [mm/s]",
-            100.0,
-            of_fingers(sliding),
-        ),  # a lost object slides faster
-        (
-            "motion [mm]:",
-            1.1 * max(20.0, *(float(np.nanmax(x, initial=0.0)) for x in (moved, height))),
-            [
-                (height, "#9aa2ac", "hand above its lowest"),
-                (moved, "#b5792a", "object from its place"),
-                (slip, "#8a4f9e", "object in the hand since pressed"),
-                (degrees, "#c77cba", "its turn in the hand [deg]"),
-            ],
-        ),
-    ]
+    strongest = max(PLOTS.least_force, PLOTS.room * float(np.nanmax(forces)))
+    plots = [("normal force [N], in the order of touch:", strongest, of_fingers(forces))]
+    # a closing by position alone has no blend
+    if np.isfinite(blend).any():
+        plots.append(("lambda: 0 by position, 1 by force", 1.0, of_fingers(blend)))
+    plots.append(("sliding of the fingertips [mm/s]", PLOTS.most_sliding, of_fingers(sliding)))
+    farthest = max(PLOTS.least_motion, *(float(np.nanmax(x, initial=0.0)) for x in (moved, height)))
+    values = zip((height, moved, slip, degrees), MOTION_COLORS.items(), strict=True)
+    lines = [(line, color, label) for line, (label, color) in values]
+    plots.append(("motion [mm]:", PLOTS.room * farthest, lines))
+    return plots

@@ -2,12 +2,13 @@
 and 3D viewers.
 """
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from torchgrasp.app.report.canvas import OBJECT, color_std, rgb
+from torchgrasp.app.report.canvas import FULL, OBJECT, color_std, rgb
 from torchgrasp.app.report.solids import link_poses, solids_by_link
 from torchgrasp.app.report.stills import to_array
 from torchgrasp.control.reference import check_single
@@ -17,6 +18,20 @@ from torchgrasp.foundation.lazy import spatial, trimesh
 from torchgrasp.hand.hand import Hand
 from torchgrasp.shape.surface import Surface
 from torchgrasp.values.planning import Grasps
+
+
+@dataclasses.dataclass(frozen=True)
+class SrgbCurve:
+    """The curve from sRGB to linear light, as IEC 61966-2-1 defines it."""
+
+    dark: float = 0.04045  # up to this value the curve is straight
+    slope: float = 12.92
+    offset: float = 0.055
+    gamma: float = 2.4
+
+
+SRGB = SrgbCurve()
+ROUGHNESS = 0.6  # of all parts, from 0, a mirror, to 1: that of matt plastic
 
 
 @checked
@@ -41,23 +56,24 @@ def write_glb(
     """
     check_single(grasp)
     up = np.array([0.0, 0.0, 1.0]) if grasp.table is None else to_array(grasp.table.normal)
+    turn = spatial.transform.Rotation.align_vectors([[0.0, 1.0, 0.0]], [up])[0]
     y_up = np.eye(4)
-    y_up[:3, :3] = spatial.transform.Rotation.align_vectors([[0.0, 1.0, 0.0]], [up])[0].as_matrix()
+    y_up[:3, :3] = turn.as_matrix()
     scene = trimesh.Scene()
     scene.add_geometry(_solid(body), geom_name="object", node_name="object", transform=y_up)
     joints = hand.expand_joints(grasp.joints.double())
     names = hand.tree.joint_names
     poses = link_poses(hand, joints, names, grasp.obj_from_hand)[0].cpu().numpy()
     for name, solid in solids_by_link(hand).items():
-        points = solid.vertices
-        faces = solid.faces
-        normals = solid.normals
         shape = trimesh.Trimesh(
-            points, faces, vertex_normals=normals, visual=_paint(solid.color), process=False
+            solid.vertices,
+            solid.faces,
+            vertex_normals=solid.normals,
+            visual=_paint(solid.color),
+            process=False,
         )
-        scene.add_geometry(
-            shape, geom_name=name, node_name=name, transform=y_up @ poses[solid.link]
-        )
+        pose = y_up @ poses[solid.link]
+        scene.add_geometry(shape, geom_name=name, node_name=name, transform=pose)
     data = scene.export(file_type="glb", include_normals=True, tree_postprocessor=_soften)
     assert isinstance(data, bytes)
     return write_file(path, data)
@@ -69,12 +85,13 @@ def _solid(body: "Surface | trimesh.Trimesh") -> "trimesh.Trimesh":
     """
     if not isinstance(body, Surface):
         return trimesh.Trimesh(body.vertices, body.faces, visual=_paint(OBJECT), process=False)
-    normals = to_array(body.normals)
-    colors = np.uint8(255 * _linear(color_std(to_array(body.std_m))[0]))
-    points = to_array(body.vertices)
-    faces = body.faces.cpu().numpy()
+    colors, _ = color_std(to_array(body.std_m))
     return trimesh.Trimesh(
-        points, faces, vertex_normals=normals, vertex_colors=colors, process=False
+        to_array(body.vertices),
+        body.faces.cpu().numpy(),
+        vertex_normals=to_array(body.normals),
+        vertex_colors=np.uint8(FULL * _linear(colors)),
+        process=False,
     )
 
 
@@ -83,24 +100,25 @@ def _paint(color: str) -> Any:
     from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
 
-    return TextureVisuals(
-        material=PBRMaterial(baseColorFactor=[*_linear(np.array(rgb(color))), 1.0])
-    )
+    opaque = [*_linear(np.array(rgb(color))), 1.0]
+    return TextureVisuals(material=PBRMaterial(baseColorFactor=opaque))
 
 
 def _linear(colors: np.ndarray) -> np.ndarray:
     """Return sRGB colours in [0, 1] as linear light, which glTF stores."""
-    return np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
+    curve = ((colors + SRGB.offset) / (1 + SRGB.offset)) ** SRGB.gamma
+    return np.where(colors <= SRGB.dark, colors / SRGB.slope, curve)
 
 
 def _soften(tree: dict[str, Any]) -> None:
     """Make every part of a glTF tree matt plastic: by default a part is a mirror of metal."""
-    matt = {"metallicFactor": 0.0, "roughnessFactor": 0.6}
+    matt = {"metallicFactor": 0.0, "roughnessFactor": ROUGHNESS}
     materials = tree.setdefault("materials", [])
     for material in materials:
         material["pbrMetallicRoughness"].update(matt)
-    for part in (
-        part for mesh in tree["meshes"] for part in mesh["primitives"] if "material" not in part
-    ):
-        part["material"] = len(materials)
-        materials.append({"pbrMetallicRoughness": dict(matt)})
+    for mesh in tree["meshes"]:
+        for part in mesh["primitives"]:
+            # a part with a colour at each vertex has no material yet
+            if "material" not in part:
+                part["material"] = len(materials)
+                materials.append({"pbrMetallicRoughness": dict(matt)})

@@ -16,6 +16,8 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.values.planning import Grasps, format_success
 
 TEMPLATES = Path(__file__).with_name("templates")  # of all pages
+ASIDE = 60.0  # between the two views of a grasp [degrees]
+FILM_TURN = 20.0  # of the film's view, so that fingers in line do not hide each other [degrees]
 Sections = dict[str, list[tuple[str, bytes]]]
 GRASP_COLUMNS = (
     "rank",
@@ -58,66 +60,46 @@ def draw_pictures(run: Run) -> Sections:
     view = stills.view_of(run.cloud)
     best = run.executable
     behind = stills.rotated(view, 180.0)
-    sections = {
-        "Seen and unseen": [
-            (
-                "The cloud from the camera's side, coloured by height.",
-                stills.draw_cloud(run.cloud, table),
-            ),
-            (
-                "The estimated surface from the camera's side.",
-                stills.draw_surface(run.surface, view, table),
-            ),
-            (
-                "The same from behind, where nothing was seen.",
-                stills.draw_surface(run.surface, behind, table),
-            ),
-        ]
-    }
+    sections: Sections = {}
     if run.scene is not None:
-        seen = [
-            (
-                "What was found in the depth image; the target has a white rim.",
-                encode_scene(run.scene),
-            )
-        ]
+        found = encode_scene(run.scene)
+        seen = [("What was found in the depth image; the target has a white rim.", found)]
         if len(best):
             among = stills.draw_among(run.scene, run.surface, run.hand, best[0], view)
             seen.append(("The best grasp among the measured points of the other objects.", among))
-        sections = {"The scene": seen, **sections}
+        sections["The scene"] = seen
+    cloud = stills.draw_cloud(run.cloud, table)
+    front, back = (stills.draw_surface(run.surface, side, table) for side in (view, behind))
+    sections["Seen and unseen"] = [
+        ("The cloud from the camera's side, coloured by height.", cloud),
+        ("The estimated surface from the camera's side.", front),
+        ("The same from behind, where nothing was seen.", back),
+    ]
+    film_side = view
     if len(best):
-        front = stills.facing(best)
-        aside = stills.rotated(front, 60.0)
+        side = stills.facing(best)
+        film_side = stills.rotated(side, FILM_TURN)
+        contacts = stills.draw_contacts(run.surface, best.contacts[0], side, table)
+        front, aside = (
+            stills.draw_grasp(run.surface, run.hand, best[0], direction, table)
+            for direction in (side, stills.rotated(side, ASIDE))
+        )
         sections["The best grasp"] = [
-            (
-                "Contacts with outward normals.",
-                stills.draw_contacts(run.surface, best.contacts[0], front, table),
-            ),
-            (
-                "The hand on the estimated surface.",
-                stills.draw_grasp(run.surface, run.hand, best[0], front, table),
-            ),
-            (
-                "The same from another side.",
-                stills.draw_grasp(run.surface, run.hand, best[0], aside, table),
-            ),
+            ("Contacts with outward normals.", contacts),
+            ("The hand on the estimated surface.", front),
+            ("The same from another side.", aside),
         ]
     if run.closure is not None and run.mesh is not None:
-        side = stills.rotated(stills.facing(best), 20.0) if len(best) else view
-        sections["Closing on the true object"] = [
-            (
-                describe_film(run.mesh, run.hand, run.closure),
-                draw_film(run.mesh, run.hand, run.closure, side),
-            )
-        ]
+        film = draw_film(run.mesh, run.hand, run.closure, film_side)
+        caption = describe_film(run.mesh, run.hand, run.closure)
+        sections["Closing on the true object"] = [(caption, film)]
     return sections
 
 
 def format_page(run: Run, pictures: Sections, view: str = "") -> str:
     """Return the HTML report of a run, with a link to its 3D page `view`."""
-    funnel, trials = (
-        (run.explanation.funnel.stages, run.explanation.trials) if run.explanation else ((), ())
-    )
+    funnel = run.explanation.funnel.stages if run.explanation else ()
+    trials = run.explanation.trials if run.explanation else ()
     outcomes = []
     if run.plan is not None:
         outcomes.append(("Outcome of every initial guess", run.plan.status))
@@ -125,13 +107,13 @@ def format_page(run: Run, pictures: Sections, view: str = "") -> str:
         outcomes.append(("Outcome of every posture", run.grasps.status))
     return render(
         "report.html",
-        title=f"Grasps of the {run.object_name} with the {run.hand.name} hand",
+        title=run.title,
         run=run,
         verdict=verdict(run),
-        good=run.closure.held if run.closure is not None else len(run.executable) > 0,
+        good=run.good,
         view=view,
         sections=[
-            (name, [(caption, base64.b64encode(png).decode("ascii")) for caption, png in shots])
+            (name, [(caption, encode_base64(png)) for caption, png in shots])
             for name, shots in pictures.items()
         ],
         fingers=list(zip(run.hand.tips.names, FINGERS, strict=False)),
@@ -160,21 +142,28 @@ def grasp_columns(grasps: Grasps) -> tuple[str, ...]:
 
 def grasp_rows(grasps: Grasps, most: int = 10) -> list[tuple[str, ...]]:
     """Return the first grasps as text, in the order of `grasp_columns`."""
-    return [
-        (
+    rows = []
+    for rank, grasp in enumerate(grasps[:most], 1):
+        std_m = grasp.contacts.std_m
+        task = grasp.certificate.task_margin
+        row = [
             str(rank),
             format_success(grasp),
             f"{1e3 * float(grasp.tip_error[0].max()):.2f}",
             f"{1e3 * float(grasp.clearance[0]):.1f}",
             f"{math.degrees(float(grasp.normal_angle[0].max())):.0f}",
             f"{float(grasp.certificate.margin[0]):.4f}",
-            ""
-            if grasp.contacts.std_m is None
-            else f"{1e3 * float(grasp.contacts.std_m[0].max()):.1f}",
-            *("" if (task := grasp.certificate.task_margin) is None else [f"{float(task[0]):.2f}"]),
-        )
-        for rank, grasp in enumerate(grasps[:most], 1)
-    ]
+            "" if std_m is None else f"{1e3 * float(std_m[0].max()):.1f}",
+        ]
+        if task is not None:
+            row.append(f"{float(task[0]):.2f}")
+        rows.append(tuple(row))
+    return rows
+
+
+def encode_base64(data: bytes) -> str:
+    """Return bytes as text for a page."""
+    return base64.b64encode(data).decode("ascii")
 
 
 def render(template: str, **values: Any) -> str:

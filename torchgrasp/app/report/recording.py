@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.app.report.canvas import FINGERS, OBJECT, color_std, rgb
+from torchgrasp.app.report.canvas import FINGERS, FULL, OBJECT, color_std, rgb
 from torchgrasp.app.report.run_data import Run, moments_of
 from torchgrasp.app.report.solids import link_poses, solids_by_link
 from torchgrasp.app.report.stills import to_array
@@ -24,6 +24,10 @@ from torchgrasp.geometry.frames import apply, inverse, rotate
 from torchgrasp.geometry.plane import upright_frame
 
 ROOT = "world/obj"  # entity of the frame of the cloud, in which all poses of grasps are
+CLOUD_COLOR = "#c2452d"  # seen before the light colours of surface and object
+NORMAL_LENGTH = 0.035  # of the arrows of contact normals [m]
+FORCE_LENGTH = 0.01  # of the arrow of a force [m/N]
+COLUMN_SHARES = (3, 2)  # widths of the 3D view and of the curves beside it
 Index = tuple[str, str, np.ndarray]
 """A timeline: its name, "sequence" or "duration", and its values."""
 
@@ -70,12 +74,11 @@ class _Recorder:
         self.stream.set_log_tick_enabled(False)
         self.stream.send_recording_name(f"{run.object_name}, {run.hand.name}")
         views = importlib.import_module("rerun.blueprint")
-        beside = views.Vertical(
-            views.TimeSeriesView(origin="/force"), views.TextLogView(origin="/moments")
-        )
-        self.stream.send_blueprint(
-            views.Horizontal(views.Spatial3DView(origin="/world"), beside, column_shares=[3, 2])
-        )
+        space = views.Spatial3DView(origin="/world")
+        curves = views.TimeSeriesView(origin="/force")
+        beside = views.Vertical(curves, views.TextLogView(origin="/moments"))
+        page = views.Horizontal(space, beside, column_shares=list(COLUMN_SHARES))
+        self.stream.send_blueprint(page)
 
     def log_plan(self) -> None:
         """Log frames, cloud and surface, and the contacts and postures of the best grasp."""
@@ -83,32 +86,29 @@ class _Recorder:
         run = self.run
         frame = inverse(upright_frame(run.cloud.points, run.cloud.viewpoint, run.spec.plane))
         self._log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
-        self._log(
-            ROOT, rr.Transform3D(translation=to_array(frame[:3, 3]), quaternion=_quaternions(frame))
-        )
-        self._log(
-            f"{ROOT}/cloud", rr.Points3D(to_array(run.cloud.points), colors=_bytes("#c2452d"))
-        )
-        shades = np.uint8(255 * color_std(to_array(run.surface.std_m))[0])
-        solid = (
+        at = {"translation": to_array(frame[:3, 3]), "quaternion": _quaternions(frame)}
+        self._log(ROOT, rr.Transform3D(**at))
+        cloud = rr.Points3D(to_array(run.cloud.points), colors=_bytes(CLOUD_COLOR))
+        self._log(f"{ROOT}/cloud", cloud)
+        shades, _ = color_std(to_array(run.surface.std_m))
+        surface = self._mesh(
             to_array(run.surface.vertices),
             run.surface.faces.cpu().numpy(),
             to_array(run.surface.normals),
+            vertex_colors=np.uint8(FULL * shades),
         )
-        self._log(f"{ROOT}/surface", self._mesh(*solid, vertex_colors=shades))
+        self._log(f"{ROOT}/surface", surface)
         if not len(run.executable):
             return
         best = run.executable[:1]
         tips = run.hand.tips
-        options = {
-            "colors": [_bytes(color) for color in FINGERS[: len(tips)]],
-            "labels": list(tips.names),
-        }
-        points = to_array(best.contacts.points[0])
-        normals = to_array(best.contacts.normals[0])
-        self._log(
-            f"{ROOT}/contacts", rr.Arrows3D(origins=points, vectors=0.035 * normals, **options)
+        contacts = rr.Arrows3D(
+            origins=to_array(best.contacts.points[0]),
+            vectors=NORMAL_LENGTH * to_array(best.contacts.normals[0]),
+            colors=[_bytes(color) for color in FINGERS[: len(tips)]],
+            labels=list(tips.names),
         )
+        self._log(f"{ROOT}/contacts", contacts)
         steps = "posture", "sequence", np.arange(len(POSTURES))
         self._log_hand(f"{ROOT}/plan/hand", steps, pose_postures(run.hand, best)[0])
         self._send("postures", steps, rr.TextLog.columns(text=list(POSTURES)))
@@ -121,47 +121,36 @@ class _Recorder:
         upright = self.run.upright()
         closure = run.closure
         mesh = run.mesh
-        assert (
-            closure is not None
-            and mesh is not None
-            and upright.closure is not None
-            and upright.mesh is not None
-        )
+        assert closure is not None
+        assert mesh is not None
+        assert upright.closure is not None
+        assert upright.mesh is not None
         seconds = to_array(closure.time)
         names = run.hand.tips.names
         time = "time", "duration", seconds
         links = link_poses(run.hand, closure.joints, closure.joint_names, closure.hand_pose)
         self._log_hand(f"{place}/hand", time, links)
         solid = (np.asarray(x) for x in (mesh.vertices, mesh.faces, mesh.vertex_normals))
-        self._log_body(
-            f"{place}/object",
-            time,
-            closure.object_pose,
-            self._mesh(*solid, albedo_factor=_bytes(OBJECT)),
-        )
+        body = self._mesh(*solid, albedo_factor=_bytes(OBJECT))
+        self._log_body(f"{place}/object", time, closure.object_pose, body)
         hand_pose = closure.hand_pose.double()
         trace = closure.trace
         points = apply(hand_pose, trace.points.double())
         forces = rotate(hand_pose, trace.forces.double())
+        # only fingers that touch have an arrow: the counts say how many at each tick
         felt = (points.isfinite() & forces.isfinite()).all(-1)
-        colors = np.array([_bytes(color) for color in FINGERS])[felt.nonzero()[:, 1]]
-        arrows = {
-            "origins": to_array(points[felt]),
-            "vectors": 0.01 * to_array(forces[felt]),
-            "colors": colors,
-        }
-        self._send(
-            f"{place}/forces", time, rr.Arrows3D.columns(**arrows).partition(felt.sum(1).tolist())
+        palette = np.array([_bytes(color) for color in FINGERS])
+        arrows = rr.Arrows3D.columns(
+            origins=to_array(points[felt]),
+            vectors=FORCE_LENGTH * to_array(forces[felt]),
+            colors=palette[felt.nonzero()[:, 1]],
         )
+        self._send(f"{place}/forces", time, arrows.partition(felt.sum(1).tolist()))
         for finger, name in enumerate(names):
-            self._send(
-                f"force/{name}",
-                time,
-                rr.Scalars.columns(scalars=to_array(closure.forces[:, finger])),
-            )
-        moments = moments_of(
-            upright.closure, torch.tensor(np.array(upright.mesh.center_mass)), names
-        )
+            curve = rr.Scalars.columns(scalars=to_array(closure.forces[:, finger]))
+            self._send(f"force/{name}", time, curve)
+        centre = torch.tensor(np.array(upright.mesh.center_mass))
+        moments = moments_of(upright.closure, centre, names)
         at = "time", "duration", seconds[[moment.tick for moment in moments]]
         self._send("moments", at, rr.TextLog.columns(text=[moment.name for moment in moments]))
 
@@ -184,9 +173,8 @@ class _Recorder:
     def _log_hand(self, place: str, index: Index, poses: Float[Tensor, "n l 4 4"]) -> None:
         """Log the links of the hand, which move along a timeline."""
         for name, solid in solids_by_link(self.run.hand).items():
-            mesh = self._mesh(
-                solid.vertices, solid.faces, solid.normals, albedo_factor=_bytes(solid.color)
-            )
+            color = _bytes(solid.color)
+            mesh = self._mesh(solid.vertices, solid.faces, solid.normals, albedo_factor=color)
             self._log_body(f"{place}/{name}", index, poses[:, solid.link], mesh)
 
     def _log_body(self, place: str, index: Index, poses: Float[Tensor, "n 4 4"], mesh: Any) -> None:
@@ -196,13 +184,10 @@ class _Recorder:
         self.stream.set_time(name, **{kind: values[0]})
         self.stream.log(place, mesh)
         self.stream.reset_time()
-        places = {
-            "translation": to_array(poses[known, :3, 3]),
-            "quaternion": _quaternions(poses[known]),
-        }
-        self._send(
-            place, (name, kind, values[known.numpy()]), self.rr.Transform3D.columns(**places)
+        moves = self.rr.Transform3D.columns(
+            translation=to_array(poses[known, :3, 3]), quaternion=_quaternions(poses[known])
         )
+        self._send(place, (name, kind, values[known.numpy()]), moves)
 
 
 def _quaternions(poses: Float[Tensor, "*n 4 4"]) -> np.ndarray:
@@ -212,4 +197,4 @@ def _quaternions(poses: Float[Tensor, "*n 4 4"]) -> np.ndarray:
 
 def _bytes(color: str) -> list[int]:
     """Return red, green and blue of a colour, from 0 to 255."""
-    return [round(255 * part) for part in rgb(color)]
+    return [round(FULL * part) for part in rgb(color)]

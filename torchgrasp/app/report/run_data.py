@@ -28,6 +28,7 @@ from torchgrasp.values.planning import ContactPlan, Grasps, PointCloud
 from torchgrasp.values.specs import ContactSpec
 
 LOST = "lost"  # name of the moment at which an object was lost
+CREEP = 0.01  # fingertips that stick slide more slowly than this [m/s]
 
 
 @checked
@@ -73,6 +74,16 @@ class Run:
         """The grasps that passed every check, best first."""
         return self.grasps[self.grasps.status == Status.OK]
 
+    @property
+    def title(self) -> str:
+        """The title of the run's pages."""
+        return f"Grasps of the {self.object_name} with the {self.hand.name} hand"
+
+    @property
+    def good(self) -> bool:
+        """Whether the object was held; without a closing, whether a grasp is executable."""
+        return bool(self.closure.held) if self.closure is not None else len(self.executable) > 0
+
     def upright(self) -> "Run":
         """Return the run in the upright frame of its cloud and table, where z is up."""
         obj_from_upright = upright_frame(self.cloud.points, self.cloud.viewpoint, self.spec.plane)
@@ -102,9 +113,12 @@ def verdict(run: Run) -> str:
     name = run.object_name
     if run.closure is not None:
         return closing_sentence(run)
-    if count := len(run.executable):
-        return f"The {hand} hand has {count} executable grasp{'s' * (count > 1)} of the {name}."
-    return refusal(run) + ("" if run.explanation is None else f" {run.explanation.advice}")
+    count = len(run.executable)
+    if count:
+        grasps = "grasp" if count == 1 else "grasps"
+        return f"The {hand} hand has {count} executable {grasps} of the {name}."
+    advice = "" if run.explanation is None else f" {run.explanation.advice}"
+    return refusal(run) + advice
 
 
 def closing_sentence(run: Run) -> str:
@@ -116,7 +130,8 @@ def closing_sentence(run: Run) -> str:
     mesh = upright.mesh
     assert closure is not None and mesh is not None
     if not closure.held:
-        return f"The {run.hand.name} hand did not hold the {run.object_name}: {closure.status.sentence}."
+        reason = closure.status.sentence
+        return f"The {run.hand.name} hand did not hold the {run.object_name}: {reason}."
     centre = torch.tensor([*mesh.center_mass, 1.0], dtype=torch.float64)
     rise = float((closure.object_pose[-1] - closure.object_pose[0])[2] @ centre)
     moved, angle = closure.object_motion
@@ -137,9 +152,8 @@ def refusal(run: Run) -> str:
         total = f"{len(run.plan)} starts"
     else:
         return f"{head}: {Status.OUT_OF_REACH.sentence}."
-    reasons = "; ".join(
-        f"{n} of {total}: {status.sentence}" for status, n in count_status(failed).items()
-    )
+    counts = count_status(failed).items()
+    reasons = "; ".join(f"{n} of {total}: {status.sentence}" for status, n in counts)
     return f"{head} ({reasons}){_too_low(run)}."
 
 
@@ -150,9 +164,9 @@ def _too_low(run: Run) -> str:
         return ""
     height = float(spec.plane.height(run.surface.vertices).max())
     needed = spec.least_height
-    return f": it is {1e3 * height:.0f} mm high, and this hand needs {1e3 * needed:.0f} mm" * (
-        height < needed
-    )
+    if height >= needed:
+        return ""
+    return f": it is {1e3 * height:.0f} mm high, and this hand needs {1e3 * needed:.0f} mm"
 
 
 class Moment(NamedTuple):
@@ -193,11 +207,11 @@ def find_loss(closure: ClosureResult, centre: Float[Tensor, "3"]) -> int | None:
     if closure.status is Status.TOO_HEAVY:
         return int(closure.hand_pose[:, 2, 3].argmax())
     if closure.status is Status.EJECTED:
-        world = apply(
-            closure.object_pose.double(), centre.double().expand(len(closure.time), 1, 3)
-        )[:, 0]
+        middle = centre.double().expand(len(closure.time), 1, 3)
+        world = apply(closure.object_pose.double(), middle)[:, 0]  # (t, 3)
         away = torch.linalg.vector_norm(world - world[0], dim=-1) > PUSHED_DISTANCE
         return int(away.int().argmax()) if bool(away.any()) else last
+    # else it slipped too far, or at most one finger still touched it: the earlier of both
     distance, angle = moved_in_hand(closure, centre)
     gone = (distance > SLIP_DISTANCE) | (angle > SLIP_ANGLE)
     gone[: pressed + 1] = False
@@ -219,17 +233,16 @@ def explain_loss(
     rises = bool(closure.phases[2].isfinite())
     time = float(closure.time[tick])
     start = float(closure.time[pressed])
-    phase = (
-        "closed"
-        if not rises or tick <= pressed
-        else "rose"
-        if time < start + LIFT_TIME
-        else "held it"
-    )
-    never = " and ".join(
-        name for finger, name in enumerate(fingers) if finger not in closure.contact_order
-    )
-    reason = f"{never} never touched the object" if never else _first_to_go(closure, tick, fingers)
+    if not rises or tick <= pressed:
+        phase = "closed"
+    else:
+        phase = "rose" if time < start + LIFT_TIME else "held it"
+    absent = [name for k, name in enumerate(fingers) if k not in closure.contact_order]
+    if absent:
+        reason = f"{' and '.join(absent)} never touched the object"
+    else:
+        reason = _first_to_go(closure, tick, fingers)
+    # these ends are no fault of a finger
     if closure.status in (Status.START_OVERLAP, Status.UNSTABLE, Status.TOO_HEAVY) or not reason:
         reason = closure.status.sentence
     lost = "Put down from" if closure.status is Status.TOO_HEAVY else "Lost at"
@@ -242,10 +255,11 @@ def _first_to_go(closure: ClosureResult, tick: int, fingers: tuple[str, ...]) ->
     """
     touched = touching(closure)[: tick + 1]
     sliding = closure.trace.sliding[: tick + 1].nan_to_num(0.0)
-    firm = touched & (sliding < 0.01)  # [m/s]: fingertips that stick creep more slowly
+    firm = touched & (sliding < CREEP)
     # The first tick after which each finger was never firm again; the finger with the earliest gave
     # way first.
-    since = [int(torch.nonzero(column)[-1]) + 1 if bool(column.any()) else 0 for column in firm.T]
+    ticks = [torch.nonzero(column) for column in firm.T]
+    since = [int(found[-1]) + 1 if len(found) else 0 for found in ticks]
     finger = min(range(len(since)), key=since.__getitem__)
     begin = since[finger]
     if begin > tick:
@@ -258,7 +272,8 @@ def _first_to_go(closure: ClosureResult, tick: int, fingers: tuple[str, ...]) ->
     normal = closure.trace.normals[begin, finger]
     press = float((force @ normal).abs())
     across = float(torch.linalg.vector_norm(force - (force @ normal) * normal))
-    return f"{name} slid first, from {time:.2f} s on, under {across:.1f} N across at {press:.1f} N of normal force"
+    loads = f"under {across:.1f} N across at {press:.1f} N of normal force"
+    return f"{name} slid first, from {time:.2f} s on, {loads}"
 
 
 def moments_of(
@@ -267,24 +282,23 @@ def moments_of(
     """Return the key moments that the film strip of a closing shows, in order."""
     found = [Moment(tick_of(closure, 0), "open hand")]
     if closure.contact_order:
-        found.append(
-            Moment(first_touches(closure)[0], f"{fingers[closure.contact_order[0]]} touches first")
-        )
+        first = fingers[closure.contact_order[0]]
+        found.append(Moment(first_touches(closure)[0], f"{first} touches first"))
+    # each closing begins where the control of the forces begins to act
     acts = torch.cat([torch.zeros(1, dtype=torch.bool), closure.trace.blend.isfinite().any(1)])
-    begins = torch.nonzero(acts[1:] & ~acts[:-1])[:, 0]  # of the closings
+    begins = torch.nonzero(acts[1:] & ~acts[:-1])[:, 0]
     if closure.attempts == len(begins) > 1:
         found.append(Moment(int(begins[-1]), f"closing {len(begins)} begins"))
     all_touch = len(closure.contact_order) == len(fingers)
     ends = ((1, "all touch" if all_touch else "the closing ends"), (2, "pressed"))
-    found += [
-        Moment(tick_of(closure, k), name) for k, name in ends if bool(closure.phases[k].isfinite())
-    ]
+    for k, name in ends:
+        if bool(closure.phases[k].isfinite()):
+            found.append(Moment(tick_of(closure, k), name))
     lost = find_loss(closure, centre)
     if lost is not None:
         found.append(Moment(lost, LOST))
     found.append(Moment(len(closure.time) - 1, "the end"))
-    found.sort(
-        key=lambda moment: (moment.tick, moment.name == LOST)
-    )  # of two at one tick, the later is kept
+    # of two at one tick, the later is kept
+    found.sort(key=lambda moment: (moment.tick, moment.name == LOST))
     later = [*(moment.tick for moment in found[1:]), len(closure.time)]
     return [m for m, tick in zip(found, later, strict=True) if m.tick < tick]

@@ -1,12 +1,14 @@
 """The picture of a scene: which pixels the library considers support, objects and obstacles."""
 
+import dataclasses
+import math
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
-from torchgrasp.app.report.canvas import GRID, INK, OBJECTS, PAPER, encode_png, rgb
+from torchgrasp.app.report.canvas import FULL, GRID, INK, OBJECTS, PAPER, encode_png, rgb
 from torchgrasp.files import write_file
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.lazy import Image, ImageDraw, ImageFont, ndimage
@@ -24,6 +26,61 @@ KINDS = {
     "obstacle": "#82878f",
 }
 """Colours of the pixels that are on no object, by their words in the legend."""
+UNMEASURED, ELSEWHERE, SUPPORT, OTHER_SUPPORT, OBSTACLE = range(len(KINDS))
+"""Indices of the kinds."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneInk:
+    """How the pixels of a scene are shaded, chosen by eye; factors darken a colour."""
+
+    size: int = 1200  # of the longer side of the picture [pixels]
+    hatches: int = 160  # stripes over the width, on obstacles
+    hatch: float = 0.8  # factor of every other stripe
+    flat: float = 0.6  # least brightness of what is on no object: relief matters most on objects
+    cell: float = 0.1  # squares of the support [m]
+    line: float = 0.25  # share of the colour that lines between squares lose
+    line_width: float = 1.2  # [pixels]
+    widest_pixel: float = 0.3  # part of a square; lines of smaller squares would run together
+    gap: int = 5  # [pixels]: missing pixels in a square of this side have no rim
+    rim: int = 3  # [pixels]
+    rim_factor: float = 0.5
+    target_rim: int = 5
+    noise: float = 3.0  # standard deviations of the noise that a support's pixels may lie off it
+    blur: float = 1.5  # standard deviation [pixels] that smooths the depth before its slopes
+    nearest: float = 1e-3  # least depth [m]
+    least: float = 1e-6  # least weight, slope and range, so that nothing is divided by 0
+    lamp: tuple[float, float, float] = (-0.5, 0.0, -0.8)  # added to the way up: right, down, ahead
+    ambient: float = 0.45
+    lit: float = 0.65
+    haze: float = 0.15  # share of the brightness that the farthest pixels lose
+    outliers: tuple[float, float] = (0.01, 0.99)  # quantiles of depth between which it grows
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneText:
+    """Layout of the numbers on objects and of the legend [pixels]."""
+
+    font: int = 24
+    number: float = 1.1  # size of a number, in radii of the largest circle in its object
+    largest_number: int = 54
+    stroke: int = 3
+    row: int = 40
+    swatch: int = 28  # width of the colour beside a text
+    swatch_top: int = 8  # of the colour, in its row
+    swatch_bottom: int = 32
+    round: int = 5  # radius of its corners
+    text: int = 40  # left end of the text, from the left end of the colour
+    left: int = 16
+    gutter: int = 70  # what a column needs beside its widest text
+    margin: int = 12  # above and below all rows
+    most_objects: int = 12  # named in the legend
+    least_share: float = 0.002  # of the pixels; a rarer kind is not in the legend
+    top: float = 0.98  # quantile of the heights of an object's points: few outliers
+
+
+INKS = SceneInk()
+TEXT = SceneText()
 
 
 @checked
@@ -48,30 +105,23 @@ def encode_scene(scene: Scene) -> bytes:
     palette = np.stack([rgb(color) for color in (*KINDS.values(), *OBJECTS)])
     color = palette[np.where(labels > 0, len(KINDS) + (labels - 1) % len(OBJECTS), kinds)]
     row, column = np.mgrid[:h, :w]
-    color[(labels == 0) & (kinds == 4) & ((row + column) // max(2, w // 160) % 2 == 0)] *= (
-        0.8  # hatched
-    )
+    bare = labels == 0
+    # obstacles are hatched
+    striped = (row + column) // max(2, w // INKS.hatches) % 2 == 0
+    color[bare & (kinds == OBSTACLE) & striped] *= INKS.hatch
     light = _light(scene)
-    color *= np.where(labels > 0, light, 0.6 + 0.4 * light)[
-        ..., None
-    ]  # relief matters most on objects
+    color *= np.where(labels > 0, light, INKS.flat + (1 - INKS.flat) * light)[..., None]
     if scene.table is not None:
-        color *= (
-            1
-            - 0.25
-            * np.where((labels == 0) & (kinds == 2), _squares(scene.image, scene.table), 0.0)[
-                ..., None
-            ]
-        )
-    whole = np.where(
-        kinds > 0, labels, ndimage.maximum_filter(labels, 5)
-    )  # single missing pixels have no rim
-    color[_rim(whole, 3) & (labels > 0)] *= 0.5
-    color[(labels == 0) & (kinds == 0)] = rgb(KINDS["not measured"])
+        squares = np.where(bare & (kinds == SUPPORT), _squares(scene.image, scene.table), 0.0)
+        color *= 1 - INKS.line * squares[..., None]
+    # single missing pixels have no rim
+    whole = np.where(kinds != UNMEASURED, labels, ndimage.maximum_filter(labels, INKS.gap))
+    color[_rim(whole, INKS.rim) & (labels > 0)] *= INKS.rim_factor
+    color[bare & (kinds == UNMEASURED)] = rgb(KINDS["not measured"])
     if scene.target is not None:
-        color[_rim(whole == scene.target, 5)] = 1.0
-    scale = 1200 / max(h, w)
-    picture = Image.fromarray(np.uint8(255 * color.clip(0, 1)))
+        color[_rim(whole == scene.target, INKS.target_rim)] = 1.0
+    scale = INKS.size / max(h, w)
+    picture = Image.fromarray(np.uint8(FULL * color.clip(0, 1)))
     picture = picture.resize((round(w * scale), round(h * scale)), Image.Resampling.BICUBIC)
     _number(picture, labels, scale)
     return encode_png(_with_legend(picture, scene, kinds))
@@ -86,11 +136,14 @@ def sort_pixels(scene: Scene) -> tuple[Int[np.ndarray, "h w"], Int[np.ndarray, "
     points = image.points()
     measured = image.depth.numpy() > 0
     kinds = measured.astype(int)
-    near = 3 * assume_noise(points.reshape(-1, 3), scene.viewpoint).reshape(labels.shape).numpy()
+    noise = assume_noise(points.reshape(-1, 3), scene.viewpoint).reshape(labels.shape).numpy()
+    near = INKS.noise * noise
     if scene.table is not None:
         height = scene.table.height(points).numpy()
-        kinds[measured & (height > near) & (labels == 0)] = 4
-        for plane, kind in (*((other, 3) for other in scene.others[::-1]), (scene.table, 2)):
+        kinds[measured & (height > near) & (labels == 0)] = OBSTACLE
+        # the table stands last: where planes meet, its colour wins
+        others = [(other, OTHER_SUPPORT) for other in scene.others[::-1]]
+        for plane, kind in (*others, (scene.table, SUPPORT)):
             kinds[measured & (np.abs(plane.height(points).numpy()) < near)] = kind
     return kinds, labels
 
@@ -99,22 +152,23 @@ def _squares(image: DepthImage, table: Plane) -> Float[np.ndarray, "h w"]:
     """Return for each pixel, in [0, 1], how well it lies on the lines of a 10 cm grid in the table
     plane.
     """
-    flat = DepthImage(
-        torch.ones_like(image.depth), image.intrinsics, image.obj_from_camera
-    ).points()
+    ones = torch.ones_like(image.depth)
+    flat = DepthImage(ones, image.intrinsics, image.obj_from_camera).points()
+    # where the rays of all pixels meet the table: (h, w, 3)
     camera = image.obj_from_camera[:3, 3].double()
     normal = table.normal.double()
     rays = flat - camera
-    reach = -table.height(camera) / (rays @ normal).clamp(max=-1e-6)
+    reach = -table.height(camera) / (rays @ normal).clamp(max=-INKS.least)
     place = camera + reach[..., None] * rays
     across = image.obj_from_camera[:3, 0].double()
     x = unit(across - (across @ normal) * normal)
     lines = np.zeros(tuple(image.depth.shape))
     for axis in (x, torch.linalg.cross(normal, x)):
-        cells = ((place @ axis) / 0.1).numpy()
-        pixel = np.hypot(*np.gradient(cells)).clip(1e-6)  # its size in cells
+        cells = ((place @ axis) / INKS.cell).numpy()
+        pixel = np.hypot(*np.gradient(cells)).clip(INKS.least)  # its size in cells
         gap = np.abs(cells - np.round(cells)) / pixel
-        lines = np.maximum(lines, np.where(pixel < 0.3, (1.2 - gap).clip(0, 1), 0.0))
+        line = (INKS.line_width - gap).clip(0, 1)
+        lines = np.maximum(lines, np.where(pixel < INKS.widest_pixel, line, 0.0))
     return lines
 
 
@@ -124,21 +178,22 @@ def _light(scene: Scene) -> Float[np.ndarray, "h w"]:
     """
     depth = scene.image.depth.double().numpy()
     seen = scene.image.depth.numpy() > 0
-    smooth = ndimage.gaussian_filter(depth, 1.5)
-    weight = ndimage.gaussian_filter(seen.astype(float), 1.5)
-    smooth = np.where(weight > 0, smooth / weight.clip(1e-6), 1.0).clip(1e-3)
-    down, right = (
-        slope * float(scene.image.intrinsics[0, 0]) / smooth for slope in np.gradient(smooth)
-    )
+    # unmeasured pixels have no weight in the mean
+    smooth = ndimage.gaussian_filter(depth, INKS.blur)
+    weight = ndimage.gaussian_filter(seen.astype(float), INKS.blur)
+    smooth = np.where(weight > 0, smooth / weight.clip(INKS.least), 1.0).clip(INKS.nearest)
+    focal = float(scene.image.intrinsics[0, 0])
+    down, right = (slope * focal / smooth for slope in np.gradient(smooth))
     sky = np.array([0.0, -1.0, 0.0])
     if scene.table is not None:
-        sky = (scene.image.obj_from_camera[:3, :3].double().T @ scene.table.normal.double()).numpy()
-    lamp = sky + np.array([-0.5, 0.0, -0.8])
+        camera_from_obj = scene.image.obj_from_camera[:3, :3].double().T
+        sky = (camera_from_obj @ scene.table.normal.double()).numpy()
+    lamp = sky + np.array(INKS.lamp)
     lamp /= np.linalg.norm(lamp)
     facing = (lamp[0] * right + lamp[1] * down - lamp[2]) / np.sqrt(1 + right**2 + down**2)
-    near, far = np.quantile(depth[seen], [0.01, 0.99])
-    distant = ((depth - near) / max(far - near, 1e-6)).clip(0, 1)
-    return (0.45 + 0.65 * facing.clip(0.0, 1.0)) * (1 - 0.15 * distant)
+    near, far = np.quantile(depth[seen], INKS.outliers)
+    distant = ((depth - near) / max(far - near, INKS.least)).clip(0, 1)
+    return (INKS.ambient + INKS.lit * facing.clip(0.0, 1.0)) * (1 - INKS.haze * distant)
 
 
 def _rim(labels: np.ndarray, width: int) -> Bool[np.ndarray, "h w"]:
@@ -159,8 +214,10 @@ def _number(picture: object, labels: Int[np.ndarray, "h w"], scale: float) -> No
         inside = np.asarray(ndimage.distance_transform_edt(body))
         row, column = divmod(int(inside.argmax()), inside.shape[1])
         place = (scale * (left + column - 0.5), scale * (top + row - 0.5))
-        font = ImageFont.load_default(float(np.clip(1.1 * scale * inside.max(), 24, 54)))
-        pen.text(place, str(label), "white", font, anchor="mm", stroke_width=3, stroke_fill=INK)
+        size = np.clip(TEXT.number * scale * inside.max(), TEXT.font, TEXT.largest_number)
+        font = ImageFont.load_default(float(size))
+        rim = {"stroke_width": TEXT.stroke, "stroke_fill": INK}
+        pen.text(place, str(label), "white", font, anchor="mm", **rim)
 
 
 def _with_legend(picture: object, scene: Scene, kinds: Int[np.ndarray, "h w"]) -> object:
@@ -168,29 +225,31 @@ def _with_legend(picture: object, scene: Scene, kinds: Int[np.ndarray, "h w"]) -
     object.
     """
     assert isinstance(picture, Image.Image)
-    shown = [
-        (name, color)
-        for k, (name, color) in enumerate(KINDS.items())
-        if (kinds == k).mean() > 0.002
-    ]
+    shares = [(kinds == k).mean() for k in range(len(KINDS))]
     entries = [
-        *shown[::-1],
-        *((_describe(scene, k), OBJECTS[(k - 1) % len(OBJECTS)]) for k in scene.things[:12]),
-    ]
-    if len(scene.things) > 12:
-        entries.append((f"and {len(scene.things) - 12} more objects", PAPER))
-    font = ImageFont.load_default(24)
-    row_height = 40
-    column_width = 70 + max(int(font.getlength(words)) for words, _ in entries)
-    rows = -(-len(entries) // max(1, picture.width // column_width))
-    sheet = Image.new("RGB", (picture.width, picture.height + row_height * rows + 24), PAPER)
+        entry
+        for entry, share in zip(KINDS.items(), shares, strict=True)
+        if share > TEXT.least_share
+    ][::-1]
+    for label in scene.things[: TEXT.most_objects]:
+        entries.append((_describe(scene, label), OBJECTS[(label - 1) % len(OBJECTS)]))
+    more = len(scene.things) - TEXT.most_objects
+    if more > 0:
+        entries.append((f"and {more} more objects", PAPER))
+    font = ImageFont.load_default(TEXT.font)
+    column_width = TEXT.gutter + max(int(font.getlength(words)) for words, _ in entries)
+    # columns are filled from above, as many as fit beside each other
+    rows = math.ceil(len(entries) / max(1, picture.width // column_width))
+    height = picture.height + TEXT.row * rows + 2 * TEXT.margin
+    sheet = Image.new("RGB", (picture.width, height), PAPER)
     sheet.paste(picture, (0, 0))
     pen = ImageDraw.Draw(sheet)
     for k, (words, color) in enumerate(entries):
-        x = 16 + k // rows * column_width
-        y = picture.height + 12 + k % rows * row_height
-        pen.rounded_rectangle((x, y + 8, x + 28, y + 32), 5, color, GRID)
-        pen.text((x + 40, y + 20), words, INK, font, anchor="lm")
+        x = TEXT.left + k // rows * column_width
+        y = picture.height + TEXT.margin + k % rows * TEXT.row
+        swatch = (x, y + TEXT.swatch_top, x + TEXT.swatch, y + TEXT.swatch_bottom)
+        pen.rounded_rectangle(swatch, TEXT.round, color, GRID)
+        pen.text((x + TEXT.text, y + TEXT.row // 2), words, INK, font, anchor="lm")
     return sheet
 
 
@@ -198,9 +257,9 @@ def _describe(scene: Scene, label: int) -> str:
     """Return the legend text of an object: its label, its height, and its distance from the camera."""
     points = scene.points[scene.rows_of(label)].double()
     distance = float((points - scene.viewpoint).norm(dim=-1).median())
-    high = (
-        ""
-        if scene.table is None
-        else f"{1e3 * float(scene.table.height(points).quantile(0.98)):.0f} mm high, "
-    )
-    return f"{label}{' (target)' * (label == scene.target)}: {high}{distance:.2f} m away"
+    high = ""
+    if scene.table is not None:
+        top = 1e3 * float(scene.table.height(points).quantile(TEXT.top))
+        high = f"{top:.0f} mm high, "
+    target = " (target)" if label == scene.target else ""
+    return f"{label}{target}: {high}{distance:.2f} m away"

@@ -15,6 +15,9 @@ from torchgrasp.hand.urdf import LinkShape, read_urdf
 
 PARKED = -1  # finger index of a link that no grasping finger owns, such as the palm
 EDGE = 0.004  # largest radius of a rounded edge [m], about that of a robot finger
+BALL_FINENESS = 3  # subdivisions of an icosahedron: 642 corners of a sphere
+TURNS = 40  # sides of a cylinder
+TILTS = 7  # rings around its rounded edges
 
 
 class Solid(NamedTuple):
@@ -24,9 +27,8 @@ class Solid(NamedTuple):
     faces: np.ndarray
     normals: Float[np.ndarray, "v 3"]
     link: int
-    finger: (
-        int  # `PARKED` if the link belongs to no grasping finger, such as the palm, or to several
-    )
+    # `PARKED` if the link belongs to no grasping finger, such as the palm, or to several
+    finger: int
 
     @property
     def color(self) -> str:
@@ -52,14 +54,19 @@ def solids_by_link(hand: Hand) -> dict[str, Solid]:
     found = {}
     solids = solids_of_links(hand)
     for link, name in enumerate(hand.tree.link_names):
-        if mine := [solid for solid in solids if solid.link == link]:
-            starts = np.cumsum([0, *(len(s.vertices) for s in mine)])
-            faces = np.concatenate(
-                [s.faces + start for s, start in zip(mine, starts, strict=False)]
-            )
-            points = np.concatenate([s.vertices for s in mine])
-            normals = np.concatenate([s.normals for s in mine])
-            found[name] = Solid(points, faces, normals, link, mine[0].finger)
+        mine = [solid for solid in solids if solid.link == link]
+        if not mine:
+            continue
+        # the faces of each shape count its vertices after those of the shapes before
+        starts = np.cumsum([0, *(len(s.vertices) for s in mine)])
+        faces = [s.faces + start for s, start in zip(mine, starts, strict=False)]
+        found[name] = Solid(
+            np.concatenate([s.vertices for s in mine]),
+            np.concatenate(faces),
+            np.concatenate([s.normals for s in mine]),
+            link,
+            mine[0].finger,
+        )
     return found
 
 
@@ -86,13 +93,12 @@ def solids_from_hand(
     `joints` [rad].
     """
     poses = link_poses(hand, joints[None], names, obj_from_hand[None])[0].cpu().numpy()
-    return [
-        solid._replace(
-            vertices=solid.vertices @ poses[solid.link, :3, :3].T + poses[solid.link, :3, 3],
-            normals=solid.normals @ poses[solid.link, :3, :3].T,
-        )
-        for solid in solids_of_links(hand)
-    ]
+    placed = []
+    for solid in solids_of_links(hand):
+        turn = poses[solid.link, :3, :3].T
+        vertices = solid.vertices @ turn + poses[solid.link, :3, 3]
+        placed.append(solid._replace(vertices=vertices, normals=solid.normals @ turn))
+    return placed
 
 
 def finger_of_links(hand: Hand) -> dict[str, int]:
@@ -102,12 +108,9 @@ def finger_of_links(hand: Hand) -> dict[str, int]:
     moves = hand.tree.moves.bool().cpu()
     finger_of = {}
     for mine, name in zip(moves, hand.tree.link_names, strict=True):
-        owners = [
-            f
-            for f in range(len(hand.tips))
-            if bool(mine.any()) and bool(moves[hand.tips.index[f]][mine].all())
-        ]
-        finger_of[name] = owners[0] if len(owners) == 1 else PARKED
+        # a finger owns the links whose joints all move its tip; no joint moves the palm
+        owners = [f for f in range(len(hand.tips)) if bool(moves[hand.tips.index[f]][mine].all())]
+        finger_of[name] = owners[0] if bool(mine.any()) and len(owners) == 1 else PARKED
     return finger_of
 
 
@@ -116,30 +119,26 @@ def round_shape(shape: LinkShape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return vertices, faces and vertex normals of a collision shape with rounded edges, in its
     link's frame.
     """
-    ball = np.asarray(
-        trimesh.creation.icosphere(
-            subdivisions=3 if shape.kind == "sphere" else 1, radius=1.0
-        ).vertices
-    )
+    fineness = BALL_FINENESS if shape.kind == "sphere" else 1
+    ball = np.asarray(trimesh.creation.icosphere(subdivisions=fineness, radius=1.0).vertices)
     radius = min(EDGE, min(shape.half) / 2)  # thin plates stay plates
     if shape.kind == "sphere":
         radius = shape.size[0]
         centres = np.zeros((1, 3))
     elif shape.kind == "box":
-        centres = np.array(list(itertools.product((-1.0, 1.0), repeat=3))) * (
-            np.array(shape.half) - radius
-        )
+        signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+        centres = signs * (np.array(shape.half) - radius)
     else:
-        tilt, turn = np.meshgrid(
-            np.linspace(-np.pi / 2, np.pi / 2, 7), np.linspace(0, 2 * np.pi, 40, endpoint=False)
-        )
-        ball = np.stack(
-            [np.cos(tilt) * np.cos(turn), np.cos(tilt) * np.sin(turn), np.sin(tilt)], -1
-        )
-        rim = (shape.size[0] - radius) * ball[:, 3]
+        tilts = np.linspace(-np.pi / 2, np.pi / 2, TILTS)
+        turns = np.linspace(0, 2 * np.pi, TURNS, endpoint=False)
+        tilt, turn = np.meshgrid(tilts, turns)
+        across = np.cos(tilt)
+        ball = np.stack([across * np.cos(turn), across * np.sin(turn), np.sin(tilt)], -1)
+        rim = (shape.size[0] - radius) * ball[:, TILTS // 2]  # the balls of a round edge lie here
         up = np.array([0.0, 0.0, shape.size[1] / 2 - radius])
         ball = ball.reshape(-1, 3)
         centres = np.concatenate([rim - up, rim + up])
+    # the shape is the hull of balls at its corners or along its rims
     points = (centres[:, None] + radius * ball).reshape(-1, 3)
     normals = np.tile(ball, (len(centres), 1))
     hull = spatial.ConvexHull(points)
@@ -147,6 +146,7 @@ def round_shape(shape: LinkShape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     points = points[kept]
     normals = normals[kept]
     faces = faces.reshape(-1, 3)
+    # the hull lists the corners of a face in any order
     a, b, c = points[faces].transpose(1, 0, 2)
     inward = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(1) < 0.0
     faces[inward] = faces[inward, ::-1]

@@ -1,5 +1,6 @@
 """Pictures as PNGs: of a cloud, an estimated surface, contacts, a grasp, a scene and a hand."""
 
+import dataclasses
 import io
 
 import numpy as np
@@ -18,14 +19,52 @@ from torchgrasp.shape.surface import Surface
 from torchgrasp.values.planning import Contacts, Grasps, PointCloud
 
 
+@dataclasses.dataclass(frozen=True)
+class StillLayout:
+    """What is shown in stills, and how large."""
+
+    most_points: int = 3000  # of a cloud: more would hide each other
+    least_height: float = 1e-12  # [m]: a flat cloud has one colour
+    most_others: int = 4000  # points of all neighbours
+    contact_arrow: float = 0.045  # [m], about as long as a fingertip with its pad
+    tip_arrow: float = 0.03  # of the pads of a hand alone [m]
+    palm_axis: float = 0.6  # length of the axes, as a share of the diagonal of the palm
+    unknown_view: Direction = (1.0, -0.8, 0.6)  # from the front, where the camera is unknown
+    grasp_rise: float = 0.4  # of the viewing direction of a grasp, for each metre along the ground
+
+
+@dataclasses.dataclass(frozen=True)
+class HandSheet:
+    """Layout of the picture of a hand: four stills, and below them the ranges of the joints."""
+
+    eye: Direction = (1.0, -0.9, 0.5)
+    aside: float = 110.0  # the other side from which the posture is seen [degrees]
+    width: float = 13.5  # [inches]
+    height: float = 10.8  # of the stills [inches]
+    row: float = 0.3  # height for each joint [inches]
+    dpi: int = 100
+    font: int = 14
+    bar: float = 0.4  # height of the bar of a joint, in rows
+    margin: float = 0.02  # beside the widest range, as a share of it
+    mark: int = 16  # length of the mark of the posture [points]
+    mark_width: int = 3
+
+
+STILLS = StillLayout()
+SHEET = HandSheet()
+APART = 10.0  # facing pads that is worth 0.1 m less between the tips and their middle
+FREE = 10.0  # a posture without collision is better than any with one
+
+
 def draw_cloud(cloud: PointCloud, table: float | None = None) -> bytes:
     """Return a PNG of a cloud from its camera, coloured by height; `table` is the height [m] of the
     table.
     """
-    points = _thinned(to_array(cloud.points), 3000)
+    points = _thinned(to_array(cloud.points), STILLS.most_points)
     height = points[:, 2] - points[:, 2].min()
+    share = height / max(float(height.max()), STILLS.least_height)
     canvas = paint.Canvas()
-    canvas.add_points(points, paint.map_colors(height / max(float(height.max()), 1e-12), "cividis"))
+    canvas.add_points(points, paint.map_colors(share, "cividis"))
     canvas.add_table(points, table)
     return canvas.render_png(points, view_of(cloud))
 
@@ -40,24 +79,16 @@ def draw_surface(surface: Surface, direction: Direction, table: float | None = N
     canvas = paint.Canvas()
     canvas.add_mesh(vertices, faces, colors, to_array(surface.normals))
     canvas.add_table(vertices, table)
-    return canvas.render_png(
-        vertices, direction, bar=("standard deviation of the surface [mm]", 1e3 * most, "viridis")
-    )
+    bar = "standard deviation of the surface [mm]", 1e3 * most, "viridis"
+    return canvas.render_png(vertices, direction, bar=bar)
 
 
 def draw_contacts(
     surface: Surface, contacts: Contacts, direction: Direction, table: float | None = None
 ) -> bytes:
     """Return a PNG of the contacts of the first grasp, with normals, on the estimated surface."""
-    vertices = to_array(surface.vertices)
     canvas = paint.Canvas()
-    canvas.add_mesh(
-        vertices,
-        surface.faces.cpu().numpy(),
-        paint.OBJECT,
-        to_array(surface.normals),
-        transparent=True,
-    )
+    vertices = _add_object(canvas, surface, transparent=True)
     _add_contacts(canvas, contacts)
     canvas.add_table(vertices, table)
     return canvas.render_png(vertices, direction)
@@ -85,9 +116,9 @@ def draw_among(
     corners = np.concatenate([corners, points])
     if len(points):
         palette = np.stack([paint.rgb(name) for name in paint.OBJECTS])
-        canvas.add_points(
-            _thinned(points, 4000), palette[(_thinned(labels, 4000) - 1) % len(palette)]
-        )
+        colors = palette[(labels - 1) % len(palette)]
+        most = STILLS.most_others
+        canvas.add_points(_thinned(points, most), _thinned(colors, most))
     canvas.add_table(corners, None if scene.table is None else 0.0)
     return canvas.render_png(corners, direction)
 
@@ -98,29 +129,36 @@ def draw_hand(hand: Hand, joints: Float[Tensor, "h"]) -> bytes:
     """
     from matplotlib.figure import Figure
 
-    # height of the ranges [inches], 0.3 for each joint
-    eye = (1.0, -0.9, 0.5)
-    bars = 0.3 * (hand.dof + 2)
     views = [
-        ("a posture with the pads face to face", joints, eye),
-        ("the same from another side", joints, rotated(eye, 110.0)),
-        ("every joint at its lower limit", hand.lower.to(joints), eye),
-        ("every joint at its upper limit", hand.upper.to(joints), eye),
+        ("a posture with the pads face to face", joints, SHEET.eye),
+        ("the same from another side", joints, rotated(SHEET.eye, SHEET.aside)),
+        ("every joint at its lower limit", hand.lower.to(joints), SHEET.eye),
+        ("every joint at its upper limit", hand.upper.to(joints), SHEET.eye),
     ]
-    figure = Figure((13.5, 10.8 + bars), dpi=100, facecolor=paint.PAPER, layout="constrained")
-    stills, ranges = figure.subfigures(2, 1, squeeze=False, height_ratios=(10.8, bars)).flat
+    bars = SHEET.row * (hand.dof + 2)  # height of the ranges with their title [inches]
+    size = SHEET.width, SHEET.height + bars
+    figure = Figure(size, dpi=SHEET.dpi, facecolor=paint.PAPER, layout="constrained")
+    heights = SHEET.height, bars
+    stills, ranges = figure.subfigures(2, 1, squeeze=False, height_ratios=heights).flat
     for axis, (title, posture, direction) in zip(stills.subplots(2, 2).flat, views, strict=True):
         axis.imshow(Image.open(io.BytesIO(draw_posture(hand, posture, direction))))
-        axis.set_title(title, loc="left", color=paint.INK, fontsize=14)
+        axis.set_title(title, loc="left", color=paint.INK, fontsize=SHEET.font)
         axis.set_axis_off()
     low, high, at = (np.rad2deg(to_array(x)) for x in (hand.lower, hand.upper, joints))
     axis = ranges.subplots()
-    axis.barh(hand.joint_names, high - low, 0.4, low, color=_joint_colors(hand))
-    axis.plot(at, hand.joint_names, "|", color=paint.INK, markersize=16, markeredgewidth=3)
+    axis.barh(hand.joint_names, high - low, SHEET.bar, low, color=_joint_colors(hand))
+    axis.plot(
+        at,
+        hand.joint_names,
+        "|",
+        color=paint.INK,
+        markersize=SHEET.mark,
+        markeredgewidth=SHEET.mark_width,
+    )
     axis.set_xlabel("ranges of the joints [degrees], the posture as a mark", color=paint.INK)
     axis.invert_yaxis()
     axis.grid(axis="x", color=paint.GRID)
-    axis.margins(x=0.02)
+    axis.margins(x=SHEET.margin)
     axis.set(axisbelow=True, facecolor=paint.PAPER)
     axis.spines[:].set_visible(False)
     return paint.encode_figure(figure)
@@ -134,8 +172,8 @@ def draw_posture(hand: Hand, joints: Float[Tensor, "h"], eye: Direction) -> byte
         hand, hand.expand_joints(joints), hand.tree.joint_names, torch.eye(4).to(joints)
     )
     points, normals = (x.cpu().numpy() for x in hand.fingertips(joints[None].double()))
-    arrow = 0.03
-    axis = 0.6 * float(np.linalg.norm(np.ptp(solids[0].vertices, axis=0)))
+    arrow = STILLS.tip_arrow
+    axis = STILLS.palm_axis * float(np.linalg.norm(np.ptp(solids[0].vertices, axis=0)))
     canvas = paint.Canvas()
     add_solids(canvas, solids)
     canvas.add_arrows(points[0], normals[0], arrow, paint.FINGERS[: len(hand.tips)])
@@ -155,10 +193,12 @@ def opposed_posture(hand: Hand, joints: Float[Tensor, "n h"]) -> Float[Tensor, "
     """
     points, normals = hand.fingertips(joints)
     inward = points.mean(1, keepdim=True) - points
-    facing = (normals * unit(inward)).sum(-1).amin(1) - 10.0 * torch.linalg.vector_norm(
-        inward, dim=-1
-    ).amax(1)
-    return joints[(facing + (hand.self_clearance(joints) > 0).to(facing) * 10.0).argmax()]
+    # the worst finger counts: how well its pad faces the others, and how far away it is
+    facing = (normals * unit(inward)).sum(-1).amin(1)
+    apart = torch.linalg.vector_norm(inward, dim=-1).amax(1)
+    score = facing - APART * apart
+    free = hand.self_clearance(joints) > 0
+    return joints[(score + free.to(score) * FREE).argmax()]
 
 
 def view_of(cloud: PointCloud) -> Direction:
@@ -167,7 +207,7 @@ def view_of(cloud: PointCloud) -> Direction:
     """
     first = cloud.split_views()[0].viewpoint
     if first is None:
-        return (1.0, -0.8, 0.6)
+        return STILLS.unknown_view
     x, y, z = (first - cloud.points.mean(0)).tolist()
     return (x, y, z)
 
@@ -179,12 +219,11 @@ def facing(grasp: Grasps) -> Direction:
     normals = grasp.contacts.normals[0, :, :2].detach().cpu().double()
     press = torch.linalg.eigh(normals.T @ normals).eigenvectors[:, 1]
     across = torch.stack([-press[1], press[0]])
-    from_palm = (
-        grasp.contacts.points[0].mean(0).cpu().double()
-        - grasp.obj_from_hand[0, :3, 3].cpu().double()
-    )
+    middle = grasp.contacts.points[0].mean(0).cpu().double()
+    from_palm = middle - grasp.obj_from_hand[0, :3, 3].cpu().double()
+    # of both sides, the one on which the palm does not hide the contacts
     x, y = (across if float(across @ from_palm[:2]) >= 0.0 else -across).tolist()
-    return (x, y, 0.4)
+    return (x, y, STILLS.grasp_rise)
 
 
 def rotated(direction: Direction, degrees: float) -> Direction:
@@ -207,13 +246,23 @@ def _grasp(
     must be in view.
     """
     joints = hand.expand_joints(grasp.joints[0].double())
-    vertices = to_array(surface.vertices)
     solids = solids_from_hand(hand, joints, hand.tree.joint_names, grasp.obj_from_hand[0])
     canvas = paint.Canvas()
-    canvas.add_mesh(vertices, surface.faces.cpu().numpy(), paint.OBJECT, to_array(surface.normals))
+    vertices = _add_object(canvas, surface)
     _add_contacts(canvas, grasp.contacts)
     add_solids(canvas, solids)
     return canvas, np.concatenate([vertices, *(s.vertices for s in solids)])
+
+
+def _add_object(
+    canvas: paint.Canvas, surface: Surface, transparent: bool = False
+) -> Float[np.ndarray, "n 3"]:
+    """Add the estimated surface in the colour of an object; return its vertices."""
+    vertices = to_array(surface.vertices)
+    faces = surface.faces.cpu().numpy()
+    normals = to_array(surface.normals)
+    canvas.add_mesh(vertices, faces, paint.OBJECT, normals, transparent=transparent)
+    return vertices
 
 
 def _add_contacts(canvas: paint.Canvas, contacts: Contacts) -> None:
@@ -222,7 +271,7 @@ def _add_contacts(canvas: paint.Canvas, contacts: Contacts) -> None:
     """
     points = to_array(contacts.points[0])
     normals = to_array(contacts.normals[0])
-    canvas.add_arrows(points, normals, 0.045, paint.FINGERS[: len(points)])
+    canvas.add_arrows(points, normals, STILLS.contact_arrow, paint.FINGERS[: len(points)])
 
 
 def add_solids(canvas: paint.Canvas, solids: list[Solid]) -> None:

@@ -2,7 +2,7 @@
 closing.
 """
 
-import base64
+import dataclasses
 import functools
 import hashlib
 import json
@@ -19,9 +19,15 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.app.report.canvas import FINGERS, OBJECT, TABLE, color_std, map_colors
+from torchgrasp.app.report.canvas import FINGERS, FULL, OBJECT, TABLE, color_std, map_colors
 from torchgrasp.app.report.film import describe_film
-from torchgrasp.app.report.page import grasp_columns, grasp_rows, render
+from torchgrasp.app.report.page import (
+    TEMPLATES,
+    encode_base64,
+    grasp_columns,
+    grasp_rows,
+    render,
+)
 from torchgrasp.app.report.run_data import Run, moments_of, verdict
 from torchgrasp.app.report.solids import link_poses, solids_of_links
 from torchgrasp.app.report.stills import facing, to_array, view_of
@@ -41,12 +47,25 @@ from torchgrasp.values.planning import Grasps
 from torchgrasp.values.specs import ContactSpec
 
 VIEW = "view.html"  # name of the page beside the report
-MOST_GRASPS = 20
-MOST_FACES = 40_000
-MOST_TICKS = 120
-"""Largest numbers of grasps, faces of a mesh and ticks of a replay, so that a page has a few
-megabytes.
-"""
+
+
+@dataclasses.dataclass(frozen=True)
+class ViewerNumbers:
+    """Most of what a page holds, so that it has a few megabytes, and how it begins."""
+
+    grasps: int = 20
+    points: int = 10_000
+    faces: int = 40_000  # of a mesh
+    ticks: int = 120  # of a replay
+    cells: int = 256  # along the diagonal of a mesh, where it is thinned first
+    coarser: float = 1.2  # larger: fewer rounds of thinning, and fewer faces in the end
+    rise: float = 0.35  # least rise of the first view for each metre along the ground
+    ramp: int = 17  # colours of the bar of standard deviations
+
+
+VIEWER = ViewerNumbers()
+COLUMNS = (0, 1, 5, 3)  # of `grasp_columns`: rank, success, margin, clearance
+MORE_COLUMNS = 6  # the first of the others that a page shows: standard deviation, task margin
 POSTURES = ("approach", "pre-grasp", "grasp", "squeeze")
 """Postures of the hand in the order of its motion; the last is the target of its drives."""
 
@@ -103,18 +122,13 @@ def show_grasps(
 def format_viewer(run: Run) -> str:
     """Return the 3D page of a run as HTML."""
     contents = describe(run)
-    folder = Path(__file__).with_name("templates")
     # The files are one function, so that no name of theirs meets a name of the library.
-    parts = "".join(
-        (folder / name).read_text(encoding="utf-8") for name in ("scene.js", "cloud.js", "panel.js")
-    )
+    names = "scene.js", "cloud.js", "panel.js"
+    parts = "".join((TEMPLATES / name).read_text(encoding="utf-8") for name in names)
     # "<" would end the block of data early; within JSON it is only in texts.
     data = json.dumps(contents, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
     scripts = (three(), f'(() => {{\n"use strict";\n{parts}}})();\n')
-    digests = [
-        base64.b64encode(hashlib.sha256(x.encode("utf-8")).digest()).decode("ascii")
-        for x in scripts
-    ]
+    digests = [encode_base64(hashlib.sha256(x.encode("utf-8")).digest()) for x in scripts]
     return render("view.html", title=contents["title"], data=data, scripts=scripts, digests=digests)
 
 
@@ -139,38 +153,34 @@ def describe(run: Run) -> dict[str, Any]:
     frame = inverse(upright_frame(run.cloud.points, run.cloud.viewpoint, run.spec.plane))
     sentence = verdict(run)
     run = run.upright()
-    best = run.executable[:MOST_GRASPS]
+    best = run.executable[: VIEWER.grasps]
     scene = run.scene
+    others = None
+    if scene is not None:
+        others = _points(scene.points[(scene.labels > 0) & ~scene.rows_of()])
+    viewpoints = [view.viewpoint for view in run.cloud.split_views()]
     x, y, z = facing(best[0]) if len(best) else view_of(run.cloud)
-    eye = np.array([x, y, max(z, 0.35 * float(np.hypot(x, y)))])  # raised to look from above
+    # raised to look from above
+    eye = np.array([x, y, max(z, VIEWER.rise * float(np.hypot(x, y)))])
+    hand = []
+    for solid in solids_of_links(run.hand):
+        mesh = _mesh(solid.vertices, solid.faces, solid.normals)
+        hand.append({"link": solid.link, "color": solid.color, **mesh})
     return {
-        "title": f"Grasps of the {run.object_name} with the {run.hand.name} hand",
+        "title": run.title,
         "source": str(run.source),
         "verdict": sentence,
-        "good": bool(run.closure.held if run.closure is not None else len(best) > 0),
+        "good": run.good,
         "eye": (eye / np.linalg.norm(eye)).tolist(),
         "frame": frame.tolist(),
-        "sensors": [
-            v.viewpoint.tolist() for v in run.cloud.split_views() if v.viewpoint is not None
-        ],
+        "sensors": [place.tolist() for place in viewpoints if place is not None],
         "table": None if run.spec.table is None else TABLE,
         "object": OBJECT,
         "fingers": [list(pair) for pair in zip(run.hand.tips.names, FINGERS, strict=False)],
         "cloud": _points(run.cloud.points),
-        "others": None
-        if scene is None
-        else _points(scene.points[(scene.labels > 0) & ~scene.rows_of()]),
+        "others": others,
         "surface": _surface(run),
-        "hand": [
-            {
-                "link": solid.link,
-                "color": solid.color,
-                "points": pack(solid.vertices),
-                "normals": pack(solid.normals),
-                "faces": pack(solid.faces, "u4"),
-            }
-            for solid in solids_of_links(run.hand)
-        ],
+        "hand": hand,
         "postures": POSTURES,
         "grasps": _grasps(run.hand, best),
         "replay": None if run.closure is None or run.mesh is None else _replay(run, run.closure),
@@ -178,8 +188,13 @@ def describe(run: Run) -> dict[str, Any]:
 
 
 def _points(points: Float[Tensor, "n 3"]) -> dict[str, object]:
-    """Return a cloud as a JSON object made by `pack`, thinned to at most 10,000 points."""
-    return pack(to_array(points)[thin_rows(len(points), 10_000)])
+    """Return a cloud as a JSON object made by `pack`, thinned if it has many points."""
+    return pack(to_array(points)[thin_rows(len(points), VIEWER.points)])
+
+
+def _mesh(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> dict[str, object]:
+    """Return a mesh with vertex normals as a dict of arrays made by `pack`."""
+    return {"points": pack(vertices), "normals": pack(normals), "faces": pack(faces, "u4")}
 
 
 def _surface(run: Run) -> dict[str, object]:
@@ -188,18 +203,16 @@ def _surface(run: Run) -> dict[str, object]:
     """
     surface = run.surface
     std_m = to_array(run.surface.std_m)
-    kept, faces = thin_mesh(to_array(surface.vertices), surface.faces.cpu().numpy(), MOST_FACES)
+    vertices = to_array(surface.vertices)
+    kept, faces = thin_mesh(vertices, surface.faces.cpu().numpy())
     colors, most = color_std(std_m)
+    ramp = map_colors(np.linspace(0.0, 1.0, VIEWER.ramp), "viridis")
     return {
-        "points": pack(to_array(surface.vertices)[kept]),
-        "normals": pack(to_array(surface.normals)[kept]),
-        "faces": pack(faces, "u4"),
+        **_mesh(vertices[kept], faces, to_array(surface.normals)[kept]),
         "std": pack(std_m[kept]),
-        "colors": pack(np.round(255 * colors[kept]), "u1"),
+        "colors": pack(np.round(FULL * colors[kept]), "u1"),
         "most_mm": 1e3 * most,
-        "ramp": np.round(255 * map_colors(np.linspace(0.0, 1.0, 17), "viridis"))
-        .astype(int)
-        .tolist(),
+        "ramp": np.round(FULL * ramp).astype(int).tolist(),
     }
 
 
@@ -208,16 +221,10 @@ def _grasps(hand: Hand, grasps: Grasps) -> dict[str, object]:
     `POSTURES`.
     """
     heads = grasp_columns(grasps)
-    columns = (
-        0,
-        1,
-        5,
-        3,
-        *range(6, len(heads)),
-    )  # rank, success, margin, clearance, standard deviation, task margin
+    columns = *COLUMNS, *range(MORE_COLUMNS, len(heads))
     return {
         "heads": [heads[k] for k in columns],
-        "rows": [[row[k] for k in columns] for row in grasp_rows(grasps, MOST_GRASPS)],
+        "rows": [[row[k] for k in columns] for row in grasp_rows(grasps, VIEWER.grasps)],
         "points": pack(to_array(grasps.contacts.points)),
         "normals": pack(to_array(grasps.contacts.normals)),
         "links": pack(to_array(pose_postures(hand, grasps))),
@@ -225,7 +232,10 @@ def _grasps(hand: Hand, grasps: Grasps) -> dict[str, object]:
 
 
 def pose_postures(hand: Hand, grasps: Grasps) -> Float[Tensor, "g p l 4 4"]:
-    """Return the poses of all links in the object's frame, in each of the `POSTURES` of each grasp."""
+    """Return the poses of all links in the object's frame, in each of the `POSTURES` of each grasp.
+
+    The result has the shape (grasps, postures, links, 4, 4).
+    """
     pose = grasps.obj_from_hand.double()
     opened = grasps.pregrasp.double()
     raised = opened_pose(hand, opened, pose, grasps.table)
@@ -244,23 +254,25 @@ def _replay(run: Run, closure: ClosureResult) -> dict[str, object]:
     assert run.mesh is not None
     centre = torch.tensor(np.array(run.mesh.center_mass), dtype=torch.float64)
     names = run.hand.tips.names
-    ticks = thin_rows(len(closure.time), MOST_TICKS)
-    kept, faces = thin_mesh(np.asarray(run.mesh.vertices), np.asarray(run.mesh.faces), MOST_FACES)
+    ticks = thin_rows(len(closure.time), VIEWER.ticks)
+    vertices = np.asarray(run.mesh.vertices)
+    kept, faces = thin_mesh(vertices, np.asarray(run.mesh.faces))
     links = link_poses(
         run.hand, closure.joints[ticks], closure.joint_names, closure.hand_pose[ticks]
     )
     hand_pose = closure.hand_pose[ticks].double()
     trace = closure.trace
-    moments = [
-        (int(np.abs(ticks - m.tick).argmin()), m.name) for m in moments_of(closure, centre, names)
-    ]
+    moments = []
+    for moment in moments_of(closure, centre, names):
+        nearest = int(np.abs(ticks - moment.tick).argmin())
+        moments.append((nearest, moment.name))
     return {
         "grasp": 1,  # the first is the one that was closed
         "story": describe_film(run.mesh, run.hand, closure),
         "moments": moments,
         "touches": pack(to_array(apply(hand_pose, trace.points[ticks].double()))),
         "pushes": pack(to_array(rotate(hand_pose, trace.forces[ticks].double()))),
-        "points": pack(np.asarray(run.mesh.vertices)[kept]),
+        "points": pack(vertices[kept]),
         "faces": pack(faces, "u4"),
         "ticks": pack(ticks, "u4"),
         "object": pack(to_array(closure.object_pose[ticks])),
@@ -275,37 +287,35 @@ def pack(values: np.ndarray, kind: str = "f4") -> dict[str, object]:
     in base64.
     """
     data = np.ascontiguousarray(values).astype(f"<{kind}").tobytes()
-    return {
-        "kind": kind,
-        "shape": list(values.shape),
-        "data": base64.b64encode(data).decode("ascii"),
-    }
+    return {"kind": kind, "shape": list(values.shape), "data": encode_base64(data)}
 
 
 def thin_mesh(
-    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], most: int
+    vertices: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    most: int = VIEWER.faces,
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, "g 3"]]:
     """Return the indices of the vertices to keep, one in each cell of a grid, and at most `most`
     faces between them.
     """
     kept = np.arange(len(vertices))
     thinned = faces
-    cell = float(np.linalg.norm(np.ptp(vertices, axis=0))) / 256 if len(vertices) else 0.0
+    diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0))) if len(vertices) else 0.0
+    cell = diagonal / VIEWER.cells
     while len(thinned) > most:
         _, kept, group = np.unique(
             np.round(vertices / cell), axis=0, return_index=True, return_inverse=True
         )
         thinned = group.reshape(-1)[faces]
+        # a face with two corners in one cell is gone
         a, b, c = thinned.T
         thinned = thinned[(a != b) & (b != c) & (c != a)]
-        cell *= 1.2
+        cell *= VIEWER.coarser
     return kept, thinned
 
 
 def thin_rows(count: int, most: int) -> Int[np.ndarray, " k"]:
     """Return the indices of at most `most` rows, evenly spread from the first to the last."""
-    return (
-        np.arange(count)
-        if count <= most
-        else np.round(np.linspace(0, count - 1, most)).astype(np.int64)
-    )
+    if count <= most:
+        return np.arange(count)
+    return np.round(np.linspace(0, count - 1, most)).astype(np.int64)
