@@ -20,8 +20,9 @@ from torch import Tensor
 
 import torchgrasp
 from tests.hostile.samples import Lengths, hints_of, sample, sample_tensor
-from torchgrasp.foundation.checks import ANY, RIGID, Range, Taken, _lengths
+from torchgrasp.foundation.checks import _lengths
 from torchgrasp.foundation.errors import Status
+from torchgrasp.foundation.rules import ANY, RIGID, Range, Taken
 
 NAN = float("nan")
 INF = float("inf")
@@ -233,9 +234,7 @@ def public() -> dict[str, Any]:
     for package in [torchgrasp, *map(importlib.import_module, inner)]:
         for name in getattr(package, "__all__", ()):
             thing = getattr(package, name)
-            if package.__name__ != "torchgrasp.foundation.checks" and (
-                inspect.isfunction(thing) or inspect.isclass(thing)
-            ):
+            if inspect.isfunction(thing) or inspect.isclass(thing):
                 found.setdefault(f"{thing.__module__}.{thing.__qualname__}", thing)
     return found
 

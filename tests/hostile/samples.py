@@ -35,8 +35,8 @@ from torchgrasp.control import no_contact, observe
 from torchgrasp.control.paper.closings import Impedance
 from torchgrasp.control.paper.stability import NAMES, StabilityModel
 from torchgrasp.data.shipped import load_shipped_grasp
-from torchgrasp.foundation.checks import Range
 from torchgrasp.foundation.errors import Status
+from torchgrasp.foundation.rules import Range
 from torchgrasp.hand.urdf import Urdf, read_urdf
 from torchgrasp.ik import GraspProblem, PostureLibrary
 from torchgrasp.planner.explain import Funnel, Losses

@@ -21,8 +21,9 @@ from tests.hostile.arguments import (
     wrong_arguments,
 )
 from tests.hostile.samples import sample
-from torchgrasp.foundation.checks import Count, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import Count
 
 MADE_INSIDE = {
     "ActuatedJoints",

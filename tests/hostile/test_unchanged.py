@@ -23,7 +23,7 @@ from tests.hostile.unchanged import changes
 from tests.make import run_python
 from tests.pinch import QUICK
 from torchgrasp.foundation.base import Value
-from torchgrasp.foundation.checks import Count
+from torchgrasp.foundation.rules import Count
 from torchgrasp.values.closing import ClosingOptions
 from torchgrasp.values.specs import TrialSpec
 

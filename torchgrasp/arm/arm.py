@@ -12,8 +12,9 @@ from torch import Tensor
 
 from torchgrasp.data.accept import HandLike, as_hand
 from torchgrasp.foundation.base import Value
-from torchgrasp.foundation.checks import Pose, Seed, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import Pose, Seed
 from torchgrasp.geometry.frames import apply, inverse, real
 from torchgrasp.hand.collision_shapes import ALWAYS, cover
 from torchgrasp.hand.hand import Hand

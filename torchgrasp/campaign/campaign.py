@@ -23,9 +23,10 @@ from torchgrasp.evaluation.sweep import PLAN_LIMIT, TRIAL_LIMIT
 from torchgrasp.evaluation.views import EvaluationSpec, ObjectView
 from torchgrasp.files import sha256
 from torchgrasp.foundation.base import Value
-from torchgrasp.foundation.checks import Range, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, DatasetError, Status
 from torchgrasp.foundation.jobs import run_as_they_end
+from torchgrasp.foundation.rules import Range
 from torchgrasp.hand.hand import Hand, HandSource
 
 LONGEST_LICENCE = 100  # letters of a licence's name; those of the SPDX list have at most 40

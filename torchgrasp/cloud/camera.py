@@ -12,9 +12,10 @@ from torch import Tensor
 from torchgrasp.cloud.depth import cloud_from_depth
 from torchgrasp.cloud.pose import check_rigid
 from torchgrasp.cloud.sensor import Image, SensorName, SensorNoise, add_noise, find_sensor
-from torchgrasp.foundation.checks import Range, Seed, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import MeshError
 from torchgrasp.foundation.lazy import trimesh
+from torchgrasp.foundation.rules import Range, Seed
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
 from torchgrasp.values.planning import PointCloud
 

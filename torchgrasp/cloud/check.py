@@ -9,10 +9,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.cloud.neighbours import find_inliers
-from torchgrasp.foundation.checks import Range, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, SuspiciousScale, TooFewPoints
 from torchgrasp.foundation.lazy import spatial
 from torchgrasp.foundation.limits import MAX_EXTENT, MIN_EXTENT
+from torchgrasp.foundation.rules import Range
 from torchgrasp.values.planning import PointCloud
 
 MIN_POINTS = 4  # fewest distinct points from which a surface can be estimated

@@ -12,8 +12,9 @@ from torch import Tensor
 
 from torchgrasp.cloud.check import MIN_POINTS, check_cloud
 from torchgrasp.cloud.pose import check_view, read_camera_pose
-from torchgrasp.foundation.checks import Positive, check_tensor, checked
+from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument, TooFewPoints
+from torchgrasp.foundation.rules import Positive
 from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.values.planning import PointCloud

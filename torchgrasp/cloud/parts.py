@@ -8,9 +8,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.cloud.check import MIN_POINTS, first_of_each
-from torchgrasp.foundation.checks import Range, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import NoSupport, TooFewPoints
 from torchgrasp.foundation.lazy import spatial
+from torchgrasp.foundation.rules import Range
 from torchgrasp.geometry.linalg import number_components
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.support_planes import SupportPlane, find_supports

@@ -12,8 +12,9 @@ from torch import Tensor
 from torchgrasp.cloud.safe_files import parse_npy, read_suffixed
 from torchgrasp.files import explain
 from torchgrasp.files.columns import read_lines
-from torchgrasp.foundation.checks import RIGID, check_tensor, is_rigid
+from torchgrasp.foundation.checks import check_tensor
 from torchgrasp.foundation.errors import BadArgument, NoSupport
+from torchgrasp.foundation.rules import RIGID, is_rigid
 from torchgrasp.geometry.linalg import Points, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.support_planes import SupportPlane, find_table

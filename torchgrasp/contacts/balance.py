@@ -26,7 +26,8 @@ from torch import Tensor
 
 from torchgrasp.contacts.form_closure import Vectors, centre_and_radius, solve_closure_lp, wrenches
 from torchgrasp.contacts.problem import contact_pairs, pull_signs
-from torchgrasp.foundation.checks import ANY, Positive, checked
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.rules import ANY, Positive
 from torchgrasp.geometry.frames import skew
 from torchgrasp.geometry.linalg import GOLDEN_ANGLE, fibonacci_sphere, unit
 

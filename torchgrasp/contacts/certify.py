@@ -26,8 +26,9 @@ from torchgrasp.contacts.form_closure import (
     wrenches,
 )
 from torchgrasp.foundation.base import FINGERTIPS
-from torchgrasp.foundation.checks import checked, is_known
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import is_known
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import degenerate
 from torchgrasp.values.planning import Certificate, Contacts

@@ -16,8 +16,9 @@ from torchgrasp.contacts.certify import check_contacts, check_unit
 from torchgrasp.contacts.form_closure import Vectors, closed_exact, first_balance, tangents
 from torchgrasp.contacts.problem import walls_at
 from torchgrasp.foundation.base import Batch
-from torchgrasp.foundation.checks import FINITE, Range, Seed, check_tensor, checked
+from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import FINITE, Range, Seed
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.estimate import surface_deviation

@@ -21,8 +21,9 @@ from torchgrasp.contacts.starts import (
     start_chunks,
 )
 from torchgrasp.foundation.base import join, pick, put
-from torchgrasp.foundation.checks import Count, Positive, Seed, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import Status
+from torchgrasp.foundation.rules import Count, Positive, Seed
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.values.planning import ContactPlan
 from torchgrasp.values.specs import ContactSpec

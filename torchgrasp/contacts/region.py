@@ -13,9 +13,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.foundation.base import Value
-from torchgrasp.foundation.checks import Fraction, Pose, checked, show
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import ndimage, trimesh
+from torchgrasp.foundation.rules import Fraction, Pose, show
 from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import Plane, as_plane

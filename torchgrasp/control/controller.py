@@ -32,8 +32,9 @@ from torchgrasp.control.relook import relocate
 from torchgrasp.control.tactile import STILL, Observation, Targets
 from torchgrasp.control.uncertainty_closing import UncertaintyClosing, with_equal_gains
 from torchgrasp.foundation.base import check_device, settle
-from torchgrasp.foundation.checks import Range, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status
+from torchgrasp.foundation.rules import Range
 from torchgrasp.geometry.frames import apply, inverse, rigid
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values.closing import ClosingOptions, choose_options

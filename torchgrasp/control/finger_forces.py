@@ -10,8 +10,9 @@ from torch import Tensor
 
 from torchgrasp.contacts.balance import least_friction_forces
 from torchgrasp.foundation.base import named_tensors, settle
-from torchgrasp.foundation.checks import Force, Positive, check_dense, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import Force, Positive, check_dense
 from torchgrasp.geometry.frames import apply, inverse, rotate
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values.planning import Grasps

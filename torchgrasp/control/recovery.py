@@ -17,7 +17,8 @@ from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.sensing import TORQUE_NOISE
 from torchgrasp.control.tactile import Observation, low_pass
 from torchgrasp.control.uncertainty_closing import PALM_SPEED
-from torchgrasp.foundation.checks import Range, checked
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.rules import Range
 from torchgrasp.geometry.linalg import limit_norm, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.values.closing import ClosingOptions

@@ -13,8 +13,9 @@ from torchgrasp.control import finger_forces, law
 from torchgrasp.control.paper.stability import StabilityModel
 from torchgrasp.control.tactile import Observation
 from torchgrasp.foundation.base import Value
-from torchgrasp.foundation.checks import ANY, Force, Pose, Positive, Range, check_tensor, checked
+from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import ANY, Force, Pose, Positive, Range
 from torchgrasp.geometry.frames import inverse, rotate
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane

@@ -26,8 +26,9 @@ from torchgrasp.control.tactile import (
     no_contact,
 )
 from torchgrasp.foundation.base import map_tensors
-from torchgrasp.foundation.checks import Positive, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import Positive
 
 WAITING_FORCE = 0.3
 """Largest force [N] of a finger that waits until the others touch, and the reading that stands for

@@ -9,7 +9,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.foundation.base import FINGERTIPS, Value, check_device
-from torchgrasp.foundation.checks import ANY, Count, Range, checked
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.rules import ANY, Count, Range
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.hand.hand import Hand
 

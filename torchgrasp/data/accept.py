@@ -16,8 +16,8 @@ from torch import Tensor
 from torchgrasp.cloud.read import make_cloud, read_cloud_file
 from torchgrasp.data.shipped import GraspObject
 from torchgrasp.foundation.base import Value
-from torchgrasp.foundation.checks import Taken, check_path, show
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import Taken, check_path, show
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import find_hand, hands_folder, load_hand
 from torchgrasp.scene.file import read_scene

@@ -19,9 +19,10 @@ import torch
 from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.cloud.read import read_cloud, save_cloud
 from torchgrasp.files import Field, format_json, read_json, write_file
-from torchgrasp.foundation.checks import Count, Seed, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import DatasetError
 from torchgrasp.foundation.lazy import trimesh
+from torchgrasp.foundation.rules import Count, Seed
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.values.planning import PointCloud
 

@@ -15,8 +15,9 @@ from torch import Tensor
 
 from torchgrasp.data.shards import MOST, JobRow, Shard, load_shard, read_row
 from torchgrasp.files import Recent, read_json
-from torchgrasp.foundation.checks import Count, Range, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import ModelFileError
+from torchgrasp.foundation.rules import Count, Range
 from torchgrasp.values.planning import Grasps, PointCloud
 
 # file that describes a data set; it is written last, so a folder with a card is complete

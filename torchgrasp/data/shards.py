@@ -16,9 +16,10 @@ from torch import Tensor
 
 from torchgrasp.files import Field, pack_tensors, read_value
 from torchgrasp.foundation.base import FINGERTIPS, Value, map_tensors, named_tensors
-from torchgrasp.foundation.checks import checked, is_rigid
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import ModelFileError, Status
 from torchgrasp.foundation.limits import JSON_LETTERS
+from torchgrasp.foundation.rules import is_rigid
 from torchgrasp.values.planning import Grasps
 
 KIND = "grasp-shard"  # kind of the file

@@ -12,7 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.foundation.checks import Seed, checked
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.rules import Seed
 
 Counts = Mapping[str, tuple[int | float, int]]
 """Passed trials and all trials of each resampled unit, a family or an object. For a mean: sum and

@@ -17,9 +17,10 @@ from torchgrasp.data.shipped import GraspObject
 from torchgrasp.evaluation.criterion import Tick, judge_lift, motion_between
 from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, TrialRun, Truth, smooth_step
 from torchgrasp.foundation.base import map_tensors
-from torchgrasp.foundation.checks import Pose, Seed, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import Status
 from torchgrasp.foundation.lazy import trimesh
+from torchgrasp.foundation.rules import Pose, Seed
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.mesh import read_mesh

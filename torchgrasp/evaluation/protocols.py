@@ -13,9 +13,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.foundation.base import Value
-from torchgrasp.foundation.checks import Count, Length, Pose, Range, Seed, check_tensor, checked
+from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import trimesh
+from torchgrasp.foundation.rules import Count, Length, Pose, Range, Seed
 from torchgrasp.geometry.frames import inverse, rigid, rotation_from_vector
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.success.task import GraspTask

@@ -14,8 +14,9 @@ from torchgrasp.evaluation.regrasp import run_lifts
 from torchgrasp.evaluation.summary import ProtocolResult
 from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, TrialRun
 from torchgrasp.foundation.base import Value
-from torchgrasp.foundation.checks import Measured, Range, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status
+from torchgrasp.foundation.rules import Measured, Range
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import rotation_angle
 from torchgrasp.values.closing import ObjectMotion

@@ -20,8 +20,9 @@ from torchgrasp.control.uncertainty_closing import UncertaintyClosing
 from torchgrasp.evaluation.lift import _Lift, run_lift
 from torchgrasp.evaluation.protocols import apply_error, seed_of
 from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, TrialRun, Truth, smooth_step
-from torchgrasp.foundation.checks import Count, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import Status
+from torchgrasp.foundation.rules import Count
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import inverse, rigid, rotation_from_vector
 from torchgrasp.geometry.mesh import read_mesh

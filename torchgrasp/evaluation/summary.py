@@ -15,8 +15,9 @@ from torch import Tensor
 
 from torchgrasp.evaluation.intervals import Share, count_by, share_over
 from torchgrasp.foundation.base import Value
-from torchgrasp.foundation.checks import Count, Measured, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import Status
+from torchgrasp.foundation.rules import Count, Measured
 
 STAGES: dict[str, tuple[Status, ...]] = {
     "start": (Status.START_OVERLAP,),

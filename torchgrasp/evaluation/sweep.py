@@ -23,9 +23,10 @@ from torchgrasp.evaluation.views import (
     try_grasp,
 )
 from torchgrasp.files import hold_folder, temporary_folder
-from torchgrasp.foundation.checks import Range, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import DatasetError, Status
 from torchgrasp.foundation.jobs import run_tasks
+from torchgrasp.foundation.rules import Range
 from torchgrasp.hand.hand import Hand
 
 # limits of the wall time [s] of planning on a view and of an attempt

@@ -21,9 +21,10 @@ from torchgrasp.control.reference import ClosingReference, check_single
 from torchgrasp.control.relook import REACH
 from torchgrasp.evaluation.frame import moved_mesh, rounded, to_frame, world_frame
 from torchgrasp.evaluation.protocols import apply_error, seed_of
-from torchgrasp.foundation.checks import Pose, Seed, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import trimesh
+from torchgrasp.foundation.rules import Pose, Seed
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField

@@ -25,9 +25,10 @@ from torchgrasp.evaluation.pull import run_protocol
 from torchgrasp.evaluation.summary import ProtocolResult, ViewScore
 from torchgrasp.evaluation.trial import GraspTrial, Truth
 from torchgrasp.foundation.base import Value, count_status
-from torchgrasp.foundation.checks import Count, Seed, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, GraspError, MissingExtra, OutputError, Status
 from torchgrasp.foundation.lazy import trimesh
+from torchgrasp.foundation.rules import Count, Seed
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand, HandSource

@@ -11,8 +11,9 @@ from torchgrasp.arm.reach import track, way_of
 from torchgrasp.control.paper.closings import POSE_TIME
 from torchgrasp.export.postures import named_postures
 from torchgrasp.foundation.base import Value
-from torchgrasp.foundation.checks import Force, Positive, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import Force, Positive
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.motion import COARSE_STEPS

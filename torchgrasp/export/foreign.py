@@ -19,10 +19,11 @@ from torchgrasp.contacts.certify import certify
 from torchgrasp.control.law import damped_inverse
 from torchgrasp.export.other_formats import bench_frame
 from torchgrasp.files import Field, is_file, read_bytes, read_json
-from torchgrasp.foundation.checks import Length, Poses, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, ModelFileError, Status
 from torchgrasp.foundation.lazy import spatial
 from torchgrasp.foundation.limits import CLOUD_BYTES
+from torchgrasp.foundation.rules import Length, Poses
 from torchgrasp.geometry.frames import apply, rigid, rotate
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values.planning import Contacts, Grasps

@@ -19,9 +19,10 @@ from torch import Tensor
 
 from torchgrasp.export.postures import named_postures, quaternion
 from torchgrasp.files import format_json, write_file
-from torchgrasp.foundation.checks import Force, Positive, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.lazy import matplotlib, spatial, trimesh
+from torchgrasp.foundation.rules import Force, Positive
 from torchgrasp.geometry.frames import rigid
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.motion import opened_pose

@@ -18,9 +18,10 @@ from torchgrasp.control.holding import PUSH
 from torchgrasp.control.paper.closings import POSE_TIME
 from torchgrasp.export.postures import named_postures, quaternion
 from torchgrasp.files import render, write_file
-from torchgrasp.foundation.checks import Positive, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import spatial, trimesh
+from torchgrasp.foundation.rules import Positive
 from torchgrasp.geometry.frames import inverse, rotation_from_rpy
 from torchgrasp.geometry.plane import Plane, upright_frame
 from torchgrasp.hand.hand import Hand

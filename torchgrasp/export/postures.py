@@ -13,9 +13,10 @@ from torch import Tensor
 from torchgrasp.control.finger_forces import Squeeze, squeeze
 from torchgrasp.control.paper.closings import POSE_TIME
 from torchgrasp.files import format_json
-from torchgrasp.foundation.checks import Force, Pose, Positive, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.lazy import spatial
+from torchgrasp.foundation.rules import Force, Pose, Positive
 from torchgrasp.geometry.frames import rotate
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.urdf import read_urdf

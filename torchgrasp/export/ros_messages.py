@@ -14,8 +14,9 @@ from torch import Tensor
 from torchgrasp.control.paper.closings import POSE_TIME
 from torchgrasp.export.arm_motion import ArmMotion
 from torchgrasp.export.postures import named_postures, quaternion, rename_joints
-from torchgrasp.foundation.checks import Force, Pose, Positive, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import Force, Pose, Positive
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.ik.motion import APPROACH_DISTANCE, UP, opened_pose

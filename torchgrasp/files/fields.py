@@ -21,7 +21,6 @@ from torch import Tensor
 
 from torchgrasp.files.write import Refuse, check_file, read_bounded, write_file
 from torchgrasp.foundation.base import Value
-from torchgrasp.foundation.checks import is_tensor
 from torchgrasp.foundation.errors import BadArgument, ModelFileError
 from torchgrasp.foundation.limits import (
     JSON_BYTES,
@@ -30,6 +29,7 @@ from torchgrasp.foundation.limits import (
     SHOWN_LETTERS,
     TENSOR_FILE_BYTES,
 )
+from torchgrasp.foundation.rules import is_tensor
 
 Item = TypeVar("Item")
 SomeValue = TypeVar("SomeValue", bound=Value)

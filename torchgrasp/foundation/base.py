@@ -10,8 +10,9 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from torchgrasp.foundation.checks import Range, check_moved, read_number, show
+from torchgrasp.foundation.checks import read_number
 from torchgrasp.foundation.errors import BadArgument, FailedRows, Status
+from torchgrasp.foundation.rules import Range, check_moved, show
 
 FINGERTIPS = (
     3,

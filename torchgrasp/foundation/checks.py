@@ -27,40 +27,25 @@ from torch import Tensor
 from typing_extensions import Unpack
 
 from torchgrasp.foundation.errors import BadArgument
-
-# isort: off
 from torchgrasp.foundation.rules import (
     ANY,
     DTYPES,
     FINITE,
-    LEAST,  # noqa: F401
     MOST,
     NUMBERS,
     RIGID,
-    Count,  # noqa: F401
-    Force,  # noqa: F401
-    Fraction,  # noqa: F401
-    Length,  # noqa: F401
-    Measured,  # noqa: F401
-    Pose,  # noqa: F401
-    Poses,  # noqa: F401
-    Positive,  # noqa: F401
     Range,
     Rows,
-    Seed,  # noqa: F401
     Taken,
     check_dense,
-    check_moved,  # noqa: F401
     check_path,
     describe,
     fits,
     is_known,
     is_rigid,
     is_tensor,
-    is_tracked,  # noqa: F401
     show,
 )
-# isort: on
 
 Checked = TypeVar("Checked", bound=Callable[..., Any])
 _thread = threading.local()  # `inside` is True while this thread is in a checked function

@@ -17,8 +17,9 @@ from typing import Annotated, Any, NamedTuple, TypeVar
 
 import torch
 
-from torchgrasp.foundation.checks import Range, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import MissingExtra, NoWorkers, Status
+from torchgrasp.foundation.rules import Range
 from torchgrasp.foundation.threads import one_thread
 
 Result = TypeVar("Result")

@@ -13,8 +13,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.foundation.base import SomeValue, Value, map_tensors
-from torchgrasp.foundation.checks import Pose, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import Pose
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
 from torchgrasp.geometry.linalg import unit
 

@@ -11,9 +11,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.foundation.base import Value, kept
-from torchgrasp.foundation.checks import Range, check_tensor, checked
+from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import spatial, trimesh
+from torchgrasp.foundation.rules import Range
 from torchgrasp.geometry.mesh import closest_on_triangles
 
 BAND = 0.026  # distance [m] within which every second node is exact: the reach of a palm's spheres

@@ -11,8 +11,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.foundation.base import Value, check_device, kept
-from torchgrasp.foundation.checks import ANY, checked, is_known
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import ANY, is_known
 from torchgrasp.geometry.frames import real
 from torchgrasp.hand.hand_toml import HandSpec
 from torchgrasp.hand.kinematics import (

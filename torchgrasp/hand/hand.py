@@ -12,9 +12,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.foundation.base import Value, kept
-from torchgrasp.foundation.checks import Count, Range, check_moved, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import pytorch_kinematics
+from torchgrasp.foundation.rules import Count, Range, check_moved
 from torchgrasp.hand.collision_shapes import CollisionSpheres
 from torchgrasp.hand.fingers import ActuatedJoints, Fingertips
 from torchgrasp.hand.kinematics import (

@@ -15,9 +15,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.foundation.base import Value
-from torchgrasp.foundation.checks import checked, is_known
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import pytorch_kinematics
+from torchgrasp.foundation.rules import is_known
 from torchgrasp.geometry.frames import real, rigid, rotation_from_rpy, skew
 from torchgrasp.hand.urdf import Urdf
 

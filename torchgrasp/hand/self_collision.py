@@ -11,8 +11,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.foundation.base import Value, kept
-from torchgrasp.foundation.checks import Range, checked, is_known
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import Range, is_known
 from torchgrasp.hand.kinematics import map_points
 
 Bound = Annotated[

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from torchgrasp.contacts.feasibility import first_violation
 from torchgrasp.foundation.base import Batch, Value
-from torchgrasp.foundation.checks import ANY, Length, Rows, checked, show
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status
+from torchgrasp.foundation.rules import ANY, Length, Rows, show
 from torchgrasp.geometry.frames import rotate
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.hand.hand import Hand

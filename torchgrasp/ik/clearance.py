@@ -13,7 +13,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.foundation.base import Value, settle
-from torchgrasp.foundation.checks import Range, checked
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.rules import Range
 from torchgrasp.geometry.plane import Plane, as_plane
 from torchgrasp.geometry.signed_distance import DistanceField, SignedDistanceField
 from torchgrasp.hand.collision_shapes import CollisionSpheres

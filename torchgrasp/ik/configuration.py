@@ -13,8 +13,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.foundation.base import Batch, Value
-from torchgrasp.foundation.checks import Poses, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import Poses
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 from torchgrasp.geometry.optim import Residuals
 from torchgrasp.hand.hand import Hand

@@ -21,8 +21,9 @@ from torchgrasp.foundation.base import (
     lexical_order,
     settle,
 )
-from torchgrasp.foundation.checks import Count, Positive, Seed, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import Count, Positive, Seed
 from torchgrasp.geometry.frames import apply, degenerate, inverse, rigid, rotate, virtual_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.candidates import Reachable, ask_reachable

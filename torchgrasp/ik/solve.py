@@ -12,8 +12,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.foundation.base import Batch, join, pick, rank_in_group, settle
-from torchgrasp.foundation.checks import ANY, check_tensor, checked
+from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import Status
+from torchgrasp.foundation.rules import ANY
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import degenerate
 from torchgrasp.hand.hand import Hand

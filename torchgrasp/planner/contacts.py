@@ -13,8 +13,9 @@ from torch import Tensor
 from torchgrasp.contacts.certify import certify
 from torchgrasp.contacts.resist import resist_loads
 from torchgrasp.foundation.base import join, lexical_order, rank_in_group
-from torchgrasp.foundation.checks import Count, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import Status
+from torchgrasp.foundation.rules import Count
 from torchgrasp.geometry.linalg import farthest_points
 from torchgrasp.ik.attempts import assign, seed_costs
 from torchgrasp.ik.seeds import nearest_postures, query_mixture

@@ -15,8 +15,9 @@ from typing_extensions import Unpack
 
 from torchgrasp.data.accept import HandLike, SeenLike, as_hand, as_seen
 from torchgrasp.foundation.base import Value, count_status
-from torchgrasp.foundation.checks import Count, Seed, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import Status
+from torchgrasp.foundation.rules import Count, Seed
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.planner.batches import Planner, rank_together
 from torchgrasp.planner.changes import Change, list_changes, more_starts

@@ -8,8 +8,9 @@ from typing import Annotated, overload
 from typing_extensions import Unpack
 
 from torchgrasp.data.accept import CloudLike, HandLike, SeenLike, as_cloud, as_hand, as_seen
-from torchgrasp.foundation.checks import Count, Range, Seed, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import Count, Range, Seed
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.planner.many import plan_many
 from torchgrasp.planner.request import PlanOptions, Request, show_options

@@ -24,8 +24,9 @@ from torchgrasp.contacts.starts import (
 )
 from torchgrasp.files import sha256
 from torchgrasp.foundation.base import settle
-from torchgrasp.foundation.checks import Seed, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import Seed
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.plane import move, round_upright, upright_frame
 from torchgrasp.hand.hand import Hand

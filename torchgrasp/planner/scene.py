@@ -10,8 +10,9 @@ from typing_extensions import Unpack
 
 from torchgrasp.data.accept import HandLike, SceneLike, as_hand, as_scene
 from torchgrasp.foundation.base import Value
-from torchgrasp.foundation.checks import Count, Fraction, Measured, Seed, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, FailedRows, GraspError, Status
+from torchgrasp.foundation.rules import Count, Fraction, Measured, Seed
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.planner.explain import Funnel
 from torchgrasp.planner.graspable import is_vague, judge_things, order_by_ease

@@ -24,8 +24,9 @@ from torchgrasp.files import (
     save_tensors,
 )
 from torchgrasp.foundation.base import check_whole, join
-from torchgrasp.foundation.checks import Count, Range, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, ModelFileError, OutputError
+from torchgrasp.foundation.rules import Count, Range
 from torchgrasp.hand.hand import Hand
 from torchgrasp.posture_model.sample import (
     CHUNK_POSTURES,

@@ -12,8 +12,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.foundation.base import Kept, Value, kept
-from torchgrasp.foundation.checks import Range, Seed, check_dense, checked, is_known
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import Range, Seed, check_dense, is_known
 from torchgrasp.geometry.linalg import cholesky
 
 ROWS_PER_CHUNK = (

@@ -14,8 +14,9 @@ from torch import Tensor
 
 from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.foundation.base import check_whole
-from torchgrasp.foundation.checks import ANY, Count, check_tensor, checked, is_known
+from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument, ModelFileError, Status
+from torchgrasp.foundation.rules import ANY, Count, is_known
 from torchgrasp.geometry.frames import degenerate, virtual_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import find_hand

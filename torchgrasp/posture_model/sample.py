@@ -19,8 +19,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.foundation.base import Batch, Value
-from torchgrasp.foundation.checks import Range, Seed, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import Range, Seed
 from torchgrasp.geometry.linalg import across, fibonacci_sphere, unit
 from torchgrasp.hand.hand import Hand
 from torchgrasp.posture_model.mixture import describe_compatibility, encode_fingertips

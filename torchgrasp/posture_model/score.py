@@ -10,8 +10,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.foundation.base import Value
-from torchgrasp.foundation.checks import Count, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import Count
 from torchgrasp.posture_model.em import start_components
 from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, PAPER_ENERGY, GraspMixture
 from torchgrasp.posture_model.sample import HandSamples

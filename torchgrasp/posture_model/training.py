@@ -12,8 +12,9 @@ from torch import Tensor
 
 from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.foundation.base import check_whole
-from torchgrasp.foundation.checks import Count, Fraction, Range, Seed, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, ModelFileError
+from torchgrasp.foundation.rules import Count, Fraction, Range, Seed
 from torchgrasp.posture_model.em import (
     Components,
     DataRows,

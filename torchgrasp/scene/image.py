@@ -17,9 +17,10 @@ from torchgrasp.cloud.pose import read_camera_pose
 from torchgrasp.cloud.safe_files import parse_npz
 from torchgrasp.files import explain, read_bounded
 from torchgrasp.foundation.base import Value
-from torchgrasp.foundation.checks import Pose, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, CloudFileError
 from torchgrasp.foundation.limits import CLOUD_BYTES
+from torchgrasp.foundation.rules import Pose
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
 from torchgrasp.geometry.linalg import Points, Vector, unit
 from torchgrasp.geometry.plane import GRID

@@ -12,8 +12,9 @@ from torch import Tensor
 from torchgrasp.cloud.pose import check_sizes, find_plausible
 from torchgrasp.cloud.sensor import SensorNoise, estimate_noise
 from torchgrasp.foundation.base import Value
-from torchgrasp.foundation.checks import Pose, Positive, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import Pose, Positive
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.plane import Plane, to_upright
 from torchgrasp.geometry.support_planes import find_table

@@ -16,8 +16,9 @@ from torchgrasp.cloud.parts import find_second_body
 from torchgrasp.cloud.prepare import PreparedCloud, prepare_cloud
 from torchgrasp.data.accept import CloudLike, as_cloud
 from torchgrasp.foundation.base import join
-from torchgrasp.foundation.checks import LEAST, Positive, Range, Seed, checked, is_known
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, CutOff, FewPoints, Flat, Gap, TwoBodies
+from torchgrasp.foundation.rules import LEAST, Positive, Range, Seed, is_known
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.plane import Plane, as_plane, round_upright, upright_frame
 from torchgrasp.shape.completion.complete import complete_cloud

@@ -10,17 +10,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.foundation.base import Value
-from torchgrasp.foundation.checks import (
-    Pose,
-    Positive,
-    Range,
-    Seed,
-    check_moved,
-    check_tensor,
-    checked,
-    is_known,
-)
+from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import Pose, Positive, Range, Seed, check_moved, is_known
 from torchgrasp.geometry.frames import apply
 from torchgrasp.geometry.linalg import cholesky, unit, unit_of_any
 from torchgrasp.geometry.plane import move

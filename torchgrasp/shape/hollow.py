@@ -12,7 +12,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.foundation.base import map_tensors
-from torchgrasp.foundation.checks import Pose, checked
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.rules import Pose
 from torchgrasp.geometry.linalg import farthest_points
 from torchgrasp.shape.completion.silhouette import TIE
 from torchgrasp.shape.estimate import JointEstimate, MeanJet, Observations, SurfaceJet, off_surface

@@ -15,7 +15,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.foundation.checks import LEAST, Positive, Range, checked, is_known, is_tracked
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.rules import LEAST, Positive, Range, is_known, is_tracked
 
 Profile = Callable[[Tensor], Tensor]
 """A radial kernel k(r), elementwise, smooth where r > 0 and four times so at 0 from the right, with

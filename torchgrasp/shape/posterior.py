@@ -10,8 +10,9 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from torchgrasp.foundation.base import Value, at_once, in_chunks
-from torchgrasp.foundation.checks import checked, is_known
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import IndefiniteCovariance
+from torchgrasp.foundation.rules import is_known
 from torchgrasp.shape.estimate import JointEstimate, MeanJet, SurfaceJet
 from torchgrasp.shape.jets import (
     Weighted,

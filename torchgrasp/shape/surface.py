@@ -13,9 +13,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.foundation.base import Value, map_tensors
-from torchgrasp.foundation.checks import Range, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import ndimage, spatial, trimesh
+from torchgrasp.foundation.rules import Range
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.linalg import Points, limit_norm, number_components, unit
 from torchgrasp.geometry.mesh import clip_mesh

@@ -8,8 +8,9 @@ import torch
 
 from torchgrasp.control import FingertipSensor, Observation, Targets, TipContact
 from torchgrasp.control.reference import ClosingReference
-from torchgrasp.foundation.checks import Range, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import Range
 from torchgrasp.sim.scene_spec import SceneSpec
 from torchgrasp.sim.simulated_scene import SimulatedScene
 from torchgrasp.values.specs import Simulator

@@ -10,8 +10,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.foundation.base import Value
-from torchgrasp.foundation.checks import Force, Range, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import Force, Range
 from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.plane import Plane
 

@@ -9,8 +9,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.foundation.base import Value
-from torchgrasp.foundation.checks import ANY, Measured, Range, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status
+from torchgrasp.foundation.rules import ANY, Measured, Range
 
 
 @checked

@@ -19,8 +19,9 @@ from torch import Tensor
 
 from torchgrasp.files import save_tensors
 from torchgrasp.foundation.base import Batch, Value, named_tensors, read_rows
-from torchgrasp.foundation.checks import ANY, Poses, Rows, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, FailedRows, Status, TooFewPoints
+from torchgrasp.foundation.rules import ANY, Poses, Rows
 from torchgrasp.geometry.plane import Plane, read_plane
 
 

@@ -6,8 +6,9 @@ from collections.abc import Callable, Iterator
 from typing import Annotated, Any, Literal
 
 from torchgrasp.foundation.base import FINGERTIPS, Value
-from torchgrasp.foundation.checks import Force, Length, Range, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import Force, Length, Range
 from torchgrasp.geometry.plane import Plane, as_plane
 from torchgrasp.values.closing import ClosingOptions, SensorModel, choose_options
 

@@ -28,8 +28,9 @@ from torchgrasp.app.author.repair import (
 )
 from torchgrasp.files import render
 from torchgrasp.foundation.base import FINGERTIPS
-from torchgrasp.foundation.checks import Seed, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import Seed
 from torchgrasp.hand.collision_shapes import collision_pairs, draw_postures
 from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.kinematics import tree_from_urdf

@@ -22,8 +22,9 @@ from torchgrasp.cloud.neighbours import draw_rows
 from torchgrasp.cloud.prepare import prepare_cloud
 from torchgrasp.data import write_objects
 from torchgrasp.export import check_surface_path, largest_std, save_surface
-from torchgrasp.foundation.checks import Range, Seed, check_tensor
+from torchgrasp.foundation.checks import check_tensor
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import Range, Seed
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import as_plane
 from torchgrasp.shape.completion.silhouette import silhouettes

@@ -13,9 +13,8 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args, get_ori
 import tyro
 from tqdm import tqdm
 
-from torchgrasp.foundation.checks import Range, check_path
 from torchgrasp.foundation.errors import BadArgument
-from torchgrasp.foundation.rules import describe
+from torchgrasp.foundation.rules import Range, check_path, describe
 
 T = TypeVar("T")
 

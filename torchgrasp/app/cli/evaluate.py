@@ -48,8 +48,8 @@ from torchgrasp.files import (
     hold_folder,
     write_file,
 )
-from torchgrasp.foundation.checks import Count, Range, Seed
 from torchgrasp.foundation.errors import BadArgument, DatasetError, Status
+from torchgrasp.foundation.rules import Count, Range, Seed
 from torchgrasp.values.specs import ClosingMode, HoldingMode, Simulator
 
 OBJECTS_HELP = (

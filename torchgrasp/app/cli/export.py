@@ -20,8 +20,8 @@ from torchgrasp.cloud.read import read_cloud
 from torchgrasp.data.shards import load_grasps
 from torchgrasp.export.foreign import Quaternion, read_poses
 from torchgrasp.files import read_json, write_file
-from torchgrasp.foundation.checks import Count
 from torchgrasp.foundation.errors import BadArgument, ModelFileError, Status
+from torchgrasp.foundation.rules import Count
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import hand_of

@@ -27,9 +27,9 @@ from torchgrasp.evaluation.lift import close_hand
 from torchgrasp.export import save_surface
 from torchgrasp.export.play import stand
 from torchgrasp.files import format_columns, format_line, sha256
-from torchgrasp.foundation.checks import Count, Seed
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.lazy import trimesh
+from torchgrasp.foundation.rules import Count, Seed
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import as_plane
 from torchgrasp.geometry.signed_distance import FIELD_SPACING, field_from_surface

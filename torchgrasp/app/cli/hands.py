@@ -33,8 +33,8 @@ from torchgrasp.app.report.stills import draw_hand, opposed_posture
 from torchgrasp.data.shipped import load_object
 from torchgrasp.files import format_columns, hold_file, render, temporary_folder, write_file
 from torchgrasp.foundation.base import count_status
-from torchgrasp.foundation.checks import Range, Seed
 from torchgrasp.foundation.errors import BadArgument, GraspError, OutputError, Status
+from torchgrasp.foundation.rules import Range, Seed
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import read_hand_toml
 from torchgrasp.hand.load import find_hand

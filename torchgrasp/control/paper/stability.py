@@ -19,8 +19,9 @@ from torch import Tensor
 
 from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.foundation.base import Value
-from torchgrasp.foundation.checks import LEAST, Positive, Range, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, ModelFileError
+from torchgrasp.foundation.rules import LEAST, Positive, Range
 from torchgrasp.hand.hand import Hand
 from torchgrasp.posture_model.gaussian import GaussianMixture
 from torchgrasp.posture_model.mixture import check_compatible

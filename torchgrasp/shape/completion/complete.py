@@ -14,9 +14,10 @@ from torch import Tensor
 
 from torchgrasp.cloud.neighbours import nearest
 from torchgrasp.foundation.base import Batch, Value, join
-from torchgrasp.foundation.checks import Count, Pose, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import spatial
+from torchgrasp.foundation.rules import Count, Pose
 from torchgrasp.geometry.frames import apply, inverse, rotate
 from torchgrasp.geometry.linalg import farthest_points, reflect, reflect_directions, unit
 from torchgrasp.shape.completion.axis import Revolution, find_axis, find_revolution

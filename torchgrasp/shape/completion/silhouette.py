@@ -8,9 +8,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.foundation.base import Value
-from torchgrasp.foundation.checks import Pose, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import ndimage, spatial
+from torchgrasp.foundation.rules import Pose
 from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import across, farthest_points, unit
 from torchgrasp.values.planning import PointCloud
