@@ -14,13 +14,11 @@ from torchgrasp.testing import check_hand
 
 folder = Path(tempfile.mkdtemp()) / "mine"
 folder.mkdir()
-shutil.copy(
-    load_hand("barrett").urdf_path, folder / "hand.urdf"
-)  # stands for the URDF of your own hand
+urdf = folder / "hand.urdf"
+shutil.copy(load_hand("barrett").urdf_path, urdf)  # stands for the URDF of your own hand
 
-write_file(
-    folder / "hand.toml", draft_hand(folder / "hand.urdf")
-)  # as `torchgrasp hand new`; read it and mend it
+# as `torchgrasp hand new`; read it and mend it
+write_file(folder / "hand.toml", draft_hand(urdf))
 hand = check_hand(folder)  # as `torchgrasp hand check`: raises with the rule that a file breaks
 print(f"{hand.name}: {hand.dof} actuated joints, fingers {', '.join(hand.tips.names)}")
 

@@ -1,8 +1,6 @@
-"""The loop of a real robot, without a simulator: joints and fingertip forces go in, targets come
-out.
+"""The loop of a real robot, without a simulator: joints and forces go in, targets come out.
 
-`FakeRobot` stands for the driver of your own hand. Replace its three methods; the loop below stays
-as it is.
+`FakeRobot` stands for the driver of your own hand. Replace its three methods; the loop stays.
 """
 
 import gc
@@ -34,36 +32,32 @@ class FakeRobot:
         return self.joints
 
     def read_fingertips(self):
-        """Return the contact of each fingertip in the hand's frame; NaN points and normals mean
-        none.
-        """
+        """Return each fingertip's contact in the hand's frame; NaN points and normals: none."""
         points = self.reference.contact_points(self.reference.hand.tip_centres(self.joints))
         normals = self.reference.normals
         force = 2e3 * ((self.reference.gains.target - points) * normals).sum(-1).clamp_min(0.0)
         nothing = (force == 0.0)[:, None]
-        sensed = (torch.where(nothing, torch.nan, points), torch.where(nothing, torch.nan, normals))
-        return TipContact(force, -force[:, None] * normals, *sensed)
+        points = torch.where(nothing, torch.nan, points)
+        felt = torch.where(nothing, torch.nan, normals)
+        return TipContact(force, -force[:, None] * normals, points, felt)
 
     def send(self, targets):
         """Send a target for every joint of the URDF, in the order of `hand.tree.joint_names` [rad].
 
         `targets.palm` [m] is for the arm; this one does not yield.
         """
-        forces = (
-            self.read_fingertips().forces
-        )  # the drives yield to them: kp (target - joint) = J^T f at rest
+        # the drives yield to the fingertips' forces: kp (target - joint) = J^T f at rest
+        forces = self.read_fingertips().forces
         torques = torch.einsum("cih,ci->h", self.reference.hand.jacobian(self.joints), forces)
-        rest = self.reference.pick(targets.joints) - torques / self.reference.pick(
-            self.reference.kp
-        )
+        stiffness = self.reference.pick(self.reference.kp)
+        rest = self.reference.pick(targets.joints) - torques / stiffness
         self.joints = self.joints + 0.05 * (rest - self.joints)
 
 
 hand = load_hand("allegro")
 grasp = plan_grasps(load_object("cylinder").view, hand, ContactSpec(table=0.0), starts=50)[0]
-print(
-    "palm to", grasp.obj_from_hand[0].numpy().round(3).tolist(), "with the joints at the pre-grasp"
-)
+palm = grasp.obj_from_hand[0].numpy().round(3).tolist()
+print("palm to", palm, "with the joints at the pre-grasp")
 
 reference = ClosingReference.from_grasp(hand, grasp, force=4.0)
 controller = GraspController(reference)
@@ -73,13 +67,10 @@ gc.collect()
 gc.freeze()  # else Python looks through all that was imported in some tick, for 0.1 s
 ticks = 0
 while not controller.closed:  # then lift the arm, and go on stepping
-    # `measure` filters the forces and flags contacts; a sensor that does so itself fills a
-    # `TactileState`
-    tactile = measure(
-        tactile, robot.read_fingertips(), reference.normals, hand.tips.radius.double(), PERIOD
-    )
+    # `measure` filters forces and flags contacts; a sensor that does so fills a `TactileState`
+    felt = robot.read_fingertips()
+    tactile = measure(tactile, felt, reference.normals, hand.tips.radius.double(), PERIOD)
     robot.send(controller.step(observe(hand, robot.read_joints(), tactile), PERIOD))
     ticks += 1
-print(
-    f"closed after {ticks * PERIOD:.2f} s, the fingers press with {tactile.reading.numpy().round(1)} N"
-)
+pressure = tactile.reading.numpy().round(1)
+print(f"closed after {ticks * PERIOD:.2f} s, the fingers press with {pressure} N")

@@ -21,23 +21,16 @@ STIFFNESS = 0.5
 
 hand = load_hand("allegro")
 grasps = plan_grasps(load_object("cylinder").view, hand, ContactSpec(table=0.0), starts=50)
-file = (
-    Path(tempfile.mkdtemp()) / "grasps.json"
-)  # as `torchgrasp export GRASPS --force 3 --kp 0.5` writes it
+# as `torchgrasp export GRASPS --force 3 --kp 0.5` writes it
+file = Path(tempfile.mkdtemp()) / "grasps.json"
 file.write_text(format_grasps(hand, grasps[:1], force=3.0, kp=STIFFNESS))
 
 content = json.loads(file.read_text())  # from here on the file is enough
 best = content["grasps"][0]
 times = content["time"]
 postures = sorted(times, key=times.get)  # pregrasp, grasp, squeeze
-print(
-    "the arm brings the hand's root to",
-    best["pose"],
-    "along",
-    best["approach"],
-    "and stays off by",
-    best["rise"],
-)
+print("the arm brings the hand's root to", best["pose"], "along", best["approach"])
+print("and stays off by", best["rise"])
 
 knots = np.array([[best["joints"][posture][joint] for joint in ORDER] for posture in postures])
 seconds = np.arange(round(times["squeeze"] * RATE) + 1) / RATE

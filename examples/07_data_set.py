@@ -22,15 +22,13 @@ trimesh.creation.cylinder(radius=0.03, height=0.12).export(folder / "meshes" / "
 trimesh.creation.box((0.05, 0.06, 0.12)).export(folder / "meshes" / "carton.ply")
 write_objects(folder / "meshes", folder / "objects", views=1)
 
-trials = EvaluationSpec(
-    grasps=2, ranks="spread", starts=40
-)  # of each view two grasps, the best and the worst
+# of each view two grasps, the best and the worst
+trials = EvaluationSpec(grasps=2, ranks="spread", starts=40)
 spec = CampaignSpec("tabletop", trials, licence="CC0-1.0")
 run_campaign(folder / "objects", load_hand("barrett"), folder / "data", spec, observer=print)
 
-data = read_shards(
-    folder / "data", points=256
-)  # a map-style dataset; here from another day's process
+# a map-style dataset; here from another day's process
+data = read_shards(folder / "data", points=256)
 for batch in torch.utils.data.DataLoader(
     data, batch_size=2, shuffle=True, generator=torch.Generator().manual_seed(0)
 ):

@@ -1,6 +1,4 @@
-"""Gradients: fit the posture model by descent instead of EM, and move fingertips onto an uncertain
-shape by descent.
-"""
+"""Gradients: fit the posture model, and move fingertips onto an uncertain shape, by descent."""
 
 import torch
 
@@ -34,41 +32,33 @@ for _ in range(300):
     logits, means, factors = leaves
     root = unit[:, None] * factors.tril()
     covariances = root @ root.mT + torch.diag(1e-4 * unit**2)
-    loss = (
-        -GraspMixture(logits.softmax(0), centre + unit * means, covariances, em.names)
-        .log_prob(rows)
-        .mean()
-    )
+    model = GraspMixture(logits.softmax(0), centre + unit * means, covariances, em.names)
+    loss = -model.log_prob(rows).mean()
     optimiser.zero_grad()
     loss.backward()
     optimiser.step()
-print(
-    f"mean log-likelihood: {float(-loss.detach()):.2f} by descent, {float(em.log_prob(rows).mean()):.2f} by EM"
-)
+ours = float(-loss.detach())
+print(f"mean log-likelihood: {ours:.2f} by descent, {float(em.log_prob(rows).mean()):.2f} by EM")
 
-# 2. Forward kinematics, the shape's posterior and the posture model form one loss of the joints
-# [rad].
+# 2. Kinematics, the shape's posterior and the posture model form one loss of the joints [rad].
 view = load_object("cylinder").view
 shape = fit_shape(view)
 model = load_mixture("barrett")
 grasp = plan_grasps(view, hand, starts=30)[0]
-# spoiled, so that there is something to do
 pose = grasp.obj_from_hand.double()
+# spoiled, so that there is something to do
 joints = (grasp.joints + 0.05).double()
 
 
 def loss_of(joints: torch.Tensor) -> torch.Tensor:
-    """Return squared distances and deviations [mm2] of the surface at the fingertips, plus the
-    energy, Eq. (21).
-    """
+    """Return squared distances and deviations [mm2] at the fingertips, plus Eq. (21)."""
     points, normals = hand.fingertips(joints)
     points = apply(pose, points)
     normals = rotate(pose, normals)
     surface = shape.predict(points)
     off = 1e3 * shape.scale * surface.distance  # [mm]
-    return (off**2 + (1e3 * surface.std_m) ** 2).sum() + model.energy(
-        encode((points, normals))
-    ).amin()
+    energy = model.energy(encode((points, normals))).amin()
+    return (off**2 + (1e3 * surface.std_m) ** 2).sum() + energy
 
 
 print(f"loss {float(loss_of(joints)):.1f} of the spoiled grasp,", end=" ")
@@ -87,6 +77,5 @@ def evaluate() -> torch.Tensor:
 optimiser.step(evaluate)
 joints = joints.detach()
 curvature = torch.func.hessian(loss_of)(joints)[0, :, 0]
-print(
-    f"{float(loss_of(joints)):.1f} after descent, with curvatures {torch.linalg.eigvalsh(curvature).numpy().round()}"
-)
+bends = torch.linalg.eigvalsh(curvature).numpy().round()
+print(f"{float(loss_of(joints)):.1f} after descent, with curvatures {bends}")

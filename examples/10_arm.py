@@ -4,8 +4,8 @@ Here the URDF is made from the published Denavit-Hartenberg parameters, with a c
 link. A maker's URDF has meshes: `torchgrasp.app.author.clean_arm` replaces them. With the network
 and `pip install robot_descriptions`:
 
-    from robot_descriptions import panda_description as found  # or ur5e_description,
-    iiwa14_description file.write_text(clean_arm(found.URDF_PATH, meshes=found.REPOSITORY_PATH))
+    from robot_descriptions import panda_description as found  # or ur5e_description, ...
+    file.write_text(clean_arm(found.URDF_PATH, meshes=found.REPOSITORY_PATH))
 """
 
 import math
@@ -54,13 +54,10 @@ grasps = plan_grasps(load_object("cylinder").view, hand, ContactSpec(table=0.0),
 best = grasps[0].raise_for_status()
 room, manipulability = best.ease[0].tolist()
 print(dict(zip(arm.joint_names, best.arm[0].tolist(), strict=True)))
-print(
-    f"{best.success[0]:.0%} likely, joints keep {room:.0%} of half their range, manipulability {manipulability:.3f}"
-)
+print(f"{best.success[0]:.0%} likely, room {room:.0%}, manipulability {manipulability:.3f}")
 
 motion = plan_motion(arm, hand, best)
 for phase, k in motion.phases.items():
-    print(
-        f"{motion.times[k]:.1f} s {phase}: arm at {[round(q, 2) for q in motion.positions[0, k, :6].tolist()]}"
-    )
+    posture = [round(q, 2) for q in motion.positions[0, k, :6].tolist()]
+    print(f"{motion.times[k]:.1f} s {phase}: arm at {posture}")
 print(len(format_motion(hand, motion).splitlines()), "lines of a trajectory_msgs/JointTrajectory")
