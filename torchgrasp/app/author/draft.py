@@ -5,6 +5,7 @@ A published URDF is repaired (`repair`), its meshes are replaced by simple shape
 and the fingertip pads are guessed (`pads`). Every guess is marked in the text.
 """
 
+import dataclasses
 import functools
 import json
 from collections.abc import Sequence
@@ -36,11 +37,24 @@ from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.kinematics import tree_from_urdf
 from torchgrasp.hand.urdf import REPAIR, SIZES, Mimic, Triple, Urdf, read_published
 
-OPTIONS = {
-    "default": 3,
-    "four": 4,
-    "five": 5,
-}  # sets of fingers that a draft declares if the hand has as many
+OPTIONS = {"default": 3, "four": 4, "five": 5}
+"""Sets of fingers that a draft declares if the hand has as many."""
+MOST_ERROR = 1000  # of the list of repairs in an error [characters]
+
+
+@dataclasses.dataclass(frozen=True)
+class DraftNumbers:
+    """Random postures from which pads are guessed, and drives like those of the shipped hands."""
+
+    postures: int = 20_000
+    chunk: int = 1000  # postures whose poses are computed at once, to bound the memory
+    rotor: float = 1e-3  # inertia [kg m2] that simulations add to each joint
+    stiffness: float = 4.0  # [1/rad], in efforts of the weakest joint
+    most_stiffness: float = 10.0  # [N m/rad]
+    damping: float = 0.03  # least time constant [s]: the ratio of damping to stiffness
+
+
+DRAFT = DraftNumbers()
 
 
 class Draft(NamedTuple):
@@ -48,9 +62,6 @@ class Draft(NamedTuple):
     URDF.
 
     `urdf` is empty if the published URDF is clean.
-
-    >>> Draft('name = "mine"', urdf="", repairs=()).toml
-    'name = "mine"'
     """
 
     toml: str
@@ -61,15 +72,15 @@ class Draft(NamedTuple):
 class Wish(NamedTuple):
     """The user's choices for a new hand: fingertip links, name, first link of the hand on an arm,
     folder of meshes.
-
-    >>> Wish(tips=("thumb_tip", "index_tip", "ring_tip"), name="mine").root
-    ''
     """
 
     tips: tuple[str, ...] = ()
     name: str = ""
     root: str = ""
     meshes: Path | None = None
+
+
+NO_WISH = Wish()
 
 
 @checked
@@ -93,16 +104,17 @@ def draft_hand(
     """
     draft = new_hand(path, Wish(tuple(tips), name or ""), seed)
     if draft.urdf:
-        raise read_published(path).wrong("; ".join(draft.repairs)[:1000], f"a clean URDF {REPAIR}")
+        repairs = "; ".join(draft.repairs)[:MOST_ERROR]
+        raise read_published(path).wrong(repairs, f"a clean URDF {REPAIR}")
     return draft.toml
 
 
 @checked
 def new_hand(
     path: Path | str,
-    wish: Wish = Wish(),
+    wish: Wish = NO_WISH,
     seed: Seed = 0,
-    file: str = "hand.urdf",  # noqa: B008
+    file: str = "hand.urdf",
 ) -> Draft:
     """Repair a published URDF, and draft a hand.toml for the clean copy, which the user saves as
     `file`.
@@ -116,6 +128,7 @@ def new_hand(
     (True, ())
     """
     published = read_published(path)
+    # frames are merged twice: a wrist that is fixed leaves new ones
     urdf, below = keep_below(published, wish.root or published.root)
     urdf, merged, taken = merge_frames(urdf)
     urdf, fixed = fix_wrist(urdf, fingertip_links(urdf) or [urdf.root])
@@ -124,16 +137,16 @@ def new_hand(
     points = shape_points(urdf, wish.meshes or published.path.parent)
     surfaces = {name: np.concatenate(parts) for name, parts in points.items() if parts}
     urdf, bodies = repair_bodies(urdf, surfaces)
-    tips = tuple(taken_again.get(x, x) for x in (taken.get(tip, tip) for tip in wish.tips))
-    tips = _checked_tips(urdf, tips)
+    # a tip that the user named may have been merged into another link
+    tips = tuple(taken.get(tip, tip) for tip in wish.tips)
+    tips = _checked_tips(urdf, tuple(taken_again.get(tip, tip) for tip in tips))
     frames = _frames(urdf, (*tips, palm_of(urdf, tips)), seed)
     guess = guess_pads(urdf, frames, tips, surfaces)
     order = list(range(len(tips)))
     if not wish.tips:
         order = order_by_facing(frames[:, :, :-1], guess.pads)
-    sets = {
-        name: [tips[k] for k in sorted(order[:n])] for name, n in OPTIONS.items() if n <= len(tips)
-    }
+    possible = {name: n for name, n in OPTIONS.items() if n <= len(tips)}
+    sets = {name: [tips[k] for k in sorted(order[:n])] for name, n in possible.items()}
     simple = {x.name for x in urdf.links if is_primitive(x)}
     clean, fitted = replace_meshes(urdf, points)
     chosen = dict[str, Pad]()
@@ -148,9 +161,7 @@ def new_hand(
         repairs.append(f"fingertips touch with a ball in their end, of radius: {', '.join(balls)}")
     names = wish.name or urdf.name, file if repairs else published.path.name
     toml = _toml_text(clean, chosen, sets, guess.approach, names, seed)
-    return Draft(
-        toml, _render("hand.urdf", urdf=clean, sizes=SIZES) if repairs else "", tuple(repairs)
-    )
+    return Draft(toml, _urdf_text(clean) if repairs else "", tuple(repairs))
 
 
 @checked
@@ -167,17 +178,16 @@ def clean_arm(path: Path | str, meshes: Path | str | None = None) -> str:
     """
     urdf, _ = repair_joints(read_published(path))
     clean, _ = replace_meshes(urdf, shape_points(urdf, Path(meshes or urdf.path.parent)))
-    return _render("hand.urdf", urdf=clean, sizes=SIZES)
+    return _urdf_text(clean)
 
 
 def _frames(urdf: Urdf, links: tuple[str, ...], seed: int) -> Float[Tensor, "3 4 _ n"]:
-    """Return the poses (3 x 4) of some links in random postures, computed in chunks to bound the
-    memory.
-    """
+    """Return the poses (3 x 4) of some links in random postures."""
     tree = tree_from_urdf(urdf)
-    at = [[x.name for x in urdf.links].index(link) for link in links]
-    values = draw_postures(urdf, _coupling(urdf), 20_000, seed)
-    return torch.cat([tree.frames(part)[:, :, at] for part in values.split(1000, 1)], -1)
+    names = [x.name for x in urdf.links]
+    at = [names.index(link) for link in links]
+    values = draw_postures(urdf, _coupling(urdf), DRAFT.postures, seed)
+    return torch.cat([tree.frames(part)[:, :, at] for part in values.split(DRAFT.chunk, 1)], -1)
 
 
 def _checked_tips(urdf: Urdf, tips: tuple[str, ...]) -> tuple[str, ...]:
@@ -187,14 +197,16 @@ def _checked_tips(urdf: Urdf, tips: tuple[str, ...]) -> tuple[str, ...]:
     ends = fingertip_links(urdf)
     chosen = tips or ends
     if not FINGERTIPS[0] <= len(chosen) <= FINGERTIPS[1] or len(set(chosen)) < len(chosen):
-        wanted = f"three to five different links in grasp order; the branches of {urdf.path} end in {list(ends)}"
+        wanted = (
+            "three to five different links in grasp order; "
+            f"the branches of {urdf.path} end in {list(ends)}"
+        )
         raise BadArgument("tips", list(tips) or f"a hand of {len(ends)} fingers", wanted)
     shaped = {x.name for x in urdf.links if x.shapes}
     for tip in chosen:
         if tip not in shaped or not urdf.movers(tip):
-            raise BadArgument(
-                "tips", tip, f"links with a collision shape that joints move, such as {list(ends)}"
-            )
+            wanted = f"links with a collision shape that joints move, such as {list(ends)}"
+            raise BadArgument("tips", tip, wanted)
     return chosen
 
 
@@ -206,19 +218,14 @@ def _gains(urdf: Urdf) -> tuple[float, float]:
     """Return stiffness [N m/rad] and damping [N m s/rad] for the drives, similar to those of the
     shipped hands.
     """
-    # inertia [kg m2] that simulations add to each joint; the damping is at least critical with it
-    rotor = 1e-3
     free = [j for j in urdf.movable if j.mimic is None]
-    kp = min(4.0 * min(j.effort for j in free), 10.0)
-    poses = (
-        tree_from_urdf(urdf)
-        .poses(torch.zeros(1, len(urdf.movable), dtype=torch.float64))[0]
-        .numpy()
-    )
+    kp = min(DRAFT.stiffness * min(j.effort for j in free), DRAFT.most_stiffness)
+    zero = torch.zeros(1, len(urdf.movable), dtype=torch.float64)
+    poses = tree_from_urdf(urdf).poses(zero)[0].numpy()  # (l, 4, 4)
     names = [x.name for x in urdf.links]
-    centres = np.array(
-        [p[:3, :3] @ x.com + p[:3, 3] for p, x in zip(poses, urdf.links, strict=True)]
-    )
+    placed = zip(poses, urdf.links, strict=True)
+    centres = np.array([pose[:3, :3] @ x.com + pose[:3, 3] for pose, x in placed])
+    # greatest inertia that a joint turns, of all links beyond it as points
     heaviest = 0.0
     for j in free:
         if j.kind == "prismatic":
@@ -226,10 +233,10 @@ def _gains(urdf: Urdf) -> tuple[float, float]:
         pose = poses[names.index(j.child)]
         moved = [k for k, name in enumerate(names) if j in urdf.joints_above(name)]
         arms = np.cross(pose[:3, :3] @ j.axis, centres[moved] - pose[:3, 3])
-        heaviest = max(
-            heaviest, float(np.array([urdf.links[k].mass for k in moved]) @ (arms**2).sum(1))
-        )
-    return kp, max(0.03 * kp, 2 * np.sqrt(kp * (heaviest + rotor)))
+        masses = np.array([urdf.links[k].mass for k in moved])
+        heaviest = max(heaviest, float(masses @ (arms**2).sum(1)))
+    critical = 2 * np.sqrt(kp * (heaviest + DRAFT.rotor))
+    return kp, max(DRAFT.damping * kp, critical)
 
 
 def _toml_text(
@@ -244,16 +251,13 @@ def _toml_text(
     hand and URDF file.
     """
     coupling = _coupling(urdf)
-    (kp, kd) = _gains(urdf)
+    kp, kd = _gains(urdf)
     chains = {tip: [j.name for j in urdf.movers(tip)[::-1]] for tip in pads}
     called = {tip: tip.removesuffix("_tip") for tip in pads}
-    options = {
-        option: (
-            [called[tip] for tip in tips],
-            _parked(urdf, {joint for tip in tips for joint in chains[tip]}),
-        )
-        for option, tips in sets.items()
-    }
+    options = {}
+    for option, grasping in sets.items():
+        joints = {joint for tip in grasping for joint in chains[tip]}
+        options[option] = ([called[tip] for tip in grasping], _parked(urdf, joints))
     return _render(
         "hand.toml",
         name=names[0],
@@ -271,6 +275,11 @@ def _toml_text(
     )
 
 
+def _urdf_text(urdf: Urdf) -> str:
+    """Return the text of a clean URDF."""
+    return _render("hand.urdf", urdf=urdf, sizes=SIZES)
+
+
 def _render(template: str, **values: Any) -> str:
     """Return the text of a file from its template."""
     filters = {"toml": functools.partial(json.dumps, ensure_ascii=False), "xml": _quoted}
@@ -281,11 +290,9 @@ def _quoted(value: str | float | Sequence[float]) -> str:
     """Return the quoted value of an XML attribute, a text or numbers; negative zero is written as
     zero.
     """
-    return quoteattr(
-        value
-        if isinstance(value, str)
-        else " ".join(f"{x + 0.0!r}" for x in np.ravel(value).tolist())
-    )
+    if isinstance(value, str):
+        return quoteattr(value)
+    return quoteattr(" ".join(f"{x + 0.0!r}" for x in np.ravel(value).tolist()))
 
 
 def _parked(urdf: Urdf, grasping: set[str]) -> dict[str, float]:
@@ -304,6 +311,9 @@ def fingertip_links(urdf: Urdf) -> tuple[str, ...]:
     parents = {j.parent for j in urdf.joints}
     shaped = {x.name for x in urdf.links if x.shapes}
     ends = []
-    for link in (x.name for x in urdf.links if x.name not in parents):
-        ends += [x for x in (link, *(j.parent for j in urdf.joints_above(link))) if x in shaped][:1]
+    for link in urdf.links:
+        if link.name in parents:
+            continue
+        branch = (link.name, *(j.parent for j in urdf.joints_above(link.name)))
+        ends += [x for x in branch if x in shaped][:1]
     return tuple(e for e in dict.fromkeys(ends) if urdf.movers(e))

@@ -24,11 +24,39 @@ from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.urdf import LinkShape, Urdf
 
 MESH_KINDS = (".stl", ".obj", ".ply", ".dae", ".glb")
-SAVING = 0.12
-SAVING_TIP = 0.04
-"""A box of a link or of a fingertip is cut in two if the cut saves this share of the volume of all
-boxes.
-"""
+
+
+@dataclasses.dataclass(frozen=True)
+class FitNumbers:
+    """How meshes become boxes, cylinders and balls."""
+
+    points: int = 4000  # on each shape
+    seed: int = 0  # of these points
+    fineness: int = 3  # subdivisions of an icosahedron that samples a sphere
+    sections: int = 48  # sides of a sampled cylinder
+    least_reach: float = 5e-4  # of a mesh [m]: nothing on a hand is thinner than a fingernail
+    # A box of a link or of a fingertip is cut in two if the cut saves this share of the volume of
+    # all boxes; smaller gives more boxes.
+    saving: float = 0.12
+    saving_tip: float = 0.04
+    # most boxes of a short and of a long body, and of a long tip behind its ball
+    short_boxes: int = 3
+    long_boxes: int = 8
+    tip_boxes: int = 4
+    long: float = 0.08  # least length of a long body [m]
+    long_tip: float = 2.6  # a tip is long that is longer than this, in radii of its ball
+    places: int = 12  # at which a cut is tried along an axis, with both ends, which are none
+    thinnest: float = 0.008  # least thickness of a part [m]
+    fewest: int = 20  # points of a part: with fewer its size is chance
+    round_share: float = 0.9  # a cylinder replaces boxes with less than this share of their volume
+    turned_share: float = 0.85  # likewise a box that is turned out of the link's axes
+    flat: float = 1e-7  # root mean square thickness [m] of a flat body, which has no hull
+    least_size: float = 1e-4  # of a shape [m], so that none is empty
+    digits: int = 6  # to which all numbers are rounded
+
+
+FIT = FitNumbers()
+MOST_NAME = 80  # of a mesh's name in an error [characters]
 Points = Float[np.ndarray, "_ 3"]  # points, of any count in each use
 Corners = tuple[np.ndarray, np.ndarray]
 
@@ -39,7 +67,7 @@ def mesh_file(urdf: Urdf, name: str, folder: Path) -> Path:
     """
     base = folder.resolve()
     here = urdf.path.resolve().parent
-    called = f"mesh {name[:80]!r}"
+    called = f"mesh {name[:MOST_NAME]!r}"
     path = PurePosixPath(name.removeprefix("package://"))
     if ":" in str(path) or "\\" in name or path.is_absolute():
         raise urdf.wrong(
@@ -48,13 +76,13 @@ def mesh_file(urdf: Urdf, name: str, folder: Path) -> Path:
         )
     if path.suffix.lower() not in MESH_KINDS:
         raise urdf.wrong(f"{called} of another format", f"a mesh ({', '.join(MESH_KINDS)})")
-    # the files of a package may lie anywhere in the folder: the first parts of the path may be left
-    # out
+    # The files of a package may lie anywhere in the folder: the first parts of the path may be left
+    # out, and folders above the URDF count.
     package = name.startswith("package://")
-    roots = (here, *(x for x in here.parents if package and x.is_relative_to(base)), base)
-    places = [
-        x.joinpath(*path.parts[k:]) for k in range(len(path.parts) if package else 1) for x in roots
-    ]
+    above = [x for x in here.parents if package and x.is_relative_to(base)]
+    roots = (here, *above, base)
+    left_out = range(len(path.parts) if package else 1)
+    places = [x.joinpath(*path.parts[k:]) for k in left_out for x in roots]
     why = ""
     for spot in places:
         try:
@@ -66,15 +94,12 @@ def mesh_file(urdf: Urdf, name: str, folder: Path) -> Path:
             elif file.is_file():
                 return file
             else:
-                alike = [
-                    x.name for x in file.parent.iterdir() if x.name.lower() == file.name.lower()
-                ]
-                why = why or (f"called {alike[0]} there" if alike and alike[0] != file.name else "")
-        except (
-            OSError,
-            RuntimeError,
-            ValueError,
-        ):  # no such folder, a loop of links, or a name that no system takes
+                beside = [x.name for x in file.parent.iterdir()]
+                alike = [x for x in beside if x.lower() == file.name.lower()]
+                if alike and alike[0] != file.name:
+                    why = why or f"called {alike[0]} there"
+        # no such folder, a loop of links, or a name that no system takes
+        except (OSError, RuntimeError, ValueError):
             continue
     raise urdf.wrong(
         f"{called}, {why or 'missing'}", f"a file inside {folder} (--meshes names another folder)"
@@ -96,20 +121,17 @@ def shape_points(urdf: Urdf, folder: Path) -> dict[str, tuple[Points, ...]]:
     for link in urdf.links:
         parts = []
         for shape in link.shapes:
-            local = (
-                meshes[shape.file] * shape.size
-                if shape.kind == "mesh"
-                else _primitive_points(shape)
-            )
+            is_mesh = shape.kind == "mesh"
+            local = meshes[shape.file] * shape.size if is_mesh else _primitive_points(shape)
             reach = float(np.abs(local).max())
+            called = f"mesh {shape.file!r} that reaches"
             if not reach <= MAX_EXTENT:
-                wanted = f"shapes that reach at most {MAX_EXTENT:g} m; a mesh in millimetres needs a scale of 0.001"
-                raise urdf.wrong(f"mesh {shape.file!r} that reaches {reach:.3g} m", wanted)
-            if shape.kind == "mesh" and reach < 5e-4:  # thinner than a fingernail
-                raise urdf.wrong(
-                    f"mesh {shape.file!r} that reaches {1e3 * reach:.3g} mm",
-                    "metres: scaled twice, or by 0?",
-                )
+                most = f"shapes that reach at most {MAX_EXTENT:g} m"
+                wanted = f"{most}; a mesh in millimetres needs a scale of 0.001"
+                raise urdf.wrong(f"{called} {reach:.3g} m", wanted)
+            if is_mesh and reach < FIT.least_reach:
+                wanted = "metres: scaled twice, or by 0?"
+                raise urdf.wrong(f"{called} {1e3 * reach:.3g} mm", wanted)
             pose = pose_of(shape)
             parts.append(local @ pose[:3, :3].T + pose[:3, 3])
         found[link.name] = tuple(parts)
@@ -126,15 +148,17 @@ def replace_meshes(urdf: Urdf, points: Mapping[str, tuple[Points, ...]]) -> tupl
     for link in urdf.links:
         shapes: list[LinkShape] = []
         for shape, on_it in zip(link.shapes, points[link.name], strict=True):
-            fitted = fit_shapes(on_it) if shape.kind == "mesh" else [shape]
-            count = count + (shape.kind == "mesh")
-            made = made + (len(fitted) if shape.kind == "mesh" else 0)
+            if shape.kind != "mesh":
+                shapes.append(shape)
+                continue
+            fitted = fit_shapes(on_it)
+            count += 1
+            made += len(fitted)
             shapes += fitted
         links.append(dataclasses.replace(link, shapes=tuple(shapes)))
-    done = (
-        [f"{count} collision meshes became {made} boxes or cylinders around them"] if count else []
-    )
-    return dataclasses.replace(urdf, links=tuple(links)), done
+    replaced = dataclasses.replace(urdf, links=tuple(links))
+    done = f"{count} collision meshes became {made} boxes or cylinders around them"
+    return replaced, [done] if count else []
 
 
 def ball_tip(urdf: Urdf, tip: str, ball: Pad, outward: np.ndarray, points: Points) -> Urdf:
@@ -144,11 +168,12 @@ def ball_tip(urdf: Urdf, tip: str, ball: Pad, outward: np.ndarray, points: Point
     link = next(x for x in urdf.links if x.name == tip)
     reach = (points - np.array(ball.center)) @ outward
     shapes = [LinkShape("sphere", (ball.radius,), ball.center, (0.0, 0.0, 0.0))]
-    if np.ptp(reach) > 2.6 * ball.radius:
+    if np.ptp(reach) > FIT.long_tip * ball.radius:
         motion = np.array(ball.normal) - ball.normal @ outward * outward
         motion /= np.linalg.norm(motion)
         axes = np.stack([motion, outward, np.cross(motion, outward)], 1)
-        shapes += _boxes(_cut(points[reach < 0] @ axes, 4, SAVING_TIP), axes)
+        behind = points[reach < 0] @ axes
+        shapes += _boxes(_cut(behind, FIT.tip_boxes, FIT.saving_tip), axes)
     ended = dataclasses.replace(link, shapes=tuple(shapes))
     return dataclasses.replace(urdf, links=tuple(ended if x is link else x for x in urdf.links))
 
@@ -172,9 +197,8 @@ def _read_points(urdf: Urdf, name: str, folder: Path) -> Points:
         raise urdf.wrong(f"mesh {name!r}: {explain(error)}", allowed) from error
     sound = isinstance(mesh, trimesh.Trimesh) and 0 < len(mesh.faces) <= MESH_FACES
     if not sound or not np.isfinite(mesh.vertices).all():
-        raise urdf.wrong(
-            f"mesh {name!r} without faces, or with vertices that are not finite", allowed
-        )
+        found = f"mesh {name!r} without faces, or with vertices that are not finite"
+        raise urdf.wrong(found, allowed)
     return scale * _sample(mesh)
 
 
@@ -182,34 +206,33 @@ def _primitive_points(shape: LinkShape) -> Points:
     if shape.kind == "box":
         return _sample(trimesh.creation.box(shape.size))
     if shape.kind == "sphere":
-        return _sample(trimesh.creation.icosphere(3, shape.size[0]))
-    return _sample(trimesh.creation.cylinder(shape.size[0], shape.size[1], sections=48))
+        return _sample(trimesh.creation.icosphere(FIT.fineness, shape.size[0]))
+    radius, length = shape.size
+    return _sample(trimesh.creation.cylinder(radius, length, sections=FIT.sections))
 
 
 def _sample(mesh: "trimesh.Trimesh") -> Points:
     """Return points on a mesh: random points of its surface, then some of its vertices."""
-    count = 4000  # points on each shape
-    points = np.asarray(trimesh.sample.sample_surface(mesh, count, seed=0)[0])
+    points = np.asarray(trimesh.sample.sample_surface(mesh, FIT.points, seed=FIT.seed)[0])
     vertices = np.asarray(mesh.vertices)
-    return np.concatenate([points, vertices[:: len(vertices) // count + 1]])
+    return np.concatenate([points, vertices[:: len(vertices) // FIT.points + 1]])
 
 
 def fit_shapes(points: Points) -> list[LinkShape]:
     """Return a few boxes, or a cylinder, that cover the points on a body."""
-    round_share = (
-        0.9  # a cylinder replaces boxes if its volume is less than this share of their volume
-    )
     turn = _axes(points)
     local = points @ turn
-    boxes = _cut(local, 3 if float(np.ptp(local, axis=0).max()) < 0.08 else 8, SAVING)
+    short = float(np.ptp(local, axis=0).max()) < FIT.long
+    boxes = _cut(local, FIT.short_boxes if short else FIT.long_boxes, FIT.saving)
     volume = sum(float(np.prod(high - low)) for low, high in boxes)
     low = local.min(0)
     high = local.max(0)
     middle = (low + high) / 2
     sides = high - low
     for axis in range(3):
-        radius = float(np.linalg.norm(np.delete(local - middle, axis, 1), axis=1).max())
-        if math.pi * radius**2 * sides[axis] < round_share * volume:
+        across = np.delete(local - middle, axis, 1)
+        radius = float(np.linalg.norm(across, axis=1).max())
+        if math.pi * radius**2 * sides[axis] < FIT.round_share * volume:
             along = np.roll(np.eye(3), -axis - 1, 0).T  # its third column is the axis
             return [_shape("cylinder", (radius, sides[axis]), turn @ along, turn @ middle)]
     return _boxes(boxes, turn)
@@ -219,16 +242,12 @@ def _axes(points: Points) -> Float[np.ndarray, "3 3"]:
     """Return the axes of the fitted boxes as columns: the axes of the link, unless rotated axes fit
     much better.
     """
-    turned_share = (
-        0.85  # a box is turned out of the link's axes if its volume falls below this share
-    )
-    if (
-        np.linalg.matrix_rank(points - points.mean(0), tol=1e-7 * math.sqrt(len(points))) < 3
-    ):  # a flat body has no hull
+    tolerance = FIT.flat * math.sqrt(len(points))
+    if np.linalg.matrix_rank(points - points.mean(0), tol=tolerance) < 3:
         return np.eye(3)
     turned, sizes = trimesh.bounds.oriented_bounds(points)
     straight = np.prod(np.ptp(points, axis=0))
-    return turned[:3, :3].T if np.prod(sizes) < turned_share * straight else np.eye(3)
+    return turned[:3, :3].T if np.prod(sizes) < FIT.turned_share * straight else np.eye(3)
 
 
 def _boxes(corners: list[Corners], axes: np.ndarray) -> list[LinkShape]:
@@ -254,16 +273,14 @@ def _cut(points: Points, most: int, saving: float) -> list[Corners]:
 
 
 def _halves(low: np.ndarray, high: np.ndarray, points: Points) -> list[tuple[float, list]]:
-    """Return each way to cut a box in two across an axis: the saved volume and both parts, each
-    over 8 mm thick.
-    """
+    """Return each way to cut a box in two across an axis: the saved volume and both parts."""
     found = []
     for axis in range(3):
-        for at in np.linspace(low[axis], high[axis], 12)[1:-1]:
-            if min(at - low[axis], high[axis] - at) < 0.008:
+        for at in np.linspace(low[axis], high[axis], FIT.places)[1:-1]:
+            if min(at - low[axis], high[axis] - at) < FIT.thinnest:
                 continue
             below = points[:, axis] < at
-            if not 20 < int(below.sum()) < len(points) - 20:
+            if not FIT.fewest < int(below.sum()) < len(points) - FIT.fewest:
                 continue
             two = []
             for part, face, side in ((points[below], 1, at), (points[~below], 0, at)):
@@ -276,15 +293,12 @@ def _halves(low: np.ndarray, high: np.ndarray, points: Points) -> list[tuple[flo
 
 
 def _shape(kind: str, size: tuple[float, ...], turn: np.ndarray, center: np.ndarray) -> LinkShape:
-    """Return a collision shape of a kind, size, rotation and centre; all numbers are rounded to
-    1e-6.
-    """
+    """Return a collision shape of a kind, size, rotation and centre, with rounded numbers."""
     pose = np.eye(4)
     pose[:3, :3] = turn
     pose[:3, 3] = center
     xyz, rpy = place(pose)
-    x, y, z = (round(v, 6) for v in xyz)
-    roll, pitch, yaw = (round(v, 6) for v in rpy)
-    return LinkShape(
-        kind, tuple(max(round(float(v), 6), 1e-4) for v in size), (x, y, z), (roll, pitch, yaw)
-    )
+    x, y, z = (round(v, FIT.digits) for v in xyz)
+    roll, pitch, yaw = (round(v, FIT.digits) for v in rpy)
+    sides = tuple(max(round(float(v), FIT.digits), FIT.least_size) for v in size)
+    return LinkShape(kind, sides, (x, y, z), (roll, pitch, yaw))

@@ -5,6 +5,7 @@ bends: the side with most of the joint's range or, for a symmetric range, toward
 fingertips.
 """
 
+import dataclasses
 import itertools
 import math
 from collections import Counter
@@ -22,12 +23,38 @@ from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.kinematics import chain_from_urdf, map_directions, map_points, pose_in_carrier
 from torchgrasp.hand.urdf import Joint, Link, LinkShape, Triple, Urdf
 
-TILT = math.radians(30)
-"""Angle [rad] by which the contact of a round tip is turned from the direction of motion to the
-finger's end.
-"""
-SHORT_ARM = 1e-3  # a joint whose axis passes a tip nearer than this [m] does not move it
-BESIDE = 0.003  # distance [m] from a ray or a plane within which points of a surface count
+
+@dataclasses.dataclass(frozen=True)
+class PadNumbers:
+    """How pads are guessed from the motion and the surface of tips."""
+
+    near_share: float = 0.1  # of random postures, those with the nearest tips, where fingers meet
+    # A joint bends to one side if the middle of its range lies farther than this share of it from
+    # zero.
+    one_sided: float = 0.1
+    # angle [rad] by which the contact of a round tip is turned from its motion to the finger's end
+    tilt: float = math.radians(30)
+    short_arm: float = 1e-3  # a joint whose axis passes a tip nearer than this [m] moves it not
+    beside: float = 0.003  # points of a surface count so near a ray or a plane [m]
+    end: float = 0.015  # length of a finger's end, half of whose thickness is the ball's radius [m]
+    radii: tuple[float, float] = (0.003, 0.013)  # least and greatest radius of a ball [m]
+    radius_digits: int = 4
+    place_digits: int = 6
+    digits: int = 12  # to which all numbers of a pad are rounded
+
+
+@dataclasses.dataclass(frozen=True)
+class FacingNumbers:
+    """When the pads of three fingers face each other."""
+
+    angle: float = 45.0  # most between a pad's normal and the way to the middle [degrees]
+    nearest: float = 0.015  # least and greatest distance of a contact from the middle [m]
+    farthest: float = 0.08
+    least: float = 1e-9  # [m], so that nothing is divided by 0
+
+
+PADS = PadNumbers()
+FACING = FacingNumbers()
 Vector = Float[np.ndarray, "3"]
 Points = Float[np.ndarray, "_ 3"]  # points, of any count in each use
 
@@ -57,31 +84,29 @@ def guess_pads(
     centres = map_points(tip_frames, torch.tensor(np.stack(cores)))  # 3 f n
     middle = centres[:, :3].mean(1, keepdim=True)
     spread = torch.linalg.vector_norm(centres[:, :3] - middle, dim=0).sum(0)
-    # the fingers meet in the postures with the nearest fingertips
-    near = spread.topk(max(1, int(0.1 * len(spread))), largest=False).indices
-    inward = (
-        (tip_frames[:, :3] * (middle - centres)[:, None])[..., near].sum(0).mean(-1).T.numpy()
-    )  # tips' frames
+    count = max(1, int(PADS.near_share * len(spread)))
+    near = spread.topk(count, largest=False).indices
+    # the mean way from each tip to the middle, in the tip's frame: (f, 3)
+    ways = tip_frames[:, :3] * (middle - centres)[:, None]
+    inward = ways[..., near].sum(0).mean(-1).T.numpy()
     pads = []
     ends = []
     for tip, core, closing in zip(tips, cores, inward, strict=True):
         joint, motion, outward = _motion(urdf, tip, core)
         middle_of_range = (joint.lower + joint.upper) / 2
-        one_sided = abs(middle_of_range) > 0.1 * (joint.upper - joint.lower)
+        one_sided = abs(middle_of_range) > PADS.one_sided * (joint.upper - joint.lower)
         bending = math.copysign(1.0, middle_of_range if one_sided else motion @ closing)
         link = urdf.links[links[tip]]
         way = bending * motion
-        single = is_primitive(link)
         ends.append(outward)
-        pads.append(
-            _pad(link.shapes[0], core, way, outward)
-            if single
-            else _ball(surfaces[tip], way, outward)
-        )
+        if is_primitive(link):
+            pads.append(_pad(link.shapes[0], core, way, outward))
+        else:
+            pads.append(_ball(surfaces[tip], way, outward))
     points = surfaces.get(palm_of(urdf, tips), np.zeros((1, 3)))
-    palm_centre = map_points(
-        frames[:, :, -1:, :1], torch.tensor((points.min(0) + points.max(0))[None] / 2)
-    )
+    palm_middle = torch.tensor((points.min(0) + points.max(0))[None] / 2)
+    palm_centre = map_points(frames[:, :, -1:, :1], palm_middle)
+    # out of the palm, along the nearest axis, towards where the fingers meet
     out = (middle[:, 0, near].mean(1) - palm_centre[:, 0, 0]).numpy()
     axis = int(np.abs(out).argmax())
     return Guess(tuple(pads), tuple(ends), _triple(np.sign(out[axis]) * np.eye(3)[axis]))
@@ -97,9 +122,8 @@ def order_by_facing(frames: Float[Tensor, "3 4 f n"], pads: Sequence[Pad]) -> li
     """Return the tips in order, as indices: three whose pads face each other in most postures, then
     the next best.
     """
-    contacts, normals = (
-        torch.tensor([getattr(p, k) for p in pads]).double() for k in ("contact", "normal")
-    )
+    contacts = torch.tensor([pad.contact for pad in pads]).double()
+    normals = torch.tensor([pad.normal for pad in pads]).double()
     points = map_points(frames, contacts)
     directions = map_directions(frames, normals)
 
@@ -109,13 +133,15 @@ def order_by_facing(frames: Float[Tensor, "3 4 f n"], pads: Sequence[Pad]) -> li
         """
         inward = points[:, tips].mean(1, keepdim=True) - points[:, tips]
         length = torch.linalg.vector_norm(inward, dim=0)
-        facing = (directions[:, tips] * inward).sum(0) / length.clamp_min(1e-9)
-        apart = (length > 0.015) & (length < 0.08)
-        return float(((facing > math.cos(math.radians(45))) & apart).all(0).double().mean())
+        cosine = (directions[:, tips] * inward).sum(0) / length.clamp_min(FACING.least)
+        apart = (length > FACING.nearest) & (length < FACING.farthest)
+        facing = cosine > math.cos(math.radians(FACING.angle))
+        return float((facing & apart).all(0).double().mean())
 
     order = max(itertools.combinations(range(len(pads)), 3), key=share)
     while len(order) < len(pads):
-        order = max(((*order, k) for k in range(len(pads)) if k not in order), key=share)
+        others = [k for k in range(len(pads)) if k not in order]
+        order = max(((*order, k) for k in others), key=share)
     return list(order)
 
 
@@ -131,17 +157,20 @@ def _ball(points: Points, motion: Vector, outward: Vector) -> Pad:
     axes = np.stack([motion, outward, np.cross(motion, outward)], 1)
     local = points @ axes
     end = local[:, 1].max()
-    near = local[local[:, 1] > end - 0.015]  # half the thickness of the finger's end is the radius
-    radius = round(float(np.clip(np.ptp(near[:, [0, 2]], axis=0).min() / 2, 0.003, 0.013)), 4)
-    ring = local[np.abs(local[:, 1] - (end - radius)) < BESIDE]
+    near = local[local[:, 1] > end - PADS.end]
+    half = np.ptp(near[:, [0, 2]], axis=0).min() / 2
+    radius = round(float(np.clip(half, *PADS.radii)), PADS.radius_digits)
+    # the middle of the finger where the ball's centre will lie
+    ring = local[np.abs(local[:, 1] - (end - radius)) < PADS.beside]
     low = ring.min(0)
     high = ring.max(0)
     core = axes @ [(low[0] + high[0]) / 2, end - radius, (low[2] + high[2]) / 2]
-    normal = math.cos(TILT) * motion + math.sin(TILT) * outward
+    normal = _tilted(motion, outward)
+    # the ball moves along the normal until it touches the surface from inside
     along = (points - core) @ normal
-    beside = np.linalg.norm(points - core - along[:, None] * normal, axis=1) < BESIDE
-    depth = float(along[beside].max(initial=radius))
-    center = _triple(np.round(core + (depth - radius) * normal, 6))
+    off = np.linalg.norm(points - core - along[:, None] * normal, axis=1)
+    depth = float(along[off < PADS.beside].max(initial=radius))
+    center = _triple(np.round(core + (depth - radius) * normal, PADS.place_digits))
     normal = np.array(_triple(normal / np.linalg.norm(normal)))
     return Pad(_triple(center + radius * normal), _triple(normal), center, radius)
 
@@ -157,12 +186,12 @@ def _motion(urdf: Urdf, tip: str, core: Vector) -> tuple[Joint, Vector, Vector]:
             arm = core - tip_from_above[:3, 3]
             motion = axis if joint.kind == "prismatic" else np.cross(axis, arm)
             length = float(np.linalg.norm(motion))
-            if length > SHORT_ARM:
+            if length > PADS.short_arm:
                 arm = arm - (arm @ axis) * axis
-                return joint, motion / length, arm / max(float(np.linalg.norm(arm)), SHORT_ARM)
-        above_from_link = rigid(
-            rotation_from_rpy(joint.rpy), torch.tensor(joint.xyz, dtype=torch.float64)
-        )
+                reach = max(float(np.linalg.norm(arm)), PADS.short_arm)
+                return joint, motion / length, arm / reach
+        origin = torch.tensor(joint.xyz, dtype=torch.float64)
+        above_from_link = rigid(rotation_from_rpy(joint.rpy), origin)
         tip_from_above = tip_from_above @ np.linalg.inv(above_from_link.numpy())
     raise BadArgument("tips", tip, "links that a joint moves")
 
@@ -175,7 +204,7 @@ def _core(urdf: Urdf, link: Link, surfaces: Mapping[str, Points]) -> Vector:
         points = surfaces[link.name]
         pose = pose_in_carrier(chain_from_urdf(urdf), link.name)[1].numpy()
         reach = np.linalg.norm(points @ pose[:, :3].T + pose[:, 3], axis=1)
-        return points[reach > reach.max() - BESIDE].mean(0)
+        return points[reach > reach.max() - PADS.beside].mean(0)
     shape = link.shapes[0]
     center = np.array(shape.xyz)
     half = np.array(shape.half)
@@ -190,7 +219,7 @@ def _pad(shape: LinkShape, core: Vector, motion: Vector, outward: Vector) -> Pad
     nearer to its end.
     """
     if shape.kind == "sphere":
-        normal = math.cos(TILT) * motion + math.sin(TILT) * outward
+        normal = _tilted(motion, outward)
         radius = shape.size[0]
         center = np.array(shape.xyz)
         normal = normal / np.linalg.norm(normal)
@@ -210,7 +239,12 @@ def _pad(shape: LinkShape, core: Vector, motion: Vector, outward: Vector) -> Pad
     return Pad(_triple(contact), _triple(rotation @ side), _triple(contact), 0.0)
 
 
+def _tilted(motion: Vector, outward: Vector) -> Vector:
+    """Return the normal of a round pad, between the tip's motion and the finger's end."""
+    return math.cos(PADS.tilt) * motion + math.sin(PADS.tilt) * outward
+
+
 def _triple(x: Vector) -> Triple:
     """Return an array as three rounded numbers."""
-    a, b, c = (round(float(v), 12) + 0.0 for v in x)
+    a, b, c = (round(float(v), PADS.digits) + 0.0 for v in x)
     return a, b, c

@@ -13,9 +13,27 @@ from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.hand.urdf import Joint, Link, LinkShape, Mimic, Triple, Urdf
 
-# drive [N m, rad/s] of a joint for which the URDF declares none, typical of small hands
-EFFORT = 1.0
-VELOCITY = 3.0
+
+@dataclasses.dataclass(frozen=True)
+class RepairNumbers:
+    """What a URDF gets that lacks it, and what is impossible in one."""
+
+    # drive [N m, rad/s] of a joint for which the URDF declares none, typical of small hands
+    effort: float = 1.0
+    velocity: float = 3.0
+    most_wrist: int = 3  # joints that move all fingertips: more are an arm
+    # least mass [kg] and edge [m] of a body without mass, so that simulators remain stable
+    least_mass: float = 1e-3
+    least_size: float = 5e-3
+    density: float = 500.0  # [kg/m3] of a bounding box: half of it is filled with 1000 kg/m3
+    # farthest mass centre and radius of gyration, in half diagonals of the bounding box
+    far_out: float = 2.0
+    rounding: float = 1e-6  # relative error of inertias, which URDFs write with few digits
+    digits: int = 15  # of an angle [rad], so that short numbers remain short
+
+
+REPAIRS = RepairNumbers()
+BOX = 12  # divisor in the inertia of a solid box
 Step = tuple[Urdf, list[str]]
 
 
@@ -26,14 +44,13 @@ def pose_of(part: Joint | LinkShape) -> np.ndarray:
 
 def place(pose: np.ndarray) -> tuple[Triple, Triple]:
     """Return translation [m] and fixed-axis angles [rad] of a 4 x 4 pose."""
-    # the smaller of the two triples, rounded to the digits of a rotation, so that short numbers
-    # remain short
+    # of the two triples that mean the same rotation, the smaller
     one = [float(angle) for angle in trimesh.transformations.euler_from_matrix(pose)]
     two = [math.copysign(math.pi, angle) - angle for angle in one]
     angles = min((one, (-two[0], two[1], -two[2])), key=lambda triple: sum(map(abs, triple)))
-    x, y, z, roll, pitch, yaw = (
-        float(x) + 0.0 for x in [*pose[:3, 3], *(round(angle, 15) for angle in angles)]
-    )
+    rounded = [round(angle, REPAIRS.digits) for angle in angles]
+    # the sum has no negative zero
+    x, y, z, roll, pitch, yaw = (float(number) + 0.0 for number in [*pose[:3, 3], *rounded])
     return (x, y, z), (roll, pitch, yaw)
 
 
@@ -51,10 +68,8 @@ def keep_below(urdf: Urdf, root: str) -> Step:
     inside = {j.name for j in joints}
     for j in joints:
         if j.mimic and j.mimic.source not in inside:
-            raise urdf.wrong(
-                f"joint {j.name} that follows {j.mimic.source!r} above {root!r}",
-                "a root above both",
-            )
+            found = f"joint {j.name} that follows {j.mimic.source!r} above {root!r}"
+            raise urdf.wrong(found, "a root above both")
     links = tuple(x for x in urdf.links if x.name in kept)
     done = f"{len(names) - len(kept)} links that are not below {root} are left out"
     return dataclasses.replace(urdf, root=root, links=links, joints=joints), [done]
@@ -79,20 +94,15 @@ def merge_frames(urdf: Urdf) -> tuple[Urdf, list[str], dict[str, str]]:
             if frame or bare_root:
                 break
         else:
-            return (
-                urdf,
-                [f"frames without mass are merged into others: {', '.join(taken)}"]
-                if taken
-                else [],
-                taken,
-            )
+            done = f"frames without mass are merged into others: {', '.join(taken)}"
+            return urdf, [done] if taken else [], taken
         moved = _moved(child, pose_of(j))
-        merged = dataclasses.replace(
-            moved if bare_root else parent, name=parent.name, shapes=parent.shapes + moved.shapes
-        )
-        below = tuple(
-            _under(x, j) if x.parent == child.name else x for x in urdf.joints if x is not j
-        )
+        # a root without mass and shapes takes over those of its child
+        heavy = moved if bare_root else parent
+        shapes = parent.shapes + moved.shapes
+        merged = dataclasses.replace(heavy, name=parent.name, shapes=shapes)
+        others = [x for x in urdf.joints if x is not j]
+        below = tuple(_under(x, j) if x.parent == child.name else x for x in others)
         kept = tuple(merged if x is parent else x for x in urdf.links if x is not child)
         taken = {name: parent.name if to == child.name else to for name, to in taken.items()}
         taken[child.name] = parent.name
@@ -117,40 +127,31 @@ def _moved(link: Link, pose: np.ndarray) -> Link:
         xyz, rpy = place(pose @ pose_of(shape))
         shapes.append(dataclasses.replace(shape, xyz=xyz, rpy=rpy))
     x, y, z = (turn @ link.com + pose[:3, 3]).tolist()
-    return Link(
-        link.name,
-        link.mass,
-        (x, y, z),
-        _triangle(turn @ _matrix(link.inertia) @ turn.T),
-        tuple(shapes),
-    )
+    inertia = _triangle(turn @ _matrix(link.inertia) @ turn.T)
+    return Link(link.name, link.mass, (x, y, z), inertia, tuple(shapes))
 
 
 def fix_wrist(urdf: Urdf, tips: Sequence[str]) -> Step:
     """Fix the wrist joints, which move all fingertips; more than three such joints are an arm,
     which is cut off.
     """
-    common = (
-        [j for j in urdf.movers(tips[0]) if all(j in urdf.movers(tip) for tip in tips)]
-        if len(tips) > 2
-        else []
-    )
-    if len(common) > 3:
+    movers = urdf.movers(tips[0]) if len(tips) > 2 else []
+    common = [j for j in movers if all(j in urdf.movers(tip) for tip in tips)]
+    if len(common) > REPAIRS.most_wrist:
         urdf, done = keep_below(urdf, common[0].child)
-        return urdf, [
-            f"{len(common)} joints above {urdf.root} move all fingertips, an arm: {done[0]}"
-        ]
+        arm = f"{len(common)} joints above {urdf.root} move all fingertips, an arm"
+        return urdf, [f"{arm}: {done[0]}"]
     if not common:
         return urdf, []
     at = {j.name: j.rest for j in common}
+    # joints that follow a wrist joint are fixed where it puts them
     for j in urdf.movable:
         if j.mimic and j.mimic.source in at:
             at[j.name] = j.mimic.ratio * at[j.mimic.source] + j.mimic.offset
     joints = tuple(_fixed(j, at[j.name]) if j.name in at else j for j in urdf.joints)
     places = ", ".join(f"{name} at {value:.4g}" for name, value in at.items())
-    return dataclasses.replace(urdf, joints=joints), [
-        f"joints that move all fingertips, a wrist, are fixed: {places}"
-    ]
+    done = f"joints that move all fingertips, a wrist, are fixed: {places}"
+    return dataclasses.replace(urdf, joints=joints), [done]
 
 
 def _fixed(joint: Joint, value: float) -> Joint:
@@ -182,9 +183,8 @@ def _add_limits(urdf: Urdf, joints: dict[str, Joint]) -> list[str]:
     endless = [j for j in urdf.movable if math.isinf(j.upper - j.lower)]
     for j in endless:
         if j.kind == "prismatic":
-            raise urdf.wrong(
-                f"joint {j.name} without a limit", "lower and upper limits of a sliding joint"
-            )
+            wanted = "lower and upper limits of a sliding joint"
+            raise urdf.wrong(f"joint {j.name} without a limit", wanted)
         joints[j.name] = dataclasses.replace(j, kind="revolute", lower=-math.pi, upper=math.pi)
     return [
         f"joint {j.name} has no limits: they are set to half a turn either way" for j in endless
@@ -193,20 +193,15 @@ def _add_limits(urdf: Urdf, joints: dict[str, Joint]) -> list[str]:
 
 def _add_drives(joints: dict[str, Joint]) -> list[str]:
     """Give joints without an effort or velocity limit the limits typical of small hands."""
-    idle = [
-        j for j in joints.values() if j.kind != "fixed" and not (j.effort > 0 and j.velocity > 0)
-    ]
+    movable = [j for j in joints.values() if j.kind != "fixed"]
+    idle = [j for j in movable if not (j.effort > 0 and j.velocity > 0)]
     for j in idle:
-        effort, velocity = (
-            x if x > 0 else usual for x, usual in ((j.effort, EFFORT), (j.velocity, VELOCITY))
-        )
+        effort = j.effort if j.effort > 0 else REPAIRS.effort
+        velocity = j.velocity if j.velocity > 0 else REPAIRS.velocity
         joints[j.name] = dataclasses.replace(j, effort=effort, velocity=velocity)
     names = ", ".join(j.name for j in idle)
-    return (
-        [f"{names} without effort or velocity get {EFFORT:g} N m, {VELOCITY:g} rad/s"]
-        if idle
-        else []
-    )
+    drive = f"{REPAIRS.effort:g} N m, {REPAIRS.velocity:g} rad/s"
+    return [f"{names} without effort or velocity get {drive}"] if idle else []
 
 
 def _follow_directly(joints: dict[str, Joint]) -> list[str]:
@@ -217,12 +212,12 @@ def _follow_directly(joints: dict[str, Joint]) -> list[str]:
     for name, j in joints.items():
         mimic = j.mimic
         while mimic and (above := joints[mimic.source].mimic):
-            mimic = Mimic(
-                above.source, mimic.ratio * above.ratio, mimic.ratio * above.offset + mimic.offset
-            )
+            offset = mimic.ratio * above.offset + mimic.offset
+            mimic = Mimic(above.source, mimic.ratio * above.ratio, offset)
         if mimic and mimic != j.mimic:
+            source = mimic.source
             done.append(
-                f"joint {name} follows a follower of {mimic.source}: it follows {mimic.source} directly"
+                f"joint {name} follows a follower of {source}: it follows {source} directly"
             )
             joints[name] = dataclasses.replace(j, mimic=mimic)
     return done
@@ -234,38 +229,35 @@ def _limit_leaders(urdf: Urdf, joints: dict[str, Joint]) -> list[str]:
     """
     done = []
     for name, j in joints.items():
-        if (mimic := j.mimic) is None:
+        mimic = j.mimic
+        if mimic is None:
             continue
         if not mimic.ratio:
-            raise urdf.wrong(
-                f"joint {name} that follows with a ratio of 0", "a fixed joint, or another ratio"
-            )
+            found = f"joint {name} that follows with a ratio of 0"
+            raise urdf.wrong(found, "a fixed joint, or another ratio")
         leader = joints[mimic.source]
         ends = sorted((end - mimic.offset) / mimic.ratio for end in (j.lower, j.upper))
         low = max(leader.lower, ends[0])
         high = min(leader.upper, ends[1])
         if not low < high:
-            raise urdf.wrong(
-                f"joint {name} that follows {leader.name} outside its own limits",
-                "limits that overlap",
-            )
+            found = f"joint {name} that follows {leader.name} outside its own limits"
+            raise urdf.wrong(found, "limits that overlap")
         if (low, high) != (leader.lower, leader.upper):
             joints[leader.name] = dataclasses.replace(leader, lower=low, upper=high)
+            new = f"[{low:.6g}, {high:.6g}]"
+            old = f"[{leader.lower:.6g}, {leader.upper:.6g}]"
             done.append(
-                f"joint {leader.name} is limited to [{low:.6g}, {high:.6g}] instead of [{leader.lower:.6g}, "
-                f"{leader.upper:.6g}]: {name}, which follows it, would leave its own limits"
+                f"joint {leader.name} is limited to {new} instead of {old}: "
+                f"{name}, which follows it, would leave its own limits"
             )
     return done
 
 
 def repair_bodies(urdf: Urdf, surfaces: Mapping[str, np.ndarray]) -> Step:
-    """Replace missing or impossible masses and inertias; `surfaces` are points (n, 3) on each link."""
-    # Least mass [kg] and edge [m] of a body without mass, so that simulators remain stable
-    least_mass = 1e-3
-    least_size = 5e-3
-    far_out = (
-        2.0  # farthest mass centre and radius of gyration, in half diagonals of the bounding box
-    )
+    """Replace missing or impossible masses and inertias.
+
+    `surfaces` are points (n, 3) on each link [m], in its frame.
+    """
     links = []
     weightless = list[str]()
     absurd = list[str]()
@@ -273,35 +265,34 @@ def repair_bodies(urdf: Urdf, surfaces: Mapping[str, np.ndarray]) -> Step:
         points = surfaces.get(link.name, np.zeros((1, 3)))
         low = points.min(0)
         high = points.max(0)
-        size = np.maximum(high - low, least_size)
-        reach = float(np.linalg.norm(size)) / 2
+        size = np.maximum(high - low, REPAIRS.least_size)
+        farthest = REPAIRS.far_out * (float(np.linalg.norm(size)) / 2)
         middle = (low + high) / 2
         mass = link.mass
         if not mass > 0:
-            mass = max(
-                least_mass, 500.0 * float(np.prod(high - low))
-            )  # half of the box is filled with 1000 kg/m3
+            mass = max(REPAIRS.least_mass, REPAIRS.density * float(np.prod(high - low)))
             weightless.append(f"{link.name} ({1e3 * mass:.3g} g)")
         principal = np.linalg.eigvalsh(_matrix(link.inertia))
-        sound = principal[0] > 0 and principal[0] + principal[1] >= principal[2] * (1 - 1e-6)
+        # of any body, two principal moments add up to the third or more
+        largest = principal[2] * (1 - REPAIRS.rounding)
+        sound = principal[0] > 0 and principal[0] + principal[1] >= largest
         known = link.name in surfaces
-        off = known and math.dist(link.com, middle) > far_out * reach
-        wide = known and principal[2] > mass * (far_out * reach) ** 2
+        off = known and math.dist(link.com, middle) > farthest
+        wide = known and principal[2] > mass * farthest**2
         if not link.mass > 0 or not sound or off or wide:
             absurd += [link.name] if link.mass > 0 else []
             x, y, z = middle.tolist() if off or not link.mass > 0 else link.com
-            inertia = mass / 12 * np.diag(size @ size - size**2)
+            inertia = mass / BOX * np.diag(size @ size - size**2)
             link = Link(link.name, mass, (x, y, z), _triangle(inertia), link.shapes)
         links.append(link)
     done = []
     if weightless:
-        done.append(
-            f"links without mass get the mass of half their bounding box: {', '.join(weightless)}"
-        )
+        names = ", ".join(weightless)
+        done.append(f"links without mass get the mass of half their bounding box: {names}")
     if absurd:
         done.append(
-            f"{', '.join(absurd)} with an inertia or mass centre that is impossible for their size and mass get those "
-            "of their bounding box"
+            f"{', '.join(absurd)} with an inertia or mass centre that is impossible for their "
+            "size and mass get those of their bounding box"
         )
     return dataclasses.replace(urdf, links=tuple(links)), done
 

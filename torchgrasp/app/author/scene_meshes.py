@@ -11,6 +11,14 @@ from torchgrasp.foundation.errors import BadArgument, MissingExtra
 from torchgrasp.foundation.limits import MESH_FACES
 from torchgrasp.hand.safe_xml import BoundedBuilder
 
+MOST_INDICES = 12 * MESH_FACES  # three corners of a face, each of up to four indices
+MAGIC = b"glTF"  # with which a .glb file begins
+JSON_SIZE = slice(12, 16)  # bytes that hold the size of its JSON
+JSON_START = 20
+MOST_TEXT = 200  # of a file's own words in an error [characters]
+GEOMETRY = ("library_geometries", "library_visual_scenes")  # libraries of a .dae that are read
+LOOKS = ("bind_material", "extra", "instance_camera", "instance_light")  # parts that are not
+
 
 def clean_dae(data: bytes) -> tuple[bytes, float]:
     """Return a COLLADA file with its geometry alone, and its unit [m]; its axes stay as they are,
@@ -34,23 +42,17 @@ def clean_dae(data: bytes) -> tuple[bytes, float]:
             kind = part.tag.removeprefix(space)
             if kind in ("instance_controller", "instance_node"):
                 raise Malformed(f"<{kind}>, where plain geometry should be")
-            library = kind.startswith("library_") and kind not in (
-                "library_geometries",
-                "library_visual_scenes",
-            )
-            if library or kind in ("bind_material", "extra", "instance_camera", "instance_light"):
+            if kind in LOOKS or (kind.startswith("library_") and kind not in GEOMETRY):
                 element.remove(part)
-    sizes = {
-        f"#{geometry.get('id')}": sum(
-            len((p.text or "").split()) for p in geometry.iter(f"{space}p")
-        )
-        for geometry in root.iter(f"{space}geometry")
-    }
-    used = sum(
-        sizes.get(instance.get("url", ""), 0) for instance in root.iter(f"{space}instance_geometry")
-    )
-    if used > (most := 12 * MESH_FACES):  # three corners of a face, each of up to four indices
-        raise Malformed(f"{used} indices of corners; at most {most}")
+    # a small file may name one geometry many times: the instances count
+    sizes = {}
+    for geometry in root.iter(f"{space}geometry"):
+        polygons = geometry.iter(f"{space}p")
+        sizes[f"#{geometry.get('id')}"] = sum(len((p.text or "").split()) for p in polygons)
+    instances = root.iter(f"{space}instance_geometry")
+    used = sum(sizes.get(instance.get("url", ""), 0) for instance in instances)
+    if used > MOST_INDICES:
+        raise Malformed(f"{used} indices of corners; at most {MOST_INDICES}")
     unit = root.find(f"{space}asset/{space}unit")
     return ET.tostring(root), 1.0 if unit is None else float(unit.get("meter", "1"))
 
@@ -59,30 +61,25 @@ def check_glb(data: bytes) -> None:
     """Raise `Malformed` for a .glb file with skins, with compressed or shared geometry, or with too
     much of it.
     """
-    if data[:4] != b"glTF":
+    if not data.startswith(MAGIC):
         raise Malformed("no header of a .glb file")
-    scene = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    size = int.from_bytes(data[JSON_SIZE], "little")
+    scene = json.loads(data[JSON_START : JSON_START + size])
     accessors = scene.get("accessors", [])
     nodes = scene.get("nodes", [])
     packed = [name for name in scene.get("extensionsRequired", []) if "mesh" in name.lower()]
     if packed or scene.get("skins") or any("bufferView" not in accessor for accessor in accessors):
-        raise Malformed(f"compressed geometry or skins {' '.join(packed)[:200]}".strip())
-    sizes = [
-        sum(
-            accessors[part.get("indices", part["attributes"]["POSITION"])]["count"]
-            for part in mesh["primitives"]
-        )
-        for mesh in scene.get("meshes", [])
-    ]
-    used = [
-        i
-        for part in (*scene.get("scenes", []), *nodes)
-        for i in part.get("nodes", part.get("children", []))
-    ]
+        raise Malformed(f"compressed geometry or skins {' '.join(packed)[:MOST_TEXT]}".strip())
+    sizes = []
+    for mesh in scene.get("meshes", []):
+        # without indices, every position is a corner
+        parts = [p.get("indices", p["attributes"]["POSITION"]) for p in mesh["primitives"]]
+        sizes.append(sum(accessors[part]["count"] for part in parts))
+    # nodes may share a mesh, and parents a node: each use counts
+    parents = *scene.get("scenes", []), *nodes
+    used = [i for part in parents for i in part.get("nodes", part.get("children", []))]
     count = sum(sizes[nodes[i]["mesh"]] for i in used if "mesh" in nodes[i])
     stored = sum(view["byteLength"] for view in scene.get("bufferViews", []))
     numbers = sum(accessor["count"] for accessor in accessors)
-    if max(count, numbers) > 12 * MESH_FACES or stored > len(
-        data
-    ):  # corners of faces, of up to four attributes
+    if max(count, numbers) > MOST_INDICES or stored > len(data):
         raise Malformed(f"{count} corners of {numbers} numbers in {stored} bytes")

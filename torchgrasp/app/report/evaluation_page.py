@@ -17,6 +17,8 @@ from torchgrasp.foundation.errors import Status
 NAMES = json.loads((TEMPLATES / "evaluation.json").read_text("utf-8"))
 SHARE_NAMES: dict[str, str] = NAMES["shares"]
 """Descriptions of the success rates of a summary."""
+OBJECT_HEADS = ("object", "pass", "with its 95 % interval", "interval", "of", "best-ranked")
+"""Titles of the columns of the table of objects; those of the views follow."""
 
 
 @checked
@@ -30,8 +32,8 @@ def write_evaluation(
 
     >>> import tempfile
     >>> jug = ViewScore("jug", "view0", 0, 4.0, note="an open surface")
-    >>> page = write_evaluation(Path(tempfile.mkdtemp(), "page.html"), "Jugs", {"hand": "allegro"}, [jug])
-    >>> "allegro" in page.read_text()
+    >>> path = Path(tempfile.mkdtemp(), "page.html")
+    >>> "allegro" in write_evaluation(path, "Jugs", {"hand": "allegro"}, [jug]).read_text()
     True
     """
     return write_file(path, format_evaluation(title, asked, scores))
@@ -41,43 +43,57 @@ def format_evaluation(title: str, asked: Mapping[str, object], scores: Sequence[
     """Return the HTML page of an evaluation; `asked` are its settings by name."""
     summary = summarise(scores)
     groups = {"": summary} | {f"{group}: ": some for group, some in summary["by_group"].items()}
-    most = max((n for reasons in summary["failures"].values() for n in reasons.values()), default=1)
-    success = summary["success"]
+    shares = [
+        (f"{group}{name}", *_share_cells(some[key], 1))
+        for group, some in groups.items()
+        for key, name in SHARE_NAMES.items()
+    ]
+    lost = [
+        (stage, name, n)
+        for stage, reasons in summary["failures"].items()
+        for name, n in reasons.items()
+    ]
+    most = max((n for *_, n in lost), default=1)  # the longest bar
     views = sorted({score.view for score in scores})
     return render(
         "evaluation.html",
         title=title,
         summary=summary,
         verdict=f"Passed: {format_share(summary['gsr'])}, with the 95 % interval over families.",
-        shares=[
-            (f"{group}{name}", *_share_cells(some[key], 1))
-            for group, some in groups.items()
-            for key, name in SHARE_NAMES.items()
-        ],
-        heads=[
-            *("object", "pass", "with its 95 % interval", "interval", "of", "best-ranked"),
-            *views,
-        ],
+        shares=shares,
+        heads=[*OBJECT_HEADS, *views],
         objects=_object_rows(scores, views, summary["by_object"]),
         failures=[
             (stage, name.lower(), str(n), n / most, Status[name].sentence)
-            for stage, reasons in summary["failures"].items()
-            for name, n in reasons.items()
+            for stage, name, n in lost
         ],
         causes=[(name, text, CAUSES[name][1]) for name, text in list_causes(summary)],
         notes=[(score.object, score.view, score.note) for score in scores if score.note],
         figures=list_figures(summary),
-        success=success
-        and (
-            f"Predicted {success['predicted']:.0%}, passed {success['passed']:.0%}; expected calibration error "
-            f"{success['error']:.2f}, Brier skill {success['skill']:.2f}, area under the curve {success['auc']:.2f}."
-        ),
-        bins=[
-            (f"{x.low:.0%} to {x.high:.0%}", f"{x.predicted:.0%}", *_share_cells(x.passed, 0))
-            for x in (success["bins"] if success else ())
-        ],
+        success=_describe_prediction(summary["success"]),
+        bins=_bin_rows(summary["success"]),
         asked=[(name.replace("_", " "), str(value)) for name, value in asked.items()],
     )
+
+
+def _describe_prediction(success: Mapping[str, Any] | None) -> str | None:
+    """Return a sentence on how well success was predicted; None without predictions."""
+    if not success:
+        return None
+    return (
+        f"Predicted {success['predicted']:.0%}, passed {success['passed']:.0%}; "
+        f"expected calibration error {success['error']:.2f}, "
+        f"Brier skill {success['skill']:.2f}, area under the curve {success['auc']:.2f}."
+    )
+
+
+def _bin_rows(success: Mapping[str, Any] | None) -> list[tuple[Any, ...]]:
+    """Return a table row for each range of predicted success: how many passed."""
+    rows = []
+    for x in success["bins"] if success else ():
+        cells = _share_cells(x.passed, 0)
+        rows.append((f"{x.low:.0%} to {x.high:.0%}", f"{x.predicted:.0%}", *cells))
+    return rows
 
 
 def _share_cells(share: Share, digits: int) -> tuple[Any, ...]:
@@ -85,7 +101,8 @@ def _share_cells(share: Share, digits: int) -> tuple[Any, ...]:
     number of trials.
     """
     value, low, high = ("-" if math.isnan(x) else f"{x:.{digits}%}" for x in share[:3])
-    return value, share, f"{low} to {high}" if share.units > 1 else "-", str(share.total)
+    interval = f"{low} to {high}" if share.units > 1 else "-"
+    return value, share, interval, str(share.total)
 
 
 def _object_rows(
@@ -120,6 +137,8 @@ def list_figures(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return table rows with counts, mean forces, overlaps, slips and computing times."""
     rows = []
     for key, (text, style) in NAMES["figures"].items():
-        found = summary[key] if isinstance(summary[key], tuple | list) else [summary[key]]
-        rows.append((text, ", ".join("-" if x is None else format(x, style) for x in found)))
+        value = summary[key]
+        found = value if isinstance(value, tuple | list) else [value]
+        texts = ["-" if x is None else format(x, style) for x in found]
+        rows.append((text, ", ".join(texts)))
     return rows

@@ -45,7 +45,8 @@ def write_report(path: Path | str, run: Run, view: str = "") -> Path:
     >>> from torchgrasp.shape import extract_surface
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> jug, hand = load_object("jug"), load_hand("barrett")
-    >>> surface, grasps = extract_surface(fit_shape(jug.view), 24), load_shipped_grasp("jug", "barrett")
+    >>> surface = extract_surface(fit_shape(jug.view), 24)
+    >>> grasps = load_shipped_grasp("jug", "barrett")
     >>> run = Run("jug", Path("jug.ply"), jug.view, hand, ContactSpec(), surface, grasps)
     >>> "executable grasp" in write_report(Path(tempfile.mkdtemp(), "report.html"), run).read_text()
     True

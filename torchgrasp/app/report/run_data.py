@@ -44,14 +44,6 @@ class Run:
         closure: result of closing on the true object; only with `mesh`.
         scene: the scene that the cloud was cut from.
         costs: what lowers the predicted success of the best grasp most.
-
-    >>> from torchgrasp import fit_shape, load_hand, load_object
-    >>> from torchgrasp.data.shipped import load_shipped_grasp
-    >>> from torchgrasp.shape import extract_surface
-    >>> view, hand, grasp = load_object("jug").view, load_hand("barrett"), load_shipped_grasp("jug", "barrett")
-    >>> surface = extract_surface(fit_shape(view), 24)
-    >>> verdict(Run("jug", Path("jug.ply"), view, hand, ContactSpec(), surface, grasp).upright())
-    'The barrett hand has 1 executable grasp of the jug.'
     """
 
     object_name: str

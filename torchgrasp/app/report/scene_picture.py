@@ -197,7 +197,7 @@ def _light(scene: Scene) -> Float[np.ndarray, "h w"]:
 
 
 def _rim(labels: np.ndarray, width: int) -> Bool[np.ndarray, "h w"]:
-    """Return a mask of the pixels with another label in the square of `width` pixels around them."""
+    """Return a mask of the pixels with another label in the square of side `width` around them."""
     whole = labels.astype(int)
     return ndimage.maximum_filter(whole, width) != ndimage.minimum_filter(whole, width)
 
@@ -254,7 +254,7 @@ def _with_legend(picture: object, scene: Scene, kinds: Int[np.ndarray, "h w"]) -
 
 
 def _describe(scene: Scene, label: int) -> str:
-    """Return the legend text of an object: its label, its height, and its distance from the camera."""
+    """Return the legend text of an object: its label, height, and distance from the camera."""
     points = scene.points[scene.rows_of(label)].double()
     distance = float((points - scene.viewpoint).norm(dim=-1).median())
     high = ""

@@ -97,7 +97,7 @@ def draw_contacts(
 def draw_grasp(
     surface: Surface, hand: Hand, grasp: Grasps, direction: Direction, table: float | None = None
 ) -> bytes:
-    """Return a PNG of the hand of the first grasp on the estimated surface, seen from `direction`."""
+    """Return a PNG of the hand of the first grasp on the estimated surface."""
     canvas, corners = _grasp(surface, hand, grasp)
     canvas.add_table(corners, table)
     return canvas.render_png(corners, direction)

@@ -85,7 +85,8 @@ def write_viewer(path: Path | str, run: Run) -> Path:
     >>> from torchgrasp.shape import extract_surface
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> jug, hand = load_object("jug"), load_hand("barrett")
-    >>> surface, grasps = extract_surface(fit_shape(jug.view), 24), load_shipped_grasp("jug", "barrett")
+    >>> surface = extract_surface(fit_shape(jug.view), 24)
+    >>> grasps = load_shipped_grasp("jug", "barrett")
     >>> run = Run("jug", Path("jug.ply"), jug.view, hand, ContactSpec(), surface, grasps)
     >>> write_viewer(Path(tempfile.mkdtemp(), "view.html"), run).stat().st_size < 8 * 2**20
     True
