@@ -37,8 +37,7 @@ for _ in range(300):
     optimiser.zero_grad()
     loss.backward()
     optimiser.step()
-ours = float(-loss.detach())
-print(f"mean log-likelihood: {ours:.2f} by descent, {float(em.log_prob(rows).mean()):.2f} by EM")
+print(f"mean log-likelihood by descent {-loss:.2f}, by EM {em.log_prob(rows).mean():.2f}")
 
 # 2. Kinematics, the shape's posterior and the posture model form one loss of the joints [rad].
 view = load_object("cylinder").view
