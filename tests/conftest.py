@@ -12,7 +12,7 @@ import torch
 from hypothesis import HealthCheck, settings
 from torch import Tensor
 
-from tests import annotations
+from tests import annotations, kept
 
 if TYPE_CHECKING:
     from torchgrasp.values.planning import PointCloud
@@ -52,9 +52,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
                 item.add_marker(pytest.mark.sim)
 
 
-def pytest_runtest_setup() -> None:
-    """Check annotations of the first calls of the next test, too."""
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Check annotations of the first calls of the next test, too; it may get kept shapes."""
     annotations.LEFT.clear()
+    kept.allow(item.path)
 
 
 @pytest.fixture

@@ -26,7 +26,7 @@ def barrett(tmp_path):
 @pytest.fixture(autouse=True)
 def few_starts(monkeypatch):
     """Try a hand with little work."""
-    monkeypatch.setattr("torchgrasp.app.cli.hands.TRIAL_STARTS", 12)
+    monkeypatch.setattr("torchgrasp.app.cli.hands.TRIAL_STARTS", 4)
 
 
 def test_new_writes_a_draft_that_check_takes_and_draws(barrett, capsys, monkeypatch):

@@ -11,7 +11,7 @@ from torchgrasp.data import write_objects
 from torchgrasp.evaluation import PROTOCOLS, EvaluationSpec
 
 LIFT = PROTOCOLS["tabletop"].with_trial(hold_time=0.1, control_rate=50.0)
-QUICK = CampaignSpec(LIFT, EvaluationSpec(2, "spread", starts=16))
+QUICK = CampaignSpec(LIFT, EvaluationSpec(2, "spread", starts=6))
 
 
 @pytest.fixture(scope="session")

@@ -78,9 +78,7 @@ def test_an_object_where_it_was_seen_is_held_at_once(seen):
     assert (result.attempts, result.stops, result.held) == (1, 0, True)
 
 
-@pytest.mark.parametrize(
-    ("aside", "simulator"), [(0.026, "sapien"), (-0.026, "sapien"), (0.022, "mujoco")]
-)
+@pytest.mark.parametrize(("aside", "simulator"), [(-0.026, "sapien"), (0.022, "mujoco")])
 def test_a_hand_that_closed_beside_the_object_closes_once_more(seen, aside, simulator):
     """The object stands off along its own tangents at the contacts: no plane there tells it, its
     round surface does.
@@ -103,7 +101,7 @@ def test_a_hand_that_closed_beside_the_object_closes_once_more(seen, aside, simu
     assert again.attempts > 1 and again.held and again.slip.distance < 0.001
 
 
-@pytest.mark.parametrize("aside", [(0.0, 0.03), (0.0, -0.04)])
+@pytest.mark.parametrize("aside", [(0.0, 0.03)])
 def test_a_hand_that_touches_something_on_its_way_goes_round_it(seen, aside):
     """The object stands where the opened hand comes down: pushed over by one that goes on, held by
     one that stops.
@@ -258,11 +256,12 @@ def test_a_start_in_the_object_missing_contact_and_too_little_friction_are_named
         torch.eye(4),
     )
     forward[2, 3] = 0.2
+    once = dataclasses.replace(spec, options=ClosingOptions(attempts=1))
     inside = close("barrett", spec=spec, error=forward)
     assert (inside.status, inside.held, len(inside.time)) == (Status.START_OVERLAP, False, 1)
-    missed = lift_grasp(GraspTrial(hand, grasp, Truth(cylinder((0.4, 0.0)))), spec)
+    missed = lift_grasp(GraspTrial(hand, grasp, Truth(cylinder((0.4, 0.0)))), once)
     assert (missed.status, missed.contact_order) == (Status.NO_CONTACT, ())
-    slippery = close("allegro", spec=dataclasses.replace(spec, friction=0.02))
+    slippery = close("allegro", spec=dataclasses.replace(once, friction=0.02))
     assert (
         slippery.status in (Status.NOT_LIFTED, Status.EJECTED, Status.DROPPED) and not slippery.held
     )

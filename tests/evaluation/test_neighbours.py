@@ -11,9 +11,11 @@ from tests.pinch import QUICK, cylinder, pinch, quick_trial
 from torchgrasp import close_hand
 from torchgrasp.foundation.errors import MeshError, Status
 from torchgrasp.sim import Neighbour
+from torchgrasp.values.closing import ClosingOptions
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
 SIMULATORS = ["sapien", "mujoco"]
+ONCE = ClosingOptions(attempts=1)
 
 
 def box(centre, size=(0.04, 0.04, 0.06)):
@@ -73,7 +75,9 @@ def test_fingers_that_close_on_a_neighbour_do_not_hold_the_object(simulator, mon
     monkeypatch.setattr(
         "torchgrasp.evaluation.lift.check_agreement", lambda *_, **__: None
     )  # else it is refused
-    result = close_beside(simulator, Neighbour(cylinder()), mesh=cylinder((-0.25, 0.0)))
+    result = close_beside(
+        simulator, Neighbour(cylinder()), mesh=cylinder((-0.25, 0.0)), options=ONCE
+    )
     assert not result.held and result.status is Status.NO_CONTACT
     assert float(result.forces.max()) == 0.0 and result.contact_order == ()
     assert float(result.disturbance.impulse[0]) > 0.01

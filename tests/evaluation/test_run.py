@@ -120,7 +120,7 @@ def test_any_number_of_workers_gives_the_same_bits_and_a_bad_object_is_refused(f
     hand = load_hand("barrett")
     noise = PoseNoise(0.002, 0.02, draws=2)
     quick = Protocol("quick", QUICK, noise=noise)
-    spec = EvaluationSpec(2, "spread", starts=8)
+    spec = EvaluationSpec(2, "spread", starts=4)
     one, two = (
         list(evaluate(folder, hand, quick, spec, workers=n, folder=tmp_path)) for n in (0, 2)
     )
@@ -201,7 +201,7 @@ def test_each_view_is_grasped_with_the_fingers_that_were_chosen_for_it(
     )
     test = PROTOCOLS["dexgraspbench"]
     test = dataclasses.replace(test, pull=dataclasses.replace(test.pull, seconds=0.1))
-    spec = EvaluationSpec(1, starts=8, only=("tin",), fingers="auto")
+    spec = EvaluationSpec(1, starts=3, only=("tin",), fingers="auto")
     (score,) = evaluate(folder, load_hand("allegro"), test, spec, folder=tmp_path)
     assert score.fingers == "index,middle,ring,thumb" and len(score.attempts) == 1
     assert score.attempts[0].force > 1.0 and score.attempts[0].status in (Status.OK, Status.MOVED)

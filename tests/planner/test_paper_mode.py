@@ -21,7 +21,7 @@ def run():
     hand = load_hand("allegro")
     view = load_object("jug").view
     note = lambda stage, text, value: stages.update({stage: value})  # noqa: E731
-    return hand, plan_grasps(view, hand, SPEC, starts=16, mode="paper", observer=note), stages
+    return hand, plan_grasps(view, hand, SPEC, starts=6, mode="paper", observer=note), stages
 
 
 def test_shape_contacts_eq21_seeds_and_ranking_are_the_papers(run):

@@ -46,7 +46,7 @@ def test_bench_writes_its_rows(name, tin, tmp_path):
         (tin,),
         hands=("barrett",),
         conditions=("none",),
-        starts=30,
+        starts=8,
         batches=(1,),
         scale=2e-4,
         workers=0,
