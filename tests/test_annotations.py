@@ -25,6 +25,7 @@ def test_each_call_of_a_nested_function_is_checked():
     two = make(2)
     none = make(0)
     for n in (2, 3):
+        LEFT.clear()
         assert (
             one(torch.zeros(n)).sum() == n and two(torch.zeros(n), z=torch.ones(n)).sum() == 2 * n
         )
@@ -34,6 +35,7 @@ def test_each_call_of_a_nested_function_is_checked():
         lambda: two(torch.zeros(2), y=3),
         lambda: none(torch.zeros(2)),
     ):
+        LEFT.clear()
         with pytest.raises(TypeError):
             call()
 
