@@ -8,14 +8,18 @@ scanned object.
 
 import dataclasses
 import itertools
+import json
 import math
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import trimesh
 import tyro
 
-from train.bodies import write_bodies
+from torchgrasp.cloud.camera import look_at, partial_view
+from torchgrasp.cloud.read import save_cloud
+from torchgrasp.files import write_file
 from train.forms import FORMS
 from train.implements import IMPLEMENTS
 from train.solids import Thing, find_rest, turn, unite
@@ -52,6 +56,8 @@ TOPPLED = {
 """Families that stand, but of which some bodies lie on their side."""
 LYING = 0.2
 """Share of the bodies of these families that lie."""
+GOLDEN_ANGLE = 137.5
+"""Between the cameras of two bodies [deg], so that no side is seen twice."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,3 +120,25 @@ def household(
         lambda body: body.mesh.extents[2] <= highest, map(author_household, itertools.count(first))
     )
     write_bodies(folder, {body.name: body.mesh for body in itertools.islice(bodies, count)})
+
+
+def write_bodies(folder: Path, solids: Mapping[str, trimesh.Trimesh]) -> None:
+    """Write bodies by name, FAMILY_NUMBER, as a folder of objects with one noisy view each
+    (`torchgrasp.data`).
+    """
+    entries = {}
+    for k, (name, mesh) in enumerate(solids.items()):
+        mesh.apply_translation([0.0, 0.0, -mesh.bounds[0, 2]])
+        cloud = partial_view(
+            mesh, look_at(GOLDEN_ANGLE * k % 360, 20.0 + 10.0 * (k % 4), target=mesh), seed=k
+        )
+        pose = np.eye(4)
+        pose[:3, 3] = cloud.viewpoint.numpy()  # pyright: ignore[reportOptionalMemberAccess]
+        (folder / name).mkdir(parents=True, exist_ok=True)
+        write_file(folder / name / "mesh.ply", mesh.export(file_type="ply"))
+        save_cloud(cloud, folder / name / "view0_noisy.ply")
+        entries[name] = {
+            "family": name.split("_")[0],
+            "views": {"view0": {"T_object_camera": pose.tolist()}},
+        }
+    write_file(folder / "manifest.json", json.dumps({"objects": entries}))

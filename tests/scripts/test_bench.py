@@ -24,7 +24,6 @@ from benchmarks.plan.exact_lp import (
 from benchmarks.shape.accuracy import find_edges, mean_row, measure_shape
 from benchmarks.shape.walls import measure_walls
 from train.bands import fit_factor
-from train.bodies import COUNTS, author_body
 
 from tests.make import cup, cup_view
 from torchgrasp import Contacts, ContactSpec, PointCloud, certify, fit_shape
@@ -147,9 +146,3 @@ def test_fit_factor_is_the_spread_of_normal_errors(spread: float):
     generator = np.random.default_rng(0)
     views = [spread * np.abs(generator.standard_normal(4000)) for _ in range(12)]
     assert fit_factor(views) == pytest.approx(spread, abs=0.03)
-
-
-def test_authored_bodies_are_closed_and_repeatable():
-    bodies = {kind: author_body(kind, 0) for kind in COUNTS}
-    assert all(body.is_volume for body in bodies.values())
-    np.testing.assert_array_equal(author_body("bowl", 0).vertices, bodies["bowl"].vertices)

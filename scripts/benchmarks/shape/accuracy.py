@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,10 +10,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from benchmarks.common import mean_over
-from benchmarks.ground_truth import nearest_on_mesh, read_views, sample_mesh
+from benchmarks.ground_truth import nearest_on_mesh, sample_mesh
 from torchgrasp.files import format_columns
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.values.planning import PointCloud
@@ -42,24 +40,6 @@ Row = dict[str, Any]
 """Numbers by name: lengths in mm, angles in degrees, shares in [0, 1], NaN where nothing was
 measured.
 """
-
-
-def measure_accuracy(objects: Path, camera: bool = True, table: bool = True) -> list[Row]:
-    """Return `measure_shape` of every noisy view of a folder, with "object" and "view".
-
-    Args:
-        objects: a folder as `torchgrasp.data` reads it.
-        camera: whether the camera's position is given.
-        table: whether the table is given.
-
-    Raises:
-        BadArgument: no manifest, or no object to measure.
-    """
-    return [
-        {"object": name, "view": view}
-        | measure_shape(fit_shape(cloud, table=0.0 if table else None), mesh, cloud)
-        for name, view, cloud, mesh in read_views(objects, camera)
-    ]
 
 
 def measure_shape(shape: ShapeGP, mesh: "trimesh.Trimesh", cloud: PointCloud, seed: int = 0) -> Row:
@@ -160,7 +140,7 @@ def _measure_sure_surface(
 
 
 def format_table(rows: Sequence[Row]) -> str:
-    """Return rows of `measure_accuracy` as a table with means."""
+    """Return rows of numbers as a table with means."""
     within = ("hidden 1 2 3 sd", "seen 1 2 3 sd", "paper's 1 2 3 sd")
     table: list[tuple[str, ...]] = [
         ("object", "view", "seen mm", "hidden mm  deg", *within, "sure mm  deg")
