@@ -45,7 +45,7 @@ def die_once(path: str) -> str:
 
 @pytest.mark.promise("F4", "F5")
 def test_a_failure_costs_its_own_task_alone_and_the_order_stays():
-    bad = {2: "KILL", 4: "hang"}
+    bad = {2: "exit", 4: "hang"}
     found = list(
         run_tasks(act, [(bad.get(i, "square"), i) for i in range(12)], workers=2, limit=1.5)
     )

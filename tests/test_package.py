@@ -43,7 +43,7 @@ OF_URDF = SLOW - {"skimage", "sklearn"} | {"matplotlib", "PIL", "mujoco"}
     [
         ("import torchgrasp", set()),
         (
-            "import torchgrasp; [torchgrasp.load_hand(name) for name in ('allegro', 'barrett', 'shadow')]",
+            "import torchgrasp; [torchgrasp.load_hand(name) for name in ('allegro', 'shadow')]",
             OF_URDF,
         ),
         (

@@ -111,7 +111,7 @@ def test_example_runs(path, capsys):
 
 
 def test_every_example_is_short_and_numbered():
-    assert 1 <= len(fenced("python")[0].strip().splitlines()) <= 10
+    assert 1 <= len(fenced("python")[0].strip().splitlines()) <= 8
     paths = sorted((ROOT / "examples").glob("*.py"))
     assert [path.name[:3] for path in paths] == [f"{k:02}_" for k in range(1, len(paths) + 1)]
     assert max(len(path.read_text().splitlines()) for path in paths) <= 80

@@ -94,7 +94,6 @@ if __name__ == "__main__":
     ("send", "sign", "code", "said"),
     [
         ("killpg", "SIGINT", 130, "interrupted"),
-        ("kill", "SIGINT", 130, "interrupted"),
         ("kill", "SIGTERM", 143, "terminated"),
     ],
 )
