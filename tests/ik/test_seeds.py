@@ -15,7 +15,7 @@ from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply, rigid, rotate, rotation_from_vector, virtual_frame
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.ik.clearance import CLEARANCE, MILLIMETRE, CollisionWorld, collision_cost
-from torchgrasp.ik.seeds import WRONG_SIDE, PostureLibrary, nearest_postures, query_mixture
+from torchgrasp.ik.seeds import SEEDS, PostureLibrary, nearest_postures, query_mixture
 from torchgrasp.posture_model.mixture import (
     DEFAULT_ENERGY,
     PERMUTATIONS,
@@ -200,7 +200,7 @@ def test_rows_are_in_order_and_the_wrong_side_comes_last(motion):
     assert bool((seeds.row.diff() >= 0).all())
     normals = rotate(seeds.obj_from_hand, hand.fingertips(seeds.joints)[1])
     side = (normals * contacts.normals[seeds.row[:, None], seeds.permutation]).sum(-1).mean(-1)
-    wrong = (side > WRONG_SIDE).long()
+    wrong = (side > SEEDS.wrong_side).long()
     same_row = seeds.row.diff() == 0
     assert bool((wrong.diff()[same_row] >= 0).all())
     # All six assignments are asked, each with three seeds or, out of reach, none.

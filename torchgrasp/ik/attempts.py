@@ -2,6 +2,7 @@
 COBYLA solver.
 """
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Generic, TypeVar
@@ -38,9 +39,32 @@ from torchgrasp.ik.refine import ITERATIONS, grasp_residuals, refine, tip_target
 from torchgrasp.values.planning import Contacts, Grasps, IKSeeds
 
 Result = TypeVar("Result", bound=Batch)
-# unit of the variables [rad]: a fingertip moves by about a millimetre, the unit of distances
-ANGLE = 0.01
-FAR = 20.0  # clearance [mm] above which clearances are not distinguished
+
+
+@dataclasses.dataclass(frozen=True)
+class CobylaNumbers:
+    """The numbers of the paper's solver."""
+
+    angle: float = 0.01
+    """Unit of the variables [rad]: a fingertip moves by about a millimetre, as the distances do."""
+    far: float = 20.0
+    """Clearance [mm] above which clearances are not distinguished."""
+    end: float = 0.05
+    """Trust region, in units of the variables, at which COBYLA stops."""
+    start: float = 10.0
+    """Trust region with which it starts."""
+    evaluations: int = 400
+    """Most evaluations."""
+    together: int = 10
+    """Seeds that are tried at a time."""
+    grasps: int = 10
+    """Executable grasps that are enough."""
+    seeds: int = 300
+    """Most seeds that are tried."""
+
+
+COBYLA = CobylaNumbers()
+ROWS = 256  # seeds whose costs are computed at a time, which bounds the memory
 
 
 def assign(contacts: Contacts, seeds: IKSeeds) -> Contacts:
@@ -159,7 +183,8 @@ def seed_costs(problem: GraspProblem, seeds: IKSeeds) -> Float[Tensor, "g"]:
     refinement.
     """
     costs = [seeds.energy[:0]]
-    for rows in torch.arange(len(seeds), device=seeds.row.device).split(at_once(seeds.row, 256)):
+    every = torch.arange(len(seeds), device=seeds.row.device)
+    for rows in every.split(at_once(seeds.row, ROWS)):
         part = seeds[rows]
         start = Configuration(part.joints, part.obj_from_hand)
         contacts = assign(problem.contacts, part)
@@ -227,7 +252,7 @@ class CobylaRun:
         """Return joints, link frames and hand pose, Eq. (24), at COBYLA's `x`, and whether the tips
         span a frame.
         """
-        step = ANGLE * torch.from_numpy(np.array(x, dtype=float)).to(self.points)
+        step = COBYLA.angle * torch.from_numpy(np.array(x, dtype=float)).to(self.points)
         joints = (self.first + step).clamp(self.hand.lower.to(step), self.hand.upper.to(step))
         frames = self.hand.tree.frames(self.hand.expand_joints(joints)[:, None].contiguous())
         tips = self.tips(frames)
@@ -254,7 +279,9 @@ class CobylaRun:
                 torch.linalg.vector_norm(apply(pose, self.tips(frames)) - self.points, dim=-1).sum()
                 / MILLIMETRE
             )
-            room = (torch.stack(self.clearances(frames, pose)) / MILLIMETRE).clamp_max(FAR) - 0.5
+            room = (torch.stack(self.clearances(frames, pose)) / MILLIMETRE).clamp_max(
+                COBYLA.far
+            ) - 0.5
             self.last = key, float(error) if framed else 1e3, room.cpu().numpy()
         return self.last[1:]
 
@@ -271,7 +298,7 @@ class CobylaRun:
         radius = self.hand.collision_spheres.radius.to(pose)
         local = map_points(frames.index_select(2, spheres.link_index), spheres.center)[..., 0].T
         centres = apply(pose, local)
-        found = [self.hand.self_collision.clearance(frames, FAR * MILLIMETRE)[0]]
+        found = [self.hand.self_collision.clearance(frames, COBYLA.far * MILLIMETRE)[0]]
         if self.world.field is not None:
             outside = self.world.field.query(centres)[0] - radius
             found += [outside[group].amin() for group in self.groups]
@@ -292,7 +319,8 @@ class CobylaRun:
 
         first = self.first.cpu().numpy()
         limits = [
-            (b.double().cpu().numpy() - first) / ANGLE for b in (self.hand.lower, self.hand.upper)
+            (b.double().cpu().numpy() - first) / COBYLA.angle
+            for b in (self.hand.lower, self.hand.upper)
         ]
         solution = minimize(
             lambda x: self.evaluate(x)[0],
@@ -300,8 +328,8 @@ class CobylaRun:
             method="COBYLA",
             bounds=list(zip(*limits, strict=True)),
             constraints=[NonlinearConstraint(lambda x: self.evaluate(x)[1], 0.0, np.inf)],
-            tol=0.05,
-            options={"rhobeg": 10.0, "maxiter": 400},
+            tol=COBYLA.end,
+            options={"rhobeg": COBYLA.start, "maxiter": COBYLA.evaluations},
         )
         joints, _, pose, _ = self.place(solution.x)
         return Configuration(joints[None], pose[None])
@@ -316,8 +344,9 @@ def solve_as_paper(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
     """
     seeds = problem.drop_unreachable(seeds)
     tried = list[Grasps]()
-    for first in range(0, max(min(len(seeds), 300), 1), 10):
-        tried.append(refine_on_contacts(problem, seeds[first : first + 10], cobyla=True))
-        if int(executable(join(tried)).sum()) >= 10:
+    step = COBYLA.together
+    for first in range(0, max(min(len(seeds), COBYLA.seeds), 1), step):
+        tried.append(refine_on_contacts(problem, seeds[first : first + step], cobyla=True))
+        if int(executable(join(tried)).sum()) >= COBYLA.grasps:
             break
     return best_first(join(tried))

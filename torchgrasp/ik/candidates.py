@@ -37,9 +37,25 @@ TIP_PENETRATION = 2 * MILLIMETRE
 """Largest distance [m] of a tip from its contact, and largest depth [m] of a tip below the
 estimated surface.
 """
-ANGLE_TOLERANCE = math.radians(
-    2
-)  # largest angle [rad] of a contact direction outside the pad's cone
+
+
+@dataclasses.dataclass(frozen=True)
+class CheckNumbers:
+    """The numbers of the checks and of the geometric score."""
+
+    angle: float = math.radians(2)
+    """Largest angle [rad] of a contact direction outside the pad's cone."""
+    limits: float = 1e-9
+    """Rounding [rad] by which a joint may pass its limits."""
+    least_cosine: float = 1e-3
+    """Forces that hardly push, or pull, need the friction of this cosine."""
+    offset: float = 0.02
+    """Distance [m] of the contacts from the centre that costs as much as a friction of one."""
+    pad_angle: float = 0.8
+    """Angle [rad] off the pads that costs as much as a friction of one."""
+
+
+CHECKS = CheckNumbers()
 
 
 @checked
@@ -176,14 +192,14 @@ def measure_errors(
     )  # from the inward normal
     links, depth, table = link_clearance(spatial, world, tips_touch=True)
     between = hand.self_clearance(configuration.joints)
-    lower = hand.lower.to(error)
-    upper = hand.upper.to(error)
-    cone = hand.tips.cone.to(error) + ANGLE_TOLERANCE
+    lower = hand.lower.to(error) - CHECKS.limits
+    upper = hand.upper.to(error) + CHECKS.limits
+    cone = hand.tips.cone.to(error) + CHECKS.angle
     conditions = {
         Status.TIP_ERROR: (error <= tolerance).all(1),
         Status.NORMAL_ANGLE: (angle <= cone).all(1) | (not rolling),
         Status.JOINT_LIMITS: (
-            (configuration.joints >= lower - 1e-9) & (configuration.joints <= upper + 1e-9)
+            (configuration.joints >= lower) & (configuration.joints <= upper)
         ).all(1),
         Status.SELF_COLLISION: between >= 0,
         Status.OBJECT_COLLISION: (links >= 0) & (depth >= -TIP_PENETRATION),
@@ -298,7 +314,7 @@ def centred_friction(contacts: Contacts) -> Float[Tensor, "g"]:
     inward = unit(contacts.points.mean(1, keepdim=True) - contacts.points)
     cosine = -(inward * contacts.normals).sum(-1)
     sine = torch.linalg.vector_norm(torch.linalg.cross(inward, contacts.normals), dim=-1)
-    return (sine / cosine.clamp_min(1e-3)).amax(1)
+    return (sine / cosine.clamp_min(CHECKS.least_cosine)).amax(1)
 
 
 def score(
@@ -310,4 +326,6 @@ def score(
         angle off the pads.
     """
     offset = torch.linalg.vector_norm(contacts.points.mean(1) - center, dim=-1)
-    return -(offset / 0.02 + centred_friction(contacts) + normal_angle.amax(1) / 0.8)
+    away = offset / CHECKS.offset
+    turned = normal_angle.amax(1) / CHECKS.pad_angle
+    return -(away + centred_friction(contacts) + turned)

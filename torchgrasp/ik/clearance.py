@@ -25,6 +25,7 @@ MILLIMETRE = 1e-3  # unit [m] of all residuals
 CLEARANCE = 4 * MILLIMETRE  # clearance [m] of links from object and table that refinement aims at
 SELF_CLEARANCE = 1 * MILLIMETRE  # the same between links, whose shapes are exact
 HINGES = 8  # number of least clearances of each kind that enter one step
+LEVELS = (0.1, 0.5, 0.8)  # probabilities of occupancy whose regions are told apart
 
 
 @checked
@@ -63,7 +64,7 @@ class Obstacles(Value):
         device = occupancy.origin.device
         occupancy = settle(occupancy, torch.device("cpu"))
         probability = occupancy.probability
-        levels = sorted({0.1, 0.5, 0.8, full})
+        levels = sorted({*LEVELS, full})
         if not bool((probability >= levels[0]).any()):
             return None
         distances = torch.stack(

@@ -53,6 +53,21 @@ class SlidingStage(NamedTuple):
     hopeless: float
 
 
+@dataclasses.dataclass(frozen=True)
+class SlidingNumbers:
+    """The numbers of the optimisation of hand and contacts together."""
+
+    seeds: int = 2
+    """Seeds of a contact set that are tried: of more, few find another grasp."""
+    rows: int = 512
+    """Seeds that are optimised at a time on a CPU."""
+    most_rows: int = 2**15
+    """The most on an accelerator: the Jacobians of more do not fit into it."""
+    projections: int = 3
+    """Steps onto the surface at the end; the solver leaves contacts within 0.1 mm."""
+
+
+SLIDING = SlidingNumbers()
 STAGES = (
     SlidingStage(5, False, 1e5),
     SlidingStage(6, True, 1e4),
@@ -215,20 +230,18 @@ def solve_sliding(
     """Optimise hand and contacts together for each unsolved contact set, and add the checked grasps
     to `attempts`.
     """
-    chosen = attempts.choose(
-        seeds, rank_in_group(seeds.row), 0, 2
-    )  # of more, few find another grasp
-    size = min(
-        at_once(chosen.row, 512), 2**15
-    )  # the Jacobians of more do not fit into an accelerator
-    for part in (chosen[k : k + size] for k in range(0, len(chosen), size)):
+    chosen = attempts.choose(seeds, rank_in_group(seeds.row), 0, SLIDING.seeds)
+    size = min(at_once(chosen.row, SLIDING.rows), SLIDING.most_rows)
+    for first in range(0, len(chosen), size):
+        part = chosen[first : first + size]
         own = joint_problem.rows(part.row)
         points = own.shape.normalise(assign(problem.contacts, part).points)
         start = Configuration(part.joints, part.obj_from_hand)
         configuration, points, left = own.solve(start, points)
         kept = part[left]
         own = own.rows(left)
-        on_surface = project(own.shape, points, 3)  # the solver leaves contacts within 0.1 mm
+        # The solver leaves contacts near the surface, not on it.
+        on_surface = project(own.shape, points, SLIDING.projections)
         plan = check_feasibility(own.shape, own.contact_problem, on_surface)
         certificate = certify(plan.contacts, own.contact_problem.spec)
         candidates = GraspCandidates(

@@ -2,6 +2,7 @@
 lift.
 """
 
+import dataclasses
 import math
 
 import torch
@@ -23,6 +24,31 @@ APPROACH_DISTANCE = 0.1  # length [m] of the straight approach: about the depth 
 COARSE_STEPS = 8
 FINE_STEPS = 16
 UP = torch.tensor([0.0, 0.0, 1.0], device="cpu")
+
+
+@dataclasses.dataclass(frozen=True)
+class MotionNumbers:
+    """The numbers of the opened hand's pose, its approaches and its lift."""
+
+    gap: float = 0.001
+    """Clearance [m] from the table of a hand that is raised."""
+    most: float = 0.03
+    """Greatest rise [m]."""
+    tilt: float = math.radians(45)
+    """Angle [rad] of the tilted approaches from the hand's axis."""
+    tilted: int = 8
+    """Number of tilted approaches, at equal angles about the axis."""
+    nodes: float = 1.2
+    """Grid spacings by which the nearest node may be wrong about a clearance."""
+    closing_steps: int = 6
+    """Postures of the closing hand that are checked."""
+    lift_steps: int = 6
+    """Heights of the lift that are checked."""
+    lift: float = 0.1
+    """Height [m] of the lift."""
+
+
+MOTION = MotionNumbers()
 Spheres = Float[Tensor, "g s 3"]
 
 
@@ -77,14 +103,12 @@ def opened_pose(
     """
     if table is None:
         return obj_from_hand
-    # [m]: what rises clears the table by the gap
-    gap = 0.001
-    most = 0.03
+    gap = MOTION.gap
     centres = apply(obj_from_hand, hand.sphere_centres(joints))
     lowest = (
         along(centres, table) - table.offset - hand.collision_spheres.radius.to(centres)
     ).amin(1)
-    rise = torch.where((lowest < 0) & (gap - lowest <= most), gap - lowest, 0.0)
+    rise = torch.where((lowest < 0) & (gap - lowest <= MOTION.most), gap - lowest, 0.0)
     pose = obj_from_hand.clone()
     pose[:, :3, 3] += rise[:, None] * table.normal.to(pose)
     return pose
@@ -99,18 +123,15 @@ def approach_directions(
     pose = opened.obj_from_hand
     axis = unit(hand.approach.to(pose))
     first, second = across(axis)
-    tilt = math.radians(45)
-    directions = 8
-    angle = torch.arange(directions, device="cpu").to(axis)[:, None] * (2 * math.pi / directions)
-    tilted = math.cos(tilt) * axis + math.sin(tilt) * (
-        torch.cos(angle) * first + torch.sin(angle) * second
-    )
+    number = torch.arange(MOTION.tilted, device="cpu").to(axis)[:, None]
+    angle = number * (2 * math.pi / MOTION.tilted)
+    sideways = torch.cos(angle) * first + torch.sin(angle) * second
+    tilted = math.cos(MOTION.tilt) * axis + math.sin(MOTION.tilt) * sideways  # (k, 3)
     directions = rotate(pose, torch.cat([axis[None], tilted]).expand(len(pose), -1, -1))
     if table is None:
         return directions
-    down = (0.0 - table.normal.to(pose)).expand(
-        len(pose), 1, 3
-    )  # minus alone would make negative zeros
+    # Minus alone would make negative zeros.
+    down = (0.0 - table.normal.to(pose)).expand(len(pose), 1, 3)
     return torch.cat([directions, down], 1)
 
 
@@ -134,15 +155,14 @@ def _clearance(
     for field in world.fields:
         coarse = field.nearest_node(path) - radius
         near, first = coarse.min(1)
-        # interpolate only spheres that may have the least clearance: nodes are up to 1.2 spacings
-        # away
+        # Only spheres that may have the least clearance are interpolated.
         if exact:
             near = (
                 field.query(path[torch.arange(len(path), device=path.device), first])[0]
                 - radius[first]
             )
             row, sphere = torch.nonzero(
-                coarse < near[:, None] + 1.2 * spread(field.spacing, coarse), as_tuple=True
+                coarse < near[:, None] + MOTION.nodes * spread(field.spacing, coarse), as_tuple=True
             )
             closer = field.rows(row).query(path[row, sphere])[0] - radius[sphere]
             near = near.scatter_reduce(0, row, closer, "amin")
@@ -209,8 +229,8 @@ def _closing(hand: Hand, opened: Configuration, closed: Configuration) -> Float[
     """Return the centres [m] of the collision spheres while a hand closes and goes down, at k equal
     steps.
     """
-    shares = torch.linspace(0, 1, 6, device="cpu").tolist()
-    # equal rotations
+    # Equal rotations of each joint.
+    shares = torch.linspace(0, 1, MOTION.closing_steps, device="cpu").tolist()
     ends = (opened.joints, closed.joints)
     poses = (opened.obj_from_hand, closed.obj_from_hand)
     postures = [
@@ -229,8 +249,9 @@ def _lift(
 
 
 def _lifted(points: Float[Tensor, "*b 3"], up: Float[Tensor, "3"]) -> Float[Tensor, "k *b 3"]:
-    """Return points [m] at six heights of a lift by 0.1 m along `up`."""
-    height = torch.arange(1, 7, device="cpu").to(points) * (0.1 / 6)
+    """Return points [m] at k heights of a lift along `up`."""
+    count = MOTION.lift_steps
+    height = torch.arange(1, count + 1, device="cpu").to(points) * (MOTION.lift / count)
     return points + (height[:, None] * up.to(points)).reshape(-1, *[1] * (points.ndim - 1), 3)
 
 

@@ -6,6 +6,8 @@ Fingertips of other shapes touch with a fixed point. The contact direction stays
 the pad's axis.
 """
 
+import dataclasses
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -21,6 +23,23 @@ TIP_WEIGHT = 2.0
 PAD_WEIGHT = 80.0
 HAND_STEP = 0.6  # largest step of a pose or a joint [m or rad]
 ITERATIONS = 30  # most steps of one refinement
+
+
+@dataclasses.dataclass(frozen=True)
+class OpeningNumbers:
+    """The numbers of the opened hand."""
+
+    gap: float = 0.012
+    """Distance [m] that each tip moves off its contact on a certain surface."""
+    deviations: float = 3.0
+    """Standard deviations of the surface that it moves on."""
+    solved: float = 1.0
+    """Sum of squared residuals [mm2] of an opened hand: half a millimetre at a tip."""
+    steps: int = 12
+    """Most steps of the optimisation."""
+
+
+OPENING = OpeningNumbers()
 
 
 def tip_targets(hand: Hand, contacts: Contacts) -> Float[Tensor, "g f 3"]:
@@ -111,15 +130,14 @@ def open_hand(
     links keep clear.
     """
     normals = contacts.normals
-    gap = 0.012 + 3.0 * contacts.require_std()
+    gap = OPENING.gap + OPENING.deviations * contacts.require_std()
     target = tip_targets(hand, contacts) + gap[..., None] * normals
     if world.plane is not None:
         up = world.plane.normal.to(target)
         height = along(target, world.plane)[..., None]
         lowest = (world.plane.offset + CLEARANCE + hand.tips.radius.to(target))[:, None]
-        target = (
-            target - height * up + torch.maximum(height, lowest) * up
-        )  # exact where the table is horizontal
+        # Exact where the table is horizontal.
+        target = target - height * up + torch.maximum(height, lowest) * up
 
     def evaluate(state: Configuration, rows: Int[Tensor, "a"]) -> Residuals:
         around = world.rows(rows)
@@ -129,11 +147,8 @@ def open_hand(
         return residual, jacobian[..., 6:]
 
     def integrate(state: Configuration, step: Float[Tensor, "a h"]) -> Configuration:
-        return state.integrate(
-            hand, torch.cat([step.new_zeros(len(step), 6), step], 1)
-        )  # the pose is fixed
+        # The pose is fixed.
+        return state.integrate(hand, torch.cat([step.new_zeros(len(step), 6), step], 1))
 
-    problem = LeastSquares(
-        evaluate, integrate, solved=1.0, largest=HAND_STEP
-    )  # half a millimetre at a tip
-    return levenberg_marquardt(problem, grasp, steps=12)[0].joints
+    problem = LeastSquares(evaluate, integrate, OPENING.solved, HAND_STEP)
+    return levenberg_marquardt(problem, grasp, OPENING.steps)[0].joints

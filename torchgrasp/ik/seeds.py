@@ -35,17 +35,37 @@ from torchgrasp.values.planning import Contacts, IKSeeds
 
 Wanted = Float[Tensor, "r p d"]
 Given = Float[Tensor, "s d"]
-# distances of tip centres [m] and of pad axes that count the same
-LENGTH_SCALE = 0.01
-COSINE_SCALE = 0.5
-CANDIDATES = (
-    64  # nearest postures of a row whose clearances are measured; also the most seeds of a row
-)
-ASSIGNMENTS = (
-    6  # assignments of contacts to fingers in which a row is compared with the whole library
-)
-# mean cosine of the outward normals of tips and contacts above which a seed touches from inside
-WRONG_SIDE = 0.3
+
+
+@dataclasses.dataclass(frozen=True)
+class SeedNumbers:
+    """The numbers of the search for initial guesses."""
+
+    length_scale: float = 0.01
+    """Distance of tip centres [m] that counts as much as `cosine_scale`."""
+    cosine_scale: float = 0.5
+    """Distance of pad axes that counts as much as `length_scale`."""
+    postures: int = 5000
+    """Random postures in the library of a hand with three fingers."""
+    many_postures: int = 20_000
+    """The same for a hand with more fingers, whose contact sets have more shapes."""
+    candidates: int = 64
+    """Nearest postures of a row whose clearances are measured; also the most seeds of a row."""
+    assignments: int = 6
+    """Assignments of contacts to fingers in which a row is compared with the whole library."""
+    compared: int = 500
+    """Postures of the library that choose these assignments."""
+    spare: int = 3
+    """Times as many postures as seeds that an arm is asked for."""
+    wrong_side: float = 0.3
+    """Mean cosine of the normals of tips and contacts above which a seed touches from inside."""
+    rows: int = 64
+    """Contact sets that are compared with the library at a time, which bounds the memory."""
+    queried: int = 256
+    """Contact sets that are asked of the model at a time: their configurations stay in the cache."""
+
+
+SEEDS = SeedNumbers()
 
 
 @checked
@@ -89,7 +109,8 @@ class PostureLibrary(Value):
         """Draw random postures within limits and without self-collision; the hand caches the last
         library of a size.
         """
-        count = (5000 if len(hand.tips) == 3 else 20_000) if count is None else count
+        if count is None:
+            count = SEEDS.postures if len(hand.tips) == 3 else SEEDS.many_postures
         found = hand.derived.get((PostureLibrary, count))
         if found is None or found[0] != seed:
             found = hand.derived[PostureLibrary, count] = seed, cls._drawn(hand, count, seed)
@@ -140,7 +161,9 @@ def feature(
     centres: Float[Tensor, "*b f 3"], pads: Float[Tensor, "*b f 3"]
 ) -> Float[Tensor, "*b d"]:
     """Return the feature vector of a posture: tip centres and pad axes, each divided by its scale."""
-    return torch.cat([centres / LENGTH_SCALE, pads / COSINE_SCALE], -1).flatten(-2).float()
+    return (
+        torch.cat([centres / SEEDS.length_scale, pads / SEEDS.cosine_scale], -1).flatten(-2).float()
+    )
 
 
 @checked
@@ -177,7 +200,8 @@ def nearest_postures(
             f"{f}, one for each fingertip of the hand",
         )
     permutations = torch.tensor(list(itertools.permutations(range(f))), device=device)
-    candidates = min(CANDIDATES, min(ASSIGNMENTS, len(permutations)) * len(given))
+    assignments = min(SEEDS.assignments, len(permutations))
+    candidates = min(SEEDS.candidates, assignments * len(given))
     check_whole("n_seeds", n_seeds, 1, candidates)
     check_device("contacts", device, "the library", given.device)
     radius = library.hand.tips.radius.double()
@@ -185,7 +209,7 @@ def nearest_postures(
     centres = contacts.points.double()[:, permutations] - radius[:, None] * inward  # (n, p, f, 3)
     framed = ~degenerate(triangle_of(centres))
     parts = []
-    for row in torch.nonzero(framed.any(1))[:, 0].split(at_once(centres, 64)):  # bounds the memory
+    for row in torch.nonzero(framed.any(1))[:, 0].split(at_once(centres, SEEDS.rows)):
         obj_from_vf, wanted = _describe(centres[row], inward[row], framed[row])
         assignment = _likely_assignments(wanted, given, framed[row])
         at = torch.arange(len(row), device=device)[:, None]
@@ -197,15 +221,14 @@ def nearest_postures(
         sample = index % len(given)
         obj_from_hand = obj_from_vf[at, order] @ library.vf_from_hand[sample]
         spheres = apply(obj_from_hand.float(), library.spheres[sample])
-        tips = (
-            2 * energy * (TIP_WEIGHT * LENGTH_SCALE / MILLIMETRE) ** 2
-        )  # squared millimetres, weighed as in `refine`
+        # Squared millimetres, weighed as in `refine`.
+        tips = 2 * energy * (TIP_WEIGHT * SEEDS.length_scale / MILLIMETRE) ** 2
         cost = tips + collision_cost(spheres, library.hand.collision_spheres, world.rows(row))
         if reachable is None:
             best = cost.topk(n_seeds, 1, largest=False).indices.flatten()
             b = at.repeat_interleave(n_seeds)  # one row for each seed
         else:
-            best = cost.topk(min(3 * n_seeds, candidates), 1, largest=False).indices
+            best = cost.topk(min(SEEDS.spare * n_seeds, candidates), 1, largest=False).indices
             reached = torch.zeros_like(best, dtype=torch.bool)
             for some in (slice(n_seeds), slice(n_seeds, None)):
                 short = torch.nonzero(reached.sum(1) < n_seeds)[:, 0]
@@ -253,12 +276,12 @@ def _likely_assignments(
     wanted: Wanted, given: Given, framed: Bool[Tensor, "r p"]
 ) -> Int[Tensor, "r a"]:
     """Return the indices of the assignments of contacts to fingers with features nearest to one of
-    500 postures.
+    the first postures.
     """
-    if wanted.shape[1] <= ASSIGNMENTS:
+    if wanted.shape[1] <= SEEDS.assignments:
         return torch.arange(wanted.shape[1], device=wanted.device).expand(len(wanted), -1)
-    nearest = _energies(wanted, given[:500], framed).amin(-1)
-    return nearest.topk(ASSIGNMENTS, 1, largest=False).indices
+    nearest = _energies(wanted, given[: SEEDS.compared], framed).amin(-1)
+    return nearest.topk(SEEDS.assignments, 1, largest=False).indices
 
 
 @checked
@@ -283,8 +306,9 @@ def query_mixture(
     check_whole("n_seeds", n_seeds, 1, len(mixture.weights) + 1)
     hand = settle(hand, contacts.points.device)
     mixture = settle(mixture, contacts.points.device)
-    firsts = range(0, max(len(contacts), 1), 256)  # their configurations stay in the cache
-    parts = [_query(hand, contacts[k : k + 256], mixture, n_seeds, max_energy) for k in firsts]
+    size = SEEDS.queried
+    firsts = range(0, max(len(contacts), 1), size)
+    parts = [_query(hand, contacts[k : k + size], mixture, n_seeds, max_energy) for k in firsts]
     rows = torch.cat([part.row + k for part, k in zip(parts, firsts, strict=True)])
     return dataclasses.replace(join(parts), row=rows)
 
@@ -313,7 +337,7 @@ def _query(
     points = contacts.points.double()[row[:, None], permutation]
     normals = contacts.normals.double()[row[:, None], permutation]
     tip_error = torch.linalg.vector_norm(apply(obj_from_hand, tips) - points, dim=-1)
-    wrong_side = (rotate(obj_from_hand, tip_normals) * normals).sum(-1).mean(-1) > WRONG_SIDE
+    wrong_side = (rotate(obj_from_hand, tip_normals) * normals).sum(-1).mean(-1) > SEEDS.wrong_side
     order = lexical_order(row, wrong_side.int(), tip_error.amax(-1))
     seeds = IKSeeds(joints, obj_from_hand, row, permutation, energy[row, assignment], tip_error)
     return seeds[order].to(contacts.points.dtype)

@@ -28,7 +28,27 @@ from torchgrasp.posture_model.mixture import GraspMixture
 from torchgrasp.values.planning import Contacts, IKSeeds
 
 Method = Literal["levenberg_marquardt", "cobyla"]
-EXACT = 1e-6  # sum of squared residuals [mm2] at which a seed is done
+
+
+@dataclasses.dataclass(frozen=True)
+class SolveNumbers:
+    """The numbers of the solver for given contacts."""
+
+    solved: float = 1e-6
+    """Sum of squared residuals [mm2] at which a seed is done."""
+    exact: float = 5e-5
+    """Largest tip error [m] of a solution that ends the search."""
+    library_seeds: int = 8
+    """Seeds of a contact set from the library."""
+    learned_seeds: int = 2
+    """Seeds of a reachable assignment from the model: the mean and one component."""
+    learned_tries: int = 4
+    """Seeds of a contact set from the model that are refined."""
+    part: int = 512
+    """Seeds that are refined at a time: their temporaries stay in the cache."""
+
+
+SOLVING = SolveNumbers()
 
 
 @checked
@@ -104,20 +124,21 @@ def solve_ik(
 
     def library_seeds(some: Contacts) -> IKSeeds:
         return nearest_postures(
-            PostureLibrary.of(hand) if library is None else library, some, world, n_seeds=8
+            PostureLibrary.of(hand) if library is None else library,
+            some,
+            world,
+            SOLVING.library_seeds,
         )
 
     def is_exact(solution: IKSolution) -> Bool[Tensor, "k"]:
-        return (solution.status == Status.OK) & (solution.tip_error.amax(1) <= 5e-5)
+        return (solution.status == Status.OK) & (solution.tip_error.amax(1) <= SOLVING.exact)
 
     attempts = Attempts(~degenerate(contacts.points), is_exact)
     attempts.add(_no_solution(hand, contacts), torch.arange(len(contacts), device=device))
-    sources = [(library_seeds, 8)]
+    sources = [(library_seeds, SOLVING.library_seeds)]
     if mixture is not None:
-        learned_seeds = partial(
-            query_mixture, hand, mixture=mixture, n_seeds=2
-        )  # the mean and one component
-        sources = [(learned_seeds, 4), *sources]
+        learned_seeds = partial(query_mixture, hand, mixture=mixture, n_seeds=SOLVING.learned_seeds)
+        sources = [(learned_seeds, SOLVING.learned_tries), *sources]
     for source, count in sources:
         rows = torch.nonzero(attempts.unsolved)[:, 0]
         if len(rows):
@@ -143,9 +164,9 @@ def _refine_seeds(
         refined = refine_by_cobyla
         rolling = False
     parts = []
-    for part in (
-        seeds[k : k + 512] for k in range(0, max(len(seeds), 1), 512)
-    ):  # temporaries stay in the cache
+    size = SOLVING.part
+    for first in range(0, max(len(seeds), 1), size):
+        part = seeds[first : first + size]
         taken = assign(contacts, part)
         configuration = refined(hand, Configuration(part.joints, part.obj_from_hand), taken, world)
         errors = measure_errors(hand, configuration, taken, world, rolling)
@@ -161,8 +182,8 @@ def refine_exactly(
     """Refine configurations with a margin of clearance, then without; keep the second result where
     links stay clear.
     """
-    refined = refine(hand, start, contacts, world, EXACT)
-    settled = refine(hand, refined, contacts, None, EXACT)
+    refined = refine(hand, start, contacts, world, SOLVING.solved)
+    settled = refine(hand, refined, contacts, None, SOLVING.solved)
     return pick(
         measure_errors(hand, settled, contacts, world).status == Status.OK, settled, refined
     )
