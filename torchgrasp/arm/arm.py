@@ -23,9 +23,27 @@ from torchgrasp.hand.urdf import Urdf, read_published
 from torchgrasp.ik.clearance import MILLIMETRE
 from torchgrasp.ik.motion import APPROACH_DISTANCE
 
-LEVER = (
-    APPROACH_DISTANCE / MILLIMETRE
-)  # distance [mm] that a turn by one radian counts as: the depth of a hand
+# Distance [mm] that a turn by one radian counts as: the depth of a hand.
+LEVER = APPROACH_DISTANCE / MILLIMETRE
+
+
+@dataclasses.dataclass(frozen=True)
+class ArmNumbers:
+    """The numbers of an arm's spheres and of its library of postures."""
+
+    joints: int = 6
+    """Fewest joints that bring a hand to any pose."""
+    postures: int = 1024
+    """Random postures in the library: one is not far from any pose."""
+    tested: int = 200
+    """Postures that tell which spheres overlap by construction."""
+    cell: float = 0.065
+    """Edge [m] of a sphere's cell: one sphere fills a section of a thin link."""
+    bulge: float = 0.01
+    """Distance [m] that a sphere may stand out of a shape."""
+
+
+ARM = ArmNumbers()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -153,7 +171,7 @@ def load_arm(
     whole = read_published(urdf)
     named = {link.name: link for link in whole.links}
     tip = max(reversed(named), key=lambda name: len(whole.movers(name))) if tip is None else tip
-    if tip not in named or len(whole.movers(tip)) < 6:
+    if tip not in named or len(whole.movers(tip)) < ARM.joints:
         raise BadArgument("tip", repr(tip), "a link that at least six joints move")
     turn = 2 * math.pi
     if followers := [joint.name for joint in whole.joints_above(tip) if joint.mimic]:
@@ -181,13 +199,12 @@ def load_arm(
     joints = chain.movable
     one = real([[float(i == j) for j in range(4)] for i in range(4)])
     lower, upper, speed = real([(j.lower, j.upper, j.velocity or math.pi) for j in joints]).T
-    # random postures: one is not far from any pose
     generator = torch.Generator().manual_seed(seed)
-    many = 1024
-    share = 2 * torch.rand(many, len(joints), generator=generator, dtype=torch.float64) - 1
-    library = (lower + upper) / 2 + share * ((upper - lower) / 2).clamp_max(
-        math.pi
-    )  # each direction of a joint once
+    drawn = torch.rand(ARM.postures, len(joints), generator=generator, dtype=torch.float64)
+    share = 2 * drawn - 1  # (m, n)
+    # Each direction of a joint once.
+    reach = ((upper - lower) / 2).clamp_max(math.pi)
+    library = (lower + upper) / 2 + share * reach
     base, mount = (
         one if x is None else x.to("cpu", torch.float64) for x in (obj_from_base, tip_from_hand)
     )
@@ -213,18 +230,12 @@ def load_arm(
         found,
         hand.source.sha256,
     )
-    met = arm.overlaps(arm.sphere_centres(library[:200].T))
+    met = arm.overlaps(arm.sphere_centres(library[: ARM.tested].T))
     bodies, owner = torch.unique((link + palm)[pairs], dim=0, return_inverse=True)
-    often = (
-        torch.zeros(len(bodies), met.shape[1])
-        .index_add(0, owner, met.float())
-        .gt(0)
-        .float()
-        .mean(1)
-    )
-    return dataclasses.replace(
-        arm, pairs=pairs[often[owner] <= ALWAYS]
-    )  # others touch by construction
+    counts = torch.zeros(len(bodies), met.shape[1]).index_add(0, owner, met.float())
+    often = counts.gt(0).float().mean(1)
+    # Others touch by construction.
+    return dataclasses.replace(arm, pairs=pairs[often[owner] <= ALWAYS])
 
 
 def _spheres(
@@ -233,11 +244,8 @@ def _spheres(
     """Return link, centre [m] and radius [m] of spheres around an arm's links and the hand's palm,
     and a palm mask.
     """
-    # [m]: one sphere fills a section of a thin link; how far it may stand out of a shape
-    cell = 0.065
-    bulge = 0.01
     covers = [
-        (k, *cover(shape, cell, bulge))
+        (k, *cover(shape, ARM.cell, ARM.bulge))
         for k, link in enumerate(chain.links)
         for shape in link.shapes
     ]

@@ -1,9 +1,8 @@
 """Inverse kinematics of an arm: which hand poses it reaches, and its way through a grasp.
 
 Postures are moved by damped least squares until the hand is in place: first those of the arm's
-    library whose tips are
-nearest, then along a way each from the one before. A way is w poses: the straight approach of the
-opened hand, the grasp, the lift.
+library whose tips are nearest, then along a way each from the one before. A way is w poses: the
+straight approach of the opened hand, the grasp, the lift.
 """
 
 import dataclasses
@@ -21,6 +20,38 @@ from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, along
 from torchgrasp.ik.motion import APPROACH_DISTANCE, COARSE_STEPS, UP, opened_pose
 from torchgrasp.values.planning import Grasps
 
+
+@dataclasses.dataclass(frozen=True)
+class ReachNumbers:
+    """The numbers of an arm's inverse kinematics and of its way through a grasp."""
+
+    tried: int = 4
+    """Postures of the library from which a pose is tried."""
+    tried_steps: int = 8
+    """Most steps from each of them."""
+    starts: int = 8
+    """Postures of the library from which a grasp is tried."""
+    steps: int = 12
+    """Most steps from each of them."""
+    solved: float = 1e-4
+    """Sum of squared errors [mm2] of a tip in place: of a hundredth of a millimetre."""
+    way_steps: int = 4
+    """Most steps from one pose of the way to the next."""
+    lift: float = 0.1
+    """Height [m] of the lift."""
+    speed: float = 0.1
+    """Speed [m/s] of the tip on the way, at which no joint may turn faster than it can."""
+    between: int = 8
+    """Every how many poses the links are compared with each other: they come near slowly."""
+    postures: int = 256
+    """Postures that are compared at a time, which bounds the memory."""
+    ways: int = 64
+    """Ways that are checked for collisions at a time."""
+    rounding: float = 1e-12
+    """Least sine of a turn that is divided by: below it, the turn is zero."""
+
+
+REACH = ReachNumbers()
 Way = tuple[Float[Tensor, "g w n"], Bool[Tensor, "g"], Float[Tensor, "g 2"]]
 """The postures on the way through each grasp, whether the arm can go it, and its ease, as in
 `Grasps`.
@@ -29,13 +60,13 @@ Way = tuple[Float[Tensor, "g w n"], Bool[Tensor, "g"], Float[Tensor, "g 2"]]
 
 def reach_poses(arm: Arm, obj_from_hand: Float[Tensor, "k 4 4"]) -> Bool[Tensor, "k"]:
     """Return a mask of the hand poses that the arm reaches within its joint limits."""
-    # postures that are tried for a pose
-    target = arm.tip_poses(obj_from_hand)
-    starts = 4
+    target = arm.tip_poses(obj_from_hand)  # (3, 4, k)
     reached = torch.zeros(len(obj_from_hand), dtype=torch.bool, device=target.device)
-    for start in _nearest(arm, target, starts).unbind(1):
+    for start in _nearest(arm, target, REACH.tried).unbind(1):
         left = torch.nonzero(~reached)[:, 0]
-        reached[left] = solve_tips(arm, arm.library[start[left]].T, target[..., left], 8, SOLVED)[1]
+        joints = arm.library[start[left]].T  # (n, k)
+        _, found = solve_tips(arm, joints, target[..., left], REACH.tried_steps, SOLVED)
+        reached[left] = found
     return reached.to(obj_from_hand.device)
 
 
@@ -65,24 +96,31 @@ def follow_grasps(
     world, each other or the palm.
     """
     poses = way_of(hand, grasps, world, up).to(arm.lower)
-    starts = 8
+    starts = REACH.starts
     at = COARSE_STEPS + 1
-    (g, w), tips = poses.shape[:2], arm.tip_poses(poses.flatten(0, 1)).unflatten(2, poses.shape[:2])
+    (g, w) = poses.shape[:2]
+    tips = arm.tip_poses(poses.flatten(0, 1)).unflatten(2, (g, w))  # (3, 4, g, w)
     near = _nearest(arm, tips[..., at], starts).flatten()
     joints, solved = solve_tips(
         arm, arm.library[near].T, tips[..., at].repeat_interleave(starts, 2)
     )
-    solved &= in_chunks(lambda x: (_is_clear(arm, x[:, None], world),), joints.T, 256)[0]
+
+    def clear(path: Float[Tensor, "g w n"]) -> tuple[Bool[Tensor, "g"]]:
+        return (_is_clear(arm, path, world),)
+
+    solved &= in_chunks(clear, joints.T[:, None], REACH.postures)[0]
     ease = torch.where(solved, measure_ease(arm, joints).prod(1), -1.0).view(g, starts)
     way = poses.new_zeros(g, w, len(joints))
     found = solved.new_zeros(g)
     least = poses.new_zeros(g, 2)
+    # The easiest posture first; a grasp that has its way is done.
     for choice in ease.argsort(dim=1, descending=True, stable=True).unbind(1):
         rows = torch.nonzero(~found & (ease.gather(1, choice[:, None])[:, 0] >= 0))[:, 0]
         if not len(rows):
             break
-        path, good = track(arm, joints[:, rows * starts + choice[rows]], tips[:, :, rows])
-        good &= in_chunks(lambda x: (_is_clear(arm, x, world),), path, 64)[0]
+        start = joints[:, rows * starts + choice[rows]]  # (n, k)
+        path, good = track(arm, start, tips[:, :, rows])
+        good &= in_chunks(clear, path, REACH.ways)[0]
         rows = rows[good]
         path = path[good]
         way[rows] = path
@@ -99,15 +137,13 @@ def way_of(
 
     It is lifted along the normal of the table, or `up` without a table.
     """
-    # [m], of the lift
     closed = grasps.obj_from_hand
-    height = 0.1
     opened = opened_pose(hand, grasps.pregrasp, closed, world.plane)
     share = torch.linspace(0, 1, COARSE_STEPS + 1, device="cpu").to(closed)[:, None]
     up = (up if world.plane is None else world.plane.normal).to(closed)
     before, after = (x[:, None].repeat(1, len(share), 1, 1) for x in (opened, closed))
     before[..., :3, 3] -= APPROACH_DISTANCE * (1 - share) * grasps.approach[:, None]
-    after[..., :3, 3] += height * share * up
+    after[..., :3, 3] += REACH.lift * share * up
     return torch.cat([before, after], 1)
 
 
@@ -117,18 +153,19 @@ def track(
     """Return postures that follow the tips from the grasp both ways, and whether each does so
     steadily.
 
-    At a speed of 0.1 m/s no joint may turn faster than it can.
+    At the hand's speed no joint may turn faster than it can.
     """
-    speed = 0.1
     at = COARSE_STEPS + 1
     path = {at: start}
     steady = torch.ones_like(start[0], dtype=torch.bool)
-    for k, last in [(k, k + 1) for k in reversed(range(at))] + [
-        (k, k - 1) for k in range(at + 1, 2 * at)
-    ]:
-        path[k], solved = solve_tips(arm, path[last], tips[..., k], steps=4)
-        seconds = torch.linalg.vector_norm(tips[:, 3, :, k] - tips[:, 3, :, last], dim=0) / speed
-        steady &= solved & ((path[k] - path[last]).abs() <= arm.speed[:, None] * seconds).all(0)
+    back = [(k, k + 1) for k in reversed(range(at))]
+    on = [(k, k - 1) for k in range(at + 1, 2 * at)]
+    for k, last in back + on:
+        path[k], solved = solve_tips(arm, path[last], tips[..., k], steps=REACH.way_steps)
+        moved = torch.linalg.vector_norm(tips[:, 3, :, k] - tips[:, 3, :, last], dim=0)
+        seconds = moved / REACH.speed
+        turned = (path[k] - path[last]).abs()
+        steady &= solved & (turned <= arm.speed[:, None] * seconds).all(0)
     return torch.stack([path[k].T for k in range(2 * at)], 1), steady
 
 
@@ -145,13 +182,14 @@ def _is_clear(arm: Arm, path: Float[Tensor, "g w n"], world: CollisionWorld) -> 
         height = along(links[:, :, turns], world.plane) - radius[turns]
         clear &= height.flatten(1).amin(1) >= world.plane.offset
     if world.field is not None:  # a lifted object is not in the way
-        clear &= (world.field.query(links[:, : COARSE_STEPS + 2])[0] - radius).flatten(1).amin(
-            1
-        ) >= 0
+        gap = world.field.query(links[:, : COARSE_STEPS + 2])[0] - radius
+        clear &= gap.flatten(1).amin(1) >= 0
     if world.obstacles is not None and world.guarded:
-        clear &= (world.obstacles.field.query(links)[0] - radius).flatten(1).amin(1) >= 0
-    if path.shape[1] > 1:  # the links come near each other slowly
-        clear &= ~arm.overlaps(centres[..., ::8].flatten(2)).any(0).view(len(path), -1).any(1)
+        gap = world.obstacles.field.query(links)[0] - radius
+        clear &= gap.flatten(1).amin(1) >= 0
+    if path.shape[1] > 1:
+        some = centres[..., :: REACH.between].flatten(2)
+        clear &= ~arm.overlaps(some).any(0).view(len(path), -1).any(1)
     return clear
 
 
@@ -172,16 +210,21 @@ def _nearest(arm: Arm, target: Float[Tensor, "3 4 k"], count: int) -> Int[Tensor
     target.
     """
     size = arm.features.square().sum(1) / 2
-    find = lambda wanted: ((size - wanted @ arm.features.T).topk(count, 1, largest=False).indices,)  # noqa: E731
-    return in_chunks(find, features(target), 256)[0]
+
+    def find(wanted: Float[Tensor, "k 12"]) -> tuple[Int[Tensor, "k s"]]:
+        # Half the squared distance, but for a summand that all postures share.
+        distance = size - wanted @ arm.features.T  # (k, m)
+        return (distance.topk(count, 1, largest=False).indices,)
+
+    return in_chunks(find, features(target), REACH.postures)[0]
 
 
 def solve_tips(
     arm: Arm,
     start: Float[Tensor, "n k"],
     target: Float[Tensor, "3 4 k"],
-    steps: int = 12,
-    solved: float = 1e-4,
+    steps: int = REACH.steps,
+    solved: float = REACH.solved,
 ) -> tuple[Float[Tensor, "n k"], Bool[Tensor, "k"]]:
     """Move postures within their limits until the tips are in place; return them, and whether each
     tip is.
@@ -220,5 +263,5 @@ def _gap(tip: Float[Tensor, "3 4 k"], target: Float[Tensor, "3 4 k"]) -> Float[T
     axis = torch.linalg.cross(tip[:, :3], target[:, :3], dim=0).sum(1) / 2
     sine = torch.linalg.vector_norm(axis, dim=0)
     cosine = ((tip[:, :3] * target[:, :3]).sum((0, 1)) - 1) / 2
-    turn = axis * (torch.atan2(sine, cosine) / sine.clamp_min(1e-12))
+    turn = axis * (torch.atan2(sine, cosine) / sine.clamp_min(REACH.rounding))
     return torch.cat([(target[:, 3] - tip[:, 3]) / MILLIMETRE, LEVER * turn])

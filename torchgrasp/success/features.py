@@ -2,6 +2,7 @@
 units.
 """
 
+import dataclasses
 from collections.abc import Sequence
 
 import torch
@@ -39,10 +40,30 @@ CAUSES: dict[str, dict[str, str]] = {
     },
 }
 """The features with their units, by what they tell about."""
-FEATURES = tuple(
-    name for names in CAUSES.values() for name in names
-)  # all features, in the order of the columns
+# All features, in the order of the columns.
+FEATURES = tuple(name for names in CAUSES.values() for name in names)
 GRIP = 15.0  # greatest force [N] that a hand which grips as the load asks for may need
+
+
+@dataclasses.dataclass(frozen=True)
+class FeatureNumbers:
+    """The numbers of the features."""
+
+    slippery: float = 0.5
+    """Share of the friction coefficient that a slippery object has."""
+    gravity: float = 9.81
+    """Acceleration [m/s2] of a lifted load."""
+    pull: float = 10.0
+    """Acceleration [m/s2] of a pull."""
+    least_force: float = 1e-3
+    """Least force [N] that counts: its logarithm is finite."""
+    most_force: float = 1e3
+    """Greatest force [N] that counts, where no force is enough."""
+    most_spare: float = 2.0
+    """Greatest logarithm of a force to spare that counts in a mean, either way."""
+
+
+MEASURES = FeatureNumbers()
 
 
 def measure_grasps(
@@ -63,20 +84,23 @@ def measure_grasps(
     pressing = task.pressing(lifted)
     greatest = greatest_force(hand, grasps, forces).to(points).nan_to_num(0.0)
     strength = torch.minimum(greatest, greatest.new_tensor(pressing or GRIP))
-    needed = _force_for(contacts, forces, center, (0.5 * friction,), task.mass, lifted)[0]
+    numbers = MEASURES
+    slipping = numbers.slippery * friction
+    needed = _force_for(contacts, forces, center, (slipping,), task.mass, lifted)[0]
     moved = touch_moved(hand, body.field, grasps, forces)
     everywhere = center if center.ndim == 1 else center.repeat(len(moved.touched), 1)
     there = _force_for(
-        moved.contacts, moved.forces, everywhere, (friction, 0.5 * friction), task.mass, lifted
+        moved.contacts, moved.forces, everywhere, (friction, slipping), task.mass, lifted
     )
-    there = there.unflatten(1, moved.touched.shape).where(moved.touched, 1e3)
-    spare, slippery = torch.log(strength.clamp_min(1e-3) / there)
+    there = there.unflatten(1, moved.touched.shape).where(moved.touched, numbers.most_force)
+    strength = strength.clamp_min(numbers.least_force)
+    spare, slippery = torch.log(strength / there).clamp(-numbers.most_spare, numbers.most_spare)
     found: dict[str, Tensor | float] = {
         "force needed": needed,
-        "force to spare": torch.log(strength.clamp_min(1e-3) / needed),
+        "force to spare": torch.log(strength / needed),
         "offset": torch.linalg.vector_norm(points.mean(1) - center, dim=-1),
-        "force to spare if moved": spare.clamp(-2.0, 2.0).mean(0),
-        "force to spare if moved and slippery": slippery.clamp(-2.0, 2.0).mean(0),
+        "force to spare if moved": spare.mean(0),
+        "force to spare if moved and slippery": slippery.mean(0),
         "carried if moved": (spare > 0).to(points).mean(0),
         "deviation": contacts.require_std().to(points).amax(1),
         "tilt": _normal_deviation(body.shape, points).amax(1),
@@ -108,11 +132,12 @@ def _force_for(
     """Return the force [N] of the strongest finger with which no contact slides under the load, for
     each friction.
     """
-    weight, pull = (9.81 * mass, 0.0) if lifted else (0.0, 10.0 * mass)
+    numbers = MEASURES
+    weight = numbers.gravity * mass if lifted else 0.0
+    pull = 0.0 if lifted else numbers.pull * mass
     load = center.new_tensor([0.0, 0.0, -weight])
-    return carrying_force(contacts, forces, center, frictions, load, pull).clamp(
-        1e-3, 1e3
-    )  # infinite: no force does
+    force = carrying_force(contacts, forces, center, frictions, load, pull)
+    return force.clamp(numbers.least_force, numbers.most_force)  # infinite: no force does
 
 
 def _normal_deviation(

@@ -2,6 +2,7 @@
 press.
 """
 
+import dataclasses
 from collections.abc import Sequence
 
 import torch
@@ -15,8 +16,24 @@ from torchgrasp.geometry.linalg import unit
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values.planning import Contacts, Grasps, IKSeeds
 
-# log-odds of success that a lift loses for each factor e on the force that carries the load
-CARRYING = 2.07
+
+@dataclasses.dataclass(frozen=True)
+class LoadNumbers:
+    """The numbers of loads."""
+
+    carrying: float = 2.07
+    """Log-odds of success that a lift loses for each factor e on the force that carries the load."""
+    torsion: float = 0.01
+    """Lever [m] of the torsion of a contact, beside that of the triangle's height."""
+    edges: int = 32
+    """Edges of a cone that stands for a friction cone."""
+    least_force: float = 0.3
+    """Least force [N] that counts in the log-odds."""
+    most_force: float = 100.0
+    """Greatest force [N] that counts."""
+
+
+LOADS = LoadNumbers()
 
 
 def lever_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "*b 3"]) -> Float[Tensor, "b"]:
@@ -41,7 +58,7 @@ def lever_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "*b 3"]) -> 
     opposite = points.gather(1, (longest + 2) % 3)[:, 0]
     arm = torch.linalg.vector_norm(torch.linalg.cross(along, center - foot), dim=-1)
     height = torch.linalg.vector_norm(torch.linalg.cross(along, opposite - foot), dim=-1)
-    return arm / (height + 0.01)  # [m], the lever of torsion
+    return arm / (height + LOADS.torsion)
 
 
 def carrying_force(
@@ -64,19 +81,20 @@ def carrying_force(
     """
     points = contacts.points.to(forces)
     normals = contacts.normals.to(forces)
-    edges = cone_edges(normals, tangents(points, normals), 1.0, edges=32)
+    edges = cone_edges(normals, tangents(points, normals), 1.0, edges=LOADS.edges)
     moment = skew(center.to(forces) - points.mean(1))  # maps a force at `center` to its torque
     eye = torch.eye(3).to(forces).expand_as(moment)
-    shared = (torch.linalg.pinv(grasp_map(points)) @ torch.cat([eye, moment], 1)).unflatten(
-        1, points.shape[1:]
-    )
+    wrench = torch.cat([eye, moment], 1)  # (b, 6, 3): of a force at `center`
+    shared = torch.linalg.pinv(grasp_map(points)) @ wrench
+    shared = shared.unflatten(1, points.shape[1:])  # (b, f, 3, 3)
     found = list[Tensor]()
     for friction in frictions:
         dual = edges + (1 - friction) * normals[:, :, None]
         across = torch.einsum("bfij,bfei->bfej", shared, dual)
         lacking = across @ load.to(forces) + push * torch.linalg.vector_norm(across, dim=-1)
         having = torch.einsum("bfi,bfei->bfe", forces, dual)
-        found.append(torch.where(having > 0, lacking.clamp_min(0) / having, torch.inf).amax((1, 2)))
+        factor = torch.where(having > 0, lacking.clamp_min(0) / having, torch.inf)
+        found.append(factor.amax((1, 2)))
     return torch.stack(found)
 
 
@@ -130,5 +148,6 @@ def log_odds_about(
         carrying_force(grasps.contacts, forces, center, (0.5 * friction,), load)[0]
         for center in centers
     ]
-    logs = torch.log(torch.stack(carried, -1).clamp(0.3, 100.0))
-    return grasps.score.to(centers)[:, None] - CARRYING * (logs - logs[:, :1])
+    forces = torch.stack(carried, -1).clamp(LOADS.least_force, LOADS.most_force)  # (g, c)
+    logs = torch.log(forces)
+    return grasps.score.to(centers)[:, None] - LOADS.carrying * (logs - logs[:, :1])

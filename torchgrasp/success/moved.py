@@ -1,5 +1,6 @@
 """The contacts of a grasp whose object is not quite where the camera saw it."""
 
+import dataclasses
 from typing import NamedTuple
 
 import torch
@@ -14,6 +15,33 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.values.planning import Contacts, Grasps
 
 Sets = Float[Tensor, "d g f 3"]
+
+
+@dataclasses.dataclass(frozen=True)
+class MovedNumbers:
+    """The numbers of the displacements and of the search for their contacts."""
+
+    count: int = 16
+    """Displacements."""
+    radius: float = 0.02
+    """The greatest displacement [m], which a hand still finds."""
+    turn: float = 0.618
+    """Step of the sizes' sequence, the golden ratio: sizes fill the ball evenly."""
+    close: float = 3e-4
+    """Distance [m] from the surface that is a touch."""
+    least: float = 2e-4
+    """Least step [m]."""
+    length: float = 0.12
+    """Longest way [m] of a fingertip."""
+    steps: int = 24
+    """Most steps."""
+    still: float = 1e-6
+    """Least path [m] of a fingertip that has a direction."""
+    flat: float = 1e-9
+    """Least gradient of a distance that has a direction."""
+
+
+MOVED = MovedNumbers()
 
 
 class MovedContacts(NamedTuple):
@@ -35,24 +63,21 @@ def touch_moved(
     """Return where the fingers touch the object if the object is displaced, by distances that a
     hand still finds.
 
-    The displacements fill a ball of 20 mm, in the axes of the hand. Each fingertip moves on along
+    The displacements fill a ball, in the axes of the hand. Each fingertip moves on along
     the line from its pre-grasp to its planned pose until it touches the surface, given by `field`.
     Balanced `forces` at the planned contacts tell how the fingers share their pushes.
     """
-    # displacements; the greatest [m]
-    count = 16
-    radius = 0.02
-    sizes = (torch.arange(count, dtype=torch.float64, device="cpu") * 0.618 % 1.0) ** (
-        1 / 3
-    )  # even in the ball
-    moved = radius * (sizes[:, None] * fibonacci_sphere(count)).to(forces)
+    count = MOVED.count
+    numbers = torch.arange(count, dtype=torch.float64, device="cpu")
+    sizes = (numbers * MOVED.turn % 1.0) ** (1 / 3)  # even in the ball
+    moved = MOVED.radius * (sizes[:, None] * fibonacci_sphere(count)).to(forces)
     pose = grasps.obj_from_hand.to(forces)
     before, after = (
         apply(pose, hand.tip_centres(q).to(forces)) for q in (grasps.pregrasp, grasps.joints)
     )
     path = after - before
-    way = path / torch.linalg.vector_norm(path, dim=-1, keepdim=True).clamp_min(1e-6)
-    start = before - rotate(pose, moved[None]).transpose(0, 1)[:, :, None]
+    way = path / torch.linalg.vector_norm(path, dim=-1, keepdim=True).clamp_min(MOVED.still)
+    start = before - rotate(pose, moved[None]).transpose(0, 1)[:, :, None]  # (d, g, f, 3)
     points, normals, found = trace(field, start, way.expand_as(start), hand.tips.radius.to(forces))
     pairs = internal_forces(grasps.contacts.points.to(forces)).flatten(2).mT
     weights = (torch.linalg.pinv(pairs) @ forces.nan_to_num(0.0).flatten(1)[..., None])[..., 0]
@@ -70,23 +95,20 @@ def trace(
     """Return where balls that move from `start` [m] along a `way` first touch a surface, its
     normals, and whether.
 
-    This is sphere tracing: a ball moves on by its distance from the surface, up to 120 mm in all.
+    This is sphere tracing: a ball moves on by its distance from the surface, up to a longest way.
     """
-    # [m]: distance of a touch; least step; longest way
-    close = 3e-4
-    least = 2e-4
-    length = 0.12
     travelled = torch.zeros_like(start[..., 0]).flatten(0, 1)
     shape = start.shape[:-1]
     field = field.rows(torch.arange(start.shape[1], device=start.device).repeat(len(start)))
     start = start.flatten(0, 1)
     way = way.flatten(0, 1)
-    for _ in range(24):
+    for _ in range(MOVED.steps):
         gap = field.query(start + travelled[..., None] * way)[0] - radius
-        travelled = torch.where(gap < close, travelled, travelled + gap.clamp_min(least)).clamp_max(
-            length
-        )
+        further = travelled + gap.clamp_min(MOVED.least)
+        travelled = torch.where(gap < MOVED.close, travelled, further).clamp_max(MOVED.length)
     distance, gradient = field.query(start + travelled[..., None] * way)
-    normals = gradient / torch.linalg.vector_norm(gradient, dim=-1, keepdim=True).clamp_min(1e-9)
+    steepness = torch.linalg.vector_norm(gradient, dim=-1, keepdim=True)
+    normals = gradient / steepness.clamp_min(MOVED.flat)
     points = start + travelled[..., None] * way - distance[..., None] * normals
-    return points.view(*shape, 3), normals.view(*shape, 3), (distance - radius < close).view(shape)
+    touching = distance - radius < MOVED.close
+    return points.view(*shape, 3), normals.view(*shape, 3), touching.view(shape)

@@ -22,6 +22,8 @@ from torch import Tensor
 
 from torchgrasp.success.model import load_success_model
 
+BOUNDS = 200  # bounds of the log-odds that are tried, at equal steps
+
 
 class Promise(NamedTuple):
     """A promise that trials support: the least log-odds of a returned grasp, and the numbers of
@@ -60,7 +62,9 @@ def least_log_odds(
     number = family.unique(return_inverse=True)[1]
     count = torch.bincount(number).to(log_odds)
     risk = (~held).to(log_odds) - (1 - share)
-    bounds = torch.linspace(float(log_odds.min()), float(log_odds.max()), 200, dtype=log_odds.dtype)
+    least = float(log_odds.min())
+    most = float(log_odds.max())
+    bounds = torch.linspace(least, most, BOUNDS, dtype=log_odds.dtype)
     weighted = risk / count[number]  # its sum is that of the means of all families
     kept = torch.where(log_odds >= bounds[:, None], weighted, 0.0).sum(1) + share <= 0
     return float(bounds[kept][0]) if bool(kept.any()) else None

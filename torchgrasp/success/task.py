@@ -89,6 +89,21 @@ class TaskWrenches(Value):
             )
 
 
+@dataclasses.dataclass(frozen=True)
+class TaskNumbers:
+    """The numbers of the named tasks."""
+
+    gravity: float = 9.81
+    """Acceleration [m/s2] of a load."""
+    push: float = 2.5
+    """Force [N] of a push."""
+    around: float = 1.24
+    """Length of the corners and axes of a cube whose mixtures fill the unit ball."""
+    upward: float = 1.2
+    """Length above which such a vector points straight up."""
+
+
+TASKS = TaskNumbers()
 TaskName = Literal["lift", "pour", "push"]
 Resist = TaskName | tuple[TaskName, ...] | TaskWrenches
 """What grasps must resist: `TaskWrenches`, or names of loads at the estimated centre. Without a
@@ -121,16 +136,15 @@ def loads_of(
     else:
         axes = torch.eye(3, dtype=torch.float64)
         corners = torch.tensor([*itertools.product((-1.0, 1.0), repeat=3)]) / math.sqrt(3)
-        around = 1.24 * torch.cat(
-            [corners, axes, -axes]
-        )  # mixtures of these vectors fill the unit ball
-        weight = torch.tensor([[0.0, 0.0, -9.81 * mass]], dtype=torch.float64)
+        # Mixtures of these vectors fill the unit ball.
+        around = TASKS.around * torch.cat([corners, axes, -axes])  # (14, 3)
+        weight = torch.tensor([[0.0, 0.0, -TASKS.gravity * mass]], dtype=torch.float64)
         # Without the vector that points up, mixtures fill the ball up to 120 degrees from straight
         # down.
         loads = {
             "lift": weight,
-            "pour": 9.81 * mass * around[around[:, 2] < 1.2],
-            "push": weight + 2.5 * around,
+            "pour": TASKS.gravity * mass * around[around[:, 2] < TASKS.upward],
+            "push": weight + TASKS.push * around,
         }
         names = (resist,) if isinstance(resist, str) else resist
         force = torch.cat([loads[name] for name in names]).to(center)
