@@ -14,6 +14,7 @@ forces need [1]. The factors c_i = 2 / (preferred normal force) also fix the sca
 [1] Boyd and El Ghaoui, Linear Algebra and its Applications 188, 1993.
 """
 
+import dataclasses
 import functools
 import math
 from collections.abc import Iterable
@@ -31,26 +32,50 @@ from torchgrasp.foundation.rules import ANY, Positive
 from torchgrasp.geometry.frames import skew
 from torchgrasp.geometry.linalg import GOLDEN_ANGLE, fibonacci_sphere, unit
 
-DIRECTIONS = 1024
-NEIGHBOURS = 128
-REFINEMENTS = 12
-SHRINK = 0.55
-"""The search tries all directions, then neighbours of the best in rounds, each of a smaller radius
-by `SHRINK`.
-"""
-EVENNESS = (
-    0.01  # weight of the ratio of the largest to the least normal force, against the tangent needed
-)
-PREFERENCE = (
-    0.2  # weight of the distance from the preferred proportions, against the tangent needed
-)
-# tangent that four or five contacts may need beyond the least one, so that their forces are more
-# even
-SLACK = 0.04
-# Newton steps, and the share of tau's distance from the needed ratio that each step leaves
-STEPS = 30
-KEPT = 0.3
-MAX_FRICTION = 10.0  # tangent of the widest friction cones in which forces are sought
+
+@dataclasses.dataclass(frozen=True)
+class BalanceNumbers:
+    """The numbers of the search over directions, of the short search, and of the Newton steps."""
+
+    directions: int = 1024
+    """Directions that the search tries first."""
+    neighbours: int = 128
+    """Neighbours of the best direction in each later round."""
+    refinements: int = 12
+    """Later rounds."""
+    shrink: float = 0.55
+    """Factor on the radius of the neighbours from round to round."""
+    evenness: float = 0.01
+    """Weight of the ratio of the largest to the least normal force, against the tangent needed."""
+    preference: float = 0.2
+    """Weight of the distance from the preferred proportions, against the tangent needed."""
+    near: int = 24
+    """Changes of the weights in each round of the short search."""
+    near_radii: tuple[float, ...] = (0.5, 0.28, 0.15)
+    """Radii of its rounds."""
+    near_least: float = 0.3
+    """Least length of a change, as a share of the radius."""
+    slack: float = 0.04
+    """Tangent that four or five contacts may need beyond the least one, for more even forces."""
+    least_preferred: float = 0.05
+    """Least preferred normal force, as a share of the largest: every finger has to push."""
+    steps: int = 30
+    """Newton steps."""
+    lengths: int = 5
+    """Lengths of each step that are tried, each twice the one before."""
+    kept: float = 0.3
+    """Share of tau's distance from the needed ratio that each step leaves."""
+    first: float = 1.1
+    """The first tau, as a multiple of the ratio that the first forces need."""
+    max_friction: float = 10.0
+    """Tangent of the widest friction cones in which forces are sought."""
+    edges: int = 4
+    """Edges of these cones."""
+    pushing: float = 1e-12
+    """Normal force above which a contact pushes: above rounding."""
+
+
+BALANCE = BalanceNumbers()
 Push = Float[Tensor, "b f k"]
 Slide = Float[Tensor, "b f 3 k"]
 """The map from coordinates in the null space to normal forces, and to tangential forces."""
@@ -87,7 +112,7 @@ def tangential_ratio(
     """
     push = -(forces * normals).sum(-1)
     tangential = torch.linalg.vector_norm(forces + push[..., None] * normals, dim=-1)
-    return torch.where(push > 0, tangential / push.clamp_min(1e-12), torch.inf)
+    return torch.where(push > 0, tangential / push.clamp_min(BALANCE.pushing), torch.inf)
 
 
 @checked
@@ -123,9 +148,11 @@ def least_friction_forces(
         preferred = preferred.expand(points.shape[:-1]).reshape(-1, points.shape[-2])
     if points.shape[-2] == 3:
         forces = _search_forces(p, n, preferred)
-    else:  # every finger has to push
-        wanted = p.new_ones(p.shape[:-1]) if preferred is None else preferred.clamp(min=0.05)
-        forces = central_forces(p, n, wanted, SLACK)
+    else:
+        wanted = p.new_ones(p.shape[:-1])
+        if preferred is not None:
+            wanted = preferred.clamp(min=BALANCE.least_preferred)
+        forces = central_forces(p, n, wanted, BALANCE.slack)
     forces = forces.to(points).reshape(points.shape)
     push = -(forces * normals).sum(-1)
     return forces * (strongest / push.amax(-1))[..., None, None]
@@ -187,15 +214,16 @@ def _improve(
         tried = weights[:, :, None] + steps
         normal = push @ tried
         across = slide @ tried
-        ratio = ((across * across).unflatten(1, (-1, 3)).sum(2) / (normal * normal)).amax(1) ** 0.5
+        tangential = (across * across).unflatten(1, (-1, 3)).sum(2)  # (b, f, s)
+        ratio = (tangential / (normal * normal)).amax(1) ** 0.5
         least = normal.amin(1)
         most = normal.amax(1)
         if preferred is None:
-            uneven = EVENNESS * most / least
+            uneven = BALANCE.evenness * most / least
         else:
             off = normal / most[:, None] - preferred[..., None]
-            uneven = PREFERENCE * (off * off).sum(1) ** 0.5
-        costs = torch.where(least > 1e-12, ratio + uneven, torch.inf)
+            uneven = BALANCE.preference * (off * off).sum(1) ** 0.5
+        costs = torch.where(least > BALANCE.pushing, ratio + uneven, torch.inf)
         best = costs.argmin(-1)
         weights = tried[row, :, best]
         weights = weights / (weights * weights).sum(-1)[:, None] ** 0.5
@@ -208,13 +236,13 @@ def _search_steps(device: torch.device) -> tuple[Float[Tensor, "3 s"], ...]:
     smaller.
     """
     with torch.device("cpu"):  # whatever the default device is
-        first, near = (fibonacci_sphere(n, GOLDEN_ANGLE, 0.0) for n in (DIRECTIONS, NEIGHBOURS))
+        first = fibonacci_sphere(BALANCE.directions, GOLDEN_ANGLE, 0.0)
+        near = fibonacci_sphere(BALANCE.neighbours, GOLDEN_ANGLE, 0.0)
         around = torch.cat([near.new_zeros(1, 3), near]).T
-    radii = 4 / math.sqrt(DIRECTIONS) * SHRINK ** np.arange(REFINEMENTS)
-    return tuple(
-        x.to(device)
-        for x in (first.T.contiguous(), *(radius * around for radius in radii.tolist()))
-    )
+    rounds = np.arange(BALANCE.refinements)
+    radii = 4 / math.sqrt(BALANCE.directions) * BALANCE.shrink**rounds
+    steps = [first.T.contiguous(), *(radius * around for radius in radii.tolist())]
+    return tuple(x.to(device) for x in steps)
 
 
 @functools.cache
@@ -222,13 +250,13 @@ def _near_steps(pairs: int, device: torch.device) -> tuple[Float[Tensor, "p s"],
     """Return for each round of a short search the changes of the weights of all pairs that it
     tries.
     """
-    count = 24
-    radii = (0.5, 0.28, 0.15)
+    count = BALANCE.near
     draw = torch.Generator("cpu").manual_seed(0)
     steps = unit(torch.randn(count, pairs, generator=draw, dtype=torch.float64, device="cpu"))
-    steps = steps * torch.linspace(0.3, 1.0, count, dtype=torch.float64, device="cpu")[:, None]
+    lengths = torch.linspace(BALANCE.near_least, 1.0, count, dtype=torch.float64, device="cpu")
+    steps = steps * lengths[:, None]  # (s, p)
     around = torch.cat([steps.new_zeros(1, pairs), steps]).T
-    return tuple((radius * around).to(device) for radius in radii)
+    return tuple((radius * around).to(device) for radius in BALANCE.near_radii)
 
 
 def central_forces(
@@ -238,19 +266,19 @@ def central_forces(
 
     `slack` is added to the friction coefficient that the forces need: a larger one gives forces
     nearer to the preferred ones. A row is NaN where no balanced forces push at every contact within
-    `MAX_FRICTION`.
+    the widest cones.
     """
     wrench = grasp_map(points / centre_and_radius(points)[1])
-    basis = (
-        torch.linalg.qr(wrench.mT, mode="complete").Q[:, :, 6:].unflatten(1, points.shape[1:])
-    )  # (b, f, 3, k)
+    null = torch.linalg.qr(wrench.mT, mode="complete").Q[:, :, 6:]
+    basis = null.unflatten(1, points.shape[1:])  # (b, f, 3, k)
     push = -(normals[..., None] * basis).sum(2)  # (b, f, k): a = push z
     slide = basis + normals[..., None] * push[:, :, None]
     pushes = push[..., :, None] * push[..., None, :]
     slides = slide.mT @ slide
     start = torch.einsum("bfik,bfi->bk", basis, -preferred[..., None] * normals)
     pulls = ~((push @ start[..., None])[..., 0] > 0).all(1)
-    wrench = wrenches(points[pulls], normals[pulls], MAX_FRICTION, edges=4)
+    # Where the preferred forces would pull somewhere, a linear programme finds a start.
+    wrench = wrenches(points[pulls], normals[pulls], BALANCE.max_friction, edges=BALANCE.edges)
     phi, _ = solve_closure_lp(wrench.flatten(1, 2))
     found = (phi.unflatten(1, wrench.shape[1:3])[..., None] * wrench[..., :3]).sum(2)
     found = torch.where((phi.amin(-1) > 0)[:, None, None], found, torch.nan)
@@ -258,10 +286,10 @@ def central_forces(
     linear = (2 / preferred[..., None] * push).sum(1)
     z = start * (2 * points.shape[1] / (linear * start).sum(1))[:, None]
     ratio = _needed(push, slide, z)
-    tau = 1.1 * ratio + slack
+    tau = BALANCE.first * ratio + slack
     row = torch.arange(len(z), device=z.device)
-    lengths = 2 ** torch.arange(5, device=z.device).to(z)
-    for _ in range(STEPS):
+    lengths = 2 ** torch.arange(BALANCE.lengths, device=z.device).to(z)
+    for _ in range(BALANCE.steps):
         cone = tau.square()[:, None, None, None] * pushes - slides  # (b, f, k, k)
         half = (cone @ z[:, None, :, None])[..., 0]
         height = (half * z[:, None]).sum(-1, keepdim=True)
@@ -272,17 +300,19 @@ def central_forces(
         step = -torch.cholesky_solve(gradient[..., None], factor)[..., 0]
         decrement = (-(gradient * step).sum(1)).clamp(min=0).sqrt()
         # Multiples of a step that is safe for every self-concordant function.
-        tried = (
-            z[:, None] + (lengths / (1 + decrement[:, None]))[..., None] * step[:, None]
-        )  # (b, l, k)
+        safe = lengths / (1 + decrement[:, None])
+        tried = z[:, None] + safe[..., None] * step[:, None]  # (b, l, k)
         normal, tangential = _size(push, slide, tried)
         widest = tau[:, None, None] * normal
         logs = ((widest - tangential).log() + (widest + tangential).log()).sum(-1)
         value = (tried @ linear[..., None])[..., 0] - logs
-        z = tried[row, torch.where(torch.isfinite(value), value, torch.inf).argmin(1)]
+        best = torch.where(torch.isfinite(value), value, torch.inf).argmin(1)
+        z = tried[row, best]
         ratio = _needed(push, slide, z)
         # Farther from the centre tau would fall faster than the steps can follow.
-        tau = torch.where(decrement < 1.0, ratio + (KEPT * (tau - ratio)).clamp(min=slack), tau)
+        tau = torch.where(
+            decrement < 1.0, ratio + (BALANCE.kept * (tau - ratio)).clamp(min=slack), tau
+        )
     return (basis @ z[:, None, :, None])[..., 0]
 
 

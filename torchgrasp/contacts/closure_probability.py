@@ -30,13 +30,11 @@ from torchgrasp.values.specs import ContactSpec
 # half the width [m] over which a fingertip senses the slope of the surface: the radius of its
 # sphere
 FOOTPRINT = 0.012
-NODES = (
-    4.0,
-    1.5,
-    0.0,
-    -1.5,
-    -4.0,
-)  # nodes of a line, in standard deviations of the surface at its contact
+# nodes of a line, in standard deviations of the surface at its contact
+NODES = (4.0, 1.5, 0.0, -1.5, -4.0)
+LINES = 32  # contact sets whose covariances are computed at a time: they stay in the cache
+DRAWS = 8192  # drawn rows that are judged at a time: their tensors take about 20 MB
+DRAWS_ON_GPU = 2**18  # the same on a GPU, which fewer leave idle: about 700 MB
 OUTER_GRID = (12.0, 9.0, 6.5, 4.0, 3.375, 2.75, 2.125, 1.5, 1.125, 0.75, 0.375, 0.0)
 """Outer half of the grid on a line, in standard deviations of the surface; all nodes are grid
 points.
@@ -141,9 +139,7 @@ def _along_lines(
     nodes = deviation[..., None] * torch.tensor(NODES, device="cpu").to(deviation)
     values = 4 * len(NODES) * points.shape[1]
     covariance = points.new_empty(len(points), values, values)
-    for rows in torch.arange(len(points), device=points.device).split(
-        32
-    ):  # the distances of a part stay in the cache
+    for rows in torch.arange(len(points), device=points.device).split(LINES):
         covariance[rows] = node_covariance(shape, points[rows], normals[rows], nodes[rows])
     slope = shape.mean_and_gradient(
         (points[:, :, None] + nodes[..., None] * normals[:, :, None]).reshape(-1, 3)
@@ -267,17 +263,13 @@ def closed_share(lines: LinePosterior, friction: float, n: int, seed: int) -> Fl
     """Return the fraction of n random surfaces, drawn on `lines`, on which each contact set has
     force closure.
     """
-    draws_per_chunk = 8192  # drawn rows that are judged at a time: their tensors take about 20 MB
-    gpu_draws = (
-        2**18
-    )  # the same on a GPU, which fewer leave idle: about 700 MB (`scripts/bench.py gpu`)
     generator = torch.Generator().manual_seed(seed)
     count = lines.points.new_zeros(len(lines))
-    guess = (
-        None if lines.points.shape[1] == 3 else first_balance(lines.points, lines.normals, friction)
-    )
-    at_once = min(n, draws_per_chunk)
-    judged = draws_per_chunk if count.device.type == "cpu" else gpu_draws
+    guess = None
+    if lines.points.shape[1] > 3:
+        guess = first_balance(lines.points, lines.normals, friction)
+    at_once = min(n, DRAWS)
+    judged = DRAWS if count.device.type == "cpu" else DRAWS_ON_GPU
     for start in range(0, n, at_once):
         size = min(at_once, n - start), lines.root.shape[-1]
         standard = torch.randn(size, dtype=torch.float64, generator=generator, device="cpu")

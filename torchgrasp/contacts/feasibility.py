@@ -146,6 +146,7 @@ def _wall_constraint(
     return FlatnessConstraint(value, by_points, points)
 
 
+BORDER = -1e-9  # signed distance (normalised) inside of which a point is in a region: rounding
 ON_SURFACE = 1e-6  # largest |f_d| of a contact on the surface, normalised: far above rounding
 
 
@@ -204,7 +205,7 @@ def within(problem: ContactProblem, points: Float[Tensor, "*b 3"]) -> Bool[Tenso
     """
     if problem.beyond is None:
         return torch.ones_like(points[..., 0], dtype=torch.bool)
-    return (problem.beyond(points.flatten(0, -2)) < -1e-9).view(points.shape[:-1])
+    return (problem.beyond(points.flatten(0, -2)) < BORDER).view(points.shape[:-1])
 
 
 def first_violation(good: dict[Status, Bool[Tensor, "b"]]) -> Int[Tensor, "b"]:

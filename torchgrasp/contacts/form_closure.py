@@ -31,25 +31,23 @@ from torchgrasp.geometry.linalg import unit
 
 Vectors = Float[Tensor, "b f 3"]  # points or normals of the contacts in every row
 Guess = Float[Tensor, "b m"] | None  # coefficients of the first wrenches of each cone
+SEAM = 1e-9  # least length of a tangent, as a share of the triangle's: above rounding
+LOOKS_ON_GPU = 16  # pivots on a GPU between two looks at whether any programme goes on
 # largest |W phi| of balanced coefficients: above rounding in float64, far below any wrench (about
 # 1)
 BALANCED = 1e-9
-MIN_MARGIN = (
-    1e-6  # least positive coefficient: far above the certificate's errors, far below 1 / (f e)
-)
-MIN_RANK_RATIO = (
-    1e-3  # least singular value of the wrenches over the largest: contacts on a line have 0
-)
+# least positive coefficient: far above the certificate's errors, far below 1 / (f e)
+MIN_MARGIN = 1e-6
+# least singular value of the wrenches over the largest: contacts on a line have 0
+MIN_RANK_RATIO = 1e-3
 # most pivots of one grasp: six reach a vertex, and with 24 wrenches fewer than 30 more reach the
 # optimum
 PIVOTS = 100
 OPTIMAL = 1e-12  # multipliers below this are zero: the objective grows no further
-ARTIFICIAL_GAIN = (
-    1e3  # added to the gain of the artificial rows, far above any multiplier: they leave first
-)
-BLOCKING = (
-    1e-11  # a bound approached more slowly than this, for each unit of the step, is parallel to it
-)
+# added to the gain of the artificial rows, far above any multiplier: they leave first
+ARTIFICIAL_GAIN = 1e3
+# a bound approached more slowly than this, for each unit of the step, is parallel to it
+BLOCKING = 1e-11
 GRASPS_PER_CHUNK = 2048  # grasps at a time: their tableaux stay in the cache
 PARALLEL = 1e-9  # planar wrenches (of length about 1) with a shorter cross product are parallel
 FIRST_EDGES = 4  # edges of a cone in the first programme
@@ -90,8 +88,8 @@ def tangents(points: Vectors, normals: Vectors) -> Vectors:
         away = points[:, None] - points[:, :, None]
         away = away - (away * normals[:, :, None]).sum(-1, keepdim=True) * normals[:, :, None]
         far, farthest = torch.linalg.vector_norm(away, dim=-1).max(-1, keepdim=True)
-        stand_in = torch.where(far**2 > 1e-9 * size, _take(away, farthest), stand_in)
-    seam = ~(length > 1e-9 * size) | (size == 0)
+        stand_in = torch.where(far**2 > SEAM * size, _take(away, farthest), stand_in)
+    seam = ~(length > SEAM * size) | (size == 0)
     return unit(torch.where(seam, stand_in, inside))
 
 
@@ -178,9 +176,7 @@ def maximise(
     slack = bounds.new_ones(b, m)
     ray = bounds.new_zeros(b, d)
     running = torch.ones_like(row, dtype=torch.bool)
-    every = (
-        1 if bounds.device.type == "cpu" else 16
-    )  # pivots between two looks at whether any programme goes on
+    every = 1 if bounds.device.type == "cpu" else LOOKS_ON_GPU
     for k in range(PIVOTS):
         multiplier = (objective[:, None] @ inverse)[:, 0]
         artificial = tight < 0

@@ -29,12 +29,12 @@ from torchgrasp.values.specs import ContactSpec
 # inequalities are solved to this share of their bound: the last steps onto the surface stay inside
 # it
 INSIDE = 0.99
-CONE_MARGIN = (
-    0.02  # the cosine between force and inward normal exceeds that of the cone by this much
-)
-LEAST_SIDE = (
-    0.05  # least distance of two tip centres, normalised: wrenches of coincident tips lack rank
-)
+ROOM = 0.1  # bound (normalised) whose share keeps contacts above the table and inside a region
+DIFFERENCE = 1e-4  # step (normalised) of differences: far below any region, far above rounding
+# the cosine between force and inward normal exceeds that of the cone by this much
+CONE_MARGIN = 0.02
+# least distance of two tip centres, normalised: wrenches of coincident tips lack rank
+LEAST_SIDE = 0.05
 
 
 PerRow = float | Float[Tensor, "b"]
@@ -140,6 +140,7 @@ def split_unknowns(x: Float[Tensor, "b u"]) -> tuple[Vectors, Float[Tensor, "b p
     """Split each vector of u unknowns into f contact points (f, 3) and the tensions of all p pairs
     of contacts.
     """
+    # u = 3 f + f (f - 1) / 2, solved for f.
     fingertips = (math.isqrt(25 + 8 * x.shape[1]) - 5) // 2
     return x[:, : 3 * fingertips].unflatten(1, (fingertips, 3)), x[:, 3 * fingertips :]
 
@@ -317,11 +318,11 @@ class ContactProblem:
         ]
         if self.up is not None:
             up = self.up.to(points)
-            values.append((1 - INSIDE) * 0.1 - self.room(points, jet.normals))
+            values.append((1 - INSIDE) * ROOM - self.room(points, jet.normals))
             jacobians.append(own(-(up @ centre_by_point)))
         if self.beyond is not None:
             value, slope = self._outside(points)
-            values.append((1 - INSIDE) * 0.1 + value)
+            values.append((1 - INSIDE) * ROOM + value)
             jacobians.append(own(slope))
         centre_by_x = torch.cat(
             [identity.repeat(1, f) / f, identity.new_zeros(3, tension.shape[1])], 1
@@ -334,7 +335,7 @@ class ContactProblem:
         differences.
         """
         assert self.beyond is not None
-        step = 1e-4  # far below any region, far above rounding
+        step = DIFFERENCE
         sides = step * torch.cat([torch.eye(3), -torch.eye(3), torch.zeros(1, 3)]).to(points)
         found = self.beyond((points[:, :, None] + sides).flatten(0, 2)).view(*points.shape[:2], 7)
         return found[..., 6], (found[..., :3] - found[..., 3:6]) / (2 * step)

@@ -24,6 +24,7 @@ from torchgrasp.geometry.signed_distance import surface_distance
 from torchgrasp.scene.scene import Scene
 from torchgrasp.values.planning import PointCloud
 
+LEAST_DEPTH = 1e-3  # depth [m] in front of the camera from which points are seen
 Distance = Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n"]]
 """Function that returns the signed distance [m] of points (n, 3) [m]: negative inside a region."""
 
@@ -129,7 +130,7 @@ class Region(Value):
 
         def distance(points: Tensor) -> Tensor:
             seen = apply(camera, points.cpu()).numpy()
-            depth = np.maximum(seen[:, 2], 1e-3)  # behind the camera nothing is seen
+            depth = np.maximum(seen[:, 2], LEAST_DEPTH)  # behind the camera nothing is seen
             place = seen[:, :2] / depth[:, None] * focal + middle
             found = ndimage.map_coordinates(pixels, place[:, ::-1].T, order=1, mode="nearest")
             return torch.from_numpy(found * depth / focal.mean()).to(points)

@@ -34,6 +34,9 @@ from torchgrasp.geometry.optim import (
 )
 from torchgrasp.shape.surface import newton_step
 
+# least and greatest damping
+LEAST_DAMPING = 1e-9
+MOST_DAMPING = 1e9
 LONGEST_STEP = (
     0.3  # a point moves at most this far in a step (normalised): there the surface is smooth
 )
@@ -159,7 +162,8 @@ class Descent(Minimisation[State, LinearConstraints]):
         kept = (model.cost - trial.cost) / promised_decrease(model, x)
         accepted = (kept > 0) & trial.inside  # NaN is not accepted
         eased = damping * (1 - (2 * kept - 1) ** 3).clamp(min=1 / 5, max=2.0)
-        return accepted, torch.where(accepted, eased.clamp(min=1e-9), (4 * damping).clamp(max=1e9))
+        eased = eased.clamp(min=LEAST_DAMPING)
+        return accepted, torch.where(accepted, eased, (4 * damping).clamp(max=MOST_DAMPING))
 
     def refuse(self, model: LinearConstraints, trial: LinearConstraints) -> LinearConstraints:
         """Return the model after a rejected step; its Jacobian is the mean of the Jacobians at the

@@ -20,6 +20,7 @@ from torchgrasp.values.specs import FLAT_RADII, ContactSpec
 
 CANDIDATE_TRIPLES = 350  # triples of surface points among which candidates are found
 CANDIDATE_FLATNESS = 0.9  # share of the largest normal variation that a candidate may have
+NEAR_SURFACE = 1e-4  # largest distance (normalised) of a point on the surface
 FAR = 0.1  # a start farther than this from the surface (normalised) is no guess of contacts
 # normalised distance from the centre to which such a start is drawn in: the paper's radius of
 # starts
@@ -180,9 +181,8 @@ def qualify(
         x.unflatten(0, points.shape[:2]) for x in shape.mean_and_gradient(points.flatten(0, 1))
     )
     normals = unit(gradient)
-    good = (distance.abs() < 1e-4) & (
-        torch.linalg.vector_norm(points, dim=-1) < problem.domain_radius
-    )
+    radius = torch.linalg.vector_norm(points, dim=-1)
+    good = (distance.abs() < NEAR_SURFACE) & (radius < problem.domain_radius)
     good &= (problem.room(points, normals) > 0) & within(problem, points)
     variance = shape.jet(points[good]).variance  # it costs more than all else
     good[good.clone()] = (variance >= 0) & (variance < spec.max_variance)

@@ -18,6 +18,11 @@ FINGERTIPS = (
     3,
     5,
 )  # fewest and most fingertips on an object: two contacts do not resist a rotation about their line
+# columns and lines of the text of a value
+WIDTH = 110
+LINES = 12
+# rows on an accelerator for each row on a CPU: fewer leave it idle, more fill its memory
+ROWS_ON_GPU = 256
 Kept = TypeVar("Kept")
 SomeValue = TypeVar("SomeValue", bound="Value")
 SomeBatch = TypeVar("SomeBatch", bound="Batch")
@@ -101,9 +106,9 @@ class Value:
         fields = [f for f in dataclasses.fields(self) if f.repr]  # pyright: ignore[reportArgumentType]
         parts = [*self._about(), *(f"{f.name}={_short(getattr(self, f.name))}" for f in fields)]
         lines = textwrap.wrap(
-            f"{type(self).__name__}({', '.join(parts)})", 110, subsequent_indent="    "
+            f"{type(self).__name__}({', '.join(parts)})", WIDTH, subsequent_indent="    "
         )
-        return "\n".join(lines if len(lines) <= 12 else [*lines[:11], "    ...)"])
+        return "\n".join(lines if len(lines) <= LINES else [*lines[: LINES - 1], "    ...)"])
 
     def _about(self) -> list[str]:
         """Return what the text of a value begins with, before the fields."""
@@ -166,10 +171,12 @@ def _short(value: Any) -> str:
         return f"{str(value.dtype).removeprefix('torch.')}{list(value.shape)}"
     if isinstance(value, dict | list | tuple) and len(value) > 4:
         return f"{type(value).__name__} of {len(value)}"
-    text = (
-        " ".join(repr(value).split()) if isinstance(value, Value) else repr(value)
-    )  # wrapped once, as a whole
-    return text if len(text) <= 110 or isinstance(value, Value) else f"{text[:107]}..."
+    text = repr(value)
+    if isinstance(value, Value):  # it is wrapped once, as a whole
+        text = " ".join(text.split())
+    if len(text) <= WIDTH or isinstance(value, Value):
+        return text
+    return f"{text[: WIDTH - len('...')]}..."
 
 
 def _digits(value: Any) -> str:
@@ -281,9 +288,7 @@ def at_once(x: Tensor, size: int) -> int:
     """Return how many rows of `x` to work on at once: `size` on a CPU, whose cache then holds all
     temporaries.
     """
-    return (
-        size if x.device.type == "cpu" else 256 * size
-    )  # fewer leave an accelerator idle, more fill its memory
+    return size if x.device.type == "cpu" else ROWS_ON_GPU * size
 
 
 def in_chunks(

@@ -55,6 +55,7 @@ FINITE = "finite numbers in every field"
 """Rules in annotations. Tensors must be finite unless annotated `ANY`; `FINITE` demands it of all
 fields of a value.
 """
+ROUNDING = 1e-4  # largest error of a rotation matrix: above rounding in float32
 RIGID = "a rigid transform: a right-handed rotation, and the row 0 0 0 1"
 """The rule for transforms: a matrix that scales or mirrors would give wrong results without an
 error.
@@ -235,7 +236,7 @@ def is_rigid(a_from_b: Float[Tensor, "*b 4 4"]) -> Bool[Tensor, "*b"]:
     eye = torch.eye(4, dtype=torch.float64, device=a_from_b.device)
     error = (rotation @ rotation.transpose(-1, -2) - eye[:3, :3]).abs().amax((-1, -2))
     right_handed = (torch.linalg.cross(x, y) * z).sum(-1) > 0
-    return (error <= 1e-4) & right_handed & (a_from_b[..., 3, :] == eye[3]).all(-1)
+    return (error <= ROUNDING) & right_handed & (a_from_b[..., 3, :] == eye[3]).all(-1)
 
 
 def check_moved(*args: Any, **kwargs: Any) -> None:

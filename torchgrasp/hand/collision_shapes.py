@@ -27,9 +27,31 @@ from torchgrasp.hand.self_collision import SelfCollision
 from torchgrasp.hand.urdf import LinkShape, Mimic, Triple, Urdf
 
 MEETING_DISTANCE = 0.002  # links that come nearer than this [m] in some posture are a pair to test
+MOST_POSTURES = 10**7  # most postures that may be asked for
+LOOK = 1000  # postures after which settled pairs are left out
+SEPARATIONS = 100_000  # separations that are computed at a time, which bounds the memory
 # links that overlap in a larger share of the postures overlap by construction: they are no pair to
 # test
 ALWAYS = 0.98
+
+
+@dataclasses.dataclass(frozen=True)
+class CoverNumbers:
+    """The numbers of the spheres that cover a hand."""
+
+    finger_cell: float = 0.015
+    """Edge [m] of a finger's cells: edges and corners stick farther out of larger cells' spheres."""
+    palm_cell: float = 0.022
+    """Edge [m] of the palm's cells."""
+    bulge: float = 0.004
+    """Distance [m] that a sphere may stand out of a shape's faces, other than a fingertip's."""
+    single_layer: float = 0.025
+    """A shape thinner than this [m] has one layer of cells across."""
+    sunk: float = 0.001
+    """Distance [m] by which a cell's corners may stand out of its sphere."""
+
+
+COVER = CoverNumbers()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,11 +75,6 @@ class CollisionSpheres(Value):
 
 def spheres_from_urdf(urdf: Urdf, spec: HandSpec) -> CollisionSpheres:
     """Return spheres that cover every collision shape of a URDF."""
-    bulge = 0.004  # how far a sphere may stand out of a shape's faces [m], other than a fingertip's
-    # Edge of the cells of fingers and palm [m]; edges and corners stick farther out of the spheres
-    # of larger cells
-    finger_cell = 0.015
-    palm_cell = 0.022
     owner = {joint: i for i, f in enumerate(spec.fingers) for joint in f.joints}
     tips = [f.tip_link for f in spec.fingers]
     rows: list[tuple[int, Triple, float, int, bool]] = []
@@ -65,10 +82,10 @@ def spheres_from_urdf(urdf: Urdf, spec: HandSpec) -> CollisionSpheres:
         movers = urdf.movers(link.name)
         touching = link.name in tips
         finger = owner.get(movers[0].name, -2) if movers else -1
-        cell = palm_cell if finger == -1 else finger_cell
+        cell = COVER.palm_cell if finger == -1 else COVER.finger_cell
         for shape in link.shapes:
             # a tip's contact is known exactly: no sphere may touch before it
-            centers, radius = cover(shape, cell, 0.0 if touching else bulge)
+            centers, radius = cover(shape, cell, 0.0 if touching else COVER.bulge)
             rows += [(index, center, radius, finger, touching) for center in centers]
     link_index, center, radius, finger, touching = zip(*rows, strict=True)
     link_index, finger, touching = (
@@ -81,14 +98,15 @@ def cover(shape: LinkShape, cell: float, bulge: float) -> tuple[list[Triple], fl
     """Return the centres and the radius [m] of spheres that cover a shape, one for each cell of
     about size `cell`.
     """
-    single_layer = 0.025  # a shape thinner than this [m] has one layer of cells across
     if shape.kind == "sphere":
         return [shape.xyz], shape.size[0]
     size = [2 * x for x in shape.half]  # a cylinder is cut as its bounding box
-    counts = [1 if x == min(size) and x < single_layer else max(1, round(x / cell)) for x in size]
+    thin = min(size)
+    single = [x == thin and x < COVER.single_layer for x in size]
+    counts = [1 if one else max(1, round(x / cell)) for x, one in zip(size, single, strict=True)]
     half = [x / n / 2 for x, n in zip(size, counts, strict=True)]
     thinnest = min((x / 2 for x, n in zip(size, counts, strict=True) if n == 1), default=math.inf)
-    radius = min(math.hypot(*half) - 0.001, thinnest + bulge)
+    radius = min(math.hypot(*half) - COVER.sunk, thinnest + bulge)
     centers = []
     for place in itertools.product(*(range(n) for n in counts)):
         if all(0 < c < n - 1 for c, n in zip(place, counts, strict=True)):
@@ -182,7 +200,7 @@ def collision_pairs(
     """Return the pairs of links that collide in some of n random postures but not in nearly all,
     without neighbours.
     """
-    check_whole("n", n, 1, 10**7)
+    check_whole("n", n, 1, MOST_POSTURES)
     tree = tree_from_urdf(urdf)
     shapes = self_collision_from_urdf(urdf, None)
     if not len(shapes.pairs):
@@ -192,12 +210,11 @@ def collision_pairs(
     )
     met, near = torch.zeros(2, len(links), dtype=torch.float64, device=links.device)
     done = 0
-    for look in draw_postures(urdf, coupling, n, seed).split(1000, 1):
+    for look in draw_postures(urdf, coupling, n, seed).split(LOOK, 1):
         if not len(owner):
             break
-        chunks = [
-            tree.frames(chunk) for chunk in look.split(max(1, 100_000 // len(owner)), 1)
-        ]  # bounds the memory
+        size = max(1, SEPARATIONS // len(owner))
+        chunks = [tree.frames(chunk) for chunk in look.split(size, 1)]
         if not done:
             _limit_near(urdf, shapes, chunks[0], look.shape[1], HAND_SEPARATIONS // 10)
         for frames in chunks:
@@ -208,9 +225,9 @@ def collision_pairs(
             near += (least < MEETING_DISTANCE).sum(1)
         done += look.shape[1]
         met[met >= done] = torch.inf  # links that overlapped in every posture so far
-        settled = (met == torch.inf) | (
-            (near > 0) & (met + (n - done) <= ALWAYS * n)
-        )  # whatever the rest shows
+        # Whatever the rest shows.
+        known = (near > 0) & (met + (n - done) <= ALWAYS * n)
+        settled = (met == torch.inf) | known
         kept = ~settled[owner]
         shapes = shapes.only(kept)
         owner = owner[kept]

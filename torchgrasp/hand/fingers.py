@@ -25,6 +25,7 @@ from torchgrasp.hand.kinematics import (
 )
 from torchgrasp.hand.urdf import Mimic, Urdf
 
+ROUNDING = 1e-6  # a joint [rad or m] may pass its limits by float32 rounding
 ROUND_PAD = math.radians(60)
 FLAT_PAD = math.radians(40)
 """Half angles [rad] of the cone about the pad's axis in which a round and a flat fingertip may
@@ -84,8 +85,8 @@ class ActuatedJoints(Value):
         float32 rounding.
         """
         self.check(joints, name)
-        low = self.lower.to(joints) - 1e-6
-        high = self.upper.to(joints) + 1e-6
+        low = self.lower.to(joints) - ROUNDING
+        high = self.upper.to(joints) + ROUNDING
         self._refuse(name, joints, (joints < low) | (joints > high), None)
 
     def _refuse(self, name: str, joints: Tensor, wrong: Tensor, allowed: str | None) -> None:

@@ -22,6 +22,12 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib  # pyright: ignore[reportMissingImports]
 
+ROUNDING = 1e-6  # largest error of a unit vector, and [m] of a contact on its sphere
+MOST_GAIN = 1e6  # greatest gain of a drive
+LEAST_GAIN = 1e-6  # least stiffness of a drive
+# radius [m] of a fingertip
+LEAST_RADIUS = 1e-4
+MOST_RADIUS = 0.1
 SUPPORTED = "three to five different fingers"  # fingers of a grasp, see `FINGERTIPS`
 _DOTTED = re.compile(
     r"""(?<![\w"'-])(?:[\w-]+|"[^"\n]*"|'[^'\n]*')(?:[ \t]*\.[ \t]*(?:[\w-]+|"[^"\n]*"|'[^'\n]*')){16}"""
@@ -122,8 +128,8 @@ def read_hand_toml(path: Path | str, fingers: Fingers = "default") -> HandSpec:
     approach = _triple(table["approach"])
     margin = table["limit_margin"].number(0.0, 1.0)
     actuators = _entries(table["actuators"], ("kp", "kd"), {})
-    kp = actuators["kp"].number(1e-6, 1e6)
-    kd = actuators["kd"].number(0.0, 1e6)
+    kp = actuators["kp"].number(LEAST_GAIN, MOST_GAIN)
+    kd = actuators["kd"].number(0.0, MOST_GAIN)
     known = tuple(map(_finger, table["finger"].items()))
     if len({f.name for f in known}) < len(known):
         raise refuse(f"{path}: fingers {[f.name for f in known]}", "different names")
@@ -192,17 +198,15 @@ def _finger(field: Field) -> Finger:
     kind = table["tip"].value
     if kind not in ("sphere", "point"):
         raise table["tip"].wrong("'sphere' or 'point'")
-    if abs(math.hypot(*normal) - 1) > 1e-6:
+    if abs(math.hypot(*normal) - 1) > ROUNDING:
         raise table["normal"].wrong("a unit vector")
     center = contact
     radius = 0.0
     if kind == "sphere":
         center = _triple(table["center"])
-        radius = table["radius"].number(1e-4, 0.1)
-        if (
-            math.dist(contact, tuple(c + radius * n for c, n in zip(center, normal, strict=True)))
-            > 1e-6
-        ):
+        radius = table["radius"].number(LEAST_RADIUS, MOST_RADIUS)
+        on_sphere = [c + radius * n for c, n in zip(center, normal, strict=True)]
+        if math.dist(contact, on_sphere) > ROUNDING:
             raise table["contact"].wrong("center + radius * normal")
     pad = Pad(contact, normal, center, radius)
     return Finger(_word(table["name"]), _texts(table["joints"]), _word(table["tip_link"]), pad)

@@ -40,6 +40,9 @@ REQUIRED = {
     "joint": ("parent", "child"),
 }
 """Elements that an element must have."""
+SHOWN = 80  # letters of a wrong text that an error shows
+SHOWN_WORD = 20  # letters of a wrong name
+FULL_TURN = 6.3  # angle [rad] above which an angle is probably in degrees
 DEGREES = "(in degrees? 90 is 1.57 rad)"
 NO_XACRO = "a URDF without xacro (xacro FILE > hand.urdf)"
 WORDS = {
@@ -145,11 +148,11 @@ def _clean(path: Path, where: str, element: ET.Element) -> ET.Element:
         f"xacro:{str(part.tag).rpartition('}')[2]}" for part in element if "xacro}" in str(part.tag)
     ]
     if left:
-        raise HandFileError("urdf", f"{path}: {where} {left[0][:80]!r}", NO_XACRO)
+        raise HandFileError("urdf", f"{path}: {where} {left[0][:SHOWN]!r}", NO_XACRO)
     for key in WORDS.get(tag, ()):
         word = element.get(key, "")
         if not 0 < len(word) <= XML_LETTERS or not word.isprintable():
-            found = "without one" if not word else f"of {len(word)} letters: {word[:20]!r}"
+            found = "without one" if not word else f"of {len(word)} letters: {word[:SHOWN_WORD]!r}"
             allowed = f"a {key} of 1 to {XML_LETTERS} printable letters"
             raise HandFileError("urdf", f"{path}: {where}: a {key} {found}", allowed)
         clean.set(key, word)
@@ -160,14 +163,14 @@ def _clean(path: Path, where: str, element: ET.Element) -> ET.Element:
         right = len(words) == count and all(
             NUMBER.fullmatch(w) and math.isfinite(float(w)) for w in words
         )
-        if right and key == "rpy" and any(abs(float(w)) > 6.3 for w in words):  # over a full turn
+        if right and key == "rpy" and any(abs(float(w)) > FULL_TURN for w in words):
             raise HandFileError("urdf", f"{path}: {where} rpy {text!r}", f"radians {DEGREES}")
         if right:
             clean.set(key, " ".join("0" if float(w) == 0 else w for w in words))  # no negative zero
         elif text != "" or key in element.attrib:
             allowed = f"{count} finite numbers" if count > 1 else "a finite number"
             raise HandFileError(
-                "urdf", f"{path}: {where} {key} {(text or 'nothing')[:80]!r}", allowed
+                "urdf", f"{path}: {where} {key} {(text or 'nothing')[:SHOWN]!r}", allowed
             )
     if tag == "geometry" and (len(element) != 1 or element[0].tag not in SIZES):
         found = f"{where} <{element[0].tag}>" if len(element) == 1 else f"{where} without one shape"

@@ -22,6 +22,8 @@ Bound = Annotated[
 Placed = tuple[
     Float[Tensor, "3 3 s n"], Float[Tensor, "3 s n"]
 ]  # axes and centres of shapes in the palm's frame
+LEAST_SQUARE = 1e-24  # least squared length [m2]: the derivative of its root is finite
+PARALLEL_EDGES = 1e-10  # squared sine below which edges are parallel
 Parts = list[tuple[int, slice]]
 """Each kind of pair, named by its number of spheres, with the slice of this kind among pairs sorted
 by kind.
@@ -284,7 +286,7 @@ def _inside(axes: Float[Tensor, "3 3 k"], v: Float[Tensor, "3 k"]) -> Float[Tens
 def _length(v: Float[Tensor, "3 *b"]) -> Float[Tensor, "*b"]:
     """Return the lengths of vectors; the derivative of the length of a zero vector is 0."""
     squared = torch.addcmul(torch.addcmul(v[0] * v[0], v[1], v[1]), v[2], v[2])
-    return torch.sqrt(squared.clamp_min(1e-24))
+    return torch.sqrt(squared.clamp_min(LEAST_SQUARE))
 
 
 class BoxPairs(NamedTuple):
@@ -320,7 +322,7 @@ class BoxPairs(NamedTuple):
         reach = next_a * size.roll(1, 0) + last_a * size.roll(-1, 0)
         reach = reach + half_b.roll(-1, 0) * size.roll(1, 1) + half_b.roll(1, 0) * size.roll(-1, 1)
         sine = 1 - rotation * rotation
-        crossing = sine > 1e-10  # the normals of the faces cover parallel edges
+        crossing = sine > PARALLEL_EDGES  # the normals of the faces cover parallel edges
         by_edges = (along.abs() - reach) * torch.rsqrt(torch.where(crossing, sine, 1.0))
         return torch.cat([by_a, by_b, torch.where(crossing, by_edges, -torch.inf).flatten(0, 1)])
 

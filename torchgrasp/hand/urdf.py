@@ -20,8 +20,10 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import HandFileError
 from torchgrasp.foundation.lazy import yourdfpy
 from torchgrasp.foundation.limits import HAND_LINKS, HAND_SHAPES, MAX_EXTENT, URDF_BYTES
-from torchgrasp.hand.safe_xml import DEGREES, SIZES, parse_urdf
+from torchgrasp.hand.safe_xml import DEGREES, FULL_TURN, SIZES, parse_urdf
 
+AXIS_ERROR = 0.001  # largest error of the length of a joint's axis
+DEEPEST = 100  # most links in a line: pytorch-kinematics walks the tree by recursion
 REPAIR = "(torchgrasp hand new writes a clean copy)"
 """The end of an error about a published URDF that the library cannot use as it is."""
 Triple = tuple[float, float, float]
@@ -271,7 +273,7 @@ def _joint(joint: Any, element: ET.Element) -> Joint:
 
 
 def _is_unit(length: float) -> bool:
-    return 0.999 < length < 1.001
+    return 1 - AXIS_ERROR < length < 1 + AXIS_ERROR
 
 
 def _check_names(urdf: Urdf) -> None:
@@ -328,11 +330,10 @@ def _check_joints(urdf: Urdf) -> None:
             raise urdf.wrong(limits, f"limits with lower < upper{swapped}")
         if math.isinf(j.lower) != math.isinf(j.upper):
             raise urdf.wrong(limits, "both limits, or none (ROS takes 0 for the missing one)")
-        if (
-            j.kind == "revolute" and math.isfinite(j.lower) and max(-j.lower, j.upper) > 6.3
-        ):  # over a full turn
+        farthest = max(-j.lower, j.upper)
+        if j.kind == "revolute" and math.isfinite(j.lower) and farthest > FULL_TURN:
             raise urdf.wrong(limits, f"radians, at most a full turn either way {DEGREES}")
-        if j.kind == "prismatic" and math.isfinite(j.lower) and max(-j.lower, j.upper) > MAX_EXTENT:
+        if j.kind == "prismatic" and math.isfinite(j.lower) and farthest > MAX_EXTENT:
             raise urdf.wrong(limits, f"at most {MAX_EXTENT:g} m either way (in millimetres?)")
         passed = [j.name]
         while mimic := movable[passed[-1]].mimic:
@@ -356,19 +357,16 @@ def _check_tree(urdf: Urdf) -> str:
         raise urdf.wrong(
             f"roots {roots}" if roots else "a cycle and no root", "exactly one root link"
         )
-    # pytorch-kinematics walks the tree by recursion
     reached = {roots[0]}
     front = [roots[0]]
     depth = 0
-    deepest = 100
     while front:
         front = [j.child for j in urdf.joints if j.parent in front]
         reached |= set(front)
         depth += 1
     if len(reached) < len(known):
         raise urdf.wrong(f"a cycle around {sorted(known - reached)[0]!r}", "a tree")
-    if depth > deepest:
-        raise urdf.wrong(
-            f"{depth} links in a line", f"at most {deepest} links from the root to a tip"
-        )
+    if depth > DEEPEST:
+        allowed = f"at most {DEEPEST} links from the root to a tip"
+        raise urdf.wrong(f"{depth} links in a line", allowed)
     return roots[0]
