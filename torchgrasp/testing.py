@@ -2,6 +2,7 @@
 relies.
 """
 
+import dataclasses
 import io
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,6 +23,22 @@ from torchgrasp.hand.urdf import LinkShape, Urdf, read_urdf
 
 __all__ = ["BrokenLaw", "check_hand"]
 
+
+@dataclasses.dataclass(frozen=True)
+class LawNumbers:
+    """The numbers of the laws."""
+
+    step: float = 1e-6
+    """Step [rad] of central differences."""
+    jacobian: float = 1e-6
+    """Their largest difference [m/rad] from the Jacobian."""
+    rounding: float = 1e-6
+    """Largest error of a joint [rad or m], and of the sum of two principal inertias, relative."""
+    outward: float = 1e-4
+    """Distance [m] outside a contact at which no shape may be."""
+
+
+LAWS = LawNumbers()
 FK_POSTURES = 50  # number of random postures in which kinematics are compared
 FK_TOLERANCE = 1e-8  # largest difference [m, and entries of rotations] from the poses of yourdfpy
 
@@ -49,7 +66,10 @@ def check_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
     joints = random_joints(hand, FK_POSTURES)
     if not bool((hand.self_clearance(joints) > 0).any()):
         met = " and ".join(most_met(hand, joints))
-        found = f"{find_hand(name_or_path)}: links that meet in all of {FK_POSTURES} random postures, as {met}"
+        found = (
+            f"{find_hand(name_or_path)}: links that meet in all of {FK_POSTURES} random "
+            f"postures, as {met}"
+        )
         raise HandFileError(
             "hand.toml",
             found,
@@ -68,15 +88,13 @@ def _check_jacobian(hand: Hand, joints: Float[Tensor, "n h"]) -> None:
     """Raise `BrokenLaw` if the Jacobian differs from central differences, or a row of a batch from
     a single posture.
     """
-    # Step [rad] of central differences, and their largest difference [m/rad] from the Jacobian
-    step = 1e-6
-    allowed = 1e-6
+    step = LAWS.step
     steps = step * torch.eye(hand.dof, dtype=torch.float64, device="cpu")
     after, before = (hand.fingertips(joints[:, None] + sign * steps)[0] for sign in (1, -1))
     error = (
         ((after - before) / (2 * step) - hand.jacobian(joints).movedim(-1, 1)).abs().amax((0, 2, 3))
     )
-    if not float(error.max()) < allowed:
+    if not float(error.max()) < LAWS.jacobian:
         found = (
             f"the column of {hand.joint_names[int(error.argmax())]} off by {float(error.max()):.3g}"
         )
@@ -134,7 +152,7 @@ def _wrong_bodies(urdf: Urdf) -> Iterator[HandFileError]:
             yield urdf.wrong(f"link {link.name} of mass {link.mass} kg", "a positive mass")
         xx, xy, xz, yy, yz, zz = link.inertia
         principal = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        if principal[0] <= 0 or principal[0] + principal[1] < principal[2] * (1 - 1e-6):
+        if principal[0] <= 0 or principal[0] + principal[1] < principal[2] * (1 - LAWS.rounding):
             yield urdf.wrong(
                 f"link {link.name} of principal inertias {principal}",
                 "positive, any two >= the third",
@@ -151,7 +169,9 @@ def _wrong_joints(urdf: Urdf, spec: HandSpec, hand: Hand) -> Iterator[HandFileEr
             yield urdf.wrong(found, "positive effort and velocity")
     ends = hand.expand_joints(torch.stack([hand.lower, hand.upper])).T.tolist()
     for joint, values in zip(urdf.movable, ends, strict=True):
-        for value in [q for q in values if not joint.lower - 1e-6 <= q <= joint.upper + 1e-6][:1]:
+        lower = joint.lower - LAWS.rounding
+        upper = joint.upper + LAWS.rounding
+        for value in [q for q in values if not lower <= q <= upper][:1]:
             allowed = f"within its limits [{joint.lower:.6g}, {joint.upper:.6g}]"
             yield spec.wrong(f"joint {joint.name} at {value:.6g}", allowed)
 
@@ -166,7 +186,7 @@ def _wrong_pads(urdf: Urdf, spec: HandSpec) -> Iterator[HandFileError]:
         if list(finger.joints) != movers:
             found = f"finger {finger.name} of joints {list(finger.joints)}"
             yield spec.wrong(found, f"the joints above {finger.tip_link} in order, {movers}")
-        outside = np.array(finger.pad.contact) + 1e-4 * np.array(finger.pad.normal)
+        outside = np.array(finger.pad.contact) + LAWS.outward * np.array(finger.pad.normal)
         if any(_inside(outside, shape) for shape in shapes[finger.tip_link]):
             found = f"the contact of finger {finger.name} lies inside its tip's shape"
             yield spec.wrong(found, "a contact on the surface, its normal outward")

@@ -1,4 +1,4 @@
-"""A robot arm that carries the hand: which grasps it reaches, and its way through them (`reach`)."""
+"""A robot arm that carries the hand: which grasps it reaches, and its way through them."""
 
 from torchgrasp.arm.arm import Arm, load_arm
 

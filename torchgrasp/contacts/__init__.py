@@ -1,4 +1,4 @@
-"""The contact planner: contact points on an uncertain surface, with certificates of force closure."""
+"""Contact points on an uncertain surface, with certificates of force closure."""
 
 from torchgrasp.contacts.closure_probability import ClosureProbability
 from torchgrasp.contacts.balance import least_friction_forces

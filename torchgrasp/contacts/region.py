@@ -38,8 +38,10 @@ class Region(Value):
     Errors call the function by the `name`.
 
     >>> from torchgrasp import load_object
-    >>> ball, rim = Region(lambda points: points.norm(dim=-1) - 0.05), Region.rim(load_object("jug").view, table=0.0)
-    >>> ball(torch.tensor([[0.0, 0.0, 0.06]])).round(decimals=3), rim(torch.tensor([0.0, 0.0, 0.01])) > 0
+    >>> ball = Region(lambda points: points.norm(dim=-1) - 0.05)
+    >>> rim = Region.rim(load_object("jug").view, table=0.0)
+    >>> point = torch.tensor([[0.0, 0.0, 0.06]])
+    >>> ball(point).round(decimals=3), rim(torch.tensor([0.0, 0.0, 0.01])) > 0
     (tensor([0.0100]), tensor(True))
     """
 

@@ -47,7 +47,10 @@ def check_starts(shape: ShapeLike, spec: ContactSpec, starts: int | Tensor) -> N
         farthest = float(torch.linalg.vector_norm(points, dim=-1).max()) if len(points) else 0.0
         if farthest > shape.domain_radius:
             found = f"a point {farthest * float(shape.scale):.4g} m from the shape's centre"
-            allowed = f"at most {float(shape.domain_radius) * float(shape.scale):.4g} m, where the shape is known"
+            allowed = (
+                f"at most {float(shape.domain_radius) * float(shape.scale):.4g} m, where the "
+                "shape is known"
+            )
             raise BadArgument("starts", found, allowed)
     elif spec.start_radius > shape.domain_radius:
         raise BadArgument(

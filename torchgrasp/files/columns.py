@@ -13,6 +13,10 @@ from jaxtyping import Float
 from torchgrasp.files.write import Malformed
 from torchgrasp.foundation.limits import CLOUD_POINTS, LINE_LETTERS, TEXT_COLUMNS
 
+# letters of wrong names, and of a wrong line, that an error shows
+SHOWN_NAMES = 200
+SHOWN_LINE = 60
+
 
 def find_columns(names: Sequence[str], columns: Sequence[np.ndarray]) -> dict[str, Any]:
     """Return `points` (n, 3), their `normals` or None, and the `other` names, of columns by name.
@@ -33,7 +37,7 @@ def find_columns(names: Sequence[str], columns: Sequence[np.ndarray]) -> dict[st
             other.append(name)
     axes = ["x", "y", "z"] + ["nx", "ny", "nz"] * (not places.keys() <= {*"xyz"})
     if missing := [axis for axis in axes if axis not in places]:
-        raise Malformed(f"columns {' '.join(names)[:200]!r} without {', '.join(missing)}")
+        raise Malformed(f"columns {' '.join(names)[:SHOWN_NAMES]!r} without {', '.join(missing)}")
     found = np.stack(
         [columns[places[axis]].reshape(len(columns[0]), -1)[:, 0] for axis in axes], -1
     )
@@ -105,7 +109,7 @@ def parse_text(data: bytes, suffix: str) -> dict[str, Any]:
         names = ["x", "y", "z", "intensity", "red", "green", "blue"][:width]
     if len(names or [0] * width) != width or (not names and width not in (3, 6)):
         named = (
-            f"the names {' '.join(names)[:200]!r}"
+            f"the names {' '.join(names)[:SHOWN_NAMES]!r}"
             if names
             else "no line of names above, such as x y z nx ny nz"
         )
@@ -173,7 +177,7 @@ def _read_text(data: bytes) -> tuple[list[str], Float[np.ndarray, "rows columns"
         raise Malformed("text of another encoding than UTF-8") from error
     except ValueError as error:
         raise Malformed(
-            f"line {number}, {shown.strip()[:60]!r}, where {width} numbers should be"
+            f"line {number}, {shown.strip()[:SHOWN_LINE]!r}, where {width} numbers should be"
         ) from error
     if not table.size:
         raise Malformed("no numbers")
@@ -189,6 +193,6 @@ def _check_line(line: str) -> None:
         raise Malformed(f"more than {TEXT_COLUMNS} numbers in a line")
     mixed = re.search(r"\d,\d", line) and re.search(r'[;"]|[^\s,]\s+[^\s,]', line)
     if mixed or re.search(r"(?:^|,)-?0\d", line):
-        raise Malformed(f"decimal commas: {line[:60]!r}")
+        raise Malformed(f"decimal commas: {line[:SHOWN_LINE]!r}")
     if re.search(r"[,;]\s*[,;]", line):
-        raise Malformed(f"an empty cell: {line[:60]!r}")
+        raise Malformed(f"an empty cell: {line[:SHOWN_LINE]!r}")

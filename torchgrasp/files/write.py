@@ -23,6 +23,8 @@ from torchgrasp.foundation.lazy import jinja2
 Refuse = Callable[[str, str], BadArgument]  # makes an error of what was found and what is allowed
 # ending of the name under which a file is written; a dot and the name of the file come first
 ENDING = ".part"
+READABLE = 0o644  # permissions of a written file: all may read it
+HOLDER_LETTERS = 200  # letters of a lock file that an error shows
 LOCK = ".lock"  # name of the lock file in a folder. It holds the process and host of the run.
 
 
@@ -48,7 +50,7 @@ def write_file(path: Path | str, content: str | bytes | Callable[[IO[bytes]], ob
                 while len(left):
                     left = left[os.write(file.fileno(), left) :]
                 os.fsync(file.fileno())  # or a power cut could leave the name without the content
-            os.chmod(part, 0o644)
+            os.chmod(part, READABLE)
             os.replace(part, path)
         except BaseException:
             with contextlib.suppress(OSError):
@@ -91,7 +93,9 @@ def is_file(path: Path | str) -> bool:
 
 
 def read_bytes(path: Path | str) -> bytes:
-    """Return the content of a file, cut at its reported size, because some system files never end."""
+    """Return the content of a file, cut at its reported size, because some system files
+    never end.
+    """
     with Path(path).open("rb") as file:
         return file.read(os.fstat(file.fileno()).st_size)
 
@@ -234,33 +238,31 @@ def temporary_folder() -> Iterator[Path]:
 def _hold(argument: str, what: Path, path: Path) -> Iterator[None]:
     """Lock a folder or a file within the context, by a lock file at `path`."""
     folder = path.parent
+    kind = "folder" if argument == "folder" else "file"
     made = [x for x in (folder, *folder.parents) if not x.exists()]
     lock = FileLock(path, timeout=0)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock.acquire()
     except Timeout as error:
-        allowed = f"a {'folder' if argument == 'folder' else 'file'} that no other run writes"
+        allowed = f"a {kind} that no other run writes"
         raise OutputError(argument, f"{what}, in use by {_holder(path)}", allowed) from error
     except OSError as error:
-        allowed = (
-            f"a {'folder' if argument == 'folder' else 'file in a folder'} that can be written"
-        )
+        place = "folder" if argument == "folder" else "file in a folder"
+        allowed = f"a {place} that can be written"
         raise OutputError(argument, f"{what} ({error.strerror or error})", allowed) from error
     try:
         with contextlib.suppress(OSError):  # on some systems nobody can write a locked file
             path.write_text(f"process {os.getpid()} on {socket.gethostname()}", encoding="utf-8")
         yield
     finally:
-        with contextlib.suppress(
-            OSError
-        ):  # before the release: another run might lock the file before it is removed
+        # Before the release: another run might lock the file before it is removed.
+        with contextlib.suppress(OSError):
             path.unlink(missing_ok=True)
         lock.release()
         with contextlib.suppress(OSError):
-            path.unlink(
-                missing_ok=True
-            ) if os.name == "nt" else None  # Windows removes no locked file
+            if os.name == "nt":  # Windows removes no locked file
+                path.unlink(missing_ok=True)
             for empty in made:
                 empty.rmdir()
 
@@ -268,7 +270,7 @@ def _hold(argument: str, what: Path, path: Path) -> Iterator[None]:
 def _holder(path: Path) -> str:
     """Return the process and host of the run that holds a lock, as its lock file states them."""
     try:
-        return path.read_text(encoding="utf-8")[:200].strip() or "another run"
+        return path.read_text(encoding="utf-8")[:HOLDER_LETTERS].strip() or "another run"
     except (OSError, UnicodeDecodeError):
         return "another run"
 

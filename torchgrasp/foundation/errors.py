@@ -109,7 +109,8 @@ class IndefiniteCovariance(GraspError, ValueError):
 
     def __init__(self, what: str, smallest_eigenvalue: float, fix: str):
         super().__init__(
-            f"{what} is not positive definite (smallest eigenvalue {smallest_eigenvalue:.3g}): {fix}"
+            f"{what} is not positive definite (smallest eigenvalue "
+            f"{smallest_eigenvalue:.3g}): {fix}"
         )
         self.smallest_eigenvalue = smallest_eigenvalue
 
@@ -182,7 +183,8 @@ class Status(enum.IntEnum):
     TOO_UNCERTAIN = 12, "the shape at a contact is less certain than max_variance allows"
     NOT_CLOSED = (
         13,
-        "the contacts do not resist every wrench at the planned friction (no frictional form closure)",
+        "the contacts do not resist every wrench at the planned friction (no frictional "
+        "form closure)",
     )
     TOO_CLOSE = 14, "two fingertips on their contacts would overlap"
     NOT_FLAT = 15, "the surface around a contact bends too sharply for a fingertip"
@@ -211,7 +213,8 @@ class Status(enum.IntEnum):
     BURIED = 31, "something lies on the object or leans over it"
     NO_PROMISE = (
         39,
-        "the predicted success is less than the promise needs: give a lower one, or add a second view",
+        "the predicted success is less than the promise needs: give a lower one, or add "
+        "a second view",
     )
     # the object in its picture, before it is planned
     FEW_PIXELS = 32, "too few pixels show the object: bring the camera nearer"
@@ -222,19 +225,23 @@ class Status(enum.IntEnum):
     )
     NO_DEPTH = (
         35,
-        "most of the object has no depth, as glass or a mirror: coat it matt, or look from another side",
+        "most of the object has no depth, as glass or a mirror: coat it matt, or look "
+        "from another side",
     )
     TOO_LOW = (
         36,
-        "the object is lower than fingertips on the table need: take a hand with smaller fingertips",
+        "the object is lower than fingertips on the table need: take a hand with smaller "
+        "fingertips",
     )
     TOO_WIDE = (
         37,
-        "the object is wider than the hand spans: take a larger hand, or choose the object to plan anyway",
+        "the object is wider than the hand spans: take a larger hand, or choose the "
+        "object to plan anyway",
     )
     TOO_VAGUE = (
         38,
-        "the shape may be off by more than half the object: add a second view, or bring the camera nearer",
+        "the shape may be off by more than half the object: add a second view, or bring "
+        "the camera nearer",
     )
     # closing
     START_OVERLAP = 40, "the hand overlaps the object or the table before closing starts"

@@ -40,7 +40,7 @@ class CoverNumbers:
     """The numbers of the spheres that cover a hand."""
 
     finger_cell: float = 0.015
-    """Edge [m] of a finger's cells: edges and corners stick farther out of larger cells' spheres."""
+    """Edge [m] of a finger's cells: corners stick farther out of larger cells' spheres."""
     palm_cell: float = 0.022
     """Edge [m] of the palm's cells."""
     bulge: float = 0.004
@@ -246,7 +246,10 @@ def _limit_near(
     """
     left = shapes.count_near(frames, MEETING_DISTANCE) * ahead // frames.shape[3]
     if left > most:
-        found = f"{len(shapes.pairs)} pairs of shapes so near each other that {left} separations must be measured"
+        found = (
+            f"{len(shapes.pairs)} pairs of shapes so near each other that {left} separations "
+            "must be measured"
+        )
         raise urdf.wrong(found, f"at most {most} separations, by fewer shapes in one place")
 
 

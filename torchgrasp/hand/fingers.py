@@ -114,7 +114,10 @@ def joints_from_files(spec: HandSpec, urdf: Urdf) -> ActuatedJoints:
     )
     for name, (low, high) in zip(names, limits.tolist(), strict=True):
         if not low < high:
-            found = f"limit_margin {spec.limit_margin:g}, which leaves [{low:g}, {high:g}] to joint {name}"
+            found = (
+                f"limit_margin {spec.limit_margin:g}, which leaves [{low:g}, {high:g}] to joint "
+                f"{name}"
+            )
             raise spec.wrong(found, "a range with lower < upper")
     coupling = limits.new_zeros(len(movable), len(names))
     offset = limits.new_zeros(len(movable))

@@ -29,9 +29,8 @@ LEAST_GAIN = 1e-6  # least stiffness of a drive
 LEAST_RADIUS = 1e-4
 MOST_RADIUS = 0.1
 SUPPORTED = "three to five different fingers"  # fingers of a grasp, see `FINGERTIPS`
-_DOTTED = re.compile(
-    r"""(?<![\w"'-])(?:[\w-]+|"[^"\n]*"|'[^'\n]*')(?:[ \t]*\.[ \t]*(?:[\w-]+|"[^"\n]*"|'[^'\n]*')){16}"""
-)
+_PART = r"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')"""
+_DOTTED = re.compile(rf"""(?<![\w"'-]){_PART}(?:[ \t]*\.[ \t]*{_PART}){{16}}""")
 """A key of more than 16 parts: the memory of the TOML reader grows with the square of their number.
 """
 
@@ -240,7 +239,10 @@ def _choose(
     """Return name and content of the option for the wanted fingers. If none is declared, the name
     lists the fingers.
     """
-    declared = f"one of the options {sorted(options)}, their number of fingers, or {SUPPORTED} of {sorted(known)}"
+    declared = (
+        f"one of the options {sorted(options)}, their number of fingers, or {SUPPORTED} "
+        f"of {sorted(known)}"
+    )
     if isinstance(wanted, str) and wanted in options:
         return wanted, options[wanted]
     names = tuple(wanted.split(",")) if isinstance(wanted, str) else wanted
@@ -284,7 +286,9 @@ def _coupling(field: Field) -> dict[str, Mimic]:
 
 
 def _pairs(field: Field) -> tuple[tuple[str, str], ...] | None:
-    """Read the pairs of links to test for self-collision from hand.toml, or None if it gives none."""
+    """Read the pairs of links to test for self-collision from hand.toml, or None if it
+    gives none.
+    """
     pairs = _entries(field, (), {"pairs": None})["pairs"]
     if pairs.value is None:
         return None

@@ -43,7 +43,8 @@ class SelfCollision(Value):
 
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("barrett")
-    >>> links, frames = hand.self_collision, hand.tree.frames(hand.expand_joints(hand.lower[None]).T)
+    >>> links = hand.self_collision
+    >>> frames = hand.tree.frames(hand.expand_joints(hand.lower[None]).T)
     >>> torch.allclose(links.clearance(frames), links.separations(frames, torch.inf).amin(0))
     True
     """
@@ -190,7 +191,9 @@ class SelfCollision(Value):
         return torch.linalg.vector_norm(self.half, dim=1) + self.radius
 
     def _sums(self, radius: Float[Tensor, " s"], like: Tensor) -> Float[Tensor, "p 1"]:
-        """Return for each pair of shapes the sum of their radii, given the `radius` of every shape."""
+        """Return for each pair of shapes the sum of their radii, given the `radius` of
+        every shape.
+        """
         return radius[self.pairs].sum(1, keepdim=True).to(like)
 
     def _choose(

@@ -75,7 +75,8 @@ class GraspProblem(Value):
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> hand, grasp = load_hand("barrett"), load_shipped_grasp("jug", "barrett")
     >>> high = lambda poses: poses[:, 2, 3] > 0.1  # or ask your arm
-    >>> GraspProblem(hand, grasp.contacts, grasp.certificate, CollisionWorld(), torch.zeros(3), high).reachable is high
+    >>> given = (hand, grasp.contacts, grasp.certificate, CollisionWorld(), torch.zeros(3))
+    >>> GraspProblem(*given, high).reachable is high
     True
     """
 

@@ -264,7 +264,8 @@ def solve_joint(
     >>> from torchgrasp.ik import CollisionWorld, PostureLibrary, nearest_postures
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> hand, grasp = load_hand("barrett"), load_shipped_grasp("jug", "barrett")
-    >>> problem = GraspProblem(hand, grasp.contacts, grasp.certificate, CollisionWorld(), torch.zeros(3).double())
+    >>> given = (hand, grasp.contacts, grasp.certificate, CollisionWorld())
+    >>> problem = GraspProblem(*given, torch.zeros(3).double())
     >>> seeds = nearest_postures(PostureLibrary.of(hand, 1000), grasp.contacts, problem.world)
     >>> solve_joint(problem, seeds, fit_shape(load_object("jug").view), ContactSpec()).status
     tensor([0])

@@ -98,7 +98,8 @@ def opened_pose(
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> hand, grasp = load_hand("barrett"), load_shipped_grasp("jug", "barrett")
-    >>> torch.equal(opened_pose(hand, grasp.pregrasp, grasp.obj_from_hand, grasp.table), grasp.obj_from_hand)
+    >>> opened = opened_pose(hand, grasp.pregrasp, grasp.obj_from_hand, grasp.table)
+    >>> torch.equal(opened, grasp.obj_from_hand)
     True
     """
     if table is None:

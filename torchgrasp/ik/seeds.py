@@ -62,7 +62,7 @@ class SeedNumbers:
     rows: int = 64
     """Contact sets that are compared with the library at a time, which bounds the memory."""
     queried: int = 256
-    """Contact sets that are asked of the model at a time: their configurations stay in the cache."""
+    """Contact sets that are asked of the model at a time: they stay in the cache."""
 
 
 SEEDS = SeedNumbers()
@@ -160,7 +160,9 @@ def tips_frame(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 4 4"]:
 def feature(
     centres: Float[Tensor, "*b f 3"], pads: Float[Tensor, "*b f 3"]
 ) -> Float[Tensor, "*b d"]:
-    """Return the feature vector of a posture: tip centres and pad axes, each divided by its scale."""
+    """Return the feature vector of a posture: tip centres and pad axes, each divided by
+    its scale.
+    """
     return (
         torch.cat([centres / SEEDS.length_scale, pads / SEEDS.cosine_scale], -1).flatten(-2).float()
     )
@@ -186,8 +188,10 @@ def nearest_postures(
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
-    >>> contacts, library = load_shipped_grasp("jug", "barrett").contacts, PostureLibrary.of(load_hand("barrett"), 1000)
-    >>> nearest_postures(library, contacts, CollisionWorld(), n_seeds=4).tip_error.max() < 0.05  # [m]
+    >>> contacts = load_shipped_grasp("jug", "barrett").contacts
+    >>> library = PostureLibrary.of(load_hand("barrett"), 1000)
+    >>> seeds = nearest_postures(library, contacts, CollisionWorld(), n_seeds=4)
+    >>> seeds.tip_error.max() < 0.05  # [m]
     tensor(True)
     """
     given = library.feature

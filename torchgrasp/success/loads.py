@@ -22,7 +22,7 @@ class LoadNumbers:
     """The numbers of loads."""
 
     carrying: float = 2.07
-    """Log-odds of success that a lift loses for each factor e on the force that carries the load."""
+    """Log-odds of success that a lift loses for each factor e on the force for the load."""
     torsion: float = 0.01
     """Lever [m] of the torsion of a contact, beside that of the triangle's height."""
     edges: int = 32

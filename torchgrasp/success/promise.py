@@ -50,7 +50,10 @@ def describe_promise(share: float) -> str:
     promise = find_promise(share)
     if promise is None:
         return f"{share:g}, which no trials support"
-    return f"{share:g} by {promise.trials} trials of {promise.families} families: pulls and lifts of authored bodies"
+    return (
+        f"{share:g} by {promise.trials} trials of {promise.families} families: pulls and "
+        "lifts of authored bodies"
+    )
 
 
 def least_log_odds(

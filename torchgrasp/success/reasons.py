@@ -18,8 +18,14 @@ from torchgrasp.success.task import GraspTask
 from torchgrasp.values.planning import Grasps
 
 SENTENCES = {
-    "load": "at half the friction the load takes {force needed} of a finger; its centre is {offset} from the contacts",
-    "moved": "the fingers carry the load at a share {carried if moved} of the places within 20 mm of the object",
+    "load": (
+        "at half the friction the load takes {force needed} of a finger; its centre is "
+        "{offset} from the contacts"
+    ),
+    "moved": (
+        "the fingers carry the load at a share {carried if moved} of the places within "
+        "20 mm of the object"
+    ),
     "surface": "the surface may be {deviation} off at a contact",
     "object": "the object is {height} high and {size} in radius",
     "task": "the task is {mass} at a friction of {friction}",
@@ -52,7 +58,8 @@ def explain_success(
 
     >>> from torchgrasp import fit_shape, load_hand, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp
-    >>> shape, grasp = fit_shape(load_object("jug").view, table=0.0), load_shipped_grasp("jug", "barrett")
+    >>> shape = fit_shape(load_object("jug").view, table=0.0)
+    >>> grasp = load_shipped_grasp("jug", "barrett")
     >>> costs = explain_success(grasp, load_hand("barrett"), shape, GraspTask(mass=0.5))
     >>> costs[0].cause, bool(costs[0].log_odds >= costs[-1].log_odds > 0)
     ('task', True)

@@ -76,7 +76,9 @@ class TaskWrenches(Value):
     Torques are about `point` [m], by default the estimated centre. Raises `BadArgument` for no
     load, or one of zeros.
 
-    >>> unscrew = TaskWrenches(torch.tensor([[0.0, 0.0, -2.5, 0.0, 0.0, 0.1], [0.0, 0.0, -2.5, 0.0, 0.0, -0.1]]))
+    >>> turn = [0.0, 0.0, -2.5, 0.0, 0.0, 0.1]
+    >>> back = [0.0, 0.0, -2.5, 0.0, 0.0, -0.1]
+    >>> unscrew = TaskWrenches(torch.tensor([turn, back]))
     """
 
     wrenches: Float[Tensor, "w 6"]

@@ -14,6 +14,9 @@ from torchgrasp.values.closing import ClosingOptions, SensorModel, choose_option
 
 Simulator = Literal["sapien", "mujoco"]
 """The simulators."""
+RIM = 0.001  # radius [m] that is flat on a rim
+PAPER_RADIUS = 0.1  # the paper's radius of starts, normalised
+ROUNDING = 1e-9  # relative error of a period
 TIP_RADIUS = 0.012
 SEPARATION = 0.026
 """Default radius [m] of a fingertip, and least distance [m] between two. Wider links lie behind
@@ -114,7 +117,8 @@ class ContactSpec(Value):
         """Return the spec with `tip_radius` set to a radius [m], at least `TIP_RADIUS`, unless it
         is set already.
 
-        >>> wide, points = ContactSpec().for_fingertips(0.015), ContactSpec(tip_radius=0.0).for_fingertips(0.015)
+        >>> wide = ContactSpec().for_fingertips(0.015)
+        >>> points = ContactSpec(tip_radius=0.0).for_fingertips(0.015)
         >>> wide.tip_radius, points.tip_radius
         (0.015, 0.0)
         """
@@ -134,7 +138,8 @@ class ContactSpec(Value):
         margins of friction and of the fingertips' `radius` [m] are spent step by step. A given
         `flat_radius` is kept: then there are no such specs.
 
-        >>> [round(spec.planned_friction, 1) for spec in ContactSpec(table=0.0).relaxed(0.003, 0.0096)]
+        >>> relaxed = ContactSpec(table=0.0).relaxed(0.003, 0.0096)
+        >>> [round(spec.planned_friction, 1) for spec in relaxed]
         [0.4, 0.6, 0.8]
         """
         if self.flatness is None or self.flat_radius is not None:
@@ -142,8 +147,6 @@ class ContactSpec(Value):
         yield from (
             dataclasses.replace(self, flat_radius=flat) for flat in FLAT_RADII if flat < below
         )
-        # radius [m] that is flat on a rim
-        rim = 0.001
         widest = self.for_fingertips(radius).fingertip_radius
         for spent in (0.0, 0.5, 1.0) if self.table is not None else ():
             tips = (
@@ -153,7 +156,7 @@ class ContactSpec(Value):
             )
             margin = self.friction_margin + spent * (1 - self.friction_margin)
             yield dataclasses.replace(
-                self, flat_radius=rim, tip_radius=tips, friction_margin=margin
+                self, flat_radius=RIM, tip_radius=tips, friction_margin=margin
             )
 
     @classmethod
@@ -178,7 +181,7 @@ class ContactSpec(Value):
             friction_margin=1.0,
             flatness=None,
             table=table,
-            start_radius=0.1,
+            start_radius=PAPER_RADIUS,
         )
         return dataclasses.replace(spec, separation=0.0, tip_radius=0.0)
 
@@ -284,7 +287,7 @@ class TrialSpec(Value):
             )
         if not all(abs(x) <= 1000.0 for x in self.push):
             raise BadArgument("push", self.push, "at most 1000 N along each axis")
-        if not self.control_rate * self.timestep < 1 + 1e-9:
+        if not self.control_rate * self.timestep < 1 + ROUNDING:
             found = f"{self.control_rate:g} Hz with a timestep of {self.timestep:g} s"
             raise BadArgument("control_rate", found, "a period of at least one timestep")
 
@@ -296,7 +299,9 @@ class TrialSpec(Value):
 
     @property
     def strongest(self) -> float:
-        """The normal force [N] of the strongest finger in the closing and in the holding "force"."""
+        """The normal force [N] of the strongest finger in the closing and in the holding
+        "force".
+        """
         return min(4.0, self.max_force or 4.0) if self.force is None else self.force
 
     @property
