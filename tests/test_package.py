@@ -152,7 +152,8 @@ def test_what_public_functions_take_is_public():
 def test_every_subpackage_names_its_public_things():
     packages = [importlib.import_module(name) for name in PACKAGES]
     silent = [package for package in packages if not getattr(package, "__all__", None)]
-    assert all("Not public." in (package.__doc__ or "") for package in silent), silent
+    said = {package.__name__: " ".join((package.__doc__ or "").split()) for package in silent}
+    assert [name for name, words in said.items() if "Not public." not in words] == []
 
 
 def test_every_public_function_has_an_example_that_calls_it():
