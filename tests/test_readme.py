@@ -12,6 +12,8 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
+from torchgrasp.app.cli.hands import HandTrial
+
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 GUIDES = [path.read_text() for path in sorted((ROOT / "docs").glob("*.md"))]
@@ -51,7 +53,7 @@ def test_the_guide_to_hands_runs_as_it_stands(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}:{os.environ['PATH']}")
-    monkeypatch.setattr("torchgrasp.app.cli.hands.TRIAL_STARTS", 6)
+    monkeypatch.setattr("torchgrasp.app.cli.hands.TRIAL", HandTrial(starts=6))
     guide = "".join(fenced("bash", (ROOT / "docs" / "hands.md").read_text())).replace(
         "--starts 200", "--starts 16"
     )

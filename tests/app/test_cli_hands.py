@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from torchgrasp.app.cli import main
+from torchgrasp.app.cli.hands import HandTrial
 from torchgrasp.hand.load import hands_folder, load_hand
 
 
@@ -26,7 +27,7 @@ def barrett(tmp_path):
 @pytest.fixture(autouse=True)
 def few_starts(monkeypatch):
     """Try a hand with little work."""
-    monkeypatch.setattr("torchgrasp.app.cli.hands.TRIAL_STARTS", 4)
+    monkeypatch.setattr("torchgrasp.app.cli.hands.TRIAL", HandTrial(starts=4))
 
 
 def test_new_writes_a_draft_that_check_takes_and_draws(barrett, capsys, monkeypatch):

@@ -25,6 +25,9 @@ from torchgrasp.foundation.errors import BadArgument, GraspError
 
 __all__ = ["main", "run_and_exit"]
 
+TERMINATED = 143
+INTERRUPTED = 130
+"""Exit codes of a command that a signal ended: 128 and the number of SIGTERM or SIGINT."""
 CHAPTERS: dict[str, dict[str, Callable[..., Command | int]]] = {
     "Plan grasps": {"grasp": grasp.Grasp, "view": look.OpenPage, "objects": look.Objects},
     "Exchange grasps with other programs": {"export": export.Export, "import": export.Import},
@@ -130,16 +133,15 @@ def _guard(given: list[str]) -> int:
         return 2
     except _Terminated:
         print("torchgrasp: terminated", file=sys.stderr)
-        return 143
+        return TERMINATED
     except KeyboardInterrupt:
         print("torchgrasp: interrupted", file=sys.stderr)
-        return 130
+        return INTERRUPTED
     except BrokenPipeError:  # the reader of stdout is gone, so nobody reads a message
         _drop_stdout()
         return 1
-    except (
-        OSError
-    ) as error:  # readers and writers of files raise GraspError: this is a full disk behind stdout
+    # readers and writers of files raise GraspError: this is a full disk behind stdout
+    except OSError as error:
         print(f"torchgrasp: {error}", file=sys.stderr)
         _drop_stdout()
         return 2
@@ -148,13 +150,10 @@ def _guard(given: list[str]) -> int:
 def _run(given: list[str]) -> int:
     """Run the command that the arguments name; return its exit code."""
     if given in ([], ["--version"], ["--help"], ["-h"]):
-        print(
-            START
-            if not given
-            else f"torchgrasp {__version__}"
-            if given == ["--version"]
-            else format_help()
-        )
+        if not given:
+            print(START)
+        else:
+            print(f"torchgrasp {__version__}" if given == ["--version"] else format_help())
         return 0
     names = {name.split()[0] for name in COMMANDS}
     if given[0] not in names and not given[0].startswith("-"):
@@ -190,14 +189,13 @@ def format_help() -> str:
     """Return the help text: all commands in chapters, each with its first sentence."""
     lines = ["torchgrasp: dexterous fingertip grasps from a partial point cloud", ""]
     for chapter, commands in CHAPTERS.items():
-        firsts = {
-            name: (command.__doc__ or "").split("\n\n")[0].split()
-            for name, command in commands.items()
-        }
-        lines += [chapter, *(f"  {name:15}{' '.join(words)}" for name, words in firsts.items()), ""]
-    return "\n".join(
-        [*lines, "Options of a command: torchgrasp COMMAND --help. Version: torchgrasp --version."]
-    )
+        lines.append(chapter)
+        for name, command in commands.items():
+            first = (command.__doc__ or "").split("\n\n")[0].split()
+            lines.append(f"  {name:15}{' '.join(first)}")
+        lines.append("")
+    lines.append("Options of a command: torchgrasp COMMAND --help. Version: torchgrasp --version.")
+    return "\n".join(lines)
 
 
 def _sentence(error: GraspError) -> str:
@@ -218,14 +216,13 @@ def _open_streams() -> Iterator[None]:
     """
     with contextlib.ExitStack() as stack:
         if None in (sys.stdin, sys.stdout, sys.stderr):
-            while (
-                free := os.open(os.devnull, os.O_RDWR)
-            ) <= 2:  # descriptors of the standard streams
+            # 0 to 2 are the descriptors of the standard streams
+            while (free := os.open(os.devnull, os.O_RDWR)) <= 2:
                 pass
             os.close(free)
-        nowhere = (
-            stack.enter_context(open(os.devnull, "w")) if None in (sys.stdout, sys.stderr) else None
-        )
+        nowhere = None
+        if None in (sys.stdout, sys.stderr):
+            nowhere = stack.enter_context(open(os.devnull, "w"))
         if sys.stdout is None:
             stack.enter_context(contextlib.redirect_stdout(nowhere))
         if sys.stderr is None:
@@ -235,9 +232,8 @@ def _open_streams() -> Iterator[None]:
 
 def _drop_stdout() -> None:
     """Redirect stdout to the null device, because Python would try to flush it at the end."""
-    with contextlib.suppress(
-        OSError, ValueError, AttributeError
-    ):  # stdout may be closed, or no file
+    # stdout may be closed, or no file
+    with contextlib.suppress(OSError, ValueError, AttributeError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # pyright: ignore[reportOptionalMemberAccess]
 
 

@@ -32,6 +32,9 @@ from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.values.planning import PointCloud
 
+GAPS = (0.001, 1.0)  # least and greatest distance between objects that --gap takes [m]
+MOST_TRIED = 20_000  # points with which a camera is sought: more give no more certainty
+
 
 @arguments(points="file", normals="file")
 class CloudCheck(Command):
@@ -64,7 +67,7 @@ def _no_view(cloud: PointCloud) -> BadArgument | None:
     """Return the error of `fit_shape` for a cloud that no single camera can see, or None if one
     camera can see it.
     """
-    some = cloud.select(draw_rows(len(cloud), 20_000))  # more points give no more certainty
+    some = cloud.select(draw_rows(len(cloud), MOST_TRIED))
     try:
         seen = prepare_cloud(some, torch.Generator().manual_seed(0))
         if seen.one_sided:
@@ -87,7 +90,8 @@ class CloudCut(Command):
     view: inputs.ViewOptions = nested(inputs.ViewOptions())
     point: tuple[float, float, float] | None = option(
         None,
-        "a point on or near the object; points farther than 0.5 m away are left out. By default the largest",
+        "a point on or near the object; points farther than 0.5 m away are left out. By default "
+        "the largest",
     )
     box: tuple[float, float, float, float, float, float] | None = option(
         None, "two corners of a box to cut first"
@@ -96,19 +100,15 @@ class CloudCut(Command):
 
     def run(self) -> int:
         """Cut the object out of the cloud and write its points; return the exit code."""
-        if not 0.001 <= self.gap <= 1.0:
+        if not GAPS[0] <= self.gap <= GAPS[1]:
             raise BadArgument("--gap", self.gap, "a number of metres in [0.001, 1]")
         file = self.view.read("CLOUD", self.cloud, whole=True)
-        near = (
-            None
-            if self.point is None
-            else check_tensor("--point", torch.tensor(self.point).double(), (3,))
-        )
-        box = (
-            None
-            if self.box is None
-            else check_tensor("--box", torch.tensor(self.box).double(), (6,)).reshape(2, 3)
-        )
+        near = None
+        box = None
+        if self.point is not None:
+            near = check_tensor("--point", torch.tensor(self.point).double(), (3,))
+        if self.box is not None:
+            box = check_tensor("--box", torch.tensor(self.box).double(), (6,)).reshape(2, 3)
         up = self.view.vertical
         up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64) if up is None else up
         thing, plane = clouds.cut_object(file.cloud, up, near, box, self.gap)
@@ -142,7 +142,8 @@ class CloudThin(Command):
         clouds.save_cloud(less, self.out, file.table)
         inputs.print_notes(file.notes)
         print(
-            f"{len(less)} of {len(file.cloud)} points, {len(some) - len(less)} outliers removed, {self.out}"
+            f"{len(less)} of {len(file.cloud)} points, {len(some) - len(less)} outliers removed, "
+            f"{self.out}"
         )
         return 0
 

@@ -23,11 +23,13 @@ from torchgrasp.scene.masks import read_labels, read_mask
 from torchgrasp.scene.scene import Scene
 
 DEPTH_HELP = (
-    'image along the optical axis (.png of 16 bit, .tiff, .exr, .npy, or .npz with an array "depth"): integers are '
+    "image along the optical axis (.png of 16 bit, .tiff, .exr, .npy, or .npz with an array "
+    '"depth"): integers are '
     "millimetres, floats metres; 0 and NaN are not measured"
 )
 INTRINSICS_HELP = (
-    "fx fy cx cy in pixels, at the image's own resolution, and of a crop its width height; or a file of ROS, Open3D, "
+    "fx fy cx cy in pixels, at the image's own resolution, and of a crop its width height; or a "
+    "file of ROS, Open3D, "
     "RealSense, Zivid or BOP (.json, .yaml), or with a matrix (.npy, .txt)"
 )
 
@@ -40,25 +42,30 @@ class _DepthCommand(Command):
     intrinsics: tuple[str, ...] = required(INTRINSICS_HELP)
     depth_unit: float | None = option(
         None,
-        "metres of one count of the depth: 0.0001 of a RealSense D405, 0.00025 of an L515, 0.001 of float mm",
+        "metres of one count of the depth: 0.0001 of a RealSense D405, 0.00025 of an L515, 0.001 "
+        "of float mm",
     )
     out: Path = required(OUT_CLOUD_HELP)
     mask: Path | None = option(
         None,
-        "mask of the object, of the depth's size and not 0 there, for `cloud scene` also of several objects: a picture "
-        "with a colour or a number for each (.png, .tiff, .npy), masks (.npy, .npz), or COCO's run lengths (.json); by "
+        "mask of the object, of the depth's size and not 0 there, for `cloud scene` also of "
+        "several objects: a picture "
+        "with a colour or a number for each (.png, .tiff, .npy), masks (.npy, .npz), or COCO's "
+        "run lengths (.json); by "
         "default every point is kept, or every object of a scene is found",
     )
     camera_pose: Path | None = option(
         None,
-        "file with frame_from_camera, 4 x 4 (.npy or .txt); by default results are in the camera's frame",
+        "file with frame_from_camera, 4 x 4 (.npy or .txt); by default results are in the "
+        "camera's frame",
     )
     up: tuple[float, float, float] | None = option(
         None, "roughly against gravity, in the frame of the results"
     )
     frames: tuple[Path, ...] = option(
         (),
-        "more depth images of the camera, which stands still: the median of each pixel has less noise",
+        "more depth images of the camera, which stands still: the median of each pixel has less "
+        "noise",
     )
 
     @property
@@ -138,7 +145,8 @@ class CloudScene(_DepthCommand):
     )
     table: tuple[float, ...] | None = option(
         None,
-        "height z of the table, or four numbers nx ny nz d of the plane n . p = d [m]; by default it is found",
+        "height z of the table, or four numbers nx ny nz d of the plane n . p = d [m]; by default "
+        "it is found",
     )
     point: tuple[float, ...] | None = option(
         None, "column and row of a pixel on the target, or x y z [m] of a point on it"
@@ -158,7 +166,8 @@ class CloudScene(_DepthCommand):
         draw_scene(seen, picture)
         for label in seen.things:
             print(
-                f"object {label}: {int(seen.rows_of(label).sum())} points{' (the target)' * (label == seen.target)}"
+                f"object {label}: {int(seen.rows_of(label).sum())} "
+                f"points{' (the target)' * (label == seen.target)}"
             )
         said = [f"table: {'unknown' if seen.table is None else seen.table.describe()}"]
         noise = seen.noise

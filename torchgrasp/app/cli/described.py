@@ -8,6 +8,8 @@ from pathlib import Path
 
 from torchgrasp.foundation.errors import BadArgument, MissingExtra
 
+MOST_ERROR = 300  # of the message of a failed download [characters]
+
 
 def locate_urdf(
     name: Path, meshes: Path | None, out: Path | None
@@ -31,9 +33,8 @@ def locate_urdf(
         found = vars(importlib.import_module(module))
     except Exception as error:  # git raises its own
         wanted = "a network, or a clone in the folder $ROBOT_DESCRIPTIONS_CACHE"
-        raise BadArgument(
-            "urdf", f"{name}, which cannot be downloaded ({error})"[:300], wanted
-        ) from error
+        failed = f"{name}, which cannot be downloaded ({error})"[:MOST_ERROR]
+        raise BadArgument("urdf", failed, wanted) from error
     others = {key: value for key, value in found.items() if key.startswith("URDF_PATH_")}
     if "URDF_PATH" not in found:
         raise BadArgument(

@@ -22,14 +22,12 @@ from torchgrasp.values.specs import Simulator
 
 CORE = ("torch", "numpy", "scipy", "trimesh", "pytorch-kinematics", "yourdfpy", "safetensors")
 """Packages that every command needs."""
-SIMULATORS: dict[Simulator, str] = {
-    "sapien": "sim",
-    "mujoco": "mujoco",
-}  # simulators, and the extra that installs each
+SIMULATORS: dict[Simulator, str] = {"sapien": "sim", "mujoco": "mujoco"}
+"""Simulators, and the extra that installs each."""
 
 
 class Finding(NamedTuple):
-    """One part of the installation, its state, and the fix if something is missing ("" otherwise)."""
+    """One part of the installation, its state, and the fix if something is missing, else ""."""
 
     part: str
     found: str
@@ -63,20 +61,22 @@ def find_parts() -> list[Finding]:
     if torch.cuda.is_available():
         gpu = f"{torch.cuda.get_device_name()}, CUDA {torch.version.cuda}"
     dask = _package("distributed", "pip install 'torchgrasp[cluster]'")
+    if dask.fix:
+        found = f"none; `torchgrasp campaign --scheduler` needs it: {dask.fix}"
+        dask = Finding(dask.part, found)
     return [
         Finding("torchgrasp", f"{__version__}, hands: {hands}"),
         Finding(
             "Python",
-            f"{platform.python_version()} on {platform.system()} {platform.machine()}, {sys.executable}",
+            f"{platform.python_version()} on {platform.system()} {platform.machine()}, "
+            f"{sys.executable}",
         ),
         *(_package(name) for name in CORE),
         Finding("processor", f"{os.cpu_count()} cores; a command uses one, and --workers N uses N"),
         Finding("GPU", gpu),
         *(_simulator(name) for name in SIMULATORS),
         *(_package(name, "pip install 'torchgrasp[sim]'") for name in ("coacd", "pebble")),
-        dask
-        if not dask.fix
-        else Finding(dask.part, f"none; `torchgrasp campaign --scheduler` needs it: {dask.fix}"),
+        dask,
     ]
 
 

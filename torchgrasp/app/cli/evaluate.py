@@ -52,6 +52,8 @@ from torchgrasp.foundation.errors import BadArgument, DatasetError, Status
 from torchgrasp.foundation.rules import Count, Range, Seed
 from torchgrasp.values.specs import ClosingMode, HoldingMode, Simulator
 
+NAME_WIDTHS = (12, 6)  # of the names of object and view, where their longest is not known yet
+COUNT_WIDTHS = (5, 7, -1)  # of executable grasps, of passed ones, and of reasons
 OBJECTS_HELP = (
     "folder with manifest.json, and for each object mesh.ply and noisy views; see docs/data.md"
 )
@@ -111,14 +113,16 @@ class Evaluate(_Trials):
     protocol: Protocol = option("dexgraspbench", PROTOCOL_HELP)
     holding: HoldingMode | None = option(
         None,
-        'how the hand presses after closing; by default as the protocol says, or "force" with --force',
+        'how the hand presses after closing; by default as the protocol says, or "force" with '
+        "--force",
     )
     force: float | None = option(
         None, "normal force of the strongest finger [N]; by default as the protocol says"
     )
     displaced: float | None = option(
         None,
-        "lifts: most that the object is displaced on each axis of the table [m]; by default as the protocol says",
+        "lifts: most that the object is displaced on each axis of the table [m]; by default as "
+        "the protocol says",
     )
     during: bool = option(False, "displace the object halfway through the approach, not before it")
     relook: bool = option(
@@ -129,7 +133,8 @@ class Evaluate(_Trials):
     )
     draws: Count | None = option(
         None,
-        "trials of each grasp, with other displacements, pushes and noise; by default as the protocol says",
+        "trials of each grasp, with other displacements, pushes and noise; by default as the "
+        "protocol says",
     )
     complete: bool = option(False, "plan on the whole cloud instead of each view")
     planned: Path | None = option(
@@ -216,7 +221,7 @@ def list_names(objects: Path, spec: EvaluationSpec) -> list[tuple[str, str]]:
     return names
 
 
-def print_score(score: ViewScore, widths: tuple[int, int] = (12, 6)) -> None:
+def print_score(score: ViewScore, widths: tuple[int, int] = NAME_WIDTHS) -> None:
     """Print one line with the result of a view; `widths` are the column widths of the names of
     object and view.
     """
@@ -227,7 +232,12 @@ def print_score(score: ViewScore, widths: tuple[int, int] = (12, 6)) -> None:
     reasons = reasons if score.attempts else score.note or score.refusal.sentence
     passed = f"{sum(attempt.passed for attempt in score.attempts)}/{len(score.attempts)}"
     cells = (score.object, score.view, score.executable, passed, reasons)
-    print(format_line(cells, (-widths[0], -widths[1], 5, 7, -1)), flush=True)
+    _print_cells(cells, widths)
+
+
+def _print_cells(cells: tuple[object, ...], widths: tuple[int, int]) -> None:
+    """Print a line of object, view, counts and reasons."""
+    print(format_line(cells, (-widths[0], -widths[1], *COUNT_WIDTHS)), flush=True)
 
 
 def print_summary(protocol: str, tried: str, summary: dict[str, Any]) -> None:
@@ -275,7 +285,8 @@ class RunCampaign(_Trials):
     )
     device: Literal["cpu", "cuda"] = option(
         "cpu",
-        'with "cuda" the workers of --scheduler that have the resource "GPU" plan on all views of a file at once',
+        'with "cuda" the workers of --scheduler that have the resource "GPU" plan on all views of '
+        "a file at once",
     )
     scheduler: str | None = option(
         None, "Dask scheduler, as tcp://10.0.0.1:8786, whose workers do the jobs instead"
@@ -307,13 +318,14 @@ class RunCampaign(_Trials):
                 reason = "" if row.status is Status.OK else row.note or row.status.sentence
                 cells = row.object, row.view, row.executable, f"{row.passed}/{row.grasps}", reason
                 with bar.external_write_mode(sys.stdout):
-                    print(format_line(cells, (-12, -6, 5, 7, -1)), flush=True)
+                    _print_cells(cells, NAME_WIDTHS)
                 bar.update()
 
             data = run_campaign(self.objects, hand, self.out, spec, source, show)
         counts = data.card["counts"]
         print(
-            f"{counts['jobs']} jobs: {', '.join(f'{n} {name.lower()}' for name, n in counts['status'].items())}"
+            f"{counts['jobs']} jobs: "
+            f"{', '.join(f'{n} {name.lower()}' for name, n in counts['status'].items())}"
         )
         print(
             f"{len(data)} grasps, {counts['passed']} of {counts['tries']} tries passed: {self.out}"

@@ -72,34 +72,42 @@ class Export(Command):
         "usd",
     ] = option(
         "json",
-        "json: frames, units, forces and torques. mujoco: the hand as a model with keyframes. moveit: a list of "
-        "moveit_msgs/Grasp in YAML. ros2: a JointTrajectory each. dexgraspbench, graspgen: files of these projects. "
-        "glb: hand and object at the best grasp, for slides. play-..., usd: hand, object, motion, and a script to play",
+        "json: frames, units, forces and torques. mujoco: the hand as a model with keyframes. "
+        "moveit: a list of "
+        "moveit_msgs/Grasp in YAML. ros2: a JointTrajectory each. dexgraspbench, graspgen: files "
+        "of these projects. "
+        "glb: hand and object at the best grasp, for slides. play-..., usd: hand, object, motion, "
+        "and a script to play",
     )
     hand: str | None = option(None, "name or folder of the hand; by default the name in the file")
     most: Count = option(20, "number of grasps, the best first")
     force: float | None = option(
         None,
-        "normal force of the strongest finger [N] in the squeeze; by default 4, in play-... and usd as --mass needs",
+        "normal force of the strongest finger [N] in the squeeze; by default 4, in play-... and "
+        "usd as --mass needs",
     )
     kp: float | None = option(
         None,
-        "stiffness of the joints under position control [N m/rad]; by default the hand's, or the bench's",
+        "stiffness of the joints under position control [N m/rad]; by default the hand's, or the "
+        "bench's",
     )
     object: str | None = option(
         None,
-        "dexgraspbench: its folder of the object; graspgen: the mesh in its data set; moveit: the object's id; "
+        "dexgraspbench: its folder of the object; graspgen: the mesh in its data set; moveit: the "
+        "object's id; "
         "glb, play-..., usd: a mesh; by default the estimated surface.ply of GRASPS",
     )
     mass: float | None = option(None, "play-..., usd: mass of the object [kg]; by default 0.1")
     friction: float | None = option(None, "play-..., usd: coefficient of friction; by default 0.8")
     rename: tuple[str, ...] = option(
         (),
-        "json, moveit, ros2: the robot's joints, as URDF=ROBOT ..., in its order, or a .json file of such an object",
+        "json, moveit, ros2: the robot's joints, as URDF=ROBOT ..., in its order, or a .json file "
+        "of such an object",
     )
     flange: tuple[float, float, float, float, float, float, float] | None = option(
         None,
-        "json, moveit: position [m] and quaternion wxyz of the robot's flange in the hand's frame, to write its pose",
+        "json, moveit: position [m] and quaternion wxyz of the robot's flange in the hand's "
+        "frame, to write its pose",
     )
 
     def run(self) -> int:
@@ -118,11 +126,8 @@ class Export(Command):
             "object_id": None if named else self.object,
         }
         robot = {name: x for name, x in robot.items() if x is not None}
-        trial: dict[str, Any] = {
-            name: x
-            for name, x in (("mass", self.mass), ("friction", self.friction))
-            if x is not None
-        }
+        given = {"mass": self.mass, "friction": self.friction}
+        trial: dict[str, Any] = {name: x for name, x in given.items() if x is not None}
         texts = inspect.signature(TEXTS[self.format]).parameters if self.format in TEXTS else ()
         taken = trial if plays else texts
         if unused := [name for name in (*robot, *trial) if name not in taken]:
@@ -174,6 +179,11 @@ def read_names(words: Sequence[str]) -> dict[str, str] | None:
     return {joint: name.text() for joint, name in file.entries().items()}
 
 
+FARTHEST = 10  # of a hand from the object's frame [m]: farther is another unit
+SLACK = 0.03  # distance of contacts from the cloud [m]: the cloud is partial
+FAR_SHARE = 0.5  # of the contacts that may be farther away
+
+
 @arguments(order="joints", pregrasp="file", obj_from_hand="file", std_m="std")
 class Import(Command):
     """Read grasps of another program, prove which have force closure, and write them as
@@ -195,7 +205,8 @@ class Import(Command):
     unit: Unit = option("m", "unit of the positions in the file")
     cloud: Path | None = option(
         None,
-        "the view for which the grasps are, for `torchgrasp evaluate --planned`; the contacts must lie on it",
+        "the view for which the grasps are, for `torchgrasp evaluate --planned`; the contacts "
+        "must lie on it",
     )
     friction: float = option(0.8, "coefficient of friction of the certificates")
     std: float = option(
@@ -211,10 +222,11 @@ class Import(Command):
                 cloud = read_cloud(self.cloud)
             self._check(hand, grasps, cloud)
             grasps.meta["cloud_sha256"] = digest(cloud)
-        elif len(grasps) and (far := float(grasps.obj_from_hand[:, :3, 3].abs().max())) > 10:
-            raise BadArgument(
-                "FILE", f"a hand {far:.0f} m off", "hands within 10 m of the object's frame: --unit"
-            )
+        elif len(grasps):
+            far = float(grasps.obj_from_hand[:, :3, 3].abs().max())
+            if far > FARTHEST:
+                wanted = f"hands within {FARTHEST} m of the object's frame: --unit"
+                raise BadArgument("FILE", f"a hand {far:.0f} m off", wanted)
         with naming(path="--out"):
             grasps.save(self.out)
         closed = int((grasps.status == Status.OK).sum())
@@ -247,15 +259,9 @@ class Import(Command):
 
 def _contradiction(grasps: Grasps, cloud: PointCloud) -> BadArgument | None:
     """Return the error to raise if grasps are not on the cloud, else None."""
+    points = grasps.contacts.points.reshape(-1, 3)
     try:
-        check_agreement(
-            "FILE",
-            grasps.contacts.points.reshape(-1, 3),
-            "the contacts",
-            cloud,
-            slack=0.03,
-            share=0.5,
-        )
+        check_agreement("FILE", points, "the contacts", cloud, slack=SLACK, share=FAR_SHARE)
     except BadArgument as error:
         return error
     return None

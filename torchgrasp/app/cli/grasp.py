@@ -52,6 +52,11 @@ from torchgrasp.values.planning import Grasps, PointCloud, format_success
 from torchgrasp.values.specs import ContactSpec, Mode, TrialSpec
 
 Among = Literal["auto"] | None
+STAGES = ("shape", "plan", "certify", "query", "refine")
+"""Stages of planning, as the planner reports them."""
+LEAST_BUDGET = 1e-3  # of --time-budget [s]
+ENOUGH = 0.9  # predicted success of an object that is easy enough: the others are not tried
+SHOWN = 5  # grasps that are printed
 
 
 @arguments(points="cloud", normals="cloud", path="out", target="label")
@@ -67,7 +72,8 @@ class Grasp(Command):
     """
 
     cloud: Path = positional(
-        f"{inputs.CLOUD_HELP}, a scene (.npz with depth and intrinsics; see docs/real_camera.md), or the name of a "
+        f"{inputs.CLOUD_HELP}, a scene (.npz with depth and intrinsics; see docs/real_camera.md), "
+        "or the name of a "
         "shipped object, as jug"
     )
     hand: str = option("allegro", inputs.HAND_HELP)
@@ -76,7 +82,8 @@ class Grasp(Command):
     )
     mesh: Path | None = option(
         None,
-        "true mesh of the object [m] in the frame of the cloud, for the simulator; a shipped object has one",
+        "true mesh of the object [m] in the frame of the cloud, for the simulator; a shipped "
+        "object has one",
     )
     close: bool = option(
         False, 'close the best grasp on the mesh, lift it and hold it (needs the extra "sim")'
@@ -96,11 +103,13 @@ class Grasp(Command):
     )
     fingers: str = option(
         "default",
-        f'{inputs.FINGERS_HELP}; "auto" tries the options of the hand and takes the most likely to succeed',
+        f'{inputs.FINGERS_HELP}; "auto" tries the options of the hand and takes the most likely '
+        "to succeed",
     )
     mode: Mode = option(
         "joint",
-        "contacts, pose and joints together; contacts first, then the learned model; or the paper as written",
+        "contacts, pose and joints together; contacts first, then the learned model; or the paper "
+        "as written",
     )
     label: int | None = option(
         None, "label of the object to grasp in a scene; by default the easiest"
@@ -110,7 +119,8 @@ class Grasp(Command):
     )
     keep: str | None = option(
         None,
-        'where contacts may be: a closed mesh, or a box as "X0 Y0 Z0 X1 Y1 Z1" [m] in the frame of the cloud',
+        'where contacts may be: a closed mesh, or a box as "X0 Y0 Z0 X1 Y1 Z1" [m] in the frame '
+        "of the cloud",
     )
     avoid: str | None = option(None, "where no contact may be: a mesh or a box, as in --keep")
     resist: tuple[TaskName, ...] = option(
@@ -122,7 +132,7 @@ class Grasp(Command):
     )
 
     def run(self) -> int:
-        """Plan grasps, close on the object if asked, and write the results; return the exit code."""
+        """Plan grasps, close the hand if asked, and write the results; return the exit code."""
         path = inputs.find_cloud(self.cloud)
         out = Path("out") / inputs.object_name(path) if self.out is None else self.out
         inputs.check_folder(out)
@@ -132,11 +142,8 @@ class Grasp(Command):
         self._check_choice(scene)
         _ = self._where  # refused before any work
         hand, among = inputs.load_fingers(self.hand, self.fingers)
-        return (
-            self._grasp_scene(path, out, hand, among)
-            if scene
-            else self._grasp_cloud(path, out, hand, among)
-        )
+        grasp = self._grasp_scene if scene else self._grasp_cloud
+        return grasp(path, out, hand, among)
 
     def _check_choice(self, scene: bool) -> None:
         """Raise `BadArgument` for options of a scene with a cloud, or of a cloud with a scene."""
@@ -145,12 +152,15 @@ class Grasp(Command):
                 raise BadArgument("--point", "--label beside it", "one of the two")
             other = vars(self.view) | {"table": None, "up": None} != vars(inputs.CloudOptions())
             if self.mesh or other or self.mode != "joint" or self.time_budget:
-                options = "--label or --point, --table, --up, --hand, --fingers, --out, --seed, --starts, --friction"
+                options = (
+                    "--label or --point, --table, --up, --hand, --fingers, --out, --seed, "
+                    "--starts, --friction"
+                )
                 raise BadArgument("CLOUD", "an option of clouds beside a scene", options)
         elif self.label is not None or self.point is not None:
             wanted = "a .npz file with depth and intrinsics"
             raise BadArgument("--label, --point", f"{self.cloud}, which is no scene", wanted)
-        elif self.time_budget is not None and not self.time_budget >= 1e-3:
+        elif self.time_budget is not None and not self.time_budget >= LEAST_BUDGET:
             raise BadArgument("--time-budget", self.time_budget, "at least 0.001 seconds")
 
     def _grasp_cloud(self, path: Path, out: Path, hand: Hand, among: Among) -> int:
@@ -168,12 +178,10 @@ class Grasp(Command):
         inputs.print_notes(file.notes, view.judge(cloud, table))
         if true_mesh is not None:
             check_mesh(cloud, true_mesh, "--mesh")
-            if (
-                plane is not None and view.table is None
-            ):  # the robot guesses its height, which the true mesh tells
-                plane = dataclasses.replace(
-                    plane, offset=float((true_mesh.vertices @ plane.normal.numpy()).min())
-                )
+            # the robot guesses the height of the table, which the true mesh tells
+            if plane is not None and view.table is None:
+                lowest = float((true_mesh.vertices @ plane.normal.numpy()).min())
+                plane = dataclasses.replace(plane, offset=lowest)
             elif plane is not None:
                 check_stand(true_mesh, plane, "--mesh")
         progress = StageProgress(
@@ -235,7 +243,7 @@ class Grasp(Command):
         )
 
     def _costs(self, grasps: Grasps, hand: Hand, shape: ShapeGP) -> tuple[str, ...]:
-        """Return what lowers the predicted success of the best executable grasp most, in sentences."""
+        """Return what lowers the success of the best executable grasp most, in sentences."""
         best = grasps[grasps.status == Status.OK][:1]
         return tuple(
             x.sentence
@@ -263,12 +271,10 @@ class Grasp(Command):
         """Return the path of the true mesh, or None if there is none; raise `BadArgument` if
         --close has no mesh.
         """
+        mesh = self.mesh
         shipped = path != self.cloud  # the cloud is given by name
-        mesh = (
-            path.with_name("mesh.ply")
-            if shipped and self.close and self.mesh is None
-            else self.mesh
-        )
+        if shipped and self.close and mesh is None:
+            mesh = path.with_name("mesh.ply")
         if self.close:
             if mesh is None:
                 raise BadArgument("--close", "no --mesh", "--close together with --mesh")
@@ -295,13 +301,11 @@ class Grasp(Command):
             progress.end(
                 "scene", f"{len(scene.things)} objects, labels {', '.join(map(str, scene.things))}"
             )
-            judged = (
-                Status.OK if scene.target is None else judge_things(scene, hand, spec)[scene.target]
-            )
-            for sentence in (
-                *scene.advice,
-                *([judged.sentence] if judged is not Status.OK else []),
-            ):
+            advice = list(scene.advice)
+            if scene.target is not None:
+                judged = judge_things(scene, hand, spec)[scene.target]
+                advice += [judged.sentence] if judged is not Status.OK else []
+            for sentence in advice:
                 print(f"advice  {sentence}")
             options = {"fingers": among, "observer": progress.end, **self._task()}
             explanation = None
@@ -324,7 +328,7 @@ class Grasp(Command):
             surface = extract_surface(shape)
             stages = tuple(progress.stages)
             plan = progress.values.get("plan")
-            told = explanation, self._costs(grasps, hand, shape)
+            costs = self._costs(grasps, hand, shape)
             run = Run(
                 name,
                 path,
@@ -335,10 +339,9 @@ class Grasp(Command):
                 grasps,
                 stages,
                 plan,
-                None,
-                None,
-                scene,
-                *told,
+                scene=scene,
+                explanation=explanation,
+                costs=costs,
             )
             progress.end("report", self._write(out, run))
         return 0 if print_grasps(run) else 1
@@ -403,21 +406,13 @@ class Grasp(Command):
         """Plan for the objects of a scene until one is easy; return the scene with it as target,
         grasps and shape.
         """
-        # An object with this predicted success is easy enough: the others are not tried.
-        plan = plan_scene(
-            scene, hand, spec, self.starts, self.seed, fingers=among, enough=0.9, **self._task()
-        )
+        options = {"fingers": among, "enough": ENOUGH, **self._task()}
+        plan = plan_scene(scene, hand, spec, self.starts, self.seed, **options)
         for thing in plan.things:
-            text = (
-                thing.reason
-                or f"{0 if thing.grasps is None else len(thing.grasps)} executable grasps"
-            )
-            print(
-                format_line(
-                    (f"object {thing.label}", format_success(thing.success), text), (-10, 7, -1)
-                ),
-                flush=True,
-            )
+            count = 0 if thing.grasps is None else len(thing.grasps)
+            text = thing.reason or f"{count} executable grasps"
+            cells = f"object {thing.label}", format_success(thing.success), text
+            print(format_line(cells, (-10, 7, -1)), flush=True)
         progress.end(
             "objects", f"{sum(thing.grasps is not None for thing in plan.things)} with a grasp"
         )
@@ -429,19 +424,12 @@ class Grasp(Command):
         return dataclasses.replace(scene, target=plan.best.label), plan.best.grasps, plan.best.shape
 
 
-STAGES = (
-    "shape",
-    "plan",
-    "certify",
-    "query",
-    "refine",
-)  # stages of planning, as the planner reports them
-
-
 def print_grasps(run: Run) -> bool:
-    """Print the five best grasps and the verdict; return whether any grasp is executable."""
+    """Print the best grasps and the verdict; return whether any grasp is executable."""
     if len(run.executable):
-        print(f"\n{format_columns([grasp_columns(run.grasps), *grasp_rows(run.executable, 5)])}\n")
+        print(
+            f"\n{format_columns([grasp_columns(run.grasps), *grasp_rows(run.executable, SHOWN)])}\n"
+        )
     for sentence in run.costs:
         print(f"lowers success  {sentence}")
     print(verdict(run))

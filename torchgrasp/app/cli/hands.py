@@ -47,7 +47,36 @@ from torchgrasp.posture_model.score import evaluate_mixture, growing_bic
 from torchgrasp.posture_model.training import FitProgress, fit_mixture
 from torchgrasp.testing import check_hand, find_faults, most_met, random_joints
 
-TRIAL_STARTS = 100  # initial guesses with which a hand is tried on a shipped object
+
+@dataclasses.dataclass(frozen=True)
+class HandTrial:
+    """How a hand is tried, and what is so rare among random postures that it is warned of."""
+
+    objects: tuple[str, ...] = ("cylinder", "jug")  # tried in turn
+    starts: int = 100  # initial guesses for each object
+    postures: int = 5000
+    some: int = 500  # postures in which the pair of links that meets most often is sought
+    # least shares of random postures of a hand with three fingers that are free, face a pad to the
+    # others, and can hold an object
+    least_free: float = 0.2
+    least_facing: float = 0.02
+    least_closing: float = 0.001
+    facing: float = 0.5  # cosine of the largest angle between a pad that faces and the middle
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainNumbers:
+    """How a posture model is fitted."""
+
+    tolerance: float = 1e-3  # mean log-likelihood [nats] by which the last step improves the fit
+    starts: int = 5
+    subset: int = 300  # postures for each Gaussian: with fewer, a Gaussian starts by chance
+    most: int = 64  # Gaussians that are tried: the paper's figure ends at 60
+    postures: int = 40_000  # by which their number is chosen
+
+
+TRIAL = HandTrial()
+TRAIN = TrainNumbers()
 
 
 @arguments()
@@ -61,8 +90,10 @@ class HandNew(Command):
     )
     tips: tuple[str, ...] = option(
         (),
-        'links of three to five fingertips in grasp order, first the three of option "default"; "four" and "five" add '
-        "the next. By default the ends of the tree's branches, in the order in which their pads face best",
+        'links of three to five fingertips in grasp order, first the three of option "default"; '
+        '"four" and "five" add '
+        "the next. By default the ends of the tree's branches, in the order in which their pads "
+        "face best",
     )
     name: str | None = option(None, "name of the hand; by default the robot's")
     root: str = option("", "first link of the hand, where the URDF has an arm, too")
@@ -124,7 +155,8 @@ class HandCheck(Command):
     hand: str = positional(HAND_HELP)
     fingers: str = option(
         "auto",
-        f'{FINGERS_HELP}; "auto" describes the default, and tries every set that hand.toml declares',
+        f'{FINGERS_HELP}; "auto" describes the default, and tries every set that hand.toml '
+        "declares",
     )
     out: Path = option(
         Path("hand.png"), "picture to write (.png): the pads, the frame of the palm, the limits"
@@ -140,7 +172,7 @@ class HandCheck(Command):
                 return 2
             sound = check_hand(self.hand, chosen)
             check_folder(self.out.parent)
-            joints = random_joints(sound, 5000)
+            joints = random_joints(sound, TRIAL.postures)
             bar.write(f"{describe(sound, joints)}\n{describe_sets(sound)}")
             model = find_hand(self.hand) / "mixture.safetensors"
             missing = (
@@ -195,53 +227,47 @@ def find_warnings(hand: Hand, joints: torch.Tensor) -> list[str]:
     """Return warnings about a hand without faults, each with its fix, from random postures (n, h)
     [rad].
     """
-    # Least shares of random postures that are free, face a pad to the others, and can hold an
-    # object; three fingers
-    least_free = 0.2
-    least_facing = 0.02
-    least_closing = 0.001
     warnings = []
     free = hand.self_clearance(joints) > 0
     named = f"[options.{hand.source.option}]"
     share = float(free.double().mean())
-    if share < least_free ** (len(hand.tips) / 3):
-        one, two = most_met(hand, joints[:500])
+    # each further finger makes a free posture rarer
+    if share < TRIAL.least_free ** (len(hand.tips) / 3):
+        one, two = most_met(hand, joints[: TRIAL.some])
         warnings.append(
-            f"only {share:.0%} of random postures are free, most often {one} meets {two}: if this is impossible, make "
+            f"only {share:.0%} of random postures are free, most often {one} meets {two}: if this "
+            "is impossible, make "
             "their collision shapes smaller, or take the pair out of [self_collision]"
         )
     points, normals = hand.fingertips(joints[free])
     inward = points.mean(1, keepdim=True) - points
-    facing = (
-        ((normals * inward).sum(-1) / torch.linalg.vector_norm(inward, dim=-1) > 0.5)
-        .double()
-        .mean(0)
-    )
+    cosine = (normals * inward).sum(-1) / torch.linalg.vector_norm(inward, dim=-1)  # (n, f)
+    facing = (cosine > TRIAL.facing).double().mean(0)
     for name, seen in zip(hand.finger_names, facing.tolist(), strict=True):
-        if seen < least_facing:
+        if seen < TRIAL.least_facing:
             warnings.append(
-                f"the pad of {name} faces the others in {seen:.1%} of free postures: if its arrow in the picture "
-                f"points the wrong way, turn contact and normal in hand.toml; or name other fingers in {named}"
+                f"the pad of {name} faces the others in {seen:.1%} of free postures: if its arrow "
+                "in the picture "
+                "points the wrong way, turn contact and normal in hand.toml; or name other "
+                f"fingers in {named}"
             )
     closing = float(can_close(points, normals).double().mean()) if len(points) else 0.0
-    if closing < least_closing:
+    if closing < TRIAL.least_closing:
         fix = f"give {named} the thumb and fingers that it faces"
         warnings.append(f"{closing:.2%} of free postures can hold an object: {fix}")
     return warnings
 
 
 def _try_objects(hand: Hand, bar: tqdm) -> bool:
-    """Plan on shipped objects until one has an executable grasp; return whether any object has one."""
-    for name in ("cylinder", "jug"):
-        grasps = plan_grasps(load_object(name).view, hand, starts=TRIAL_STARTS)
+    """Plan on shipped objects until one has an executable grasp; return whether any has one."""
+    for name in TRIAL.objects:
+        grasps = plan_grasps(load_object(name).view, hand, starts=TRIAL.starts)
         count = count_status(grasps.status)
         good = count.get(Status.OK, 0)
         lost = ", ".join(f"{number} {status.name.lower()}" for status, number in count.items())
-        found = (
-            f"{good} of {len(grasps)} grasps executable"
-            if good
-            else f"no executable grasp ({lost})"
-        )
+        found = f"no executable grasp ({lost})"
+        if good:
+            found = f"{good} of {len(grasps)} grasps executable"
         bar.write(f"{hand.source.option} on the shipped {name}: {found}")
         if good:
             return True
@@ -292,7 +318,8 @@ class HandSample(Command):
                 bar.update,
             )
         print(
-            f"{self.n} {self.sampling} postures of {hand.name} in {self.out}, {time.perf_counter() - begin:.0f} s"
+            f"{self.n} {self.sampling} postures of {hand.name} in {self.out}, "
+            f"{time.perf_counter() - begin:.0f} s"
         )
         return 0
 
@@ -344,22 +371,21 @@ class HandTrain(Command):
                     bar.update()
                     bar.set_postfix(log_likelihood=f"{float(progress.log_likelihood[-1]):.4f}")
 
-                # The tolerance is a mean log-likelihood [nats]. With fewer postures a Gaussian
-                # starts by chance.
                 mixture = fit_mixture(
                     samples[: self.n],
                     components,
                     self.seed,
-                    tolerance=1e-3,
-                    starts=5,
-                    subset=300 * components,
+                    tolerance=TRAIN.tolerance,
+                    starts=TRAIN.starts,
+                    subset=TRAIN.subset * components,
                     checkpoint=self.checkpoint,
                     observer=show,
                 )
             meta = mixture.meta
             spent = time.perf_counter() - begin
             print(
-                f"{len(mixture.weights)} components in {meta['iterations']} steps (converged: {meta['converged']}, "
+                f"{len(mixture.weights)} components in {meta['iterations']} steps (converged: "
+                f"{meta['converged']}, "
                 f"components placed anew: {meta['reseeded']}), {spent:.0f} s, "
                 f"added relative variance {mixture.regularisation:g}"
             )
@@ -378,9 +404,8 @@ def choose_components(hand: Hand, seed: int, workers: int) -> int:
     """Return the number of Gaussians with the least BIC on separate random postures; print the BIC
     curve.
     """
-    most = 64  # the paper's figure ends at 60
-    apart = sample_configurations(hand, 40_000, seed + 1, workers, "grasping")
-    with make_bar(most, "fit", desc="components") as bar:
-        curve = growing_bic(apart, most, observer=lambda m: bar.update())
+    apart = sample_configurations(hand, TRAIN.postures, seed + 1, workers, "grasping")
+    with make_bar(TRAIN.most, "fit", desc="components") as bar:
+        curve = growing_bic(apart, TRAIN.most, observer=lambda m: bar.update())
     print(curve)
     return int(curve.components[curve.bic.argmin()])

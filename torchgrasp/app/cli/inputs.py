@@ -33,11 +33,16 @@ from torchgrasp.hand.load import load_hand
 from torchgrasp.values.planning import PointCloud
 from torchgrasp.values.specs import Simulator
 
+WIDEST = 1.5  # tangent of half an angle of view wider than that of depth cameras
+MOST_UNSEEN = 0.01  # share of the points outside: more, and the cloud is in another frame
 MOST_POINTS = 100_000  # most points of a file that are used; a shape is fitted to fewer
 CLOUD_HELP = "point cloud of one object (.ply, .pcd, .npy, .npz, or text as .xyz, .csv, .pts)"
 OUT_CLOUD_HELP = "point cloud to write (.npz or .ply), in metres"
 HAND_HELP = "name of a shipped hand (allegro, barrett, leap, shadow), or the folder of another hand"
-FINGERS_HELP = "fingers that grasp: an option of the hand, a number of fingers, or names as in index,middle,thumb"
+FINGERS_HELP = (
+    "fingers that grasp: an option of the hand, a number of fingers, "
+    "or names as in index,middle,thumb"
+)
 STARTS_HELP = "random initial guesses of the contact planner"
 SEED_HELP = "random seed"
 
@@ -48,7 +53,8 @@ class ViewOptions:
 
     viewpoint: tuple[float, float, float] | None = option(
         None,
-        "position of the camera [m] in the frame of the cloud; by default the file's, else an estimate",
+        "position of the camera [m] in the frame of the cloud; by default the file's, else an "
+        "estimate",
     )
     no_viewpoint: bool = option(False, "estimate the camera's position instead of using the file's")
     no_normals: bool = option(False, "fit normals instead of using the file's")
@@ -60,8 +66,10 @@ class ViewOptions:
     )
     camera_pose: Path | None = option(
         None,
-        "file with frame_from_camera, 4 x 4 (.npy or .txt), for a cloud in the camera's frame (x right, y down, z "
-        "forward). The cloud is moved into the pose's frame; results are in this frame, and the camera is known",
+        "file with frame_from_camera, 4 x 4 (.npy or .txt), for a cloud in the camera's frame (x "
+        "right, y down, z "
+        "forward). The cloud is moved into the pose's frame; results are in this frame, and the "
+        "camera is known",
     )
 
     @property
@@ -118,8 +126,10 @@ class CloudOptions(ViewOptions):
 
     table: tuple[float, ...] | None = option(
         None,
-        "height of the table along the vertical, or four numbers nx ny nz d of the plane n . p = d [m]; by default the "
-        "file's, as `cloud cut` writes it, else at the lowest point of the cloud that is no outlier",
+        "height of the table along the vertical, or four numbers nx ny nz d of the plane n . p = "
+        "d [m]; by default the "
+        "file's, as `cloud cut` writes it, else at the lowest point of the cloud that is no "
+        "outlier",
     )
     no_table: bool = option(False, "there is no table")
 
@@ -153,12 +163,10 @@ class CloudOptions(ViewOptions):
         return given if up is None else Plane(up, given)
 
     def given_vertical(self, plane: Plane | None) -> Tensor | None:
-        """Return the unit vector of --up, else the normal of --table, or None if neither is given."""
-        return (
-            self.vertical
-            if self.up is not None or self.table is None or plane is None
-            else plane.normal
-        )
+        """Return the unit vector of --up, else the normal of --table; None if neither is given."""
+        if self.up is not None or self.table is None or plane is None:
+            return self.vertical
+        return plane.normal
 
     def judge(self, cloud: PointCloud, table: Plane | float | None) -> tuple[Advice, ...]:
         """Return advice on the quality of a cloud; raise `BadArgument` if no grasp should be
@@ -193,12 +201,13 @@ def _move(name: str, cloud: PointCloud, pose: Tensor) -> PointCloud:
     """Return a cloud moved from the camera's frame to the pose's frame; raise `BadArgument` if it
     is in another.
     """
-    widest = 1.5  # tangent of half an angle of view wider than that of depth cameras
-    unseen = float(
-        (cloud.points[:, :2].abs().amax(1) >= widest * cloud.points[:, 2]).double().mean()
-    )
-    if unseen > 0.01:
-        allowed = "a cloud in the camera's frame (z forward) for --camera-pose; in another frame, --viewpoint X Y Z"
+    outside = cloud.points[:, :2].abs().amax(1) >= WIDEST * cloud.points[:, 2]
+    unseen = float(outside.double().mean())
+    if unseen > MOST_UNSEEN:
+        allowed = (
+            "a cloud in the camera's frame (z forward) for --camera-pose; "
+            "in another frame, --viewpoint X Y Z"
+        )
         raise BadArgument(name, f"{unseen:.0%} of the points out of a camera's sight", allowed)
     normals = None if cloud.normals is None else rotate(pose, cloud.normals)
     frustum = None if cloud.frustum is None else rotate(pose, cloud.frustum)
@@ -237,8 +246,10 @@ def find_cloud(path: Path, name: str = "CLOUD") -> Path:
 
 def print_notes(notes: tuple[str, ...], advice: tuple[Advice, ...] = ()) -> None:
     """Print notes on how a file was read, and advice on the cloud."""
-    for name, sentence in [*(("note", n) for n in notes), *(("advice", str(a)) for a in advice)]:
-        print(f"{name:8}{sentence}")
+    for note in notes:
+        print(f"{'note':8}{note}")
+    for one in advice:
+        print(f"{'advice':8}{one!s}")
 
 
 def check_folder(path: Path) -> None:
@@ -292,14 +303,11 @@ def describe_table(table: Plane | float) -> str:
 
 
 def object_name(path: Path) -> str:
-    """Return a name for the object of a file: the name of the file, or of its folder for a generic
-    file name.
-    """
+    """Return a name for the object of a file: that of the file, or of its folder if generic."""
     if re.fullmatch(r"(mesh|view\d*)(_noisy)?", path.stem):
         return path.resolve().parent.name or "object"
-    return (
-        f"object in {path.name}" if path.stem in ("cloud", "model", "points", "scan") else path.stem
-    )
+    generic = path.stem in ("cloud", "model", "points", "scan")
+    return f"object in {path.name}" if generic else path.stem
 
 
 def import_simulator(name: Simulator = "sapien") -> None:

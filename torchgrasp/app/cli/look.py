@@ -23,18 +23,18 @@ class OpenPage(Command):
     def run(self) -> int:
         """Print the address of the 3D page and open it in the browser; return the exit code."""
         folder = self.folder if self.folder.exists() else "out" / self.folder
-        page = (
-            folder
-            if folder.suffix == ".html"
-            else (folder if folder.is_dir() else folder.parent) / VIEW
-        )
+        page = folder
+        if folder.suffix != ".html":
+            page = (folder if folder.is_dir() else folder.parent) / VIEW
         if not page.is_file():
-            wanted = f"a folder that `torchgrasp grasp` wrote with a report: `torchgrasp grasp CLOUD --out {self.folder}`"
+            command = f"`torchgrasp grasp CLOUD --out {self.folder}`"
+            wanted = f"a folder that `torchgrasp grasp` wrote with a report: {command}"
             raise BadArgument("FOLDER", f"{self.folder} without {VIEW}", wanted)
         print(page.resolve().as_uri())
         if not self.no_browser and not webbrowser.open(page.resolve().as_uri()):
             print(
-                "No browser was found here: open this address on another machine, or copy the file, which is whole."
+                "No browser was found here: open this address on another machine, or copy the "
+                "file, which is whole."
             )
         return 0
 
@@ -48,6 +48,7 @@ class Objects(Command):
         for name in list_objects():
             folder = DATA / name
             print(
-                f"{name} ({MASSES[name]:g} kg)\n  view: {folder / 'view.ply'}\n  mesh: {folder / 'mesh.ply'}"
+                f"{name} ({MASSES[name]:g} kg)\n  view: {folder / 'view.ply'}\n  mesh: "
+                f"{folder / 'mesh.ply'}"
             )
         return 0
