@@ -1,5 +1,5 @@
 """Modules that take long to import, or that few users need: each is imported when one of its names
-is first used.
+is first used. `lazy_loader` would import the parents of submodules, such as SciPy, at once.
 """
 
 import importlib
@@ -41,9 +41,10 @@ else:
     pytorch_kinematics = _Late("pytorch_kinematics")
     trimesh = _Late("trimesh")
     yourdfpy = _Late("yourdfpy")
-    Image, ImageDraw, ImageFont = (
-        _Late(f"PIL.{name}") for name in ("Image", "ImageDraw", "ImageFont")
-    )
-    ndimage, optimize, sparse, spatial = map(
-        _Late, ("scipy.ndimage", "scipy.optimize", "scipy.sparse", "scipy.spatial")
-    )
+    Image = _Late("PIL.Image")
+    ImageDraw = _Late("PIL.ImageDraw")
+    ImageFont = _Late("PIL.ImageFont")
+    ndimage = _Late("scipy.ndimage")
+    optimize = _Late("scipy.optimize")
+    sparse = _Late("scipy.sparse")
+    spatial = _Late("scipy.spatial")
