@@ -4,6 +4,7 @@ Trials of one object are correlated, and so are objects of one family. The boots
 resamples whole families, 10 000 times. The interval lies between the 2.5 % and 97.5 % quantiles.
 """
 
+import dataclasses
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
@@ -15,6 +16,17 @@ from torch import Tensor
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.rules import Seed
 
+
+@dataclasses.dataclass(frozen=True)
+class BootstrapNumbers:
+    """How an interval is found."""
+
+    resamples: int = 10_000  # resamples of the families; more: ends of the interval vary less
+    outside: float = 0.05  # probability that the value lies outside the interval
+    tails: tuple[float, float] = (0.025, 0.975)  # quantiles at the ends of the interval
+
+
+BOOTSTRAP = BootstrapNumbers()
 Counts = Mapping[str, tuple[int | float, int]]
 """Passed trials and all trials of each resampled unit, a family or an object. For a mean: sum and
 number of values.
@@ -56,7 +68,7 @@ def share_over(counts: Counts, seed: Seed = 0) -> Share:
     """
     found = contrast_over([counts], [1.0], seed)
     if found.units > 1 and found.value in (0.0, 1.0):
-        bound = 0.05 ** (1 / found.units)
+        bound = BOOTSTRAP.outside ** (1 / found.units)
         return found._replace(low=bound) if found.value else found._replace(high=1 - bound)
     return found
 
@@ -70,7 +82,6 @@ def contrast_over(columns: Sequence[Counts], weights: Sequence[float], seed: See
     Resamples in which a column has no trial are left out. The weights 1 and -1 give a difference.
     An interval of zero width means that the units agree, not that the value is exact.
     """
-    resamples = 10_000  # number of resamples behind an interval
     names = sorted({name for counts in columns for name, (_, total) in counts.items() if total})
     total = sum(total for _, total in columns[0].values())
     if not names:
@@ -82,12 +93,12 @@ def contrast_over(columns: Sequence[Counts], weights: Sequence[float], seed: See
     if len(names) == 1:
         return Share(value, math.nan, math.nan, total, 1)
     drawn = torch.randint(
-        len(names), (resamples, len(names)), generator=torch.Generator().manual_seed(seed)
+        len(names), (BOOTSTRAP.resamples, len(names)), generator=torch.Generator().manual_seed(seed)
     )
-    times = torch.zeros(resamples, len(names), dtype=torch.float64)
+    times = torch.zeros(BOOTSTRAP.resamples, len(names), dtype=torch.float64)
     times.scatter_add_(1, drawn, torch.ones_like(drawn, dtype=torch.float64))
     values = _combine(torch.einsum("ru,uck->rck", times, table), weights)
-    low, high = values.nanquantile(torch.tensor([0.025, 0.975], dtype=torch.float64)).tolist()
+    low, high = values.nanquantile(torch.tensor(BOOTSTRAP.tails, dtype=torch.float64)).tolist()
     return Share(value, low, high, total, len(names))
 
 
@@ -106,4 +117,5 @@ def format_share(share: Share, unit: str = "families") -> str:
     value = f"{100 * share.value:.1f} %"
     if math.isnan(share.low):
         return f"{value} of {share.total}, one of the {unit}: no interval"
-    return f"{value} [{100 * share.low:.1f}, {100 * share.high:.1f}] of {share.total}, {share.units} {unit}"
+    ends = f"[{100 * share.low:.1f}, {100 * share.high:.1f}]"
+    return f"{value} {ends} of {share.total}, {share.units} {unit}"

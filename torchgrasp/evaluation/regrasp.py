@@ -36,6 +36,19 @@ from torchgrasp.values.planning import Grasps
 from torchgrasp.values.specs import TrialSpec
 
 
+@dataclasses.dataclass(frozen=True)
+class RegraspNumbers:
+    """How far the next grasp differs from those tried, and where a failed object's mass may be."""
+
+    gap: float = 0.015  # mean distance [m] of the contacts above which a grasp differs
+    turn: float = math.radians(30)  # angle [rad] of the approaches above which a grasp differs
+    share: float = 0.35  # share of the mass that may be at one point of the surface
+    places: int = 64  # points of the surface that are tried for it, at least; fewer if it has fewer
+
+
+REGRASP = RegraspNumbers()
+
+
 @checked
 def next_grasp(
     grasps: Grasps, tried: Sequence[int], surface: SignedDistanceField | None = None
@@ -60,7 +73,7 @@ def list_others(grasps: Grasps, tried: Sequence[int]) -> Int[Tensor, "k"]:
     approach = grasps.approach
     points = grasps.contacts.points.double()
     gaps = torch.linalg.vector_norm(points[:, None] - points[list(tried)], dim=-1).mean(-1)
-    differs = (gaps > 0.015) | (approach @ approach[list(tried)].T < math.cos(math.radians(30)))
+    differs = (gaps > REGRASP.gap) | (approach @ approach[list(tried)].T < math.cos(REGRASP.turn))
     return differs.all(-1).nonzero()[:, 0]
 
 
@@ -72,13 +85,12 @@ def _chances(
 
     A share of the mass may be at any point of the surface, which may explain the failures.
     """
-    # of mass; places
-    share = 0.35
-    count = 64
     shell = (surface.values.abs() < surface.spacing).nonzero().double()
-    places = surface.origin.double() + surface.spacing * shell[:: max(1, len(shell) // count)]
+    places = (
+        surface.origin.double() + surface.spacing * shell[:: max(1, len(shell) // REGRASP.places)]
+    )
     middle = places.mean(0)
-    centers = torch.cat([middle[None], middle + share * (places - middle)])
+    centers = torch.cat([middle[None], middle + REGRASP.share * (places - middle)])
     log_odds = log_odds_about(
         grasps, centers, float(grasps.meta["friction"]), (-table.normal).tolist()
     )

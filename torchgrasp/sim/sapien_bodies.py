@@ -16,6 +16,7 @@ Settings that differ from SAPIEN's defaults:
   own.
 """
 
+import dataclasses
 import math
 import warnings
 from collections.abc import Iterable, Iterator
@@ -35,6 +36,20 @@ from torchgrasp.sim.scene_spec import (
 )
 
 
+@dataclasses.dataclass(frozen=True)
+class BodyNumbers:
+    """Settings of PhysX for bodies."""
+
+    contact_offset: float = 0.002  # distance [m] at which contacts are made before shapes touch
+    iterations: int = 32  # of the solver for positions, in a step; more: held objects creep less
+    scale: float = 0.01  # of a cooked hull to a true one; PhysX drops vertices within 0.7 mm
+    hull: int = 129  # most vertices of a hull of which PhysX keeps all, as it keeps 255 faces
+    foot: int = 100  # lowest vertices of a larger hull, whose foot is a shape of its own
+
+
+BODIES = BodyNumbers()
+
+
 def open_world(
     sapien: Any, physx: Any, gravity: float, timestep: float, patches: bool = False
 ) -> tuple[Any, Any]:
@@ -42,9 +57,11 @@ def open_world(
     physx.set_scene_config(
         gravity=np.array([0, 0, -gravity], np.float32), enable_tgs=patches, enable_pcm=True
     )
-    physx.set_shape_config(contact_offset=0.002, rest_offset=0.0)
+    physx.set_shape_config(contact_offset=BODIES.contact_offset, rest_offset=0.0)
     physx.set_body_config(
-        solver_position_iterations=32, solver_velocity_iterations=1, sleep_threshold=0.0
+        solver_position_iterations=BODIES.iterations,
+        solver_velocity_iterations=1,
+        sleep_threshold=0.0,
     )
     system = physx.PhysxCpuSystem()
     scene = sapien.Scene([system])
@@ -85,7 +102,7 @@ def rigid_body(
     PhysX drops vertices within 0.7 mm of the hull of the others. Therefore it gets hulls a hundred
     times as large.
     """
-    scale = 0.01
+    scale = BODIES.scale
     body = physx.PhysxRigidDynamicComponent()
     for vertices in (some for hull in hulls for some in split_hull(hull)):
         scaled = (vertices / scale).astype(np.float32)
@@ -109,12 +126,9 @@ def split_hull(hull: np.ndarray) -> Iterator[np.ndarray]:
     """Yield the vertices of a convex hull; then of its foot, a pyramid, if PhysX keeps not all
     vertices of the hull.
     """
-    # PhysX keeps 255 faces: as many as 129 vertices have
-    most = 129
-    lowest = 100
     yield hull
-    if len(hull) > most:
-        yield np.vstack([hull[hull[:, 2].argsort(kind="stable")[:lowest]], hull.mean(0)])
+    if len(hull) > BODIES.hull:
+        yield np.vstack([hull[hull[:, 2].argsort(kind="stable")[: BODIES.foot]], hull.mean(0)])
 
 
 def mounted_hand(scene: Any, material: Any, spec: SceneSpec) -> Any:
