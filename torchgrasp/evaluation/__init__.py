@@ -1,4 +1,4 @@
-"""Trials of grasps in simulation, published protocols, and the evaluation of a folder of objects."""
+"""Trials of grasps in simulation, published protocols, and the evaluation of folders of objects."""
 
 from torchgrasp.values.closing import ClosingTrace, Disturbance, ObjectMotion
 from torchgrasp.evaluation.intervals import Share

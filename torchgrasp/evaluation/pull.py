@@ -72,7 +72,7 @@ def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") ->
 
 
 def run_pulls(driver: TrialDriver, spec: PullSpec) -> PullResult:
-    """Grasp the object once, and pull it in each direction from the grasp on, until one pull fails."""
+    """Grasp the object once, and pull it in each direction until one pull fails."""
     started = time.process_time()
     run = driver.open()
     start = run.scene.object_pose()

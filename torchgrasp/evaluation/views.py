@@ -100,7 +100,7 @@ def choose_rows(executable: int, most: int, ranks: Ranks) -> list[int]:
 
 @dataclasses.dataclass(frozen=True)
 class ObjectView:
-    """A hand and a view of an object: the input of one planning task, named by the files of both."""
+    """A hand and a view of an object: the input of one planning task, named by their files."""
 
     objects: Path
     object: str

@@ -72,7 +72,7 @@ class MujocoScene(SimulatedScene):
         self._mujoco.mj_step1(self.model, data)
 
     def restart(self, spec: SceneSpec) -> None:
-        """Change to the start of another scene, which differs in joints and pose of the hand alone."""
+        """Change to the start of another scene that differs in the hand's joints and pose alone."""
         self.spec = spec
         model = self.model
         pose = spec.world_from_hand

@@ -1,4 +1,4 @@
-"""A simulated scene seen by a controller: joint and palm targets in, observations of the hand out."""
+"""A simulated scene seen by a controller: joint and palm targets in, observations out."""
 
 import math
 from typing import Annotated

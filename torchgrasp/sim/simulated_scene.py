@@ -176,7 +176,7 @@ class SimulatedScene(abc.ABC):
 
     @checked
     def lift(self, height: float, speed: float = 0.0) -> None:
-        """Set the target height [m] to which the mount lifts the hand, and the target speed [m/s]."""
+        """Set the mount's target height [m] and target speed [m/s]."""
         self._move_mount(LIFT_JOINT, height, speed)
 
     @checked
