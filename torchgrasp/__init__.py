@@ -40,7 +40,7 @@ from torchgrasp.success.task import GraspTask
 from torchgrasp.success.reasons import explain_success
 from torchgrasp.planner.explain import explain_empty
 from torchgrasp.planner.grasps import plan_grasps, stream_grasps
-from torchgrasp.planner.scene import plan_scene
+from torchgrasp.planner.scene_plan import plan_scene
 from torchgrasp.control.reference import ClosingReference, closing_gains
 from torchgrasp.control.controller import GraspController
 from torchgrasp.evaluation.lift import close_hand

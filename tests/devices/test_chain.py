@@ -58,7 +58,7 @@ from torchgrasp.ik.candidates import measure_errors
 from torchgrasp.ik.configuration import Configuration
 from torchgrasp.ik.motion import collision_probability, lift_clearance
 from torchgrasp.planner.contacts import spread_rows
-from torchgrasp.planner.problem import take_target
+from torchgrasp.planner.objects import take_target
 from torchgrasp.scene import estimate_occupancy
 from torchgrasp.shape import extract_surface
 from torchgrasp.shape.completion.complete import complete_cloud

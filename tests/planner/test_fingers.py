@@ -28,7 +28,7 @@ from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply
 from torchgrasp.hand import hand_of
 from torchgrasp.planner.request import finger_sets
-from torchgrasp.planner.run import expected_success
+from torchgrasp.planner.ranking import expected_success
 
 SPEC = ContactSpec(table=0.0)
 ALL = ("index", "middle", "ring", "thumb")
@@ -165,7 +165,7 @@ def test_a_thing_of_a_scene_is_grasped_with_the_fingers_asked_for(monkeypatch):
         asked.append((cloud.target, fingers))
         raise BadArgument("cloud", "seen", "nothing")
 
-    monkeypatch.setattr("torchgrasp.planner.scene.plan_grasps", note)
+    monkeypatch.setattr("torchgrasp.planner.scene_plan.plan_grasps", note)
     plan_scene(scene, hand, fingers="auto")
     assert sorted(asked) == [(label, "auto") for label in scene.things]
 

@@ -14,7 +14,7 @@ from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.planner import ThingPlan
 from torchgrasp.planner.batches import Owned, rank
 from torchgrasp.planner.graspable import hand_span, is_vague, judge_things, order_by_ease
-from torchgrasp.planner.problem import Problem, take_target
+from torchgrasp.planner.objects import Problem, take_target
 from torchgrasp.planner.request import Request
 from torchgrasp.planner.stack import Stack
 
@@ -109,13 +109,13 @@ def test_refused_objects_are_not_planned(monkeypatch):
         planned.append(scene.target)
         return ThingPlan(scene.target, 0.0)
 
-    monkeypatch.setattr("torchgrasp.planner.scene._plan_thing", plan)
+    monkeypatch.setattr("torchgrasp.planner.scene_plan._plan_thing", plan)
     plan_scene(scene, HAND, starts=5)
     assert planned == [2]
 
 
 def test_a_vague_shape_ends_the_planning_with_its_status(monkeypatch):
-    monkeypatch.setattr("torchgrasp.planner.scene.is_vague", lambda shape: True)
+    monkeypatch.setattr("torchgrasp.planner.scene_plan.is_vague", lambda shape: True)
     (thing,) = plan_scene(see(BOX), HAND, starts=5).things
     assert (
         thing.status is Status.TOO_VAGUE
@@ -171,7 +171,7 @@ def test_a_heap_of_specks_costs_no_planning(monkeypatch):
         tile.sum(-1) % 9 == 0
     )
     many = dataclasses.replace(scene, labels=labels * (torch.rand(len(labels)) < 0.02))
-    monkeypatch.setattr("torchgrasp.planner.scene._plan_thing", None)
+    monkeypatch.setattr("torchgrasp.planner.scene_plan._plan_thing", None)
     plan = plan_scene(many, HAND)
     assert len(plan.things) == 30 and {thing.status for thing in plan.things} == {Status.FEW_PIXELS}
 

@@ -26,7 +26,7 @@ from torchgrasp.geometry.frames import apply, inverse, rotate
 from torchgrasp.geometry.plane import Plane, move
 from torchgrasp.ik.seeds import query_mixture
 from torchgrasp.planner.contacts import spread_rows
-from torchgrasp.planner.problem import digest
+from torchgrasp.planner.objects import digest
 from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, encode_fingertips, load_mixture
 from torchgrasp.success.model import load_success_model
 from torchgrasp.success.order import by_success, grade

@@ -26,7 +26,7 @@ from torchgrasp.geometry.plane import Plane, move
 from torchgrasp.ik.attempts import assign
 from torchgrasp.planner.contacts import contact_costs, find_contacts
 from torchgrasp.planner.many import estimate_shapes, plan_stacks
-from torchgrasp.planner.problem import Problem
+from torchgrasp.planner.objects import Problem
 from torchgrasp.planner.request import Request
 from torchgrasp.planner.stack import Stack
 from torchgrasp.success import TaskWrenches

@@ -11,7 +11,7 @@ from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_from_vector
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
 from torchgrasp.planner.graspable import order_by_ease
-from torchgrasp.planner.problem import TARGET_POINTS, take_target
+from torchgrasp.planner.objects import TARGET_POINTS, take_target
 
 HAND = load_hand("barrett")
 

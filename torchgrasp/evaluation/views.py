@@ -35,7 +35,7 @@ from torchgrasp.hand.hand import Hand, HandSource
 from torchgrasp.hand.hand_toml import Fingers
 from torchgrasp.hand.load import hand_of, load_hand
 from torchgrasp.planner.grasps import plan_grasps
-from torchgrasp.planner.problem import digest
+from torchgrasp.planner.objects import digest
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.surface import surface_field
 from torchgrasp.sim.convex_parts import convex_parts

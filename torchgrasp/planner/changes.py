@@ -8,7 +8,7 @@ from typing import Any
 
 from torchgrasp.foundation.errors import Status
 from torchgrasp.hand.load import hands_folder, load_hand
-from torchgrasp.planner.problem import take_target
+from torchgrasp.planner.objects import take_target
 from torchgrasp.planner.request import Request, finger_sets
 from torchgrasp.scene.scene import Scene
 

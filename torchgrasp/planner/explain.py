@@ -4,31 +4,56 @@ Every change is tried by planning with it.
 """
 
 import dataclasses
-import itertools
 import math
 import time
 from typing import Any
 
 from jaxtyping import Int
 from torch import Tensor
-from typing_extensions import Unpack
 
+from torchgrasp.arm.arm import Arm
 from torchgrasp.data.accept import HandLike, SeenLike, as_hand, as_seen
 from torchgrasp.foundation.base import Value, count_status
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import Status
 from torchgrasp.foundation.rules import Count, Seed
 from torchgrasp.foundation.threads import single_threaded
-from torchgrasp.planner.batches import Planner, rank_together
+from torchgrasp.hand.hand_toml import Fingers
+from torchgrasp.ik.candidates import Reachable
 from torchgrasp.planner.changes import Change, list_changes, more_starts
-from torchgrasp.planner.problem import Problem
-from torchgrasp.planner.request import Observer, PlanOptions, Request, show_options
-from torchgrasp.planner.run import expected_success
-from torchgrasp.planner.stack import Stack
+from torchgrasp.planner.objects import Objects, ShapedObject, find_model, pose
+from torchgrasp.planner.planner import plan_objects
+from torchgrasp.planner.ranking import expected_success, rank_together
+from torchgrasp.planner.request import Budget, Observer, Promised, Request, Where
+from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.success.task import GraspTask, Resist
 from torchgrasp.values.planning import Certificate, ContactPlan, Grasps, IKSeeds
-from torchgrasp.values.specs import ContactSpec
+from torchgrasp.values.specs import ContactSpec, Mode, Ranking
 
-MOST_TRIALS = 8  # most changes that are tried
+
+@dataclasses.dataclass(frozen=True)
+class ExplainNumbers:
+    """The bounds on the work of an explanation."""
+
+    trials: int = 8
+    """Most changes that are tried."""
+    starts: int = 20
+    """Starts with which a change is tried: one change takes about a second."""
+    more: int = 4
+    """Ratio by which more starts are tried; only requests of few starts are tried so."""
+    postures: int = 500
+    """Size of the posture library; more take seconds for a hand that often meets itself."""
+    judged: int = 5
+    """A plan is judged by the best one in so many of its guesses."""
+    enough: float = 0.8
+    """Expected success at which a change is good enough to end the search."""
+    beside: float = 0.2
+    """Weight of other failures of a stage, since a failed set reports only one of its failures."""
+    least: float = 0.25
+    """Changes of less weight, as a share of the greatest, are not tried."""
+
+
+EXPLAIN = ExplainNumbers()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -196,7 +221,6 @@ class Explanation(Value):
         return f"{self.funnel}\n{self.advice}"
 
 
-@show_options
 @checked
 @single_threaded
 def explain_empty(
@@ -205,7 +229,20 @@ def explain_empty(
     spec: ContactSpec | None = None,
     starts: Count = 1000,
     seed: Seed = 0,
-    **options: Unpack[PlanOptions],
+    *,
+    fingers: Fingers | None = None,
+    task: GraspTask | None = None,
+    promise: Promised | None = None,
+    reachable: Reachable | None = None,
+    arm: Arm | None = None,
+    keep: Where | None = None,
+    avoid: Where | None = None,
+    resist: Resist | None = None,
+    mode: Mode = "joint",
+    ranking: Ranking | None = None,
+    time_budget: Budget | None = None,
+    shape: ShapeGP | None = None,
+    observer: Observer | None = None,
 ) -> Explanation:
     """Explain why `plan_grasps` found no executable grasp, and find a single change that gives
     grasps.
@@ -231,28 +268,51 @@ def explain_empty(
     >>> explanation.best.words
     'if the friction were 0.4 instead of 0'
     """
-    starts_tried = 20  # starts with which a change is tried: one change takes about a second
-    request = Request(as_seen(cloud, "cloud"), as_hand(hand, "hand"), spec, starts, seed, **options)
+    numbers = EXPLAIN
+    request = Request(
+        as_seen(cloud, "cloud"),
+        as_hand(hand, "hand"),
+        spec,
+        starts,
+        seed,
+        fingers=fingers,
+        task=task,
+        promise=promise,
+        reachable=reachable,
+        arm=arm,
+        keep=keep,
+        avoid=avoid,
+        resist=resist,
+        mode=mode,
+        ranking=ranking,
+        time_budget=time_budget,
+        shape=shape,
+        observer=observer,
+    )
     deadline = math.inf if request.time_budget is None else time.monotonic() + request.time_budget
-    few = dataclasses.replace(request, starts=min(starts, starts_tried))
-    funnel, _, problem = try_request(few, first=request.tell)
+    few = dataclasses.replace(request, starts=min(starts, numbers.starts))
+    funnel, _, objects = try_request(few, first=request.tell)
     # each set needs a library
     trials = list[Trial]()
     left = 0
-    plans = MOST_TRIALS - 2 * (len(few.hands) - 1)
+    plans = numbers.trials - 2 * (len(few.hands) - 1)
     more = more_starts(request)
     for change in [] if funnel.executable else [*order_changes(list_changes(few), funnel), more]:
         if any(
-            x.executable if change is more else x.expected >= 0.8 and x.choice >= change.choice
+            x.executable
+            if change is more
+            else x.expected >= numbers.enough and x.choice >= change.choice
             for x in trials
         ):
             continue  # little is left for this change
         plans -= len(change.request.hands)
-        allowed = starts <= 4 * starts_tried if change is more else plans >= 0 or not trials
+        allowed = (
+            starts <= numbers.more * numbers.starts if change is more else plans >= 0 or not trials
+        )
         if not allowed or time.monotonic() >= deadline:
             left += 1
             continue
-        found, expected, _ = try_request(change.request, None if change.refit else problem)
+        found, expected, _ = try_request(change.request, None if change.refit else objects)
         trials.append(Trial(change.words, change.choice, found.executable, expected, found))
         request.tell("change", str(trials[-1]), trials[-1])
     trials.sort(
@@ -287,41 +347,44 @@ def order_changes(changes: list[Change], funnel: Funnel) -> list[Change]:
 
 
 def try_request(
-    request: Request, known: Problem | None = None, first: Observer | None = None
-) -> tuple[Funnel, float, Problem]:
-    """Plan a request with a small library of postures; return the losses, the expected success, and
-    the problem.
+    request: Request,
+    known: Objects | None = None,
+    first: Observer | None = None,
+    numbers: ExplainNumbers = EXPLAIN,
+) -> tuple[Funnel, float, Objects]:
+    """Plan a request with a small library of postures.
 
-    The object of a `known` problem is used again. Several sets of fingers share the initial
-    guesses. If no contact set is found, the most relaxed constraints are tried, too. The success is
-    that of the best fifth of the guesses. An observer `first` hears "funnel" and the losses of the
-    first plan.
+    Returns the losses, the expected success, and the object as it was posed last. The object of
+    `known` is used again. Several sets of fingers share the initial guesses. If no contact set is
+    found, the most relaxed constraints are tried, too. The success is that of the best fifth of the
+    guesses. An observer `first` hears "funnel" and the losses of the first plan.
     """
-    postures = 500  # more take seconds to draw for a hand that often collides with itself
     told = dict[str, Any]()
     hands = request.hands
-    found = list[tuple[Funnel, float]]()
     starts = max(request.starts // len(hands), 1)
     share = dataclasses.replace(
         request, starts=starts, observer=lambda stage, _, value: told.update({stage: value})
     )
-    problem = known or Problem.of(share, hands[0])
+    model = find_model(share) if known is None else known.model
+    object_ = ShapedObject.of(share) if known is None else known.each[0]
+    found = list[tuple[Funnel, float]]()
+    best = max(starts // numbers.judged, 1)
+    objects = known
     for hand in hands:
-        problem = problem.for_request(share, hand, postures)
-        specs = list(
-            problem.given_spec.relaxed(problem.spec.ring_radius, float(hand.tips.radius.max()))
-        )[-1:]
-        relaxed = (
-            problem.replace("flat", "drawn", given_spec=spec, descends=True) for spec in specs
-        )
-        for tried in itertools.chain((problem,), relaxed):
-            grasps = rank_together(
-                [batch for (batch,) in Planner(Stack.of([tried])).run(math.inf)], request.order
-            )
+        objects = pose(object_, share, hand, model, postures=numbers.postures)
+        relaxed = list(objects.relaxed_specs())[-1:]
+        for spec in (None, *relaxed):
+            tried = objects
+            if spec is not None:
+                tried = objects.posed_again(share, hand, spec, numbers.postures, descends=True)
+            batches = [grasps for (grasps,) in plan_objects(tried, math.inf)]
+            grasps = rank_together(batches, request.order)
             funnel = Funnel.of(told["plan"], told["certify"], told["query"], grasps)
             if not found and first is not None:
                 first("funnel", str(funnel.worst), funnel)
-            found.append((funnel, expected_success(grasps, max(starts // 5, 1))))
+            found.append((funnel, expected_success(grasps, best)))
             if funnel.stages[0].kept:
                 break
-    return *max(found, key=lambda pair: (pair[1], pair[0].executable)), problem
+    assert objects is not None
+    funnel, expected = max(found, key=lambda pair: (pair[1], pair[0].executable))
+    return funnel, expected, objects

@@ -1,22 +1,23 @@
-"""The planner's entry points: from a point cloud or a scene to ranked grasps, all at once or batch
-by batch.
-"""
+"""The planner's entry points: from a point cloud or a scene to ranked grasps, or to batches."""
 
 from collections.abc import Iterator, Sequence
-from typing import Annotated, overload
+from typing import Annotated, Any, overload
 
-from typing_extensions import Unpack
-
+from torchgrasp.arm.arm import Arm
 from torchgrasp.data.accept import CloudLike, HandLike, SeenLike, as_cloud, as_hand, as_seen
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Count, Range, Seed
 from torchgrasp.foundation.threads import single_threaded
+from torchgrasp.hand.hand_toml import Fingers
+from torchgrasp.ik.candidates import Reachable
 from torchgrasp.planner.many import plan_many
-from torchgrasp.planner.request import PlanOptions, Request, show_options
+from torchgrasp.planner.request import Budget, Observer, Promised, Request, Where
 from torchgrasp.planner.run import plan_request, stream_request
+from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.success.task import GraspTask, Resist
 from torchgrasp.values.planning import Grasps
-from torchgrasp.values.specs import ContactSpec
+from torchgrasp.values.specs import ContactSpec, Mode, Ranking
 
 
 @overload
@@ -26,7 +27,20 @@ def plan_grasps(
     spec: ContactSpec | None = None,
     starts: Count = 1000,
     seed: Seed = 0,
-    **options: Unpack[PlanOptions],
+    *,
+    fingers: Fingers | None = None,
+    task: GraspTask | None = None,
+    promise: Promised | None = None,
+    reachable: Reachable | None = None,
+    arm: Arm | None = None,
+    keep: Where | None = None,
+    avoid: Where | None = None,
+    resist: Resist | None = None,
+    mode: Mode = "joint",
+    ranking: Ranking | None = None,
+    time_budget: Budget | None = None,
+    shape: ShapeGP | None = None,
+    observer: Observer | None = None,
 ) -> Grasps: ...
 @overload
 def plan_grasps(
@@ -37,9 +51,20 @@ def plan_grasps(
     seed: Seed = 0,
     *,
     workers: Annotated[int, Range(0, 1024)] = 0,
-    **options: Unpack[PlanOptions],
+    fingers: Fingers | None = None,
+    task: GraspTask | None = None,
+    promise: Promised | None = None,
+    reachable: Reachable | None = None,
+    arm: Arm | None = None,
+    keep: Where | None = None,
+    avoid: Where | None = None,
+    resist: Resist | None = None,
+    mode: Mode = "joint",
+    ranking: Ranking | None = None,
+    time_budget: Budget | None = None,
+    shape: ShapeGP | None = None,
+    observer: Observer | None = None,
 ) -> list[Grasps]: ...
-@show_options
 @checked
 @single_threaded
 def plan_grasps(
@@ -50,7 +75,19 @@ def plan_grasps(
     seed: Seed = 0,
     *,
     workers: Annotated[int, Range(0, 1024)] = 0,
-    **options: Unpack[PlanOptions],
+    fingers: Fingers | None = None,
+    task: GraspTask | None = None,
+    promise: Promised | None = None,
+    reachable: Reachable | None = None,
+    arm: Arm | None = None,
+    keep: Where | None = None,
+    avoid: Where | None = None,
+    resist: Resist | None = None,
+    mode: Mode = "joint",
+    ranking: Ranking | None = None,
+    time_budget: Budget | None = None,
+    shape: ShapeGP | None = None,
+    observer: Observer | None = None,
 ) -> Grasps | list[Grasps]:
     """Plan grasps of a hand on the object of a partial point cloud, or on the target of a scene,
     the best grasp first.
@@ -60,52 +97,82 @@ def plan_grasps(
     >>> grasps.joints.shape[1]
     4
 
-    Args: cloud: points that a camera saw [m], in any frame; the grasps are in this frame. A
-        `PointCloud`, a `Scene` with a target, an array or tensor (n, 3), a cloud of Open3D or
-        trimesh, a file for `read_cloud` or `read_scene`, or a `GraspObject`. Missing normals and
-        viewpoint are estimated; `cloud_from_array` takes them. A sequence gives a list of results;
-        a bad cloud has no grasps, and `meta["refused"]` holds the reason. hand: from `load_hand`,
-        or its name or folder; it is moved to the device of the cloud. spec: the constraints on
-        contacts; by default `ContactSpec()`, in mode "paper" `ContactSpec.paper()`. starts: number
-        of random initial guesses of the contact planner. seed: random seed; on the CPU the same
-        seed gives bitwise the same grasps. workers: number of processes for a sequence of clouds; 0
-        means this process. On a GPU, which plans all clouds at once, they estimate the shapes.
+    Args:
+        cloud: points that a camera saw [m], in any frame; the grasps are in this frame. A
+            `PointCloud`, a `Scene` with a target, an array or tensor (n, 3), a cloud of Open3D or
+            trimesh, a file for `read_cloud` or `read_scene`, or a `GraspObject`. Missing normals
+            and viewpoint are estimated; `cloud_from_array` takes them. A sequence gives a list of
+            results; a bad cloud has no grasps, and `meta["refused"]` holds the reason.
+        hand: from `load_hand`, or its name or folder; it is moved to the device of the cloud.
+        spec: the constraints on contacts; by default `ContactSpec()`, in mode "paper"
+            `ContactSpec.paper()`.
+        starts: number of random initial guesses of the contact planner.
+        seed: random seed; on the CPU the same seed gives bitwise the same grasps.
+        workers: number of processes for a sequence of clouds; 0 means this process. On a GPU, which
+            plans all clouds at once, they estimate the shapes.
         fingers: the fingers that grasp, as in `load_hand`; by default those of `hand`. "auto"
-        chooses, of the sets that the hand declares, the one with the greatest expected success.
-        `hand_of` loads the hand of the result. task: what the grasps must do, for which their
-        success is predicted; by default `GraspTask()`. promise: share of the returned grasps that
-        must hold, or None; less sure grasps get the status `NO_PROMISE`. `meta["promise"]` says
-        which trials chose the bound (`torchgrasp.success.promise`). reachable: function that
-        returns as booleans (k,) which hand poses `obj_from_hand` (k, 4, 4) an arm reaches, in the
-        frame of the cloud; by default all poses are reachable. arm: the arm that carries the hand,
-        from `load_arm`; it must reach each grasp by a straight approach, and lift. Without a table
-        z points up. keep, avoid: a `Region` in which all contacts lie, and one in which none lies;
-        or a function of points (n, 3) [m] that returns their signed distance [m], negative inside.
-        Contacts lie on the estimated surface. resist: what contacts must resist, see `Resist`:
-        "lift", "pour", "push", several of them, or `TaskWrenches`. Forces are in the planned
-        friction cones, and of the hand's strength. `Grasps.certificate` has the proof; grasps that
-        resist less than all have the status `NOT_RESISTED`. mode: see `Mode`; all modes but "joint"
-        need the hand's learned model, and three fingers. ranking: criterion by which grasps are
-        ordered, see `Ranking`; by default "success", in mode "paper" "variance". time_budget: wall
-        time [s] after which no batch begins; `meta["starts"]` is the number of planned guesses.
+            chooses, of the sets that the hand declares, the one with the greatest expected success.
+            `hand_of` loads the hand of the result.
+        task: what the grasps must do, for which their success is predicted; by default
+            `GraspTask()`.
+        promise: share of the returned grasps that must hold, or None; less sure grasps get the
+            status `NO_PROMISE`. `meta["promise"]` says which trials chose the bound
+            (`torchgrasp.success.promise`).
+        reachable: function that returns as booleans (k,) which hand poses `obj_from_hand` (k, 4, 4)
+            an arm reaches, in the frame of the cloud; by default all poses are reachable.
+        arm: the arm that carries the hand, from `load_arm`; it must reach each grasp by a straight
+            approach, and lift. Without a table z points up.
+        keep, avoid: a `Region` in which all contacts lie, and one in which none lies; or a function
+            of points (n, 3) [m] that returns their signed distance [m], negative inside. Contacts
+            lie on the estimated surface.
+        resist: what contacts must resist, see `Resist`: "lift", "pour", "push", several of them, or
+            `TaskWrenches`. Forces are in the planned friction cones, and of the hand's strength.
+            `Grasps.certificate` has the proof; grasps that resist less than all have the status
+            `NOT_RESISTED`.
+        mode: see `Mode`; all modes but "joint" need the hand's learned model, and three fingers.
+        ranking: criterion by which grasps are ordered, see `Ranking`; by default "success", in mode
+            "paper" "variance".
+        time_budget: wall time [s] after which no batch begins; `meta["starts"]` is the number of
+            planned guesses.
         shape: the object's shape if it is known better than the cloud shows, as after a touch
-        (`ShapeGP.update`). observer: function that is called after each stage with the stage's
-        name, a line of text and its result.
+            (`ShapeGP.update`).
+        observer: function that is called after each stage with the stage's name, a line of text and
+            its result.
 
-    Returns: Grasps: executable grasps (`Status.OK`) first, best first. `explain_empty` explains an
-        empty result.
+    Returns:
+        Grasps: executable grasps (`Status.OK`) first, best first. `explain_empty` explains an empty
+            result.
 
-    Raises: BadArgument: an argument of the wrong type or range; a cloud of an object that is not of
-        graspable size; a scene without a target; `shape`, `observer`, `reachable`, `arm` or a
-        region beside several clouds. MissingExtra, NoWorkers: pebble is not installed, or no worker
-        process can start.
+    Raises:
+        BadArgument: an argument of the wrong type or range; a cloud of an object that is not of
+            graspable size; a scene without a target; `shape`, `observer`, `reachable`, `arm` or a
+            region beside several clouds.
+        MissingExtra, NoWorkers: pebble is not installed, or no worker process can start.
 
     The result does not depend on the frame of cloud, camera and table. In a scene the hand keeps
     clear of the target's neighbours and of space that is probably full. The remaining risk of
     collision lowers `Grasps.success`. Grasps are planned in batches, each larger than the one
     before. `stream_grasps` yields each batch when it ends.
     """
-    given = {"hand": as_hand(hand, "hand"), "spec": spec, "starts": starts, "seed": seed, **options}
+    given: dict[str, Any] = dict(
+        hand=as_hand(hand, "hand"),
+        spec=spec,
+        starts=starts,
+        seed=seed,
+        fingers=fingers,
+        task=task,
+        promise=promise,
+        reachable=reachable,
+        arm=arm,
+        keep=keep,
+        avoid=avoid,
+        resist=resist,
+        mode=mode,
+        ranking=ranking,
+        time_budget=time_budget,
+        shape=shape,
+        observer=observer,
+    )
     if isinstance(cloud, Sequence) and not isinstance(cloud, str):
         return plan_many([as_cloud(one, "cloud") for one in cloud], workers, given)
     if workers:
@@ -113,7 +180,6 @@ def plan_grasps(
     return plan_request(Request(as_seen(cloud, "cloud"), **given))
 
 
-@show_options
 @checked
 @single_threaded
 def stream_grasps(
@@ -122,7 +188,20 @@ def stream_grasps(
     spec: ContactSpec | None = None,
     starts: Count = 1000,
     seed: Seed = 0,
-    **options: Unpack[PlanOptions],
+    *,
+    fingers: Fingers | None = None,
+    task: GraspTask | None = None,
+    promise: Promised | None = None,
+    reachable: Reachable | None = None,
+    arm: Arm | None = None,
+    keep: Where | None = None,
+    avoid: Where | None = None,
+    resist: Resist | None = None,
+    mode: Mode = "joint",
+    ranking: Ranking | None = None,
+    time_budget: Budget | None = None,
+    shape: ShapeGP | None = None,
+    observer: Observer | None = None,
 ) -> Iterator[Grasps]:
     """Yield the executable grasps of each batch of `plan_grasps` when the batch ends, best first.
 
@@ -137,6 +216,24 @@ def stream_grasps(
     >>> bool((first.status == 0).all())
     True
     """
-    return stream_request(
-        Request(as_seen(cloud, "cloud"), as_hand(hand, "hand"), spec, starts, seed, **options)
+    request = Request(
+        as_seen(cloud, "cloud"),
+        as_hand(hand, "hand"),
+        spec,
+        starts,
+        seed,
+        fingers=fingers,
+        task=task,
+        promise=promise,
+        reachable=reachable,
+        arm=arm,
+        keep=keep,
+        avoid=avoid,
+        resist=resist,
+        mode=mode,
+        ranking=ranking,
+        time_budget=time_budget,
+        shape=shape,
+        observer=observer,
     )
+    return stream_request(request)

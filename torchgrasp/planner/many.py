@@ -17,10 +17,10 @@ from torchgrasp.foundation.errors import BadArgument, GraspError, MissingExtra, 
 from torchgrasp.foundation.jobs import pack, run_tasks, unpack
 from torchgrasp.hand.hand import Hand, HandSource
 from torchgrasp.hand.load import load_hand
-from torchgrasp.planner.batches import plan_hands
-from torchgrasp.planner.problem import Problem, settle_hand
+from torchgrasp.planner.objects import Objects, join_objects, pose_request, settle_hand
+from torchgrasp.planner.planner import plan_objects
 from torchgrasp.planner.request import Request
-from torchgrasp.planner.run import finish, plan_request
+from torchgrasp.planner.run import finish, plan_request, relax
 from torchgrasp.values.planning import Certificate, Contacts, Grasps, PointCloud
 
 Result = TypeVar("Result")
@@ -52,12 +52,12 @@ def plan_many(clouds: Sequence[PointCloud], workers: int, given: dict[str, Any])
 
 
 def plan_stacks(
-    requests: Sequence[Request], prepared: Iterator[Problem | Grasps], device: torch.device
+    requests: Sequence[Request], prepared: Iterator[Objects | Grasps], device: torch.device
 ) -> Iterator[Grasps]:
-    """Yield the grasps of prepared problems, which differ in their clouds alone, planned at once on
+    """Yield the grasps of posed objects, whose requests differ in their clouds alone, planned at once on
     a device.
 
-    The problems of the next stack are prepared while the device plans. A refused problem, which is
+    The objects of the next stack are prepared while the device plans. A refused cloud, which is
     an empty set of grasps, stays as it is.
     """
     most = 128  # clouds at once: of more the device would wait longer for the shapes
@@ -72,8 +72,8 @@ def plan_stacks(
 
 
 @checked
-def _take(prepared: Iterator[Problem | Grasps], count: int) -> list[Problem | Grasps]:
-    """Return the next problems of an iterator; in any thread the library does not check its own
+def _take(prepared: Iterator[Objects | Grasps], count: int) -> list[Objects | Grasps]:
+    """Return the next objects of an iterator; in any thread the library does not check its own
     calls.
     """
     return list(itertools.islice(prepared, count))
@@ -81,8 +81,8 @@ def _take(prepared: Iterator[Problem | Grasps], count: int) -> list[Problem | Gr
 
 def estimate_shapes(
     requests: Sequence[Request], workers: int
-) -> Generator[Problem | Grasps, None, None]:
-    """Yield the planning problem of each request on the CPU, or an empty set of grasps for a bad
+) -> Generator[Objects | Grasps, None, None]:
+    """Yield the posed object of each request on the CPU, or an empty set of grasps for a bad
     cloud.
     """
     return _each(
@@ -92,30 +92,35 @@ def estimate_shapes(
 
 def _plan_stack(
     requests: Sequence[Request],
-    prepared: Sequence[Problem | Grasps],
+    prepared: Sequence[Objects | Grasps],
     device: torch.device,
     deadline: float,
 ) -> Iterator[Grasps]:
-    """Yield the grasps of prepared problems that are planned at once on a device."""
+    """Yield the grasps of posed objects that are planned at once on a device."""
     hand = settle_hand(requests[0].hands[0], torch.device("cpu"))
-    pairs = zip(prepared, requests, strict=True)
-    problems = [
-        x if isinstance(x, Grasps) else x.replace(hand=hand, request=request)
-        for x, request in pairs
+    # a process gave back objects without the hand's caches
+    ready = [
+        x if isinstance(x, Grasps) else dataclasses.replace(x, hand=hand, request=request)
+        for x, request in zip(prepared, requests, strict=True)
     ]
-    planned = iter(plan_hands([x for x in problems if isinstance(x, Problem)], deadline, device))
-    for x in problems:
+    posed = [x for x in ready if isinstance(x, Objects)]
+    batches: Iterator[tuple[Grasps, ...]] = iter(())
+    if posed:
+        batches = zip(*plan_objects(join_objects(posed, device), deadline), strict=True)
+    for x in ready:
         if isinstance(x, Grasps):
             yield x
         else:
-            yield finish(x.request, [x.give_back(grasps.to("cpu")) for grasps in next(planned)])
+            planned = relax(x, iter(next(batches)), deadline)
+            yield finish(x.request, [x.give_back(grasps) for grasps in planned])
 
 
-def _prepare(request: Request) -> Problem:
+def _prepare(request: Request) -> Objects:
     """Estimate the shape of a request's object, and draw initial guesses."""
-    problem = Problem.of(request, settle_hand(request.hands[0], torch.device("cpu"))).prepared()
-    bare = dataclasses.replace(request.hand)  # a problem that another process plans needs no caches
-    return problem.replace(hand=bare, request=dataclasses.replace(request, hand=bare))
+    objects = pose_request(request, settle_hand(request.hands[0], torch.device("cpu")))
+    # objects that another process plans need no caches
+    bare = dataclasses.replace(request.hand)
+    return dataclasses.replace(objects, hand=bare, request=dataclasses.replace(request, hand=bare))
 
 
 def _or_refuse(function: Callable[[Request], Result], request: Request) -> Result | Grasps:

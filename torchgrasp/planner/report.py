@@ -10,7 +10,7 @@ import torch
 from torchgrasp.foundation.base import count_status, join
 from torchgrasp.foundation.errors import Status
 from torchgrasp.ik.attempts import executable
-from torchgrasp.planner.problem import Problem
+from torchgrasp.planner.objects import Objects
 from torchgrasp.shape.estimate import surface_deviation
 from torchgrasp.values.planning import Grasps, format_success
 
@@ -20,15 +20,15 @@ class Report:
     end of each batch.
     """
 
-    def __init__(self, problem: Problem, batches: int, planned: int) -> None:
+    def __init__(self, objects: Objects, batches: int, planned: int) -> None:
         """Take the number of all `batches`, and the number `planned` of those batches that plan new
         initial guesses.
         """
-        self.problem = problem
+        self.objects = objects
         self.batches = batches
         self.planned = planned
         self.heard = (
-            problem.request.observer is not None
+            objects.request.observer is not None
         )  # without an observer nothing is stored or counted
         self.parts: dict[str, list[Any]] = {"plan": [], "certify": [], "query": []}
         self.ended = self.offered = self.closed = 0
@@ -39,12 +39,12 @@ class Report:
         """
         if not self.heard:
             return
-        shape = self.problem.shape
-        vertices = self.problem.surface.vertices
+        shape = self.objects.each[0].shape
+        vertices = self.objects.each[0].surface.vertices
         jet = shape.jet(shape.normalise(vertices[:: len(vertices) // 500 + 1]))
         std_m = shape.std_factor * shape.scale * surface_deviation(jet.variance, jet.gradient)
         certain = float((std_m < 0.004).double().mean())
-        self.problem.tell(
+        self.objects.tell(
             "shape", f"{len(shape.x)} points, {certain:.0%} of the surface certain to 4 mm", shape
         )
 
@@ -75,7 +75,7 @@ class Report:
             good = int(executable(grasps).sum())
             best = f", the best {format_success(grasps)} likely" if good else ""
             text = f"{self.ended} of {self.batches}: {good} executable of {len(grasps)}{best}"
-            self.problem.tell("batch", text, grasps)
+            self.objects.tell("batch", text, grasps)
         if last and len(self.parts["plan"]) < self.planned:
             for stage in self.parts:
                 self._tell(stage)
@@ -86,10 +86,10 @@ class Report:
         if stage == "plan":
             text = f"{len(value)} starts: {describe(count_status(value.status))}"
         elif stage == "certify":
-            text = f"{self.closed} of {self.offered} closed at friction {self.problem.spec.planned_friction:g}"
+            text = f"{self.closed} of {self.offered} closed at friction {self.objects.spec.planned_friction:g}"
         else:
             text = f"{len(value)} seeds for {len(torch.unique(value.row))} of {self.closed} triples"
-        self.problem.tell(stage, text, value)
+        self.objects.tell(stage, text, value)
 
 
 def describe(counts: dict[Status, int]) -> str:

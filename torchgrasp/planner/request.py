@@ -1,19 +1,14 @@
 """The request: the checked arguments of `plan_grasps`."""
 
 import dataclasses
-import inspect
 import math
-import re
-import types
-import typing
-from collections.abc import Callable, Sequence
-from typing import Annotated, Any, TypedDict, TypeVar
+from collections.abc import Callable
+from typing import Annotated, Any
 
 from torchgrasp.arm.arm import Arm
 from torchgrasp.contacts.region import combine
-from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.checks import Count, Range, Seed, checked
 from torchgrasp.foundation.errors import BadArgument
-from torchgrasp.foundation.rules import Count, Range, Seed, Taken
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import Fingers
 from torchgrasp.hand.load import with_fingers
@@ -38,39 +33,6 @@ Where = Callable[..., Any]
 """A `Region`, or a function that returns the signed distance [m] of points (n, 3) [m], negative
 inside.
 """
-Function = TypeVar("Function", bound=Callable[..., Any])
-
-
-class SceneOptions(TypedDict, total=False):
-    """The types of the optional keyword arguments of `plan_grasps` that `plan_scene` has, too.
-
-    >>> options: SceneOptions = {"fingers": 4}  # plan_scene(scene, hand, **options)
-    """
-
-    fingers: Fingers | None
-    task: GraspTask | None
-    promise: Promised | None
-    reachable: Reachable | None
-    arm: Arm | None
-    keep: Where | None
-    avoid: Where | None
-    resist: Resist | None
-
-
-class PlanOptions(SceneOptions, total=False):
-    """The types of the optional keyword arguments of `plan_grasps`, which explains them; `Request`
-    has the defaults.
-
-    >>> options: PlanOptions = {"fingers": 4, "ranking": "success"}  # plan_grasps(cloud, hand, **options)
-    >>> sorted(options)
-    ['fingers', 'ranking']
-    """
-
-    mode: Mode
-    ranking: Ranking | None
-    time_budget: Budget | None
-    shape: ShapeGP | None
-    observer: Observer | None
 
 
 @checked
@@ -143,50 +105,6 @@ class Request:
     def hands(self) -> tuple[Hand, ...]:
         """One hand for each set of fingers that may grasp."""
         return finger_sets(self.hand, self.fingers, self.mode)
-
-
-class _Plain(str):
-    """A text that a signature shows without quotes."""
-
-    __repr__ = str.__str__
-
-
-def show_options(function: Function) -> Function:
-    """Return the function, whose signature names each option in place of `**options`, and each type
-    in plain words.
-    """
-    signature = inspect.signature(function)
-    hints = typing.get_type_hints(function, include_extras=True)
-    inner = typing.get_type_hints(typing.get_args(hints.pop("options"))[0], include_extras=True)
-    defaults = {field.name: field.default for field in dataclasses.fields(Request)}
-    named = [one for one in signature.parameters.values() if one.name in hints]
-    named += [
-        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=defaults[name])
-        for name in inner
-    ]
-    parameters = [
-        one.replace(annotation=_Plain(_shorten((hints | inner)[one.name]))) for one in named
-    ]
-    shown = signature.replace(
-        parameters=parameters, return_annotation=_Plain(_shorten(hints["return"]))
-    )
-    setattr(function, "__signature__", shown)  # noqa: B010
-    return function
-
-
-def _shorten(hint: Any) -> str:
-    """Return a type as text, without the names of modules and without rules."""
-    origin = typing.get_origin(hint)
-    inside = typing.get_args(hint)
-    if origin is Annotated:
-        return inside[1].alias if isinstance(inside[1], Taken) else _shorten(inside[0])
-    if origin in (typing.Union, types.UnionType):
-        return " | ".join(map(_shorten, inside))
-    if origin is Sequence:
-        return f"Sequence[{_shorten(inside[0])}]"
-    return (
-        "None" if hint is type(None) else re.sub(r"\b(\w+\.)+", "", inspect.formatannotation(hint))
-    )
 
 
 def finger_sets(hand: Hand, fingers: Fingers | None, mode: Mode = "joint") -> tuple[Hand, ...]:

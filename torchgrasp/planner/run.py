@@ -1,6 +1,4 @@
-"""The plan of one request: its batches, joined or one by one; of several sets of fingers the best
-set's.
-"""
+"""The plan of one request: its batches, joined or one by one; of sets of fingers the best set's."""
 
 import dataclasses
 import math
@@ -13,15 +11,16 @@ import torch
 from torchgrasp.foundation.base import count_status
 from torchgrasp.foundation.errors import Status
 from torchgrasp.hand.hand import Hand
-from torchgrasp.planner.batches import plan_hand, rank_together
-from torchgrasp.planner.problem import Problem, settle_hand
+from torchgrasp.ik.attempts import executable
+from torchgrasp.planner.objects import Objects, pose_request
+from torchgrasp.planner.planner import plan_objects
+from torchgrasp.planner.ranking import expected_success, rank_together
 from torchgrasp.planner.report import describe
 from torchgrasp.planner.request import Request
 from torchgrasp.values.planning import Grasps
 
-# best grasps of a set of fingers by which the set is judged: the number that an evaluation tries of
-# a view
-BEST = 20
+LIKELY = 0.5
+"""Predicted success of a best grasp at which constraints are not relaxed."""
 
 
 def plan_request(request: Request) -> Grasps:
@@ -30,9 +29,7 @@ def plan_request(request: Request) -> Grasps:
 
 
 def stream_request(request: Request) -> Iterator[Grasps]:
-    """Plan in batches; yield the executable grasps of each batch that has any, the best grasp
-    first.
-    """
+    """Plan in batches; yield the executable grasps of each batch that has any, the best first."""
     batches = list[Grasps]()
     for grasps in _plan_batches(request):
         batches.append(grasps)
@@ -45,61 +42,87 @@ def stream_request(request: Request) -> Iterator[Grasps]:
 def finish(request: Request, batches: list[Grasps]) -> Grasps:
     """Rank the grasps of all batches together, report them to the observer, and return them."""
     grasps = rank_together(batches, request.order)
-    request.tell(
-        "refine", f"{len(grasps)} refined: {describe(count_status(grasps.status))}", grasps
-    )
+    counts = describe(count_status(grasps.status))
+    request.tell("refine", f"{len(grasps)} refined: {counts}", grasps)
     return grasps
 
 
-def _plan_batches(request: Request) -> Iterator[Grasps]:
-    """Yield the grasps of each batch in the frame of the request; several sets of fingers give a
-    single batch.
+def plan_hand(objects: Objects, deadline: float) -> Iterator[Grasps]:
+    """Yield the grasps of each batch of a single object, with relaxed constraints if need be."""
+    batches = (grasps for (grasps,) in plan_objects(objects, deadline))
+    yield from relax(objects, batches, deadline)
+
+
+def relax(objects: Objects, batches: Iterator[Grasps], deadline: float) -> Iterator[Grasps]:
+    """Yield batches of a single object; if no grasp is likely to hold, plan with relaxed constraints.
+
+    A contact set must be flat within the largest of `FLAT_RADII` that the object allows, which can
+    leave few contacts. With relaxed constraints the hand may begin above its pose, too, and go down
+    while it closes (`opened_pose`). The failed grasps are those of the last constraints
+    (`ContactSpec.relaxed`).
     """
-    deadline = math.inf if request.time_budget is None else time.monotonic() + request.time_budget
+    failed = list[Grasps]()
+    best = 0.0
+    relaxed = objects.relaxed_specs()
+    while True:
+        failed.clear()
+        for grasps in batches:
+            good = grasps[executable(grasps)]
+            failed.append(grasps)
+            if len(good):
+                best = max(best, float(torch.sigmoid(good.score).max()))
+                yield from failed
+                failed.clear()
+        if best > LIKELY or objects.buried or time.monotonic() >= deadline:
+            break
+        spec = next(relaxed, None)
+        if spec is None:
+            break
+        objects = objects.posed_again(
+            objects.request, objects.hand, spec, objects.postures, descends=True
+        )
+        batches = (grasps for (grasps,) in plan_objects(objects, deadline))
+    yield from failed
+
+
+def _plan_batches(request: Request) -> Iterator[Grasps]:
+    """Yield the grasps of each batch in the request's frame; sets of fingers give one batch."""
+    deadline = math.inf
+    if request.time_budget is not None:
+        deadline = time.monotonic() + request.time_budget
     hands = request.hands
-    problem = Problem.of(request, hands[0])
+    objects = pose_request(request, hands[0])
     if len(hands) == 1:
-        for grasps in plan_hand(problem, deadline):
-            yield problem.give_back(grasps)
+        for grasps in plan_hand(objects, deadline):
+            yield objects.give_back(grasps)
     else:
-        yield _plan_sets(problem, hands, deadline)
+        yield _plan_sets(objects, hands, deadline)
 
 
-def _plan_sets(problem: Problem, hands: tuple[Hand, ...], deadline: float) -> Grasps:
+def _plan_sets(objects: Objects, hands: tuple[Hand, ...], deadline: float) -> Grasps:
     """Return the grasps of the set of fingers whose expected success is greatest.
 
     All sets share the remaining time. The observer is called with "fingers" after each set, then
     with the stages of the best set.
     """
-    best = None
-    asked = problem.request
+    asked = objects.request
+    best: tuple[float, Grasps, list[tuple[str, str, Any]]] | None = None
     for left, hand in zip(range(len(hands), 0, -1), hands, strict=True):
         stages = list[tuple[str, str, Any]]()
-        request = dataclasses.replace(problem.request, observer=lambda *stage: stages.append(stage))  # noqa: B023
-        problem = problem.replace(
-            "flat", "drawn", request=request, hand=settle_hand(hand, problem.shape.device)
-        )
+        # the stages are heard at once, so the list is the loop's own
+        request = dataclasses.replace(asked, observer=lambda *stage: stages.append(stage))  # noqa: B023
+        own = objects.posed_again(request, hand)
         now = time.monotonic()
-        batches = list(plan_hand(problem, now + (deadline - now) / left))
-        grasps = problem.give_back(rank_together(batches, problem.request.order))
+        batches = list(plan_hand(own, now + (deadline - now) / left))
+        grasps = own.give_back(rank_together(batches, asked.order))
         expected = expected_success(grasps)
         count = int((grasps.status == Status.OK).sum())
-        asked.tell(
-            "fingers",
-            f"{', '.join(hand.finger_names)}: {count} executable, {expected:.0%} expected",
-            grasps,
-        )
+        names = ", ".join(hand.finger_names)
+        asked.tell("fingers", f"{names}: {count} executable, {expected:.0%} expected", grasps)
         if best is None or expected > best[0]:
             best = expected, grasps, stages
     assert best is not None
-    for stage in best[2]:
+    _, grasps, stages = best
+    for stage in stages:
         asked.tell(*stage)
-    return best[1]
-
-
-def expected_success(grasps: Grasps, best: int = BEST) -> float:
-    """Return the mean predicted success of the `best` best executable grasps; 0 for each grasp that
-    is missing.
-    """
-    likely = torch.where(grasps.status == Status.OK, torch.sigmoid(grasps.score), 0.0)
-    return float(likely.sort(descending=True).values[:best].sum()) / best
+    return grasps

@@ -1,41 +1,59 @@
-"""The sizes of the planner's batches, each larger than the last, so that the first grasps come
-early.
-"""
+"""The sizes of the planner's batches, each larger than the last: the first grasps come early."""
 
+import dataclasses
 from typing import NamedTuple
 
-FIRST = 8  # contact sets that the hand tries in the first batch
-TRIED = 250
-TRIED_IN_SCENE = 160
-"""Most contact sets that the hand tries: fewer in a scene, because there it tries more postures for
-each set.
-"""
-OFFERED = 4  # planned rows for each row that the hand tries
+from torchgrasp.values.specs import Mode
+
+
+@dataclasses.dataclass(frozen=True)
+class ScheduleNumbers:
+    """The numbers of the batches."""
+
+    first: int = 8
+    """Contact sets that the hand tries in the first batch."""
+    growth: int = 6
+    """Ratio of the sizes of successive batches."""
+    tried: int = 250
+    """Most contact sets that the hand tries."""
+    tried_in_scene: int = 160
+    """The same in a scene: fewer, because there the hand tries more postures for each set."""
+    offered: int = 4
+    """Planned rows for each row that the hand tries."""
+
+
+SCHEDULE = ScheduleNumbers()
 
 
 class BatchSize(NamedTuple):
-    """The size of one batch: the number of new initial guesses, and of contact sets that the hand
-    tries.
-    """
+    """The size of one batch: new initial guesses, and contact sets that the hand tries."""
 
     starts: int
     tried: int
 
 
-def schedule(starts: int, most: int) -> list[BatchSize]:
-    """Return batches with `starts` guesses and `most` contact sets in all; a small remainder joins
-    the last batch.
+def batch_sizes(mode: Mode, starts: int, crowded: bool) -> list[BatchSize]:
+    """Return the sizes of the batches; modes other than "joint" have one. `crowded`: in a scene."""
+    most = SCHEDULE.tried_in_scene if crowded else SCHEDULE.tried
+    return schedule(starts, most) if mode == "joint" else [BatchSize(starts, most)]
+
+
+def schedule(starts: int, most: int, numbers: ScheduleNumbers = SCHEDULE) -> list[BatchSize]:
+    """Return batches with `starts` guesses and `most` contact sets in all.
+
+    A small remainder joins the last batch.
     """
-    growth = 6  # ratio of the sizes of successive batches
     batches = list[BatchSize]()
-    size = FIRST
+    size = numbers.first
     most = min(most, starts)
-    tried = planned = 0
+    tried = 0
+    planned = 0
     while tried < most:
         size = size if most - tried >= 2 * size else most - tried
         tried += size
-        further = min(starts, max(OFFERED * tried, starts * tried // most)) - planned
+        wanted = max(numbers.offered * tried, starts * tried // most)
+        further = min(starts, wanted) - planned
         batches.append(BatchSize(further, size))
-        planned = planned + further
-        size = growth * size
+        planned += further
+        size *= numbers.growth
     return batches

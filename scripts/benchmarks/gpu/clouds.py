@@ -16,7 +16,7 @@ from torchgrasp import ContactSpec, Grasps, PointCloud, Status, load_hand, plan_
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.jobs import pack, run_tasks, unpack
 from torchgrasp.planner.many import estimate_shapes, plan_stacks
-from torchgrasp.planner.problem import Problem
+from torchgrasp.planner.objects import Problem
 from torchgrasp.planner.request import Request
 
 Result = TypeVar("Result")

@@ -25,7 +25,7 @@ from torchgrasp.foundation.rules import Count
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import hand_of
-from torchgrasp.planner.problem import digest
+from torchgrasp.planner.objects import digest
 from torchgrasp.values.planning import Grasps, PointCloud
 from torchgrasp.values.specs import ContactSpec, TrialSpec
 

@@ -38,8 +38,8 @@ from torchgrasp.hand.load import hand_of
 from torchgrasp.planner.explain import explain_empty
 from torchgrasp.planner.graspable import judge_things
 from torchgrasp.planner.grasps import plan_grasps
-from torchgrasp.planner.problem import take_target
-from torchgrasp.planner.scene import plan_scene
+from torchgrasp.planner.objects import take_target
+from torchgrasp.planner.scene_plan import plan_scene
 from torchgrasp.scene.file import read_scene
 from torchgrasp.scene.image import is_scene
 from torchgrasp.scene.masks import label_again

@@ -6,20 +6,22 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from typing_extensions import Unpack
-
+from torchgrasp.arm.arm import Arm
 from torchgrasp.data.accept import HandLike, SceneLike, as_hand, as_scene
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, FailedRows, GraspError, Status
 from torchgrasp.foundation.rules import Count, Fraction, Measured, Seed
 from torchgrasp.foundation.threads import single_threaded
+from torchgrasp.hand.hand_toml import Fingers
+from torchgrasp.ik.candidates import Reachable
 from torchgrasp.planner.explain import Funnel
 from torchgrasp.planner.graspable import is_vague, judge_things, order_by_ease
 from torchgrasp.planner.grasps import plan_grasps
-from torchgrasp.planner.request import SceneOptions, finger_sets, show_options
+from torchgrasp.planner.request import Promised, Where, finger_sets
 from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.success.task import GraspTask, Resist
 from torchgrasp.values.planning import Grasps
 from torchgrasp.values.specs import ContactSpec
 
@@ -66,7 +68,6 @@ class ScenePlan(Value):
         return next((thing for thing in self.things if thing.grasps is not None), None)
 
 
-@show_options
 @checked
 @single_threaded
 def plan_scene(
@@ -77,7 +78,14 @@ def plan_scene(
     seed: Seed = 0,
     *,
     enough: Fraction = 1.0,
-    **options: Unpack[SceneOptions],
+    fingers: Fingers | None = None,
+    task: GraspTask | None = None,
+    promise: Promised | None = None,
+    reachable: Reachable | None = None,
+    arm: Arm | None = None,
+    keep: Where | None = None,
+    avoid: Where | None = None,
+    resist: Resist | None = None,
 ) -> ScenePlan:
     """Plan grasps of the objects of a scene, and rank the objects by predicted success.
 
@@ -103,8 +111,22 @@ def plan_scene(
     hand = as_hand(hand, "hand")
     if not scene.things:
         raise BadArgument("scene", "no object on the table", "a scene with at least one object")
-    finger_sets(hand, options.get("fingers"))  # raises for unknown fingers
-    plan = functools.partial(plan_grasps, hand=hand, spec=spec, starts=starts, seed=seed, **options)
+    finger_sets(hand, fingers)  # raises for unknown fingers
+    plan = functools.partial(
+        plan_grasps,
+        hand=hand,
+        spec=spec,
+        starts=starts,
+        seed=seed,
+        fingers=fingers,
+        task=task,
+        promise=promise,
+        reachable=reachable,
+        arm=arm,
+        keep=keep,
+        avoid=avoid,
+        resist=resist,
+    )
     plans: list[ThingPlan] = []
     judged = judge_things(scene, hand, spec)
     for label in order_by_ease(scene):

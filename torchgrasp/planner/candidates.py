@@ -1,0 +1,374 @@
+"""The rows of a plan: contact sets that the hand tries, and what happened to each, as a status."""
+
+import dataclasses
+import enum
+from collections.abc import Callable, Iterator, Sequence
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchgrasp.contacts.certify import certify
+from torchgrasp.contacts.plan import plan_chunk, stages_for
+from torchgrasp.contacts.problem import rows_of
+from torchgrasp.contacts.resist import resist_loads
+from torchgrasp.contacts.starts import STARTS_PER_CHUNK
+from torchgrasp.foundation.base import at_once, join, lexical_order, rank_in_group
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import Status
+from torchgrasp.foundation.rules import Count
+from torchgrasp.geometry.linalg import farthest_points
+from torchgrasp.ik.attempts import assign, seed_costs
+from torchgrasp.ik.seeds import nearest_postures, query_mixture
+from torchgrasp.planner.objects import CloudIndex, Objects
+from torchgrasp.posture_model.mixture import PAPER_ENERGY
+from torchgrasp.success.loads import lever_arm, strength_of
+from torchgrasp.values.planning import Certificate, ContactPlan, Contacts, Grasps, IKSeeds
+
+
+class Row(enum.IntEnum):
+    """What happened to a row so far."""
+
+    SEEDED = 0
+    """It has force closure and initial hand postures, and waits."""
+    BEGUN = 1
+    """A few solver steps on its fixed contacts failed."""
+    STUCK = 2
+    """All solver steps on its fixed contacts failed."""
+    ENDED = 3
+    """Its grasp is executable, or failed with sliding contacts, too."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ChoiceNumbers:
+    """The numbers by which contact sets are chosen for the hand."""
+
+    likely: int = 2
+    """Farthest-point sampling takes n sets from the `likely` * n sets of the lowest cost."""
+    weak: float = 1e6
+    """Cost of sets that resist less than the task's loads: above all other costs."""
+    tried: int = 2
+    """Seeds of a set that its cost looks at: as many as the solver refines."""
+    lever: float = 0.3
+    """Weight of the load's lever arm beside the fingertips' errors, both as logarithms."""
+    short: float = 0.1
+    """Lever arm [in object sizes] below which a shorter one hardly counts."""
+    touching: float = 1e-3
+    """Squared errors [mm2] below which seeds count as equally near."""
+
+
+CHOICE = ChoiceNumbers()
+
+
+@dataclasses.dataclass(frozen=True)
+class Candidates:
+    """The rows of a plan: b contact sets with force closure, and what happened to each.
+
+    `load` is the wrench [N, N m] of the task, about the centroid, that the greatest forces resist
+    the least. `seeds` are initial hand postures, each with the index of its row. `cost` ranks rows
+    that wait. `cloud` is the index of the row's object, `status` a `Row`, and `turn` the number of
+    the batch in which it was first tried, or 0. `grasp` is the index of a tried row's best grasp in
+    `grasps`, or -1.
+    """
+
+    contacts: Contacts
+    certificate: Certificate
+    seeds: IKSeeds
+    load: Float[Tensor, "b 6"]
+    cost: Float[Tensor, "b"]
+    cloud: CloudIndex
+    status: Int[Tensor, "b"]
+    turn: Int[Tensor, "b"]
+    grasp: Int[Tensor, "b"]
+    grasps: Grasps | None = None
+
+    @classmethod
+    def of(
+        cls,
+        contacts: Contacts,
+        certificate: Certificate,
+        seeds: IKSeeds,
+        load: Float[Tensor, "b 6"],
+        cost: Float[Tensor, "b"],
+        cloud: CloudIndex,
+    ) -> "Candidates":
+        """Return rows that wait."""
+        zero = torch.zeros_like(cloud)
+        return cls(
+            contacts, certificate, seeds, load, cost, cloud, zero + Row.SEEDED, zero, zero - 1
+        )
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self.cloud)
+
+    def find(self, status: Row, clouds: Bool[Tensor, "c"] | None = None) -> Int[Tensor, "k"]:
+        """Return the rows with a status, of some clouds, in the order in which they were tried."""
+        chosen = self.status == status
+        if clouds is not None:
+            chosen = chosen & clouds[self.cloud]
+        rows = torch.nonzero(chosen)[:, 0]
+        return rows[torch.argsort(self.turn[rows], stable=True)]
+
+    def select(self, rows: Int[Tensor, "k"]) -> tuple[Contacts, Certificate, IKSeeds]:
+        """Return contacts, certificates and seeds of k rows; the seeds' rows count these k."""
+        number = rows.new_full((len(self),), -1)
+        number[rows] = torch.arange(len(rows), device=rows.device)
+        seeds = self.seeds[number[self.seeds.row] >= 0]
+        seeds = seeds[torch.argsort(number[seeds.row], stable=True)]
+        seeds = dataclasses.replace(seeds, row=number[seeds.row])
+        return self.contacts[rows], self.certificate[rows], seeds
+
+    def begin(self, rows: Int[Tensor, "k"], turn: int) -> "Candidates":
+        """Return the rows after some of them were chosen in the batch `turn`."""
+        return dataclasses.replace(self, turn=self.turn.index_fill(0, rows, turn))
+
+    def put(self, rows: Int[Tensor, "k"], grasps: Grasps, status: Int[Tensor, "k"]) -> "Candidates":
+        """Return the rows after `rows` got their best grasps so far, and a status each."""
+        before = 0 if self.grasps is None else len(self.grasps)
+        index = torch.arange(before, before + len(rows), device=rows.device)
+        return dataclasses.replace(
+            self,
+            status=self.status.index_copy(0, rows, status),
+            grasp=self.grasp.index_copy(0, rows, index),
+            grasps=grasps if self.grasps is None else join([self.grasps, grasps]),
+        )
+
+    def best(self, rows: Int[Tensor, "k"]) -> Grasps:
+        """Return the best grasps of rows that were tried."""
+        assert self.grasps is not None
+        return self.grasps[self.grasp[rows]]
+
+
+def join_candidates(parts: Sequence[Candidates]) -> Candidates:
+    """Return several groups of rows as one group, in order; only the first may have been tried."""
+    first = 0
+    seeds = list[IKSeeds]()
+    for part in parts:
+        seeds.append(dataclasses.replace(part.seeds, row=part.seeds.row + first))
+        first += len(part)
+    columns = ("load", "cost", "cloud", "status", "turn", "grasp")
+    return Candidates(
+        contacts=join([part.contacts for part in parts]),
+        certificate=join([part.certificate for part in parts]),
+        seeds=join(seeds),
+        grasps=parts[0].grasps,
+        **{name: torch.cat([getattr(part, name) for part in parts]) for name in columns},
+    )
+
+
+def draw(objects: Objects, sizes: Sequence[int]) -> Iterator[tuple[ContactPlan, CloudIndex]]:
+    """Yield for each batch the contact plan of its initial guesses, and the cloud of each row.
+
+    A CPU plans batch by batch. An accelerator plans all batches before the first, because each
+    launch costs it more than further rows.
+    """
+    starts = torch.stack(objects.starts)  # (c, s, f, 3)
+    clouds = len(objects)
+    groups = [[size] for size in sizes] if objects.device.type == "cpu" else [list(sizes)]
+    begin = 0
+    for group in groups:
+        count = sum(group)
+        first = starts[:, begin : begin + count].flatten(0, 1).to(objects.device)
+        cloud = torch.arange(clouds, device=objects.device).repeat_interleave(count)
+        begin += count
+        most = at_once(first, STARTS_PER_CHUNK)
+        parts = [
+            plan_chunk(
+                rows_of(objects.shape, own),
+                objects.constraints.rows(own),
+                part,
+                stages_for(objects.spec),
+            )
+            for part, own in zip(first.split(most), cloud.split(most), strict=True)
+        ]
+        plan = join(parts)
+        index = torch.arange(clouds * count, device=objects.device).view(clouds, count)
+        for rows in index.split(group, 1):
+            yield plan[rows.flatten()], cloud[rows.flatten()]
+
+
+def find_candidates(
+    objects: Objects,
+    plan: ContactPlan,
+    cloud: CloudIndex,
+    most: int,
+    note: Callable[..., None],
+) -> Candidates:
+    """Choose at most `most` planned contact sets of each cloud, far apart; return the closed ones.
+
+    In mode "paper" with ranking "variance" all sets are chosen, the most certain first. `note` is
+    called with the results of the stages "plan", "certify" and "query". Sets that not even the
+    greatest forces could hold have failed.
+    """
+    request = objects.request
+    load = plan.contacts.points.new_zeros(len(plan), 6)
+    if objects.loads is not None:
+        plan, load = _drop_weak(objects, plan, cloud, load)
+    note("plan", plan)
+    if request.mode == "paper" and request.order == "variance":
+        variance = plan.contacts.variance
+        assert variance is not None
+        rows = torch.nonzero(plan.status == Status.OK)[:, 0]
+        rows = rows[torch.argsort(variance[rows].sum(1), stable=True)]
+    else:
+        rows = _spread(plan, cloud, most, len(objects))
+    certificate = certify(plan.contacts[rows], objects.spec)
+    closed = torch.nonzero(certificate.closed)[:, 0]
+    certificate = certificate[closed]
+    kept = rows[closed]
+    contacts = plan.contacts[kept]
+    note("certify", certificate, offered=len(rows))
+    seeds = find_seeds(objects, contacts, cloud[kept])
+    note("query", seeds)
+    cost = torch.zeros_like(certificate.margin)
+    return Candidates.of(contacts, certificate, seeds, load[kept], cost, cloud[kept])
+
+
+def _drop_weak(
+    objects: Objects, plan: ContactPlan, cloud: CloudIndex, load: Float[Tensor, "b 6"]
+) -> tuple[ContactPlan, Float[Tensor, "b 6"]]:
+    """Return the plan, in which sets that cannot resist the task have failed, and the worst loads."""
+    assert objects.loads is not None
+    rows = torch.nonzero(plan.status == Status.OK)[:, 0]
+    points = plan.contacts.points[rows]
+    normals = plan.contacts.normals[rows]
+    full = torch.full_like(points[..., 0], objects.strongest)
+    proof = resist_loads(points, normals, full, objects.loads[cloud[rows]], objects.spec)
+    weak = rows[~(proof.margin >= 1)]
+    status = plan.status.index_fill(0, weak, int(Status.NOT_RESISTED))
+    return dataclasses.replace(plan, status=status), load.index_copy(0, rows, proof.load)
+
+
+def _spread(plan: ContactPlan, cloud: CloudIndex, most: int, clouds: int) -> Int[Tensor, "k"]:
+    """Return at most `most` successful contact sets of each cloud that lie far apart."""
+    solved = torch.nonzero(plan.status == Status.OK)[:, 0]
+    own = by_cloud(cloud[solved], clouds)
+    if max(map(len, own)) > most:  # the host chooses
+        found = plan[solved].to("cpu")
+        own = [rows[spread_rows(found[rows], most)] for rows in own]
+    return solved[torch.cat(own).to(solved.device)]
+
+
+@checked
+def spread_rows(plan: ContactPlan, most: Count) -> Int[Tensor, "k"]:
+    """Return at most `most` successful rows of a plan that lie far apart, in ascending order."""
+    rows = torch.nonzero(plan.status == Status.OK)[:, 0]
+    if len(rows) <= most:
+        return rows
+    first = int(plan.quality[rows].argmin())
+    points = sorted_points(plan.contacts[rows])
+    return rows[farthest_points(points, most, first=first).sort().values]
+
+
+def find_seeds(objects: Objects, contacts: Contacts, cloud: CloudIndex) -> IKSeeds:
+    """Return initial hand postures near contacts.
+
+    In mode "joint" they are random postures, in other modes those of the learned model.
+    """
+    mixture = objects.model[0]
+    if mixture is None:
+        world = objects.world.rows(cloud)
+        return nearest_postures(objects.library, contacts, world, reachable=objects.reachable)
+    if objects.request.mode == "paper":
+        return query_mixture(objects.hand, contacts, mixture, n_seeds=1, max_energy=PAPER_ENERGY)
+    return query_mixture(objects.hand, contacts, mixture)
+
+
+def with_costs(objects: Objects, found: Candidates, numbers: ChoiceNumbers = CHOICE) -> Candidates:
+    """Return the rows with their costs: large if the hand misses them, or the load's arm is long.
+
+    If grasps must resist loads, the seeds in which the fingers resist the most come first, and rows
+    without a seed that resists all loads cost more than all other rows. A row without seeds has an
+    infinite cost.
+    """
+    contacts = found.contacts
+    seeds = found.seeds
+    weak = torch.zeros_like(found.certificate.margin)
+    if objects.loads is not None:
+        touched = assign(contacts, seeds)
+        strength = strength_of(objects.hand, seeds, touched, objects.strongest)
+        arms = touched.points - touched.points.mean(1, keepdim=True)
+        load = found.load[seeds.row, None]
+        proof = resist_loads(arms, touched.normals, strength, load, objects.spec)
+        share = proof.margin.clamp(max=1)
+        weak = weak.scatter_reduce(0, seeds.row, share, "amax")
+        weak = torch.where(weak < 1, numbers.weak * (2 - weak), 0.0)
+        seeds = seeds[lexical_order(seeds.row, -share)]
+    first = seeds[rank_in_group(seeds.row) < numbers.tried]
+    reach = objects.reach(contacts, found.certificate, found.cloud)
+    residual = seed_costs(reach, first)
+    least = torch.full((len(contacts),), torch.inf, dtype=residual.dtype, device=residual.device)
+    least = least.scatter_reduce(0, first.row, residual, "amin")
+    arm = lever_arm(contacts.points, objects.body.rows(found.cloud).center)
+    missed = least.clamp_min(numbers.touching).log()
+    cost = missed + numbers.lever * (arm + numbers.short).log() + weak
+    return dataclasses.replace(found, seeds=seeds, cost=cost)
+
+
+def choose(
+    rows: Candidates, most: int, clouds: int, numbers: ChoiceNumbers = CHOICE
+) -> Int[Tensor, "k"]:
+    """Return at most `most` of each cloud's cheapest waiting rows, far from each other.
+
+    They lie far from rows that were chosen before, too. Farthest-point sampling runs for all clouds
+    at once, on their device.
+    """
+    if not len(rows):
+        return rows.cloud
+    points = sorted_points(rows.contacts)
+    before = torch.nonzero(rows.turn > 0)[:, 0]
+    cost = rows.cost.index_fill(0, before, torch.inf)
+    # the cheapest rows of each cloud, (c, m)
+    table, held = _table(rows.cloud, clouds)
+    least, order = torch.where(held, cost[table], torch.inf).sort(dim=1, stable=True)
+    index = table.gather(1, order)[:, : numbers.likely * most]
+    likely = _are_likely(least[:, : numbers.likely * most], most, numbers)
+    x = points[index]  # (c, m, 3 f)
+    nearest = torch.full_like(likely, torch.inf, dtype=x.dtype)
+    if len(before):
+        earlier, held = _table(rows.cloud[before], clouds)  # (c, e)
+        gaps = (x[:, :, None] - points[before[earlier]][:, None]).square().sum(-1)  # (c, m, e)
+        nearest = torch.where(held[:, None], gaps, torch.inf).amin(2)
+    picks = list[Tensor]()
+    for _ in range(min(most, index.shape[1])):
+        # the first of the largest
+        picks.append(torch.where(likely, nearest, -1.0).argmax(1, keepdim=True))
+        one = x.gather(1, picks[-1][..., None].expand(-1, -1, x.shape[2]))
+        nearest = torch.minimum(nearest, (x - one).square().sum(-1))
+    chosen = index.gather(1, torch.cat(picks, 1))
+    known = torch.arange(chosen.shape[1], device=index.device) < likely.sum(1, keepdim=True)
+    chosen = torch.where(known, chosen, len(rows)).sort(1).values.flatten()
+    return chosen[torch.nonzero(chosen < len(rows))[:, 0]]
+
+
+def _are_likely(
+    cost: Float[Tensor, "*c m"], most: int, numbers: ChoiceNumbers
+) -> Bool[Tensor, "*c m"]:
+    """Return for sorted costs a mask of rows to choose from.
+
+    Beyond the first `most` only those that resist the task's loads are.
+    """
+    needed = torch.arange(cost.shape[-1], device=cost.device) < most
+    return torch.isfinite(cost) & ((cost < numbers.weak) | needed)
+
+
+def _table(cloud: CloudIndex, clouds: int) -> tuple[Int[Tensor, "c m"], Bool[Tensor, "c m"]]:
+    """Return the rows of each cloud in their order, and a mask of the places that hold one."""
+    count = torch.bincount(cloud, minlength=clouds)
+    table = cloud.new_zeros(clouds, int(count.max()))
+    table[cloud, rank_in_group(cloud)] = torch.arange(len(cloud), device=cloud.device)
+    return table, torch.arange(table.shape[1], device=cloud.device) < count[:, None]
+
+
+def by_cloud(cloud: CloudIndex, clouds: int) -> list[Int[Tensor, "k"]]:
+    """Return the indices of the rows of each cloud, in their order, on the CPU."""
+    cloud = cloud.cpu()
+    count = torch.bincount(cloud, minlength=clouds)
+    return list(torch.argsort(cloud, stable=True).split(count.tolist()))
+
+
+def sorted_points(contacts: Contacts) -> Float[Tensor, "b d"]:
+    """Return each contact set as one vector of 3 f coordinates, its contacts sorted by height."""
+    order = torch.argsort(contacts.points[..., 2], dim=1, stable=True)
+    return contacts.points.gather(1, order[..., None].expand(-1, -1, 3)).flatten(1)

@@ -1,0 +1,435 @@
+"""The objects of a plan: a batch of c objects, derived once, in three steps: seen, shaped, posed.
+
+`ShapedObject.of` takes the first two steps, which know neither hand nor constraints. `pose` takes
+the third step for one object. `join_objects` makes a batch of posed objects on one device.
+"""
+
+import dataclasses
+import functools
+import hashlib
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchgrasp.arm.reach import reach_poses, with_arm
+from torchgrasp.cloud.check import FEW_POINTS, remove_duplicates
+from torchgrasp.cloud.neighbours import is_flat
+from torchgrasp.contacts.problem import ContactProblem, ShapeLike, rows_of
+from torchgrasp.contacts.region import seen_from
+from torchgrasp.contacts.starts import (
+    check_starts,
+    drawn_starts,
+    settle_flatness,
+    start_chunks,
+)
+from torchgrasp.files import sha256
+from torchgrasp.foundation.base import settle
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import Seed
+from torchgrasp.geometry.field_batch import FieldBatch
+from torchgrasp.geometry.frames import inverse
+from torchgrasp.geometry.plane import Plane, move, round_upright, upright_frame
+from torchgrasp.hand.hand import Hand
+from torchgrasp.ik.candidates import GraspProblem, Reachable, ask_reachable
+from torchgrasp.ik.clearance import CollisionWorld, Obstacles
+from torchgrasp.ik.joint import JointProblem
+from torchgrasp.ik.motion import lift_clearance
+from torchgrasp.ik.seeds import PostureLibrary
+from torchgrasp.planner.request import Request
+from torchgrasp.planner.schedule import BatchSize, batch_sizes
+from torchgrasp.posture_model.mixture import GraspMixture, load_mixture, mixture_path
+from torchgrasp.scene.occupancy import Occupancy, estimate_occupancy
+from torchgrasp.scene.scene import Scene
+from torchgrasp.shape.batch import ShapeBatch
+from torchgrasp.shape.completion.silhouette import silhouettes
+from torchgrasp.shape.fit import FitOptions, fit_upright
+from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.surface import Mesh, collision_field, extract_mesh
+from torchgrasp.success.body import EstimatedBody
+from torchgrasp.success.features import GRIP
+from torchgrasp.success.promise import describe_promise
+from torchgrasp.success.task import loads_of
+from torchgrasp.values.planning import Certificate, Contacts, Grasps, PointCloud
+from torchgrasp.values.specs import ContactSpec
+
+TARGET_POINTS = 1000
+"""Most points of a scene's target that are used: they lie a few millimetres apart."""
+BURIED = 0.003
+"""Depth [m] by which a rising object may enter obstacles further than at rest: noise of the grid."""
+
+CloudIndex = Int[Tensor, "b"]
+"""The index of the cloud to which each row belongs."""
+Model = tuple[GraspMixture | None, str]
+"""The learned mixture of a mode that uses one, and the SHA-256 of its file or "none"."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ShapedObject:
+    """One object as it was seen, and its estimated shape, in an upright frame (z axis up).
+
+    `cloud` is in the caller's frame, all else in the upright frame. `table` is the table that the
+    caller or the scene names, in the caller's frame. `vague` tells that the cloud hardly shows the
+    object: few points, one plane, or a part beyond the image border.
+    """
+
+    cloud: PointCloud
+    scene: Scene | None
+    table: Plane | float | None
+    obj_from_upright: Float[Tensor, "4 4"]
+    shape: ShapeGP
+    surface: Mesh
+    body: EstimatedBody
+    vague: bool
+    occupancy: Occupancy | None
+
+    @classmethod
+    def of(cls, request: Request) -> "ShapedObject":
+        """Find the object of a request and its upright frame, and estimate its shape."""
+        # seen: the object's points, the table, and the frame in which z points up
+        cloud = request.cloud
+        spec = request.contact_spec
+        scene = None
+        if isinstance(cloud, Scene):
+            scene = cloud
+            cloud = take_target(scene, request.seed)
+            spec = dataclasses.replace(
+                spec, table=scene.table if spec.table is None else spec.table
+            )
+        cloud = remove_duplicates(cloud)
+        frame = upright_frame(cloud.points, cloud.viewpoint, spec.plane)
+        # shaped: the Gaussian process, its surface and the distances from the surface
+        shape = request.shape
+        if shape is None:
+            options = FitOptions(support="paper" if request.mode == "paper" else "camera")
+            floor = None if spec.table is None else 0.0
+            shape = fit_upright(round_upright(cloud, frame), request.seed, floor, options)
+        else:
+            shape = shape.moved(inverse(frame))
+        surface = extract_mesh(shape)
+        body = EstimatedBody.around(shape, surface.vertices, collision_field(shape, surface))
+        # the surroundings of a scene's target
+        occupancy = None
+        if scene is not None:
+            scene = scene.to_upright(frame)
+            if scene.target is not None:
+                occupancy = estimate_occupancy(scene, scene.target)
+        return cls(
+            cloud, scene, spec.table, frame, shape, surface, body, is_vague_cloud(cloud), occupancy
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Objects:
+    """A batch of c objects, and what a hand may do with them; they share request and hand.
+
+    `given_spec` are the constraints in the caller's frame; `specs` are those of each object in its
+    upright frame, with a known flat radius. `sizes` are those of the plan's batches. `starts` holds
+    the initial guesses of each object,
+    (s, f, 3) in normalised units. The fields from `shape` on have one row for each object, or are
+    the values of a single object. A hand that `descends` may go down while it closes. `postures`
+    is the size of the posture library. `buried`: obstacles prevent that the object is lifted.
+    """
+
+    request: Request
+    hand: Hand
+    given_spec: ContactSpec
+    specs: tuple[ContactSpec, ...]
+    each: tuple[ShapedObject, ...]
+    sizes: tuple[BatchSize, ...]
+    starts: tuple[Float[Tensor, "s f 3"], ...]
+    shape: ShapeLike
+    constraints: ContactProblem
+    body: EstimatedBody
+    world: CollisionWorld
+    loads: Float[Tensor, "c w 6"] | None
+    model: Model
+    buried: bool = False
+    descends: bool = False
+    postures: int | None = None
+
+    def __len__(self) -> int:
+        """Return the number of objects."""
+        return len(self.each)
+
+    @property
+    def device(self) -> torch.device:
+        """The device of the objects."""
+        return self.body.center.device
+
+    @property
+    def spec(self) -> ContactSpec:
+        """The constraints of the first object; those of the others differ in the flat radius."""
+        return self.specs[0]
+
+    @property
+    def strongest(self) -> float:
+        """The greatest normal force [N] of a finger in the task."""
+        task = self.request.grasp_task
+        return task.pressing(task.lifts(self.spec.plane)) or GRIP
+
+    @property
+    def library(self) -> PostureLibrary:
+        """Random postures of the hand; the hand keeps them."""
+        hand = settle_hand(self.hand, self.each[0].shape.device)
+        return settle(PostureLibrary.of(hand, self.postures, self.request.seed), self.device)
+
+    @property
+    def reachable(self) -> Reachable | None:
+        """The function that says which hand poses arm and user accept, in the upright frame."""
+        arm = self.request.arm
+        frame = self.each[0].obj_from_upright
+        by_arm = None if arm is None else functools.partial(reach_poses, arm)
+        asked = [x for x in (self.request.reachable, by_arm) if x is not None]
+        if not asked:
+            return None
+        return lambda poses: torch.stack(
+            [ask_reachable(x, frame.to(poses) @ poses) for x in asked]
+        ).all(0)
+
+    def relaxed_specs(self) -> Iterator[ContactSpec]:
+        """Yield relaxed constraints of a single object, in the caller's frame."""
+        radius = float(self.hand.tips.radius.max())
+        return iter(self.given_spec.relaxed(self.spec.ring_radius, radius))
+
+    def posed_again(
+        self,
+        request: Request,
+        hand: Hand,
+        spec: ContactSpec | None = None,
+        postures: int | None = None,
+        descends: bool = False,
+    ) -> "Objects":
+        """Return the same single object for another request, hand or contact constraints."""
+        (object_,) = self.each
+        return pose(object_, request, hand, self.model, spec, postures, descends)
+
+    def reach(
+        self, contacts: Contacts, certificate: Certificate, cloud: CloudIndex
+    ) -> GraspProblem:
+        """Return the problem of moving the hand onto b contact sets with their certificates."""
+        center = self.body.rows(cloud).center
+        world = self.world.rows(cloud)
+        return GraspProblem(
+            self.hand, contacts, certificate, world, center, self.reachable, self.descends
+        )
+
+    def slide(self, cloud: CloudIndex) -> JointProblem:
+        """Return the problem of hand and sliding contacts together, for b rows."""
+        constraints = self.constraints.rows(cloud)
+        return JointProblem(
+            self.hand, rows_of(self.shape, cloud), constraints, self.world.rows(cloud)
+        )
+
+    def on_arm(self, grasps: Grasps) -> Grasps:
+        """Return grasps with the arm's postures, if there is an arm; unreachable ones have failed."""
+        arm = self.request.arm
+        if arm is None:
+            return grasps
+        frame = self.each[0].obj_from_upright
+        arm = settle(arm.moved(inverse(frame)), self.device)
+        # the third row is the caller's z axis, along which the arm lifts without a table
+        return with_arm(arm, self.hand, grasps, self.world, frame[2, :3])
+
+    def tell(self, stage: str, message: str, value: Any) -> None:
+        """Report a stage to the observer, with its result in the caller's frame."""
+        if self.request.observer is not None:
+            self.request.observer(stage, message, self._moved(value))
+
+    def give_back(self, grasps: Grasps) -> Grasps:
+        """Return grasps of a single object in the caller's frame, on the device of its cloud.
+
+        Their metadata name the frames, units and inputs of the plan.
+        """
+        request = self.request
+        spec = self.given_spec
+        (object_,) = self.each
+        meta = {
+            "hand": self.hand.name,
+            "hand_sha256": self.hand.source.sha256,
+            "cloud_sha256": digest(object_.cloud),
+            "joint_names": ",".join(self.hand.joint_names),
+            "finger_names": ",".join(self.hand.finger_names),
+            "frames": (
+                "obj: the frame of the cloud; hand: the base link of the hand's URDF; "
+                "a_from_b maps b into a"
+            ),
+            "units": "metre, radian",
+            "unit_m": repr(float(object_.shape.scale)),
+            "friction": f"{spec.friction:g}",
+            "planned_friction": f"{spec.planned_friction:g}",
+            "table": "none" if spec.plane is None else spec.plane.describe(),
+            "mode": request.mode,
+            "ranking": request.order,
+            "task": request.grasp_task.describe(),
+            "promise": "none" if request.promise is None else describe_promise(request.promise),
+            "mixture_sha256": self.model[1],
+            "seed": str(request.seed),
+        }
+        if request.resist is not None:
+            meta["resist"] = f"{request.resist} with {request.grasp_task.mass:g} kg"
+        moved = self._moved(grasps.to(object_.shape.device))
+        return dataclasses.replace(moved, meta=grasps.meta | meta)
+
+    def _moved(self, value: Any) -> Any:
+        """Return a value of any type, moved from the upright frame to the caller's frame."""
+        frame = self.each[0].obj_from_upright
+        return value.moved(frame) if isinstance(value, ShapeGP) else move(value, frame)
+
+
+def pose_request(request: Request, hand: Hand) -> Objects:
+    """Return the single object of a request, ready for the rows of a plan with a hand."""
+    model = find_model(request)  # first, so that a missing model is told before any work
+    return pose(ShapedObject.of(request), request, hand, model)
+
+
+def pose(
+    object_: ShapedObject,
+    request: Request,
+    hand: Hand,
+    model: Model,
+    spec: ContactSpec | None = None,
+    postures: int | None = None,
+    descends: bool = False,
+) -> Objects:
+    """Return one object with hand, constraints, initial guesses and obstacles.
+
+    Args:
+        object_: the object, with its shape.
+        request, hand, model: the plan's arguments, its hand, and the mixture of its mode.
+        spec: constraints in the caller's frame; by default the request's, on the object's table.
+        postures, descends: as in `Objects`.
+    """
+    shape = object_.shape
+    hand = settle_hand(hand, shape.device)
+    if spec is None:
+        spec = dataclasses.replace(request.contact_spec, table=object_.table)
+    # the constraints of this hand's fingertips, in the upright frame
+    upright = dataclasses.replace(
+        spec,
+        table=None if spec.table is None else 0.0,
+        region=seen_from(spec.region, object_.obj_from_upright),
+    )
+    check_starts(shape, upright, request.starts)
+    tips = hand.tips
+    upright = upright.for_fingertips(float(tips.radius.max()))
+    upright = dataclasses.replace(upright, fingertips=len(tips))
+    flat = settle_flatness(shape, upright, request.seed)
+    # guesses are drawn batch by batch, in chunks that are planned at once
+    sizes = batch_sizes(request.mode, request.starts, object_.scene is not None)
+    chunks = [count for size in sizes for count in start_chunks(size.starts)]
+    starts = torch.cat(list(drawn_starts(shape, flat, chunks, request.seed)))
+    # what the hand must not touch
+    obstacles = None
+    if object_.occupancy is not None:
+        obstacles = Obstacles.of(object_.occupancy, hard=not flat.spec.contact_allowed)
+    loads = None
+    if request.resist is not None:
+        frame = inverse(object_.obj_from_upright).to(object_.body.center)
+        mass = request.grasp_task.mass
+        on_table = flat.spec.plane is not None
+        loads = loads_of(request.resist, mass, object_.body.center, frame, on_table)[None]
+    mixture = None if model[0] is None else model[0].to(shape.device)
+    return Objects(
+        request=request,
+        hand=hand,
+        given_spec=spec,
+        specs=(flat.spec,),
+        each=(object_,),
+        sizes=tuple(sizes),
+        starts=(starts,),
+        shape=shape,
+        constraints=ContactProblem.of(shape, flat.spec),
+        body=object_.body,
+        world=CollisionWorld(object_.body.field, flat.spec.plane, obstacles),
+        loads=loads,
+        model=(mixture, model[1]),
+        buried=is_buried(object_.surface, obstacles),
+        descends=descends,
+        postures=postures,
+    )
+
+
+def join_objects(parts: Sequence[Objects], device: torch.device) -> Objects:
+    """Return posed objects without scenes as one batch on a device."""
+    first = parts[0]
+    shape = ShapeBatch.of([part.each[0].shape for part in parts], device)
+    rings = shape.scales.new_tensor([part.spec.ring_radius for part in parts])
+    bodies = [part.body for part in parts]
+    field = FieldBatch.of([body.field for body in bodies]).to(device)  # pyright: ignore[reportArgumentType]
+    center = torch.stack([body.center for body in bodies]).to(device)
+    size, height, breadth = (
+        shape.scales.new_tensor([getattr(body, name) for body in bodies])
+        for name in ("size", "height", "breadth")
+    )
+    plane = first.spec.plane
+    loads = [part.loads for part in parts if part.loads is not None]
+    return dataclasses.replace(
+        first,
+        hand=settle_hand(first.hand, device),
+        specs=tuple(part.spec for part in parts),
+        each=tuple(part.each[0] for part in parts),
+        starts=tuple(part.starts[0] for part in parts),
+        shape=shape,
+        constraints=ContactProblem.of(shape, first.spec, rings),
+        body=EstimatedBody(shape, field, center, size, height, breadth),
+        world=CollisionWorld(field, None if plane is None else plane.to(device)),
+        loads=torch.cat(loads).to(center) if loads else None,
+    )
+
+
+def find_model(request: Request) -> Model:
+    """Return the learned mixture of the request's hand, if its mode uses one."""
+    if request.mode == "joint":
+        return None, "none"
+    folder = request.hand.urdf_path.parent
+    # of postures of all sizes alike, so that Eq. (21) knows small objects
+    own = folder / "paper.safetensors"
+    path = own if request.mode == "paper" and own.is_file() else mixture_path(folder)
+    return load_mixture(path), sha256(path)
+
+
+def is_vague_cloud(cloud: PointCloud) -> bool:
+    """Return whether a cloud hardly shows its object: few points, one plane, or cut off."""
+    in_image = cloud.frustum is not None and cloud.viewpoint is not None
+    cut = in_image and silhouettes(cloud.to("cpu")).cut
+    return cut or len(cloud) < FEW_POINTS or is_flat(cloud.points)
+
+
+def is_buried(surface: Mesh, obstacles: Obstacles | None) -> bool:
+    """Return whether the rising object would enter obstacles clearly deeper than at rest."""
+    if obstacles is None or not obstacles.hard:
+        return False
+    standing = float(obstacles.field.query(surface.vertices)[0].min())
+    return lift_clearance(surface.vertices, obstacles) < min(standing, 0.0) - BURIED
+
+
+def settle_hand(hand: Hand, device: torch.device) -> Hand:
+    """Return the hand on a device; the hand caches one copy, with its caches, for each device."""
+    if hand.lower.device != device and device not in hand.derived:
+        hand.derived[device] = hand.to(device)
+    return hand.derived.get(device, hand)
+
+
+@checked
+def take_target(scene: Scene, seed: Seed) -> PointCloud:
+    """Return at most `TARGET_POINTS` random points of a scene's target.
+
+    Raises `BadArgument` unless the target is the label of an object.
+    """
+    if scene.target not in scene.things:
+        allowed = f"one of the labels {list(scene.things)}: scene.select(label)"
+        raise BadArgument("target", scene.target, allowed)
+    cloud = scene.cloud()
+    generator = torch.Generator().manual_seed(seed)
+    rows = torch.randperm(len(cloud), generator=generator, device="cpu")
+    return cloud.select(rows[:TARGET_POINTS].sort().values.to(cloud.points.device))
+
+
+def digest(cloud: PointCloud) -> str:
+    """Return the SHA-256 of a cloud's points, by which grasps know the cloud of their plan."""
+    points = cloud.points.detach().cpu().double().contiguous().numpy()
+    return hashlib.sha256(points.tobytes()).hexdigest()

@@ -1,0 +1,118 @@
+"""The order of grasps: by their predicted success in the task, or by the variance at contacts."""
+
+import dataclasses
+from collections.abc import Sequence
+from itertools import accumulate
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.contacts.resist import resist_loads
+from torchgrasp.foundation.base import join
+from torchgrasp.foundation.errors import Status
+from torchgrasp.ik.motion import collision_probability
+from torchgrasp.planner.objects import CloudIndex, Objects
+from torchgrasp.success.features import measure_grasps
+from torchgrasp.success.loads import strength_of
+from torchgrasp.success.model import load_success_model
+from torchgrasp.success.order import (
+    by_success,
+    grade,
+    is_covered,
+    keep_promise,
+    rank_by_variance,
+)
+from torchgrasp.values.planning import Grasps
+from torchgrasp.values.specs import Ranking
+
+SURE = 1e-6
+"""Probability that stands for 0 in log-odds, so that they stay finite."""
+BEST = 20
+"""Best grasps by which a set of fingers is judged: as many as an evaluation tries of a view."""
+
+
+def rank(objects: Objects, grasps: Grasps, cloud: CloudIndex) -> list[Grasps]:
+    """Return the grasps of each cloud in the request's order, scored by log-odds, on the CPU.
+
+    If the object cannot be lifted out of its surroundings, its grasps get the status `BURIED`.
+    Grasps of less success than a promise asks for get `NO_PROMISE`.
+    """
+    request = objects.request
+    if objects.buried:
+        lost = torch.where(grasps.status == Status.OK, int(Status.BURIED), grasps.status)
+        grasps = dataclasses.replace(grasps, status=lost)
+    grasps = objects.on_arm(grasps)
+    grasps = prove_resistance(objects, grasps, cloud)
+    rows = torch.nonzero(grasps.status == Status.OK)[:, 0]
+    log_odds, known = predict(objects, grasps[rows], cloud[rows])
+    # the host sorts
+    cpu = torch.device("cpu")
+    cloud = cloud.cpu()
+    vague = torch.tensor([one.vague for one in objects.each])
+    known = known.cpu() & ~vague[cloud[rows.cpu()]]
+    graded = grade(grasps.to(cpu), log_odds.cpu(), known)
+    if request.promise is not None:
+        graded = keep_promise(graded, request.promise)
+    ranked = by_success(graded, cloud)
+    counts = torch.bincount(cloud, minlength=len(objects)).tolist()
+    found = [
+        ranked[last - count : last] for last, count in zip(accumulate(counts), counts, strict=True)
+    ]
+    return found if request.order == "success" else [rank_by_variance(one) for one in found]
+
+
+def predict(
+    objects: Objects, grasps: Grasps, cloud: CloudIndex
+) -> tuple[Float[Tensor, "g"], Tensor]:
+    """Return the log-odds of success of g grasps, and a mask of those that trials support."""
+    task = objects.request.grasp_task
+    spec = objects.spec
+    features = measure_grasps(
+        objects.hand,
+        objects.body.rows(cloud),
+        grasps,
+        spec.friction,
+        task,
+        task.lifts(spec.plane),
+    )
+    log_odds = load_success_model(features.device).log_odds(features)
+    obstacles = objects.world.obstacles
+    if obstacles is not None:
+        hit = collision_probability(objects.hand, grasps, obstacles, spec.plane)
+        free = 1 - hit.to(log_odds)
+        log_odds = torch.logit(torch.sigmoid(log_odds) * free, eps=SURE)
+    return log_odds, is_covered(features)
+
+
+def prove_resistance(objects: Objects, grasps: Grasps, cloud: CloudIndex) -> Grasps:
+    """Return grasps with the loads that they resist; executable ones that resist too little fail."""
+    if objects.loads is None:
+        return grasps
+    contacts = grasps.contacts
+    strength = strength_of(objects.hand, grasps, contacts, objects.strongest)
+    loads = objects.loads[cloud]  # (g, w, 6)
+    proof = resist_loads(contacts.points, contacts.normals, strength, loads, objects.spec)
+    weak = (grasps.status == Status.OK) & ~(proof.margin >= 1)
+    status = grasps.status.masked_fill(weak, int(Status.NOT_RESISTED))
+    fields = dict(
+        zip(("task_margin", "task_load", "task_twist", "task_forces"), proof, strict=True)
+    )
+    proven = dataclasses.replace(grasps.certificate, task_strength=strength, **fields)
+    return dataclasses.replace(grasps, certificate=proven, status=status)
+
+
+def rank_together(batches: Sequence[Grasps], ranking: Ranking) -> Grasps:
+    """Return the grasps of all batches, executable ones first, with the last batch's metadata."""
+    ranked = by_success(join(batches))
+    ranked = ranked if ranking == "success" else rank_by_variance(ranked)
+    return dataclasses.replace(ranked, meta=batches[-1].meta)
+
+
+def expected_success(grasps: Grasps, best: int = BEST) -> float:
+    """Return the mean predicted success of the `best` best executable grasps.
+
+    Each grasp that is missing counts as 0.
+    """
+    likely = torch.where(grasps.status == Status.OK, torch.sigmoid(grasps.score), 0.0)
+    return float(likely.sort(descending=True).values[:best].sum()) / best
