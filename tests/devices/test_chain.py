@@ -57,7 +57,7 @@ from torchgrasp.ik.attempts import solve_contact_first
 from torchgrasp.ik.candidates import measure_errors
 from torchgrasp.ik.configuration import Configuration
 from torchgrasp.ik.motion import collision_probability, lift_clearance
-from torchgrasp.planner.contacts import spread_rows
+from torchgrasp.planner.candidates import spread_rows
 from torchgrasp.planner.objects import take_target
 from torchgrasp.scene import estimate_occupancy
 from torchgrasp.shape import extract_surface

@@ -11,12 +11,13 @@ import trimesh
 from tests.make import load_hand, real, same_bits
 from torchgrasp import ContactSpec, Status, load_object, plan_grasps, stream_grasps
 from torchgrasp.cloud.camera import look_at, partial_view
+from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.contacts.certify import certify
 from torchgrasp.foundation.base import join
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import rigid
-from torchgrasp.planner.contacts import LIKELY, WEAK, Pool, SeededContacts
-from torchgrasp.planner.schedule import FIRST, schedule
+from torchgrasp.planner.candidates import CHOICE, Candidates, Row, choose, join_candidates
+from torchgrasp.planner.schedule import SCHEDULE, schedule
 from torchgrasp.values.planning import Certificate, Contacts, IKSeeds
 
 SPEC = ContactSpec(table=0.0)
@@ -88,7 +89,7 @@ def test_a_budget_ends_after_the_batch_that_passes_it(parts):
         list(stages) == ["shape", "batch", "plan", "certify", "query", "refine"] and len(heard) == 6
     )
     assert len(stages["plan"]) == 32  # what was not planned has no status
-    assert len(short) <= FIRST
+    assert len(short) <= SCHEDULE.first
     for wrong in (0.0, -1.0, float("nan")):
         with pytest.raises(BadArgument, match="time_budget"):
             plan_grasps(VIEW, HAND, SPEC, 20, time_budget=wrong)
@@ -103,7 +104,7 @@ def test_an_observer_hears_of_each_batch_and_of_the_stages_of_all(whole):
     assert int(values["query"].row.max()) == len(values["certify"]) - 1  # rows of all batches
     assert same_bits(values["refine"], grasps)
     batches = [value for stage, _, value in heard if stage == "batch"]
-    assert sum(len(batch) for batch in batches) < len(grasps) and len(batches[0]) <= FIRST
+    assert sum(len(batch) for batch in batches) < len(grasps) and len(batches[0]) <= SCHEDULE.first
 
 
 def test_without_a_grasp_contacts_are_planned_on_smaller_flat_areas():
@@ -171,7 +172,7 @@ def test_batches_plan_all_starts_and_try_all_rows():
             batches = schedule(starts, most)
             assert sum(batch.starts for batch in batches) == starts
             assert sum(batch.tried for batch in batches) == min(starts, most)
-            assert min(batch.tried for batch in batches) >= min(FIRST, starts)
+            assert min(batch.tried for batch in batches) >= min(SCHEDULE.first, starts)
             assert all(b.tried >= a.tried for a, b in pairwise(batches))
             assert (
                 batches[0].starts >= batches[0].tried
@@ -179,8 +180,8 @@ def test_batches_plan_all_starts_and_try_all_rows():
             )
 
 
-def offer(points, seeds_of):
-    """Contacts at the given points; row i has the seeds `seeds_of[i]`, each known by its energy."""
+def offer(points, seeds_of, cost, cloud=None):
+    """Rows at the given points; row i has the seeds `seeds_of[i]`, each known by its energy."""
     n = len(points)
     nan = torch.full((len(points),), torch.nan, dtype=torch.float64)
     row = torch.tensor([i for i, found in enumerate(seeds_of) for _ in found], dtype=torch.int64)
@@ -202,9 +203,28 @@ def offer(points, seeds_of):
     )
     contacts = Contacts(points, torch.zeros_like(points))
     seeds = dataclasses.replace(seeds, row=row)
-    owner = torch.zeros(n, dtype=torch.int64)
+    cloud = torch.zeros(n, dtype=torch.int64) if cloud is None else cloud
     load = torch.zeros(n, 6).double()
-    return SeededContacts(contacts, certificate, seeds, owner, load)
+    return Candidates.of(contacts, certificate, seeds, load, cost, cloud)
+
+
+class Offered:
+    """Rows that come in parts; each is chosen at most once."""
+
+    def __init__(self, clouds):
+        self.clouds = clouds
+        self.rows = None
+        self.turn = 0
+
+    def add(self, part):
+        self.rows = part if self.rows is None else join_candidates([self.rows, part])
+
+    def take(self, most):
+        self.turn += 1
+        chosen = choose(self.rows, most, self.clouds)
+        self.rows = self.rows.begin(chosen, self.turn)
+        contacts, _, seeds = self.rows.select(chosen)
+        return contacts, seeds, self.rows.cloud[chosen]
 
 
 def test_the_likeliest_rows_are_taken_once_far_apart_with_their_own_seeds():
@@ -212,37 +232,37 @@ def test_the_likeliest_rows_are_taken_once_far_apart_with_their_own_seeds():
     points = torch.rand(30, 3, 3, generator=rng, dtype=torch.float64)
     cost = torch.rand(30, generator=rng, dtype=torch.float64)
     cost[4] = torch.inf  # no seed
-    seeds = [[] if i == 4 else [float(i), i + 0.5] for i in range(30)]
-    untried = Pool(1)
+    seeds_of = [[] if i == 4 else [float(i), i + 0.5] for i in range(30)]
+    untried = Offered(1)
     for rows in (range(12), range(12, 30)):
-        part = offer(points[list(rows)], [seeds[i] for i in rows])
-        untried.add(part, cost[list(rows)])
+        index = list(rows)
+        untried.add(offer(points[index], [seeds_of[i] for i in rows], cost[index]))
     gone = []
     for most in (4, 9, 40):
-        taken = untried.take(most)
-        rows = [int((points == one).flatten(1).all(1).nonzero()) for one in taken.contacts.points]
+        contacts, seeds, _ = untried.take(most)
+        rows = [int((points == one).flatten(1).all(1).nonzero()) for one in contacts.points]
         left = [i for i in range(30) if i not in gone and i != 4]
-        likely = sorted(left, key=lambda i: float(cost[i]))[: LIKELY * most]
+        likely = sorted(left, key=lambda i: float(cost[i]))[: CHOICE.likely * most]
         assert set(rows) <= set(likely) and len(rows) == min(most, len(left))
-        assert taken.seeds.energy.tolist() == [e for i in rows for e in seeds[i]]
-        assert taken.seeds.row.tolist() == [k for k in range(len(rows)) for _ in range(2)]
+        assert seeds.energy.tolist() == [e for i in rows for e in seeds_of[i]]
+        assert seeds.row.tolist() == [k for k in range(len(rows)) for _ in range(2)]
         gone += rows
     assert sorted(gone) == [i for i in range(30) if i != 4]
-    assert len(untried.take(5).contacts) == 0
+    assert len(untried.take(5)[0]) == 0
 
 
 def test_sets_that_do_not_resist_the_task_are_taken_only_where_others_lack():
     points = torch.rand(30, 3, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    cost = torch.arange(30).double() + WEAK * (torch.arange(30) % 3 > 0)  # each third set resists
+    # each third set resists
+    cost = torch.arange(30).double() + CHOICE.weak * (torch.arange(30) % 3 > 0)
     for most in (6, 9, 14):
-        pool = Pool(1)
-        pool.add(offer(points, [[float(i)] for i in range(30)]), cost)
-        taken = {int(i) for i in pool.take(most).seeds.energy}
+        offered = Offered(1)
+        offered.add(offer(points, [[float(i)] for i in range(30)], cost))
+        taken = {int(i) for i in offered.take(most)[1].energy}
         strong = {i for i in taken if i % 3 == 0}
         assert len(taken) == most and len(strong) == min(most, 10)
-        assert taken - strong == set(
-            sorted(set(range(30)) - set(range(0, 30, 3)))[: most - len(strong)]
-        )
+        others = sorted(set(range(30)) - set(range(0, 30, 3)))
+        assert taken - strong == set(others[: most - len(strong)])
 
 
 def test_the_contact_sets_of_several_clouds_are_chosen_at_once_as_those_of_each_alone():
@@ -252,20 +272,40 @@ def test_the_contact_sets_of_several_clouds_are_chosen_at_once_as_those_of_each_
     cost = torch.rand(40, generator=rng, dtype=torch.float64)
     # the cloud in the middle has none
     cost[7] = torch.inf
-    owner = torch.randint(clouds - 1, (40,), generator=rng) * 2
-    cost[10:34] += WEAK
-    together = Pool(clouds)
-    alone = [Pool(1) for _ in range(clouds)]
-    together.add(offer(points[:0], []), cost[:0])
-    assert len(together.take(4).contacts) == 0
+    cloud = torch.randint(clouds - 1, (40,), generator=rng) * 2
+    cost[10:34] += CHOICE.weak
+    together = Offered(clouds)
+    alone = [Offered(1) for _ in range(clouds)]
+    together.add(offer(points[:0], [], cost[:0]))
+    assert len(together.take(4)[0]) == 0
     for rows in (torch.arange(15), torch.arange(15, 40)):
-        part = offer(points[rows], [[0.0]] * len(rows))
-        together.add(part._replace(owner=owner[rows]), cost[rows])
-        for k, pool in enumerate(alone):
-            own = rows[owner[rows] == k]
-            pool.add(offer(points[own], [[0.0]] * len(own)), cost[own])
+        together.add(offer(points[rows], [[0.0]] * len(rows), cost[rows], cloud[rows]))
+        for k, one in enumerate(alone):
+            own = rows[cloud[rows] == k]
+            one.add(offer(points[own], [[0.0]] * len(own), cost[own]))
         most = 4 if rows[0] == 0 else 9
-        found = together.take(most)
-        expected = [pool.take(most).contacts.points for pool in alone]
-        assert torch.equal(found.contacts.points, torch.cat(expected))
-        assert torch.bincount(found.owner, minlength=clouds).tolist() == [len(x) for x in expected]
+        contacts, _, owner = together.take(most)
+        expected = [one.take(most)[0].points for one in alone]
+        assert torch.equal(contacts.points, torch.cat(expected))
+        counts = torch.bincount(owner, minlength=clouds).tolist()
+        assert counts == [len(x) for x in expected]
+
+
+def test_what_happened_to_a_row_is_its_status_and_rows_are_found_in_the_order_of_their_turns():
+    points = torch.rand(6, 3, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    rows = offer(points, [[float(i)] for i in range(6)], torch.zeros(6).double())
+    assert rows.find(Row.SEEDED).tolist() == list(range(6)) and not len(rows.find(Row.ENDED))
+    rows = rows.begin(torch.tensor([4, 5]), 1).begin(torch.tensor([0, 2]), 2)
+    tried = torch.tensor([0, 4, 2])
+    grasps = load_shipped_grasp("jug", "barrett")[[0, 0, 0]]
+    grasps = dataclasses.replace(grasps, score=real([1.0, 2.0, 3.0]))
+    status = torch.tensor([Row.STUCK, Row.STUCK, Row.ENDED])
+    rows = rows.put(tried, grasps, status)
+    assert rows.find(Row.STUCK).tolist() == [4, 0]  # row 4 was tried in the first turn
+    assert rows.find(Row.STUCK, torch.tensor([False])).tolist() == []
+    assert rows.best(torch.tensor([4, 2])).score.tolist() == [2.0, 3.0]
+    again = dataclasses.replace(grasps[:1], score=real([9.0]))
+    rows = rows.put(torch.tensor([4]), again, torch.tensor([int(Row.ENDED)]))
+    assert rows.best(torch.tensor([4, 0])).score.tolist() == [9.0, 1.0]
+    _, _, seeds = rows.select(torch.tensor([5, 1]))
+    assert seeds.energy.tolist() == [5.0, 1.0] and seeds.row.tolist() == [0, 1]

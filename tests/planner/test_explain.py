@@ -12,9 +12,9 @@ from tests.make import ball, load_hand, see
 from torchgrasp import ContactSpec, PointCloud, Status, explain_empty, load_object
 from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.ik.seeds import PostureLibrary
-from torchgrasp.planner.batches import Planner
+from torchgrasp.planner import explain
 from torchgrasp.planner.changes import list_changes
-from torchgrasp.planner.explain import Funnel, Losses, order_changes
+from torchgrasp.planner.explain import ExplainNumbers, Funnel, Losses, order_changes
 from torchgrasp.planner.request import Request
 from torchgrasp.values.planning import Certificate, ContactPlan, Contacts, Grasps, IKSeeds
 
@@ -25,7 +25,7 @@ VIEW = load_object("cylinder").view
 @pytest.fixture
 def first_only(monkeypatch):
     """Try the change alone that comes first."""
-    monkeypatch.setattr("torchgrasp.planner.explain.MOST_TRIALS", 1)
+    monkeypatch.setattr("torchgrasp.planner.explain.EXPLAIN", ExplainNumbers(trials=1))
 
 
 def view_of(mesh: trimesh.Trimesh) -> PointCloud:
@@ -197,7 +197,7 @@ def test_a_disc_too_low_needs_its_table_gone_and_an_object_under_another_the_oth
 
 
 def test_fingers_without_a_thumb_are_told_to_take_it(monkeypatch):
-    monkeypatch.setattr("torchgrasp.planner.explain.MOST_TRIALS", 2)
+    monkeypatch.setattr("torchgrasp.planner.explain.EXPLAIN", ExplainNumbers(trials=2))
     spec = dataclasses.replace(TABLE, flat_radius=0.008)
     explanation = explain_empty(VIEW, load_hand("allegro", "paper_literal"), spec, starts=8)
     assert explanation.funnel.executable == 0 and explanation.best is not None
@@ -298,12 +298,12 @@ def test_the_work_is_bounded_and_what_the_bound_left_out_is_counted(made_up, fin
 
 
 def test_a_thing_that_no_hand_holds_is_explained_with_few_plans_and_twice_alike(monkeypatch):
-    monkeypatch.setattr("torchgrasp.planner.explain.MOST_TRIALS", 1)
+    monkeypatch.setattr("torchgrasp.planner.explain.EXPLAIN", ExplainNumbers(trials=1))
     plans = []
     heard = []
-    run = Planner.run
+    run = explain.plan_objects
     monkeypatch.setattr(
-        Planner, "run", lambda self, *given: plans.append(self.stack) or run(self, *given)
+        explain, "plan_objects", lambda objects, *given: plans.append(objects) or run(objects, *given)
     )
     cloud = ball(radius=0.14, centre=(0.0, 0.0, 0.14))
     hand = load_hand("barrett")
@@ -317,5 +317,5 @@ def test_a_thing_that_no_hand_holds_is_explained_with_few_plans_and_twice_alike(
     )
     assert heard[0][0] == "funnel" and heard[0][2] == 1  # the first answer needs one plan alone
     assert len(plans) <= 2 * 2 * 2 and len(heard) == len(first.trials) + len(again.trials) + 2
-    assert all(p.first.request.starts <= 20 and len(p.library.joints) <= 500 for p in plans)
+    assert all(p.request.starts <= 20 and len(p.library.joints) <= 500 for p in plans)
     assert PostureLibrary.of(hand) is own  # the next plan need not draw it anew

@@ -12,11 +12,10 @@ from torchgrasp import ContactSpec, Scene, Status, plan_scene
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.planner import ThingPlan
-from torchgrasp.planner.batches import Owned, rank
 from torchgrasp.planner.graspable import hand_span, is_vague, judge_things, order_by_ease
-from torchgrasp.planner.objects import Problem, take_target
+from torchgrasp.planner.objects import pose_request, take_target
+from torchgrasp.planner.ranking import rank
 from torchgrasp.planner.request import Request
-from torchgrasp.planner.stack import Stack
 
 HAND = load_hand("allegro")
 BOX = (0.0, 0.0, 0.06, 0.1)
@@ -146,9 +145,9 @@ BEYOND = {
 
 def is_unknown(scene: Scene) -> bool:
     """Return whether the success of a good grasp of the first object is unknown."""
-    problem = Problem.of(Request(take_target(scene.select(1), 0), HAND), HAND)
+    objects = pose_request(Request(take_target(scene.select(1), 0), HAND), HAND)
     grasps = load_shipped_grasp("jug", "allegro")
-    (ranked,) = rank(Stack.of([problem]), Owned(grasps, torch.zeros_like(grasps.status)))
+    (ranked,) = rank(objects, grasps, torch.zeros_like(grasps.status))
     return bool(ranked.success.isnan().all())
 
 

@@ -24,11 +24,10 @@ from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse, rotate
 from torchgrasp.geometry.plane import Plane, move
 from torchgrasp.ik.attempts import assign
-from torchgrasp.planner.contacts import contact_costs, find_contacts
+from torchgrasp.planner.candidates import draw, find_candidates, with_costs
 from torchgrasp.planner.many import estimate_shapes, plan_stacks
-from torchgrasp.planner.objects import Problem
+from torchgrasp.planner.objects import join_objects, pose_request
 from torchgrasp.planner.request import Request
-from torchgrasp.planner.stack import Stack
 from torchgrasp.success import TaskWrenches
 from torchgrasp.success.task import loads_of
 
@@ -153,13 +152,13 @@ def test_a_load_that_is_too_great_is_named_and_given_up():
     )
 
 
-def could_resist(stack, contacts, owner, strength) -> list[bool]:
+def could_resist(objects, contacts, owner, strength) -> list[bool]:
     """Whether contacts of these strengths [N] resist all loads of their cloud, by HiGHS."""
     found = list[bool]()
     for p, n, own, most in zip(
         contacts.points, contacts.normals, owner.tolist(), strength, strict=True
     ):
-        loads = stack.problems[own].loads.numpy()
+        loads = objects.loads[own].numpy()
         found.append(all(by_highs(p, n, most.numpy(), load) >= 1 for load in loads))
     return found
 
@@ -168,27 +167,24 @@ def could_resist(stack, contacts, owner, strength) -> list[bool]:
 def steered():
     """The plan of two clouds that must resist pushes, with the contact sets that the hand may try."""
     views = [VIEW, load_object("cylinder").view]
-    stack = Stack.of(
-        [
-            Problem.of(Request(x, HAND, ContactSpec(table=0.0), 40, resist="push"), HAND)
-            for x in views
-        ]
-    )
-    plan, owner = next(stack.plans())
+    requests = [Request(x, HAND, ContactSpec(table=0.0), 40, resist="push") for x in views]
+    objects = join_objects([pose_request(x, HAND) for x in requests], torch.device("cpu"))
+    sizes = [size.starts for size in objects.sizes if size.starts]
+    plan, owner = next(draw(objects, sizes))
     told = {}
-    found = find_contacts(
-        stack, plan, owner, 1000, lambda stage, value, **_: told.update({stage: value})
+    found = find_candidates(
+        objects, plan, owner, 1000, lambda stage, value, **_: told.update({stage: value})
     )
-    return stack, (plan, owner), told["plan"], found
+    return objects, (plan, owner), told["plan"], found
 
 
 def test_the_hand_tries_the_contact_sets_that_resist_with_the_greatest_forces_and_the_plan_says_so_of_others(
     steered,
 ):
-    stack, (plan, owner), told, found = steered
+    objects, (plan, owner), told, found = steered
     rows = torch.nonzero(plan.status == Status.OK)[:, 0]
     strength = torch.full((len(rows), 3), 15.0)  # the greatest force of a finger
-    resisting = torch.tensor(could_resist(stack, plan.contacts[rows], owner[rows], strength))
+    resisting = torch.tensor(could_resist(objects, plan.contacts[rows], owner[rows], strength))
     assert 10 < int(resisting.sum()) < len(rows) - 10
     assert torch.equal(told.status[rows] == Status.OK, resisting)
     assert bool((told.status[rows[~resisting]] == Status.NOT_RESISTED).all())
@@ -196,7 +192,8 @@ def test_the_hand_tries_the_contact_sets_that_resist_with_the_greatest_forces_an
 
 
 def test_contact_sets_and_postures_that_resist_the_worst_load_come_first(steered):
-    found, cost = contact_costs(steered[0], steered[-1])
+    found = with_costs(steered[0], steered[-1])
+    cost = found.cost
     seeds = found.seeds
     contacts = assign(found.contacts, found.seeds)
     hand_from_obj = inverse(seeds.obj_from_hand)
