@@ -303,7 +303,9 @@ def test_a_thing_that_no_hand_holds_is_explained_with_few_plans_and_twice_alike(
     heard = []
     run = explain.plan_objects
     monkeypatch.setattr(
-        explain, "plan_objects", lambda objects, *given: plans.append(objects) or run(objects, *given)
+        explain,
+        "plan_objects",
+        lambda objects, *given: plans.append(objects) or run(objects, *given),
     )
     cloud = ball(radius=0.14, centre=(0.0, 0.0, 0.14))
     hand = load_hand("barrett")

@@ -122,6 +122,7 @@ def _guard(function: Any, owner: Any, gradients: bool, always: Callable[[], bool
         )  # a compiler traces the function, not the checks
         if compiling or ((inside := getattr(_thread, "inside", False)) and not always()):
             return function(*args, **kwargs)
+        _check_options(signature, kwargs)
         bound = signature.bind(*args, **kwargs)
         shared = _Call(gradients, deep=not inside)
         hints = _hints(owner)
@@ -377,6 +378,16 @@ def _lengths(value: Any) -> dict[str, int]:
 def _hints(thing: Any) -> dict[str, Any]:
     """Return the annotations of a function or class."""
     return typing.get_type_hints(thing, include_extras=True)
+
+
+def _check_options(signature: inspect.Signature, given: dict[str, Any]) -> None:
+    """Raise `TypeError` for a keyword argument that a function lacks, with those that it has."""
+    kinds = {one.kind for one in signature.parameters.values()}
+    if inspect.Parameter.VAR_KEYWORD in kinds:
+        return
+    for name in given.keys() - signature.parameters.keys():
+        options = ", ".join(signature.parameters)
+        raise TypeError(f"got an unexpected keyword argument {name!r}: expected one of {options}")
 
 
 def _option(hint: Any, key: str) -> Any:

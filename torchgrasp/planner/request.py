@@ -7,8 +7,9 @@ from typing import Annotated, Any
 
 from torchgrasp.arm.arm import Arm
 from torchgrasp.contacts.region import combine
-from torchgrasp.foundation.checks import Count, Range, Seed, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import Count, Range, Seed
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import Fingers
 from torchgrasp.hand.load import with_fingers
