@@ -26,7 +26,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from tests.devices.elsewhere import TRAFFIC
 
 LIBRARY = str(Path(__file__).resolve().parents[2] / "torchgrasp") + "/"
-HELPERS = ("foundation/base.py", "foundation/checks.py", "foundation/marks.py")
+HELPERS = ("foundation/base.py", "foundation/checks.py", "foundation/rules.py")
 """Files whose operations belong to the caller."""
 IDLE = {
     "empty",

@@ -16,7 +16,7 @@ from torchgrasp import ContactSpec, Grasps, PointCloud, Status, load_hand, plan_
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.jobs import pack, run_tasks, unpack
 from torchgrasp.planner.many import estimate_shapes, plan_stacks
-from torchgrasp.planner.objects import Problem
+from torchgrasp.planner.objects import Objects
 from torchgrasp.planner.request import Request
 
 Result = TypeVar("Result")
@@ -39,7 +39,7 @@ def plan_clouds(o: Options) -> list[Row]:
     packed = run_tasks(see_view, [(k,) for k in range(max(o.batches))], workers, 600.0)
     seen: list[PointCloud] = [unpack(x) for x in packed]
     requests = [Request(cloud, hand, SPEC, o.starts) for cloud in seen]
-    problems, shaped = timed(lambda: list(estimate_shapes(requests, workers)))
+    objects, shaped = timed(lambda: list(estimate_shapes(requests, workers)))
     rows.append(
         Row(
             f"shapes of {len(seen)} clouds, {workers} processes",
@@ -49,12 +49,12 @@ def plan_clouds(o: Options) -> list[Row]:
             {"s": shaped},
         )
     )
-    plan_at_once(requests[:2], problems[:2], device)  # what a process keeps is made before
+    plan_at_once(requests[:2], objects[:2], device)  # what a process keeps is made before
     call = partial(plan_grasps, hand=hand, spec=SPEC, starts=o.starts, workers=workers)
     for count in sorted(o.batches):
         what = f"{count} clouds of {POINTS} points, {hand.name}, {o.starts} starts"
         there = [cloud.to(device) for cloud in seen[:count]]
-        known = partial(plan_at_once, requests[:count], problems[:count], device)
+        known = partial(plan_at_once, requests[:count], objects[:count], device)
         row, found = measure(f"{what}: at once, with known shapes", known)
         rows += [row, measure(f"{what}: a whole call", partial(call, there))[0]]
         if count == min(o.batches):
@@ -78,10 +78,10 @@ def see_view(k: int) -> Any:
 
 @checked
 def plan_at_once(
-    requests: list[Request], problems: list[Problem | Grasps], device: torch.device
+    requests: list[Request], objects: list[Objects | Grasps], device: torch.device
 ) -> list[Grasps]:
-    """Return the grasps of problems with known shapes, planned at once on a device."""
-    return list(plan_stacks(requests, iter(problems), device))
+    """Return the grasps of objects with known shapes, planned at once on a device."""
+    return list(plan_stacks(requests, iter(objects), device))
 
 
 def measure(what: str, plan: Callable[[], list[Grasps]]) -> tuple[Row, list[Grasps]]:
