@@ -2,7 +2,7 @@
 learning.
 
 The same on files: `torchgrasp cloud views MESHES --out OBJECTS`, then `torchgrasp campaign OBJECTS
-    --hand barrett ...`.
+--hand barrett ...`.
 """
 
 import tempfile

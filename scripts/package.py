@@ -127,8 +127,8 @@ def find_pythons() -> list[str]:
 
 
 def try_wheel(work: Path, wheel: Path, interpreter: str, index: str | None) -> dict[str, object]:
-    """Install the wheel in an empty environment, do the main job in an empty folder, then the self-
-    test.
+    """Install the wheel in an empty environment, do the main job in an empty folder, then the
+    self-test.
     """
     environment = work / "environment"
     empty = work / "empty"

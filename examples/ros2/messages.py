@@ -1,7 +1,7 @@
 """ROS 2 messages to clouds and poses, and grasps to messages.
 
 The classes of messages are given as `types`: those of ROS (`ros_types`), or those of rosbags, as in
-    the tests.
+the tests.
 """
 
 import array

@@ -1,5 +1,5 @@
-"""Fig. 6 (b, d): the number of Gaussians by the Bayesian information criterion and by cross-
-validation.
+"""Fig. 6 (b, d): the number of Gaussians by the Bayesian information criterion and by
+cross-validation.
 """
 
 import json

@@ -62,9 +62,8 @@ def grasps(out: Path, starts: int = 1000, seed: int = 0, only: tuple[str, ...] =
     object gives.
 
     fig9.png: one contact triple by two postures of the same hand. fig10.png: one triple by both
-    hands. fig11.png and
-    fig12.png: grasps of the Barrett and of the Allegro hand. All are planned by
-    `plan_grasps(mode="paper")`, and have passed every check.
+    hands. fig11.png and fig12.png: grasps of the Barrett and of the Allegro hand. All are planned
+    by `plan_grasps(mode="paper")`, and have passed every check.
 
     Args:
         out: folder of the pictures; it is made where it does not exist.

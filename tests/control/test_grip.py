@@ -225,7 +225,7 @@ def carried(
     noise.
 
     The joints follow at once: what the hand wants is what is felt. A finger slides where that
-        exceeds its cone.
+    exceeds its cone.
     """
     strong = {
         name: drive._replace(effort=8.0) for name, drive in reference().hand.actuators.items()

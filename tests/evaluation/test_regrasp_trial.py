@@ -84,8 +84,8 @@ def test_the_next_grasp_is_the_best_that_differs_from_all_tried():
 
 
 def rod_and_pinches(*places: float, scores: list[float]) -> tuple[Grasps, SignedDistanceField]:
-    """A rod of 200 mm along x, and pinches of it at some places along x [m], ranked by their log-
-    odds.
+    """A rod of 200 mm along x, and pinches of it at some places along x [m], ranked by their
+    log-odds.
     """
     axes = [torch.arange(-30, 31), torch.arange(-8, 9), torch.arange(-8, 9)]
     nodes = 0.004 * torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).double()

@@ -2,7 +2,7 @@
 process.
 
 They run in a process of their own: the annotation checks of the tests draw from Python's global
-    generator themselves.
+generator themselves.
 """
 
 import dataclasses

@@ -31,7 +31,7 @@ def check_kernel(kernel: Kernel, seed: int = 0) -> Kernel:
     * `variance`: k(0) and -k''(0), the prior variances of distance and normal, are positive.
     * `smooth`: k'(0) = 0, without which surfaces have no normals.
     * `derivatives`: a closed form equals autograd of the profile, which equals finite differences
-        of k.
+      of k.
     * `covariance`: no combination of distances and normals in the ball has a negative variance.
     """
     length = _length(kernel)

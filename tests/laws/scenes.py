@@ -37,15 +37,15 @@ def check_scene(open_scene: Open, hand: Hand | None = None) -> None:
     The laws, by the name that an error gives them:
 
     * `joints`: `joint_names` are the movable joints of the URDF, which start where the
-        specification says.
+      specification says.
     * `kinematics`: root, fingertips and Jacobian are those of the hand, and nothing overlaps.
     * `rest`: an object on the table stays where it stands, and nothing is touched.
     * `rock`: a cylinder tipped by few degrees stands again on the table.
     * `fall`: without a table it falls by g t^2 / 2.
     * `pull`: a force at the mass centre of a weightless object moves it by F t^2 / (2 m) and turns
-        it nowhere.
+      it nowhere.
     * `slide`: an object on the table slides only under a force beyond friction; `displace` moves
-        the object.
+      the object.
     * `drive`: joints go to the targets of their drives.
     * `lift`, `approach`: the mount moves the hand along the world's z axis, and along the approach.
     * `overlap`: a hand that begins inside the object is told so.

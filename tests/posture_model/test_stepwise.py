@@ -1,5 +1,5 @@
-"""EM on nested random subsets: what the subsets hold, and fits beside full-batch EM and scikit-
-learn.
+"""EM on nested random subsets: what the subsets hold, and fits beside full-batch EM and
+scikit-learn.
 """
 
 import dataclasses

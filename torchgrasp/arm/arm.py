@@ -149,12 +149,16 @@ def load_arm(
 ) -> Arm:
     """Load a robot arm that carries a hand from the arm's URDF, for `plan_grasps`.
 
-    Args: urdf: path of the file; a joint without limits gets one turn either way. hand: the hand on
-        the arm, or its name or folder. tip: the link that carries the hand; by default the one that
-        most joints move, the last of equals. obj_from_base: pose of the arm's root link in the
-        frame of the cloud; by default the same frame. tip_from_hand: pose of the hand's root link
-        in the frame of the tip; by default the same frame. seed: random seed of the postures from
-        which inverse kinematics starts.
+    Args:
+        urdf: path of the file; a joint without limits gets one turn either way.
+        hand: the hand on the arm, or its name or folder.
+        tip: the link that carries the hand; by default the one that most joints move, the last of
+            equals.
+        obj_from_base: pose of the arm's root link in the frame of the cloud; by default the same
+            frame.
+        tip_from_hand: pose of the hand's root link in the frame of the tip; by default the same
+            frame.
+        seed: random seed of the postures from which inverse kinematics starts.
 
     Raises `HandFileError` for a URDF that is missing or malformed. On the way to the tip it may
     have no mesh, which `clean_arm` replaces, and no joint without a drive. Raises `BadArgument` for

@@ -40,12 +40,14 @@ class CampaignSpec(Value):
     Raises `BadArgument` for an unknown protocol, or trials of whole clouds, of grasps that were
     planned before, or of other fingers than the hand's.
 
-    Args: protocol: test protocol of each grasp, or its name in `torchgrasp.evaluation.PROTOCOLS`.
+    Args:
+        protocol: test protocol of each grasp, or its name in `torchgrasp.evaluation.PROTOCOLS`.
         trials: which views are planned on, and how many of their grasps are tried, with the hand's
-        own fingers. licence: licence of the data set, preferably an SPDX identifier such as
-        "CC-BY-4.0". jobs_in_shard: number of jobs (an object and a view) in one file. device:
-        "cuda" plans on all views of a file at once, on the workers of a Dask cluster that have a
-        GPU and the resource "GPU". A GPU's rounding may change grasps.
+            own fingers.
+        licence: licence of the data set, preferably an SPDX identifier such as "CC-BY-4.0".
+        jobs_in_shard: number of jobs (an object and a view) in one file.
+        device: "cuda" plans on all views of a file at once, on the workers of a Dask cluster that
+            have a GPU and the resource "GPU". A GPU's rounding may change grasps.
 
     >>> CampaignSpec("dexgraspbench").test.trial.friction
     0.6
@@ -97,17 +99,22 @@ def run_campaign(
     jobs (`WORKER_DIED`, `TIMED_OUT`, `BROKEN`). Equal results give equal bytes, whatever the
     workers, their order and the interruptions (docs/promises.md, N10, on equal results).
 
-    Args: objects: a folder as in `torchgrasp.data`. On a cluster it has the same path on every
-        machine. hand: from `load_hand`, with the fingers that grasp. folder: folder of the data
-        set; no other run may write to it at the same time. spec: options of the campaign;
-        `CampaignSpec()` by default. workers: number of processes on this machine, where 0 means
-        this process. Or the address of a Dask scheduler, such as "tcp://10.0.0.1:8786", whose
-        workers have one thread each. observer: called with the row of each finished job.
+    Args:
+        objects: a folder as in `torchgrasp.data`. On a cluster it has the same path on every
+            machine.
+        hand: from `load_hand`, with the fingers that grasp.
+        folder: folder of the data set; no other run may write to it at the same time.
+        spec: options of the campaign; `CampaignSpec()` by default.
+        workers: number of processes on this machine, where 0 means this process. Or the address of
+            a Dask scheduler, such as "tcp://10.0.0.1:8786", whose workers have one thread each.
+        observer: called with the row of each finished job.
 
-    Raises: BadArgument: no objects, no scheduler at the address or for "cuda", or a machine with
-        other versions or another hand. OutputError: the folder holds another campaign or other
-        files, another run holds it, or it cannot be written. MissingExtra: the simulator, pebble
-        for workers, or Dask for a cluster is not installed.
+    Raises:
+        BadArgument: no objects, no scheduler at the address or for "cuda", or a machine with other
+            versions or another hand.
+        OutputError: the folder holds another campaign or other files, another run holds it, or it
+            cannot be written.
+        MissingExtra: the simulator, pebble for workers, or Dask for a cluster is not installed.
 
     >>> import tempfile, trimesh
     >>> from torchgrasp import load_hand

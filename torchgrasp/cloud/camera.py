@@ -39,10 +39,12 @@ def look_at(
 ) -> Transform:
     """Return the pose obj_from_camera (4 x 4) of an upright camera that looks at a target.
 
-    Args: azimuth: direction of the camera, from x towards y [deg]. elevation: angle of the camera
-        above the horizontal [deg], in [-89.9, 89.9]. distance: distance of the camera from the
-        target [m], in [0.01, 10]. target: point (3,) [m] in the middle of the image; or a mesh for
-        the centre of its box, or None for the origin.
+    Args:
+        azimuth: direction of the camera, from x towards y [deg].
+        elevation: angle of the camera above the horizontal [deg], in [-89.9, 89.9].
+        distance: distance of the camera from the target [m], in [0.01, 10].
+        target: point (3,) [m] in the middle of the image; or a mesh for the centre of its box, or
+            None for the origin.
 
     Raises `BadArgument` for an angle or a distance outside its range, and `MeshError` for a mesh
     without faces.
@@ -83,11 +85,13 @@ def partial_view(
     Raises `BadArgument` for fewer than 4 points or a pose that is not rigid, `MeshError` for a mesh
     without faces, and `TooFewPoints` if the camera sees nothing of the mesh.
 
-    Args: mesh: surface of the object, in the object frame [m]. camera_pose: transform
-        obj_from_camera (4 x 4), see `look_at`. n: number of pixels drawn at random; if there are
-        fewer pixels, all are returned. noise: True for the default noise, False for exact depths,
-        the name of a camera, or a `SensorNoise`. seed: random seed of the noise and of the choice
-        of points.
+    Args:
+        mesh: surface of the object, in the object frame [m].
+        camera_pose: transform obj_from_camera (4 x 4), see `look_at`.
+        n: number of pixels drawn at random; if there are fewer pixels, all are returned.
+        noise: True for the default noise, False for exact depths, the name of a camera, or a
+            `SensorNoise`.
+        seed: random seed of the noise and of the choice of points.
 
     >>> import trimesh
     >>> box = trimesh.creation.box([0.06, 0.06, 0.1])

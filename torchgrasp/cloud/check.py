@@ -25,10 +25,12 @@ def check_cloud(cloud: PointCloud) -> PointCloud:
     """Return the cloud itself if it is fit for grasp planning, else raise an error. A flat cloud is
     fit, too.
 
-    Raises: BadArgument: a number that is not finite; a tensor that requires a gradient; points that
-        all coincide or lie on a line; a normal of length zero. TooFewPoints: fewer than 4 distinct
-        points. SuspiciousScale: the longest side of the bounding box is outside [5 mm, 2 m]; the
-        unit is often mm.
+    Raises:
+        BadArgument: a number that is not finite; a tensor that requires a gradient; points that all
+            coincide or lie on a line; a normal of length zero.
+        TooFewPoints: fewer than 4 distinct points.
+        SuspiciousScale: the longest side of the bounding box is outside [5 mm, 2 m]; the unit is
+            often mm.
 
     >>> check_cloud(PointCloud(torch.rand(50, 3))).viewpoint is None
     True

@@ -50,20 +50,27 @@ def cloud_from_depth(
     camera's frame has x right, y down and z forward. Depths of 0, NaN, 65535 counts or more than 50
     m are not measured. The camera is the viewpoint, and the sides of the image give the frustum.
 
-    Args: depth: (h, w) or (h, w, 1), distance along the optical axis: floats in metres, or integers
-        (such as uint16) in millimetres. intrinsics: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], its 9
-        numbers, a 3 x 4 projection matrix, (fx, fy, cx, cy) [pixels], or (fx, fy, cx, cy, width,
-        height) with the size of the image, which may be a crop. Or the dict or object of ROS
-        (CameraInfo), Open3D, RealSense, Zivid or BOP, with its depth_scale. mask: (h, w), pixels of
-        the object, bool or uint8 (0 is outside); None for all measured pixels. camera_pose:
-        obj_from_camera (4, 4), rigid; None if the result shall be in the camera's frame.
+    Args:
+        depth: (h, w) or (h, w, 1), distance along the optical axis: floats in metres, or integers
+            (such as uint16) in millimetres.
+        intrinsics: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], its 9 numbers, a 3 x 4 projection matrix,
+            (fx, fy, cx, cy) [pixels], or (fx, fy, cx, cy, width, height) with the size of the
+            image, which may be a crop. Or the dict or object of ROS (CameraInfo), Open3D,
+            RealSense, Zivid or BOP, with its depth_scale.
+        mask: (h, w), pixels of the object, bool or uint8 (0 is outside); None for all measured
+            pixels.
+        camera_pose: obj_from_camera (4, 4), rigid; None if the result shall be in the camera's
+            frame.
         depth_unit: metres for one count of the depth, such as 0.00025; None for the depth_scale of
-        the intrinsics, else for the units under `depth`. up: direction (3,) against gravity, in the
-        object frame, with which the normal of a table in the image is compared; None for z.
+            the intrinsics, else for the units under `depth`.
+        up: direction (3,) against gravity, in the object frame, with which the normal of a table in
+            the image is compared; None for z.
 
-    Raises: BadArgument: depth that is negative or of another unit; intrinsics of another
-        resolution; a mask of another size or without pixels; a pose that is not rigid, is more than
-        100 m off, or turns a table upside down. TooFewPoints: fewer than 4 measured pixels.
+    Raises:
+        BadArgument: depth that is negative or of another unit; intrinsics of another resolution; a
+            mask of another size or without pixels; a pose that is not rigid, is more than 100 m
+            off, or turns a table upside down.
+        TooFewPoints: fewer than 4 measured pixels.
         SuspiciousScale: an extent outside [5 mm, 2 m], as of a scene without a mask.
 
     >>> cloud_from_depth(np.full((48, 64), 500, dtype=np.uint16), (600.0, 600.0, 32.0, 24.0)).viewpoint

@@ -72,10 +72,13 @@ def cut_object(
     """Return the points of one object that stands on a support, and the support's plane if one was
     found.
 
-    Args: cloud: points [m] of a scene. up: unit vector that points up. point: place on or near the
-        object [m]; points over 0.5 m away are left out. None for the largest object. box: two
-        opposite corners [m] of a box along the axes; points outside are left out first. gap: least
-        distance [m] between objects.
+    Args:
+        cloud: points [m] of a scene.
+        up: unit vector that points up.
+        point: place on or near the object [m]; points over 0.5 m away are left out. None for the
+            largest object.
+        box: two opposite corners [m] of a box along the axes; points outside are left out first.
+        gap: least distance [m] between objects.
 
     Raises `TooFewPoints` for fewer than 4 points in the box, near the point or of the object.
 

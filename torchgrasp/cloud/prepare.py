@@ -67,8 +67,8 @@ def prepare_cloud(
 
     Normals of random signs are ignored: with them a single view would look like a whole surface. If
     `clean`, outliers are removed, all normals are fitted anew, and a missing viewpoint is estimated
-    above the object, where `up` points.
-    A viewpoint that too few given normals face is then ignored: the cloud is a whole surface.
+    above the object, where `up` points. A viewpoint that too few given normals face is then
+    ignored: the cloud is a whole surface.
     """
     max_views = 16
     min_points = 10

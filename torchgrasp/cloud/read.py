@@ -71,12 +71,18 @@ def read_cloud(
     Images (h, w, 3) of points are accepted. Rows with NaN or infinity are left out; so are zero
     rows, if several.
 
-    Args: path: the file. viewpoint: the camera's position (3,) [m] in the cloud's frame; None for
-        the viewpoint in the file. unit: unit of length of the file's points and viewpoint.
+    Args:
+        path: the file.
+        viewpoint: the camera's position (3,) [m] in the cloud's frame; None for the viewpoint in
+            the file.
+        unit: unit of length of the file's points and viewpoint.
 
-    Raises: CloudFileError: no such file; an unknown suffix; malformed content; more than 512 MB or
-        5 million points. BadArgument: a viewpoint other than three numbers; points on one line.
-        TooFewPoints: fewer than 4 distinct points. SuspiciousScale: an extent outside [5 mm, 2 m].
+    Raises:
+        CloudFileError: no such file; an unknown suffix; malformed content; more than 512 MB or 5
+            million points.
+        BadArgument: a viewpoint other than three numbers; points on one line.
+        TooFewPoints: fewer than 4 distinct points.
+        SuspiciousScale: an extent outside [5 mm, 2 m].
 
     >>> read_cloud("scan.docx")
     Traceback (most recent call last): torchgrasp.foundation.errors.CloudFileError: path: expected a

@@ -128,9 +128,12 @@ def least_friction_forces(
     small error: the search also slightly favours even forces. Forces of four or five contacts may
     need slightly more friction than the least.
 
-    Args: points: contacts [m]. normals: outward unit normals of the object. strongest: normal force
-        of the strongest finger [N]. preferred: ratios of the normal forces to prefer among forces
-        of similar friction; by default they are equal.
+    Args:
+        points: contacts [m].
+        normals: outward unit normals of the object.
+        strongest: normal force of the strongest finger [N].
+        preferred: ratios of the normal forces to prefer among forces of similar friction; by
+            default they are equal.
 
     Returns:
         Forces; NaN rows where no balanced forces push at all contacts.
@@ -319,8 +322,8 @@ def central_forces(
 def _size(
     push: Push, slide: Slide, z: Float[Tensor, "b l k"]
 ) -> tuple[Float[Tensor, "b l f"], Float[Tensor, "b l f"]]:
-    """Return the sizes of normal and tangential forces at all contacts, for l vectors z of null-
-    space coordinates.
+    """Return the sizes of normal and tangential forces at all contacts, for l vectors z of
+    null-space coordinates.
     """
     tangential = (slide.flatten(1, 2) @ z.mT).unflatten(1, slide.shape[1:3])  # (b, f, 3, l)
     return z @ push.mT, torch.linalg.vector_norm(tangential, dim=2).mT

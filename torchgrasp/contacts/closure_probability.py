@@ -239,13 +239,17 @@ def closure_probability(
     `BadArgument` for a wrong argument, or a contact that is not finite or outside the shape's
     domain.
 
-    Args: shape: the uncertain shape. contacts: sets of 3 to 5 contacts [m] with outward unit
-        normals, inside the domain of the shape. A draw in which a finger meets no surface within 12
-        standard deviations counts as one without force closure. spec: its `friction` is used, the
-        friction coefficient at execution; `planned_friction` is not used. n: number of random
-        surfaces. The standard error is at most 1 / (2 sqrt(n)): 0.01 for 2500. It is computed for
-        the fraction (k + 1) / (n + 2) if k draws have force closure, and so never 0. seed: random
-        seed.
+    Args:
+        shape: the uncertain shape.
+        contacts: sets of 3 to 5 contacts [m] with outward unit normals, inside the domain of the
+            shape. A draw in which a finger meets no surface within 12 standard deviations counts as
+            one without force closure.
+        spec: its `friction` is used, the friction coefficient at execution; `planned_friction` is
+            not used.
+        n: number of random surfaces. The standard error is at most 1 / (2 sqrt(n)): 0.01 for 2500.
+            It is computed for the fraction (k + 1) / (n + 2) if k draws have force closure, and so
+            never 0.
+        seed: random seed.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp

@@ -338,7 +338,7 @@ def most_opposing(
     and that wrench.
 
     A witness is a wrench that disproves force closure: its products with all contact wrenches are
-        at least 0.
+    at least 0.
     """
     centre, radius = centre_and_radius(points)
     arm = (points - centre) / radius

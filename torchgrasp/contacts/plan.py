@@ -58,10 +58,13 @@ def plan_contacts(
     from more. Raises `BadArgument` for `starts` that are not positive, of a wrong shape, or outside
     the shape's domain, or another wrong argument.
 
-    Args: shape: a `ShapeGP`, or another implicit surface with the same methods. spec: the
-        constraints on contacts; `ContactSpec()` by default. starts: number of random initial
-        guesses (Sec. 6.2), or the initial contact points [m]. seed: random seed. time_budget: wall
-        time [s] of the call, in which at least 25 starts are planned; by default all are planned.
+    Args:
+        shape: a `ShapeGP`, or another implicit surface with the same methods.
+        spec: the constraints on contacts; `ContactSpec()` by default.
+        starts: number of random initial guesses (Sec. 6.2), or the initial contact points [m].
+        seed: random seed.
+        time_budget: wall time [s] of the call, in which at least 25 starts are planned; by default
+            all are planned.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> plan = plan_contacts(fit_shape(load_object("jug").view), ContactSpec.paper(), starts=8)

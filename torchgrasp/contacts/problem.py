@@ -117,9 +117,7 @@ def triple_mean_jet(shape: ShapeLike, points: Vectors) -> MeanJet:
 
 @functools.cache
 def contact_pairs(fingertips: int, device: torch.device) -> Int[Tensor, "2 p"]:
-    """Return the indices of all p pairs of contacts: neighbours (i, i + 1) first, then
-    (i, i + 2).
-    """
+    """Return the indices of all p pairs of contacts: neighbours (i, i + 1) first, then (i, i + 2)."""
     order = [
         (i, (i + gap) % fingertips)
         for gap in range(1, fingertips // 2 + 1)

@@ -212,8 +212,6 @@ def equal_tensions(points: Vectors) -> Float[Tensor, "b p"]:
 
 
 def normalise_tensions(points: Vectors, tension: Float[Tensor, "b p"]) -> Float[Tensor, "b p"]:
-    """Return the tensions, scaled so that the mean size of the contact forces that they
-    cause is 1.
-    """
+    """Return the tensions, scaled so that the mean size of the contact forces that they cause is 1."""
     force, _ = forces_from_tensions(points, tension)
     return tension / torch.linalg.vector_norm(force, dim=-1).mean(-1, keepdim=True)

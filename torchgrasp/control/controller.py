@@ -67,15 +67,18 @@ class GraspController:
     `Targets.left` from the pre-grasp; `stops` counts the stops at an unexpected touch. A new view
     of the object (`relook`) moves this path.
 
-    Args: reference: the closing plan. closing, holding, options: modes of closing and holding, and
-        options of the closing, as in `TrialSpec`. The holding None means "grip", or "force" where
-        the closing or the sensor does not allow it. approach: remaining length [m] of the approach;
-        it is 0 if the hand is at its pre-grasp.
+    Args:
+        reference: the closing plan.
+        closing, holding, options: modes of closing and holding, and options of the closing, as in
+            `TrialSpec`. The holding None means "grip", or "force" where the closing or the sensor
+            does not allow it.
+        approach: remaining length [m] of the approach; it is 0 if the hand is at its pre-grasp.
 
-    Raises: BadArgument: unknown modes; options or the holding "law" for a closing mode that does
-        not allow them; "impedance" for more than three fingertips; modes that need more than the
-        sensor measures; an approach whose options allow no stops, or whose plan lacks a table, a
-        surface or tactile fingertips.
+    Raises:
+        BadArgument: unknown modes; options or the holding "law" for a closing mode that does not
+            allow them; "impedance" for more than three fingertips; modes that need more than the
+            sensor measures; an approach whose options allow no stops, or whose plan lacks a table,
+            a surface or tactile fingertips.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp import ClosingReference

@@ -33,20 +33,28 @@ class ClosingReference(Value):
     """The plan for closing a hand on one grasp, in the hand's frame. Joints are the actuated joints
     [rad].
 
-    Args: hand: the hand, in float64. kp: stiffness of every joint's drive [N m/rad], in the order
-        of `hand.tree.joint_names`. obj_from_hand: planned pose of the hand in the frame of the
-        grasp. pregrasp: joints of the opened hand. joints: joints of the grasp. squeeze: joint
-        targets that press on the object without feedback, from `torchgrasp.control.squeeze`.
-        normals: outward normals of the planned contacts. gains: contacts, controller gains and
-        desired forces, of the closing "uncertainty" unless `as_printed`. approach: unit vector
-        along which the opened hand moves to its pre-grasp; None means no approach. table: the
-        table, which no fingertip enters while it searches, or None if it is unknown. surface:
-        estimated surface of the object in the frame of the grasp (`surface_field`), with which
-        touches are compared to locate the object. Without it, the tangent planes of the contacts
-        are used. sensor: sensors of the fingertips. max_force: largest normal force [N] of a
-        fingertip; None means no limit. distance_variance: variance [m^2] of the signed distance at
-        each contact (f_cov in Eq. 12 of the paper); None if it is unknown. The closing "paper"
-        needs it. friction: coefficient of friction that the grasp was planned for.
+    Args:
+        hand: the hand, in float64.
+        kp: stiffness of every joint's drive [N m/rad], in the order of `hand.tree.joint_names`.
+        obj_from_hand: planned pose of the hand in the frame of the grasp.
+        pregrasp: joints of the opened hand.
+        joints: joints of the grasp.
+        squeeze: joint targets that press on the object without feedback, from
+            `torchgrasp.control.squeeze`.
+        normals: outward normals of the planned contacts.
+        gains: contacts, controller gains and desired forces, of the closing "uncertainty" unless
+            `as_printed`.
+        approach: unit vector along which the opened hand moves to its pre-grasp; None means no
+            approach.
+        table: the table, which no fingertip enters while it searches, or None if it is unknown.
+        surface: estimated surface of the object in the frame of the grasp (`surface_field`), with
+            which touches are compared to locate the object. Without it, the tangent planes of the
+            contacts are used.
+        sensor: sensors of the fingertips.
+        max_force: largest normal force [N] of a fingertip; None means no limit.
+        distance_variance: variance [m^2] of the signed distance at each contact (f_cov in Eq. 12 of
+            the paper); None if it is unknown. The closing "paper" needs it.
+        friction: coefficient of friction that the grasp was planned for.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -83,10 +91,12 @@ class ClosingReference(Value):
     ) -> "ClosingReference":
         """Return the closing plan of one grasp, on the CPU.
 
-        Args: grasp: a single grasp, planned for the hand. force: normal force of the strongest
-            finger [N]. kp: stiffness of every joint's drive [N m/rad]; by default the hand's own.
+        Args:
+            grasp: a single grasp, planned for the hand.
+            force: normal force of the strongest finger [N].
+            kp: stiffness of every joint's drive [N m/rad]; by default the hand's own.
             stability: model that chooses among balanced forces that need nearly equal friction, and
-            gives the covariance of the forces; without it the covariance grows with the force.
+                gives the covariance of the forces; without it the covariance grows with the force.
 
         Raises `BadArgument` for not exactly one grasp, joints or fingers of another hand, a force
         or stiffness that is not positive, joints beyond their limits, or numbers in the grasp that

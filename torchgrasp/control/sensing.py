@@ -62,11 +62,13 @@ def feel_torques(
 ) -> TactileState:
     """Return the tactile state of fingertips whose forces are estimated from joint torques.
 
-    Args: tactile: the state at the last tick. reference: the closing plan; its normals give the
-        direction in which a finger presses. jacobian: Jacobian of the fingertips by all joints
-        [m/rad], as in `Observation`. torques: torques of all joints [N m] that contacts cause,
-        without those of weight, friction and acceleration. period: time since the last readings
-        [s].
+    Args:
+        tactile: the state at the last tick.
+        reference: the closing plan; its normals give the direction in which a finger presses.
+        jacobian: Jacobian of the fingertips by all joints [m/rad], as in `Observation`.
+        torques: torques of all joints [N m] that contacts cause, without those of weight, friction
+            and acceleration.
+        period: time since the last readings [s].
 
     Raises `BadArgument` for a Jacobian with the shape of another hand.
 

@@ -97,11 +97,14 @@ def measure(
     """Return the simulated tactile state one tick later, with lag, noise and sampling of the
     sensors.
 
-    Args: tactile: the state at the last tick. pads: outward surface normals at the planned
-        contacts, which direct the noise of tips that touch nothing. radius: radius of the tips [m];
-        0 means that they are not round, and 12 mm is assumed. period: period of the tick [s].
-        generator: draws the noise; without one there is no noise. noise: factor on the standard
-        deviation of the noise.
+    Args:
+        tactile: the state at the last tick.
+        pads: outward surface normals at the planned contacts, which direct the noise of tips that
+            touch nothing.
+        radius: radius of the tips [m]; 0 means that they are not round, and 12 mm is assumed.
+        period: period of the tick [s].
+        generator: draws the noise; without one there is no noise.
+        noise: factor on the standard deviation of the noise.
 
     Raises `BadArgument` for true contacts on another device than the state.
 
@@ -169,10 +172,11 @@ def low_pass(cutoff: float, period: float) -> float:
 class Targets(NamedTuple):
     """Commands to hand and arm until the next tick.
 
-    Args: joints: targets of all joints of the URDF, in the order of `hand.tree.joint_names` [rad].
+    Args:
+        joints: targets of all joints of the URDF, in the order of `hand.tree.joint_names` [rad].
         palm: displacement of the palm [m] from its planned path, in the hand's axes; the palm does
-        not rotate. left: remaining length [m] of the approach; it is 0 if the hand is at its
-        pre-grasp.
+            not rotate.
+        left: remaining length [m] of the approach; it is 0 if the hand is at its pre-grasp.
     """
 
     joints: Float[Tensor, " j"]

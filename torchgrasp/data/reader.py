@@ -50,9 +50,13 @@ class GraspShards:
     of simulated trials that passed. `closed` (a bool) tells whether the grasp has force closure,
     `job` is the index in `jobs`.
 
-    Args: folder: folder of the data set. card: content of `card.json`. jobs: a row for each object
-        and view, with or without grasps. size: number of jobs in a shard. points: number of points
-        of each item's cloud; None means all points, so that clouds may differ in size.
+    Args:
+        folder: folder of the data set.
+        card: content of `card.json`.
+        jobs: a row for each object and view, with or without grasps.
+        size: number of jobs in a shard.
+        points: number of points of each item's cloud; None means all points, so that clouds may
+            differ in size.
     """
 
     folder: Path

@@ -63,24 +63,32 @@ def close_hand(
     the end, and it slipped by less than 20 mm and 30 degrees in the closed hand. Equal arguments
     give bitwise equal results.
 
-    Args: grasp: a single grasp. hand: the hand of the grasp, or its name or folder. mesh: the true
-        object [m], closed, in the frame of the grasp: a trimesh, a file, or a `GraspObject` with
-        parts. spec: parameters of the trial; `TrialSpec()` by default. seed: random seed of the
-        tactile sensors' noise. error: true pose of the hand in its planned frame, unknown to the
-        controller; by default the planned pose. parts: convex parts of the mesh; by default they
-        are computed (`convex_parts`). table: the true table below the object, in the grasp's frame;
-        by default level, at the mesh's lowest point. neighbours: other bodies on the table, which
-        the hand may push. told: the table that the controller knows, in the grasp's frame; by
-        default that of the plan (`Grasps.table`). surface: estimated surface of the object
-        (`surface_field`), to estimate the object's pose from touches. Without it, only the tangent
-        planes of the planned contacts are used. slide: motion [m] of the object along the table,
-        halfway through the approach, unknown to the controller.
+    Args:
+        grasp: a single grasp.
+        hand: the hand of the grasp, or its name or folder.
+        mesh: the true object [m], closed, in the frame of the grasp: a trimesh, a file, or a
+            `GraspObject` with parts.
+        spec: parameters of the trial; `TrialSpec()` by default.
+        seed: random seed of the tactile sensors' noise.
+        error: true pose of the hand in its planned frame, unknown to the controller; by default the
+            planned pose.
+        parts: convex parts of the mesh; by default they are computed (`convex_parts`).
+        table: the true table below the object, in the grasp's frame; by default level, at the
+            mesh's lowest point.
+        neighbours: other bodies on the table, which the hand may push.
+        told: the table that the controller knows, in the grasp's frame; by default that of the plan
+            (`Grasps.table`).
+        surface: estimated surface of the object (`surface_field`), to estimate the object's pose
+            from touches. Without it, only the tangent planes of the planned contacts are used.
+        slide: motion [m] of the object along the table, halfway through the approach, unknown to
+            the controller.
 
-    Raises: BadArgument: not exactly one grasp, joints of another hand, or a pre-grasp outside the
-        joint limits; an approach that is no unit vector; contacts off the mesh; a table that the
-        mesh does not stand on; the holding "law" for a closing that does not follow it (Eq. 25).
-        MeshError: the mesh is missing, open or without volume. MissingExtra: the simulator is not
-        installed.
+    Raises:
+        BadArgument: not exactly one grasp, joints of another hand, or a pre-grasp outside the joint
+            limits; an approach that is no unit vector; contacts off the mesh; a table that the mesh
+            does not stand on; the holding "law" for a closing that does not follow it (Eq. 25).
+        MeshError: the mesh is missing, open or without volume.
+        MissingExtra: the simulator is not installed.
 
     >>> from torchgrasp import load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp

@@ -58,15 +58,21 @@ class Protocol(Value):
     Raises `BadArgument` for a rotation during the approach, or a push or a displacement in a
     protocol of pulls.
 
-    Args: name: the protocol's name. trial: parameters of the simulated trials. pull: the pulls;
-        None means a lift. noise: random errors of the hand's pose in pulls, and displacements of
-        the object along the table in lifts. criterion: a lift passes if the object is "held"
-        (`close_hand`), or has "risen" by half of the lift at the end. displaced: when the object of
-        a lift is displaced: "before" the approach, or halfway through the "approach". push: size of
-        a force [N] in a random direction at the lifted object. relook: whether the camera looks at
-        the object of a lift once more, from the same place, before the approach. tries: largest
-        number of grasps to try in a lift: another grasp where the object stays behind
-        (`lift_grasps`).
+    Args:
+        name: the protocol's name.
+        trial: parameters of the simulated trials.
+        pull: the pulls; None means a lift.
+        noise: random errors of the hand's pose in pulls, and displacements of the object along the
+            table in lifts.
+        criterion: a lift passes if the object is "held" (`close_hand`), or has "risen" by half of
+            the lift at the end.
+        displaced: when the object of a lift is displaced: "before" the approach, or halfway through
+            the "approach".
+        push: size of a force [N] in a random direction at the lifted object.
+        relook: whether the camera looks at the object of a lift once more, from the same place,
+            before the approach.
+        tries: largest number of grasps to try in a lift: another grasp where the object stays
+            behind (`lift_grasps`).
     """
 
     name: str
@@ -172,7 +178,7 @@ PROTOCOLS = {
 * dexgraspbench-hard: the same with halved friction, as in Dexonomy (arXiv 2504.18829).
 * pose-noise: the same with errors of the hand's pose.
 * paper: the paper's lift (Sec. 6.5) at friction 0.8; errors of the object's pose stand for a real
-    robot's chance.
+  robot's chance.
 * tabletop: a lift by 0.1 m at friction 0.6, held for 2 s while the hand shakes.
 * household: the same at friction 0.8.
 * table-lift: a lift by 0.2 m of 0.249 kg with friction 0.8 at the fingertips and 0.2 at the table,

@@ -37,14 +37,19 @@ class ProtocolResult(Value):
     """The outcome of one trial of the grasp at `rank`, with the pose error of number `draw`; NaN if
     not measured.
 
-    Args: moved: motion of the object [m]; in a lift relative to the hand. turned: rotation of the
-        object [rad]; in a lift relative to the hand. force: mean normal force of the fingers [N].
-        overlap: overlap of hand and object at the grasp [m]. seconds: CPU time. slip: motion of the
-        object in the closed hand [m], in a lift. slip_angle: rotation of the object in the closed
-        hand [rad], in a lift. predicted: predicted success of the grasp. tries: number of grasps
-        that were tried; all but `predicted`, `rank` and `overlap` is of the last grasp. cause: why
-        the object of a lift was not held, a name in `CAUSES`, or "". size: size of the cause, in
-        the cause's unit.
+    Args:
+        moved: motion of the object [m]; in a lift relative to the hand.
+        turned: rotation of the object [rad]; in a lift relative to the hand.
+        force: mean normal force of the fingers [N].
+        overlap: overlap of hand and object at the grasp [m].
+        seconds: CPU time.
+        slip: motion of the object in the closed hand [m], in a lift.
+        slip_angle: rotation of the object in the closed hand [rad], in a lift.
+        predicted: predicted success of the grasp.
+        tries: number of grasps that were tried; all but `predicted`, `rank` and `overlap` is of the
+            last grasp.
+        cause: why the object of a lift was not held, a name in `CAUSES`, or "".
+        size: size of the cause, in the cause's unit.
     """
 
     rank: int

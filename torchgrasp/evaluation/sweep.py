@@ -52,11 +52,14 @@ def evaluate(
     another run holds the folder or it cannot be written. Without the simulator, or pebble for
     workers, `MissingExtra` is raised.
 
-    Args: objects: a folder as in `torchgrasp.data`. hand: the hand that grasps. protocol: a
-        protocol or its name in `PROTOCOLS`. spec: which views and grasps are tried;
-        `EvaluationSpec()` by default. folder: folder for the executable grasps of each view,
-        OBJECT/VIEW.safetensors; by default a temporary folder. No other run may write to it at the
-        same time. workers: number of worker processes; the scores do not depend on it.
+    Args:
+        objects: a folder as in `torchgrasp.data`.
+        hand: the hand that grasps.
+        protocol: a protocol or its name in `PROTOCOLS`.
+        spec: which views and grasps are tried; `EvaluationSpec()` by default.
+        folder: folder for the executable grasps of each view, OBJECT/VIEW.safetensors; by default a
+            temporary folder. No other run may write to it at the same time.
+        workers: number of worker processes; the scores do not depend on it.
 
     >>> import tempfile
     >>> from torchgrasp import load_hand, load_object

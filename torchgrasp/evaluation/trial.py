@@ -77,10 +77,11 @@ class TrialDriver:
     """A trial that is checked once and can run any number of times; a wrong one raises the errors
     of `close_hand`.
 
-    Attributes: reference: the closing plan; by default derived from what the robot knows of the
-        trial. obj_from_world: pose of the simulator's frame in the grasp's frame. If there is a
-        true table, the frame is upright on it. Numbers are then rounded, so that results are
-        bitwise invariant to rigid motion.
+    Attributes:
+        reference: the closing plan; by default derived from what the robot knows of the trial.
+        obj_from_world: pose of the simulator's frame in the grasp's frame. If there is a true
+            table, the frame is upright on it. Numbers are then rounded, so that results are bitwise
+            invariant to rigid motion.
     """
 
     def __init__(

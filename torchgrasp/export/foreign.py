@@ -57,9 +57,11 @@ def read_foreign(
     | `.json` with `pose` and `dofs` (MultiGripperGrasp) | lists of seven numbers and of joints, in the `order` given |
     | `.npz` with `grasp_qpos` (DexGraspBench) | rows of pose and joints; `pregrasp_qpos`, if it is there |
 
-    Args: hand: the grasping hand. For the Allegro hand DexGraspBench's frame and joint order are
-        known. order: names (as in the hand's URDF) of the joints in the file; other names are
-        ignored. quaternion: order of the numbers in a pose, after its position.
+    Args:
+        hand: the grasping hand. For the Allegro hand DexGraspBench's frame and joint order are
+            known.
+        order: names (as in the hand's URDF) of the joints in the file; other names are ignored.
+        quaternion: order of the numbers in a pose, after its position.
 
     Raises `ModelFileError` for a missing or malformed file, and `BadArgument` for an order that
     misses a joint.
@@ -217,11 +219,14 @@ def grasps_from_joints(
     certificate if you know the surface. `clearance` is that of self-collision, and success is
     unknown, because no object is known. The approach is the hand's own approach axis.
 
-    Args: joints: actuated joints [rad], in the order of `hand.joint_names`. obj_from_hand: poses of
-        the root link of the hand's URDF. pregrasp: joints of the opened hand; by default each tip
-        moves 20 mm off its contact, or as far as limits allow. spec: friction and number of cone
-        edges of the certificate; `ContactSpec()` by default. std_m: standard deviation [m] of the
-        surface at each contact, for closing controllers that use it.
+    Args:
+        joints: actuated joints [rad], in the order of `hand.joint_names`.
+        obj_from_hand: poses of the root link of the hand's URDF.
+        pregrasp: joints of the opened hand; by default each tip moves 20 mm off its contact, or as
+            far as limits allow.
+        spec: friction and number of cone edges of the certificate; `ContactSpec()` by default.
+        std_m: standard deviation [m] of the surface at each contact, for closing controllers that
+            use it.
 
     Raises `BadArgument` for wrong shapes, joints outside the limits, or poses that are not rigid.
 

@@ -52,11 +52,14 @@ def save_dexgraspbench(
     joints [rad]. The evaluator only accepts a pickled dictionary; ours holds only arrays, numbers
     and a text.
 
-    Args: hand: the Allegro hand, whose model the bench has. grasps: grasps planned for this hand.
-        folder: folder to write, in the bench `output/NAME_allegro/graspdata/OBJECT`. object_path:
-        the object's folder in the bench (`assets/...`); its frame must be that of the planned
-        cloud. force: normal force of the strongest finger [N]. kp: stiffness of the bench's drives
-        [N m/rad].
+    Args:
+        hand: the Allegro hand, whose model the bench has.
+        grasps: grasps planned for this hand.
+        folder: folder to write, in the bench `output/NAME_allegro/graspdata/OBJECT`.
+        object_path: the object's folder in the bench (`assets/...`); its frame must be that of the
+            planned cloud.
+        force: normal force of the strongest finger [N].
+        kp: stiffness of the bench's drives [N m/rad].
 
     Raises `OutputError`, and `BadArgument` for a hand that is not in the bench, or joints of
     another hand.

@@ -68,11 +68,16 @@ def save_play(
     `play.json` has the motion, drives, contacts and the object; its text "frames" explains the
     numbers.
 
-    Args: hand: the hand. grasps: one or more grasps of the hand. folder: the folder to write.
-        player: the simulator. mesh: closed mesh of the object [m] in the frame of the grasps; or
-        the estimated surface, which then stands. spec: mass, friction, force, stiffness, heights,
-        times and timestep; `TrialSpec()` by default. parts: convex parts of the mesh; by default
-        they are computed (`convex_parts`).
+    Args:
+        hand: the hand.
+        grasps: one or more grasps of the hand.
+        folder: the folder to write.
+        player: the simulator.
+        mesh: closed mesh of the object [m] in the frame of the grasps; or the estimated surface,
+            which then stands.
+        spec: mass, friction, force, stiffness, heights, times and timestep; `TrialSpec()` by
+            default.
+        parts: convex parts of the mesh; by default they are computed (`convex_parts`).
 
     Raises `BadArgument` for no grasps or joints of another hand, `MeshError` for an open mesh, and
     `OutputError`.

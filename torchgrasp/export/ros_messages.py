@@ -64,11 +64,13 @@ def format_moveit(
     targets that press, with the torques [N m] as effort. `grasp_quality` is the predicted success.
     The retreat is up: the normal of the plan's table, or z.
 
-    Args: force: normal force of the strongest finger [N]. kp: stiffness of the robot's own position
-        control [N m/rad]; by default the hand's. rename: the robot's names of joints, by their
-        names in the URDF; these joints come first, in this order. flange: pose of the robot's
-        flange in the frame of the root link. object_id: id of the object in the planning scene,
-        which the hand may touch.
+    Args:
+        force: normal force of the strongest finger [N].
+        kp: stiffness of the robot's own position control [N m/rad]; by default the hand's.
+        rename: the robot's names of joints, by their names in the URDF; these joints come first, in
+            this order.
+        flange: pose of the robot's flange in the frame of the root link.
+        object_id: id of the object in the planning scene, which the hand may touch.
 
     Raises `BadArgument` for joints of another hand, a force or stiffness that is not positive,
     unknown or equal names, or a grasp whose hand goes down while it closes (`opened_pose`), which a

@@ -93,9 +93,7 @@ def is_file(path: Path | str) -> bool:
 
 
 def read_bytes(path: Path | str) -> bytes:
-    """Return the content of a file, cut at its reported size, because some system files
-    never end.
-    """
+    """Return the content of a file, cut at its reported size, because some system files never end."""
     with Path(path).open("rb") as file:
         return file.read(os.fstat(file.fileno()).st_size)
 

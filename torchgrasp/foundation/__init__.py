@@ -1,3 +1,1 @@
-"""What every other folder builds on, without robotics: errors, checks of arguments, values,
-processes, limits.
-"""
+"""What all other folders build on, without robotics: errors, checks, processes, limits. Not public."""

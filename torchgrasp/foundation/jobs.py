@@ -197,9 +197,7 @@ class _Apart(SpawnContext):
 
 
 def _begin(function: Callable[..., Any]) -> None:
-    """Prepare a worker process: it uses one torch thread, and it ends when its parent
-    process ends.
-    """
+    """Prepare a worker process: it uses one torch thread, and it ends when its parent process ends."""
     torch.set_num_threads(1)
     parent = multiprocessing.parent_process()
     assert parent is not None

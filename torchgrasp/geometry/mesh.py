@@ -40,10 +40,12 @@ def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
     """Return a closed triangle mesh [m], read from a file or given, after checks; a bad mesh is
     never repaired.
 
-    Raises: MeshError: the file is no .obj, .off, .ply or .stl file, has no faces, or has too many
-        faces or bytes; or the mesh has non-finite vertices, an open surface, faces that are not all
-        turned outward, or no volume. SuspiciousScale: the longest side of the bounding box is
-        outside [5 mm, 2 m]; most often the unit is mm.
+    Raises:
+        MeshError: the file is no .obj, .off, .ply or .stl file, has no faces, or has too many faces
+            or bytes; or the mesh has non-finite vertices, an open surface, faces that are not all
+            turned outward, or no volume.
+        SuspiciousScale: the longest side of the bounding box is outside [5 mm, 2 m]; most often the
+            unit is mm.
     """
     name = "a mesh"
     if not isinstance(mesh, trimesh.Trimesh):

@@ -250,9 +250,7 @@ class Hand(Value):
 
     @checked(gradients=True)
     def tip_centres(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b f 3"]:
-        """Return the centres [m] of the fingertip spheres; for tips of radius 0 the
-        contact points.
-        """
+        """Return the centres [m] of the fingertip spheres; for tips of radius 0 the contact points."""
         _, carriers = self.tips.frames(self._columns(joints))
         return _rows(map_points(carriers, self.tips.in_carriers[2]), joints)
 

@@ -286,9 +286,7 @@ def _coupling(field: Field) -> dict[str, Mimic]:
 
 
 def _pairs(field: Field) -> tuple[tuple[str, str], ...] | None:
-    """Read the pairs of links to test for self-collision from hand.toml, or None if it
-    gives none.
-    """
+    """Read the pairs of links to test for self-collision from hand.toml, or None if it gives none."""
     pairs = _entries(field, (), {"pairs": None})["pairs"]
     if pairs.value is None:
         return None

@@ -60,12 +60,14 @@ def find_hand(name_or_path: str | Path) -> Path:
 def load_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
     """Load a hand from its hand.toml and URDF, with the chosen grasping fingers.
 
-    Args: name_or_path: a shipped hand, such as "allegro", "barrett", "leap" or "shadow", or the
-        folder of another hand. fingers: the grasping fingers, as an option of hand.toml: "default",
-        or for the Allegro "four" (all) or "paper_literal" (index, middle and ring); or as a number,
-        for the first option with so many fingers; or as the names of three to five fingers in grasp
-        order. Joints of other fingers are parked where an option parks them, else at zero or the
-        limit nearest to zero.
+    Args:
+        name_or_path: a shipped hand, such as "allegro", "barrett", "leap" or "shadow", or the
+            folder of another hand.
+        fingers: the grasping fingers, as an option of hand.toml: "default", or for the Allegro
+            "four" (all) or "paper_literal" (index, middle and ring); or as a number, for the first
+            option with so many fingers; or as the names of three to five fingers in grasp order.
+            Joints of other fingers are parked where an option parks them, else at zero or the limit
+            nearest to zero.
 
     Raises `HandFileError` if a file is missing or malformed, or the two do not fit, and
     `BadArgument` for unknown fingers.

@@ -191,9 +191,7 @@ class SelfCollision(Value):
         return torch.linalg.vector_norm(self.half, dim=1) + self.radius
 
     def _sums(self, radius: Float[Tensor, " s"], like: Tensor) -> Float[Tensor, "p 1"]:
-        """Return for each pair of shapes the sum of their radii, given the `radius` of
-        every shape.
-        """
+        """Return for each pair of shapes the sum of their radii, given the `radius` of every shape."""
         return radius[self.pairs].sum(1, keepdim=True).to(like)
 
     def _choose(

@@ -170,9 +170,7 @@ def refine_on_contacts(
 def try_best_seeds(
     problem: GraspProblem, seeds: IKSeeds, steps: int = ITERATIONS
 ) -> Attempts[Grasps]:
-    """Refine the first two seeds of each contact set onto fixed contacts, and return the
-    results.
-    """
+    """Refine the first two seeds of each contact set onto fixed contacts, and return the results."""
     attempts = Attempts(torch.ones_like(problem.certificate.closed), executable)
     attempts.refine(
         seeds, rank_in_group(seeds.row), (2,), partial(refine_on_contacts, problem, steps=steps)

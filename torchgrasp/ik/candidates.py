@@ -324,7 +324,7 @@ def score(
     """Return the geometric score of each grasp, at most 0; a higher score is better.
 
     Three things lower it: the contacts' distance from `center` [m], the friction needed, and the
-        angle off the pads.
+    angle off the pads.
     """
     offset = torch.linalg.vector_norm(contacts.points.mean(1) - center, dim=-1)
     away = offset / CHECKS.offset

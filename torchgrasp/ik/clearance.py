@@ -34,11 +34,13 @@ class Obstacles(Value):
     """Regions of a scene that are probably occupied, given as grids of the distance [m] from these
     regions.
 
-    Args: field: signed distances from the region that counts as occupied, negative inside.
+    Args:
+        field: signed distances from the region that counts as occupied, negative inside.
         distances: for each of the `levels`, the distances from the region that is occupied with at
-        least this probability; 0 inside, on the same grid. levels: k probabilities, ascending.
+            least this probability; 0 inside, on the same grid.
+        levels: k probabilities, ascending.
         hard: whether links must not touch the occupied region; otherwise a collision only lowers
-        the predicted success.
+            the predicted success.
 
     >>> from torchgrasp import load_scene
     >>> from torchgrasp.scene import estimate_occupancy

@@ -25,9 +25,7 @@ from torchgrasp.hand.kinematics import map_points
 @checked
 @dataclasses.dataclass(frozen=True)
 class Configuration(Batch):
-    """Configurations of a free-floating hand: its joints [rad] and its pose in the
-    object's frame.
-    """
+    """Configurations of a free-floating hand: its joints [rad] and its pose in the object's frame."""
 
     joints: Float[Tensor, "g h"]
     obj_from_hand: Poses

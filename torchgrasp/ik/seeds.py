@@ -160,9 +160,7 @@ def tips_frame(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 4 4"]:
 def feature(
     centres: Float[Tensor, "*b f 3"], pads: Float[Tensor, "*b f 3"]
 ) -> Float[Tensor, "*b d"]:
-    """Return the feature vector of a posture: tip centres and pad axes, each divided by
-    its scale.
-    """
+    """Return the feature vector of a posture: tip centres and pad axes, each divided by its scale."""
     return (
         torch.cat([centres / SEEDS.length_scale, pads / SEEDS.cosine_scale], -1).flatten(-2).float()
     )

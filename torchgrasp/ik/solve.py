@@ -94,15 +94,20 @@ def solve_ik(
     finite, or not one for each fingertip, a mixture of another hand, or an unknown method. For more
     than three fingertips it refuses a mixture and COBYLA.
 
-    Args: contacts: b contact sets, one contact for each fingertip; `std_m` and `variance` are not
-        used. mixture: the hand's learned model; without it, all initial guesses come from
-        `library`. world: object, table and obstacles that the links must not touch; by default,
-        only self-collision counts. method: "cobyla" is the paper's method (Sec. 6.3), which brings
-        each tip's contact point to its contact and ignores the contact directions. library: the
-        hand's random postures; by default they are drawn when they are needed.
+    Args:
+        contacts: b contact sets, one contact for each fingertip; `std_m` and `variance` are not
+            used.
+        mixture: the hand's learned model; without it, all initial guesses come from `library`.
+        world: object, table and obstacles that the links must not touch; by default, only
+            self-collision counts.
+        method: "cobyla" is the paper's method (Sec. 6.3), which brings each tip's contact point to
+            its contact and ignores the contact directions.
+        library: the hand's random postures; by default they are drawn when they are needed.
 
-    Returns: The best configuration for each contact set. With `Status.OK` every tip is within 1 mm
-        of its contact, every contact direction is inside its pad's cone, and every link is clear.
+    Returns:
+        The best configuration for each contact set. With `Status.OK` every tip is within 1 mm of
+            its contact, every
+        contact direction is inside its pad's cone, and every link is clear.
 
     >>> from torchgrasp.hand.load import load_hand
     >>> points = 0.05 * torch.eye(3)[None].double()

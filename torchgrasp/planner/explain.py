@@ -185,8 +185,8 @@ class Explanation(Value):
     >>> funnel = Funnel((Losses("grasps", "postures", 40, {Status.TABLE_COLLISION: 40}),))
     >>> lower = Trial("if the table were 20 mm lower", choice=True, executable=9, expected=7.5, funnel=funnel)
     >>> print(Explanation(50, funnel, (lower,)))
-    grasps: 0 of 40 postures (40 table_collision) What would help most (1 change tried): if the
-    table were 20 mm lower: 9 executable grasps, from 50 starts.
+    grasps: 0 of 40 postures (40 table_collision)
+    What would help most (1 change tried): if the table were 20 mm lower: 9 executable grasps, from 50 starts.
     """
 
     starts: int
@@ -260,9 +260,11 @@ def explain_empty(
     they could prevent; fewer with "auto" fingers. If no change helps, a request of at most 80
     guesses is tried with four times as many. Raises the errors of `plan_grasps`.
 
-    Args: cloud, hand, spec, starts, seed: as in `plan_grasps`. options: the further arguments of
-        `plan_grasps`. The `observer` is called with "funnel" and the `Funnel` of the first plan,
-        then with "change" and the `Trial` of each change. No change begins after `time_budget`.
+    Args:
+        cloud, hand, spec, starts, seed: as in `plan_grasps`.
+        options: the further arguments of `plan_grasps`. The `observer` is called with "funnel" and
+            the `Funnel` of the first plan, then with "change" and the `Trial` of each change. No
+            change begins after `time_budget`.
 
     >>> from torchgrasp import load_hand, load_object
     >>> spec = ContactSpec(friction=0.0, table=0.0)

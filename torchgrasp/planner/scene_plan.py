@@ -97,12 +97,16 @@ def plan_scene(
     off by the image border, are planned last. Raises `BadArgument` for a scene without objects, or
     an argument of the wrong type or range.
 
-    Args: scene: objects on a table, or a file of `save_scene`. hand: from `load_hand`, or its name
-        or folder. spec: the constraints on contacts; `ContactSpec()` by default. starts: number of
-        random initial guesses of the contact planner for each object. seed: random seed. enough:
-        predicted success of a grasp, in [0, 1], at which the remaining objects are not planned.
+    Args:
+        scene: objects on a table, or a file of `save_scene`.
+        hand: from `load_hand`, or its name or folder.
+        spec: the constraints on contacts; `ContactSpec()` by default.
+        starts: number of random initial guesses of the contact planner for each object.
+        seed: random seed.
+        enough: predicted success of a grasp, in [0, 1], at which the remaining objects are not
+            planned.
         options: see `plan_grasps`; `fingers` "auto" chooses for each object. `hand_of` loads the
-        hand of grasps.
+            hand of grasps.
 
     >>> from torchgrasp import load_hand, load_scene
     >>> plan = plan_scene(load_scene(), load_hand("barrett"), starts=30, enough=0.5)

@@ -141,8 +141,8 @@ def expectation_maximisation(
 def expectation(
     shard: DataRows, components: Components
 ) -> tuple[Float[Tensor, "m f"], Float[Tensor, ""]]:
-    """Return for each component the features summed with its responsibilities, and the log-
-    likelihood of all data.
+    """Return for each component the features summed with its responsibilities, and the
+    log-likelihood of all data.
     """
     x = shard.rows
     coefficients = coefficients_from_components(components)

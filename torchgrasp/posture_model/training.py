@@ -138,17 +138,22 @@ def fit_mixture(
     A checkpoint that is damaged or cannot be written is a `ModelFileError` or `OutputError`. A
     component that collapsed more than three times is an `IndefiniteCovariance`.
 
-    Args: samples: joints [rad] and fingertip codes of postures of one hand. components: number m of
-        Gaussians. iterations: largest number of steps. tolerance: stop when a step raises the mean
-        log-likelihood by less [nats]. regularisation: variance added to every dimension of a
-        component, relative to its variance over all samples. starts: number of k-means
-        initialisations, with consecutive seeds. After a few steps of each, the fit of the greatest
-        likelihood continues. subset: least number of rows of nested random subsets, each half of
-        the next. EM fits one after the other, and all rows at last. Every start is fitted to the
-        smaller subsets. By default, EM sees all rows in each step. checkpoint: file that stores the
-        fit after every step. A fit that continues from it gives the same bits. distributed: whether
-        `samples` are only the part of this process under torchrun. All processes must see the same
-        checkpoint.
+    Args:
+        samples: joints [rad] and fingertip codes of postures of one hand.
+        components: number m of Gaussians.
+        iterations: largest number of steps.
+        tolerance: stop when a step raises the mean log-likelihood by less [nats].
+        regularisation: variance added to every dimension of a component, relative to its variance
+            over all samples.
+        starts: number of k-means initialisations, with consecutive seeds. After a few steps of
+            each, the fit of the greatest likelihood continues.
+        subset: least number of rows of nested random subsets, each half of the next. EM fits one
+            after the other, and all rows at last. Every start is fitted to the smaller subsets. By
+            default, EM sees all rows in each step.
+        checkpoint: file that stores the fit after every step. A fit that continues from it gives
+            the same bits.
+        distributed: whether `samples` are only the part of this process under torchrun. All
+            processes must see the same checkpoint.
 
     >>> import torch
     >>> numbers = torch.rand(500, 7, generator=torch.Generator().manual_seed(0))

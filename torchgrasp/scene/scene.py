@@ -30,13 +30,17 @@ from torchgrasp.values.planning import PointCloud
 class Scene(Value):
     """Objects on a table, as one camera saw them, in the given frame ("obj").
 
-    Args: points: every measured point [m]. labels: 1, 2, ... for the objects, 0 for the table and
-        everything else. image: the camera's depth image, which shows free space and hidden space.
-        pixels: row and column of each point in the image. table: the plane that the objects stand
-        on, or None if it is unknown. target: label of the object to be grasped, or None if none is
-        chosen. others: other planes that objects could stand on, the more plausible first. notes: a
-        sentence for each given mask or label from which pixels were removed. given: labels whose
-        pixels the user gave, as labels or as a mask; the library found the other objects.
+    Args:
+        points: every measured point [m].
+        labels: 1, 2, ... for the objects, 0 for the table and everything else.
+        image: the camera's depth image, which shows free space and hidden space.
+        pixels: row and column of each point in the image.
+        table: the plane that the objects stand on, or None if it is unknown.
+        target: label of the object to be grasped, or None if none is chosen.
+        others: other planes that objects could stand on, the more plausible first.
+        notes: a sentence for each given mask or label from which pixels were removed.
+        given: labels whose pixels the user gave, as labels or as a mask; the library found the
+            other objects.
 
     >>> from torchgrasp import load_scene
     >>> target = load_scene().select([394, 312])  # a clicked pixel: column, row
@@ -74,21 +78,27 @@ class Scene(Value):
         Pixels on the table and flying pixels at rims get the label 0. Without labels the objects
         are the connected components above the table.
 
-        Args: depth: (h, w), as `cloud_from_depth` takes it: floats in metres, or integers in
-            millimetres. intrinsics: (3, 3), (fx, fy, cx, cy) [pixels], or another form that
-            `cloud_from_depth` takes. camera_pose: obj_from_camera (4, 4), rigid; without it results
-            are in the camera's frame. mask: (h, w), not 0 at the target, accurate to a few pixels;
-            or in another form that `labels` allows. labels: (h, w) of whole numbers, where 0 means
-            no object; a picture with a colour for each object; a list of masks; or COCO's run
-            lengths. point: a place on the target, as a pixel (u, v) or a point (x, y, z) [m].
-            table: a plane, or its height z [m]; by default it is fitted. up: (3,), against gravity,
-            for the fit; None allows any direction. depth_unit: metres of one count of the depth, as
-            `cloud_from_depth` takes it.
+        Args:
+            depth: (h, w), as `cloud_from_depth` takes it: floats in metres, or integers in
+                millimetres.
+            intrinsics: (3, 3), (fx, fy, cx, cy) [pixels], or another form that `cloud_from_depth`
+                takes.
+            camera_pose: obj_from_camera (4, 4), rigid; without it results are in the camera's
+                frame.
+            mask: (h, w), not 0 at the target, accurate to a few pixels; or in another form that
+                `labels` allows.
+            labels: (h, w) of whole numbers, where 0 means no object; a picture with a colour for
+                each object; a list of masks; or COCO's run lengths.
+            point: a place on the target, as a pixel (u, v) or a point (x, y, z) [m].
+            table: a plane, or its height z [m]; by default it is fitted.
+            up: (3,), against gravity, for the fit; None allows any direction.
+            depth_unit: metres of one count of the depth, as `cloud_from_depth` takes it.
 
-        Raises: BadArgument: what `cloud_from_depth` refuses; mask or labels of another size; a
-            target that is the table; a point where nothing was measured; a camera below the table;
-            a pose or a unit that the view contradicts. NoSupport: no plane is found on which
-            objects stand.
+        Raises:
+            BadArgument: what `cloud_from_depth` refuses; mask or labels of another size; a target
+                that is the table; a point where nothing was measured; a camera below the table; a
+                pose or a unit that the view contradicts.
+            NoSupport: no plane is found on which objects stand.
         """
         if sum(given is not None for given in (mask, labels, point)) > 1 and mask is not None:
             raise BadArgument("mask", "a mask beside labels or a point", "one of them")

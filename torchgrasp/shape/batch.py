@@ -29,9 +29,12 @@ Evaluate = Callable[[Tensor, Tensor], tuple[Tensor, ...]]
 class Walls(Value):
     """The posteriors of w surfaces with thin-plate kernels; missing observations have the weight 0.
 
-    Args: x: observed points, those with normals first. a: weight of each observed distance. b:
-        weight of each observed normal, of the first `near` points. whitener: rows of covariances
-        with all observations (distances, then normals by component), times this matrix, are white.
+    Args:
+        x: observed points, those with normals first.
+        a: weight of each observed distance.
+        b: weight of each observed normal, of the first `near` points.
+        whitener: rows of covariances with all observations (distances, then normals by component),
+            times this matrix, are white.
         psi: length of each kernel.
     """
 
@@ -131,11 +134,15 @@ class ShapeBatch(Value):
 
     Numbers of a shape, such as its `scale`, are tensors with one number for each row.
 
-    Args: surfaces: the posteriors of all surfaces: one for each cloud, then the inner ones of open
-        vessels. wall: the indices of each cloud's outer and inner surface, which are the same if
-        the object is not hollow. centers, scales, radii, factors: center [m], scale [m], domain
-        radius and factor of deviations of each cloud. owner: the cloud of each row. hollow: whether
-        any object is hollow.
+    Args:
+        surfaces: the posteriors of all surfaces: one for each cloud, then the inner ones of open
+            vessels.
+        wall: the indices of each cloud's outer and inner surface, which are the same if the object
+            is not hollow.
+        centers, scales, radii, factors: center [m], scale [m], domain radius and factor of
+            deviations of each cloud.
+        owner: the cloud of each row.
+        hollow: whether any object is hollow.
     """
 
     surfaces: Walls

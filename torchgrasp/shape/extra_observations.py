@@ -64,7 +64,8 @@ STD_FACTORS: dict[tuple[Kind, bool], float] = {
 """Ratio of real errors to the posterior's standard deviations, by kind of hidden side and whether
 the table is known.
 
-`scripts/train.py bands DIR` fits them."""
+`scripts/train.py bands DIR` fits them.
+"""
 Part = tuple[Observations, Tensor | None]  # observations, and the errors that their distances share
 FreeSpace = tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]
 """Normalised points in free space, and least signed distances there."""

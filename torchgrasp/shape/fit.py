@@ -74,26 +74,33 @@ def fit_shape(
     With "paper", as in Sec. 3.1, the cloud's centre is observed at distance -1, and 20 random
     points around it at +1.
 
-    Args: cloud: points [m] of one object from one view or several (`merge_clouds`), as in
-        `plan_grasps`. Normals, if they are given, tell whether the points cover the whole surface.
-        Walls thinner than the cloud's spacing merge, but an open vessel seen from above on a
-        `table` becomes a `HollowShape` with two surfaces. noise: standard deviation of an observed
-        signed distance, in radii of the object. If `support` is "paper", also of a normal. budget:
-        number of observed points: 1 inside, 20 outside, the rest the most informative of the cloud.
-        The default is 85 for "camera", which does not count points of the outline and mirrored
-        points, and 70 for "paper". "sure", the paper's rule, adds points until no point's variance
-        exceeds `noise`, at most 1000. psi_scale: ratio of the kernel's length psi to the longest
-        distance between observed points; below 1.34 the covariance may be indefinite. support:
-        observations besides the cloud's points, "camera" or "paper"; see above. seed: random seed.
-        table: the table's plane, or its height [m] along z; only "camera" uses it. kernel:
-        "thin_plate", "matern52" or "rbf", whose length psi sets (`kernel_by_name`); or your own
-        `Kernel` of normalised distances. criterion: what is greatest at the most informative point:
-        the "variance" of its distance, the "error"
+    Args:
+        cloud: points [m] of one object from one view or several (`merge_clouds`), as in
+            `plan_grasps`. Normals, if they are given, tell whether the points cover the whole
+            surface. Walls thinner than the cloud's spacing merge, but an open vessel seen from
+            above on a `table` becomes a `HollowShape` with two surfaces.
+        noise: standard deviation of an observed signed distance, in radii of the object. If
+            `support` is "paper", also of a normal.
+        budget: number of observed points: 1 inside, 20 outside, the rest the most informative of
+            the cloud. The default is 85 for "camera", which does not count points of the outline
+            and mirrored points, and 70 for "paper". "sure", the paper's rule, adds points until no
+            point's variance exceeds `noise`, at most 1000.
+        psi_scale: ratio of the kernel's length psi to the longest distance between observed points;
+            below 1.34 the covariance may be indefinite.
+        support: observations besides the cloud's points, "camera" or "paper"; see above.
+        seed: random seed.
+        table: the table's plane, or its height [m] along z; only "camera" uses it.
+        kernel: "thin_plate", "matern52" or "rbf", whose length psi sets (`kernel_by_name`); or your
+            own `Kernel` of normalised distances.
+        criterion: what is greatest at the most informative point: the "variance" of its distance,
+            the "error"
             |mean distance|, or "both", |error| + 2 sqrt(variance).
 
-    Raises: BadArgument: an argument out of range; a table above the object's foot; a cloud that
-        `prepare_cloud` refuses; a view that is not wholly in front of its camera; for "camera" a
-        whole surface without normals. TooFewPoints: too few points are left; see `prepare_cloud`.
+    Raises:
+        BadArgument: an argument out of range; a table above the object's foot; a cloud that
+            `prepare_cloud` refuses; a view that is not wholly in front of its camera; for "camera"
+            a whole surface without normals.
+        TooFewPoints: too few points are left; see `prepare_cloud`.
         IndefiniteCovariance: `psi_scale` is too small, or the kernel too long for the noise.
 
     >>> from torchgrasp.geometry.linalg import unit
@@ -227,13 +234,16 @@ def condition(
     and the domain's radius are constants. Raises `BadArgument` for an unknown kernel or points
     inside torch.vmap, and `IndefiniteCovariance` if psi is too small for these observations.
 
-    Args: observations: signed distances and normals at points, with their noise, all normalised.
-        torch.vmap may map over distances, normals and noise. Then `IndefiniteCovariance` is not
-        raised, and the estimate is NaN. normalisation: centre and scale of the normalised frame.
-        cloud: the points that the camera saw [m]. psi_scale: ratio of the kernel's length psi to
-        the longest distance between observed points; the paper's value 1 makes the covariance
-        indefinite. std_factor: ratio of the surface's true deviations to the posterior's standard
-        deviations. kernel: a name (see `kernel_by_name`), or any `Kernel` of normalised distances.
+    Args:
+        observations: signed distances and normals at points, with their noise, all normalised.
+            torch.vmap may map over distances, normals and noise. Then `IndefiniteCovariance` is not
+            raised, and the estimate is NaN.
+        normalisation: centre and scale of the normalised frame.
+        cloud: the points that the camera saw [m].
+        psi_scale: ratio of the kernel's length psi to the longest distance between observed points;
+            the paper's value 1 makes the covariance indefinite.
+        std_factor: ratio of the surface's true deviations to the posterior's standard deviations.
+        kernel: a name (see `kernel_by_name`), or any `Kernel` of normalised distances.
 
     >>> x, noise = torch.cat([torch.eye(3), -torch.eye(3)]).double() / 2, torch.full((6,), 0.01).double()
     >>> seen = Observations(x, 0 * noise, 2 * x, noise > 0, noise, noise)

@@ -42,12 +42,14 @@ class ShapeGP(Posterior, Normalisation):
     points, where the thin plate's normals have one derivative only. `update` refuses points that
     require a gradient.
 
-    Args: psi: the kernel's length psi, normalised. domain_radius: radius, normalised, of the ball
-        in which the posterior is valid. std_factor: ratio of the surface's true deviations to the
-        posterior's standard deviations, calibrated on known objects. cloud: the points that the
-        camera saw, after cleaning. kind: how the hidden side was completed: "ball", "revolution",
-        "mirrored", "vessel", "guess" (from the outline alone), "cut off" (by the image border), or
-        "whole" (no hidden side).
+    Args:
+        psi: the kernel's length psi, normalised.
+        domain_radius: radius, normalised, of the ball in which the posterior is valid.
+        std_factor: ratio of the surface's true deviations to the posterior's standard deviations,
+            calibrated on known objects.
+        cloud: the points that the camera saw, after cleaning.
+        kind: how the hidden side was completed: "ball", "revolution", "mirrored", "vessel", "guess"
+            (from the outline alone), "cut off" (by the image border), or "whole" (no hidden side).
 
     >>> from torchgrasp import fit_shape, load_object
     >>> view = load_object("jug").view

@@ -37,11 +37,14 @@ class Kernel:
     k'', k'''. Autograd of the profile defines them. Gradients also reach tensors that the profile
     itself uses, such as a length.
 
-    Args: profile: the function k(r). diameter: diameter of the ball, normalised, within which k is
-        a covariance; infinite if it is a covariance everywhere. remedy: fix that the error suggests
-        if the covariance is not positive definite. closed_form: function of `r` and `count` that
-        returns these derivatives faster, or False. It serves plain tensors; where a gradient is
-        needed, the profile's derivatives are taken by autograd.
+    Args:
+        profile: the function k(r).
+        diameter: diameter of the ball, normalised, within which k is a covariance; infinite if it
+            is a covariance everywhere.
+        remedy: fix that the error suggests if the covariance is not positive definite.
+        closed_form: function of `r` and `count` that returns these derivatives faster, or False. It
+            serves plain tensors; where a gradient is needed, the profile's derivatives are taken by
+            autograd.
 
     >>> kernel = Kernel(lambda r: (1 + r) * torch.exp(-r))
     >>> [round(float(s), 4) for s in kernel.derivatives(torch.ones(1, dtype=torch.float64), 4)]

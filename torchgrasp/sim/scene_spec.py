@@ -62,20 +62,31 @@ class Body:
 class SceneSpec:
     """Parameters of a simulated scene: a hand on its mount, the object, the table and neighbours.
 
-    Args: urdf_path: URDF of the hand. world_from_hand: pose of the hand (4, 4). joints: start
-        position of every joint of the URDF by name [rad]. drives: motor of every joint of the URDF
-        by name. tip_links: names of the links of the f fingertips, in the order of the grasp's
-        contacts. mesh: closed mesh of the object, which gives table height, centre of mass and
-        inertia. parts: convex bodies that make up the object. mass: mass of the object [kg].
-        friction: friction coefficient of every contact. table_friction: friction coefficient of
-        bodies with the table and each other; by default `friction`. gravity: gravity [m/s^2].
-        timestep: timestep of the simulator [s]. travel: largest height [m] of a lift. approach:
-        displacement [m] from the hand's start to the pose `world_from_hand`. table: whether there
-        is a table. patch: radius [m] of a fingertip's contact patch; torsional friction is friction
-        x force x patch. height: height of the table [m]; by default the lowest point of the mesh.
-        neighbours: other bodies on the table. self_pairs: pairs of the hand's links that collide
-        with each other. yields: largest displacement [m] of the mount along each axis of the world;
-        0 if the mount is stiff. start: displacement [m] of a mount that yields at the beginning.
+    Args:
+        urdf_path: URDF of the hand.
+        world_from_hand: pose of the hand (4, 4).
+        joints: start position of every joint of the URDF by name [rad].
+        drives: motor of every joint of the URDF by name.
+        tip_links: names of the links of the f fingertips, in the order of the grasp's contacts.
+        mesh: closed mesh of the object, which gives table height, centre of mass and inertia.
+        parts: convex bodies that make up the object.
+        mass: mass of the object [kg].
+        friction: friction coefficient of every contact.
+        table_friction: friction coefficient of bodies with the table and each other; by default
+            `friction`.
+        gravity: gravity [m/s^2].
+        timestep: timestep of the simulator [s].
+        travel: largest height [m] of a lift.
+        approach: displacement [m] from the hand's start to the pose `world_from_hand`.
+        table: whether there is a table.
+        patch: radius [m] of a fingertip's contact patch; torsional friction is friction x force x
+            patch.
+        height: height of the table [m]; by default the lowest point of the mesh.
+        neighbours: other bodies on the table.
+        self_pairs: pairs of the hand's links that collide with each other.
+        yields: largest displacement [m] of the mount along each axis of the world; 0 if the mount
+            is stiff.
+        start: displacement [m] of a mount that yields at the beginning.
         mount: the prismatic joints of the mount, instead of those that lift, approach and yield.
     """
 

@@ -1,7 +1,7 @@
 """A simulated scene for one trial: table, object and a hand on a mount.
 
 Every trial opens a fresh scene: only then are two runs bitwise equal. The world's frame is the
-    frame of the grasp.
+frame of the grasp.
 """
 
 import abc

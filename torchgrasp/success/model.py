@@ -23,9 +23,7 @@ KIND = "success-model"
 
 @dataclasses.dataclass(frozen=True)
 class SuccessModel(Value):
-    """Boosted trees: t trees of m nodes, of which the first is the root. A leaf is its
-    own child.
-    """
+    """Boosted trees: t trees of m nodes, of which the first is the root. A leaf is its own child."""
 
     feature: Int[Tensor, "t m"]  # the feature that a node reads
     threshold: Float[

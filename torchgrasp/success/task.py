@@ -22,13 +22,16 @@ from torchgrasp.geometry.plane import Plane
 class GraspTask(Value):
     """What a grasp must do. The predicted success is that of this task.
 
-    Args: mass: of the object [kg]. force: normal force [N] of the strongest finger. None: the hand
-        that lifts grips as the felt load asks for, and one that is pulled at presses with 4 N.
+    Args:
+        mass: of the object [kg].
+        force: normal force [N] of the strongest finger. None: the hand that lifts grips as the felt
+            load asks for, and one that is pulled at presses with 4 N.
         lift: whether the object is lifted off its table. Otherwise it floats, and is pulled along
-        six directions with a force of 10 m/s^2 times its mass. None means a lift if the planner
-        knows the table, but not in open loop. closing: how the hand closes, see `TrialSpec`.
+            six directions with a force of 10 m/s^2 times its mass. None means a lift if the planner
+            knows the table, but not in open loop.
+        closing: how the hand closes, see `TrialSpec`.
         displaced: whether the object may be elsewhere: up to 30 mm along the table, or 5 mm and 5
-        degrees if it floats.
+            degrees if it floats.
 
     Raises `BadArgument` for a number outside its range, or a lift in open loop.
 

@@ -1,3 +1,1 @@
-"""The values that pass between folders: clouds, contacts, grasps; closings; and the options of
-users.
-"""
+"""What passes between folders: clouds, contacts, grasps, closings, options of users. Not public."""

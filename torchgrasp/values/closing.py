@@ -61,11 +61,13 @@ class Disturbance(Value):
     The three columns are contacts with neighbours, with the table, and contacts of links other than
     fingertips with the object.
 
-    Args: first_touch: time [s] of the first contact; infinite if there is none. impulse: sum of the
-        normal impulses [N s]. force: largest mean normal force [N] in a control tick. early:
-        whether the first of these contacts was before a fingertip touched the object.
+    Args:
+        first_touch: time [s] of the first contact; infinite if there is none.
+        impulse: sum of the normal impulses [N s].
+        force: largest mean normal force [N] in a control tick.
+        early: whether the first of these contacts was before a fingertip touched the object.
         neighbour_pose: transform that has moved each of m neighbours from its start to its place at
-        each tick.
+            each tick.
     """
 
     first_touch: Annotated[Float[Tensor, "3"], ANY]
@@ -80,12 +82,17 @@ class Disturbance(Value):
 class ClosingTrace(Value):
     """True contacts at every control tick, and estimates of the controller, in the hand's frame.
 
-    Args: forces: forces [N] on the object, with friction. points: contact points [m]; NaN without
-        contact. normals: outward unit normals; NaN without contact. sliding: speed [m/s] of each
-        fingertip along the surface. blend: weight lambda of Eq. (26), 0 for position and 1 for
-        force control; NaN if the control law was not active. friction: coefficient of friction that
-        the holding mode "grip" estimates; NaN before the hand holds. load: load [N] on the grasp
-        that the holding mode "grip" estimates; NaN before the hand holds.
+    Args:
+        forces: forces [N] on the object, with friction.
+        points: contact points [m]; NaN without contact.
+        normals: outward unit normals; NaN without contact.
+        sliding: speed [m/s] of each fingertip along the surface.
+        blend: weight lambda of Eq. (26), 0 for position and 1 for force control; NaN if the control
+            law was not active.
+        friction: coefficient of friction that the holding mode "grip" estimates; NaN before the
+            hand holds.
+        load: load [N] on the grasp that the holding mode "grip" estimates; NaN before the hand
+            holds.
     """
 
     forces: Annotated[Float[Tensor, "t f 3"], ANY]
@@ -103,23 +110,35 @@ class ClosureResult(Value):
     """The result of closing a hand on the true object in simulation; NaN if the trial ended before
     a measurement.
 
-    Args: held: whether the object was lifted with the hand and slipped little. status: `OK`, or the
-        reason why it was not held. time: times [s] of the control ticks. forces: normal force [N]
-        of each fingertip. object_pose: pose of the object in the frame of the grasp. hand_pose:
-        pose of the hand in the frame of the grasp. joints: positions [rad] of every joint of the
-        URDF, in the order of `joint_names`. targets: positions [rad] to which the drives of these
-        joints were sent in the tick that ended. joint_names: names of the joints. contact_order:
-        the fingers in the order of their first contacts. object_motion: motion of the object in the
-        hand from the pre-grasp to the end. pushed: motion of the object from the pre-grasp until
-        all fingers touched, or the closing ended. before_lift: motion of the object from the start
-        to the lift. rise: height [m] by which the object's centre has risen at the end. unbalanced:
-        norm of the sum of the fingertip forces before the lift, relative to the sum of their norms.
-        slip: motion of the object in the hand after the hand has pressed. start_overlap: depth [m]
-        by which the opened hand penetrates the object or the table at the start. disturbance:
-        unintended contacts of the hand. trace: contacts and estimates at every tick. phases: times
-        [s] at which the hand arrived, all fingers touched, and the hand pressed; NaN if never.
-        stops: how often the approaching hand stopped at a contact. attempts: how often the hand
-        closed. seconds: wall time [s] of the trial.
+    Args:
+        held: whether the object was lifted with the hand and slipped little.
+        status: `OK`, or the reason why it was not held.
+        time: times [s] of the control ticks.
+        forces: normal force [N] of each fingertip.
+        object_pose: pose of the object in the frame of the grasp.
+        hand_pose: pose of the hand in the frame of the grasp.
+        joints: positions [rad] of every joint of the URDF, in the order of `joint_names`.
+        targets: positions [rad] to which the drives of these joints were sent in the tick that
+            ended.
+        joint_names: names of the joints.
+        contact_order: the fingers in the order of their first contacts.
+        object_motion: motion of the object in the hand from the pre-grasp to the end.
+        pushed: motion of the object from the pre-grasp until all fingers touched, or the closing
+            ended.
+        before_lift: motion of the object from the start to the lift.
+        rise: height [m] by which the object's centre has risen at the end.
+        unbalanced: norm of the sum of the fingertip forces before the lift, relative to the sum of
+            their norms.
+        slip: motion of the object in the hand after the hand has pressed.
+        start_overlap: depth [m] by which the opened hand penetrates the object or the table at the
+            start.
+        disturbance: unintended contacts of the hand.
+        trace: contacts and estimates at every tick.
+        phases: times [s] at which the hand arrived, all fingers touched, and the hand pressed; NaN
+            if never.
+        stops: how often the approaching hand stopped at a contact.
+        attempts: how often the hand closed.
+        seconds: wall time [s] of the trial.
     """
 
     held: bool
@@ -156,13 +175,16 @@ SensorKind = Literal["tactile", "torque", "binary"]
 class ClosingOptions(Value):
     """Options of the closing modes "uncertainty" and "fixed", which extend the paper's control law.
 
-    Args: wait: whether a finger that touches waits for the others, so that all press together.
+    Args:
+        wait: whether a finger that touches waits for the others, so that all press together.
         pose_estimate: whether early and late touches update the estimated object pose, which moves
-        all contact targets. palm_reach: largest displacement [m] of the palm, which follows the
-        estimated object pose; 0 means that the palm does not move. stops: how often the approaching
-        hand may stop at an unexpected contact and move sideways; 0 means never. attempts: largest
-        number of closings: on a known table the hand closes again if the grasp seems too weak to
-        lift.
+            all contact targets.
+        palm_reach: largest displacement [m] of the palm, which follows the estimated object pose; 0
+            means that the palm does not move.
+        stops: how often the approaching hand may stop at an unexpected contact and move sideways; 0
+            means never.
+        attempts: largest number of closings: on a known table the hand closes again if the grasp
+            seems too weak to lift.
 
     Raises `BadArgument` for a number outside its range, for `palm_reach` or a second attempt
     without `pose_estimate`, or for `stops` with a `palm_reach` of 0.
@@ -208,11 +230,13 @@ class SensorModel(Value):
     """The sensors of a hand's fingertips: kind, delay, noise and dead sensors. `FingertipSensor`
     simulates them.
 
-    Args: kind: what the sensors measure. "tactile": force, position and sliding of each contact,
-        like a BioTac. "torque": only the force, from the torques of the finger's joints. "binary":
-        only whether the tip touches. delay: age [s] of the readings, rounded to whole samples of
-        the sensor. noise: factor that multiplies the usual noise of the sensor. dead: names of the
-        fingers whose sensor is known to be broken.
+    Args:
+        kind: what the sensors measure. "tactile": force, position and sliding of each contact, like
+            a BioTac. "torque": only the force, from the torques of the finger's joints. "binary":
+            only whether the tip touches.
+        delay: age [s] of the readings, rounded to whole samples of the sensor.
+        noise: factor that multiplies the usual noise of the sensor.
+        dead: names of the fingers whose sensor is known to be broken.
 
     Raises `BadArgument` for a number outside its range, or an unknown kind.
 

@@ -30,10 +30,12 @@ from torchgrasp.geometry.plane import Plane, read_plane
 class PointCloud(Value):
     """The measured surface points of one object, with optional normals and camera positions.
 
-    Args: points: surface points [m], at least 4. normals: outward normals of any length, or None.
+    Args:
+        points: surface points [m], at least 4.
+        normals: outward normals of any length, or None.
         viewpoint: position of the camera [m], or of each point's camera; None if it is unknown.
         frustum: inward unit normals of the four sides of the camera's view, or of each point's
-        camera; None if unknown. An object that reaches a side is cut off there.
+            camera; None if unknown. An object that reaches a side is cut off there.
 
     Raises `BadArgument` for a wrong shape or dtype or numbers that are not finite, `TooFewPoints`
     for fewer than 4 points.

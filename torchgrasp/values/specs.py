@@ -37,21 +37,29 @@ class ContactSpec(Value):
     The estimated surface differs from the true one, so the defaults keep larger margins than the
     paper: a lower friction, a flat surface, and a distance between fingertips.
 
-    Args: friction: coefficient of friction between fingertip and object at execution. edges: number
-        of edges of the linearised friction cone, at least 3. max_variance: largest variance of the
-        surface at a contact, S_thresh of Eq. (12), in normalised units. friction_margin: contacts
-        are planned and certified with `friction * friction_margin`. separation: least distance
-        between the centres of two fingertips [m]; by default their diameter plus 2 mm. Contacts on
-        opposite sides of a thin object may be closer. flatness: largest angle [rad] between the
-        normals at a contact and on a ring around it; None checks nothing. flat_radius: radius [m]
-        of the ring; by default the largest of `FLAT_RADII` that the object allows. table: the
-        table's `Plane` in the cloud's frame, or its height [m] along z; None means no table.
+    Args:
+        friction: coefficient of friction between fingertip and object at execution.
+        edges: number of edges of the linearised friction cone, at least 3.
+        max_variance: largest variance of the surface at a contact, S_thresh of Eq. (12), in
+            normalised units.
+        friction_margin: contacts are planned and certified with `friction * friction_margin`.
+        separation: least distance between the centres of two fingertips [m]; by default their
+            diameter plus 2 mm. Contacts on opposite sides of a thin object may be closer.
+        flatness: largest angle [rad] between the normals at a contact and on a ring around it; None
+            checks nothing.
+        flat_radius: radius [m] of the ring; by default the largest of `FLAT_RADII` that the object
+            allows.
+        table: the table's `Plane` in the cloud's frame, or its height [m] along z; None means no
+            table.
         tip_radius: radius [m] of the fingertips, which may rest on the table; 0 means points. By
-        default the hand's. start_radius: normalised radius of the sphere on which initial guesses
-        are drawn (Sec. 6.2; the paper: 0.1). fingertips: number of contacts, one for each
-        fingertip: 3, 4 or 5. contact_allowed: whether links may touch and push the target's
-        neighbours; collisions then only lower the predicted success. region: function of points (n,
-        3) [m], such as a `Region`, that is negative where contacts may be.
+            default the hand's.
+        start_radius: normalised radius of the sphere on which initial guesses are drawn (Sec. 6.2;
+            the paper: 0.1).
+        fingertips: number of contacts, one for each fingertip: 3, 4 or 5.
+        contact_allowed: whether links may touch and push the target's neighbours; collisions then
+            only lower the predicted success.
+        region: function of points (n, 3) [m], such as a `Region`, that is negative where contacts
+            may be.
 
     Raises `BadArgument` for a number outside its range.
 
@@ -216,35 +224,47 @@ class TrialSpec(Value):
     holding or simulator, options of a closing that has none, a sensor or force that the closing
     cannot use, or a control period below one timestep.
 
-    Args: closing: how the hand closes. "paper": Eqs. 25-28 as written, with forces of the hand's
-        stability model. "uncertainty": such a law with the calibrated deviation and components
-        (`ClosingOptions`). "fixed": the same with equal gains. "paper_position": PI position
-        control to the contacts until 0.5 N, the paper's baseline. "position": PI control to goals
-        behind the contacts. "open_loop": joint motion from pre-grasp to grasp to squeeze. holding:
-        how the closed hand presses: "force" (balanced forces), "grip" (the forces that the felt
-        load and a push of 2.5 N need), "impedance" (the grasp is a spring in the hand), "position"
-        (joint targets are kept) or "law" (Eq. 25 continues). In open loop the squeeze is kept. None
-        means "grip", or "force" if `force` is given, the closing is not "uncertainty" or "fixed",
-        or a fingertip is not tactile. options: components of the closing "uncertainty" or "fixed";
-        by default all components. sensor: sensors of the fingertips; the controller knows their
-        kind. max_force: largest normal force [N] of a fingertip; None means no limit. mass: mass of
-        the object [kg]. friction: coefficient of friction of every contact. table_friction:
-        coefficient of friction between object and table; by default `friction`. gravity: gravity
-        [m/s^2]. approach: length [m] of the straight path to the pre-grasp; 0 means that the hand
-        starts there. lift_height: height of the lift [m]. hold_time: time [s] after the lift.
-        shake: amplitude [m] of a vertical sinusoid of 5 Hz during the hold. push: force [N] at the
-        object's centre of mass during the hold, in the world's axes, whose z axis points up. force:
-        normal force of the strongest finger [N] in the closing and in the holding "force"; None
-        means 4 N, or `max_force` if it is less. noise: whether the sensor is noisy; for a tactile
-        sensor 0.1 N normal, 0.3 N tangential and 1.5 mm of position. timestep: timestep of the
-        simulator [s]. control_rate: rate of the controller [Hz]. simulator: "sapien" or "mujoco".
-        density: density of the object [kg/m^3]; it replaces `mass` unless None. patch: radius [m]
-        of the contact patch of a fingertip; torsional friction is friction x force x patch. With 0
-        the contacts are hard points, as in the paper. kp: stiffness of all joint drives [N m/rad];
-        by default the hand's own. overlap: largest overlap [m] of hand and object at the start; the
-        object's convex parts bulge a little. table: whether the object stands on a table.
+    Args:
+        closing: how the hand closes. "paper": Eqs. 25-28 as written, with forces of the hand's
+            stability model. "uncertainty": such a law with the calibrated deviation and components
+            (`ClosingOptions`). "fixed": the same with equal gains. "paper_position": PI position
+            control to the contacts until 0.5 N, the paper's baseline. "position": PI control to
+            goals behind the contacts. "open_loop": joint motion from pre-grasp to grasp to squeeze.
+        holding: how the closed hand presses: "force" (balanced forces), "grip" (the forces that the
+            felt load and a push of 2.5 N need), "impedance" (the grasp is a spring in the hand),
+            "position" (joint targets are kept) or "law" (Eq. 25 continues). In open loop the
+            squeeze is kept. None means "grip", or "force" if `force` is given, the closing is not
+            "uncertainty" or "fixed", or a fingertip is not tactile.
+        options: components of the closing "uncertainty" or "fixed"; by default all components.
+        sensor: sensors of the fingertips; the controller knows their kind.
+        max_force: largest normal force [N] of a fingertip; None means no limit.
+        mass: mass of the object [kg].
+        friction: coefficient of friction of every contact.
+        table_friction: coefficient of friction between object and table; by default `friction`.
+        gravity: gravity [m/s^2].
+        approach: length [m] of the straight path to the pre-grasp; 0 means that the hand starts
+            there.
+        lift_height: height of the lift [m].
+        hold_time: time [s] after the lift.
+        shake: amplitude [m] of a vertical sinusoid of 5 Hz during the hold.
+        push: force [N] at the object's centre of mass during the hold, in the world's axes, whose z
+            axis points up.
+        force: normal force of the strongest finger [N] in the closing and in the holding "force";
+            None means 4 N, or `max_force` if it is less.
+        noise: whether the sensor is noisy; for a tactile sensor 0.1 N normal, 0.3 N tangential and
+            1.5 mm of position.
+        timestep: timestep of the simulator [s].
+        control_rate: rate of the controller [Hz].
+        simulator: "sapien" or "mujoco".
+        density: density of the object [kg/m^3]; it replaces `mass` unless None.
+        patch: radius [m] of the contact patch of a fingertip; torsional friction is friction x
+            force x patch. With 0 the contacts are hard points, as in the paper.
+        kp: stiffness of all joint drives [N m/rad]; by default the hand's own.
+        overlap: largest overlap [m] of hand and object at the start; the object's convex parts
+            bulge a little.
+        table: whether the object stands on a table.
         self_collision: whether links of the hand collide with each other, in the pairs that the
-        hand names.
+            hand names.
 
     >>> TrialSpec(mass=0.3).pressing, TrialSpec(force=6.0).pressing
     ('grip', 'force')
@@ -299,9 +319,7 @@ class TrialSpec(Value):
 
     @property
     def strongest(self) -> float:
-        """The normal force [N] of the strongest finger in the closing and in the holding
-        "force".
-        """
+        """The normal force [N] of the strongest finger in the closing and in the holding "force"."""
         return min(4.0, self.max_force or 4.0) if self.force is None else self.force
 
     @property

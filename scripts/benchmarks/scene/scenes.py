@@ -76,8 +76,8 @@ def _separation(a: Float[Tensor, "n 2"], b: Float[Tensor, "m 2"]) -> float:
 
 
 def _widest_strip(a: Float[Tensor, "n 2"], b: Float[Tensor, "m 2"]) -> float:
-    """Return the greatest distance of b from an edge of a, outward; a's corners run counter-
-    clockwise.
+    """Return the greatest distance of b from an edge of a, outward; a's corners run
+    counter-clockwise.
     """
     edge = a.roll(-1, 0) - a
     outward = torch.stack([edge[:, 1], -edge[:, 0]], -1) / torch.linalg.vector_norm(

@@ -56,8 +56,8 @@ def test_lengths_are_those_of_the_code_in_any_frame():
 
 
 def test_log_odds_rank_held_grasps_above_others():
-    """Both densities are Gaussians of known mean: the odds are their quadratic form, and rank held-
-    out states.
+    """Both densities are Gaussians of known mean: the odds are their quadratic form, and rank
+    held-out states.
     """
     held = states(300, 2.0, 2)
     failed = states(300, 0.7, 3)

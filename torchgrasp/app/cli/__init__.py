@@ -1,7 +1,7 @@
 """The command line `torchgrasp`.
 
 Exit codes: 0 done, 1 no executable grasp or object not held, 2 bad input, 130 interrupted, 143
-    terminated.
+terminated.
 """
 
 import contextlib

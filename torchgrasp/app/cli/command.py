@@ -100,8 +100,8 @@ def _metavar(kind: Any) -> str:
 
 
 def execute(command: Command) -> int:
-    """Check paths and number ranges of a command's arguments, then run it; errors name the command-
-    line options.
+    """Check paths and number ranges of a command's arguments, then run it; errors name the
+    command-line options.
     """
     fields = {f.name: f for f in dataclasses.fields(command) if "help" in f.metadata}  # pyright: ignore[reportArgumentType]
     options = {

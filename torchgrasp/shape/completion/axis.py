@@ -2,9 +2,8 @@
 
 The lines along the normals of a surface of revolution meet its axis: they lie in a linear line
 complex of pitch 0 (Pottmann and Wallner, Computational Line Geometry, 2001). The distance by which
-a normal's line misses the axis is the
-moment of the normal about a point of the axis times the axis direction: it is linear in either
-    factor.
+a normal's line misses the axis is the moment of the normal about a point of the axis times the axis
+direction: it is linear in either factor.
 """
 
 import dataclasses
