@@ -11,8 +11,8 @@ import trimesh
 from tests.make import load_hand, real, same_bits
 from torchgrasp import ContactSpec, Status, load_object, plan_grasps, stream_grasps
 from torchgrasp.cloud.camera import look_at, partial_view
-from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.contacts.certify import certify
+from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.foundation.base import join
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import rigid

@@ -27,8 +27,8 @@ from torchgrasp.export import format_grasps
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply
 from torchgrasp.hand import hand_of
-from torchgrasp.planner.request import finger_sets
 from torchgrasp.planner.ranking import expected_success
+from torchgrasp.planner.request import finger_sets
 
 SPEC = ContactSpec(table=0.0)
 ALL = ("index", "middle", "ring", "thumb")
