@@ -57,8 +57,8 @@ from torchgrasp.ik.attempts import solve_contact_first
 from torchgrasp.ik.candidates import measure_errors
 from torchgrasp.ik.configuration import Configuration
 from torchgrasp.ik.motion import collision_probability, lift_clearance
-from torchgrasp.planner.candidates import spread_rows
 from torchgrasp.planner.objects import take_target
+from torchgrasp.planner.rows import spread_rows
 from torchgrasp.scene import estimate_occupancy
 from torchgrasp.shape import extract_surface
 from torchgrasp.shape.completion.complete import complete_cloud

@@ -16,7 +16,7 @@ from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.foundation.base import join
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import rigid
-from torchgrasp.planner.candidates import CHOICE, Candidates, Row, choose, join_candidates
+from torchgrasp.planner.rows import CHOICE, Candidates, Row, choose, join_candidates
 from torchgrasp.planner.schedule import SCHEDULE, schedule
 from torchgrasp.values.planning import Certificate, Contacts, IKSeeds
 

@@ -25,8 +25,8 @@ from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse, rotate
 from torchgrasp.geometry.plane import Plane, move
 from torchgrasp.ik.seeds import query_mixture
-from torchgrasp.planner.candidates import spread_rows
 from torchgrasp.planner.objects import digest
+from torchgrasp.planner.rows import spread_rows
 from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, encode_fingertips, load_mixture
 from torchgrasp.success.model import load_success_model
 from torchgrasp.success.order import by_success, grade

@@ -24,10 +24,10 @@ from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse, rotate
 from torchgrasp.geometry.plane import Plane, move
 from torchgrasp.ik.attempts import assign
-from torchgrasp.planner.candidates import draw, find_candidates, with_costs
 from torchgrasp.planner.many import estimate_shapes, plan_stacks
 from torchgrasp.planner.objects import join_objects, pose_request
 from torchgrasp.planner.request import Request
+from torchgrasp.planner.rows import draw, find_candidates, with_costs
 from torchgrasp.success import TaskWrenches
 from torchgrasp.success.task import loads_of
 

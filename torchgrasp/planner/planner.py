@@ -23,7 +23,10 @@ from torchgrasp.ik.attempts import (
 )
 from torchgrasp.ik.joint import solve_sliding
 from torchgrasp.ik.refine import ITERATIONS
-from torchgrasp.planner.candidates import (
+from torchgrasp.planner.objects import CloudIndex, Objects
+from torchgrasp.planner.ranking import rank
+from torchgrasp.planner.report import Report
+from torchgrasp.planner.rows import (
     Candidates,
     Row,
     choose,
@@ -32,9 +35,6 @@ from torchgrasp.planner.candidates import (
     join_candidates,
     with_costs,
 )
-from torchgrasp.planner.objects import CloudIndex, Objects
-from torchgrasp.planner.ranking import rank
-from torchgrasp.planner.report import Report
 from torchgrasp.planner.schedule import SCHEDULE
 from torchgrasp.values.planning import Grasps
 

@@ -29,7 +29,7 @@ TERMINATED = 143
 INTERRUPTED = 130
 """Exit codes of a command that a signal ended: 128 and the number of SIGTERM or SIGINT."""
 CHAPTERS: dict[str, dict[str, Callable[..., Command | int]]] = {
-    "Plan grasps": {"grasp": grasp.Grasp, "view": look.OpenPage, "objects": look.Objects},
+    "Plan grasps": {"grasp": grasp.Grasp, "view": look.OpenPage, "objects": look.ListObjects},
     "Exchange grasps with other programs": {"export": export.Export, "import": export.Import},
     "Try many grasps in simulation": {
         "evaluate": evaluate.Evaluate,

@@ -40,7 +40,7 @@ class OpenPage(Command):
 
 
 @arguments()
-class Objects(Command):
+class ListObjects(Command):
     """List the shipped objects, each with a noisy view and a true mesh."""
 
     def run(self) -> int:
