@@ -37,7 +37,7 @@ def _install() -> None:
         return
     installed = True
     from torchgrasp.ik.seeds import PostureLibrary
-    from torchgrasp.planner import problem
+    from torchgrasp.planner import objects
     from torchgrasp.shape import fit
 
     fit_upright = fit.fit_upright
@@ -67,7 +67,7 @@ def _install() -> None:
             KEPT[key] = draw(hand, count, seed)
         return dataclasses.replace(KEPT[key], hand=hand)
 
-    fit.fit_upright = problem.fit_upright = shape
+    fit.fit_upright = objects.fit_upright = shape
     PostureLibrary._drawn = staticmethod(library)
 
 

@@ -3,8 +3,6 @@
 Every change is tried by planning with it.
 """
 
-from __future__ import annotations  # help shows the names of types
-
 import dataclasses
 import math
 import time

@@ -1,7 +1,5 @@
 """The planner's entry points: from a point cloud or a scene to ranked grasps, or to batches."""
 
-from __future__ import annotations  # help shows the names of types
-
 from collections.abc import Iterator, Sequence
 from typing import Annotated, Any, overload
 

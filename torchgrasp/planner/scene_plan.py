@@ -1,7 +1,5 @@
 """Planning for all objects of a scene: the objects are ranked by their best grasps."""
 
-from __future__ import annotations  # help shows the names of types
-
 import dataclasses
 import functools
 import math
