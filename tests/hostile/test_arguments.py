@@ -41,7 +41,7 @@ MADE_INSIDE = {
     "Observations",
     "Outlines",
     "PreparedCloud",
-    "Progress",
+    "FitProgress",
     "SampleFolder",
     "SceneSpec",
     "SelfCollision",
