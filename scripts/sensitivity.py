@@ -36,7 +36,8 @@ CLOSED = ("control", "sim", "evaluation")
 """Folders whose numbers act on plans, and on closings."""
 OPTIONS = ("Numbers", "Layout")
 """Ends of the names of options values."""
-SENSITIVITY = """Each constant and each field of an options value is moved by 20 %, up and then down, on plans, a scene and closings.
+SENSITIVITY = """Each constant and each field of an options value is moved by 20 %, up and then down.
+It acts on plans, a scene and closings.
 A number without effect here is a tolerance, a bound of memory or of a file, or serves a case that is not here."""
 
 

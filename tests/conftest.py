@@ -12,7 +12,7 @@ import torch
 from hypothesis import HealthCheck, settings
 from torch import Tensor
 
-from tests import annotations, kept
+from tests import annotations
 
 if TYPE_CHECKING:
     from torchgrasp.values.planning import PointCloud
@@ -53,9 +53,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Check annotations of the first calls of the next test, too; it may get kept shapes."""
+    """Check annotations of the first calls of the next test, too."""
     annotations.LEFT.clear()
-    kept.allow(item.path)
 
 
 @pytest.fixture

@@ -60,8 +60,9 @@ def test_ply_of_another_writer(tmp_path, points, encoding):
 
 
 def test_ply_big_endian_with_other_properties(tmp_path, points):
-    header = "ply\nformat binary_big_endian 1.0\nelement vertex 60\nproperty uchar red\nproperty double x\n"
-    header += "property double y\nproperty double z\nelement face 0\nproperty list uchar int vertex_indices\nend_header\n"
+    header = "ply\nformat binary_big_endian 1.0\nelement vertex 60\nproperty uchar red\n"
+    header += "property double x\nproperty double y\nproperty double z\nelement face 0\n"
+    header += "property list uchar int vertex_indices\nend_header\n"
     rows = b"".join(struct.pack(">Bddd", 7, *p) for p in points)
     (tmp_path / "a.ply").write_bytes(header.encode() + rows)
     np.testing.assert_array_equal(read_cloud(tmp_path / "a.ply").points.numpy(), points)
@@ -92,7 +93,8 @@ def test_pcd(tmp_path, points, encoding, view, found):
     header = (
         "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z _ normal_x normal_y normal_z\nSIZE 8 8 8 1 4 4 4\n"
     )
-    header += f"TYPE F F F U F F F\nCOUNT 1 1 1 4 1 1 1\nWIDTH 60\nHEIGHT 1\nVIEWPOINT {view}\nPOINTS 60\nDATA {encoding}\n"
+    header += "TYPE F F F U F F F\nCOUNT 1 1 1 4 1 1 1\nWIDTH 60\nHEIGHT 1\n"
+    header += f"VIEWPOINT {view}\nPOINTS 60\nDATA {encoding}\n"
     if encoding == "ascii":
         body = "".join(
             " ".join(map(repr, [*map(float, p), 0, 0, 0, 0, *map(float, n)])) + "\n"

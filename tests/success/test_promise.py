@@ -123,7 +123,9 @@ def kept(monkeypatch):
         said, held = draw_trials(300, 5)
         rows = np.stack([said.ravel(), held.ravel(), np.arange(300).repeat(4)], -1)
         table = real(rows[: 4 * families].tolist()).view(-1, 3)
-        monkeypatch.setattr(promise, "load_success_model", lambda: type("Model", (), {"kept": table}))
+        monkeypatch.setattr(
+            promise, "load_success_model", lambda: type("Model", (), {"kept": table})
+        )
         monkeypatch.setattr(promise, "find_promise", functools.cache(find_promise.__wrapped__))
         return promise.find_promise
 

@@ -42,7 +42,7 @@ from torchgrasp.ik.seeds import PostureLibrary
 from torchgrasp.planner.request import Request
 from torchgrasp.planner.schedule import BatchSize, batch_sizes
 from torchgrasp.posture_model.mixture import GraspMixture, load_mixture, mixture_path
-from torchgrasp.scene.occupancy import Occupancy, estimate_occupancy
+from torchgrasp.scene.occupancy import estimate_occupancy
 from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.batch import ShapeBatch
 from torchgrasp.shape.completion.silhouette import silhouettes
@@ -72,8 +72,9 @@ class ShapedObject:
     """One object as it was seen, and its estimated shape, in an upright frame (z axis up).
 
     `cloud` is in the caller's frame, all else in the upright frame. `table` is the table that the
-    caller or the scene names, in the caller's frame. `vague` tells that the cloud hardly shows the
-    object: few points, one plane, or a part beyond the image border.
+    caller or the scene names, in the caller's frame. `obstacles` surround a scene's target. `vague`
+    tells that the cloud hardly shows the object: few points, one plane, or a part beyond the image
+    border.
     """
 
     cloud: PointCloud
@@ -84,7 +85,7 @@ class ShapedObject:
     surface: Mesh
     body: EstimatedBody
     vague: bool
-    occupancy: Occupancy | None
+    obstacles: Obstacles | None
 
     @classmethod
     def of(cls, request: Request) -> "ShapedObject":
@@ -112,13 +113,13 @@ class ShapedObject:
         surface = extract_mesh(shape)
         body = EstimatedBody.around(shape, surface.vertices, collision_field(shape, surface))
         # the surroundings of a scene's target
-        occupancy = None
+        obstacles = None
         if scene is not None:
             scene = scene.to_upright(frame)
             if scene.target is not None:
-                occupancy = estimate_occupancy(scene, scene.target)
+                obstacles = Obstacles.of(estimate_occupancy(scene, scene.target))
         return cls(
-            cloud, scene, spec.table, frame, shape, surface, body, is_vague_cloud(cloud), occupancy
+            cloud, scene, spec.table, frame, shape, surface, body, is_vague_cloud(cloud), obstacles
         )
 
 
@@ -323,9 +324,9 @@ def pose(
     chunks = [count for size in sizes for count in start_chunks(size.starts)]
     starts = torch.cat(list(drawn_starts(shape, flat, chunks, request.seed)))
     # what the hand must not touch
-    obstacles = None
-    if object_.occupancy is not None:
-        obstacles = Obstacles.of(object_.occupancy, hard=not flat.spec.contact_allowed)
+    obstacles = object_.obstacles
+    if obstacles is not None:
+        obstacles = dataclasses.replace(obstacles, hard=not flat.spec.contact_allowed)
     loads = None
     if request.resist is not None:
         frame = inverse(object_.obj_from_upright).to(object_.body.center)

@@ -66,10 +66,11 @@ def plan_objects(objects: Objects, deadline: float) -> Iterator[list[Grasps]]:
         assert rows is not None
         rows, grasps, cloud = step(objects, rows, size.tried, turn, last)
         late = time.monotonic() >= deadline
-        left = torch.cat([rows.find(Row.BEGUN), rows.find(Row.STUCK)])
-        if late and len(left):  # what waits for a later batch has failed
-            grasps = join([grasps, rows.best(left)])
-            cloud = torch.cat([cloud, rows.cloud[left]])
+        if late:  # what waits for a later batch has failed
+            left = torch.cat([rows.find(Row.BEGUN), rows.find(Row.STUCK)])
+            if len(left):
+                grasps = join([grasps, rows.best(left)])
+                cloud = torch.cat([cloud, rows.cloud[left]])
         ranked = rank(objects, grasps, cloud)
         report.end_batch(ranked[0], last=late)
         yield [dataclasses.replace(grasps, meta={"starts": str(planned)}) for grasps in ranked]

@@ -12,7 +12,13 @@ from torchgrasp.foundation.base import count_status
 from torchgrasp.foundation.errors import Status
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.attempts import executable
-from torchgrasp.planner.objects import Objects, pose_request
+from torchgrasp.planner.objects import (
+    Objects,
+    ShapedObject,
+    find_model,
+    pose,
+    pose_request,
+)
 from torchgrasp.planner.planner import plan_objects
 from torchgrasp.planner.ranking import expected_success, rank_together
 from torchgrasp.planner.report import describe
@@ -91,27 +97,28 @@ def _plan_batches(request: Request) -> Iterator[Grasps]:
     if request.time_budget is not None:
         deadline = time.monotonic() + request.time_budget
     hands = request.hands
-    objects = pose_request(request, hands[0])
     if len(hands) == 1:
+        objects = pose_request(request, hands[0])
         for grasps in plan_hand(objects, deadline):
             yield objects.give_back(grasps)
     else:
-        yield _plan_sets(objects, hands, deadline)
+        yield _plan_sets(request, hands, deadline)
 
 
-def _plan_sets(objects: Objects, hands: tuple[Hand, ...], deadline: float) -> Grasps:
+def _plan_sets(asked: Request, hands: tuple[Hand, ...], deadline: float) -> Grasps:
     """Return the grasps of the set of fingers whose expected success is greatest.
 
-    All sets share the remaining time. The observer is called with "fingers" after each set, then
-    with the stages of the best set.
+    All sets share the object and the remaining time. The observer is called with "fingers" after
+    each set, then with the stages of the best set.
     """
-    asked = objects.request
+    model = find_model(asked)
+    object_ = ShapedObject.of(asked)
     best: tuple[float, Grasps, list[tuple[str, str, Any]]] | None = None
     for left, hand in zip(range(len(hands), 0, -1), hands, strict=True):
         stages = list[tuple[str, str, Any]]()
         # the stages are heard at once, so the list is the loop's own
         request = dataclasses.replace(asked, observer=lambda *stage: stages.append(stage))  # noqa: B023
-        own = objects.posed_again(request, hand)
+        own = pose(object_, request, hand, model)
         now = time.monotonic()
         batches = list(plan_hand(own, now + (deadline - now) / left))
         grasps = own.give_back(rank_together(batches, asked.order))
