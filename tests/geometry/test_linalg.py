@@ -120,15 +120,24 @@ def test_least_squares_have_the_same_bits_in_every_call(generator):
         assert torch.equal(solve_least_squares(rows, values), first)
 
 
-def test_tests_check_annotations_a_wrong_rank_letter_and_type_are_refused():
-    rows = torch.rand(4, 2).double()
-    values = torch.rand(4).double()
-    assert solve_least_squares(rows, values).shape == (2,)
-    for arguments in ((values, values), (rows, values[:3]), (rows.long(), values)):
-        with pytest.raises(TypeError):
-            solve_least_squares(*arguments)
+ROWS = torch.ones(4, 2, dtype=torch.float64)
+VALUES = torch.ones(4, dtype=torch.float64)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [(VALUES, VALUES), (ROWS, VALUES[:3]), (ROWS.long(), VALUES)],
+    ids=["rank", "letter", "type"],
+)
+def test_tests_check_annotations_of_tensors(arguments):
     with pytest.raises(TypeError):
-        limit_norm(rows, "1")  # pyright: ignore[reportArgumentType]
+        solve_least_squares(*arguments)
+
+
+def test_tests_check_annotations_and_let_right_arguments_pass():
+    assert solve_least_squares(torch.rand(4, 2).double(), VALUES).shape == (2,)
+    with pytest.raises(TypeError):
+        limit_norm(ROWS, "1")  # pyright: ignore[reportArgumentType]
 
 
 def test_components_are_those_of_the_pairs_and_keep_the_order_of_nodes():

@@ -85,8 +85,8 @@ def read_cloud(
         SuspiciousScale: an extent outside [5 mm, 2 m].
 
     >>> read_cloud("scan.docx")
-    Traceback (most recent call last): torchgrasp.foundation.errors.CloudFileError: path: expected a
-    file ending in .ply, ..., got scan.docx
+    Traceback (most recent call last):
+    torchgrasp.foundation.errors.CloudFileError: path: expected a file ending in .ply, ..., got scan.docx
     """
     return check_cloud(read_cloud_file(path, viewpoint, unit).cloud)
 
@@ -103,8 +103,8 @@ def read_cloud_file(
     Raises `CloudFileError`, `BadArgument` and `TooFewPoints` as `read_cloud`.
 
     >>> read_cloud_file("none.ply")
-    Traceback (most recent call last): torchgrasp.foundation.errors.CloudFileError: path: expected a
-    .ply file, got none.ply, which is no file
+    Traceback (most recent call last):
+    torchgrasp.foundation.errors.CloudFileError: path: expected a .ply file, got none.ply, which is no file
     """
     try:
         position = None if viewpoint is None else torch.as_tensor(viewpoint, dtype=torch.float64)
@@ -170,8 +170,8 @@ def save_cloud(cloud: PointCloud, path: Path | str, table: Plane | None = None) 
     has one viewpoint.
 
     >>> save_cloud(PointCloud(torch.rand(9, 3)), "cloud.txt")
-    Traceback (most recent call last): torchgrasp.foundation.errors.BadArgument: path: expected a
-    file ending in .npz or .ply, got cloud.txt
+    Traceback (most recent call last):
+    torchgrasp.foundation.errors.BadArgument: path: expected a file ending in .npz or .ply, got cloud.txt
     """
     path = Path(path)
     arrays = {name: tensor.detach().cpu().numpy() for name, tensor in named_tensors(cloud).items()}
