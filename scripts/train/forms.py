@@ -1,7 +1,7 @@
 """Simple forms and toys of a household: blocks, prisms, extrusions, forms that run into each other.
 Lengths are in mm.
 
-Each function makes one body of its family; `draw` draws its sizes.
+Each function makes one body of its family. Its table draws the first sizes, `draw` the others.
 """
 
 import math
@@ -10,12 +10,15 @@ import numpy as np
 
 from train.solids import (
     Draw,
+    Families,
     Thing,
     around,
     ball,
     box,
     disc,
+    family,
     join,
+    lie,
     lump,
     move,
     pebble,
@@ -23,25 +26,30 @@ from train.solids import (
     rod,
     slab,
     stack,
+    tip,
     turn,
 )
 
+FORMS: Families = {}
+"""The families of this file by name. New ones come last."""
 
-def cube(draw: Draw) -> Thing:
+
+@family(FORMS, a=(15, 75))
+def cube(draw: Draw, a: float) -> Thing:
     """A block about as high as wide, with cut edges."""
-    a = draw(15, 75)
     x, y, z = (a * draw(0.8, 1.2) for _ in range(3))
     return slab(x, y, z, draw(0.03, 0.25) * min(x, y), draw(0.02, 0.15) * z)
 
 
-def column(draw: Draw) -> Thing:
+@family(FORMS, many=(3, 9), r=(16, 60))
+def column(draw: Draw, many: float, r: float) -> Thing:
     """A prism of three to eight sides, some with a narrower top."""
-    count = int(draw(3, 9))
-    r = draw(16, 60)
+    count = int(many)
     outline = disc(r, r * draw(0.6, 1.0), 0, count)[:, :2]
-    return turn(prism(outline, draw(20, 170), draw(0.6, 1.0)), "x", 90 if draw(0, 1) < 0.4 else 0)
+    return tip(draw, prism(outline, draw(20, 170), draw(0.6, 1.0)), 0.4)
 
 
+@family(FORMS)
 def pyramid(draw: Draw) -> Thing:
     """A pyramid or a cone with a blunt tip."""
     count = (3, 4, 4, 6, 24, 24)[int(draw(0, 6))]
@@ -50,12 +58,9 @@ def pyramid(draw: Draw) -> Thing:
     return stack([(r, 0), (r * draw(0.05, 0.4), h)], draw(0.7, 1.0), count)
 
 
-def wedge(draw: Draw) -> Thing:
+@family(FORMS, x=(50, 160), y=(25, 80), low=(3, 10), high=(20, 75))
+def wedge(draw: Draw, x: float, y: float, low: float, high: float) -> Thing:
     """A ramp with a blunt edge."""
-    x = draw(50, 160)
-    y = draw(25, 80)
-    low = draw(3, 10)
-    high = draw(20, 75)
     return lump(
         np.array(
             [
@@ -68,13 +73,10 @@ def wedge(draw: Draw) -> Thing:
     )
 
 
-def profile(draw: Draw) -> Thing:
+@family(FORMS, x=(30, 95), z=(25, 95), depth=(12, 110), wall=(3, 14), sort=(0, 5))
+def profile(draw: Draw, x: float, z: float, depth: float, wall: float, sort: float) -> Thing:
     """A piece of an extruded L, T, U, Z or H, on its foot or on its end."""
-    x = draw(30, 95)
-    z = draw(25, 95)
-    depth = draw(12, 110)
-    wall = draw(3, 14)
-    kind = int(draw(0, 5))
+    kind = int(sort)
     left = -(x - wall) / 2
     right = (x - wall) / 2
     centre = 0.0
@@ -87,21 +89,20 @@ def profile(draw: Draw) -> Thing:
     top = box(x, depth, wall, (wall - x, 0, z - wall))
     webs = [solid for at in upright for solid in box(wall, depth, z, (at, 0, 0))]
     bars = (foot[0], foot[1], foot[0], foot[0] + top, foot[2])[kind]
-    return turn(webs + bars, "x", 90 if draw(0, 1) < 0.4 else 0)
+    return tip(draw, webs + bars, 0.4)
 
 
-def cross(draw: Draw) -> Thing:
+@family(FORMS, many=(3, 7), reach=(25, 90), wide=(8, 24), h=(8, 45))
+def cross(draw: Draw, many: float, reach: float, wide: float, h: float) -> Thing:
     """A plus or a star of three to six arms, lying or standing."""
-    count = int(draw(3, 7))
-    reach = draw(25, 90)
-    wide = draw(8, 24)
-    h = draw(8, 45)
+    count = int(many)
     arms = around(box(reach, wide, h, (reach / 2, 0, 0)), count)
     return turn(
         arms + stack([(wide, 0), (wide, h + draw(0, 6) + 0.5)]), "x", 90 if draw(0, 1) < 0.4 else 0
     )
 
 
+@family(FORMS)
 def stone(draw: Draw) -> Thing:
     """A stone: the hull of random points."""
     size = [draw(14, 60) for _ in range(3)]
@@ -109,6 +110,7 @@ def stone(draw: Draw) -> Thing:
     return lump(points / np.linalg.norm(points, axis=1, keepdims=True) * size)
 
 
+@family(FORMS)
 def blocks(draw: Draw) -> Thing:
     """Two to four boxes and bars that run into each other."""
     first = [draw(25, 80) for _ in range(3)]
@@ -126,9 +128,9 @@ def blocks(draw: Draw) -> Thing:
     return thing
 
 
-def bubbles(draw: Draw) -> Thing:
+@family(FORMS, r=(15, 38))
+def bubbles(draw: Draw, r: float) -> Thing:
     """Two to four ellipsoids that run into each other: a toy, a root of ginger, a potato."""
-    r = draw(15, 38)
     thing = ball(r, r * draw(0.7, 1.3), r * draw(0.7, 1.2), 6)
     for _ in range(int(draw(1, 4))):
         a = draw(0.4, 0.9) * r
@@ -145,10 +147,9 @@ def bubbles(draw: Draw) -> Thing:
     return thing
 
 
-def duck(draw: Draw) -> Thing:
+@family(FORMS, r=(20, 42), head=(0.5, 0.75))
+def duck(draw: Draw, r: float, head: float) -> Thing:
     """An animal of rubber: a body, a head, a beak, ears or a tail."""
-    r = draw(20, 42)
-    head = draw(0.5, 0.75)
     thing = ball(r * draw(1.0, 1.5), r, 0.85 * r) + move(
         ball(head * r, head * r, head * r), 0.6 * r, 0, 1.2 * r
     )
@@ -162,40 +163,31 @@ def duck(draw: Draw) -> Thing:
     return thing + (ears[0] + ears[1] if draw(0, 1) < 0.5 else [])
 
 
-def car(draw: Draw) -> Thing:
+@family(FORMS, x=(50, 120), y=(24, 50), z=(12, 28), wheel=(7, 14))
+def car(draw: Draw, x: float, y: float, z: float, wheel: float) -> Thing:
     """A toy car: a body, a cabin and four wheels."""
-    x = draw(50, 120)
-    y = draw(24, 50)
-    z = draw(12, 28)
-    wheel = draw(7, 14)
     body = box(x, y, z, (0, 0, 0.6 * wheel)) + move(
         slab(0.5 * x, 0.85 * y, z, 4, 3), draw(-0.15, 0.1) * x, 0, 0.5 * wheel + z
     )
-    rims = [
-        turn(stack([(wheel, -y / 2 - 3), (wheel, y / 2 + 3)], sides=16), "x", 90) for _ in (0, 1)
-    ]
+    rims = [lie(stack([(wheel, -y / 2 - 3), (wheel, y / 2 + 3)], sides=16)) for _ in (0, 1)]
     return body + move(rims[0], -0.32 * x, 0, wheel) + move(rims[1], 0.32 * x, 0, wheel)
 
 
-def stool(draw: Draw) -> Thing:
+@family(FORMS, r=(25, 75), h=(30, 120), top=(5, 14), leg=(4, 8), many=(3, 5))
+def stool(draw: Draw, r: float, h: float, top: float, leg: float, many: float) -> Thing:
     """A small table of three or four legs, some upside down."""
-    r = draw(25, 75)
-    h = draw(30, 120)
-    top = draw(5, 14)
-    leg = draw(4, 8)
-    count = int(draw(3, 5))
+    count = int(many)
     legs = around(rod((1.0 * r - 8, 0, 0), (0.7 * r - 8, 0, h), leg, 0.9 * leg), count)
     return turn(
         legs + move(stack([(r, 0), (r, top)]), z=h - 2), "x", 180 if draw(0, 1) < 0.3 else 0
     )
 
 
-def pegs(draw: Draw) -> Thing:
+@family(FORMS, long=(2, 6), across=(1, 4), gap=(18, 36), base=(6, 16))
+def pegs(draw: Draw, long: float, across: float, gap: float, base: float) -> Thing:
     """A board with a row or a field of pegs."""
-    nx = int(draw(2, 6))
-    ny = int(draw(1, 4))
-    gap = draw(18, 36)
-    base = draw(6, 16)
+    nx = int(long)
+    ny = int(across)
     r = draw(0.18, 0.35) * gap
     h = draw(12, 60)
     places = [
@@ -207,33 +199,13 @@ def pegs(draw: Draw) -> Thing:
     return box(nx * gap, max(ny * gap, 24), base) + rods
 
 
-def gear(draw: Draw) -> Thing:
+@family(FORMS, r=(20, 70), h=(8, 30), many=(5, 13))
+def gear(draw: Draw, r: float, h: float, many: float) -> Thing:
     """A wheel with teeth or spokes, lying or standing on its rim."""
-    r = draw(20, 70)
-    h = draw(8, 30)
-    count = int(draw(5, 13))
+    count = int(many)
     tooth = prism(
         [(0.9 * r, -0.15 * r), (1.2 * r, -0.1 * r), (1.2 * r, 0.1 * r), (0.9 * r, 0.15 * r)],
         0.9 * h,
     )
     wheel = prism(disc(r, r, 0)[:, :2], h) + stack([(0.4 * r, 0), (0.35 * r, h + draw(1, 20))])
-    return turn(wheel + around(tooth, count), "x", 90 if draw(0, 1) < 0.3 else 0)
-
-
-FORMS = (
-    cube,
-    column,
-    pyramid,
-    wedge,
-    profile,
-    cross,
-    stone,
-    blocks,
-    bubbles,
-    duck,
-    car,
-    stool,
-    pegs,
-    gear,
-)
-"""Families of this file. New ones come last."""
+    return tip(draw, wheel + around(tooth, count), 0.3)

@@ -26,11 +26,12 @@ from train.solids import Thing, find_rest, turn, unite
 from train.things import THINGS
 from train.vessels import VESSELS
 
+TABLES = (VESSELS, FORMS, THINGS, IMPLEMENTS)
 FAMILIES = {
-    maker.__name__: maker
-    for makers in itertools.zip_longest(VESSELS, FORMS, THINGS, IMPLEMENTS)
-    for maker in makers
-    if maker is not None
+    name: table[name]
+    for names in itertools.zip_longest(*TABLES)
+    for name, table in zip(names, TABLES, strict=True)
+    if name is not None
 }
 """Makers by family. A new one changes all bodies: the family of a body depends on their number."""
 CALIBRATING = frozenset(name for k, name in enumerate(sorted(FAMILIES)) if k % 6 in (0, 1, 3))

@@ -50,6 +50,25 @@ class Solid(NamedTuple):
 
 Thing = list[Solid]
 
+Families = dict[str, Callable[[Draw], Thing]]
+"""Makers of bodies by the name of their family."""
+
+
+def family(families: Families, **sizes: tuple[float, float]) -> Callable[[Callable], Callable]:
+    """Enter a maker into a table under its name, with the limits between which its sizes are drawn,
+    one after another.
+    """
+
+    def enter(make: Callable[..., Thing]) -> Callable[..., Thing]:
+        def maker(draw: Draw) -> Thing:
+            drawn = {name: draw(*limits) for name, limits in sizes.items()}
+            return make(draw, **drawn)
+
+        families[make.__name__] = maker
+        return make
+
+    return enter
+
 
 def stack(profile: Profile, oval: float = 1.0, sides: int = SIDES) -> Thing:
     """Return a solid of revolution about z, one frustum between two neighbouring points; `oval`
@@ -260,6 +279,16 @@ def turn(thing: Thing, axis: str, degrees: float) -> Thing:
         Solid(body.transform(pose), [piece @ matrix.T for piece in pieces])
         for body, pieces in thing
     ]
+
+
+def lie(thing: Thing) -> Thing:
+    """Return the thing on its side: a quarter of a turn about x."""
+    return turn(thing, "x", 90)
+
+
+def tip(draw: Draw, thing: Thing, share: float, degrees: float = 90.0) -> Thing:
+    """Return the thing, turned about x in this share of all cases."""
+    return turn(thing, "x", degrees if draw(0, 1) < share else 0)
 
 
 def around(thing: Thing, count: int, whole: float = 360.0) -> Thing:
