@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.data.accept import HandLike, as_hand
-from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.base import Value, flatnonzero
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Pose, Seed
@@ -214,7 +214,7 @@ def load_arm(
     )
     link, center, radius, palm = _spheres(chain, hand.to("cpu", torch.float64), mount)
     above = tree.moves.sum(1).long()[link]  # the number of joints that move each sphere
-    moving = torch.nonzero((above > 0) & ~palm)[:, 0]
+    moving = flatnonzero((above > 0) & ~palm)
     pairs = torch.nonzero(above - above[:, None] > 1)
     found = features(tree.frames(library.T.contiguous())[:, :, -1])
     arm = Arm(

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.arm.arm import LEVER, Arm, features
-from torchgrasp.foundation.base import in_chunks
+from torchgrasp.foundation.base import flatnonzero, in_chunks
 from torchgrasp.foundation.errors import Status
 from torchgrasp.geometry.optim import SOLVED
 from torchgrasp.hand.hand import Hand
@@ -61,9 +61,9 @@ Way = tuple[Float[Tensor, "g w n"], Bool[Tensor, "g"], Float[Tensor, "g 2"]]
 def reach_poses(arm: Arm, obj_from_hand: Float[Tensor, "k 4 4"]) -> Bool[Tensor, "k"]:
     """Return a mask of the hand poses that the arm reaches within its joint limits."""
     target = arm.tip_poses(obj_from_hand)  # (3, 4, k)
-    reached = torch.zeros(len(obj_from_hand), dtype=torch.bool, device=target.device)
+    reached = target.new_zeros(len(obj_from_hand), dtype=torch.bool)
     for start in _nearest(arm, target, REACH.tried).unbind(1):
-        left = torch.nonzero(~reached)[:, 0]
+        left = flatnonzero(~reached)
         joints = arm.library[start[left]].T  # (n, k)
         _, found = solve_tips(arm, joints, target[..., left], REACH.tried_steps, SOLVED)
         reached[left] = found
@@ -76,7 +76,7 @@ def with_arm(
     """Return grasps with the postures of the arm; executable ones through which it has no way
     become `UNREACHABLE`.
     """
-    rows = torch.nonzero(grasps.status == Status.OK)[:, 0]
+    rows = flatnonzero(grasps.status == Status.OK)
     way, found, least = follow_grasps(arm, hand, grasps[rows], world, up)
     status = grasps.status.index_put(
         (rows[~found],), torch.tensor(int(Status.UNREACHABLE)).to(grasps.status)
@@ -115,7 +115,7 @@ def follow_grasps(
     least = poses.new_zeros(g, 2)
     # The easiest posture first; a grasp that has its way is done.
     for choice in ease.argsort(dim=1, descending=True, stable=True).unbind(1):
-        rows = torch.nonzero(~found & (ease.gather(1, choice[:, None])[:, 0] >= 0))[:, 0]
+        rows = flatnonzero(~found & (ease.gather(1, choice[:, None])[:, 0] >= 0))
         if not len(rows):
             break
         start = joints[:, rows * starts + choice[rows]]  # (n, k)
@@ -243,7 +243,7 @@ def solve_tips(
         gap = _gap(tip, target[..., rows])
         error = gap.square().sum(0)
         done[rows] = error < solved
-        left = torch.nonzero(error >= solved)[:, 0]
+        left = flatnonzero(error >= solved)
         if step == steps or not len(left):
             break
         rows = rows[left]

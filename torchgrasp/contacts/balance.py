@@ -27,10 +27,11 @@ from torch import Tensor
 
 from torchgrasp.contacts.form_closure import Vectors, centre_and_radius, solve_closure_lp, wrenches
 from torchgrasp.contacts.problem import contact_pairs, pull_signs
+from torchgrasp.foundation.base import row_numbers
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.rules import ANY, Positive
 from torchgrasp.geometry.frames import skew
-from torchgrasp.geometry.linalg import GOLDEN_ANGLE, fibonacci_sphere, unit
+from torchgrasp.geometry.linalg import GOLDEN_ANGLE, eye_like, fibonacci_sphere, norm, unit
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,7 +87,7 @@ def grasp_map(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 6 n"]:
     centroid.
     """
     arms = points - points.mean(-2, keepdim=True)
-    eye = torch.eye(3, dtype=points.dtype, device=points.device).expand(*arms.shape[:-2], 3, 3)
+    eye = eye_like(3, points).expand(*arms.shape[:-2], 3, 3)
     return torch.cat(
         [torch.cat([eye] * arms.shape[-2], -1), torch.cat(skew(arms).unbind(-3), -1)], -2
     )
@@ -111,7 +112,7 @@ def tangential_ratio(
     not push.
     """
     push = -(forces * normals).sum(-1)
-    tangential = torch.linalg.vector_norm(forces + push[..., None] * normals, dim=-1)
+    tangential = norm(forces + push[..., None] * normals)
     return torch.where(push > 0, tangential / push.clamp_min(BALANCE.pushing), torch.inf)
 
 
@@ -210,7 +211,7 @@ def _improve(
     """Return the weights of least cost in rounds of tried steps, of length 1, and whether they push
     everywhere.
     """
-    row = torch.arange(len(push), device=push.device)
+    row = row_numbers(push)
     best = row
     costs = weights
     for steps in rounds:
@@ -290,7 +291,7 @@ def central_forces(
     z = start * (2 * points.shape[1] / (linear * start).sum(1))[:, None]
     ratio = _needed(push, slide, z)
     tau = BALANCE.first * ratio + slack
-    row = torch.arange(len(z), device=z.device)
+    row = row_numbers(z)
     lengths = 2 ** torch.arange(BALANCE.lengths, device=z.device).to(z)
     for _ in range(BALANCE.steps):
         cone = tau.square()[:, None, None, None] * pushes - slides  # (b, f, k, k)

@@ -25,12 +25,13 @@ from torchgrasp.contacts.form_closure import (
     solve_closure_lp,
     wrenches,
 )
-from torchgrasp.foundation.base import FINGERTIPS
+from torchgrasp.foundation.base import FINGERTIPS, flatnonzero
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import is_known
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import degenerate
+from torchgrasp.geometry.linalg import norm
 from torchgrasp.values.planning import Certificate, Contacts
 from torchgrasp.values.specs import ContactSpec
 
@@ -91,13 +92,13 @@ class _Proof(torch.autograd.Function):
         b, m, _ = wrench.shape
         margin, ratio, residual = (wrench.new_full((b,), torch.nan) for _ in range(3))
         witness, phi, dual = (wrench.new_full((b, width), torch.nan) for width in (6, m, 6))
-        rows = torch.nonzero(torch.isfinite(wrench).flatten(1).all(-1))[:, 0]
+        rows = flatnonzero(torch.isfinite(wrench).flatten(1).all(-1))
         known = wrench[rows]
         ratio[rows] = rank_ratio(known[:, None])
         margin[rows], residual[rows], witness[rows], phi[rows], dual[rows] = _prove(known)
         balanced = (margin >= MIN_MARGIN) & (residual <= MAX_RESIDUAL)
         closed = balanced & (ratio >= MIN_RANK_RATIO) & ~flat
-        lacking = torch.nonzero(balanced & ~closed)[:, 0]
+        lacking = flatnonzero(balanced & ~closed)
         if len(lacking):
             witness[lacking] = torch.linalg.svd(wrench[lacking], full_matrices=False).Vh[:, -1]
         return margin, ratio, residual, closed, witness, phi, dual
@@ -183,7 +184,7 @@ def _prove(wrench: Float[Tensor, "b m 6"]) -> tuple[Tensor, ...]:
     margin = torch.where(unbalanced, -torch.inf, margin)
     residual = torch.where(unbalanced, torch.inf, residual)
     proven = (residual <= EXACT) & (upper - margin <= GAP) & ((margin - MIN_MARGIN).abs() > 2 * GAP)
-    for row in torch.nonzero(~(proven | unbalanced))[:, 0].tolist():
+    for row in flatnonzero(~(proven | unbalanced)).tolist():
         margin[row], residual[row], dual, balance = solve_by_highs(wrench[row].cpu().numpy())
         phi[row] = balance.to(phi)
         witness[row] = witness[row] if dual is None else torch.from_numpy(dual).to(witness)
@@ -243,7 +244,7 @@ def check_unit(normals: Vectors) -> Vectors:
     """
     if not is_known(normals):
         return normals
-    length = torch.linalg.vector_norm(normals.detach(), dim=-1)
+    length = norm(normals.detach())
     wrong = torch.nonzero((length - 1).abs() > UNIT_TOLERANCE)
     if len(wrong):
         row, contact = wrong[0].tolist()

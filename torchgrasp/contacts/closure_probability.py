@@ -15,12 +15,12 @@ from torch import Tensor
 from torchgrasp.contacts.certify import check_contacts, check_unit
 from torchgrasp.contacts.form_closure import Vectors, closed_exact, first_balance, tangents
 from torchgrasp.contacts.problem import walls_at
-from torchgrasp.foundation.base import Batch
+from torchgrasp.foundation.base import Batch, row_numbers
 from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import FINITE, Range, Seed
 from torchgrasp.foundation.threads import single_threaded
-from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.linalg import norm, unit
 from torchgrasp.shape.estimate import surface_deviation
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.posterior import combined_covariance, symmetric_root
@@ -85,9 +85,7 @@ def well_inside(shape: ShapeGP, contacts: Contacts) -> Bool[Tensor, "b"]:
     """Return a mask of the contact sets inside the shape's domain, at least half a fingertip's
     width from its edge.
     """
-    radius = torch.linalg.vector_norm(
-        shape.normalise(contacts.points.detach().double().to(shape.device)), dim=-1
-    )
+    radius = norm(shape.normalise(contacts.points.detach().double().to(shape.device)))
     return (radius + FOOTPRINT / shape.scale <= shape.domain_radius).all(-1)
 
 
@@ -139,7 +137,7 @@ def _along_lines(
     nodes = deviation[..., None] * torch.tensor(NODES, device="cpu").to(deviation)
     values = 4 * len(NODES) * points.shape[1]
     covariance = points.new_empty(len(points), values, values)
-    for rows in torch.arange(len(points), device=points.device).split(LINES):
+    for rows in row_numbers(points).split(LINES):
         covariance[rows] = node_covariance(shape, points[rows], normals[rows], nodes[rows])
     slope = shape.mean_and_gradient(
         (points[:, :, None] + nodes[..., None] * normals[:, :, None]).reshape(-1, 3)

@@ -30,10 +30,10 @@ from torchgrasp.contacts.problem import (
     walls_at,
 )
 from torchgrasp.contacts.solver import project
-from torchgrasp.foundation.base import Batch, spread
+from torchgrasp.foundation.base import Batch, flatnonzero, spread
 from torchgrasp.foundation.errors import Status
 from torchgrasp.geometry.frames import degenerate
-from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.linalg import eye_like, norm, unit
 from torchgrasp.shape.estimate import surface_deviation
 from torchgrasp.values.planning import ContactPlan, Contacts
 
@@ -72,7 +72,7 @@ def normal_variation(
         around = project(surface, ring[own], steps=1)
         there = unit(surface.mean_and_gradient(around.flatten(0, 1))[1]).view_as(around)
         here = normals[own][:, None].expand_as(there)
-        sine = torch.linalg.vector_norm(torch.linalg.cross(here, there), dim=-1)
+        sine = norm(torch.linalg.cross(here, there))
         variation[own] = torch.atan2(sine, (here * there).sum(-1)).amax(-1)
     return variation
 
@@ -124,7 +124,7 @@ def _wall_constraint(
     vessel's outer wall.
     """
     jet = triple_mean_jet(shape, points)
-    identity = torch.eye(3, dtype=points.dtype, device=points.device)
+    identity = eye_like(3, points)
     around = ring_directions(jet.normals, points, GUIDING_POINTS).transpose(1, 2)
     normal = jet.normals[:, None]
     normal_jacobian = jet.normal_jacobian[:, None]
@@ -134,11 +134,11 @@ def _wall_constraint(
     ring_by_point = identity - spread(radius, turned) * normal[..., :, None] * turned
     there = triple_mean_jet(shape, ring.flatten(0, 1))
     difference = there.normals.view_as(ring) - normal
-    chord = torch.linalg.vector_norm(difference, dim=-1)
+    chord = norm(difference)
     direction = difference / torch.where(chord == 0, 1.0, chord)[..., None]
     change = there.normal_jacobian.view(*ring.shape, 3) @ ring_by_point - normal_jacobian
     slope = (direction[..., None, :] @ change)[..., 0, :]
-    own = torch.eye(points.shape[1], dtype=points.dtype, device=points.device)
+    own = eye_like(points.shape[1], points)
     by_points = (
         torch.einsum("bkij,il->bkilj", spread(radius, slope) * slope, own).flatten(3).flatten(1, 2)
     )
@@ -168,11 +168,10 @@ def check_feasibility(shape: ShapeLike, problem: ContactProblem, points: Vectors
     closed = finite & (residual <= BALANCED) & (coefficients.amin(-1) >= MIN_MARGIN)
     closed &= rank_ratio(wrench) >= MIN_RANK_RATIO  # 0 / 0 of a row that is not finite is False
 
-    apart = torch.linalg.vector_norm(problem.sides(points, normals), dim=-1).amin(-1) * scale
+    apart = norm(problem.sides(points, normals)).amin(-1) * scale
     room = problem.room(points, normals)
     good = {
-        Status.OUT_OF_DOMAIN: torch.linalg.vector_norm(points, dim=-1).amax(-1)
-        <= shape.domain_radius,
+        Status.OUT_OF_DOMAIN: norm(points).amax(-1) <= shape.domain_radius,
         Status.OFF_SURFACE: (jet.distance.abs() <= ON_SURFACE).all(-1),
         Status.OUTSIDE: within(problem, points).all(-1),
         Status.TOO_UNCERTAIN: ((jet.variance >= 0) & (jet.variance < spec.max_variance)).all(-1),
@@ -183,7 +182,7 @@ def check_feasibility(shape: ShapeLike, problem: ContactProblem, points: Vectors
     if spec.flatness is not None:
         # A ring costs eight evaluations a contact, so it is measured only where nothing has failed
         # before.
-        rows = torch.nonzero(torch.stack(list(good.values())).all(0))[:, 0]
+        rows = flatnonzero(torch.stack(list(good.values())).all(0))
         ring = problem.rows(rows).ring
         flat_rows = (
             normal_variation(rows_of(shape, rows), points[rows], normals[rows], ring).amax(-1)
@@ -195,7 +194,7 @@ def check_feasibility(shape: ShapeLike, problem: ContactProblem, points: Vectors
     std_m = spread(shape.std_factor * scale, deviation) * deviation
     contacts = Contacts(metres, normals, jet.variance, std_m)
     phi = coefficients.unflatten(1, wrench.shape[1:3])
-    quality = torch.linalg.vector_norm(points.mean(1), dim=-1) * scale
+    quality = norm(points.mean(1)) * scale
     return ContactPlan(contacts, phi, quality, first_violation(good))
 
 

@@ -25,9 +25,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.foundation.base import at_once, in_chunks
+from torchgrasp.foundation.base import at_once, flatnonzero, in_chunks
 from torchgrasp.geometry.frames import degenerate, subsets
-from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.linalg import eye_like, norm, unit
 
 Vectors = Float[Tensor, "b f 3"]  # points or normals of the contacts in every row
 Guess = Float[Tensor, "b m"] | None  # coefficients of the first wrenches of each cone
@@ -78,16 +78,16 @@ def tangents(points: Vectors, normals: Vectors) -> Vectors:
         points[:, second] - points[:, first], points[:, third] - points[:, first]
     )  # (b, k, 3)
     inside = torch.linalg.cross(plane[:, None], normals[:, :, None])  # (b, f, k, 3)
-    length, best = torch.linalg.vector_norm(inside, dim=-1).max(-1, keepdim=True)
+    length, best = norm(inside).max(-1, keepdim=True)
     inside = _take(inside, best)
-    size = torch.linalg.vector_norm(plane, dim=-1).amax(-1)[:, None, None]
+    size = norm(plane).amax(-1)[:, None, None]
     smallest = normals.abs().argmin(-1)
-    axis = torch.eye(3, dtype=normals.dtype, device=normals.device)[smallest]
+    axis = eye_like(3, normals)[smallest]
     stand_in = torch.linalg.cross(axis, normals)
     if points.shape[1] > 3:
         away = points[:, None] - points[:, :, None]
         away = away - (away * normals[:, :, None]).sum(-1, keepdim=True) * normals[:, :, None]
-        far, farthest = torch.linalg.vector_norm(away, dim=-1).max(-1, keepdim=True)
+        far, farthest = norm(away).max(-1, keepdim=True)
         stand_in = torch.where(far**2 > SEAM * size, _take(away, farthest), stand_in)
     seam = ~(length > SEAM * size) | (size == 0)
     return unit(torch.where(seam, stand_in, inside))
@@ -172,7 +172,7 @@ def maximise(
     row = torch.arange(b, device=bounds.device)
     # The first tight rows are artificial, v = 0 itself: they leave first, in either direction.
     tight = bounds.new_full((b, d), -1).long()
-    inverse = torch.eye(d, dtype=bounds.dtype, device=bounds.device).repeat(b, 1, 1)
+    inverse = eye_like(d, bounds).repeat(b, 1, 1)
     slack = bounds.new_ones(b, m)
     ray = bounds.new_zeros(b, d)
     running = torch.ones_like(row, dtype=torch.bool)
@@ -213,7 +213,7 @@ def maximise(
     # From the tight rows alone, so that the roundings of the pivots are gone.
     artificial = tight < 0
     index = tight.clamp(min=0)
-    identity = torch.eye(d, dtype=bounds.dtype, device=bounds.device)
+    identity = eye_like(d, bounds)
     basis = torch.where(
         artificial[:, :, None], identity, bounds.gather(1, index[:, :, None].expand(b, d, d))
     )
@@ -258,12 +258,12 @@ def _closed_in_plane(points: Vectors, normals: Vectors, friction: float) -> Bool
     basis = torch.stack([along, torch.linalg.cross(across, along)], -1)  # (b, 3, 2)
     inward = -normals @ basis
     position = arm @ basis
-    projected = torch.linalg.vector_norm(inward, dim=-1)
+    projected = norm(inward)
     cone = math.cos(math.atan(friction))
-    rows = torch.nonzero((projected > cone).all(-1))[
-        :, 0
-    ]  # the others have a cone that the plane does not cut
-    closed = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+    rows = flatnonzero(
+        (projected > cone).all(-1)
+    )  # the others have a cone that the plane does not cut
+    closed = points.new_zeros(len(points), dtype=torch.bool)
     closed[rows] = _spans_plane(inward[rows], position[rows], torch.arccos(cone / projected[rows]))
     return closed
 
@@ -286,7 +286,7 @@ def _spans_plane(
     first, second = subsets(6, 2, inward.device).unbind(-1)
     plane = torch.linalg.cross(planar[:, first], planar[:, second])  # (b, 15, 3)
     side = plane @ planar.mT  # (b, 15, 6)
-    spans = torch.linalg.vector_norm(plane, dim=-1) > PARALLEL
+    spans = norm(plane) > PARALLEL
     both = (side.amax(-1) > PARALLEL) & (side.amin(-1) < -PARALLEL)
     return (both | ~spans).all(-1) & spans.any(-1)
 
@@ -297,10 +297,10 @@ def _closed_by_proof(
     """Return which sets of four or five contacts have force closure; cones get edges until each
     verdict is proven.
     """
-    closed = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+    closed = points.new_zeros(len(points), dtype=torch.bool)
     if friction == 0:  # forces along normals may balance, but only seven or more span all wrenches
         return closed
-    rows = torch.nonzero((torch.isfinite(points) & torch.isfinite(normals)).flatten(1).all(1))[:, 0]
+    rows = flatnonzero((torch.isfinite(points) & torch.isfinite(normals)).flatten(1).all(1))
     wrench = wrenches(points[rows], normals[rows], friction, FIRST_EDGES).flatten(1, 2)
     if guess is not None:
         phi = guess[rows]  # corrected to balance the wrenches
@@ -316,7 +316,7 @@ def _closed_by_proof(
         proven = _balances(wrench, phi)
         closed[rows[proven]] = True
         least, opposing = most_opposing(points[rows], normals[rows], friction, witness)
-        left = torch.nonzero(~proven & (least.amin(-1) < -BALANCED))[:, 0]
+        left = flatnonzero(~proven & (least.amin(-1) < -BALANCED))
         if len(left) == 0:
             break
         rows = rows[left]
@@ -346,7 +346,7 @@ def most_opposing(
     motion = force + torch.linalg.cross(torque, arm)
     along = (motion * normals).sum(-1, keepdim=True)
     sideways = motion - along * normals
-    length = torch.linalg.vector_norm(sideways, dim=-1, keepdim=True)
+    length = norm(sideways, keepdim=True)
     push = -normals - friction * sideways / torch.where(length == 0, 1.0, length)
     return -(along + friction * length)[..., 0], torch.cat(
         [push, torch.linalg.cross(arm, push)], -1

@@ -5,7 +5,6 @@ once.
 import time
 from collections.abc import Iterator
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -20,7 +19,7 @@ from torchgrasp.contacts.starts import (
     settle_flatness,
     start_chunks,
 )
-from torchgrasp.foundation.base import join, pick, put
+from torchgrasp.foundation.base import flatnonzero, join, pick, put
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import Status
 from torchgrasp.foundation.rules import Count, Positive, Seed
@@ -120,6 +119,6 @@ def plan_chunk(
     for stage in (*stages, FINISH):
         state = descend(shape, problem, state, stage)
     plan = check_feasibility(shape, problem, project(shape, state.points, steps=3))
-    failed = torch.nonzero(plan.status != Status.OK)[:, 0]
+    failed = flatnonzero(plan.status != Status.OK)
     begun = check_feasibility(rows_of(shape, failed), problem.rows(failed), first[failed])
     return put(plan, failed, pick(begun.status == Status.OK, begun, plan[failed]))

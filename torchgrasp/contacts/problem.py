@@ -22,6 +22,7 @@ from torch import Tensor
 
 from torchgrasp.contacts.form_closure import Vectors
 from torchgrasp.foundation.base import Batch, map_tensors, spread
+from torchgrasp.geometry.linalg import eye_like, norm
 from torchgrasp.shape.batch import ShapeBatch
 from torchgrasp.shape.estimate import MeanJet, SurfaceJet
 from torchgrasp.values.specs import ContactSpec
@@ -95,7 +96,7 @@ def walls_at(shape: AnyShape, points: Vectors) -> list[tuple[AnyShape, Bool[Tens
     """
     walls = walls_of(shape)
     if len(walls) == 1:
-        return [(walls[0], torch.ones(points.shape[:2], dtype=torch.bool, device=points.device))]
+        return [(walls[0], points.new_ones(points.shape[:2], dtype=torch.bool))]
     owner = getattr(shape, "wall_at")(points.flatten(0, 1))  # noqa: B009
     return list(zip(walls, owner.unflatten(0, points.shape[:2]).unbind(-1), strict=True))
 
@@ -295,7 +296,7 @@ class ContactProblem:
         b, f = points.shape[:2]
         unknowns = 3 * f + tension.shape[1]
         own = functools.partial(_by_own_point, unknowns=unknowns)
-        identity = torch.eye(3, dtype=points.dtype, device=points.device)
+        identity = eye_like(3, points)
         threshold = self.spec.max_variance * INSIDE
         ball = self.domain_radius * INSIDE
         edge = spread(ball, tension)
@@ -347,7 +348,7 @@ class ContactProblem:
         with derivatives.
         """
         sides = self.sides(points, normals)
-        length = torch.linalg.vector_norm(sides, dim=-1)
+        length = norm(sides)
         along = (sides / length[..., None])[..., None, :]
         first, second = contact_pairs(points.shape[1], points.device)
         pair = torch.arange(len(first), device=points.device)
@@ -368,11 +369,11 @@ class ContactProblem:
         normals = jet.normals
         at = torch.arange(points.shape[1], device=points.device)
         force, sides = forces_from_tensions(points, tension)
-        size = torch.linalg.vector_norm(force, dim=-1, keepdim=True)
+        size = norm(force, keepdim=True)
         direction = force / size
         outward = (normals * direction).sum(-1, keepdim=True)
         by_force = (normals - outward * direction) / size
-        steep = torch.linalg.vector_norm(jet.gradient, dim=-1, keepdim=True)
+        steep = norm(jet.gradient, keepdim=True)
         across = (
             direction - outward * normals
         ) / steep  # (1 - n n^T) u / |g|, which the Hessian carries to the point

@@ -18,6 +18,7 @@ from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import ndimage, trimesh
 from torchgrasp.foundation.rules import Fraction, Pose, show
 from torchgrasp.geometry.frames import apply, inverse
+from torchgrasp.geometry.linalg import norm
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import Plane, as_plane
 from torchgrasp.geometry.signed_distance import surface_distance
@@ -89,9 +90,7 @@ class Region(Value):
 
         def distance(points: Tensor) -> Tensor:
             beyond = (apply(frame.to(points), points) - middle.to(points)).abs() - half.to(points)
-            return torch.linalg.vector_norm(beyond.clamp_min(0), dim=-1) + beyond.amax(
-                -1
-            ).clamp_max(0)
+            return norm(beyond.clamp_min(0)) + beyond.amax(-1).clamp_max(0)
 
         return cls(distance)
 

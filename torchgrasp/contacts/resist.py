@@ -25,6 +25,7 @@ from torchgrasp.contacts.form_closure import (
     maximise,
     wrenches,
 )
+from torchgrasp.foundation.base import row_numbers
 from torchgrasp.values.specs import ContactSpec
 
 
@@ -61,7 +62,7 @@ def resist_loads(
     edge = strength[..., None, None] * wrenches(points, normals, spec.planned_friction, spec.edges)
     edge = torch.cat([edge, torch.zeros_like(edge[:, :, :1])], 2)  # the last is no push
     goal = (-about / unit).flatten(0, 1)
-    rows = torch.arange(len(goal), device=goal.device).split(GRASPS_PER_CHUNK)
+    rows = row_numbers(goal).split(GRASPS_PER_CHUNK)
     found = [_solve(edge[row // count], goal[row]) for row in rows]
     margin, twist, forces = map(torch.cat, zip(*found, strict=True))
     worst = margin.view(-1, count).argmin(1)

@@ -23,6 +23,7 @@ from torchgrasp.contacts.problem import (
     triple_mean_jet,
 )
 from torchgrasp.foundation.base import Batch
+from torchgrasp.geometry.linalg import norm
 from torchgrasp.geometry.optim import (
     Damping,
     Linearisation,
@@ -119,7 +120,7 @@ class Descent(Minimisation[State, LinearConstraints]):
         weight = torch.cat([centre, surface, bounds * (constraints.bounds > 0)], 1)
         residual = weight * constraints.values
         cost = residual.square().sum(1) / 2
-        inside = torch.linalg.vector_norm(state.points, dim=-1).amax(-1) < problem.domain_radius
+        inside = norm(state.points).amax(-1) < problem.domain_radius
         return LinearConstraints(cost, residual, weight, constraints.jacobian, inside)
 
     def step(self, model: LinearConstraints, damping: Damping) -> Steps:
@@ -134,7 +135,7 @@ class Descent(Minimisation[State, LinearConstraints]):
         descent = -(jacobian.mT @ model.residual[..., None])
         x = torch.cholesky_solve(descent, factor)[..., 0]
         x = torch.where((failed == 0)[:, None], x, torch.nan)
-        length = torch.linalg.vector_norm(split_unknowns(x)[0], dim=-1).amax(-1)
+        length = norm(split_unknowns(x)[0]).amax(-1)
         shrink = (length / LONGEST_STEP).clamp(min=1.0)
         return x / shrink[:, None], length / shrink > self.stage.settled  # NaN is not longer
 
@@ -214,4 +215,4 @@ def equal_tensions(points: Vectors) -> Float[Tensor, "b p"]:
 def normalise_tensions(points: Vectors, tension: Float[Tensor, "b p"]) -> Float[Tensor, "b p"]:
     """Return the tensions, scaled so that the mean size of the contact forces that they cause is 1."""
     force, _ = forces_from_tensions(points, tension)
-    return tension / torch.linalg.vector_norm(force, dim=-1).mean(-1, keepdim=True)
+    return tension / norm(force).mean(-1, keepdim=True)

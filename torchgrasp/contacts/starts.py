@@ -15,7 +15,7 @@ from torchgrasp.contacts.form_closure import Vectors, closed_exact
 from torchgrasp.contacts.problem import ContactProblem, ShapeLike, device_of, walls_of
 from torchgrasp.contacts.solver import project
 from torchgrasp.foundation.errors import BadArgument
-from torchgrasp.geometry.linalg import Points, unit
+from torchgrasp.geometry.linalg import Points, norm, unit
 from torchgrasp.values.specs import FLAT_RADII, ContactSpec
 
 CANDIDATE_TRIPLES = 350  # triples of surface points among which candidates are found
@@ -44,7 +44,7 @@ def check_starts(shape: ShapeLike, spec: ContactSpec, starts: int | Tensor) -> N
             allowed = f"as many as spec.fingertips: {spec.fingertips}"
             raise BadArgument("starts", f"{starts.shape[1]} contacts a row", allowed)
         points = shape.normalise(starts)
-        farthest = float(torch.linalg.vector_norm(points, dim=-1).max()) if len(points) else 0.0
+        farthest = float(norm(points).max()) if len(points) else 0.0
         if farthest > shape.domain_radius:
             found = f"a point {farthest * float(shape.scale):.4g} m from the shape's centre"
             allowed = (
@@ -168,7 +168,7 @@ def draw_in(shape: ShapeLike, points: Vectors) -> Vectors:
     distance, _ = shape.mean_and_gradient(points.flatten(0, 1))
     far = distance.view(points.shape[:2]).abs().amax(-1) > FAR
     shifted = points - points.mean(1, keepdim=True)
-    longest = torch.linalg.vector_norm(shifted, dim=-1).amax(-1)
+    longest = norm(shifted).amax(-1)
     drawn = shifted * (NEAR_CENTRE / longest).clamp(max=1.0)[:, None, None]
     return torch.where(far[:, None, None], drawn, points)
 
@@ -184,7 +184,7 @@ def qualify(
         x.unflatten(0, points.shape[:2]) for x in shape.mean_and_gradient(points.flatten(0, 1))
     )
     normals = unit(gradient)
-    radius = torch.linalg.vector_norm(points, dim=-1)
+    radius = norm(points)
     good = (distance.abs() < NEAR_SURFACE) & (radius < problem.domain_radius)
     good &= (problem.room(points, normals) > 0) & within(problem, points)
     variance = shape.jet(points[good]).variance  # it costs more than all else
@@ -212,9 +212,7 @@ def candidate_rows(
         choice = torch.randint(len(points), drawn, generator=generator, device="cpu").to(
             points.device
         )
-        apart = torch.linalg.vector_norm(
-            problem.sides(points[choice], normals[choice]), dim=-1
-        ).amin(-1)
+        apart = norm(problem.sides(points[choice], normals[choice])).amin(-1)
         choice = choice[apart > problem.separation]
         closed = choice[closed_exact(points[choice], normals[choice], problem.friction)][:missing]
         rows.append(points[closed])

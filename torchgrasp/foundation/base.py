@@ -241,7 +241,7 @@ def read_rows(rows: Any, count: int) -> slice | Tensor:
     if index.dtype == torch.bool:
         if index.shape != (count,):
             raise refused
-        return torch.nonzero(index)[:, 0]
+        return flatnonzero(index)
     if not isinstance(rows, Tensor) and not len(index.reshape(-1)):
         return slice(0, 0)  # an empty list
     if index.dtype not in (torch.int64, torch.int32):  # torch takes bytes for a mask
@@ -302,6 +302,16 @@ def in_chunks(
     return tuple(map(torch.cat, zip(*map(evaluate, x.split(size)), strict=True)))
 
 
+def row_numbers(rows: Tensor) -> Int[Tensor, "n"]:
+    """Return the numbers 0 to n - 1 of the n rows of a tensor, on its device."""
+    return torch.arange(len(rows), device=rows.device)
+
+
+def flatnonzero(mask: Bool[Tensor, "n"]) -> Int[Tensor, "k"]:
+    """Return the indices of the entries of a mask that are True, ascending."""
+    return torch.nonzero(mask)[:, 0]
+
+
 def lexical_order(*keys: Tensor) -> Int[Tensor, "g"]:
     """Return the indices that sort rows ascending by the first key; ties are sorted by the next
     key.
@@ -319,9 +329,7 @@ def rank_in_group(group: Int[Tensor, "g"], *keys: Tensor) -> Int[Tensor, "g"]:
     order = lexical_order(group, *keys)
     grouped = group[order].contiguous()
     rank = torch.empty_like(order)
-    rank[order] = torch.arange(len(order), device=order.device) - torch.searchsorted(
-        grouped, grouped
-    )
+    rank[order] = row_numbers(order) - torch.searchsorted(grouped, grouped)
     return rank
 
 

@@ -19,9 +19,19 @@ Vector = Float[Tensor, "3"]
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))  # golden section of the full circle [rad]
 
 
+def norm(v: Float[Tensor, "*b d"], keepdim: bool = False) -> Float[Tensor, "*c"]:
+    """Return the lengths of vectors, which lie along the last axis."""
+    return torch.linalg.vector_norm(v, dim=-1, keepdim=keepdim)
+
+
+def eye_like(n: int, like: Tensor) -> Float[Tensor, "n n"]:
+    """Return the identity matrix of n rows, with the dtype and on the device of a tensor."""
+    return torch.eye(n, dtype=like.dtype, device=like.device)
+
+
 def unit(v: Float[Tensor, "*b d"]) -> Float[Tensor, "*b d"]:
     """Return vectors of length 1 in the direction of `v`; a zero vector gives NaN."""
-    return v / torch.linalg.vector_norm(v, dim=-1, keepdim=True)
+    return v / norm(v, keepdim=True)
 
 
 def unit_of_any(v: Float[Tensor, "*b d"]) -> Float[Tensor, "*b d"]:

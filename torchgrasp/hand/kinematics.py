@@ -14,12 +14,13 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.base import Value, flatnonzero, row_numbers
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import pytorch_kinematics
 from torchgrasp.foundation.rules import is_known
 from torchgrasp.geometry.frames import real, rigid, rotation_from_rpy, skew
+from torchgrasp.geometry.linalg import eye_like
 from torchgrasp.hand.urdf import Urdf
 
 
@@ -93,9 +94,7 @@ class KinematicTree(Value):
     def poses(self, values: Float[Tensor, "n j"]) -> Float[Tensor, "n l 4 4"]:
         """Return the pose `root_from_link` of every link, given all movable joints [rad or m]."""
         frames = self.frames(values.T.contiguous())
-        last = torch.eye(4, dtype=frames.dtype, device=frames.device)[3, :, None, None].expand(
-            1, 4, *frames.shape[2:]
-        )
+        last = eye_like(4, frames)[3, :, None, None].expand(1, 4, *frames.shape[2:])
         return torch.cat([frames, last]).permute(3, 2, 0, 1)
 
     @checked(gradients=True)
@@ -146,11 +145,11 @@ class FreeMotion(Value):
         """Return the tables for groups of markers: link indices, coordinates, and 1 for points or 0
         for directions.
         """
-        own = torch.nonzero((coupling != 0).any(1))[:, 0]
+        own = flatnonzero((coupling != 0).any(1))
         eye = functools.partial(torch.eye, dtype=tree.axis.dtype, device=tree.axis.device)
         axes = eye(3)
         slides = tree.prismatic[own]
-        root = torch.nonzero(tree.places == 0)[:, 0].expand(6)
+        root = flatnonzero(tree.places == 0).expand(6)
         link = torch.cat([root, tree.child[own]])
         turning = torch.cat([0 * axes, axes, tree.axis[own] * (1 - slides[:, None])])
         sliding = torch.cat([axes, 0 * axes, tree.axis[own] * slides[:, None]])
@@ -165,7 +164,7 @@ class FreeMotion(Value):
             torch.cat([x, torch.full_like(x[:, :1], kind)], 1).to(axes) for _, x, kind in groups
         ]
         product = axes.new_zeros(len(at), 4, len(tree.link_names))
-        product[torch.arange(len(at), device=at.device), :, at] = torch.cat(local)
+        product[row_numbers(at), :, at] = torch.cat(local)
         moves = torch.cat([axes.new_ones(len(tree.moves), 6), tree.moves[:, own]], 1)
         whole = torch.block_diag(eye(6), coupling[own])
         same = whole.shape[0] == whole.shape[1] and torch.equal(whole, eye(len(whole)))

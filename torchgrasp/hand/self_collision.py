@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.foundation.base import Value, kept
+from torchgrasp.foundation.base import Value, flatnonzero, kept, row_numbers
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Range, is_known
@@ -76,7 +76,7 @@ class SelfCollision(Value):
             dense = not torch.compiler.is_compiling() and not is_known(
                 near
             )  # torch.vmap cannot select entries
-            every = torch.ones(near.shape, dtype=torch.bool, device=near.device) if dense else near
+            every = near.new_ones(near.shape, dtype=torch.bool) if dense else near
             pair, row, parts = self._choose(every)
         apart = self._separations(shapes, pair, row, parts)
         apart = torch.where(near[pair, row], apart, torch.inf) if dense else apart
@@ -107,7 +107,7 @@ class SelfCollision(Value):
             separation[at], push = self._of_kind(kind, shapes, pair[at], row[at])
             is_close = separation[at] < below
             if pair.device.type == "cpu":
-                close = torch.nonzero(is_close)[:, 0]
+                close = flatnonzero(is_close)
             else:  # wrenches of all cost less than a wait
                 close = torch.arange(at.stop - at.start, device=pair.device)
             if len(close):
@@ -117,7 +117,7 @@ class SelfCollision(Value):
                     [force, torch.linalg.cross(point, force, dim=0)]
                 )
         number = torch.full_like(apart, len(pair), dtype=torch.long)
-        number[pair, row] = torch.arange(len(pair), device=pair.device)
+        number[pair, row] = row_numbers(pair)
         return apart.index_put((pair, row), separation), number, wrench
 
     @checked(gradients=True)

@@ -15,6 +15,7 @@ from torch import Tensor
 from torchgrasp.foundation.base import (
     Batch,
     at_once,
+    flatnonzero,
     join,
     lexical_order,
     map_tensors,
@@ -23,6 +24,7 @@ from torchgrasp.foundation.base import (
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import Status
 from torchgrasp.geometry.frames import apply, degenerate, inverse, virtual_frame
+from torchgrasp.geometry.linalg import norm
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.kinematics import map_points
 from torchgrasp.ik.candidates import (
@@ -243,7 +245,7 @@ class CobylaRun:
         self.points = points.double()
         spheres = hand.collision_spheres
         groups = [(spheres.finger == k) & ~spheres.touching for k in (-2, -1, 0, 1, 2)]
-        self.groups = [torch.nonzero(group)[:, 0] for group in groups if bool(group.any())]
+        self.groups = [flatnonzero(group) for group in groups if bool(group.any())]
         self.last: tuple[bytes, float, np.ndarray] | None = None
 
     def place(
@@ -275,10 +277,7 @@ class CobylaRun:
         key = np.asarray(x).tobytes()
         if self.last is None or self.last[0] != key:
             _, frames, pose, framed = self.place(x)
-            error = (
-                torch.linalg.vector_norm(apply(pose, self.tips(frames)) - self.points, dim=-1).sum()
-                / MILLIMETRE
-            )
+            error = norm(apply(pose, self.tips(frames)) - self.points).sum() / MILLIMETRE
             room = (torch.stack(self.clearances(frames, pose)) / MILLIMETRE).clamp_max(
                 COBYLA.far
             ) - 0.5

@@ -12,12 +12,12 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.contacts.feasibility import first_violation
-from torchgrasp.foundation.base import Batch, Value
+from torchgrasp.foundation.base import Batch, Value, flatnonzero
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.rules import ANY, Length, Rows, show
 from torchgrasp.geometry.frames import rotate
-from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.linalg import norm, unit
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, link_clearance
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
@@ -117,7 +117,7 @@ def ask_reachable(reachable: Reachable, obj_from_hand: Float[Tensor, "k 4 4"]) -
     malformed answer.
     """
     if not len(obj_from_hand):
-        return torch.zeros(0, dtype=torch.bool, device=obj_from_hand.device)
+        return obj_from_hand.new_zeros(0, dtype=torch.bool)
     answer = reachable(obj_from_hand)
     if (
         not isinstance(answer, Tensor)
@@ -186,7 +186,7 @@ def measure_errors(
     if rolling:
         touching = hand.tips.center
         target = tip_targets(hand, contacts)
-    error = torch.linalg.vector_norm(spatial.points(hand.tips.index, touching) - target, dim=-1)
+    error = norm(spatial.points(hand.tips.index, touching) - target)
     pads = spatial.pads.permute(2, 1, 0)
     angle = torch.acos(
         (-(pads * contacts.normals).sum(-1)).clamp(-1.0, 1.0)
@@ -244,7 +244,7 @@ def check_candidates(
     errors = measure_errors(hand, configuration, contacts, world, rolling, tolerance)
 
     pregrasp = configuration.joints.clone()
-    touching = torch.nonzero((planned == Status.OK) & (errors.status == Status.OK))[:, 0]
+    touching = flatnonzero((planned == Status.OK) & (errors.status == Status.OK))
     pregrasp[touching] = open_hand(
         hand, configuration[touching], contacts[touching], world.rows(touching)
     )
@@ -256,13 +256,13 @@ def check_candidates(
     status = torch.where(blocked, int(Status.PREGRASP), errors.status)
 
     approach = rotate(configuration.obj_from_hand, hand.approach.to(problem.center)[None])[:, 0]
-    ready = torch.nonzero(status == Status.OK)[:, 0]
+    ready = flatnonzero(status == Status.OK)
     approach[ready], clearance = find_approach(hand, opened[ready], world.rows(ready))
     status[ready] = torch.where(clearance >= 0, int(Status.OK), int(Status.NO_APPROACH))
     if world.obstacles is not None:
         _keep_clear(problem, configuration, opened, approach, status)
     if problem.reachable is not None:
-        ready = torch.nonzero((status == Status.OK) & (planned == Status.OK))[:, 0]
+        ready = flatnonzero((status == Status.OK) & (planned == Status.OK))
         refused = ~ask_reachable(problem.reachable, configuration.obj_from_hand[ready])
         status[ready[refused]] = int(Status.UNREACHABLE)
     return Grasps(
@@ -295,12 +295,12 @@ def _keep_clear(
     """
     hand = problem.hand
     world = problem.world
-    crowded = torch.nonzero(status == Status.NO_APPROACH)[:, 0]
+    crowded = flatnonzero(status == Status.NO_APPROACH)
     direction, clearance = find_approach(hand, opened[crowded], world.alone)
     pushed = crowded[clearance >= 0]
     if world.guarded:
         status[pushed] = int(Status.NEIGHBOUR_COLLISION)
-        ready = torch.nonzero(status == Status.OK)[:, 0]
+        ready = flatnonzero(status == Status.OK)
         room = motion_clearance(hand, configuration[ready], opened[ready], world)
         status[ready[room < 0]] = int(Status.NEIGHBOUR_COLLISION)
     else:
@@ -314,7 +314,7 @@ def centred_friction(contacts: Contacts) -> Float[Tensor, "g"]:
     """
     inward = unit(contacts.points.mean(1, keepdim=True) - contacts.points)
     cosine = -(inward * contacts.normals).sum(-1)
-    sine = torch.linalg.vector_norm(torch.linalg.cross(inward, contacts.normals), dim=-1)
+    sine = norm(torch.linalg.cross(inward, contacts.normals))
     return (sine / cosine.clamp_min(CHECKS.least_cosine)).amax(1)
 
 
@@ -326,7 +326,7 @@ def score(
     Three things lower it: the contacts' distance from `center` [m], the friction needed, and the
     angle off the pads.
     """
-    offset = torch.linalg.vector_norm(contacts.points.mean(1) - center, dim=-1)
+    offset = norm(contacts.points.mean(1) - center)
     away = offset / CHECKS.offset
     turned = normal_angle.amax(1) / CHECKS.pad_angle
     return -(away + centred_friction(contacts) + turned)

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.foundation.base import Value, settle
+from torchgrasp.foundation.base import Value, row_numbers, settle
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.rules import Range
 from torchgrasp.geometry.plane import Plane, as_plane
@@ -241,7 +241,7 @@ def sphere_rows(
     coarse, index = torch.stack(found, 1).topk(
         min(HINGES, len(radius)), dim=2, largest=False, sorted=False
     )
-    points = centres[torch.arange(len(centres), device=centres.device)[:, None, None], index]
+    points = centres[row_numbers(centres)[:, None, None], index]
     clearance = []
     direction = []
     for k, field in enumerate(world.fields):

@@ -27,8 +27,16 @@ from torchgrasp.contacts.problem import (
     triple_mean_jet,
 )
 from torchgrasp.contacts.solver import equal_tensions, normalise_tensions, project
-from torchgrasp.foundation.base import Batch, at_once, rank_in_group, spread
+from torchgrasp.foundation.base import (
+    Batch,
+    at_once,
+    flatnonzero,
+    rank_in_group,
+    row_numbers,
+    spread,
+)
 from torchgrasp.foundation.checks import checked
+from torchgrasp.geometry.linalg import eye_like
 from torchgrasp.geometry.optim import LeastSquares, Residuals, levenberg_marquardt
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.attempts import Attempts, assign, best_first, best_grasps, try_best_seeds
@@ -159,9 +167,7 @@ class JointProblem:
         hand = self.hand
         normals = jet.normals
         normal_jacobian = jet.normal_jacobian
-        identity, own = (
-            torch.eye(k, dtype=normals.dtype, device=normals.device) for k in (3, len(hand.tips))
-        )
+        identity, own = (eye_like(k, normals) for k in (3, len(hand.tips)))
         rolled = hand.tips.radius.to(normals)[:, None, None] * normal_jacobian
         target = spread(self.shape.scale, rolled) * identity + rolled
         pads = spatial.pads.permute(2, 1, 0)
@@ -197,7 +203,7 @@ class JointProblem:
         """
         own = self
         largest = self.contact_problem.spec.flatness
-        rows = torch.arange(len(points), device=points.device)
+        rows = row_numbers(points)
         tension = equal_tensions(points)
         for stage in STAGES:
             flat = None
@@ -213,7 +219,7 @@ class JointProblem:
                 largest=HAND_STEP,
             )
             state, cost = levenberg_marquardt(sliding, state, stage.steps)
-            kept = torch.nonzero(cost < stage.hopeless)[:, 0]
+            kept = flatnonzero(cost < stage.hopeless)
             configuration = state.configuration[kept]
             points = state.points[kept]
             tension = state.tension[kept]

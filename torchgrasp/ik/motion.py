@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.foundation.base import spread
+from torchgrasp.foundation.base import flatnonzero, row_numbers, spread
 from torchgrasp.foundation.checks import checked
 from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import across, unit
@@ -71,7 +71,7 @@ def find_approach(
     chosen = candidates[:, 0].clone()
     clearance = torch.full_like(coarse[:, 0], -math.inf)
     for choice in torch.argsort(coarse, dim=1, descending=True, stable=True).unbind(1):
-        touching = torch.nonzero(clearance < 0)[:, 0]
+        touching = flatnonzero(clearance < 0)
         if not len(touching):
             break
         direction = candidates[touching, choice[touching]]
@@ -158,10 +158,7 @@ def _clearance(
         near, first = coarse.min(1)
         # Only spheres that may have the least clearance are interpolated.
         if exact:
-            near = (
-                field.query(path[torch.arange(len(path), device=path.device), first])[0]
-                - radius[first]
-            )
+            near = field.query(path[row_numbers(path), first])[0] - radius[first]
             row, sphere = torch.nonzero(
                 coarse < near[:, None] + MOTION.nodes * spread(field.spacing, coarse), as_tuple=True
             )

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchgrasp.geometry.linalg import eye_like
 from torchgrasp.geometry.optim import SOLVED, LeastSquares, Residuals, levenberg_marquardt
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.clearance import CLEARANCE, MILLIMETRE, CollisionWorld, along, clearance_rows
@@ -64,9 +65,7 @@ def tip_rows(
         -1
     )  # the contact direction is the inward normal
     weight = PAD_WEIGHT * (outside > 0).to(pads)
-    axes = torch.eye(3, dtype=pads.dtype, device=pads.device).expand(g, len(tips), 3, 3) * (
-        TIP_WEIGHT / MILLIMETRE
-    )
+    axes = eye_like(3, pads).expand(g, len(tips), 3, 3) * (TIP_WEIGHT / MILLIMETRE)
     pulls = torch.cat(
         [axes, torch.linalg.cross(centres[:, :, None].expand_as(axes), axes)], -1
     ).flatten(1, 2)

@@ -17,6 +17,7 @@ from torchgrasp.foundation.base import (
     at_once,
     check_device,
     check_whole,
+    flatnonzero,
     join,
     lexical_order,
     settle,
@@ -25,6 +26,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Count, Positive, Seed
 from torchgrasp.geometry.frames import apply, degenerate, inverse, rigid, rotate, virtual_frame
+from torchgrasp.geometry.linalg import eye_like, norm
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.candidates import Reachable, ask_reachable
 from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, collision_cost
@@ -211,7 +213,7 @@ def nearest_postures(
     centres = contacts.points.double()[:, permutations] - radius[:, None] * inward  # (n, p, f, 3)
     framed = ~degenerate(triangle_of(centres))
     parts = []
-    for row in torch.nonzero(framed.any(1))[:, 0].split(at_once(centres, SEEDS.rows)):
+    for row in flatnonzero(framed.any(1)).split(at_once(centres, SEEDS.rows)):
         obj_from_vf, wanted = _describe(centres[row], inward[row], framed[row])
         assignment = _likely_assignments(wanted, given, framed[row])
         at = torch.arange(len(row), device=device)[:, None]
@@ -233,7 +235,7 @@ def nearest_postures(
             best = cost.topk(min(SEEDS.spare * n_seeds, candidates), 1, largest=False).indices
             reached = torch.zeros_like(best, dtype=torch.bool)
             for some in (slice(n_seeds), slice(n_seeds, None)):
-                short = torch.nonzero(reached.sum(1) < n_seeds)[:, 0]
+                short = flatnonzero(reached.sum(1) < n_seeds)
                 poses = obj_from_hand[short[:, None], best[short, some]]
                 reached[short, some] = ask_reachable(reachable, poses.flatten(0, 1)).reshape(
                     poses.shape[:2]
@@ -245,7 +247,7 @@ def nearest_postures(
         sample = sample[b, best]
         chosen = assignment[b, order]
         gap = apply(obj_from_vf[b, order], library.centres[sample]) - centres[row[b], chosen]
-        tip_error = torch.linalg.vector_norm(gap, dim=-1)
+        tip_error = norm(gap)
         energy = energy[b, best].double()
         joints = library.joints[sample]
         pose = obj_from_hand[b, best]
@@ -259,7 +261,7 @@ def _describe(
     """Return frame and features of r contact sets for p assignments to fingers, valid where
     `framed` is true.
     """
-    stand_in = torch.eye(3, dtype=centres.dtype, device=centres.device)
+    stand_in = eye_like(3, centres)
     triangle = torch.where(framed[..., None, None], triangle_of(centres), stand_in)
     obj_from_vf = rigid(virtual_frame(triangle)[..., :3, :3], centres.mean(-2))
     vf_from_obj = inverse(obj_from_vf)
@@ -338,7 +340,7 @@ def _query(
     obj_from_hand = code.obj_from_vf[row, assignment] @ inverse(virtual_frame(tips))  # Eq. (24)
     points = contacts.points.double()[row[:, None], permutation]
     normals = contacts.normals.double()[row[:, None], permutation]
-    tip_error = torch.linalg.vector_norm(apply(obj_from_hand, tips) - points, dim=-1)
+    tip_error = norm(apply(obj_from_hand, tips) - points)
     wrong_side = (rotate(obj_from_hand, tip_normals) * normals).sum(-1).mean(-1) > SEEDS.wrong_side
     order = lexical_order(row, wrong_side.int(), tip_error.amax(-1))
     seeds = IKSeeds(joints, obj_from_hand, row, permutation, energy[row, assignment], tip_error)

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.foundation.base import Batch, join, pick, rank_in_group, settle
+from torchgrasp.foundation.base import Batch, flatnonzero, join, pick, rank_in_group, settle
 from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import Status
 from torchgrasp.foundation.rules import ANY
@@ -145,7 +145,7 @@ def solve_ik(
         learned_seeds = partial(query_mixture, hand, mixture=mixture, n_seeds=SOLVING.learned_seeds)
         sources = [(learned_seeds, SOLVING.learned_tries), *sources]
     for source, count in sources:
-        rows = torch.nonzero(attempts.unsolved)[:, 0]
+        rows = flatnonzero(attempts.unsolved)
         if len(rows):
             seeds = source(contacts[rows])
             seeds = dataclasses.replace(seeds, row=rows[seeds.row])

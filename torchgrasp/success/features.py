@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchgrasp.contacts.balance import least_friction_forces
 from torchgrasp.foundation.base import spread
-from torchgrasp.geometry.linalg import across, unit
+from torchgrasp.geometry.linalg import across, norm, unit
 from torchgrasp.hand.hand import Hand
 from torchgrasp.shape.batch import ShapeBatch
 from torchgrasp.shape.gp import ShapeGP
@@ -98,7 +98,7 @@ def measure_grasps(
     found: dict[str, Tensor | float] = {
         "force needed": needed,
         "force to spare": torch.log(strength / needed),
-        "offset": torch.linalg.vector_norm(points.mean(1) - center, dim=-1),
+        "offset": norm(points.mean(1) - center),
         "force to spare if moved": spare.mean(0),
         "force to spare if moved and slippery": slippery.mean(0),
         "carried if moved": (spare > 0).to(points).mean(0),
@@ -148,7 +148,7 @@ def _normal_deviation(
     """
     mean, covariance = shape.estimate(shape.normalise(points).flatten(0, 1))
     normal = unit(mean[:, 1:])
-    slope = torch.linalg.vector_norm(mean[:, 1:], dim=-1)
+    slope = norm(mean[:, 1:])
     tangents = torch.stack(across(normal), -1)
     tangential = tangents.mT @ covariance[:, 1:, 1:] @ tangents
     one, other = tangential.diagonal(dim1=1, dim2=2).unbind(1)

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchgrasp.contacts.balance import grasp_map, least_friction_forces
 from torchgrasp.contacts.form_closure import cone_edges, tangents
 from torchgrasp.geometry.frames import apply, inverse, rotate, skew, subsets
-from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.linalg import norm, unit
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values.planning import Contacts, Grasps, IKSeeds
 
@@ -52,12 +52,12 @@ def lever_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "*b 3"]) -> 
             .amin(1)
         )
     sides = points.roll(-1, dims=1) - points
-    longest = torch.linalg.vector_norm(sides, dim=-1).argmax(1)[:, None, None].expand(-1, 1, 3)
+    longest = norm(sides).argmax(1)[:, None, None].expand(-1, 1, 3)
     along = unit(sides.gather(1, longest)[:, 0])
     foot = points.gather(1, longest)[:, 0]
     opposite = points.gather(1, (longest + 2) % 3)[:, 0]
-    arm = torch.linalg.vector_norm(torch.linalg.cross(along, center - foot), dim=-1)
-    height = torch.linalg.vector_norm(torch.linalg.cross(along, opposite - foot), dim=-1)
+    arm = norm(torch.linalg.cross(along, center - foot))
+    height = norm(torch.linalg.cross(along, opposite - foot))
     return arm / (height + LOADS.torsion)
 
 
@@ -91,7 +91,7 @@ def carrying_force(
     for friction in frictions:
         dual = edges + (1 - friction) * normals[:, :, None]
         across = torch.einsum("bfij,bfei->bfej", shared, dual)
-        lacking = across @ load.to(forces) + push * torch.linalg.vector_norm(across, dim=-1)
+        lacking = across @ load.to(forces) + push * norm(across)
         having = torch.einsum("bfi,bfei->bfe", forces, dual)
         factor = torch.where(having > 0, lacking.clamp_min(0) / having, torch.inf)
         found.append(factor.amax((1, 2)))

@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.files import read_value
-from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.base import Value, row_numbers
 
 MODEL = Path(__file__).with_name("model.safetensors")
 KIND = "success-model"
@@ -47,7 +47,7 @@ class SuccessModel(Value):
             len(features), len(self.feature), dtype=torch.int64, device=features.device
         )
         trees = torch.arange(len(self.feature), device=features.device)
-        rows = torch.arange(len(features), device=features.device)[:, None]
+        rows = row_numbers(features)[:, None]
         for _ in range(self.depth):
             above = features[rows, self.feature[trees, node]] > self.threshold[trees, node]
             node = self.children[trees, node, above.long()]
@@ -58,7 +58,7 @@ class SuccessModel(Value):
         """The number of steps from the root to the deepest leaf."""
         reached = torch.zeros(len(self.feature), 1, dtype=torch.int64, device=self.feature.device)
         depth = 0
-        trees = torch.arange(len(self.feature), device=self.feature.device)[:, None]
+        trees = row_numbers(self.feature)[:, None]
         while bool(
             (
                 (below := self.children[trees, reached].flatten(1))

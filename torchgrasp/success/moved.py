@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchgrasp.contacts.balance import forces_near, internal_forces
 from torchgrasp.geometry.frames import apply, rotate
-from torchgrasp.geometry.linalg import fibonacci_sphere
+from torchgrasp.geometry.linalg import fibonacci_sphere, norm
 from torchgrasp.geometry.signed_distance import DistanceField
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values.planning import Contacts, Grasps
@@ -76,7 +76,7 @@ def touch_moved(
         apply(pose, hand.tip_centres(q).to(forces)) for q in (grasps.pregrasp, grasps.joints)
     )
     path = after - before
-    way = path / torch.linalg.vector_norm(path, dim=-1, keepdim=True).clamp_min(MOVED.still)
+    way = path / norm(path, keepdim=True).clamp_min(MOVED.still)
     start = before - rotate(pose, moved[None]).transpose(0, 1)[:, :, None]  # (d, g, f, 3)
     points, normals, found = trace(field, start, way.expand_as(start), hand.tips.radius.to(forces))
     pairs = internal_forces(grasps.contacts.points.to(forces)).flatten(2).mT
@@ -107,7 +107,7 @@ def trace(
         further = travelled + gap.clamp_min(MOVED.least)
         travelled = torch.where(gap < MOVED.close, travelled, further).clamp_max(MOVED.length)
     distance, gradient = field.query(start + travelled[..., None] * way)
-    steepness = torch.linalg.vector_norm(gradient, dim=-1, keepdim=True)
+    steepness = norm(gradient, keepdim=True)
     normals = gradient / steepness.clamp_min(MOVED.flat)
     points = start + travelled[..., None] * way - distance[..., None] * normals
     touching = distance - radius < MOVED.close

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.foundation.base import lexical_order
+from torchgrasp.foundation.base import flatnonzero, lexical_order
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.success.features import FEATURES
 from torchgrasp.success.model import load_success_model
@@ -40,7 +40,7 @@ def grade(grasps: Grasps, log_odds: Float[Tensor, "k"], known: Bool[Tensor, "k"]
     """Return grasps with score, interval and `known` of the k executable ones by their log-odds of
     success.
     """
-    good = torch.nonzero(grasps.status == Status.OK)[:, 0]
+    good = flatnonzero(grasps.status == Status.OK)
     score = grasps.score.clone()
     score[good] = log_odds.to(score)
     interval = torch.zeros_like(score)[:, None].repeat(1, 2)

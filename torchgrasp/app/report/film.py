@@ -14,8 +14,10 @@ from torchgrasp.app.report.run_data import explain_loss, first_touches, moments_
 from torchgrasp.app.report.solids import solids_from_hand
 from torchgrasp.app.report.stills import add_solids, to_array
 from torchgrasp.evaluation.causes import moved_in_hand, tick_of
+from torchgrasp.foundation.base import flatnonzero
 from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.geometry.frames import apply
+from torchgrasp.geometry.linalg import norm
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values.closing import ClosureResult
 
@@ -167,7 +169,7 @@ def _draw_stills(
 ) -> list[np.ndarray]:
     """Return pictures of the hand and the object at the given ticks, all at the same scale."""
     known = closure.joints.isfinite().all(-1) & closure.object_pose.isfinite().all(-1).all(-1)
-    finite = torch.nonzero(known)[:, 0]
+    finite = flatnonzero(known)
     # of a simulation that diverged, the last state before
     at = torch.stack([finite[finite <= tick][-1] for tick in ticks])
     vertices = torch.tensor(np.array(mesh.vertices), dtype=torch.float64)
@@ -237,7 +239,7 @@ def _list_plots(
     degrees = to_array(torch.rad2deg(turn).masked_fill(before, torch.nan))
     middle = _centre(mesh).expand(len(closure.time), 1, 3)
     centres = apply(closure.object_pose.double(), middle)[:, 0]  # (t, 3)
-    moved = 1e3 * to_array(torch.linalg.vector_norm(centres - centres[0], dim=-1))
+    moved = 1e3 * to_array(norm(centres - centres[0]))
     height = 1e3 * to_array(closure.hand_pose[:, 2, 3])
     height = height - np.nanmin(height)
     forces = to_array(closure.forces)

@@ -13,11 +13,12 @@ from torchgrasp.app.report.canvas import ALARM, INK
 from torchgrasp.evaluation.causes import moved_in_hand, tick_of
 from torchgrasp.evaluation.criterion import SLIP_ANGLE, SLIP_DISTANCE
 from torchgrasp.evaluation.lift import LIFT_TIME, PUSHED_DISTANCE
-from torchgrasp.foundation.base import count_status
+from torchgrasp.foundation.base import count_status, flatnonzero
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import Status
 from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.geometry.frames import apply, inverse
+from torchgrasp.geometry.linalg import norm
 from torchgrasp.geometry.plane import move, upright_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.planner.explain import Explanation
@@ -201,7 +202,7 @@ def find_loss(closure: ClosureResult, centre: Float[Tensor, "3"]) -> int | None:
     if closure.status is Status.EJECTED:
         middle = centre.double().expand(len(closure.time), 1, 3)
         world = apply(closure.object_pose.double(), middle)[:, 0]  # (t, 3)
-        away = torch.linalg.vector_norm(world - world[0], dim=-1) > PUSHED_DISTANCE
+        away = norm(world - world[0]) > PUSHED_DISTANCE
         return int(away.int().argmax()) if bool(away.any()) else last
     # else it slipped too far, or at most one finger still touched it: the earlier of both
     distance, angle = moved_in_hand(closure, centre)
@@ -278,7 +279,7 @@ def moments_of(
         found.append(Moment(first_touches(closure)[0], f"{first} touches first"))
     # each closing begins where the control of the forces begins to act
     acts = torch.cat([torch.zeros(1, dtype=torch.bool), closure.trace.blend.isfinite().any(1)])
-    begins = torch.nonzero(acts[1:] & ~acts[:-1])[:, 0]
+    begins = flatnonzero(acts[1:] & ~acts[:-1])
     if closure.attempts == len(begins) > 1:
         found.append(Moment(int(begins[-1]), f"closing {len(begins)} begins"))
     all_touch = len(closure.contact_order) == len(fingers)

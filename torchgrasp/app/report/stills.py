@@ -11,8 +11,9 @@ from torch import Tensor
 from torchgrasp.app.report import canvas as paint
 from torchgrasp.app.report.canvas import Direction
 from torchgrasp.app.report.solids import PARKED, Solid, finger_of_links, solids_from_hand
+from torchgrasp.foundation.base import flatnonzero
 from torchgrasp.foundation.lazy import Image
-from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.linalg import norm, unit
 from torchgrasp.hand.hand import Hand
 from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.surface import Surface
@@ -195,7 +196,7 @@ def opposed_posture(hand: Hand, joints: Float[Tensor, "n h"]) -> Float[Tensor, "
     inward = points.mean(1, keepdim=True) - points
     # the worst finger counts: how well its pad faces the others, and how far away it is
     facing = (normals * unit(inward)).sum(-1).amin(1)
-    apart = torch.linalg.vector_norm(inward, dim=-1).amax(1)
+    apart = norm(inward).amax(1)
     score = facing - APART * apart
     free = hand.self_clearance(joints) > 0
     return joints[(score + free.to(score) * FREE).argmax()]
@@ -287,8 +288,7 @@ def _joint_colors(hand: Hand) -> list[str]:
     finger_of_link = finger_of_links(hand)
     finger_of_joint = [finger_of_link[hand.tree.link_names[k]] for k in hand.tree.child.tolist()]
     moved = [
-        {finger_of_joint[j] for j in torch.nonzero(row)[:, 0].tolist()}
-        for row in hand.actuated.coupling.T
+        {finger_of_joint[j] for j in flatnonzero(row).tolist()} for row in hand.actuated.coupling.T
     ]
     colors = {PARKED: paint.HAND, **dict(enumerate(paint.FINGERS))}
     return [colors[min(fingers)] if len(fingers) == 1 else paint.HAND for fingers in moved]
