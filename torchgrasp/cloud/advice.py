@@ -16,7 +16,7 @@ from torchgrasp.foundation.errors import BadArgument, NoSupport
 from torchgrasp.foundation.lazy import spatial
 from torchgrasp.geometry.linalg import Points, Vector, unit
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.geometry.support_planes import LEAST_WIDTH, find_supports
+from torchgrasp.geometry.support_planes import SUPPORTS, find_supports
 from torchgrasp.values.planning import PointCloud
 
 FEWEST = 50  # fewest points that show whether a camera is right, or whether pixels fly off rims
@@ -99,7 +99,7 @@ def _find_support(points: Points, eye: Vector | None, up: Vector) -> tuple[Plane
     """Return the plane of a table that was left in the cloud, and its share of the points; None if
     there is none.
     """
-    for sky, width in ((up, 0.06), *([(None, LEAST_WIDTH)] if eye is not None else [])):
+    for sky, width in ((up, 0.06), *([(None, SUPPORTS.least_width)] if eye is not None else [])):
         try:
             plane = find_supports(points, eye, sky, least_width=width)[0].plane
         except NoSupport:

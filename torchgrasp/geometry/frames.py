@@ -17,6 +17,9 @@ from torchgrasp.foundation.errors import DegenerateContacts
 from torchgrasp.foundation.rules import is_known
 from torchgrasp.geometry.linalg import unit
 
+FLAT = 1e-3
+"""Height of a contact triangle over its longest side below which noise turns its frame."""
+
 
 def rigid(
     rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"]
@@ -71,7 +74,8 @@ def real(numbers: Any) -> Tensor:
 
 def rotation_from_rpy(rpy: tuple[float, float, float]) -> Float[Tensor, "3 3"]:
     """Return the rotation of URDF's fixed-axis roll, pitch and yaw [rad]."""
-    (cr, cp, cy), (sr, sp, sy) = [math.cos(a) for a in rpy], [math.sin(a) for a in rpy]
+    cr, cp, cy = map(math.cos, rpy)
+    sr, sp, sy = map(math.sin, rpy)
     rows = [
         [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
         [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
@@ -100,16 +104,12 @@ def degenerate(points: Float[Tensor, "*b f 3"]) -> Bool[Tensor, "*b"]:
     """Return a mask of the contact sets that lie nearly on a line: even the largest contact
     triangle is too flat.
     """
-    # Least height of the largest contact triangle over its longest side: noise turns the frame of a
-    # flatter one
-    min_ratio = 1e-3
     corners = points[..., subsets(points.shape[-2], 3, points.device), :]  # (*b, k, 3, 3)
     sides = corners - corners.roll(1, dims=-2)
     longest = torch.linalg.vector_norm(sides, dim=-1).amax((-1, -2))
-    doubled_area = torch.linalg.vector_norm(
-        torch.linalg.cross(sides[..., 0, :], sides[..., 1, :]), dim=-1
-    ).amax(-1)
-    return ~(doubled_area > min_ratio * longest**2)
+    normals = torch.linalg.cross(sides[..., 0, :], sides[..., 1, :])
+    doubled_area = torch.linalg.vector_norm(normals, dim=-1).amax(-1)
+    return ~(doubled_area > FLAT * longest**2)
 
 
 def virtual_frame(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 4 4"]:

@@ -23,17 +23,17 @@ from torchgrasp.foundation.limits import (
     PLY_PROPERTIES,
 )
 
-SUFFIXES = (
-    ".obj",
-    ".off",
-    ".ply",
-    ".stl",
-)  # formats whose memory is bounded by the size of the file
-_REFERENCE = re.compile(
-    rb"/\S*"
-)  # normal and texture of a corner in an .obj: two textures would open the surface
+# formats whose memory is bounded by the size of the file
+SUFFIXES = (".obj", ".off", ".ply", ".stl")
+# normal and texture of a corner in an .obj: two textures would open the surface
+_REFERENCE = re.compile(rb"/\S*")
 MESH_FILE = f"a mesh file ({', '.join(SUFFIXES)})"
 LEAST_VOLUME = 1e-12  # least volume [m^3] of a body
+LEAST_SPAN = 1e-40  # least squared double area [m4] of a triangle that is divided by
+# a binary .stl: title, 32-bit count of faces, and bytes of each face
+STL_TITLE = 80
+STL_HEAD = STL_TITLE + 4
+STL_FACE = 50
 
 
 def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
@@ -115,7 +115,7 @@ def closest_on_triangles(
     uu, vv, uv = (np.einsum("ij,ij->i", x, y) for x, y in ((u, u), (v, v), (u, v)))
     uw = np.einsum("ij,ij->i", u, w)
     vw = np.einsum("ij,ij->i", v, w)
-    span = np.maximum(uu * vv - uv * uv, 1e-40)
+    span = np.maximum(uu * vv - uv * uv, LEAST_SPAN)
     s = (vv * uw - uv * vw) / span
     t = (uu * vw - uv * uw) / span
     best = a + s[:, None] * u + t[:, None] * v
@@ -217,8 +217,9 @@ def _count_faces(data: bytes, suffix: str) -> int:
     if suffix == ".obj":
         return data.count(b"\nf")
     if suffix == ".stl":
-        declared = int.from_bytes(data[80:84], "little")
-        return declared if len(data) == 84 + 50 * declared else data.count(b"facet normal")
+        declared = int.from_bytes(data[STL_TITLE:STL_HEAD], "little")
+        binary = len(data) == STL_HEAD + STL_FACE * declared
+        return declared if binary else data.count(b"facet normal")
     return _read_header(data) if suffix == ".ply" else 0
 
 

@@ -16,6 +16,7 @@ from torch import Tensor
 from torchgrasp.foundation.base import Batch, named_tensors, pick, put
 
 SOLVED = 0.1  # sum of squared residuals at which a row of `LeastSquares` ends
+CHECK_EVERY = 6  # steps between two looks for ended problems on an accelerator: the host waits
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,7 +85,7 @@ def levenberg_marquardt(
     costs = model.cost
     damping = torch.full_like(model.cost, problem.first_damping)
     going = torch.ones_like(rows, dtype=torch.bool)
-    every = 1 if rows.device.type == "cpu" else 6
+    every = 1 if rows.device.type == "cpu" else CHECK_EVERY
     for k in range(steps):
         x, taken = problem.step(model, damping)
         going = going & taken
@@ -130,12 +131,18 @@ class LinearResiduals(Linearisation):
 class LeastSquares(Minimisation[State, LinearResiduals]):
     """A batch of least-squares problems: the cost is the sum of squared residuals."""
 
-    residuals: Callable[
-        [State, Int[Tensor, "a"]], Residuals
-    ]  # with Jacobian, of the problems with given indices
+    # with Jacobian, of the problems with given indices
+    residuals: Callable[[State, Int[Tensor, "a"]], Residuals]
     moved: Callable[[State, Float[Tensor, "a d"]], State]  # the states after given steps
     solved: float = SOLVED  # sum of squared residuals below which a problem is solved
     largest: float = 0.3  # largest change of a variable in one step
+    floor: float = 1e-3  # damping of a joint that moves nothing
+    fall: float = 3.0  # divisor of the damping after an accepted step
+    rise: float = 4.0  # factor on the damping after a refused step
+    least: float = 1e-6  # least damping
+    most: float = 1e6  # greatest damping
+    lost: float = 30.0  # damping beyond which a refused step ends a problem
+    stalled: float = 0.02  # relative decrease of the cost below which a problem has converged
 
     def linearise(self, state: State, rows: Int[Tensor, "a"]) -> LinearResiduals:
         """Return the residuals, their Jacobian and the sum of squared residuals of each problem."""
@@ -149,9 +156,8 @@ class LeastSquares(Minimisation[State, LinearResiduals]):
         normal = model.jacobian.mT @ model.jacobian
         diagonal = normal.diagonal(dim1=1, dim2=2)
         # Relative damping alone would leave a joint that moves nothing undamped.
-        factor, info = torch.linalg.cholesky_ex(
-            normal + torch.diag_embed(damping[:, None] * diagonal + 1e-3)
-        )
+        damped = normal + torch.diag_embed(damping[:, None] * diagonal + self.floor)
+        factor, info = torch.linalg.cholesky_ex(damped)
         x = -torch.cholesky_solve(model.jacobian.mT @ model.residual[..., None], factor)[..., 0]
         taken = ~(model.cost < self.solved) & torch.isfinite(damping)
         # A GPU may factor a matrix with an infinite diagonal without complaint; its step is NaN.
@@ -166,10 +172,8 @@ class LeastSquares(Minimisation[State, LinearResiduals]):
         self, model: LinearResiduals, trial: LinearResiduals, x: Step, damping: Damping
     ) -> Verdict:
         """Accept a step that lowers the cost; stop a problem that has converged or is stuck."""
-        lost = 30.0  # damping beyond which a refused step ends a row of `LeastSquares`
-        # relative decrease of the sum of squares below which a row of `LeastSquares` has converged
-        stalled = 0.02
         better = trial.cost < model.cost
-        rests = torch.where(better, trial.cost > (1 - stalled) * model.cost, damping > lost)
-        after = torch.where(better, damping / 3, damping * 4).clamp(1e-6, 1e6)
-        return better, torch.where(rests, torch.inf, after)
+        converged = trial.cost > (1 - self.stalled) * model.cost
+        rests = torch.where(better, converged, damping > self.lost)
+        after = torch.where(better, damping / self.fall, damping * self.rise)
+        return better, torch.where(rests, torch.inf, after.clamp(self.least, self.most))

@@ -27,6 +27,8 @@ POSES = ("obj_from_hand", "obj_from_vf")
 invariant.
 """
 LEAST_TILT = 0.05  # least sine of the angle between the vertical and a camera that has an azimuth
+UNIT_ERROR = 1e-4  # greatest error of a unit normal's length
+MOST_ABOVE = 0.01  # height [m] of a table above the middle of a cloud: several calibration errors
 
 
 @checked
@@ -48,7 +50,7 @@ class Plane(Value):
 
     def __post_init__(self) -> None:
         length = float(torch.linalg.vector_norm(self.normal))
-        if not abs(length - 1) < 1e-4:
+        if not abs(length - 1) < UNIT_ERROR:
             raise BadArgument("normal", f"a vector of length {length:g}", "a unit vector")
 
     @classmethod
@@ -111,19 +113,14 @@ def upright_frame(
     points = points.detach().cpu().double()
     centre = points.mean(0)
     offset = points - centre
-    eye = (
-        None
-        if viewpoint is None
-        else viewpoint.detach().cpu().double().reshape(-1, 3).mean(0) - centre
-    )
+    eye = None
+    if viewpoint is not None:
+        eye = viewpoint.detach().cpu().double().reshape(-1, 3).mean(0) - centre
     if table is not None:
         middle = float(table.height(points).median())
-        if middle < -0.01:  # several errors of a calibration
-            raise BadArgument(
-                "table",
-                f"a plane {-middle:.3g} m above the middle of the cloud",
-                "one under the object",
-            )
+        if middle < -MOST_ABOVE:
+            found = f"a plane {-middle:.3g} m above the middle of the cloud"
+            raise BadArgument("table", found, "one under the object")
         z = unit(table.normal.detach().cpu().double())
         centre = centre - table.height(centre) * z
     elif eye is not None and bool(eye.any()):
@@ -134,11 +131,8 @@ def upright_frame(
         z = z if float((offset @ z).pow(3).sum()) >= 0 else -z
     if eye is not None:
         level = eye - (eye @ z) * z
-        eye = (
-            level
-            if torch.linalg.vector_norm(level) > LEAST_TILT * torch.linalg.vector_norm(eye)
-            else None
-        )
+        steep = LEAST_TILT * torch.linalg.vector_norm(eye)
+        eye = level if torch.linalg.vector_norm(level) > steep else None
     if eye is None:
         level = offset - (offset @ z)[:, None] * z
         eye = level[torch.linalg.vector_norm(level, dim=1).argmax()]

@@ -13,23 +13,71 @@ from torch import Tensor
 from torchgrasp.foundation.lazy import spatial
 from torchgrasp.geometry.linalg import Points, Vector
 
-NOISE = 0.001
-NOISE_GROWTH = 0.0035
-"""Assumed noise [m] of a depth camera, and its growth with the squared distance [1/m]."""
-ROUGH = 2.5  # a greater scale of the residuals, over the assumed noise, belongs to no flat plane
-LEAST_SHARE = 0.05  # least share of the points on a plane
-REACH = 0.30  # height [m] of objects above a plane
-MOST_TILT = 30.0  # greatest angle [deg] between the normal and `up`
+
+@dataclasses.dataclass(frozen=True)
+class PlaneNumbers:
+    """The numbers of the search for planes."""
+
+    noise: float = 0.001
+    """Assumed noise [m] of a depth camera that is near."""
+    noise_growth: float = 0.0035
+    """Growth of the noise with the squared distance [1/m]."""
+    distance: float = 0.7
+    """Distance [m] of a camera that is not known."""
+    planes: int = 8
+    """Most planes of a view."""
+    scored: int = 2000
+    """Points that score the proposals."""
+    triples: int = 4000
+    """Proposals by random points, which may be far apart."""
+    neighbours: int = 60
+    """Nearest points from which a proposal by neighbours is drawn."""
+    least_height: float = 10.0
+    """Least height of a triangle, over the noise: a lower triangle's normal is noise."""
+    least_side: float = 1e-12
+    """Least side [m] that a triangle's area is divided by."""
+    at_once: int = 500
+    """Proposals that are scored at once, which bounds memory."""
+    least_share: float = 0.05
+    """Least share of the points on a plane."""
+    most_tilt: float = 30.0
+    """Greatest angle [deg] between the normal and `up`."""
+    tilt_slack: float = 5.0
+    """Further angle [deg] of a proposal, which the fit may turn back."""
+    reach: float = 0.30
+    """Height [m] of objects above a plane."""
+    rough: float = 2.5
+    """Scale of the residuals, over the assumed noise, from which a plane is not flat."""
+    smooth: float = 0.2
+    """Least scale of the residuals: points may lie better than the assumed noise."""
+    core: float = 3.0
+    """Greatest distance of a point on a plane, over noise and scale."""
+    quantile: float = 0.25
+    """Quantile of the distances that measures the scale: few points of objects count in it."""
+    per_quantile: float = 3.14
+    """Standard deviation over this quantile, for normal residuals."""
+    tukey: float = 4.685
+    """Residual of no weight, over the scale: with it, Tukey's fit of normal residuals has 95 % of
+    the efficiency of least squares.
+    """
+    steps: int = 30
+    """Most steps of a fit."""
+    still: float = 1e-12
+    """Change of a plane below which its fit ends."""
+
+
+PLANES = PlaneNumbers()
 
 
 def assume_noise(
     points: Float[Tensor, "n 3"], eye: Float[Tensor, "3"] | None
 ) -> Float[Tensor, "n"]:
-    """Return the assumed noise [m] of each point. If the camera is unknown, its distance is taken
-    as 0.7 m.
-    """
-    squared = torch.full((len(points),), 0.7**2, dtype=points.dtype, device="cpu")
-    return NOISE + NOISE_GROWTH * (squared if eye is None else (points - eye).square().sum(-1))
+    """Return the assumed noise [m] of each point; `PLANES.distance` is that of an unknown camera."""
+    if eye is None:
+        squared = torch.full((len(points),), PLANES.distance**2, dtype=points.dtype, device="cpu")
+    else:
+        squared = (points - eye).square().sum(-1)
+    return PLANES.noise + PLANES.noise_growth * squared
 
 
 class SeenPoints:
@@ -64,58 +112,57 @@ class PlaneFit:
         elif view.eye is not None:
             side = float(self.normal @ view.eye) - self.offset
         else:
-            side = float((view.points @ self.normal - self.offset).clamp(-REACH, REACH).sum())
-        return (
-            self
-            if side >= 0
-            else dataclasses.replace(self, normal=-self.normal, offset=-self.offset)
-        )
+            heights = view.points @ self.normal - self.offset
+            side = float(heights.clamp(-PLANES.reach, PLANES.reach).sum())
+        if side >= 0:
+            return self
+        return dataclasses.replace(self, normal=-self.normal, offset=-self.offset)
 
 
 def fit_planes(view: SeenPoints, generator: torch.Generator) -> Iterator[PlaneFit]:
-    """Yield at most 8 planes, each with the most points that lie on no plane before it."""
-    scored = 2000  # points that score the proposals
-    points = view.points[:scored]
-    noise = view.noise[:scored]
-    normals, offsets = _propose(view, scored, generator)
-    held = _held(points, noise, normals, offsets)
+    """Yield at most `PLANES.planes` planes, each with the most points that lie on no plane before
+    it.
+    """
+    points = view.points[: PLANES.scored]
+    noise = view.noise[: PLANES.scored]
+    normals, offsets = _propose(view, generator)
+    held = _held(points, noise, normals, offsets)  # (m, n)
     left = torch.ones(len(points), device="cpu")
-    for _ in range(8 if len(held) else 0):
+    for _ in range(PLANES.planes if len(held) else 0):
         counts = held @ left
         i = int(counts.argmax())
-        if int(counts[i]) < 0.5 * LEAST_SHARE * len(points):
+        if int(counts[i]) < 0.5 * PLANES.least_share * len(points):
             break
         fit = _refine(view, normals[i], float(offsets[i]))
         yield fit
-        left = left * ((points @ fit.normal - fit.offset).abs() > 3 * noise) * (1 - held[i])
+        beside = (points @ fit.normal - fit.offset).abs() > PLANES.core * noise
+        left = left * beside * (1 - held[i])
 
 
 def _propose(
-    view: SeenPoints, scored: int, generator: torch.Generator
+    view: SeenPoints, generator: torch.Generator
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m"]]:
     """Return unit normals and offsets [m] of planes through random triples of points, distant or
     neighbouring.
     """
     points = view.points
-    some = points[:scored]
-    near = torch.from_numpy(spatial.KDTree(some.numpy()).query(some.numpy(), min(60, len(some)))[1])
+    some = points[: PLANES.scored]
+    tree = spatial.KDTree(some.numpy())
+    near = torch.from_numpy(tree.query(some.numpy(), min(PLANES.neighbours, len(some)))[1])
     pick = torch.randint(near.shape[1], (2, len(some), 1), generator=generator, device="cpu")
-    far = points[torch.randint(len(points), (3, 4000), generator=generator, device="cpu")]
-    a, b, c = torch.cat(
-        [far, torch.stack([some, *(some[near.gather(1, k)[:, 0]] for k in pick)])], 1
-    )
+    drawn = torch.randint(len(points), (3, PLANES.triples), generator=generator, device="cpu")
+    beside = [some[near.gather(1, k)[:, 0]] for k in pick]
+    a, b, c = torch.cat([points[drawn], torch.stack([some, *beside])], 1)
     normal = torch.linalg.cross(b - a, c - a)
     double_area = torch.linalg.vector_norm(normal, dim=-1)
-    longest = torch.stack([(b - a).norm(dim=-1), (c - a).norm(dim=-1), (c - b).norm(dim=-1)]).amax(
-        0
-    )
-    wide = (
-        double_area / longest.clamp_min(1e-12) > 10 * view.noise.median()
-    )  # a lower triangle's normal is noise
+    sides = torch.stack([(b - a).norm(dim=-1), (c - a).norm(dim=-1), (c - b).norm(dim=-1)])
+    height = double_area / sides.amax(0).clamp_min(PLANES.least_side)
+    wide = height > PLANES.least_height * view.noise.median()
     normal = normal[wide] / double_area[wide, None]
     offset = (normal * a[wide]).sum(-1)
     if view.sky is not None:
-        upright = (normal @ view.sky).abs() > math.cos(math.radians(MOST_TILT + 5.0))
+        tilt = math.radians(PLANES.most_tilt + PLANES.tilt_slack)
+        upright = (normal @ view.sky).abs() > math.cos(tilt)
         normal = normal[upright]
         offset = offset[upright]
     return normal, offset
@@ -131,8 +178,9 @@ def _held(
     else 0.
     """
     held = torch.empty(len(normals), len(points), device="cpu")
-    for rows in torch.arange(len(normals), device="cpu").split(500):
-        held[rows] = ((normals[rows] @ points.T - offsets[rows, None]).abs_() < 2 * noise).float()
+    for rows in torch.arange(len(normals), device="cpu").split(PLANES.at_once):
+        height = normals[rows] @ points.T - offsets[rows, None]
+        held[rows] = (height.abs_() < 2 * noise).float()
     return held
 
 
@@ -143,15 +191,14 @@ def _refine(view: SeenPoints, normal: Float[Tensor, "3"], offset: float) -> Plan
     points = view.points
     noise = view.noise
     scale = 1.0
-    for _ in range(30):
+    for _ in range(PLANES.steps):
         ratio = (points @ normal - offset) / noise
-        core = ratio.abs() < 3 * scale
-        scale = (
-            min(max(float(3.14 * ratio[core].abs().quantile(0.25)), 0.2), ROUGH)
-            if bool(core.any())
-            else scale
-        )
-        weight = (1 - (ratio / (4.685 * scale)).square()).clamp_min(0).square() / noise.square()
+        core = ratio.abs() < PLANES.core * scale
+        if bool(core.any()):
+            measured = float(PLANES.per_quantile * ratio[core].abs().quantile(PLANES.quantile))
+            scale = min(max(measured, PLANES.smooth), PLANES.rough)
+        share = (ratio / (PLANES.tukey * scale)).square()
+        weight = (1 - share).clamp_min(0).square() / noise.square()
         weight = weight / weight.sum()
         mean = weight @ points
         offset_points = points - mean
@@ -162,7 +209,7 @@ def _refine(view: SeenPoints, normal: Float[Tensor, "3"], offset: float) -> Plan
         change = float((turned - normal).abs().max()) + abs(moved - offset)
         normal = turned
         offset = moved
-        if change < 1e-12:
+        if change < PLANES.still:
             break
-    on = ((points @ normal - offset).abs() / noise) < 3 * scale
+    on = ((points @ normal - offset).abs() / noise) < PLANES.core * scale
     return PlaneFit(normal, offset, scale, int(on.sum()))

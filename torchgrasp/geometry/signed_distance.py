@@ -17,12 +17,44 @@ from torchgrasp.foundation.lazy import spatial, trimesh
 from torchgrasp.foundation.rules import Range
 from torchgrasp.geometry.mesh import closest_on_triangles
 
-BAND = 0.026  # distance [m] within which every second node is exact: the reach of a palm's spheres
-# spacings outside and inside the surface within which every node is exact
-NEAR = 3
-INWARD = 5
-FAR_SHARE = 8  # one of so many samples of the surface is used for nodes beyond the band
 FIELD_SPACING = 0.004  # spacing [m] of nodes with an error below that of an estimated surface
+# Share of a cubic at the middle: its four neighbours have the weights -1, 9, 9, -1.
+SIXTEENTH = 1 / 16
+
+
+@dataclasses.dataclass(frozen=True)
+class FieldNumbers:
+    """The numbers of a distance field that is made from a mesh."""
+
+    band: float = 0.026
+    """Distance [m] within which every second node is exact: the reach of a palm's spheres."""
+    near: float = 3.0
+    """Spacings outside the surface within which every node is exact."""
+    inward: float = 5.0
+    """Spacings inside the surface within which every node is exact."""
+    most_nodes: float = 2e7
+    """Most nodes of a grid: 160 MB."""
+    least_area: float = 1e-14
+    """Least area [m2] of a triangle that counts."""
+    sample: float = 0.002
+    """Side [m] of the square for which the surface has one sample."""
+    least_samples: int = 2000
+    """Least samples of a surface."""
+    most_samples: int = 40_000
+    """Most samples of a surface, which bounds the time."""
+    few: int = 8
+    """One of so many samples is used for nodes beyond the band."""
+    tried: int = 3
+    """Triangles that are tried for a point within the band."""
+    leaf: int = 32
+    """Samples in a leaf of the search tree."""
+    at_once: int = 8192
+    """Points whose distances are sought at once, which bounds memory."""
+    digits: int = 9
+    """Decimals [m] in which the corners of neighbouring triangles agree."""
+
+
+FIELDS = FieldNumbers()
 
 
 class Grid(NamedTuple):
@@ -33,9 +65,8 @@ class Grid(NamedTuple):
     last: Int[Tensor, "*b 3"]  # node on each axis
     stride: Any  # number of values between neighbours on the x and on the y axis
     first: Any  # place of the first value
-    corners: Int[
-        Tensor, "8 *b"
-    ]  # steps from the first corner of a cell to all corners, among the values
+    # steps from the first corner of a cell to all corners, among the values
+    corners: Int[Tensor, "8 *b"]
 
 
 class DistanceField(Value, abc.ABC):
@@ -58,7 +89,8 @@ class DistanceField(Value, abc.ABC):
         grid = self._grid(points)
         node = torch.round((points - grid.origin) / grid.spacing).clamp_min_(0)
         node = torch.minimum(node, grid.last.to(points)).long()
-        (dx, dy), (x, y, z) = grid.stride, node.unbind(-1)
+        dx, dy = grid.stride
+        x, y, z = node.unbind(-1)
         return self.nodes[x * dx + y * dy + z + grid.first].to(points)
 
     @abc.abstractmethod
@@ -79,23 +111,24 @@ class DistanceField(Value, abc.ABC):
         cell = torch.minimum(inside.detach().long(), last - 1)
         fx, fy, fz = (inside - cell).unbind(-1)
         flat = cell[..., 0] * dx + cell[..., 1] * dy + cell[..., 2] + first
-        corner = self.nodes[flat + corners].to(points)
-        z = [torch.lerp(corner[2 * i], corner[2 * i + 1], fz) for i in range(4)]
-        y = [torch.lerp(z[0], z[1], fy), torch.lerp(z[2], z[3], fy)]
-        slope_z = [corner[2 * i + 1] - corner[2 * i] for i in range(4)]
-        slope_z = torch.lerp(
-            torch.lerp(slope_z[0], slope_z[1], fy), torch.lerp(slope_z[2], slope_z[3], fy), fx
-        )
-        slope_y = torch.lerp(z[1] - z[0], z[3] - z[2], fx)
+        # (2, 2, 2, *b): the corners on x, y and z
+        corner = self.nodes[flat + corners].to(points).unflatten(0, (2, 2, 2))
+        low = corner[:, :, 0]
+        high = corner[:, :, 1]
+        z = torch.lerp(low, high, fz)
+        y = torch.lerp(z[:, 0], z[:, 1], fy)
+        slope_z = high - low
+        slope_z = torch.lerp(slope_z[:, 0], slope_z[:, 1], fy)
+        slope_z = torch.lerp(slope_z[0], slope_z[1], fx)
+        slope_y = z[:, 1] - z[:, 0]
+        slope_y = torch.lerp(slope_y[0], slope_y[1], fx)
         slope = torch.stack([y[1] - y[0], slope_y, slope_z], -1) / spacing
         beyond = (position - inside) * spacing
-        outside = (beyond != 0).any(
-            -1, keepdim=True
-        )  # the norm of a zero vector has no second derivative
+        # The norm of a zero vector has no second derivative.
+        outside = (beyond != 0).any(-1, keepdim=True)
         length = torch.linalg.vector_norm(torch.where(outside, beyond, 1.0), dim=-1, keepdim=True)
         away = torch.where(outside, length, 0.0)[..., 0]
-        outward = beyond / length
-        gradient = torch.where(beyond != 0, 0.0, slope) + outward
+        gradient = torch.where(beyond != 0, 0.0, slope) + beyond / length
         return torch.lerp(y[0], y[1], fx) + away, gradient
 
 
@@ -133,7 +166,8 @@ class SignedDistanceField(DistanceField):
         return shape - 1, corner_steps(shape[1] * shape[2], shape[2])
 
     def _grid(self, points: Float[Tensor, "*b 3"]) -> Grid:
-        (last, corners), (_, ny, nz) = self._cells, self.values.shape
+        last, corners = self._cells
+        _, ny, nz = self.values.shape
         corners = corners.view(-1, *[1] * (points.ndim - 1))
         return Grid(self.origin.to(points), self.spacing, last, (ny * nz, nz), 0, corners)
 
@@ -164,20 +198,22 @@ def field_from_surface(
     high = vertices.amax(0).double() + margin
     # the first nodes are every fourth of the finest
     counts = [4 * max(1, int(c)) + 1 for c in torch.ceil((high - low) / (4 * spacing)).tolist()]
-    if np.prod(np.array(counts, dtype=float)) > 2e7:  # 160 MB
+    if np.prod(np.array(counts, dtype=float)) > FIELDS.most_nodes:
         raise BadArgument("spacing", spacing, f"a coarser grid than {counts} nodes")
     origin = low.cpu().numpy()
     lines = [origin[k] + spacing * np.arange(counts[k]) for k in range(3)]
     nodes = np.stack(np.meshgrid(*(line[::4] for line in lines), indexing="ij"), -1)
     values = surface.distance(nodes.reshape(-1, 3), far=True).reshape(nodes.shape[:3])
     known = np.zeros(values.shape, dtype=bool)
-    for step, inward, outward in ((2, np.inf, BAND), (1, INWARD * spacing, NEAR * spacing)):
+    finest = (1, FIELDS.inward * spacing, FIELDS.near * spacing)
+    for step, inward, outward in ((2, np.inf, FIELDS.band), finest):
         before = known
         values = _refine(values)
         known = np.zeros(values.shape, dtype=bool)
         known[::2, ::2, ::2] = before
         near = np.nonzero((-inward < values) & (values < outward) & ~known)
-        values[near] = surface.distance(np.stack([lines[k][::step][near[k]] for k in range(3)], -1))
+        nodes = np.stack([lines[k][::step][near[k]] for k in range(3)], -1)
+        values[near] = surface.distance(nodes)
         known[near] = True
     to = {"device": vertices.device, "dtype": torch.float64}
     return SignedDistanceField(low.to(**to), float(spacing), torch.tensor(values, **to))
@@ -213,11 +249,13 @@ def _upsample(values: np.ndarray, axis: int) -> np.ndarray:
     if known.dtype == bool:
         fine[1::2] = known[:-1]
     else:
-        padded = np.concatenate([2 * known[:1] - known[1:2], known, 2 * known[-1:] - known[-2:-1]])
-        fine[1::2] = (9 * (known[:-1] + known[1:]) - padded[:-3] - padded[3:]) / 16
-    return np.ascontiguousarray(
-        np.moveaxis(fine, 0, axis)
-    )  # queries would copy another layout each time
+        before = 2 * known[:1] - known[1:2]
+        after = 2 * known[-1:] - known[-2:-1]
+        padded = np.concatenate([before, known, after])
+        inner = 9 * (known[:-1] + known[1:])
+        fine[1::2] = (inner - padded[:-3] - padded[3:]) * SIXTEENTH
+    # queries would copy another layout each time
+    return np.ascontiguousarray(np.moveaxis(fine, 0, axis))
 
 
 class _Surface:
@@ -227,38 +265,32 @@ class _Surface:
 
     def __init__(self, vertices: Tensor, faces: Tensor):
         if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0 or faces.is_floating_point():
-            raise BadArgument(
-                "faces",
-                f"{faces.dtype} of shape {tuple(faces.shape)}",
-                "integers (f, 3) with f >= 1",
-            )
+            found = f"{faces.dtype} of shape {tuple(faces.shape)}"
+            raise BadArgument("faces", found, "integers (f, 3) with f >= 1")
         if faces.min() < 0 or faces.max() >= len(vertices):
-            raise BadArgument(
-                "faces", f"faces {int(faces.min())}..{int(faces.max())}", f"0..{len(vertices) - 1}"
-            )
-        corners = vertices.detach().cpu().double().numpy()[faces.cpu().numpy()]
-        area = (
-            np.linalg.norm(
-                np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-            )
-            / 2
-        )
-        corners = corners[area > 1e-14]
-        area = area[area > 1e-14]
-        if len(area) == 0:
+            found = f"faces {int(faces.min())}..{int(faces.max())}"
+            raise BadArgument("faces", found, f"0..{len(vertices) - 1}")
+        corners = vertices.detach().cpu().double().numpy()[faces.cpu().numpy()]  # (f, 3, 3)
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        double_area = np.linalg.norm(normals, axis=1)
+        kept = double_area / 2 > FIELDS.least_area
+        if not kept.any():
             raise BadArgument("faces", "faces without area", "a surface")
+        corners = corners[kept]
+        area = double_area[kept] / 2
+        self.triangles = corners
+        self.normals = _pseudonormals(corners, normals[kept] / double_area[kept, None])
         rng = np.random.default_rng(0)
-        count = int(np.clip(area.sum() / 0.002**2, 2000, 40_000))
+        wanted = area.sum() / FIELDS.sample**2
+        count = int(np.clip(wanted, FIELDS.least_samples, FIELDS.most_samples))
         owner = np.repeat(np.arange(len(area)), rng.multinomial(count, area / area.sum()))
         u, v = np.sort(rng.random((2, len(owner))), axis=0)
         weights = np.stack([u, v - u, 1 - v], 1)
         samples = (corners[owner] * weights[:, :, None]).sum(1)
-        self.owner = np.concatenate([np.arange(len(area)), owner])
-        self.triangles = corners
-        self.normals = _pseudonormals(corners)
         samples = np.concatenate([corners.mean(1), samples])
-        self.tree = spatial.KDTree(samples, leafsize=32)
-        self.few = spatial.KDTree(samples[::FAR_SHARE], leafsize=32)
+        self.owner = np.concatenate([np.arange(len(area)), owner])
+        self.tree = spatial.KDTree(samples, leafsize=FIELDS.leaf)
+        self.few = spatial.KDTree(samples[:: FIELDS.few], leafsize=FIELDS.leaf)
 
     def distance(self, points: np.ndarray, far: bool = False) -> np.ndarray:
         """Return the signed distances [m] of points (n, 3); `far` uses fewer samples, for distant
@@ -266,42 +298,39 @@ class _Surface:
         """
         parts = []
         tree = self.few if far else self.tree
-        owners = self.owner[::FAR_SHARE] if far else self.owner
-        for part in (points[k : k + 8192] for k in range(0, max(1, len(points)), 8192)):
-            _, index = tree.query(part, k=1 if far else min(3, len(owners)))
-            owner = owners[index.reshape(len(part), -1)]
-            feet, feature = closest_on_triangles(
-                np.repeat(part, owner.shape[1], 0), self.triangles[owner.reshape(-1)]
-            )
-            gap = part[:, None] - feet.reshape(*owner.shape, 3)
+        owners = self.owner[:: FIELDS.few] if far else self.owner
+        tried = 1 if far else min(FIELDS.tried, len(owners))
+        for begin in range(0, max(1, len(points)), FIELDS.at_once):
+            part = points[begin : begin + FIELDS.at_once]
+            _, index = tree.query(part, k=tried)
+            owner = owners[index.reshape(len(part), tried)]  # (p, t)
+            triangles = self.triangles[owner.reshape(-1)]
+            feet, feature = closest_on_triangles(np.repeat(part, tried, 0), triangles)
+            gap = part[:, None] - feet.reshape(*owner.shape, 3)  # (p, t, 3)
             squared = (gap * gap).sum(-1)
             rows = np.arange(len(part))
             best = squared.argmin(1)
             normal = self.normals[owner[rows, best], feature.reshape(owner.shape)[rows, best]]
-            parts.append(
-                np.copysign(np.sqrt(squared[rows, best]), (gap[rows, best] * normal).sum(1))
-            )
+            sign = (gap[rows, best] * normal).sum(1)
+            parts.append(np.copysign(np.sqrt(squared[rows, best]), sign))
         return np.concatenate(parts)
 
 
-def _pseudonormals(corners: np.ndarray) -> np.ndarray:
+def _pseudonormals(corners: np.ndarray, face: np.ndarray) -> np.ndarray:
     """Return pseudonormals (Baerentzen and Aanaes, 2005) of each triangle's face, 3 sides and 3
-    corners, (f, 7, 3).
+    corners, (f, 7, 3), given the unit normals of the faces (f, 3).
     """
-    face = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    face /= np.linalg.norm(face, axis=1, keepdims=True)
-    ids = trimesh.grouping.unique_rows(corners.reshape(-1, 3), digits=9)[1].reshape(-1, 3)
+    vertices = corners.reshape(-1, 3)
+    ids = trimesh.grouping.unique_rows(vertices, digits=FIELDS.digits)[1].reshape(-1, 3)
     ahead = np.roll(corners, -1, 1) - corners
     back = np.roll(corners, 1, 1) - corners
-    cosine = (ahead * back).sum(-1) / (
-        np.linalg.norm(ahead, axis=-1) * np.linalg.norm(back, axis=-1)
-    )
+    lengths = np.linalg.norm(ahead, axis=-1) * np.linalg.norm(back, axis=-1)
+    cosine = (ahead * back).sum(-1) / lengths
     weighted = face[:, None] * np.arccos(np.clip(cosine, -1, 1))[..., None]
     at_corner = _sum_by(ids.reshape(-1), weighted.reshape(-1, 3))
-    side = np.sort(np.stack([ids, np.roll(ids, -1, 1)], -1), -1)
-    side = np.unique(side[..., 0] * (ids.max() + 1) + side[..., 1], return_inverse=True)[1].reshape(
-        -1, 3
-    )
+    ends = np.sort(np.stack([ids, np.roll(ids, -1, 1)], -1), -1)  # (f, 3, 2)
+    number = ends[..., 0] * (ids.max() + 1) + ends[..., 1]
+    side = np.unique(number, return_inverse=True)[1].reshape(-1, 3)
     at_side = _sum_by(side.reshape(-1), np.repeat(face, 3, 0))
     return np.concatenate([face[:, None], at_side[side], at_corner[ids]], 1)
 

@@ -16,28 +16,66 @@ from torchgrasp.foundation.errors import BadArgument, NoSupport
 from torchgrasp.foundation.lazy import ndimage, spatial
 from torchgrasp.geometry.linalg import Points, Vector, unit
 from torchgrasp.geometry.plane import Plane, as_plane
-from torchgrasp.geometry.plane_fit import (
-    LEAST_SHARE,
-    MOST_TILT,
-    REACH,
-    ROUGH,
-    PlaneFit,
-    SeenPoints,
-    assume_noise,
-    fit_planes,
-)
+from torchgrasp.geometry.plane_fit import PLANES, PlaneFit, SeenPoints, assume_noise, fit_planes
 
-MOST_THROUGH = (
-    0.1  # greatest number of points seen through a support's region, over the number on it
-)
-MOST_PIERCED = 0.05  # greatest share of the low points over a support that continue below it
-LEAST_STANDING = 0.001  # least share of the points that stand low on a support, over its region
-LEAST_WIDTH = 0.14
-FURNITURE = 0.3
-"""Least width [m] of a support's region; a wider face than FURNITURE [m] belongs to no object that
-a hand grasps.
-"""
-LOW = 0.06  # height [m] below which points of an object stand close to its support
+
+@dataclasses.dataclass(frozen=True)
+class SupportNumbers:
+    """The numbers that decide whether a plane supports objects, and how far it extends."""
+
+    points: int = 20_000
+    """Most points that are used, which bounds the time."""
+    least_points: int = 50
+    """Least points of a view."""
+    at_once: int = 10_000
+    """Points that are compared with a region at once, which bounds memory."""
+    thickness: float = 4.0
+    """Greatest distance of a point on a support, over its noise."""
+    least_thickness: float = 0.001
+    """Distance [m] that is added to the noise: a table is not quite flat."""
+    most_through: float = 0.1
+    """Most points seen through a support's region, over the points on it."""
+    edge: float = 0.05
+    """Border of the region, over its width, through which points may be seen."""
+    low: float = 0.06
+    """Height [m] below which points of an object stand close to its support."""
+    pierced_cell: float = 0.02
+    """Width [m] of the columns in which points above and below a support are counted."""
+    below: float = 0.2
+    """Least points below a support over those above it, in a column that goes through it."""
+    most_pierced: float = 0.05
+    """Greatest share of the low points over a support that continue below it."""
+    least_standing: float = 0.001
+    """Least share of the points that stand low on a support, over its region."""
+    least_low: float = 0.05
+    """Least share of the low points that stand over the region."""
+    steep: float = 0.9
+    """Cosine of the camera's angle to the normal from which objects hide their own feet."""
+    grazing: float = 5.0
+    """Least angle [deg] between the plane and the camera's direction."""
+    favour: float = 2.0
+    """Factor on the score of the support that the camera looks at."""
+    least_width: float = 0.14
+    """Least width [m] of a support's region."""
+    furniture: float = 0.3
+    """Width [m] of a region from which it belongs to no object that a hand grasps."""
+    parallel: float = 0.985
+    """Least cosine between the normals of parallel planes: ten degrees."""
+    same: float = 0.02
+    """Distance [m] below which parallel planes are the same one."""
+    cell: float = 0.03
+    """Width [m] of the cells in which points on a plane are connected."""
+    closing: int = 2
+    """Cells by which the groups of points grow and shrink again, to close gaps."""
+    least_part: float = 0.02
+    """Least size of a group of points, over the largest group."""
+    most_open: float = 0.05
+    """Most points seen below the plane between two groups, over the smaller group."""
+    least_height: float = 1e-9
+    """Least height [m] that a ray to a plane is divided by."""
+
+
+SUPPORTS = SupportNumbers()
 # what a view must show
 SUPPORT = "a plane with objects on it and nothing seen through it, or a table that is given"
 
@@ -47,9 +85,8 @@ class SupportPlane:
     """A plane that objects stand on, and its region: the convex hull of the points on it."""
 
     plane: Plane  # the camera is above it
-    sides: Float[Tensor, "s 4"] | None = (
-        None  # outward unit vector and offset [m] of each; None: unbounded
-    )
+    # outward unit vector and offset [m] of each; None: unbounded
+    sides: Float[Tensor, "s 4"] | None = None
     width: float = math.inf  # smaller width of the region [m]
 
     def covers(self, points: Float[Tensor, "*b 3"], margin: float = 0.0) -> Bool[Tensor, "*b"]:
@@ -60,7 +97,7 @@ class SupportPlane:
             return torch.ones(points.shape[:-1], dtype=torch.bool, device=points.device)
         # parts that a cache holds
         sides = self.sides.to(points)
-        rows = points.reshape(-1, 3).split(10_000)
+        rows = points.reshape(-1, 3).split(SUPPORTS.at_once)
         parts = [(sides[:, :3] @ part.T + sides[:, 3:]).amax(0) < margin for part in rows]
         return torch.cat(parts).reshape(points.shape[:-1])
 
@@ -84,19 +121,15 @@ def find_table(
     if plane is None:
         return find_supports(points, viewpoint, direction)
     if direction is not None and float(unit(direction) @ plane.normal.double()) < 0.5:
-        raise BadArgument(
-            "up", direction.tolist(), "a direction within 60 degrees of the table's normal"
-        )
-    if float(plane.height(viewpoint)) <= 0:
-        raise BadArgument(
-            "table",
-            f"the camera {-float(plane.height(viewpoint)):.3g} m below it",
-            "a table below it",
-        )
+        allowed = "a direction within 60 degrees of the table's normal"
+        raise BadArgument("up", direction.tolist(), allowed)
+    above = float(plane.height(viewpoint))
+    if above <= 0:
+        raise BadArgument("table", f"the camera {-above:.3g} m below it", "a table below it")
     points = points.double().cpu()
     eye = viewpoint.double().cpu()
-    points = points[:: 1 + len(points) // 20_000]
-    on = plane.height(points).abs() < 3 * assume_noise(points, eye)
+    points = points[:: 1 + len(points) // SUPPORTS.points]
+    on = plane.height(points).abs() < PLANES.core * assume_noise(points, eye)
     return (bound(plane, points, on, eye) or SupportPlane(plane),)
 
 
@@ -104,7 +137,7 @@ def find_supports(
     points: Points,
     viewpoint: Vector | None = None,
     up: Vector | None = None,
-    least_width: float = LEAST_WIDTH,
+    least_width: float = SUPPORTS.least_width,
 ) -> tuple[SupportPlane, ...]:
     """Return the planes that support objects in a view, the most plausible first, each with the
     region that it covers.
@@ -118,19 +151,19 @@ def find_supports(
     is no support.
     """
     points = check_tensor("points", points, (None, 3)).detach().cpu().double()
-    eye = (
-        None
-        if viewpoint is None
-        else check_tensor("viewpoint", viewpoint, (3,)).detach().cpu().double()
-    )
-    sky = None if up is None else unit(check_tensor("up", up, (3,)).detach().cpu().double())
-    if len(points) < 50:
+    eye = sky = None
+    if viewpoint is not None:
+        eye = check_tensor("viewpoint", viewpoint, (3,)).detach().cpu().double()
+    if up is not None:
+        sky = unit(check_tensor("up", up, (3,)).detach().cpu().double())
+    if len(points) < SUPPORTS.least_points:
         raise NoSupport("table", f"{len(points)} points", SUPPORT)
     generator = torch.Generator().manual_seed(0)
-    points = points[torch.randperm(len(points), generator=generator, device="cpu")[:20_000]]
+    drawn = torch.randperm(len(points), generator=generator, device="cpu")[: SUPPORTS.points]
+    points = points[drawn]
+    # The points are centred so that distant origins cost no digits.
     centre = points.mean(0)
-    points = points - centre  # so that distant origins cost no digits
-    view = SeenPoints(points, None if eye is None else eye - centre, sky)
+    view = SeenPoints(points - centre, None if eye is None else eye - centre, sky)
     found: list[_Candidate] = []
     reasons: list[str] = []
     for fit in fit_planes(view, generator):
@@ -159,22 +192,23 @@ def bound(
     middle = points[on].mean(0)
     axes = _axes(plane.normal.to(points), points[on])
     crossing, behind = cross(plane, points, eye)
-    flat, lower = (((p - middle) @ axes) for p in (points[on], crossing[behind & ~on]))
+    # (n, 2), in the plane
+    flat = (points[on] - middle) @ axes
+    lower = (crossing[behind & ~on] - middle) @ axes
     region = None
     for part in _parts(flat):
-        grown = Hull.of(part if region is None else torch.cat([region.corners, part]))
-        if region is None or int((grown.holds(lower) & ~region.holds(lower)).sum()) < 0.05 * len(
-            part
-        ):
+        if region is None:
+            region = Hull.of(part)
+            continue
+        grown = Hull.of(torch.cat([region.corners, part]))
+        seen = grown.holds(lower) & ~region.holds(lower)
+        if int(seen.sum()) < SUPPORTS.most_open * len(part):
             region = grown
     if region is None or region.width <= 0:
         return None
     outward = region.sides[:, :2] @ axes.T
-    return SupportPlane(
-        plane,
-        torch.cat([outward, (region.sides[:, 2] - outward @ middle)[:, None]], -1),
-        region.width,
-    )
+    offset = region.sides[:, 2] - outward @ middle
+    return SupportPlane(plane, torch.cat([outward, offset[:, None]], -1), region.width)
 
 
 def _axes(normal: Vector, points: Points) -> Float[Tensor, "3 2"]:
@@ -220,19 +254,21 @@ def _parts(flat: Float[Tensor, "n 2"]) -> Iterator[Float[Tensor, "m 2"]]:
     """Yield the connected groups of points in a plane, the largest first, without narrow strips and
     specks.
     """
-    cells = torch.floor(flat / 0.03).long()
-    cells = cells - cells.amin(0) + 3
-    grid = np.zeros((cells.amax(0) + 4).tolist(), dtype=bool)
+    cells = torch.floor(flat / SUPPORTS.cell).long()
+    # Groups grow into the empty cells at the border.
+    border = SUPPORTS.closing + 1
+    cells = cells - cells.amin(0) + border
+    place = tuple(cells.T.numpy())
+    grid = np.zeros((cells.amax(0) + border + 1).tolist(), dtype=bool)
+    grid[place] = True
     box = np.ones((3, 3))
-    grid[tuple(cells.T.numpy())] = True
+    closed = ndimage.binary_closing(grid, box, iterations=SUPPORTS.closing)
     labels = np.empty(grid.shape, dtype=np.int32)
-    ndimage.label(
-        ndimage.binary_opening(ndimage.binary_closing(grid, box, iterations=2), box), output=labels
-    )
-    own = torch.from_numpy(labels[tuple(cells.T.numpy())]).long()
+    ndimage.label(ndimage.binary_opening(closed, box), output=labels)
+    own = torch.from_numpy(labels[place]).long()
     count = torch.bincount(own)[1:]
     for k in torch.argsort(count, descending=True, stable=True).tolist():
-        if count[k] >= 0.02 * count.max():
+        if count[k] >= SUPPORTS.least_part * count.max():
             yield flat[own == k + 1]
 
 
@@ -240,14 +276,14 @@ def cross(plane: Plane, points: Points, eye: Vector | None) -> tuple[Points, Boo
     """Return where the camera rays through points cross a plane [m], and which points lie behind
     the plane.
 
-    Without a camera, the points themselves are returned, and only points at most `REACH` [m] below
-    count.
+    Without a camera, the points themselves are returned, and only points at most `PLANES.reach` [m]
+    below count.
     """
     height = plane.height(points)
     if eye is None:
-        return points, (height < 0) & (height > -REACH)
+        return points, (height < 0) & (height > -PLANES.reach)
     above = float(plane.height(eye))
-    ratio = above / (above - height).clamp_min(1e-9)
+    ratio = above / (above - height).clamp_min(SUPPORTS.least_height)
     return eye + ratio[:, None] * (points - eye), height < 0
 
 
@@ -261,33 +297,26 @@ class _Candidate:
 
     def parallel(self, other: "_Candidate") -> bool:
         """Return whether two planes are parallel within ten degrees."""
-        return float(self.support.plane.normal @ other.support.plane.normal) > 0.985
+        cosine = float(self.support.plane.normal @ other.support.plane.normal)
+        return cosine > SUPPORTS.parallel
 
     def repeats(self, other: "_Candidate") -> bool:
         """Return whether the other candidate is a fit of the same plane."""
-        return self.parallel(other) and abs(float(other.support.plane.height(self.middle))) < 0.02
+        height = float(other.support.plane.height(self.middle))
+        return self.parallel(other) and abs(height) < SUPPORTS.same
 
 
 def _ordered(found: list[_Candidate]) -> list[_Candidate]:
     """Return the candidate supports ordered by score, with the highest wide support parallel to the
     best one first.
     """
-    first = max(found, key=lambda candidate: candidate.score)
-    furniture = [
-        candidate
-        for candidate in found
-        if candidate.support.width > FURNITURE and candidate.parallel(first)
-    ]
-    higher = [
-        candidate
-        for candidate in furniture
-        if float(first.support.plane.height(candidate.middle)) > 0
-    ]
-    first = max(higher, key=lambda candidate: candidate.score, default=first)
-    return [
-        first,
-        *sorted((c for c in found if c is not first), key=lambda candidate: -candidate.score),
-    ]
+    found = sorted(found, key=lambda candidate: -candidate.score)
+    best = found[0]
+    for candidate in found:
+        wide = candidate.support.width > SUPPORTS.furniture and candidate.parallel(best)
+        if wide and float(best.support.plane.height(candidate.middle)) > 0:
+            return [candidate, *(other for other in found if other is not candidate)]
+    return found
 
 
 def _judge(view: SeenPoints, fit: PlaneFit, least_width: float) -> _Candidate | str:
@@ -295,53 +324,57 @@ def _judge(view: SeenPoints, fit: PlaneFit, least_width: float) -> _Candidate | 
     nothing.
     """
     points = view.points
-    height = view.points @ fit.normal - fit.offset
-    tolerance = 4 * fit.scale * view.noise + 0.001
+    height = points @ fit.normal - fit.offset
+    tolerance = SUPPORTS.thickness * fit.scale * view.noise + SUPPORTS.least_thickness
     share = fit.count / len(points)
-    if share < LEAST_SHARE:
+    if share < PLANES.least_share:
         return f"no plane with more than {share:.1%} of the points"
-    if fit.scale >= ROUGH:
+    if fit.scale >= PLANES.rough:
         return "no flat plane"
-    if view.sky is not None and float(fit.normal @ view.sky) < math.cos(math.radians(MOST_TILT)):
-        return f"no plane within {MOST_TILT:g} degrees of level"
+    level = math.cos(math.radians(PLANES.most_tilt))
+    if view.sky is not None and float(fit.normal @ view.sky) < level:
+        return f"no plane within {PLANES.most_tilt:g} degrees of level"
     on = height.abs() < tolerance
     plane = Plane(fit.normal, fit.offset)
     support = bound(plane, points, on, view.eye)
-    if support is None or support.width < least_width:
-        return f"a flat face about {0.0 if support is None else support.width:.2f} m wide"
+    width = 0.0 if support is None else support.width
+    if support is None or width < least_width:
+        return f"a flat face about {width:.2f} m wide"
     middle = points[on & support.covers(points)].mean(0)
-    if view.eye is not None and float(unit(view.eye - middle) @ fit.normal) < math.sin(
-        math.radians(5.0)
-    ):
-        return "a plane that the camera does not see from above"
-    inner = 0.05 * support.width
+    # Without a camera, no object hides its feet.
+    steep = False
+    if view.eye is not None:
+        sine = float(unit(view.eye - middle) @ fit.normal)
+        if sine < math.sin(math.radians(SUPPORTS.grazing)):
+            return "a plane that the camera does not see from above"
+        steep = sine > SUPPORTS.steep
+    inner = SUPPORTS.edge * width
     crossing, behind = cross(plane, points, view.eye)
     through = int((behind & (height < -tolerance) & support.covers(crossing, -inner)).sum())
-    if through > MOST_THROUGH * fit.count:
-        return f"a plane with {share:.0%} of the points, but {through / len(points):.0%} of them below it"
+    told = f"a plane with {share:.0%} of the points"
+    if through > SUPPORTS.most_through * fit.count:
+        return f"{told}, but {through / len(points):.0%} of them below it"
     # Low points of an object are over the plane's own region. A pan's rim is not over its floor.
-    over = (height > tolerance) & (height < REACH) & support.covers(points, -inner)
-    low = int(((height > tolerance) & (height < LOW)).sum())
-    standing = int((over & (height < LOW)).sum())
-    cells = (
-        torch.floor(points @ _axes(fit.normal, points) / 0.02)
-        .long()
-        .unique(dim=0, return_inverse=True)[1]
+    above = height > tolerance
+    over = above & (height < PLANES.reach) & support.covers(points, -inner)
+    low = above & (height < SUPPORTS.low)
+    standing = low & over
+    below = (-height > tolerance) & (-height < SUPPORTS.low)
+    columns = torch.floor(points @ _axes(fit.normal, points) / SUPPORTS.pierced_cell).long()
+    cells = columns.unique(dim=0, return_inverse=True)[1]
+    pierced = torch.bincount(cells, below.double()) > SUPPORTS.below * torch.bincount(
+        cells, standing.double()
     )
-    above, below = ((sign * height > tolerance) & (sign * height < LOW) for sign in (1, -1))
-    pierced = torch.bincount(cells, below.double()) > 0.2 * torch.bincount(
-        cells, (above & over).double()
-    )
-    if int((pierced[cells] & above & over).sum()) > max(
-        LEAST_STANDING * len(points), MOST_PIERCED * standing
-    ):
-        return f"a plane with {share:.0%} of the points, but objects go through it"
-    steep = (
-        view.eye is not None and float(unit(view.eye - middle) @ fit.normal) > 0.9
-    )  # it hides the feet of objects
-    if (int(over.sum()) if steep else standing) < max(LEAST_STANDING * len(points), 0.05 * low):
-        return f"a plane with {share:.0%} of the points and nothing that stands on it"
-    return _Candidate(support, standing * (2.0 if _looked_at(view, fit, support) else 1.0), middle)
+    count = int(standing.sum())
+    least = SUPPORTS.least_standing * len(points)
+    if int((pierced[cells] & standing).sum()) > max(least, SUPPORTS.most_pierced * count):
+        return f"{told}, but objects go through it"
+    # From a steep view, objects hide their feet.
+    feet = int(over.sum()) if steep else count
+    if feet < max(least, SUPPORTS.least_low * int(low.sum())):
+        return f"{told} and nothing that stands on it"
+    favour = SUPPORTS.favour if _looked_at(view, fit, support) else 1.0
+    return _Candidate(support, count * favour, middle)
 
 
 def _looked_at(view: SeenPoints, fit: PlaneFit, support: SupportPlane) -> bool:
