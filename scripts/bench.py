@@ -1,11 +1,11 @@
 #!/usr/bin/env python
 """Measure torchgrasp: python scripts/bench.py SUBJECT [--only BENCH ...] [--objects DIR] [options].
 
-* close: table-lift, perturb, where, success, play, arm: lifts, predicted success, exports
+* close: table-lift, where, success, play: lifts, predicted success, exports
 
 * gpu: clouds, launches: many clouds at once, also without a GPU
 
-* plan: pace, executable, certificates, wrenches: time to grasps, proofs
+* plan: pace, certificates: time to grasps, proofs
 
 * scene: real, rooms: supports and things in depth images
 

@@ -11,14 +11,13 @@
 * household DIR: bodies of a household, with views, for any bench
 * trials DIR: grasps on these bodies, each tried with its own task
 * objects: meshes, convex parts and views of the own objects
-* scene: the depth image of the shipped scene
 * golden: grasps with known verdicts, for torchgrasp selftest
 """
 
 import sys
 
 import tyro
-from train.author_objects import golden, objects, scene
+from train.author_objects import golden, objects
 from train.bands import bands
 from train.household import household
 from train.occupancy import occupancy
@@ -41,7 +40,6 @@ if __name__ == "__main__":
             household,
             trials,
             objects,
-            scene,
             golden,
         )
     }

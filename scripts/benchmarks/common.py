@@ -46,7 +46,7 @@ class Options:
         names: objects to keep; by default all.
         views: names of the views that are measured, as view0; by default all.
         hands: names of hands.
-        conditions: of close/table-lift, or perturbations of close/perturb; by default all.
+        conditions: of close/table-lift; by default all.
         grasps: grasps of each view, the best or spread over all ranks.
         starts: random starts of the contact planner.
         batches: numbers of clouds of gpu/clouds and gpu/launches.

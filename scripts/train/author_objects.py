@@ -11,9 +11,9 @@ import numpy as np
 import trimesh
 
 from torchgrasp import ContactSpec, load_hand, load_object, plan_grasps
-from torchgrasp.cloud.camera import INTRINSICS, look_at, partial_view, render_depth
+from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.cloud.read import save_cloud
-from torchgrasp.data.shipped import DATA, SCENE, list_objects
+from torchgrasp.data.shipped import DATA, list_objects
 from torchgrasp.evaluation.golden import GOLDEN, run_golden
 from torchgrasp.files import write_file
 from torchgrasp.foundation.errors import BadArgument, Status
@@ -26,32 +26,12 @@ VIEWS = {
     "spray": (50.0, 25.0),
 }
 """Azimuth and elevation [deg] of the camera for each object."""
-SCENE_SEED = 1
-"""Of the scene: its things stand apart, one of them in front of another."""
 
 
 def objects() -> None:
     """Write mesh, convex parts and noisy view of every object of the library."""
     for name in list_objects():
         write_object(name)
-
-
-def scene() -> None:
-    """Write the depth image of a scene of the library's objects, with labels, camera and table."""
-    from benchmarks.scene.drop import drop  # needs SAPIEN, which the other trainings do not
-
-    count = len(list_objects())
-    placed = drop(None, (count, count), SCENE_SEED)
-    depth, labels = render_depth(placed.meshes, placed.camera_pose, seed=SCENE_SEED)
-    arrays = {
-        "depth": np.round(1e3 * depth.numpy()).astype(np.uint16),
-        "intrinsics": INTRINSICS.numpy(),
-        "camera_pose": placed.camera_pose.numpy(),
-        "labels": labels.numpy().astype(np.uint8),
-        "table": np.array([0.0, 0.0, 1.0, 0.0]),
-    }
-    write_file(SCENE, lambda file: np.savez_compressed(file, **arrays))
-    print(f"{SCENE}: {', '.join(placed.names)}")
 
 
 def write_object(name: str) -> None:

@@ -3,8 +3,8 @@ once.
 """
 
 import pytest
-from benchmarks.ur5e import ur5e
 
+from tests.arm.ur5e import ur5e
 from tests.make import load_hand
 from torchgrasp import ContactSpec, load_object, plan_grasps
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from benchmarks.ur5e import by_products, ur5e, ur5e_urdf
 
+from tests.arm.ur5e import by_products, ur5e, ur5e_urdf
 from tests.make import random_motion
 from torchgrasp import load_object, plan_grasps
 from torchgrasp.app.author import clean_arm

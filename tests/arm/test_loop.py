@@ -13,7 +13,7 @@ from torchgrasp.evaluation.trial import GraspTrial, Truth
 @pytest.mark.sim
 def test_the_arm_brings_the_hand_and_lifts(arm, hand, grasps):
     pytest.importorskip("mujoco")
-    from benchmarks.close.arm import TRIAL, ArmDriver, lift_with_arm
+    from tests.arm.carried import TRIAL, ArmDriver, lift_with_arm
 
     body = load_object("cylinder")
     trial = GraspTrial(hand, grasps[0], Truth(body.mesh, body.parts), 0)

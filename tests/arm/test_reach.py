@@ -7,8 +7,8 @@ import dataclasses
 import pytest
 import torch
 import yaml
-from benchmarks.ur5e import ur5e, ur5e_urdf
 
+from tests.arm.ur5e import ur5e, ur5e_urdf
 from tests.make import distance_field, random_motion, real
 from torchgrasp import ContactSpec, Plane, Status, load_object, plan_grasps
 from torchgrasp.arm.reach import follow_grasps, way_of

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 import torch
-from benchmarks.ur5e import ur5e
 
+from tests.arm.ur5e import ur5e
 from tests.devices.conftest import same, sent
 from tests.devices.elsewhere import DEVICE
 from torchgrasp import (

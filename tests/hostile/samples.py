@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import torch
 import trimesh
-from benchmarks.ur5e import ur5e
 from jaxtyping import AbstractArray
 from torch import Tensor
 from typing_extensions import Unpack
 
 import torchgrasp
+from tests.arm.ur5e import ur5e
 from tests.make import see
 from torchgrasp import (
     ClosingReference,

@@ -31,7 +31,7 @@ from torchgrasp.contacts.form_closure import solve_closure_lp, wrenches
 from torchgrasp.geometry.linalg import unit
 
 RUNS = ("gpu/launches", "scene/rooms")
-SIMULATED = ("close/perturb",)
+SIMULATED = ("close/where",)
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -44,7 +44,6 @@ def test_bench_writes_its_rows(name, tin, tmp_path):
         (short,),
         (tin,),
         hands=("barrett",),
-        conditions=("none",),
         starts=8,
         batches=(1,),
         scale=2e-4,

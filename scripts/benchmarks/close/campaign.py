@@ -12,20 +12,18 @@ import trimesh
 from paper.trials import CELL_SECONDS, Subject, TableSpec
 
 from benchmarks.common import Options
-from benchmarks.perturb import Perturbation, household_mass, perturb_view
-from torchgrasp import Grasps, ShapeGP, Status, fit_shape, load_grasps, load_hand, plan_grasps
+from torchgrasp import Status, fit_shape
 from torchgrasp.data import list_views, read_entry, read_object_mesh, read_view
-from torchgrasp.evaluation.protocols import seed_of
 from torchgrasp.files import format_json, write_file
-from torchgrasp.foundation.errors import GraspError
 from torchgrasp.foundation.jobs import run_tasks
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.shape.surface import surface_field
 from torchgrasp.sim.convex_parts import convex_parts
-from torchgrasp.values.specs import ContactSpec
 
-RIGHT = Perturbation()
-"""No error of the camera or the table."""
+DENSITY = 500.0
+LIGHTEST = 0.05
+HEAVIEST = 1.2
+"""Density [kg/m^3] of objects of unknown mass: half full, hollow, or of wood; bounds of it [kg]."""
 
 
 class Solid(NamedTuple):
@@ -76,7 +74,8 @@ def read_solid(subject: Subject) -> Solid:
     folder = folder_of(subject)
     name = subject.name
     mesh = read_object_mesh(folder, name)
-    mass = household_mass(float(mesh.volume), read_entry(folder, name).mass)
+    known = read_entry(folder, name).mass
+    mass = min(max(DENSITY * float(mesh.volume), LIGHTEST), HEAVIEST) if known is None else known
     return Solid(mesh, convex_parts(mesh), mass, list_views(folder, only=[name])[0][1])
 
 
@@ -86,39 +85,8 @@ def folder_of(subject: Subject) -> Path:
     return subject.folder
 
 
-def plan_view(
-    spec: TableSpec, subject: Subject, hand: str, friction: float, seen: Perturbation = RIGHT
-) -> list[Grasps]:
-    """Return the executable grasps of the first view, kept or planned; none where planning is
-    refused.
-    """
-    view = read_solid(subject).view
-    path = spec.kept("plans", f"{hand}_{subject.label}_{view}", friction, seen).with_suffix(
-        ".safetensors"
-    )
-    if not path.is_file():
-        cloud = read_view(folder_of(subject), subject.name, view)
-        seed = seed_of(spec.seed, subject.label, view)
-        cloud, table = perturb_view(cloud, seen, seed)
-        try:
-            grasps = plan_grasps(
-                cloud, load_hand(hand), ContactSpec(friction, table=table), spec.starts, spec.seed
-            )
-        except GraspError as error:
-            print(f"{subject.name}, {hand}: {error}", flush=True)
-            return []
-        grasps[grasps.status == Status.OK].save(path)
-    grasps = load_grasps(path)
-    return [grasps[k] for k in range(len(grasps))]
-
-
 @functools.lru_cache(maxsize=2)
-def fit_view(
-    spec: TableSpec, subject: Subject, seen: Perturbation = RIGHT
-) -> tuple[ShapeGP, SignedDistanceField]:
-    """Return the shape of the first view, and its surface, with which touches are compared."""
-    view = read_solid(subject).view
-    cloud = read_view(folder_of(subject), subject.name, view)
-    cloud, table = perturb_view(cloud, seen, seed_of(spec.seed, subject.label, view))
-    shape = fit_shape(cloud, table=table)
-    return shape, surface_field(shape)
+def felt_surface(subject: Subject) -> SignedDistanceField:
+    """Return the estimated surface of the first view, with which touches are compared."""
+    cloud = read_view(folder_of(subject), subject.name, read_solid(subject).view)
+    return surface_field(fit_shape(cloud, table=0.0))

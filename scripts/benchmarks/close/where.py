@@ -16,7 +16,7 @@ import torch
 from paper.tables6_7 import format_points
 from paper.trials import Subject, TableSpec, subjects
 
-from benchmarks.close.campaign import fit_view, folder_of, keep, read_solid, run_all, table_spec
+from benchmarks.close.campaign import felt_surface, folder_of, keep, read_solid, run_all, table_spec
 from benchmarks.common import Options, Row, bench
 from torchgrasp import ContactSpec, PointCloud, Region, Status, close_hand, load_hand, plan_grasps
 from torchgrasp.data import read_view
@@ -94,8 +94,7 @@ def _compare(
         contacts = good.contacts.points.reshape(-1, 3)
         executable.append(len(good))
         seed = seed_of(spec.seed, subject.label)
-        felt = fit_view(spec, subject)[1]
-        given: dict[str, Any] = {"parts": solid.parts, "surface": felt}
+        given: dict[str, Any] = {"parts": solid.parts, "surface": felt_surface(subject)}
         done = (
             close_hand(good[0], hand, solid.mesh, trial, seed, **given).status.name
             if len(good)

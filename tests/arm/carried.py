@@ -1,12 +1,10 @@
-"""Lifts by an Allegro hand on a UR5e, beside lifts by the same hand without an arm; what the arm
-adds to planning.
+"""Lifts in MuJoCo by a hand that an arm carries.
 
 The arm's joints have position drives with the gains and efforts of MuJoCo Menagerie's model of the
 UR5e. Its base stands on the table. What the mount of a hand without an arm would do, the arm's
 joints do by inverse kinematics.
 """
 
-import dataclasses
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from typing import Any
@@ -14,16 +12,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.common import Options, Row, bench, timed
-from benchmarks.ur5e import ur5e
-from torchgrasp import ContactSpec, Status, TrialSpec, load_hand, plan_grasps
+from torchgrasp import TrialSpec
 from torchgrasp.arm import Arm
 from torchgrasp.arm.reach import solve_tips
-from torchgrasp.data import list_views, read_object_mesh, read_view
 from torchgrasp.evaluation.lift import run_lift
-from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, Truth
+from torchgrasp.evaluation.trial import GraspTrial, TrialDriver
 from torchgrasp.hand.hand import Actuator
-from torchgrasp.sim.convex_parts import convex_parts
 from torchgrasp.sim.mujoco_scene import (
     MujocoScene,
     format_numbers,
@@ -42,11 +36,6 @@ Menagerie.
 """
 ROTOR = 0.1
 """Inertia [kg m2] of the rotors at the joints, of the same."""
-LEAST = 0.95
-SLOWEST = 1.5
-"""Bars: share of the lifts without an arm that succeed with it; processor time of a plan over that
-without an arm.
-"""
 
 
 class ArmScene(MujocoScene):
@@ -164,83 +153,3 @@ class ArmDriver(TrialDriver):
 def lift_with_arm(trial: GraspTrial, arm: Arm, spec: TrialSpec = TRIAL) -> ClosureResult:
     """Close the hand on the true object and lift it with the arm."""
     return run_lift(ArmDriver(trial, spec, arm))
-
-
-@dataclasses.dataclass(frozen=True)
-class Lifts:
-    """The lifts of a grasp without and with the arm: their statuses, and whether the object rose by
-    half the lift.
-    """
-
-    object: str
-    free: str
-    carried: str
-    free_risen: bool
-    carried_risen: bool
-
-
-@bench("close/arm", objects=True)
-def arm(o: Options) -> list[Row]:
-    """Plan each object's first view with and without the arm; lift the best grasps of the plan with
-    it both ways.
-    """
-    hand = load_hand("allegro")
-    lifts = list[Lifts]()
-    seconds = np.zeros(2)
-    empty = list[str]()
-    carried = ur5e(hand)
-    for folder in o.objects:
-        for name, view in dict(list_views(folder, only=o.names)[::-1]).items():
-            cloud = read_view(folder, name, view)
-            spec = ContactSpec(table=0.0)
-            plain, alone = timed(lambda: plan_grasps(cloud, hand, spec, o.starts, o.seed))  # noqa: B023
-            found, more = timed(
-                lambda: plan_grasps(cloud, hand, spec, o.starts, o.seed, arm=carried)  # noqa: B023
-            )
-            seconds += more, alone
-            counts = [int((x.status == Status.OK).sum()) for x in (plain, found)]
-            print(
-                f"{name}: {counts[0]} grasps in {alone:.1f} s, with the arm {counts[1]} in {more:.1f} s",
-                flush=True,
-            )
-            good = found[found.status == Status.OK][: o.grasps]
-            empty += [name] * (len(good) == 0)
-            mesh = read_object_mesh(folder, name)
-            parts = convex_parts(mesh)
-            for grasp in good:
-                lifts.append(
-                    _lift(name, GraspTrial(hand, grasp, Truth(mesh, parts), o.seed), carried)
-                )
-                print(lifts[-1], flush=True)
-    risen = [(x.free_risen, x.carried_risen) for x in lifts]
-    held = [(x.free == "OK", x.carried == "OK") for x in lifts]
-    rows = [_share("risen", risen, lifts), _share("held without slip", held, lifts)]
-    ratio = float(seconds[0] / seconds[1])
-    words = f"{ratio:.2f} ({seconds[0]:.0f} s, without {seconds[1]:.0f} s); no grasp: {', '.join(empty) or 'none'}"
-    return [
-        *rows,
-        Row(
-            "time of a plan with the arm",
-            f"<= {SLOWEST}",
-            words,
-            ratio <= SLOWEST,
-            {"ratio": ratio},
-        ),
-    ]
-
-
-def _share(what: str, pairs: list[tuple[bool, bool]], lifts: list[Lifts]) -> Row:
-    """Return how many of the grasps that succeed without the arm do so with it."""
-    free, carried, both = (sum(map(of, pairs)) for of in (lambda x: x[0], lambda x: x[1], all))
-    words = f"{both} of {free} that do so without the arm; of all {len(pairs)}: {carried} with it, {free} without"
-    return Row(
-        f"{what} with the arm", f">= {LEAST:.0%}", words, both >= LEAST * free, {"lifts": lifts}
-    )
-
-
-def _lift(name: str, trial: GraspTrial, arm: Arm) -> Lifts:
-    """Lift a grasp both ways."""
-    free = run_lift(TrialDriver(trial, TRIAL))
-    carried = lift_with_arm(trial, arm)
-    risen = [bool(x.rise >= TRIAL.lift_height / 2) for x in (free, carried)]
-    return Lifts(name, free.status.name, carried.status.name, *risen)
