@@ -1,0 +1,302 @@
+"""The intrinsics of a depth camera in the forms of many drivers, and checks that they fit an image."""
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from numbers import Real
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.foundation.checks import check_tensor
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.limits import SHOWN_LETTERS
+
+Matrix = Float[Tensor, "3 3"]
+OPEN3D = "intrinsic_matrix"
+MATRICES = ("k", "cam_k", "camera_matrix", OPEN3D, "cameraintrinsics", "cameramatrix", "data")
+"""Names of a matrix of intrinsics, or of an object that holds it: of ROS, BOP, Open3D and Zivid."""
+ATTRIBUTES = (
+    *MATRICES,
+    *("K", "fx", "fy", "cx", "cy", "ppx", "ppy"),
+    *("width", "height", "roi", "binning_x", "binning_y"),
+)
+"""Names of the attributes of an object that describes a camera."""
+SIDES = ("x_offset", "y_offset", "width", "height")
+"""Names of the numbers of ROS's region of interest."""
+SCALES = (1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 4, 4 / 3, 3 / 2, 2, 3, 4)
+"""Ratios of two resolutions of one camera."""
+MODES = (
+    *((320, 240), (424, 240), (480, 270), (512, 424), (640, 360), (640, 480), (640, 576)),
+    *((848, 480), (960, 540), (1024, 768), (1280, 720), (1280, 960), (1920, 1080)),
+    *((1944, 1200), (2048, 1536)),
+)
+"""Resolutions (width, height) [px] of depth cameras."""
+
+
+@dataclasses.dataclass(frozen=True)
+class IntrinsicsNumbers:
+    """What intrinsics are read, and what a camera may have."""
+
+    most: int = 12
+    """Longest list of numbers: that of a 3 x 4 projection."""
+    nested: int = 4
+    """Most objects in each other that lead to a matrix; those of ROS and Zivid have two."""
+    greatest: float = 1e9
+    """A width, a height or a depth scale is less; more is no number of a camera."""
+    widest: float = 1e6
+    """A side of a region of interest [px], and a binning, is less."""
+    shown: int = 8
+    """Most names of a wrong object that an error shows."""
+    shown_name: int = 20
+    """Most letters of each of them."""
+    focal: float = 0.15
+    """Least focal length over the side of the image: a view of 147 degrees, wider than any."""
+    unequal: float = 0.05
+    """Greatest difference of fx and fy, over fy, of four numbers in their right order."""
+    beside: float = 0.1
+    """Greatest shift of their principal point from the middle, as a share of the side."""
+    farthest: float = 8.0
+    """Greatest such shift of a crop: beyond it, the point belongs to another image."""
+    corner: float = 0.05
+    """A crop may reach so far out of the image of its camera, as a share of the side."""
+    moved: float = 0.04
+    """Least shift of a crop's corner, as a share of the side: a camera's point is off by less."""
+    centred: float = 0.05
+    """Greatest shift of the principal point from the middle of a resolution that is guessed."""
+    off: float = 0.16
+    """Such a shift in the image itself at which a resolution is guessed: few cameras have more."""
+    same_ratio: float = 0.02
+    """Greatest difference of two ratios of sides that count as one."""
+
+
+LIMITS = IntrinsicsNumbers()
+
+
+class Written(NamedTuple):
+    """Intrinsics as they were written: numbers, image [width, height], metres of a count, and
+    ROS's window.
+    """
+
+    table: Any
+    size: list[float] | None = None
+    scale: float | None = None
+    window: Sequence[float] = ()
+
+
+def parse_intrinsics(value: object) -> tuple[Matrix, list[float] | None, float | None]:
+    """Return the matrix [px] of any form of intrinsics, the image's [width, height] and the metres
+    of a count, if stated.
+
+    Raises `BadArgument` for anything else.
+    """
+    table, size, scale, window = _read_written(value)
+    k = as_tensor("intrinsics", table)
+    allowed = "(fx, fy, cx, cy), or a 3 x 3 matrix"
+    k = k if k.is_complex() else k.double()
+    if k.ndim == 1 and len(k) in (3 * 3, 3 * 4):
+        k = k.reshape(3, -1)
+    if k.shape in ((4,), (6,)):
+        fx, fy, cx, cy = k[:4].tolist()
+        size = k[4:].tolist() or size
+        k = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+    if k.shape not in ((3, 3), (3, 4), (4, 4)):
+        raise BadArgument("intrinsics", f"shape {tuple(k.shape)}", allowed)
+    check_tensor("intrinsics", k, tuple(k.shape))
+    if bool(k[:3, 3:].any()):
+        found = f"a fourth column {k[:3, 3].tolist()}"
+        raise BadArgument("intrinsics", found, f"{allowed}: K of this camera")
+
+    k = k[:3, :3]
+    positive = bool(k[0, 0] > 0) and bool(k[1, 1] > 0)
+    skewed = bool(k[0, 1] != 0) or bool(k[1, 0] != 0)
+    if not positive or skewed or k[2].tolist() != [0, 0, 1]:
+        turned = bool(k[2, :2].any()) and not bool(k[:2, 2].any())
+        allowed = "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0"
+        raise BadArgument("intrinsics", k.tolist(), allowed + ", the transpose" * turned)
+    if any(window):
+        k, size = _cut(k, size, window)
+    return k, size, scale
+
+
+def _cut(
+    k: Matrix, size: list[float] | None, window: Sequence[float]
+) -> tuple[Matrix, list[float] | None]:
+    """Return the intrinsics and the size of ROS's region of interest; those given are of the whole
+    sensor.
+    """
+    corner, sides, bins = k.new_tensor(window).reshape(3, 2)
+    bins = bins.clamp_min(1)
+    centre = k[:2, 2:] - corner[:, None]
+    binned = torch.cat([k[:2, :2], centre], 1) / bins[:, None]
+    # A side of 0 is that of the whole sensor, which may be unknown.
+    whole = torch.tensor(size or [0.0, 0.0]).to(sides)
+    sides = torch.where(sides > 0, sides, whole) / bins
+    stated = sides.floor().tolist() if bool(sides.all()) else size
+    return torch.cat([binned, k[2:]]), stated
+
+
+def _read_written(value: object) -> Written:
+    """Return the intrinsics in an array, a list, a mapping or an object."""
+    if isinstance(value, Tensor | np.ndarray | Sequence) and not isinstance(value, str):
+        return Written(value)
+    named, key, table = _find_matrix(value)
+    if not isinstance(table, Tensor | np.ndarray) and not _is_table(table):
+        names = [str(name)[: LIMITS.shown_name] for name in list(named)[: LIMITS.shown]]
+        found = f"a {type(value).__name__} of {', '.join(names) or 'nothing'}"
+        allowed = "fx, fy, cx and cy, or a matrix K; of a file of many images, the entry of this"
+        raise BadArgument("intrinsics", found, f"{allowed} image")
+    by_column = key == OPEN3D and isinstance(table, list) and len(table) == 9
+    if by_column and table[2] == table[5] == 0:
+        table = [table[i::3] for i in range(3)]
+
+    width = named.get("width", named.get("image_width"))
+    height = named.get("height", named.get("image_height"))
+    scale = named.get("depth_scale")
+    for name, x in (("width", width), ("height", height), ("depth_scale", scale)):
+        if x is not None and (not _is_table([x]) or not 0 < x < LIMITS.greatest):
+            found = f"{name} = {str(x)[:SHOWN_LETTERS]!r}"
+            raise BadArgument("intrinsics", found, f"a positive {name}")
+    # Open3D states the counts of a metre, RealSense metres of a count, BOP millimetres of a count.
+    if scale is not None and key == OPEN3D:
+        scale = 1 / scale
+    elif scale is not None and "ppx" not in named:
+        scale = scale / 1000.0
+    size = None if width is None or height is None else [float(width), float(height)]
+    return Written(table, size, scale, _read_window(named))
+
+
+def _find_matrix(value: object) -> tuple[dict[str, Any], str, Any]:
+    """Return what a description of a camera names, the name of its matrix ("" for four numbers),
+    and the LIMITS.
+    """
+    inner: Any = value
+    if not isinstance(value, Mapping):
+        inner = {name: getattr(value, name) for name in ATTRIBUTES if hasattr(value, name)}
+    named = dict[str, Any]()
+    key = ""
+    # ROS and Zivid write a matrix as an object.
+    for _ in range(LIMITS.nested):
+        named |= {str(name).lower(): x for name, x in inner.items()}
+        key = next((name for name in MATRICES if name in named), "")
+        inner = named.pop(key, None)
+        if not isinstance(inner, Mapping):
+            break
+    if not key:
+        cx = named.get("cx", named.get("ppx"))
+        cy = named.get("cy", named.get("ppy"))
+        inner = [named.get("fx"), named.get("fy"), cx, cy]
+    return named, key, inner
+
+
+def _read_window(named: Mapping[str, Any]) -> list[float]:
+    """Return x, y, width and height of ROS's region of interest [px], and the binning in x and y; 0
+    if not set.
+    """
+    roi = named.get("roi", {})
+    region = roi if isinstance(roi, Mapping) else {side: getattr(roi, side, 0) for side in SIDES}
+    found = [region.get(side, 0) for side in SIDES]
+    found += [named.get("binning_x", 0), named.get("binning_y", 0)]
+    if not _is_table(found) or not all(0 <= number < LIMITS.widest for number in found):
+        shown = f"roi and binning {str(found)[:SHOWN_LETTERS]}"
+        raise BadArgument("intrinsics", shown, "numbers of pixels >= 0")
+    return [float(number) for number in found]
+
+
+def _is_table(value: object) -> bool:
+    """Return whether a value from a file is a short list of numbers, or of rows of at most 4."""
+    if not isinstance(value, list | tuple) or not 0 < len(value) <= LIMITS.most:
+        return False
+    rows = [row if isinstance(row, list | tuple) else [row] for row in value]
+    if any(len(row) > 4 for row in rows):
+        return False
+    return all(isinstance(x, Real) and not isinstance(x, bool) for row in rows for x in row)
+
+
+def check_intrinsics(k: Matrix, stated: list[float] | None, size: Sequence[int]) -> None:
+    """Raise `BadArgument` for intrinsics that no camera has, or of another resolution than an image
+    (h, w) or a crop.
+    """
+    height, width = size
+    (fx, _, cx), (_, fy, cy) = k[:2].tolist()
+    if min(fx / width, fy / height) < LIMITS.focal:
+        angle = math.degrees(2 * math.atan(max(width / fx, height / fy) / 2))
+        found = f"fx = {fx:.4g} and fy = {fy:.4g}, a view of {angle:.0f} degrees"
+        fix = "multiply normalised ones by width and height, divide millimetres by the size of a"
+        raise BadArgument("intrinsics", found, f"focal lengths in pixels: {fix} pixel")
+
+    def shift(cx: float, cy: float) -> float:
+        return max(abs(cx / width - 0.5), abs(cy / height - 0.5))
+
+    def fits(fx: float, fy: float, cx: float, cy: float) -> bool:
+        return abs(fx / fy - 1) < LIMITS.unequal and shift(cx, cy) < LIMITS.beside
+
+    orders = {"fx, cx, fy, cy": (fx, cx, fy, cy), "cx, cy, fx, fy": (cx, cy, fx, fy)}
+    for order, meant in orders.items():
+        if not fits(fx, fy, cx, cy) and min(meant) > 0 and fits(*meant):
+            raise BadArgument("intrinsics", f"the order {order}", "the order fx, fy, cx, cy")
+    if shift(cx, cy) > LIMITS.farthest:
+        found = f"a principal point ({cx:.4g}, {cy:.4g}) px in an image of {width} x {height}"
+        raise BadArgument("intrinsics", found, "a crop nearer to it")
+    _check_size(k, stated, k.new_tensor([width, height]))
+
+
+def _check_size(k: Matrix, stated: list[float] | None, image: Float[Tensor, "2"]) -> None:
+    """Raise `BadArgument` if intrinsics belong to another resolution than the size of an image."""
+    shown = f"an image of {image[0]:g} x {image[1]:g}"
+    centre = 2 * k[:2, 2]
+    if stated is not None:
+        own = k.new_tensor(stated)
+        corner = (own - centre) / 2  # of the crop, seen from the middle
+        low = -LIMITS.corner * own
+        high = (1 + LIMITS.corner) * own - image
+        inside = bool(((corner > low) & (corner < high)).all())
+        if inside and bool((corner.abs() > LIMITS.moved * own).any()):
+            return
+        if torch.equal(own, image):
+            return
+        found = f"those of an image of {own[0]:g} x {own[1]:g} px for {shown}"
+    else:
+        # The principal point tells the size of the image, roughly.
+        modes = map(k.new_tensor, MODES)
+        sizes = [image * scale for scale in SCALES]
+        sizes += [mode for mode in modes if not torch.equal(mode, image)]
+        near = [m for m in sizes if bool(((centre / m - 1).abs() < LIMITS.centred).all())]
+        if not near or float((centre / image - 1).abs().max()) < LIMITS.off:
+            return
+        own = near[0]
+        found = f"a principal point ({k[0, 2]:.1f}, {k[1, 2]:.1f}) px in {shown}"
+
+    fix = ""
+    ratio = image / own
+    if abs(float(ratio[0] / ratio[1]) - 1) < LIMITS.same_ratio:
+        fix = f"all four times {float(ratio[0]):.4g}; "
+    elif torch.equal(own, image.flip(0)):
+        fix = "the transposed image, (height, width); "
+    crop = (
+        "of a crop, cx and cy less its corner, and (fx, fy, cx, cy, width, height) with the size "
+        "of the crop"
+    )
+    raise BadArgument("intrinsics", found, f"intrinsics of the same resolution: {fix}{crop}")
+
+
+def as_tensor(name: str, value: Any) -> Tensor:
+    """Return an array of numbers as a tensor; raise `BadArgument` about `name` for anything else."""
+    if isinstance(value, Tensor):
+        return value
+    try:
+        array = np.array(value)
+        # Some files are big-endian.
+        return torch.from_numpy(array.astype(array.dtype.newbyteorder("=")))
+    except (TypeError, ValueError) as error:  # text, objects, rows of different length
+        raise BadArgument(name, describe_array(value), "an array of numbers") from error
+
+
+def describe_array(value: object) -> str:
+    """Return the type, the shape and the dtype of an array as text."""
+    shape = getattr(value, "shape", ())
+    dtype = getattr(value, "dtype", "no dtype")
+    return f"{type(value).__name__} of shape {tuple(shape)}, {dtype}"
