@@ -21,7 +21,7 @@ from torchgrasp import TrialSpec
 from torchgrasp.control.controller import CLOSING_TIME, GraspController
 from torchgrasp.control.finger_forces import desired_forces
 from torchgrasp.control.holding import RAMP, ForceHold, GripHold, held_forces
-from torchgrasp.control.paper.closings import POSE_TIME
+from torchgrasp.control.protocol import POSE_TIME
 from torchgrasp.control.recovery import PRESSING_TIME
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.linalg import fibonacci_sphere

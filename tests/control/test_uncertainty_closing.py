@@ -29,7 +29,8 @@ from torchgrasp.control.law import (
     position_gain,
     surface_covariance,
 )
-from torchgrasp.control.paper.closings import SETTLED, STOP_FORCE, PaperClosing, PositionClosing
+from torchgrasp.control.paper.closings import STOP_FORCE, PaperClosing, PositionClosing
+from torchgrasp.control.protocol import SETTLED
 from torchgrasp.control.reference import next_target
 from torchgrasp.control.sensing import WAITING_FORCE
 from torchgrasp.control.uncertainty_closing import (

@@ -4,22 +4,16 @@ no simulator.
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.control.holding import ForceHold, GripHold, keep_targets
+from torchgrasp.control.holding import GripHold
+from torchgrasp.control.modes import choose_holding, make_closing
 from torchgrasp.control.object_pose import Touches
-from torchgrasp.control.paper.closings import (
-    Impedance,
-    OpenLoopClosing,
-    PaperClosing,
-    PositionClosing,
-)
-from torchgrasp.control.paper.stability import load_stability
+from torchgrasp.control.protocol import Closing, LawClosing
 from torchgrasp.control.recovery import (
     PRESSING_TIME,
     GraspCheck,
@@ -30,22 +24,16 @@ from torchgrasp.control.recovery import (
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.relook import relocate
 from torchgrasp.control.tactile import STILL, Observation, Targets
-from torchgrasp.control.uncertainty_closing import UncertaintyClosing, with_equal_gains
+from torchgrasp.control.uncertainty_closing import UncertaintyClosing
 from torchgrasp.foundation.base import check_device, settle
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.rules import Range
 from torchgrasp.geometry.frames import apply, inverse, rigid
-from torchgrasp.hand.hand import Hand
 from torchgrasp.values.closing import ClosingOptions, choose_options
 from torchgrasp.values.planning import PointCloud
 from torchgrasp.values.specs import ClosingMode, HoldingMode, check_modes, default_holding
 
-Step = Callable[[Observation, float], Float[Tensor, " j"]]
-"""Function of an observation and the time [s] to the next tick, which returns the targets [rad] of
-all joints.
-"""
-Closing = OpenLoopClosing | PositionClosing | PaperClosing | UncertaintyClosing
 Period = Annotated[float, Range(1e-5, 1.0)]
 CLOSING_TIME = (
     4.0  # longest time [s] of closing before the hand presses with the contacts that it has
@@ -152,7 +140,7 @@ class GraspController:
     @property
     def closed(self) -> bool:
         """Whether the hand has closed and pressed long enough, so that it may be lifted."""
-        if isinstance(self.closing, OpenLoopClosing):
+        if not self.closing.feels:
             return self.closing.done
         return self.pressed >= PRESSING_TIME - 1e-9 and (self.check is None or self.check.secure)
 
@@ -172,7 +160,7 @@ class GraspController:
         command the fingers.
         """
         acts = self.hold is None and self.reopening is None and self.time > 0.0
-        if acts and isinstance(self.closing, PaperClosing | UncertaintyClosing):
+        if acts and isinstance(self.closing, LawClosing):
             return self.closing.share
         return torch.full_like(self.reference.normals[:, 0], torch.nan)
 
@@ -255,7 +243,7 @@ class GraspController:
                     self.targets.joints
                 )  # without a finger that opposes them, pressing ones push the object away
             return self.hold(observation, period)
-        if not over or isinstance(self.closing, OpenLoopClosing):
+        if not over or not self.closing.feels:
             if self.judges:
                 if self.time == 0.0:
                     self.felt.append(
@@ -265,7 +253,7 @@ class GraspController:
             self.time += period
             return self.closing(observation, period)
         if self._make_hold is None:
-            assert isinstance(self.closing, PaperClosing | UncertaintyClosing)
+            assert isinstance(self.closing, LawClosing)
             self.hold = self.closing.press()
         else:
             self.hold = self._make_hold(self.reference, observation, self.targets.joints)
@@ -312,36 +300,3 @@ class GraspController:
                     self.reference, self.options, self.length, self.felt, reopening
                 )
         return targets
-
-
-def make_closing(
-    reference: ClosingReference, mode: ClosingMode, options: ClosingOptions
-) -> Closing:
-    """Return the controller that closes the hand along the plan `reference`, for a closing mode
-    such as "paper".
-    """
-    match mode:
-        case "open_loop":
-            return OpenLoopClosing(reference)
-        case "position":
-            return PositionClosing(reference)
-        case "paper_position":
-            return PositionClosing(reference, depth=0.0)
-        case "paper":
-            return PaperClosing(reference)
-        case "fixed":
-            return UncertaintyClosing(with_equal_gains(reference), options)
-        case "uncertainty":
-            return UncertaintyClosing(reference, options)
-
-
-def choose_holding(
-    hand: Hand, mode: HoldingMode
-) -> Callable[[ClosingReference, Observation, Float[Tensor, " j"]], Step] | None:
-    """Return the function that makes a mode's hold controller; None if the closing controller goes
-    on to hold.
-    """
-    if mode == "impedance":
-        hand.require_three("holding", "'impedance', whose virtual frame is of three,")
-        return functools.partial(Impedance, stability=load_stability(hand))
-    return {"force": ForceHold, "grip": GripHold, "position": keep_targets}.get(mode)

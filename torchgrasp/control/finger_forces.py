@@ -2,20 +2,49 @@
 drives.
 """
 
-from typing import NamedTuple
+import dataclasses
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.contacts.balance import least_friction_forces
-from torchgrasp.foundation.base import named_tensors, settle
+from torchgrasp.foundation.base import Value, named_tensors, settle
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Force, Positive, check_dense
 from torchgrasp.geometry.frames import apply, inverse, rotate
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values.planning import Grasps
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class PreferredForces(Value):
+    """Typical normal forces [N] of stable grasps, their covariance [N^2], and the typical spring
+    stiffness [N/m].
+    """
+
+    forces: Float[Tensor, "3"]
+    covariance: Float[Tensor, "3 3"]
+    springs: Float[Tensor, "3"]
+
+
+@runtime_checkable
+class ForcePreference(Protocol):
+    """What chooses among balanced forces that need nearly equal friction, such as a model of
+    stability.
+    """
+
+    def preferred_forces(
+        self, tips: Float[Tensor, "3 3"], force: Positive | None = None
+    ) -> PreferredForces:
+        """Return the forces preferred for fingertips with given centres `tips` [m].
+
+        `force` [N] is the normal force of the finger that presses hardest; None leaves it open.
+        """
+        ...
 
 
 def desired_forces(

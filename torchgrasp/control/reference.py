@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.control import finger_forces, law
-from torchgrasp.control.paper.stability import StabilityModel
 from torchgrasp.control.tactile import Observation
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import check_tensor, checked
@@ -87,7 +86,7 @@ class ClosingReference(Value):
         grasp: Grasps,
         force: Force = 4.0,
         kp: Positive | None = None,
-        stability: StabilityModel | None = None,
+        stability: finger_forces.ForcePreference | None = None,
     ) -> "ClosingReference":
         """Return the closing plan of one grasp, on the CPU.
 
@@ -95,8 +94,9 @@ class ClosingReference(Value):
             grasp: a single grasp, planned for the hand.
             force: normal force of the strongest finger [N].
             kp: stiffness of every joint's drive [N m/rad]; by default the hand's own.
-            stability: model that chooses among balanced forces that need nearly equal friction, and
-                gives the covariance of the forces; without it the covariance grows with the force.
+            stability: chooses among balanced forces that need nearly equal friction, as the
+                stability model of `load_stability` does, and gives the covariance of the forces;
+                without it the covariance grows with the force.
 
         Raises `BadArgument` for not exactly one grasp, joints or fingers of another hand, a force
         or stiffness that is not positive, joints beyond their limits, or numbers in the grasp that
@@ -295,7 +295,10 @@ def _number(grasp: Grasps, name: str) -> float | None:
 
 @checked
 def closing_gains(
-    grasp: Grasps, hand: Hand, force: Force = 4.0, stability: StabilityModel | None = None
+    grasp: Grasps,
+    hand: Hand,
+    force: Force = 4.0,
+    stability: finger_forces.ForcePreference | None = None,
 ) -> ClosingGains:
     """Return contact, gains and desired force of each finger for one grasp, in the hand's frame.
 

@@ -18,7 +18,7 @@ from torchgrasp.control.law import (
     tip_velocity,
 )
 from torchgrasp.control.object_pose import ContactPlanes
-from torchgrasp.control.paper.closings import SETTLED, Settled, strongest_lead
+from torchgrasp.control.protocol import SETTLED, Settled, strongest_lead
 from torchgrasp.control.reference import ClosingReference, next_target
 from torchgrasp.control.sensing import WAITING_FORCE, DriveFeel
 from torchgrasp.control.tactile import STILL, Observation
@@ -55,6 +55,8 @@ class UncertaintyClosing:
     * The options `wait`, `pose_estimate` and `palm_reach` of `ClosingOptions` act while the fingers
       close.
     """
+
+    feels = True
 
     def __init__(self, reference: ClosingReference, options: ClosingOptions) -> None:
         self.reference = reference

@@ -14,8 +14,7 @@ from torch import Tensor
 from torchgrasp.cloud.camera import partial_view
 from torchgrasp.control.controller import GraspController
 from torchgrasp.control.holding import GripHold
-from torchgrasp.control.paper.closings import OpenLoopClosing
-from torchgrasp.control.paper.stability import load_stability
+from torchgrasp.control.modes import choose_preference
 from torchgrasp.control.recovery import can_guard
 from torchgrasp.control.reference import ClosingReference, check_single
 from torchgrasp.control.relook import REACH
@@ -212,11 +211,8 @@ def derive_reference(
     """Return the closing plan, given all that the robot knows; its table is in the frame of the
     grasp.
     """
-    stability = None
-    if closing == "paper":
-        hand.require_three("closing", "'paper', whose model of stability is of three,")
-        stability = load_stability(hand)
-    plan = ClosingReference.from_grasp(hand, grasp, force, kp, stability)
+    preference = choose_preference(hand, closing)
+    plan = ClosingReference.from_grasp(hand, grasp, force, kp, preference)
     table = table and table.moved(inverse(grasp.obj_from_hand[0]))
     sensor = sensor or plan.sensor
     return dataclasses.replace(
@@ -339,7 +335,7 @@ class TrialRun:
         Then it keeps them, whatever it would observe.
         """
         ticks = self.robot.ticks(seconds)
-        rests = isinstance(self.controller.closing, OpenLoopClosing) and self.controller.closed
+        rests = not self.controller.closing.feels and self.controller.closed
         for _ in range(1 if rests else ticks):
             self.step()
         if rests:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchgrasp.arm.arm import Arm
 from torchgrasp.arm.reach import track, way_of
-from torchgrasp.control.paper.closings import POSE_TIME
+from torchgrasp.control.protocol import POSE_TIME
 from torchgrasp.export.postures import named_postures
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked

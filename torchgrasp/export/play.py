@@ -15,7 +15,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.control.holding import PUSH
-from torchgrasp.control.paper.closings import POSE_TIME
+from torchgrasp.control.protocol import POSE_TIME
 from torchgrasp.export.postures import named_postures, quaternion
 from torchgrasp.files import render, write_file
 from torchgrasp.foundation.checks import checked

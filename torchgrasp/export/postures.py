@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.control.finger_forces import Squeeze, squeeze
-from torchgrasp.control.paper.closings import POSE_TIME
+from torchgrasp.control.protocol import POSE_TIME
 from torchgrasp.files import format_json
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status

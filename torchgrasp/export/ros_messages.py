@@ -11,7 +11,7 @@ import yaml
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.control.paper.closings import POSE_TIME
+from torchgrasp.control.protocol import POSE_TIME
 from torchgrasp.export.arm_motion import ArmMotion
 from torchgrasp.export.postures import named_postures, quaternion, rename_joints
 from torchgrasp.foundation.checks import checked

@@ -7,6 +7,7 @@ import torch
 
 from tests.point_fingers import PERIOD, TOUCHING, observation, real, reference
 from torchgrasp.contacts.balance import grasp_map
+from torchgrasp.control.finger_forces import PreferredForces
 from torchgrasp.control.holding import RAMP, held_forces
 from torchgrasp.control.paper.closings import (
     ROTATION_STIFFNESS,
@@ -17,7 +18,7 @@ from torchgrasp.control.paper.closings import (
     side_lengths,
     spring_forces,
 )
-from torchgrasp.control.paper.stability import PreferredForces, StabilityModel
+from torchgrasp.control.paper.stability import StabilityModel
 from torchgrasp.geometry.frames import rigid, rotation_from_vector, virtual_frame
 
 

@@ -5,7 +5,7 @@ impedance hold.
 import math
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.contacts.balance import grasp_map, internal_forces
@@ -19,15 +19,14 @@ from torchgrasp.control.law import (
     tip_velocity,
 )
 from torchgrasp.control.paper.stability import StabilityModel, lengths_of, state_of
+from torchgrasp.control.protocol import POSE_TIME, SETTLED, Settled, strongest_lead
 from torchgrasp.control.reference import ClosingReference, next_target
-from torchgrasp.control.tactile import NOISE, STILL, Observation, low_pass
+from torchgrasp.control.tactile import STILL, Observation, low_pass
 from torchgrasp.foundation.checks import checked
 from torchgrasp.geometry.frames import degenerate, rigid, virtual_frame
 from torchgrasp.geometry.linalg import limit_norm
 
 Rows = Float[Tensor, "*b 3 3"]
-SETTLED = 0.1  # time [s] for which a closing's end must hold before the closing is done
-POSE_TIME = 0.4  # time [s] from pre-grasp to grasp in open loop, and again from grasp to squeeze
 STOP_FORCE = 0.5  # force [N] at which the position controller stops a finger (Sec. 6.5).
 # stiffness of the virtual frame [N/m, N m/rad]
 TRANSLATION_STIFFNESS = 1200.0
@@ -48,6 +47,7 @@ class PaperClosing:
     """
 
     palm = STILL
+    feels = True
 
     def __init__(self, reference: ClosingReference) -> None:
         self.reference = reference.as_printed()
@@ -82,51 +82,6 @@ class PaperClosing:
         return reference.expand(self.target)
 
 
-class Settled:
-    """The `time` [s] for which all fingers have touched near their planned contacts with steady
-    forces.
-    """
-
-    def __init__(self, reference: ClosingReference) -> None:
-        self.time = 0.0
-        self.steady = torch.zeros_like(reference.normals[:, 0])
-
-    def update(
-        self,
-        observation: Observation,
-        touching: Bool[Tensor, "f"],
-        share: Float[Tensor, "f"],
-        period: float,
-        pressing: bool = True,
-    ) -> None:
-        """Add a tick to `time` if all fingers touch and, with `pressing`, press steadily; otherwise
-        set `time` to 0.
-        """
-        average = observation.tactile.average
-        settled = bool(touching.all())
-        if pressing:
-            settled = settled and bool(
-                (share >= 0.5).all() & ((average - self.steady).abs() < NOISE).all()
-            )
-        self.time = self.time + period if settled else 0.0
-        if not settled:
-            self.steady = average
-
-
-def strongest_lead(reference: ClosingReference) -> Float[Tensor, " h"]:
-    """Return how far [rad] each joint's target is ahead of the joint at the largest torque of its
-    drive.
-    """
-    hand = reference.hand
-    effort = torch.tensor(
-        [hand.actuators[name].effort for name in hand.tree.joint_names], dtype=torch.float64
-    )
-    leads = (effort / reference.kp)[
-        :, None
-    ] / hand.actuated.coupling.abs()  # infinite where nothing is driven
-    return leads.amin(0)
-
-
 class PositionClosing:
     """The paper's baseline (Table 7): a PI position controller for each fingertip, stopped at
     `STOP_FORCE`.
@@ -136,6 +91,7 @@ class PositionClosing:
     """
 
     palm = STILL
+    feels = True
 
     def __init__(self, reference: ClosingReference, depth: float = 0.02) -> None:
         self.reference = reference
@@ -169,6 +125,7 @@ class OpenLoopClosing:
     """
 
     palm = STILL
+    feels = False
 
     def __init__(self, reference: ClosingReference) -> None:
         self.reference = reference

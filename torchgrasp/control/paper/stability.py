@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.control.finger_forces import PreferredForces
 from torchgrasp.files import load_tensors, save_tensors
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
@@ -53,18 +54,6 @@ def state_of(
 def lengths_of(tips: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
     """Return the distances [m] of three fingertips' centres from their centroid."""
     return torch.linalg.vector_norm(tips - tips.mean(-2, keepdim=True), dim=-1)
-
-
-@checked
-@dataclasses.dataclass(frozen=True)
-class PreferredForces(Value):
-    """Typical normal forces [N] of stable grasps, their covariance [N^2], and the typical spring
-    stiffness [N/m].
-    """
-
-    forces: Float[Tensor, "3"]
-    covariance: Float[Tensor, "3 3"]
-    springs: Float[Tensor, "3"]
 
 
 @checked

@@ -1,0 +1,65 @@
+"""Closings and holds by the names of their modes."""
+
+import functools
+from collections.abc import Callable
+
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.control.finger_forces import ForcePreference
+from torchgrasp.control.holding import ForceHold, GripHold, keep_targets
+from torchgrasp.control.paper.closings import (
+    Impedance,
+    OpenLoopClosing,
+    PaperClosing,
+    PositionClosing,
+)
+from torchgrasp.control.paper.stability import load_stability
+from torchgrasp.control.protocol import Closing, Step
+from torchgrasp.control.reference import ClosingReference
+from torchgrasp.control.tactile import Observation
+from torchgrasp.control.uncertainty_closing import UncertaintyClosing, with_equal_gains
+from torchgrasp.hand.hand import Hand
+from torchgrasp.values.closing import ClosingOptions
+from torchgrasp.values.specs import ClosingMode, HoldingMode
+
+
+def choose_preference(hand: Hand, mode: ClosingMode) -> ForcePreference | None:
+    """Return what chooses among balanced forces in a closing mode; None if nothing does."""
+    if mode != "paper":
+        return None
+    hand.require_three("closing", "'paper', whose model of stability is of three,")
+    return load_stability(hand)
+
+
+def make_closing(
+    reference: ClosingReference, mode: ClosingMode, options: ClosingOptions
+) -> Closing:
+    """Return the controller that closes the hand along the plan `reference`, for a closing mode
+    such as "paper".
+    """
+    match mode:
+        case "open_loop":
+            return OpenLoopClosing(reference)
+        case "position":
+            return PositionClosing(reference)
+        case "paper_position":
+            return PositionClosing(reference, depth=0.0)
+        case "paper":
+            return PaperClosing(reference)
+        case "fixed":
+            return UncertaintyClosing(with_equal_gains(reference), options)
+        case "uncertainty":
+            return UncertaintyClosing(reference, options)
+
+
+def choose_holding(
+    hand: Hand, mode: HoldingMode
+) -> Callable[[ClosingReference, Observation, Float[Tensor, " j"]], Step] | None:
+    """Return the function that makes a mode's hold controller; None if the closing controller goes
+    on to hold.
+    """
+    if mode == "impedance":
+        hand.require_three("holding", "'impedance', whose virtual frame is of three,")
+        return functools.partial(Impedance, stability=load_stability(hand))
+    return {"force": ForceHold, "grip": GripHold, "position": keep_targets}.get(mode)

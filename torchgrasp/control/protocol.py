@@ -1,0 +1,100 @@
+"""What all closings share: what the controller asks of them, and when a closing has settled."""
+
+from collections.abc import Callable
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchgrasp.control.reference import ClosingReference
+from torchgrasp.control.tactile import NOISE, Observation
+
+SETTLED = 0.1  # time [s] for which a closing's end must hold before the closing is done
+POSE_TIME = 0.4  # time [s] from pre-grasp to grasp in open loop, and again from grasp to squeeze
+Step = Callable[[Observation, float], Float[Tensor, " j"]]
+"""Function of an observation and the time [s] to the next tick, which returns the targets [rad] of
+all joints.
+"""
+
+
+@runtime_checkable
+class Closing(Protocol):
+    """A controller that closes the fingers; a call is a `Step`."""
+
+    @property
+    def palm(self) -> Float[Tensor, "3"]:
+        """How far [m] the palm is displaced from its plan."""
+        ...
+
+    @property
+    def done(self) -> bool:
+        """Whether the closing has ended."""
+        ...
+
+    @property
+    def feels(self) -> bool:
+        """Whether sensors change its targets; otherwise these press at the end, and no hold
+        follows.
+        """
+        ...
+
+    def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
+        """Return the targets [rad] of all joints for the next tick, `period` [s] later."""
+        ...
+
+
+@runtime_checkable
+class LawClosing(Closing, Protocol):
+    """A closing by a control law, which can go on to press."""
+
+    @property
+    def share(self) -> Float[Tensor, "f"]:
+        """Each finger's share of force control, from 0 to 1."""
+        ...
+
+    def press(self) -> Step:
+        """Return the step with which the same law presses."""
+        ...
+
+
+class Settled:
+    """The `time` [s] for which all fingers have touched near their planned contacts with steady
+    forces.
+    """
+
+    def __init__(self, reference: ClosingReference) -> None:
+        self.time = 0.0
+        self.steady = torch.zeros_like(reference.normals[:, 0])
+
+    def update(
+        self,
+        observation: Observation,
+        touching: Bool[Tensor, "f"],
+        share: Float[Tensor, "f"],
+        period: float,
+        pressing: bool = True,
+    ) -> None:
+        """Add a tick to `time` if all fingers touch and, with `pressing`, press steadily; otherwise
+        set `time` to 0.
+        """
+        average = observation.tactile.average
+        settled = bool(touching.all())
+        if pressing:
+            steady = ((average - self.steady).abs() < NOISE).all()
+            settled = settled and bool((share >= 0.5).all() & steady)
+        self.time = self.time + period if settled else 0.0
+        if not settled:
+            self.steady = average
+
+
+def strongest_lead(reference: ClosingReference) -> Float[Tensor, " h"]:
+    """Return how far [rad] each joint's target is ahead of the joint at the largest torque of its
+    drive.
+    """
+    hand = reference.hand
+    efforts = [hand.actuators[name].effort for name in hand.tree.joint_names]
+    effort = torch.tensor(efforts, dtype=torch.float64)
+    # infinite where nothing is driven
+    leads = (effort / reference.kp)[:, None] / hand.actuated.coupling.abs()  # (j, h)
+    return leads.amin(0)
