@@ -61,16 +61,8 @@ def pyramid(draw: Draw) -> Thing:
 @family(FORMS, x=(50, 160), y=(25, 80), low=(3, 10), high=(20, 75))
 def wedge(draw: Draw, x: float, y: float, low: float, high: float) -> Thing:
     """A ramp with a blunt edge."""
-    return lump(
-        np.array(
-            [
-                (s * x / 2, t * y / 2, z)
-                for s, top in ((-1, low), (1, high))
-                for t in (-1, 1)
-                for z in (0, top)
-            ]
-        )
-    )
+    ends = [(s * x / 2, t * y / 2, top) for s, top in ((-1, low), (1, high)) for t in (-1, 1)]
+    return lump(np.array([(at, side, z) for at, side, top in ends for z in (0, top)]))
 
 
 @family(FORMS, x=(30, 95), z=(25, 95), depth=(12, 110), wall=(3, 14), sort=(0, 5))
@@ -97,9 +89,8 @@ def cross(draw: Draw, many: float, reach: float, wide: float, h: float) -> Thing
     """A plus or a star of three to six arms, lying or standing."""
     count = int(many)
     arms = around(box(reach, wide, h, (reach / 2, 0, 0)), count)
-    return turn(
-        arms + stack([(wide, 0), (wide, h + draw(0, 6) + 0.5)]), "x", 90 if draw(0, 1) < 0.4 else 0
-    )
+    hub = stack([(wide, 0), (wide, h + draw(0, 6) + 0.5)])
+    return tip(draw, arms + hub, 0.4)
 
 
 @family(FORMS)
@@ -119,12 +110,8 @@ def blocks(draw: Draw) -> Thing:
         x, y, z = (draw(0.25, 1.1) * edge for edge in first)
         side = (draw(-0.5, 0.5) * first[0], draw(-0.5, 0.5) * first[1], draw(0.1, 0.9) * first[2])
         turned = draw(0, 90)
-        thing += move(
-            turn(
-                box(x, y, z) if draw(0, 1) < 0.6 else stack([(x / 2, 0), (x / 2, z)]), "z", turned
-            ),
-            *side,
-        )
+        solid = box(x, y, z) if draw(0, 1) < 0.6 else stack([(x / 2, 0), (x / 2, z)])
+        thing += move(turn(solid, "z", turned), *side)
     return thing
 
 
@@ -136,13 +123,9 @@ def bubbles(draw: Draw, r: float) -> Thing:
         a = draw(0.4, 0.9) * r
         angle = draw(0, 6.28)
         tilt = draw(-0.6, 1.2)
-        at = (
-            np.array(
-                [math.cos(angle) * math.cos(tilt), math.sin(angle) * math.cos(tilt), math.sin(tilt)]
-            )
-            * r
-            * 0.9
-        )
+        level = math.cos(tilt)
+        way = np.array([math.cos(angle) * level, math.sin(angle) * level, math.sin(tilt)])
+        at = way * r * 0.9
         thing += move(ball(a, a * draw(0.7, 1.3), a * draw(0.7, 1.3), 6), *at.tolist())
     return thing
 
@@ -150,9 +133,8 @@ def bubbles(draw: Draw, r: float) -> Thing:
 @family(FORMS, r=(20, 42), head=(0.5, 0.75))
 def duck(draw: Draw, r: float, head: float) -> Thing:
     """An animal of rubber: a body, a head, a beak, ears or a tail."""
-    thing = ball(r * draw(1.0, 1.5), r, 0.85 * r) + move(
-        ball(head * r, head * r, head * r), 0.6 * r, 0, 1.2 * r
-    )
+    thing = ball(r * draw(1.0, 1.5), r, 0.85 * r)
+    thing += move(ball(head * r, head * r, head * r), 0.6 * r, 0, 1.2 * r)
     thing += pebble(0.35 * r, 0.25 * r, 0.15 * r, ((0.6 + head) * r, 0, 1.15 * r))
     thing += pebble(0.45 * r, 0.3 * r, 0.25 * r, (-1.1 * r, 0, 0.35 * r))
     tall = draw(0.2, 0.7) * r
@@ -166,9 +148,9 @@ def duck(draw: Draw, r: float, head: float) -> Thing:
 @family(FORMS, x=(50, 120), y=(24, 50), z=(12, 28), wheel=(7, 14))
 def car(draw: Draw, x: float, y: float, z: float, wheel: float) -> Thing:
     """A toy car: a body, a cabin and four wheels."""
-    body = box(x, y, z, (0, 0, 0.6 * wheel)) + move(
-        slab(0.5 * x, 0.85 * y, z, 4, 3), draw(-0.15, 0.1) * x, 0, 0.5 * wheel + z
-    )
+    body = box(x, y, z, (0, 0, 0.6 * wheel))
+    cabin = slab(0.5 * x, 0.85 * y, z, 4, 3)
+    body += move(cabin, draw(-0.15, 0.1) * x, 0, 0.5 * wheel + z)
     rims = [lie(stack([(wheel, -y / 2 - 3), (wheel, y / 2 + 3)], sides=16)) for _ in (0, 1)]
     return body + move(rims[0], -0.32 * x, 0, wheel) + move(rims[1], 0.32 * x, 0, wheel)
 
@@ -178,9 +160,7 @@ def stool(draw: Draw, r: float, h: float, top: float, leg: float, many: float) -
     """A small table of three or four legs, some upside down."""
     count = int(many)
     legs = around(rod((1.0 * r - 8, 0, 0), (0.7 * r - 8, 0, h), leg, 0.9 * leg), count)
-    return turn(
-        legs + move(stack([(r, 0), (r, top)]), z=h - 2), "x", 180 if draw(0, 1) < 0.3 else 0
-    )
+    return tip(draw, legs + move(stack([(r, 0), (r, top)]), z=h - 2), 0.3, 180)
 
 
 @family(FORMS, long=(2, 6), across=(1, 4), gap=(18, 36), base=(6, 16))

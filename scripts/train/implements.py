@@ -37,9 +37,8 @@ IMPLEMENTS: Families = {}
 def spatula(draw: Draw, handle: float, blade: float, rise: float) -> Thing:
     """A handle with a broad, thin blade that may be cranked."""
     line = np.array([(-handle, 0, rise + 5), (-20, 0, rise + 5), (8, 0, 4)])
-    return path(line, draw(3.5, 7), draw(6, 12)) + move(
-        slab(blade, draw(35, 85), draw(2.5, 6), 8, 0.5), blade / 2
-    )
+    grip = path(line, draw(3.5, 7), draw(6, 12))
+    return grip + move(slab(blade, draw(35, 85), draw(2.5, 6), 8, 0.5), blade / 2)
 
 
 @family(IMPLEMENTS, a=(18, 38), b=(12, 26), length=(70, 165))
@@ -48,9 +47,8 @@ def spoon(draw: Draw, a: float, b: float, length: float) -> Thing:
     line = np.array(
         [(0.7 * a, 0, 8), (a + 15, 0, 12), (a + 0.6 * length, 0, draw(12, 24)), (a + length, 0, 10)]
     )
-    return move(pebble(a, b, draw(5, 9)), z=7) + path(
-        line, draw(2.2, 4), [draw(3, 5), 3, draw(4, 8), draw(5, 9)]
-    )
+    bowl = move(pebble(a, b, draw(5, 9)), z=7)
+    return bowl + path(line, draw(2.2, 4), [draw(3, 5), 3, draw(4, 8), draw(5, 9)])
 
 
 @family(IMPLEMENTS, many=(2, 6), tine=(30, 65), length=(70, 150), wide=(5, 7))
@@ -59,18 +57,11 @@ def fork(draw: Draw, many: float, tine: float, length: float, wide: float) -> Th
     count = int(many)
     gap = wide + draw(3, 9)
     sides = (np.arange(count) - (count - 1) / 2) * gap
-    prongs = join(
-        path(
-            np.array([(-8, y, 5), (0.5 * tine, y, 6), (tine, y, 12)]),
-            2.5,
-            [0.5 * wide, 0.45 * wide, 0.3 * wide],
-        )
-        for y in sides.tolist()
-    )
+    lines = [np.array([(-8, y, 5), (0.5 * tine, y, 6), (tine, y, 12)]) for y in sides.tolist()]
+    prongs = join(path(line, 2.5, [0.5 * wide, 0.45 * wide, 0.3 * wide]) for line in lines)
     bridge = box(14, (count - 1) * gap + wide, 6, (-8, 0, 2))
-    return (
-        prongs + bridge + path(np.array([(-10, 0, 5), (-length, 0, 9)]), draw(2.5, 5), draw(4, 9))
-    )
+    handle = path(np.array([(-10, 0, 5), (-length, 0, 9)]), draw(2.5, 5), draw(4, 9))
+    return prongs + bridge + handle
 
 
 @family(IMPLEMENTS, many=(6, 20), pitch=(7, 11), tooth=(18, 40), h=(6, 12))
@@ -78,21 +69,15 @@ def comb(draw: Draw, many: float, pitch: float, tooth: float, h: float) -> Thing
     """A spine with many teeth."""
     count = int(many)
     places = [((k - (count - 1) / 2) * pitch, tooth / 2, 0) for k in range(count)]
-    return join(box(0.5 * pitch, tooth, h - 1, at) for at in places) + box(
-        count * pitch + 6, draw(12, 26), h, (0, -5, 0)
-    )
+    teeth = join(box(0.5 * pitch, tooth, h - 1, at) for at in places)
+    return teeth + box(count * pitch + 6, draw(12, 26), h, (0, -5, 0))
 
 
 @family(IMPLEMENTS, handle=(80, 125), blade=(60, 120), wide=(18, 40), h=(9, 18))
 def knife(draw: Draw, handle: float, blade: float, wide: float, h: float) -> Thing:
     """A knife that lies on its side, with a handle and a pointed blade."""
-    outline = [
-        (-5, -wide / 2),
-        (0.6 * blade, -0.45 * wide),
-        (blade, 0.35 * wide),
-        (blade, 0.5 * wide),
-        (-5, 0.5 * wide),
-    ]
+    outline = [(-5, -wide / 2), (0.6 * blade, -0.45 * wide), (blade, 0.35 * wide)]
+    outline += [(blade, 0.5 * wide), (-5, 0.5 * wide)]
     grip = move(slab(handle, draw(16, 28), h, 6, 0.25 * h), x=-handle / 2)
     return grip + move(prism(outline, draw(2, 4)), z=0.4 * h)
 
@@ -101,11 +86,8 @@ def knife(draw: Draw, handle: float, blade: float, wide: float, h: float) -> Thi
 def brush(draw: Draw, handle: float, head: float, wide: float, thick: float) -> Thing:
     """A brush: a handle, a head and a block of bristles."""
     bristles = move(slab(0.9 * head, 0.85 * wide, draw(12, 35) + thick, 3, 0.5), x=head / 2)
-    return (
-        bristles
-        + move(slab(head, wide, thick, 5, 2), x=head / 2)
-        + rod((5, 0, 5), (-handle, 0, 6), 5, draw(5, 9))
-    )
+    back = move(slab(head, wide, thick, 5, 2), x=head / 2)
+    return bristles + back + rod((5, 0, 5), (-handle, 0, 6), 5, draw(5, 9))
 
 
 @family(IMPLEMENTS, wide=(20, 75), hair=(35, 60), handle=(90, 130), h=(10, 20))
@@ -114,11 +96,9 @@ def broad(draw: Draw, wide: float, hair: float, handle: float, h: float) -> Thin
     tip = [(hair, t * 0.48 * wide, z) for t in (-1, 1) for z in (0.35 * h, 0.65 * h)]
     root = [(0.0, t * 0.48 * wide, z) for t in (-1, 1) for z in (0.05 * h, 0.95 * h)]
     line = np.array([(-10, 0, h / 2), (-25, 0, h / 2), (-40, 0, h / 2), (-25 - handle, 0, h / 2)])
-    return (
-        lump(np.array(tip + root))
-        + box(22, wide, h, (-10, 0, 0))
-        + path(line, [0.4 * h, 0.4 * h, 4, 5], [0.4 * wide, 8, 6, 8])
-    )
+    bristles = lump(np.array(tip + root))
+    ferrule = box(22, wide, h, (-10, 0, 0))
+    return bristles + ferrule + path(line, [0.4 * h, 0.4 * h, 4, 5], [0.4 * wide, 8, 6, 8])
 
 
 @family(IMPLEMENTS, length=(130, 220), r=(6, 13), head=(55, 110), face=(9, 24))
@@ -128,16 +108,10 @@ def hammer(draw: Draw, length: float, r: float, head: float, face: float) -> Thi
         top = lie(stack([(face, -head / 2), (face, head / 2)]))
     else:
         claw = [(s * 0.4 * face, head / 2, z) for s in (-1, 1) for z in (-2, 2)]
-        top = box(1.6 * face, head, 1.6 * face, (0, -0.2 * head, -0.8 * face)) + lump(
-            np.array(
-                claw
-                + [
-                    (s * 0.7 * face, 0.2 * head, z)
-                    for s in (-1, 1)
-                    for z in (-0.7 * face, 0.7 * face)
-                ]
-            )
-        )
+        half = 0.7 * face
+        claw += [(s * 0.7 * face, 0.2 * head, z) for s in (-1, 1) for z in (-half, half)]
+        top = box(1.6 * face, head, 1.6 * face, (0, -0.2 * head, -0.8 * face))
+        top = top + lump(np.array(claw))
     return top + rod((-0.5 * face, 0, 0), (length - face, 0, 0), 0.8 * r, r)
 
 
@@ -146,11 +120,8 @@ def axe(draw: Draw, length: float, r: float, head: float, edge: float) -> Thing:
     """A small axe or a cleaver, lying."""
     blade = [(-18, 10, z) for z in (-12, 12)] + [(16, 10, z) for z in (-12, 12)]
     blade += [(x, 10 + head, z) for x in (-30, 28) for z in (-edge, edge)]
-    return (
-        lump(np.array(blade))
-        + box(34, 34, 26, (-1, 0, -13))
-        + rod((-22, 0, 0), (length - 22, 0, 0), r, 0.9 * r)
-    )
+    top = lump(np.array(blade)) + box(34, 34, 26, (-1, 0, -13))
+    return top + rod((-22, 0, 0), (length - 22, 0, 0), r, 0.9 * r)
 
 
 @family(IMPLEMENTS, r=(9, 18), grip=(60, 110), shaft=(40, 130))
@@ -169,10 +140,8 @@ def torch(draw: Draw, r: float, grip: float, neck: float, head: float) -> Thing:
     """A flashlight or a microphone: a grip and a wider head, lying."""
     wide = draw(1.2, 1.9) * r
     outline = [(0.9 * r, 0), (r, 3), (r, grip), (wide, grip + neck), (wide, grip + neck + head)]
-    round_end = [
-        (0.8 * wide, grip + neck + head + 0.5 * wide),
-        (0.4 * wide, grip + neck + head + 0.8 * wide),
-    ]
+    top = grip + neck + head
+    round_end = [(0.8 * wide, top + 0.5 * wide), (0.4 * wide, top + 0.8 * wide)]
     return lie(stack(outline + (round_end if draw(0, 1) < 0.4 else [])))
 
 
@@ -181,9 +150,8 @@ def wrench(draw: Draw, length: float, h: float, wide: float) -> Thing:
     """A spanner with an open jaw, and a ring or a jaw at its other end."""
     size = draw(0.75, 1.1) * wide
     jaw = path(arc(size + 2, 50, 310, 11, (0, 0, 0)), 0.45 * wide, h / 2, sides=4)
-    other = path(
-        arc(0.9 * size + 3, 0, 337.5, 16, (0, 0, 0)), 0.4 * wide, 0.45 * h, closed=True, sides=4
-    )
+    line = arc(0.9 * size + 3, 0, 337.5, 16, (0, 0, 0))
+    other = path(line, 0.4 * wide, 0.45 * h, closed=True, sides=4)
     start = -size - 2
     end = -size - length
     shank = box(length, wide, 0.8 * h, ((start + end) / 2, 0, -0.4 * h))
@@ -199,26 +167,11 @@ def scissors(draw: Draw, r: float, t: float, blade: float, arm: float, open_: fl
         loop = lie(
             path(arc((draw(1.0, 1.5) * r + t, r + t), 0, 337.5, 16, (0, 0, 0)), t, t, closed=True)
         )
-        outline = [
-            (-arm, -4),
-            (0, -7),
-            (0.7 * blade, -5),
-            (blade, -1),
-            (blade, 1),
-            (0, 7),
-            (-arm, 4),
-        ]
-        leg = prism(outline, t + 1.5)
-        half = (
-            move(loop, x=-arm - r - 2, y=0.35 * r, z=t)
-            if s > 0
-            else move(loop, x=-arm - r - 2, y=-0.35 * r, z=t)
-        )
-        thing += turn(
-            half + move(leg, z=0 if s > 0 else t),
-            "z",
-            -s * open_ - s * math.degrees(math.atan2(0.5 * r, arm + r)),
-        )
+        edge = [(0.7 * blade, -5), (blade, -1), (blade, 1)]
+        leg = prism([(-arm, -4), (0, -7), *edge, (0, 7), (-arm, 4)], t + 1.5)
+        half = move(loop, x=-arm - r - 2, y=s * 0.35 * r, z=t)
+        slant = math.degrees(math.atan2(0.5 * r, arm + r))
+        thing += turn(half + move(leg, z=0 if s > 0 else t), "z", -s * open_ - s * slant)
     return thing
 
 
@@ -227,24 +180,10 @@ def pliers(draw: Draw, length: float, t: float, bow: float, jaw: float) -> Thing
     """Pliers: two bowed grips that meet at a joint, and two jaws."""
     thing = stack([(draw(9, 14), -t - 1), (10, t + 1)])
     for s in (-1, 1):
-        line = np.array(
-            [
-                (0, 0, 0),
-                (-0.25 * length, 0, s * bow),
-                (-0.6 * length, 0, s * 1.1 * bow),
-                (-length, 0, s * bow),
-            ]
-        )
-        thing += lie(path(line, 0.9 * t, t))
-        outline = [
-            (-6, 0),
-            (-6, s * 9),
-            (0.3 * jaw, s * 9),
-            (jaw, s * 4),
-            (jaw, s * 0.7),
-            (0, s * 0.7),
-        ]
-        thing += move(prism(outline, 2 * t - 1), z=-t + 0.5)
+        bent = [(-0.25 * length, 0, s * bow), (-0.6 * length, 0, s * 1.1 * bow)]
+        thing += lie(path(np.array([(0, 0, 0), *bent, (-length, 0, s * bow)]), 0.9 * t, t))
+        front = [(0.3 * jaw, s * 9), (jaw, s * 4), (jaw, s * 0.7), (0, s * 0.7)]
+        thing += move(prism([(-6, 0), (-6, s * 9), *front], 2 * t - 1), z=-t + 0.5)
     return thing
 
 
@@ -252,14 +191,9 @@ def pliers(draw: Draw, length: float, t: float, bow: float, jaw: float) -> Thing
 def tongs(draw: Draw, length: float, wide: float, gap: float, t: float) -> Thing:
     """Tongs, tweezers or a clothes peg: two arms that meet at one end."""
     bend = arc((gap + 4, gap), 90, 270, 9, (0, 0, 0))
-    line = np.concatenate(
-        [
-            [(length, 0, 0.4 * gap + t), (0.6 * length, 0, gap)],
-            bend,
-            [(0.6 * length, 0, -gap), (length, 0, -0.4 * gap - t)],
-        ]
-    )
-    return lie(path(line, t, wide, sides=4))
+    upper = [(length, 0, 0.4 * gap + t), (0.6 * length, 0, gap)]
+    lower = [(0.6 * length, 0, -gap), (length, 0, -0.4 * gap - t)]
+    return lie(path(np.concatenate([upper, bend, lower]), t, wide, sides=4))
 
 
 @family(IMPLEMENTS, length=(80, 170), wide=(20, 42), rise=(6, 20), t=(8, 16))
@@ -273,15 +207,8 @@ def stapler(draw: Draw, length: float, wide: float, rise: float, t: float) -> Th
 @family(IMPLEMENTS, x=(90, 170), y=(45, 85), z=(14, 30), rise=(28, 45))
 def iron(draw: Draw, x: float, y: float, z: float, rise: float) -> Thing:
     """A flat iron, a stamp or a trowel: a pointed sole with a handle over it."""
-    outline = [
-        (-x / 2, -y / 2),
-        (0.05 * x, -y / 2),
-        (0.35 * x, -0.25 * y),
-        (x / 2, 0),
-        (0.35 * x, 0.25 * y),
-        (0.05 * x, y / 2),
-        (-x / 2, y / 2),
-    ]
+    outline = [(-x / 2, -y / 2), (0.05 * x, -y / 2), (0.35 * x, -0.25 * y), (x / 2, 0)]
+    outline += [(0.35 * x, 0.25 * y), (0.05 * x, y / 2), (-x / 2, y / 2)]
     handle = path(arc((0.36 * x, rise), -6, 186, 9, (-0.06 * x, 0, z)), draw(5, 8), draw(6, 11))
     return prism(outline, z, draw(0.75, 1.0)) + handle
 
@@ -289,41 +216,29 @@ def iron(draw: Draw, x: float, y: float, z: float, rise: float) -> Thing:
 @family(IMPLEMENTS, x=(60, 170), y=(30, 80), z=(40, 110))
 def trolley(draw: Draw, x: float, y: float, z: float) -> Thing:
     """A box or a lunch case with an arched grip on its top."""
-    grip = path(
-        arc((draw(0.22, 0.4) * x, draw(22, 45)), -5, 185, 11, (0, 0, z)), draw(3, 6), draw(4, 10)
-    )
+    line = arc((draw(0.22, 0.4) * x, draw(22, 45)), -5, 185, 11, (0, 0, z))
+    grip = path(line, draw(3, 6), draw(4, 10))
     return slab(x, y, z, 6, 3) + grip
 
 
 @family(IMPLEMENTS, r=(18, 36), length=(90, 170), grip=(70, 110), lean=(60, 105))
 def dryer(draw: Draw, r: float, length: float, grip: float, lean: float) -> Thing:
     """A hair dryer, a drill or a toy pistol: a barrel with a grip across, lying."""
-    barrel = turn(
-        stack([(0.8 * r, 0), (r, 0.15 * length), (r, 0.5 * length), (draw(0.45, 0.9) * r, length)]),
-        "y",
-        90,
-    )
+    barrel = [(0.8 * r, 0), (r, 0.15 * length), (r, 0.5 * length), (draw(0.45, 0.9) * r, length)]
     a = math.radians(lean)
     at = (0.25 * length, 0.0, 0.0)
     end = (at[0] - (grip + r) * math.cos(a), -(grip + r) * math.sin(a), 0.0)
-    return barrel + rod(at, end, 0.5 * r, draw(0.45, 0.65) * r)
+    return turn(stack(barrel), "y", 90) + rod(at, end, 0.5 * r, draw(0.45, 0.65) * r)
 
 
 @family(IMPLEMENTS, r=(22, 48), h=(25, 55), wall=(2, 5), grip=(40, 90))
 def bell(draw: Draw, r: float, h: float, wall: float, grip: float) -> Thing:
     """A hand bell, a stamp or a plunger: a grip on a wide, hollow foot."""
-    mouth = move(
-        turn(vessel([(0.4 * r, 0), (0.6 * r, 0.4 * h), (r, h)], wall, wall + 2), "x", 180), z=h
-    )
+    mouth = turn(vessel([(0.4 * r, 0), (0.6 * r, 0.4 * h), (r, h)], wall, wall + 2), "x", 180)
     knob = draw(7, 14)
-    return mouth + stack(
-        [
-            (0.35 * knob + 3, h - 2),
-            (0.6 * knob, h + 8),
-            (knob, h + 0.7 * grip),
-            (0.7 * knob, h + grip),
-        ]
-    )
+    outline = [(0.35 * knob + 3, h - 2), (0.6 * knob, h + 8)]
+    outline += [(knob, h + 0.7 * grip), (0.7 * knob, h + grip)]
+    return move(mouth, z=h) + stack(outline)
 
 
 @family(IMPLEMENTS, r=(24, 65), h=(6.5, 12), handle=(60, 110))
@@ -332,14 +247,8 @@ def racket(draw: Draw, r: float, h: float, handle: float) -> Thing:
     if draw(0, 1) < 0.5:
         head = stack([(r, -h / 2), (r, h / 2)], draw(0.75, 1.0))
     else:
-        head = lie(
-            path(
-                arc((r - 4, (r - 4) * draw(0.75, 1.0)), 0, 345, 24, (0, 0, 0)),
-                4,
-                h / 2,
-                closed=True,
-            )
-        )
+        line = arc((r - 4, (r - 4) * draw(0.75, 1.0)), 0, 345, 24, (0, 0, 0))
+        head = lie(path(line, 4, h / 2, closed=True))
     return head + rod((r - 4, 0, 0), (r + handle, 0, 0), 0.42 * h + 1, draw(4, 10))
 
 
@@ -377,10 +286,8 @@ def key(draw: Draw, r: float, h: float, shaft: float) -> Thing:
 @family(IMPLEMENTS, r=(30, 52), h=(55, 100), wall=(2.5, 5), spout=(50, 80))
 def watering(draw: Draw, r: float, h: float, wall: float, spout: float) -> Thing:
     """A watering can: a hollow drum with a long spout and a handle behind."""
-    handle = path(
-        arc((draw(24, 36), 0.4 * h), -88, 88, 9, (r - 0.6 * wall, 0, 0.5 * h)), 4, draw(4, 8)
-    )
-    tube = rod(
-        (-r + 0.5 * wall + 3, 0, 0.2 * h), (-r - spout, 0, draw(0.9, 1.3) * h), draw(7, 11), 6
-    )
+    line = arc((draw(24, 36), 0.4 * h), -88, 88, 9, (r - 0.6 * wall, 0, 0.5 * h))
+    handle = path(line, 4, draw(4, 8))
+    end = (-r - spout, 0, draw(0.9, 1.3) * h)
+    tube = rod((-r + 0.5 * wall + 3, 0, 0.2 * h), end, draw(7, 11), 6)
     return vessel([(r, 0), (r, h)], wall, 4) + handle + tube

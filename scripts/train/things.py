@@ -44,14 +44,10 @@ def carton(draw: Draw) -> Thing:
 @family(THINGS, x=(45, 95), y=(45, 95), h=(60, 170), roof=(15, 45))
 def gable(draw: Draw, x: float, y: float, h: float, roof: float) -> Thing:
     """A carton with a roof and a crest, as of milk; or a house."""
-    ridge = [(s * x / 2, t * y / 2, h) for s in (-1, 1) for t in (-1, 1)] + [
-        (s * x / 2, 0, h + roof) for s in (-1, 1)
-    ]
-    return (
-        box(x, y, h)
-        + lump(np.array(ridge))
-        + box(0.98 * x, 4, draw(5, 15), (0, 0, h + 0.85 * roof))
-    )
+    ridge = [(s * x / 2, t * y / 2, h) for s in (-1, 1) for t in (-1, 1)]
+    ridge += [(s * x / 2, 0, h + roof) for s in (-1, 1)]
+    house = box(x, y, h) + lump(np.array(ridge))
+    return house + box(0.98 * x, 4, draw(5, 15), (0, 0, h + 0.85 * roof))
 
 
 @family(THINGS)
@@ -99,13 +95,9 @@ def remote(draw: Draw, x: float, y: float, z: float) -> Thing:
 @family(THINGS, x=(26, 42), y=(30, 65), z=(22, 55))
 def mouse(draw: Draw, x: float, y: float, z: float) -> Thing:
     """A low dome on a flat base: a computer mouse, a bun, half a fruit."""
-    return stack(
-        [
-            (x, 0),
-            *[(x * math.cos(t), 0.15 * z + 0.85 * z * math.sin(t)) for t in np.linspace(0, 1.4, 7)],
-        ],
-        y / x,
-    )
+    angles = np.linspace(0, 1.4, 7)
+    dome = [(x * math.cos(t), 0.15 * z + 0.85 * z * math.sin(t)) for t in angles]
+    return stack([(x, 0), *dome], y / x)
 
 
 @family(THINGS, r=(3.6, 16))
@@ -125,13 +117,8 @@ def pen(draw: Draw, r: float, length: float, tip: float) -> Thing:
 @family(THINGS, r=(7, 14), length=(50, 110), cap=(25, 45))
 def marker(draw: Draw, r: float, length: float, cap: float) -> Thing:
     """A marker or a lipstick with a thicker cap, lying or standing on it."""
-    outline = [
-        (draw(1.05, 1.25) * r, 0),
-        (1.2 * r, cap),
-        (r, cap),
-        (r, cap + length),
-        (0.9 * r, cap + length + 3),
-    ]
+    outline = [(draw(1.05, 1.25) * r, 0), (1.2 * r, cap), (r, cap)]
+    outline += [(r, cap + length), (0.9 * r, cap + length + 3)]
     return turn(stack(outline), "x", 0 if draw(0, 1) < 0.3 else 90)
 
 
@@ -144,18 +131,10 @@ def glasses(draw: Draw, wide: float, tall: float, bridge: float, t: float, arm: 
         rim = turn(path(loop, 0.8 * t, t, closed=True), "z", 90)
         lens = turn(lie(prism(disc(wide, tall, 0)[:, :2], 2)), "z", 90)
         side = s * (2 * wide + bridge / 2)
-        line = np.array(
-            [
-                (t - 2, side, 1.4 * tall),
-                (-0.7 * arm, side, 1.4 * tall),
-                (-arm, 0.98 * side, 0.4 * tall),
-            ]
-        )
-        thing += (
-            rim
-            + move(lens, -1, s * (wide + bridge / 2), tall + t) * int(draw(0, 2))
-            + path(line, t, 0.8 * t)
-        )
+        straight = [(t - 2, side, 1.4 * tall), (-0.7 * arm, side, 1.4 * tall)]
+        line = np.array([*straight, (-arm, 0.98 * side, 0.4 * tall)])
+        glass = move(lens, -1, s * (wide + bridge / 2), tall + t) * int(draw(0, 2))
+        thing += rim + glass + path(line, t, 0.8 * t)
     return thing
 
 
@@ -163,11 +142,8 @@ def glasses(draw: Draw, wide: float, tall: float, bridge: float, t: float, arm: 
 def watch(draw: Draw, r: float, wide: float, t: float) -> Thing:
     """A watch or a bracelet: a closed band with a dial, standing on its edge or lying on it."""
     band = path(arc((r, 0.85 * r), 0, 345, 24, (0, 0, 0)), t, wide, closed=True)
-    dial = move(
-        stack([(draw(1.1, 1.8) * wide + 5, 0), (draw(1.1, 1.7) * wide + 4, draw(7, 13))]),
-        z=0.85 * r - 3,
-    )
-    return tip(draw, band + dial, 0.5)
+    dial = stack([(draw(1.1, 1.8) * wide + 5, 0), (draw(1.1, 1.7) * wide + 4, draw(7, 13))])
+    return tip(draw, band + move(dial, z=0.85 * r - 3), 0.5)
 
 
 @family(THINGS, r=(12, 40), wide=(3.5, 9), bend=(120, 260), leg=(20, 110))
@@ -200,11 +176,8 @@ def plug(draw: Draw, x: float, y: float, z: float, pin: float) -> Thing:
 def camera(draw: Draw, x: float, y: float, z: float) -> Thing:
     """A camera or a projector: a box with a lens at its front and a hump above."""
     lens = lie(stack([(0.36 * z, 0), (draw(0.28, 0.4) * z, y / 2 + draw(10, 50))]))
-    return (
-        slab(x, y, z, 5, 3)
-        + move(lens, draw(-0.15, 0.15) * x, 0, z / 2)
-        + box(0.35 * x, 0.6 * y, z + draw(6, 14))
-    )
+    body = slab(x, y, z, 5, 3) + move(lens, draw(-0.15, 0.15) * x, 0, z / 2)
+    return body + box(0.35 * x, 0.6 * y, z + draw(6, 14))
 
 
 @family(THINGS, r=(25, 55), depth=(22, 45))
@@ -225,12 +198,10 @@ def spray(draw: Draw, r: float, h: float, neck: float) -> Thing:
         draw(0.6, 1.0),
     )
     if draw(0, 1) < 0.4:
-        spout = path(
-            np.array([(-8, 0, h + 44), (18, 0, h + 46), (draw(32, 48), 0, h + 38)]), 5, draw(5, 9)
-        )
+        line = np.array([(-8, 0, h + 44), (18, 0, h + 46), (draw(32, 48), 0, h + 38)])
+        spout = path(line, 5, draw(5, 9))
         return body + rod((0, 0, h + 10), (0, 0, h + 44), 5) + spout
     head = box(draw(52, 80), draw(18, 26), draw(18, 28), (10, 0, h + 16))
-    trigger = path(
-        np.array([(22, 0, h + 20), (26, 0, h + 2), (38, 0, h - draw(8, 22))]), 4, draw(5, 8)
-    )
+    line = np.array([(22, 0, h + 20), (26, 0, h + 2), (38, 0, h - draw(8, 22))])
+    trigger = path(line, 4, draw(5, 8))
     return body + head + trigger + rod((30, 0, h + 26), (draw(52, 62), 0, h + 26), 6)

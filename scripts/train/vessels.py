@@ -64,10 +64,8 @@ def jar(draw: Draw, r: float, h: float, neck: float) -> Thing:
 def tub(draw: Draw, r: float, h: float, lip: float) -> Thing:
     """A filled tub that is wider at its rim than at its foot, as of yoghurt."""
     foot = draw(0.6, 0.9) * r
-    return stack(
-        [(foot, 0), (r, h - lip), (r + lip, h - lip), (r + lip, h)],
-        draw(0.7, 1.0) if draw(0, 1) < 0.3 else 1,
-    )
+    oval = draw(0.7, 1.0) if draw(0, 1) < 0.3 else 1
+    return stack([(foot, 0), (r, h - lip), (r + lip, h - lip), (r + lip, h)], oval)
 
 
 @family(VESSELS, many=(4, 10), h=(30, 180), r=(12, 42))
@@ -91,12 +89,9 @@ def fruit(draw: Draw, r: float, tall: float, lean: float, blunt: float) -> Thing
     angle = np.linspace(math.pi - 0.25, 0.25, 10)
     radii = r * np.sin(angle) ** blunt * (1 + lean * np.cos(angle))
     body = stack(list(zip(radii, tall * r * np.cos(angle), strict=True)))
-    stem = (
-        rod((0, 0, 0.9 * tall * r), (4, 0, tall * r + draw(5, 15)), draw(2, 4))
-        if draw(0, 1) < 0.5
-        else []
-    )
-    return turn(body + stem, "x", 90 if tall > 1.15 else 0)
+    if draw(0, 1) < 0.5:
+        body += rod((0, 0, 0.9 * tall * r), (4, 0, tall * r + draw(5, 15)), draw(2, 4))
+    return turn(body, "x", 90 if tall > 1.15 else 0)
 
 
 @family(VESSELS, r=(11, 20), spread=(35, 65))
@@ -148,12 +143,8 @@ def pin(draw: Draw, r: float, length: float, end: float) -> Thing:
     """A rolling pin, a bat or a pestle: a thick rod with thinner ends, lying."""
     first = draw(0.3, 0.7) * r
     last = draw(0.3, 1.0) * r
-    outline = [
-        (first, 0),
-        (first, end),
-        (r, end + 0.1 * length),
-        (draw(0.6, 1.0) * r, end + length),
-    ]
+    thinner = (draw(0.6, 1.0) * r, end + length)
+    outline = [(first, 0), (first, end), (r, end + 0.1 * length), thinner]
     return lie(stack([*outline, (last, end + length), (last, 2 * end + length)]))
 
 
@@ -191,9 +182,9 @@ def mug(draw: Draw, r: float, h: float, wall: float) -> Thing:
     foot = draw(0.75, 1.0) * r
     pieces = vessel([(foot, 0), (r, 0.45 * h), (r, h)], wall, draw(3, 7))
     reach = draw(18, 38)
-    return pieces + _grip(
-        r - 0.6 * wall, h * draw(0.48, 0.55), h * draw(0.8, 0.9), reach, draw(3, 5), draw(4, 9)
-    )
+    low = h * draw(0.48, 0.55)
+    high = h * draw(0.8, 0.9)
+    return pieces + _grip(r - 0.6 * wall, low, high, reach, draw(3, 5), draw(4, 9))
 
 
 @family(VESSELS, r=(24, 45), bowl=(45, 100), stem=(30, 95), wall=(1.5, 3))
@@ -202,24 +193,17 @@ def goblet(draw: Draw, r: float, bowl: float, stem: float, wall: float) -> Thing
     foot = draw(0.75, 1.0) * r
     thin = draw(3.5, 7)
     up = vessel([(0.45 * r, 0), (r, 0.5 * bowl), (draw(0.75, 1.1) * r, bowl)], wall, 5)
-    return stack([(foot, 0), (foot, 3), (thin, 9), (thin, stem - 6), (0.45 * r, stem)]) + move(
-        up, z=stem
-    )
+    leg = stack([(foot, 0), (foot, 3), (thin, 9), (thin, stem - 6), (0.45 * r, stem)])
+    return leg + move(up, z=stem)
 
 
 @family(VESSELS, r=(38, 110), h=(28, 85), wall=(2, 6))
 def bowl(draw: Draw, r: float, h: float, wall: float) -> Thing:
     """A bowl with a foot, upright or upside down, round or oval."""
     foot = draw(0.35, 0.65) * r
-    outline = [
-        (foot, 0),
-        (foot + 0.62 * (r - foot), 0.33 * h),
-        (foot + 0.9 * (r - foot), 0.67 * h),
-        (r, h),
-    ]
-    pieces = vessel(
-        outline, wall, min(1.5 * wall, 0.2 * h), draw(0.65, 1.0) if draw(0, 1) < 0.3 else 1.0
-    )
+    belly = [(foot + 0.62 * (r - foot), 0.33 * h), (foot + 0.9 * (r - foot), 0.67 * h)]
+    oval = draw(0.65, 1.0) if draw(0, 1) < 0.3 else 1.0
+    pieces = vessel([(foot, 0), *belly, (r, h)], wall, min(1.5 * wall, 0.2 * h), oval)
     return tip(draw, pieces, 0.2, 180)
 
 
@@ -227,32 +211,24 @@ def bowl(draw: Draw, r: float, h: float, wall: float) -> Thing:
 def dish(draw: Draw, r: float, h: float, wall: float) -> Thing:
     """A plate or a saucer."""
     foot = draw(0.55, 0.7) * r
-    return vessel(
-        [(foot, 0), (foot + 0.45 * (r - foot), 0.55 * h), (r, h)], wall, min(wall, 0.35 * h)
-    )
+    outline = [(foot, 0), (foot + 0.45 * (r - foot), 0.55 * h), (r, h)]
+    return vessel(outline, wall, min(wall, 0.35 * h))
 
 
 @family(VESSELS, r=(25, 60), h=(80, 240), wall=(2, 6), neck=(0.4, 0.8))
 def vase(draw: Draw, r: float, h: float, wall: float, neck: float) -> Thing:
     """A vase with a belly and a narrower neck."""
     foot = draw(0.5, 0.9) * r
-    outline = [
-        (foot, 0),
-        (r, draw(0.3, 0.5) * h),
-        (neck * r, 0.8 * h),
-        (draw(1.0, 1.4) * neck * r, h),
-    ]
-    return vessel(outline, wall, draw(4, 10))
+    outline = [(foot, 0), (r, draw(0.3, 0.5) * h), (neck * r, 0.8 * h)]
+    return vessel([*outline, (draw(1.0, 1.4) * neck * r, h)], wall, draw(4, 10))
 
 
 @family(VESSELS, r=(45, 88), h=(45, 120), wall=(2, 5), half=(16, 28))
 def pot(draw: Draw, r: float, h: float, wall: float, half: float) -> Thing:
     """A pot with two handles at its sides."""
     start = math.sqrt(r**2 - half**2) - 0.6 * wall
-    grip = move(
-        lie(_grip(start, -half, half, r - start + draw(14, 28), draw(3, 5), draw(3.5, 6))),
-        z=0.8 * h,
-    )
+    bow = _grip(start, -half, half, r - start + draw(14, 28), draw(3, 5), draw(3.5, 6))
+    grip = move(lie(bow), z=0.8 * h)
     sides = grip + turn(grip, "z", 180)
     return vessel([(0.92 * r, 0), (r, 0.15 * h), (r, h)], wall, draw(3, 7)) + sides
 
@@ -271,19 +247,12 @@ def pitcher(draw: Draw, r: float, h: float, wall: float) -> Thing:
     """A tall jug with a spout and a handle, hollow."""
     top = draw(0.7, 1.0) * r
     neck = draw(0.5, 0.65)
-    lip = lump(
-        np.array(
-            [(-top + wall, y, z) for y in (-14, 14) for z in (0.86 * h, h)] + [(-top - 16, 0, h)]
-        )
-    )
-    grip = _grip(
-        top - 0.6 * wall, (neck + 0.05) * h, 0.92 * h, draw(25, 40), draw(3.5, 6), draw(5, 9)
-    )
-    return (
-        vessel([(0.85 * r, 0), (r, 0.3 * h), (top, neck * h), (top, h)], wall, draw(4, 8))
-        + lip
-        + grip
-    )
+    rim = [(-top + wall, y, z) for y in (-14, 14) for z in (0.86 * h, h)]
+    lip = lump(np.array([*rim, (-top - 16, 0, h)]))
+    low = (neck + 0.05) * h
+    grip = _grip(top - 0.6 * wall, low, 0.92 * h, draw(25, 40), draw(3.5, 6), draw(5, 9))
+    outline = [(0.85 * r, 0), (r, 0.3 * h), (top, neck * h), (top, h)]
+    return vessel(outline, wall, draw(4, 8)) + lip + grip
 
 
 @family(VESSELS, r=(28, 75), h=(40, 110), wall=(2, 5), rise=(0.7, 1.3))
@@ -299,22 +268,13 @@ def teapot(draw: Draw, r: float, squat: float) -> Thing:
     h = squat * r
     body = move(stack(_round(r, h)), z=0.92 * h)
     knob = rod((0, 0, 1.8 * h), (0, 0, 1.9 * h + 6), 4) + pebble(9, 9, 7, (0, 0, 1.9 * h + 10))
-    spout = rod(
-        (-0.75 * r, 0, 0.8 * h), (-1.45 * r, 0, draw(1.3, 1.8) * h), draw(8, 12), draw(5, 7)
-    )
+    end = (-1.45 * r, 0, draw(1.3, 1.8) * h)
+    spout = rod((-0.75 * r, 0, 0.8 * h), end, draw(8, 12), draw(5, 7))
     if draw(0, 1) < 0.5:
-        return (
-            body
-            + knob
-            + spout
-            + path(arc((0.72 * r, 1.35 * h), -8, 188, 13, (0, 0, 1.6 * h)), 4, draw(4, 9))
-        )
-    return (
-        body
-        + knob
-        + spout
-        + _grip(0.85 * r, 0.55 * h, 1.3 * h, draw(25, 40), draw(4, 5.5), draw(5, 8))
-    )
+        grip = path(arc((0.72 * r, 1.35 * h), -8, 188, 13, (0, 0, 1.6 * h)), 4, draw(4, 9))
+    else:
+        grip = _grip(0.85 * r, 0.55 * h, 1.3 * h, draw(25, 40), draw(4, 5.5), draw(5, 8))
+    return body + knob + spout + grip
 
 
 @family(VESSELS, r=(25, 65), h=(30, 70), neck=(6, 12), tip=(25, 60), wall=(1.5, 3.5))
@@ -343,16 +303,10 @@ def tray(draw: Draw, x: float, y: float, h: float, wall: float) -> Thing:
 @family(VESSELS, r=(20, 40), h=(15, 38), wall=(1.5, 3.5), length=(60, 160))
 def ladle(draw: Draw, r: float, h: float, wall: float, length: float) -> Thing:
     """A ladle or a measuring cup: a small bowl with a long handle."""
-    line = np.array(
-        [
-            (0.976 * r - 0.6 * wall, 0, 0.85 * h),
-            (r + 12, 0, 0.95 * h),
-            (r + length, 0, h * draw(0.9, 2.0)),
-        ]
-    )
-    return vessel([(0.6 * r, 0), (0.92 * r, 0.5 * h), (r, h)], wall, 3) + path(
-        line, draw(2.5, 4), draw(4, 8)
-    )
+    end = (r + length, 0, h * draw(0.9, 2.0))
+    line = np.array([(0.976 * r - 0.6 * wall, 0, 0.85 * h), (r + 12, 0, 0.95 * h), end])
+    cup = vessel([(0.6 * r, 0), (0.92 * r, 0.5 * h), (r, h)], wall, 3)
+    return cup + path(line, draw(2.5, 4), draw(4, 8))
 
 
 def _bottle(draw: Draw, oval: float) -> Thing:
