@@ -1,6 +1,7 @@
 """Reading of a depth camera's pose, and checks that the pose is rigid and fits the camera's view."""
 
 import contextlib
+import dataclasses
 import math
 from pathlib import Path
 
@@ -14,27 +15,103 @@ from torchgrasp.files import explain
 from torchgrasp.files.columns import read_lines
 from torchgrasp.foundation.checks import check_tensor
 from torchgrasp.foundation.errors import BadArgument, NoSupport
+from torchgrasp.foundation.limits import SHOWN_LETTERS
 from torchgrasp.foundation.rules import RIGID, is_rigid
 from torchgrasp.geometry.linalg import Points, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.support_planes import SupportPlane, find_table
 
 UNIT = "depth in metres: depth_unit (--depth-unit) says how many metres a count is"
+FIXES = {
+    (3, 4): "add the row 0 0 0 1",
+    (4 * 4,): "reshape it to 4 x 4",
+    (7,): "make a matrix of the quaternion",
+}
+"""What makes a pose of other shapes."""
+FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0])).double()
+OPTICAL = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]).double()
+"""From the axes of OpenGL's camera to ours, and from ours to those of ROS's camera_link."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PoseNumbers:
+    """By what a view contradicts the pose of its camera, or the unit of its depths."""
+
+    scaled: float = 1e-4
+    """Greatest difference from orthogonal axes, and of their lengths, of a scaled rotation."""
+    farthest: float = 100.0
+    """A camera farther from the origin [m] has a pose that is not in metres."""
+    farthest_table: float = 10.0
+    """The same of a table, along its normal [m]."""
+    millimetres: float = 200.0
+    """A position above this, not in metres, is in mm; else in cm."""
+    shallow: float = 0.15
+    deep: float = 4.0
+    """Least and greatest median depth [m] of a view in which a table should have been found."""
+    turn: float = 0.985
+    """A rotation is nearly none if the diagonal of its matrix is above this: about 10 degrees."""
+    shift: float = 0.1
+    """A shift below this [m] is nearly none: the colour camera stands beside the depth camera."""
+    high: float = 4.0
+    """Greatest height [m] of a camera above the table if the unit of the depth is assumed."""
+    highest: float = 10.0
+    """The same if the unit is given."""
+    tilt: float = 3.0
+    """Greatest tilt of a table [deg] that needs no explanation."""
+    level: float = 5.0
+    """A table this near to level [deg], or at a third of its tilt, explains another pose."""
+    sloped: float = 15.0
+    """A table tilted by less than this [deg], or as far from upside down, may be a slope."""
+    drawn: int = 20_000
+    """About as many points tell whether a given table was seen."""
+    on_table: float = 0.03
+    """Such points are within this distance of it [m]."""
+    seen: float = 0.001
+    """Least share of the points on a table that was seen."""
+    lowest: float = 0.01
+    """Share of the points that may be lower than all of the objects."""
+    above: float = 0.5
+    """A table is farther than this [m] below all points only by a wrong pose."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SizeNumbers:
+    """What heights of a camera [m] and sizes of objects [m] contradict the unit of the depths."""
+
+    points: int = 100
+    """Fewest points of an object whose size counts."""
+    smaller: int = 5
+    """One object in so many may be smaller than the size that is judged."""
+    low_table: float = -0.5
+    """A table below this [m] may be one that a wrong unit moved down."""
+    near: float = 0.05
+    """Greatest difference [m] of a camera's height from that of a known wrong unit."""
+    units: tuple[float, ...] = (0.25, 0.1)
+    """Millimetres of a count that are often taken for one."""
+    high: float = 1.0
+    """A camera above this is high: it is noted, and objects of 12 cm may be a fourth as large."""
+    large_scaled: float = 0.12
+    """Objects larger than this are too large if the table's height is that of a wrong unit, too."""
+    higher: float = 1.5
+    large: float = 0.2
+    """Objects larger than this are too large under a camera that is higher than this."""
+    huge: float = 0.5
+    """Objects larger than this are too large under any high camera."""
+    low: float = 0.12
+    small: float = 0.03
+    """Objects that are all smaller than this are too small under a camera lower than this."""
+
+
+POSE = PoseNumbers()
+SIZES = SizeNumbers()
 
 
 def check_rigid(name: str, pose: Tensor) -> Float[Tensor, "4 4"]:
     """Return the given pose if it is rigid to 1e-4; else raise `BadArgument`, which names the
     fault.
     """
-    fixes = {
-        (3, 4): "add the row 0 0 0 1",
-        (16,): "reshape it to 4 x 4",
-        (7,): "make a matrix of the quaternion",
-    }
-    if tuple(pose.shape) in fixes:
-        raise BadArgument(
-            name, f"shape {tuple(pose.shape)}", f"a 4 x 4 matrix: {fixes[tuple(pose.shape)]}"
-        )
+    if fix := FIXES.get(tuple(pose.shape)):
+        raise BadArgument(name, f"shape {tuple(pose.shape)}", f"a 4 x 4 matrix: {fix}")
     check_tensor(name, pose, (4, 4))
     if not bool(is_rigid(pose)):
         raise BadArgument(name, f"{pose.tolist()}{_describe_fault(pose.double())}", RIGID)
@@ -45,17 +122,18 @@ def _describe_fault(pose: Float[Tensor, "4 4"]) -> str:
     """Return, as the end of a sentence, why a matrix is no rigid transform, and the fix."""
     if bool(pose[3, :3].any()) and not bool(pose[:3, 3].any()):
         return ", a transposed pose: give its transpose"
-    length = torch.linalg.vector_norm(pose[:3, :3], dim=0)
-    side = torch.linalg.det(pose[:3, :3])
+    turn = pose[:3, :3]
+    length = torch.linalg.vector_norm(turn, dim=0)
     if not bool((length > 0).all()) or pose[3].tolist() != [0, 0, 0, 1]:
         return ""
-    axes = pose[:3, :3] / length
-    error = float((axes.T @ axes - torch.eye(3).to(axes)).abs().max())
-    if float(side) < 0:
+    if float(torch.linalg.det(turn)) < 0:
         return ", a mirrored rotation: its axes are left-handed"
-    if error < 1e-4 and float(length.max() / length.min()) < 1.0001:
+    axes = turn / length
+    error = float((axes.T @ axes - torch.eye(3).to(axes)).abs().max())
+    if error < POSE.scaled and float(length.max() / length.min()) < 1 + POSE.scaled:
         return f", a rotation times {float(length[0]):.4g}: divide it by its scale"
-    return f", axes of length {length.tolist()} that are {error:.2g} from orthogonal: take U @ Vh of its SVD"
+    found = f", axes of length {length.tolist()} that are {error:.2g} from orthogonal"
+    return f"{found}: take U @ Vh of its SVD"
 
 
 def read_camera_pose(pose: Tensor | np.ndarray) -> Float[Tensor, "4 4"]:
@@ -63,19 +141,24 @@ def read_camera_pose(pose: Tensor | np.ndarray) -> Float[Tensor, "4 4"]:
     try:
         read = torch.as_tensor(pose).double()
     except (TypeError, ValueError) as error:
-        raise BadArgument("camera_pose", repr(pose)[:80], "a 4 x 4 matrix of numbers") from error
+        found = repr(pose)[:SHOWN_LETTERS]
+        raise BadArgument("camera_pose", found, "a 4 x 4 matrix of numbers") from error
     read = check_rigid("camera_pose", read)
-    check_distance(read, float(torch.linalg.vector_norm(read[:3, 3])), 100.0, "the camera")
+    distance = float(torch.linalg.vector_norm(read[:3, 3]))
+    _check_distance(read, distance, POSE.farthest, "the camera")
     return read
 
 
-def check_distance(pose: Float[Tensor, "4 4"], distance: float, most: float, what: str) -> None:
+def _check_distance(pose: Float[Tensor, "4 4"], distance: float, most: float, what: str) -> None:
     """Refuse a pose as not in metres if `what`, such as the camera, is over `most` [m] from the
     frame's origin.
     """
     if abs(distance) > most:
-        factor = 1000 if float(pose[:3, 3].abs().max()) > 200 else 100
-        allowed = f"a pose in metres; in {'mm' if factor == 1000 else 'cm'}, divide camera_pose[:3, 3] by {factor}"
+        large = float(pose[:3, 3].abs().max()) > POSE.millimetres
+        fix = "in mm, divide camera_pose[:3, 3] by 1000"
+        if not large:
+            fix = "in cm, divide camera_pose[:3, 3] by 100"
+        allowed = f"a pose in metres; {fix}"
         raise BadArgument("camera_pose", f"{what} {distance:.4g} m from the origin", allowed)
 
 
@@ -86,9 +169,8 @@ def read_pose(name: str, path: Path | str) -> Float[Tensor, "4 4"]:
         table = parse_npy(data) if suffix == ".npy" else read_lines(data)
         pose = torch.from_numpy(np.array(table, dtype=np.float64))
     except Exception as error:
-        raise BadArgument(
-            name, f"{path}: {explain(error)}", f"a well-formed {suffix} file of 4 x 4 numbers"
-        ) from error
+        allowed = f"a well-formed {suffix} file of 4 x 4 numbers"
+        raise BadArgument(name, f"{path}: {explain(error)}", allowed) from error
     return check_rigid(name, pose)
 
 
@@ -106,12 +188,14 @@ def find_plausible(
     try:
         supports = find_table(points, eye, table, up)
     except NoSupport:
+        if table is not None:
+            raise
         middle = float(((points - eye) @ pose[:3, 2]).median())
-        if table is None and not 0.15 < middle < 4.0:
-            raise BadArgument(
-                "depth", f"a median depth of {middle:.3g} m, and no table", UNIT
-            ) from None
-        if up is not None and table is None and not _is_own(pose):
+        if not POSE.shallow < middle < POSE.deep:
+            found = f"a median depth of {middle:.3g} m, and no table"
+            raise BadArgument("depth", found, UNIT) from None
+        # A wrong pose may have turned the table away from `up`.
+        if up is not None and not _is_own(pose):
             with contextlib.suppress(NoSupport):
                 _check_normals(find_table(points, eye, None, None), pose, up)
         raise
@@ -134,10 +218,8 @@ def _is_own(pose: Float[Tensor, "4 4"]) -> bool:
     """Return whether a pose is nearly the identity, so that the frame is the camera's, where z need
     not be up.
     """
-    return (
-        float(torch.diagonal(pose[:3, :3]).min()) > 0.985
-        and float(torch.linalg.vector_norm(pose[:3, 3])) < 0.1
-    )
+    turn = float(torch.diagonal(pose[:3, :3]).min())
+    return turn > POSE.turn and float(torch.linalg.vector_norm(pose[:3, 3])) < POSE.shift
 
 
 def _check_supports(
@@ -149,9 +231,9 @@ def _check_supports(
     plane = supports[0].plane
     if not _is_own(pose):
         _check_normals(supports, pose, up)
-        check_distance(pose, plane.offset, 10.0, "a table")
+        _check_distance(pose, plane.offset, POSE.farthest_table, "a table")
     height = float(plane.height(pose[:3, 3]))
-    if height > (10.0 if known_unit else 4.0):
+    if height > (POSE.highest if known_unit else POSE.high):
         raise BadArgument("depth", f"a camera {height:.3g} m above the table", UNIT)
 
 
@@ -161,59 +243,56 @@ def _check_normals(
     """Refuse a pose with the table upside down, or tilted where another pose convention would make
     it level.
     """
-    sky = (
-        torch.tensor([0.0, 0.0, 1.0]).double()
-        if up is None
-        else unit(torch.as_tensor(up).double().cpu())
-    )
+    sky = torch.tensor([0.0, 0.0, 1.0]).double()
+    if up is not None:
+        sky = unit(torch.as_tensor(up).double().cpu())
     normals = torch.stack([support.plane.normal.double() for support in supports])
     tilt = math.degrees(math.acos(min(1.0, max(-1.0, float((normals @ sky).max())))))
-    if tilt < 3.0:
+    if tilt < POSE.tilt:
         return
+
+    # The table's normal, as the camera saw it, is turned by each pose that may have been meant.
     turn = pose[:3, :3]
-    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0]).double())
-    optical = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]).double()
-    mirror, upset = (
-        torch.diag(torch.tensor(signs).double()) for signs in ([-1.0, 1.0, 1.0], [1.0, -1.0, 1.0])
-    )
+    seen = turn.T @ normals[0]
+    mirror = torch.diag(torch.tensor([-1.0, 1.0, 1.0]).double())
+    upset = torch.diag(torch.tensor([1.0, -1.0, 1.0]).double())
     meant = {
-        "camera_pose @ diag(1, -1, -1, 1), if it is OpenGL's (y up, z backward)": turn @ flip,
+        "camera_pose @ diag(1, -1, -1, 1), if it is OpenGL's (y up, z backward)": turn @ FLIP,
         "the inverse of camera_pose, if it is camera_from_world": turn.T,
-        "inv(camera_pose) @ diag(1, -1, -1, 1), if it is OpenGL's view matrix": turn.T @ flip,
-        "the pose of the optical frame, if it is of ROS's camera_link (x forward, z up)": turn
-        @ optical,
+        "inv(camera_pose) @ diag(1, -1, -1, 1), if it is OpenGL's view matrix": turn.T @ FLIP,
+        "the pose of the optical frame, if it is of ROS's camera_link (x forward, z up)": (
+            turn @ OPTICAL
+        ),
         "depth[::-1], if the image is upside down": turn @ upset,
         "depth[:, ::-1], if the image is mirrored": turn @ mirror,
     }
-    seen = turn.T @ normals[0]
-    level = math.cos(math.radians(min(5.0, tilt / 3)))
+    level = math.cos(math.radians(min(POSE.level, tilt / 3)))
     fixes = [fix for fix, world in meant.items() if float(world @ seen @ sky) > level]
     cosine = float(normals[0] @ sky)
-    if not fixes and (tilt < 15.0 or cosine > -math.cos(math.radians(15.0))):
+    upright = cosine > -math.cos(math.radians(POSE.sloped))
+    if not fixes and (tilt < POSE.sloped or upright):
         return  # a frame that is tilted
+
     angle = math.degrees(math.acos(max(-1.0, cosine)))
-    other = "`up`, if z is not up" if up is None else "another `up`"
     normal = ", ".join(f"{x:.2f}" for x in normals[0].tolist())
+    found = f"a table whose normal ({normal}) is {angle:.0f} degrees from up"
+    other = "`up`, if z is not up" if up is None else "another `up`"
     allowed = f"a pose in which the table's normal points up: {' or '.join([*fixes[:3], other])}"
-    raise BadArgument(
-        "camera_pose", f"a table whose normal ({normal}) is {angle:.0f} degrees from up", allowed
-    )
+    raise BadArgument("camera_pose", found, allowed)
 
 
 def _check_given_table(points: Points, plane: Plane) -> None:
     """Refuse a given table that the camera did not see: it is above most points, or far below all
     points.
     """
-    height = plane.height(points[:: 1 + len(points) // 20_000].double())
-    low = float(torch.quantile(height, 0.01))
+    height = plane.height(points[:: 1 + len(points) // POSE.drawn].double())
+    low = float(torch.quantile(height, POSE.lowest))
     middle = float(height.median())
-    if float((height.abs() < 0.03).double().mean()) < 0.001 and (middle < 0 or low > 0.5):
+    on = float((height.abs() < POSE.on_table).double().mean())
+    if on < POSE.seen and (middle < 0 or low > POSE.above):
         found = f"one that no point is near: they are {middle:.3g} m above it, in the middle"
-        raise BadArgument(
-            "table",
-            found,
-            "the table in the frame of a camera_pose in metres, whose z looks forward",
-        )
+        allowed = "the table in the frame of a camera_pose in metres, whose z looks forward"
+        raise BadArgument("table", found, allowed)
 
 
 def check_sizes(
@@ -223,24 +302,29 @@ def check_sizes(
     camera is high.
     """
     parts = [points[labels == k] for k in labels.unique().tolist() if k > 0]
-    sizes = sorted(float((part.amax(0) - part.amin(0)).max()) for part in parts if len(part) >= 100)
+    large_enough = [part for part in parts if len(part) >= SIZES.points]
+    sizes = sorted(float((part.amax(0) - part.amin(0)).max()) for part in large_enough)
     height = float(plane.height(pose[:3, 3]))
-    above_origin = float(plane.normal @ pose[:3, 3])
-    # Counts of 0.25 mm read as millimetres put the camera four times too high above a table near z
-    # = 0.
-    scaled = plane.offset < -0.5 and any(
-        abs(above_origin - factor * height) < 0.05 for factor in (0.25, 0.1)
-    )
+    high = height > SIZES.high
     found = f"a camera {height:.3g} m above the table"
     if sizes:
-        most = sizes[len(sizes) // 5]  # nearly all objects are larger
-        large = (most > 0.2 and height > 1.5) or (
-            scaled and not _is_own(pose) and most > 0.12 and height > 1.0
-        )
-        if large or (most > 0.5 and height > 1.0) or (sizes[-1] < 0.03 and height < 0.12):
-            raise BadArgument(
-                "depth", f"{found} and objects of {sizes[0]:.2g} to {sizes[-1]:.2g} m", UNIT
-            )
-    return (
-        f"{found}: if it was not so high, depth_unit (--depth-unit) says the metres of a count",
-    ) * (height > 1.0)
+        most = sizes[len(sizes) // SIZES.smaller]  # nearly all objects are larger
+        large = most > SIZES.large and height > SIZES.higher
+        large |= most > SIZES.huge and high
+        large |= most > SIZES.large_scaled and high and _is_scaled(pose, plane, height)
+        small = sizes[-1] < SIZES.small and height < SIZES.low
+        if large or small:
+            found = f"{found} and objects of {sizes[0]:.2g} to {sizes[-1]:.2g} m"
+            raise BadArgument("depth", found, UNIT)
+    note = f"{found}: if it was not so high, depth_unit (--depth-unit) says the metres of a count"
+    return (note,) * high
+
+
+def _is_scaled(pose: Float[Tensor, "4 4"], plane: Plane, height: float) -> bool:
+    """Return whether a wrong unit explains the table's place: counts of 0.25 mm read as millimetres
+    put a camera four times too high above a table near z = 0.
+    """
+    if plane.offset >= SIZES.low_table or _is_own(pose):
+        return False
+    above_origin = float(plane.normal @ pose[:3, 3])
+    return any(abs(above_origin - unit * height) < SIZES.near for unit in SIZES.units)
