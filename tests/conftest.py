@@ -1,5 +1,6 @@
 """Generators, analytic shapes and small hands that several tests share."""
 
+import gc
 import math
 import os
 import re
@@ -30,7 +31,7 @@ collect_ignore = [
 
 SLOW = [HealthCheck.too_slow, HealthCheck.function_scoped_fixture]
 settings.register_profile(
-    "short", max_examples=100, derandomize=True, deadline=None, suppress_health_check=SLOW
+    "short", max_examples=40, derandomize=True, deadline=None, suppress_health_check=SLOW
 )
 settings.register_profile(
     "long", max_examples=100_000, deadline=None, database=None, suppress_health_check=SLOW
@@ -50,6 +51,17 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if isinstance(item, pytest.DoctestItem) and item.dtest is not None:
             if any(SIMULATED.search(example.source) for example in item.dtest.examples):
                 item.add_marker(pytest.mark.sim)
+
+
+GARBAGE = (50_000, 10, 10)
+"""Thresholds of the collector of garbage: a plan makes many objects and hardly a cycle."""
+
+
+def pytest_collection_finish() -> None:
+    """Take what lives until the end, libraries and tests, out of what the collector looks at."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(*GARBAGE)
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

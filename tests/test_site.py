@@ -15,18 +15,23 @@ APART = {"report": "app.report"}
 """Pages named otherwise than their packages."""
 
 
-@pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The site, built by `scripts/docs`: a dead link is an error."""
-    folder = tmp_path_factory.mktemp("site")
-    words = [str(ROOT / "scripts" / "docs"), "--quiet", "--site-dir", str(folder)]
+@pytest.mark.slow
+def test_the_site_is_built_whole_and_fetches_nothing_from_elsewhere(tmp_path: Path):
+    """One test, since the site takes long to build: `scripts/docs` refuses a dead link itself."""
+    words = [str(ROOT / "scripts" / "docs"), "--quiet", "--site-dir", str(tmp_path)]
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
-    return folder
+    check_entries(sorted((tmp_path / "api").glob("*.html")))
+    # Examples of docstrings are code and no quotes.
+    text = (tmp_path / "api" / "torchgrasp.html").read_text()
+    assert "&gt;&gt;&gt;" in text and "<blockquote>" not in text
+    elsewhere = re.compile(r'<(script|img|link rel="stylesheet")[^>]*(src|href)="https?://')
+    for page in tmp_path.rglob("*.html"):
+        assert not elsewhere.search(page.read_text()), page
 
 
-def test_every_public_name_has_its_entry(site: Path):
-    pages = sorted((site / "api").glob("*.html"))
+def check_entries(pages: list[Path]) -> None:
+    """Every public name of a listed package has its entry."""
     entries = {
         last
         for page in pages
@@ -43,15 +48,3 @@ def test_every_public_name_has_its_entry(site: Path):
             name for name in package.__all__ if getattr(getattr(package, name), "__doc__", None)
         }
         assert named <= entries, (page.stem, named - entries)
-
-
-def test_examples_of_docstrings_are_code_and_no_quotes(site: Path):
-    text = (site / "api" / "torchgrasp.html").read_text()
-    assert "&gt;&gt;&gt;" in text and "<blockquote>" not in text
-
-
-def test_nothing_is_fetched_from_elsewhere(site: Path):
-    for page in site.rglob("*.html"):
-        assert not re.search(
-            r'<(script|img|link rel="stylesheet")[^>]*(src|href)="https?://', page.read_text()
-        ), page
