@@ -291,16 +291,18 @@ def write_page(done: dict[str, str]) -> None:
         (*re.fullmatch(r"torchgrasp\.(\S+):(\d+) (.+) \[\d+\]", key).groups(), done[key])
         for key in done
     ]  # pyright: ignore
-    silent = [
-        (module, int(line), name) for module, line, name, effect in found if effect == "no effect"
-    ]
-    every = Counter(x[0].split(".")[0] for x in found)
-    without = Counter(x[0].split(".")[0] for x in silent)
+    every = Counter(module.split(".")[0] for module, *_ in found)
+    silent = Counter(
+        (module.split(".")[0], reason_of(module, int(line)))
+        for module, line, _, effect in found
+        if effect == "no effect"
+    )
+    without = Counter(folder for folder, _ in silent.elements())
     lines = ["# Numbers", "", "`scripts/sensitivity.py`", "", describe_run(1), "", SENSITIVITY, ""]
     lines += ["| folder | numbers | without effect |", "| --- | --- | --- |"]
     lines += [f"| {folder} | {n} | {without[folder]} |" for folder, n in sorted(every.items())]
-    lines += ["", "| number without effect | its reason |", "| --- | --- |"]
-    lines += [f"| `{module}.{name}` | {reason_of(module, line)} |" for module, line, name in silent]
+    lines += ["", "| folder | numbers without effect | how many |", "| --- | --- | --- |"]
+    lines += [f"| {folder} | {reason} | {n} |" for (folder, reason), n in silent.items()]
     (ROOT / "docs" / "results" / "sensitivity.md").write_text("\n".join(lines) + "\n")
 
 
