@@ -12,8 +12,9 @@ from torchgrasp.scene.creases import cut_creases
 from torchgrasp.scene.image import DepthImage
 from torchgrasp.scene.merge import find_touching, merge_pieces
 from torchgrasp.scene.segment import rests_on, segment
+from torchgrasp.scene.table_image import TableImage
 
-TABLE = Plane.horizontal(0.0)
+TABLE = SupportPlane(Plane.horizontal(0.0))
 
 
 def cup():
@@ -49,7 +50,7 @@ def look(meshes, elevation=40.0, noise=True):
 )
 def test_each_thing_has_one_label(meshes, elevation):
     image, labels = look(meshes, elevation)
-    found = segment(image, SupportPlane(TABLE))
+    found = segment(TableImage.of(image, TABLE))
     assert found.max() == len(meshes)
     for k in range(1, len(meshes) + 1):
         mine = (labels == k) & (image.depth > 0)
@@ -60,14 +61,14 @@ def test_each_thing_has_one_label(meshes, elevation):
 
 def test_an_empty_table_has_no_things():
     image, _ = look([box([0.01, 0.01, 0.01], [0.0, 0.0, -0.1])])
-    assert not segment(image, SupportPlane(TABLE)).any()
+    assert not segment(TableImage.of(image, TABLE)).any()
 
 
 def test_flying_pixels_belong_to_nothing():
     image, labels = look([box([0.06, 0.06, 0.1], [0, 0, 0.05])], noise=False)
     row = torch.nonzero(labels == 1)[:, 0].min()
     column = 320
-    exact = rests_on(image, TABLE)
+    exact = rests_on(TableImage.of(image, TABLE))
     assert (exact & (labels == 1)).sum() > 0.96 * (labels == 1).sum()
     flying = image.depth.clone()
     away = 0.015 + 0.06 * torch.rand(
@@ -75,8 +76,8 @@ def test_flying_pixels_belong_to_nothing():
     )
     flying[row - 2 : row, column - 20 : column + 20] = image.depth[row + 3, column] + away
     moved = DepthImage(flying, image.intrinsics, image.obj_from_camera)
-    assert not rests_on(moved, TABLE)[row - 2 : row, column - 20 : column + 20].any()
-    assert segment(moved, SupportPlane(TABLE)).max() == 1
+    assert not rests_on(TableImage.of(moved, TABLE))[row - 2 : row, column - 20 : column + 20].any()
+    assert segment(TableImage.of(moved, TABLE)).max() == 1
 
 
 def test_the_floor_of_a_pan_belongs_to_it_and_the_table_in_a_ring_does_not():
@@ -85,9 +86,11 @@ def test_the_floor_of_a_pan_belongs_to_it_and_the_table_in_a_ring_does_not():
     pan, labels = look([trimesh.util.concatenate([rim, floor])], 60.0)
     ring, _ = look([rim], 60.0)
     inside = (pan.points()[..., :2].norm(dim=-1) < 0.07) & (labels == 1)
-    assert (segment(pan, SupportPlane(TABLE))[inside & (pan.depth > 0)] == 1).double().mean() > 0.95
     assert (
-        segment(ring, SupportPlane(TABLE))[inside & (ring.depth > 0)] == 0
+        segment(TableImage.of(pan, TABLE))[inside & (pan.depth > 0)] == 1
+    ).double().mean() > 0.95
+    assert (
+        segment(TableImage.of(ring, TABLE))[inside & (ring.depth > 0)] == 0
     ).double().mean() > 0.95
 
 
@@ -106,7 +109,7 @@ def test_a_mug_with_its_handle_and_a_standing_ring_are_one(elevation, turn):
     mug.apply_transform(trimesh.transformations.rotation_matrix(turn, [0, 0, 1]))
     for meshes in ([mug], [torus(0.05, 0.01, [0, 0, 0.06], turn)]):
         image, _ = look(meshes, elevation)
-        assert segment(image, SupportPlane(TABLE)).max() == 1
+        assert segment(TableImage.of(image, TABLE)).max() == 1
 
 
 @pytest.mark.parametrize(
@@ -122,21 +125,21 @@ def test_a_mug_with_its_handle_and_a_standing_ring_are_one(elevation, turn):
 )
 def test_objects_that_touch_are_cut_at_the_crease_and_told(meshes):
     image, labels = look(meshes, 45.0)
-    found = segment(image, SupportPlane(TABLE))
+    found = segment(TableImage.of(image, TABLE))
     assert found.max() == 2
     for k in (1, 2):
         mine = found[(labels == k) & (found > 0)]
         assert (mine == mine.mode().values).double().mean() > 0.95
-    assert find_touching(image, found) == [(1, 2)]
+    assert find_touching(image, image.points(), found) == [(1, 2)]
 
 
 def test_objects_apart_do_not_touch_and_a_convex_surface_has_no_crease():
     image, _ = look(
         [box([0.05, 0.05, 0.06], [0, -0.05, 0.03]), box([0.05, 0.05, 0.06], [0, 0.05, 0.03])], 45.0
     )
-    found = segment(image, SupportPlane(TABLE))
-    assert found.max() == 2 and find_touching(image, found) == []
-    assert torch.equal(cut_creases(image, found), found)
+    found = segment(TableImage.of(image, TABLE))
+    assert found.max() == 2 and find_touching(image, image.points(), found) == []
+    assert torch.equal(cut_creases(image, image.points(), found), found)
 
 
 def test_an_uneven_place_of_the_table_is_no_object():
@@ -144,17 +147,18 @@ def test_an_uneven_place_of_the_table_is_no_object():
     place = image.points()[..., :2]
     rise = 0.0038 * torch.exp(-((place - torch.tensor([0.0, -0.05])) / 0.02).square().sum(-1))
     depth = torch.where(image.depth > 0, image.depth - rise / math.sin(math.radians(45.0)), 0.0)
-    found = segment(DepthImage(depth, image.intrinsics, image.obj_from_camera), SupportPlane(TABLE))
+    found = segment(
+        TableImage.of(DepthImage(depth, image.intrinsics, image.obj_from_camera), TABLE)
+    )
     assert found.max() == 1
 
 
 def test_a_box_upon_a_box_is_an_object_and_a_knob_upon_a_box_is_a_part():
     base = box([0.16, 0.16, 0.05], [0, 0, 0.025])
-    jump = torch.full((480, 640), 0.008, dtype=torch.float64)
     for top, count in (
         (box([0.07, 0.09, 0.06], [0, 0, 0.08]), 2),
         (box([0.02, 0.02, 0.02], [0, 0, 0.06]), 1),
     ):
         image, labels = look([base, top], 45.0)
         pieces = torch.where(image.depth > 0, labels, 0)
-        assert len(merge_pieces(image, pieces, TABLE, jump)[1:].unique()) == count
+        assert len(merge_pieces(TableImage.of(image, TABLE), pieces)[1:].unique()) == count

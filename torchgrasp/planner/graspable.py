@@ -16,7 +16,7 @@ from torchgrasp.geometry.plane import to_upright, upright_frame
 from torchgrasp.geometry.support_planes import find_table
 from torchgrasp.hand.hand import Hand
 from torchgrasp.scene.scene import Scene
-from torchgrasp.scene.segment import OVERHANG
+from torchgrasp.scene.segment import SEGMENT
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.success.order import largest_known
@@ -44,7 +44,7 @@ def judge_things(scene: Scene, hand: Hand, spec: ContactSpec | None = None) -> d
     }
     if scene.table is not None:
         support = find_table(scene.points, scene.viewpoint, scene.table, None)[0]
-        over = support.covers(scene.points[scene.labels > 0].cpu().double(), OVERHANG)
+        over = support.covers(scene.points[scene.labels > 0].cpu().double(), SEGMENT.overhang)
         off = {
             label: Status.OFF_TABLE
             for label in found

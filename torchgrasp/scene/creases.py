@@ -2,45 +2,77 @@
 concave angle.
 """
 
+import dataclasses
+
 import numpy as np
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.foundation.lazy import ndimage, spatial
 from torchgrasp.geometry.linalg import number_components
-from torchgrasp.scene.image import DepthImage
-
-REACH = 0.012  # distance [m] on either side of a crease over which its angle is measured
+from torchgrasp.scene.image import DepthImage, scale_pixels
 
 
-def cut_creases(image: DepthImage, pieces: Int[Tensor, "h w"]) -> Int[Tensor, "h w"]:
+@dataclasses.dataclass(frozen=True)
+class CreaseNumbers:
+    """Numbers of the search for creases."""
+
+    reach: float = 0.012
+    """Distance [m] on either side of a crease over which its angle is measured."""
+    part: int = 300
+    """Pixels of the smallest part, in an image of 640 x 480."""
+    bend: float = 0.35
+    """Least sine of the angle by which each side of a crease rises above the chord across it."""
+    chord: float = 0.048
+    """Longest chord across a crease [m]: a longer one spans a jump of depth."""
+    border: int = 5
+    """Parts that share fewer pixels of border stay apart."""
+    near: float = 0.004
+    """Points nearer to the border than this [m] are on the crease, and rounded."""
+    far: float = 0.025
+    """Points farther from the border than this [m] do not count for its angle."""
+    points: int = 20
+    """Fewest points of a side whose normal is known."""
+    concave: float = 0.5
+    """Least sine of the angle by which each fitted side rises above the chord."""
+    least_share: float = 1e-9
+    """A share of averaged pixels that is not 0, for the division."""
+    least_length: float = 1e-12
+    """A length that is not 0, for the division [m]."""
+
+
+CREASE = CreaseNumbers()
+# ways across a crease (row, column), in the length of a step
+WAYS = ((1.0, 0.0), (0.0, 1.0), (0.7, 0.7), (0.7, -0.7))
+
+
+def cut_creases(
+    image: DepthImage, points: Float[Tensor, "h w 3"], pieces: Int[Tensor, "h w"]
+) -> Int[Tensor, "h w"]:
     """Cut each piece along its concave creases, and return an image of each pixel's part number, 0
     for none.
     """
-    least = 300 * pieces.numel() / (640 * 480)  # pixels of the smallest part
-    points = (
-        image.points() - image.obj_from_camera[:3, 3]
-    ).numpy()  # from the camera, so that normals can face it
+    least = scale_pixels(CREASE.part, pieces)
+    # from the camera, so that normals can face it
+    seen = (points - image.obj_from_camera[:3, 3]).numpy()
     parts = pieces.clone()
     last = int(pieces.max())
+    # only pieces of two parts or more are searched, and numbered 1, 2, ...
     names, count = pieces[pieces > 0].unique(return_counts=True)
+    large = names[count >= 2 * least]
     numbers = torch.zeros(last + 1, dtype=torch.int32)
-    numbers[names[count >= 2 * least]] = torch.arange(
-        1, 1 + int((count >= 2 * least).sum()), dtype=torch.int32
-    )
+    numbers[large] = torch.arange(1, 1 + len(large), dtype=torch.int32)
     found = numbers[pieces].numpy()
     boxes: list[tuple[slice, slice]] = ndimage.find_objects(found)
     for number, box in enumerate(boxes, start=1):
         mask = found[box] == number
-        scale = float(image.intrinsics[0, 0]) / float(
-            image.depth[box][torch.from_numpy(mask)].median()
-        )
-        own = _divide(points[box], mask, scale * REACH, least)
-        joined = [(a, b) for a, b in _borders(own) if not _is_concave(own, points[box], a, b)]
-        own = number_components(
-            np.array(joined, dtype=np.int64).reshape(-1, 2), int(own.max()) + 1
-        )[own]
+        pixels_a_metre = image.focal / float(image.depth[box][torch.from_numpy(mask)].median())
+        own = _divide(seen[box], mask, pixels_a_metre * CREASE.reach, least)
+        # parts that meet at no concave angle are one
+        joined = [(a, b) for a, b in _borders(own) if not _is_concave(own, seen[box], a, b)]
+        pairs = np.array(joined, dtype=np.int64).reshape(-1, 2)
+        own = number_components(pairs, int(own.max()) + 1)[own]
         new = torch.from_numpy(own.astype(np.int64))
         parts[box] = torch.where(new > 1, last + new - 1, parts[box])
         last += max(0, int(own.max()) - 1)
@@ -50,42 +82,51 @@ def cut_creases(image: DepthImage, pieces: Int[Tensor, "h w"]) -> Int[Tensor, "h
 def _divide(points: np.ndarray, mask: np.ndarray, reach: float, least: float) -> np.ndarray:
     """Return the part (1, 2, ...) of each pixel of a piece, 0 outside it; pixels on creases join
     the nearest part.
+
+    `reach` [px] is the distance over which an angle is measured, `least` the pixels of a part.
     """
     step = max(2, round(reach))
     inside = (slice(step, -step), slice(step, -step))
     mask = np.pad(mask, step)
     points = np.pad(points, ((step, step), (step, step), (0, 0)))
-    share = np.maximum(ndimage.uniform_filter(mask.astype(float), step | 1), 1e-9)
-    smooth = [
-        ndimage.uniform_filter(np.where(mask, points[..., k], 0.0), step | 1) / share
-        for k in range(3)
-    ]
-    smooth = np.stack(smooth, -1)
-    normal, known = _normals(smooth, mask, max(1, step // 2))
-    crease = np.zeros_like(mask)
-    for down, right in ((1.0, 0.0), (0.0, 1.0), (0.7, 0.7), (0.7, -0.7)):
-        shift = (round(step * down), round(step * right))
-        before = (-shift[0], -shift[1])
-        after = shift
-        chord = np.roll(smooth, before, (0, 1)) - np.roll(smooth, after, (0, 1))
-        length = np.linalg.norm(chord, axis=-1) + 1e-12
-        first = (np.roll(normal, after, (0, 1)) * chord).sum(-1) / length
-        second = -(np.roll(normal, before, (0, 1)) * chord).sum(-1) / length
-        ends = np.roll(known, after, (0, 1)) & np.roll(known, before, (0, 1))
-        crease |= ends & (np.minimum(first, second) > 0.35) & (length < 4 * REACH)
+    crease = _find_creases(points, mask, step)
     number = np.empty(mask.shape, dtype=np.int32)
-    ndimage.label(
-        ndimage.binary_erosion(mask & ~crease, iterations=max(1, step // 3)), output=number
-    )
+    thin = ndimage.binary_erosion(mask & ~crease, iterations=max(1, step // 3))
+    ndimage.label(thin, output=number)
     large = np.bincount(number.ravel()) >= least
     large[0] = False
-    names: np.ndarray = np.where(large, np.cumsum(large), 0)[number]
     if large.sum() < 2:
         return mask[inside].astype(np.int64)
+    names: np.ndarray = np.where(large, np.cumsum(large), 0)[number]
     nearest = np.asarray(
         ndimage.distance_transform_edt(names == 0, return_distances=False, return_indices=True)
     )
     return np.where(mask, names[tuple(nearest)], 0)[inside]
+
+
+def _find_creases(points: np.ndarray, mask: np.ndarray, step: int) -> np.ndarray:
+    """Return a mask of the pixels at which the surface bends towards the camera, seen over `step`
+    pixels to either side.
+    """
+    width = step | 1
+    share = np.maximum(ndimage.uniform_filter(mask.astype(float), width), CREASE.least_share)
+    axes = [
+        ndimage.uniform_filter(np.where(mask, points[..., k], 0.0), width) / share for k in range(3)
+    ]
+    smooth = np.stack(axes, -1)
+    normal, known = _normals(smooth, mask, max(1, step // 2))
+    crease = np.zeros_like(mask)
+    for down, right in WAYS:
+        after = (round(step * down), round(step * right))
+        before = (-after[0], -after[1])
+        chord = np.roll(smooth, before, (0, 1)) - np.roll(smooth, after, (0, 1))
+        length = np.linalg.norm(chord, axis=-1) + CREASE.least_length
+        first = (np.roll(normal, after, (0, 1)) * chord).sum(-1) / length
+        second = -(np.roll(normal, before, (0, 1)) * chord).sum(-1) / length
+        ends = np.roll(known, after, (0, 1)) & np.roll(known, before, (0, 1))
+        bent = np.minimum(first, second) > CREASE.bend
+        crease |= ends & bent & (length < CREASE.chord)
+    return crease
 
 
 def _normals(points: np.ndarray, mask: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray]:
@@ -98,18 +139,19 @@ def _normals(points: np.ndarray, mask: np.ndarray, step: int) -> tuple[np.ndarra
         sides.append(np.roll(points, -step, axis) - np.roll(points, step, axis))
         known &= np.roll(mask, -step, axis) & np.roll(mask, step, axis)
     normal = np.cross(*sides)
-    normal /= np.linalg.norm(normal, axis=-1, keepdims=True) + 1e-12
-    return np.where((normal * points).sum(-1, keepdims=True) > 0, -normal, normal), known
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True) + CREASE.least_length
+    away = (normal * points).sum(-1, keepdims=True) > 0
+    return np.where(away, -normal, normal), known
 
 
 def _borders(parts: np.ndarray) -> list[tuple[int, int]]:
-    """Return the pairs of part numbers whose parts share a border of at least 5 pixels."""
+    """Return the pairs of part numbers whose parts share a border of enough pixels."""
     found = []
     for one, other in ((parts[1:], parts[:-1]), (parts[:, 1:], parts[:, :-1])):
         differ = (one != other) & (one > 0) & (other > 0)
         found.append(np.sort(np.stack([one[differ], other[differ]], -1), -1))
     pairs, count = np.unique(np.concatenate(found), axis=0, return_counts=True)
-    return [(int(a), int(b)) for a, b in pairs[count >= 5]]
+    return [(int(a), int(b)) for a, b in pairs[count >= CREASE.border]]
 
 
 def _is_concave(parts: np.ndarray, points: np.ndarray, a: int, b: int) -> bool:
@@ -121,14 +163,16 @@ def _is_concave(parts: np.ndarray, points: np.ndarray, a: int, b: int) -> bool:
     border = spatial.KDTree(points[first & ndimage.binary_dilation(second)])
     sides = []
     for side in (points[first], points[second]):
-        distance = border.query(side, distance_upper_bound=0.025)[0]
-        sides.append(side[(distance > 0.004) & np.isfinite(distance)])
-    if min(len(side) for side in sides) < 20:
+        distance = border.query(side, distance_upper_bound=CREASE.far)[0]
+        sides.append(side[(distance > CREASE.near) & np.isfinite(distance)])
+    if min(len(side) for side in sides) < CREASE.points:
         return False
     middles = [side.mean(0) for side in sides]
-    chord = (middles[1] - middles[0]) / (np.linalg.norm(middles[1] - middles[0]) + 1e-12)
+    chord = middles[1] - middles[0]
+    chord = chord / (np.linalg.norm(chord) + CREASE.least_length)
     rise = []
     for side, middle, sign in zip(sides, middles, (1.0, -1.0), strict=True):
         normal = np.linalg.svd(side - middle, full_matrices=False)[2][2]
-        rise.append(sign * float(normal @ chord) * (-1.0 if normal @ middle > 0 else 1.0))
-    return min(rise) > 0.5
+        facing = -1.0 if normal @ middle > 0 else 1.0
+        rise.append(sign * float(normal @ chord) * facing)
+    return min(rise) > CREASE.concave

@@ -25,7 +25,43 @@ from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
 from torchgrasp.geometry.linalg import Points, Vector, unit
 from torchgrasp.geometry.plane import GRID
 
-LEAST_PIXELS = 30  # fewest pixels of an object: fewer do not show its shape
+
+@dataclasses.dataclass(frozen=True)
+class ImageNumbers:
+    """Numbers of pixels in depth images."""
+
+    least_pixels: int = 30
+    """Fewest pixels of an object: fewer do not show its shape."""
+    border_pixels: int = 5
+    """An object that reaches the border in fewer pixels is not cut: they are noise."""
+    squares: int = 3
+    """Fewest measured depths in a square of 3 x 3 pixels whose median is taken."""
+    usual: int = 640 * 480
+    """Pixels of the image for which counts of pixels are given."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ProjectionNumbers:
+    """Numbers of the projection of a cloud to an image."""
+
+    steep: float = 0.01
+    """Least part of the vertical across the view; below it any direction will do as down."""
+    widest: float = 75.0
+    """Widest angle from the middle of a view [deg]."""
+    cells: int = 64
+    """Cells to a side of a view, of which those with points count as filled."""
+    inset: float = 0.001
+    """The last point of a view lies by this share of a cell inside the last cell."""
+    most_steps: int = 1023
+    """Most pixels from one side of an image made of a cloud to the other."""
+    least_extent: float = 1e-6
+    """Least extent of a view, for the division."""
+
+
+IMAGE = ImageNumbers()
+PROJECTION = ProjectionNumbers()
+# grid [m] of a camera's rounded pose
+POSE_GRID = GRID**1.5
 
 
 @checked
@@ -37,6 +73,11 @@ class DepthImage(Value):
     intrinsics: Float[Tensor, "3 3"]  # [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels
     obj_from_camera: Pose
     bounded: bool = True  # whether its border is the camera's; an image made of a cloud has none
+
+    @property
+    def focal(self) -> float:
+        """The focal length along a row [px]."""
+        return float(self.intrinsics[0, 0])
 
     @property
     def frustum(self) -> Float[Tensor, "4 3"] | None:
@@ -57,7 +98,7 @@ class DepthImage(Value):
             inverse(obj_from_upright.double()).to(self.obj_from_camera.device)
             @ self.obj_from_camera.double()
         )
-        return dataclasses.replace(self, obj_from_camera=torch.round(pose / GRID**1.5) * GRID**1.5)
+        return dataclasses.replace(self, obj_from_camera=torch.round(pose / POSE_GRID) * POSE_GRID)
 
     def points(self) -> Float[Tensor, "h w 3"]:
         """Return the point [m] of every pixel; the camera's position where nothing was measured."""
@@ -65,16 +106,16 @@ class DepthImage(Value):
         k = self.intrinsics.double()
         row = torch.arange(z.shape[0], dtype=z.dtype, device=z.device)[:, None]
         column = torch.arange(z.shape[1], dtype=z.dtype, device=z.device)
-        camera = torch.stack(
-            [z * (column - k[0, 2]) / k[0, 0], z * (row - k[1, 2]) / k[1, 1], z], -1
-        )
+        x = z * (column - k[0, 2]) / k[0, 0]
+        y = z * (row - k[1, 2]) / k[1, 1]
+        camera = torch.stack([x, y, z], -1)
         return apply(self.obj_from_camera.double(), camera.reshape(-1, 3)).reshape(*z.shape, 3)
 
     def at_border(self, pixels: Int[Tensor, "n 2"]) -> bool:
         """Return whether pixels (row, column) of an object reach the border of the camera's image."""
         last = torch.tensor(self.depth.shape, device=pixels.device) - 1
         reaching = ((pixels <= 1) | (pixels >= last - 1)).any(-1)
-        return self.bounded and int(reaching.sum()) >= 5  # fewer are noise
+        return self.bounded and int(reaching.sum()) >= IMAGE.border_pixels
 
     def without_speckle(self) -> "DepthImage":
         """Return the image in which each depth is the median of the measured depths in its 3 x 3
@@ -86,7 +127,8 @@ class DepthImage(Value):
         ranked = np.sort(squares, axis=-1)  # NaN last
         count = np.isfinite(squares).sum(-1)
         middle = np.take_along_axis(ranked, np.maximum(count - 1, 0)[..., None] // 2, -1)[..., 0]
-        found = np.where((count >= 3) & (depth > 0), np.nan_to_num(middle), depth)
+        known = (count >= IMAGE.squares) & (depth > 0)
+        found = np.where(known, np.nan_to_num(middle), depth)
         return dataclasses.replace(self, depth=torch.from_numpy(found))
 
 
@@ -102,11 +144,14 @@ def read_image(
         if camera_pose is None
         else read_camera_pose(camera_pose).cpu()
     )
-    if int((z > 0).sum()) < LEAST_PIXELS:
-        raise BadArgument(
-            "depth", f"{int((z > 0).sum())} measured pixels", f"at least {LEAST_PIXELS}"
-        )
+    if (count := int((z > 0).sum())) < IMAGE.least_pixels:
+        raise BadArgument("depth", f"{count} measured pixels", f"at least {IMAGE.least_pixels}")
     return DepthImage(z.cpu(), k.cpu(), pose)
+
+
+def scale_pixels(count: int, labels: Int[Tensor, "h w"]) -> float:
+    """Return the number of pixels in an image that corresponds to `count` of 640 x 480 pixels."""
+    return count * labels.numel() / IMAGE.usual
 
 
 def label_radii(points: Float[Tensor, "h w 3"], labels: Int[Tensor, "h w"]) -> Float[Tensor, "k"]:
@@ -131,30 +176,27 @@ def image_of_cloud(
     """
     forward = unit(unit(points - viewpoint).mean(0))
     down = -up + (up @ forward) * forward
-    if float(torch.linalg.vector_norm(down)) < 0.01:  # straight from above, any direction will do
+    # straight from above, any direction will do
+    if float(torch.linalg.vector_norm(down)) < PROJECTION.steep:
         side = points[(points - points.mean(0)).norm(dim=-1).argmax()] - viewpoint
         down = side - (side @ forward) * forward
     down = unit(down)
     pose = rigid(torch.stack([torch.linalg.cross(down, forward), down, forward], -1), viewpoint)
     camera = apply(inverse(pose), points)
-    # [deg]
+    # (n, 2), at a depth of 1
     flat = camera[:, :2] / camera[:, 2:]
-    widest = 75.0
-    if not bool((camera[:, 2] > 0).all()) or float(flat.norm(dim=-1).max()) > math.tan(
-        math.radians(widest)
-    ):
-        raise BadArgument(
-            "cloud",
-            "points all around the camera",
-            f"a view within {widest:g} degrees of its middle",
-        )
+    widest = math.tan(math.radians(PROJECTION.widest))
+    if not bool((camera[:, 2] > 0).all()) or float(flat.norm(dim=-1).max()) > widest:
+        allowed = f"a view within {PROJECTION.widest:g} degrees of its middle"
+        raise BadArgument("cloud", "points all around the camera", allowed)
     low = flat.amin(0)
     high = flat.amax(0)
-    extent = (high - low).clamp_min(1e-6)
-    cells = ((flat - low) / extent * 63.999).long()
-    filled = len((cells[:, 0] * 64 + cells[:, 1]).unique()) / 64**2
+    extent = (high - low).clamp_min(PROJECTION.least_extent)
+    # a pixel covers about two points of the filled part of the view
+    cells = ((flat - low) / extent * (PROJECTION.cells - PROJECTION.inset)).long()
+    filled = len((cells[:, 0] * PROJECTION.cells + cells[:, 1]).unique()) / PROJECTION.cells**2
     pixel = math.sqrt(2 * float(extent.prod()) * filled / len(points))
-    pixel = max(pixel, float(extent.max()) / 1023)  # an image of at most 1024 pixels
+    pixel = max(pixel, float(extent.max()) / PROJECTION.most_steps)
     width, height = (int(side) + 1 for side in (extent / pixel).tolist())
     middle = (low + high) / 2
     centre = torch.tensor([(width - 1) / 2, (height - 1) / 2], dtype=points.dtype) - middle / pixel
@@ -163,6 +205,7 @@ def image_of_cloud(
     )
     column, row = torch.round(flat / pixel + centre).long().unbind(-1)
     pixels = torch.stack([row.clamp(0, height - 1), column.clamp(0, width - 1)], -1)
+    # of several points in a pixel the nearest is seen
     depth = torch.full((height * width,), torch.inf, dtype=torch.float64)
     depth.scatter_reduce_(0, pixels[:, 0] * width + pixels[:, 1], camera[:, 2], "amin")
     depth = torch.where(torch.isfinite(depth), depth, 0.0).reshape(height, width)

@@ -1,6 +1,7 @@
 """Masks and labels of objects from other tools: images, lists of masks, and COCO's run lengths."""
 
 import contextlib
+import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,12 +14,38 @@ from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import ndimage
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.support_planes import SupportPlane
-from torchgrasp.scene.image import LEAST_PIXELS, DepthImage
+from torchgrasp.scene.image import IMAGE, DepthImage
 from torchgrasp.scene.segment import count_labels, rests_on, segment
+from torchgrasp.scene.table_image import TableImage
 
-MOST_LABELS = 1000  # more values are those of a photograph
-# least share of a mask's pixels on the target: a third of a box drawn around an object are
-MASK_SHARE = 0.05
+
+@dataclasses.dataclass(frozen=True)
+class MaskNumbers:
+    """Numbers of the rules by which given masks and labels are read."""
+
+    most_labels: int = 1000
+    """Most objects: more values are those of a photograph."""
+    least_share: float = 0.05
+    """Least share of a mask's pixels on its target: a third of a box drawn around an object are."""
+    own_share: float = 0.5
+    """A segmented object belongs to a mask that has this share of the object's pixels."""
+    mask_share: float = 0.3
+    """A segmented object belongs to a mask if it has this share of the mask's pixels."""
+    low: float = 0.01
+    """Pixels lower than this above the support [m] lie on it."""
+    rim: int = 4
+    """Masks are off by so many pixels."""
+    told: float = 0.05
+    """A larger share of a mask's pixels that is removed is told."""
+
+
+MASKS = MaskNumbers()
+# red, green and blue of a pixel are told apart in one whole number
+COLOUR_PLACES = np.array([1 << 32, 1 << 16, 1])
+# COCO's text of run lengths: the letter of 0, the bits of a letter, and the most bits of a number
+FIRST_LETTER = ord("0")
+LETTER_BITS = 5
+MOST_BITS = 35
 
 
 def read_labels(labels: Any, shape: tuple[int, ...], name: str = "labels") -> Int[Tensor, "..."]:
@@ -36,13 +63,13 @@ def read_labels(labels: Any, shape: tuple[int, ...], name: str = "labels") -> In
     masks = _masks(labels, shape)
     if masks is None:
         read = _read_one(labels, shape, name)
-        if (count := len(read.unique())) > MOST_LABELS + 1:
+        if (count := len(read.unique())) > MASKS.most_labels + 1:
             raise BadArgument(
-                name, f"{count} values, as of a photograph", f"at most {MOST_LABELS} objects"
+                name, f"{count} values, as of a photograph", f"at most {MASKS.most_labels} objects"
             )
         return read
-    if len(masks) > MOST_LABELS:
-        raise BadArgument(name, f"{len(masks)} masks", f"at most {MOST_LABELS}")
+    if len(masks) > MASKS.most_labels:
+        raise BadArgument(name, f"{len(masks)} masks", f"at most {MASKS.most_labels}")
     stack = torch.zeros(shape, dtype=torch.long)
     size = torch.zeros(shape, dtype=torch.long)
     for k, mask in enumerate(masks, start=1):
@@ -61,9 +88,8 @@ def _masks(labels: Any, shape: tuple[int, ...]) -> Any:
     if isinstance(labels, Tensor | np.ndarray):
         several = len(shape) == 2 and tuple(labels.shape[1:]) in (shape, (1, *shape))
         return labels.reshape(-1, *shape) if several else None
-    with contextlib.suppress(
-        ValueError, TypeError, KeyError
-    ):  # of rows of different length, and of other types
+    # of rows of different length, and of other types
+    with contextlib.suppress(ValueError, TypeError, KeyError):
         if len(labels) and (isinstance(labels[0], Mapping) or np.ndim(labels[0]) >= 2):
             return labels
     return None
@@ -87,12 +113,7 @@ def _read_one(labels: Any, shape: tuple[int, ...], name: str) -> Int[Tensor, "..
         numbers = numbers[..., 0]
     if len(shape) == 2 and read.shape in ((*shape, 3), (*shape, 4)) and exact:
         colour = numbers[..., :3] * (numbers[..., 3:] > 0) if read.shape[-1] == 4 else numbers
-        packed = torch.from_numpy(np.abs(colour) @ np.array([1 << 32, 1 << 16, 1]))
-        return (
-            torch.cat([packed.new_zeros(1), packed.reshape(-1)])
-            .unique(return_inverse=True)[1][1:]
-            .reshape(shape)
-        )
+        return _dense(torch.from_numpy(np.abs(colour) @ COLOUR_PLACES))
     if read.shape != tuple(shape) or not exact:
         raise BadArgument(name, f"shape {read.shape}, {read.dtype}", whole)
     if (numbers < 0).any():
@@ -100,6 +121,12 @@ def _read_one(labels: Any, shape: tuple[int, ...], name: str) -> Int[Tensor, "..
             name, int(numbers.min()), "labels >= 0; 0 is the table and all that is no object"
         )
     return torch.from_numpy(numbers)
+
+
+def _dense(values: Tensor) -> Tensor:
+    """Return labels 0, 1, ... of values in their order, where 0 stays 0."""
+    padded = torch.cat([values.new_zeros(1), values.reshape(-1)])
+    return padded.unique(return_inverse=True)[1][1:].reshape(values.shape)
 
 
 def read_mask(mask: Any, shape: tuple[int, ...]) -> Bool[Tensor, "..."]:
@@ -147,26 +174,29 @@ def _run_lengths(text: bytes) -> list[int]:
     """Return run lengths from COCO's text, 5 bits a letter; from the fourth on, it holds run i
     minus run i - 2.
     """
+    more = 1 << LETTER_BITS
+    sign = more >> 1
     runs: list[int] = []
-    value = shift = 0
+    value = 0
+    shift = 0
     for letter in text:
-        bits = letter - 48
-        if not 0 <= bits < 64 or shift > 35:
+        bits = letter - FIRST_LETTER
+        if not 0 <= bits < 2 * more or shift > MOST_BITS:
             raise ValueError("a letter that is no run length")
-        value |= (bits & 31) << shift
-        shift += 5
-        if not bits & 32:
-            value -= (1 << shift) if bits & 16 else 0
-            runs.append(value + (runs[-2] if len(runs) > 2 else 0))
-            value = shift = 0
+        value |= (bits % more) << shift
+        shift += LETTER_BITS
+        if bits & more:
+            continue
+        # the last letter of a number holds its sign
+        value -= (1 << shift) if bits & sign else 0
+        runs.append(value + (runs[-2] if len(runs) > 2 else 0))
+        value = 0
+        shift = 0
     return runs
 
 
 def label_image(
-    image: DepthImage,
-    support: SupportPlane,
-    labels: Int[Tensor, "h w"] | None,
-    mask: Bool[Tensor, "h w"] | None,
+    view: TableImage, labels: Int[Tensor, "h w"] | None, mask: Bool[Tensor, "h w"] | None
 ) -> tuple[Int[Tensor, "h w"], tuple[str, ...]]:
     """Return each pixel's label and notes; labels come from given labels, a given mask, or else
     from segmentation.
@@ -177,48 +207,54 @@ def label_image(
     loses nearly all is a `BadArgument`.
     """
     if labels is not None:
-        kept = torch.where(rests_on(image, support.plane), labels, 0)
-        if not bool((kept > 0).any()):
-            raise BadArgument(
-                "labels", "none that rises above the table", "labels of objects on the table"
-            )
-        names, own = labels.unique(return_inverse=True)
-        lost, seen = (
-            torch.bincount(own[pixels], minlength=len(names)).tolist()
-            for pixels in (_on_support(image, support) & (kept == 0), image.depth > 0)
-        )
-        counts = zip(names.tolist(), lost, seen, strict=True)
-        return kept, tuple(
-            note for k, *count in counts if k > 0 for note in _removed(f"mask {k}", *count)
-        )
-    objects = segment(image, support)
+        return _trim_labels(view, labels)
+    objects = segment(view)
     if mask is None:
         return objects, ()
-    inside = mask & rests_on(image, support.plane)
-    pieces = torch.where(inside, objects, 0)
+    inside = mask & rests_on(view)
+    # objects that the mask shows, or that fill much of it, belong to the target
     length = int(objects.max()) + 1
     whole = count_labels(objects, length)
-    part = count_labels(pieces, length)
-    belongs = (part >= 0.5 * whole) | (part >= 0.3 * max(1, int(inside.sum())))
+    part = count_labels(torch.where(inside, objects, 0), length)
+    shown = part >= MASKS.own_share * whole
+    belongs = shown | (part >= MASKS.mask_share * max(1, int(inside.sum())))
     belongs[0] = True
     target = inside & belongs[objects]
-    seen = int((mask & (image.depth > 0)).sum())
-    if int(target.sum()) < max(LEAST_PIXELS, MASK_SHARE * seen):
+    seen = int((mask & view.measured).sum())
+    if int(target.sum()) < max(IMAGE.least_pixels, MASKS.least_share * seen):
         found = f"{int(target.sum())} of {seen} measured pixels above the table"
-        least = f"at least {LEAST_PIXELS}, and a {1 / MASK_SHARE:.0f}th: this target is the table"
+        share = f"a {1 / MASKS.least_share:.0f}th"
+        least = f"at least {IMAGE.least_pixels}, and {share}: this target is the table"
         raise BadArgument("mask", found, least)
-    rest = _beside(objects, target, mask, belongs)
-    _, number = torch.cat([torch.zeros(1, dtype=torch.long), rest.reshape(-1)]).unique(
-        return_inverse=True
-    )
-    rest = number[1:].reshape(rest.shape)
-    low = mask & ~inside & _on_support(image, support)
+    rest = _dense(_beside(objects, target, mask, belongs))
+    low = mask & ~inside & _on_support(view)
     strips = inside & ~target
     notes = [
         *_removed("mask", int(low.sum()), seen),
         *_removed("mask", int(strips.sum()), seen, "another object"),
     ]
     return torch.where(target, 1, torch.where(rest > 0, rest + 1, 0)), tuple(notes)
+
+
+def _trim_labels(
+    view: TableImage, labels: Int[Tensor, "h w"]
+) -> tuple[Int[Tensor, "h w"], tuple[str, ...]]:
+    """Return given labels without pixels on the table and flying pixels, and a note on each label
+    that loses many.
+    """
+    kept = torch.where(rests_on(view), labels, 0)
+    if not bool((kept > 0).any()):
+        raise BadArgument(
+            "labels", "none that rises above the table", "labels of objects on the table"
+        )
+    names, own = labels.unique(return_inverse=True)
+    lost = count_labels(own[_on_support(view) & (kept == 0)], len(names))
+    seen = count_labels(own[view.measured], len(names))
+    notes = list[str]()
+    for k, *counts in zip(names.tolist(), lost.tolist(), seen.tolist(), strict=True):
+        if k > 0:
+            notes += _removed(f"mask {k}", *counts)
+    return kept, tuple(notes)
 
 
 def label_again(
@@ -229,21 +265,24 @@ def label_again(
     given: tuple[int, ...],
     first: int,
 ) -> Int[Tensor, "h w"]:
-    """Return the label of each pixel after another support has replaced the former table.
+    """Return the label of each pixel after another support has replaced the former
+    table.
 
     Labels that the user gave lose pixels on the support, and gain pixels of their objects that the
     former table hid. Other objects are segmented again, and each keeps the label of most of its
     former pixels. The label `first` is assigned before the others.
     """
+    view = TableImage.of(image, support)
+    before = TableImage(image, view.points, SupportPlane(former))
     own = torch.isin(labels, torch.tensor(given, dtype=torch.long))
-    kept = torch.where(own & rests_on(image, support.plane), labels, 0)
-    found = segment(image, support)
-    seen = rests_on(image, former)
+    kept = torch.where(own & rests_on(view), labels, 0)
+    found = segment(view)
+    seen = rests_on(before)
     width = int(found.max()) + 1
-    (names, row) = labels.unique(return_inverse=True)
-    shared = count_labels((row * width + found)[seen], len(names) * width).reshape(
-        len(names), width
-    )
+    names, row = labels.unique(return_inverse=True)
+    # (former label, label found): the pixels that they share
+    shared = count_labels((row * width + found)[seen], len(names) * width)
+    shared = shared.reshape(len(names), width)
     shared[:, 0] = 0
     number = torch.arange(width) + names[-1]
     belongs = torch.zeros(width, dtype=torch.bool)
@@ -265,25 +304,21 @@ def _beside(objects: Tensor, target: Tensor, mask: Tensor, belongs: Tensor) -> I
     """Return labels without the target, strips of its object around `mask`, and specks: these
     become 0.
     """
-    about = torch.from_numpy(
-        ndimage.binary_dilation(mask.numpy(), iterations=4)
-    )  # masks are off by a few pixels
+    about = torch.from_numpy(ndimage.binary_dilation(mask.numpy(), iterations=MASKS.rim))
     rest = torch.where(target | (about & belongs[objects]), 0, objects)
-    few = count_labels(rest, len(belongs)) < LEAST_PIXELS
+    few = count_labels(rest, len(belongs)) < IMAGE.least_pixels
     return torch.where(few[rest], 0, rest)
 
 
-def _on_support(image: DepthImage, support: SupportPlane) -> Bool[Tensor, "h w"]:
+def _on_support(view: TableImage) -> Bool[Tensor, "h w"]:
     """Return a mask of the measured pixels that lie on the plane of the support or below it."""
-    return (image.depth > 0) & (support.plane.height(image.points()) < 0.01)
+    return view.measured & (view.height < MASKS.low)
 
 
 def _removed(mask: str, count: int, seen: int, where: str = "the support") -> list[str]:
     """Return a list with one sentence that `count` of `seen` pixels were removed from a mask; empty
     if they are few.
     """
-    return (
-        [f"{mask}: {count} of {seen} pixels lie on {where} and were removed"]
-        if count > 0.05 * seen
-        else []
-    )
+    if count <= MASKS.told * seen:
+        return []
+    return [f"{mask}: {count} of {seen} pixels lie on {where} and were removed"]

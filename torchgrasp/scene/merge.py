@@ -7,37 +7,106 @@ other. Touching pieces also belong to one object, unless both stand on the table
 the other.
 """
 
+import dataclasses
 import itertools
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.cloud.parts import label_bodies
 from torchgrasp.foundation.lazy import spatial
 from torchgrasp.geometry.frames import inverse, rotate
 from torchgrasp.geometry.linalg import across, unit
-from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.support_planes import Hull
 from torchgrasp.scene.image import DepthImage
-
-GAP = 0.008
-TOUCH = 3
-FAR = 0.05
-"""Pieces touch where TOUCH pixels are within GAP [m]; parts of one object are within FAR [m]."""
-REACH = (
-    0.02  # greatest distance [m] of two pieces that meet at two ends: pixels at rims are missing
-)
-NESTED = (
-    0.4  # a body with this share of its points over the footprint of a larger one is a part of it
-)
+from torchgrasp.scene.table_image import TableImage
 
 
-def merge_pieces(
-    image: DepthImage, pieces: Int[Tensor, "h w"], table: Plane, jump: Float[Tensor, "h w"]
-) -> Tensor:
+@dataclasses.dataclass(frozen=True)
+class MergeNumbers:
+    """Numbers of the rules by which pieces are one object; lengths are in metres."""
+
+    gap: float = 0.008
+    """Pieces touch where points are nearer than this."""
+    touching: int = 3
+    """Least number of such points; of fewer, the gap is not known."""
+    far: float = 0.05
+    """Parts of one object are nearer than this."""
+    spacing: float = 0.0015
+    """Distance of the points that are kept of a large piece."""
+    dense: int = 3000
+    """Pieces of fewer pixels keep all their points."""
+    small: int = 30
+    """Pieces of fewer points are no bodies; they go to the nearest body."""
+    points: int = 2000
+    """A body keeps about as many points, at most twice as many."""
+    reach: float = 0.02
+    """Pieces that meet at two ends are nearer than this: pixels at rims are missing."""
+    end_depth: float = 0.01
+    """Points up to this much farther than the nearest belong to an end."""
+    end_gap: float = 0.015
+    """Points of one end are nearer to each other than this."""
+    end_points: int = 6
+    """Least points of an end."""
+    low: float = 0.02
+    """Quantile of the heights of a body's points that is its foot."""
+    high: float = 0.98
+    """Quantile of the heights of a body's points that is its top."""
+    nested: float = 0.4
+    """A body with this share of its points over a larger one's footprint is a part of it."""
+    beside: float = 0.3
+    """Bodies that stand side by side have a smaller share of their points over each other."""
+    standing: float = 0.015
+    """A body whose foot is lower than this stands on the table."""
+    standing_share: float = 0.5
+    """A body whose foot is lower than this share of its top stands, too: its foot is hidden."""
+    lesser: float = 0.1
+    """A body with a smaller share of the other's points is a part of it, such as a knob."""
+    upon: float = 0.01
+    """The top of a body upon another is higher by this."""
+    upon_foot: float = 0.5
+    """The foot of a body upon another is higher than this share of the other's top."""
+    upon_share: float = 0.5
+    """Share of a body's points over the body that it lies upon."""
+    ring_width: float = 0.025
+    """A standing ring, seen from its edge, has a narrower footprint."""
+    ring_foot: float = 0.01
+    """The foot of both parts of such a ring is higher: none stands."""
+    level: float = 0.005
+    """The tops of two parts of a rim differ by less."""
+    rim_gap: float = 0.4
+    """Largest gap in a rim, over the width of its footprint."""
+    rim: float = 0.004
+    """Points no lower than this below the top belong to a rim."""
+    wall: float = 0.012
+    """Points farther than this inside the footprint are in a rim's middle."""
+    hollow: float = 0.2
+    """Least share of high points in the middle of a body that is not hollow."""
+    handle: float = 0.7
+    """A floating body of a smaller size, over its neighbour's, may be a handle that is far off."""
+    from_above: float = 0.2
+    """Least part in the image of the way down: below it, no edge of a piece is the lower one."""
+    below: int = 4
+    """Distance of the pixel that is below an edge [px]."""
+    seen: float = 0.7
+    """Share of the lower edge below which the table is seen, if a piece floats."""
+    edge: float = 0.1
+    """Quantile of the heights of the lower edge that counts as its height."""
+    peak: float = 0.9
+    """Quantile of the heights of a piece that counts as its top, for a floating piece."""
+    floating: float = 0.006
+    """The lower edge of a floating piece is higher than this."""
+    floating_share: float = 0.4
+    """The lower edge of a floating piece is higher than this share of its top."""
+
+
+MERGE = MergeNumbers()
+
+
+def merge_pieces(view: TableImage, pieces: Int[Tensor, "h w"]) -> Int[Tensor, "k"]:
     """Return, for each piece number, the number of the piece's object; 0 for number 0 and for
     pieces of no object.
     """
@@ -45,25 +114,23 @@ def merge_pieces(
     whole = torch.bincount(pieces.reshape(-1))
     if len(whole) == 1:
         return new
-    floating = _floating(image, pieces, table, jump)
-    thin = _thinned(image, pieces, whole)
-    names, count = thin[thin > 0].unique(return_counts=True)
-    order = torch.argsort(thin[thin > 0], stable=True)
-    axes = torch.stack(across(table.normal.double()), -1)
-    points = image.points()
-    points = torch.cat(
-        [points @ axes, table.height(points)[..., None]], -1
-    )  # z is the height above the table
-    parts = points[thin > 0][order].split(count.tolist())
+    floating = _floating(view, pieces)
+    thin = _thinned(view.image, pieces, whole)
+    kept = thin > 0
+    names, count = thin[kept].unique(return_counts=True)
+    # z is the height above the table (n, 3)
+    axes = torch.stack(across(view.support.plane.normal.double()), -1)
+    points = torch.cat([view.points @ axes, view.height[..., None]], -1)[kept]
+    parts = points[torch.argsort(thin[kept], stable=True)].split(count.tolist())
     gap = _gaps([spatial.KDTree(part.numpy()) for part in parts])
-    large = [k for k in range(len(parts)) if len(parts[k]) >= 30]
-    bodies = _joined(
-        [_Body((k,), parts[k], int(whole[names[k]])) for k in large], gap, floating[names].tolist()
-    )
-    for number, body in enumerate(bodies, start=1):
+    large = [k for k, part in enumerate(parts) if len(part) >= MERGE.small]
+    bodies = [_Body((k,), parts[k], int(whole[names[k]])) for k in large]
+    joined = _joined(bodies, gap, floating[names].tolist())
+    for number, body in enumerate(joined, start=1):
         new[names[list(body.rows)]] = number
-    for k in range(len(parts)):  # smaller pieces go to the nearest large one
-        if large and k not in large and gap[k, large].min() < GAP:
+    # smaller pieces go to the nearest large one
+    for k in range(len(parts)):
+        if large and k not in large and gap[k, large].min() < MERGE.gap:
             new[names[k]] = new[names[large[int(gap[k, large].argmin())]]]
     return new
 
@@ -74,20 +141,20 @@ def _thinned(
     """Return the piece numbers at pixels 1.5 mm apart, 0 between them; small pieces keep their
     number everywhere.
     """
-    step = max(
-        1, int(0.0015 * float(image.intrinsics[0, 0]) / float(image.depth[pieces > 0].median()))
-    )
-    kept = (count < 3000)[pieces]
+    depth = float(image.depth[pieces > 0].median())
+    step = max(1, int(MERGE.spacing * image.focal / depth))
+    kept = (count < MERGE.dense)[pieces]
     kept[::step, ::step] = True
     return torch.where(kept, pieces, 0)
 
 
-def find_touching(image: DepthImage, labels: Int[Tensor, "h w"]) -> list[tuple[int, int]]:
+def find_touching(
+    image: DepthImage, points: Float[Tensor, "h w 3"], labels: Int[Tensor, "h w"]
+) -> list[tuple[int, int]]:
     """Return the pairs of labels of objects that touch, so that the border between the objects is a
     guess.
     """
     names = labels[labels > 0].unique().tolist()
-    points = image.points()
     if len(names) < 2:
         return []
     labels = _thinned(image, labels, torch.bincount(labels.reshape(-1)))
@@ -95,7 +162,7 @@ def find_touching(image: DepthImage, labels: Int[Tensor, "h w"]) -> list[tuple[i
     return [
         (names[a], names[b])
         for a, b in itertools.combinations(range(len(gap)), 2)
-        if gap[a, b] < 0.5 * GAP
+        if gap[a, b] < MERGE.gap / 2
     ]
 
 
@@ -110,47 +177,50 @@ def _joined(bodies: list["_Body"], gap: np.ndarray, floating: list[bool]) -> lis
     done: list[_Body] = []
     while bodies:
         body = bodies.pop()
-        parts = [other for other in bodies + done if _one_body(body, other, between(body, other))][
-            :1
-        ]
-        bodies, done = ([other for other in some if other not in parts] for some in (bodies, done))
-        (bodies if parts else done).append(sum(parts, body))
-    for body in [
-        body for body in done if all(floating[row] for row in body.rows)
-    ]:  # the roots of a handle are hidden
-        others = [other for other in done if other is not body]
-        nearest = min(others, key=lambda other: between(body, other), default=body)
-        reach = FAR if body.size < 0.7 * nearest.size else GAP
-        if (
-            body in done
-            and nearest is not body
-            and between(body, nearest) < reach
-            and not _upon(body, nearest)
-        ):
-            done = [other for other in others if other is not nearest] + [body + nearest]
+        parts = (x for x in bodies + done if _one_body(body, x, between(body, x)))
+        part = next(parts, None)
+        if part is None:
+            done.append(body)
+            continue
+        # a joined body is compared with all others again
+        bodies = [x for x in bodies if x is not part] + [body + part]
+        done = [x for x in done if x is not part]
+    for body in [x for x in done if all(floating[row] for row in x.rows)]:
+        others = [x for x in done if x is not body]
+        if body not in done or not others:
+            continue
+        nearest = min(others, key=lambda other: between(body, other))
+        # a handle may be far from its object: its roots are hidden
+        reach = MERGE.far if body.size < MERGE.handle * nearest.size else MERGE.gap
+        if between(body, nearest) < reach and not _upon(body, nearest):
+            done = [x for x in others if x is not nearest] + [body + nearest]
     return done
 
 
 def _gaps(trees: list[Any]) -> np.ndarray:
     """Return the gaps [m] between each two point sets (KD-trees): 0 if they meet at two ends,
-    infinite beyond `FAR`.
+    infinite if they are far apart.
     """
     low = np.stack([tree.mins for tree in trees])
     high = np.stack([tree.maxes for tree in trees])
     gap = np.full((len(trees), len(trees)), np.inf)
     for a, b in itertools.combinations(range(len(trees)), 2):
         small, large = sorted((a, b), key=lambda k: trees[k].n)
-        rows = (
-            (trees[small].data > low[large] - FAR) & (trees[small].data < high[large] + FAR)
-        ).all(-1)
-        if rows.sum() >= TOUCH:
-            points = trees[small].data[rows]
-            distance = trees[large].query(points, distance_upper_bound=FAR)[0]
-            least = np.partition(distance, TOUCH - 1)[TOUCH - 1]
-            if least < REACH:  # a handle or a rim meets its body at two ends
-                ends = label_bodies(torch.from_numpy(points[distance < least + 0.01]), gap=0.015)
-                least = 0.0 if int((torch.bincount(ends) >= 6).sum()) > 1 else least
-            gap[a, b] = gap[b, a] = least
+        points = trees[small].data
+        # only points near the other's bounding box can be near its points
+        near = (points > low[large] - MERGE.far) & (points < high[large] + MERGE.far)
+        points = points[near.all(-1)]
+        if len(points) < MERGE.touching:
+            continue
+        distance = trees[large].query(points, distance_upper_bound=MERGE.far)[0]
+        least = np.partition(distance, MERGE.touching - 1)[MERGE.touching - 1]
+        if least < MERGE.reach:
+            # a handle or a rim meets its body at two ends
+            ends = torch.from_numpy(points[distance < least + MERGE.end_depth])
+            count = torch.bincount(label_bodies(ends, gap=MERGE.end_gap))
+            least = 0.0 if int((count >= MERGE.end_points).sum()) > 1 else least
+        gap[a, b] = least
+        gap[b, a] = least
     return gap
 
 
@@ -162,86 +232,88 @@ class _Body:
     def __init__(self, rows: tuple[int, ...], points: Float[Tensor, "n 3"], count: int) -> None:
         self.rows = rows
         self.count = count
-        self.points = points[:: 1 + len(points) // 2000]
+        self.points = points[:: 1 + len(points) // MERGE.points]
         self.hull = Hull.of(points[:, :2])
-        self.foot, self.top = (
-            self.points[:, 2].quantile(torch.tensor([0.02, 0.98], dtype=points.dtype)).tolist()
-        )
+        ends = torch.tensor([MERGE.low, MERGE.high], dtype=points.dtype)
+        self.foot, self.top = self.points[:, 2].quantile(ends).tolist()
 
     def share_over(self, other: "_Body") -> float:
         """Return the share of the points that are over the footprint of another body."""
         return float(other.hull.holds(self.points[:, :2]).double().mean())
 
     def __add__(self, other: "_Body") -> "_Body":
-        return _Body(
-            self.rows + other.rows, torch.cat([self.points, other.points]), self.count + other.count
-        )
+        points = torch.cat([self.points, other.points])
+        return _Body(self.rows + other.rows, points, self.count + other.count)
 
     @property
     def size(self) -> float:
         """The longest side [m] of the bounding box of the body's points."""
         return float((self.points.amax(0) - self.points.amin(0)).max())
 
+    @property
+    def stands(self) -> bool:
+        """Whether the body stands on the table."""
+        return self.foot < max(MERGE.standing, MERGE.standing_share * self.top)
+
 
 def _one_body(a: _Body, b: _Body, gap: float) -> bool:
     """Return whether two bodies are one object: they touch, one is over the other's footprint, or
     both form a rim.
     """
-    if gap == 0.0 or gap > FAR:
+    if gap == 0.0 or gap > MERGE.far:
         return gap == 0.0
     small, large = (a, b) if a.count < b.count else (b, a)
     over = small.share_over(large)
-    beside = over < 0.3 and all(body.foot < max(0.015, 0.5 * body.top) for body in (small, large))
-    apart = (beside and small.count > 0.1 * large.count) or _upon(
-        small, large
-    )  # side by side, or one upon the other
-    if not apart and (gap < GAP or over > NESTED):
+    alike = small.count > MERGE.lesser * large.count
+    side_by_side = over < MERGE.beside and small.stands and large.stands
+    apart = (side_by_side and alike) or _upon(small, large)
+    if not apart and (gap < MERGE.gap or over > MERGE.nested):
         return True
+    # a standing ring from its edge: none of its parts stands
     hull = Hull.of(torch.cat([a.hull.corners, b.hull.corners]))
-    if (
-        hull.width < 0.025 and min(a.foot, b.foot) > 0.01
-    ):  # a standing ring from its edge: none of its parts stands
+    if hull.width < MERGE.ring_width and min(a.foot, b.foot) > MERGE.ring_foot:
         return True
-    if (
-        abs(a.top - b.top) > 0.005 or gap > 0.4 * hull.width
-    ):  # two heights, or a wide gap in the rim
+    # a rim has one height, and no wide gap
+    if abs(a.top - b.top) > MERGE.level or gap > MERGE.rim_gap * hull.width:
         return False
+    # only a hollow body has no top in its middle
     both = torch.cat([a.points, b.points])
-    high = both[
-        both[:, 2] > max(a.top, b.top) - 0.004, :2
-    ]  # only a hollow body has no top in its middle
-    return float(hull.holds(high, -0.012).double().mean()) < 0.2
+    rim = both[both[:, 2] > max(a.top, b.top) - MERGE.rim, :2]
+    return float(hull.holds(rim, -MERGE.wall).double().mean()) < MERGE.hollow
 
 
 def _upon(small: _Body, large: _Body) -> bool:
     """Return whether a body is an object that lies upon another one: a lid or a knob is smaller."""
-    higher = small.top > large.top + 0.01 and small.foot > 0.5 * large.top
-    return higher and small.count > 0.1 * large.count and small.share_over(large) > 0.5
+    return (
+        small.top > large.top + MERGE.upon
+        and small.foot > MERGE.upon_foot * large.top
+        and small.count > MERGE.lesser * large.count
+        and small.share_over(large) > MERGE.upon_share
+    )
 
 
-def _floating(
-    image: DepthImage, pieces: Int[Tensor, "h w"], table: Plane, jump: Float[Tensor, "h w"]
-) -> Tensor:
+def _floating(view: TableImage, pieces: Int[Tensor, "h w"]) -> Bool[Tensor, "k"]:
     """Return a mask of the pieces that float: the table is seen below most of their lower edge,
     which is high.
     """
+    image = view.image
     floating = torch.zeros(int(pieces.max()) + 1, dtype=torch.bool)
-    down = -rotate(inverse(image.obj_from_camera), table.normal.double()[None])[0, :2]
-    if float(torch.linalg.vector_norm(down)) < 0.2:  # seen from above, no edge is the lower one
+    normal = view.support.plane.normal.double()
+    down = -rotate(inverse(image.obj_from_camera), normal[None])[0, :2]
+    if float(torch.linalg.vector_norm(down)) < MERGE.from_above:
         return floating
-    column, row = torch.round(4 * unit(down)).long().tolist()
-    below, depth_below = (torch.roll(x, (-row, -column), (0, 1)) for x in (pieces, image.depth))
+    column, row = torch.round(MERGE.below * unit(down)).long().tolist()
+    below = torch.roll(pieces, (-row, -column), (0, 1))
+    depth_below = torch.roll(image.depth, (-row, -column), (0, 1))
     edge = (pieces > 0) & (below != pieces) & (depth_below > 0)
-    hidden = edge & (below > 0) & (depth_below < image.depth - jump)
+    hidden = edge & (below > 0) & (depth_below < image.depth - view.jump)
     free = edge & (below == 0)
-    height = table.height(image.points())
     count = torch.bincount(pieces[free], minlength=len(floating))
-    some = (count >= TOUCH) & (
-        count >= 0.7 * (count + torch.bincount(pieces[hidden], minlength=len(floating)))
-    )
+    whole = count + torch.bincount(pieces[hidden], minlength=len(floating))
+    some = (count >= MERGE.touching) & (count >= MERGE.seen * whole)
     for k in torch.nonzero(some)[:, 0].tolist():
         mine = pieces == k
-        low = float(height[mine & free].quantile(0.1))
-        top = float(height[mine].quantile(0.9))
-        floating[k] = low > max(0.006, 0.4 * top)
+        low = float(view.height[mine & free].quantile(MERGE.edge))
+        top = float(view.height[mine].quantile(MERGE.peak))
+        floating[k] = low > max(MERGE.floating, MERGE.floating_share * top)
     return floating

@@ -22,6 +22,7 @@ from torchgrasp.scene.creases import cut_creases
 from torchgrasp.scene.image import DepthImage, image_of_cloud, read_image
 from torchgrasp.scene.masks import label_image, read_labels, read_mask
 from torchgrasp.scene.merge import find_touching
+from torchgrasp.scene.table_image import TableImage
 from torchgrasp.values.planning import PointCloud
 
 
@@ -110,7 +111,7 @@ class Scene(Value):
         supports = find_plausible(
             points[measured], image.obj_from_camera, table, up, depth_unit is not None
         )
-        found, notes = label_image(image, supports[0], given, inside)
+        found, notes = label_image(TableImage(image, points, supports[0]), given, inside)
         if table is None and depth_unit is None:
             notes += check_sizes(
                 points[measured], found[measured], image.obj_from_camera, supports[0].plane
@@ -191,7 +192,8 @@ class Scene(Value):
             whole[row[front], column[front]] = values[front]
             return whole
 
-        found, notes = label_image(image, supports[0], to_image(given), to_image(inside))
+        view = TableImage.of(image, supports[0])
+        found, notes = label_image(view, to_image(given), to_image(inside))
         own = torch.where(front, found[row, column], 0)
         target = None if inside is None else 1
         scene = cls(points, own, image, pixels, planes[0], target, planes[1:], notes)
@@ -245,13 +247,14 @@ class Scene(Value):
             for plane in self.others
         ]
         labels = self.pixel_labels
-        for a, b in find_touching(self.image, labels):
+        points = self.image.points()
+        for a, b in find_touching(self.image, points, labels):
             if a in self.given and b in self.given:
                 continue
             found.append(
                 f"objects {a} and {b} touch, and their border is a guess: give a mask of the one to grasp"
             )
-        parts = cut_creases(self.image, labels)
+        parts = cut_creases(self.image, points, labels)
         for k in (k for k in self.things if k not in self.given):
             sizes = parts[labels == k].unique(return_counts=True)[1]
             if int((sizes > 0.1 * sizes.sum()).sum()) > 1:

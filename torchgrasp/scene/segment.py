@@ -2,30 +2,75 @@
 objects.
 """
 
+import dataclasses
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from torchgrasp.cloud.sensor import fit_noise
 from torchgrasp.foundation.lazy import ndimage, spatial
 from torchgrasp.geometry.linalg import number_components
-from torchgrasp.geometry.plane import Plane
-from torchgrasp.geometry.support_planes import SupportPlane
 from torchgrasp.scene.creases import cut_creases
-from torchgrasp.scene.image import DepthImage, label_radii
-from torchgrasp.scene.merge import REACH, merge_pieces
-
-BAND = 0.010  # heights [m] below this, of either sign, measure the noise of the table
-LEAST_HEIGHT = 0.002  # least height [m] of an object's pixels above the table
-NEAR = 0.005  # distance [m] within which a pixel at a depth jump belongs to an object
-FEW = 6  # pieces with fewer pixels are noise
-OVERHANG = 0.05  # distance [m] to which an object extends beyond the visible region of its support
-# greatest root mean square distance [m] of an object's points from their middle; a wall has more
-VAST = 0.2
+from torchgrasp.scene.image import label_radii, scale_pixels
+from torchgrasp.scene.merge import MERGE, merge_pieces
+from torchgrasp.scene.table_image import TableImage
 
 
-def segment(image: DepthImage, support: SupportPlane) -> Int[Tensor, "h w"]:
+@dataclasses.dataclass(frozen=True)
+class SegmentNumbers:
+    """Numbers of the segmentation; counts of pixels are those of an image of 640 x 480."""
+
+    risen: float = 2.5
+    """Least mean height of an object's pixels, in deviations of the table's noise."""
+    least_height: float = 0.002
+    """Least mean height of an object's pixels [m], however small the noise."""
+    own: float = 0.6
+    """Least height of a pixel itself, over the least mean height around it."""
+    near: float = 0.005
+    """A pixel at a jump of depth joins an object within this distance [m]."""
+    rounds: int = 12
+    """Most rounds in which objects grow into pixels at jumps."""
+    few: int = 6
+    """Pieces and holes with fewer pixels are noise, in an image of any size."""
+    overhang: float = 0.05
+    """An object extends this far [m] beyond the visible region of its support, at most."""
+    high: float = 0.005
+    """A tenth of an object's pixels are as high as this [m]; an uneven table is not."""
+    high_deviations: float = 4.0
+    """The same pixels are higher than so many deviations of the noise."""
+    high_share: float = 0.1
+    """Share of an object's pixels that must be high."""
+    over: float = 0.2
+    """Least share of an object's pixels over the visible region of its support."""
+    vast: float = 0.2
+    """Largest root mean square distance [m] of an object's points from their middle: a wall's is
+    larger.
+    """
+    floor: float = 0.001
+    """Least height of the inner floor of an object above the table [m]."""
+    speck: int = 100
+    """Objects with fewer pixels are left out."""
+    small: int = 500
+    """Objects with fewer pixels may be noise, or a fringe of a large object."""
+    uneven: float = 8.0
+    """A small object is higher than so many deviations of the noise."""
+    uneven_share: float = 0.25
+    """Share of a small object's pixels that must be so high."""
+    margin: int = 4
+    """Distance from a small object at which a large one is sought [px]."""
+    fringe: float = 0.005
+    """Largest half width of a fringe [m]."""
+    larger: int = 10
+    """An object with a fringe has so many times the pixels of the fringe."""
+
+
+SEGMENT = SegmentNumbers()
+# (row, column) of the pixels to which a pixel is joined; two steps bridge a missing pixel
+NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0))
+
+
+def segment(view: TableImage) -> Int[Tensor, "h w"]:
     """Return the label of each pixel: 1, 2, ... for objects, the largest first, and 0 for all other
     pixels.
 
@@ -33,154 +78,139 @@ def segment(image: DepthImage, support: SupportPlane) -> Int[Tensor, "h w"]:
     without a crease. Pieces of one object are merged. Pixels at jumps go to the object whose
     surface they lie on, if there is one. Pixels beside the region of the support get 0.
     """
-    table = support.plane
-    points = image.points()
-    measured = image.depth > 0
-    smooth = image.without_speckle()
-    mean, threshold = _smoothed(image, table)
-    risen = _risen(smooth, table, mean, threshold)
-    risen[risen.clone()] = support.covers(points[risen], OVERHANG)
-    core, jump = _core(smooth, risen)
-    pieces = _grown(points, _components(core, smooth.depth, jump), risen)
-    thin = _components(risen & (pieces == 0), smooth.depth, jump)
+    smooth = view.smooth
+    risen = _risen(view)
+    risen[risen.clone()] = view.support.covers(view.points[risen], SEGMENT.overhang)
+    core = _core(smooth, risen)
+    pieces = _grown(view, _components(smooth, core), risen)
+    # what has no core, such as a pen, is a piece of its own
+    thin = _components(smooth, risen & (pieces == 0))
     pieces = torch.where((pieces == 0) & (thin > 0), pieces.max() + thin, pieces)
     sure = core | (thin > 0)
-    # A tenth of an object's pixels are 5 mm high and four deviations of the noise; an uneven table
-    # is not.
-    flat = measured & (mean.abs() < BAND)
+    pieces = torch.where(_are_things(view, pieces, sure)[pieces], pieces, 0)
+    pieces = cut_creases(smooth.image, smooth.points, pieces)
+    group = merge_pieces(smooth, torch.where(sure, pieces, 0))
+    labels = _numbered(_filled(view, group[pieces]))
+    # small objects that are noise are known only beside whole ones
+    small = count_labels(labels) < scale_pixels(SEGMENT.small, labels)
+    deviations = view.mean_height / view.fitted_noise
+    noise = torch.zeros_like(small)
+    for k in torch.nonzero(small)[:, 0].tolist():
+        noise[k] = k > 0 and _is_noise(view, deviations, labels, k)
+    return _numbered(torch.where(noise[labels], 0, labels))
+
+
+def _are_things(view: TableImage, pieces: Tensor, sure: Tensor) -> Bool[Tensor, "k"]:
+    """Return a mask of the piece numbers whose pixels are many, high, over the support and near
+    each other.
+    """
     whole = count_labels(pieces)
-    noise = fit_noise(image.depth[flat], mean[flat]).sigma(image.depth)
-    high = (
-        count_labels(torch.where(mean > (4 * noise).clamp_min(0.005), pieces, 0), len(whole))
-        >= 0.1 * whole
-    )
-    few = count_labels(torch.where(sure, pieces, 0), len(high)) < FEW
-    over = pieces[pieces > 0][support.covers(points[pieces > 0])]
-    beside = count_labels(over, len(high)) < 0.2 * whole
-    vast = label_radii(points, pieces) > VAST
-    pieces = cut_creases(smooth, torch.where((few | ~high | beside | vast)[pieces], 0, pieces))
-    group = merge_pieces(smooth, torch.where(sure, pieces, 0), table, jump)
-    whole = _numbered(_filled(group[pieces], measured, table.height(points)))
-    small = torch.nonzero(count_labels(whole) < 500 * whole.numel() / (640 * 480))[:, 0].tolist()
-    pixel = image.depth / float(image.intrinsics[0, 0])
-    noisy = [k for k in small if k > 0 and _is_noise(whole, k, points, pixel, mean / noise)]
-    return _numbered(
-        torch.where(torch.isin(whole, torch.tensor(noisy, dtype=whole.dtype)), 0, whole)
+    least = (SEGMENT.high_deviations * view.fitted_noise).clamp_min(SEGMENT.high)
+    high = count_labels(torch.where(view.mean_height > least, pieces, 0), len(whole))
+    many = count_labels(torch.where(sure, pieces, 0), len(whole)) >= SEGMENT.few
+    mine = pieces > 0
+    over = count_labels(pieces[mine][view.support.covers(view.points[mine])], len(whole))
+    return (
+        many
+        & (high >= SEGMENT.high_share * whole)
+        & (over >= SEGMENT.over * whole)
+        & (label_radii(view.points, pieces) <= SEGMENT.vast)
     )
 
 
-def rests_on(image: DepthImage, table: Plane) -> Bool[Tensor, "h w"]:
+def rests_on(view: TableImage) -> Bool[Tensor, "h w"]:
     """Return a mask of the pixels that rise above the table and lie on a surface; flying pixels are
     left out.
     """
-    smooth = image.without_speckle()
-    risen = _risen(smooth, table, *_smoothed(image, table))
-    return _grown(image.points(), _core(smooth, risen)[0].long(), risen) > 0
+    risen = _risen(view)
+    return _grown(view, _core(view.smooth, risen).long(), risen) > 0
 
 
-def _smoothed(image: DepthImage, table: Plane) -> tuple[Tensor, Tensor]:
-    """Return the mean height [m] of the 5 x 5 pixels around each pixel, and the least height of an
-    object there.
-    """
-    measured = image.depth > 0
-    height = table.height(image.points())
-    near = measured & (
-        height.abs() < 3 * BAND
-    )  # at an object's foot, without its distant neighbours
-    share = torch.from_numpy(ndimage.uniform_filter(near.double().numpy(), 5))
-    total = torch.from_numpy(ndimage.uniform_filter(torch.where(near, height, 0.0).numpy(), 5))
-    mean = torch.where(near, total / share.clamp_min(1e-9), height)
-    squared = image.depth.square()
-    flat = measured & (mean.abs() < BAND)
-    noise = 1.4826 * float((mean.abs() / squared)[flat].median()) if bool(flat.any()) else 0.0
-    return mean, (2.5 * noise * squared).clamp_min(LEAST_HEIGHT)
-
-
-def _risen(
-    smooth: DepthImage, table: Plane, mean: Tensor, threshold: Tensor
-) -> Bool[Tensor, "h w"]:
+def _risen(view: TableImage) -> Bool[Tensor, "h w"]:
     """Return a mask of the pixels above the table: their own height and the mean around them exceed
     a threshold.
     """
-    return (
-        (smooth.depth > 0) & (mean > threshold) & (table.height(smooth.points()) > 0.6 * threshold)
-    )
+    noise = SEGMENT.risen * view.median_noise * view.image.depth.square()
+    least = noise.clamp_min(SEGMENT.least_height)
+    smooth = view.smooth
+    return smooth.measured & (view.mean_height > least) & (smooth.height > SEGMENT.own * least)
 
 
-def _core(smooth: DepthImage, risen: Tensor) -> tuple[Tensor, Tensor]:
-    """Return a mask of pixels above the table and away from depth jumps; and, per pixel, the least
-    depth jump [m].
-    """
-    depth = smooth.depth
-    jump = 0.006 + 2.0 * depth / float(smooth.intrinsics[0, 0])
-    farthest = torch.from_numpy(
-        ndimage.maximum_filter(torch.where(depth > 0, depth, 0.0).numpy(), 3)
-    )
-    nearest = torch.from_numpy(
-        ndimage.minimum_filter(torch.where(depth > 0, depth, 100.0).numpy(), 3)
-    )
-    return risen & ~((farthest - depth > jump) | (depth - nearest > jump)), jump
+def _core(smooth: TableImage, risen: Tensor) -> Bool[Tensor, "h w"]:
+    """Return a mask of pixels above the table and away from depth jumps."""
+    depth = smooth.image.depth
+    behind = torch.where(smooth.measured, depth, 0.0).numpy()
+    # where nothing was measured, all is far away
+    before = torch.where(smooth.measured, depth, 100.0).numpy()
+    farthest = torch.from_numpy(ndimage.maximum_filter(behind, 3))
+    nearest = torch.from_numpy(ndimage.minimum_filter(before, 3))
+    return risen & ~((farthest - depth > smooth.jump) | (depth - nearest > smooth.jump))
 
 
-def _components(core: Tensor, depth: Tensor, jump: Tensor) -> Int[Tensor, "h w"]:
+def _components(smooth: TableImage, core: Tensor) -> Int[Tensor, "h w"]:
     """Return the number, from 1, of each pixel's connected component in the mask `core`; 0 outside
     of the mask.
     """
     h, w = core.shape
+    depth = smooth.image.depth
     index = torch.arange(h * w).reshape(h, w)
     edges = []
-    for down, right in ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0)):
+    for down, right in NEIGHBOURS:
         a = (slice(0, h - down), slice(max(0, -right), w - max(0, right)))
         b = (slice(down, h), slice(max(0, right), w - max(0, -right)))
-        joined = core[a] & core[b] & ((depth[a] - depth[b]).abs() < jump[a])
+        joined = core[a] & core[b] & ((depth[a] - depth[b]).abs() < smooth.jump[a])
         edges.append(torch.stack([index[a][joined], index[b][joined]]))
-    number = torch.from_numpy(
-        number_components(torch.cat(edges, 1).T.numpy(), h * w).astype(np.int64)
-    )
+    pairs = torch.cat(edges, 1).T.numpy()
+    number = torch.from_numpy(number_components(pairs, h * w).astype(np.int64))
     return torch.where(core, number.reshape(h, w) + 1, 0)
 
 
-def _grown(points: Tensor, labels: Tensor, risen: Tensor) -> Int[Tensor, "h w"]:
-    """Return labels in which pixels above the table without a label get that of the nearest point
-    within `NEAR`.
+def _grown(view: TableImage, labels: Tensor, risen: Tensor) -> Int[Tensor, "h w"]:
+    """Return labels in which pixels above the table without a label get that of the nearest point,
+    if one is near.
     """
-    labels = torch.where((count_labels(labels) < FEW)[labels], 0, labels).reshape(-1)
-    place = points.reshape(-1, 3).numpy()
+    labels = torch.where((count_labels(labels) < SEGMENT.few)[labels], 0, labels).reshape(-1)
+    place = view.points.reshape(-1, 3).numpy()
     loose = torch.nonzero(risen.reshape(-1) & (labels == 0))[:, 0]
     new = torch.nonzero(labels)[:, 0]
-    for _ in range(12):
+    for _ in range(SEGMENT.rounds):
         if not len(new) or not len(loose):
             break
         distance, index = spatial.KDTree(place[new.numpy()]).query(
-            place[loose.numpy()], distance_upper_bound=NEAR
+            place[loose.numpy()], distance_upper_bound=SEGMENT.near
         )
         found = torch.from_numpy(np.isfinite(distance))
         labels[loose[found]] = labels[new[torch.from_numpy(index)[found]]]
+        # the pixels found last are those at which an object grows on
         new = loose[found]
         loose = loose[~found]
     return labels.reshape(risen.shape)
 
 
-def _filled(labels: Tensor, measured: Tensor, height: Tensor) -> Int[Tensor, "h w"]:
+def _filled(view: TableImage, labels: Tensor) -> Int[Tensor, "h w"]:
     """Return labels in which the inner floor of an object, such as a pan, has the label of that
     object.
     """
     holes = np.empty(labels.shape, dtype=np.int32)
-    ndimage.label((measured & (labels == 0)).numpy(), output=holes)
+    ndimage.label((view.measured & (labels == 0)).numpy(), output=holes)
     whole = labels.clone()
     boxes: list[tuple[slice, slice]] = ndimage.find_objects(holes)
-    for number, box in enumerate(boxes, start=1):
-        row, column = (slice(max(0, side.start - 2), side.stop + 2) for side in box)
-        hole = torch.from_numpy(holes[row, column] == number)
-        if int(hole.sum()) < FEW:
+    for number, (rows, columns) in enumerate(boxes, start=1):
+        # with a border of two pixels, in which the objects around the hole are seen
+        box = (
+            slice(max(0, rows.start - 2), rows.stop + 2),
+            slice(max(0, columns.start - 2), columns.stop + 2),
+        )
+        hole = torch.from_numpy(holes[box] == number)
+        if int(hole.sum()) < SEGMENT.few:
             continue
-        around = labels[row, column][
-            torch.from_numpy(ndimage.binary_dilation(hole.numpy(), iterations=2)) & ~hole
-        ]
+        near = torch.from_numpy(ndimage.binary_dilation(hole.numpy(), iterations=2))
+        around = labels[box][near & ~hole]
         names = around[around > 0].unique()
         edge = bool(hole[0].any() | hole[-1].any() | hole[:, 0].any() | hole[:, -1].any())
-        if len(names) == 1 and not edge and float(height[row, column][hole].median()) > 0.001:
-            whole[row, column] = torch.where(hole, names, whole[row, column])
+        # a hole whose floor is the table is no part of its object, such as a ring
+        if len(names) == 1 and not edge and float(view.height[box][hole].median()) > SEGMENT.floor:
+            whole[box] = torch.where(hole, names, whole[box])
     return whole
 
 
@@ -190,41 +220,42 @@ def count_labels(labels: Tensor, length: int = 0) -> Int[Tensor, "k"]:
 
 
 def _numbered(labels: Int[Tensor, "h w"]) -> Int[Tensor, "h w"]:
-    """Return labels renumbered 1, 2, ... from the largest object; specks (below 100 pixels of 640 x
-    480) become 0.
-    """
+    """Return labels renumbered 1, 2, ... from the largest object; specks become 0."""
     count = count_labels(labels)
     count[0] = 0
     order = torch.argsort(count, descending=True, stable=True)
-    order = order[count[order] >= 100 * labels.numel() / (640 * 480)]
+    order = order[count[order] >= scale_pixels(SEGMENT.speck, labels)]
     new = torch.zeros_like(count)
     new[order] = torch.arange(1, len(order) + 1)
     return new[labels]
 
 
-def _is_noise(
-    labels: Int[Tensor, "h w"], k: int, points: Tensor, pixel: Tensor, deviations: Tensor
-) -> bool:
-    """Return whether the small object k is an uneven place of the table, or a fringe of a body ten
+def _is_noise(view: TableImage, deviations: Tensor, labels: Int[Tensor, "h w"], k: int) -> bool:
+    """Return whether the small object k is an uneven place of the table, or a fringe of a body many
     times as large.
 
-    `pixel` is the width of each pixel on its surface [m]. `deviations` are heights above the table
-    over the noise's.
+    `deviations` (h, w) are heights above the table over the noise's.
     """
     mine = labels == k
-    if float((deviations[mine] > 8).double().mean()) < 0.25:
+    uneven = (deviations[mine] > SEGMENT.uneven).double().mean()
+    if float(uneven) < SEGMENT.uneven_share:
         return True
-    rows, columns = (
-        slice(max(0, int(side.min()) - 4), int(side.max()) + 5) for side in torch.nonzero(mine).T
+    # only pixels about the object matter from here on
+    margin = SEGMENT.margin
+    row, column = torch.nonzero(mine).T
+    box = (
+        slice(max(0, int(row.min()) - margin), int(row.max()) + margin + 1),
+        slice(max(0, int(column.min()) - margin), int(column.max()) + margin + 1),
     )
-    width = float(pixel[mine].median())
-    mine = mine[rows, columns]
-    near = labels[rows, columns]
-    points = points[rows, columns]
-    if width * float(np.max(np.asarray(ndimage.distance_transform_edt(mine.numpy())))) > 0.005:
+    pixel = float((view.image.depth[mine] / view.image.focal).median())
+    mine = mine[box]
+    inside = np.asarray(ndimage.distance_transform_edt(mine.numpy()))
+    if pixel * float(np.max(inside)) > SEGMENT.fringe:
         return False
-    around = (
-        torch.from_numpy(ndimage.binary_dilation(mine.numpy(), iterations=4)) & (near > 0) & ~mine
+    near = torch.from_numpy(ndimage.binary_dilation(mine.numpy(), iterations=margin))
+    large = count_labels(labels)[labels[box]] > SEGMENT.larger * int(mine.sum())
+    around = near & (labels[box] > 0) & ~mine & large
+    points = view.points[box]
+    return (
+        bool(around.any()) and float(torch.cdist(points[around], points[mine]).min()) < MERGE.reach
     )
-    around &= count_labels(labels)[near] > 10 * int(mine.sum())
-    return bool(around.any()) and float(torch.cdist(points[around], points[mine]).min()) < REACH

@@ -1,0 +1,100 @@
+"""A depth image above its table: points, heights and the noise of the table, each computed once."""
+
+import dataclasses
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchgrasp.cloud.sensor import fit_noise
+from torchgrasp.foundation.base import Value, kept
+from torchgrasp.foundation.lazy import ndimage
+from torchgrasp.geometry.support_planes import SupportPlane
+from torchgrasp.scene.image import DepthImage
+
+
+@dataclasses.dataclass(frozen=True)
+class HeightNumbers:
+    """Numbers of the heights above a table, and of their noise."""
+
+    window: int = 5
+    """Side of the square over which heights are averaged [px]."""
+    band: float = 0.010
+    """Mean heights below this [m], of either sign, measure the noise of the table."""
+    foot: float = 0.030
+    """Heights up to this [m] are averaged: at an object's foot, not its distant neighbours."""
+    normal: float = 1.4826
+    """Standard deviation over the median of the absolute value, of a normal distribution."""
+    jump: float = 0.006
+    """Least jump of depth between two surfaces [m], beside that of a slope."""
+    slope: float = 2.0
+    """Depth by which a surface may slope from pixel to pixel, over a pixel's width."""
+    least_share: float = 1e-9
+    """A share of averaged pixels that is not 0, for the division."""
+
+
+HEIGHT = HeightNumbers()
+
+
+@dataclasses.dataclass(frozen=True)
+class TableImage(Value):
+    """A depth image, its points [m], and the support of the objects in it."""
+
+    image: DepthImage
+    points: Float[Tensor, "h w 3"]
+    support: SupportPlane
+
+    @classmethod
+    def of(cls, image: DepthImage, support: SupportPlane) -> "TableImage":
+        """Return the image above a support, with its points."""
+        return cls(image, image.points(), support)
+
+    @property
+    def measured(self) -> Bool[Tensor, "h w"]:
+        """The pixels at which a depth was measured."""
+        return self.image.depth > 0
+
+    @kept
+    def height(self) -> Float[Tensor, "h w"]:
+        """The height of each pixel's point above the table [m]."""
+        return self.support.plane.height(self.points)
+
+    @kept
+    def smooth(self) -> "TableImage":
+        """The image without speckle, above the same support."""
+        return TableImage.of(self.image.without_speckle(), self.support)
+
+    @kept
+    def mean_height(self) -> Float[Tensor, "h w"]:
+        """The mean height of the 5 x 5 pixels around each pixel [m]."""
+        near = self.measured & (self.height.abs() < HEIGHT.foot)
+        share = torch.from_numpy(ndimage.uniform_filter(near.double().numpy(), HEIGHT.window))
+        low = torch.where(near, self.height, 0.0)
+        total = torch.from_numpy(ndimage.uniform_filter(low.numpy(), HEIGHT.window))
+        return torch.where(near, total / share.clamp_min(HEIGHT.least_share), self.height)
+
+    @kept
+    def flat(self) -> Bool[Tensor, "h w"]:
+        """The pixels on the table, which measure its noise."""
+        return self.measured & (self.mean_height.abs() < HEIGHT.band)
+
+    @kept
+    def median_noise(self) -> float:
+        """The noise of mean heights over the squared depth [1/m], from the median: few outliers
+        do not move it. It is 0 if no pixel shows the table.
+        """
+        if not bool(self.flat.any()):
+            return 0.0
+        relative = (self.mean_height.abs() / self.image.depth.square())[self.flat]
+        return HEIGHT.normal * float(relative.median())
+
+    @kept
+    def fitted_noise(self) -> Float[Tensor, "h w"]:
+        """The noise of mean heights at each pixel's depth [m], as a fitted sensor has it."""
+        depth = self.image.depth
+        return fit_noise(depth[self.flat], self.mean_height[self.flat]).sigma(depth)
+
+    @kept
+    def jump(self) -> Float[Tensor, "h w"]:
+        """The least difference in depth [m] between a pixel and another surface beside it."""
+        return HEIGHT.jump + HEIGHT.slope * self.image.depth / self.image.focal
