@@ -8,18 +8,13 @@ from torch import Tensor
 
 from torchgrasp.cloud.prepare import PreparedCloud
 from torchgrasp.foundation.base import Value, join
-from torchgrasp.geometry.linalg import Points, farthest_points, fibonacci_sphere, unit
-from torchgrasp.shape.completion.complete import (
-    LEAST_NOISE,
-    PART,
-    Completion,
-    Kind,
-    correlated_errors,
-)
-from torchgrasp.shape.completion.silhouette import TIE, Outlines, Silhouette
+from torchgrasp.geometry.linalg import Points, fibonacci_sphere, unit
+from torchgrasp.shape.completion.complete import HIDDEN, Completion, Kind, correlated_errors
+from torchgrasp.shape.completion.silhouette import OUTLINE, Outlines, Silhouette, pick_apart
+from torchgrasp.shape.completion.symmetry import AXIS
 from torchgrasp.shape.completion.vessel import (
-    FORM_ERROR,
-    RIM,
+    VESSEL,
+    WALL,
     HiddenWall,
     Vessel,
     Wall,
@@ -30,22 +25,86 @@ from torchgrasp.shape.estimate import Normalisation, Observations, off_surface, 
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.values.planning import PointCloud
 
-# number of points outside, and normalised radius of their sphere (Sec. 3.1)
-OUTER_POINTS = 20
-OUTER_RADIUS = 1.2
-# standard deviation, normalised, of a distance outside: the nearest of sparse points is too far
-# away
-OUTER_NOISE = 0.3
-NORMAL_NOISE = 0.05
-RIM_NORMAL_NOISE = 0.5
-HIDDEN_NORMAL_NOISE = 0.25
-"""Standard deviations of unit normals: on the seen side, on the outline, and on the hidden side."""
-RIM_NOISE = 0.002  # standard deviation [m] of a point of the outline
-FREE_NOISE = (
-    0.003  # standard deviation [m] of a distance observed in free space: it is only a lower bound
-)
-OUTLINE_ERROR = 0.005  # the object may reach this far [m] beyond its outline: a camera loses rims
-MAX_RADIUS = 1.15  # share of the radius of all points within which free space is probed
+
+@dataclasses.dataclass(frozen=True)
+class OutsideNumbers:
+    """The numbers of the points outside the object."""
+
+    points: int = 20
+    radius: float = 1.2
+    """Number of points, and normalised radius of their sphere (Sec. 3.1)."""
+    noise: float = 0.3
+    """Deviation, normalised, of a distance: the nearest of sparse points is too far away."""
+
+
+OUTSIDE = OutsideNumbers()
+
+
+@dataclasses.dataclass(frozen=True)
+class ObservationNumbers:
+    """The standard deviations of observations."""
+
+    normal: float = 0.05
+    rim_normal: float = 0.5
+    hidden_normal: float = 0.25
+    vessel_rim_normal: float = 0.5
+    """Of unit normals: on the seen side, on the outline, on the hidden side, and on the outline of
+    a vessel.
+    """
+    rim: float = 0.002
+    """Of a point of the outline [m]."""
+    free: float = 0.003
+    """Of a distance observed in free space [m]: it is only a lower bound."""
+
+
+NOISE = ObservationNumbers()
+
+
+@dataclasses.dataclass(frozen=True)
+class FreeNumbers:
+    """The numbers of the points in free space."""
+
+    outline_error: float = 0.005
+    """The object may reach so far [m] beyond its outline: a camera loses rims."""
+    radius: float = 1.15
+    """Share of the radius of all points within which free space is probed."""
+    ground: int = 9
+    ground_side: float = 0.9
+    """Points along each side of a square below the table, and half its side, normalised."""
+    below: tuple[float, ...] = (0.003, 0.012)
+    """Depths [m] of these points."""
+    least: float = 0.001
+    """A smaller distance [m] is no constraint."""
+    beside: tuple[float, ...] = (0.008, 0.016)
+    """Distances [m] of camera rays from the outline."""
+    rays: int = 32
+    """Rays at each distance."""
+    depths: int = 13
+    """Points along each ray, over the object's depth."""
+    violation: float = 0.002
+    """A point so deep [m] inside the shape violates free space."""
+    violations: int = 16
+    """Most such points that are added at once."""
+
+
+FREE = FreeNumbers()
+
+
+@dataclasses.dataclass(frozen=True)
+class MiddleNumbers:
+    """The numbers of the points off a vessel's surfaces."""
+
+    points: int = 150
+    """Most points in the middle of the wall."""
+    side: float = 0.8
+    """Greatest vertical part of the normals of a side: a floor may be thicker than known."""
+    over: float = 0.5
+    """Height of a point over the rim, in radii: the inner surface, without a lid, still surrounds
+    free space there.
+    """
+
+
+MIDDLE = MiddleNumbers()
 STD_FACTORS: dict[tuple[Kind, bool], float] = {
     ("ball", True): 0.5,
     ("revolution", True): 0.56,
@@ -76,18 +135,14 @@ class ExtraObservations(Value):
     """The normalised frame of a surface, and the observations besides the cloud."""
 
     frame: Normalisation
-    anchors: (
-        Observations  # observed distances at points inside and outside the object, without normals
-    )
+    # observed distances at points inside and outside the object, without normals
+    anchors: Observations
     normal_noise: float  # standard deviation of the cloud's normals
-    std_factor: float = (
-        1.0  # ratio of the surface's true deviations to the posterior's standard deviations
-    )
+    # ratio of the surface's true deviations to the posterior's standard deviations
+    std_factor: float = 1.0
     parts: tuple[Part, ...] = ()  # observed points of the outline and of the hidden side
     free: FreeSpace | None = None  # points in free space, or None if they are not used
-    rows: Bool[Tensor, "rows"] | None = (
-        None  # mask of the cloud's points on this surface; None means all
-    )
+    rows: Bool[Tensor, "rows"] | None = None  # the cloud's points on this surface; None means all
     kind: Kind = "guess"  # how the hidden side was completed, as in `ShapeGP`
 
 
@@ -99,10 +154,9 @@ def paper_support(
     """
     center = seen.points.mean(0)
     scale = float(torch.linalg.vector_norm(seen.points - center, dim=-1).max())
-    sphere = unit(
-        torch.randn(OUTER_POINTS, 3, dtype=torch.float64, device="cpu", generator=generator)
-    ).to(center)
-    x = torch.cat([torch.zeros_like(center)[None], OUTER_RADIUS * sphere])
+    draws = torch.randn(OUTSIDE.points, 3, dtype=torch.float64, device="cpu", generator=generator)
+    sphere = unit(draws).to(center)
+    x = torch.cat([torch.zeros_like(center)[None], OUTSIDE.radius * sphere])
     distance = torch.cat([-torch.ones_like(center[:1]), torch.ones_like(sphere[:, 0])])
     return ExtraObservations(Normalisation(center, scale), off_surface(x, distance, noise), noise)
 
@@ -125,53 +179,57 @@ def camera_support(
     is the standard deviation of the distance observed inside, normalised; `table` is the table's
     height [m].
     """
-    hidden = seen.points[:0] if completion is None else completion.points.to(seen.points)
-    surface = torch.cat([seen.points, hidden])
-    # The domain holds the whole of a ball. Of others the hidden side is too uncertain to set the
-    # scale.
-    frame = frame_around(
-        surface if completion is not None and completion.kind == "ball" else seen.points
-    )
-    center = frame.center
-    kind = "whole"
+    kind: Kind = "whole"
     parts = ()
     free = None
     inside = True
+    surface = seen.points
+    around = surface
+    if completion is not None:
+        kind = completion.kind
+        surface = torch.cat([seen.points, completion.points.to(seen.points)])
+        # The domain holds the whole of a ball. Of others the hidden side is too uncertain to set
+        # the scale.
+        if kind == "ball":
+            around = surface
+    frame = frame_around(around)
+    center = frame.center
     if completion is not None:
         parts = _observe_completion(completion, frame)
-        kind = completion.kind
-        reach = (
-            torch.linalg.vector_norm(frame.normalise(surface), dim=-1).max()
-            if completion.frame
-            else 1.0
-        )
-        free = free_space(completion.outline, frame, table, float(reach))
-        inside = (
-            not completion.frame and float(completion.outline.violation(center.cpu())) == 0.0
-        )  # an arch, a bowl
-    sphere = OUTER_RADIUS * fibonacci_sphere(OUTER_POINTS).to(center)
+        reach = 1.0
+        if completion.frame:
+            reach = float(torch.linalg.vector_norm(frame.normalise(surface), dim=-1).max())
+        free = free_space(completion.outline, frame, table, reach)
+        # the centre of an arch or of a bowl is not inside
+        inside = not completion.frame and float(completion.outline.violation(center.cpu())) == 0.0
+    sphere = OUTSIDE.radius * fibonacci_sphere(OUTSIDE.points).to(center)
     x = torch.cat([torch.zeros_like(center)[None], sphere]) if inside else sphere
     distance = torch.cdist(x, frame.normalise(surface)).amin(1)
-    inner = off_surface(x[:-OUTER_POINTS], -distance[:-OUTER_POINTS], noise)
-    outer = x[-OUTER_POINTS:]
-    anchors = join([inner, off_surface(outer, distance[-OUTER_POINTS:], OUTER_NOISE)])
-    return ExtraObservations(
-        frame, anchors, NORMAL_NOISE, STD_FACTORS[kind, table is not None], parts, free, kind=kind
-    )
+    count = len(x) - OUTSIDE.points
+    inner = off_surface(x[:count], -distance[:count], noise)
+    outer = off_surface(sphere, distance[count:], OUTSIDE.noise)
+    factor = STD_FACTORS[kind, table is not None]
+    anchors = join([inner, outer])
+    return ExtraObservations(frame, anchors, NOISE.normal, factor, parts, free, kind=kind)
 
 
 def _observe_completion(completion: Completion, frame: Normalisation) -> tuple[Part, ...]:
     """Return observations of points on the outline and on the hidden side, and the errors that they
     share.
     """
-    outline = completion.outline
-    hidden = observe(frame, completion.points, completion.normals, LEAST_NOISE, HIDDEN_NORMAL_NOISE)
-    tilt = (completion.asymmetry / PART).to(
-        frame.center
-    )  # slope of a field with that deviation and length
+    hidden = observe(
+        frame, completion.points, completion.normals, HIDDEN.noise, NOISE.hidden_normal
+    )
+    # slope of a field with that deviation and length
+    tilt = (completion.asymmetry / HIDDEN.part).to(frame.center)
     hidden = dataclasses.replace(hidden, normal_noise=torch.hypot(hidden.normal_noise, tilt))
-    rim = observe(frame, outline.rim, outline.rim_normals, RIM_NOISE, RIM_NORMAL_NOISE)
-    return (rim, None), (hidden, completion.deviations.to(frame.center) / frame.scale)
+    rim = _observe_rim(completion.outline, frame, NOISE.rim_normal)
+    return rim, (hidden, completion.deviations.to(frame.center) / frame.scale)
+
+
+def _observe_rim(outline: Outlines, frame: Normalisation, normal_noise: float) -> Part:
+    """Return observations of points on the outline."""
+    return observe(frame, outline.rim, outline.rim_normals, NOISE.rim, normal_noise), None
 
 
 def observe(
@@ -209,51 +267,48 @@ def vessel_supports(
     frame = frame_around(cloud.points)
     outer, inner = complete_walls(cloud, vessel, outline, table)
     hidden = join([outer.hidden, lid(vessel)])
-    axis = torch.cat([vessel.center, torch.zeros(1, dtype=torch.float64, device="cpu")])
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64, device="cpu")
-    sphere = frame.metres(OUTER_RADIUS * fibonacci_sphere(OUTER_POINTS))
-
-    def anchors(points: Points, distance: Float[Tensor, "n"]) -> Observations:
-        return off_surface(frame.normalise(points), distance / frame.scale, noise)
-
-    surface = torch.cat([cloud.points[outer.seen], hidden.points])
-    middle = (axis + 0.5 * (table + vessel.rim) * up)[None]
-    depth = torch.minimum(torch.cdist(middle, surface).amin(1), middle[:, 2] - table)
-    body = anchors(
-        torch.cat([middle, sphere]), torch.cat([-depth, torch.cdist(sphere, surface).amin(1)])
-    )
-    rim = observe(frame, outline.rim, outline.rim_normals, RIM_NOISE, 2 * HIDDEN_NORMAL_NOISE)
-
-    surface = torch.cat([cloud.points[inner.seen], inner.hidden.points])
-    bottom = float(surface[:, 2].min())
-    over = (
-        vessel.rim + 0.5 * vessel.radius
-    )  # there the inner surface still surrounds free space: it has no lid
-    heights = torch.tensor(
-        [0.5 * (bottom + vessel.rim), vessel.rim, over], dtype=torch.float32, device="cpu"
-    ).double()
-    inside = axis + heights[:, None] * up
-    around = sphere[sphere[:, 2] < vessel.rim]
-    clear = torch.cat([torch.cdist(inside, surface).amin(1), -torch.cdist(around, surface).amin(1)])
-    space = anchors(torch.cat([inside, around]), clear)
+    up = AXIS[0]
+    axis = torch.cat([vessel.center, up.new_zeros(1)])
+    sphere = frame.metres(OUTSIDE.radius * fibonacci_sphere(OUTSIDE.points))
 
     def support(
-        anchors: Observations, parts: list[Part], free: FreeSpace | None, rows: Tensor
+        points: Points, distance: Float[Tensor, "n"], parts: list[Part], rows: Bool[Tensor, "rows"]
     ) -> ExtraObservations:
+        anchors = off_surface(frame.normalise(points), distance / frame.scale, noise)
         on_device = tuple(
             (part.to(device), None if errors is None else errors.to(device))
             for part, errors in parts
         )
-        placed = (frame.to(device), anchors.to(device), NORMAL_NOISE)
-        factor = STD_FACTORS["vessel", True]
-        return ExtraObservations(*placed, factor, on_device, free, rows.to(device), "vessel")
+        return ExtraObservations(
+            frame.to(device),
+            anchors.to(device),
+            NOISE.normal,
+            STD_FACTORS["vessel", True],
+            on_device,
+            rows=rows.to(device),
+            kind="vessel",
+        )
 
-    free = free_space(outline, frame.to(device), table)
-    return (
-        support(body, [(rim, None), _observe_hidden(frame, hidden)], free, outer.seen),
-        support(space, [_observe_hidden(frame, inner.hidden)], None, inner.seen),
-        _middle(cloud, vessel, (outer, inner), frame).to(device),
-    )
+    surface = torch.cat([cloud.points[outer.seen], hidden.points])
+    middle = (axis + 0.5 * (table + vessel.rim) * up)[None]
+    depth = torch.minimum(torch.cdist(middle, surface).amin(1), middle[:, 2] - table)
+    clear = torch.cat([-depth, torch.cdist(sphere, surface).amin(1)])
+    rim = _observe_rim(outline, frame, NOISE.vessel_rim_normal)
+    parts = [rim, _observe_hidden(frame, hidden)]
+    body = support(torch.cat([middle, sphere]), clear, parts, outer.seen)
+    body = dataclasses.replace(body, free=free_space(outline, frame.to(device), table))
+
+    surface = torch.cat([cloud.points[inner.seen], inner.hidden.points])
+    bottom = float(surface[:, 2].min())
+    over = vessel.rim + MIDDLE.over * vessel.radius
+    places = [0.5 * (bottom + vessel.rim), vessel.rim, over]
+    heights = torch.tensor(places, dtype=torch.float32, device="cpu").double()
+    inside = axis + heights[:, None] * up
+    around = sphere[sphere[:, 2] < vessel.rim]
+    clear = torch.cat([torch.cdist(inside, surface).amin(1), -torch.cdist(around, surface).amin(1)])
+    parts = [_observe_hidden(frame, inner.hidden)]
+    space = support(torch.cat([inside, around]), clear, parts, inner.seen)
+    return body, space, _middle(cloud, vessel, (outer, inner), frame).to(device)
 
 
 def _middle(
@@ -270,24 +325,21 @@ def _middle(
         normals += [cloud.normals[seen], wall.hidden.normals]
     at = torch.cat(points)
     out = torch.cat(normals)
-    below = at[:, 2] < vessel.rim - RIM
+    below = at[:, 2] < vessel.rim - VESSEL.rim
     at = at[below]
     out = out[below]
-    rows = farthest_points(at, 150, tie=TIE)
+    rows = pick_apart(at, MIDDLE.points)
     x = frame.normalise(at[rows] - 0.5 * vessel.thickness * out[rows])
-    return Middle(
-        x, out[rows, 2].abs() < 0.8, vessel.thickness / frame.scale
-    )  # a floor may be thicker
+    return Middle(x, out[rows, 2].abs() < MIDDLE.side, vessel.thickness / frame.scale)
 
 
 def _observe_hidden(frame: Normalisation, wall: HiddenWall) -> Part:
     """Return observations of points on a hidden wall, in normalised units, and their correlated
     errors.
     """
-    errors = correlated_errors(wall.points, wall.shared, FORM_ERROR)
-    return observe(
-        frame, wall.points, wall.normals, LEAST_NOISE, HIDDEN_NORMAL_NOISE
-    ), errors / frame.scale
+    errors = correlated_errors(wall.points, wall.shared, WALL.form)
+    seen = observe(frame, wall.points, wall.normals, HIDDEN.noise, NOISE.hidden_normal)
+    return seen, errors / frame.scale
 
 
 def free_space(
@@ -302,52 +354,47 @@ def free_space(
     origin = frame.center.double().cpu()
     scale = frame.scale * reach
     points = torch.cat([_points_beside(view, origin, scale) for view in outline.views])
-    least = outline.hull_distance(points) - OUTLINE_ERROR
+    least = outline.hull_distance(points) - FREE.outline_error
     if table is not None:
-        side = scale * torch.linspace(-0.9, 0.9, 9, dtype=torch.float64, device="cpu")
+        half = FREE.ground_side
+        steps = torch.linspace(-half, half, FREE.ground, dtype=torch.float64, device="cpu")
+        side = scale * steps
         ground = torch.cartesian_prod(side, side) + origin[:2]
-        for below in (0.003, 0.012):  # [m]
+        for below in FREE.below:
             height = torch.full_like(ground[:, :1], table - below)
             points = torch.cat([points, torch.cat([ground, height], 1)])
             least = torch.cat([least, torch.full_like(ground[:, 0], below)])
     x = (points - origin) / scale
-    keep = (torch.linalg.vector_norm(x, dim=-1) < MAX_RADIUS) & (
-        least > 0.001
-    )  # a smaller distance is no constraint
+    keep = (torch.linalg.vector_norm(x, dim=-1) < FREE.radius) & (least > FREE.least)
     return reach * x[keep].to(frame.center), least[keep].to(frame.center) / frame.scale
 
 
 def free_space_violations(
     shape: ShapeGP, x: Float[Tensor, "n 3"], least: Float[Tensor, "n"]
 ) -> Tensor:
-    """Return the indices of at most 16 free-space points that lie 2 mm or more inside the shape,
-    the worst first.
+    """Return the indices of some free-space points that lie well inside the shape, the worst
+    first.
     """
     short = shape.mean(x) - least
-    rows = torch.nonzero(short < -0.002 / shape.scale)[:, 0]
+    rows = torch.nonzero(short < -FREE.violation / shape.scale)[:, 0]
     rows = rows[torch.argsort(short[rows], stable=True)]
-    return rows[farthest_points(x[rows], 16, tie=TIE)]
+    return rows[pick_apart(x[rows], FREE.violations)]
 
 
-def _points_beside(
-    outline: Silhouette, origin: Float[Tensor, "3"], scale: float
-) -> Float[Tensor, "n 3"]:
-    """Return points [m] on camera rays, 32 each 8 and 16 mm outside the outline, over the object's
-    depth.
-    """
+def _points_beside(outline: Silhouette, origin: Float[Tensor, "3"], scale: float) -> Points:
+    """Return points [m] on camera rays beside the outline, over the object's depth."""
     # the depth is 0 beyond the image
     depth = float(outline.depth[outline.depth > 0].median())
     rays = []
-    for offset in (0.008, 0.016):
-        near = (outline.outside - offset / depth).abs() <= 0.75 * outline.cell
+    for offset in FREE.beside:
+        near = (outline.outside - offset / depth).abs() <= OUTLINE.edge * outline.cell
         row, column = torch.nonzero(near, as_tuple=True)
         position = outline.corner + outline.cell * torch.stack([column, row], -1).double()
-        beside = torch.cat(
-            [position, torch.ones_like(position[:, :1])], -1
-        )  # at depth 1 in the camera's frame
-        rays.append(beside[farthest_points(beside, 32, tie=TIE)])
+        # at depth 1 in the camera's frame
+        beside = torch.cat([position, torch.ones_like(position[:, :1])], -1)
+        rays.append(beside[pick_apart(beside, FREE.rays)])
     middle = float((origin - outline.viewpoint) @ outline.axes[2])
-    depths = middle + scale * torch.linspace(-1.0, 1.0, 13, dtype=torch.float64, device="cpu")
-    return (torch.cat(rays)[:, None] * depths[:, None]).reshape(
-        -1, 3
-    ) @ outline.axes + outline.viewpoint
+    steps = torch.linspace(-1.0, 1.0, FREE.depths, dtype=torch.float64, device="cpu")
+    depths = middle + scale * steps
+    local = torch.cat(rays)[:, None] * depths[:, None]  # (r, depths, 3)
+    return local.reshape(-1, 3) @ outline.axes + outline.viewpoint

@@ -34,8 +34,8 @@ from torchgrasp.shape.conditioning import (
 )
 from torchgrasp.shape.estimate import Normalisation, Observations, off_surface, on_surface
 from torchgrasp.shape.extra_observations import (
-    FREE_NOISE,
-    OUTER_POINTS,
+    NOISE,
+    OUTSIDE,
     ExtraObservations,
     camera_support,
     free_space_violations,
@@ -47,7 +47,23 @@ from torchgrasp.shape.hollow import HollowShape, tie_walls
 from torchgrasp.shape.kernel import Kernel, KernelName, is_plain, kernel_by_name
 from torchgrasp.values.planning import PointCloud
 
-MAX_BUDGET = 1000  # greatest number of observed points: their factor has 4000 rows
+
+@dataclasses.dataclass(frozen=True)
+class ShapeNumbers:
+    """The numbers of a shape fit."""
+
+    budget: int = 1000
+    """Greatest number of observed points: their factor has 4000 rows."""
+    camera: int = 85
+    paper: int = 70
+    """Usual numbers of observed points, by the kind of support."""
+    rounds: int = 3
+    """Most rounds in which violated free space is observed."""
+    gap: float = 0.025
+    """Width [m] of a gap that misleads a fingertip; a handle's is narrower."""
+
+
+SHAPE = ShapeNumbers()
 
 
 @checked
@@ -55,7 +71,7 @@ MAX_BUDGET = 1000  # greatest number of observed points: their factor has 4000 r
 def fit_shape(
     cloud: CloudLike,
     noise: Annotated[float, Range(LEAST, 1.0)] = 0.01,
-    budget: Annotated[int, Range(OUTER_POINTS + 5, MAX_BUDGET)] | Literal["sure"] | None = None,
+    budget: Annotated[int, Range(OUTSIDE.points + 5, SHAPE.budget)] | Literal["sure"] | None = None,
     psi_scale: Annotated[float, Range(1.0, 100.0)] = 1.5,
     support: Literal["camera", "paper"] = "camera",
     seed: Seed = 0,
@@ -192,11 +208,11 @@ def _fit_surface(seen: PreparedCloud, support: ExtraObservations, options: FitOp
     kernel = (
         kernel_by_name(options.kernel, psi) if isinstance(options.kernel, str) else options.kernel
     )
-    usual = 85 if options.support == "camera" else 70
+    usual = SHAPE.camera if options.support == "camera" else SHAPE.paper
     stop = -math.inf
     budget = options.budget or usual
     if budget == "sure":
-        budget = MAX_BUDGET
+        budget = SHAPE.budget
         stop = options.noise
     budget = max(budget - len(support.anchors), 1)
     posterior = select_points(
@@ -210,11 +226,11 @@ def _fit_surface(seen: PreparedCloud, support: ExtraObservations, options: FitOp
     if support.free is None:
         return shape
     free, least = support.free
-    for _ in range(3):
+    for _ in range(SHAPE.rounds):
         rows = free_space_violations(shape, free, least)
         if not len(rows):
             break
-        shape = shape.append(off_surface(free[rows], least[rows], FREE_NOISE / shape.scale))
+        shape = shape.append(off_surface(free[rows], least[rows], NOISE.free / shape.scale))
     return shape
 
 
@@ -273,7 +289,7 @@ def _warn_of_ambiguity(cloud: PointCloud, outline: Outlines, on_table: bool) -> 
             CutOff,
             "the border of the image cuts the object off: the part beyond it is a guess; turn the camera",
         )
-    if outline.gap > 0.025:  # [m]; a narrower gap, such as a handle's, does not mislead a fingertip
+    if outline.gap > SHAPE.gap:
         width = f"a gap of {1e3 * outline.gap:.0f} mm in the view"
         _warn(
             Gap, f"{width}: a hole, or a patch that was not measured; the surface there is a guess"

@@ -14,14 +14,30 @@ from torch import Tensor
 from torchgrasp.foundation.base import map_tensors
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.rules import Pose
-from torchgrasp.geometry.linalg import farthest_points
-from torchgrasp.shape.completion.silhouette import TIE
+from torchgrasp.shape.completion.silhouette import pick_apart
 from torchgrasp.shape.estimate import JointEstimate, MeanJet, Observations, SurfaceJet, off_surface
 from torchgrasp.shape.extra_observations import Middle
 from torchgrasp.shape.gp import ShapeGP, common_fields
 from torchgrasp.values.planning import PointCloud
 
 Found = TypeVar("Found")
+
+
+@dataclasses.dataclass(frozen=True)
+class TieNumbers:
+    """The numbers by which a wall gets its thickness."""
+
+    rounds: int = 3
+    """Most rounds; each observes the points that are farthest off."""
+    points: int = 24
+    """Most points of a round."""
+    off: float = 0.0005
+    """A wall that differs so much [m] from its thickness is corrected."""
+    noise: float = 0.0007
+    """Deviation [m] of an observed distance that the thickness adds."""
+
+
+TIE_WALLS = TieNumbers()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -157,16 +173,16 @@ def tie_walls(shape: HollowShape, middle: Middle) -> HollowShape:
     """
     x = middle.x
     thickness = middle.thickness
-    noise = 0.0007 / shape.scale
-    for _ in range(3):
+    noise = TIE_WALLS.noise / shape.scale
+    for _ in range(TIE_WALLS.rounds):
         distance = torch.stack([wall.mean(x) for wall in shape.walls])
         short = distance.sum(0) + thickness
         off = torch.where(middle.side, short.abs(), short)
-        rows = torch.nonzero(off > 0.0005 / shape.scale)[:, 0]
+        rows = torch.nonzero(off > TIE_WALLS.off / shape.scale)[:, 0]
         if not len(rows):
             break
         rows = rows[torch.argsort(off[rows], descending=True, stable=True)]
-        rows = rows[farthest_points(x[rows], 24, tie=TIE)]
+        rows = rows[pick_apart(x[rows], TIE_WALLS.points)]
         variance = torch.stack([wall.estimate(x[rows])[1][:, 0, 0] for wall in shape.walls])
         walls = []
         for wall, own, other, beyond in zip(

@@ -13,11 +13,8 @@ from torchgrasp import PointCloud, fit_shape
 from torchgrasp.cloud import look_at, partial_view
 from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.shape.completion.complete import (
-    LEAST_NOISE,
-    NEARBY,
-    NEARBY_ANGLE,
-    NEARBY_SHIFT,
-    TEMPERATURE,
+    HIDDEN,
+    MIRROR,
     Completion,
     complete_cloud,
 )
@@ -154,13 +151,13 @@ def test_shared_errors_are_the_second_moment_of_the_mixture_of_planes():
         )
         sources = reflect(found.points[mine], plane)
         normals = found.normals[mine]
-        steps = torch.linspace(-1, 1, NEARBY, dtype=torch.float64)
+        steps = torch.linspace(-1, 1, MIRROR.near, dtype=torch.float64)
         moment = torch.zeros(len(sources), len(sources), dtype=torch.float64)
         total = 0.0
         for other in planes_near(
-            scorer, plane, NEARBY_ANGLE * steps, NEARBY_SHIFT * scorer.size * steps
+            scorer, plane, MIRROR.angle * steps, MIRROR.shift * scorer.size * steps
         ):
-            chance = math.exp(float(scorer.score(other[None])[0]) / TEMPERATURE)
+            chance = math.exp(float(scorer.score(other[None])[0]) / MIRROR.temperature)
             moved = ((reflect(sources, other) - found.points[mine]) * normals).sum(1)
             moment = moment + chance * moved[:, None] * moved
             total = total + chance
@@ -173,7 +170,7 @@ def test_shared_errors_are_the_second_moment_of_the_mixture_of_planes():
 
 def _deviation(found: Completion) -> Tensor:
     """The standard deviation [m] of each point's whole error."""
-    return torch.sqrt(LEAST_NOISE**2 + (found.deviations**2).sum(1))
+    return torch.sqrt(HIDDEN.noise**2 + (found.deviations**2).sum(1))
 
 
 def _without_symmetry(cloud: PointCloud) -> PointCloud:

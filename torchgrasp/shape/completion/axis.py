@@ -19,30 +19,75 @@ from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
 from torchgrasp.geometry.linalg import (
     Points,
     across,
-    farthest_points,
     fibonacci_sphere,
     solve_least_squares,
     unit,
 )
 from torchgrasp.geometry.plane import LEAST_TILT
-from torchgrasp.shape.completion.silhouette import TIE, Outlines
-from torchgrasp.shape.completion.symmetry import PROBES, SymmetryScorer
+from torchgrasp.shape.completion.silhouette import Outlines, pick_apart
+from torchgrasp.shape.completion.symmetry import SYMMETRY, SymmetryScorer
 
-# distance [m] of a normal's line from the axis at which it has half the weight in the fit
-HALF_WEIGHT = 0.004
-STEEP = 0.3  # least length of the level part of the normals that fit a vertical axis
-MISS = 0.2
-LEAST_RADIUS = 0.01
-"""A normal meets the axis if its line passes within MISS times the point's radius, or LEAST_RADIUS
-[m] if greater.
-"""
-# usual miss of a body's normals: a share of the radius and an error [m]
-ROUNDNESS = 0.055
-ROUND_ERROR = 0.0018
-MAX_SPREAD = 0.075  # greatest RMS of the relative misses of an upright body's normals
-BODY_SHARE = 0.6  # least share of the cloud on the body; other points are an attached part
-MAX_COST = 1.0  # greatest mean of log(1 + (miss / HALF_WEIGHT)^2) of an axis
-MAX_FREE = 0.12  # greatest share of the rotated body in free space
+
+@dataclasses.dataclass(frozen=True)
+class AxisNumbers:
+    """The numbers of the fits of an axis."""
+
+    half_weight: float = 0.004
+    """Distance [m] of a normal's line from the axis at which it has half the weight."""
+    first_half_weight: float = 0.02
+    narrowing: float = 0.6
+    """This distance in the first step in space, and the factor of its excess from step to step."""
+    steep: float = 0.3
+    """Least length of the level part of the normals that fit a vertical axis."""
+    rounds: int = 30
+    """Rounds of the fit of a vertical axis; each has new weights."""
+    starts: int = 12
+    """Directions, over half a sphere, from which the fit in space starts."""
+    steps: int = 12
+    """Gauss-Newton steps of the fit in space."""
+    damping: float = 1e-6
+    least_diagonal: float = 1e-9
+    """Share of the diagonal that is added to it, and least diagonal: a ball leaves the direction
+    free, and a prism the place along a side.
+    """
+    turn: float = 0.3
+    """Greatest turn [rad] of a step: misses are linear in small turns only."""
+    cost: float = 1.0
+    """Greatest mean of log(1 + (miss / half_weight)^2) of an axis in space."""
+
+
+AXIS_FIT = AxisNumbers()
+
+
+@dataclasses.dataclass(frozen=True)
+class RoundNumbers:
+    """The numbers by which a body is round."""
+
+    miss: float = 0.2
+    least_radius: float = 0.01
+    """A normal meets the axis if its line passes within this share of the point's radius, or of the
+    least radius [m] if greater.
+    """
+    roundness: float = 0.055
+    error: float = 0.0018
+    """Usual miss of a body's normals: a share of the radius and an error [m]."""
+    spread: float = 0.075
+    """Greatest RMS of the relative misses of an upright body's normals."""
+    body_share: float = 0.6
+    """Least share of the cloud on the body; other points are an attached part."""
+    near: float = 0.004
+    """Distance [m] of a point from its slice in height, and from the slice's median in radius."""
+    one_way: float = 0.95
+    """Greatest length of the mean level direction of normals: more is one flat side."""
+    turns: int = 12
+    """Parts of a full circle by which the body is turned, to compare it with free space."""
+    inside: float = 0.003
+    """A turned point so deep [m] in free space or in the table is no part of the object."""
+    free: float = 0.12
+    """Greatest share of the turned body there."""
+
+
+ROUND = RoundNumbers()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,35 +109,41 @@ def find_axis(scorer: SymmetryScorer) -> tuple[Float[Tensor, "4 4"], Revolution]
     to be empty.
     """
     center, direction, cost = _fit_axis(*scorer.probes)
-    if not cost < MAX_COST:
+    if not cost < AXIS_FIT.cost:
         return None
     axis_from_cloud = _frame(center, direction, scorer.outline)
     points = apply(axis_from_cloud, scorer.points)
     lines = _lines_from_above(points, rotate(axis_from_cloud, scorer.normals))
-    origin = torch.zeros(2, dtype=torch.float64, device="cpu")
-    error = torch.tensor(ROUND_ERROR, dtype=torch.float64, device="cpu")
-    mask = _round_body(
-        points, lines, origin, lambda _, typical: torch.hypot(ROUNDNESS * typical, error)
-    )
+    origin = points.new_zeros(2)
+    error = points.new_tensor(ROUND.error)
+
+    def allowed(_: Tensor, typical: Tensor) -> Tensor:
+        return torch.hypot(ROUND.roundness * typical, error)
+
+    mask = _round_body(points, lines, origin, allowed)
     if mask is None:
         return None
-    spread = points[mask][farthest_points(points[mask], PROBES, tie=TIE)]
-    turned = apply(inverse(axis_from_cloud), (spread @ rotations_about_z(12).mT).flatten(0, 1))
-    excluded = scorer.outline.violation(turned) > 0.003
+    body = points[mask]
+    body = body[pick_apart(body, SYMMETRY.probes)]
+    turned = (body @ rotations_about_z(ROUND.turns).mT).flatten(0, 1)
+    turned = apply(inverse(axis_from_cloud), turned)
+    excluded = scorer.outline.violation(turned) > ROUND.inside
     if scorer.table is not None:
-        excluded |= scorer.table.height(turned) < -0.003
-    return (
-        (axis_from_cloud, Revolution(origin, mask)) if excluded.double().mean() < MAX_FREE else None
-    )
+        excluded |= scorer.table.height(turned) < -ROUND.inside
+    if not excluded.double().mean() < ROUND.free:
+        return None
+    return axis_from_cloud, Revolution(origin, mask)
 
 
 def find_revolution(points: Points, normals: Points) -> Revolution | None:
     """Return the upright body of revolution to which most points belong, or None if there is none."""
     lines = _lines_from_above(points, normals)
     center = _fit_to_lines(points, lines)
-    mask = _round_body(
-        points, lines, center, lambda radius, _: MAX_SPREAD * radius.clamp_min(LEAST_RADIUS)
-    )
+
+    def allowed(radius: Tensor, _: Tensor) -> Tensor:
+        return ROUND.spread * radius.clamp_min(ROUND.least_radius)
+
+    mask = _round_body(points, lines, center, allowed)
     return None if mask is None else Revolution(center, mask)
 
 
@@ -116,7 +167,7 @@ class _Lines(NamedTuple):
 def _lines_from_above(points: Points, normals: Points) -> _Lines:
     """Return the lines through points along their normals, projected onto the horizontal plane."""
     slope = torch.linalg.vector_norm(normals[:, :2], dim=1)
-    steep = slope > STEEP
+    steep = slope > AXIS_FIT.steep
     level = torch.where(steep[:, None], normals[:, :2] / slope[:, None], 0.0)
     across = torch.stack([-level[:, 1], level[:, 0]], 1)
     return _Lines(slope, steep, level, across, (across * points[:, :2]).sum(1))
@@ -126,11 +177,9 @@ def _fit_to_lines(points: Points, lines: _Lines) -> Float[Tensor, "2"]:
     """Return the point (x, y) [m] that most lines meet, by reweighted least squares (Cauchy)."""
     miss = torch.zeros_like(lines.offset)
     center = points[:, :2].mean(0)
-    for _ in range(30):
-        weight = lines.slope / (1.0 + (miss / HALF_WEIGHT) ** 2)
-        center = solve_least_squares(
-            weight[:, None].sqrt() * lines.across, weight.sqrt() * lines.offset
-        )
+    for _ in range(AXIS_FIT.rounds):
+        weight = (lines.slope / (1.0 + (miss / AXIS_FIT.half_weight) ** 2)).sqrt()
+        center = solve_least_squares(weight[:, None] * lines.across, weight * lines.offset)
         miss = lines.offset - lines.across @ center
     return center
 
@@ -150,21 +199,17 @@ def _round_body(
     """
     miss = lines.offset - lines.across @ center
     radius = torch.linalg.vector_norm(points[:, :2] - center, dim=1)
-    meets = lines.steep & (miss.abs() / radius.clamp_min(LEAST_RADIUS) < MISS)
-    near = 0.004  # [m], of a point's slice in height and of its median in radius
-    slices = ((points[:, 2:] - points[:, 2]).abs() < near) & meets
+    meets = lines.steep & (miss.abs() / radius.clamp_min(ROUND.least_radius) < ROUND.miss)
+    slices = ((points[:, 2:] - points[:, 2]).abs() < ROUND.near) & meets  # (n, n)
     typical = torch.where(slices, radius, torch.nan).nanmedian(1).values
-    mask = torch.where(
-        lines.steep, meets & ((radius - typical).abs() < near), radius < typical + near
-    )
+    # a wall has the typical radius; a flat end may lie anywhere within it
+    wall = meets & ((radius - typical).abs() < ROUND.near)
+    mask = torch.where(lines.steep, wall, radius < typical + ROUND.near)
     side = mask & lines.steep
     spread = (miss / allowed(radius, typical))[side].square().mean().sqrt()
     one_way = torch.linalg.vector_norm(lines.level[side].mean(0))
-    return (
-        mask
-        if bool((mask.double().mean() > BODY_SHARE) & (spread < 1.0) & (one_way < 0.95))
-        else None
-    )
+    enough = mask.double().mean() > ROUND.body_share
+    return mask if bool(enough & (spread < 1.0) & (one_way < ROUND.one_way)) else None
 
 
 def _fit_axis(
@@ -173,33 +218,34 @@ def _fit_axis(
     """Return a point [m] and the direction of the axis that most lines along the normals meet, and
     the fit's cost.
     """
-    # Gauss-Newton steps with robust weights (Cauchy) from so many directions; each narrows the
-    # weights
-    starts = 12
-    direction = fibonacci_sphere(2 * starts)[:starts]
+    # Gauss-Newton steps with robust weights (Cauchy) from many directions; each narrows the weights
+    starts = AXIS_FIT.starts
+    direction = fibonacci_sphere(2 * starts)[:starts]  # (s, 3)
     center = points.mean(0).expand_as(direction)
-    cost = torch.zeros(starts, dtype=torch.float64, device="cpu")
-    for step in range(12):
-        axes = torch.stack(across(direction), 1)
-        arm = points - center[:, None]
-        moment = torch.linalg.cross(arm, normals.expand_as(arm))
-        miss = (moment * direction[:, None]).sum(-1)
-        lever = torch.linalg.cross(direction[:, None].expand_as(arm), normals.expand_as(arm))
-        slope = torch.cat([lever @ axes.mT, moment @ axes.mT], 2)
-        scale = HALF_WEIGHT + (0.02 - HALF_WEIGHT) * 0.6**step
+    cost = direction.new_zeros(starts)
+    for step in range(AXIS_FIT.steps):
+        axes = torch.stack(across(direction), 1)  # (s, 2, 3)
+        arm = points - center[:, None]  # (s, n, 3)
+        own = normals.expand_as(arm)
+        moment = torch.linalg.cross(arm, own)
+        miss = (moment * direction[:, None]).sum(-1)  # (s, n)
+        lever = torch.linalg.cross(direction[:, None].expand_as(arm), own)
+        slope = torch.cat([lever @ axes.mT, moment @ axes.mT], 2)  # (s, n, 4)
+        wider = AXIS_FIT.first_half_weight - AXIS_FIT.half_weight
+        scale = AXIS_FIT.half_weight + wider * AXIS_FIT.narrowing**step
         weighted = slope / (1.0 + (miss / scale) ** 2)[..., None]
         system = slope.mT @ weighted
-        # Damping: a ball leaves the direction free, and a prism the place along a side.
-        system = system + 1e-6 * torch.diag_embed(system.diagonal(dim1=1, dim2=2).clamp_min(1e-9))
+        diagonal = system.diagonal(dim1=1, dim2=2).clamp_min(AXIS_FIT.least_diagonal)
+        system = system + AXIS_FIT.damping * torch.diag_embed(diagonal)
         found = -torch.linalg.solve(system, (weighted * miss[..., None]).sum(1))
-        length = torch.linalg.vector_norm(found[:, 2:], dim=1, keepdim=True)
-        turn = found[:, 2:] * (
-            0.3 / length.clamp_min(0.3)
-        )  # [rad], misses are linear in small turns only
+        turn = found[:, 2:]
+        length = torch.linalg.vector_norm(turn, dim=1, keepdim=True)
+        turn = turn * (AXIS_FIT.turn / length.clamp_min(AXIS_FIT.turn))
         center = center + (found[:, None, :2] @ axes)[:, 0]
         direction = unit(direction + (turn[:, None] @ axes)[:, 0])
+        # of all points of the axis, the one beside the cloud's middle
         center = center + ((points.mean(0) - center) * direction).sum(1, keepdim=True) * direction
-        cost = torch.log1p((miss / HALF_WEIGHT) ** 2).mean(1)
+        cost = torch.log1p((miss / AXIS_FIT.half_weight) ** 2).mean(1)
     best = int(cost.argmin())
     return center[best], direction[best], float(cost[best])
 
@@ -213,11 +259,8 @@ def _frame(
     eye = torch.stack([view.viewpoint for view in outline.views]).mean(0) - center
     level = eye - (eye @ direction) * direction
     length = torch.linalg.vector_norm(level)
-    x = (
-        level / length
-        if length > LEAST_TILT * torch.linalg.vector_norm(eye)
-        else across(direction)[0]
-    )
+    tilted = length > LEAST_TILT * torch.linalg.vector_norm(eye)
+    x = level / length if tilted else across(direction)[0]
     rotation = torch.stack([x, torch.linalg.cross(direction, x), direction])
     return rigid(rotation, -rotation @ center)
 
@@ -225,7 +268,7 @@ def _frame(
 def rotations_about_z(n: int) -> Float[Tensor, "m 3 3"]:
     """Return the rotations about z by k / n of a full circle, for k from 1 to n - 1."""
     angle = torch.arange(1, n, dtype=torch.float64, device="cpu") * (2 * math.pi / n)
-    turn = torch.zeros(n - 1, 3, 3, dtype=torch.float64, device="cpu")
+    turn = angle.new_zeros(n - 1, 3, 3)
     turn[:, 0, 0] = angle.cos()
     turn[:, 0, 1] = -angle.sin()
     turn[:, 1, 0] = angle.sin()

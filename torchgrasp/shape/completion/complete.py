@@ -19,12 +19,12 @@ from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import spatial
 from torchgrasp.foundation.rules import Count, Pose
 from torchgrasp.geometry.frames import apply, inverse, rotate
-from torchgrasp.geometry.linalg import farthest_points, reflect, reflect_directions, unit
+from torchgrasp.geometry.linalg import Points, reflect, reflect_directions, unit
 from torchgrasp.shape.completion.axis import Revolution, find_axis, find_revolution
 from torchgrasp.shape.completion.ellipsoid import find_ellipsoid
-from torchgrasp.shape.completion.silhouette import FRONT_MARGIN, TIE, Outlines
+from torchgrasp.shape.completion.silhouette import OUTLINE, Outlines, pick_apart
 from torchgrasp.shape.completion.symmetry import (
-    PROBES,
+    SYMMETRY,
     Mirror,
     SymmetryScorer,
     find_plane_through_axis,
@@ -34,23 +34,69 @@ from torchgrasp.shape.completion.symmetry import (
 from torchgrasp.shape.posterior import symmetric_root
 from torchgrasp.values.planning import PointCloud
 
-# least distance [m] of a hidden point from the cloud and from another hidden point
-NEW = 0.006
-SPACING = 0.004
-# standard deviation [m] of a mirrored point of an object that is symmetric about that very plane
-LEAST_NOISE = 0.003
-# score of a symmetric object, and asymmetry [m] for each 1 of score below
-SYMMETRIC = 0.45
-ASYMMETRY = 0.060
-PART = (
-    0.02  # length scale [m] of the asymmetry: a part without a mirror image is missing as a whole
-)
-THIN = 0.012  # width [m] below which a part is a bar: that of a fingertip
-TEMPERATURE = 0.1  # a plane's probability is proportional to exp(score / temperature)
-# planes near a plane: steps of an axis, angle [rad], shift / size
-NEARBY = 5
-NEARBY_ANGLE = 0.15
-NEARBY_SHIFT = 0.045
+
+@dataclasses.dataclass(frozen=True)
+class HiddenNumbers:
+    """The numbers of the points on the hidden side."""
+
+    new: float = 0.006
+    """Least distance [m] of a hidden point from the cloud."""
+    spacing: float = 0.004
+    """Least distance [m] of a hidden point from another one."""
+    noise: float = 0.003
+    """Deviation [m] of a mirrored point of an object that is symmetric about that very plane."""
+    part: float = 0.02
+    """Length scale [m] of the asymmetry: a part without a mirror image is missing as a whole."""
+    foot: float = 0.004
+    """Points so low [m] above the table that look down lie on the face that stands on it."""
+    down: float = -0.7
+    """Greatest vertical part of the normals of this face."""
+    attached: int = 20
+    """Least points of an attached part, such as a handle."""
+
+
+HIDDEN = HiddenNumbers()
+
+
+@dataclasses.dataclass(frozen=True)
+class MirrorNumbers:
+    """The numbers of the errors of mirrored points."""
+
+    symmetric: float = 0.45
+    """Score of a symmetric object."""
+    asymmetry: float = 0.060
+    """Asymmetry [m] for each 1 of score below."""
+    temperature: float = 0.1
+    """A plane's probability is proportional to exp(score / temperature)."""
+    near: int = 5
+    """Steps of an axis over the planes near a plane."""
+    angle: float = 0.15
+    shift: float = 0.045
+    """Farthest of these planes: angle [rad], and shift over the size."""
+    twice: float = 0.05
+    """Loss of score of an image that is mirrored twice: single images come first."""
+
+
+MIRROR = MirrorNumbers()
+
+
+@dataclasses.dataclass(frozen=True)
+class BarNumbers:
+    """The numbers of the bars of a frame."""
+
+    thin: float = 0.012
+    """Width [m] below which a part is a bar: that of a fingertip."""
+    empty: float = 0.5
+    """The middle of a frame lies less deep in the outline than this share of its distance."""
+    neighbours: int = 30
+    """Points from which width and direction are taken, as many as normals are fitted with."""
+    middle: float = 0.8
+    """Least width at a point, as a share of the bar's: points in its middle."""
+    deviation: float = 0.5
+    """Deviation of a point on the far side, as a share of the width."""
+
+
+BAR = BarNumbers()
 Kind = Literal["ball", "revolution", "mirrored", "guess", "cut off", "vessel", "whole"]
 """What the hidden side was estimated from: an ellipsoid, an axis, mirror planes, or only the
 outline (a guess).
@@ -62,24 +108,20 @@ SomeHidden = TypeVar("SomeHidden", bound=Any)  # a batch with `points` [m]
 class Completion(Value):
     """Estimated points of the hidden side, with their errors along the normals.
 
-    The errors have the covariance LEAST_NOISE^2 I + D D^T [m^2], where I is the identity and D is
-    `deviations`.
+    The errors have the covariance noise^2 I + D D^T [m^2], where I is the identity, D is
+    `deviations`, and the noise is that of `HiddenNumbers`.
     """
 
     points: Float[Tensor, "m 3"]
     normals: Float[Tensor, "m 3"]
-    shared: Float[
-        Tensor, "m c"
-    ]  # standard deviations [m] of the errors that each mirror plane causes
-    asymmetry: Float[
-        Tensor, "m"
-    ]  # standard deviation [m] of a smooth error, because the object is not quite symmetric
-    planes: Float[
-        Tensor, "p 4"
-    ]  # planes n.x = o, as (n, o); for each part of the object, its best plane is first
-    scores: Float[
-        Tensor, "p"
-    ]  # of the planes: 1 if the mirror image lies on the cloud, near 0 if nothing confirms it
+    # standard deviations [m] of the errors that each mirror plane causes
+    shared: Float[Tensor, "m c"]
+    # standard deviation [m] of a smooth error, because the object is not quite symmetric
+    asymmetry: Float[Tensor, "m"]
+    # planes n.x = o, as (n, o); for each part of the object, its best plane is first
+    planes: Float[Tensor, "p 4"]
+    # of the planes: 1 if the mirror image lies on the cloud, near 0 if nothing confirms it
+    scores: Float[Tensor, "p"]
     outline: Outlines
     kind: Kind  # how the hidden side was completed, which selects the calibration
     frame: bool = False  # whether the object is a frame of bars round an empty middle
@@ -114,10 +156,9 @@ def correlated_errors(
     together.
     """
     deviation = torch.sqrt(local**2 + (shared**2).sum(1))
-    alike = torch.exp(-0.5 * (torch.cdist(points, points) / PART) ** 2)
-    return torch.cat(
-        [shared, deviation[:, None] * symmetric_root(alike, 1.0, "keep hidden points apart")], 1
-    )
+    alike = torch.exp(-0.5 * (torch.cdist(points, points) / HIDDEN.part) ** 2)
+    field = symmetric_root(alike, 1.0, "keep hidden points apart")
+    return torch.cat([shared, deviation[:, None] * field], 1)
 
 
 @checked
@@ -133,29 +174,32 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: Count 
     `table` is the height [m] of a table with normal z.
     """
     if cloud.normals is None or cloud.viewpoint is None:
-        raise BadArgument(
-            "cloud",
-            "no normals or no viewpoint",
-            "outward normals and viewpoints: see prepare_cloud",
-        )
+        needed = "outward normals and viewpoints: see prepare_cloud"
+        raise BadArgument("cloud", "no normals or no viewpoint", needed)
     scorer = SymmetryScorer.of(cloud.to("cpu", torch.float64), table)
     outline = scorer.outline
-    none = scorer.points[:0]
-    no_plane = scorer.points.new_zeros(0, 4)
-    if outline.cut:  # an image's border is no outline, and half an object is not symmetric
-        return Completion(
-            none, none, none[:, :0], none[:, 0], no_plane, none[:, 0], outline, "cut off"
-        )
+    none = scorer.points[:0]  # (0, 3)
+    number = none[:, 0]
+    no_plane = none.new_zeros(0, 4)
+    nothing = Completion(none, none, none[:, :0], number, no_plane, number, outline, "cut off")
+    # an image's border is no outline, and half an object is not symmetric
+    if outline.cut:
+        return nothing
+
     ball = find_ellipsoid(scorer.points, scorer.normals, outline, table)
     if ball is not None:
         rows = torch.nonzero(_hidden(scorer, ball.points))[:, 0]
-        rows = rows[farthest_points(ball.points[rows], budget, tie=TIE)]
+        rows = rows[pick_apart(ball.points[rows], budget)]
         points = ball.points[rows]
-        misfit = torch.full_like(ball.points[rows, 0], ball.misfit)
-        shared = ball.deviations[rows]
-        return Completion(
-            points, ball.normals[rows], shared, misfit, no_plane, none[:, 0], outline, "ball"
+        return dataclasses.replace(
+            nothing,
+            points=points,
+            normals=ball.normals[rows],
+            shared=ball.deviations[rows],
+            asymmetry=torch.full_like(points[:, 0], ball.misfit),
+            kind="ball",
         )
+
     round_body = None if table is None else find_revolution(scorer.points, scorer.normals)
     axis = find_axis(scorer) if round_body is None else None
     if axis is not None:
@@ -163,38 +207,32 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: Count 
         round_body = axis[1]
     parts = _split(scorer, round_body)
     planes = torch.cat([part.planes for part in parts])
-    scores = torch.cat([part.scores for part in parts])
     images = sorted(_mirror(parts), key=lambda image: -image.score)
 
-    def allowed(image: _Image, apart: float = NEW) -> Bool[Tensor, "n"]:
+    def allowed(image: _Image, apart: float = HIDDEN.new) -> Bool[Tensor, "n"]:
         hidden = _hidden(scorer, image.points, apart)
         if scorer.table is None:
             return hidden
         # Free space already bounds the shape at the face on the table.
-        return hidden & ~(
-            (scorer.table.height(image.points) < 0.004)
-            & (image.normals @ scorer.table.normal < -0.7)
-        )
+        low = scorer.table.height(image.points) < HIDDEN.foot
+        return hidden & ~(low & (image.normals @ scorer.table.normal < HIDDEN.down))
 
     merged = merge_hidden(_Image.of(scorer, none, none, len(planes)), images, allowed, _thin)
     frame = _is_frame(scorer)
     if frame:
-        merged = merge_hidden(
-            merged, [_back_of_bars(scorer, len(planes))], lambda image: allowed(image, 0.0), _thin
-        )
-    chosen = merged[farthest_points(merged.points, budget, tie=TIE)]
-    shared = chosen.shared.flatten(1)
-    asymmetry = chosen.variance.sqrt()
-    kind: Kind = "guess" if not len(planes) else "mirrored" if round_body is None else "revolution"
+        backs = [_back_of_bars(scorer, len(planes))]
+        merged = merge_hidden(merged, backs, lambda image: allowed(image, 0.0), _thin)
+    chosen = merged[pick_apart(merged.points, budget)]
+    kind: Kind = "mirrored" if round_body is None else "revolution"
     found = Completion(
         chosen.points,
         chosen.normals,
-        shared,
-        asymmetry,
+        chosen.shared.flatten(1),
+        chosen.variance.sqrt(),
         planes,
-        scores,
+        torch.cat([part.scores for part in parts]),
         scorer.outline,
-        kind,
+        kind if len(planes) else "guess",
         frame,
     )
     return found if axis is None else found.moved(inverse(axis[0]))
@@ -219,14 +257,14 @@ class _Image(Batch):
     normals: Tensor
     score: float  # infinite if the part is not mirrored
     variance: Float[Tensor, "n"]  # [m^2], due to asymmetry
-    shared: Float[
-        Tensor, "n planes near"
-    ]  # shift [m] for each nearby plane, weighted by the root of its probability
+    # shift [m] for each nearby plane, weighted by the root of its probability
+    shared: Float[Tensor, "n planes near"]
 
     @classmethod
     def of(cls, scorer: SymmetryScorer, points: Tensor, normals: Tensor, n_planes: int) -> "_Image":
         """Return unmirrored points as an image of infinite score, without errors."""
-        shared = points.new_zeros(len(points), n_planes, NEARBY ** (2 if scorer.upright else 3))
+        axes = 2 if scorer.upright else 3  # of the planes near a plane
+        shared = points.new_zeros(len(points), n_planes, MIRROR.near**axes)
         return cls(points, normals, math.inf, torch.zeros_like(points[:, 0]), shared)
 
 
@@ -234,15 +272,15 @@ def _split(scorer: SymmetryScorer, revolution: Revolution | None) -> list[_Part]
     """Split the cloud into a body of revolution and an attached part, such as a handle, or return
     the whole cloud.
     """
-    every = torch.arange(len(scorer.points), device="cpu")
     if revolution is None:
+        every = torch.arange(len(scorer.points), device="cpu")
         return [_Part(scorer, every, *find_planes(scorer))]
-    rows = every[revolution.body]
-    rest = every[~revolution.body]
+    rows = torch.nonzero(revolution.body)[:, 0]
+    rest = torch.nonzero(~revolution.body)[:, 0]
     body = scorer.for_part(rows)
-    attached = scorer.for_part(rest)
     parts = [_Part(body, rows, *find_planes(body, turned=True))]
-    if len(rest) >= 20:
+    if len(rest) >= HIDDEN.attached:
+        attached = scorer.for_part(rest)
         plane = find_plane_through_axis(attached, revolution.center, scorer.points[rest])
         parts.append(_Part(attached, rest, *plane))
     return parts
@@ -257,24 +295,21 @@ def _mirror(parts: list[_Part]) -> list[_Image]:
     before = 0
     for part in parts:
         scorer = part.scorer
-        points = part.scorer.points[part.rows]
-        normals = part.scorer.normals[part.rows]
-        if len(points) == len(
-            scorer.points
-        ):  # the outline is of the whole cloud; its images are edges of the far side
+        points = scorer.points[part.rows]
+        normals = scorer.normals[part.rows]
+        # the outline is of the whole cloud; its images are edges of the far side
+        if len(points) == len(scorer.points):
             points = torch.cat([points, scorer.outline.rim])
             normals = torch.cat([normals, scorer.outline.rim_normals])
         original = _Image.of(scorer, points, normals, total)
-        planes = enumerate(zip(part.planes, part.scores.tolist(), strict=True), start=before)
-        mirrors = [_mirror_in(scorer, number, plane, score) for number, (plane, score) in planes]
-        once = [mirror(original) for mirror in mirrors]
-        twice = [
-            mirror(image)
-            for i, image in enumerate(once[:2])
-            for j, mirror in enumerate(mirrors)
-            if i != j
+        mirrors = [
+            _mirror_in(scorer, before + i, plane, score)
+            for i, (plane, score) in enumerate(zip(part.planes, part.scores.tolist(), strict=True))
         ]
-        images += once + twice
+        once = [mirror(original) for mirror in mirrors]
+        images += once
+        for i, image in enumerate(once[:2]):
+            images += [mirror(image) for j, mirror in enumerate(mirrors) if j != i]
         before += len(mirrors)
     return images
 
@@ -285,70 +320,65 @@ def _mirror_in(
     """Return a function that mirrors points in a plane; how images in nearby planes differ gives
     the points' errors.
     """
-    steps = torch.linspace(-1.0, 1.0, NEARBY, dtype=plane.dtype, device="cpu")
-    near = planes_near(scorer, plane, NEARBY_ANGLE * steps, NEARBY_SHIFT * scorer.size * steps)
-    weight = torch.softmax(scorer.score(near)[0] / TEMPERATURE, 0)
+    steps = torch.linspace(-1.0, 1.0, MIRROR.near, dtype=plane.dtype, device="cpu")
+    near = planes_near(scorer, plane, MIRROR.angle * steps, MIRROR.shift * scorer.size * steps)
+    weight = torch.softmax(scorer.score(near)[0] / MIRROR.temperature, 0)
+    asymmetry = MIRROR.asymmetry * max(MIRROR.symmetric - score, 0.0)
 
     def mirror(of: _Image) -> _Image:
         points = reflect(of.points, plane)
         normals = reflect_directions(of.normals, plane)
-        shift = ((reflect(of.points, near[:, None]) - points) * normals).sum(-1)
+        shift = ((reflect(of.points, near[:, None]) - points) * normals).sum(-1)  # (near, n)
         shared = of.shared.clone()  # a mirror leaves errors across the surface as they are
         shared[:, number] += (weight.sqrt()[:, None] * shift).T
-        variance = of.variance + (ASYMMETRY * max(SYMMETRIC - score, 0.0)) ** 2
-        return _Image(
-            points,
-            normals,
-            score if math.isinf(of.score) else min(of.score, score) - 0.05,
-            variance,
-            shared,
-        )
+        worse = score if math.isinf(of.score) else min(of.score, score) - MIRROR.twice
+        return _Image(points, normals, worse, of.variance + asymmetry**2, shared)
 
     return mirror
 
 
 def _is_frame(scorer: SymmetryScorer) -> bool:
-    """Tell whether the middle of the cloud is empty: outside the outline or close to it, and over
-    `THIN` from it.
+    """Tell whether the middle of the cloud is empty: outside the outline or close to it, and wider
+    than a bar from the cloud.
     """
-    middle = (scorer.points.amin(0) + scorer.points.amax(0)) / 2
+    middle = scorer.center
     away = float(torch.cdist(middle[None], scorer.points).amin())
-    return away > THIN and float(scorer.outline.hull_distance(middle)) > -0.5 * away
+    inside = -float(scorer.outline.hull_distance(middle))
+    return away > BAR.thin and inside < BAR.empty * away
 
 
 def _back_of_bars(scorer: SymmetryScorer, n_planes: int) -> _Image:
-    """Return points on the far side of parts narrower than `THIN`: a thin bar is about as deep as
-    it is wide.
+    """Return points on the far side of thin bars: such a bar is about as deep as it is wide.
 
     The points lie behind the middle of a bar, across its direction. Their standard deviation is
     half of the width.
     """
-    # the neighbours with which normals are fitted
     points = scorer.points
-    near = nearest(scorer.points, 30)[1]
-    half = -scorer.outline.hull_distance(points)
-    width = 2 * half[near].amax(1)
-    rows = torch.nonzero((2 * half > 0.8 * width) & (width < THIN))[:, 0]
-    rows = rows[farthest_points(points[rows], 2 * PROBES, tie=TIE)]
-    around = points[near[rows]]
+    near = nearest(points, BAR.neighbours)[1]
+    across = -2 * scorer.outline.hull_distance(points)
+    width = across[near].amax(1)
+    rows = torch.nonzero((across > BAR.middle * width) & (width < BAR.thin))[:, 0]
+    rows = rows[pick_apart(points[rows], 2 * SYMMETRY.probes)]
+    at = points[rows]
     width = width[rows]
+    around = points[near[rows]]
     bar = torch.linalg.svd(around - around.mean(1, keepdim=True), full_matrices=False).Vh[:, 0]
-    rays = points[rows, None] - torch.stack([view.viewpoint for view in scorer.outline.views])
+    # of several views, the one that faces the bar most
+    rays = at[:, None] - torch.stack([view.viewpoint for view in scorer.outline.views])
     facing = (rays * scorer.normals[rows, None]).sum(-1).argmin(1)
     ray = unit(rays[torch.arange(len(rows), device="cpu"), facing])
     back = unit(ray - (ray * bar).sum(1, keepdim=True) * bar)
-    image = _Image.of(scorer, points[rows] + width[:, None] * back, back, n_planes)
-    return dataclasses.replace(image, variance=(0.5 * width) ** 2)
+    image = _Image.of(scorer, at + width[:, None] * back, back, n_planes)
+    return dataclasses.replace(image, variance=(BAR.deviation * width) ** 2)
 
 
 def merge_hidden(
     merged: SomeHidden,
     parts: Iterable[SomeHidden],
     allowed: Callable[[SomeHidden], Bool[Tensor, "n"]],
-    thin: Callable[[Float[Tensor, "n 3"]], Int[Tensor, "k"]],
+    thin: Callable[[Points], Int[Tensor, "k"]],
 ) -> SomeHidden:
-    """Add to `merged` the points of each part that are `allowed` and farther than `SPACING` [m]
-    from earlier points.
+    """Add to `merged` the points of each part that are `allowed` and not beside earlier points.
 
     `thin` selects the points of a part to keep: it returns their indices.
     """
@@ -356,28 +386,25 @@ def merge_hidden(
         new = part[allowed(part)]
         if len(merged) and len(new):
             distance, _ = spatial.KDTree(merged.points.numpy()).query(new.points.numpy())
-            new = new[torch.from_numpy(distance) > SPACING]
+            new = new[torch.from_numpy(distance) > HIDDEN.spacing]
         merged = join([merged, new[thin(new.points)]])
     return merged
 
 
-def _hidden(
-    scorer: SymmetryScorer, points: Float[Tensor, "n 3"], apart: float = NEW
-) -> Bool[Tensor, "n"]:
+def _hidden(scorer: SymmetryScorer, points: Points, apart: float = HIDDEN.new) -> Bool[Tensor, "n"]:
     """Tell which points are hidden in every view, not below the table, and farther than `apart` [m]
     from the cloud.
     """
     hidden = (scorer.nearest(points)[0] > apart) & scorer.outline.hides(points)
-    return (
-        hidden if scorer.table is None else hidden & (scorer.table.height(points) > -FRONT_MARGIN)
-    )
+    if scorer.table is None:
+        return hidden
+    return hidden & (scorer.table.height(points) > -OUTLINE.front)
 
 
-def _thin(points: Float[Tensor, "n 3"]) -> Int[Tensor, "k"]:
-    """Return the indices of points that are at least `SPACING` apart, earlier points first."""
-    apart = (
-        torch.cdist(points, points) >= SPACING
-    ).numpy()  # NumPy's calls cost a quarter of torch's
+def _thin(points: Points) -> Int[Tensor, "k"]:
+    """Return the indices of points that do not lie beside earlier ones."""
+    # NumPy's calls cost a quarter of torch's
+    apart = (torch.cdist(points, points) >= HIDDEN.spacing).numpy()
     keep = np.ones(len(points), dtype=bool)
     for i in range(len(points)):
         if keep[i]:

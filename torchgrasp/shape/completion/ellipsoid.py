@@ -14,25 +14,48 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.foundation.lazy import optimize
-from torchgrasp.geometry.linalg import Points, farthest_points, fibonacci_sphere, unit
-from torchgrasp.shape.completion.silhouette import TIE, Outlines
+from torchgrasp.geometry.linalg import Points, fibonacci_sphere, unit
+from torchgrasp.shape.completion.silhouette import Outlines, pick_apart
 
-# points of the cloud and the outline that count as independent
-INDEPENDENT = 60
-INDEPENDENT_RIM = 8
-POINT_NOISE = 0.001
-SLOPE_NOISE = 0.15
-RIM_NOISE = 0.002
-TABLE_NOISE = 0.001
-"""Standard deviations of a point [m], of its normal, of the outline [m] and of the table [m]."""
-ELONGATION = 0.03  # standard deviation of the logarithm of an axis over the mean axis
-# greatest RMS distance of the cloud, in metres and in mean radii
-MAX_MISFIT = 0.00165
-MAX_RELATIVE_MISFIT = 0.052
-FORWARD = float(
-    np.sqrt(np.finfo(float).eps)
-)  # step of the finite differences, over a parameter or 1
 UPPER = np.triu_indices(3)  # entries of a symmetric matrix that are parameters
+
+
+@dataclasses.dataclass(frozen=True)
+class EllipsoidNumbers:
+    """The numbers of the fit of an ellipsoid."""
+
+    points: int = 300
+    """Most points of the cloud in the fit."""
+    independent: int = 60
+    independent_rim: int = 8
+    """Points of the cloud and of the outline that count as independent."""
+    point: float = 0.001
+    slope: float = 0.15
+    rim: float = 0.002
+    table: float = 0.001
+    """Deviations of a point [m], of its normal, of the outline [m] and of the table [m]."""
+    elongation: float = 0.03
+    """Deviation of the logarithm of an axis over the mean axis."""
+    misfit: float = 0.00165
+    relative_misfit: float = 0.052
+    """Greatest RMS distance of the cloud, in metres and in mean radii."""
+    agreement: float = 0.9
+    """Least mean cosine of the normals with those of the ellipsoid."""
+    longest: float = 1.5
+    """Greatest ratio of two axes: a longer body is no ball."""
+    spread: int = 400
+    """Points over the whole ellipsoid."""
+    step: float = 1e-5
+    """Step of the parameters from which the errors of these points follow."""
+    least_radius: float = 0.25
+    """Least radius of the first ball, over the longest side of the cloud."""
+    evaluations: int = 40
+    """Most evaluations of the fit."""
+    forward: float = float(np.sqrt(np.finfo(float).eps))
+    """Step of the finite differences, over a parameter or 1."""
+
+
+ELLIPSOID = EllipsoidNumbers()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,9 +64,8 @@ class Ellipsoid:
 
     points: Float[Tensor, "n 3"]
     normals: Float[Tensor, "n 3"]
-    deviations: Float[
-        Tensor, "n 9"
-    ]  # standard deviations [m] along the normals, one column per independent error
+    # standard deviations [m] along the normals, one column per independent error
+    deviations: Float[Tensor, "n 9"]
     misfit: float  # RMS distance [m] of the cloud from the ellipsoid
 
 
@@ -54,23 +76,25 @@ def find_ellipsoid(
 
     The body may have a flat foot: the ellipsoid may reach below the table, but not float above it.
     """
-    rows = farthest_points(points, 300, tie=TIE)
+    rows = pick_apart(points, ELLIPSOID.points)
     fit = _Fit(points[rows].numpy(), normals[rows].numpy(), outline, table)
     parameters, covariance = fit.solve()
     one = parameters[None]
+    distance, normal = fit.distance_and_normal(one)
+    misfit = float(np.sqrt((distance[0] ** 2).mean()))
+    agreement = float((normal[0] * fit.normals).sum(1).mean())
     axes = np.exp(np.linalg.eigvalsh(_symmetric(one[:, 3:])[0]))
-    distance, normal = (x[0] for x in fit.distance_and_normal(one))
-    misfit = float(np.sqrt((distance**2).mean()))
-    agreement = float((normal * fit.normals).sum(1).mean())
-    if misfit > min(MAX_MISFIT, MAX_RELATIVE_MISFIT * float(axes.mean())) or agreement < 0.9:
+    most = min(ELLIPSOID.misfit, ELLIPSOID.relative_misfit * float(axes.mean()))
+    if misfit > most or agreement < ELLIPSOID.agreement or axes[2] > ELLIPSOID.longest * axes[0]:
         return None
-    if axes[2] > 1.5 * axes[0]:
-        return None
+
     root = torch.from_numpy(_exponential(one[:, 3:])[0])
-    direction = fibonacci_sphere(400)
+    direction = fibonacci_sphere(ELLIPSOID.spread)
     across = unit(direction @ torch.linalg.inv(root))
-    moved = _support(one + 1e-5 * np.eye(9), across.numpy()) - _support(one, across.numpy())
-    spread = torch.from_numpy(moved.T / 1e-5 @ np.linalg.cholesky(covariance))
+    # how the surface moves along its normals with each parameter
+    near = one + ELLIPSOID.step * np.eye(9)
+    moved = _support(near, across.numpy()) - _support(one, across.numpy())
+    spread = torch.from_numpy(moved.T / ELLIPSOID.step @ np.linalg.cholesky(covariance))
     return Ellipsoid(torch.from_numpy(parameters[:3]) + direction @ root, across, spread, misfit)
 
 
@@ -89,17 +113,21 @@ class _Fit:
 
     def solve(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the 9 fitted parameters and their covariance matrix."""
+        # a ball by linear least squares is the first guess
         rows = np.concatenate([2 * self.points, np.ones_like(self.points[:, :1])], 1)
         ball = np.linalg.lstsq(rows, (self.points**2).sum(1), rcond=None)[0]
         longest = np.ptp(self.points, axis=0).max()
-        radius = np.log(
-            np.clip(np.sqrt(max(ball[3] + ball[:3] @ ball[:3], 0.0)), longest / 4, longest)
-        )
+        radius = np.sqrt(max(ball[3] + ball[:3] @ ball[:3], 0.0))
+        radius = np.log(np.clip(radius, longest * ELLIPSOID.least_radius, longest))
         start = np.concatenate([ball[:3], radius * np.eye(3)[UPPER]])
         jacobian: Any = self.jacobian  # of which SciPy's annotations do not know
-        options: Any = {"x_scale": "jac", "loss": "soft_l1", "max_nfev": 40}
         found = optimize.least_squares(
-            lambda x: self.residuals(x[None])[0], start, jacobian, **options
+            lambda x: self.residuals(x[None])[0],
+            start,
+            jacobian,
+            x_scale="jac",
+            loss="soft_l1",
+            max_nfev=ELLIPSOID.evaluations,
         )
         return found.x, np.linalg.inv(found.jac.T @ found.jac)
 
@@ -107,7 +135,7 @@ class _Fit:
         """Return the derivatives of the residuals by finite differences, all parameters in one
         evaluation.
         """
-        step = FORWARD * np.maximum(1.0, np.abs(parameters))
+        step = ELLIPSOID.forward * np.maximum(1.0, np.abs(parameters))
         found = self.residuals(np.concatenate([parameters[None], parameters + np.diag(step)]))
         return ((found[1:] - found[0]) / step[:, None]).T
 
@@ -116,24 +144,22 @@ class _Fit:
         row per ellipsoid.
         """
         distance, normal = self.distance_and_normal(parameters)
-        share = np.sqrt(len(self.points) / INDEPENDENT)
-        k = len(parameters)
-        shape = _symmetric(parameters[:, 3:])
+        share = np.sqrt(len(self.points) / ELLIPSOID.independent)
+        shape = _symmetric(parameters[:, 3:])  # (k, 3, 3)
         mean = np.trace(shape, axis1=1, axis2=2)[:, None, None] / 3
-        parts = [
-            distance / (POINT_NOISE * share),
-            ((normal - self.normals) / (SLOPE_NOISE * share)).reshape(k, -1),
-            ((shape - np.eye(3) * mean) / ELONGATION).reshape(k, -1),
-        ]
+        bent = (normal - self.normals) / (ELLIPSOID.slope * share)
+        longer = (shape - np.eye(3) * mean) / ELLIPSOID.elongation
+        k = len(parameters)
+        parts = [distance / (ELLIPSOID.point * share), bent.reshape(k, -1), longer.reshape(k, -1)]
         for view in self.outline.views:
-            across = (
-                view.rim_normals.numpy()
-            )  # the camera lies in the tangent planes of the outline
+            # the camera lies in the tangent planes of the outline
+            across = view.rim_normals.numpy()
             beyond = _support(parameters, across) - across @ view.viewpoint.numpy()
-            parts.append(beyond / (RIM_NOISE * np.sqrt(max(len(across), 1) / INDEPENDENT_RIM)))
+            share = np.sqrt(max(len(across), 1) / ELLIPSOID.independent_rim)
+            parts.append(beyond / (ELLIPSOID.rim * share))
         if self.table is not None:
             bottom = -_support(parameters, np.array([[0.0, 0.0, -1.0]])) - self.table
-            parts.append(np.maximum(bottom, 0.0) / TABLE_NOISE)
+            parts.append(np.maximum(bottom, 0.0) / ELLIPSOID.table)
         return np.concatenate(parts, 1)
 
     def distance_and_normal(self, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

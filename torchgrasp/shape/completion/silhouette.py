@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.foundation.base import Value
@@ -16,14 +16,62 @@ from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import across, farthest_points, unit
 from torchgrasp.values.planning import PointCloud
 
-# the outline is a union of discs about the pixels, then shrunk [pixel spacings]
-GROW = 2.0
-SHRINK = 1.65
-FRONT_MARGIN = (
-    0.002  # a point may be this far [m] in front of the visible surface: noise of the camera
-)
-MAX_BEHIND = 0.2  # greatest share of points behind others in a single view
+
+@dataclasses.dataclass(frozen=True)
+class OutlineNumbers:
+    """The numbers of outlines; a spacing is that of the pixels at depth 1."""
+
+    grow: float = 2.0
+    shrink: float = 1.65
+    """The outline is a union of discs of this radius about the pixels, then shrunk [spacings]."""
+    neighbours: int = 5
+    """Pixels, with the pixel itself, of which the farthest gives the spacing."""
+    fine: float = 4.0
+    """Cells on one spacing."""
+    cells: int = 320
+    """Most cells along the object."""
+    margin: float = 0.25
+    """Margin of the raster, as a share of the object's extent: points beside it are looked up."""
+    front: float = 0.002
+    """A point may be this far [m] in front of the visible surface: noise of the camera."""
+    beside: float = 0.001
+    """A hidden point may be this far [m] outside the outline."""
+    least_depth: float = 1e-9
+    """Least depth [m] of a point: behind the camera is far outside."""
+    edge: float = 0.75
+    """Cells within which a node lies on a line."""
+    smooth: float = 3.0
+    """Deviation [cells] of the blur before the slope of the outline is taken."""
+    least_slope: float = 1e-12
+    """Least length of this slope: a bound of a divisor."""
+    rim: int = 16
+    """Points of the outline."""
+    rim_neighbours: int = 4
+    """Pixels beside such a point, whose median depth it gets."""
+
+
+OUTLINE = OutlineNumbers()
+
+
+@dataclasses.dataclass(frozen=True)
+class BehindNumbers:
+    """The numbers by which a cloud is no single view."""
+
+    share: float = 0.2
+    """Greatest share of points behind others."""
+    radius: float = 0.3
+    """A point is behind another if it is deeper by this share of the cloud's radius."""
+    neighbours: int = 6
+    """Pixels, with the pixel itself, that a point is compared with."""
+
+
+BEHIND = BehindNumbers()
 TIE = 2e-9  # relative difference of squared distances by rounding: the frame must not decide
+
+
+def pick_apart(points: Float[Tensor, "n d"], count: int) -> Int[Tensor, "picks"]:
+    """Return the indices of at most `count` points far apart, the same ones in every frame."""
+    return farthest_points(points, count, tie=TIE)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,9 +83,8 @@ class Silhouette(Value):
     corner: Float[Tensor, "2"]  # first node of the raster, at depth 1
     cell: float  # spacing of the nodes, at depth 1
     outside: Float[Tensor, "h w"]  # signed distance to the outline at depth 1, positive outside
-    depth: Float[
-        Tensor, "h w"
-    ]  # at each node, the depth [m] of the visible pixel nearest to the node
+    # at each node, the depth [m] of the visible pixel nearest to the node
+    depth: Float[Tensor, "h w"]
     rim: Float[Tensor, "k 3"]  # points of the outline [m] at the visible depth
     rim_normals: Float[Tensor, "k 3"]  # at the rim points, perpendicular to the camera rays
     # whether the object reaches the border of the image; points beyond do not count as outside
@@ -57,7 +104,7 @@ class Silhouette(Value):
         if hidden.
         """
         outside, visible, depth = self._look_up(points)
-        in_front = (visible - depth - FRONT_MARGIN).clamp_min(0)
+        in_front = (visible - depth - OUTLINE.front).clamp_min(0)
         return torch.where(outside > 0, outside * depth, in_front)
 
     @checked
@@ -76,12 +123,9 @@ class Silhouette(Value):
         own depth [m].
         """
         local = (points - self.viewpoint) @ self.axes.T
-        depth = local[..., 2].clamp_min(1e-9)  # behind the camera is far outside
+        depth = local[..., 2].clamp_min(OUTLINE.least_depth)
         position = (local[..., :2] / depth[..., None] - self.corner) / self.cell
-        limit = (
-            torch.tensor(self.outside.shape, dtype=position.dtype, device=position.device).flip(0)
-            - 1
-        )
+        limit = position.new_tensor(self.outside.shape).flip(0) - 1
         clamped = torch.minimum(position.clamp_min(0), limit)
         column, row = torch.round(clamped).long().unbind(-1)
         beyond = torch.linalg.vector_norm(position - clamped, dim=-1) * self.cell
@@ -137,7 +181,9 @@ class Outlines(Value):
         """Return a mask of the points that may be on the hidden side: no view excludes them, within
         a tolerance.
         """
-        return (self.hull_distance(points) < 0.001) & (self.violation(points) < FRONT_MARGIN)
+        return (self.hull_distance(points) < OUTLINE.beside) & (
+            self.violation(points) < OUTLINE.front
+        )
 
 
 @checked
@@ -162,44 +208,54 @@ def silhouette(view: PointCloud) -> Silhouette:
     """
     assert view.viewpoint is not None
     axes, pixels, depths = (t.numpy() for t in _project(view.points, view.viewpoint))
-    distance, _ = spatial.KDTree(pixels).query(pixels, k=min(5, len(pixels)))
+    distance, _ = spatial.KDTree(pixels).query(pixels, k=min(OUTLINE.neighbours, len(pixels)))
     spacing = float(np.median(distance[:, -1]))
+    disc = OUTLINE.grow * spacing
     low = pixels.min(0)
-    high = pixels.max(0)
-    extent = float((high - low).max())
-    cell = max(spacing / 4.0, extent / 320)
-    margin = int(np.ceil(GROW * spacing / cell)) + int(0.25 * extent / cell) + 2
-    shape = tuple(np.ceil((high - low) / cell).astype(int)[::-1] + 2 * margin + 1)
+    size = pixels.max(0) - low
+    extent = float(size.max())
+    cell = max(spacing / OUTLINE.fine, extent / OUTLINE.cells)
+    margin = int(np.ceil(disc / cell)) + int(OUTLINE.margin * extent / cell) + 2
+    shape = tuple(np.ceil(size / cell).astype(int)[::-1] + 2 * margin + 1)
     corner = low - margin * cell
     column, row = np.round((pixels - corner) / cell).astype(int).T
-    order = np.argsort(
-        -depths
-    )  # of pixels that share a cell the nearest to the camera is written last
+    # of pixels that share a cell the nearest to the camera is written last
+    order = np.argsort(-depths)
     raster = np.zeros(shape)
     raster[row[order], column[order]] = depths[order]
     nearest = np.asarray(
         ndimage.distance_transform_edt(raster == 0, return_distances=False, return_indices=True)
     )
-    measured = _distance(raster == 0) * cell <= GROW * spacing
+
+    measured = _distance(raster == 0) * cell <= disc
     grown = np.asarray(ndimage.binary_fill_holes(measured))
     gaps = grown & ~measured
-    gap = 2 * (float(_distance(gaps).max()) * cell + GROW * spacing) * bool(gaps.any())
-    grown &= ~_find_holes(gaps, measured, GROW * spacing / cell)
-    inside = _distance(grown) * cell > SHRINK * spacing
-    unseen = _beyond_image(view.frustum, axes, corner, cell, grown, GROW * spacing)
+    gap = 2 * (float(_distance(gaps).max()) * cell + disc) * bool(gaps.any())
+    grown &= ~_find_holes(gaps, measured, disc / cell)
+    inside = _distance(grown) * cell > OUTLINE.shrink * spacing
+    unseen = _beyond_image(view.frustum, axes, corner, cell, grown, disc)
     inside |= unseen
     outside = (_distance(~inside) - _distance(inside)) * cell
     outside += np.where(inside, 0.5, -0.5) * cell  # the outline runs between two cells
-    seen = ~unseen if not unseen.any() else _distance(~unseen) * cell > GROW * spacing
+    cut = bool(unseen.any())
+    # the border of the image is no rim
+    seen = _distance(~unseen) * cell > disc if cut else ~unseen
     rim, rim_normals = _rim(outside, seen, corner, cell, pixels, depths)
-    depth = np.where(unseen, 0.0, raster[tuple(nearest)])  # nothing is in front of what is not seen
-    images = (torch.from_numpy(outside), torch.from_numpy(depth))
-    gap = gap * float(np.median(depths))
+
     origin = view.viewpoint.double().cpu()
     axes = torch.from_numpy(axes)
-    edge = torch.from_numpy(rim) @ axes + origin, torch.from_numpy(rim_normals) @ axes
+    depth = np.where(unseen, 0.0, raster[tuple(nearest)])  # nothing is in front of what is not seen
     return Silhouette(
-        origin, axes, torch.from_numpy(corner), cell, *images, *edge, bool(unseen.any()), gap
+        viewpoint=origin,
+        axes=axes,
+        corner=torch.from_numpy(corner),
+        cell=cell,
+        outside=torch.from_numpy(outside),
+        depth=torch.from_numpy(depth),
+        rim=torch.from_numpy(rim) @ axes + origin,
+        rim_normals=torch.from_numpy(rim_normals) @ axes,
+        cut=cut,
+        gap=gap * float(np.median(depths)),
     )
 
 
@@ -211,9 +267,8 @@ def _find_holes(gaps: np.ndarray, measured: np.ndarray, grown: float) -> np.ndar
     number, count = ndimage.label(gaps)  # pyright: ignore[reportGeneralTypeIssues]
     wide = _distance(measured)
     holes = np.zeros_like(gaps)
-    for k, radius in enumerate(
-        ndimage.maximum(_distance(gaps), number, range(1, count + 1)) + grown, start=1
-    ):
+    radii = ndimage.maximum(_distance(gaps), number, range(1, count + 1)) + grown
+    for k, radius in enumerate(radii, start=1):
         if radius > 2 * grown:  # a narrower gap lies between sparse points
             around = measured & (_distance(number != k) < 2 * radius)
             holes |= (number == k) & (2 * (wide[around].max() - grown) < radius)
@@ -249,22 +304,21 @@ def _check_view(points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]) -> 
     behind = int(((points - viewpoint) @ forward <= 0).sum())
     if behind:
         found = f"{viewpoint.tolist()} m, with {behind} of {len(points)} points beside or behind it"
-        raise BadArgument(
-            "viewpoint", found, "the position of a camera that has the whole cloud in front of it"
-        )
+        needed = "the position of a camera that has the whole cloud in front of it"
+        raise BadArgument("viewpoint", found, needed)
     _, pixels, depth = _project(points, viewpoint)
-    apart, index = spatial.KDTree(pixels.numpy()).query(pixels.numpy(), k=min(6, len(pixels)))
-    deeper = (
-        depth[:, None] - depth[torch.from_numpy(index)] - torch.from_numpy(apart) * depth[:, None]
-    )
+    count = min(BEHIND.neighbours, len(pixels))
+    apart, index = spatial.KDTree(pixels.numpy()).query(pixels.numpy(), k=count)
+    # a surface as steep as 45 degrees is no second one
+    depth = depth[:, None]
+    deeper = depth - depth[torch.from_numpy(index), 0] - torch.from_numpy(apart) * depth  # (n, k)
     points = points.double().cpu()
     radius = torch.linalg.vector_norm(points - (points.amax(0) + points.amin(0)) / 2, dim=-1).max()
-    share = float((deeper.amax(1) > 0.3 * radius).double().mean())
-    if share > MAX_BEHIND:
+    share = float((deeper.amax(1) > BEHIND.radius * radius).double().mean())
+    if share > BEHIND.share:
         found = f"{share:.0%} of the points behind others, which no camera sees at once"
-        raise BadArgument(
-            "cloud", found, "a single view, the viewpoint of each point, or outward normals"
-        )
+        needed = "a single view, the viewpoint of each point, or outward normals"
+        raise BadArgument("cloud", found, needed)
 
 
 def _project(
@@ -297,17 +351,18 @@ def _rim(
     """Return 16 evenly spread points of the outline at the depth of nearby pixels, and their
     surface normals.
     """
-    row, column = np.nonzero(seen & (np.abs(outside) <= 0.75 * cell))
-    smooth = ndimage.gaussian_filter(outside, 3.0)
-    slope = np.stack([np.gradient(smooth, axis=axis)[row, column] for axis in (1, 0)], -1)
-    slope /= np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-12)
-    position = corner + cell * np.stack([column, row], -1)
-    if len(position) == 0:
+    row, column = np.nonzero(seen & (np.abs(outside) <= OUTLINE.edge * cell))
+    if not len(row):
         return np.zeros((0, 3)), np.zeros((0, 3))
-    picks = farthest_points(torch.from_numpy(position), 16, tie=TIE).numpy()
+    smooth = ndimage.gaussian_filter(outside, OUTLINE.smooth)
+    slope = np.stack([np.gradient(smooth, axis=axis)[row, column] for axis in (1, 0)], -1)
+    slope /= np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), OUTLINE.least_slope)
+    position = corner + cell * np.stack([column, row], -1)
+    picks = pick_apart(torch.from_numpy(position), OUTLINE.rim).numpy()
     position = position[picks]
     slope = slope[picks]
-    _, index = spatial.KDTree(pixels).query(position, k=min(4, len(pixels)))
+    count = min(OUTLINE.rim_neighbours, len(pixels))
+    _, index = spatial.KDTree(pixels).query(position, k=count)
     depth = np.median(depths[index].reshape(len(position), -1), axis=-1)
     ray = np.concatenate([position, np.ones((len(position), 1))], -1)
     # The cone's normal is perpendicular to the ray and to the outline's tangent, and leans with the

@@ -14,39 +14,86 @@ from torch import Tensor
 from torchgrasp.foundation.lazy import spatial
 from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import (
-    farthest_points,
+    Points,
     fibonacci_sphere,
     reflect,
     reflect_directions,
     unit,
 )
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.shape.completion.silhouette import TIE, Outlines, silhouettes
+from torchgrasp.shape.completion.silhouette import Outlines, pick_apart, silhouettes
 from torchgrasp.values.planning import PointCloud
 
-MATCH_DISTANCE = 0.003  # distance [m] over which a mirrored point stops matching the cloud
-PROBES = 150  # points of the cloud that score a plane
-# offsets tried for each direction of a plane, and for a known direction
-OFFSETS = 17
-FINE_OFFSETS = 65
-# cosines of a plane's normal with the view: hides points above, is frontal above
-MIN_FACING = 0.35
-FACING = 0.7
-RIM_PRIOR = (
-    0.15  # loss of score at a quarter of the size from the rim: a view ends near the mirror plane
-)
-WITHIN = 0.12  # greatest loss of score against the best plane
-APART = math.cos(math.radians(25.0))  # closer planes mirror to the same points
-# greatest mean violation of free space, in [0, 1], of a plane added for the points that it hides
-MAX_VIOLATION = 0.15
-# a plane near the best one is dropped if its score is less by this: it matches only because it is
-# near
-SLOPE = 0.15
+
+@dataclasses.dataclass(frozen=True)
+class SymmetryNumbers:
+    """The numbers of the score of a mirror plane."""
+
+    match: float = 0.003
+    """Distance [m] over which a mirrored point stops matching the cloud."""
+    far: float = 4.0
+    """A match is sought within so many times this distance."""
+    worst: float = 3.0
+    """Depth in free space, over the same distance, of the greatest violation by a point."""
+    probes: int = 150
+    """Points of the cloud that score a plane."""
+    leaf: int = 32
+    """Points in a leaf of the tree of all points."""
+
+
+SYMMETRY = SymmetryNumbers()
+
+
+@dataclasses.dataclass(frozen=True)
+class PlaneSearchNumbers:
+    """The numbers of the search for mirror planes; cosines are those of normals."""
+
+    sphere: int = 160
+    """Directions over a whole sphere, of which half are tried: n and -n are one plane."""
+    level: int = 24
+    """Directions of upright planes that are tried."""
+    level_through_axis: int = 96
+    """Directions of planes that are tried for a part attached to a body of revolution."""
+    offsets: int = 17
+    fine_offsets: int = 65
+    """Offsets tried for each direction of a plane, and for a known direction."""
+    least_extent: float = 0.15
+    """Least half range of the offsets, as a share of the cloud's size."""
+    one_side: float = 0.05
+    """Least length of the mean view of one side; shorter: from above, or from several sides."""
+    hides: float = 0.35
+    facing: float = 0.7
+    """Cosines with the view: above them a plane hides points, and is frontal."""
+    rim_prior: float = 0.15
+    rim_distance: float = 0.25
+    """Loss of score at this distance from the rim, over the size: a view ends near the plane."""
+    square: float = 0.1
+    square_prior: float = 0.1
+    """Greatest cosine of planes at right angles to the best one, and their gain of score."""
+    most: int = 4
+    """Most planes that are chosen from all directions."""
+    within: float = 0.12
+    """Greatest loss of score against the best plane."""
+    apart: float = math.cos(math.radians(25.0))
+    """Cosine of planes that mirror to the same points."""
+    square_apart: float = 0.42
+    """Cosine with a square plane above which a plane replaces it."""
+    violation: float = 0.15
+    """Greatest mean violation of free space, in [0, 1], of a plane that the cloud cannot confirm."""
+    slope: float = 0.15
+    """A plane near the best one of so much less score matches only because it is near."""
+    end_score: float = 0.4
+    """Least score of the plane that mirrors the ends of a body of revolution."""
+    widths: tuple[float, ...] = (1.0, 0.5, 0.25)
+    """Widths of the grids that refine a plane, each half as wide as the last."""
+    angle: float = 0.06
+    shift: float = 0.04
+    """Steps of the widest grid: angle [rad], and shift over the size."""
+
+
+SEARCH = PlaneSearchNumbers()
+# the axis of a body of revolution in its frame
 AXIS = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64, device="cpu")
-END_SCORE = 0.4
-"""The axis of a body of revolution in its frame, and the least score of the plane that mirrors its
-ends.
-"""
 Mirror = Float[Tensor, "4"]
 Mirrors = Float[Tensor, "_ 4"]
 """Mirror planes n.x = o, given as (n, o)."""
@@ -82,26 +129,24 @@ class SymmetryScorer:
         assert cloud.normals is not None
         plane = None if table is None else Plane.horizontal(table)
         every = torch.arange(len(cloud), device="cpu")
-        return cls(
-            cloud.points, cloud.normals, silhouettes(cloud), plane, table is not None, every
-        ).for_part(every)
+        outline = silhouettes(cloud)
+        whole = cls(cloud.points, cloud.normals, outline, plane, table is not None, every)
+        return whole.for_part(every)
 
     def about_axis(self, axis_from_cloud: Float[Tensor, "4 4"]) -> "SymmetryScorer":
         """Return the scorer in a frame whose z axis is the axis of revolution."""
         points = apply(axis_from_cloud, self.points)
         normals = rotate(axis_from_cloud, self.normals)
         table = None if self.table is None else self.table.moved(axis_from_cloud)
-        return SymmetryScorer(
-            points, normals, self.outline.moved(axis_from_cloud), table, True, self.rows
-        )
+        outline = self.outline.moved(axis_from_cloud)
+        return SymmetryScorer(points, normals, outline, table, True, self.rows)
 
     def for_part(self, rows: Int[Tensor, "k"]) -> "SymmetryScorer":
         """Return the scorer whose probes are chosen only from the points of the cloud with the
         indices `rows`.
         """
-        return dataclasses.replace(
-            self, rows=rows[farthest_points(self.points[rows], PROBES, tie=TIE)]
-        )
+        chosen = pick_apart(self.points[rows], SYMMETRY.probes)
+        return dataclasses.replace(self, rows=rows[chosen])
 
     @functools.cached_property
     def probes(self) -> tuple[Float[Tensor, "k 3"], Float[Tensor, "k 3"]]:
@@ -111,7 +156,7 @@ class SymmetryScorer:
     @functools.cached_property
     def tree(self) -> "spatial.KDTree":
         """The k-d tree over all points of the cloud, for finding nearest neighbours."""
-        return spatial.KDTree(self.points.numpy(), leafsize=32)
+        return spatial.KDTree(self.points.numpy(), leafsize=SYMMETRY.leaf)
 
     @property
     def center(self) -> Tensor:
@@ -138,15 +183,17 @@ class SymmetryScorer:
 
         The score is the match of the mirror image with the cloud, minus twice the violation.
         """
-        mirrored = reflect(self.probes[0], planes[:, None])
-        normals = reflect_directions(self.probes[1], planes[:, None])
-        distance, index = self.nearest(mirrored, 4 * MATCH_DISTANCE)
-        agreement = (normals * self.normals[index]).sum(-1).clamp_min(0)
-        match = (torch.exp(-0.5 * (distance / MATCH_DISTANCE) ** 2) * agreement).mean(-1)
+        points, normals = self.probes
+        mirrored = reflect(points, planes[:, None])  # (p, k, 3)
+        turned = reflect_directions(normals, planes[:, None])
+        distance, index = self.nearest(mirrored, SYMMETRY.far * SYMMETRY.match)
+        agreement = (turned * self.normals[index]).sum(-1).clamp_min(0)
+        match = (torch.exp(-0.5 * (distance / SYMMETRY.match) ** 2) * agreement).mean(-1)
         depth = self.outline.violation(mirrored)
         if self.table is not None:
             depth = depth + (-self.table.height(mirrored)).clamp_min(0)
-        violation = ((depth / MATCH_DISTANCE).clamp_max(3.0) ** 2 / 9.0).mean(-1)
+        worst = SYMMETRY.worst
+        violation = ((depth / SYMMETRY.match).clamp_max(worst) ** 2 / worst**2).mean(-1)
         return match - 2.0 * violation, violation
 
 
@@ -158,45 +205,45 @@ def find_planes(scorer: SymmetryScorer, turned: bool = False) -> tuple[Mirrors, 
     it. A horizontal plane at half the height is added to give the underside. A body of revolution
     (`turned`) needs neither, because every plane through its axis matches.
     """
-    view = torch.stack(
-        [unit(scorer.center - seen.viewpoint) for seen in scorer.outline.views]
-    ).mean(0)
-    if not scorer.upright:
-        directions = fibonacci_sphere(160)[:80]  # half a sphere: n and -n are one
+    views = [unit(scorer.center - seen.viewpoint) for seen in scorer.outline.views]
+    view = torch.stack(views).mean(0)
+    if scorer.upright:
+        directions = _level_directions(SEARCH.level)
+        view = view * (1.0 - AXIS[0])
     else:
-        directions = _level_directions(24)
-        view = view * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64, device="cpu")
+        directions = fibonacci_sphere(SEARCH.sphere)[: SEARCH.sphere // 2]
     # From above, or from sides that are far apart, no side alone is hidden, and every plane may add
     # points.
-    across = unit(view) if float(torch.linalg.vector_norm(view)) > 0.05 else None
-    grid = _plane_grid(scorer, directions)
+    across = unit(view) if float(torch.linalg.vector_norm(view)) > SEARCH.one_side else None
+    grid = _plane_grid(scorer, directions)  # (d, k, 4)
     scores = scorer.score(grid.reshape(-1, 4))[0].reshape(grid.shape[:2])
     if not scorer.upright:
         rim = (scorer.outline.rim @ directions.T).median(0).values
-        scores = scores - RIM_PRIOR * ((grid[..., 3] - rim[:, None]) / (0.25 * scorer.size)) ** 2
+        away = (grid[..., 3] - rim[:, None]) / (SEARCH.rim_distance * scorer.size)
+        scores = scores - SEARCH.rim_prior * away**2
     strongest = int(scores.max(1).values.argmax())
-    scores = scores + 0.1 * ((directions @ directions[strongest]).abs() < 0.1)[:, None]
+    square = (directions @ directions[strongest]).abs() < SEARCH.square
+    scores = scores + SEARCH.square_prior * square[:, None]
 
     planes = [_refine(scorer, grid[i, k]) for i, k in _pick_planes(scores, directions, across)]
     if scorer.table is None or turned:
-        planes += list(_across_plane(scorer, planes, grid, across))
+        planes += _across_plane(scorer, planes, grid, across)
         if turned and scorer.table is None:
-            planes += list(
-                _best_plane(scorer, _plane_grid(scorer, AXIS, FINE_OFFSETS)[0], END_SCORE)
-            )
+            ends = _plane_grid(scorer, AXIS, SEARCH.fine_offsets)[0]
+            planes += _best_plane(scorer, ends, SEARCH.end_score)
     else:
         best = _refine(scorer, grid[strongest, int(scores[strongest].argmax())])
         # Some planes score well only because they are near the best plane.
-        least = float(scorer.score(best[None])[0]) - SLOPE
-        apart = [abs(float(plane[:3] @ best[:3])) < APART for plane in planes]
+        least = float(scorer.score(best[None])[0]) - SEARCH.slope
         planes = [
-            p
-            for p, far in zip(planes, apart, strict=True)
-            if far or float(scorer.score(p[None])[0]) > least
+            plane
+            for plane in planes
+            if abs(float(plane[:3] @ best[:3])) < SEARCH.apart
+            or float(scorer.score(plane[None])[0]) > least
         ]
-        planes += list(_square_plane(scorer, planes, best, across))
-        half = ((scorer.points[:, 2].max() + scorer.table.offset) / 2)[None, None]
-        planes += list(_best_plane(scorer, torch.cat([AXIS, half], 1), 0.0))
+        planes += _square_plane(scorer, planes, best, across)
+        half = (scorer.points[:, 2].max() + scorer.table.offset) / 2
+        planes += _best_plane(scorer, torch.cat([AXIS, half[None, None]], 1), 0.0)
     if not planes:
         return scorer.points.new_zeros(0, 4), scorer.points.new_zeros(0)
     found = torch.stack(planes)
@@ -206,14 +253,14 @@ def find_planes(scorer: SymmetryScorer, turned: bool = False) -> tuple[Mirrors, 
 
 
 def find_plane_through_axis(
-    scorer: SymmetryScorer, center: Float[Tensor, "2"], part: Float[Tensor, "n 3"]
+    scorer: SymmetryScorer, center: Float[Tensor, "2"], part: Points
 ) -> tuple[Float[Tensor, "1 4"], Float[Tensor, "1"]]:
     """Return the mirror plane of an attached part, such as a handle, through the axis at `center`,
     and its score.
 
     A plane across which the part extends less is preferred, even if half of the part is hidden.
     """
-    normals = _level_directions(96)
+    normals = _level_directions(SEARCH.level_through_axis)
     planes = torch.cat([normals, (normals[:, :2] @ center)[:, None]], -1)
     arm = part[:, :2] - center
     extent = (arm @ normals[:, :2].T).square().mean(0) / arm.square().sum(1).mean()
@@ -237,9 +284,8 @@ def planes_near(
     normals = unit(normal + tilts @ sideways)
     # Rotate about the cloud's centre: a frame's origin may be far away.
     offsets = plane[3] + (normals - normal) @ scorer.center
-    return torch.cat(
-        [normals.repeat_interleave(len(shifts), 0), (offsets[:, None] + shifts).reshape(-1, 1)], 1
-    )
+    offsets = (offsets[:, None] + shifts).reshape(-1, 1)  # (t s, 1)
+    return torch.cat([normals.repeat_interleave(len(shifts), 0), offsets], 1)
 
 
 def _level_directions(n: int) -> Float[Tensor, "n 3"]:
@@ -249,17 +295,16 @@ def _level_directions(n: int) -> Float[Tensor, "n 3"]:
 
 
 def _plane_grid(
-    scorer: SymmetryScorer, directions: Directions, count: int = OFFSETS
+    scorer: SymmetryScorer, directions: Directions, count: int = SEARCH.offsets
 ) -> Float[Tensor, "d k 4"]:
     """Return planes with the given normals, each at `count` offsets over the cloud's extent."""
     along = scorer.points @ directions.T
     low = along.amin(0)
     high = along.amax(0)
     middle = (low + high) / 2
-    half = ((high - low) / 2).clamp_min(0.15 * scorer.size)
-    offsets = middle[:, None] + half[:, None] * torch.linspace(
-        -1, 1, count, dtype=torch.float64, device="cpu"
-    )
+    half = ((high - low) / 2).clamp_min(SEARCH.least_extent * scorer.size)
+    steps = torch.linspace(-1, 1, count, dtype=torch.float64, device="cpu")
+    offsets = middle[:, None] + half[:, None] * steps  # (d, count)
     return torch.cat([directions[:, None].expand(-1, count, -1), offsets[..., None]], -1)
 
 
@@ -274,9 +319,9 @@ def _pick_planes(
     order = [i for i in torch.argsort(best, descending=True, stable=True).tolist() if hides[i]]
     chosen: list[int] = []
     for i in order:
-        if len(chosen) == 4 or best[i] <= best[order[0]] - WITHIN:
+        if len(chosen) == SEARCH.most or best[i] <= best[order[0]] - SEARCH.within:
             break
-        if all(abs(float(directions[i] @ directions[j])) < APART for j in chosen):
+        if all(abs(float(directions[i] @ directions[j])) < SEARCH.apart for j in chosen):
             chosen.append(i)
     return [(i, int(offset[i])) for i in chosen]
 
@@ -287,54 +332,53 @@ def _hides(directions: Directions, across: View) -> Bool[Tensor, "d"]:
     """
     if across is None:
         return torch.ones(len(directions), dtype=torch.bool, device="cpu")
-    return (directions @ across).abs() > MIN_FACING
+    return (directions @ across).abs() > SEARCH.hides
 
 
 def _across_plane(
     scorer: SymmetryScorer, planes: list[Mirror], grid: Float[Tensor, "d k 4"], across: View
-) -> Mirrors:
-    """Return, as a row, the best plane that faces the view; no row if `planes` has one or all
-    violate free space.
+) -> list[Mirror]:
+    """Return the best plane that faces the view; none if `planes` has one or all violate free
+    space.
     """
-    if across is None or any(abs(float(plane[:3] @ across)) > FACING for plane in planes):
-        return grid.new_zeros(0, 4)
-    found = _best_plane(
-        scorer, grid[(grid[:, 0, :3] @ across).abs() > FACING].reshape(-1, 4), -math.inf
-    )
-    return torch.stack([_refine(scorer, plane) for plane in found]) if len(found) else found
+    if across is None or any(abs(float(plane[:3] @ across)) > SEARCH.facing for plane in planes):
+        return []
+    facing = (grid[:, 0, :3] @ across).abs() > SEARCH.facing
+    found = _best_plane(scorer, grid[facing].reshape(-1, 4), -math.inf)
+    return [_refine(scorer, plane) for plane in found]
 
 
 def _square_plane(
     scorer: SymmetryScorer, planes: list[Mirror], best: Mirror, across: View
-) -> Mirrors:
-    """Return the best vertical plane at right angles to `best`, as a row.
+) -> list[Mirror]:
+    """Return the best vertical plane at right angles to `best`.
 
-    There is no row if it is known already or if mirrored points would be visible.
+    There is none if it is known already or if mirrored points would be visible.
     """
     direction = torch.stack([-best[1], best[0], torch.zeros_like(best[0])])[None]
-    near = any(abs(float(plane[:3] @ direction[0])) > 0.42 for plane in planes)
+    near = any(abs(float(plane[:3] @ direction[0])) > SEARCH.square_apart for plane in planes)
     if near or not bool(_hides(direction, across)):
-        return best.new_zeros(0, 4)
-    return _best_plane(scorer, _plane_grid(scorer, direction, FINE_OFFSETS)[0], -math.inf)
+        return []
+    return _best_plane(scorer, _plane_grid(scorer, direction, SEARCH.fine_offsets)[0], -math.inf)
 
 
-def _best_plane(scorer: SymmetryScorer, planes: Mirrors, least: float) -> Mirrors:
-    """Return, as a row, the plane of the greatest score above `least` that does not violate free
-    space, or no row.
+def _best_plane(scorer: SymmetryScorer, planes: Mirrors, least: float) -> list[Mirror]:
+    """Return the plane of the greatest score above `least` that does not violate free space, or
+    none.
     """
     if not len(planes):
-        return planes
+        return []
     scores, violation = scorer.score(planes)
-    scores = torch.where(violation < MAX_VIOLATION, scores, -torch.inf)
-    return planes[scores.argmax()][None][scores.max()[None] > least]
+    scores = torch.where(violation < SEARCH.violation, scores, -torch.inf)
+    best = scores.argmax()
+    return [planes[best]] if float(scores[best]) > least else []
 
 
 def _refine(scorer: SymmetryScorer, plane: Mirror) -> Mirror:
-    """Return the plane of the best score nearby, after three grid searches, each half as wide as
-    the last.
-    """
+    """Return the plane of the best score nearby, after grid searches, each narrower than the last."""
     steps = torch.tensor([-1.0, 0.0, 1.0], dtype=plane.dtype, device="cpu")
-    for width in (1.0, 0.5, 0.25):
-        near = planes_near(scorer, plane, 0.06 * width * steps, 0.04 * scorer.size * width * steps)
+    for width in SEARCH.widths:
+        angles = SEARCH.angle * width * steps
+        near = planes_near(scorer, plane, angles, SEARCH.shift * scorer.size * width * steps)
         plane = near[scorer.score(near)[0].argmax()]
     return plane

@@ -11,29 +11,88 @@ from torch import Tensor
 
 from torchgrasp.foundation.base import Batch, Value
 from torchgrasp.foundation.lazy import spatial
-from torchgrasp.geometry.linalg import Points, farthest_points, solve_least_squares, unit
+from torchgrasp.geometry.linalg import Points, solve_least_squares, unit
 from torchgrasp.shape.completion.axis import fit_axis, rotations_about_z
-from torchgrasp.shape.completion.complete import NEW, merge_hidden
-from torchgrasp.shape.completion.silhouette import TIE, Outlines
+from torchgrasp.shape.completion.complete import HIDDEN, merge_hidden
+from torchgrasp.shape.completion.silhouette import Outlines, pick_apart
 from torchgrasp.values.planning import PointCloud
 
-# least length of the horizontal part of a wall's normals: others are of rim, floor and noise
-LEVEL = 0.5
-# least shares: of the walls on the body, of either wall
-BODY_SHARE = 0.65
-INNER_SHARE = 0.09
-OUTER_SHARE = 0.07
-# usual thickness [m], its deviation, and that of a fit
-USUAL = 0.0035
-SPREAD = 0.0015
-THICKNESS_ERROR = 0.0012
-RIM = (
-    0.003  # points so near [m] below the rim belong to no wall: their normals depend on both walls
-)
-# deviations [m] of axis, form and unseen floor
-CENTER_ERROR = 0.0006
-FORM_ERROR = 0.001
-FLOOR_ERROR = 0.003
+
+@dataclasses.dataclass(frozen=True)
+class VesselNumbers:
+    """The numbers by which a vessel is found."""
+
+    level: float = 0.5
+    """Least length of the level part of a wall's normals: others are of rim, floor and noise."""
+    terms: int = 4
+    """Coefficients of the outer radius as a polynomial of the height: a cubic one."""
+    top: float = 0.98
+    """Quantile of the heights that is the top: noise lifts some points above the rim."""
+    below_top: float = 0.002
+    """Points so near [m] below the top do not join the fit."""
+    rounds: int = 30
+    """Rounds of the fit; each has new weights."""
+    miss: float = 0.006
+    """Miss [m] of half the weight in the last rounds."""
+    wider: float = 4.0
+    """The first round has a scale wider by so many times `miss`, as the axis is not yet known."""
+    narrowing: float = 0.8
+    """Factor of this excess from round to round."""
+    on_body: float = 0.002
+    """Greatest miss [m] of a point of the body: twice a camera's noise."""
+    thinnest: float = 0.0003
+    thickest: float = 0.012
+    """A fitted wall [m] outside these bounds is no wall."""
+    floor: float = 0.7
+    """Vertical part of a normal from which a point inside the mouth belongs to the floor."""
+    rim: float = 0.003
+    """Points so near [m] below the rim belong to no wall: their normals depend on both walls."""
+    body_share: float = 0.65
+    """Least share of the walls on the body."""
+    inner_share: float = 0.09
+    outer_share: float = 0.07
+    """Least shares of the cloud on either wall."""
+    depth: float = 0.012
+    """The inside must be seen so far [m] below the rim: the recess of a lid is no cavity."""
+    usual: float = 0.0035
+    spread: float = 0.0015
+    """Usual thickness [m] of a wall, and its deviation."""
+    error: float = 0.0012
+    """Deviation [m] of a fitted thickness."""
+    least_slope: float = 1e-9
+    least_spread: float = 1e-6
+    """Bounds of divisors: of a normal's level part, and of the deviation of heights [m]."""
+
+
+VESSEL = VesselNumbers()
+
+
+@dataclasses.dataclass(frozen=True)
+class WallNumbers:
+    """The numbers of the hidden parts of a vessel's walls."""
+
+    center: float = 0.0006
+    form: float = 0.001
+    floor: float = 0.003
+    """Deviations [m] of the axis, of the form and of an unseen floor."""
+    up: float = 0.9
+    """Least vertical part of the normals of a seen floor."""
+    floor_points: int = 10
+    """A seen floor has more points than this."""
+    floor_rings: tuple[tuple[float, int], ...] = ((0.0, 1), (0.4, 5), (0.75, 8))
+    lid_rings: tuple[tuple[float, int], ...] = ((0.0, 1), (0.5, 6))
+    """Points of an unseen floor and of a lid: shares of the radius, and points on each ring."""
+    turned: int = 80
+    """Points of a wall that are turned about the axis."""
+    turns: int = 24
+    """Parts of a full circle by which they are turned."""
+    thinned: int = 200
+    """Most hidden points of one part that are compared with other parts."""
+    budget: int = 50
+    """Most hidden points of one wall."""
+
+
+WALL = WallNumbers()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,71 +107,69 @@ class Vessel(Value):
     body: Bool[Tensor, "n"]  # mask of the points on either wall, without handles, rim and floor
 
 
-def find_vessel(points: Points, normals: Points) -> Vessel | None:
+def find_vessel(points: Points, normals: Points, numbers: VesselNumbers = VESSEL) -> Vessel | None:
     """Return the open vessel that a cloud shows, or None if it shows no vessel.
 
     Normals of an inner wall point to the axis. Both walls are fitted at once: the outer radius is a
     cubic polynomial of the height, and the inner radius is less by the thickness over the length of
     the normal's horizontal part. Robust weights (Cauchy) ignore handles.
     """
+    height = points[:, 2]
     slope = torch.linalg.vector_norm(normals[:, :2], dim=1)
-    level = normals[:, :2] / slope[:, None].clamp_min(1e-9)
-    middle = points[:, 2].mean()
-    spread = points[:, 2].std().clamp_min(1e-6)
-    # noise lifts some points above the rim
-    exponents = torch.arange(4, device=points.device).to(points)
-    top = 0.98
-    powers = ((points[:, 2:] - middle) / spread) ** exponents
-    below = points[:, 2] < points[:, 2].quantile(top) - 0.002
+    level = normals[:, :2] / slope[:, None].clamp_min(numbers.least_slope)
+    steep = slope > numbers.level
+    middle = height.mean()
+    spread = height.std().clamp_min(numbers.least_spread)
+    exponents = torch.arange(numbers.terms, device=points.device).to(points)
+    powers = ((points[:, 2:] - middle) / spread) ** exponents  # (n, terms)
+    below = height < height.quantile(numbers.top) - numbers.below_top
     center = fit_axis(points, normals)
     miss = torch.zeros_like(slope)
-    found = torch.zeros_like(slope)
-    radius = slope
-    facing = slope
-    for k in range(30):
+    found = miss
+    radius = miss
+    facing = miss
+    for k in range(numbers.rounds):
         arm = points[:, :2] - center
         radius = torch.linalg.vector_norm(arm, dim=1)
         out = unit(arm)
         facing = (out * level).sum(1)
-        wall = below & (slope > LEVEL) & (facing.abs() > LEVEL)
-        scale = 0.006 * (1.0 + 4.0 * 0.8**k)  # miss [m] of half the weight
+        wall = below & steep & (facing.abs() > numbers.level)
+        scale = numbers.miss * (1.0 + numbers.wider * numbers.narrowing**k)
         weight = (wall / (1.0 + (miss / scale) ** 2)).sqrt()[:, None]
-        inside = (facing < 0) / slope.clamp_min(LEVEL)
-        terms = torch.cat([powers, -inside[:, None], out], 1)  # the last two columns move the axis
+        inside = (facing < 0) / slope.clamp_min(numbers.level)
+        # the last two columns move the axis
+        terms = torch.cat([powers, -inside[:, None], out], 1)  # (n, terms + 3)
         if not bool((weight > 0).sum() > 2 * terms.shape[1]):
             return None
         found = solve_least_squares(weight * terms, weight[:, 0] * radius)
         miss = radius - terms @ found
         center = center + found[-2:]
-    thickness = float(found[4])
 
-    wall = (slope > LEVEL) & (facing.abs() > LEVEL)
-    body = wall & (miss.abs() < 0.002)  # [m], twice a camera's noise
+    wall = steep & (facing.abs() > numbers.level)
+    body = wall & (miss.abs() < numbers.on_body)
     within = (points[:, :2].amin(0) < center) & (center < points[:, :2].amax(0))
-    if not bool(within.all() & body.any()) or not 0.0003 < thickness < 0.012:
+    thickness = float(found[numbers.terms])
+    if not numbers.thinnest < thickness < numbers.thickest:
         return None
-    rim = float(points[body, 2].quantile(top))
-    mouth = float(((rim - middle) / spread) ** exponents @ found[:4])
-    floor = (
-        0.7  # vertical part of a normal from which a point inside the mouth belongs to the floor
-    )
-    inward = ((facing < 0) & (slope > 1.0 - floor)) | (normals[:, 2] > floor)
-    inner = inward & (radius < mouth) & (points[:, 2] < rim - RIM)
-    shares = (
-        (body & inner).double().mean(),
-        (body & ~inner).double().mean(),
-        body.sum() / wall.sum(),
-    )
-    enough = all(
-        float(s) > least
-        for s, least in zip(shares, (INNER_SHARE, OUTER_SHARE, BODY_SHARE), strict=True)
-    )
-    # The recess of a lid is no cavity: the inside must be seen 12 mm below the rim.
-    if not enough or not math.isfinite(mouth) or float(rim - points[inner, 2].min()) < 0.012:
+    if not bool(within.all() & body.any()):
         return None
-    usual = 1.0 / (1.0 + (SPREAD / THICKNESS_ERROR) ** 2)
-    thickness = usual * USUAL + (1.0 - usual) * thickness
-    return Vessel(center, thickness, mouth, rim, inner, body & (points[:, 2] < rim - RIM))
+
+    rim = float(height[body].quantile(numbers.top))
+    mouth = float(((rim - middle) / spread) ** exponents @ found[: numbers.terms])
+    floor = normals[:, 2] > numbers.floor
+    inward = ((facing < 0) & (slope > 1.0 - numbers.floor)) | floor
+    below = height < rim - numbers.rim
+    inner = inward & (radius < mouth) & below
+    enough = (
+        float((body & inner).double().mean()) > numbers.inner_share
+        and float((body & ~inner).double().mean()) > numbers.outer_share
+        and float(body.sum() / wall.sum()) > numbers.body_share
+    )
+    if not enough or float(rim - height[inner].min()) < numbers.depth:
+        return None
+    usual = 1.0 / (1.0 + (numbers.spread / numbers.error) ** 2)
+    thickness = usual * numbers.usual + (1.0 - usual) * thickness
+    return Vessel(center, thickness, mouth, rim, inner, body & below)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,7 +196,7 @@ class Wall(Value):
 
 
 def complete_walls(
-    cloud: PointCloud, vessel: Vessel, outline: Outlines, table: float
+    cloud: PointCloud, vessel: Vessel, outline: Outlines, table: float, numbers: WallNumbers = WALL
 ) -> tuple[Wall, Wall]:
     """Return the outer and the inner wall of a vessel on a table of height `table` [m].
 
@@ -149,39 +206,32 @@ def complete_walls(
     points = cloud.points
     normals = cloud.normals
     assert normals is not None
-    every = HiddenWall(
-        points, normals, torch.zeros(len(points), 4, dtype=points.dtype, device="cpu")
-    )
-    outside = every[vessel.body & ~vessel.inner]
-    inside = every[vessel.body & vessel.inner]
-    seen_floor = vessel.inner & (normals[:, 2] > 0.9)
-    has_floor = int(seen_floor.sum()) > 10
-    floor = float(points[seen_floor, 2].median()) if has_floor else table + vessel.thickness
-
-    outer = _merge(
-        points[~vessel.inner],
-        outline,
-        [_across(inside, vessel), _turn(outside, vessel)],
-        vessel,
-        table,
-    )
-    parts = [
+    inner = vessel.inner
+    every = HiddenWall(points, normals, points.new_zeros(len(points), 4))
+    outside = every[vessel.body & ~inner]
+    inside = every[vessel.body & inner]
+    turned = _turn(outside, vessel, numbers)
+    outer_parts = [_across(inside, vessel), turned]
+    inner_parts = [
         _across(outside, vessel),
-        _turn(inside, vessel),
-        _across(_turn(outside, vessel), vessel),
+        _turn(inside, vessel, numbers),
+        _across(turned, vessel),
     ]
-    if not has_floor:
-        radius = float(
-            torch.linalg.vector_norm(points[vessel.inner, :2] - vessel.center, dim=1).min()
-        )
-        parts.append(_disc(vessel, floor, radius, ((0.0, 1), (0.4, 5), (0.75, 8))))
-    inner = _merge(points[vessel.inner], outline, parts, vessel, floor)
-    return Wall(~vessel.inner, outer), Wall(vessel.inner, inner)
+    seen_floor = inner & (normals[:, 2] > numbers.up)
+    if int(seen_floor.sum()) > numbers.floor_points:
+        floor = float(points[seen_floor, 2].median())
+    else:
+        floor = table + vessel.thickness
+        away = torch.linalg.vector_norm(points[inner, :2] - vessel.center, dim=1)
+        inner_parts.append(_disc(vessel, floor, float(away.min()), numbers.floor_rings))
+    outer_hidden = _merge(points[~inner], outline, outer_parts, vessel, table)
+    inner_hidden = _merge(points[inner], outline, inner_parts, vessel, floor)
+    return Wall(~inner, outer_hidden), Wall(inner, inner_hidden)
 
 
 def lid(vessel: Vessel) -> HiddenWall:
     """Return points of an imagined flat lid that closes the outer surface at the rim."""
-    return _disc(vessel, vessel.rim, vessel.radius, ((0.0, 1), (0.5, 6)))
+    return _disc(vessel, vessel.rim, vessel.radius, WALL.lid_rings)
 
 
 def _across(wall: HiddenWall, vessel: Vessel) -> HiddenWall:
@@ -189,22 +239,21 @@ def _across(wall: HiddenWall, vessel: Vessel) -> HiddenWall:
     away.
     """
     shared = wall.shared.clone()
-    shared[:, 2] += THICKNESS_ERROR
+    shared[:, 2] += VESSEL.error
     return HiddenWall(wall.points - vessel.thickness * wall.normals, -wall.normals, shared)
 
 
-def _turn(wall: HiddenWall, vessel: Vessel) -> HiddenWall:
-    """Return 80 points of a wall, rotated about the axis by 23 angles, with the errors of the axis
-    position.
+def _turn(wall: HiddenWall, vessel: Vessel, numbers: WallNumbers) -> HiddenWall:
+    """Return some points of a wall, rotated about the axis by parts of a full circle, with the
+    errors of the axis position.
     """
-    wall = wall[farthest_points(wall.points, 80, tie=TIE)]
-    turn = rotations_about_z(24)
-    axis = torch.cat([vessel.center, torch.zeros(1, dtype=torch.float64, device="cpu")])
-    points = (wall.points - axis) @ turn.mT + axis
+    wall = wall[pick_apart(wall.points, numbers.turned)]
+    turn = rotations_about_z(numbers.turns)  # (k, 3, 3)
+    axis = torch.cat([vessel.center, turn.new_zeros(1)])
+    points = (wall.points - axis) @ turn.mT + axis  # (k, m, 3)
     normals = wall.normals @ turn.mT
-    moved = (
-        CENTER_ERROR * (torch.eye(3, dtype=torch.float64, device="cpu") - turn)[:, None]
-    )  # of points, with the axis
+    # how points move with the axis
+    moved = numbers.center * (torch.eye(3).to(turn) - turn)[:, None]
     shared = wall.shared.expand(len(turn), -1, -1).clone()
     shared[..., :2] += (normals[..., None, :] @ moved)[..., 0, :2]
     return HiddenWall(points.flatten(0, 1), normals.flatten(0, 1), shared.flatten(0, 1))
@@ -218,13 +267,14 @@ def _disc(
     """
     places = []
     for share, count in rings:
-        angle = torch.arange(count, dtype=torch.float64, device="cpu") * (2 * math.pi / count)
+        angle = torch.arange(count).to(vessel.center) * (2 * math.pi / count)
         places.append(share * radius * torch.stack([angle.cos(), angle.sin()], 1) + vessel.center)
     level = torch.cat(places)
     points = torch.cat([level, torch.full_like(level[:, :1], height)], 1)
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64, device="cpu").expand_as(points)
-    shared = torch.zeros(len(points), 4, dtype=torch.float64, device="cpu")
-    shared[:, 3] = FLOOR_ERROR
+    up = torch.zeros_like(points)
+    up[:, 2] = 1.0
+    shared = points.new_zeros(len(points), 4)
+    shared[:, 3] = WALL.floor
     return HiddenWall(points, up, shared)
 
 
@@ -237,14 +287,13 @@ def _merge(
     tree = spatial.KDTree(seen.numpy())
 
     def allowed(part: HiddenWall) -> Bool[Tensor, "n"]:
-        within = (part.points[:, 2] < vessel.rim - RIM) & (part.points[:, 2] >= least)
-        return (
-            within
-            & outline.hides(part.points)
-            & torch.from_numpy(tree.query(part.points.numpy())[0] > NEW)
-        )
+        height = part.points[:, 2]
+        within = (height < vessel.rim - VESSEL.rim) & (height >= least)
+        new = torch.from_numpy(tree.query(part.points.numpy())[0] > HIDDEN.new)
+        return within & outline.hides(part.points) & new
 
-    merged = merge_hidden(
-        parts[0][:0], parts, allowed, lambda points: farthest_points(points, 4 * 50, tie=TIE)
-    )
-    return merged[farthest_points(merged.points, 50, tie=TIE)]
+    def thin(points: Points) -> Tensor:
+        return pick_apart(points, WALL.thinned)
+
+    merged = merge_hidden(parts[0][:0], parts, allowed, thin)
+    return merged[pick_apart(merged.points, WALL.budget)]
