@@ -58,6 +58,7 @@ def stack(*meshes):
     return np.concatenate([m.vertices for m in meshes]), np.concatenate(faces)
 
 
+@functools.cache
 def with_table(side=0.24):
     """Return a view of the jug and of a patch of the table around it."""
     mesh = load_object("jug").mesh

@@ -120,7 +120,7 @@ def test_counts_have_the_line_of_the_library_and_its_stage(device):
 
 def test_a_plan_waits_for_the_device_only_where_it_is_known(device, hand):
     with Launches() as counted:
-        plan_grasps(sent(load_object("cylinder").view), hand, ContactSpec(table=0.0), 40)
+        plan_grasps(sent(load_object("cylinder").view), hand, ContactSpec(table=0.0), 8)
     known = {
         (file, function)
         for file, functions in KNOWN.items()

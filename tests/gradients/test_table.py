@@ -159,7 +159,7 @@ ALL = {**ROWS, **LAW}
 ALIKE = re.compile(
     r"HollowShape\.(?!predict|mean$)|GraspMixture\.(log|marg|cond)|jet|joint_at|estimate|predict, "
 ).search
-"""Finds rows that share most of their code with others; a quick run leaves them out."""
+"""Finds rows that share most of their code with others: `--hypothesis-profile=long` tries them."""
 CHECKS = {
     name.removeprefix("check_"): check
     for name, check in globals().items()
@@ -167,22 +167,30 @@ CHECKS = {
 }
 
 
-def cells() -> Iterator[Any]:
+def cells() -> Iterator[tuple[str, str]]:
     """Yield the rows and checks that are tried; of rows that share their code, the derivatives
     alone.
     """
     for name in ALL:
         for check in CHECKS:
-            if not ALIKE(name):
-                yield pytest.param(name, check)
-            elif check in ("backward", "double_backward", "hessian", "vmap", "jvp"):
-                yield pytest.param(name, check, marks=pytest.mark.slow)
+            if not ALIKE(name) or check in (
+                "backward",
+                "double_backward",
+                "hessian",
+                "vmap",
+                "jvp",
+            ):
+                yield name, check
 
 
 @pytest.mark.parametrize(("name", "check"), cells())
 @pytest.mark.filterwarnings("ignore")  # torch warns of its own forward mode and compiler
-def test_a_row_of_the_table(name: str, check: str):
+def test_a_row_of_the_table(name: str, check: str, request: pytest.FixtureRequest):
+    """Of rows that share their code the first derivatives alone are tried in a short run."""
     row = ALL[name]
+    long = request.config.getoption("--hypothesis-profile") == "long"
+    if ALIKE(name) and check != "backward" and not long:
+        pytest.skip("its code is that of another row")
     if check in row.lacks:
         pytest.skip("the table says that it lacks this")
     CHECKS[check](row, *row.make(F64))

@@ -32,7 +32,7 @@ REFUSED = re.compile(r"torchgrasp: --(out|checkpoint|parquet): .*(No space left|
 HELD = {"sample": "samples", "grasp": "grasps", "evaluate": "evaluation", "campaign": "campaign"}
 """The folder that each command holds."""
 
-STEP = 30
+STEP = 75
 """Every so many-th call is tried, from another first one in each test."""
 
 
