@@ -25,8 +25,8 @@ from tests.point_fingers import (
 )
 from torchgrasp import Plane, Status
 from torchgrasp.control.holding import (
-    MIN_PUSH,
-    PRIOR_STD,
+    FRICTION,
+    GRIP,
     PUSH,
     FrictionEstimate,
     GripHold,
@@ -198,8 +198,10 @@ def test_friction_estimate_is_a_gaussian_posterior():
     estimate = FrictionEstimate()
     estimate.update(0.5, 4.0)
     noise = 0.4 * math.hypot(1.0, 0.5) / 4.0
-    precision = PRIOR_STD**-2 + noise**-2
-    assert estimate.mean == pytest.approx((0.8 * PRIOR_STD**-2 + 0.5 * noise**-2) / precision)
+    precision = FRICTION.std**-2 + noise**-2
+    assert estimate.mean == pytest.approx(
+        (FRICTION.mean * FRICTION.std**-2 + 0.5 * noise**-2) / precision
+    )
     assert estimate.std == pytest.approx(precision**-0.5)
 
 
@@ -313,6 +315,6 @@ def test_grip_floors_stay_finite_for_a_planned_force_along_the_surface(sideways,
     known = dataclasses.replace(reference(), max_force=max_force)
     seen = dataclasses.replace(seen, tactile=tactile)
     hold = GripHold(known, seen, torch.zeros(9).double())
-    floor = hold._bounded(np.maximum(hold.grip, MIN_PUSH))
+    floor = hold._bounded(np.maximum(hold.grip, GRIP.least_push))
     assert np.isfinite(floor).all() and (floor > 0).all()
-    assert max_force is not None or (floor >= MIN_PUSH).all()
+    assert max_force is not None or (floor >= GRIP.least_push).all()

@@ -9,8 +9,8 @@ from tests.control.test_localization import CENTER, RADIUS, ball_field
 from tests.point_fingers import PERIOD, observation, on_table, real
 from torchgrasp import ClosingReference, GraspController, load_hand
 from torchgrasp.control import no_contact, observe
-from torchgrasp.control.object_pose import FINE_TURNS, TURNS
-from torchgrasp.control.recovery import ACCELERATION, SPEED, GuardedApproach
+from torchgrasp.control.object_pose import SEARCH
+from torchgrasp.control.recovery import APPROACH, GuardedApproach
 from torchgrasp.control.uncertainty_closing import PALM_SPEED
 from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.foundation.errors import BadArgument
@@ -65,9 +65,9 @@ def test_guarded_approach_passes_an_object_in_its_place():
     lefts, palms = come(hand, real([0, 0, 0]))
     speeds = -lefts.diff() / PERIOD
     assert hand.stops == 0 and lefts[-1] == 0.0 and not palms.any()
-    assert (speeds > 0).all() and speeds.max() <= SPEED * (1 + 1e-9)
+    assert (speeds > 0).all() and speeds.max() <= APPROACH.speed * (1 + 1e-9)
     changes = speeds.diff().abs() / PERIOD
-    assert changes[:-1].max() <= ACCELERATION * 1.2  # braking is sampled
+    assert changes[:-1].max() <= APPROACH.acceleration * 1.2  # braking is sampled
     assert speeds[-1] <= 0.02  # it arrives slowly
 
 
@@ -87,9 +87,9 @@ def test_guarded_approach_draws_back_before_its_palm_moves_within_its_reach():
     lefts, palms = come(GuardedApproach(above(), ALL, LENGTH, []), real([0.016, 0, 0]))
     stopped = int((lefts.diff() >= 0).int().argmax())
     first = int((palms.abs().sum(-1) > 0).int().argmax())
-    feeling = 0.06 + (len(TURNS) + len(FINE_TURNS) + 2) * PERIOD
+    feeling = 0.06 + (len(SEARCH.turns) + len(SEARCH.fine_turns) + 2) * PERIOD
     assert (
-        lefts[stopped + 1 : stopped + 6].diff() >= SPEED * PERIOD * (1 - 1e-9)
+        lefts[stopped + 1 : stopped + 6].diff() >= APPROACH.speed * PERIOD * (1 - 1e-9)
     ).all()  # it draws back at once
     assert (first - stopped) * PERIOD >= feeling and (lefts[stopped : first + 1].diff() >= 0).all()
     assert lefts[first] >= float(lefts[stopped]) + 0.02 - 1e-9
@@ -203,7 +203,7 @@ def test_controller_comes_down_once_more_after_it_closed_on_nothing():
     palm = torch.stack(palms)
     ups = ((left[1:] > 0) & (left[:-1] == 0)).nonzero()[:, 0]
     assert len(ups) == 2  # it draws back before its palm moves to another place
-    assert (left.diff().abs() <= SPEED * PERIOD * (1 + 1e-9)).all()
+    assert (left.diff().abs() <= APPROACH.speed * PERIOD * (1 + 1e-9)).all()
     places = [palm[int(k)] for k in (*ups, -1)]
     assert all((one - other).norm() > 0.015 for k, one in enumerate(places) for other in places[:k])
 

@@ -11,7 +11,7 @@ import torch
 
 from tests.point_fingers import TARGET, observation, on_table, real
 from torchgrasp import SensorModel
-from torchgrasp.control.object_pose import FINE_TURNS, PITCH, TURNS, Localization, Touches
+from torchgrasp.control.object_pose import SEARCH, Localization, Touches
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.signed_distance import SignedDistanceField
@@ -97,7 +97,7 @@ def test_localization_finds_a_ball_from_three_touches(shift):
     wanted = real([shift[0], 0.0, shift[1]])
     there = known(ball_field())
     found = locate(there, touch(there, CENTER + RADIUS * BALL_POINTS + wanted, BALL_POINTS))
-    assert (found[:3] - wanted).norm() < PITCH / 2
+    assert (found[:3] - wanted).norm() < SEARCH.pitch / 2
 
 
 def test_localization_finds_the_link_that_touches_on_the_side_of_earlier_touches():
@@ -122,7 +122,7 @@ def test_localization_finds_the_link_that_touches_on_the_side_of_earlier_touches
         assert (
             found[:3] - place
         ).norm() < 6e-3  # without the earlier touches it would be off by 30 mm
-        assert (locate(there, earlier)[:3] - place).norm() < PITCH / 2
+        assert (locate(there, earlier)[:3] - place).norm() < SEARCH.pitch / 2
 
 
 def test_localization_believes_the_last_of_touches_that_contradict_each_other():
@@ -187,7 +187,9 @@ def test_localization_finds_a_turned_block(turn):
     there = known(field(block))
     (place, direct) = displaced(wanted, turn)
     found = locate(there, touch(there, place(points), direct(normals)))
-    assert (found[:3] - wanted).norm() < 3e-3 and abs(float(found[4]) - turn) <= FINE_TURNS[-1]
+    assert (found[:3] - wanted).norm() < 3e-3 and abs(float(found[4]) - turn) <= SEARCH.fine_turns[
+        -1
+    ]
 
 
 def test_localization_depends_on_no_frame_and_its_error_is_small_under_noise():
@@ -199,7 +201,7 @@ def test_localization_depends_on_no_frame_and_its_error_is_small_under_noise():
         locate(x, touch(x, CENTER + RADIUS * BALL_POINTS + wanted, BALL_POINTS))
         for x in (one, other)
     ]
-    assert (found[0] - found[1]).norm() < PITCH / 2
+    assert (found[0] - found[1]).norm() < SEARCH.pitch / 2
     generator = torch.Generator().manual_seed(0)
     there = known(ball_field())
     wanted = real([0.01, 0.0, 0.014])
@@ -245,7 +247,7 @@ def test_localization_tries_one_turn_a_call_and_finds_no_displacement_without_to
     there = known(ball_field())
     assert locate(there).norm() == 0.0
     search = Localization(there, [touch(there, CENTER + RADIUS * BALL_POINTS, BALL_POINTS)])
-    for k in range(len(TURNS) + len(FINE_TURNS)):
+    for k in range(len(SEARCH.turns) + len(SEARCH.fine_turns)):
         assert not search.done and search.step == k
         search()
     assert search.done and math.isfinite(search.cost)

@@ -23,8 +23,8 @@ from tests.point_fingers import (
 from torchgrasp import ClosingReference, ContactSpec, GraspController
 from torchgrasp.control.controller import CLOSING_TIME
 from torchgrasp.control.recovery import (
-    MISPLACED,
-    OPENING_TIME,
+    CHECK,
+    OPENING,
     PRESSING_TIME,
     GraspCheck,
     Reopening,
@@ -87,7 +87,9 @@ def test_the_closing_plan_knows_the_friction_that_the_grasp_was_planned_for():
             planned(text)
 
 
-@pytest.mark.parametrize(("off", "secure"), [(0.9 * MISPLACED, True), (1.1 * MISPLACED, False)])
+@pytest.mark.parametrize(
+    ("off", "secure"), [(0.9 * CHECK.misplaced, True), (1.1 * CHECK.misplaced, False)]
+)
 def test_grasp_check_rejects_a_misplaced_object(off, secure):
     assert judge(pressing(), torch.cat([real([0, 0, off]), STILL])).secure is secure
 
@@ -120,7 +122,9 @@ def test_reopening_opens_before_the_palm_moves():
     assert torch.equal(opening.palm, goal)
     speeds = torch.stack(palms).diff(dim=0).norm(dim=-1) / PERIOD
     assert speeds.max() <= PALM_SPEED * (1 + 1e-9)
-    assert abs(ticks * PERIOD - (OPENING_TIME + float(goal.norm()) / PALM_SPEED + 0.1)) < 3 * PERIOD
+    assert (
+        abs(ticks * PERIOD - (OPENING.opening + float(goal.norm()) / PALM_SPEED + 0.1)) < 3 * PERIOD
+    )
 
 
 @pytest.mark.parametrize(("reach", "length"), [(0.02, 0.02), (0.0, 0.0)])
@@ -174,7 +178,7 @@ def test_controller_closes_again_after_meeting_nothing(closing):
     ticks = close(controller, observation(0.02))
     assert controller.attempts == 2
     assert ticks * PERIOD < controller.attempts * (
-        CLOSING_TIME + PRESSING_TIME + OPENING_TIME + 0.02 / PALM_SPEED + 0.3
+        CLOSING_TIME + PRESSING_TIME + OPENING.opening + 0.02 / PALM_SPEED + 0.3
     )
 
 

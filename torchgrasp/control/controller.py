@@ -23,7 +23,7 @@ from torchgrasp.control.recovery import (
 )
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.relook import relocate
-from torchgrasp.control.tactile import STILL, Observation, Targets
+from torchgrasp.control.tactile import EARLY, STILL, Observation, Targets
 from torchgrasp.control.uncertainty_closing import UncertaintyClosing
 from torchgrasp.foundation.base import check_device, settle
 from torchgrasp.foundation.checks import checked
@@ -35,9 +35,8 @@ from torchgrasp.values.planning import PointCloud
 from torchgrasp.values.specs import ClosingMode, HoldingMode, check_modes, default_holding
 
 Period = Annotated[float, Range(1e-5, 1.0)]
-CLOSING_TIME = (
-    4.0  # longest time [s] of closing before the hand presses with the contacts that it has
-)
+# longest time [s] of closing before the hand presses with the contacts that it has
+CLOSING_TIME = 4.0
 
 
 class GraspController:
@@ -142,7 +141,7 @@ class GraspController:
         """Whether the hand has closed and pressed long enough, so that it may be lifted."""
         if not self.closing.feels:
             return self.closing.done
-        return self.pressed >= PRESSING_TIME - 1e-9 and (self.check is None or self.check.secure)
+        return self.pressed >= PRESSING_TIME - EARLY and (self.check is None or self.check.secure)
 
     @property
     def status(self) -> Status:

@@ -2,6 +2,7 @@
 the sensed load.
 """
 
+import dataclasses
 import math
 from collections.abc import Callable
 
@@ -11,21 +12,100 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.contacts.balance import least_friction_forces
+from torchgrasp.control.law import TINY
 from torchgrasp.control.least_forces import Balance, LeastForces, balance, friction_ratios
 from torchgrasp.control.reference import ClosingReference
-from torchgrasp.control.tactile import Observation, low_pass
+from torchgrasp.control.tactile import Observation, smooth
 from torchgrasp.foundation.errors import Status
 from torchgrasp.geometry.frames import apply, inverse
 
 MAX_FACTOR = 1.5  # largest factor on the forces; it bounds the force if a sensor reads too little
 RAMP = 0.4  # time [s] in which the forces rise to the desired forces
-MIN_PUSH = 0.4  # least normal force [N] of a finger: four standard deviations of its reading
-# standard deviation of the friction estimate at the start, and its least value
-PRIOR_STD = 0.2
-MIN_STD = 0.03
-LIFTED = 0.35  # load [N] from which the object counts as lifted
 # force [N] from any side at the object's centre that a grip withstands without pressing harder
 PUSH = 2.5
+
+
+@dataclasses.dataclass(frozen=True)
+class FrictionNumbers:
+    """The numbers of the estimate of the friction coefficient."""
+
+    mean: float = 0.8
+    """Estimate at the start."""
+    std: float = 0.2
+    """Standard deviation of the estimate at the start."""
+    least_std: float = 0.03
+    """Least standard deviation: below it the estimate would no longer follow."""
+    least: float = 0.15
+    """Least coefficient at the start; a finger that sticks raises it."""
+    most: float = 1.5
+    """Largest estimate."""
+    noise: float = 0.4
+    """Noise [N] of a fingertip's force; that of the ratio is this over the normal force."""
+
+
+@dataclasses.dataclass(frozen=True)
+class GripNumbers:
+    """The numbers of the grip that carries the felt load."""
+
+    least_push: float = 0.4
+    """Least normal force [N] of a finger: four standard deviations of its reading."""
+    lifted: float = 0.35
+    """Load [N] from which the object counts as lifted."""
+    planned: float = 0.01
+    """Least planned force of a finger, as a share of the largest."""
+    fastest: float = 60.0
+    """Largest rate [N/s] of a fingertip's force."""
+    room: float = 0.8
+    """Share of the largest force that the floors of a balance may need."""
+    near: float = 0.95
+    """Share of the limits of torque and force from which the forces are near them."""
+    # cut-offs [Hz] of the felt normals, forces and load
+    normals: float = 1.0
+    forces: float = 8.0
+    load: float = 3.0
+    carried: float = 0.7
+    """Cut-off [Hz] of the load that counts as carried; a faster one rocks the object."""
+    carries: float = 0.8
+    """Share of the carried load; all of it would press ever harder on a rigid table."""
+    settled: float = 0.4
+    """Time [s] before which the hand may still reopen beside the object."""
+    sure: float = 4.0
+    """Rate [1/s] at which the reserve for a push then grows to its whole."""
+    lever: float = 0.1
+    """Longest lever [m] at which weight and pushes may turn the object."""
+    slow: float = 0.008
+    """Speed [m/s] of a fingertip along the surface above which it slides."""
+    slide: float = 0.03
+    """Time [s] of sliding after which the filtered forces show the friction."""
+    ratio: float = 2.0
+    """Largest ratio of tangential to normal force that the friction estimate sees."""
+    growth: float = 1.05
+    """Ratio to the largest load so far above which a load is new."""
+    steady: float = 0.3
+    """Time [s] without a new load after which the load is steady."""
+    release: float = 3.0
+    """Rate [1/s] at which forces that are not needed then fall."""
+    changes: float = 2.0
+    """Largest rate [1/s] of the friction coefficient, and half of that of the reserve's share."""
+    over: float = 0.25
+    """Time [s] of sliding with forces at their limits after which the load is too heavy."""
+    feedback: float = 4.0
+    """Gain [1/s] of the feedback of felt forces."""
+
+
+@dataclasses.dataclass(frozen=True)
+class WeightNumbers:
+    """The numbers of an object's likely weight."""
+
+    density: float = 1000.0
+    """Density [kg/m^3]: that of water."""
+    mass: float = 0.4
+    """Least mass [kg]: a small thing may be of metal."""
+
+
+FRICTION = FrictionNumbers()
+GRIP = GripNumbers()
+WEIGHT = WeightNumbers()
 
 
 class ForceHold:
@@ -44,11 +124,9 @@ class ForceHold:
         forces, self.strength = held_forces(reference, observation)
         self.lead = torch.einsum("cij,ci->j", observation.jacobian, forces) / reference.kp
         largest = float(torch.linalg.vector_norm(forces, dim=-1).max())
-        self.most = (
-            MAX_FACTOR
-            if reference.max_force is None
-            else min(MAX_FACTOR, reference.max_force / largest)
-        )
+        self.most = MAX_FACTOR
+        if reference.max_force is not None:
+            self.most = min(MAX_FACTOR, reference.max_force / largest)
         self.factor = min(1.0, self.most)
         self.time = 0.0
         self.senses_force = reference.sensor.kind != "binary"
@@ -99,7 +177,8 @@ def held_forces(
         if bool(torch.isfinite(balanced).all()):
             forces = balanced
             normals = sensed.normals
-    return forces, float(-((forces * normals).sum(-1) * reference.alive).sum())
+    pushes = (forces * normals).sum(-1) * reference.alive
+    return forces, float(-pushes.sum())
 
 
 class FrictionEstimate:
@@ -108,9 +187,9 @@ class FrictionEstimate:
     """
 
     def __init__(self) -> None:
-        self.mean = 0.8
-        self.std = PRIOR_STD
-        self.least = 0.15
+        self.mean = FRICTION.mean
+        self.std = FRICTION.std
+        self.least = FRICTION.least
 
     def update(self, ratio: float, force: float, slides: bool = True) -> None:
         """Update the estimate by a fingertip's tangential over normal force, and its normal force
@@ -119,14 +198,15 @@ class FrictionEstimate:
         A fingertip that sticks shows that friction is at least its ratio; a slide with a smaller
         ratio is a spin.
         """
-        noise = 0.4 * math.hypot(1.0, ratio) / force
+        noise = FRICTION.noise * math.hypot(1.0, ratio) / force
         if not slides:
             self.least = max(self.least, ratio - noise)
             self.mean = max(self.mean, self.least)
         elif ratio + noise > self.least:
             weight = self.std**2 / (self.std**2 + noise**2)
-            self.mean = min(max(self.mean + weight * (ratio - self.mean), self.least), 1.5)
-            self.std = max(self.std * math.sqrt(1 - weight), MIN_STD)
+            mean = self.mean + weight * (ratio - self.mean)
+            self.mean = min(max(mean, self.least), FRICTION.most)
+            self.std = max(self.std * math.sqrt(1 - weight), FRICTION.least_std)
 
     @property
     def high(self) -> float:
@@ -147,21 +227,21 @@ class GripHold:
     def __init__(
         self, reference: ClosingReference, observation: Observation, start: Float[Tensor, " j"]
     ) -> None:
-        max_force = (
-            1000.0 if reference.max_force is None else reference.max_force
-        )  # [N], no hand presses as hard
+        # no hand presses with more [N]
+        max_force = 1000.0 if reference.max_force is None else reference.max_force
         hand = reference.hand
         self.start = start.numpy()
         self.rest = observation.joints.numpy()
         self.stiffness = reference.kp.numpy()
         effort = np.array([hand.actuators[name].effort for name in hand.tree.joint_names])
-        forces, _ = held_forces(reference, observation)
+        forces = held_forces(reference, observation)[0].numpy()
         self.normals = _sensed(observation, reference.normals.numpy())
         self.radius = hand.tips.radius.numpy()
-        self.solver = LeastForces(forces.numpy().copy(), effort, max_force)
-        push = np.abs((forces.numpy() * self.normals).sum(-1))
-        self.planned = np.maximum(push, 0.01 * max(float(push.max()), MIN_PUSH))
-        self.grip = np.minimum(push, max_force)  # the closing has pressed so hard
+        self.solver = LeastForces(forces.copy(), effort, max_force)
+        push = np.abs((forces * self.normals).sum(-1))  # (f,)
+        self.planned = np.maximum(push, GRIP.planned * max(float(push.max()), GRIP.least_push))
+        # the closing has pressed so hard
+        self.grip = np.minimum(push, max_force)
         self.felt = np.zeros((len(push), 3))
         self.load = np.zeros(6)
         self.carried = np.zeros(6)
@@ -170,11 +250,14 @@ class GripHold:
         self.friction = FrictionEstimate()
         self.cover = 0.0
         self.aim = self.friction.mean
-        self.sent, self.trim, self.most = *np.zeros((2, len(push), 3)), 0.0
-        self.time = self.steady = self.over = 0.0
-        self.released = self.strained = (
-            False  # whether the load is steady, and forces are near their limits
-        )
+        self.sent = np.zeros((len(push), 3))
+        self.trim = np.zeros((len(push), 3))
+        self.most = 0.0  # largest load [N] so far
+        self.time = 0.0
+        self.steady = 0.0
+        self.over = 0.0
+        self.released = False  # whether the load is steady
+        self.strained = False  # whether forces are near their limits
         self.status = Status.OK
         self.slid = np.zeros(len(push))
 
@@ -188,67 +271,59 @@ class GripHold:
         """A mask of the fingers that have slid for so long that the filtered forces show the
         friction.
         """
-        return self.slid > 0.03  # [s]
+        return self.slid > GRIP.slide
 
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
         """Return the targets [rad] of all joints for the next tick, `period` [s] later."""
         self.time += period
-        # [N/s]
         jacobian = observation.jacobian.numpy()
-        fastest_rise = 60.0
         contacts, reserve = self._feel(observation, period)
         self._adapt(observation, period)
-        floor = self._bounded(np.maximum(self.cover * self.grip, MIN_PUSH))
+        floor = self._bounded(np.maximum(self.cover * self.grip, GRIP.least_push))
         wanted = self.solver.solve(
             contacts, self.normals, jacobian, self.load, self.aim, floor, reserve
         )
         self._judge(wanted, jacobian, period)
         step = self._command(contacts, wanted, period) - self.sent
-        length = np.maximum(np.linalg.norm(step, axis=-1, keepdims=True), 1e-9)
-        self.sent = self.sent + step * np.minimum(1.0, fastest_rise * period / length)
+        length = np.maximum(np.linalg.norm(step, axis=-1, keepdims=True), TINY)
+        self.sent = self.sent + step * np.minimum(1.0, GRIP.fastest * period / length)
         self.sent /= max(1.0, self.solver.share(self.sent, self.normals, jacobian))
         torque = np.einsum("cij,ci->j", jacobian, self.sent)
         share = min(self.time / RAMP, 1.0)
-        return torch.from_numpy(
-            self.start + share * (self.rest + torque / self.stiffness - self.start)
-        )
+        targets = self.start + share * (self.rest + torque / self.stiffness - self.start)
+        return torch.from_numpy(targets)
 
     def _bounded(self, push: np.ndarray) -> np.ndarray:
         """Return normal forces [N] of all fingers, reduced where a balance would need forces near
         the largest.
         """
         largest = float((push / self.planned).max() * self.planned.max())
-        return push * min(1.0, 0.8 * self.solver.most / max(largest, 1e-9))
+        return push * min(1.0, GRIP.room * self.solver.most / max(largest, TINY))
 
     def _feel(self, observation: Observation, period: float) -> tuple[Balance, np.ndarray]:
         """Filter the sensed forces, load and normals; return the contacts' grasp map and each
         finger's reserve [N].
         """
         normals = _sensed(observation, self.normals)
-        self.normals = self.normals + low_pass(1.0, period) * (normals - self.normals)
+        self.normals = smooth(self.normals, normals, GRIP.normals, period)
         self.normals /= np.linalg.norm(self.normals, axis=-1, keepdims=True)
-        points = observation.tips.numpy() - self.radius[:, None] * self.normals
+        points = observation.tips.numpy() - self.radius[:, None] * self.normals  # (f, 3)
         touching = observation.tactile.contact.numpy()
         forces = observation.tactile.forces.numpy()
         contacts = balance(points, touching)
-        if (
-            not touching.all()
-            and friction_ratios(contacts.inner(self.solver.start), self.normals).max() > self.aim
-        ):
-            contacts = balance(points)  # the fingers that touch cannot hold without the others
-        self.felt = self.felt + low_pass(8.0, period) * (forces - self.felt)
+        if not touching.all():
+            needed = friction_ratios(contacts.inner(self.solver.start), self.normals).max()
+            if needed > self.aim:
+                # the fingers that touch cannot hold without the others
+                contacts = balance(points)
+        self.felt = smooth(self.felt, forces, GRIP.forces, period)
         load = self._weight(contacts.wrench @ forces.ravel())
-        self.load = self.load + low_pass(3.0, period) * (load - self.load)
-        self.carried = self.carried + low_pass(0.7, period) * (
-            load - self.carried
-        )  # a faster one rocks the object
-        sure = min(
-            max(4.0 * (self.time - 0.4), 0.0), 1.0
-        )  # earlier the hand may still reopen beside the object
+        self.load = smooth(self.load, load, GRIP.load, period)
+        self.carried = smooth(self.carried, load, GRIP.carried, period)
+        sure = min(max(GRIP.sure * (self.time - GRIP.settled), 0.0), 1.0)
         push = self.cover * sure * (PUSH + self.unfelt)
-        reserve = push * push_reserve(
-            contacts, self.normals, self.centre - points.mean(0), self.aim
-        )
+        arm = self.centre - points.mean(0)
+        reserve = push * push_reserve(contacts, self.normals, arm, self.aim)
         return contacts, self._bounded(reserve)
 
     def _weight(self, load: np.ndarray) -> np.ndarray:
@@ -257,60 +332,58 @@ class GripHold:
         """
         if self.up is None:
             return load
-        lifted = max(float(load[:3] @ self.up), 0.0)
+        rise = float(load[:3] @ self.up)
+        lifted = max(rise, 0.0)
         most = PUSH if self.released else 0.0
-        side = load[:3] - float(load[:3] @ self.up) * self.up
-        side = side * min(1.0, most / max(float(np.linalg.norm(side)), 1e-9))
-        torque = load[3:] * min(
-            1.0, 0.1 * (lifted + most) / max(float(np.linalg.norm(load[3:])), 1e-9)
-        )
+        side = _limited(load[:3] - rise * self.up, most)
+        torque = _limited(load[3:], GRIP.lever * (lifted + most))
         return np.concatenate([lifted * self.up + side, torque])
 
     def _adapt(self, observation: Observation, period: float) -> None:
         """Update the friction estimate by sliding fingers, and reduce forces that are not needed."""
-        slides = (
-            observation.tactile.sliding.numpy() > 0.008
-        ) & observation.tactile.contact.numpy()  # [m/s]
+        tactile = observation.tactile
+        slides = (tactile.sliding.numpy() > GRIP.slow) & tactile.contact.numpy()
         self.slid = np.where(slides, self.slid + period, 0.0)
         if self.time < RAMP:
             return
         push = -(self.felt * self.normals).sum(-1)
         ratios = friction_ratios(self.felt, self.normals)
-        for ratio, force, slides in zip(
-            ratios.tolist(), push.tolist(), self.sliding.tolist(), strict=True
-        ):
-            if force > 0.5 * MIN_PUSH:
-                self.friction.update(min(ratio, 2.0), force, slides)
+        fingers = zip(ratios.tolist(), push.tolist(), self.sliding.tolist(), strict=True)
+        for ratio, force, slides in fingers:
+            if force > 0.5 * GRIP.least_push:
+                self.friction.update(min(ratio, GRIP.ratio), force, slides)
         self._release(period)
 
     def _release(self, period: float) -> None:
         """Once the lifted load is steady, reduce the forces of the closing and the reserve for an
         unknown weight.
         """
-        if self.weight > 1.05 * self.most:
+        if self.weight > GRIP.growth * self.most:
             self.most = self.weight
             self.steady = 0.0
         self.steady += period
-        if self.steady < 0.3 or self.weight < LIFTED:
+        if self.steady < GRIP.steady or self.weight < GRIP.lifted:
             return
         self.released = True
-        self.grip, self.unfelt = (
-            x * (1 - min(3.0 * period, 1.0)) for x in (self.grip, self.unfelt)
-        )
+        kept = 1 - min(GRIP.release * period, 1.0)
+        self.grip = self.grip * kept
+        self.unfelt = self.unfelt * kept
 
     def _judge(self, wanted: np.ndarray, jacobian: np.ndarray, period: float) -> None:
         """Choose the friction coefficient for the forces of the next tick; judge whether the load
         is too heavy.
         """
         share = self.solver.share(wanted, self.normals, jacobian)
-        fastest = 2.0 * period
-        self.cover = min(max(self.cover + fastest * (2 if share < 0.95 else -4), 0.0), 1.0)
+        fastest = GRIP.changes * period
+        # the reserve falls twice as fast as it grows
+        cover = self.cover + fastest * (2 if share < GRIP.near else -4)
+        self.cover = min(max(cover, 0.0), 1.0)
         goal = self.friction.high if share > 1.0 and self.cover == 0.0 else self.friction.mean
         self.aim += min(max(goal - self.aim, -fastest), fastest)
-        self.strained = share > 0.95
+        self.strained = share > GRIP.near
         beyond = self.strained and self.cover == 0.0 and bool(self.sliding.any())
-        self.over = self.over + period if beyond and self.weight > LIFTED else 0.0
-        if self.over > 0.25:  # [s]
+        self.over = self.over + period if beyond and self.weight > GRIP.lifted else 0.0
+        if self.over > GRIP.over:
             self.status = Status.TOO_HEAVY
 
     def _command(self, contacts: Balance, wanted: np.ndarray, period: float) -> np.ndarray:
@@ -319,16 +392,14 @@ class GripHold:
         """
         if self.time > RAMP:
             lacking = ((self.felt - wanted) * self.normals).sum(-1)
-            self.trim = self.trim - period * 4.0 * lacking[:, None] * self.normals
-            flat = self.trim.ravel()
-            self.trim = (flat - contacts.inverse @ (contacts.wrench @ flat)).reshape(-1, 3)
-            largest, bound = (
-                float(np.linalg.norm(x, axis=-1).max()) for x in (self.trim, 0.5 * wanted)
-            )
-            self.trim = self.trim * min(1.0, bound / max(largest, 1e-9))
-        missing = (
-            self.load - 0.8 * self.carried
-        )  # carrying all of it would press ever harder on a rigid table
+            trim = self.trim - period * GRIP.feedback * lacking[:, None] * self.normals
+            # without the part that would move the object
+            flat = trim.ravel()
+            trim = (flat - contacts.inverse @ (contacts.wrench @ flat)).reshape(-1, 3)
+            largest = float(np.linalg.norm(trim, axis=-1).max())
+            bound = float(np.linalg.norm(0.5 * wanted, axis=-1).max())
+            self.trim = trim * min(1.0, bound / max(largest, TINY))
+        missing = self.load - GRIP.carries * self.carried
         return wanted + self.trim - (contacts.inverse @ missing).reshape(-1, 3)
 
 
@@ -341,16 +412,17 @@ def push_reserve(
     The push acts at `arm` [m] from the middle of the contacts. The fingers share it like springs of
     equal stiffness.
     """
-    pushes = np.concatenate([np.eye(3), np.cross(arm, np.eye(3)).T])
+    pushes = np.concatenate([np.eye(3), np.cross(arm, np.eye(3)).T])  # (6, 3): of three sides
     share = (contacts.inverse @ pushes).reshape(-1, 3, 3)
     along = np.einsum("fi,fij->fj", normals, share)
     across = share - normals[:, :, None] * along[:, None]
-    return np.hypot(
-        np.linalg.norm(along, axis=-1), np.linalg.norm(across, ord=2, axis=(1, 2)) / friction
-    )
+    tangential = np.linalg.norm(across, ord=2, axis=(1, 2))
+    return np.hypot(np.linalg.norm(along, axis=-1), tangential / friction)
 
 
-def likely_body(reference: ClosingReference) -> tuple[np.ndarray, float]:
+def likely_body(
+    reference: ClosingReference, numbers: WeightNumbers = WEIGHT
+) -> tuple[np.ndarray, float]:
     """Return the object's centre [m] in the hand's frame and its largest likely weight [N], from
     what a robot knows.
 
@@ -359,20 +431,25 @@ def likely_body(reference: ClosingReference) -> tuple[np.ndarray, float]:
     """
     field = reference.surface
     points = reference.gains.target
-    density = 1000.0
     if field is None or not bool((field.values < 0).any()):
         ball = math.pi / 6 * float(torch.cdist(points, points).max()) ** 3
-        return points.mean(0).numpy(), 9.81 * max(density * ball, 0.4)
-    shell = (field.values.abs() < field.spacing).nonzero()
-    inside = (field.values < 0).nonzero()
-    inside = inside[
-        ((inside >= shell.amin(0)) & (inside <= shell.amax(0))).all(-1)
-    ]  # farther the sign may be wrong
-    centre = apply(
-        inverse(reference.obj_from_hand),
-        (field.origin + field.spacing * inside.double().mean(0))[None],
-    )
-    return centre[0].numpy(), 9.81 * max(density * len(inside) * field.spacing**3, 0.4)
+        centre = points.mean(0)
+        mass = numbers.density * ball
+    else:
+        shell = (field.values.abs() < field.spacing).nonzero()
+        inside = (field.values < 0).nonzero()
+        # farther than the shell the sign may be wrong
+        known = (inside >= shell.amin(0)) & (inside <= shell.amax(0))
+        inside = inside[known.all(-1)]
+        middle = field.origin + field.spacing * inside.double().mean(0)
+        centre = apply(inverse(reference.obj_from_hand), middle[None])[0]
+        mass = numbers.density * len(inside) * field.spacing**3
+    return centre.numpy(), 9.81 * max(mass, numbers.mass)
+
+
+def _limited(vector: np.ndarray, most: float) -> np.ndarray:
+    """Return a vector (3,), shortened to the length `most` if it is longer."""
+    return vector * min(1.0, most / max(float(np.linalg.norm(vector)), TINY))
 
 
 def _sensed(observation: Observation, normals: np.ndarray) -> np.ndarray:

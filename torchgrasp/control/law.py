@@ -24,9 +24,9 @@ FORCE_BANDWIDTH = 15.0
 # isotropic standard deviation [N] of Sigma_fd: the tactile sensor's noise along the surface
 FORCE_FLOOR = 0.3
 MAX_SPEED = 0.04  # largest speed [m/s] of a fingertip
-MAX_STEP = (
-    0.05  # largest change [rad] of a joint in one tick; it bounds steps near a singular posture
-)
+TINY = 1e-9  # least length by which a vector is divided
+# largest change [rad] of a joint in one tick; it bounds steps near a singular posture
+MAX_STEP = 0.05
 
 
 def surface_covariance(normals: Vectors, std_m: Numbers) -> Matrices:

@@ -6,6 +6,7 @@ hand stands still, `Localization` compares touched points and normals with the e
 that it also finds displacements along the object's own surface.
 """
 
+import dataclasses
 from collections.abc import Sequence
 
 import torch
@@ -17,12 +18,56 @@ from torchgrasp.control.tactile import STILL, Observation
 from torchgrasp.geometry.frames import apply, rotation_from_vector
 from torchgrasp.geometry.linalg import across, unit
 
-TURNS = (-0.24, -0.12, 0.0, 0.12, 0.24)
-FINE_TURNS = (-0.06, 0.0, 0.06)
-"""Turns [rad] of the object that `Localization` tries, and turns about the best of them."""
-# distance [m] between the displacements that `Localization` tries, and the largest
-PITCH = 0.006
-FARTHEST = 0.072
+
+@dataclasses.dataclass(frozen=True)
+class ContactPlaneNumbers:
+    """The prior of the object's displacement before any touch: mostly along the table."""
+
+    shift: float = 0.01
+    """Standard deviation [m] of the shift along the table, or in all directions without one."""
+    height: float = 0.001
+    """Standard deviation [m] of the shift along the table's normal."""
+    turn: float = 0.09
+    """Standard deviation [rad] of the turn about the table's normal, or about every axis."""
+    tilt: float = 0.01
+    """Standard deviation [rad] of a tilt on the table."""
+    missed: float = 0.025
+    """A finger farther [m] beyond its plane has missed the object."""
+
+
+@dataclasses.dataclass(frozen=True)
+class LocalizationNumbers:
+    """The numbers of the search for the object from touches."""
+
+    turns: tuple[float, ...] = (-0.24, -0.12, 0.0, 0.12, 0.24)
+    """Turns [rad] that are tried."""
+    fine_turns: tuple[float, ...] = (-0.06, 0.0, 0.06)
+    """Turns [rad] that are tried about the best of them."""
+    pitch: float = 0.006
+    """Distance [m] between the shifts that are tried; the fine search has a quarter of it."""
+    farthest: float = 0.072
+    """Largest shift [m] on each axis that is tried."""
+    # standard deviations of shift [m] and turn [rad] before any touch
+    shift: float = 0.03
+    turn: float = 0.15
+    surface: float = 0.004
+    """Standard deviation [m] of the estimated surface."""
+    normal: float = 0.3
+    """Standard deviation of a sensed normal, a unit vector."""
+    gap: float = 0.001
+    """Least distance [m] from the surface of a tip in the air."""
+    worst: float = 20.0
+    """Bound on the cost of one tip, so that a wrong touch does not decide."""
+    older: float = 4.0
+    """Growth of the variance with each later touch, which moves the object by twice the surface's
+    deviation.
+    """
+    empty: float = 80.0
+    """Cost of the object where the hand closed on nothing."""
+
+
+PLANES = ContactPlaneNumbers()
+SEARCH = LocalizationNumbers()
 
 
 class ContactPlanes:
@@ -59,18 +104,15 @@ class ContactPlanes:
         fingertips that touch.
         """
         off = ((points - self.target) * self.normals).sum(-1)
-        beyond = (off - self.rows @ self.expected).clamp_min(
-            -0.025
-        )  # a finger farther on has missed the object
+        beyond = (off - self.rows @ self.expected).clamp_min(-PLANES.missed)
         touching = touching & self.alive
         active = touching
         found = self.expected
         for _ in range(len(off)):
             weight = self.weight * active
-            found = self.expected + torch.linalg.solve(
-                self.prior + self.rows.T @ (weight[:, None] * self.rows),
-                self.rows.T @ (weight * beyond),
-            )
+            precision = self.prior + self.rows.T @ (weight[:, None] * self.rows)  # (6, 6)
+            found = self.expected + torch.linalg.solve(precision, self.rows.T @ (weight * beyond))
+            # fingers beyond their planes that touch nothing bound the displacement
             missed = touching | active | (self.alive & (off < self.rows @ found))
             if torch.equal(missed, active):
                 break
@@ -88,19 +130,14 @@ def _prior(reference: ClosingReference) -> Float[Tensor, "6 6"]:
     """Return the inverse covariance of the object's displacement before any touch: mostly along the
     table.
     """
-    # [m, m, rad, rad]
-    shift_std = 0.01
-    height_std = 0.001
-    turn_std = 0.09
-    tilt_std = 0.01
     eye = torch.eye(3, dtype=reference.normals.dtype)
-    place = eye / shift_std**2
-    turn = eye / turn_std**2
+    place = eye / PLANES.shift**2
+    turn = eye / PLANES.turn**2
     if reference.table is not None:
         up = unit(reference.table.normal)
         across = up[:, None] * up
-        place = place + across * (height_std**-2 - shift_std**-2)
-        turn = eye / tilt_std**2 + across * (turn_std**-2 - tilt_std**-2)
+        place = place + across * (PLANES.height**-2 - PLANES.shift**-2)
+        turn = eye / PLANES.tilt**2 + across * (PLANES.turn**-2 - PLANES.tilt**-2)
     return torch.block_diag(place, turn)
 
 
@@ -118,15 +155,14 @@ class Touches:
     ) -> None:
         self.links = torch.zeros(0, 4) if links is None else links
         self.kept = links is not None
-        self.points, self.normals = torch.zeros(2, *reference.normals.shape, dtype=torch.float64)
+        self.points = torch.zeros(reference.normals.shape, dtype=torch.float64)
+        self.normals = torch.zeros(reference.normals.shape, dtype=torch.float64)
         self.count = torch.zeros(len(reference.normals), dtype=torch.int64)
         self.tips = reference.gains.target
         self.known = reference.alive
-        self.contact, self.palm, self.nothing = (
-            torch.zeros_like(self.known),
-            STILL,
-            not len(self.links),
-        )
+        self.contact = torch.zeros_like(self.known)
+        self.palm = STILL
+        self.nothing = not len(self.links)
 
     def add(self, observation: Observation, palm: Float[Tensor, "3"]) -> None:
         """Add one observation to the averages; `palm` [m] is how far the palm is displaced from its
@@ -134,11 +170,8 @@ class Touches:
         """
         sensed = observation.tactile
         if bool(sensed.contact.any()):
-            placed = (
-                torch.isfinite(sensed.points).all(-1)
-                & torch.isfinite(sensed.normals).all(-1)
-                & sensed.contact
-            )
+            finite = torch.isfinite(sensed.points) & torch.isfinite(sensed.normals)
+            placed = finite.all(-1) & sensed.contact
             self.points = self.points + torch.where(placed[:, None], sensed.points + palm, 0.0)
             self.normals = self.normals + torch.where(placed[:, None], sensed.normals, 0.0)
             self.count = self.count + placed
@@ -186,7 +219,7 @@ class Localization:
     @property
     def done(self) -> bool:
         """Whether the search for the object's pose has tried all rotation angles."""
-        return self.step >= len(TURNS) + len(FINE_TURNS)
+        return self.step >= len(SEARCH.turns) + len(SEARCH.fine_turns)
 
     @property
     def displacement(self) -> Float[Tensor, "6"]:
@@ -197,16 +230,17 @@ class Localization:
         """Try one rotation angle with a grid of translations; the last calls search finely around
         the best result.
         """
-        if self.step < len(TURNS):
-            shifts = _square(FARTHEST, PITCH)
-            turn = TURNS[self.step]
+        fine = self.step - len(SEARCH.turns)
+        if fine < 0:
+            shifts = _square(SEARCH.farthest, SEARCH.pitch)
+            turn = SEARCH.turns[self.step]
         else:
-            if self.step == len(TURNS):
+            if fine == 0:
                 self.coarse = self.shift, self.turn
             middle, facing = self.coarse
-            fine = PITCH / 4
-            shifts = middle + _square(PITCH - fine, fine)
-            turn = facing + FINE_TURNS[self.step - len(TURNS)]
+            pitch = SEARCH.pitch / 4
+            shifts = middle + _square(SEARCH.pitch - pitch, pitch)
+            turn = facing + SEARCH.fine_turns[fine]
         costs = self._costs(shifts, turn)
         best = int(costs.argmin())
         if float(costs[best]) < self.cost:
@@ -219,18 +253,13 @@ class Localization:
         """Return the negative log-probability of each translation [m] along the table, for one
         rotation [rad].
         """
-        # [m, rad]
-        shift_std = 0.03
-        turn_std = 0.15
-        cost = (shifts / shift_std).square().sum(-1) + (turn / turn_std) ** 2
-        for age, touches in enumerate(
-            self.touches
-        ):  # a touch moves the object by twice the surface's deviation
-            cost = cost + self._misfit(touches, shifts, turn) / (1 + 4 * age)
+        cost = (shifts / SEARCH.shift).square().sum(-1) + (turn / SEARCH.turn) ** 2  # (m,)
+        for age, touches in enumerate(self.touches):
+            cost = cost + self._misfit(touches, shifts, turn) / (1 + SEARCH.older * age)
             if touches.nothing:
-                cost = cost + 80 * torch.exp(
-                    -2 * ((shifts - self.axes @ touches.palm) / shift_std).square().sum(-1)
-                )
+                # the object is probably not where the hand was
+                off = (shifts - self.axes @ touches.palm) / SEARCH.shift
+                cost = cost + SEARCH.empty * torch.exp(-2 * off.square().sum(-1))
         return 0.5 * cost
 
     def _misfit(
@@ -239,39 +268,36 @@ class Localization:
         """Return how badly touches fit to each translation [m] along the table, for one rotation
         [rad].
         """
-        # [m, 1]
-        surface_std = 0.004
-        normal_std = 0.3
-        # least distance [m] of a tip in the air; bound on the cost of one tip
-        gap = 0.001
-        worst = 20.0
         felt = touches.felt
-        (points, normals) = touches.means()
+        points, normals = touches.means()
         rotation = rotation_from_vector(turn * self.up)
         there = torch.where(felt[:, None], points, touches.tips) - self.center
-        before = (there - (shifts @ self.axes)[:, None]) @ rotation + self.center
+        moved = (shifts @ self.axes)[:, None]  # (m, 1, 3)
+        # where the tips were relative to the object before it moved: (m, f, 3)
+        before = (there - moved) @ rotation + self.center
         distance, gradient = self.surface.query(apply(self.obj_from_hand, before))
         outward = unit(gradient @ self.obj_from_hand[:3, :3] @ rotation.T)
-        place = (distance / surface_std).square().clamp_max(2 * worst)
-        facing = ((outward - normals) / normal_std).square().sum(-1)
-        inside = (
-            ((self.radius + gap - distance).clamp_min(0.0) / surface_std)
-            .square()
-            .clamp_max(2 * worst)
-        )
-        fit = torch.where(
-            felt, place + facing, torch.where(touches.contact | ~touches.known, 0.0, inside)
-        ).sum(-1)
+        facing = ((outward - normals) / SEARCH.normal).square().sum(-1)
+        touched = _bounded_cost(distance) + facing
+        # a tip in the air is not in the object; a tip that touches somewhere, or is blind, may be
+        inside = _bounded_cost((self.radius + SEARCH.gap - distance).clamp_min(0.0))
+        untouched = torch.where(touches.contact | ~touches.known, 0.0, inside)
+        fit = torch.where(felt, touched, untouched).sum(-1)
         if len(touches.links):
-            before = (
-                touches.links[:, :3] - self.center - (shifts @ self.axes)[:, None]
-            ) @ rotation + self.center
+            # one of the spheres touches
+            before = (touches.links[:, :3] - self.center - moved) @ rotation + self.center
             off = self.surface.query(apply(self.obj_from_hand, before))[0] - touches.links[:, 3]
-            fit = fit + (off.abs().amin(-1) / surface_std).square().clamp_max(2 * worst)
+            fit = fit + _bounded_cost(off.abs().amin(-1))
         return fit
+
+
+def _bounded_cost(distance: Float[Tensor, "*m"]) -> Float[Tensor, "*m"]:
+    """Return twice the negative log-probability of a distance [m] to the surface, bounded."""
+    return (distance / SEARCH.surface).square().clamp_max(2 * SEARCH.worst)
 
 
 def _square(half: float, pitch: float) -> Float[Tensor, "m 2"]:
     """Return the points of a square grid with spacing `pitch` from -half to half on both axes [m]."""
-    line = torch.arange(-round(half / pitch), round(half / pitch) + 1, dtype=torch.float64) * pitch
+    most = round(half / pitch)
+    line = torch.arange(-most, most + 1, dtype=torch.float64) * pitch
     return torch.cartesian_prod(line, line)

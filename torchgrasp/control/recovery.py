@@ -4,6 +4,7 @@ closing, and a check.
 The first two locate the object from touches (`Localization`) and move the palm to the object.
 """
 
+import dataclasses
 import math
 from typing import Annotated
 
@@ -15,7 +16,7 @@ from torchgrasp.contacts.balance import least_friction_forces, tangential_ratio
 from torchgrasp.control.object_pose import Localization, Touches
 from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.sensing import TORQUE_NOISE
-from torchgrasp.control.tactile import Observation, low_pass
+from torchgrasp.control.tactile import EARLY, Observation, smooth
 from torchgrasp.control.uncertainty_closing import PALM_SPEED
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.rules import Range
@@ -23,29 +24,83 @@ from torchgrasp.geometry.linalg import limit_norm, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.values.closing import ClosingOptions
 
-# largest speed [m/s] of the approach, and its acceleration [m/s^2]
-SPEED = 0.1
-ACCELERATION = 1.0
-PRESSING_TIME = (
-    0.5  # time [s] from the end of closing until the hand counts as closed, and is judged
-)
-MISPLACED = 0.008
-"""Distance [m] between the displacements of object and palm from which the hand opens: twice the
-estimate's error.
-"""
-OPENING_TIME = 0.5  # time [s] in which the fingers open
+# time [s] from the end of closing until the hand counts as closed, and is judged
+PRESSING_TIME = 0.5
+
+
+@dataclasses.dataclass(frozen=True)
+class ApproachNumbers:
+    """The numbers of the guarded approach."""
+
+    speed: float = 0.1
+    """Largest speed [m/s]."""
+    acceleration: float = 1.0
+    """Acceleration and deceleration [m/s^2]."""
+    back: float = 0.02
+    """Distance [m] by which the hand draws back at a touch."""
+    feeling: float = 0.06
+    """Time [s] in which touches are averaged."""
+    # a link touches where its drive feels more than the noise and the inertia
+    start: float = 0.02
+    """Length [m] at the start, far from the object, in which drives feel the inertia alone."""
+    moving: float = 0.05
+    """Speed [m/s] from which drives are believed: the palm has not just stopped."""
+    noises: float = 3.0
+    """Standard deviations of a joint torque that count as noise."""
+
+
+@dataclasses.dataclass(frozen=True)
+class GraspCheckNumbers:
+    """The numbers of the check of a pressing grasp."""
+
+    first: float = 0.1
+    """Time [s] of pressing after which touches are averaged: the forces have risen."""
+    last: float = 0.3
+    """Time [s] of pressing until which touches are averaged."""
+    misplaced: float = 0.008
+    """Distance [m] between the displacements of object and palm from which the hand opens: twice
+    the estimate's error.
+    """
+
+
+@dataclasses.dataclass(frozen=True)
+class OpeningTimes:
+    """The times of a hand that opens again."""
+
+    opening: float = 0.5
+    """Time [s] in which the fingers open."""
+    rest: float = 0.1
+    """Time [s] for which the open hand then rests."""
+
+
+@dataclasses.dataclass(frozen=True)
+class LostNumbers:
+    """The numbers by which a rising hand loses its object."""
+
+    load: float = 0.2
+    """Load [N] below which hardly any is carried."""
+    cutoff: float = 3.0
+    """Cut-off [Hz] of the load."""
+    first: float = 0.01
+    """Height [m] from which a missing touch counts."""
+    low: float = 0.02
+    """Height [m] up to which slides are summed."""
+    slip: float = 0.0015
+    """Slide [m] of two fingertips from which the hand will lose the object."""
+
+
+APPROACH = ApproachNumbers()
+CHECK = GraspCheckNumbers()
+OPENING = OpeningTimes()
+LOST = LostNumbers()
 
 
 def can_guard(reference: ClosingReference) -> bool:
     """Return whether the hand can stop at a touch: the plan has approach, table and surface, the
     tips are tactile.
     """
-    known = (
-        reference.approach is not None
-        and reference.table is not None
-        and reference.surface is not None
-    )
-    return known and reference.sensor.kind == "tactile"
+    needed = reference.approach, reference.table, reference.surface
+    return reference.sensor.kind == "tactile" and all(x is not None for x in needed)
 
 
 class GuardedApproach:
@@ -104,10 +159,11 @@ class GuardedApproach:
         if self.feeling:
             self._feel(observation, period)
         if self.left < self.retreat:
-            self.speed = min(self.speed + ACCELERATION * period, SPEED)
+            self.speed = min(self.speed + APPROACH.acceleration * period, APPROACH.speed)
             self.left = min(self.left + self.speed * period, self.retreat)
             if self.left >= self.retreat:
-                self.speed = self.retreat = 0.0
+                self.speed = 0.0
+                self.retreat = 0.0
         elif not self.feeling and not torch.equal(self.palm, self.goal):
             self.palm = next_palm(self.palm, self.goal, period)
         elif not self.feeling:
@@ -116,57 +172,56 @@ class GuardedApproach:
     def _advance(self, observation: Observation, period: float) -> None:
         """Move on towards the pre-grasp, or stop at a touch of a fingertip or of another link."""
         links = self._touching_links(observation)
-        if self.stops < self.options.stops and (
-            bool(observation.tactile.contact.any()) or len(links)
-        ):
-            self.speed = SPEED
+        touches = bool(observation.tactile.contact.any()) or len(links)
+        if touches and self.stops < self.options.stops:
+            # draw back at once
+            self.speed = APPROACH.speed
             self.time = 0.0
             self.feeling = True
-            self.retreat = min(self.left + 0.02, self.length)
+            self.retreat = min(self.left + APPROACH.back, self.length)
             self.felt.append(Touches(self.reference, links))
             self.search = Localization(self.reference, self.felt)
-            self.felt[-1].add(observation, self.palm - self.left * self.direction)
+            self.felt[-1].add(observation, self._displaced())
         else:
-            braking = math.sqrt(
-                2 * ACCELERATION * self.left
-            )  # the speed from which the hand just stops in time
-            self.speed = min(
-                self.speed + ACCELERATION * period, SPEED, max(braking, ACCELERATION * period)
-            )
+            change = APPROACH.acceleration * period
+            # the speed from which the hand just stops in time
+            braking = math.sqrt(2 * APPROACH.acceleration * self.left)
+            self.speed = min(self.speed + change, APPROACH.speed, max(braking, change))
             self.left = max(self.left - self.speed * period, 0.0)
+
+    def _displaced(self) -> Float[Tensor, "3"]:
+        """Return how far [m] the palm is from its planned pre-grasp."""
+        return self.palm - self.left * self.direction
 
     def _touching_links(self, observation: Observation) -> Float[Tensor, "m 4"]:
         """Return spheres of links of which one touches, as the drives feel: centres and radii [m];
         or none.
         """
-        # [m/s]: the palm has not just stopped
         hand = self.reference.hand
         joints = observation.joints
-        settled = 0.05
         self.rest = joints if self.rest is None else self.rest
         pushes = (self.reference.kp * (joints - self.rest)).abs()
-        if self.length - self.left < 0.02:  # the hand is far from the object, and speeds up
+        if self.length - self.left < APPROACH.start:
             self.inertia = torch.maximum(self.inertia, pushes)
-        excess = pushes - self.inertia - 3 * TORQUE_NOISE
+        excess = pushes - self.inertia - APPROACH.noises * TORQUE_NOISE  # (j,) [N m]
         spheres = hand.collision_spheres
-        if self.speed < settled or bool((excess <= 0.0).all()):
+        if self.speed < APPROACH.moving or bool((excess <= 0.0).all()):
             return torch.zeros(0, 4, dtype=torch.float64)
+        # a link beyond the most blocked joint touches
         moved = hand.tree.moves[:, excess.argmax()][spheres.link_index] > 0
-        centres = (
-            hand.sphere_centres(self.reference.pick(joints))[moved]
-            + self.palm
-            - self.left * self.direction
-        )
+        centres = hand.sphere_centres(self.reference.pick(joints))[moved]
+        centres = centres + self.palm - self.left * self.direction
         return torch.cat([centres, spheres.radius.double()[moved, None]], -1)
 
     def _feel(self, observation: Observation, period: float) -> None:
         """Average the touch readings, then locate the object, then choose the palm's new goal: one
         stage per call.
         """
-        if self.time < 0.06:  # [s]
+        last = self.felt[-1]
+        if self.time < APPROACH.feeling:
             self.time += period
-            self.felt[-1].add(observation, self.palm - self.left * self.direction)
-        elif not self.search.done and (bool(self.felt[-1].felt.any()) or len(self.felt[-1].links)):
+            last.add(observation, self._displaced())
+        elif not self.search.done and (bool(last.felt.any()) or len(last.links)):
             self.search()
         else:
             self.feeling = False
@@ -179,9 +234,8 @@ class GuardedApproach:
         moves.
         """
         self.displacement = displacement
-        self.goal = self.reference.rise + palm_goal(
-            displacement[:3], self.reference.table, self.options.palm_reach
-        )
+        shift = palm_goal(displacement[:3], self.reference.table, self.options.palm_reach)
+        self.goal = self.reference.rise + shift
         way = float(torch.linalg.vector_norm(self.goal - self.palm))
         self.retreat = max(self.retreat, min(self.left + way, self.length))
 
@@ -212,25 +266,28 @@ class GraspCheck:
         self.felt = felt
         self.known = reference.surface is not None and reference.table is not None
         self.search: Localization | None = None
-        self.judged = self.secure = last
+        self.judged = last
+        self.secure = last
 
     def __call__(self, observation: Observation, pressed: float) -> None:
         """Average the touches, locate the object, and judge the grasp once `pressed` [s] reaches
         `PRESSING_TIME`.
         """
-        if self.judged or pressed < 0.1:
+        if self.judged or pressed < CHECK.first:
             return
-        if pressed < 0.3:
+        if pressed < CHECK.last:
             self.touches.add(observation, self.palm)
         elif self.known and not (self.search and self.search.done):
-            if self.search is None and bool(self.touches.felt.any()):
-                self.felt[-1:] = [self.touches]
-            self.search = self.search or Localization(self.reference, self.felt)
+            if self.search is None:
+                if bool(self.touches.felt.any()):
+                    self.felt[-1] = self.touches
+                self.search = Localization(self.reference, self.felt)
             self.search()
             self.displacement = self.search.displacement
-        elif pressed >= PRESSING_TIME - 1e-9:
+        elif pressed >= PRESSING_TIME - EARLY:
             self.touches.contact = observation.tactile.contact
-            self.judged, self.secure = True, self._is_secure()
+            self.judged = True
+            self.secure = self._is_secure()
 
     def _is_secure(self) -> bool:
         """Return whether all fingers touch, planned friction lets forces balance, and the palm has
@@ -239,15 +296,15 @@ class GraspCheck:
         touches = self.touches
         if not bool((touches.contact | ~touches.known).all()):
             return False
-        if float(torch.linalg.vector_norm(self.displacement[:3] - self.palm)) > MISPLACED:
+        if float(torch.linalg.vector_norm(self.displacement[:3] - self.palm)) > CHECK.misplaced:
             return False
         if not bool(touches.felt.all()):
-            return True  # without all places of contacts the forces cannot be judged
+            # without all places of contacts the forces cannot be judged
+            return True
         points, normals = touches.means()
         ratio = tangential_ratio(least_friction_forces(points, normals), normals)
-        return bool(
-            (ratio <= self.reference.friction).all()
-        )  # false for NaN, where no forces balance
+        # false for NaN, where no forces balance
+        return bool((ratio <= self.reference.friction).all())
 
 
 class Reopening:
@@ -276,25 +333,25 @@ class Reopening:
         self.closed = palm
         self.begun = begun
         self.time = 0.0
-        self.goal = (
-            reference.rise + palm_goal(displacement[:3], reference.table, reach) if reach else begun
-        )
+        self.goal = begun
+        if reach:
+            self.goal = reference.rise + palm_goal(displacement[:3], reference.table, reach)
 
     @property
     def done(self) -> bool:
         """Whether the hand is open and at rest."""
-        return self.time >= OPENING_TIME + 0.1
+        return self.time >= OPENING.opening + OPENING.rest
 
     def __call__(self, period: float) -> Float[Tensor, " j"]:
         """Return the targets of all joints [rad] for the next tick: first the fingers open, then
         the palm moves.
         """
-        opens = self.time < OPENING_TIME
+        opens = self.time < OPENING.opening
         if opens or torch.equal(self.palm, self.goal):
             self.time += period
         else:
             self.palm = next_palm(self.palm, self.goal, period)
-        share = min(self.time / OPENING_TIME, 1.0)
+        share = min(self.time / OPENING.opening, 1.0)
         if opens:
             self.palm = torch.lerp(self.closed, self.begun, share)
         return torch.lerp(self.start, self.opened, share)
@@ -332,20 +389,16 @@ class LiftCheck:
         """Return `lost` at the end of a tick of `period` [s], in which the hand has risen to
         `height` [m].
         """
-        # load [N], heights of touches and slides, slide [m]
-        least = 0.2
-        first = 0.01
-        low = 0.02
-        slip = 0.0015
         tactile = observation.tactile
-        if height <= low:
+        if height <= LOST.low:
             self.slid = self.slid + period * tactile.sliding
         if self.table is not None:
             load = float((tactile.forces @ self.table.normal.double()).sum())
-            self.load += low_pass(3.0, period) * (load - self.load)
-        slack = int((tactile.contact | ~self.alive).sum()) < 2 and self.load < least
-        slides = float(self.slid.sort().values[-2]) > slip
-        self.lost = self.lost or (slack and height >= first) or slides
+            self.load = smooth(self.load, load, LOST.cutoff, period)
+        touching = int((tactile.contact | ~self.alive).sum())
+        slack = touching < 2 and self.load < LOST.load
+        slides = float(self.slid.sort().values[-2]) > LOST.slip
+        self.lost = self.lost or (slack and height >= LOST.first) or slides
         return self.lost
 
 
@@ -367,6 +420,6 @@ def next_palm(
     """
     way = goal - palm
     longest = PALM_SPEED * period
-    return (
-        goal if float(torch.linalg.vector_norm(way)) <= longest else palm + limit_norm(way, longest)
-    )
+    if float(torch.linalg.vector_norm(way)) <= longest:
+        return goal
+    return palm + limit_norm(way, longest)

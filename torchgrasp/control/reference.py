@@ -262,7 +262,7 @@ def next_target(
     """
     jacobian = observation.jacobian @ reference.hand.actuated.coupling
     step = law.joint_step(jacobian, velocity, period, reference.joints - target)
-    step = step * min(1.0, fastest * period / max(float(step.abs().max()), 1e-9))
+    step = step * min(1.0, fastest * period / max(float(step.abs().max()), law.TINY))
     joints = reference.pick(observation.joints)
     return reference.clamp(
         torch.minimum(torch.maximum(target + step, joints - lead), joints + lead)

@@ -21,9 +21,9 @@ from torchgrasp.control.tactile import (
     TactileState,
     TipContact,
     flag,
-    low_pass,
     measure,
     no_contact,
+    smooth,
 )
 from torchgrasp.foundation.base import map_tensors
 from torchgrasp.foundation.checks import checked
@@ -143,7 +143,7 @@ class DriveFeel:
         self.before = joints
         forces = _forces_by_torques(self.reference, observation.jacobian) @ torques
         pushes = -(forces * self.reference.normals).sum(-1)
-        self.pushes = self.pushes + low_pass(FLAG_CUTOFF, period) * (pushes - self.pushes)
+        self.pushes = smooth(self.pushes, pushes, FLAG_CUTOFF, period)
         return self.pushes
 
 

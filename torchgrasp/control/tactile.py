@@ -2,8 +2,9 @@
 
 import dataclasses
 import math
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, TypeVar
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -17,10 +18,30 @@ from torchgrasp.hand.hand import Hand
 SAMPLING_RATE = 100.0  # samples of a fingertip a second [Hz]
 NOISE = 0.1  # standard deviation [N] of the normal force (Sec. 6.5).
 FLAG_CUTOFF = 5.0  # cut-off [Hz] of the average force behind the contact flag
-TOUCH_ON = (
-    0.2  # average force [N] at which the contact flag turns on; it turns off at half of this force
-)
+# average force [N] at which the contact flag turns on; it turns off at half of this force
+TOUCH_ON = 0.2
+EARLY = 1e-9  # largest rounding [s] of times that are sums of ticks
 STILL = torch.zeros(3, dtype=torch.float64)  # displacement of a palm that stays on its path
+Filtered = TypeVar("Filtered", Tensor, np.ndarray, float)
+
+
+@dataclasses.dataclass(frozen=True)
+class TactileNumbers:
+    """The numbers of the simulated fingertips; their noise in the normal force is `NOISE`."""
+
+    cutoff: float = 20.0
+    """Cut-off [Hz] of the lag of the sensor."""
+    tangential: float = 0.3
+    """Standard deviation [N] of the force along the surface."""
+    place: float = 1.5e-3
+    """Standard deviation [m] of the contact's place."""
+    slide: float = 2e-3
+    """Standard deviation [m/s] of the sliding speed."""
+    radius: float = 0.012
+    """Radius [m] that is assumed of tips that are not round."""
+
+
+TACTILE = TactileNumbers()
 
 
 @checked
@@ -117,10 +138,10 @@ def measure(
     check_device("truth", truth.forces.device, "the tactile state", tactile.lagged.device)
     sliding = torch.zeros_like(truth.normal_force) if truth.sliding is None else truth.sliding
     force = torch.cat([truth.normal_force[..., None], truth.forces, sliding[..., None]], dim=-1)
-    lagged = tactile.lagged + low_pass(20.0, period) * (force - tactile.lagged)
+    lagged = smooth(tactile.lagged, force, TACTILE.cutoff, period)
     age = tactile.age + period
     interval = 1 / SAMPLING_RATE
-    if age < interval - 1e-9:
+    if age < interval - EARLY:
         return dataclasses.replace(tactile, lagged=lagged, age=age)
     reading = lagged[..., 0]
     forces = lagged[..., 1:4]
@@ -128,24 +149,19 @@ def measure(
     points = truth.points
     normals = truth.normals
     if generator is not None:
-        # [m, N, m/s]
-        place_noise = 1.5e-3
-        tangential_noise = 0.3
-        slide_noise = 2e-3
         along = torch.where(torch.isfinite(normals), normals, pads)
+        # (2, *b, f, 3): of the force, and of place and speed
         drawn = noise * torch.randn(2, *forces.shape, generator=generator, dtype=forces.dtype)
         normal_part = (drawn * along).sum(-1, keepdim=True)
         push = normal_part[0]
         across = drawn - normal_part * along
         reading = reading + NOISE * push[..., 0]
-        sliding = sliding + slide_noise * normal_part[1, ..., 0]
-        forces = forces - NOISE * push * along + tangential_noise * across[0]
-        curvature_radius = torch.where(radius > 0, radius, 0.012)[:, None]
-        normals = unit(truth.normals + place_noise / curvature_radius * across[1])
-        points = truth.points + curvature_radius * (truth.normals - normals)
-    average = tactile.average + low_pass(FLAG_CUTOFF, max(period, interval)) * (
-        reading - tactile.average
-    )
+        sliding = sliding + TACTILE.slide * normal_part[1, ..., 0]
+        forces = forces - NOISE * push * along + TACTILE.tangential * across[0]
+        curvature = torch.where(radius > 0, radius, TACTILE.radius)[:, None]
+        normals = unit(truth.normals + TACTILE.place / curvature * across[1])
+        points = truth.points + curvature * (truth.normals - normals)
+    average = smooth(tactile.average, reading, FLAG_CUTOFF, max(period, interval))
     contact = flag(tactile.contact, average, 1.0 if generator is None else max(noise, 1.0))
     age = min(max(age - interval, 0.0), interval)
     return TactileState(reading, forces, contact, points, normals, lagged, average, sliding, age)
@@ -167,6 +183,11 @@ def low_pass(cutoff: float, period: float) -> float:
     period [s].
     """
     return 1 - math.exp(-2 * math.pi * cutoff * period)
+
+
+def smooth(old: Filtered, new: Filtered, cutoff: float, period: float) -> Filtered:
+    """Return a filtered value one tick later, from its `old` value and the `new` measurement."""
+    return old + low_pass(cutoff, period) * (new - old)
 
 
 class Targets(NamedTuple):

@@ -21,7 +21,7 @@ from torchgrasp.control.law import (
 from torchgrasp.control.paper.stability import StabilityModel, lengths_of, state_of
 from torchgrasp.control.protocol import POSE_TIME, SETTLED, Settled, strongest_lead
 from torchgrasp.control.reference import ClosingReference, next_target
-from torchgrasp.control.tactile import STILL, Observation, low_pass
+from torchgrasp.control.tactile import STILL, Observation, smooth
 from torchgrasp.foundation.checks import checked
 from torchgrasp.geometry.frames import degenerate, rigid, virtual_frame
 from torchgrasp.geometry.linalg import limit_norm
@@ -234,9 +234,7 @@ class Impedance:
         """Return the targets [rad] of all joints for the next tick, `period` [s] later."""
         self.time += period
         share = min(self.time / RAMP, 1.0)
-        self.reading = self.reading + low_pass(2.0, period) * (
-            observation.tactile.reading - self.reading
-        )
+        self.reading = smooth(self.reading, observation.tactile.reading, 2.0, period)
         if share == 1.0:
             self.factor = regulate(self.factor, observation, self.raised * self.strength, period)
             self._adapt(observation, period)
