@@ -22,7 +22,7 @@ from torchgrasp import GraspController, TrialSpec
 from torchgrasp.control import FingertipSensor, TipContact, feel_flags, feel_torques, no_contact
 from torchgrasp.control.holding import MAX_FACTOR, ForceHold
 from torchgrasp.control.sensing import TORQUE_NOISE, WAITING_FORCE, DriveFeel
-from torchgrasp.control.uncertainty_closing import STALLED, UncertaintyClosing
+from torchgrasp.control.uncertainty_closing import CLOSING, UncertaintyClosing
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.values.closing import NO_OPTIONS, ClosingOptions, SensorModel
 
@@ -162,7 +162,7 @@ def test_dead_finger_stops_where_its_drives_push_which_measure_blocked_joints_bu
     ahead = -(targets * NORMALS[2]).sum(-1)
     assert law.done and bool(law.touched.all())
     assert (
-        STALLED < 100.0 * float(ahead[-1]) < 3 * STALLED
+        CLOSING.stalled < 100.0 * float(ahead[-1]) < 3 * CLOSING.stalled
     )  # it stands, the lag of the average later
     assert torch.allclose(ahead[-20:], ahead[-1:], atol=1e-9)
     known = reference()

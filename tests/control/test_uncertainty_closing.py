@@ -34,9 +34,7 @@ from torchgrasp.control.protocol import SETTLED
 from torchgrasp.control.reference import next_target
 from torchgrasp.control.sensing import WAITING_FORCE
 from torchgrasp.control.uncertainty_closing import (
-    LEAD,
-    PATIENCE,
-    QUICK_TOUCH,
+    CLOSING,
     UncertaintyClosing,
     rim_contacts,
     with_equal_gains,
@@ -115,7 +113,7 @@ def test_waiting_finger_rests_and_yields_to_more_than_the_waiting_force():
         contact = FREE  # the finger rests although it no longer touches
     step = law(observation(0.02, (1.0, 0, 0)), PERIOD).reshape(3, 3)
     assert float((step[0] * NORMALS[0]).sum()) > 0
-    last = law(observation(0.02, (0.0, QUICK_TOUCH, QUICK_TOUCH)), PERIOD).reshape(3, 3)
+    last = law(observation(0.02, (0.0, CLOSING.touch, CLOSING.touch)), PERIOD).reshape(3, 3)
     assert float((last[0] * NORMALS[0]).sum()) < float(
         (step[0] * NORMALS[0]).sum()
     )  # all have touched: all press
@@ -130,7 +128,7 @@ def test_finger_presses_at_once_without_waiting(wait, sign):
     assert float(step[0] @ NORMALS[0]) * sign > 0
 
 
-@pytest.mark.parametrize(("contact", "time"), [(TOUCHING, SETTLED), (ONE, PATIENCE)])
+@pytest.mark.parametrize(("contact", "time"), [(TOUCHING, SETTLED), (ONE, CLOSING.patience)])
 def test_closing_ends_when_all_touch_or_patience_is_over(contact, time):
     law = closing()
     ticks = 0
@@ -140,7 +138,7 @@ def test_closing_ends_when_all_touch_or_patience_is_over(contact, time):
     assert ticks * PERIOD == pytest.approx(time, abs=1.5 * PERIOD)
     untouched = closing()
     for _ in range(100):
-        untouched(observation(), 2 * PATIENCE / 100)
+        untouched(observation(), 2 * CLOSING.patience / 100)
     assert not untouched.done
 
 
@@ -149,7 +147,7 @@ def test_targets_stay_near_the_joints_but_late_fingers_search_and_press_harder()
     stopping = PositionClosing(reference())
     for _ in range(150):
         targets = law(observation(0.5), PERIOD)
-    assert targets.abs().max() == pytest.approx(LEAD)
+    assert targets.abs().max() == pytest.approx(CLOSING.lead)
     for _ in range(60):
         targets = stopping(observation(0.5), 0.5)
     assert targets.abs().max() == pytest.approx(1.0)
@@ -158,7 +156,7 @@ def test_targets_stay_near_the_joints_but_late_fingers_search_and_press_harder()
     first = law(seen, PERIOD).reshape(3, 3)
     assert float(first[2] @ NORMALS[2]) < -0.5 * MAX_SPEED * PERIOD
     last = [law(seen, PERIOD) for _ in range(240)][-1]
-    assert last.abs().max() > 1.5 * LEAD  # the joints do not follow, as if blocked
+    assert last.abs().max() > 1.5 * CLOSING.lead  # the joints do not follow, as if blocked
 
 
 @pytest.mark.parametrize("up", [1.0, -1.0])

@@ -1,5 +1,7 @@
 """A second look at an object: how far it has moved along its table since its surface was estimated."""
 
+import dataclasses
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -12,7 +14,33 @@ from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.values.planning import PointCloud
 
 REACH = 0.08  # largest displacement [m] on each axis of the table that `relocate` tries at first
-SCALE = 0.004  # distance [m] from the surface beyond which a point of a new view counts less
+
+
+@dataclasses.dataclass(frozen=True)
+class RelookNumbers:
+    """The numbers of the search for the moved object."""
+
+    scale: float = 0.004
+    """Distance [m] from the surface beyond which a point of a new view counts less."""
+    points: int = 300
+    """Most points of the cloud that are used."""
+    shifts: int = 17
+    """Shifts of the grid on each axis of the table, to `REACH`."""
+    turns: int = 7
+    """Turns of the grid."""
+    farthest: float = 0.52
+    """Largest turn [rad] of the grid: 30 degrees."""
+    best: int = 16
+    """Motions of the grid from which steps start."""
+    steps: int = 20
+    """Gauss-Newton steps from each of them."""
+    longest: tuple[float, float, float] = (0.01, 0.01, 0.1)
+    """Longest step [m, m, rad]."""
+    std: tuple[float, float, float] = (0.05, 0.05, 0.2)
+    """Standard deviations [m, m, rad] of the weak prior."""
+
+
+RELOOK = RelookNumbers()
 
 
 @checked
@@ -25,20 +53,19 @@ def relocate(surface: SignedDistanceField, cloud: PointCloud, table: Plane) -> F
     search to 80 mm and 30 degrees starts Gauss-Newton steps. The `surface` (`surface_field`), a new
     `cloud` of the object [m] and the `table` are in one frame.
     """
-    # points of the cloud, places of the grid, and steps from each of them
-    most = 300
-    best = 16
-    steps = 20
-    rows = torch.linspace(0, len(cloud) - 1, min(len(cloud), most)).round().long()
+    count = min(len(cloud), RELOOK.points)
+    rows = torch.linspace(0, len(cloud) - 1, count).round().long()
     search = _Registration(surface, cloud.points[rows], table)
-    # [m, rad]
-    line = torch.linspace(-REACH, REACH, 17).double()
-    turns = torch.linspace(-0.52, 0.52, 7).double()
-    motions = torch.cartesian_prod(line, line, turns)
-    motions = motions[search.cost(surface.nearest_node(search.undo(motions))).argsort()[:best]]
-    for _ in range(steps):
+    line = torch.linspace(-REACH, REACH, RELOOK.shifts).double()
+    turns = torch.linspace(-RELOOK.farthest, RELOOK.farthest, RELOOK.turns).double()
+    motions = torch.cartesian_prod(line, line, turns)  # (m, 3)
+    # distances at grid nodes are rough, but fast
+    rough = search.cost(surface.nearest_node(search.undo(motions)))
+    motions = motions[rough.argsort()[: RELOOK.best]]
+    for _ in range(RELOOK.steps):
         motions = motions + search.step(motions)
-    found = motions[search.cost(surface.query(search.undo(motions))[0]).argmin()]
+    distance, _ = surface.query(search.undo(motions))
+    found = motions[search.cost(distance).argmin()]
     rotation = rotation_from_vector(found[2] * search.up)
     return rigid(rotation, search.pivot + found[:2] @ search.axes - rotation @ search.pivot)
 
@@ -65,23 +92,22 @@ class _Registration:
 
     def cost(self, distance: Float[Tensor, "m n"]) -> Float[Tensor, "m"]:
         """Return the sum of Cauchy's costs of signed distances [m]."""
-        return (distance / SCALE).square().log1p().sum(-1)
+        return (distance / RELOOK.scale).square().log1p().sum(-1)
 
     def step(self, motions: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
         """Return one Gauss-Newton step from each motion, with a weak prior for what the points do
         not tell.
         """
-        # [m, m, rad]
-        longest = motions.new_tensor([0.01, 0.01, 0.1])
-        std = motions.new_tensor([0.05, 0.05, 0.2])
+        longest = motions.new_tensor(RELOOK.longest)
+        std = motions.new_tensor(RELOOK.std)
         before = self.undo(motions)
         distance, gradient = self.surface.query(before)
         arms = torch.linalg.cross(self.up.expand_as(before), before - self.pivot)
-        along = self.axes @ rotation_from_vector(
-            motions[:, 2:] * self.up
-        )  # the axes before the turn
-        rows = -torch.cat([gradient @ along.mT, (gradient * arms).sum(-1, keepdim=True)], -1)
-        weighted = rows / (SCALE**2 + distance.square())[..., None]
+        # the axes before the turn: (m, 2, 3)
+        along = self.axes @ rotation_from_vector(motions[:, 2:] * self.up)
+        turning = (gradient * arms).sum(-1, keepdim=True)
+        rows = -torch.cat([gradient @ along.mT, turning], -1)  # (m, n, 3)
+        weighted = rows / (RELOOK.scale**2 + distance.square())[..., None]
         matrix = weighted.mT @ rows + torch.diag(std**-2)
         value = (weighted.mT @ distance[..., None])[..., 0]
         return torch.linalg.solve(matrix, -value - motions / std**2).clamp(-longest, longest)

@@ -25,16 +25,52 @@ from torchgrasp.control.tactile import STILL, Observation
 from torchgrasp.geometry.linalg import limit_norm
 from torchgrasp.values.closing import ClosingOptions
 
-# longest time [s] from the first touch until the closing ends, even if some finger has not touched
-PATIENCE = 2.5
-# reading [N] of a tactile fingertip that counts as a touch before the contact flag turns on
-QUICK_TOUCH = 0.45
 PALM_SPEED = 0.04  # largest speed [m/s] of the palm that follows the object
-STALLED = 0.25  # force [N] of its drives at which a finger without a sensor counts as touching
-LEAD = 0.04
-"""Largest lead [rad] of a waiting finger's target over its joint: it bounds the force of a link
-that is blocked.
-"""
+
+
+@dataclasses.dataclass(frozen=True)
+class ClosingNumbers:
+    """The numbers of the default closing."""
+
+    patience: float = 2.5
+    """Longest time [s] from the first touch until the closing ends, even if some finger has not
+    touched.
+    """
+    touch: float = 0.45
+    """Reading [N] of a tactile fingertip that is a touch before the contact flag turns on."""
+    lead: float = 0.04
+    """Largest lead [rad] of a waiting finger's target over its joint: it bounds the force of a link
+    that is blocked.
+    """
+    growth: float = 0.25
+    """Time [s] of waiting for others in which this lead grows by its size."""
+    follows: float = 6.0
+    """Gain [1/s] with which the palm follows the object."""
+    # of a finger without a sensor
+    stalled: float = 0.25
+    """Force [N] of its drives at which it counts as touching."""
+    deviations: float = 3.0
+    """Standard deviations beyond its estimated contact at which it counts as touching."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RimNumbers:
+    """The numbers of fingertips that slide along the table to the rim of a low object."""
+
+    slope: float = 0.25
+    """Least part of the contact's normal along the table's normal."""
+    near: float = 0.004
+    """Height [m] of a tip below which it is at the table."""
+    rate: float = 12.0
+    """Rate [1/s] at which a tip goes down to its height."""
+    gap: float = 0.0003
+    """Height [m] of a sliding tip: the lower a tip, the flatter its contact's normal."""
+    fastest: float = 0.8
+    """Largest speed [rad/s] of joints: faster ones lag, and tips leave the table."""
+
+
+CLOSING = ClosingNumbers()
+RIM = RimNumbers()
 
 
 class UncertaintyClosing:
@@ -63,9 +99,9 @@ class UncertaintyClosing:
         self.waits = options.wait
         self.reach = options.palm_reach
         self.planes = ContactPlanes(reference) if options.pose_estimate else None
-        self.begun = self.palm = (
-            reference.rise
-        )  # displacement [m] of the palm when the closing began, and now
+        # displacement [m] of the palm when the closing began, and now
+        self.begun = reference.rise
+        self.palm = reference.rise
         self.raised = bool(self.palm.any())
         self.displacement = torch.zeros(6, dtype=torch.float64)  # of the object [m, rad]
         self.touched = torch.zeros_like(reference.normals[:, 0], dtype=torch.bool)
@@ -82,7 +118,8 @@ class UncertaintyClosing:
     @property
     def done(self) -> bool:
         """Whether the closing has ended."""
-        return self.settled.time >= SETTLED or (self.waits and self.waiting >= PATIENCE)
+        late = self.waits and self.waiting >= CLOSING.patience
+        return late or self.settled.time >= SETTLED
 
     def begin_at(
         self, displacement: Float[Tensor, "6"], palm: Float[Tensor, "3"]
@@ -108,33 +145,37 @@ class UncertaintyClosing:
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
         """Return the targets [rad] of all joints for the next tick, `period` [s] later."""
         reference = self.reference
-        gains = self.reference.gains
-        normals = self.reference.normals
+        gains = reference.gains
+        normals = reference.normals
         contact = observation.tactile.contact
         reading = observation.tactile.reading
         tips = observation.tips + self.palm
         if self.waits:
-            contact = self.touched | contact | (reading >= QUICK_TOUCH if self.quick else contact)
+            contact = self.touched | contact
+            if self.quick:
+                contact = contact | (reading >= CLOSING.touch)
         points = reference.contact_points(tips)
         planned, drift = self._follow(points, contact)
         error = planned - points
-        ahead = -(error * normals).sum(
-            -1
-        )  # how far [m] each planned contact still lies ahead of its fingertip
+        # how far [m] each planned contact still lies ahead of its fingertip: (f,)
+        ahead = -(error * normals).sum(-1)
         touches, rests = self._without_sensor(observation, ahead, contact, period)
         contact = contact | touches
         if self.waits:
             self.touched = self.touched | contact
             contact = self.touched
+        # a finger that has passed its contact goes on along the normal
         error = error + ahead.clamp_max(0.0)[:, None] * normals
         share = torch.where(contact | rests, 1.0, blend(error, gains.covariance))
-        self.share, self.waiting = share, self.waiting + period if bool(contact.any()) else 0.0
+        self.share = share
+        self.waiting = self.waiting + period if bool(contact.any()) else 0.0
         touching = observation.tactile.contact | (contact & ~self.alive)
         self.settled.update(observation, touching, share, period, pressing=not self.waits)
         desired = self._desired(reading, contact, rests)
         force_error = -(desired - reading)[:, None] * normals
         velocity = tip_velocity(error, force_error, share, gains.position_gain, gains.force_gain)
         if not bool(contact.any()):
+            # all fingers reach their contacts at the same time
             left = ahead.clamp_min(0.0) + POSITION_FLOOR
             velocity = velocity * (left / left.max())[:, None]
         if reference.table is not None:
@@ -143,12 +184,10 @@ class UncertaintyClosing:
             velocity = slide_along(velocity, height, reference.table.normal, self.low)
         velocity, descent = self._descend(velocity - drift, observation, period)
         self.palm = self.palm + period * (drift + descent)
-        lead = (
-            LEAD * (1 + self.waiting / 0.25) if self.waits else self.strongest
-        )  # grows while others are awaited
-        fastest = (
-            0.8 if bool(self.low.any()) else math.inf
-        )  # [rad/s]: faster joints lag, and tips leave the table
+        lead = self.strongest
+        if self.waits:
+            lead = CLOSING.lead * (1 + self.waiting / CLOSING.growth)
+        fastest = RIM.fastest if bool(self.low.any()) else math.inf
         self.target = next_target(
             reference, self.target, velocity, observation, lead, period, fastest
         )
@@ -167,11 +206,10 @@ class UncertaintyClosing:
         if self.reach:
             way = limit_norm(self.displacement[:3], self.reach) - self.palm
             table = self.reference.table
-            if (
-                self.raised and table is not None
-            ):  # what the palm has left of its descent is no drift
+            if self.raised and table is not None:
+                # what the palm has left of its descent is no drift
                 way = way - (way @ table.normal) * table.normal
-            drift = limit_norm(6.0 * way, PALM_SPEED)
+            drift = limit_norm(CLOSING.follows * way, PALM_SPEED)
         return self.planes.moved(self.displacement), drift
 
     def _descend(
@@ -185,12 +223,14 @@ class UncertaintyClosing:
         if not self.raised or self.reference.table is None:
             return velocity, STILL
         up = self.reference.table.normal
-        jacobian = observation.jacobian @ self.reference.hand.actuated.coupling
+        jacobian = observation.jacobian @ self.reference.hand.actuated.coupling  # (f, 3, h)
+        # without the motion along the table's normal
         flat = jacobian - up[:, None] * (up @ jacobian)[:, None]
-        made = (
-            jacobian @ joint_step(flat, velocity - (velocity @ up)[:, None] * up, period) / period
-        )
-        return made, limit_norm(((velocity - made) @ up).amax() * up, PALM_SPEED)
+        along = velocity - (velocity @ up)[:, None] * up
+        made = jacobian @ joint_step(flat, along, period) / period
+        # the tip that lacks most height decides how the palm moves
+        descent = ((velocity - made) @ up).amax() * up
+        return made, limit_norm(descent, PALM_SPEED)
 
     def _without_sensor(
         self,
@@ -209,7 +249,8 @@ class UncertaintyClosing:
         covariance = self.reference.gains.covariance
         deviation = torch.einsum("fi,fij,fj->f", normals, covariance, normals).sqrt()
         pushes = self.drives(observation, self.reference.expand(self.target), period)
-        touches = blind & ((pushes >= STALLED) | (ahead <= -3.0 * deviation))
+        beyond = ahead <= -CLOSING.deviations * deviation
+        touches = blind & ((pushes >= CLOSING.stalled) | beyond)
         others = bool((contact | blind).all())
         return touches, blind & (ahead <= 0.0) & (not others)
 
@@ -232,13 +273,10 @@ def rim_contacts(reference: ClosingReference) -> Bool[Tensor, "f"]:
     """
     if reference.table is None:
         return torch.zeros_like(reference.alive)
-    # slope, and [m]
-    least = 0.25
-    near = 0.004
     normals = reference.normals
     radius = reference.hand.tips.radius
     height = reference.table.height(reference.gains.target + radius[:, None] * normals) - radius
-    return (normals @ reference.table.normal > least) & (height < near)
+    return (normals @ reference.table.normal > RIM.slope) & (height < RIM.near)
 
 
 def slide_along(
@@ -250,10 +288,7 @@ def slide_along(
     """Return fingertip velocities [m/s]; `low` tips at `height` [m] over the table go down, and
     then keep low.
     """
-    # [1/s], [m]: the lower a tip, the flatter its contact's normal
-    rate = 12.0
-    gap = 0.0003
-    down = rate * (gap - height) - velocity @ up
+    down = RIM.rate * (RIM.gap - height) - velocity @ up
     return velocity + (down * low)[:, None] * up
 
 
@@ -262,10 +297,10 @@ def with_equal_gains(reference: ClosingReference) -> ClosingReference:
     uncertainty.
     """
     gains = reference.gains
+    eye = torch.eye(3, dtype=gains.covariance.dtype).expand_as(gains.covariance)
     isotropic = dataclasses.replace(
         gains,
-        covariance=POSITION_FLOOR**2
-        * torch.eye(3, dtype=gains.covariance.dtype).expand_as(gains.covariance),
+        covariance=POSITION_FLOOR**2 * eye,
         position_gain=torch.full_like(gains.position_gain, POSITION_RATE),
         force_gain=gains.force_gain.amax(-1, keepdim=True).expand_as(gains.force_gain),
     )
