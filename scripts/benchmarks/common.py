@@ -95,8 +95,8 @@ class Row:
     what: str
     bar: str
     measured: str
-    met: bool | None
-    numbers: dict[str, Any]
+    met: bool | None = None
+    numbers: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     def __str__(self) -> str:
         verdict = {True: "met", False: "MISSED", None: "-"}[self.met]

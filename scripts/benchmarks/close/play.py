@@ -146,10 +146,5 @@ def _row(
     words += f"lifted {sum(played.values())}, by our trial {sum(own.values())}"
     judged = trial == next(iter(TRIALS))
     met = (len(own) - len(differ)) / len(own) >= LEAST_SAME if judged else None
-    return Row(
-        what,
-        f">= {LEAST_SAME:.0%}" if judged else "-",
-        words,
-        met,
-        {"same": same, "differ": differ},
-    )
+    bar = f">= {LEAST_SAME:.0%}" if judged else "-"
+    return Row(what, bar, words, met, {"same": same, "differ": differ})

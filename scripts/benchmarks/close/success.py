@@ -81,7 +81,7 @@ def success(o: Options) -> list[Row]:
     cells = [Cell(*found) for found in run_all(try_object, tasks, spec.workers)]
     planned = [cell for cell in cells if cell.tried]
     return [
-        Row("views with an executable grasp", "-", f"{len(planned)} of {len(cells)}", None, {}),
+        Row("views with an executable grasp", "-", f"{len(planned)} of {len(cells)}"),
         *judge_predictions(planned),
         *judge_order(planned),
         *judge_promise(planned),
@@ -112,26 +112,14 @@ def pull_at(
     contacts = ContactSpec(friction, table=Plane.horizontal(0.0))
     grasps = plan_grasps(cloud, model, contacts, spec.starts, spec.seed, task=protocol.task)
     good = grasps[grasps.status == Status.OK]
-    rest = (
-        [BEST + k for k in choose_rows(len(good) - BEST, OTHERS, "spread")]
-        if len(good) > BEST
-        else []
-    )
+    more = max(len(good) - BEST, 0)
+    rest = [BEST + k for k in choose_rows(more, OTHERS, "spread")] if more else []
     tried = list[tuple[int, float, bool]]()
     for rank in (*range(min(BEST, len(good))), *rest):
-        trial = GraspTrial(
-            model,
-            good[rank],
-            Truth(solid.mesh, solid.parts),
-            seed_of(spec.seed, subject.label, rank),
-        )
-        tried.append(
-            (
-                rank,
-                float(torch.sigmoid(good.score[rank])),
-                run_protocol(trial, protocol, rank).passed,
-            )
-        )
+        seed = seed_of(spec.seed, subject.label, rank)
+        trial = GraspTrial(model, good[rank], Truth(solid.mesh, solid.parts), seed)
+        predicted = float(torch.sigmoid(good.score[rank]))
+        tried.append((rank, predicted, run_protocol(trial, protocol, rank).passed))
     return len(good), tried
 
 
@@ -147,24 +135,16 @@ def judge_predictions(cells: list[Cell]) -> list[Row]:
             continue
         said = judge_trials(trials)
         bar = 0.04 if name == "all" else 0.08
-        text = f"{said['error']:.3f} of {len(trials)}: predicted {said['predicted']:.2f}, passed {said['passed']:.2f}"
-        rows.append(
-            Row(f"calibration error, {name}", f"<= {bar}", text, said["error"] <= bar, said)
-        )
+        error = said["error"]
+        text = f"{error:.3f} of {len(trials)}: predicted {said['predicted']:.2f}, passed {said['passed']:.2f}"
+        rows.append(Row(f"calibration error, {name}", f"<= {bar}", text, error <= bar, said))
     every = judge_trials([(cell.family, *x) for cell in cells for x in cell.tried])
     best = judge_trials([(cell.family, *x) for cell in cells for x in cell.best])
     for name, said, bar in (("20 best", best, 0.8), ("all ranks", every, 0.88)):
-        rows.append(
-            Row(
-                f"area under the curve, {name}",
-                f">= {bar}",
-                f"{said['auc']:.3f}",
-                said["auc"] >= bar,
-                {},
-            )
-        )
+        area = said["auc"]
+        rows.append(Row(f"area under the curve, {name}", f">= {bar}", f"{area:.3f}", area >= bar))
     bins = [f"{x.predicted:.2f}: {format_share(x.passed)}" for x in every["bins"]]
-    return [*rows, Row("predicted and passed", "-", "; ".join(bins), None, {})]
+    return [*rows, Row("predicted and passed", "-", "; ".join(bins))]
 
 
 def judge_trials(trials: Iterable[tuple[str, int, float, bool]]) -> dict[str, Any]:
@@ -183,17 +163,9 @@ def judge_order(cells: list[Cell]) -> list[Row]:
         (c.family, 100 * (c.best[0][2] - sum(x[2] for x in c.best) / len(c.best))) for c in cells
     ]
     gain = mean_over(gains)
-    rows = list[Row]()
     text = f"{gain.value:+.1f} [{gain.low:.1f}, {gain.high:.1f}] points of {gain.total} plans"
-    rows.append(
-        Row(
-            "best one over the mean of 20 best",
-            ">= +6 points",
-            text,
-            gain.value >= 6 and gain.low > 0,
-            {},
-        )
-    )
+    met = gain.value >= 6 and gain.low > 0
+    rows = [Row("best one over the mean of 20 best", ">= +6 points", text, met)]
     bars = {"solid": (95, 99), "shell": (90, 97), "thin": (80, 90)}
     for name, (one, two) in bars.items():
         mine = [cell for cell in cells if cell.group == name]
@@ -212,19 +184,12 @@ def judge_promise(cells: list[Cell]) -> list[Row]:
     """
     promise = find_promise(SHARE)
     if promise is None:
-        return [Row(f"promise {SHARE:g}", "a bound", "the trials support none", False, {})]
+        return [Row(f"promise {SHARE:g}", "a bound", "the trials support none", False)]
     least = float(torch.sigmoid(torch.tensor(promise.least)))
     kept = [cell for cell in cells if cell.best[0][1] >= least]
     refused = 100 * (1 - len(kept) / len(cells))
-    rows = [
-        Row(
-            f"promise {SHARE:g}: views refused",
-            "<= 15 %",
-            f"{refused:.1f} %",
-            refused <= 15,
-            {"least": least},
-        )
-    ]
+    what = f"promise {SHARE:g}: views refused"
+    rows = [Row(what, "<= 15 %", f"{refused:.1f} %", refused <= 15, {"least": least})]
     for name, mine in {"all": kept, **group_cells(kept)}.items():
         found = share_of(mine, lambda cell: cell.best[0][2])
         rows.append(bar_row(f"promise {SHARE:g}: held of returned, {name}", 100 * SHARE, found))
@@ -254,10 +219,5 @@ def share_of(cells: list[Cell], held: Callable[[Cell], bool]) -> Share:
 
 def bar_row(what: str, bar: float, found: Share) -> Row:
     """Return a row for a share of plans."""
-    return Row(
-        what,
-        f">= {bar:g} %",
-        format_share(found),
-        100 * found.value >= bar if found.total else None,
-        {},
-    )
+    met = 100 * found.value >= bar if found.total else None
+    return Row(what, f">= {bar:g} %", format_share(found), met)

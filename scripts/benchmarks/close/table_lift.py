@@ -35,13 +35,6 @@ BARS: dict[str, tuple[dict[str, Any], float, float]] = {
     "in place": ({}, 0.97, 0.92),
     "moved by up to 3 cm": ({"noise": PoseNoise(0.03)}, 0.93, 0.0),
     "moved by up to 5 cm": ({"noise": PoseNoise(0.05)}, 0.85, 0.0),
-    "moved by up to 5 cm in the approach": (
-        {"noise": PoseNoise(0.05), "displaced": "approach"},
-        0.85,
-        0.0,
-    ),
-    "moved by up to 3 cm, seen again": ({"noise": PoseNoise(0.03), "relook": True}, 0.93, 0.0),
-    "moved by up to 5 cm, seen again": ({"noise": PoseNoise(0.05), "relook": True}, 0.85, 0.0),
     "pushed with 2.5 N": ({"push": 2.5}, 0.95, 0.0),
 }
 """Conditions by name: changes of the protocol, and the project's bars for the shares risen and held
@@ -89,10 +82,8 @@ def table_lift(o: Options) -> list[Row]:
             protocol = dataclasses.replace(BASE, **changes)
             scores = lift(protocol, o.simulator, 1)
             what = f"{hand.name}, {name}"
-            found = [
-                _row(what, scores, least, strict),
-                *_by_distance(what, scores, protocol.noise, o.seed),
-            ]
+            found = [_row(what, scores, least, strict)]
+            found += _by_distance(what, scores, protocol.noise, o.seed)
             print(*found, sep="\n", flush=True)
             rows += found
     return rows
@@ -142,13 +133,8 @@ def _row(what: str, scores: Sequence[ViewScore], least: float, strict: float) ->
         for a in x.attempts
         if not a.held
     ]
-    numbers = {
-        "risen": risen["top1"],
-        "held": held["top1"],
-        "causes": risen["causes"],
-        "not held": lost,
-    }
-    return Row(what, bar, "; ".join(words), met, numbers)
+    numbers = {"risen": risen["top1"], "held": held["top1"], "causes": risen["causes"]}
+    return Row(what, bar, "; ".join(words), met, numbers | {"not held": lost})
 
 
 def _by_distance(
@@ -171,9 +157,8 @@ def _by_distance(
             share = share_over(count_by((score.unit, x.passed) for score, x in mine))
             met = None if least is None else share.value >= least
             bar = "" if least is None else f">= {least:.0%}"
-            yield Row(
-                f"{what}, {low} to {high} mm", bar, format_share(share), met, {"share": share}
-            )
+            where = f"{what}, {low} to {high} mm"
+            yield Row(where, bar, format_share(share), met, {"share": share})
 
 
 def _strict(score: ViewScore) -> ViewScore:
@@ -206,10 +191,5 @@ def _agree(hand: str, first: Sequence[ViewScore], second: Sequence[ViewScore]) -
         ]
         met = same.value >= LEAST_AGREED and abs(apart.value) <= MOST_APART
         bar = f">= {LEAST_AGREED:.0%}, within {100 * MOST_APART:.0f} points"
-        yield Row(
-            f"{hand}, same verdict, {kind}",
-            bar,
-            words,
-            met,
-            {"same": same, "apart": apart, "differ": differ},
-        )
+        numbers = {"same": same, "apart": apart, "differ": differ}
+        yield Row(f"{hand}, same verdict, {kind}", bar, words, met, numbers)

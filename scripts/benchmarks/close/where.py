@@ -95,12 +95,11 @@ def _compare(
         executable.append(len(good))
         seed = seed_of(spec.seed, subject.label)
         given: dict[str, Any] = {"parts": solid.parts, "surface": felt_surface(subject)}
-        done = (
-            close_hand(good[0], hand, solid.mesh, trial, seed, **given).status.name
-            if len(good)
-            else "NO_GRASP"
-        )
-        status.append(done)
+        if len(good):
+            done = close_hand(good[0], hand, solid.mesh, trial, seed, **given)
+            status.append(done.status.name)
+        else:
+            status.append("NO_GRASP")
     inside = int((region(contacts) < 0).sum()) if len(contacts) else 0
     told = "upper half" if upper else "end"
     pairs: Any = [tuple(x) for x in (executable, status, seconds)]
@@ -146,15 +145,9 @@ def _rows(hand: str, found: Sequence[Found]) -> list[Row]:
         for name in ("executable", "seconds")
     )
     more = f"{grasps[0]} executable grasps free, {grasps[1]} kept; {seconds[0]:.0f} and {seconds[1]:.0f} s of planning"
+    near = change.value >= -0.03
+    found_inside = f"{inside} of {contacts}; {more}"
     return [
-        Row(
-            f"held, {hand}", "within 3 points of free", text, change.value >= -0.03, {"lost": lost}
-        ),
-        Row(
-            f"contacts inside, {hand}",
-            "100 %",
-            f"{inside} of {contacts}; {more}",
-            inside == contacts > 0,
-            {},
-        ),
+        Row(f"held, {hand}", "within 3 points of free", text, near, {"lost": lost}),
+        Row(f"contacts inside, {hand}", "100 %", found_inside, inside == contacts > 0),
     ]

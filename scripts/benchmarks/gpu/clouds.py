@@ -35,20 +35,12 @@ def plan_clouds(o: Options) -> list[Row]:
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     hand = load_hand(o.hands[0])
     workers = max(o.workers, 1)
-    rows = list[Row]()
     packed = run_tasks(see_view, [(k,) for k in range(max(o.batches))], workers, 600.0)
     seen: list[PointCloud] = [unpack(x) for x in packed]
     requests = [Request(cloud, hand, SPEC, o.starts) for cloud in seen]
     objects, shaped = timed(lambda: list(estimate_shapes(requests, workers)))
-    rows.append(
-        Row(
-            f"shapes of {len(seen)} clouds, {workers} processes",
-            "-",
-            f"{shaped:.1f} s",
-            None,
-            {"s": shaped},
-        )
-    )
+    what = f"shapes of {len(seen)} clouds, {workers} processes"
+    rows = [Row(what, "-", f"{shaped:.1f} s", numbers={"s": shaped})]
     plan_at_once(requests[:2], objects[:2], device)  # what a process keeps is made before
     call = partial(plan_grasps, hand=hand, spec=SPEC, starts=o.starts, workers=workers)
     for count in sorted(o.batches):
@@ -68,12 +60,8 @@ def see_view(k: int) -> Any:
     """Return a view of a shipped object with few points, packed, for another process."""
     torch.set_num_threads(1)
     cloud = views(1, k)[0]
-    rows = (
-        torch.randperm(len(cloud), generator=torch.Generator().manual_seed(k))[:POINTS]
-        .sort()
-        .values
-    )
-    return pack(cloud.select(rows))
+    mixed = torch.randperm(len(cloud), generator=torch.Generator().manual_seed(k))
+    return pack(cloud.select(mixed[:POINTS].sort().values))
 
 
 @checked
@@ -115,13 +103,8 @@ def compare(what: str, alone: list[Grasps], together: list[Grasps]) -> Row:
         for one, other in pairs
     )
     text = f"status in {status} of {every} rows, joints and pose in {same}"
-    return Row(
-        what,
-        "the same in all rows",
-        text,
-        status == every,
-        {"rows": every, "status": status, "same": same},
-    )
+    found = {"rows": every, "status": status, "same": same}
+    return Row(what, "the same in all rows", text, status == every, found)
 
 
 def numbers(grasps: Grasps) -> Tensor:

@@ -46,15 +46,8 @@ def count_launches(o: Options) -> list[Row]:
             size: say([n.by_stage(kind)[stage] / size for kind in KINDS])
             for size, n in found.items()
         }
-        rows.append(
-            Row(
-                f"stage {stage}",
-                "-",
-                "; ".join(f"batch {b}: {x}" for b, x in texts.items()),
-                None,
-                {"batches": texts},
-            )
-        )
+        text = "; ".join(f"batch {b}: {x}" for b, x in texts.items())
+        rows.append(Row(f"stage {stage}", "-", text, numbers={"batches": texts}))
     size, last = list(found.items())[-1]
     return rows + [lines_row(kind, last.most(kind, 10), size) for kind in KINDS]
 
@@ -87,13 +80,8 @@ def say(counts: Iterable[float]) -> str:
 def batch_row(size: int, counted: Launches, hand: Hand, starts: int) -> Row:
     """Return the row of a batch of clouds that are planned at once."""
     each = {kind: counted.total(kind) / size for kind in KINDS}
-    return Row(
-        f"{size} clouds at once; {hand.name}, {starts} starts; for each cloud",
-        "-",
-        say(each.values()),
-        None,
-        each,
-    )
+    what = f"{size} clouds at once; {hand.name}, {starts} starts; for each cloud"
+    return Row(what, "-", say(each.values()), numbers=each)
 
 
 def lines_row(kind: str, lines: list[tuple[Place, int]], size: int) -> Row:

@@ -5,6 +5,7 @@ boards.
 import dataclasses
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -115,10 +116,17 @@ def rooms(
     )
 
 
-Furniture = tuple[list[tuple[str, trimesh.Trimesh]], float, tuple, tuple[float, float, float]]
-"""Named parts, the radius [m] of the circle that things stand in, the view (azimuths, elevations
-[deg], distances [m]) and the tilt of the support about the origin as a rotation vector.
-"""
+class Furniture(NamedTuple):
+    """Named parts, the radius [m] of the circle that things stand in, and the limits of the view
+    (azimuths, elevations [deg], distances [m]).
+
+    `tilt` turns the support about the origin, as a rotation vector.
+    """
+
+    parts: list[tuple[str, trimesh.Trimesh]]
+    radius: float
+    view: tuple[tuple[float, float], ...]
+    tilt: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 def _round(rng: np.random.Generator) -> Furniture:
@@ -127,12 +135,8 @@ def _round(rng: np.random.Generator) -> Furniture:
     top = trimesh.creation.cylinder(radius, 0.02, sections=64).apply_translation([0, 0, -0.01])
     leg = _box([0.06, 0.06, high - 0.02], [0, 0, -high / 2 - 0.01])
     chair = _box([0.4, 0.4, 0.05], [-0.9, rng.uniform(-0.5, 0.5), -0.3])
-    return (
-        [("table", top), ("leg", leg), ("floor", _floor(-high)), ("chair", chair)],
-        radius - 0.06,
-        ((0, 360), (28, 50), (0.7, 1.1)),
-        (0.0, 0.0, 0.0),
-    )
+    parts = [("table", top), ("leg", leg), ("floor", _floor(-high)), ("chair", chair)]
+    return Furniture(parts, radius - 0.06, ((0, 360), (28, 50), (0.7, 1.1)))
 
 
 def _rectangular(rng: np.random.Generator) -> Furniture:
@@ -141,7 +145,7 @@ def _rectangular(rng: np.random.Generator) -> Furniture:
     high = rng.uniform(0.4, 0.75)
     top = _box([wide, long, 0.03], [0, 0, -0.015])
     parts = [("table", top), ("floor", _floor(-high)), ("wall", _wall(-rng.uniform(0.8, 1.4)))]
-    return parts, wide / 2 - 0.03, ((-45, 45), (25, 50), (0.7, 1.1)), (0.0, 0.0, 0.0)
+    return Furniture(parts, wide / 2 - 0.03, ((-45, 45), (25, 50), (0.7, 1.1)))
 
 
 def _holes(rng: np.random.Generator) -> Furniture:
@@ -149,26 +153,16 @@ def _holes(rng: np.random.Generator) -> Furniture:
     hole = 0.03
     cells = np.arange(-4, 5) * step
     strips = [_box([step - hole, 0.9, 0.01], [x + step / 2, 0, -0.005]) for x in cells[:-1]]
-    bars = [
-        _box([hole, step - hole, 0.01], [x, y + step / 2, -0.005])
-        for x in cells
-        for y in cells[:-1]
-    ]
-    top = _join(*strips, *bars)
-    return (
-        [("table", top), ("floor", _floor(-0.5))],
-        0.25,
-        ((0, 360), (35, 55), (0.6, 0.9)),
-        (0.0, 0.0, 0.0),
-    )
+    places = [[x, y + step / 2, -0.005] for x in cells for y in cells[:-1]]
+    bars = [_box([hole, step - hole, 0.01], place) for place in places]
+    parts = [("table", _join(*strips, *bars)), ("floor", _floor(-0.5))]
+    return Furniture(parts, 0.25, ((0, 360), (35, 55), (0.6, 0.9)))
 
 
 def _wall_table(rng: np.random.Generator) -> Furniture:
-    parts = [
-        ("table", _box([0.7, 1.4, 0.03], [0, 0, -0.015])),
-        ("wall", _wall(-rng.uniform(0.25, 0.34))),
-    ]
-    return parts, 0.22, ((-35, 35), (25, 45), (0.6, 0.9)), (0.0, 0.0, 0.0)
+    top = _box([0.7, 1.4, 0.03], [0, 0, -0.015])
+    parts = [("table", top), ("wall", _wall(-rng.uniform(0.25, 0.34)))]
+    return Furniture(parts, 0.22, ((-35, 35), (25, 45), (0.6, 0.9)))
 
 
 def _bin(rng: np.random.Generator) -> Furniture:
@@ -179,45 +173,37 @@ def _bin(rng: np.random.Generator) -> Furniture:
     sides += [_box([wide, 0.01, high], [0, y * long / 2, high / 2]) for y in (-1, 1)]
     parts = [("table", _box([wide, long, 0.01], [0, 0, -0.005])), ("bin", _join(*sides))]
     parts.append(("floor", _floor(-rng.choice([0.02, 0.5]))))
-    return parts, wide / 2 - 0.04, ((0, 360), (50, 70), (0.6, 0.9)), (0.0, 0.0, 0.0)
+    return Furniture(parts, wide / 2 - 0.04, ((0, 360), (50, 70), (0.6, 0.9)))
 
 
 def _shelf(rng: np.random.Generator) -> Furniture:
     gap = rng.uniform(0.35, 0.45)
-    parts = [
-        ("table", _box([0.35, 0.9, 0.02], [0, 0, -0.01])),
-        ("board", _box([0.35, 0.9, 0.02], [0, 0, gap + 0.01])),
-    ]
-    parts += [
-        ("wall", _wall(-0.18)),
-        ("side", _box([0.35, 0.02, gap], [0, 0.44, gap / 2])),
-        ("floor", _floor(-0.6)),
-    ]
-    return parts, 0.15, ((-30, 30), (15, 25), (0.6, 0.9)), (0.0, 0.0, 0.0)
+    top = _box([0.35, 0.9, 0.02], [0, 0, -0.01])
+    board = _box([0.35, 0.9, 0.02], [0, 0, gap + 0.01])
+    side = _box([0.35, 0.02, gap], [0, 0.44, gap / 2])
+    parts = [("table", top), ("board", board), ("wall", _wall(-0.18)), ("side", side)]
+    parts.append(("floor", _floor(-0.6)))
+    return Furniture(parts, 0.15, ((-30, 30), (15, 25), (0.6, 0.9)))
 
 
 def _board(rng: np.random.Generator) -> Furniture:
     angle = math.radians(rng.uniform(8, 20))
     way = rng.uniform(0, 2 * math.pi)
     tilt = (angle * math.cos(way), angle * math.sin(way), 0.0)
-    parts = [
-        ("table", _box([0.55, 0.75, 0.015], [0, 0, -0.0075])),
-        ("floor", _floor(-rng.uniform(0.2, 0.6))),
-    ]
-    return parts, 0.24, ((0, 360), (35, 55), (0.6, 0.9)), tilt
+    top = _box([0.55, 0.75, 0.015], [0, 0, -0.0075])
+    parts = [("table", top), ("floor", _floor(-rng.uniform(0.2, 0.6)))]
+    return Furniture(parts, 0.24, ((0, 360), (35, 55), (0.6, 0.9)), tilt)
 
 
 def _ground(rng: np.random.Generator) -> Furniture:
     parts = [("table", _box([3, 3, 0.01], [0, 0, -0.005])), ("wall", _wall(-rng.uniform(0.6, 1.2)))]
-    return parts, 0.25, ((-45, 45), (30, 55), (0.7, 1.0)), (0.0, 0.0, 0.0)
+    return Furniture(parts, 0.25, ((-45, 45), (30, 55), (0.7, 1.0)))
 
 
 def _above(rng: np.random.Generator) -> Furniture:
-    parts = [
-        ("table", _box([0.9, 0.9, 0.03], [0, 0, -0.015])),
-        ("floor", _floor(-rng.uniform(0.4, 0.75))),
-    ]
-    return parts, 0.22, ((0, 360), (78, 89), (0.6, 0.9)), (0.0, 0.0, 0.0)
+    top = _box([0.9, 0.9, 0.03], [0, 0, -0.015])
+    parts = [("table", top), ("floor", _floor(-rng.uniform(0.4, 0.75)))]
+    return Furniture(parts, 0.22, ((0, 360), (78, 89), (0.6, 0.9)))
 
 
 KINDS: dict[str, Callable[[np.random.Generator], Furniture]] = {
@@ -299,29 +285,19 @@ def _ball(rng: np.random.Generator) -> trimesh.Trimesh:
 
 def _vessel(bottom: float, top: float, high: float, wall: float = 0.004) -> trimesh.Trimesh:
     """Return an open vessel with straight sides; its inside is seen from above."""
-    profile = [
-        [0, 0],
-        [bottom, 0],
-        [top, high],
-        [top - wall, high],
-        [bottom - wall, wall],
-        [0, wall],
-    ]
-    return trimesh.creation.revolve(np.array(profile), sections=64)
+    outside = [[0, 0], [bottom, 0], [top, high]]
+    inside = [[top - wall, high], [bottom - wall, wall], [0, wall]]
+    return trimesh.creation.revolve(np.array(outside + inside), sections=64)
 
 
 def _mug(rng: np.random.Generator) -> trimesh.Trimesh:
     radius = rng.uniform(0.035, 0.045)
     high = rng.uniform(0.08, 0.11)
-    handle = trimesh.creation.torus(0.5 * high - 0.01, 0.006).apply_transform(
-        rigid(
-            rotation_from_vector(torch.tensor([math.pi / 2, 0.0, 0.0]).double()),
-            torch.zeros(3).double(),
-        ).numpy()
-    )
-    handle = handle.slice_plane([0, 0, 0], [1, 0, 0]).apply_translation(
-        [radius - 0.003, 0, high / 2]
-    )
+    quarter = rotation_from_vector(torch.tensor([math.pi / 2, 0.0, 0.0]).double())
+    ring = trimesh.creation.torus(0.5 * high - 0.01, 0.006)
+    ring.apply_transform(rigid(quarter, torch.zeros(3).double()).numpy())
+    handle = ring.slice_plane([0, 0, 0], [1, 0, 0])
+    handle.apply_translation([radius - 0.003, 0, high / 2])
     mug = _join(_vessel(radius, radius, high), handle)
     return mug.apply_transform(
         trimesh.transformations.rotation_matrix(rng.uniform(0, 2 * math.pi), [0, 0, 1])
@@ -341,15 +317,9 @@ def _glass(rng: np.random.Generator) -> trimesh.Trimesh:
 def _bottle(rng: np.random.Generator) -> trimesh.Trimesh:
     radius = rng.uniform(0.03, 0.042)
     high = rng.uniform(0.16, 0.24)
-    profile = [
-        [0, 0],
-        [radius, 0],
-        [radius, 0.6 * high],
-        [0.013, 0.8 * high],
-        [0.013, high],
-        [0, high],
-    ]
-    return trimesh.creation.revolve(np.array(profile), sections=48)
+    body = [[0, 0], [radius, 0], [radius, 0.6 * high]]
+    neck = [[0.013, 0.8 * high], [0.013, high], [0, high]]
+    return trimesh.creation.revolve(np.array(body + neck), sections=48)
 
 
 def _ring(rng: np.random.Generator) -> trimesh.Trimesh:
