@@ -10,7 +10,7 @@ from torchgrasp.cloud.agreement import check_foot
 from torchgrasp.cloud.neighbours import find_inliers, nearest
 from torchgrasp.cloud.parts import LAYER, find_second_body
 from torchgrasp.cloud.prepare import FACING, share_facing
-from torchgrasp.cloud.viewpoint import MAX_BEHIND, MAX_EDGE_ON, share_unseen
+from torchgrasp.cloud.viewpoint import UNSEEN, share_unseen
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.errors import BadArgument, NoSupport
 from torchgrasp.foundation.lazy import spatial
@@ -133,12 +133,12 @@ def _judge_camera(clean: PointCloud, given: bool) -> list[Advice]:
             shares = share_unseen(
                 view.points.double(), view.normals.double(), view.viewpoint.double()
             )
-            worst = max(worst, shares, key=lambda s: max(s[0] / MAX_EDGE_ON, s[1] / MAX_BEHIND))
+            worst = max(worst, shares, key=lambda s: max(UNSEEN.excess(s)))
     edge_on, behind = worst
-    if edge_on <= MAX_EDGE_ON and behind <= MAX_BEHIND:
+    if max(UNSEEN.excess(worst)) <= 1:
         return []
     what = f"has {behind:.0%} of them behind others"
-    if edge_on / MAX_EDGE_ON > behind / MAX_BEHIND:
+    if UNSEEN.excess(worst)[0] > UNSEEN.excess(worst)[1]:
         what = f"sees {edge_on:.0%} of them edge-on"
     if given:
         found = f"a viewpoint that the points contradict: a camera there {what}"

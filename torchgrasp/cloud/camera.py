@@ -1,5 +1,6 @@
 """A virtual depth camera, exact or with the noise of a real camera."""
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from typing import Annotated
@@ -28,6 +29,21 @@ INTRINSICS = torch.tensor(
     [[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1]], dtype=torch.float64
 )
 """Intrinsics [px] of the default camera."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RenderNumbers:
+    """What a virtual camera renders."""
+
+    nearest: float = 1e-3
+    """A mesh has a box in the image only if all of it is farther than this from the camera [m]."""
+    margin: float = 1e-2
+    """Width [focal lengths] of the margin about that box, for rounding."""
+    table: float = 0.6
+    """Radius [m] of the table."""
+
+
+RENDER = RenderNumbers()
 
 
 @checked
@@ -113,9 +129,7 @@ def cast_mesh(mesh: "trimesh.Trimesh", obj_from_camera: Transform) -> tuple[Imag
     """
     if not len(mesh.faces):
         raise MeshError("mesh", "no faces", "a mesh with a surface")
-    row, column = torch.meshgrid(
-        torch.arange(HEIGHT).double(), torch.arange(WIDTH).double(), indexing="ij"
-    )
+    row, column = _pixels()
     x = (column - INTRINSICS[0, 2]) / FOCAL
     y = (row - INTRINSICS[1, 2]) / FOCAL
     rays = torch.stack([x, y, torch.ones_like(x)], -1)
@@ -138,6 +152,13 @@ def cast_mesh(mesh: "trimesh.Trimesh", obj_from_camera: Transform) -> tuple[Imag
     return images[0], images[1]
 
 
+def _pixels() -> tuple[Image, Image]:
+    """Return the row and the column of each pixel of the default camera."""
+    sides = (torch.arange(n).double() for n in (HEIGHT, WIDTH))
+    row, column = torch.meshgrid(*sides, indexing="ij")
+    return row, column
+
+
 def _in_image_box(
     mesh: "trimesh.Trimesh", obj_from_camera: Transform, x: Image, y: Image
 ) -> Bool[Tensor, "h w"]:
@@ -146,17 +167,12 @@ def _in_image_box(
     """
     vertices = torch.from_numpy(np.array(mesh.vertices, dtype=np.float64))
     u, v, depth = apply(inverse(obj_from_camera), vertices).unbind(-1)
-    if float(depth.min()) <= 1e-3:
+    if float(depth.min()) <= RENDER.nearest:
         return torch.ones_like(x, dtype=torch.bool)
     u = u / depth
     v = v / depth
-    margin = 1e-2
-    return (
-        (x >= u.min() - margin)
-        & (x <= u.max() + margin)
-        & (y >= v.min() - margin)
-        & (y <= v.max() + margin)
-    )
+    wide = (x >= u.min() - RENDER.margin) & (x <= u.max() + RENDER.margin)
+    return wide & (y >= v.min() - RENDER.margin) & (y <= v.max() + RENDER.margin)
 
 
 def render_depth(
@@ -179,9 +195,8 @@ def render_depth(
     cosine = torch.zeros_like(depth)
     labels = torch.zeros(HEIGHT, WIDTH, dtype=torch.int64)
     layers = [(0, *_cast_table(table, pose))] if table is not None else []
-    for label, z, against in layers + [
-        (k + 1, *cast_mesh(mesh, pose)) for k, mesh in enumerate(meshes)
-    ]:
+    layers += [(k + 1, *cast_mesh(mesh, pose)) for k, mesh in enumerate(meshes)]
+    for label, z, against in layers:
         nearer = (z > 0) & (z < depth)
         depth = torch.where(nearer, z, depth)
         cosine = torch.where(nearer, against, cosine)
@@ -196,14 +211,12 @@ def _cast_table(height: float, obj_from_camera: Transform) -> tuple[Image, Image
     """Return the table's depth image [m], and |cosine| between ray and normal; both are 0 where a
     ray misses.
     """
-    row, column = torch.meshgrid(
-        torch.arange(HEIGHT).double(), torch.arange(WIDTH).double(), indexing="ij"
-    )
+    row, column = _pixels()
     rays = torch.stack([column, row, torch.ones_like(row)], -1) @ torch.linalg.inv(INTRINSICS).T
     direction = rotate(obj_from_camera, rays)
     origin = obj_from_camera[:3, 3]
     depth = (height - origin[2]) / direction[..., 2]
     where = origin[:2] + depth[..., None] * direction[..., :2]
-    met = (depth > 0) & (torch.linalg.vector_norm(where, dim=-1) < 0.6)
+    met = (depth > 0) & (torch.linalg.vector_norm(where, dim=-1) < RENDER.table)
     cosine = direction[..., 2].abs() / torch.linalg.vector_norm(direction, dim=-1)
     return torch.where(met, depth, 0.0), torch.where(met, cosine, 0.0)

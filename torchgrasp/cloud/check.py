@@ -2,6 +2,7 @@
 clouds.
 """
 
+import dataclasses
 from typing import Annotated
 
 import torch
@@ -20,6 +21,27 @@ MIN_POINTS = 4  # fewest distinct points from which a surface can be estimated
 FEW_POINTS = 100  # fewer points are a speck of noise, or too coarse for a shape
 
 
+@dataclasses.dataclass(frozen=True)
+class CloudNumbers:
+    """When points coincide or lie on a line, and of what unit an extent [m] may be."""
+
+    sample: int = 20_000
+    """About as many points mostly show that enough are distinct."""
+    coincident: float = 1e-9
+    """Greatest distance of coincident points, over the cloud's extent: above rounding, below any
+    sensor's resolution.
+    """
+    line: float = 1e-6
+    """Points are on a line if the second spread is less than this, over the first."""
+    scene: float = 10.0
+    """A smaller extent is that of a scene, or in cm."""
+    longest: float = 45.0
+    """A smaller extent is in cm, of an object of 45 cm at most; a larger one is in mm."""
+
+
+CLOUD = CloudNumbers()
+
+
 @checked
 def check_cloud(cloud: PointCloud) -> PointCloud:
     """Return the cloud itself if it is fit for grasp planning, else raise an error. A flat cloud is
@@ -36,7 +58,7 @@ def check_cloud(cloud: PointCloud) -> PointCloud:
     True
     """
     points = _check(cloud)
-    rows = _distinct_rows(points[:: max(1, len(points) // 20_000)])  # a sample mostly suffices
+    rows = _distinct_rows(points[:: max(1, len(points) // CLOUD.sample)])
     _check_distinct(points, rows if len(rows) >= MIN_POINTS else _distinct_rows(points))
     return cloud
 
@@ -72,11 +94,8 @@ def voxel_downsample(cloud: PointCloud, voxel: Annotated[float, Range(1e-5, 1.0)
     order = torch.argsort(torch.linalg.vector_norm(place - cell - 0.5, dim=-1), stable=True)
     rows = order[first_of_each(group[order])].sort().values
     if len(rows) < MIN_POINTS:
-        raise TooFewPoints(
-            "points",
-            f"{len(rows)} voxels of {voxel:g} m",
-            f"points in at least {MIN_POINTS} voxels",
-        )
+        found = f"{len(rows)} voxels of {voxel:g} m"
+        raise TooFewPoints("points", found, f"points in at least {MIN_POINTS} voxels")
     return cloud.select(rows)
 
 
@@ -100,11 +119,10 @@ def _check_distinct(points: Float[Tensor, "n 3"], rows: Int[Tensor, "m"]) -> Non
     lie on a line.
     """
     if len(rows) < MIN_POINTS:
-        raise TooFewPoints(
-            "points", f"{len(rows)} distinct points", f"at least {MIN_POINTS} distinct points"
-        )
+        allowed = f"at least {MIN_POINTS} distinct points"
+        raise TooFewPoints("points", f"{len(rows)} distinct points", allowed)
     spread = torch.linalg.svdvals((points - points.mean(0)).double())
-    if float(spread[1]) < 1e-6 * float(spread[0]):
+    if float(spread[1]) < CLOUD.line * float(spread[0]):
         raise BadArgument("points", f"{len(points)} points on one line", "points of a surface")
 
 
@@ -115,20 +133,17 @@ def _check(cloud: PointCloud) -> Float[Tensor, "n 3"]:
     points = cloud.points
     extent = float((points.amax(0) - points.amin(0)).max())
     if extent == 0.0:
-        raise BadArgument(
-            "points", f"{len(points)} points that all coincide", "points of a surface"
-        )
+        found = f"{len(points)} points that all coincide"
+        raise BadArgument("points", found, "points of a surface")
     if not MIN_EXTENT <= extent <= MAX_EXTENT:
         allowed = f"an extent of {MIN_EXTENT:g} to {MAX_EXTENT:g} metres"
-        raise SuspiciousScale(
-            "points", f"{extent:.4g} m; is this cloud {_guess_unit(extent)}?", allowed
-        )
+        found = f"{extent:.4g} m; is this cloud {_guess_unit(extent)}?"
+        raise SuspiciousScale("points", found, allowed)
     if cloud.normals is not None:
         zero = int((torch.linalg.vector_norm(cloud.normals, dim=-1) == 0).sum())
         if zero:
-            raise BadArgument(
-                "normals", f"{zero} normals of length zero", "normals with a direction"
-            )
+            found = f"{zero} normals of length zero"
+            raise BadArgument("normals", found, "normals with a direction")
     return points
 
 
@@ -138,10 +153,10 @@ def _guess_unit(extent: float) -> str:
     """
     if extent < MIN_EXTENT:
         return "normalised"
-    if extent < 10:
-        return f"a whole scene (torchgrasp cloud cut), or in cm ({extent / 100:.3g} m: --unit cm)"
-    unit, scale = ("cm", 100) if extent < 45 else ("mm", 1000)
-    return f"in {unit} ({extent / scale:.3g} m: --unit {unit})"
+    in_cm = f"in cm ({extent / 100.0:.3g} m: --unit cm)"
+    if extent < CLOUD.scene:
+        return f"a whole scene (torchgrasp cloud cut), or {in_cm}"
+    return in_cm if extent < CLOUD.longest else f"in mm ({extent / 1000.0:.3g} m: --unit mm)"
 
 
 def _distinct_rows(points: Float[Tensor, "n 3"]) -> Int[Tensor, "m"]:
@@ -150,20 +165,16 @@ def _distinct_rows(points: Float[Tensor, "n 3"]) -> Int[Tensor, "m"]:
     """
     points = points.detach().double()
     low = points.amin(0)
-    tolerance = 1e-9 * float(
-        (points.amax(0) - low).max()
-    )  # above rounding, below any sensor's resolution
+    tolerance = CLOUD.coincident * float((points.amax(0) - low).max())
     # Points that share a cell of half the tolerance coincide: one point a cell leaves few pairs
     # among many copies.
-    _, group = torch.unique(
-        torch.floor((points - low) / (tolerance / 2)), dim=0, return_inverse=True
-    )
+    cells = torch.floor((points - low) / (tolerance / 2))
+    _, group = torch.unique(cells, dim=0, return_inverse=True)
     rows = first_of_each(group).sort().values
     pairs = spatial.KDTree(points[rows].cpu().numpy()).query_pairs(tolerance, output_type="ndarray")
+    # The first index of a pair is the smaller one, which is kept.
     keep = torch.ones(len(rows), dtype=torch.bool, device=rows.device)
-    keep[torch.from_numpy(pairs[:, 1]).to(rows.device)] = (
-        False  # the first index of a pair is the smaller one
-    )
+    keep[torch.from_numpy(pairs[:, 1]).to(rows.device)] = False
     return rows[keep]
 
 
@@ -172,6 +183,5 @@ def first_of_each(group: Int[Tensor, "n"]) -> Int[Tensor, "groups"]:
     group number.
     """
     order = torch.arange(len(group), device=group.device)
-    return torch.full_like(order, len(order)).scatter_reduce(0, group, order, "amin")[
-        : int(group.max()) + 1
-    ]
+    first = torch.full_like(order, len(order)).scatter_reduce(0, group, order, "amin")
+    return first[: int(group.max()) + 1]

@@ -2,6 +2,7 @@
 each point.
 """
 
+import dataclasses
 import math
 
 import numpy as np
@@ -11,6 +12,33 @@ from torch import Tensor
 
 from torchgrasp.foundation.lazy import spatial
 from torchgrasp.geometry.linalg import Points, unit
+
+
+@dataclasses.dataclass(frozen=True)
+class NeighbourNumbers:
+    """How many neighbours of a point are looked at, the point itself included, and how."""
+
+    spacing: int = 9
+    """Neighbours for the spacing: a raster's eight, more than fly off a rim together."""
+    outlier: float = 2.5
+    """An outlier is farther from them than so many medians; depth and slope vary views less."""
+    plane: int = 25
+    """About eight for each of a plane's three unknowns."""
+    quadric: int = 30
+    """Five for each of a quadric's six unknowns."""
+    width: float = 0.7
+    """Width of the weights of neighbours, over the distance of the farthest."""
+    ridge: float = 1e-3
+    """Weight of flatness beside that of the points: it decides only where points are few."""
+    block: int = 1 << 14
+    """Points whose quadrics are fitted at once: bounds the memory for clouds of any size."""
+    flat: int = 2000
+    """Most points that tell whether a cloud is flat."""
+    thin: float = 1e-3
+    """A cloud without noise is flat below this thickness, over its length."""
+
+
+NEAR = NeighbourNumbers()
 
 
 def draw_rows(count: int, most: int) -> Int[Tensor, "m"]:
@@ -33,33 +61,27 @@ def nearest(
     array = points.detach().cpu().numpy()
     asked = array if rows is None else array[rows.cpu().numpy()]
     distance, index = spatial.KDTree(array).query(asked, k=min(k, len(array)))
-    return torch.from_numpy(distance).to(points), torch.from_numpy(
-        np.asarray(index, dtype=np.int64)
-    ).to(points.device)
+    places = torch.from_numpy(np.asarray(index, dtype=np.int64))
+    return torch.from_numpy(distance).to(points), places.to(points.device)
 
 
 def find_inliers(points: Points, rows: Int[Tensor, "m"] | None = None) -> Bool[Tensor, "m"]:
     """Return a mask of the given points (by default all points) that are not outliers; see
     `remove_outliers`.
     """
-    spacing = nearest(points, 9, rows)[0][:, 1:].mean(
-        -1
-    )  # to eight: more than fly off a rim together
-    return (
-        spacing <= 2.5 * spacing.median()
-    )  # the spacing of real views varies less, with depth and slope
+    spacing = nearest(points, NEAR.spacing, rows)[0][:, 1:].mean(-1)
+    return spacing <= NEAR.outlier * spacing.median()
 
 
 def is_flat(points: Points) -> bool:
     """Return whether a cloud is no thicker than its noise: twice the error of quadrics around the
     points.
     """
-    points = points[draw_rows(len(points), 2000).to(points.device)].double()
+    points = points[draw_rows(len(points), NEAR.flat).to(points.device)].double()
     points = points[find_inliers(points)]
-    thickness, _, length = (
-        (torch.linalg.svdvals(points - points.mean(0)) / math.sqrt(len(points))).sort().values
-    )
-    return float(thickness) < max(2 * float(fit_quadrics(points)[2].median()), 1e-3 * float(length))
+    spread = torch.linalg.svdvals(points - points.mean(0)) / math.sqrt(len(points))
+    thickness, _, length = spread.sort().values.tolist()
+    return thickness < max(2 * float(fit_quadrics(points)[2].median()), NEAR.thin * length)
 
 
 def fit_local_planes(
@@ -68,7 +90,7 @@ def fit_local_planes(
     """Fit a plane around each point in `rows`, by default each point; return normals of any sign
     and rms errors [m].
     """
-    distance, index = nearest(points, 25, rows)  # about eight for each of a plane's three unknowns
+    distance, index = nearest(points, NEAR.plane, rows)
     mean_squares, axes = _principal_axes(points[index], _weigh(distance))
     return axes[..., 0], mean_squares[:, 0].clamp_min(0).sqrt()
 
@@ -80,13 +102,11 @@ def fit_quadrics(points: Points) -> tuple[Points, Points, Float[Tensor, "n"]]:
     Planes would move the points of a ball of radius r inward by s^2 / 2r, where s is the
     neighbours' spread.
     """
-    block = 1 << 14  # bounds the memory for clouds of any size
-    distance, index = nearest(points, 30)  # five for each of a quadric's six unknowns
-    blocks = zip(points.split(block), distance.split(block), index.split(block), strict=True)
-    feet, normals, rms = zip(
-        *(_fit_block(at, points[rows], _weigh(d)) for at, d, rows in blocks), strict=True
-    )
-    return torch.cat(feet), torch.cat(normals), torch.cat(rms)
+    whole = (points, *nearest(points, NEAR.quadric))
+    blocks = zip(*(x.split(NEAR.block) for x in whole), strict=True)
+    fits = [_fit_block(at, points[rows], _weigh(distance)) for at, distance, rows in blocks]
+    feet, normals, rms = map(torch.cat, zip(*fits, strict=True))
+    return feet, normals, rms
 
 
 def _fit_block(
@@ -96,30 +116,29 @@ def _fit_block(
     weights.
     """
     _, axes = _principal_axes(near, weight)
-    height, u, v = ((near - points[:, None]) @ axes).unbind(-1)
+    height, u, v = ((near - points[:, None]) @ axes).unbind(-1)  # (m, k) each
     size = torch.stack([u, v], -1).norm(dim=-1).amax(-1, keepdim=True)
     u = u / size
     v = v / size
     terms = torch.stack([torch.ones_like(u), u, v, u * u, u * v, v * v], -1)
     weighted = weight[..., None] * terms
-    flat = 1e-3 * torch.tensor([0.0, 1.0, 1.0, 1.0, 1.0, 1.0]).to(
-        points
-    )  # decides only where points are few
+    flat = NEAR.ridge * torch.tensor([0.0, 1.0, 1.0, 1.0, 1.0, 1.0]).to(points)
     moments = weighted.transpose(-1, -2) @ terms + torch.diag_embed(flat)
-    quadric = torch.linalg.solve(moments, (weighted * height[..., None]).sum(-2))
+    quadric = torch.linalg.solve(moments, (weighted * height[..., None]).sum(-2))  # (m, 6)
     residual = height - (terms * quadric[:, None]).sum(-1)
-    gradient = torch.stack(
-        [torch.ones_like(size[:, 0]), -quadric[:, 1] / size[:, 0], -quadric[:, 2] / size[:, 0]], -1
-    )
+    # The surface is where height - quadric is 0: its gradient there is the normal.
+    slope = -quadric[:, 1:3] / size
+    gradient = torch.cat([torch.ones_like(size), slope], -1)
+    normals = unit((axes @ gradient[..., None])[..., 0])
     feet = points + quadric[:, :1] * axes[..., 0]
-    return feet, unit((axes @ gradient[..., None])[..., 0]), (weight * residual**2).sum(-1).sqrt()
+    return feet, normals, (weight * residual**2).sum(-1).sqrt()
 
 
 def _weigh(distance: Float[Tensor, "m k"]) -> Float[Tensor, "m k"]:
     """Return the weights exp(-(d / 0.7 d_k)^2) of neighbours, scaled to sum 1; d_k is the farthest
     distance d.
     """
-    weight = torch.exp(-((distance / (0.7 * distance[:, -1:])) ** 2))
+    weight = torch.exp(-((distance / (NEAR.width * distance[:, -1:])) ** 2))
     return weight / weight.sum(-1, keepdim=True)
 
 
@@ -130,4 +149,5 @@ def _principal_axes(
     axes as columns.
     """
     difference = near - (weight[..., None] * near).sum(1)[:, None]
-    return torch.linalg.eigh((weight[..., None] * difference).transpose(-1, -2) @ difference)
+    moments = (weight[..., None] * difference).transpose(-1, -2) @ difference  # (n, 3, 3)
+    return torch.linalg.eigh(moments)

@@ -24,6 +24,42 @@ FACING = 0.9  # least share of a view's normals that face the camera; noise turn
 MAX_POINTS = 2000  # most points to which a shape is fitted: they bound the time of the selection
 
 
+@dataclasses.dataclass(frozen=True)
+class PrepareNumbers:
+    """The views of a cloud, and the distance to which points are moved."""
+
+    views: int = 16
+    """Most cameras of a cloud."""
+    points: int = 10
+    """Fewest points of each view."""
+    moved: float = 4.5
+    """Points farther from the fit, in medians of its errors, are beyond Gaussian noise."""
+    least: float = 1e-12
+    """A distance [m] that counts as none, where a fit has no error."""
+
+
+@dataclasses.dataclass(frozen=True)
+class NormalNumbers:
+    """How given normals are compared with those of neighbours."""
+
+    neighbours: int = 9
+    """The point itself and eight neighbours: enough for a majority."""
+    edge: float = 0.7
+    """Signs are not compared below this |cosine|: across an edge of 45 degrees."""
+    over: float = 0.3
+    """Nor above this height over the tangent plane, over the distance: behind a thin wall."""
+    pairs: int = 20
+    """Fewest pairs that tell; of fewer any share may be chance."""
+    random: float = 0.35
+    """Signs of which this share is opposed are not trusted; random ones oppose half."""
+    rounded: float = 1e-3
+    """Greatest error of a unit length: text files round to three digits."""
+
+
+PREPARE = PrepareNumbers()
+NORMALS = NormalNumbers()
+
+
 @checked
 @dataclasses.dataclass(frozen=True)
 class NormalCheck(Value):
@@ -42,20 +78,15 @@ class PreparedCloud(Value):
     cloud: PointCloud  # distinct points [m] with outward normals, in the given dtype
     points: Points  # at most 2000 of them, in float64
     normals: Points  # at `points`, of unit length
-    viewpoint: (
-        Float[Tensor, "*views 3"] | None
-    )  # the camera [m] of all `points`, or of each, if known
-    frustum: (
-        Float[Tensor, "*views 4 3"] | None
-    )  # normals of the sides of the camera's view, if known
+    # the camera [m] of all `points`, or of each, and the normals of the sides of its view, if known
+    viewpoint: Float[Tensor, "*views 3"] | None
+    frustum: Float[Tensor, "*views 4 3"] | None
 
     @property
     def one_sided(self) -> bool:
         """Whether the cloud shows only what its cameras see, so that the object has a hidden side."""
-        return (
-            self.viewpoint is not None
-            and share_facing(self.points, self.normals, self.viewpoint) >= FACING
-        )
+        eye = self.viewpoint
+        return eye is not None and share_facing(self.points, self.normals, eye) >= FACING
 
 
 @checked
@@ -70,47 +101,38 @@ def prepare_cloud(
     above the object, where `up` points. A viewpoint that too few given normals face is then
     ignored: the cloud is a whole surface.
     """
-    max_views = 16
-    min_points = 10
     cloud = remove_duplicates(cloud)
-    points = cloud.points
     normals = cloud.normals
     viewpoint = cloud.viewpoint
     if viewpoint is not None and viewpoint.ndim == 2:
         _, count = viewpoint.unique(dim=0, return_counts=True)
-        if len(count) > max_views:
-            raise BadArgument(
-                "viewpoint", f"{len(count)} different cameras", f"at most {max_views} cameras"
-            )
-        if int(count.min()) < min_points:
-            allowed = f"at least {min_points} points of each view"
+        if len(count) > PREPARE.views:
+            allowed = f"at most {PREPARE.views} cameras"
+            raise BadArgument("viewpoint", f"{len(count)} different cameras", allowed)
+        if int(count.min()) < PREPARE.points:
+            allowed = f"at least {PREPARE.points} points of each view"
             raise TooFewPoints("points", f"{count.min()} points of one view", allowed)
-    if normals is not None and not compare_normals(points.double(), normals.double()).oriented:
-        normals = None
-    if (
-        clean
-        and normals is not None
-        and viewpoint is not None
-        and share_facing(points, normals, viewpoint) < FACING
-    ):
-        viewpoint = None
+    if normals is not None:
+        if not compare_normals(cloud.points.double(), normals.double()).oriented:
+            normals = None
+        elif clean and viewpoint is not None:
+            facing = share_facing(cloud.points, normals, viewpoint)
+            viewpoint = viewpoint if facing >= FACING else None
     cloud = dataclasses.replace(cloud, normals=normals, viewpoint=viewpoint)
     if clean or normals is None:
         cloud = _fit_normals(cloud, clean, up)
+
     precise = cloud.to(torch.float64)
+    points = precise.points
     if clean and precise.viewpoint is None:
-        guess = guess_viewpoint(precise.points, fit_local_planes(precise.points)[0], up)[0].to(
-            points.dtype
-        )
-        precise = dataclasses.replace(precise, viewpoint=guess.double())
+        guess = guess_viewpoint(points, fit_local_planes(points)[0], up)[0]
+        precise = dataclasses.replace(precise, viewpoint=guess.to(cloud.points.dtype).double())
     if len(precise) > MAX_POINTS:
-        precise = precise.select(
-            torch.randperm(len(precise), generator=generator)[:MAX_POINTS].to(points.device)
-        )
+        drawn = torch.randperm(len(precise), generator=generator)[:MAX_POINTS]
+        precise = precise.select(drawn.to(points.device))
     assert precise.normals is not None
-    return PreparedCloud(
-        cloud, precise.points, unit(precise.normals), precise.viewpoint, precise.frustum
-    )
+    normals = unit(precise.normals)
+    return PreparedCloud(cloud, precise.points, normals, precise.viewpoint, precise.frustum)
 
 
 @checked
@@ -146,7 +168,7 @@ def _fit_normals(cloud: PointCloud, clean: bool, up: Vector | None = None) -> Po
     feet, normals, rms = fit_quadrics(points.double())
     if clean:
         offset = torch.linalg.vector_norm(points.double() - feet, dim=-1)
-        keep = offset <= 4.5 * rms.median() + 1e-12  # beyond Gaussian noise
+        keep = offset <= PREPARE.moved * rms.median() + PREPARE.least
         cloud = cloud.select(keep)
         points = feet.to(points.dtype)[keep]
         normals = normals[keep]
@@ -166,26 +188,22 @@ def compare_normals(points: Points, normals: Points) -> NormalCheck:
     """Return how well normals agree among neighbouring points: which are flipped, and whether signs
     can be trusted.
     """
-    distance, index = nearest(
-        points, 9
-    )  # the point itself and eight neighbours: enough for a majority
+    distance, index = nearest(points, NORMALS.neighbours)
+    others = index[:, 1:]  # (n, 8)
     directions = unit(normals)
-    cosine = (directions[:, None] * directions[index[:, 1:]]).sum(-1)
-    height = ((points[index[:, 1:]] - points[:, None]) * directions[:, None]).sum(-1).abs()
-    # Signs are not compared across an edge of 45 degrees, nor far over the tangent plane, maybe
-    # behind a thin wall.
-    compared = (cosine.abs() > 0.7) & (height <= 0.3 * distance[:, 1:])
+    cosine = (directions[:, None] * directions[others]).sum(-1)
+    height = ((points[others] - points[:, None]) * directions[:, None]).sum(-1).abs()
+    compared = (cosine.abs() > NORMALS.edge) & (height <= NORMALS.over * distance[:, 1:])
     against = compared & (cosine < 0)
     pairs = int(compared.sum())
-    opposed = (
-        int(against.sum()) / pairs if pairs >= 20 else 0.0
-    )  # of fewer pairs any share may be chance
-    scaled = (
-        torch.linalg.vector_norm(normals, dim=-1) - 1
-    ).abs() > 1e-3  # text files round to three digits
-    flipped = 2 * against.sum(-1) > compared.sum(-1)
-    # Random signs oppose half of the pairs.
-    return NormalCheck(flipped, opposed, oriented=opposed < 0.35, scaled=int(scaled.sum()))
+    opposed = int(against.sum()) / pairs if pairs >= NORMALS.pairs else 0.0
+    error = (torch.linalg.vector_norm(normals, dim=-1) - 1).abs()
+    return NormalCheck(
+        flipped=2 * against.sum(-1) > compared.sum(-1),
+        opposed=opposed,
+        oriented=opposed < NORMALS.random,
+        scaled=int((error > NORMALS.rounded).sum()),
+    )
 
 
 def share_facing(points: Points, normals: Points, viewpoint: Float[Tensor, "*views 3"]) -> float:
@@ -216,9 +234,8 @@ def merge_clouds(
     if not len(clouds):
         raise BadArgument("clouds", "none", "at least one PointCloud")
     if len(poses) != len(clouds):
-        raise BadArgument(
-            "poses", f"{len(poses)} for {len(clouds)} clouds", "one pose for each cloud"
-        )
+        found = f"{len(poses)} for {len(clouds)} clouds"
+        raise BadArgument("poses", found, "one pose for each cloud")
     for i, (cloud, pose) in enumerate(zip(clouds, poses, strict=True)):
         check_cloud(cloud)
         check_rigid(f"poses[{i}]", pose)
@@ -229,13 +246,13 @@ def merge_clouds(
     if len(views) == 1:
         return views[0]
     normals = [v.normals for v in views if v.normals is not None]
+    # Each point has its camera: a view's viewpoint and frustum are repeated for its points.
     viewpoints = [v.viewpoint.expand(len(v), 3) for v in views if v.viewpoint is not None]
     viewpoint = torch.cat(viewpoints) if len(viewpoints) == len(views) else None
     frustums = [v.frustum.expand(len(v), 4, 3) for v in views if v.frustum is not None]
     frustum = torch.cat(frustums) if len(frustums) == len(views) else None
-    return check_cloud(
-        PointCloud(torch.cat([v.points for v in views]), torch.cat(normals), viewpoint, frustum)
-    )
+    points = torch.cat([v.points for v in views])
+    return check_cloud(PointCloud(points, torch.cat(normals), viewpoint, frustum))
 
 
 def _view_in_frame(cloud: PointCloud, obj_from_cloud: Float[Tensor, "4 4"]) -> PointCloud:
@@ -247,11 +264,11 @@ def _view_in_frame(cloud: PointCloud, obj_from_cloud: Float[Tensor, "4 4"]) -> P
     points = apply(pose, cloud.points.double())
     normals = rotate(pose, unit_of_any(cloud.normals.double()))
     viewpoint = cloud.viewpoint
-    frustum = cloud.frustum
     if viewpoint is not None:
-        viewpoint = (
-            apply(pose, viewpoint.double().reshape(-1, 3)).reshape(viewpoint.shape).to(dtype)
-        )
+        placed = apply(pose, viewpoint.double().reshape(-1, 3))
+        viewpoint = placed.reshape(viewpoint.shape).to(dtype)
+    frustum = cloud.frustum
     if frustum is not None:
-        frustum = rotate(pose, frustum.double().reshape(-1, 3)).reshape(frustum.shape).to(dtype)
+        turned = rotate(pose, frustum.double().reshape(-1, 3))
+        frustum = turned.reshape(frustum.shape).to(dtype)
     return PointCloud(points.to(dtype), normals.to(dtype), viewpoint, frustum)

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchgrasp.cloud.intrinsics import as_tensor
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
@@ -22,6 +23,59 @@ from torchgrasp.geometry.plane import Plane
 Image = Float[Tensor, "h w"]
 SensorName = Literal["realsense", "kinect_v1", "azure", "zivid"]
 """Depth cameras with a model of their noise."""
+
+
+@dataclasses.dataclass(frozen=True)
+class RimNumbers:
+    """Where a depth camera errs beside the random noise: at rims and in corners."""
+
+    background: float = 100.0
+    """Depth [m] that stands for a pixel in which nothing is seen."""
+    width: int = 5
+    """A rim pixel has the other surface within two pixels: in a square of this side [px]."""
+    jump: float = 0.010
+    """Least depth [m] between the two surfaces."""
+    corner: float = 8.0
+    """Width of the surroundings [px] whose light reaches a corner."""
+    deepest: float = 0.01
+    """Greatest depth [m] of a corner behind its surroundings; a deeper pixel is no corner."""
+
+
+@dataclasses.dataclass(frozen=True)
+class EstimateNumbers:
+    """How noise is estimated from a table, or from depth errors."""
+
+    patch: int = 21
+    """Side [px] of the patches whose mean error is the bias."""
+    least: int = 1000
+    """Fewest pixels that show the noise of a table."""
+    near: float = 0.02
+    """Pixels farther from the plane than this [m] do not count."""
+    full: float = 0.9
+    """Least share of a patch on the table: others are at the feet of objects."""
+    least_share: float = 1e-9
+    """Keeps the mean of an empty patch finite."""
+    errors: int = 100
+    """Fewest errors to which a model is fitted."""
+    groups: int = 8
+    """Groups of depths whose spread is fitted."""
+    gaussian: float = 1.4826
+    """Standard deviation over the median absolute deviation of Gaussian errors."""
+
+
+@dataclasses.dataclass(frozen=True)
+class StillNumbers:
+    """When frames show that camera and scene stood still."""
+
+    off: float = 0.02
+    """A pixel differs if it is off by more than this, as a share of its depth."""
+    share: float = 0.05
+    """Greatest share of pixels that differ; noise and flying pixels change fewer."""
+
+
+RIMS = RimNumbers()
+ESTIMATE = EstimateNumbers()
+STILL = StillNumbers()
 
 
 @checked
@@ -39,25 +93,18 @@ class SensorNoise(Value):
     step: float = 0.0  # between two values of the disparity [px]; 0: none
     floor: float = 0.0  # standard deviation [m] at any distance
     growth: float = 0.0  # without a base: standard deviation over the squared distance [1/m]
-    grain: float = (
-        0.0  # width of the patches in which pixels have similar noise [px]; 0: each has its own
-    )
+    grain: float = 0.0  # width of patches of similar noise [px]; 0: each pixel has its own
     bias: float = 0.0008  # standard deviation of the smooth bias [m]
     bias_width: float = 12.0  # width of the patches of the bias [px]
-    shadow: bool = (
-        False  # whether the second camera or projector misses surfaces beside nearer ones
-    )
+    shadow: bool = False  # whether a second eye misses surfaces beside nearer ones
     flying: float = 0.25  # share of flying pixels at rims
     flight: float = 0.008  # mean distance of flying pixels behind the rim [m]
     lost_rim: float = 0.35  # share of rim pixels without depth
     lost: float = 0.01  # share of all pixels without depth
-    grazing: tuple[float, float] = (
-        72.5,
-        87.0,
-    )  # angle of ray and normal [deg] at which pixels fade, and are gone
-    multipath: float = (
-        0.0  # excess of depth in a corner, over the corner's depth behind its surroundings
-    )
+    # angle of ray and normal [deg] at which pixels fade, and are gone
+    grazing: tuple[float, float] = (72.5, 87.0)
+    # excess of depth in a corner, over the corner's depth behind its surroundings
+    multipath: float = 0.0
 
     @checked
     def sigma(self, depth: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
@@ -124,31 +171,32 @@ def add_noise(
     noisy = torch.where(measured, depth, 1.0)
     if sensor.base:
         disparity = sensor.base / noisy + sensor.disparity * own
-        noisy = sensor.base / (torch.round(disparity / sensor.step) * sensor.step).clamp_min(
-            sensor.step
-        )
+        steps = torch.round(disparity / sensor.step) * sensor.step
+        noisy = sensor.base / steps.clamp_min(sensor.step)
     else:
         noisy = noisy + sensor.sigma(noisy) * own
     noisy = noisy + patches(sensor.bias, sensor.bias_width)
-    # A rim pixel has, within two pixels, background or a surface more than 10 mm away.
-    far = torch.from_numpy(ndimage.maximum_filter(torch.where(measured, depth, 100.0).numpy(), 5))
-    near = torch.from_numpy(ndimage.minimum_filter(torch.where(measured, depth, 100.0).numpy(), 5))
-    rim = (far - depth > 0.010) | (depth - near > 0.010)
+    # Other surfaces, and the background, next to a pixel make it a rim.
+    full = torch.where(measured, depth, RIMS.background).numpy()
+    far = torch.from_numpy(ndimage.maximum_filter(full, RIMS.width))
+    near = torch.from_numpy(ndimage.minimum_filter(full, RIMS.width))
+    rim = (far - depth > RIMS.jump) | (depth - near > RIMS.jump)
     flies = rim & (uniform() < sensor.flying)
     noisy = noisy + torch.where(flies, -sensor.flight * torch.log1p(-uniform()), 0.0)
-    if sensor.multipath:  # light by way of the walls of a corner takes longer
-        around = torch.from_numpy(ndimage.gaussian_filter(depth.numpy(), 8.0))
+    # Light by way of the walls of a corner takes longer.
+    if sensor.multipath:
+        around = torch.from_numpy(ndimage.gaussian_filter(depth.numpy(), RIMS.corner))
         excess = (depth - around).clamp_min(0.0)
-        noisy = noisy + sensor.multipath * torch.where(excess < 0.01, excess, 0.0)
+        noisy = noisy + sensor.multipath * torch.where(excess < RIMS.deepest, excess, 0.0)
+    # Pixels fade at grazing angles, and behind what hides them from the second eye.
     angle = torch.rad2deg(torch.arccos(cosine.clamp(0.0, 1.0)))
     low, high = sensor.grazing
     lost = (rim & (uniform() < sensor.lost_rim)) | (uniform() < sensor.lost)
     lost = lost | (uniform() < (angle - low) / (high - low))
     if sensor.shadow:
         column = torch.arange(depth.shape[1], dtype=torch.float64)
-        second = column - torch.where(
-            measured, sensor.base / depth, 0.0
-        )  # column in the other eye's image
+        # column in the other eye's image
+        second = column - torch.where(measured, sensor.base / depth, 0.0)
         lost = lost | (second.flip(1).cummin(1).values.flip(1) < second)
     return torch.where(measured & ~lost, noisy, 0.0)
 
@@ -165,40 +213,43 @@ def estimate_noise(
     The plane is in the camera's frame. Of the pixels `on_table`, those over 20 mm from the plane do
     not count. The noise is None if fewer than 1000 pixels show the table.
     """
-    # pixels
-    patch = 21
-    least = 1000
     row, column = (torch.arange(n, dtype=torch.float64) for n in depth.shape)
     x = (column - intrinsics[0, 2]) / intrinsics[0, 0]
     y = (row - intrinsics[1, 2]) / intrinsics[1, 1]
     a, b, c = table.normal.double().tolist()
     along = a * x + b * y[:, None] + c  # of a ray with depth 1 and the table's normal
-    error = depth - table.offset / along
-    on = on_table & (depth > 0) & ((error * along).abs() < 0.02)
-    share = torch.from_numpy(ndimage.uniform_filter(on.double().numpy(), patch))
-    mean = torch.from_numpy(
-        ndimage.uniform_filter(torch.where(on, error, 0.0).numpy(), patch)
-    ) / share.clamp_min(1e-9)
-    on = on & (share > 0.9)  # away from the feet of objects
-    if int(on.sum()) < least:
+    error = depth - table.offset / along  # (h, w)
+    on = on_table & (depth > 0) & ((error * along).abs() < ESTIMATE.near)
+
+    # The mean over the pixels of a patch that show the table is their bias.
+    share = torch.from_numpy(ndimage.uniform_filter(on.double().numpy(), ESTIMATE.patch))
+    total = ndimage.uniform_filter(torch.where(on, error, 0.0).numpy(), ESTIMATE.patch)
+    mean = torch.from_numpy(total) / share.clamp_min(ESTIMATE.least_share)
+    on = on & (share > ESTIMATE.full)
+    if int(on.sum()) < ESTIMATE.least:
         return None
     random = fit_noise(depth[on], (error - mean)[on])
-    bias = 1.4826 * float((mean[on] - mean[on].median()).abs().median())
-    return dataclasses.replace(random, bias=bias, bias_width=float(patch))
+    bias = float(_deviation(mean[on] - mean[on].median()))
+    return dataclasses.replace(random, bias=bias, bias_width=float(ESTIMATE.patch))
 
 
 def fit_noise(depth: Float[Tensor, "n"], error: Float[Tensor, "n"]) -> SensorNoise:
     """Return a noise model whose `floor` and `growth` are fitted robustly to depth errors [m] at
     given depths [m].
     """
-    if len(depth) < 100:
+    if len(depth) < ESTIMATE.errors:
         return SensorNoise()
-    groups = torch.argsort(depth).tensor_split(8)
+    groups = torch.argsort(depth).tensor_split(ESTIMATE.groups)
     middle = torch.stack([depth[rows].median() for rows in groups])
-    variance = torch.stack([(1.4826 * error[rows].abs().median()).square() for rows in groups])
+    variance = torch.stack([_deviation(error[rows]).square() for rows in groups])
     terms = torch.stack([torch.ones_like(middle), middle**4], -1)
     floor, growth = np.sqrt(optimize.nnls(terms.numpy(), variance.numpy())[0]).tolist()
     return SensorNoise(floor=floor, growth=growth)
+
+
+def _deviation(error: Float[Tensor, "n"]) -> Float[Tensor, ""]:
+    """Return the standard deviation of errors, from their median absolute value."""
+    return ESTIMATE.gaussian * error.abs().median()
 
 
 @checked
@@ -214,25 +265,21 @@ def median_depth(frames: Sequence[Tensor | np.ndarray]) -> Tensor:
     >>> median_depth([torch.tensor([[0.0, 0.7]]), torch.tensor([[0.0, 0.701]]), torch.tensor([[0.5, 0.702]])])
     tensor([[0.0000, 0.7010]])
     """
-    images = [
-        frame
-        if isinstance(frame, Tensor)
-        else torch.from_numpy(np.array(frame, frame.dtype.newbyteorder("=")))
-        for frame in frames
-    ]
+    images = [as_tensor("frames", frame) for frame in frames]
     kinds = sorted({f"{tuple(image.shape)} {image.dtype}" for image in images})
     if len(kinds) != 1 or images[0].ndim != 2:
-        raise BadArgument(
-            "frames", " and ".join(kinds) or "none", "images (h, w) of one size and one dtype"
-        )
-    stack = torch.stack(images).double()
+        found = " and ".join(kinds) or "none"
+        raise BadArgument("frames", found, "images (h, w) of one size and one dtype")
+    stack = torch.stack(images).double()  # (frames, h, w)
     stack = torch.where(torch.isfinite(stack) & (stack > 0), stack, torch.nan)
     middle = torch.nanquantile(stack, 0.5, dim=0)
     for number, frame in enumerate(stack, start=1):
         off = (frame / middle - 1).abs()
-        share = float((off > 0.02).sum()) / max(1, int(torch.isfinite(off).sum()))
-        if share > 0.05:  # noise and flying pixels change fewer
-            found = f"frame {number} differs by more than 2 % in {share:.0%} of its pixels"
+        share = float((off > STILL.off).sum()) / max(1, int(torch.isfinite(off).sum()))
+        if share > STILL.share:
+            more = f"{100.0 * STILL.off:g} %"
+            found = f"frame {number} differs by more than {more} in {share:.0%} of its pixels"
             raise BadArgument("frames", found, "frames of a camera and a scene that stand still")
     middle = torch.where(2 * torch.isfinite(stack).sum(0) > len(stack), middle, 0.0)
-    return (middle if images[0].is_floating_point() else torch.round(middle)).to(images[0].dtype)
+    whole = not images[0].is_floating_point()
+    return (torch.round(middle) if whole else middle).to(images[0].dtype)

@@ -1,5 +1,7 @@
 """A guess of where the camera of a view was, and a test whether a camera can have been at a place."""
 
+import contextlib
+import dataclasses
 import math
 
 import torch
@@ -12,10 +14,67 @@ from torchgrasp.foundation.lazy import spatial
 from torchgrasp.geometry.linalg import Points, Vector, fibonacci_sphere, unit
 from torchgrasp.geometry.support_planes import find_supports
 
-MAX_EDGE_ON = 0.15
-MAX_BEHIND = 0.2
-"""Largest shares of a view's points that its camera sees edge-on, and that lie behind others."""
-DRAWN = 2000  # most points that tell where the camera was
+
+@dataclasses.dataclass(frozen=True)
+class UnseenNumbers:
+    """When a camera cannot have seen the points of a view."""
+
+    edge_on: float = 0.15
+    """Greatest share of points that a camera sees edge-on."""
+    behind: float = 0.2
+    """Greatest share of points that lie behind others."""
+    grazing: float = 0.17
+    """A surface is seen edge-on if the cosine between ray and normal is below this: 80 degrees."""
+    neighbours: int = 6
+    """A point is compared with its neighbours in the image; itself is one of so many."""
+    slope: float = 2.0
+    """Slopes up to this, depth over width, hide nothing."""
+    step: float = 0.1
+    """Least step of depth behind which points are hidden, over the radius of the cloud."""
+
+    def excess(self, shares: tuple[float, float]) -> tuple[float, float]:
+        """Return the shares edge-on and behind, each over the greatest that is allowed."""
+        return shares[0] / self.edge_on, shares[1] / self.behind
+
+
+@dataclasses.dataclass(frozen=True)
+class GuessNumbers:
+    """How the camera of a view is guessed."""
+
+    drawn: int = 2000
+    """Most points that tell where the camera was."""
+    half_view: float = 50.0
+    """Points of a camera in the origin are at most this far from its axis [deg]."""
+    far: float = 2.0
+    """Such a cloud is farther from the origin than this, in radii of the cloud."""
+    directions: int = 400
+    """Directions that are tried; they are about 10 degrees apart."""
+    above: float = 0.1
+    """Least cosine between a direction and the vertical: a camera is above the support."""
+    distance: float = 4.0
+    """Distance of a guessed camera, in radii of the cloud."""
+    density: float = 3.0
+    """Weight of the density beside the bulge; wrong cameras were rarest with it."""
+    rival: float = 0.3
+    """Directions whose score is less than this below the best are likely, too."""
+    least_angle: float = 15.0
+    """Least angle [deg] within which a camera is likely."""
+    sure: float = 1.0
+    """Least score of a direction that the points tell."""
+    better: float = 0.5
+    """A place whose score is this much below the best is none from where a view was taken."""
+    tangent: float = 0.3
+    """Surfaces with a smaller cosine to the ray count less for the bulge, as noise turns them."""
+    neighbours: int = 13
+    """The twelfth neighbour measures the density; the point itself is one of so many."""
+    least_cosine: float = 0.1
+    """Least cosine between ray and normal for the density, which noise would make infinite."""
+    least: float = 1e-12
+    """Keeps quotients and logarithms of zero finite."""
+
+
+UNSEEN = UnseenNumbers()
+GUESS = GuessNumbers()
 
 
 def guess_viewpoint(
@@ -30,33 +89,39 @@ def guess_viewpoint(
     may be at the origin, where the points lie in front of it and a camera can have taken the view.
     An angle of 180 degrees means that the points hardly tell the direction.
     """
-    rows = draw_rows(len(points), DRAWN).to(points.device)
-    points = points[rows]
-    normals = normals[rows]
-    in_front = points[:, 2] > math.cos(math.radians(50)) * torch.linalg.vector_norm(points, dim=-1)
+    points, normals = _draw(points, normals)
     centre, radius = _enclose(points)
-    above = up is None or assumed or float(centre @ up.to(points)) < 0
-    far = bool(torch.linalg.vector_norm(centre) > 2 * radius)
-    if (
-        far
-        and above
-        and bool(in_front.all())
-        and can_see(points, normals, torch.zeros_like(points[0]))
-    ):
-        return torch.zeros_like(points[0]), 15.0
-    try:
+    origin = torch.zeros_like(points[0])
+    may_be_own = up is None or assumed or float(centre @ up.to(points)) < 0
+    if may_be_own and _is_ahead(points, centre, radius) and can_see(points, normals, origin):
+        return origin, GUESS.least_angle
+    with contextlib.suppress(NoSupport):
         up = find_supports(points, up=up)[0].plane.normal
-    except NoSupport:
-        pass
-    directions = fibonacci_sphere(400).to(points)  # about 10 degrees apart
+
+    directions = fibonacci_sphere(GUESS.directions).to(points)
     if up is not None:
-        directions = directions[directions @ up.to(points) > 0.1]
-    bulge, density = _explain(points, normals, centre + 4 * radius * directions)
-    score = bulge + 3 * density  # wrong cameras were rarest with three
+        directions = directions[directions @ up.to(points) > GUESS.above]
+    bulge, density = _explain(points, normals, centre + GUESS.distance * radius * directions)
+    score = bulge + GUESS.density * density
     best = score.argmax()
-    rivals = directions[score > score[best] - 0.3] @ directions[best]
-    angle = max(15.0, math.degrees(math.acos(min(float(rivals.min()), 1.0))))
-    return centre + 4 * radius * directions[best], angle if score[best] > 1 else 180.0
+    rivals = directions[score > score[best] - GUESS.rival] @ directions[best]
+    angle = math.degrees(math.acos(min(float(rivals.min()), 1.0)))
+    angle = max(GUESS.least_angle, angle) if score[best] > GUESS.sure else 180.0
+    return centre + GUESS.distance * radius * directions[best], angle
+
+
+def _draw(points: Points, normals: Points) -> tuple[Points, Points]:
+    """Return some of the points, with their normals."""
+    rows = draw_rows(len(points), GUESS.drawn).to(points.device)
+    return points[rows], normals[rows]
+
+
+def _is_ahead(points: Points, centre: Vector, radius: Float[Tensor, ""]) -> bool:
+    """Return whether points lie before a camera in the origin that looks along z."""
+    least = math.cos(math.radians(GUESS.half_view))
+    in_front = points[:, 2] > least * torch.linalg.vector_norm(points, dim=-1)
+    far = torch.linalg.vector_norm(centre) > GUESS.far * radius
+    return bool(far) and bool(in_front.all())
 
 
 def can_see(points: Points, normals: Points, viewpoint: Vector) -> bool:
@@ -66,17 +131,14 @@ def can_see(points: Points, normals: Points, viewpoint: Vector) -> bool:
     hold: the points are as dense as the camera's pixels; no other place explains the points much
     better; the camera looks down on a support.
     """
-    rows = draw_rows(len(points), DRAWN).to(points.device)
-    points = points[rows]
-    normals = normals[rows]
-    edge_on, behind = share_unseen(points, normals, viewpoint)
-    if edge_on > MAX_EDGE_ON or behind > MAX_BEHIND:
+    points, normals = _draw(points, normals)
+    if max(UNSEEN.excess(share_unseen(points, normals, viewpoint))) > 1:
         return False
     centre, radius = _enclose(points)
-    others = centre + 4 * radius * fibonacci_sphere(400).to(points)
+    others = centre + GUESS.distance * radius * fibonacci_sphere(GUESS.directions).to(points)
     bulge, density = _explain(points, normals, torch.cat([viewpoint[None], others]))
-    score = bulge + 3 * density
-    if bool(density[0] > 0) or bool(score[0] > score.max() - 0.5):
+    score = bulge + GUESS.density * density
+    if bool(density[0] > 0) or bool(score[0] > score.max() - GUESS.better):
         return True
     try:
         find_supports(points, viewpoint)
@@ -89,9 +151,8 @@ def _enclose(points: Points) -> tuple[Vector, Float[Tensor, ""]]:
     """Return the centre of the points' box along their principal axes, and its distance to the
     farthest point.
     """
-    axes = torch.linalg.svd(
-        points - points.mean(0), full_matrices=False
-    ).Vh  # independent of the frame
+    # Principal axes do not depend on the frame.
+    axes = torch.linalg.svd(points - points.mean(0), full_matrices=False).Vh
     along = points @ axes.T
     centre = (along.amax(0) + along.amin(0)) / 2 @ axes
     return centre, torch.linalg.vector_norm(points - centre, dim=-1).max()
@@ -106,18 +167,21 @@ def _explain(
     Visible surfaces bulge towards the camera. A pixel covers an area that grows with the squared
     distance, over the cosine between ray and normal.
     """
-    away = viewpoints - points[:, None]
-    distance = torch.linalg.vector_norm(away, dim=-1).clamp_min(1e-12)
-    cosine = (away * normals[:, None]).sum(-1) / distance
+    away = viewpoints - points[:, None]  # (n, k, 3)
+    distance = torch.linalg.vector_norm(away, dim=-1).clamp_min(GUESS.least)
+    cosine = (away * normals[:, None]).sum(-1) / distance  # (n, k)
     bulge = (normals * (points - _enclose(points)[0])).sum(-1)
-    bulging = (bulge[:, None] * torch.tanh(cosine / 0.3)).sum(0) / bulge.abs().sum().clamp_min(
-        1e-12
-    )
-    density = -2 * torch.log(nearest(points, 13)[0][:, -1].clamp_min(1e-12))  # up to a constant
+    towards = (bulge[:, None] * torch.tanh(cosine / GUESS.tangent)).sum(0)
+    bulging = towards / bulge.abs().sum().clamp_min(GUESS.least)
+
+    # The logarithm of the density, up to a constant, against that of the camera's pixels.
+    spacing = nearest(points, GUESS.neighbours)[0][:, -1].clamp_min(GUESS.least)
+    density = -2 * torch.log(spacing)
     density = density - density.median()
-    error = density[:, None] - torch.log(cosine.abs().clamp_min(0.1)) + 2 * torch.log(distance)
-    error = (error - error.median(0).values).abs().mean(0)
-    return bulging, 1 - error / density.abs().mean().clamp_min(1e-12)
+    steep = cosine.abs().clamp_min(GUESS.least_cosine)
+    error = density[:, None] - torch.log(steep) + 2 * torch.log(distance)
+    error = (error - error.median(0).values).abs().mean(0)  # (k,)
+    return bulging, 1 - error / density.abs().mean().clamp_min(GUESS.least)
 
 
 def share_unseen(points: Points, normals: Points, viewpoint: Vector) -> tuple[float, float]:
@@ -127,9 +191,7 @@ def share_unseen(points: Points, normals: Points, viewpoint: Vector) -> tuple[fl
     The second share is 1 if a point lies behind the camera.
     """
     ray = unit(points - viewpoint)
-    edge_on = float(
-        ((ray * normals).sum(-1).abs() < 0.17).double().mean()
-    )  # the cosine of 80 degrees
+    edge_on = float(((ray * normals).sum(-1).abs() < UNSEEN.grazing).double().mean())
     middle = (points.amax(0) + points.amin(0)) / 2
     forward = middle - viewpoint
     if not bool(forward.any()) or bool(((points - viewpoint) @ forward <= 0).any()):
@@ -138,9 +200,10 @@ def share_unseen(points: Points, normals: Points, viewpoint: Vector) -> tuple[fl
     local = (points - viewpoint) @ axes.T
     depth = local[:, 0].abs()
     pixels = (local[:, 1:] / depth[:, None]).cpu().numpy()
-    apart, index = spatial.KDTree(pixels).query(pixels, k=min(6, len(pixels)))
-    # a point lies behind a neighbour if it is deeper by more than a slope explains
+    apart, index = spatial.KDTree(pixels).query(pixels, k=min(UNSEEN.neighbours, len(pixels)))
+
+    # A point lies behind a neighbour if it is deeper by more than a slope explains.
     step = (depth[:, None] - depth[torch.from_numpy(index).to(depth.device)]).abs()
-    step = step - 2 * torch.from_numpy(apart).to(depth) * depth[:, None]
+    step = step - UNSEEN.slope * torch.from_numpy(apart).to(depth) * depth[:, None]
     radius = torch.linalg.vector_norm(points - middle, dim=-1).max()
-    return edge_on, float((step.amax(1) > 0.1 * radius).double().mean())
+    return edge_on, float((step.amax(1) > UNSEEN.step * radius).double().mean())
