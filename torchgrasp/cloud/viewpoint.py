@@ -110,7 +110,7 @@ def guess_viewpoint(
     return centre + GUESS.distance * radius * directions[best], angle
 
 
-def _draw(points: Points, normals: Points) -> tuple[Points, Points]:
+def _draw(points: Points, normals: Points) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]]:
     """Return some of the points, with their normals."""
     rows = draw_rows(len(points), GUESS.drawn).to(points.device)
     return points[rows], normals[rows]
