@@ -39,7 +39,7 @@ from torchgrasp.foundation.errors import BadArgument, GraspError
 from torchgrasp.foundation.jobs import run_tasks
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.posture_model.em import DataRows, expectation_maximisation, start_components
+from torchgrasp.posture_model.em import DataRows, EmRule, expectation_maximisation, start_components
 from torchgrasp.posture_model.gaussian import GaussianMixture
 from torchgrasp.posture_model.mixture import describe_compatibility
 from train.pull_trials import PullRecord, RisingPull, pull_until_lost
@@ -93,6 +93,7 @@ TILT = math.radians(15)
 REGULARISATION = 0.05
 """Variance that a fit adds to every number, relative to its variance over the few hundred trials.
 """
+FITTING = EmRule(iterations=300, tolerance=1e-4, regularisation=REGULARISATION)
 
 
 def body(name: str) -> tuple[trimesh.Trimesh, list[trimesh.Trimesh]]:
@@ -247,7 +248,7 @@ def _fit(states: Float[Tensor, "n 9"], components: int, seed: int) -> GaussianMi
     scale = states.std(0, correction=0)
     shard = DataRows((states - centre) / scale)
     start = start_components(shard, components, seed, REGULARISATION)
-    fitted = expectation_maximisation(shard, start, 300, 1e-4, REGULARISATION).components
+    fitted = expectation_maximisation(shard, start, FITTING).components
     covariances = fitted.covariances * scale[:, None] * scale
     return GaussianMixture(fitted.weights, fitted.means * scale + centre, covariances, NAMES)
 

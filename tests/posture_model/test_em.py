@@ -10,9 +10,10 @@ from sklearn.mixture import GaussianMixture
 from tests.make import near, real
 from torchgrasp.foundation.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.posture_model.em import (
-    MAX_RESEEDS,
+    EM,
     Components,
     DataRows,
+    EmRule,
     FitProgress,
     coefficients_from_components,
     components_from_sums,
@@ -67,7 +68,7 @@ def test_eq20_em_equals_scikit_learn_from_the_same_start():
     m = 6
     steps = 15
     start = start_components(DataRows(x), m, seed=0, regularisation=1e-6)
-    ours = expectation_maximisation(DataRows(x), start, steps, tolerance=0.0, regularisation=1e-6)
+    ours = expectation_maximisation(DataRows(x), start, EmRule(steps, 0.0, 1e-6))
     first = start.components
     theirs = GaussianMixture(
         m,
@@ -91,9 +92,7 @@ def test_log_likelihood_never_decreases(m):
     fit = expectation_maximisation(
         DataRows(x),
         start_components(DataRows(x), m, 1, 1e-6),
-        60,
-        tolerance=0.0,
-        regularisation=1e-6,
+        EmRule(60, 0.0, 1e-6),
     )
     assert float(fit.log_likelihood.diff().min()) >= -1e-9
     # The last entry belongs to the components that are returned.
@@ -125,10 +124,9 @@ def test_an_indefinite_start_and_data_that_span_no_covariance_are_errors():
     start = start_components(DataRows(x), 3, 0, 1e-6)
     flat = start.components.covariances * torch.tensor([1.0, 1, 0])[:, None, None]
     components = Components(start.components.weights, start.components.means, flat)
+    begun = FitProgress(components, start.reseeded, start.log_likelihood)
     with pytest.raises(IndefiniteCovariance, match="fewer components"):
-        expectation_maximisation(
-            DataRows(x), FitProgress(components, start.reseeded, start.log_likelihood), 5, 0.0, 0.0
-        )
+        expectation_maximisation(DataRows(x), begun, EmRule(5, 0.0, 0.0))
     x = torch.cat([x, x[:, :1]], 1)  # a column twice
     with pytest.raises(IndefiniteCovariance, match="collapsed 1 times"):
         start_components(DataRows(x), 3, 0, 0.0)
@@ -143,13 +141,15 @@ def test_a_collapsed_component_is_placed_anew_and_the_fit_recovers():
         dataclasses.replace(start.components, means=means), start.reseeded, start.log_likelihood
     )
     steps: list[FitProgress] = []
-    fit = expectation_maximisation(DataRows(x), lost, 200, 1e-6, 1e-6, observer=steps.append)
+    fit = expectation_maximisation(
+        DataRows(x), lost, EmRule(200, 1e-6, 1e-6), observer=steps.append
+    )
     assert fit.reseeded.tolist() == [0, 1, 0]
     assert [step.jumped for step in steps[:2]] == [True, False]
     assert fit.converged
     assert float(fit.components.weights.min()) > 0.05
     assert float(fit.log_likelihood[1:].diff().min()) >= -1e-9
-    usual = expectation_maximisation(DataRows(x), start, 200, 1e-6, 1e-6)
+    usual = expectation_maximisation(DataRows(x), start, EmRule(200, 1e-6, 1e-6))
     assert abs(float(fit.log_likelihood[-1] - usual.log_likelihood[-1])) < 0.05
 
 
@@ -159,7 +159,7 @@ def test_a_component_is_placed_anew_three_times_and_no_more():
     components = start_components(DataRows(x), 3, 0, 1e-6).components
     sums, _ = expectation(DataRows(x), components)
     sums[2] = 0.0
-    for before in range(MAX_RESEEDS):
+    for before in range(EM.most_reseeds):
         result, reseeded = maximisation(sums, len(x), 0.0, torch.tensor([0, 0, before]))
         assert reseeded.tolist() == [0, 0, before + 1]
         heaviest = int(components_from_sums(sums, len(x), 0.0).weights.argmax())
@@ -174,4 +174,4 @@ def test_a_component_is_placed_anew_three_times_and_no_more():
         apart = (result.means[2] - result.means[heaviest]).abs()
         torch.testing.assert_close(apart, spread[-1].sqrt() * axes[:, -1].abs())
     with pytest.raises(IndefiniteCovariance, match=r"component 2, of 0\.0 rows, collapsed 4 times"):
-        maximisation(sums, len(x), 0.0, torch.tensor([0, 0, MAX_RESEEDS]))
+        maximisation(sums, len(x), 0.0, torch.tensor([0, 0, EM.most_reseeds]))

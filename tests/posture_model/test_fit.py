@@ -9,7 +9,7 @@ import torch
 
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.posture_model.sample import HandSamples
-from torchgrasp.posture_model.training import TRIAL_STEPS, fit_mixture
+from torchgrasp.posture_model.training import MIXTURES, fit_mixture
 
 
 def banana(n: int = 4000, unit: float = 1.0) -> HandSamples:
@@ -73,15 +73,17 @@ def test_same_seed_same_mixture_and_the_likeliest_of_several_starts_goes_on():
     second = fit_mixture(samples, 4, seed=2)
     assert torch.equal(first.covariances, second.covariances)
     alone = [
-        fit_mixture(samples, 6, seed=seed, iterations=TRIAL_STEPS, tolerance=0.0)
+        fit_mixture(samples, 6, seed=seed, iterations=MIXTURES.trial_steps, tolerance=0.0)
         for seed in (2, 3, 4)
     ]
     best = max(alone, key=lambda mixture: float(mixture.meta["log_likelihood"]))
-    together = fit_mixture(samples, 6, seed=2, iterations=TRIAL_STEPS, tolerance=0.0, starts=3)
+    together = fit_mixture(
+        samples, 6, seed=2, iterations=MIXTURES.trial_steps, tolerance=0.0, starts=3
+    )
     assert len({mixture.meta["log_likelihood"] for mixture in alone}) == 3
     assert torch.equal(together.covariances, best.covariances)
     # The steps of the trial count, and more follow.
-    assert together.meta["iterations"] == str(TRIAL_STEPS)
+    assert together.meta["iterations"] == str(MIXTURES.trial_steps)
     assert fit_mixture(samples, 6, iterations=1).meta["iterations"] == "1"
     assert (
         fit_mixture(samples, 6, seed=2, iterations=30, tolerance=0.0, starts=3).meta["iterations"]

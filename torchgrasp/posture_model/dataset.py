@@ -39,14 +39,9 @@ from torchgrasp.posture_model.sample import (
 
 MANIFEST = "samples.json"  # file that describes the samples of a folder
 KEPT = 128  # chunks that stay in memory: all of a million postures, which take 200 MB
-META_KEYS = (
-    "hand",
-    "fingers",
-    "hand_sha256",
-    "hand_codes",
-    "seed",
-    "sampling",
-)  # the keys of `SampleSpec.meta`
+MANIFEST_BYTES = 2**20  # largest manifest
+# the keys of `SampleSpec.meta`
+META_KEYS = ("hand", "fingers", "hand_sha256", "hand_codes", "seed", "sampling")
 Chunk = Annotated[int, Range(0, 1_000_000)]
 
 
@@ -100,12 +95,12 @@ class SampleFolder:
         path = self.path(i)
         tensors, meta = load_tensors(path, "samples", {"joints", "q"})
         shapes = tuple(tensors["joints"].shape), tuple(tensors["q"].shape)
-        if shapes != (wanted := ((sizes[i], len(self.joint_names)), (sizes[i], 6))):
+        wanted = (sizes[i], len(self.joint_names)), (sizes[i], 6)
+        if shapes != wanted:
             raise ModelFileError("path", f"{path}: tensors of shapes {shapes}", f"shapes {wanted}")
         if {key: meta.get(key) for key in self.meta} != self.meta or meta.get("chunk") != str(i):
-            raise ModelFileError(
-                "path", f"{path}: the chunk of other samples", f"chunk {i} of {self.meta}"
-            )
+            found = f"{path}: the chunk of other samples"
+            raise ModelFileError("path", found, f"chunk {i} of {self.meta}")
         return HandSamples(tensors["joints"], tensors["q"], self.joint_names, dict(self.meta))
 
     @checked
@@ -169,9 +164,8 @@ def write_samples(
 
     with hold_folder(samples.folder):
         begin_folder(samples.folder / MANIFEST, json.dumps(content, indent=1) + "\n", "samples")
-        missing = [
-            i for i in range(len(counts)) if not samples.holds(i)
-        ]  # a damaged chunk is drawn again
+        # A damaged chunk is drawn again.
+        missing = [i for i in range(len(counts)) if not samples.holds(i)]
         lacking = sum(counts[i] for i in missing)
         needed = 8 * lacking * (hand.dof + 6)
         free = shutil.disk_usage(samples.folder).free
@@ -202,7 +196,8 @@ def load_samples(folder: Path | str) -> SampleFolder:
     """
     folder = Path(folder)
     refuse = partial(ModelFileError, "folder")
-    manifest = read_json(folder / MANIFEST, refuse, "a folder written by write_samples", 2**20)
+    allowed = "a folder written by write_samples"
+    manifest = read_json(folder / MANIFEST, refuse, allowed, MANIFEST_BYTES)
     samples = _parse_manifest(folder, manifest)
     chunks = len(chunk_sizes(samples.n))
     if missing := sum(not samples.path(i).is_file() for i in range(chunks)):

@@ -16,17 +16,43 @@ import torch.distributed
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.base import Value, row_numbers
 from torchgrasp.foundation.errors import BadArgument, IndefiniteCovariance
+from torchgrasp.geometry.linalg import eye_like
 from torchgrasp.posture_model.gaussian import whitening_matrices
 
-CACHED_ROWS = 2048  # rows of one pass: their features and responsibilities stay in the cache
-SINGULAR_VARIANCE = (
-    1e-12  # a conditional variance of this size is rounding, beside the data's variance of 1
-)
-MAX_RESEEDS = (
-    3  # a component that collapses more often shows that the data support fewer components
-)
+
+@dataclasses.dataclass(frozen=True)
+class EmNumbers:
+    """The numbers of expectation-maximisation and of its start by k-means."""
+
+    cached_rows: int = 2048
+    """Rows of one pass: their features and responsibilities stay in the cache."""
+    device_rows: int = 2**17
+    """Rows of one pass on a GPU, which smaller passes leave idle."""
+    singular: float = 1e-12
+    """A conditional variance of this size is rounding, beside the data's variance of 1."""
+    most_reseeds: int = 3
+    """A component that collapses more often shows that the data support fewer components."""
+    drawn: int = 20_000
+    """Rows from which k-means++ draws: some hundred for each component."""
+    lloyd_steps: int = 10
+    """Steps of k-means. EM follows, so the clusters need not converge."""
+
+
+EM = EmNumbers()
+
+
+@dataclasses.dataclass(frozen=True)
+class EmRule:
+    """When a fit ends, and the variance that it adds."""
+
+    iterations: int
+    """Most steps, including the steps before the start."""
+    tolerance: float
+    """Least rise [nats] of the mean log-likelihood in a step that goes on."""
+    regularisation: float
+    """Added to every variance."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,33 +133,39 @@ class Fit(FitProgress):
 
     converged: bool = False
 
+    def resumed(self) -> FitProgress:
+        """Return the state in which this fit goes on: its last likelihood is not yet known."""
+        history = self.log_likelihood[:-1]
+        return FitProgress(self.components, self.reseeded, history, self.jumped, self.rows)
+
+
+def likeliest(starts: list[FitProgress], fit: Callable[[FitProgress], Fit]) -> FitProgress:
+    """Fit each start, and return the state of the likeliest fit; a single start is not fitted."""
+    if len(starts) == 1:
+        return starts[0]
+    return max(map(fit, starts), key=lambda found: float(found.log_likelihood[-1])).resumed()
+
 
 def expectation_maximisation(
     shard: DataRows,
     start: FitProgress,
-    iterations: int,
-    tolerance: float,
-    regularisation: float,
+    rule: EmRule,
     observer: Callable[[FitProgress], None] = lambda progress: None,
 ) -> Fit:
-    """Fit a mixture by EM steps until a step raises the mean log-likelihood by less than
-    `tolerance` [nats].
+    """Fit a mixture by EM steps until the rule ends them.
 
-    `iterations` bounds the number of steps, including the steps before `start`. `regularisation` is
-    added to every variance. Raises `IndefiniteCovariance` for an indefinite start, or a component
-    that collapses too often.
+    Raises `IndefiniteCovariance` for an indefinite start, or a component that collapses too often.
     """
     n = shard.count()
     state = start
     while True:
         sums, log_likelihood = expectation(shard, state.components)
         history = torch.cat([state.log_likelihood, (log_likelihood / n)[None]])
-        converged = (
-            len(history) > 1 and not state.jumped and float(history[-1] - history[-2]) < tolerance
-        )
-        if converged or len(history) > iterations:
+        known = len(history) > 1 and not state.jumped
+        converged = known and float(history[-1] - history[-2]) < rule.tolerance
+        if converged or len(history) > rule.iterations:
             return Fit(state.components, state.reseeded, history, state.jumped, n, converged)
-        components, reseeded = maximisation(sums, n, regularisation, state.reseeded)
+        components, reseeded = maximisation(sums, n, rule.regularisation, state.reseeded)
         state = FitProgress(components, reseeded, history, reseeded is not state.reseeded, n)
         observer(state)
 
@@ -148,10 +180,9 @@ def expectation(
     coefficients = coefficients_from_components(components)
     sums = torch.zeros_like(coefficients)
     log_likelihood = x.new_zeros(())
-    at_once = min(
-        CACHED_ROWS if x.device.type == "cpu" else 2**17, len(x) or 1
-    )  # smaller passes leave a GPU idle
-    # reused
+    at_once = EM.cached_rows if x.device.type == "cpu" else EM.device_rows
+    at_once = min(at_once, len(x) or 1)
+    # Every pass uses these again.
     features = x.new_empty(coefficients.shape[1], at_once)
     joint = x.new_empty(len(coefficients), at_once)
     floor = math.log(torch.finfo(x.dtype).tiny) / 2  # far below rounding; denormal numbers are slow
@@ -200,9 +231,8 @@ def coefficients_from_components(components: Components) -> Float[Tensor, "m f"]
         - 0.5 * (linear * means).sum(-1)
     )
     i, j = torch.triu_indices(d, d, device=means.device)
-    quadratic = precision[:, i, j] * torch.where(
-        i == j, -0.5, -1.0
-    )  # a mixed product occurs twice in the square
+    # A mixed product occurs twice in the square.
+    quadratic = precision[:, i, j] * torch.where(i == j, -0.5, -1.0)
     return torch.cat([constant[:, None], linear, quadratic], dim=1)
 
 
@@ -213,7 +243,7 @@ def maximisation(
     collapsed.
 
     A component collapses if its covariance is singular or it has fewer than d + 1 rows. It is
-    replaced by half of the heaviest component, split across its longest axis. After `MAX_RESEEDS`
+    replaced by half of the heaviest component, split across its longest axis. After `EM.most_reseeds`
     times, `IndefiniteCovariance` is raised.
     """
     components = components_from_sums(sums, n, regularisation)
@@ -221,19 +251,21 @@ def maximisation(
     means = components.means.clone()
     covariances = components.covariances.clone()
     factor, info = torch.linalg.cholesky_ex(covariances)
-    regular = (info == 0) & (factor.diagonal(dim1=-2, dim2=-1) ** 2 > SINGULAR_VARIANCE).all(-1)
+    variances = factor.diagonal(dim1=-2, dim2=-1) ** 2  # (m, d), each given those before it
+    regular = (info == 0) & (variances > EM.singular).all(-1)
     collapsed = (sums[:, 0] < means.shape[1] + 1) | ~regular
     if not bool(collapsed.any()):
         return Components(weights / weights.sum(), means, covariances), reseeded
     reseeded = reseeded + collapsed
-    if bool(collapsed.all()) or int(reseeded.max()) > MAX_RESEEDS:
+    if bool(collapsed.all()) or int(reseeded.max()) > EM.most_reseeds:
         k = int(reseeded.argmax())
-        smallest = (
-            float(torch.linalg.eigvalsh(covariances[k]).min())
-            if bool(covariances[k].isfinite().all())
-            else 0.0
+        smallest = 0.0
+        if bool(covariances[k].isfinite().all()):
+            smallest = float(torch.linalg.eigvalsh(covariances[k]).min())
+        what = (
+            f"the covariance of component {k}, of {float(sums[k, 0]):.1f} rows, "
+            f"collapsed {int(reseeded[k])} times,"
         )
-        what = f"the covariance of component {k}, of {float(sums[k, 0]):.1f} rows, collapsed {int(reseeded[k])} times,"
         raise IndefiniteCovariance(what, smallest, "use fewer components or more samples")
     weights[collapsed] = 0
     for k in collapsed.nonzero()[:, 0].tolist():
@@ -241,7 +273,9 @@ def maximisation(
         spread, axes = torch.linalg.eigh(covariances[heaviest])
         half = 0.5 * spread[-1].sqrt() * axes[:, -1]
         weights[[k, heaviest]] = weights[heaviest] / 2
-        means[k], means[heaviest] = means[heaviest] + half, means[heaviest] - half
+        middle = means[heaviest].clone()
+        means[k] = middle + half
+        means[heaviest] = middle - half
         covariances[k] = covariances[heaviest]
     return Components(weights / weights.sum(), means, covariances), reseeded
 
@@ -250,19 +284,16 @@ def components_from_sums(sums: Float[Tensor, "m f"], n: int, regularisation: flo
     """Return weights, means and covariances from the weighted sums of features; NaN for a component
     without data.
     """
-    d = round(
-        (math.sqrt(8 * sums.shape[1] + 1) - 3) / 2
-    )  # from the number of features, 1 + d + d (d + 1) / 2
+    # from the number of features, 1 + d + d (d + 1) / 2
+    d = round((math.sqrt(8 * sums.shape[1] + 1) - 3) / 2)
     count = sums[:, :1]
     means = sums[:, 1 : d + 1] / count
     i, j = torch.triu_indices(d, d, device=sums.device)
     second = sums.new_zeros(len(sums), d, d)
     second[:, i, j] = sums[:, d + 1 :] / count
     second[:, j, i] = second[:, i, j]
-    ridge = regularisation * torch.eye(d, dtype=sums.dtype, device=sums.device)
-    return Components(
-        count[:, 0] / n, means, second - means[:, :, None] * means[:, None, :] + ridge
-    )
+    covariances = second - means[:, :, None] * means[:, None, :]
+    return Components(count[:, 0] / n, means, covariances + regularisation * eye_like(d, sums))
 
 
 def start_components(shard: DataRows, m: int, seed: int, regularisation: float) -> FitProgress:
@@ -271,18 +302,18 @@ def start_components(shard: DataRows, m: int, seed: int, regularisation: float) 
     """
     generator = torch.Generator().manual_seed(seed)
     centres = _plus_plus(_subsample(shard, generator), m, generator)
-    for _ in range(10):  # Lloyd's algorithm: EM follows, so the clusters need not converge
-        sums = _sums_of_clusters(
-            shard, centres, lambda x: torch.cat([torch.ones_like(x[:, :1]), x], dim=1).T
-        )
-        centres = torch.where(
-            sums[:, :1] > 0, sums[:, 1:] / sums[:, :1], centres
-        )  # a centre without data stays
+
+    def count_and_sum(x: Float[Tensor, "r d"]) -> Float[Tensor, "f r"]:
+        return torch.cat([torch.ones_like(x[:, :1]), x], dim=1).T
+
+    for _ in range(EM.lloyd_steps):
+        sums = _sums_of_clusters(shard, centres, count_and_sum)
+        # A centre without data stays.
+        centres = torch.where(sums[:, :1] > 0, sums[:, 1:] / sums[:, :1], centres)
     sums = _sums_of_clusters(shard, centres, features_from_data)
     n = round(float(sums[:, 0].sum()))
-    components, reseeded = maximisation(
-        sums, n, regularisation, torch.zeros(m, dtype=torch.long, device=sums.device)
-    )
+    never = torch.zeros(m, dtype=torch.long, device=sums.device)
+    components, reseeded = maximisation(sums, n, regularisation, never)
     return FitProgress(components, reseeded, sums.new_empty(0))
 
 
@@ -290,12 +321,9 @@ def _subsample(shard: DataRows, generator: torch.Generator) -> Float[Tensor, "s 
     """Return random data rows, drawn from all processes; every process gets the same rows."""
     x = shard.rows
     lengths = shard.lengths()
-    order = torch.randperm(
-        int(lengths.sum()), generator=generator, device="cpu"
-    )  # for any number of processes
-    pick = (
-        order[:20_000].to(x.device) - lengths[: shard.rank].sum()
-    )  # some hundred for each component
+    # The number of processes does not change the order.
+    order = torch.randperm(int(lengths.sum()), generator=generator, device="cpu")
+    pick = order[: EM.drawn].to(x.device) - lengths[: shard.rank].sum()
     here = (pick >= 0) & (pick < len(x))
     pool = x.new_zeros(len(pick), x.shape[1])
     pool[here] = x[pick[here]]
@@ -310,9 +338,8 @@ def _plus_plus(
     squared = ((pool - centres) ** 2).sum(1)
     for k in range(1, m):
         if not bool((squared > 0).any()):
-            raise BadArgument(
-                "components", m, f"at most {k}, the number of different rows of the data"
-            )
+            allowed = f"at most {k}, the number of different rows of the data"
+            raise BadArgument("components", m, allowed)
         pick = torch.multinomial(squared.cpu(), 1, generator=generator).to(pool.device)
         centres = torch.cat([centres, pool[pick]])
         squared = torch.minimum(squared, ((pool - pool[pick]) ** 2).sum(1))
@@ -328,8 +355,8 @@ def _sums_of_clusters(
     centre.
     """
     sums = centres.new_zeros(len(centres), len(features(centres[:1])))
-    for rows in shard.rows.split(CACHED_ROWS):
+    for rows in shard.rows.split(EM.cached_rows):
         nearest = (0.5 * (centres**2).sum(1) - rows @ centres.T).argmin(1)
-        member = nearest[:, None] == torch.arange(len(centres), device=rows.device)
+        member = nearest[:, None] == row_numbers(centres)
         sums.addmm_(member.T.to(rows), features(rows).T)
     return shard.sum(sums)

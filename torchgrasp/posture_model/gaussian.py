@@ -15,11 +15,13 @@ from torchgrasp.foundation.base import Kept, Value, kept
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Range, Seed, check_dense, is_known
-from torchgrasp.geometry.linalg import cholesky
+from torchgrasp.geometry.linalg import cholesky, eye_like
 
+PARAMETERS = ("weights", "means", "covariances")
 ROWS_PER_CHUNK = (
-    8192  # rows evaluated together: this bounds the memory for rows x components x dimensions
+    8192  # rows evaluated together: bounds the memory of rows x components x dimensions
 )
+ROUNDING = 1e-6  # greatest error of the weights' sum, and relative asymmetry of a covariance
 
 
 class of_parameters(kept[Kept]):
@@ -29,7 +31,7 @@ class of_parameters(kept[Kept]):
 
     def __get__(self, instance: Any, owner: Any = None) -> Any:
         """Return the value of the property."""
-        if any(x.requires_grad for x in (instance.weights, instance.means, instance.covariances)):
+        if any(getattr(instance, name).requires_grad for name in PARAMETERS):
             return self.func(instance)
         found = vars(instance).get(self.attrname)
         return super().__get__(instance, owner) if found is None else found
@@ -65,32 +67,28 @@ class GaussianMixture(Value):
         weights = self.weights.detach()
         covariances = self.covariances.detach()
         if self.means.shape[1] != d:
-            raise BadArgument(
-                "names", f"{d} names of {self.means.shape[1]} dimensions", "one for each"
-            )
+            found = f"{d} names of {self.means.shape[1]} dimensions"
+            raise BadArgument("names", found, "one for each")
         if d < 1 or len(set(self.names)) < d:
             raise BadArgument("names", self.names, "at least one, each once")
         if is_known(weights) and not (
-            bool((weights >= 0).all()) and abs(float(weights.double().sum()) - 1) <= 1e-6
+            bool((weights >= 0).all()) and abs(float(weights.double().sum()) - 1) <= ROUNDING
         ):
-            found = (
-                f"the least weight {weights.min()} and sum {float(weights.sum())}"
-                if len(weights)
-                else "no weights"
-            )
+            found = "no weights"
+            if len(weights):
+                found = f"the least weight {weights.min()} and sum {float(weights.sum())}"
             raise BadArgument("weights", found, "at least one, none negative, of sum 1 within 1e-6")
         if not is_known(covariances):
             return
         scale = covariances.diagonal(dim1=-2, dim2=-1).abs().sqrt()
         skewness = (covariances - covariances.mT).abs()
-        if bool((skewness > 1e-6 * scale[:, :, None] * scale[:, None, :]).any()):
-            raise BadArgument(
-                "covariances", "an asymmetric matrix", "symmetric positive definite matrices"
-            )
+        allowed = "symmetric positive definite matrices"
+        if bool((skewness > ROUNDING * scale[:, :, None] * scale[:, None, :]).any()):
+            raise BadArgument("covariances", "an asymmetric matrix", allowed)
         info = torch.linalg.cholesky_ex(covariances.double()).info
         if bool((info != 0).any()):
             found = f"an indefinite matrix in component {int(info.nonzero()[0])}"
-            raise BadArgument("covariances", found, "symmetric positive definite matrices")
+            raise BadArgument("covariances", found, allowed)
 
     @checked(gradients=True)
     def log_prob(self, x: Float[Tensor, "*b d"]) -> Float[Tensor, "*b"]:
@@ -106,9 +104,8 @@ class GaussianMixture(Value):
         """Return log(weight) + log N(x | mean, covariance), the log joint density, for every row x
         and component.
         """
-        return self.weights.double().log() + (
-            self.whitening.log_scale - 0.5 * self.whitening.squared(x.double())
-        )
+        density = self.whitening.log_scale - 0.5 * self.whitening.squared(x.double())
+        return self.weights.double().log() + density
 
     @checked
     def sample(self, n: Annotated[int, Range(0, 10**8)], seed: Seed = 0) -> Float[Tensor, "n d"]:
@@ -116,7 +113,7 @@ class GaussianMixture(Value):
 
         Samples are not differentiable: parameters that require a gradient are refused.
         """
-        for name in ("weights", "means", "covariances"):
+        for name in PARAMETERS:
             check_dense(name, getattr(self, name), gradients=False)
         generator = torch.Generator().manual_seed(seed)
         weights = self.weights.double().cpu()
@@ -124,12 +121,10 @@ class GaussianMixture(Value):
         draw = torch.rand(n, generator=generator, dtype=torch.float64, device="cpu")
         # By rounding the sum of the weights may lie below a draw, which then belongs to the last
         # component.
-        component = torch.searchsorted(weights.cumsum(0), draw, right=True).clamp(
-            max=len(weights) - 1
-        )
-        noise = torch.randn(
-            n, len(self.names), generator=generator, dtype=torch.float64, device="cpu"
-        )
+        component = torch.searchsorted(weights.cumsum(0), draw, right=True)
+        component = component.clamp(max=len(weights) - 1)
+        shape = (n, len(self.names))
+        noise = torch.randn(shape, generator=generator, dtype=torch.float64, device="cpu")
         factor = torch.linalg.cholesky(self.covariances.double().cpu())
         rows = means[component]
         for k in range(len(weights)):
@@ -143,9 +138,8 @@ class GaussianMixture(Value):
         """
         index = self._index(names)
         block = self.covariances.double()[:, index][:, :, index]
-        return GaussianMixture(
-            self.weights.double(), self.means.double()[:, index], block, tuple(names)
-        )
+        means = self.means.double()[:, index]
+        return GaussianMixture(self.weights.double(), means, block, tuple(names))
 
     @checked(gradients=True)
     def condition(self, given: dict[str, float]) -> "GaussianMixture":
@@ -166,13 +160,12 @@ class GaussianMixture(Value):
         weights = torch.softmax(part.log_joint(values[None])[0], 0)
         means = self.means.double()
         covariances = self.covariances.double()
-        cross = covariances[:, rest][:, :, observed] @ part.whitening.matrix.transpose(
-            -1, -2
-        )  # whitened
+        # whitened: (m, rest, observed)
+        cross = covariances[:, rest][:, :, observed] @ part.whitening.matrix.mT
         offset = part.whitening.matrix @ (values - part.means)[..., None]
         means = means[:, rest] + (cross @ offset)[..., 0]
-        covariances = covariances[:, rest][:, :, rest] - cross @ cross.transpose(-1, -2)
-        covariances = (covariances + covariances.transpose(-1, -2)) / 2
+        covariances = covariances[:, rest][:, :, rest] - cross @ cross.mT
+        covariances = (covariances + covariances.mT) / 2
         names = tuple(self.names[i] for i in rest)
         if is_known(weights):
             weights, means, covariances = (x[weights > 0] for x in (weights, means, covariances))
@@ -196,17 +189,15 @@ class GaussianMixture(Value):
         means = self.means.double()
         d = len(self.names)
         matrix = whitening_matrices(self.covariances.double())
-        log_scale = matrix.diagonal(dim1=-2, dim2=-1).log().sum(-1) - 0.5 * d * math.log(
-            2 * math.pi
-        )
+        spread = matrix.diagonal(dim1=-2, dim2=-1).log().sum(-1)
+        log_scale = spread - 0.5 * d * math.log(2 * math.pi)
         return Whitening(matrix, (matrix @ means[..., None])[..., 0], log_scale)
 
     def _index(self, names: Sequence[str]) -> list[int]:
         unknown = [name for name in names if name not in self.names]
         if unknown or len(set(names)) < len(names):
-            raise BadArgument(
-                "names", unknown or tuple(names), f"some of {', '.join(self.names)}, each once"
-            )
+            allowed = f"some of {', '.join(self.names)}, each once"
+            raise BadArgument("names", unknown or tuple(names), allowed)
         return [self.names.index(name) for name in names]
 
 
@@ -231,9 +222,8 @@ def map_rows(
     function: Callable[[Float[Tensor, "n d"]], Tensor], x: Float[Tensor, "*b d"]
 ) -> Tensor:
     """Apply a function to all rows in float64, chunk by chunk; batch axes and dtype are as in `x`."""
-    y = torch.cat(
-        [function(rows) for rows in x.reshape(-1, x.shape[-1]).double().split(ROWS_PER_CHUNK)]
-    )
+    chunks = x.reshape(-1, x.shape[-1]).double().split(ROWS_PER_CHUNK)
+    y = torch.cat([function(rows) for rows in chunks])
     return y.reshape(x.shape[:-1] + y.shape[1:]).to(x.dtype)
 
 
@@ -241,8 +231,7 @@ def whitening_matrices(covariances: Float[Tensor, "m d d"]) -> Float[Tensor, "m 
     """Return for each covariance the lower-triangular W with W^T W = covariance^-1; raises
     `IndefiniteCovariance`.
     """
-    factor = cholesky(
-        covariances, "a component's covariance", "use fewer components or more samples"
-    )
-    eye = torch.eye(factor.shape[-1], dtype=factor.dtype, device=factor.device)
+    fix = "use fewer components or more samples"
+    factor = cholesky(covariances, "a component's covariance", fix)
+    eye = eye_like(factor.shape[-1], factor)
     return torch.linalg.solve_triangular(factor, eye.expand_as(factor), upper=False)

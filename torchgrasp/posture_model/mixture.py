@@ -17,30 +17,28 @@ from torchgrasp.foundation.base import check_whole
 from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument, ModelFileError, Status
 from torchgrasp.foundation.rules import ANY, Count, is_known
-from torchgrasp.geometry.frames import degenerate, virtual_frame
+from torchgrasp.geometry.frames import degenerate, real, virtual_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import find_hand
-from torchgrasp.posture_model.gaussian import GaussianMixture, map_rows, of_parameters
+from torchgrasp.posture_model.gaussian import PARAMETERS, GaussianMixture, map_rows, of_parameters
 from torchgrasp.values.planning import ContactCode, Contacts
 
 PERMUTATIONS: tuple[tuple[int, int, int], ...] = tuple(itertools.permutations(range(3)))  # pyright: ignore[reportAssignmentType]
 """The six assignments of three contacts to three fingers: finger i touches contact
 `PERMUTATIONS[k][i]`.
 """
-CODE_NAMES = (
-    "L1",
-    "L2",
-    "L3",
-    "N1",
-    "N2",
-    "N3",
-)  # the numbers of a code q = (L, N): three lengths [m], three cosines
+# the numbers of a code q = (L, N): three lengths [m], three cosines
+CODE_NAMES = ("L1", "L2", "L3", "N1", "N2", "N3")
 PAPER_ENERGY = 2.0
 """The paper's greatest energy f_i, Eq. (21), of a code that the hand reaches."""
 DEFAULT_ENERGY = 6.295793622
 """The greatest energy of a reached code, by default: half the 95 % quantile of chi-square with 6
 degrees of freedom.
 """
+UNIT_ERROR = 1e-3  # greatest error of a unit normal's length
+# shares of the joints' range in the postures that identify a hand
+PROBED = (0.2, 0.5, 0.7)
+WRITTEN = 1e-5  # greatest difference of codes that were written with seven decimals
 
 
 def encode_fingertips(
@@ -78,21 +76,20 @@ def encode(contacts: Contacts | tuple[Tensor, Tensor]) -> ContactCode:
     check_tensor("points", points, (None, 3, 3))
     check_tensor("normals", normals, (len(points), 3, 3))
     lengths = torch.linalg.vector_norm(normals, dim=-1)
-    if is_known(lengths) and bool(((lengths - 1).abs() > 1e-3).any()):
-        worst = lengths.flatten()[(lengths - 1).abs().argmax()].item()
+    error = (lengths - 1).abs()
+    if is_known(lengths) and bool((error > UNIT_ERROR).any()):
+        worst = lengths.flatten()[error.argmax()].item()
         raise BadArgument("normals", f"a normal of length {worst:.6g}", "unit vectors")
     order = torch.tensor(PERMUTATIONS, device=points.device)
     # (b, 6, 3, 3)
     ordered_points = points[:, order]
     ordered_normals = normals[:, order]
-    flat = degenerate(ordered_points).any(
-        1
-    )  # in any order: at the threshold rounding may distinguish them
+    # in any order: at the threshold rounding may distinguish them
+    flat = degenerate(ordered_points).any(1)
     bad = flat[:, None, None]
     # A degenerate row gets another triangle, so that one call frames all rows.
-    ordered_points = torch.where(
-        bad[..., None], torch.eye(3, device="cpu").to(points), ordered_points
-    )
+    other = torch.eye(3, device="cpu").to(points)
+    ordered_points = torch.where(bad[..., None], other, ordered_points)
     return ContactCode(
         q=torch.where(bad, torch.nan, encode_fingertips(ordered_points, ordered_normals)),
         obj_from_vf=torch.where(bad[..., None], torch.nan, virtual_frame(ordered_points)),
@@ -126,16 +123,17 @@ def check_compatible(meta: dict[str, str], joint_names: tuple[str, ...], hand: H
         return
     ours = _probe_codes(hand).flatten()
     try:
-        theirs = torch.tensor(
-            [float(x) for x in meta["hand_codes"].split()], dtype=torch.float64, device="cpu"
-        )
+        theirs = real([float(x) for x in meta["hand_codes"].split()])
     except ValueError as error:
         raise BadArgument("mixture", f"hand_codes {meta['hand_codes']!r}", "numbers") from error
-    same = theirs.shape == ours.shape and torch.allclose(theirs.to(ours), ours, rtol=0, atol=1e-5)
-    if not same:  # to the seven digits that were written
-        whose = f"hand {meta.get('hand')!r}, fingers {meta.get('fingers')!r}, of other limits or fingertips"
+    same = theirs.shape == ours.shape and torch.allclose(
+        theirs.to(ours), ours, rtol=0, atol=WRITTEN
+    )
+    if not same:
+        whose = f"hand {meta.get('hand')!r}, fingers {meta.get('fingers')!r}"
         allowed = f"one of {hand.name!r}, {hand.source.option!r}: train it anew"
-        raise BadArgument("mixture", f"a model of {whose}", allowed)
+        found = f"a model of {whose}, of other limits or fingertips"
+        raise BadArgument("mixture", found, allowed)
 
 
 def _probe_codes(hand: Hand) -> Float[Tensor, "3 q"]:
@@ -144,10 +142,9 @@ def _probe_codes(hand: Hand) -> Float[Tensor, "3 q"]:
     """
     lower = hand.lower.double()
     upper = hand.upper.double()
-    share = torch.tensor([0.2, 0.5, 0.7], dtype=torch.float64, device=lower.device)
-    index = (
-        torch.arange(hand.dof, device="cpu")[None] + torch.arange(3, device="cpu")[:, None]
-    ) % 3
+    share = real(PROBED).to(lower.device)
+    joint = torch.arange(hand.dof, device="cpu")
+    index = (joint + torch.arange(3, device="cpu")[:, None]) % 3  # (3, h)
     return encode_fingertips(*hand.fingertips(lower + share[index] * (upper - lower)))
 
 
@@ -175,9 +172,8 @@ class GraspMixture(GaussianMixture):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.names[-6:] != CODE_NAMES or len(self.names) < 7:
-            raise BadArgument(
-                "names", self.names, f"the joints' names, then {', '.join(CODE_NAMES)}"
-            )
+            allowed = f"the joints' names, then {', '.join(CODE_NAMES)}"
+            raise BadArgument("names", self.names, allowed)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -259,9 +255,8 @@ class GraspMixture(GaussianMixture):
             top = torch.log_softmax(codes.log_joint(q), -1).topk(k, dim=-1)  # free of underflow
             # the bracket of Eq. (23), the mean of the joints given the code in each component
             difference = q[:, None] - self.means[:, -6:].double()
-            means = self.means[:, :-6].double() + torch.einsum(
-                "mhc,nmc->nmh", regression, difference
-            )
+            turned = torch.einsum("mhc,nmc->nmh", regression, difference)
+            means = self.means[:, :-6].double() + turned
             index = top.indices[..., None].expand(-1, -1, len(self.joint_names))
             return torch.cat([means.gather(-2, index), top.values.exp()[..., None]], -1)
 
@@ -278,14 +273,9 @@ class GraspMixture(GaussianMixture):
         >>> load_mixture(file).joint_names
         ('spread', 'f1_flex', 'f2_flex', 'f3_flex')
         """
-        tensors = {
-            name: getattr(self, name).detach() for name in ("weights", "means", "covariances")
-        }
-        meta = {
-            **self.meta,
-            "names": " ".join(self.names),
-            "regularisation": repr(self.regularisation),
-        }
+        tensors = {name: getattr(self, name).detach() for name in PARAMETERS}
+        meta = self.meta | {"names": " ".join(self.names)}
+        meta |= {"regularisation": repr(self.regularisation)}
         return save_tensors(path, "mixture", tensors, meta)
 
 
@@ -312,20 +302,18 @@ def load_mixture(name_or_path: Path | str) -> GraspMixture:
     torch.Size([40, 18])
     """
     path = mixture_path(name_or_path)
-    tensors, meta = load_tensors(path, "mixture", {"weights", "means", "covariances"})
+    tensors, meta = load_tensors(path, "mixture", set(PARAMETERS))
+    types = [str(t.dtype) for t in tensors.values()]
     if any(t.dtype != torch.float64 for t in tensors.values()):
-        raise ModelFileError(
-            "path", f"{path}: {[str(t.dtype) for t in tensors.values()]}", "float64 tensors"
-        )
+        raise ModelFileError("path", f"{path}: {types}", "float64 tensors")
     try:
         names = tuple(meta.pop("names").split())
         regularisation = float(meta.pop("regularisation"))
         rest = {k: v for k, v in meta.items() if k not in ("kind", "version")}
         return GraspMixture(**tensors, names=names, regularisation=regularisation, meta=rest)
     except (KeyError, AttributeError, TypeError, ValueError) as error:
-        raise ModelFileError(
-            "path", f"{path}: {error}", "a mixture that GraspMixture.save wrote"
-        ) from error
+        allowed = "a mixture that GraspMixture.save wrote"
+        raise ModelFileError("path", f"{path}: {error}", allowed) from error
 
 
 def mixture_path(name_or_path: Path | str) -> Path:

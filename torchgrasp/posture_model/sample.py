@@ -45,10 +45,11 @@ def roll_contacts(
     cone = hand.tips.cone.to(axes)
     radius = hand.tips.radius.to(axes)
     share, turn = torch.from_numpy(generator.random((2, len(joints), 3))).to(axes)
-    angle = ROLL * torch.sqrt(
-        -2 * torch.log1p(-share * -torch.expm1(-0.5 * (cone / ROLL) ** 2))
-    )  # Rayleigh's law
-    (first, second), turn = across(axes), 2 * math.pi * turn[..., None]
+    # The angle has Rayleigh's law, cut off at the cone.
+    within = -torch.expm1(-0.5 * (cone / ROLL) ** 2)
+    angle = ROLL * torch.sqrt(-2 * torch.log1p(-share * within))
+    first, second = across(axes)
+    turn = 2 * math.pi * turn[..., None]
     tilt = torch.cos(turn) * first + torch.sin(turn) * second
     normals = torch.cos(angle)[..., None] * axes + torch.sin(angle)[..., None] * tilt
     return points + radius[:, None] * (normals - axes), normals
@@ -84,11 +85,12 @@ def _close_triples(
     return closed.any(1)
 
 
-CHUNK_POSTURES = (
-    10_000  # free postures from one generator; another number gives a seed other postures
-)
+CHUNK_POSTURES = 10_000  # free postures from one generator; another number gives other postures
 BLOCK_POSTURES = 2_000  # postures that a generator draws at a time; fixed for the same reason
 MAX_SAMPLES = 10**8  # most postures of one set: a hundred times the paper's million (Sec. 6.3).
+LEAST_KEPT = 1e-3
+BLOCKS = 10
+"""Least share of postures that are kept, after so many blocks: another hand would draw for hours."""
 Sampling = Literal["uniform", "grasping"]
 """Which of the random postures without self-collision are taken.
 
@@ -192,8 +194,6 @@ def draw_chunk(
     """Return joints [rad] and codes of the postures of chunk i, and how many postures were drawn to
     find them.
     """
-    # least share of postures that are kept, after ten blocks: another hand would draw for hours
-    least_kept = 1e-3
     count = chunk_sizes(spec.n)[i]
     parts = []
     kept = 0
@@ -202,10 +202,9 @@ def draw_chunk(
         parts.append(next(blocks))
         kept = kept + len(parts[-1][0])
         drawn = BLOCK_POSTURES * len(parts)
-        if kept < least_kept * drawn and len(parts) >= 10:
-            raise BadArgument(
-                "hand", f"{kept} kept of {drawn} postures", "a hand that can move freely"
-            )
+        if kept < LEAST_KEPT * drawn and len(parts) >= BLOCKS:
+            found = f"{kept} kept of {drawn} postures"
+            raise BadArgument("hand", found, "a hand that can move freely")
     joints, q = (torch.cat(tensors)[:count] for tensors in zip(*parts, strict=True))
     return joints, q, BLOCK_POSTURES * len(parts)
 

@@ -13,7 +13,7 @@ from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Count
-from torchgrasp.posture_model.em import start_components
+from torchgrasp.posture_model.em import EmRule, start_components
 from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, PAPER_ENERGY, GraspMixture
 from torchgrasp.posture_model.sample import HandSamples
 from torchgrasp.posture_model.stepwise import growing_fits
@@ -24,6 +24,8 @@ from torchgrasp.posture_model.training import (
 )
 
 COMPARED_MODES = 4  # modes of which the nearest is compared: a code has a few postures at most
+GROWING = EmRule(iterations=100, tolerance=1e-3, regularisation=MAX_REGULARISATION)
+"""When each of the growing fits ends."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,15 +33,12 @@ class MixtureScore(Value):
     """Errors with which a learned model predicts the joints of held-out postures from their codes."""
 
     joint_names: tuple[str, ...]
-    error: Float[
-        Tensor, "h"
-    ]  # mean absolute error of each joint [rad], predicted by the conditional mean, Eq. (23)
-    deviation: Float[
-        Tensor, "h"
-    ]  # standard deviation of the absolute error over the postures [rad]
-    nearest_mode: (
-        float  # mean absolute error [rad] of the best of the `COMPARED_MODES` likeliest modes
-    )
+    # mean absolute error of each joint [rad], predicted by the conditional mean, Eq. (23)
+    error: Float[Tensor, "h"]
+    # standard deviation of the absolute error over the postures [rad]
+    deviation: Float[Tensor, "h"]
+    # mean absolute error [rad] of the best of the `COMPARED_MODES` likeliest modes
+    nearest_mode: float
     paper_coverage: float  # share of codes of energy below `PAPER_ENERGY`
     default_coverage: float  # share of codes of energy below `DEFAULT_ENERGY`
     log_likelihood: float  # mean over the postures [nats]
@@ -59,7 +58,8 @@ class MixtureScore(Value):
             f"  {name:20s} {error:.3f} +- {deviation:.3f}" for name, error, deviation in rows
         )
         return (
-            f"mean absolute error on {self.postures} held-out postures [rad]: Eq. (23) +- deviation over postures\n"
+            f"mean absolute error on {self.postures} held-out postures [rad]: "
+            "Eq. (23) +- deviation over postures\n"
             f"{joints}\n  {'all joints':20s} {self.mean_error:.3f}; "
             f"the nearest of {COMPARED_MODES} modes {self.nearest_mode:.3f}\n"
             f"within reach: {self.paper_coverage:.4f} at the paper's {PAPER_ENERGY:g}, "
@@ -82,9 +82,8 @@ class MixtureScore(Value):
 def evaluate_mixture(mixture: GraspMixture, samples: HandSamples) -> MixtureScore:
     """Return the errors of a model on held-out postures; there must be at least two postures."""
     if samples.joint_names != mixture.joint_names:
-        raise BadArgument(
-            "samples", f"joints {samples.joint_names}", f"the mixture's {mixture.joint_names}"
-        )
+        allowed = f"the mixture's {mixture.joint_names}"
+        raise BadArgument("samples", f"joints {samples.joint_names}", allowed)
     if len(samples) < 2:
         raise BadArgument("samples", f"{len(samples)} postures", "at least 2")
     joints = samples.joints.double()
@@ -118,11 +117,8 @@ class BicCurve(Value):
             for m, b in zip(self.components.tolist(), self.bic.tolist(), strict=True)
         ]
         least = int(self.components[self.bic.argmin()])
-        end = (
-            ", the largest asked for: no minimum is seen"
-            if least == int(self.components.max())
-            else ""
-        )
+        last = least == int(self.components.max())
+        end = ", the largest asked for: no minimum is seen" if last else ""
         return "\n".join(["    m            BIC", *rows, f"least at {least}{end}"])
 
 
@@ -145,9 +141,7 @@ def growing_bic(
     shard, _, scale = standardised_rows(samples, most)
     start = start_components(shard, 1, 0, MAX_REGULARISATION)
     criterion = []
-    for m, fit in zip(
-        range(1, most + 1), growing_fits(shard, start, 100, 1e-3, MAX_REGULARISATION), strict=False
-    ):
+    for m, fit in zip(range(1, most + 1), growing_fits(shard, start, GROWING), strict=False):
         log_likelihood = float(fit.log_likelihood[-1] - scale.log().sum())  # in the samples' units
         criterion.append(information_criterion(fit.components, len(samples), log_likelihood))
         observer(m)

@@ -16,12 +16,18 @@ from torch import Tensor
 
 from torchgrasp.posture_model.em import (
     DataRows,
+    EmRule,
     Fit,
     FitProgress,
     expectation,
     expectation_maximisation,
     maximisation,
 )
+
+ENOUGH = 8
+"""Greatest subset that compares starts, over the smallest: on fewer rows, the likeliest fit is
+often not the likeliest on all rows.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,9 +41,8 @@ class Subsets:
 
     shard: DataRows
     sizes: tuple[int, ...]
-    place: Int[Tensor, "n"] | None = (
-        None  # of each row of this process in the random order of all rows
-    )
+    # of each row of this process in the random order of all rows
+    place: Int[Tensor, "n"] | None = None
 
     @staticmethod
     def of(shard: DataRows, smallest: int | None, seed: int) -> "Subsets":
@@ -45,15 +50,13 @@ class Subsets:
         only all rows.
         """
         n = shard.count()
-        sizes = tuple(
-            size for size in halves(n)[::-1] if smallest is not None and size >= smallest
-        ) or (n,)
+        least = n if smallest is None else smallest
+        sizes = tuple(size for size in halves(n)[::-1] if size >= least) or (n,)
         if len(sizes) == 1:
             return Subsets(shard, sizes)
         place = torch.randperm(n, generator=torch.Generator().manual_seed(seed), device="cpu")
-        return Subsets(
-            shard, sizes, place.split(shard.lengths().tolist())[shard.rank].to(shard.rows.device)
-        )
+        own = place.split(shard.lengths().tolist())[shard.rank]
+        return Subsets(shard, sizes, own.to(shard.rows.device))
 
     def take(self, size: int) -> DataRows:
         """Return the rows of this process in the subset of so many rows."""
@@ -71,72 +74,39 @@ def fit_subsets(
     subsets: Subsets,
     sizes: Sequence[int],
     start: FitProgress,
-    iterations: int,
-    tolerance: float,
-    regularisation: float,
+    rule: EmRule,
     observer: Callable[[FitProgress], None] = lambda progress: None,
 ) -> Fit:
-    """Fit a mixture by EM to the subsets of these sizes in turn; the other arguments are those of
-    EM.
+    """Fit a mixture by EM to the subsets of these sizes in turn.
 
-    `iterations` bounds the steps on all subsets together. The last log-likelihood is that of the
-    last subset.
+    The rule bounds the steps on all subsets together. The last log-likelihood is that of the last
+    subset.
     """
     for size in sizes[:-1]:
-        part = subsets.take(size)
-        start = _next(
-            expectation_maximisation(part, start, iterations, tolerance, regularisation, observer)
-        )
-    return expectation_maximisation(
-        subsets.take(sizes[-1]), start, iterations, tolerance, regularisation, observer
-    )
+        fit = expectation_maximisation(subsets.take(size), start, rule, observer)
+        # The next step sees other rows.
+        start = dataclasses.replace(fit.resumed(), jumped=True)
+    return expectation_maximisation(subsets.take(sizes[-1]), start, rule, observer)
 
 
-def likeliest_fit(
-    subsets: Subsets,
-    starts: list[FitProgress],
-    iterations: int,
-    tolerance: float,
-    regularisation: float,
-) -> FitProgress:
-    """Fit each start to the smaller subsets; return the state of the likeliest fit."""
-    # times the first subset: on fewer rows, the likeliest fit is often not the likeliest on all
-    # rows
-    enough = 8
-    sizes = [
-        size for size in subsets.sizes[:-1] if size <= enough * subsets.sizes[0]
-    ] or subsets.sizes
-    if len(starts) == 1:
-        return starts[0]
-    fits = [
-        fit_subsets(subsets, sizes, start, iterations, tolerance, regularisation)
-        for start in starts
-    ]
-    return _next(max(fits, key=lambda fit: float(fit.log_likelihood[-1])))
+def fit_smallest(subsets: Subsets, start: FitProgress, rule: EmRule) -> Fit:
+    """Fit a mixture to the smaller subsets, from which the fit to all rows goes on."""
+    most = ENOUGH * subsets.sizes[0]
+    sizes = [size for size in subsets.sizes[:-1] if size <= most] or subsets.sizes
+    return dataclasses.replace(fit_subsets(subsets, sizes, start, rule), jumped=True)
 
 
-def growing_fits(
-    shard: DataRows, start: FitProgress, iterations: int, tolerance: float, regularisation: float
-) -> Iterator[Fit]:
+def growing_fits(shard: DataRows, start: FitProgress, rule: EmRule) -> Iterator[Fit]:
     """Yield fits without end, each of one component more; each starts from the last, its heaviest
     component split.
     """
+    n = shard.count()
     while True:
-        yield (fit := expectation_maximisation(shard, start, iterations, tolerance, regularisation))
+        fit = expectation_maximisation(shard, start, rule)
+        yield fit
         sums, _ = expectation(shard, fit.components)
-        sums = torch.cat(
-            [sums, torch.zeros_like(sums[:1])]
-        )  # a component without rows takes half of the heaviest
-        components, split = maximisation(
-            sums, shard.count(), regularisation, fit.reseeded.new_zeros(len(sums))
-        )
-        start = FitProgress(components, torch.zeros_like(split), fit.log_likelihood[:0])
-
-
-def _next(fit: Fit) -> FitProgress:
-    """Return the state in which the next subset begins: the likelihood of its rows is not yet
-    known.
-    """
-    return FitProgress(
-        fit.components, fit.reseeded, fit.log_likelihood[:-1], jumped=True, rows=fit.rows
-    )
+        # A component without rows takes half of the heaviest.
+        sums = torch.cat([sums, torch.zeros_like(sums[:1])])
+        never = fit.reseeded.new_zeros(len(sums))
+        components, _ = maximisation(sums, n, rule.regularisation, never)
+        start = FitProgress(components, never, fit.log_likelihood[:0])

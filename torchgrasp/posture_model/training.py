@@ -18,16 +18,35 @@ from torchgrasp.foundation.rules import Count, Fraction, Range, Seed
 from torchgrasp.posture_model.em import (
     Components,
     DataRows,
+    EmRule,
+    Fit,
     FitProgress,
     expectation_maximisation,
+    likeliest,
     start_components,
 )
 from torchgrasp.posture_model.mixture import CODE_NAMES, GraspMixture
 from torchgrasp.posture_model.sample import HandSamples
-from torchgrasp.posture_model.stepwise import Subsets, fit_subsets, halves, likeliest_fit
+from torchgrasp.posture_model.stepwise import Subsets, fit_smallest, fit_subsets, halves
 
 MAX_REGULARISATION = 1e-6  # largest variance added to a dimension, relative to the data's
-TRIAL_STEPS = 20  # steps of EM before starts are compared; a whole fit takes some hundred
+
+
+@dataclasses.dataclass(frozen=True)
+class MixtureNumbers:
+    """The numbers of a fit to samples."""
+
+    trial_steps: int = 20
+    """Steps of EM before starts are compared; a whole fit takes some hundred."""
+    constant: float = 1e-9
+    """Standard deviation of a number that does not vary, over its size plus one."""
+    same: float = 1e-9
+    """Relative difference of means and deviations of the same data, added in another order."""
+    same_zero: float = 1e-12
+    """Difference of such numbers that are nearly zero."""
+
+
+MIXTURES = MixtureNumbers()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,34 +102,31 @@ class Checkpoint:
         for name, ours in (("centre", self.centre), ("scale", self.scale)):
             saved = tensors[name].to(ours)
             if saved.shape != ours.shape or not torch.allclose(
-                saved, ours, rtol=1e-9, atol=1e-12
-            ):  # order of the sum
+                saved, ours, rtol=MIXTURES.same, atol=MIXTURES.same_zero
+            ):
                 other[name] = "of other data"
         if other:
-            allowed = (
-                f"a new file, or the checkpoint of this fit: {self.settings} and the same data"
-            )
-            raise BadArgument("checkpoint", f"{path}: {other}", allowed)
+            fit = f"the checkpoint of this fit: {self.settings} and the same data"
+            raise BadArgument("checkpoint", f"{path}: {other}", f"a new file, or {fit}")
         for name, shape in shapes.items():
             t = tensors[name]
             dtype = torch.int64 if name == "reseeded" else torch.float64
             if (shape != (-1,) and t.shape != shape) or t.dtype != dtype:
-                raise ModelFileError(
-                    "checkpoint", f"{path}: {name} {tuple(t.shape)} {t.dtype}", str(shape)
-                )
+                found = f"{path}: {name} {tuple(t.shape)} {t.dtype}"
+                raise ModelFileError("checkpoint", found, str(shape))
         sizes = {str(size): size for size in halves(int(self.settings["rows"]))}
-        if (step_rows := meta.get("step_rows", "")) not in sizes:
-            raise ModelFileError(
-                "checkpoint", f"{path}: a step on {step_rows!r} rows", f"one of {list(sizes)}"
-            )
-        components = Components(tensors["weights"], tensors["means"], tensors["covariances"])
-        state = (
+        step_rows = meta.get("step_rows", "")
+        if step_rows not in sizes:
+            found = f"{path}: a step on {step_rows!r} rows"
+            raise ModelFileError("checkpoint", found, f"one of {list(sizes)}")
+        progress = FitProgress(
+            Components(tensors["weights"], tensors["means"], tensors["covariances"]),
             tensors["reseeded"],
             tensors["log_likelihood"],
             meta.get("jumped") == "True",
             sizes[step_rows],
         )
-        return FitProgress(components, *state).to(self.centre.device)
+        return progress.to(self.centre.device)
 
 
 @checked
@@ -173,26 +189,29 @@ def fit_mixture(
         "regularisation": regularisation,
     }
     settings = {name: str(value) for name, value in (fixed | {"subset": subset}).items()}
-    saved = Checkpoint(
-        None if checkpoint is None else Path(checkpoint), shard, centre, scale, settings
-    )
+    path = None if checkpoint is None else Path(checkpoint)
+    saved = Checkpoint(path, shard, centre, scale, settings)
+    rule = EmRule(iterations, tolerance, regularisation)
+
+    def try_start(begun: FitProgress) -> Fit:
+        if subset is not None:
+            return fit_smallest(subsets, begun, rule)
+        trial = EmRule(MIXTURES.trial_steps, 0.0, regularisation)
+        return expectation_maximisation(shard, begun, trial)
+
     start = saved.load()
     if start is None:
         first = subsets.take(subsets.sizes[0])
-        begun = [
-            start_components(first, components, seed + k, regularisation) for k in range(starts)
-        ]
-        if subset is None:
-            start = _likeliest(shard, begun, regularisation)
-        else:
-            start = likeliest_fit(subsets, begun, iterations, tolerance, regularisation)
+        seeds = range(seed, seed + starts)
+        begun = [start_components(first, components, k, regularisation) for k in seeds]
+        start = likeliest(begun, try_start)
 
     def observe(progress: FitProgress) -> None:
         saved.save(progress)
         observer(progress)
 
     sizes = [size for size in subsets.sizes if size >= start.rows]  # the smaller ones are done
-    fit = fit_subsets(subsets, sizes, start, iterations, tolerance, regularisation, observe)
+    fit = fit_subsets(subsets, sizes, start, rule, observe)
     log_likelihood = float(fit.log_likelihood[-1] - scale.log().sum())  # in the samples' units
     report = {
         "samples": str(n),
@@ -227,16 +246,12 @@ def standardised_rows(
     samples.
     """
     if samples.q.shape[1] != len(CODE_NAMES):
-        raise BadArgument(
-            "samples",
-            f"codes of {samples.q.shape[1]} numbers",
-            "codes of three fingertips: six numbers",
-        )
-    shard = DataRows.of(
-        samples.rows().double(), distributed
-    )  # a copy, which is standardised in place
-    # fewer samples leave the covariance of d dimensions singular
+        found = f"codes of {samples.q.shape[1]} numbers"
+        raise BadArgument("samples", found, "codes of three fingertips: six numbers")
+    # a copy, which is standardised in place
+    shard = DataRows.of(samples.rows().double(), distributed)
     n = shard.count()
+    # Fewer samples leave the covariance of d dimensions singular.
     least = shard.rows.shape[1] + 2
     if n < least:
         raise BadArgument("samples", f"{n} samples", f"at least {least}")
@@ -246,24 +261,10 @@ def standardised_rows(
     centre = shard.sum(x.sum(0)) / n
     x.sub_(centre)
     scale = (shard.sum(x.square().sum(0)) / n).sqrt()
-    constant = (scale <= 1e-9 * (1 + centre.abs())).tolist()
+    constant = (scale <= MIXTURES.constant * (1 + centre.abs())).tolist()
     if any(constant):
         found = ", ".join(name for name, c in zip(names, constant, strict=True) if c)
-        raise BadArgument(
-            "samples", f"no variation in {found}", "samples that vary in every dimension"
-        )
+        allowed = "samples that vary in every dimension"
+        raise BadArgument("samples", f"no variation in {found}", allowed)
     x.div_(scale)
     return shard, centre, scale
-
-
-def _likeliest(shard: DataRows, starts: list[FitProgress], regularisation: float) -> FitProgress:
-    """Run `TRIAL_STEPS` EM steps from each initial state; return the result of the greatest
-    likelihood.
-    """
-    if len(starts) == 1:
-        return starts[0]
-    fits = [
-        expectation_maximisation(shard, start, TRIAL_STEPS, 0.0, regularisation) for start in starts
-    ]
-    best = max(fits, key=lambda fit: float(fit.log_likelihood[-1]))
-    return FitProgress(best.components, best.reseeded, best.log_likelihood[:-1], best.jumped)
