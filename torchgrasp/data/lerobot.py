@@ -26,6 +26,9 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.values.closing import ClosureResult
 
 Episodes = Sequence[tuple[str, ClosureResult]]
+PERCENTILES = (1, 10, 50, 90, 99)
+"""The quantiles that LeRobot's statistics hold."""
+RATE_DECIMALS = 6  # to which rates [Hz] are rounded before they are compared
 
 
 @checked
@@ -60,15 +63,14 @@ def write_lerobot(folder: Path | str, episodes: Episodes, hand: Hand) -> Path:
     joints = sorted(hand.tree.joint_names)
     rates = list[float]()
     for i, (_, x) in enumerate(episodes):
-        rates.append(round(1 / float(x.time[1] - x.time[0]), 6) if len(x.time) > 1 else 0.0)
+        rates.append(
+            round(1 / float(x.time[1] - x.time[0]), RATE_DECIMALS) if len(x.time) > 1 else 0.0
+        )
         same = sorted(x.joint_names) == joints and x.forces.shape[1] == len(hand.finger_names)
         if not same or not rates[i] or rates[i] != rates[0]:
             found = f"{len(x.time)} ticks at {rates[i]:g} Hz of {len(x.joint_names)} joints"
-            raise BadArgument(
-                f"episodes[{i}]",
-                found,
-                f"a closing of {hand.name}, two ticks or more, all at one rate",
-            )
+            allowed = f"a closing of {hand.name}, two ticks or more, all at one rate"
+            raise BadArgument(f"episodes[{i}]", found, allowed)
     if not rates:
         raise BadArgument("episodes", "none", "at least one closing")
     files = dict(_files(episodes, hand, rates[0]))
@@ -92,31 +94,26 @@ def _files(episodes: Episodes, hand: Hand, rate: float) -> Iterator[tuple[str, s
     for i, (start, end) in enumerate(itertools.pairwise(ends)):
         row = {"episode_index": i, "tasks": [episodes[i][0]], "length": end - start}
         row |= {"dataset_from_index": start, "dataset_to_index": end}
-        row |= {
-            f"{of}/{index}_index": 0
-            for of in ("data", "meta/episodes")
-            for index in ("chunk", "file")
-        }
-        stats = {name: _stats(x[start:end]) for name, x in frames.items()}
-        rows.append(
-            row | {f"stats/{name}/{key}": x for name, of in stats.items() for key, x in of.items()}
-        )
+        for of in ("data", "meta/episodes"):
+            row |= {f"{of}/chunk_index": 0, f"{of}/file_index": 0}
+        for name, x in frames.items():
+            row |= {f"stats/{name}/{key}": some for key, some in _stats(x[start:end]).items()}
+        rows.append(row)
     yield f"data/{file}", pack_table(as_table(frames, {}))
     yield f"meta/episodes/{file}", pack_table(import_arrow().Table.from_pylist(rows))
-    words = as_table(
-        {"task_index": torch.arange(len(tasks)), "task": tasks},
-        {"pandas": render_card("tasks.json")},
-    )
+    columns = {"task_index": torch.arange(len(tasks)), "task": tasks}
+    words = as_table(columns, {"pandas": render_card("tasks.json")})
     yield "meta/tasks.parquet", pack_table(words)
     yield "meta/stats.json", json.dumps({name: _stats(x) for name, x in frames.items()}, indent=1)
     pose = ("x", "y", "z", "qx", "qy", "qz", "qw")
     fingers = hand.finger_names
-    names = {"action": [*joints, *(f"hand.{x}" for x in pose)]}
-    names |= {
-        "observation.state": names["action"],
+    state = [*joints, *(f"hand.{x}" for x in pose)]
+    names = {
+        "action": state,
+        "observation.state": state,
         "observation.environment_state": [f"object.{x}" for x in pose],
+        "observation.forces": [f"{finger}.{axis}" for finger in fingers for axis in "xyz"],
     }
-    names["observation.forces"] = [f"{finger}.{axis}" for finger in fingers for axis in "xyz"]
     features = {
         name: {
             "dtype": str(x.dtype).removeprefix("torch."),
@@ -163,16 +160,16 @@ def _frames(
 
 def _numbers(poses: Float[Tensor, "t 4 4"]) -> Float[Tensor, "t 7"]:
     """Return poses as positions [m] and quaternions (x, y, z, w), whose signs do not jump."""
-    turns = torch.from_numpy(
-        spatial.transform.Rotation.from_matrix(poses[:, :3, :3].numpy()).as_quat(canonical=True)
-    )
+    rotations = spatial.transform.Rotation.from_matrix(poses[:, :3, :3].numpy())
+    turns = torch.from_numpy(rotations.as_quat(canonical=True))
     signs = torch.where((turns[1:] * turns[:-1]).sum(1) < 0, -1.0, 1.0).cumprod(0)
-    return torch.cat([poses[:, :3, 3], torch.cat([turns[:1], turns[1:] * signs[:, None]])], 1)
+    turns[1:] *= signs[:, None]
+    return torch.cat([poses[:, :3, 3], turns], 1)
 
 
 def _stats(column: Tensor) -> dict[str, list[Any]]:
     """Return statistics of each number of a feature over all frames, named as LeRobot names them."""
     x = column.double().reshape(len(column), -1).numpy()
     found = {"min": x.min(0), "max": x.max(0), "mean": x.mean(0), "std": x.std(0)}
-    found |= {f"q{q:02d}": np.quantile(x, q / 100, axis=0) for q in (1, 10, 50, 90, 99)}
+    found |= {f"q{q:02d}": np.quantile(x, q / 100.0, axis=0) for q in PERCENTILES}
     return {name: numbers.tolist() for name, numbers in found.items()} | {"count": [len(x)]}

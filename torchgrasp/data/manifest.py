@@ -30,25 +30,39 @@ from torchgrasp.values.planning import PointCloud
 WHOLE = "whole"
 MOST_SCALE = 1e4
 MOST_METRES = 1e4
+LEAST_MASS = 1e-6
 MOST_MASS = 1e4
-"""Largest scale, its inverse being the least, largest coordinate [m] of a camera, and largest mass
-[kg].
+"""Largest scale, its inverse being the least, largest coordinate [m] of a camera, and least and
+largest mass [kg].
 """
-MESHES = (
-    ".ply",
-    ".stl",
-    ".obj",
-    ".off",
-)  # suffixes of the meshes that `write_objects` takes from a folder
+NAME_BYTES = 100  # longest name: file names have 255 bytes
+SHOWN_NAMES = 100  # most names that an error message quotes
+# suffixes of the meshes that `write_objects` takes from a folder
+MESHES = (".ply", ".stl", ".obj", ".off")
+
+
+@dataclasses.dataclass(frozen=True)
+class CameraNumbers:
+    """Where the cameras of `write_objects` are."""
+
+    lowest: float = 25.0
+    """Least angle [deg] above the horizontal."""
+    highest: float = 45.0
+    """Greatest angle [deg] above the horizontal."""
+    distance: float = 0.5
+    """Distance [m] from the object."""
+    seeds: int = 2**31
+    """Number of seeds of a view's noise."""
+
+
+CAMERAS = CameraNumbers()
 
 
 @dataclasses.dataclass(frozen=True)
 class ObjectEntry:
     """The description of an object in the manifest of a folder of objects."""
 
-    views: dict[
-        str, tuple[float, ...]
-    ]  # position [m] of the camera of each view by name, at scale 1
+    views: dict[str, tuple[float, ...]]  # camera's position [m] of each view by name, at scale 1
     scale: float  # scale factor of mesh and clouds
     family: str  # family of similar objects; the object's own name by default
     group: str  # such as "solid", "thin" or "shell"; "" by default
@@ -105,7 +119,7 @@ def _parse_entry(name: str, field: Field) -> ObjectEntry:
         1.0 if scale is None else scale.number(1 / MOST_SCALE, MOST_SCALE),
         name if family is None else family.text(),
         "" if group is None else group.text(),
-        None if mass is None or mass.value is None else mass.number(1e-6, MOST_MASS),
+        None if mass is None or mass.value is None else mass.number(LEAST_MASS, MOST_MASS),
     )
 
 
@@ -130,34 +144,28 @@ def write_objects(
     >>> len(read_view(folder / "objects", "carton", "view0"))
     1000
     """
-    # angles of the camera above the horizontal [deg], its distance [m]
-    lowest = 25.0
-    highest = 45.0
-    distance = 0.5
     files = sorted(path for path in Path(meshes).glob("*") if path.suffix.lower() in MESHES)
     names = [path.stem for path in files]
     if not files or len(set(names)) != len(names):
         found = f"{meshes} without meshes" if not files else f"{meshes} with two meshes of one name"
-        raise DatasetError(
-            "meshes", found, f"a folder of files {', '.join(MESHES)}, each of its own name"
-        )
+        allowed = f"a folder of files {', '.join(MESHES)}, each of its own name"
+        raise DatasetError("meshes", found, allowed)
     generator = torch.Generator().manual_seed(seed)
     entries = dict[str, object]()
     for path in files:
         mesh = read_mesh(path)
         low, high = mesh.bounds
-        mesh = mesh.copy().apply_translation(
-            [-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2]]
-        )
-        write_file(Path(out) / path.stem / "mesh.ply", mesh.export(file_type="ply"))
+        shift = [-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2]]
+        mesh = mesh.copy().apply_translation(shift)
+        folder = Path(out) / path.stem
+        write_file(folder / "mesh.ply", mesh.export(file_type="ply"))
         poses = dict[str, object]()
         for k in range(views):
             first, second = torch.rand(2, generator=generator).tolist()
-            camera = look_at(360.0 * first, lowest + (highest - lowest) * second, distance, mesh)
-            noise = int(torch.randint(2**31, (1,), generator=generator))
-            save_cloud(
-                partial_view(mesh, camera, seed=noise), Path(out) / path.stem / f"view{k}_noisy.ply"
-            )
+            elevation = CAMERAS.lowest + (CAMERAS.highest - CAMERAS.lowest) * second
+            camera = look_at(360.0 * first, elevation, CAMERAS.distance, mesh)
+            noise = int(torch.randint(CAMERAS.seeds, (1,), generator=generator))
+            save_cloud(partial_view(mesh, camera, seed=noise), folder / f"view{k}_noisy.ply")
             poses[f"view{k}"] = {"T_object_camera": camera.tolist()}
         entries[path.stem] = {"views": poses}
     write_file(Path(out) / "manifest.json", format_json({"objects": entries}))
@@ -168,11 +176,13 @@ def _check_name(field: Field, name: str) -> None:
     """Raise the field's error for a name that is more than one part of a path, or that is not
     printable.
     """
-    longest_name = 100  # most letters of a name: file names have 255 bytes
     plain = name.isprintable() and not set(name) & set("/\\:") and name == name.strip(" .")
-    if not plain or not 0 < len(name.encode("utf-8", "surrogatepass")) <= longest_name:
-        allowed = f"a printable name of 1 to {longest_name} bytes without / \\ : or a dot or space at its ends"
-        raise field.refuse(f"{field.path}: the name {name[:longest_name]!r}", allowed)
+    if not plain or not 0 < len(name.encode("utf-8", "surrogatepass")) <= NAME_BYTES:
+        allowed = (
+            f"a printable name of 1 to {NAME_BYTES} bytes "
+            "without / \\ : or a dot or space at its ends"
+        )
+        raise field.refuse(f"{field.path}: the name {name[:NAME_BYTES]!r}", allowed)
 
 
 @checked
@@ -219,9 +229,8 @@ def read_view(objects: Path | str, name: str, view: str, camera: bool = True) ->
         cloud = read_cloud(_file(objects, name, "full_normals.ply"))
         return PointCloud(cloud.points * entry.scale, cloud.normals)
     if view not in entry.views:
-        raise DatasetError(
-            "objects", f"{objects}: view {view!r} of {name!r}", f"one of {sorted(entry.views)}"
-        )
+        found = f"{objects}: view {view!r} of {name!r}"
+        raise DatasetError("objects", found, f"one of {sorted(entry.views)}")
     cloud = read_cloud(_file(objects, name, f"{view}_noisy.ply"))
     viewpoint = torch.tensor(entry.views[view], dtype=torch.float64)
     return PointCloud(cloud.points * entry.scale, None, viewpoint * entry.scale if camera else None)
@@ -250,9 +259,8 @@ def _file(objects: Path | str, name: str, file: str) -> Path:
     path = Path(objects) / name / file
     folder = Path(objects).resolve()
     if not path.resolve().is_relative_to(folder):
-        raise DatasetError(
-            "objects", f"{path}, which is {path.resolve()}", f"files within {folder}"
-        )
+        found = f"{path}, which is {path.resolve()}"
+        raise DatasetError("objects", found, f"files within {folder}")
     return path
 
 
@@ -269,7 +277,6 @@ def _read_fields(objects: Path | str, only: Sequence[str]) -> dict[str, Field]:
     entries = top["objects"].entries() if "objects" in top else {}
     chosen = {name: entries[name] for name in entries if not only or name in only}
     if not chosen:
-        raise refuse(
-            f"{path} with {sorted(entries)[:100]}", "a manifest with the objects asked for"
-        )
+        found = f"{path} with {sorted(entries)[:SHOWN_NAMES]}"
+        raise refuse(found, "a manifest with the objects asked for")
     return chosen

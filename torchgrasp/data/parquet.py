@@ -4,13 +4,14 @@ line.
 
 import itertools
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from torchgrasp.data.reader import CARD, GraspShards
+from torchgrasp.data.shards import JobRow
 from torchgrasp.data.table_folder import (
     as_column,
     as_table,
@@ -22,6 +23,9 @@ from torchgrasp.data.table_folder import (
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, ModelFileError, Status
 from torchgrasp.foundation.lazy import jinja2
+
+OBJECT = ("object", "view", "family", "group")
+"""Columns of every table that say what a row is about."""
 
 
 @checked
@@ -40,9 +44,8 @@ def write_parquet(data: GraspShards, folder: Path | str) -> Path:
     """
     import_arrow()
     if not len(data):
-        raise BadArgument(
-            "data", f"{len(data.jobs)} jobs without a grasp", "a data set with grasps"
-        )
+        found = f"{len(data.jobs)} jobs without a grasp"
+        raise BadArgument("data", found, "a data set with grasps")
     try:
         source = {name: data.card[name] for name in ("campaign", "licence", "asked")}
         asked = source["asked"]
@@ -55,9 +58,8 @@ def write_parquet(data: GraspShards, folder: Path | str) -> Path:
         }
         render_card("shards.md", card=data.card)
     except (LookupError, TypeError, jinja2.TemplateError) as error:
-        raise ModelFileError(
-            "data", f"{data.folder / CARD} ({error})", "the card of `torchgrasp campaign`"
-        ) from error
+        found = f"{data.folder / CARD} ({error})"
+        raise ModelFileError("data", found, "the card of `torchgrasp campaign`") from error
     return write_folder(folder, source, _files(data, of_campaign))
 
 
@@ -84,28 +86,23 @@ def _grasp_columns(data: GraspShards, jobs: range, of_campaign: dict[str, Any]) 
     """Return the columns of the grasps of some jobs by name, or none if the jobs have no grasp."""
     numbers = range(data.starts[jobs.start], data.starts[jobs.stop])
     items = [data[i] for i in numbers]
+    if not items:
+        return {}
     of = [int(item["job"]) for item in items]
+    columns: dict[str, Any] = {"grasp": list(numbers), "job": of}
+    columns |= _of_rows([data.jobs[j] for j in of], OBJECT)
+    columns |= {name: [value] * len(items) for name, value in of_campaign.items()}
+    for name in items[0]:
+        if name not in ("job", "points", "viewpoint"):  # of the view
+            columns[name] = torch.stack([x[name] for x in items])
     tries = itertools.chain(*(data.job(j).outcome.tolist() for j in jobs))
-    of_view = "job", "points", "viewpoint"
-    return (
-        {}
-        if not items
-        else {
-            "grasp": list(numbers),
-            "job": of,
-            **{
-                name: [getattr(data.jobs[j], name) for j in of]
-                for name in ("object", "view", "family", "group")
-            },
-            **{name: [value] * len(items) for name, value in of_campaign.items()},
-            **{
-                name: torch.stack([x[name] for x in items])
-                for name in items[0]
-                if name not in of_view
-            },
-            "outcomes": [[Status(status).name for status in of_grasp] for of_grasp in tries],
-        }
-    )
+    columns["outcomes"] = [[Status(status).name for status in of_grasp] for of_grasp in tries]
+    return columns
+
+
+def _of_rows(rows: Sequence[JobRow], names: Sequence[str]) -> dict[str, list[Any]]:
+    """Return columns of some fields of the rows of jobs."""
+    return {name: [getattr(row, name) for row in rows] for name in names}
 
 
 def _view_columns(data: GraspShards, jobs: range) -> dict[str, Any]:
@@ -116,22 +113,15 @@ def _view_columns(data: GraspShards, jobs: range) -> dict[str, Any]:
     places = arrow.list_(arrow.float32(), 3)
     points = [torch.zeros(0, 3) if x is None else x.points for x in clouds]
     eyes = [None if x is None or x.viewpoint is None else x.viewpoint.tolist() for x in clouds]
-    ends = [0, *itertools.accumulate(map(len, points))]
+    ends = arrow.array([0, *itertools.accumulate(map(len, points))], arrow.int32())
+    rows_of_points = as_column(torch.cat(points).float())
     return {
         "job": list(jobs),
-        **{
-            name: [getattr(row, name) for row in rows]
-            for name in ("object", "view", "family", "group")
-        },
+        **_of_rows(rows, OBJECT),
         "status": [row.status.name for row in rows],
-        **{
-            name: [getattr(row, name) for row in rows]
-            for name in ("note", "executable", "grasps", "passed")
-        },
+        **_of_rows(rows, ("note", "executable", "grasps", "passed")),
         "viewpoint": arrow.array(eyes, places),
-        "points": arrow.ListArray.from_arrays(
-            arrow.array(ends, arrow.int32()), as_column(torch.cat(points).float())
-        ),
+        "points": arrow.ListArray.from_arrays(ends, rows_of_points),
     }
 
 

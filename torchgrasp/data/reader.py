@@ -22,6 +22,7 @@ from torchgrasp.values.planning import Grasps, PointCloud
 
 # file that describes a data set; it is written last, so a folder with a card is complete
 CARD = "card.json"
+CARD_BYTES = 256 * 1024**2  # largest card
 
 
 class ShardJob(NamedTuple):
@@ -100,13 +101,10 @@ class GraspShards:
             "contacts": contacts.points[g],
             "normals": contacts.normals[g],
             "std_m": contacts.require_std()[g],
-        }
-        item |= {"margin": certificate.margin[g], "witness": certificate.witness[g]}
-        item |= {
+            "margin": certificate.margin[g],
+            "witness": certificate.witness[g],
             "predicted": torch.sigmoid(grasps.score[g]),
             "simulated": records.passed[g].double().mean(),
-        }
-        item |= {
             "points": _choose(records.points, self.points, i),
             "viewpoint": records.viewpoints[0],
         }
@@ -166,21 +164,18 @@ def read_shards(folder: Path | str, points: Count | None = None) -> GraspShards:
     >>> data[0]["points"].shape, data.jobs[0].object, data.job(0).row.grasps
     (torch.Size([100, 3]), 'carton', 1)
     """
-    # largest card in bytes
     folder = Path(folder)
-    most_card = 256 * 1024**2
     refuse = functools.partial(ModelFileError, "folder")
-    card = read_json(
-        folder / CARD, refuse, "a folder that `torchgrasp campaign` finished", most_card
-    )
+    allowed = "a folder that `torchgrasp campaign` finished"
+    card = read_json(folder / CARD, refuse, allowed, CARD_BYTES)
     fields = card.entries("campaign", "jobs_in_shard", "jobs")
     fields["campaign"].text()
     jobs = tuple(read_row(row, bare=True) for row in fields["jobs"].items(MOST))
     size = fields["jobs_in_shard"].whole(1, MOST)
-    if lacking := sum(not shard_path(folder, k).is_file() for k in range(-(-len(jobs) // size))):
-        raise refuse(
-            f"{folder} without {lacking} of its shards", "all shards: run the campaign again"
-        )
+    lacking = sum(not shard_path(folder, k).is_file() for k in range(-(-len(jobs) // size)))
+    if lacking:
+        found = f"{folder} without {lacking} of its shards"
+        raise refuse(found, "all shards: run the campaign again")
     return GraspShards(folder, card.value, jobs, size, points)
 
 

@@ -24,6 +24,7 @@ from torchgrasp.values.planning import Grasps
 
 KIND = "grasp-shard"  # kind of the file
 MOST = 1_000_000  # most points, grasps and tries of one job
+META_LETTERS = 10_000  # letters of an entry of the metadata, which may name all joints
 
 
 class JobRow(NamedTuple):
@@ -122,9 +123,8 @@ def load_shard(path: Path, meta: dict[str, str]) -> Shard:
     sizes = len(records.points), len(records.viewpoints), len(records.grasps)
     known = {int(status) for status in Status}
     if counted != sizes or not set(records.outcome.unique().tolist()) <= known:
-        raise refuse(
-            f"{path} of {counted} points, jobs and grasps, with tensors of {sizes}", "equal counts"
-        )
+        found = f"{path} of {counted} points, jobs and grasps, with tensors of {sizes}"
+        raise refuse(found, "equal counts")
     return Shard(rows, records)
 
 
@@ -132,16 +132,15 @@ def read_row(field: Field, bare: bool = False) -> JobRow:
     """Read the row of a job from JSON; a `bare` row has no metadata."""
     fields = field.entries(*JobRow._fields[: -1 if bare else None])  # the metadata comes last
     texts = {name: fields[name].text() for name in ("object", "view", "note", "family", "group")}
-    counts = {
-        name: fields[name].whole(0, MOST) for name in ("executable", "points", "grasps", "passed")
-    }
+    counted = ("executable", "points", "grasps", "passed")
+    counts = {name: fields[name].whole(0, MOST) for name in counted}
     status = fields["status"].text()
     if status not in Status.__members__:
         raise fields["status"].wrong("the name of a Status")
-    longest_meta = 10_000  # letters of an entry of the metadata, which may name all joints
-    meta = (
-        {} if bare else {key: x.text(longest_meta) for key, x in fields["meta"].entries().items()}
-    )
+    meta = {}
+    if not bare:
+        entries = fields["meta"].entries()
+        meta = {key: x.text(META_LETTERS) for key, x in entries.items()}
     return JobRow(**texts, status=Status[status], **counts, meta=meta)  # pyright: ignore[reportArgumentType]
 
 
@@ -172,17 +171,14 @@ def load_grasps(path: Path | str) -> Grasps:
 def check_grasps(path: Path | str, grasps: Grasps) -> None:
     """Raise `ModelFileError` if grasps from a file cannot have been written by `Grasps.save`."""
     f = grasps.contacts.fingertips
+    known = torch.tensor([int(status) for status in Status], device="cpu")
+    fingers = torch.arange(f, device="cpu")
+    few = torch.tensor([not FINGERTIPS[0] <= f <= FINGERTIPS[1]], device="cpu")
     wrong = {
-        f"{f} fingertips, not three to five": torch.tensor(
-            [not FINGERTIPS[0] <= f <= FINGERTIPS[1]], device="cpu"
-        ),
+        f"{f} fingertips, not three to five": few,
         "obj_from_hand that is not rigid": ~is_rigid(grasps.obj_from_hand),
-        "an unknown status": ~torch.isin(
-            grasps.status, torch.tensor([int(status) for status in Status], device="cpu")
-        ),
-        "a permutation that is none": (
-            grasps.permutation.sort(1).values != torch.arange(f, device="cpu")
-        ).any(1),
+        "an unknown status": ~torch.isin(grasps.status, known),
+        "a permutation that is none": (grasps.permutation.sort(1).values != fingers).any(1),
     }
     for found in (name for name, rows in wrong.items() if bool(rows.any())):
         raise ModelFileError("path", f"{path}: {found}", "grasps that Grasps.save wrote")

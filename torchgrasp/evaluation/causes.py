@@ -19,6 +19,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import Status
 from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.geometry.frames import apply, inverse, rotation_angle
+from torchgrasp.geometry.linalg import norm
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.values.closing import ClosureResult
 from torchgrasp.values.specs import TrialSpec
@@ -27,6 +28,8 @@ CAUSES: dict[str, list[str]] = json.loads(Path(__file__).with_suffix(".json").re
 """Causes by name: the unit of the size, and a sentence. The first that applies to a trial is its
 cause.
 """
+SHAPE_OFF = 10.0  # distance [mm] of a planned contact from the true surface
+RAISED = 1e-3  # height [m] below that of the lift from which the hand counts as raised
 
 
 @checked
@@ -37,14 +40,13 @@ def find_cause(tries: Sequence[LiftTry], trial: GraspTrial, spec: TrialSpec) -> 
     The result is "" and NaN if the object was held.
     """
     truth = trial.truth
-    (*before, (row, lift)) = tries
+    *before, (row, lift) = tries
     if lift.held or lift.status is Status.UNSTABLE:
         return "", math.nan
     if lift.status is Status.START_OVERLAP:
         return "start overlap", 1e3 * lift.start_overlap
-    for _, result in reversed(
-        before
-    ):  # each record begins with the object where the try before left it
+    # Each record begins with the object where the try before left it.
+    for _, result in reversed(before):
         lift = dataclasses.replace(lift, object_pose=lift.object_pose @ result.object_pose[-1])
         truth = dataclasses.replace(truth, slide=None)
     trial = dataclasses.replace(trial, grasp=trial.grasp[row], truth=truth)
@@ -59,27 +61,22 @@ def _sizes(
     """
     mesh = read_mesh(trial.truth.mesh)
     truth = trial.truth
-    up = (
-        torch.tensor([0.0, 0.0, 1.0]).double()
-        if truth.table is None
-        else truth.table.normal.double()
-    )
+    up = torch.tensor([0.0, 0.0, 1.0]).double()
+    if truth.table is not None:
+        up = truth.table.normal.double()
     centre = torch.tensor(mesh.center_mass.tolist()).double()
-    (touched, pressed) = (tick_of(lift, k) for k in (1, 2))
-    start, closed, lifted = apply(lift.object_pose[[0, touched, pressed]], centre.expand(3, 1, 3))[
-        :, 0
-    ]
+    pressed = tick_of(lift, 2)
+    poses = lift.object_pose[[0, tick_of(lift, 1), pressed]]
+    start, closed, lifted = apply(poses, centre.expand(3, 1, 3))[:, 0]
     start = start if truth.slide is None else start + truth.slide.to(start)
     upright = lift.object_pose[[0, pressed], :3, :3] @ up
     tilt = torch.atan2(torch.linalg.cross(*upright).norm(), upright[0] @ upright[1])
     yield "toppled", math.degrees(tilt), math.degrees(SLIP_ANGLE)
     yield "pushed away", 1e3 * float((closed - start).norm()), 1e3 * SLIP_DISTANCE
     yield "ejected", 1e3 * float((lifted - closed).norm()), 1e3 * SLIP_DISTANCE
-    off = (
-        1e3
-        * trimesh.proximity.closest_point(mesh, trial.grasp.contacts.points[0].double().numpy())[1]
-    )
-    yield "shape off", float(off.max()), 10.0
+    points = trial.grasp.contacts.points[0].double().numpy()
+    off = 1e3 * trimesh.proximity.closest_point(mesh, points)[1]
+    yield "shape off", float(off.max()), SHAPE_OFF
     missing = [finger for finger in range(len(off)) if finger not in lift.contact_order]
     yield "never met", float(off[missing].max()) if missing else math.nan, -1.0
     weak = lift.status in (Status.TOO_WEAK, Status.TOO_HEAVY)
@@ -88,7 +85,7 @@ def _sizes(
     lost = (slid >= SLIP_DISTANCE) | (turned >= SLIP_ANGLE)
     first = int(lost.int().argmax())
     heights = (lift.hand_pose[pressed:, :3, 3] - lift.hand_pose[pressed, :3, 3]) @ up
-    risen = int((heights >= spec.lift_height - 1e-3).int().argmax()) or -1
+    risen = int((heights >= spec.lift_height - RAISED).int().argmax()) or -1
     yield "dropped when pushed", math.nan if bool(lost[risen]) else math.hypot(*spec.push), 0.0
     rotates = bool(lost[first]) and bool(slid[first] < SLIP_DISTANCE)
     yield "turned", math.degrees(turned.max()) if rotates else math.nan, 0.0
@@ -113,4 +110,4 @@ def moved_in_hand(
     start = hand_from_object[tick_of(lift, 2)]
     centres = apply(hand_from_object, centre.double().expand(len(hand_from_object), 1, 3))[:, 0]
     turn = rotation_angle(start[:3, :3].T @ hand_from_object[:, :3, :3])
-    return torch.linalg.vector_norm(centres - apply(start, centre.double()[None]), dim=-1), turn
+    return norm(centres - apply(start, centre.double()[None])), turn

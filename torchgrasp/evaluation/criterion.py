@@ -14,6 +14,7 @@ from torchgrasp.control import TipContact
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.errors import Status
 from torchgrasp.geometry.frames import apply, inverse, rotation_angle
+from torchgrasp.geometry.linalg import norm
 from torchgrasp.values.closing import ObjectMotion
 
 SLIP_DISTANCE = 0.02
@@ -55,11 +56,8 @@ def judge_lift(ticks: Sequence[Tick], pressed: int, judged: int, lift_height: fl
     gripped = [bool(tick.touching >= 2) for tick in ticks[-judged:]]
     if rise[-1] >= half and sum(gripped) > 0.5 * len(gripped):
         slip = motion_between(ticks[pressed], ticks[-1])
-        return (
-            Status.OK
-            if slip.distance < SLIP_DISTANCE and slip.angle < SLIP_ANGLE
-            else Status.SLIPPED
-        )
+        still = slip.distance < SLIP_DISTANCE and slip.angle < SLIP_ANGLE
+        return Status.OK if still else Status.SLIPPED
     return Status.DROPPED if max(rise) >= half else Status.NOT_LIFTED
 
 
@@ -69,10 +67,7 @@ def motion_between(first: Tick, last: Tick, in_hand: bool = True) -> ObjectMotio
     """
     eye = torch.eye(4, dtype=torch.float64)
     start, end = (inverse(tick.hand_pose) if in_hand else eye for tick in (first, last))
-    centres = apply(torch.stack([start, end]), torch.stack([first.centre, last.centre])[:, None])[
-        :, 0
-    ]
+    centres = torch.stack([first.centre, last.centre])[:, None]  # (2, 1, 3)
+    centres = apply(torch.stack([start, end]), centres)[:, 0]
     turned = (start @ first.object_pose)[:3, :3].T @ (end @ last.object_pose)[:3, :3]
-    return ObjectMotion(
-        float(torch.linalg.vector_norm(centres[1] - centres[0])), float(rotation_angle(turned))
-    )
+    return ObjectMotion(float(norm(centres[1] - centres[0])), float(rotation_angle(turned)))

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.geometry.frames import inverse, rigid
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.geometry.plane import GRID, Plane, to_upright
+from torchgrasp.geometry.plane import FINE, Plane, to_upright
 from torchgrasp.values.planning import Grasps
 
 
@@ -26,9 +26,8 @@ def world_frame(table: Plane, obj_from_hand: Float[Tensor, "4 4"]) -> Float[Tens
     origin = obj_from_hand[:3, 3]
     level = [axis - (axis @ z) * z for axis in obj_from_hand[:3, :2].unbind(-1)]
     x = unit(level[0] if torch.linalg.vector_norm(level[0]) > 0.5 else level[1])
-    return rigid(
-        torch.stack([x, torch.linalg.cross(z, x), z], -1), origin - table.height(origin) * z
-    )
+    axes = torch.stack([x, torch.linalg.cross(z, x), z], -1)
+    return rigid(axes, origin - table.height(origin) * z)
 
 
 def to_frame(grasp: Grasps, obj_from_frame: Float[Tensor, "4 4"]) -> Grasps:
@@ -44,21 +43,19 @@ def to_frame(grasp: Grasps, obj_from_frame: Float[Tensor, "4 4"]) -> Grasps:
         normals=turn(grasp.contacts.normals),
     )
     pose = rounded(frame_from_obj @ grasp.obj_from_hand)
-    return dataclasses.replace(
-        grasp, contacts=contacts, obj_from_hand=pose, approach=turn(grasp.approach)
-    )
+    approach = turn(grasp.approach)
+    return dataclasses.replace(grasp, contacts=contacts, obj_from_hand=pose, approach=approach)
 
 
 def rounded(numbers: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
     """Round numbers of about size 1 to multiples of a billionth."""
-    return torch.round(numbers / GRID**1.5) * GRID**1.5
+    return torch.round(numbers / FINE) * FINE
 
 
 def moved_mesh(mesh: "trimesh.Trimesh", obj_from_world: Float[Tensor, "4 4"]) -> "trimesh.Trimesh":
     """Return a mesh, converted to the simulator's frame, with vertices rounded to multiples of
     `GRID`.
     """
-    vertices = to_upright(
-        torch.from_numpy(np.array(mesh.vertices, dtype=np.float64)), obj_from_world
-    )
-    return trimesh.Trimesh(vertices.numpy(), mesh.faces, process=False)
+    vertices = torch.from_numpy(np.array(mesh.vertices, dtype=np.float64))
+    moved = to_upright(vertices, obj_from_world).numpy()
+    return trimesh.Trimesh(moved, mesh.faces, process=False)

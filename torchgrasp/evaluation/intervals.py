@@ -86,16 +86,15 @@ def contrast_over(columns: Sequence[Counts], weights: Sequence[float], seed: See
     total = sum(total for _, total in columns[0].values())
     if not names:
         return Share(math.nan, math.nan, math.nan, 0, 0)
-    table = torch.tensor(
-        [[counts.get(name, (0, 0)) for counts in columns] for name in names], dtype=torch.float64
-    )
+    found = [[counts.get(name, (0, 0)) for counts in columns] for name in names]
+    table = torch.tensor(found, dtype=torch.float64)  # (u, c, 2)
     value = float(_combine(table.sum(0), weights))
     if len(names) == 1:
         return Share(value, math.nan, math.nan, total, 1)
-    drawn = torch.randint(
-        len(names), (BOOTSTRAP.resamples, len(names)), generator=torch.Generator().manual_seed(seed)
-    )
-    times = torch.zeros(BOOTSTRAP.resamples, len(names), dtype=torch.float64)
+    shape = (BOOTSTRAP.resamples, len(names))
+    generator = torch.Generator().manual_seed(seed)
+    drawn = torch.randint(len(names), shape, generator=generator)
+    times = torch.zeros(shape, dtype=torch.float64)
     times.scatter_add_(1, drawn, torch.ones_like(drawn, dtype=torch.float64))
     values = _combine(torch.einsum("ru,uck->rck", times, table), weights)
     low, high = values.nanquantile(torch.tensor(BOOTSTRAP.tails, dtype=torch.float64)).tolist()
@@ -114,8 +113,8 @@ def format_share(share: Share, unit: str = "families") -> str:
     """Return a success rate with its interval as text."""
     if math.isnan(share.value):
         return "nothing measured"
-    value = f"{100 * share.value:.1f} %"
+    value = f"{100.0 * share.value:.1f} %"
     if math.isnan(share.low):
         return f"{value} of {share.total}, one of the {unit}: no interval"
-    ends = f"[{100 * share.low:.1f}, {100 * share.high:.1f}]"
+    ends = f"[{100.0 * share.low:.1f}, {100.0 * share.high:.1f}]"
     return f"{value} {ends} of {share.total}, {share.units} {unit}"

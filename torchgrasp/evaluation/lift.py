@@ -23,6 +23,7 @@ from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.foundation.rules import Pose, Seed
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import inverse
+from torchgrasp.geometry.linalg import norm
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
@@ -34,9 +35,26 @@ from torchgrasp.values.planning import Grasps
 from torchgrasp.values.specs import TrialSpec
 
 LIFT_TIME = 1.0  # time [s] in which the hand rises
-PUSHED_DISTANCE = (
-    0.05  # motion [m] of the object's centre during the closing that counts as ejected
-)
+PUSHED_DISTANCE = 0.05  # motion [m] of the object's centre in the closing that counts as ejected
+
+
+@dataclasses.dataclass(frozen=True)
+class LiftNumbers:
+    """The numbers of a lift and its verdict."""
+
+    shaking: float = 5.0
+    """Frequency [Hz] at which the raised hand shakes."""
+    judged: float = 0.2
+    """Last seconds in which the fingers must touch the object."""
+    lost: float = 0.5
+    """Motion [m] of the object beyond the lift's height that ends the trial."""
+    slack: float = 0.03
+    """Distance [m] from the mesh within which contacts of a grasp lie."""
+    share: float = 0.99
+    """Share of the contacts that must lie so."""
+
+
+LIFTS = LiftNumbers()
 
 
 @checked
@@ -103,9 +121,9 @@ def close_hand(
         mesh = mesh.mesh
     mesh = read_mesh(mesh)
     hand = hand if isinstance(hand, Hand) else hand_of(grasp, hand)
-    check_agreement(
-        "mesh", grasp.contacts.points[0], "a contact of the grasp", mesh, slack=0.03, share=0.99
-    )
+    points = grasp.contacts.points[0]
+    limits = {"slack": LIFTS.slack, "share": LIFTS.share}
+    check_agreement("mesh", points, "a contact of the grasp", mesh, **limits)
     if table is not None:
         check_stand(mesh, table)
     truth = Truth(mesh, parts, error, table, neighbours, slide)
@@ -121,9 +139,7 @@ def lift_grasp(trial: GraspTrial, spec: TrialSpec | None = None) -> ClosureResul
 
 def run_lift(driver: TrialDriver) -> ClosureResult:
     """Run a lift trial in a fresh scene."""
-    started = time.perf_counter()
-    lift = _Lift(driver.open())
-    return lift.result(lift.perform(), time.perf_counter() - started)
+    return _Lift(driver.open()).complete()
 
 
 class _ObjectLost(Exception):
@@ -144,6 +160,12 @@ class _Lift:
         self.touched: int | None = None
         self.pressed: int | None = None
 
+    def complete(self) -> ClosureResult:
+        """Run all phases of the trial; return its record."""
+        started = time.perf_counter()
+        status = self.perform()
+        return self.result(status, time.perf_counter() - started)
+
     def perform(self) -> Status:
         """Run all phases of the trial; return its status."""
         run = self.run
@@ -156,10 +178,8 @@ class _Lift:
             self.arrived = len(self.ticks) - 1
             for _ in run.close():
                 self._record()
-                all_touched = run.controller.hold is not None or bool(
-                    np.isfinite(run.robot.first_touch).all()
-                )
-                if self.touched is None and all_touched:
+                touching = run.controller.hold is not None or self._touched_all()
+                if self.touched is None and touching:
                     self.touched = len(self.ticks) - 1
             self.pressed = len(self.ticks) - 1
             self.touched = self.pressed if self.touched is None else self.touched
@@ -194,9 +214,8 @@ class _Lift:
         ticks = self.run.robot.ticks(min(time, rising))
         for k in range(ticks):
             share, rate = smooth_step((k + 1) / ticks)
-            self.run.scene.lift(
-                height * (1 - share), -height * rate / (ticks * self.run.robot.period)
-            )
+            speed = -height * rate / (ticks * self.run.robot.period)
+            self.run.scene.lift(height * (1 - share), speed)
             self.run.step()
             self._record()
         return Status.TOO_HEAVY if self._moved() < PUSHED_DISTANCE else Status.DROPPED
@@ -205,16 +224,14 @@ class _Lift:
         """Return target height [m] and speed [m/s] at a time, for a rise of `rising` seconds and
         then shaking.
         """
-        rate_hz = 5.0  # frequency of the shaking [Hz]
         share, rate = smooth_step(min(time / rising, 1.0))
         height = self.spec.lift_height * share
         if time < rising or self.spec.shake == 0.0:
             return height, self.spec.lift_height * rate / rising
-        frequency = 2 * math.pi * rate_hz
+        frequency = 2 * math.pi * LIFTS.shaking
         phase = frequency * (time - rising)
-        return height + self.spec.shake * math.sin(phase), self.spec.shake * frequency * math.cos(
-            phase
-        )
+        speed = self.spec.shake * frequency * math.cos(phase)
+        return height + self.spec.shake * math.sin(phase), speed
 
     def _record(self) -> None:
         """Record a tick; raise an error if the simulation has diverged or the object is too far
@@ -235,14 +252,12 @@ class _Lift:
             pose[:3, :3] @ scene.centre + pose[:3, 3],
             np.array(self.run.felt),
         )
-        tick = Tick(
-            *map(torch.as_tensor, arrays), blend=self.run.controller.blend, truth=robot.truth
-        )
-        self.ticks.append(tick)
+        numbers = map(torch.as_tensor, arrays)
+        self.ticks.append(Tick(*numbers, blend=self.run.controller.blend, truth=robot.truth))
         moved = self._moved()
         if not np.isfinite(joints).all() or not math.isfinite(moved):
             raise FloatingPointError
-        if moved > 0.5 + self.spec.lift_height:  # [m]
+        if moved > LIFTS.lost + self.spec.lift_height:
             self.pushed = self.pushed or moved
             raise _ObjectLost
 
@@ -251,18 +266,21 @@ class _Lift:
         the object.
         """
         start = self.ticks[0].centre + torch.from_numpy(self.run.slid)
-        return float(torch.linalg.vector_norm(self.ticks[-1].centre - start))
+        return float(norm(self.ticks[-1].centre - start))
+
+    def _touched_all(self) -> bool:
+        """Return whether every finger has touched the object."""
+        return bool(np.isfinite(self.run.robot.first_touch).all())
 
     def _verdict(self) -> Status:
         """Return the status of a completed trial: `Status.OK` if the object was held, or else the
         first failure.
         """
-        judged = judge_lift(
-            self.ticks, self.pressed or 0, self.run.robot.ticks(0.2), self.spec.lift_height
-        )
+        last = self.run.robot.ticks(LIFTS.judged)
+        judged = judge_lift(self.ticks, self.pressed or 0, last, self.spec.lift_height)
         if judged in (Status.OK, Status.SLIPPED):
             return judged
-        if not np.isfinite(self.run.robot.first_touch).all():
+        if not self._touched_all():
             return Status.NO_CONTACT
         if self.pushed > PUSHED_DISTANCE:
             return Status.EJECTED
@@ -281,10 +299,8 @@ class _Lift:
         ticks = map_tensors(lambda *tensors: torch.stack(tensors), *self.ticks)
         robot = self.run.robot
         obj_from_world = self.run.obj_from_world
-        reached = [
-            math.nan if k is None else ticks.time[k]
-            for k in (self.arrived, self.touched, self.pressed)
-        ]
+        ends = (self.arrived, self.touched, self.pressed)
+        reached = [math.nan if k is None else ticks.time[k] for k in ends]
         first_touch = robot.first_touch
         first_stray = torch.from_numpy(robot.first_stray)
         truth = ticks.truth
@@ -292,9 +308,8 @@ class _Lift:
         assert truth.sliding is not None
         if not torch.equal(obj_from_world, torch.eye(4, dtype=torch.float64)):
             bodies = {"object_pose": ticks.object_pose, "neighbour_pose": ticks.neighbour_pose}
-            moved = {
-                name: obj_from_world @ x @ inverse(obj_from_world) for name, x in bodies.items()
-            }
+            world_from_obj = inverse(obj_from_world)
+            moved = {name: obj_from_world @ x @ world_from_obj for name, x in bodies.items()}
             ticks = dataclasses.replace(ticks, hand_pose=obj_from_world @ ticks.hand_pose, **moved)
         disturbance = Disturbance(
             first_stray * self.spec.timestep,

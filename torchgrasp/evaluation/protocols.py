@@ -23,6 +23,8 @@ from torchgrasp.success.task import GraspTask
 from torchgrasp.values.planning import Grasps
 from torchgrasp.values.specs import TrialSpec
 
+LEAST_MASS = 1e-3  # least mass [kg] of a task, so that no load is zero
+
 
 @checked
 @dataclasses.dataclass(frozen=True)
@@ -88,11 +90,8 @@ class Protocol(Value):
     def __post_init__(self) -> None:
         """Raise `BadArgument` if fields contradict each other."""
         if self.displaced == "approach" and self.noise.rotation:
-            raise BadArgument(
-                "noise.rotation",
-                self.noise.rotation,
-                "0 for an object displaced during the approach",
-            )
+            allowed = "0 for an object displaced during the approach"
+            raise BadArgument("noise.rotation", self.noise.rotation, allowed)
         lifts = self.criterion, self.displaced, self.push, self.relook, self.tries
         if self.pull is not None and lifts != ("held", "before", 0.0, False, 1):
             found = "a pull with a criterion, displacement, push, second look or tries of a lift"
@@ -109,13 +108,8 @@ class Protocol(Value):
         lift = self.pull is None
         mass = trial.mass if self.pull is None else trial.mass * self.pull.acceleration / 10.0
         closing = "open_loop" if trial.closing == "open_loop" and not lift else "uncertainty"
-        return GraspTask(
-            max(mass, 1e-3),
-            trial.force,
-            lift,
-            closing,
-            self.noise.translation + self.noise.rotation > 0,
-        )
+        displaced = self.noise.translation + self.noise.rotation > 0
+        return GraspTask(max(mass, LEAST_MASS), trial.force, lift, closing, displaced)
 
     @checked
     def with_trial(self, **changes: Any) -> "Protocol":
@@ -208,11 +202,9 @@ def apply_error(obj_from_hand: Pose, error: Pose | None) -> Float[Tensor, "4 4"]
     float64.
     """
     planned = obj_from_hand.to("cpu", torch.float64)
-    return (
-        planned
-        if error is None
-        else planned @ check_tensor("error", error, (4, 4)).to("cpu", torch.float64)
-    )
+    if error is None:
+        return planned
+    return planned @ check_tensor("error", error, (4, 4)).to("cpu", torch.float64)
 
 
 @checked
@@ -249,9 +241,8 @@ def draw_object_poses(
     drawn = 2 * torch.rand(count, 3, generator=generator, dtype=torch.float64) - 1
     up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     rotation = rotation_from_vector(noise.rotation * drawn[:, :1] * up)
-    return rigid(
-        rotation, noise.translation * drawn[:, [1, 2, 2]] * (1 - up) + pivot - rotation @ pivot
-    )
+    shift = noise.translation * drawn[:, [1, 2, 2]] * (1 - up)
+    return rigid(rotation, shift + pivot - rotation @ pivot)
 
 
 def error_from_object_pose(obj_from_hand: Pose, object_pose: Pose) -> Float[Tensor, "4 4"]:
@@ -280,9 +271,8 @@ def draw_slide(noise: PoseNoise, seed: Seed) -> Float[Tensor, "3"]:
     """Return a random displacement [m] of an object along its table, of at most `noise.translation`
     on each axis.
     """
-    return draw_object_poses(dataclasses.replace(noise, rotation=0.0), torch.zeros(3), 1, seed)[
-        0, :3, 3
-    ]
+    level = dataclasses.replace(noise, rotation=0.0)
+    return draw_object_poses(level, torch.zeros(3), 1, seed)[0, :3, 3]
 
 
 @checked

@@ -126,9 +126,8 @@ def _look(run: TrialRun, spec: PullSpec, start: np.ndarray) -> tuple[Status, np.
         return Status.UNSTABLE, np.full(2, math.inf)
     moved = np.linalg.norm((pose @ centre - start @ centre)[:3])
     turned = float(rotation_angle(torch.from_numpy(start[:3, :3].T @ pose[:3, :3])))
-    return Status.OK if moved < spec.distance and turned < spec.angle else Status.MOVED, np.array(
-        [moved, turned]
-    )
+    still = moved < spec.distance and turned < spec.angle
+    return Status.OK if still else Status.MOVED, np.array([moved, turned])
 
 
 @checked
@@ -167,7 +166,9 @@ def run_protocol(
         lifts = run_lifts(driver, trial.grasp, protocol.tries)
         tries = len(lifts)
         lift = lifts[-1].result
-        status, (moved, turned), slip = lift.status, lift.object_motion, lift.slip
+        status = lift.status
+        moved, turned = lift.object_motion
+        slip = lift.slip
         force = math.nan if status is Status.START_OVERLAP else float(lift.forces[-1].mean())
         risen = lift.rise >= 0.5 * protocol.trial.lift_height
         passed = lift.held if protocol.criterion == "held" else risen

@@ -4,7 +4,6 @@ another grasp.
 
 import dataclasses
 import math
-import time
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -20,11 +19,13 @@ from torchgrasp.control.uncertainty_closing import UncertaintyClosing
 from torchgrasp.evaluation.lift import _Lift, run_lift
 from torchgrasp.evaluation.protocols import apply_error, seed_of
 from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, TrialRun, Truth, smooth_step
+from torchgrasp.foundation.base import flatnonzero
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import Status
 from torchgrasp.foundation.rules import Count
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import inverse, rigid, rotation_from_vector
+from torchgrasp.geometry.linalg import norm
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
@@ -43,6 +44,7 @@ class RegraspNumbers:
     gap: float = 0.015  # mean distance [m] of the contacts above which a grasp differs
     turn: float = math.radians(30)  # angle [rad] of the approaches above which a grasp differs
     share: float = 0.35  # share of the mass that may be at one point of the surface
+    withdrawal: float = 0.6  # time [s] in which the opened hand withdraws, and the object rests
     places: int = 64  # points of the surface that are tried for it, at least; fewer if it has fewer
 
 
@@ -72,9 +74,9 @@ def list_others(grasps: Grasps, tried: Sequence[int]) -> Int[Tensor, "k"]:
     """
     approach = grasps.approach
     points = grasps.contacts.points.double()
-    gaps = torch.linalg.vector_norm(points[:, None] - points[list(tried)], dim=-1).mean(-1)
+    gaps = norm(points[:, None] - points[list(tried)]).mean(-1)  # (g, t)
     differs = (gaps > REGRASP.gap) | (approach @ approach[list(tried)].T < math.cos(REGRASP.turn))
-    return differs.all(-1).nonzero()[:, 0]
+    return flatnonzero(differs.all(-1))
 
 
 def _chances(
@@ -86,14 +88,12 @@ def _chances(
     A share of the mass may be at any point of the surface, which may explain the failures.
     """
     shell = (surface.values.abs() < surface.spacing).nonzero().double()
-    places = (
-        surface.origin.double() + surface.spacing * shell[:: max(1, len(shell) // REGRASP.places)]
-    )
+    some = shell[:: max(1, len(shell) // REGRASP.places)]
+    places = surface.origin.double() + surface.spacing * some  # (p, 3)
     middle = places.mean(0)
     centers = torch.cat([middle[None], middle + REGRASP.share * (places - middle)])
-    log_odds = log_odds_about(
-        grasps, centers, float(grasps.meta["friction"]), (-table.normal).tolist()
-    )
+    friction = float(grasps.meta["friction"])
+    log_odds = log_odds_about(grasps, centers, friction, (-table.normal).tolist())  # (g, p + 1)
     weight = torch.sigmoid(-log_odds[list(tried)]).prod(0)
     return (torch.sigmoid(log_odds) @ weight / weight.sum()).where(grasps.success > 0, 0.0)
 
@@ -140,20 +140,17 @@ def run_lifts(driver: TrialDriver, grasps: Grasps, tries: int) -> tuple[LiftTry,
     done = list[LiftTry]()
     while len(tried) < tries and len(list_others(grasps, tried)):
         lift = _CheckedLift(driver.open())
-        started = time.perf_counter()
-        result = lift.result(lift.perform(), time.perf_counter() - started)
+        result = lift.complete()
         done.append(LiftTry(tried[-1], result))
         if not (lift.check.lost or result.status is Status.TOO_HEAVY):
             return tuple(done)
         trial = driver.trial
         controller = lift.run.controller
         row = next_grasp(grasps, tried, trial.surface)
-        truth = _left_behind(
-            trial, result, _felt(controller), grasps.obj_from_hand[row].to("cpu", torch.float64)
-        )
-        trial = dataclasses.replace(
-            trial, grasp=grasps[row], truth=truth, seed=seed_of(trial.seed, "again")
-        )
+        following = grasps.obj_from_hand[row].to("cpu", torch.float64)
+        truth = _left_behind(trial, result, _felt(controller), following)
+        seed = seed_of(trial.seed, "again")
+        trial = dataclasses.replace(trial, grasp=grasps[row], truth=truth, seed=seed)
         tried = [*tried, row]
         driver = TrialDriver(trial, driver.spec)
     last = run_lift(driver)  # it goes on whatever the hand feels
@@ -188,7 +185,7 @@ class _CheckedLift(_Lift):
         while not opening.done:
             run.robot.tick(Targets(opening(run.robot.period), opening.palm))
             self._record()
-        ticks = run.robot.ticks(0.6)
+        ticks = run.robot.ticks(REGRASP.withdrawal)
         for k in range(2 * ticks):
             share, rate = smooth_step(min((k + 1) / ticks, 1.0))
             run.scene.approach(length * share, -length * rate / (ticks * run.robot.period))
@@ -210,14 +207,11 @@ def _left_behind(
     """
     truth = trial.truth
     planned = trial.grasp.obj_from_hand[0].to("cpu", torch.float64)
-    error = (
-        inverse(following) @ apply_error(planned, truth.error) @ felt @ inverse(planned) @ following
-    )
-    table = (
-        Plane.horizontal(float(read_mesh(truth.mesh).bounds[0, 2]))
-        if truth.table is None
-        else truth.table
-    )
+    true = apply_error(planned, truth.error)
+    error = inverse(following) @ true @ felt @ inverse(planned) @ following
+    table = truth.table
+    if table is None:
+        table = Plane.horizontal(float(read_mesh(truth.mesh).bounds[0, 2]))
     bodies = Neighbour(read_mesh(truth.mesh), truth.parts), *truth.neighbours
     poses = result.object_pose[-1], *result.disturbance.neighbour_pose[-1]
     target, *others = (_moved(body, pose.numpy()) for body, pose in zip(bodies, poses, strict=True))

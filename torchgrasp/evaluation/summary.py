@@ -29,6 +29,7 @@ STAGES: dict[str, tuple[Status, ...]] = {
     "simulation": (Status.UNSTABLE, Status.TIMED_OUT, Status.WORKER_DIED),
 }
 """The stages at which an attempt can fail, in order, with their statuses."""
+QUANTILES = (0.5, 0.95)  # the median and a large value, which few exceed
 
 
 @checked
@@ -219,7 +220,7 @@ def _quantiles(values: Iterable[float]) -> tuple[float, float] | None:
     known = torch.tensor([value for value in values if not math.isnan(value)], dtype=torch.float64)
     if not len(known):
         return None
-    median, most = known.quantile(torch.tensor([0.5, 0.95], dtype=torch.float64)).tolist()
+    median, most = known.quantile(torch.tensor(QUANTILES, dtype=torch.float64)).tolist()
     return median, most
 
 

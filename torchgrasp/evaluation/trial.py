@@ -37,6 +37,23 @@ from torchgrasp.values.planning import Grasps
 from torchgrasp.values.specs import ClosingMode, TrialSpec
 
 
+@dataclasses.dataclass(frozen=True)
+class TrialNumbers:
+    """The numbers of a trial."""
+
+    unit_error: float = 1e-4
+    """Greatest error of a unit approach's length."""
+    decimals: int = 9
+    """Decimals [m] to which a table's offset is rounded."""
+    speed: float = 0.2
+    """Mean speed [m/s] of an unguarded approach."""
+    relooked: float = 1.5
+    """Distance that the mount yields after a second look, over its reach."""
+
+
+TRIALS = TrialNumbers()
+
+
 @checked
 @dataclasses.dataclass(frozen=True)
 class Truth:
@@ -102,7 +119,7 @@ class TrialDriver:
             known = to_frame(planned, pose)
             if told is not None:
                 told = told.moved(inverse(pose))
-                told = Plane(rounded(told.normal), round(told.offset, 9))
+                told = Plane(rounded(told.normal), round(told.offset, TRIALS.decimals))
         if reference is None:
             reference = derive_reference(
                 hand,
@@ -117,10 +134,10 @@ class TrialDriver:
             )
             reference = dataclasses.replace(reference, obj_from_hand=pose)
         hand.check_joints(grasp.pregrasp)
-        if spec.approach and not abs(float(torch.linalg.vector_norm(grasp.approach)) - 1) < 1e-4:
-            raise BadArgument(
-                "grasp", f"an approach along {grasp.approach[0].tolist()}", "a unit vector"
-            )
+        length = float(torch.linalg.vector_norm(grasp.approach))
+        if spec.approach and not abs(length - 1) < TRIALS.unit_error:
+            found = f"an approach along {grasp.approach[0].tolist()}"
+            raise BadArgument("grasp", found, "a unit vector")
         self.reference = reference
         self.scene_spec = self._scene_spec(hand, grasp)
 
@@ -136,9 +153,9 @@ class TrialDriver:
         if spec.kp is not None:
             drives = {name: drive._replace(kp=spec.kp) for name, drive in drives.items()}
         true_pose = apply_error(grasp.obj_from_hand[0], truth.error)
-        approach = (
-            true_pose[:3, :3] @ grasp.obj_from_hand[0, :3, :3].T @ grasp.approach[0] * spec.approach
-        )
+        turn = true_pose[:3, :3] @ grasp.obj_from_hand[0, :3, :3].T
+        approach = turn @ grasp.approach[0] * spec.approach
+        relooked = TRIALS.relooked * REACH * (truth.camera is not None)
         return SceneSpec(
             urdf_path=hand.urdf_path,
             world_from_hand=true_pose.numpy(),
@@ -159,9 +176,7 @@ class TrialDriver:
             height=None if truth.table is None else 0.0,
             neighbours=tuple(self._body(x, x.mass) for x in truth.neighbours),
             self_pairs=hand.self_pairs if spec.self_collision else (),
-            yields=spec.components.palm_reach
-            + 1.5 * REACH * (truth.camera is not None)
-            + float(rise.norm()),
+            yields=spec.components.palm_reach + relooked + float(rise.norm()),
         )
 
     def _body(self, given: Truth | Neighbour, mass: float | None = None) -> Body:
@@ -170,11 +185,8 @@ class TrialDriver:
         """
         mesh, parts = read_solid(given.mesh, given.parts)
         if mass is None:
-            mass = (
-                self.spec.mass
-                if self.spec.density is None
-                else self.spec.density * float(mesh.volume)
-            )
+            density = self.spec.density
+            mass = self.spec.mass if density is None else density * float(mesh.volume)
         if self.trial.truth.table is not None:
             mesh, *parts = (moved_mesh(x, self.obj_from_world) for x in (mesh, *parts))
         return Body(mesh, parts, mass)
@@ -215,9 +227,8 @@ def derive_reference(
     plan = ClosingReference.from_grasp(hand, grasp, force, kp, preference)
     table = table and table.moved(inverse(grasp.obj_from_hand[0]))
     sensor = sensor or plan.sensor
-    return dataclasses.replace(
-        plan, table=table, surface=surface, sensor=sensor, max_force=max_force
-    )
+    known = {"table": table, "surface": surface, "sensor": sensor, "max_force": max_force}
+    return dataclasses.replace(plan, **known)
 
 
 class TrialRun:
@@ -231,11 +242,10 @@ class TrialRun:
         self.spec = spec
         self.mass = driver.scene_spec.mass
         self.obj_from_world = driver.obj_from_world
-        slide = trial.truth.slide
-        world_from_obj = driver.obj_from_world[:3, :3].T
-        self.slide = (
-            None if slide is None else (world_from_obj @ slide.to("cpu", torch.float64)).numpy()
-        )
+        self.slide = None
+        if trial.truth.slide is not None:
+            slide = trial.truth.slide.to("cpu", torch.float64)
+            self.slide = (driver.obj_from_world[:3, :3].T @ slide).numpy()
         guarded = spec.approach if spec.components.stops and can_guard(driver.reference) else 0.0
         self.controller = GraspController(
             driver.reference, spec.closing, spec.pressing, spec.options, guarded
@@ -243,9 +253,8 @@ class TrialRun:
         if trial.truth.camera is not None:
             self._relook(driver, trial.truth.camera)
         start = driver.scene_spec.world_from_hand[:3, :3] @ self.controller.targets.palm.numpy()
-        self.scene = driver._open_scene(
-            dataclasses.replace(driver.scene_spec, start=tuple(start.tolist()))
-        )
+        scene_spec = dataclasses.replace(driver.scene_spec, start=tuple(start.tolist()))
+        self.scene = driver._open_scene(scene_spec)
         generator = torch.Generator().manual_seed(trial.seed) if spec.noise else None
         self.robot = SimulatedHand(self.scene, driver.reference, spec.control_rate, generator)
         self.overlap = self.scene.penetration()
@@ -256,12 +265,10 @@ class TrialRun:
         seen_from = driver.reference.obj_from_hand.numpy()
         scene_spec = driver.scene_spec
         mesh = scene_spec.mesh.copy()
-        mesh.apply_transform(
-            seen_from @ np.linalg.inv(scene_spec.world_from_hand)
-        )  # the robot takes its pose for true
-        self.controller.relook(
-            partial_view(mesh, camera, seed=seed_of(driver.trial.seed, "relook"))
-        )
+        # The robot takes its pose for true.
+        mesh.apply_transform(seen_from @ np.linalg.inv(scene_spec.world_from_hand))
+        seed = seed_of(driver.trial.seed, "relook")
+        self.controller.relook(partial_view(mesh, camera, seed=seed))
 
     @property
     def starts(self) -> bool:
@@ -283,7 +290,6 @@ class TrialRun:
         """Move the opened hand straight to its pre-grasp; in a guarded approach, a touch stops the
         hand.
         """
-        speed = 0.2  # mean speed [m/s] of an unguarded approach
         half = 0.5 * self.spec.approach
         if self.controller.approaching:
             self.observation = self.robot.tick(self.controller.targets)
@@ -295,7 +301,7 @@ class TrialRun:
             self.scene.approach(0.0)
             return
         length = self.spec.approach
-        ticks = self.robot.ticks(length / speed) if length else 0
+        ticks = self.robot.ticks(length / TRIALS.speed) if length else 0
         for k in range(ticks):
             share, rate = smooth_step((k + 1) / ticks)
             self._slide(share >= 0.5)
@@ -347,11 +353,9 @@ class TrialRun:
         the mode "grip".
         """
         hold = self.controller.hold
-        return (
-            (hold.friction.mean, hold.weight)
-            if isinstance(hold, GripHold)
-            else (math.nan, math.nan)
-        )
+        if isinstance(hold, GripHold):
+            return hold.friction.mean, hold.weight
+        return math.nan, math.nan
 
     def strained(self) -> bool:
         """Return whether any joint's drive would need its greatest torque or more to reach its
@@ -361,15 +365,10 @@ class TrialRun:
         hold = self.controller.hold
         if isinstance(hold, GripHold):
             return hold.strained
-        effort = torch.tensor(
-            [reference.hand.actuators[name].effort for name in reference.hand.tree.joint_names]
-        )
-        return bool(
-            (
-                reference.kp * (self.controller.targets.joints - self.observation.joints).abs()
-                >= effort
-            ).any()
-        )
+        hand = reference.hand
+        effort = torch.tensor([hand.actuators[name].effort for name in hand.tree.joint_names])
+        off = (self.controller.targets.joints - self.observation.joints).abs()
+        return bool((reference.kp * off >= effort).any())
 
 
 def smooth_step(time: float) -> tuple[float, float]:

@@ -20,6 +20,7 @@ from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
 from torchgrasp.geometry.linalg import unit
 
 GRID = 2.0**-20  # spacing [m] of rounded points: far above the rounding errors of a transform
+FINE = GRID**1.5  # spacing of rounded numbers of about size 1: a billionth
 POINTS = ("points", "viewpoint", "vertices")
 DIRECTIONS = ("normals", "approach", "witness", "frustum", "task_load", "task_twist", "task_forces")
 POSES = ("obj_from_hand", "obj_from_vf")

@@ -21,8 +21,11 @@ from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.geometry.mesh import LEAST_VOLUME, check_solid, read_mesh
 from torchgrasp.sim.decompose import decompose
 
+THRESHOLD = 0.05  # concavity of a part below which CoACD cuts no further
 _SEARCH: dict[str, Any] = {"mcts_iterations": 60, "mcts_max_depth": 2, "mcts_nodes": 10}
 """Settings of CoACD's search for cuts, which make it narrower and faster than by default."""
+MOST_PARTS = 1000  # most parts that a caller may give
+DECIMALS = 6  # to which corners are rounded [m] whose hull would not be closed
 _log = logging.getLogger(__name__)
 
 
@@ -45,9 +48,8 @@ def convex_parts(
     if mesh.is_convex:
         return [hull(mesh.vertices)]
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    path = (
-        home / "torchgrasp" if cache is None else Path(cache)
-    ) / f"{_fingerprint(mesh)}.safetensors"
+    folder = home / "torchgrasp" if cache is None else Path(cache)
+    path = folder / f"{_fingerprint(mesh)}.safetensors"
     parts = list[trimesh.Trimesh]()
     if path.is_file():
         try:
@@ -55,7 +57,7 @@ def convex_parts(
         except (ModelFileError, ValueError):
             _log.warning("%s is damaged and will be made anew", path)
     if not parts:
-        pieces = decompose(mesh, {"threshold": 0.05, **_SEARCH})
+        pieces = decompose(mesh, {"threshold": THRESHOLD, **_SEARCH})
         parts = [trimesh.Trimesh(vertices, faces).convex_hull for vertices, faces in pieces]
         try:
             _save(parts, path)
@@ -80,16 +82,17 @@ def hull(corners: np.ndarray) -> "trimesh.Trimesh":
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         body = trimesh.convex.convex_hull(corners)
-        return body if body.is_watertight else trimesh.convex.convex_hull(np.round(corners, 6))
+        return (
+            body if body.is_watertight else trimesh.convex.convex_hull(np.round(corners, DECIMALS))
+        )
 
 
 def check_parts(parts: "Sequence[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":
     """Return the caller's parts as a list; raise `MeshError` if one is not convex, or for none or
     too many parts.
     """
-    max_parts = 1000  # most parts that a caller may give
-    if len(parts) > max_parts:
-        raise MeshError("parts", f"{len(parts)} parts", f"at most {max_parts}")
+    if len(parts) > MOST_PARTS:
+        raise MeshError("parts", f"{len(parts)} parts", f"at most {MOST_PARTS}")
     for index, part in enumerate(parts):
         check_solid(part, f"part {index}")
         if not part.is_convex:
@@ -103,7 +106,7 @@ def _fingerprint(mesh: "trimesh.Trimesh") -> str:
     """Return the cache's key for a mesh: a SHA-256 of the mesh and of the settings with which it is
     cut.
     """
-    digest = hashlib.sha256(f"coacd 0.05 {sorted(_SEARCH.items())}".encode())
+    digest = hashlib.sha256(f"coacd {THRESHOLD} {sorted(_SEARCH.items())}".encode())
     digest.update(np.ascontiguousarray(mesh.vertices, dtype="<f8").tobytes())
     digest.update(np.ascontiguousarray(mesh.faces, dtype="<i8").tobytes())
     return digest.hexdigest()
@@ -111,11 +114,10 @@ def _fingerprint(mesh: "trimesh.Trimesh") -> str:
 
 def _save(parts: "list[trimesh.Trimesh]", path: Path) -> None:
     """Write the vertices of all parts to a cache file."""
+    vertices = [np.array(part.vertices, dtype=np.float64) for part in parts]
     tensors = {
-        "vertices": torch.cat(
-            [torch.from_numpy(np.array(p.vertices, dtype=np.float64)) for p in parts]
-        ),
-        "counts": torch.tensor([len(p.vertices) for p in parts]),
+        "vertices": torch.from_numpy(np.concatenate(vertices)),
+        "counts": torch.tensor([len(part) for part in vertices]),
     }
     save_tensors(path, "parts", tensors, {})
 
@@ -128,14 +130,12 @@ def _load(path: Path, mesh: "trimesh.Trimesh") -> "list[trimesh.Trimesh]":
 
     tensors, _ = load_tensors(path, "parts", {"vertices", "counts"})
     try:
-        outside = (tensors["vertices"] - torch.tensor(mesh.bounds.mean(0))).abs() > torch.tensor(
-            mesh.extents
-        )
-        if bool(outside.any()):
+        vertices = tensors["vertices"]
+        away = (vertices - torch.tensor(mesh.bounds.mean(0))).abs()
+        if bool((away > torch.tensor(mesh.extents)).any()):
             raise RuntimeError("corners far outside the mesh")
-        corners = torch.split(tensors["vertices"], tensors["counts"].tolist())
+        corners = torch.split(vertices, tensors["counts"].tolist())
         return [hull(c.numpy()) for c in corners]
     except (QhullError, RuntimeError) as error:
-        raise ModelFileError(
-            "path", f"{path}: {error}", "corners of bodies with a volume"
-        ) from error
+        allowed = "corners of bodies with a volume"
+        raise ModelFileError("path", f"{path}: {error}", allowed) from error

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 # processor time [s] that a mesh may take, and further time [s] for each face
 SECONDS = 60.0
 SECONDS_PER_FACE = 0.005
+WALL = 10.0  # time limit on a busy machine, over the processor time
+GIBIBYTES = 4  # memory that a mesh may take
+GIBIBYTE = 2**30
 
 
 def decompose(
@@ -35,8 +38,8 @@ def decompose(
     if importlib.util.find_spec("coacd") is None:
         raise MissingExtra("coacd", "sim")
     seconds = int(SECONDS + SECONDS_PER_FACE * len(mesh.faces))
-    gibibytes = 4
-    asked = json.dumps({"seconds": seconds, "memory": gibibytes << 30, "search": search})
+    memory = GIBIBYTES * GIBIBYTE
+    asked = json.dumps({"seconds": seconds, "memory": memory, "search": search})
     buffer = io.BytesIO()
     np.savez(buffer, vertices=mesh.vertices, faces=mesh.faces)
     paths = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "PYTHONSAFEPATH": "1"}
@@ -45,13 +48,13 @@ def decompose(
             [sys.executable, __file__, asked],
             input=buffer.getvalue(),
             capture_output=True,
-            timeout=10.0 * seconds,  # of wall time, on a busy machine
+            timeout=WALL * seconds,
             env=os.environ | paths,
         )
         with np.load(io.BytesIO(ended.stdout), allow_pickle=False) as found:
             return [(found[f"v{k}"], found[f"f{k}"]) for k in range(len(found) // 2)]
     except (subprocess.TimeoutExpired, OSError, ValueError, EOFError, KeyError) as error:
-        found = f"{len(mesh.faces)} faces that CoACD cannot cut in {seconds} s and {gibibytes} GiB"
+        found = f"{len(mesh.faces)} faces that CoACD cannot cut in {seconds} s and {GIBIBYTES} GiB"
         allowed = "a mesh that does not cross itself, with fewer faces; or give `parts`"
         raise MeshError("mesh", found, allowed) from error
 
@@ -68,18 +71,12 @@ def main(asked: dict[str, Any]) -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # CoACD prints here
     coacd.set_log_level("off")
     given = np.load(io.BytesIO(sys.stdin.buffer.read()), allow_pickle=False)
-    parts = coacd.run_coacd(
-        coacd.Mesh(given["vertices"], given["faces"]), seed=0, **asked["search"]
-    )
+    mesh = coacd.Mesh(given["vertices"], given["faces"])
+    arrays = {}
+    for k, part in enumerate(coacd.run_coacd(mesh, seed=0, **asked["search"])):
+        arrays[f"v{k}"], arrays[f"f{k}"] = part
     buffer = io.BytesIO()
-    np.savez(
-        buffer,
-        **{
-            f"{name}{k}": x
-            for k, part in enumerate(parts)
-            for name, x in zip("vf", part, strict=True)
-        },
-    )
+    np.savez(buffer, **arrays)
     with os.fdopen(out, "wb") as pipe:
         pipe.write(buffer.getvalue())
 

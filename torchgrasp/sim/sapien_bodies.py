@@ -86,9 +86,9 @@ def table(sapien: Any, physx: Any, material: Any) -> Any:
     """
     body = physx.PhysxRigidStaticComponent()
     top = physx.PhysxCollisionShapePlane(material)
-    top.set_local_pose(
-        sapien.Pose(q=[math.sqrt(0.5), 0.0, -math.sqrt(0.5), 0.0])
-    )  # its normal is its x axis
+    # Its normal is its x axis.
+    half = math.sqrt(0.5)
+    top.set_local_pose(sapien.Pose(q=[half, 0.0, -half, 0.0]))
     body.attach(top)
     return body
 

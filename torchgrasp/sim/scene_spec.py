@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import itertools
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Sequence
@@ -27,6 +26,25 @@ approach ends.
 """
 SHIFT_JOINTS = ("torchgrasp_shift_x", "torchgrasp_shift_y", "torchgrasp_shift_z")
 """Names of the prismatic joints of a mount that yields, along the world's axes."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneNumbers:
+    """The numbers of a scene and its mount."""
+
+    near: float = 3e-4
+    """Height [m] over the table below which vertices lie on it."""
+    slack: float = 0.01
+    """Distance [m] by which a slide of the mount may go beyond its motion."""
+    lift_slack: float = 0.05
+    """Height [m] by which the hand may rise beyond its lift."""
+    level: float = 1e-9
+    """Cosine of the pitch below which roll and yaw have one axis."""
+    bits: int = 31
+    """Bits of a collision mask: MuJoCo's masks are signed numbers of 32 bits."""
+
+
+SCENES = SceneNumbers()
 
 
 @checked
@@ -125,14 +143,16 @@ class SceneSpec:
         """
         if self.mount is not None:
             return list(self.mount)
-        slides = [Slide(LIFT_JOINT, (0.0, 0.0, 1.0), -0.01, self.travel + 0.05, 0.0)]
+        slack = SCENES.slack
+        highest = self.travel + SCENES.lift_slack
+        slides = [Slide(LIFT_JOINT, (0.0, 0.0, 1.0), -slack, highest, 0.0)]
         length = float(np.linalg.norm(self.approach))
         if length > 0:
             x, y, z = self.approach
             axis = (x / length, y / length, z / length)
-            slides.append(Slide(APPROACH_JOINT, axis, -length - 0.01, 0.01, -length))
+            slides.append(Slide(APPROACH_JOINT, axis, -length - slack, slack, -length))
         if self.yields > 0:
-            most = self.yields + 0.01
+            most = self.yields + slack
             axes = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
             each = zip(SHIFT_JOINTS, axes, self.start, strict=True)
             slides += [Slide(name, axis, -most, most, start) for name, axis, start in each]
@@ -160,13 +180,13 @@ class SceneSpec:
 
         On the facets of a scanned round body, the body would roll away before it is touched.
         """
-        near = 3e-4  # [m]
-        found = [
-            [np.array(x.vertices, dtype=float) for x in body.parts]
-            for body in (self.body, *self.neighbours)
-        ]
-        for vertices in itertools.chain(*found) if self.table else ():
-            vertices[vertices[:, 2] < self.table_height + near, 2] = self.table_height
+        lowest = self.table_height + SCENES.near if self.table else -math.inf
+        found = []
+        for body in (self.body, *self.neighbours):
+            hulls = [np.array(part.vertices, dtype=float) for part in body.parts]
+            for vertices in hulls:
+                vertices[vertices[:, 2] < lowest, 2] = self.table_height
+            found.append(hulls)
         return found
 
     @checked
@@ -174,9 +194,8 @@ class SceneSpec:
         """Raise `BadArgument` if a joint in `names` has no initial position or no drive."""
         missing = [name for name in names if name not in self.joints or name not in self.drives]
         if missing:
-            raise BadArgument(
-                "joints", f"no position or drive for {missing}", "one for every joint of the URDF"
-            )
+            found = f"no position or drive for {missing}"
+            raise BadArgument("joints", found, "one for every joint of the URDF")
 
 
 MOUNT_DRIVE = Actuator(effort=1e4, velocity=10.0, kp=1e4, kd=1e3)
@@ -209,15 +228,15 @@ def mounted_urdf(spec: SceneSpec) -> str:
     for joint in robot.iter("joint"):
         for mimic in joint.findall("mimic"):
             joint.remove(mimic)
-    angles = euler_from_rotation(spec.world_from_hand[:3, :3])
-    known = {
-        "slides": spec.slides,
-        "root": urdf.root,
-        "place": spec.world_from_hand[:3, 3],
-        "angles": angles,
-    }
-    path = Path(__file__).parent / "templates" / "mount.xml.jinja"
-    robot[:0] = list(ET.fromstring(render(path, **known, wrist=WRIST_JOINT)))
+    mount = render(
+        Path(__file__).parent / "templates" / "mount.xml.jinja",
+        slides=spec.slides,
+        root=urdf.root,
+        place=spec.world_from_hand[:3, 3],
+        angles=euler_from_rotation(spec.world_from_hand[:3, :3]),
+        wrist=WRIST_JOINT,
+    )
+    robot[:0] = list(ET.fromstring(mount))
     return ET.tostring(robot, encoding="unicode")
 
 
@@ -230,7 +249,7 @@ def euler_from_rotation(rotation: np.ndarray) -> tuple[float, float, float]:
     sine = -float(rotation[2, 0])
     cosine = math.hypot(float(rotation[0, 0]), float(rotation[1, 0]))
     pitch = math.atan2(sine, cosine)
-    if cosine < 1e-9:
+    if cosine < SCENES.level:
         return 0.0, pitch, math.atan2(-float(rotation[0, 1]), float(rotation[1, 1]))
     roll = math.atan2(float(rotation[2, 1]), float(rotation[2, 2]))
     return roll + 0.0, pitch + 0.0, math.atan2(float(rotation[1, 0]), float(rotation[0, 0]))
@@ -244,10 +263,10 @@ def pair_masks(pairs: Iterable[tuple[str, str]], first: int) -> dict[str, tuple[
     MuJoCo. Only one link of each pair needs its own bit; bits from number `first` are free.
     `HandFileError` is raised if they do not suffice.
     """
-    bits = 31  # MuJoCo's masks are signed numbers of 32 bits
     left = [tuple(pair) for pair in pairs]
-    kinds, hits = (dict.fromkeys((name for pair in left for name in pair), 0) for _ in range(2))
-    for bit in range(first, bits):
+    kinds = dict.fromkeys((name for pair in left for name in pair), 0)
+    hits = dict(kinds)
+    for bit in range(first, SCENES.bits):
         if not left:
             break
         names = [name for pair in left for name in pair]
@@ -258,6 +277,6 @@ def pair_masks(pairs: Iterable[tuple[str, str]], first: int) -> dict[str, tuple[
                 hits[two if one == owner else one] |= 1 << bit
         left = [pair for pair in left if owner not in pair]
     if left:
-        allowed = f"pairs that {bits - first} bits distinguish"
+        allowed = f"pairs that {SCENES.bits - first} bits distinguish"
         raise HandFileError("self_collision", f"{len(left)} pairs too many", allowed)
     return {name: (kinds[name], hits[name]) for name in kinds}
