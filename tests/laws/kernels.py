@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchgrasp.foundation.errors import BrokenLaw
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.shape.kernel import NEAR_ZERO, Kernel, differentiate, gram
+from torchgrasp.shape.kernel import PROFILE, Kernel, differentiate, gram
 
 SPREADS = (0.3, 1.0, 3.0, 10.0)
 """Diameters of point sets over the kernel's own length: points that all agree, and points that
@@ -105,7 +105,7 @@ def _check_derivatives(kernel: Kernel, r: Float[Tensor, " n"], length: float) ->
     given = kernel.derivatives(r, 4)
     exact = differentiate(kernel.profile, r * r / 2, 4)
     for order, (a, b, factor) in enumerate(zip(given, exact, factors, strict=True)):
-        error = ((a - b) * factor).abs().where((r > NEAR_ZERO) | (order < 3), 0.0)
+        error = ((a - b) * factor).abs().where((r > PROFILE.near_zero) | (order < 3), 0.0)
         if not float(error.max()) < 1e-6:
             place = float(r[error.argmax()])
             found = f"derivative {order} of the closed form off by {float(error.max()):.3g} at r = {place:.3g}"

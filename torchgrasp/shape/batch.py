@@ -20,6 +20,7 @@ from torchgrasp.shape.estimate import MeanJet, SurfaceJet
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.jets import Weighted, evaluate_jet, evaluate_mean, evaluate_mean_jet
 from torchgrasp.shape.kernel import Kernel, cross_covariance, differentiate_thin_plate, thin_plate
+from torchgrasp.shape.posterior import CHUNK
 
 Evaluate = Callable[[Tensor, Tensor], tuple[Tensor, ...]]
 """A function of points and the surface of each."""
@@ -302,6 +303,6 @@ class ShapeBatch(Value):
     ) -> tuple[Tensor, ...]:
         """Return the results of a function of points and surfaces, for chunks of points, joined."""
         wall = self._surface_at(x) if wall is None else wall
-        size = at_once(x, 256)
+        size = at_once(x, CHUNK.jet)
         parts = [evaluate(*part) for part in zip(x.split(size), wall.split(size), strict=True)]
         return tuple(map(torch.cat, zip(*parts, strict=True)))

@@ -28,9 +28,18 @@ from torchgrasp.shape.estimate import (
 from torchgrasp.shape.posterior import Posterior, symmetric_root
 from torchgrasp.values.planning import PointCloud, ShapeEstimate
 
-MAX_JOINT = (
-    1000  # most points of one joint posterior: its memory grows with the square of their number
-)
+
+@dataclasses.dataclass(frozen=True)
+class DomainNumbers:
+    """The bounds within which a shape is asked."""
+
+    reach: float = 1.25
+    """Radius of the domain over that of the observations: far from them nothing is known."""
+    joint: int = 1000
+    """Most points of one joint posterior: its memory grows with the square of their number."""
+
+
+DOMAIN = DomainNumbers()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,8 +86,7 @@ class ShapeGP(Posterior, Normalisation):
         """Return the shape of a posterior in a normalised frame; its domain follows from kernel and
         observations.
         """
-        # Far from all observations the posterior has no information.
-        reach = 1.25 * float(torch.linalg.vector_norm(posterior.x.detach(), dim=-1).max())
+        reach = DOMAIN.reach * float(torch.linalg.vector_norm(posterior.x.detach(), dim=-1).max())
         radius = min(posterior.kernel.diameter / 2.0, reach)
         fields = common_fields(posterior, Posterior) | common_fields(frame, Normalisation)
         return cls(**fields, psi=psi, domain_radius=radius, std_factor=std_factor, cloud=cloud)
@@ -159,9 +167,8 @@ class ShapeGP(Posterior, Normalisation):
         steeper = normal.transpose(1, 2) @ jet.hessian  # the derivative of the slope
         along = normal @ steeper
         std = surface_deviation(jet.variance, jet.gradient)[:, None]
-        relative = (
-            jet.variance_gradient / (2 * jet.variance[:, None]) - steeper[:, 0] / length[:, 0]
-        )
+        relative = jet.variance_gradient / (2 * jet.variance[:, None])
+        relative = relative - steeper[:, 0] / length[:, 0]
         return ShapeDerivatives(
             distance=_reshape(jet.gradient / self.scale, points),
             normal=_reshape((jet.hessian - along) / (length * self.scale), points),
@@ -177,8 +184,9 @@ class ShapeGP(Posterior, Normalisation):
         Raises the errors of `differentiate`, and `BadArgument` for more points.
         """
         x = self._queries(points)
-        if len(x) > MAX_JOINT:
-            raise BadArgument("points", f"{len(x)} points", f"at most {MAX_JOINT} points at once")
+        if len(x) > DOMAIN.joint:
+            most = f"at most {DOMAIN.joint} points at once"
+            raise BadArgument("points", f"{len(x)} points", most)
         return self.joint_at(x).to(points.dtype)
 
     @checked(gradients=True)
@@ -196,12 +204,11 @@ class ShapeGP(Posterior, Normalisation):
         prior = float(self.prior_block()[0, 0].detach())
         root = symmetric_root(joint.covariance, prior, "query points within the domain")
         generator = torch.Generator("cpu").manual_seed(seed)
-        with (
-            torch._C._DisableFuncTorch()
-        ):  # the draws are the same for all that torch.vmap maps over
-            draws = torch.randn(
-                n, len(root), dtype=torch.float64, device="cpu", generator=generator
-            ).to(self.device)
+        # the draws are the same for all that torch.vmap maps over
+        with torch._C._DisableFuncTorch():
+            size = (n, len(root))
+            draws = torch.randn(size, dtype=torch.float64, device="cpu", generator=generator)
+            draws = draws.to(self.device)
         return (joint.mean + (draws @ root).reshape(n, *joint.mean.shape)).to(points)
 
     @checked
@@ -239,9 +246,8 @@ class ShapeGP(Posterior, Normalisation):
             direction = unit_of_any(normals.to(x))
             check_tensor("normals", direction, (len(x), 3))  # a normal of length 0 has become NaN
         new = on_surface(x, direction, torch.full_like(x[:, 0], noise / self.scale), normal_noise)
-        return self.append(
-            dataclasses.replace(new, has_normal=new.has_normal & (normals is not None))
-        )
+        has_normal = new.has_normal & (normals is not None)
+        return self.append(dataclasses.replace(new, has_normal=has_normal))
 
     @checked
     def append(self, new: Observations) -> "ShapeGP":
@@ -262,14 +268,13 @@ class ShapeGP(Posterior, Normalisation):
 
         back = slice(None) if self.order is None else torch.argsort(self.order)
         covariance = (self.factor @ self.factor.T)[back][:, back]
+        covariance = turn(turn(covariance).T)
         return dataclasses.replace(
             self,
             x=self.x @ rotation.T,
             center=apply(b_from_a.to(self.center), self.center[None])[0],
             weights=turn(self.weights[:, None])[:, 0],
-            factor=cholesky(
-                turn(turn(covariance).T), "the covariance of the observations", self.kernel.remedy
-            ),
+            factor=cholesky(covariance, "the covariance of the observations", self.kernel.remedy),
             order=None,
             cloud=move(self.cloud, b_from_a),
         )
@@ -305,18 +310,16 @@ class ShapeGP(Posterior, Normalisation):
         outside = (torch.linalg.vector_norm(x.detach(), dim=-1) > self.domain_radius)[:, None]
         if not (is_known(outside) and bool(outside.any())):
             return self.estimate(x)
-        outward = unit(
-            torch.where(outside, x, 1.0)
-        )  # with finite derivatives at points inside, too
+        # with finite derivatives at points inside, too
+        outward = unit(torch.where(outside, x, 1.0))
         nearest = torch.where(outside, self.domain_radius * outward, x)
         mean, spread = self.estimate(nearest)
         away = ((x - nearest) * outward).sum(-1, keepdim=True)
         slope = (mean[:, 1:] * outward).sum(-1, keepdim=True)
         across = self.domain_radius / (self.domain_radius + away) * (mean[:, 1:] - slope * outward)
         grown = torch.cat([mean[:, :1] + away, unit(outward + across)], 1)
-        return torch.where(outside, grown, mean), torch.where(
-            outside[..., None], self.prior_block(), spread
-        )
+        spread = torch.where(outside[..., None], self.prior_block(), spread)
+        return torch.where(outside, grown, mean), spread
 
 
 def _reshape(rows: Float[Tensor, "q *c"], points: Float[Tensor, "*b 3"]) -> Tensor:

@@ -24,8 +24,23 @@ k'(0) = 0.
 """
 KernelName = Literal["thin_plate", "matern52", "rbf"]
 Orders = Annotated[int, Range(1, 4)]  # how many of k and its derivatives
-# below it k(r) is taken as its Taylor polynomial of degree 4, as k'(r) / r is 0 / 0 at r = 0
-NEAR_ZERO = 1e-4
+# length over psi of the Matern kernel whose gradients have the prior variance 6 psi
+MATERN52_LENGTH = math.sqrt(5.0 / 18.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class ProfileNumbers:
+    """The numbers by which a profile is differentiated near r = 0, where k'(r) / r is 0 / 0."""
+
+    near_zero: float = 1e-4
+    """Below it k(r) is taken as its Taylor polynomial of degree 4."""
+    power: float = 1.5
+    """Points with r^2 up to this power of the rounding error coincide: rounding of the third
+    derivative would dominate.
+    """
+
+
+PROFILE = ProfileNumbers()
 
 
 @checked
@@ -82,8 +97,9 @@ def differentiate(
     Higher ones, and infinite ones, count as 0 there: covariances and their second derivatives
     multiply them by a power of r.
     """
-    near = u < NEAR_ZERO**2 / 2
-    r = torch.sqrt(2.0 * torch.where(near, NEAR_ZERO**2 / 2, u))
+    least = PROFILE.near_zero**2 / 2
+    near = u < least
+    r = torch.sqrt(2.0 * torch.where(near, least, u))
     values = _differentiate_by_distance(profile, r, count - 1)
     inverse = 1.0 / r
     if count > 1:
@@ -95,15 +111,12 @@ def differentiate(
     if is_known(near) and not bool(near.any()):
         return tuple(values)
     k, _, second, third, fourth = _differentiate_by_distance(profile, u.new_zeros(()), 4)
-    apart = (
-        2.0 * u > torch.finfo(u.dtype).eps ** 1.5
-    )  # closer points coincide: rounding of `third` would dominate
-    r = torch.where(
-        apart, torch.sqrt(2.0 * torch.where(apart, u, 1.0)), 0.0
-    )  # its gradient is finite at 0, too
+    apart = 2.0 * u > torch.finfo(u.dtype).eps ** PROFILE.power
+    # the gradient of r is finite at 0, too
+    r = torch.where(apart, torch.sqrt(2.0 * torch.where(apart, u, 1.0)), 0.0)
     inverse = torch.where(apart, 1.0 / torch.where(apart, r, 1.0), 0.0)
     series = (
-        k + u * (second + u * fourth / 6.0) + r**3 * third / 6.0,
+        k + u * (second + u * fourth / 6) + r**3 * third / 6,
         second + u * fourth / 3.0 + r * third / 2.0,
         fourth / 3.0 + inverse * third / 2.0,
         -(inverse**3) * third / 2.0,
@@ -154,12 +167,12 @@ def differentiate_thin_plate(psi: float | Tensor, r: Tensor, count: int) -> tupl
     """Return k and its derivatives by r^2 / 2 of the thin plate kernel in closed form, `count` in
     all.
     """
-    values = [(2.0 * r).sub_(3.0 * psi).mul_(r).mul_(r).add_(psi**3), (6.0 * r).sub_(6.0 * psi)]
+    values = [(2.0 * r).sub_(3.0 * psi).mul_(r).mul_(r).add_(psi**3), (6 * r).sub_(6 * psi)]
     if count > 2:
         inverse = torch.reciprocal(r).masked_fill_(r == 0, 0.0)
-        values.append(6.0 * inverse)
+        values.append(6 * inverse)
         if count > 3:
-            values.append((inverse * inverse).mul_(inverse).mul_(-6.0))
+            values.append((inverse * inverse).mul_(inverse).mul_(-6))
     return tuple(values[:count])
 
 
@@ -170,7 +183,7 @@ def matern52_kernel(length: Positive, variance: Positive = 1.0) -> Kernel:
     >>> float(matern52_kernel(1.0).profile(torch.zeros(())))
     1.0
     """
-    scale = math.sqrt(5.0) / length
+    scale = math.sqrt(5) / length
 
     def profile(r: Tensor) -> Tensor:
         s = scale * r
@@ -215,8 +228,8 @@ def kernel_by_name(name: KernelName, psi: Positive) -> Kernel:
     if name == "thin_plate":
         return thin_plate_kernel(psi)
     if name == "matern52":
-        return matern52_kernel(psi * math.sqrt(5.0 / 18.0), psi**3)
-    return rbf_kernel(psi / math.sqrt(6.0), psi**3)
+        return matern52_kernel(psi * MATERN52_LENGTH, psi**3)
+    return rbf_kernel(psi / math.sqrt(6), psi**3)
 
 
 def cross_covariance(
@@ -266,14 +279,11 @@ def _differentiable_cross_covariance(
     near = d[:, :n_oriented]
     slope = -first[:, :n_oriented]
     one = torch.eye(3, dtype=x.dtype, device=x.device)
-    bent = (
-        slope[..., None] * one
-        - second[:, :n_oriented, :, None] * near[..., :, None] * near[..., None, :]
-    )
+    tilted = second[:, :n_oriented, :, None] * near[..., :, None]
+    bent = slope[..., None] * one - tilted * near[..., None, :]  # (q, n_oriented, 3, 3)
     with_distances = torch.cat([k, first * d], -1).permute(2, 0, 1)
-    with_normals = (
-        torch.cat([(slope * near)[..., None, :], bent], -2).permute(2, 0, 3, 1).flatten(2)
-    )
+    with_normals = torch.cat([(slope * near)[..., None, :], bent], -2)  # (q, n_oriented, 4, 3)
+    with_normals = with_normals.permute(2, 0, 3, 1).flatten(2)
     return torch.cat([with_distances, with_normals], -1)
 
 

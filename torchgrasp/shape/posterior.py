@@ -32,6 +32,29 @@ from torchgrasp.shape.kernel import (
 
 
 @dataclasses.dataclass(frozen=True)
+class ChunkNumbers:
+    """How many points are worked on at once: on a CPU the temporaries of a chunk stay in the cache."""
+
+    mean: int = 2048
+    gradient: int = 512
+    jet: int = 256
+    """Points of a chunk for the mean, for its gradient, and for an estimate or a jet."""
+    memory: int = 2**27
+    """Memory [B] of the temporaries of an estimate on an accelerator."""
+    entry: int = 32
+    """Memory [B] of a column of the covariance of distance and gradient."""
+    least: int = 64
+    """Least points of a chunk on an accelerator."""
+    tile: int = 24
+    """Matrix products are fastest with a multiple of so many columns."""
+
+
+CHUNK = ChunkNumbers()
+# least eigenvalue of a covariance, over the prior variance: less is more than rounding
+LEAST_EIGENVALUE = -1e-8
+
+
+@dataclasses.dataclass(frozen=True)
 class Posterior(Value):
     """A Gaussian process given observed distances and normals, in normalised units and float64.
 
@@ -42,12 +65,10 @@ class Posterior(Value):
 
     x: Float[Tensor, "n 3"]  # observed points, those with normals first
     has_normal: Bool[Tensor, "n"]
-    weights: Float[
-        Tensor, "rows"
-    ]  # (K + noise)^-1 y of the observed y: all distances, then the normals by component
-    factor: Float[
-        Tensor, "rows rows"
-    ]  # lower Cholesky factor of K + noise; rows of later observations come last
+    # (K + noise)^-1 y of the observed y: all distances, then the normals by component
+    weights: Float[Tensor, "rows"]
+    # lower Cholesky factor of K + noise; rows of later observations come last
+    factor: Float[Tensor, "rows rows"]
     order: Int[Tensor, "rows"] | None  # row in `weights` of each row of `factor`; None if the same
     kernel: Kernel
 
@@ -56,12 +77,10 @@ class Posterior(Value):
         """The inverse L^-T of the transposed Cholesky factor, in blocks of columns without the
         zeros below them.
         """
-        # matrix products are fastest with a multiple of so many columns
         rows = len(self.factor)
-        tile = 24
         one = torch.eye(rows, dtype=self.x.dtype, device=self.x.device)
         inverse = torch.linalg.solve_triangular(self.factor, one, upper=False)
-        width = max(tile * round(rows / (4 * tile)), tile)
+        width = CHUNK.tile * max(round(rows / (4 * CHUNK.tile)), 1)
         return [inverse[i : i + width, : i + width].T.contiguous() for i in range(0, rows, width)]
 
     @cached_property
@@ -79,9 +98,8 @@ class Posterior(Value):
         """Return the mean signed distance at normalised points."""
         if not self._is_plain(x):
             return self.distance_rows(x) @ self.weights
-        return in_chunks(lambda part: evaluate_mean(self.weighted, part, gradient=False), x, 2048)[
-            0
-        ]
+        mean = partial(evaluate_mean, self.weighted, gradient=False)
+        return in_chunks(mean, x, CHUNK.mean)[0]
 
     @checked(gradients=True)
     def mean_and_gradient(
@@ -91,10 +109,8 @@ class Posterior(Value):
         if not self._is_plain(x):
             distance, *slope = (self.cross(x) @ self.weights).unbind(0)
             return distance, torch.stack(slope, -1)
-        found = in_chunks(
-            lambda part: evaluate_mean(self.weighted, part, gradient=True), x, at_once(x, 512)
-        )
-        return found  # pyright: ignore[reportReturnType]
+        mean = partial(evaluate_mean, self.weighted, gradient=True)
+        return in_chunks(mean, x, at_once(x, CHUNK.gradient))  # pyright: ignore[reportReturnType]
 
     @checked(gradients=True)
     def estimate(
@@ -121,9 +137,9 @@ class Posterior(Value):
                         spread[:, p, m] -= explained
             return mean, spread
 
-        # On a CPU the temporaries of a chunk stay in the cache. On an accelerator they take at most
-        # 128 MiB.
-        size = 256 if x.device.type == "cpu" else max(2**27 // (32 * rows), 64)
+        size = CHUNK.jet
+        if x.device.type != "cpu":
+            size = max(CHUNK.memory // (CHUNK.entry * rows), CHUNK.least)
         return in_chunks(evaluate, x, size)  # pyright: ignore[reportReturnType]
 
     @checked(gradients=True)
@@ -137,19 +153,17 @@ class Posterior(Value):
         the data, and A the inverse covariance of the data. Its gradient is -2 times the gradient of
         a mean with the weights A k*.
         """
-        size = at_once(x, 256)
-        if not self._is_plain(x):
-            return SurfaceJet(*in_chunks(partial(_differentiable_jet, self), x, size))
-        return SurfaceJet(
-            *in_chunks(lambda part: evaluate_jet(self.weighted, part, self.explain), x, size)
-        )
+        evaluate = partial(_differentiable_jet, self)
+        if self._is_plain(x):
+            evaluate = partial(evaluate_jet, self.weighted, explain=self.explain)
+        return SurfaceJet(*in_chunks(evaluate, x, at_once(x, CHUNK.jet)))
 
     @checked(gradients=True)
     def mean_jet(self, x: Float[Tensor, "q 3"]) -> MeanJet:
         """Return the mean distance with first and second derivatives at normalised points, at less
         cost than `jet`.
         """
-        size = at_once(x, 256)
+        size = at_once(x, CHUNK.jet)
         if not self._is_plain(x):
             return MeanJet(*in_chunks(partial(_differentiable_jet, self), x, size)[:3])
         return MeanJet(*in_chunks(lambda part: evaluate_mean_jet(self.weighted, part)[0], x, size))
@@ -234,9 +248,8 @@ class Posterior(Value):
     def weighted(self) -> Weighted:
         """The observed points with the posterior weights of their distances and normals."""
         n = len(self.x)
-        return Weighted(
-            self.x, self.weights[:n], self.weights[n:].reshape(3, self.n_oriented).T, self.kernel
-        )
+        normals = self.weights[n:].reshape(3, self.n_oriented).T
+        return Weighted(self.x, self.weights[:n], normals, self.kernel)
 
 
 def _differentiable_jet(posterior: Posterior, x: Float[Tensor, "q 3"]) -> tuple[Tensor, ...]:
@@ -244,11 +257,9 @@ def _differentiable_jet(posterior: Posterior, x: Float[Tensor, "q 3"]) -> tuple[
 
     def total(x: Tensor) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]:
         mean, spread = posterior.estimate(x)
-        return (mean[:, 1:].sum(0), spread[:, 0, 0].sum(0)), (
-            mean[:, 0],
-            mean[:, 1:],
-            spread[:, 0, 0],
-        )
+        gradient = mean[:, 1:]
+        variance = spread[:, 0, 0]
+        return (gradient.sum(0), variance.sum(0)), (mean[:, 0], gradient, variance)
 
     (hessian, slope), (distance, gradient, variance) = torch.func.jacrev(total, has_aux=True)(x)
     return distance, gradient, hessian.transpose(0, 1), variance, slope
@@ -260,16 +271,16 @@ def combined_covariance(
     """Return the covariance of weighted sums of distances: m sums for each of g groups of p points,
     so v = g m sums.
     """
-    (b, g, p), rows = x.shape[:3], len(posterior.factor)
+    b, g, p, _ = x.shape
+    rows = len(posterior.factor)
     v = g * weights.shape[2]
     points = x.flatten(1, 2)
     cross = posterior.distance_rows(points.flatten(0, 1)).view(b, g, p, rows)
-    whitened = posterior.whiten((weights @ cross).view(b * v, rows)).view(
-        b, v, rows
-    )  # the sums: they are fewer
-    prior = posterior.kernel.profile(
-        torch.linalg.vector_norm(points[:, :, None] - points[:, None], dim=-1)
-    )
+    # the sums are whitened: they are fewer than the points
+    sums = (weights @ cross).view(b * v, rows)
+    whitened = posterior.whiten(sums).view(b, v, rows)
+    apart = torch.linalg.vector_norm(points[:, :, None] - points[:, None], dim=-1)
+    prior = posterior.kernel.profile(apart)  # (b, g p, g p)
     prior = weights @ prior.view(b, g, p, g * p)  # (b, g, m, g p)
     prior = weights @ prior.view(b, v, g, p).permute(0, 2, 3, 1)  # (b, g, m, v)
     return torch.baddbmm(prior.reshape(b, v, v), whitened, whitened.mT, alpha=-1.0)
@@ -286,11 +297,14 @@ def symmetric_root(
     and its gradient is NaN elsewhere.
     """
     values, vectors = torch.linalg.eigh(covariance.detach())
-    if is_known(values) and values.numel() and not float(values.min()) >= -1e-8 * prior:
-        raise IndefiniteCovariance("the joint covariance", float(values.min()), fix)
+    if is_known(values) and values.numel():
+        least = float(values.min())
+        if not least >= LEAST_EIGENVALUE * prior:
+            raise IndefiniteCovariance("the joint covariance", least, fix)
     roots = torch.where(values > 0, values, 0.0).sqrt()
     root = (vectors * roots[..., None, :]) @ vectors.mT
-    for _ in range(0 if is_plain(covariance) else 2):  # Newton's steps change the derivatives alone
+    # Newton's steps change the derivatives alone
+    for _ in range(0 if is_plain(covariance) else 2):
         rest = vectors.mT @ (covariance - root @ root) @ vectors
         root = root + vectors @ (rest / (roots[..., None] + roots[..., None, :])) @ vectors.mT
     return root

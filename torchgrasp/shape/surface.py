@@ -28,14 +28,46 @@ from torchgrasp.geometry.signed_distance import (
 from torchgrasp.shape.estimate import surface_deviation
 from torchgrasp.shape.gp import ShapeGP
 
-RESOLUTION = 48  # cells along the domain's diameter
-COARSE = 4
-STEEPER = 1.3
-"""Side [cells] of the first blocks of the grid, and the greatest assumed ratio of the mean's slope
-within a block to the slope between its corners. Blocks that the zero level cannot reach are not
-refined.
-"""
-LEAST_SHARE = 0.02  # least share of the cloud nearest to a sheet of the zero level that is kept
+
+@dataclasses.dataclass(frozen=True)
+class SurfaceNumbers:
+    """The numbers of the extraction of a surface."""
+
+    resolution: int = 48
+    """Cells along the domain's diameter."""
+    coarse: int = 4
+    """Side [cells] of the first blocks of the grid."""
+    steeper: float = 1.3
+    """Greatest assumed ratio of the mean's slope within a block to the slope between its corners.
+    Blocks that the zero level cannot reach are not refined.
+    """
+    rounding: float = 1e-12
+    """Nodes on the ball are within it, to this share of its radius."""
+    steps: int = 3
+    """Most Newton steps of a vertex."""
+    least_slope: float = 1e-12
+    """Least squared slope of a step: a bound of a divisor."""
+    settled: float = 1e-4
+    """A vertex that moves less, normalised, is on the surface."""
+    share: float = 0.02
+    """Least share of the cloud nearest to a sheet of the zero level that is kept."""
+
+
+SURFACE = SurfaceNumbers()
+
+
+@dataclasses.dataclass(frozen=True)
+class NodeNumbers:
+    """The spacing of the field that collisions are checked with, in metres."""
+
+    thick: float = 0.04
+    """Least side of a thick body, which is not hollow."""
+    wide: float = 0.004
+    close: float = 0.003
+    """Spacing of the nodes for thick bodies, and for others."""
+
+
+NODES = NodeNumbers()
 
 
 @checked
@@ -65,7 +97,7 @@ class Surface(Value):
 @checked
 @single_threaded
 def extract_surface(
-    shape: ShapeGP, resolution: Annotated[int, Range(8, 256)] = RESOLUTION
+    shape: ShapeGP, resolution: Annotated[int, Range(8, 256)] = SURFACE.resolution
 ) -> Surface:
     """Return the surface, where the mean distance is zero (Eq. 9 of the paper), by marching cubes
     and Newton steps.
@@ -97,7 +129,7 @@ class Mesh(Value):
 
 def extract_mesh(shape: ShapeGP) -> Mesh:
     """Return the estimated surface as a mesh, at the default resolution."""
-    x, faces = zip(*_trace_walls(shape, RESOLUTION), strict=True)
+    x, faces = zip(*_trace_walls(shape, SURFACE.resolution), strict=True)
     return Mesh(shape.metres(torch.cat(x)), torch.cat(faces))
 
 
@@ -105,11 +137,10 @@ def collision_field(shape: ShapeGP, mesh: Mesh) -> SignedDistanceField:
     """Return the signed distance field of a shape's `extract_mesh`, with nodes as close as thin
     bodies need.
     """
-    thick = (
-        float((mesh.vertices.amax(0) - mesh.vertices.amin(0)).min()) > 0.04
-        and len(shape.walls) == 1
-    )
-    return field_from_surface(mesh.vertices, mesh.faces, spacing=0.004 if thick else 0.003)
+    size = mesh.vertices.amax(0) - mesh.vertices.amin(0)
+    thick = float(size.min()) > NODES.thick and len(shape.walls) == 1
+    spacing = NODES.wide if thick else NODES.close
+    return field_from_surface(mesh.vertices, mesh.faces, spacing)
 
 
 def _trace_walls(
@@ -136,7 +167,8 @@ def _trace_wall(
     radius = whole.domain_radius
     device = shape.x.device
     step = 2.0 * radius / resolution
-    volume = _grid(shape, radius, step, COARSE * math.ceil(resolution / COARSE))
+    cells = SURFACE.coarse * math.ceil(resolution / SURFACE.coarse)
+    volume = _grid(shape, radius, step, cells)
     if not (np.nanmin(volume) < 0.0 < np.nanmax(volume)):
         raise BadArgument(
             "shape", "a mean that is nowhere zero", "a shape with a surface inside its domain"
@@ -150,24 +182,22 @@ def _trace_wall(
         spacing=(step,) * 3,
         gradient_direction="ascent",
     )
-    used, faces = np.unique(
-        faces[_carry_cloud(corners - radius, faces, shape)], return_inverse=True
-    )
+    kept = faces[_carry_cloud(corners - radius, faces, shape)]
+    used, faces = np.unique(kept, return_inverse=True)
     x = torch.from_numpy(corners[used].astype(np.float64) - radius).to(device)
     faces = torch.from_numpy(faces.reshape(-1, 3).astype(np.int64)).to(device)
     normals = torch.zeros_like(x)
     rows = torch.arange(len(x), device=device)
-    for _ in range(3):
+    for _ in range(SURFACE.steps):
         value, gradient = shape.mean_and_gradient(x[rows])
-        motion = newton_step(value, gradient, step, 1e-12)
+        motion = newton_step(value, gradient, step, SURFACE.least_slope)
         x[rows] = x[rows] + motion
         normals[rows] = gradient
-        rows = rows[torch.linalg.vector_norm(motion, dim=-1) > 1e-4]
+        rows = rows[torch.linalg.vector_norm(motion, dim=-1) > SURFACE.settled]
     if others:  # the cut turns triangles around, so they are wound after it
         value = torch.stack([wall.mean(x) for wall in others]).amax(0)
-        vertices, triangles, _ = clip_mesh(
-            x.cpu().numpy(), faces.cpu().numpy(), value.cpu().numpy()
-        )
+        parts = [part.cpu().numpy() for part in (x, faces, value)]
+        vertices, triangles, _ = clip_mesh(*parts)
         x = torch.from_numpy(vertices).to(x)
         faces = torch.from_numpy(triangles).to(faces)
         normals = shape.mean_and_gradient(x)[1]
@@ -187,40 +217,31 @@ def _grid(shape: ShapeGP, radius: float, step: float, cells: int) -> np.ndarray:
     line = -radius + step * torch.arange(cells + 1, dtype=torch.float64, device=shape.x.device)
 
     def mean(stride: int, nodes: tuple[np.ndarray, ...]) -> np.ndarray:
-        x = torch.stack(
-            [line[stride * torch.tensor(axis, device=line.device)] for axis in nodes], -1
-        )
-        return shape.mean(x).cpu().numpy()
+        axes = [line[stride * torch.tensor(axis, device=line.device)] for axis in nodes]
+        return shape.mean(torch.stack(axes, -1)).cpu().numpy()
 
-    count = cells // COARSE + 1
-    stride = COARSE
-    values = mean(stride, tuple(np.indices((count, count, count)).reshape(3, -1))).reshape(
-        (count,) * 3
-    )
-    steepest = (
-        STEEPER
-        * max(float(np.abs(np.diff(values, axis=axis)).max()) for axis in range(3))
-        / (stride * step)
-    )
+    def finer(nodes: np.ndarray) -> np.ndarray:
+        return nodes.repeat(2, 0).repeat(2, 1).repeat(2, 2)
+
+    stride = SURFACE.coarse
+    size = (cells // stride + 1,) * 3
+    every = np.indices(size).reshape(3, -1)
+    values = mean(stride, tuple(every)).reshape(size)
+    climb = max(float(np.abs(np.diff(values, axis=axis)).max()) for axis in range(3))
+    steepest = SURFACE.steeper * climb / (stride * step)
     while stride > 1:
-        least = ndimage.minimum_filter(np.abs(values), 2, origin=-1)[
-            :-1, :-1, :-1
-        ]  # over the corners of each cell
-        near = (
-            (least < steepest * math.sqrt(0.75) * stride * step)
-            .repeat(2, 0)
-            .repeat(2, 1)
-            .repeat(2, 2)
-        )
+        # over the corners of each cell
+        least = ndimage.minimum_filter(np.abs(values), 2, origin=-1)[:-1, :-1, :-1]
+        # the surface reaches a cell from a corner within half its diagonal
+        near = finer(least < steepest * (math.sqrt(3) / 2) * stride * step)
         stride //= 2
-        values = values.repeat(2, 0).repeat(2, 1).repeat(2, 2)[:-1, :-1, :-1]
-        wanted = np.nonzero(
-            ndimage.maximum_filter(np.pad(near, ((0, 1),) * 3), 2)
-        )  # the corners of those cells
+        values = finer(values)[:-1, :-1, :-1]
+        # the corners of those cells
+        wanted = np.nonzero(ndimage.maximum_filter(np.pad(near, ((0, 1),) * 3), 2))
         values[wanted] = mean(stride, wanted)
     squares = (line * line).cpu().numpy()
     distance = squares[:, None, None] + squares[:, None] + squares
-    values[distance > (radius * (1.0 + 1e-12)) ** 2] = np.nan
+    values[distance > (radius * (1.0 + SURFACE.rounding)) ** 2] = np.nan
     return values
 
 
@@ -240,7 +261,7 @@ def _carry_cloud(corners: np.ndarray, faces: np.ndarray, shape: ShapeGP) -> np.n
     cloud = shape.normalise(shape.cloud.points.to(shape.x)).cpu().numpy()
     _, nearest = spatial.KDTree(corners).query(cloud)
     share = np.bincount(label[nearest], minlength=label.max() + 1) / len(cloud)
-    return (share >= min(LEAST_SHARE, share.max()))[label[faces[:, 0]]]
+    return (share >= min(SURFACE.share, share.max()))[label[faces[:, 0]]]
 
 
 @checked
