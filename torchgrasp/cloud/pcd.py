@@ -6,7 +6,15 @@ import numpy as np
 
 from torchgrasp.files import Malformed
 from torchgrasp.files.columns import find_columns, read_fields
-from torchgrasp.foundation.limits import CLOUD_BYTES, CLOUD_POINTS
+from torchgrasp.foundation.limits import CLOUD_BYTES, CLOUD_POINTS, PLY_HEADER_BYTES
+
+MOST_NUMBERS = 4096
+"""Most numbers of a point in one field: histograms of features have a few hundred."""
+LITERALS = 1 << 5
+"""A control byte of LZF below this counts literal bytes; its other bits are part of a distance."""
+LETTERS = {"F": "f", "I": "i", "U": "u"}
+DEFAULT = [0, 0, 0, 1, 0, 0, 0]
+"""NumPy's letters of the types, and the viewpoint that many writers fill in."""
 
 
 def parse_pcd(data: bytes) -> dict[str, Any]:
@@ -22,37 +30,33 @@ def parse_pcd(data: bytes) -> dict[str, Any]:
     counts = [int(c) for c in header.get("COUNT", ["1"] * len(names))]
     sizes = header["SIZE"]
     kinds = header["TYPE"]
-    if (
-        not len(names) == len(counts) == len(sizes) == len(kinds)
-        or min(counts) < 1
-        or max(counts) > 4096
-    ):
+    alike = len(names) == len(counts) == len(sizes) == len(kinds)
+    if not alike or min(counts) < 1 or max(counts) > MOST_NUMBERS:
         raise Malformed("FIELDS, SIZE, TYPE and COUNT that do not match")
-    count = (
-        int(header["POINTS"][0])
-        if "POINTS" in header
-        else int(header["WIDTH"][0]) * int(header["HEIGHT"][0])
-    )
+    if "POINTS" in header:
+        count = int(header["POINTS"][0])
+    else:
+        count = int(header["WIDTH"][0]) * int(header["HEIGHT"][0])
     if not 0 <= count <= CLOUD_POINTS:
         raise Malformed(f"{count} points, not up to {CLOUD_POINTS}")
-    letters = {"F": "f", "I": "i", "U": "u"}
     encoding = header["DATA"][0].lower()
     fields = [
-        (f"{letters[k.upper()]}{int(s)}", c) for k, s, c in zip(kinds, sizes, counts, strict=True)
+        (f"{LETTERS[k.upper()]}{int(s)}", c) for k, s, c in zip(kinds, sizes, counts, strict=True)
     ]
     if encoding not in ("ascii", "binary", "binary_compressed"):
         raise Malformed(f"DATA {encoding}, not ascii, binary or binary_compressed")
     if encoding == "binary_compressed":
         body = _decompress(body, [np.dtype(f"({n},)<{kind}") for kind, n in fields], count)
-    found = find_columns(
-        names, read_fields(body, fields, count, "" if encoding == "ascii" else "<")
-    )
+    order = "" if encoding == "ascii" else "<"
+    found = find_columns(names, read_fields(body, fields, count, order))
+
     viewpoint = np.array([float(x) for x in header["VIEWPOINT"]]) if "VIEWPOINT" in header else None
-    if viewpoint is not None and len(viewpoint) != 7:
+    if viewpoint is None:
+        return {**found, "viewpoint": None, "default": False}
+    if len(viewpoint) != 7:
         raise Malformed(f"VIEWPOINT with {len(viewpoint)} numbers, not 7")
-    default = viewpoint is not None and np.array_equal(viewpoint, [0, 0, 0, 1, 0, 0, 0])
-    position = None if viewpoint is None else viewpoint[:3]
-    return {**found, "viewpoint": position, "default": default}
+    default = np.array_equal(viewpoint, DEFAULT)
+    return {**found, "viewpoint": viewpoint[:3], "default": default}
 
 
 def _split_header(data: bytes) -> tuple[dict[str, list[str]], bytes]:
@@ -63,7 +67,7 @@ def _split_header(data: bytes) -> tuple[dict[str, list[str]], bytes]:
     start = 0
     while "DATA" not in header:
         stop = data.find(b"\n", start)
-        if stop < 0 or stop > 65536:
+        if stop < 0 or stop > PLY_HEADER_BYTES:
             raise Malformed("no PCD header")
         words = data[start:stop].decode("ascii").split("#")[0].split()
         if words:
@@ -110,18 +114,17 @@ def decompress(data: bytes, size: int) -> bytes:
 
     while i < len(data):
         control = take(1)[0]
-        if control < 32:
+        if control < LITERALS:
             out += take(control + 1)
         else:
             length = (control >> 5) + 2
             length += take(1)[0] if length == 9 else 0
-            start = len(out) - ((control & 31) << 8) - take(1)[0] - 1
+            start = len(out) - ((control & (LITERALS - 1)) << 8) - take(1)[0] - 1
             if start < 0:
                 raise Malformed("LZF data that copy bytes from before their start")
             piece = out[start : start + length]
-            out += (piece * (length // len(piece) + 1))[
-                :length
-            ]  # the copy may overlap what it writes
+            # The copy may overlap what it writes.
+            out += (piece * (length // len(piece) + 1))[:length]
         if len(out) > size:
             raise Malformed(f"LZF data of more than {size} bytes")
     if len(out) < size:

@@ -1,5 +1,6 @@
 """Reader and writer of the PLY format; a mesh is read as points on its surface."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -7,7 +8,7 @@ import numpy as np
 from torchgrasp.files import Malformed, explain
 from torchgrasp.files.columns import find_columns, read_fields
 from torchgrasp.foundation.lazy import trimesh
-from torchgrasp.foundation.limits import CLOUD_POINTS, TEXT_MESH_BYTES
+from torchgrasp.foundation.limits import CLOUD_POINTS, PLY_HEADER_BYTES, TEXT_MESH_BYTES
 from torchgrasp.geometry.mesh import load_triangles
 
 TYPES = {
@@ -24,6 +25,9 @@ TYPES = {
     **{"float": "f4", "float32": "f4", "double": "f8", "float64": "f8"},
 }
 """NumPy's types by the old and new names of the PLY format."""
+SHAPES = {"viewpoint": (3,), "frustum": (4, 3), "table": (4,)}
+"""Shapes of the arrays in comments."""
+SAMPLED = 2000  # points on the surface of a mesh
 Property = tuple[str, str, str]  # name, type, and type of the length if it is a list
 
 
@@ -34,16 +38,15 @@ def parse_ply(data: bytes) -> dict[str, Any]:
     header, body = _split_header(data)
     encoding = ""
     known = dict[str, np.ndarray]()
-    sizes = {"viewpoint": 3, "frustum": 12, "table": 4}
     elements: list[tuple[str, int, list[Property]]] = []
     for line in header:
         match line.split():
             case ["format", kind, "1.0"]:
                 encoding = kind
-            case ["comment", name, *numbers] if len(numbers) == sizes.get(name):
-                known[name] = np.array([float(x) for x in numbers]).reshape(
-                    (4, 3) if name == "frustum" else -1
-                )
+            case ["comment", name, *numbers] if name in SHAPES and len(numbers) == math.prod(
+                SHAPES[name]
+            ):
+                known[name] = np.array([float(x) for x in numbers]).reshape(SHAPES[name])
             case ["element", name, count]:
                 elements.append((name, int(count), []))
             case ["property", "list", length, kind, name] if (
@@ -58,24 +61,20 @@ def parse_ply(data: bytes) -> dict[str, Any]:
         raise Malformed(f"the encoding {encoding!r}")
     # Before the body is parsed: a mesh has twice as many faces as corners.
     if any(not 0 <= count <= 2 * CLOUD_POINTS for _, count, _ in elements):
-        raise Malformed(
-            f"elements {[(name, count) for name, count, _ in elements]}; at most {CLOUD_POINTS} points"
-        )
+        counts = [(name, count) for name, count, _ in elements]
+        raise Malformed(f"elements {counts}; at most {CLOUD_POINTS} points")
     faces = sum(count for name, count, _ in elements if name == "face")
     if faces:
         if encoding == "ascii" and len(body) > TEXT_MESH_BYTES:
-            raise Malformed(
-                f"a mesh of {len(body)} bytes of text, which may have {TEXT_MESH_BYTES}"
-            )
+            found = f"a mesh of {len(body)} bytes of text"
+            raise Malformed(f"{found}, which may have {TEXT_MESH_BYTES}")
         points, normals = _sample_mesh(data)
         return {"points": points, "normals": normals, "viewpoint": known.get("viewpoint")}
     if not elements or elements[0][0] != "vertex":
         raise Malformed("a first element that is not called vertex")
     _, count, properties = elements[0]
-    found = _read_columns(
-        body, encoding, count, properties, not any(more for _, more, _ in elements[1:])
-    )
-    return found | known
+    last = not any(more for _, more, _ in elements[1:])
+    return _read_columns(body, encoding, count, properties, last) | known
 
 
 def format_ply(
@@ -101,7 +100,7 @@ def format_ply(
 
 def _split_header(data: bytes) -> tuple[list[str], bytes]:
     """Return the lines of a PLY file's header, and the data after the header."""
-    end = data.find(b"end_header", 0, 65536)
+    end = data.find(b"end_header", 0, PLY_HEADER_BYTES)
     stop = data.find(b"\n" if b"\n" in data[: max(end, 0)] else b"\r", end) + 1
     if not data.startswith(b"ply") or end < 0 or stop == 0:
         raise Malformed("no PLY header")
@@ -122,9 +121,8 @@ def _read_columns(
         if counter:
             names = [*names, "_"]
             fields = [*fields, (counter, 1)]
-            lengths[len(fields)] = int(
-                read_fields(body, fields, min(count, 1), order, False)[-1][0, 0]
-            )
+            first = read_fields(body, fields, min(count, 1), order, False)
+            lengths[len(fields)] = int(first[-1][0, 0])
         fields.append((kind, lengths.get(len(fields), 1)))
         names.append(f"list {name}" if counter else name)
     columns = read_fields(body, fields, count, order, last)
@@ -148,6 +146,6 @@ def _sample_mesh(data: bytes) -> tuple[np.ndarray, np.ndarray | None]:
         or not np.isfinite(mesh.vertices).all()
     ):
         raise Malformed("a mesh without a surface")
-    points, faces = trimesh.sample.sample_surface(mesh, 2000, seed=0)[:2]
+    points, faces = trimesh.sample.sample_surface(mesh, SAMPLED, seed=0)[:2]
     mesh.merge_vertices()
     return np.asarray(points), np.asarray(mesh.face_normals[faces]) if mesh.is_volume else None

@@ -27,6 +27,28 @@ from torchgrasp.geometry.plane import Plane
 from torchgrasp.values.planning import PointCloud
 
 TEXTS = (".xyz", ".txt", ".csv", ".asc", ".pts", ".xyzi", ".xyzn", ".xyzrgb")  # tables of numbers
+SUFFIXES = (".ply", ".pcd", ".npz", ".npy", *TEXTS)
+METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+"""Length [m] of each unit of files."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ReadNumbers:
+    """How the arrays of a file are understood."""
+
+    shown: int = 200
+    """Most letters of the names of columns in a note."""
+    unit: float = 1e-4
+    """Greatest error of the length of a table's normal."""
+    near_unit: float = 0.05
+    """Greatest error of the length of a normal in columns 4 to 6, and"""
+    normals: float = 0.9
+    """the least share of such rows by which these columns are normals."""
+    drawn: int = 2000
+    """Most points that tell whether a camera was in the origin."""
+
+
+READ = ReadNumbers()
 
 
 @checked
@@ -112,30 +134,30 @@ def read_cloud_file(
         raise BadArgument("viewpoint", repr(viewpoint), "three numbers [m]") from error
     if position is not None:
         check_tensor("viewpoint", position, (3,))
-    path, suffix = Path(path), Path(path).suffix.lower()
-    parsers = {
-        ".ply": parse_ply,
-        ".pcd": parse_pcd,
-        ".npz": lambda data: parse_npz(
-            data, ("points", "normals", "viewpoint", "frustum", "table"), "points"
-        ),
-        ".npy": lambda data: {"columns": parse_npy(data)},
-        **dict.fromkeys(TEXTS, lambda data: parse_text(data, suffix)),
-    }
-    if suffix not in parsers:
-        raise CloudFileError(
-            "path", path, f"a file ending in .ply, .pcd, .npz, .npy, {', '.join(TEXTS)}"
-        )
-    data = read_bounded(
-        path, CLOUD_BYTES, f"a {suffix} file", functools.partial(CloudFileError, "path")
-    )
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        allowed = f"a file ending in {', '.join(SUFFIXES)}"
+        raise CloudFileError("path", path, allowed)
+    refuse = functools.partial(CloudFileError, "path")
+    data = read_bounded(path, CLOUD_BYTES, f"a {suffix} file", refuse)
     try:
-        arrays = parsers[suffix](data)
+        arrays = _parse(data, suffix)
     except Exception as error:  # zlib, zipfile, numpy and trimesh each raise their own
-        raise CloudFileError(
-            "path", f"{path}: {explain(error)}", f"a well-formed {suffix} file"
-        ) from error
-    return make_cloud(str(path), arrays, position, {"m": 1.0, "cm": 0.01, "mm": 0.001}[unit])
+        allowed = f"a well-formed {suffix} file"
+        raise CloudFileError("path", f"{path}: {explain(error)}", allowed) from error
+    return make_cloud(str(path), arrays, position, METRES[unit])
+
+
+def _parse(data: bytes, suffix: str) -> dict[str, Any]:
+    """Return the arrays in a file of a known suffix, by name."""
+    if suffix == ".ply":
+        return parse_ply(data)
+    if suffix == ".pcd":
+        return parse_pcd(data)
+    if suffix == ".npz":
+        return parse_npz(data, ("points", "normals", "viewpoint", "frustum", "table"), "points")
+    return {"columns": parse_npy(data)} if suffix == ".npy" else parse_text(data, suffix)
 
 
 @checked
@@ -195,23 +217,18 @@ def make_cloud(
     if "columns" in arrays:
         arrays = _split_columns(source, arrays, notes)
     if arrays.get("other"):
-        notes.append(f"columns {', '.join(arrays['other'])[:200]} were left out")
+        notes.append(f"columns {', '.join(arrays['other'])[: READ.shown]} were left out")
     points = scale * _as_rows(source, "points", arrays["points"])
-    normals = (
-        None if arrays.get("normals") is None else _as_rows(source, "normals", arrays["normals"])
-    )
+    normals = arrays.get("normals")
+    normals = None if normals is None else _as_rows(source, "normals", normals)
+    # Frustum and default are those of the arrays' own camera.
     default = bool(arrays.get("default")) and viewpoint is None
-    frustum = (
-        None if viewpoint is not None else arrays.get("frustum")
-    )  # it belongs to the arrays' camera
+    frustum = arrays.get("frustum") if viewpoint is None else None
     if viewpoint is None and arrays.get("viewpoint") is not None:
         viewpoint = scale * _as_rows(source, "viewpoint", arrays["viewpoint"])
         if not bool(torch.isfinite(viewpoint).all()):
-            raise BadArgument(
-                "path",
-                f"{source}: a viewpoint with NaN or infinity",
-                "a viewpoint of finite numbers",
-            )
+            found = f"{source}: a viewpoint with NaN or infinity"
+            raise BadArgument("path", found, "a viewpoint of finite numbers")
     if normals is not None and len(normals) != len(points):
         found = f"{source}: {len(normals)} normals of {len(points)} points"
         raise CloudFileError("path", found, "one normal for each point")
@@ -220,7 +237,8 @@ def make_cloud(
         raise CloudFileError("path", found, "one viewpoint, or one for each point")
     keep, normals = _find_measured(points, normals, notes)
     if int(keep.sum()) < MIN_POINTS:
-        found = f"{source} with {int(keep.sum())} points" + "".join(f" ({note})" for note in notes)
+        left_out = "".join(f" ({note})" for note in notes)
+        found = f"{source} with {int(keep.sum())} points{left_out}"
         raise TooFewPoints("path", found, f"at least {MIN_POINTS} points")
     if viewpoint is not None and viewpoint.ndim == 2:
         viewpoint = viewpoint[keep]
@@ -233,10 +251,9 @@ def make_cloud(
     table = arrays.get("table")
     if table is not None:
         *normal, offset = _as_numbers(source, "table", table, (4,)).tolist()
-        if not abs(math.hypot(*normal) - 1) < 1e-4:
-            raise CloudFileError(
-                "path", f"{source}: a table with the normal {normal}", "a unit vector"
-            )
+        if not abs(math.hypot(*normal) - 1) < READ.unit:
+            found = f"{source}: a table with the normal {normal}"
+            raise CloudFileError("path", found, "a unit vector")
         table = Plane(torch.tensor(normal, dtype=torch.float64), scale * offset)
     return CloudFile(cloud, tuple(notes), table)
 
@@ -263,9 +280,8 @@ def _as_rows(source: str, name: str, array: Any) -> Tensor:
         allowed = "an array of shape (n, 3), or (h, w, 3) of an image, or (3,) of one viewpoint"
         raise CloudFileError("path", f"{source}: {name} of shape {array.shape}", allowed)
     if array.size > 3 * CLOUD_POINTS:
-        raise CloudFileError(
-            "path", f"{source} with {array.size // 3} points", f"at most {CLOUD_POINTS} points"
-        )
+        found = f"{source} with {array.size // 3} points"
+        raise CloudFileError("path", found, f"at most {CLOUD_POINTS} points")
     # A copy is owned, writable and of native bytes. Numbers beyond double precision become
     # infinite, as if missing.
     with np.errstate(invalid="ignore", over="ignore"):
@@ -288,10 +304,10 @@ def _split_columns(source: str, arrays: dict[str, Any], notes: list[str]) -> dic
     if table.shape[-1] == 6:
         more = table[..., 3:].reshape(-1, 3).astype(np.float64)
         more = more[np.isfinite(more).all(1) & more.any(1)]
-        length = np.linalg.norm(
-            more.clip(-2, 2), axis=1
-        )  # squares of larger numbers would overflow
-        if len(more) and np.mean(np.abs(length - 1) < 0.05) >= 0.9:
+        # Squares of larger numbers would overflow.
+        length = np.linalg.norm(more.clip(-2, 2), axis=1)
+        near_unit = np.abs(length - 1) < READ.near_unit
+        if len(more) and np.mean(near_unit) >= READ.normals:
             split["normals"] = table[..., 3:]
         else:
             notes.append("columns 4 to 6 are no unit vectors (colours?) and were left out")
@@ -304,28 +320,24 @@ def _find_measured(
     """Return a mask of the measured rows, and the normals (None if most are missing); add notes on
     the other rows.
     """
+    total = len(points)
     finite = torch.isfinite(points).all(1)
     if not bool(finite.all()):
-        notes.append(
-            f"{int((~finite).sum())} of {len(points)} rows with NaN or infinity were left out"
-        )
+        notes.append(f"{int((~finite).sum())} of {total} rows with NaN or infinity were left out")
     origin = (points == 0).all(1)
     if int(origin.sum()) > 1:
-        notes.append(
-            f"{int(origin.sum())} of {len(points)} rows at exactly (0, 0, 0), missing pixels, were left out"
-        )
+        missing = "rows at exactly (0, 0, 0), missing pixels, were left out"
+        notes.append(f"{int(origin.sum())} of {total} {missing}")
         finite &= ~origin
     if normals is None:
         return finite, None
     bad = finite & ~(torch.isfinite(normals).all(1) & normals.ne(0).any(1))
-    if not bool(bad.any()):
-        return finite, normals
-    if 2 * int(bad.sum()) > int(finite.sum()):
-        notes.append(f"{int(bad.sum())} normals are missing (NaN or zero): all were left out")
+    count = int(bad.sum())
+    if 2 * count > int(finite.sum()):
+        notes.append(f"{count} normals are missing (NaN or zero): all were left out")
         return finite, None
-    notes.append(
-        f"{int(bad.sum())} of {len(points)} rows without a normal (NaN or zero) were left out"
-    )
+    if count:
+        notes.append(f"{count} of {total} rows without a normal (NaN or zero) were left out")
     return finite & ~bad, normals
 
 
@@ -333,13 +345,12 @@ def _judge_default(cloud: PointCloud, notes: list[str]) -> PointCloud:
     """Return the cloud, without its viewpoint (0, 0, 0) if no camera can have been there; a note
     then says so.
     """
-    points = cloud.points[draw_rows(len(cloud), 2000)]
+    points = cloud.points[draw_rows(len(cloud), READ.drawn)]
     if bool(points.ne(points[0]).any()):  # else all coincide, which is refused later
         points = points[find_inliers(points)]
         if can_see(points, fit_local_planes(points)[0], torch.zeros(3, dtype=points.dtype)):
             return cloud
     default = "the default viewpoint (0, 0, 0) of PCD"
-    notes.append(
-        f"{default}, from which a camera cannot have seen these points, was left out (--viewpoint gives one)"
-    )
+    unseen = "from which a camera cannot have seen these points, was left out"
+    notes.append(f"{default}, {unseen} (--viewpoint gives one)")
     return PointCloud(cloud.points, cloud.normals)

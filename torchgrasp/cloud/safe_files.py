@@ -17,7 +17,16 @@ from torchgrasp.files import Malformed, check_file, explain, read_bytes
 from torchgrasp.files.columns import read_lines
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import Image
-from torchgrasp.foundation.limits import CLOUD_BYTES, JSON_BYTES, TOML_BYTES
+from torchgrasp.foundation.limits import CLOUD_BYTES, JSON_BYTES, SHOWN_LETTERS, TOML_BYTES
+
+GREY = ("1", "L", "I", "I;16", "I;16B", "F")
+COLOURS = ("P", "RGB", "RGBA")
+"""Pillow's modes of pictures."""
+HEADERS = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
+"""Readers of the headers of .npy files, by the version of the format."""
 
 
 def parse_npy(data: bytes) -> np.ndarray:
@@ -28,13 +37,9 @@ def parse_npy(data: bytes) -> np.ndarray:
         raise Malformed("no header of an .npy file")
     stream = io.BytesIO(data)
     version = np.lib.format.read_magic(stream)
-    if version not in ((1, 0), (2, 0)):
+    read = HEADERS.get(version)
+    if read is None:
         raise Malformed(f"version {version} of the npy format")
-    read = (
-        np.lib.format.read_array_header_1_0
-        if version == (1, 0)
-        else np.lib.format.read_array_header_2_0
-    )
     shape, _, dtype = read(stream)
     if dtype.hasobject or dtype.itemsize * math.prod(shape) > len(data):
         raise Malformed(f"an array of shape {shape} and type {dtype}, which the file cannot hold")
@@ -49,19 +54,14 @@ def parse_npz(data: bytes, names: Sequence[str], required: str = "") -> dict[str
     if not zipfile.is_zipfile(io.BytesIO(data)):
         raise Malformed("no archive, as .npz files are")
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        members = [
-            info
-            for info in archive.infolist()
-            if not names or info.filename.removesuffix(".npy") in names
-        ]
-        if required and f"{required}.npy" not in [info.filename for info in members]:
-            found = [info.filename.removesuffix(".npy") for info in archive.infolist()][:8]
+        infos = [(info.filename.removesuffix(".npy"), info) for info in archive.infolist()]
+        members = {name: info for name, info in infos if not names or name in names}
+        if required and f"{required}.npy" not in [info.filename for info in members.values()]:
+            found = [name for name, _ in infos][:8]
             raise Malformed(f"no array named {required!r}, but {found}")
-        if sum(info.file_size for info in members) > CLOUD_BYTES:
+        if sum(info.file_size for info in members.values()) > CLOUD_BYTES:
             raise Malformed(f"arrays of more than {CLOUD_BYTES} bytes")
-        return {
-            info.filename.removesuffix(".npy"): parse_npy(archive.read(info)) for info in members
-        }
+        return {name: parse_npy(archive.read(info)) for name, info in members.items()}
 
 
 def read_image_file(name: str, path: Path | str) -> Any:
@@ -87,9 +87,8 @@ def read_image_file(name: str, path: Path | str) -> Any:
             return parse_json(data)
         return _read_exr(Path(path)) if suffix == ".exr" else _parse_picture(data, masks)
     except ModuleNotFoundError as error:
-        raise BadArgument(
-            name, f"{path} without the package OpenEXR", "pip install OpenEXR, or a .png file"
-        ) from error
+        found = f"{path} without the package OpenEXR"
+        raise BadArgument(name, found, "pip install OpenEXR, or a .png file") from error
     except Exception as error:  # zlib, zipfile, numpy and Pillow each raise their own
         allowed = f"a well-formed {suffix} file" + " of one channel" * (not masks)
         raise BadArgument(name, f"{path}: {explain(error)}", allowed) from error
@@ -120,9 +119,8 @@ def read_intrinsics(name: str, path: Path | str, image: str = "") -> Any:
                 raise Malformed(f"{len(data)} bytes")
             found = next(yaml.safe_load_all(data))
     except Exception as error:  # YAML and JSON each raise their own
-        raise BadArgument(
-            name, f"{path}: {explain(error)}", f"a well-formed {suffix} file of intrinsics"
-        ) from error
+        allowed = f"a well-formed {suffix} file of intrinsics"
+        raise BadArgument(name, f"{path}: {explain(error)}", allowed) from error
     entry = str(int(image)) if image.isdecimal() else ""
     return found[entry] if isinstance(found, dict) and entry in found else found
 
@@ -144,13 +142,9 @@ def _parse_picture(data: bytes, colours: bool) -> np.ndarray:
     allowed, too.
     """
     with Image.open(io.BytesIO(data), formats=("PNG", "TIFF")) as image:
-        if colours and image.mode in (
-            "P",
-            "RGB",
-            "RGBA",
-        ):  # the number of a palette's colour is the label
-            return np.asarray(image)
-        if image.mode not in ("1", "L", "I", "I;16", "I;16B", "F"):
+        # The number of a palette's colour is the label.
+        allowed = GREY + COLOURS if colours else GREY
+        if image.mode not in allowed:
             raise Malformed(f"a picture of mode {image.mode}")
         return np.asarray(image)
 
@@ -162,5 +156,5 @@ def _read_exr(path: Path) -> np.ndarray:
     channels = OpenEXR.File(str(path)).channels()
     depth = [name for name in channels if name.split(".")[-1] in ("Z", "V")] or list(channels)
     if len(depth) > 1:
-        raise Malformed(f"channels {', '.join(depth)[:80]}")
+        raise Malformed(f"channels {', '.join(depth)[:SHOWN_LETTERS]}")
     return channels[depth[0]].pixels
