@@ -23,6 +23,9 @@ POSITION_RATE = 4.0  # largest position gain [1/s]: alpha_p = POSITION_RATE * PO
 FORCE_BANDWIDTH = 15.0
 # isotropic standard deviation [N] of Sigma_fd: the tactile sensor's noise along the surface
 FORCE_FLOOR = 0.3
+FORCE_SHARE = 0.1  # standard deviation of a normal force, as a share of the force
+PRINTED_FLOOR = 1e-4  # least standard deviation [m] of Sigma_cov as the paper prints it
+DAMPING = 1e-5  # damping [m^2] of the inverse Jacobian
 MAX_SPEED = 0.04  # largest speed [m/s] of a fingertip
 TINY = 1e-9  # least length by which a vector is divided
 # largest change [rad] of a joint in one tick; it bounds steps near a singular posture
@@ -44,10 +47,10 @@ def printed_covariance(normals: Vectors, distance_variance: Numbers) -> Matrices
 
     `distance_variance` [m^2] is f_cov, the variance of the signed distance. `normals` are R n, in
     the hand's frame. A normal across an axis makes Sigma_cov singular, so each entry is at least
-    the square of `floor`, 0.1 mm.
+    the square of `PRINTED_FLOOR`.
     """
-    floor = 1e-4  # [m]
-    return torch.diag_embed((distance_variance[..., None] * normals).abs().clamp_min(floor**2))
+    entries = (distance_variance[..., None] * normals).abs()
+    return torch.diag_embed(entries.clamp_min(PRINTED_FLOOR**2))
 
 
 def force_covariance(
@@ -59,8 +62,9 @@ def force_covariance(
     all directions. `deviation` [N] is the standard deviation of each normal force; by default a
     tenth of the force.
     """
-    std = 0.1 * (forces * normals).sum(-1) if deviation is None else deviation
-    return _normal_covariance(normals, std, FORCE_FLOOR)
+    if deviation is None:
+        deviation = FORCE_SHARE * (forces * normals).sum(-1)
+    return _normal_covariance(normals, deviation, FORCE_FLOOR)
 
 
 def _normal_covariance(normals: Vectors, std: Numbers, floor: float) -> Tensor:
@@ -97,7 +101,7 @@ def force_gain(covariance: Matrices, alpha_f: Numbers | float) -> Vectors:
 
 
 def damped_inverse(
-    jacobian: Float[Tensor, "*b m h"], damping: float = 1e-5
+    jacobian: Float[Tensor, "*b m h"], damping: float = DAMPING
 ) -> Float[Tensor, "*b h m"]:
     """Return the damped inverse J^T (J J^T + damping I)^-1 of a Jacobian; `damping` is in m^2."""
     m, h = jacobian.shape[-2:]
@@ -148,7 +152,7 @@ def joint_step(
     velocity: Float[Tensor, "*b f 3"],
     period: float,
     posture_error: Float[Tensor, "*b h"] | None = None,
-    damping: float = 1e-5,
+    damping: float = DAMPING,
 ) -> Float[Tensor, "*b h"]:
     """Return the change of the joints [rad] in one tick, which moves the fingertips with the given
     velocities [m/s].

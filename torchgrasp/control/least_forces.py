@@ -4,13 +4,14 @@ tick.
 For normal forces n_i above floor_i, tangential forces t_i, joint torques tau_j, friction
 coefficient mu and a small weight eps of the barrier, the method minimises
 
-    sum n_i + PENALTY sum max(|tau_j| / effort_j - KNEE, 0)^2
+    sum n_i + penalty sum max(|tau_j| / effort_j - knee, 0)^2
         - eps sum [log(mu^2 (n_i - reserve_i)^2 - |t_i|^2) + log(n_i - floor_i)]
 
 over all forces that balance the load. A reserve keeps a force within its cone when a push changes
 the force. It is written in NumPy, whose calls cost less than torch's for small matrices.
 """
 
+import dataclasses
 import math
 from typing import NamedTuple
 
@@ -21,11 +22,49 @@ from jaxtyping import Bool, Float
 from torchgrasp.contacts.balance import grasp_map
 
 Array = np.ndarray
-PENALTY = 500.0
-KNEE = 0.9
-"""Weight [N] of the penalty on joint torques and normal forces, and the share of their limits where
-it begins.
-"""
+
+
+@dataclasses.dataclass(frozen=True)
+class BarrierNumbers:
+    """The numbers of the barrier method."""
+
+    penalty: float = 500.0
+    """Weight [N] of the penalty on joint torques and normal forces."""
+    knee: float = 0.9
+    """Share of their limits where the penalty begins."""
+    gap: float = 0.01
+    """Weight of the barrier, as a share of load and floors: forces keep a distance from the cones
+    beyond the noise.
+    """
+    growth: float = 0.02
+    """Least share of the internal forces that is added if the load has grown; others are doubled."""
+    growths: int = 9
+    """Shares of the internal forces that are tried beside none."""
+    margin: float = 1.25
+    """Least ratio of the coefficient to that which the internal forces need: below it the forces
+    would grow huge.
+    """
+    steps: int = 8
+    """Most Newton steps of one call."""
+    strides: int = 8
+    """Lengths of a step that are tried, each twice the one before."""
+    solved: float = 0.3
+    """Newton decrement at which the steps end."""
+    lower: float = 0.5
+    """Share of the found force to which a floor is lowered that no forces reach."""
+    raised: float = 1.05
+    """Ratio of the coefficient, where it is raised, to the least with which forces were found."""
+    rank: float = 1e-12
+    """Least singular value of a grasp map, as a share of the largest; contacts on one line have
+    rank 5.
+    """
+    least: float = 1e-12
+    """Least normal force [N] by which is divided."""
+    ridge: float = 1e-9
+    """Added to the diagonal of the Hessian, which may be singular."""
+
+
+BARRIER = BarrierNumbers()
 
 
 class Balance(NamedTuple):
@@ -49,12 +88,12 @@ def balance(points: Float[Array, "f 3"], touching: Bool[Array, "f"] | bool = Tru
     """Return the grasp map at contact points [m] that touch, its pseudo-inverse and its null space,
     from one SVD.
     """
-    wrench = grasp_map(torch.from_numpy(points)).numpy() * np.repeat(
-        np.broadcast_to(touching, len(points)), 3
-    )
+    columns = np.repeat(np.broadcast_to(touching, len(points)), 3)
+    wrench = grasp_map(torch.from_numpy(points)).numpy() * columns
     left, values, right = np.linalg.svd(wrench)
-    rank = int((values > 1e-12 * values[0]).sum())  # that of contacts on one line is 5
-    return Balance(wrench, (right[:rank].T / values[:rank]) @ left[:, :rank].T, right[rank:].T)
+    rank = int((values > BARRIER.rank * values[0]).sum())
+    inverse = (right[:rank].T / values[:rank]) @ left[:, :rank].T  # (n, 6)
+    return Balance(wrench, inverse, right[rank:].T)
 
 
 def friction_ratios(forces: Float[Array, "f 3"], normals: Float[Array, "f 3"]) -> Float[Array, "f"]:
@@ -63,7 +102,7 @@ def friction_ratios(forces: Float[Array, "f 3"], normals: Float[Array, "f 3"]) -
     """
     push = -(forces * normals).sum(-1)
     slide = np.linalg.norm(forces + push[:, None] * normals, axis=-1)
-    return np.where(push > 0, slide / np.maximum(push, 1e-12), np.inf)
+    return np.where(push > 0, slide / np.maximum(push, BARRIER.least), np.inf)
 
 
 class LeastForces:
@@ -100,26 +139,25 @@ class LeastForces:
         """
         floor = np.maximum(floor, reserve)
         count = len(normals)
+        # rows that give each torque and each normal force as a share of its limit
         push = -(np.eye(count)[:, :, None] * normals / self.most).reshape(count, -1)
-        limits = np.concatenate([jacobian.reshape(3 * count, -1).T / self.effort[:, None], push])
-        gap = 0.01 * (
-            float(np.linalg.norm(load[:3])) + float(floor.sum())
-        )  # distance from the cones beyond the noise
+        torque = jacobian.reshape(3 * count, -1).T / self.effort[:, None]
+        limits = np.concatenate([torque, push])
+        gap = BARRIER.gap * (float(np.linalg.norm(load[:3])) + float(floor.sum()))
         barrier = _Barrier(contacts, normals, limits, load, gap, reserve)
-        growth = np.concatenate(
-            [[0.0], 0.02 * 2.0 ** np.arange(9)]
-        )  # added internal forces, if the load has grown
+        # the load may have grown: internal forces are added
+        growth = np.concatenate([[0.0], BARRIER.growth * 2.0 ** np.arange(BARRIER.growths)])
         tried = barrier.place(self.forces) + growth[:, None] * barrier.place(self.start, 0.0)
-        needed = 1.25 * float(friction_ratios(contacts.inner(self.start), normals).max())
+        ratios = friction_ratios(contacts.inner(self.start), normals)
+        needed = BARRIER.margin * float(ratios.max())
         friction = max(friction, needed) if math.isfinite(needed) else friction
-        strides = 2.0 ** np.arange(
-            8
-        )  # multiples of a step that is safe for every self-concordant function
+        # multiples of a step that is safe for every self-concordant function
+        strides = 2.0 ** np.arange(BARRIER.strides)
         with np.errstate(invalid="ignore", divide="ignore"):  # of logarithms outside the cones
             z = barrier.choose(tried, friction, floor)
-            for _ in range(
-                8 if math.isfinite(barrier.squared) else 0
-            ):  # no cone contains a finger that does not press
+            # no cone contains a finger that does not press
+            steps = BARRIER.steps if math.isfinite(barrier.squared) else 0
+            for _ in range(steps):
                 step, decrement = barrier.newton(z)
                 trial = z + np.minimum(strides / (1 + decrement), 1.0)[:, None] * step
                 value = barrier.value(trial)
@@ -127,7 +165,7 @@ class LeastForces:
                 if not math.isfinite(value[best]):
                     break
                 z = trial[best]
-                if decrement < 0.3:
+                if decrement < BARRIER.solved:
                     break
         self.forces = barrier.forces(z)
         return self.forces
@@ -142,7 +180,8 @@ class LeastForces:
         [N].
         """
         torque = np.abs(np.einsum("nij,ni->j", jacobian, forces)) / self.effort
-        return max(float(torque.max()), float((-(forces * normals).sum(-1)).max()) / self.most)
+        push = -(forces * normals).sum(-1)
+        return max(float(torque.max()), float(push.max()) / self.most)
 
 
 class _Barrier:
@@ -192,15 +231,20 @@ class _Barrier:
         push = tried @ self.push.T + self.push_0
         forces = self.forces(tried)
         across = np.sqrt(np.maximum((forces**2).sum(-1) - push**2, 0.0))
-        above = (push > floor).all(-1)
-        above = above if (reached := bool(above.any())) else np.arange(len(tried)) == len(tried) - 1
-        self.floor = floor if reached else np.maximum(np.minimum(floor, 0.5 * push[-1]), 0.0)
+        above = (push > floor).all(-1)  # (g,)
+        self.floor = floor
+        if not bool(above.any()):
+            # only the row of the largest internal forces is left
+            above = np.arange(len(tried)) == len(tried) - 1
+            self.floor = np.maximum(np.minimum(floor, BARRIER.lower * push[-1]), 0.0)
         self.reserve = np.minimum(self.reserve, self.floor)
         left = push - self.reserve
-        ratio = np.where(left > 0, across / np.maximum(left, 1e-12), np.inf).max(-1)
+        ratio = np.where(left > 0, across / np.maximum(left, BARRIER.least), np.inf).max(-1)
         ratio = np.where(above, ratio, np.inf)
         least = float(ratio.min())
-        self.squared = max(friction, 1.05 * least if least >= friction else 0.0) ** 2
+        if least >= friction:
+            friction = max(friction, BARRIER.raised * least)
+        self.squared = friction**2
         value = self.value(tried)
         best = int(value.argmin())
         return tried[best if math.isfinite(value[best]) else int(ratio.argmin())]
@@ -214,7 +258,7 @@ class _Barrier:
         cone = self.squared * (n - self.reserve) ** 2 + n * n - (self.forces(z) ** 2).sum(-1)
         inside = ((cone > 0) & (n > self.floor)).all(-1)
         logs = np.log(cone).sum(-1) + np.log(n - self.floor).sum(-1)
-        over = PENALTY * (np.maximum(np.abs(t) - KNEE, 0.0) ** 2).sum(-1)
+        over = BARRIER.penalty * (np.maximum(np.abs(t) - BARRIER.knee, 0.0) ** 2).sum(-1)
         return np.where(inside, n.sum(-1) + over - self.gap * logs, np.inf)
 
     def newton(self, z: Float[Array, " k"]) -> tuple[Float[Array, " k"], float]:
@@ -228,22 +272,20 @@ class _Barrier:
         force = self.forces(z)
         left = n - self.reserve
         cone = self.squared * left * left + n * n - (force * force).sum(-1)
-        half = (self.squared * left + n)[:, None] * push - np.einsum(
-            "ni,nik->nk", force, self.rows
-        )  # of the gradient
+        # half of the gradient of each cone: (f, k)
+        moved = np.einsum("ni,nik->nk", force, self.rows)
+        half = (self.squared * left + n)[:, None] * push - moved
         above = n - self.floor
-        over = np.sign(t) * np.maximum(np.abs(t) - KNEE, 0.0)
-        gradient = (
-            push.sum(0)
-            + 2 * PENALTY * over @ self.tau
-            - gap * ((2 / cone) @ half + (1 / above) @ push)
-        )
-        hessian = (self.tau.T * (2 * PENALTY * (over != 0))) @ self.tau + gap * (
-            (push.T / above**2) @ push
-        )
-        hessian += gap * (
-            (half.T * (4 / cone**2)) @ half - 2 * (1 + self.squared) * (push.T / cone) @ push
-        )
+        # of the penalty
+        over = np.sign(t) * np.maximum(np.abs(t) - BARRIER.knee, 0.0)
+        penalty = 2 * BARRIER.penalty
+        barrier = gap * ((2 / cone) @ half + (1 / above) @ push)
+        gradient = push.sum(0) + penalty * over @ self.tau - barrier  # (k,)
+        # (k, k): of the penalty and the floors, of the cones' gradients, of their curvature
+        hessian = (self.tau.T * (penalty * (over != 0))) @ self.tau
+        hessian = hessian + gap * ((push.T / above**2) @ push)
+        bent = 2 * (1 + self.squared) * (push.T / cone) @ push
+        hessian += gap * ((half.T * (4 / cone**2)) @ half - bent)
         hessian += gap * np.einsum("n,nkl->kl", 2 / cone, self.spread)
-        step = -np.linalg.solve(hessian + 1e-9 * np.eye(len(z)), gradient)
+        step = -np.linalg.solve(hessian + BARRIER.ridge * np.eye(len(z)), gradient)
         return step, math.sqrt(max(-float(gradient @ step), 0.0) / gap)

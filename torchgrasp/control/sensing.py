@@ -35,6 +35,10 @@ WAITING_FORCE = 0.3
 a binary contact.
 """
 TORQUE_NOISE = 0.01  # standard deviation [N m] of a sensed joint torque
+SWITCH_ON = 0.45  # reading [N] at which a binary contact closes; it opens at `TOUCH_ON`
+# standard deviations [N] of a contact force across and along the normal, before it is sensed
+ACROSS_STD = 0.5
+ALONG_STD = 3.0
 
 
 @checked
@@ -93,9 +97,9 @@ def feel_torques(
     sensed = measure(tactile, pushes, reference.normals, radius, period)
     if sensed.reading is tactile.reading:
         return sensed
-    factor = (
-        torch.einsum("fc,fcj->fj", reference.normals, forces_by).norm(dim=-1) * TORQUE_NOISE / NOISE
-    )
+    # where the noise of torques makes a force noisier than that of a fingertip, flags turn later
+    along = torch.einsum("fc,fcj->fj", reference.normals, forces_by)
+    factor = along.norm(dim=-1) * TORQUE_NOISE / NOISE
     factor = (factor * reference.sensor.noise).clamp_min(1.0)
     return dataclasses.replace(sensed, contact=flag(tactile.contact, sensed.average, factor))
 
@@ -107,9 +111,8 @@ def _forces_by_torques(
     [N m].
     """
     along = reference.normals[:, :, None] * reference.normals[:, None]
-    across, up = (
-        (TORQUE_NOISE / std) ** 2 for std in (0.5, 3.0)
-    )  # [N] across and along the normal
+    across = (TORQUE_NOISE / ACROSS_STD) ** 2
+    up = (TORQUE_NOISE / ALONG_STD) ** 2
     prior = across * torch.eye(3, dtype=jacobian.dtype) + (up - across) * along
     return torch.linalg.solve(jacobian @ jacobian.mT + prior, jacobian)
 
@@ -137,9 +140,8 @@ class DriveFeel:
         of the tick.
         """
         joints = observation.joints
-        torques = (
-            self.reference.kp * (targets - joints) - self.damping * (joints - self.before) / period
-        )
+        damped = self.damping * (joints - self.before) / period
+        torques = self.reference.kp * (targets - joints) - damped
         self.before = joints
         forces = _forces_by_torques(self.reference, observation.jacobian) @ torques
         pushes = -(forces * self.reference.normals).sum(-1)
@@ -200,10 +202,9 @@ class FingertipSensor:
                 before, truth, reference.normals, radius, period, self.generator, noise
             )
         report = self.sensed
-        if self.model.kind == "binary":  # a switch closes at 0.45 N and opens at TOUCH_ON
-            self.switched = torch.where(
-                self.switched, report.reading > TOUCH_ON, report.reading >= 0.45
-            )
+        if self.model.kind == "binary":
+            stays = report.reading > TOUCH_ON
+            self.switched = torch.where(self.switched, stays, report.reading >= SWITCH_ON)
             report = feel_flags(report, self.switched)
         if not self.whole:
             nothing = no_contact(fingers=len(self.alive))

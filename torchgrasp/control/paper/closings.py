@@ -2,6 +2,7 @@
 impedance hold.
 """
 
+import dataclasses
 import math
 
 import torch
@@ -31,9 +32,39 @@ STOP_FORCE = 0.5  # force [N] at which the position controller stops a finger (S
 # stiffness of the virtual frame [N/m, N m/rad]
 TRANSLATION_STIFFNESS = 1200.0
 ROTATION_STIFFNESS = 4.0
-GRASP_STIFFNESS = (
-    100.0  # stiffness [N/m] of the spring along each side of the triangle of fingertips
-)
+GRASP_STIFFNESS = 100.0  # stiffness [N/m] of the spring along each side of the fingertips' triangle
+
+
+@dataclasses.dataclass(frozen=True)
+class PositionNumbers:
+    """The numbers of the position controller, as in the paper but for the depth."""
+
+    depth: float = 0.02
+    """Distance [m] of the goal behind the planned contact."""
+    arrived: float = 1e-3
+    """Distance [m] from the goal at which a finger stops."""
+    integral: float = 2.0
+    """Integral gain [1/s^2]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class UnstableNumbers:
+    """The numbers by which an impedance answers to an unstable grasp."""
+
+    odds: float = 3.0
+    """Odds of stability above which a grasp counts as stable."""
+    cutoff: float = 2.0
+    """Cut-off [Hz] of the readings that are judged."""
+    wait: float = 0.3
+    """Time [s] after the ramp in which the filtered readings follow the forces."""
+    raised: float = 2.0
+    """Factor to which the forces are raised."""
+    rate: float = 8.0
+    """Rate [1/s] at which forces and stiffness change."""
+
+
+POSITION = PositionNumbers()
+UNSTABLE = UnstableNumbers()
 
 
 class PaperClosing:
@@ -68,8 +99,8 @@ class PaperClosing:
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
         """Return the targets [rad] of all joints for the next tick, `period` [s] later."""
         reference = self.reference
-        gains = self.reference.gains
-        normals = self.reference.normals
+        gains = reference.gains
+        normals = reference.normals
         error = gains.target - reference.contact_points(observation.tips)
         self.share = blend(error, gains.covariance)
         self.settled.update(observation, observation.tactile.contact, self.share, period)
@@ -93,7 +124,7 @@ class PositionClosing:
     palm = STILL
     feels = True
 
-    def __init__(self, reference: ClosingReference, depth: float = 0.02) -> None:
+    def __init__(self, reference: ClosingReference, depth: float = POSITION.depth) -> None:
         self.reference = reference
         self.aim = reference.gains.target - depth * reference.normals
         self.target = reference.pregrasp
@@ -103,16 +134,13 @@ class PositionClosing:
 
     def __call__(self, observation: Observation, period: float) -> Float[Tensor, " j"]:
         """Return the targets [rad] of all joints for the next tick, `period` [s] later."""
-        # [m], [1/s^2]
         reference = self.reference
-        stop_distance = 1e-3
-        integral_rate = 2.0
         error = self.aim - reference.contact_points(observation.tips)
-        arrived = torch.linalg.vector_norm(error, dim=-1) < stop_distance
+        arrived = torch.linalg.vector_norm(error, dim=-1) < POSITION.arrived
         self.stopped = self.stopped | arrived | (observation.tactile.reading >= STOP_FORCE)
         self.done = bool(self.stopped.all())
         self.integral = self.integral + period * error
-        demand = POSITION_RATE * error + integral_rate * self.integral
+        demand = POSITION_RATE * error + POSITION.integral * self.integral
         velocity = torch.where(self.stopped[:, None], 0.0, limit_norm(demand, MAX_SPEED))
         step = joint_step(observation.jacobian @ reference.hand.actuated.coupling, velocity, period)
         self.target = reference.clamp(self.target + step)
@@ -214,9 +242,9 @@ class Impedance:
         self.reference = reference
         self.stability = stability
         self.coupling = reference.hand.actuated.coupling
-        self.springs = (
-            torch.full((3,), GRASP_STIFFNESS).to(observation.tips) if springs is None else springs
-        )
+        if springs is None:
+            springs = torch.full((3,), GRASP_STIFFNESS).to(observation.tips)
+        self.springs = springs
         self.stiffness = (self.coupling**2 * reference.kp[:, None]).sum(0)
         forces, self.strength = held_forces(reference, observation)
         self.frame = rigid(torch.eye(3).to(observation.tips), observation.tips.mean(0))
@@ -234,7 +262,7 @@ class Impedance:
         """Return the targets [rad] of all joints for the next tick, `period` [s] later."""
         self.time += period
         share = min(self.time / RAMP, 1.0)
-        self.reading = smooth(self.reading, observation.tactile.reading, 2.0, period)
+        self.reading = smooth(self.reading, observation.tactile.reading, UNSTABLE.cutoff, period)
         if share == 1.0:
             self.factor = regulate(self.factor, observation, self.raised * self.strength, period)
             self._adapt(observation, period)
@@ -249,16 +277,14 @@ class Impedance:
         """If the grasp is unstable, raise its forces; move its stiffness to that of stable grasps
         as wide as it.
         """
-        if (
-            self.stability is None or self.time < RAMP + 0.3
-        ):  # the filtered readings must have followed the forces
+        if self.stability is None or self.time < RAMP + UNSTABLE.wait:
             return
         state = state_of(self.springs, lengths_of(observation.tips), self.reading)
-        if float(self.stability.log_odds(state)) > math.log(3):
+        if float(self.stability.log_odds(state)) > math.log(UNSTABLE.odds):
             return
         preferred = self.stability.preferred_forces(observation.tips)
-        share = min(8.0 * period, 1.0)
-        self.raised += share * (2.0 - self.raised)
+        share = min(UNSTABLE.rate * period, 1.0)
+        self.raised += share * (UNSTABLE.raised - self.raised)
         self.springs = self.springs * (preferred.springs / self.springs) ** share
 
     @checked
