@@ -19,6 +19,8 @@ from torchgrasp.ik.clearance import CollisionWorld
 from torchgrasp.ik.motion import COARSE_STEPS
 from torchgrasp.values.planning import Grasps
 
+HELD = 1e-3  # largest difference [m, 1] between the poses of the grasps and of the arm's hand
+
 
 @checked
 @dataclasses.dataclass(frozen=True)
@@ -57,22 +59,13 @@ def plan_motion(
     """
     arm = arm.to("cpu", torch.float64)
     grasps = grasps.to("cpu", torch.float64)
-    if (
-        grasps.arm is None
-        or grasps.arm.shape[1] != len(arm.lower)
-        or not _holds(arm, grasps.arm, grasps.obj_from_hand)
-    ):
-        raise BadArgument(
-            "grasps",
-            "a grasp without a posture of this arm",
-            "executable grasps of plan_grasps(arm=)",
-        )
-    # [s], at 0.1 m/s
+    if grasps.arm is None or not _holds(arm, grasps.arm, grasps.obj_from_hand):
+        found = "a grasp without a posture of this arm"
+        raise BadArgument("grasps", found, "executable grasps of plan_grasps(arm=)")
     near = COARSE_STEPS
-    step = 1.0 / COARSE_STEPS
     poses = way_of(hand.to("cpu", torch.float64), grasps, CollisionWorld(table=grasps.table))
     tips = arm.tip_poses(poses.flatten(0, 1)).unflatten(2, poses.shape[:2])
-    way, _ = track(arm, grasps.arm.T.contiguous(), tips)
+    way, _ = track(arm, grasps.arm.T.contiguous(), tips)  # (g, 2 near + 1, n)
     postures = named_postures(hand, grasps, force, kp)[1]
     opened, closed, pressed = (
         torch.stack(list(joints.values()), -1)[:, None] for joints in postures.values()
@@ -80,11 +73,14 @@ def plan_motion(
     fingers = torch.cat(
         [opened.expand(-1, near + 1, -1), closed, pressed.expand(-1, near + 1, -1)], 1
     )
-    steps = [0.0, *[step] * near, POSE_TIME, POSE_TIME, *[step] * near]
+    arms = torch.cat([way[:, : near + 2], way[:, near + 1 :]], 1)
+    # 0.1 m in a second; while the fingers close and press, the arm rests
+    moves = [1.0 / near] * near
+    steps = [0.0, *moves, POSE_TIME, POSE_TIME, *moves]
     return ArmMotion(
         (*arm.joint_names, *postures["grasp"]),
         torch.tensor(steps, dtype=torch.float64).cumsum(0),
-        torch.cat([torch.cat([way[:, : near + 2], way[:, near + 1 :]], 1), fingers], 2),
+        torch.cat([arms, fingers], 2),
         {
             "above": 0,
             "pregrasp": near,
@@ -96,5 +92,6 @@ def plan_motion(
 
 
 def _holds(arm: Arm, joints: Float[Tensor, "g n"], obj_from_hand: Float[Tensor, "g 4 4"]) -> bool:
-    """Return whether the arm holds the hand in the given poses, to a millimetre."""
-    return torch.allclose(arm.hand_poses(joints), obj_from_hand, rtol=0.0, atol=1e-3)
+    """Return whether joints of an arm are this one's, and it then holds the hand in the poses."""
+    fits = joints.shape[1] == len(arm.lower)
+    return fits and torch.allclose(arm.hand_poses(joints), obj_from_hand, rtol=0.0, atol=HELD)

@@ -31,6 +31,10 @@ from torchgrasp.values.specs import ContactSpec
 
 MOST_GRASPS = 100_000  # most grasps of a file: more are no plan of one object
 FAR = 10_000.0  # largest number of a pose or posture [mm, rad] in a JSON file
+ROUNDING = 1e-3  # largest error of a quaternion's length: that of a file of few digits
+# distance [m] of opened fingertips from their contacts, and linear steps, which reach it to 1 mm
+OPENED = 0.02
+OPENING_STEPS = 4
 _refuse = functools.partial(ModelFileError, "path")  # the error of a bad file of grasps
 Quaternion = Literal["wxyz", "xyzw"]
 
@@ -80,11 +84,11 @@ def read_foreign(
     if path.suffix.lower() == ".npz":
         return _read_bench(path, hand, tuple(order), quaternion)
     file = read_json(path, _refuse, "a JSON file of grasps, or .npz")
-    if "grasps" in (fields := file.entries()):
-        names = fields["rename"].entries() if "rename" in fields else {}
-        return _read_own(
-            fields["grasps"], hand, [names[j].text() if j in names else j for j in hand.joint_names]
-        )
+    fields = file.entries()
+    if "grasps" in fields:
+        renamed = fields["rename"].entries() if "rename" in fields else {}
+        names = [renamed[x].text() if x in renamed else x for x in hand.joint_names]
+        return _read_own(fields["grasps"], hand, names)
     content = file.entries("pose", "dofs")
     places = _places(hand, tuple(order))
     pose = _table(content["pose"], 7)
@@ -107,27 +111,21 @@ def _read_own(rows: Field, hand: Hand, names: list[str]) -> ForeignGrasps:
             posture = postures[name].entries(*names)
             values.append([posture[joint].number(-FAR, FAR) for joint in names])
         place = pose.entries("position", "quaternion_wxyz")
-        poses.append(
-            [
-                *place["position"].numbers(3, -FAR, FAR),
-                *place["quaternion_wxyz"].numbers(4, -FAR, FAR),
-            ]
-        )
-    closed, pregrasp = (
-        torch.tensor(x, dtype=torch.float64).reshape(-1, hand.dof) for x in (joints, opened)
-    )
-    return ForeignGrasps(
-        closed, read_poses(np.array(poses, dtype=float).reshape(-1, 7), "wxyz"), pregrasp
-    )
+        position = place["position"].numbers(3, -FAR, FAR)
+        turn = place["quaternion_wxyz"].numbers(4, -FAR, FAR)
+        poses.append([*position, *turn])
+    closed = torch.tensor(joints, dtype=torch.float64).reshape(-1, hand.dof)
+    pregrasp = torch.tensor(opened, dtype=torch.float64).reshape(-1, hand.dof)
+    places = np.array(poses, dtype=float).reshape(-1, 7)
+    return ForeignGrasps(closed, read_poses(places, "wxyz"), pregrasp)
 
 
 def _table(field: Field, width: int) -> np.ndarray:
     """Return a field as an array (n, width); raise an error for anything but a list of lists of
     numbers.
     """
-    return np.array([row.numbers(width, -FAR, FAR) for row in field.items(MOST_GRASPS)]).reshape(
-        -1, width
-    )
+    rows = [row.numbers(width, -FAR, FAR) for row in field.items(MOST_GRASPS)]
+    return np.array(rows).reshape(-1, width)
 
 
 def _read_bench(
@@ -150,22 +148,16 @@ def _read_bench(
         good = table.dtype.kind == "f" and table.ndim in (1, 2) and table.shape[-1] == width
         if not good or table.size > MOST_GRASPS * width or not np.isfinite(table).all():
             found = f"{path}: {name} of shape {table.shape}, {table.dtype}"
-            raise _refuse(
-                found, f"finite numbers (g, {width}): seven of the pose, {len(order)} joints"
-            )
+            allowed = f"finite numbers (g, {width}): seven of the pose, {len(order)} joints"
+            raise _refuse(found, allowed)
     rows = {name: table.reshape(-1, width).astype(float) for name, table in tables.items()}
     if len({len(table) for table in rows.values()}) != 1:
-        raise _refuse(
-            f"{path}: {', '.join(f'{len(x)} of {name}' for name, x in rows.items())}",
-            "as many of either",
-        )
+        counts = ", ".join(f"{len(x)} of {name}" for name, x in rows.items())
+        raise _refuse(f"{path}: {counts}", "as many of either")
     grasp = rows["grasp_qpos"]
-    opened = rows.get("pregrasp_qpos")
-    return ForeignGrasps(
-        torch.tensor(grasp[:, 7:][:, places]),
-        read_poses(grasp[:, :7], quaternion) @ bench_from_root,
-        None if opened is None else torch.tensor(opened[:, 7:][:, places]),
-    )
+    joints = {name: torch.tensor(x[:, 7:][:, places]) for name, x in rows.items()}
+    poses = read_poses(grasp[:, :7], quaternion) @ bench_from_root
+    return ForeignGrasps(joints["grasp_qpos"], poses, joints.get("pregrasp_qpos"))
 
 
 def _places(hand: Hand, order: tuple[str, ...]) -> list[int]:
@@ -174,9 +166,9 @@ def _places(hand: Hand, order: tuple[str, ...]) -> list[int]:
     """
     missing = [name for name in hand.joint_names if name not in order]
     if missing or len(set(order)) != len(order):
-        found = (
-            f"{len(order)} names without {', '.join(missing[:4])}" if missing else "a name twice"
-        )
+        found = "a name twice"
+        if missing:
+            found = f"{len(order)} names without {', '.join(missing[:4])}"
         raise BadArgument("order", found, f"each of {', '.join(hand.joint_names)} once")
     return [order.index(name) for name in hand.joint_names]
 
@@ -186,19 +178,14 @@ def read_poses(numbers: np.ndarray, quaternion: Quaternion) -> Float[Tensor, "g 
     order.
     """
     turns = numbers[:, 3:] if quaternion == "xyzw" else numbers[:, [4, 5, 6, 3]]
-    far = (
-        np.abs(np.linalg.norm(turns, axis=1) - 1) > 1e-3
-    )  # more than the rounding of a file of few digits
+    far = np.abs(np.linalg.norm(turns, axis=1) - 1) > ROUNDING
     if far.any():
         length = float(np.linalg.norm(turns[far][0]))
-        raise _refuse(
-            f"pose {int(np.argmax(far))} with a quaternion of length {length:.4g}", "length 1"
-        )
-    matrices = (
-        spatial.transform.Rotation.from_quat(turns).as_matrix()
-        if len(turns)
-        else np.zeros((0, 3, 3))
-    )
+        found = f"pose {int(np.argmax(far))} with a quaternion of length {length:.4g}"
+        raise _refuse(found, "length 1")
+    matrices = np.zeros((0, 3, 3))
+    if len(turns):
+        matrices = spatial.transform.Rotation.from_quat(turns).as_matrix()
     return rigid(torch.tensor(matrices), torch.tensor(numbers[:, :3]))
 
 
@@ -245,11 +232,10 @@ def grasps_from_joints(
     std = None if std_m is None else torch.full_like(normals[..., 0], std_m)
     contacts = Contacts(apply(pose, pads), normals, std_m=std)
     certificate = certify(contacts, spec)
-    opened = (
-        _open(hand, joints, -pad_normals)
-        if pregrasp is None
-        else hand.check_joints(pregrasp.double().cpu())
-    )
+    if pregrasp is None:
+        opened = _open(hand, joints, -pad_normals)
+    else:
+        opened = hand.check_joints(pregrasp.double().cpu())
     g, f = normals.shape[:2]
     zeros = torch.zeros(g, f, dtype=torch.float64)
     meta = {"hand": hand.name, "hand_sha256": hand.source.sha256, "units": "metre, radian"}
@@ -279,11 +265,8 @@ def _open(
     """Return joints at which each fingertip has moved 20 mm off its contact along `away`, if joint
     limits allow.
     """
-    # distance [m], and linear steps, which reach it within 1 mm
-    opening = 0.02
-    steps = 4
-    for _ in range(steps):
-        jacobian = hand.jacobian(joints).flatten(1, 2)
-        step = damped_inverse(jacobian) @ (opening / steps * away).flatten(1)[..., None]
+    for _ in range(OPENING_STEPS):
+        jacobian = hand.jacobian(joints).flatten(1, 2)  # (g, 3 f, h)
+        step = damped_inverse(jacobian) @ (OPENED / OPENING_STEPS * away).flatten(1)[..., None]
         joints = torch.minimum(torch.maximum(joints + step[..., 0], hand.lower), hand.upper)
     return joints

@@ -29,6 +29,10 @@ from torchgrasp.ik.motion import opened_pose
 from torchgrasp.shape.surface import Surface
 from torchgrasp.values.planning import Grasps
 
+# quantile of the standard deviations that is the largest colour, and its least value [m]
+QUANTILE = 0.99
+LEAST_STD = 1e-6
+BRIGHTEST = 255  # of a colour channel
 BENCH_HANDS = {"allegro": ([1.0, 0.0, 1.0, 0.0], tuple(f"joint_{k}" for k in range(16)))}
 """Hands that DexGraspBench has: rotation (x, y, z, w) of the root link in its hand frame, and
 joints in its order.
@@ -83,16 +87,13 @@ def save_dexgraspbench(
         content: dict[str, Any] = {"obj_path": object_path, "obj_scale": 1.0}
         content["obj_pose"] = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
         for name, joints in postures.items():
-            obj_from_bench = (opened if name == "pregrasp" else closed)[row] @ bench_from_root.mT
+            obj_from_hand = opened if name == "pregrasp" else closed
+            obj_from_bench = obj_from_hand[row] @ bench_from_root.mT
             place = [*obj_from_bench[:3, 3].tolist(), *quaternion(obj_from_bench)]
-            content[f"{name}_qpos"] = np.array(
-                [*place, *(float(joints[joint][row]) for joint in order)]
-            )
-        paths.append(
-            write_file(
-                Path(folder) / f"{row}.npy", lambda file, x=content: np.save(file, np.array(x))
-            )
-        )
+            posture = [float(joints[joint][row]) for joint in order]
+            content[f"{name}_qpos"] = np.array([*place, *posture])
+        path = Path(folder) / f"{row}.npy"
+        paths.append(write_file(path, lambda file, x=content: np.save(file, np.array(x))))
     return paths
 
 
@@ -149,15 +150,14 @@ def save_surface(surface: Surface, path: Path | str) -> Path:
     path = check_surface_path(path)
     std = surface.std_m.detach().cpu().double().numpy()
     shares = np.clip(std / largest_std(surface), 0.0, 1.0)
-    colors = (255 * matplotlib.colormaps["viridis"](shares) + 0.5).astype(
-        np.uint8
-    )  # as in the report
-    vertices, normals = (
-        x.detach().cpu().double().numpy() for x in (surface.vertices, surface.normals)
-    )
-    faces = surface.faces.cpu().numpy()
+    # as in the report
+    colors = BRIGHTEST * matplotlib.colormaps["viridis"](shares) + 0.5
     mesh = trimesh.Trimesh(
-        vertices, faces, vertex_normals=normals, vertex_colors=colors, process=False
+        surface.vertices.detach().cpu().double().numpy(),
+        surface.faces.cpu().numpy(),
+        vertex_normals=surface.normals.detach().cpu().double().numpy(),
+        vertex_colors=colors.astype(np.uint8),
+        process=False,
     )
     if path.suffix.lower() == ".ply":
         mesh.vertex_attributes["std_m"] = std.astype(np.float32)
@@ -177,7 +177,7 @@ def largest_std(surface: Surface) -> float:
     >>> 0.001 < largest_std(surface) < 0.05
     True
     """
-    return max(float(surface.std_m.double().quantile(0.99)), 1e-6)
+    return max(float(surface.std_m.double().quantile(QUANTILE)), LEAST_STD)
 
 
 @checked

@@ -47,6 +47,32 @@ Player = Literal["mujoco", "maniskill", "newton", "isaaclab", "usd"]
 TEMPLATES = Path(__file__).parent / "templates"
 USD = {"isaaclab": ("hand.usda", "object.usda"), "usd": ("hand.usda", "object.usda", "scene.usda")}
 """Files in USD's text format, by player."""
+UPRIGHT = 1e-12  # largest difference of a normal's z from 1 on a table that counts as level
+ORIGIN = (0.0, 0.0, 0.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class PlayNumbers:
+    """The numbers of a played motion."""
+
+    room: float = 0.1
+    """Way [m] of the mount beyond approach and lift."""
+    speed: float = 0.2
+    """Speed [m/s] of the approach: the mean speed of our trials."""
+    lift: float = 1.0
+    """Time [s] of the lift."""
+    friction: float = 0.1
+    """Least coefficient of friction for which the force is chosen."""
+    force: float = 100.0
+    """Largest force [N], far beyond what hands exert."""
+    # of the mount's links
+    mass: float = 0.1
+    """Mass [kg]."""
+    inertia: float = 1e-4
+    """Moment of inertia [kg m^2] about every axis."""
+
+
+PLAY = PlayNumbers()
 
 
 @checked
@@ -96,27 +122,25 @@ def save_play(
     grasps = grasps.to("cpu", torch.float64)
     spec = spec or TrialSpec()
     folder = Path(folder)
-    solid, pieces = read_solid(
-        stand(mesh, grasps.table).mesh() if isinstance(mesh, Surface) else mesh, parts
-    )
+    if isinstance(mesh, Surface):
+        mesh = stand(mesh, grasps.table).mesh()
+    solid, pieces = read_solid(mesh, parts)
     world_from_obj = _world_from_obj(grasps, solid)
     if not torch.equal(world_from_obj, torch.eye(4, dtype=torch.float64)):
-        solid, *pieces = (
-            body.copy().apply_transform(world_from_obj.numpy()) for body in (solid, *pieces)
-        )
+        motion = world_from_obj.numpy()
+        solid, *pieces = (body.copy().apply_transform(motion) for body in (solid, *pieces))
     scene = _scene(hand, spec, solid, pieces)
     write_file(folder / "object.ply", _mesh_file(solid, "ply"))
     if player in ("mujoco", "newton"):
         write_file(folder / "scene.xml", scene_mjcf(scene))
-    values = _describe(hand, grasps, world_from_obj, scene, spec) | (
-        describe_bodies(scene) if player in USD else {}
-    )
+    values = _describe(hand, grasps, world_from_obj, scene, spec)
+    if player in USD:
+        values |= describe_bodies(scene)
     if player == "maniskill":
         write_file(folder / "hand.urdf", mounted_urdf(scene))
         split = [some for corners in scene.hulls[0] for some in split_hull(corners)]
-        values["body"]["files"] = [
-            f"part_{k}.obj" for k in range(len(split))
-        ]  # others may lie there of an earlier call
+        # others may lie there of an earlier call
+        values["body"]["files"] = [f"part_{k}.obj" for k in range(len(split))]
         for name, corners in zip(values["body"]["files"], split, strict=True):
             write_file(folder / name, _mesh_file(hull(100.0 * corners), "obj"))
     filters = {
@@ -146,7 +170,7 @@ def _world_from_obj(grasps: Grasps, mesh: "trimesh.Trimesh") -> Float[Tensor, "4
     tilted.
     """
     table = grasps.table
-    if table is None or float(table.normal[2]) > 1 - 1e-12:
+    if table is None or float(table.normal[2]) > 1 - UPRIGHT:
         return torch.eye(4, dtype=torch.float64)
     return inverse(upright_frame(torch.from_numpy(np.array(mesh.vertices)), None, table))
 
@@ -157,7 +181,7 @@ def _scene(
     """Return the scene with all joints at zero, and the hand's mount along the axes of its root
     link.
     """
-    reach = spec.approach + spec.lift_height + 0.1  # [m]
+    reach = spec.approach + spec.lift_height + PLAY.room
     axes = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
     slides = [Slide(f"mount_{x}", axis, -reach, reach, 0.0) for x, axis in axes.items()]
     drives = {
@@ -194,13 +218,10 @@ def pressing_force(spec: TrialSpec, mass: Positive) -> float:
     >>> round(pressing_force(TrialSpec(friction=0.8), 0.25), 1), pressing_force(TrialSpec(force=3.0), 0.25)
     (6.2, 3.0)
     """
-    # friction; force [N], far beyond what hands exert
-    least = 0.1
-    most = 100.0
-    needed = min(
-        (mass * spec.gravity + PUSH) / max(spec.friction, least), spec.max_force or most, most
-    )
-    return needed if spec.force is None else spec.force
+    if spec.force is not None:
+        return spec.force
+    needed = (mass * spec.gravity + PUSH) / max(spec.friction, PLAY.friction)
+    return min(needed, spec.max_force or PLAY.force, PLAY.force)
 
 
 def _describe(
@@ -215,22 +236,20 @@ def _describe(
     masks = pair_masks(scene.self_pairs, first=1)
     _, postures = named_postures(hand, grasps, pressing_force(spec, scene.mass), spec.kp)
     poses = world_from_obj @ grasps.obj_from_hand
-    rise = (
-        world_from_obj @ opened_pose(hand, grasps.pregrasp, grasps.obj_from_hand, grasps.table)
-        - poses
-    )[:, :3, 3]
+    opened = opened_pose(hand, grasps.pregrasp, grasps.obj_from_hand, grasps.table)
+    rise = (world_from_obj @ opened - poses)[:, :3, 3]
     far = -spec.approach * (grasps.approach @ world_from_obj[:3, :3].T)
     up = torch.tensor([0.0, 0.0, spec.lift_height], dtype=torch.float64).expand_as(rise)
-    # by the name of the phase that ends: displacement of the hand in the world, posture, duration
-    # [s]
+    # by the phase that ends: displacement of the hand in the world, posture, duration [s]
     motion = {
         "approach": (rise + far, "pregrasp", 0.0),
-        "pregrasp": (rise, "pregrasp", spec.approach / 0.2),  # the mean speed [m/s] of our trials
+        "pregrasp": (rise, "pregrasp", spec.approach / PLAY.speed),
         "grasp": (0 * rise, "grasp", POSE_TIME),
         "squeeze": (0 * rise, "squeeze", POSE_TIME),
-        "lift": (up, "squeeze", 1.0),
+        "lift": (up, "squeeze", PLAY.lift),
         "hold": (up, "squeeze", spec.hold_time),
     }
+    ends = np.cumsum([duration for _, _, duration in motion.values()])
     return {
         "hand": hand.name,
         "timestep": spec.timestep,
@@ -246,9 +265,7 @@ def _describe(
         },
         "drives": {name: x._asdict() for name, x in (mount | scene.drives).items()},
         "collision": {link.name: masks.get(link.name, (0, 0)) for link in scene.urdf.links},
-        "times": dict(
-            zip(motion, np.cumsum([x[2] for x in motion.values()]).tolist(), strict=True)
-        ),
+        "times": dict(zip(motion, ends.tolist(), strict=True)),
         "grasps": [
             {
                 "position": pose[:3, 3].tolist(),
@@ -269,15 +286,9 @@ def _principal(inertia: np.ndarray) -> dict[str, list[float]]:
     of its axes.
     """
     moments, axes = np.linalg.eigh(inertia)
-    return {
-        "moments": moments.tolist(),
-        "axes": _turn(axes * [1.0, 1.0, np.sign(np.linalg.det(axes))]),
-    }
-
-
-def _turn(rotation: np.ndarray) -> list[float]:
-    """Return a rotation (3, 3) as a quaternion (w, x, y, z)."""
-    return spatial.transform.Rotation.from_matrix(rotation).as_quat(scalar_first=True).tolist()
+    # a rotation, not a reflection
+    turn = axes * [1.0, 1.0, np.sign(np.linalg.det(axes))]
+    return {"moments": moments.tolist(), "axes": quaternion(turn)}
 
 
 def describe_bodies(scene: SceneSpec) -> dict[str, Any]:
@@ -287,31 +298,20 @@ def describe_bodies(scene: SceneSpec) -> dict[str, Any]:
     Raises `BadArgument` for names of links or joints that USD does not allow.
     """
     urdf = scene.urdf
-    still = Link("base", 0.1, (0.0, 0.0, 0.0), (1e-4, 0.0, 0.0, 1e-4, 0.0, 1e-4), ())
+    moment = PLAY.inertia
+    still = Link("base", PLAY.mass, ORIGIN, (moment, 0.0, 0.0, moment, 0.0, moment), ())
+    # a mount of slides along the axes of the hand's root link carries the hand
     names = ["base", *(f"{slide.name}_link" for slide in scene.slides)]
-    joints = [
-        Joint(
-            x.name,
-            "prismatic",
-            parent,
-            child,
-            (0.0, 0.0, 0.0),
-            (0.0, 0.0, 0.0),
-            x.axis,
-            x.lower,
-            x.upper,
-        )
-        for x, parent, child in zip(scene.slides, names, names[1:], strict=False)
-    ]
-    joints += [
-        Joint("wrist", "fixed", names[-1], urdf.root, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
-        *urdf.joints,
-    ]
+    joints = list[Joint]()
+    for x, parent, child in zip(scene.slides, names, names[1:], strict=False):
+        slide = Joint(x.name, "prismatic", parent, child, ORIGIN, ORIGIN, x.axis, x.lower, x.upper)
+        joints.append(slide)
+    joints.append(Joint("wrist", "fixed", names[-1], urdf.root, ORIGIN, ORIGIN))
+    joints += urdf.joints
     links = [*(dataclasses.replace(still, name=name) for name in names), *urdf.links]
     if wrong := [x.name for x in (*links, *joints) if not x.name.isidentifier()]:
-        raise BadArgument(
-            "hand", f"{wrong[0]!r}", "names of letters, digits and _, which USD allows"
-        )
+        allowed = "names of letters, digits and _, which USD allows"
+        raise BadArgument("hand", repr(wrong[0]), allowed)
     poses = {"base": np.eye(4)}
     left = list(joints)
     while left:
@@ -329,12 +329,12 @@ def describe_bodies(scene: SceneSpec) -> dict[str, Any]:
                 "mass": link.mass,
                 "centre": link.com,
                 "place": poses[link.name][:3, 3],
-                "rotation": _turn(poses[link.name][:3, :3]),
+                "rotation": quaternion(poses[link.name][:3, :3]),
                 "passes": [
                     x.name for x in links[k + 1 :] if frozenset((x.name, link.name)) not in meet
                 ],
                 "shapes": [
-                    vars(x) | {"place": x.xyz, "rotation": _turn(_pose(x)[:3, :3])}
+                    vars(x) | {"place": x.xyz, "rotation": quaternion(_pose(x)[:3, :3])}
                     for x in link.shapes
                 ],
                 **_principal(np.array(link.inertia)[[[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]]),
@@ -345,8 +345,8 @@ def describe_bodies(scene: SceneSpec) -> dict[str, Any]:
             vars(x)
             | {
                 "place": x.xyz,
-                "axis": _turn(_along(x.axis)),
-                "rotation": _turn(_pose(x)[:3, :3] @ _along(x.axis)),
+                "axis": quaternion(_along(x.axis)),
+                "rotation": quaternion(_pose(x)[:3, :3] @ _along(x.axis)),
                 "drive": None if x.kind == "fixed" else drives[x.name],
                 "armature": ARMATURE * (x in urdf.joints),
                 "degrees": math.degrees(1.0) if x.kind == "revolute" else 1.0,

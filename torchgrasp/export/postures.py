@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -168,12 +169,10 @@ def describe_pose(a_from_b: Float[Tensor, "4 4"]) -> dict[str, list[float]]:
     return {"position": a_from_b[:3, 3].tolist(), "quaternion_wxyz": quaternion(a_from_b)}
 
 
-def quaternion(a_from_b: Float[Tensor, "4 4"]) -> list[float]:
-    """Return the rotation of a pose as a unit quaternion (w, x, y, z)."""
-    x, y, z, w = spatial.transform.Rotation.from_matrix(
-        a_from_b[:3, :3].double().cpu().numpy()
-    ).as_quat()
-    return [float(q) for q in (w, x, y, z)]
+def quaternion(a_from_b: Tensor | np.ndarray) -> list[float]:
+    """Return a rotation (3, 3), or that of a pose (4, 4), as a unit quaternion (w, x, y, z)."""
+    matrix = torch.as_tensor(a_from_b)[:3, :3].double().cpu().numpy()
+    return spatial.transform.Rotation.from_matrix(matrix).as_quat(scalar_first=True).tolist()
 
 
 @checked
@@ -200,9 +199,8 @@ def format_keyframes(
     urdf = read_urdf(hand.urdf_path)
     _, postures = named_postures(hand, grasps, force, kp)
     nested = nest_links(urdf)
-    order = [
-        joint.name for _, joint, _ in nested if joint and joint.kind != "fixed"
-    ]  # as MuJoCo numbers them
+    # as MuJoCo numbers them
+    order = [joint.name for _, joint, _ in nested if joint and joint.kind != "fixed"]
     steps = (  # name, distance from the pose, joints, targets
         ("approach", APPROACH_DISTANCE, "pregrasp", "pregrasp"),
         ("pregrasp", 0.0, "pregrasp", "pregrasp"),
@@ -215,12 +213,10 @@ def format_keyframes(
         for name, distance, state, targets in steps:
             pose = opened[row] if state == "pregrasp" else closed
             position = pose[:3, 3] - distance * grasps.approach[row]
-            joints, control = (
-                [float(postures[x][joint][row]) for joint in order] for x in (state, targets)
-            )
-            keys.append(
-                (f"grasp_{row}_{name}", [*position.tolist(), *quaternion(pose), *joints], control)
-            )
+            joints = [float(postures[state][joint][row]) for joint in order]
+            control = [float(postures[targets][joint][row]) for joint in order]
+            qpos = [*position.tolist(), *quaternion(pose), *joints]
+            keys.append((f"grasp_{row}_{name}", qpos, control))
     drives = {name: x if kp is None else x._replace(kp=kp) for name, x in hand.actuators.items()}
     known = {
         "name": hand.name,

@@ -22,6 +22,7 @@ from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.ik.motion import APPROACH_DISTANCE, UP, opened_pose
 from torchgrasp.values.planning import Grasps
 
+NANOSECONDS = 1e9  # in a second
 OBJECT_FRAME = "object"
 """Name in the messages of the object's frame, which is the frame of the cloud; publish a transform
 of that name.
@@ -85,17 +86,13 @@ def format_moveit(
     hand = hand.to("cpu")
     grasps = grasps.to("cpu")
     up = UP if grasps.table is None else grasps.table.normal
-    poses = (
-        grasps.obj_from_hand.double()
-        if flange is None
-        else grasps.obj_from_hand.double() @ flange.double().cpu()
-    )
-    if not torch.equal(
-        opened_pose(hand, grasps.pregrasp, grasps.obj_from_hand, grasps.table), grasps.obj_from_hand
-    ):
-        raise BadArgument(
-            "grasps", "a hand that goes down while it closes", "hands that close at one pose"
-        )
+    poses = grasps.obj_from_hand.double()
+    if flange is not None:
+        poses = poses @ flange.double().cpu()
+    opened = opened_pose(hand, grasps.pregrasp, grasps.obj_from_hand, grasps.table)
+    if not torch.equal(opened, grasps.obj_from_hand):
+        found = "a hand that goes down while it closes"
+        raise BadArgument("grasps", found, "hands that close at one pose")
     messages = [
         {
             "id": f"grasp_{row}",
@@ -150,19 +147,14 @@ def format_motion(hand: Hand, motion: ArmMotion) -> str:
     >>> format_motion(load_hand("barrett"), motion).splitlines()[-1]
     '  time_from_start: {sec: 1, nanosec: 500000000}'
     """
-    times = [{"sec": int(x), "nanosec": round(1e9 * (x % 1))} for x in motion.times.tolist()]
-    documents = [
-        {
-            "joint_names": list(motion.joint_names),
-            "points": [
-                {"positions": q, "time_from_start": at} for q, at in zip(rows, times, strict=True)
-            ],
-        }
-        for rows in motion.positions.tolist()
-    ]
-    return _document(
-        hand, "a trajectory_msgs/JointTrajectory of arm and hand for each grasp", documents
-    )
+    times = [_duration(x) for x in motion.times.tolist()]
+    documents = list[dict[str, Any]]()
+    for rows in motion.positions.tolist():
+        timed = zip(rows, times, strict=True)
+        points = [{"positions": q, "time_from_start": at} for q, at in timed]
+        documents.append({"joint_names": list(motion.joint_names), "points": points})
+    what = "a trajectory_msgs/JointTrajectory of arm and hand for each grasp"
+    return _document(hand, what, documents)
 
 
 def _trajectories(
@@ -181,11 +173,16 @@ def _trajectories(
             {
                 "positions": [float(posture[joint][row]) for joint in names],
                 "effort": effort,
-                "time_from_start": {"sec": 0, "nanosec": round(1e9 * k * POSE_TIME)},
+                "time_from_start": _duration(k * POSE_TIME),
             }
             for k, (posture, effort) in enumerate(zip(postures.values(), efforts, strict=True))
         ]
         yield {"header": {"frame_id": root}, "joint_names": list(names.values()), "points": points}
+
+
+def _duration(seconds: float) -> dict[str, int]:
+    """Return a time as a builtin_interfaces/Duration, a dictionary."""
+    return {"sec": int(seconds), "nanosec": round(NANOSECONDS * (seconds % 1))}
 
 
 def _pose(obj_from_hand: Float[Tensor, "4 4"]) -> dict[str, Any]:
