@@ -23,10 +23,8 @@ from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.plane import Plane, upright_frame
 from torchgrasp.scene.image import DepthImage
 from torchgrasp.scene.occupancy import (
-    ABOVE,
     MODEL,
-    NOISE,
-    SIDEWAYS,
+    OCCUPANCY,
     cast_shadows,
     load_occupancy_model,
     probability,
@@ -105,13 +103,13 @@ def collect(
         rng = np.random.default_rng(seed)
         own = scene.points[scene.rows_of()]
         tops = scene.points[scene.labels > 0][:, 2]
-        low = own.amin(0).numpy() - SIDEWAYS
-        high = own.amax(0).numpy() + SIDEWAYS
+        low = own.amin(0).numpy() - OCCUPANCY.sideways
+        high = own.amax(0).numpy() + OCCUPANCY.sideways
         low[2] = 0.0
-        high[2] = float(tops.max()) + ABOVE
+        high[2] = float(tops.max()) + OCCUPANCY.above
         places = torch.from_numpy(rng.uniform(low, high, (PLACES, 3)))
         behind, owner = shadows.look(places)
-        hidden = (owner == -1) | ((owner != 0) & (behind > -NOISE))
+        hidden = (owner == -1) | ((owner != 0) & (behind > -OCCUPANCY.noise))
         kinds = {"unseen": owner == -1, "target": owner == scene.target}
         kinds["thing"] = ~kinds["unseen"] & ~kinds["target"]
         for kind, rows in kinds.items():

@@ -12,11 +12,26 @@ from torchgrasp.planner.objects import take_target
 from torchgrasp.planner.request import Request, finger_sets
 from torchgrasp.scene.scene import Scene
 
-FRICTIONS = (
-    0.4,
-    0.8,
-    1.2,
-)  # coefficients of friction that are tried: of smooth plastic, of rubber, of soft silicone
+
+@dataclasses.dataclass(frozen=True)
+class ChangeNumbers:
+    """The values to which a limit or a property is changed, in ascending order."""
+
+    frictions: tuple[float, ...] = (0.4, 0.8, 1.2)
+    """Coefficients of friction: of smooth plastic, of rubber, of soft silicone."""
+    clearly: float = 1.4
+    """A friction is tried from this ratio to the present one on."""
+    tried: int = 2
+    """Most frictions that are tried."""
+    variances: tuple[float, ...] = (0.03, 0.1)
+    """Largest variances of the surface at a contact."""
+    flatnesses: tuple[float, ...] = (0.44, 0.9)
+    """Largest variations of the surface's normal about a contact."""
+    margins: tuple[float, ...] = (0.5, 1.0)
+    """Shares of the friction that are planned with."""
+
+
+CHANGES = ChangeNumbers()
 UNKNOWN = frozenset({Status.OUT_OF_DOMAIN, Status.TOO_UNCERTAIN})
 AT_TABLE = frozenset(
     {Status.BELOW_TABLE, Status.TABLE_COLLISION, Status.PREGRASP, Status.NO_APPROACH}
@@ -56,9 +71,9 @@ def list_changes(request: Request) -> list[Change]:
     return [change for kind in kinds for change in kind(request)]
 
 
-def more_starts(request: Request) -> Change:
-    """Return the change of settings that makes the planner try four times as many initial guesses."""
-    more = dataclasses.replace(request, starts=4 * request.starts)
+def more_starts(request: Request, ratio: int) -> Change:
+    """Return the change of settings that makes the planner try so many times the initial guesses."""
+    more = dataclasses.replace(request, starts=ratio * request.starts)
     return Change(f"with {more.starts} starts", True, frozenset(Status), more)
 
 
@@ -117,10 +132,13 @@ def _limits(request: Request) -> Iterator[Change]:
     spec = request.contact_spec
     tips = float(request.hand.tips.radius.max())
     own = spec.for_fingertips(tips)
-    if (wider := _next((0.03, 0.1), spec.max_variance)) is not None:
+    if (wider := _next(CHANGES.variances, spec.max_variance)) is not None:
         words = f"with max_variance={wider:g} instead of {spec.max_variance:g} (contacts on a less certain surface)"
         yield Change(words, True, UNKNOWN, _with(request, max_variance=wider))
-    if spec.flatness is not None and (wider := _next((0.44, 0.9), spec.flatness)) is not None:
+    if (
+        spec.flatness is not None
+        and (wider := _next(CHANGES.flatnesses, spec.flatness)) is not None
+    ):
         words = f"with flatness={wider:g} instead of {spec.flatness:g} (contacts nearer to edges)"
         yield Change(words, True, frozenset({Status.NOT_FLAT}), _with(request, flatness=wider))
     if (least := own.least_separation) > 0:
@@ -134,7 +152,7 @@ def _limits(request: Request) -> Iterator[Change]:
         )
         cures = frozenset({Status.BELOW_TABLE, Status.TOO_CLOSE})
         yield Change(words, True, cures, _with(request, tip_radius=tips))
-    if spec.friction > 0 and (wider := _next((0.5, 1.0), spec.friction_margin)) is not None:
+    if spec.friction > 0 and (wider := _next(CHANGES.margins, spec.friction_margin)) is not None:
         words = f"with friction_margin={wider:g} instead of {spec.friction_margin:g} (less room for errors)"
         yield Change(words, True, OPEN, _with(request, friction_margin=wider))
 
@@ -145,11 +163,10 @@ def _next(limits: tuple[float, ...], present: float) -> float | None:
 
 
 def _friction(request: Request) -> Iterator[Change]:
-    """Yield changes to the next two of `FRICTIONS` that are clearly above the present friction
-    coefficient.
-    """
+    """Yield changes to the next two frictions that are clearly above the present one."""
     present = request.contact_spec.friction
-    for friction in [f for f in FRICTIONS if f >= 1.4 * present][:2]:
+    higher = [f for f in CHANGES.frictions if f >= CHANGES.clearly * present]
+    for friction in higher[: CHANGES.tried]:
         words = f"if the friction were {friction:g} instead of {present:g}"
         yield Change(words, False, OPEN, _with(request, friction=friction))
 

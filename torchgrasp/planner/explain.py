@@ -294,29 +294,27 @@ def explain_empty(
     deadline = math.inf if request.time_budget is None else time.monotonic() + request.time_budget
     few = dataclasses.replace(request, starts=min(starts, numbers.starts))
     funnel, _, objects = try_request(few, first=request.tell)
-    # each set needs a library
     trials = list[Trial]()
     left = 0
+    # each set of fingers needs a library of postures
     plans = numbers.trials - 2 * (len(few.hands) - 1)
-    more = more_starts(request)
-    for change in [] if funnel.executable else [*order_changes(list_changes(few), funnel), more]:
-        if any(
-            x.executable
-            if change is more
-            else x.expected >= numbers.enough and x.choice >= change.choice
-            for x in trials
-        ):
+    changes = [] if funnel.executable else order_changes(list_changes(few), funnel)
+    for change in changes:
+        good = [x for x in trials if x.expected >= numbers.enough]
+        if any(x.choice >= change.choice for x in good):
             continue  # little is left for this change
         plans -= len(change.request.hands)
-        allowed = (
-            starts <= numbers.more * numbers.starts if change is more else plans >= 0 or not trials
-        )
-        if not allowed or time.monotonic() >= deadline:
+        if (plans < 0 and trials) or time.monotonic() >= deadline:
             left += 1
             continue
-        found, expected, _ = try_request(change.request, None if change.refit else objects)
-        trials.append(Trial(change.words, change.choice, found.executable, expected, found))
-        request.tell("change", str(trials[-1]), trials[-1])
+        trials.append(_try_change(change, None if change.refit else objects, request.tell))
+    # more starts, only if no change helps
+    if not funnel.executable and not any(x.executable for x in trials):
+        if starts <= numbers.more * numbers.starts and time.monotonic() < deadline:
+            more = more_starts(request, numbers.more)
+            trials.append(_try_change(more, objects, request.tell))
+        else:
+            left += 1
     trials.sort(
         key=lambda trial: (
             -round(trial.expected, 1),
@@ -326,6 +324,14 @@ def explain_empty(
         )
     )
     return Explanation(few.starts, funnel, tuple(trials), left)
+
+
+def _try_change(change: Change, known: Objects | None, tell: Observer) -> Trial:
+    """Return the result of planning with a change, on a known object, and tell it."""
+    funnel, expected, _ = try_request(change.request, known)
+    trial = Trial(change.words, change.choice, funnel.executable, expected, funnel)
+    tell("change", str(trial), trial)
+    return trial
 
 
 def order_changes(changes: list[Change], funnel: Funnel) -> list[Change]:
@@ -343,8 +349,9 @@ def order_changes(changes: list[Change], funnel: Funnel) -> list[Change]:
             beside |= contacts
         if change.cures - contacts:
             beside |= frozenset(Status) - contacts
-        weight[k] = (1 - 0.2) * funnel.share(change.cures) + 0.2 * funnel.share(beside)
-    least = 0.25 * max(weight.values(), default=0.0)
+        own = (1 - EXPLAIN.beside) * funnel.share(change.cures)
+        weight[k] = own + EXPLAIN.beside * funnel.share(beside)
+    least = EXPLAIN.least * max(weight.values(), default=0.0)
     return [changes[k] for k in sorted(weight, key=lambda k: -weight[k]) if 0 < weight[k] >= least]
 
 

@@ -2,6 +2,7 @@
 planning.
 """
 
+import dataclasses
 import math
 
 import numpy as np
@@ -21,6 +22,64 @@ from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.success.order import largest_known
 from torchgrasp.values.specs import FLAT_RADII, TIP_RADIUS, ContactSpec
+
+
+@dataclasses.dataclass(frozen=True)
+class JudgeNumbers:
+    """Numbers by which an object's image shows that a hand cannot grasp it."""
+
+    on_support: float = 0.5
+    """Least share of an object's points over its support."""
+    top: float = 0.98
+    """Quantile of the heights of an object's points that is its top."""
+    high: float = 0.9
+    """Quantile of the heights of an object's points that must be high enough for fingertips."""
+    border: int = 5
+    """Pixels at the image border of an object that is cut off; fewer are noise."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SpanNumbers:
+    """Numbers of the span of a hand."""
+
+    postures: int = 5000
+    """Random postures in which the span of a hand is sought."""
+    least_distance: float = 1e-9
+    """A distance of pads that is not 0, for the division [m]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class VagueNumbers:
+    """Numbers by which an estimated shape is vague."""
+
+    cells: int = 24
+    """Cells to a side of the grid on which the surface is extracted."""
+    worst: float = 0.99
+    """Quantile of the standard deviations on a surface that counts as the largest."""
+
+
+@dataclasses.dataclass(frozen=True)
+class EaseNumbers:
+    """Numbers of the order in which objects are planned; lengths are in metres."""
+
+    room: float = 0.06
+    """More free space around an object makes nothing easier."""
+    height: float = 0.08
+    """More height makes nothing easier."""
+    side: float = 0.01
+    """Side of a column of points."""
+    top: float = 0.95
+    """Quantile of the heights of an object's points that is its height."""
+    covered: float = 5.0
+    """Weight of the share of an object that has something above it, at most 1 in all."""
+    columns: int = 2**16
+    """Cells of the grid along an axis, of which half are at negative coordinates."""
+
+
+JUDGE = JudgeNumbers()
+SPAN = SpanNumbers()
+VAGUE = VagueNumbers()
+EASE = EaseNumbers()
 
 
 @checked
@@ -45,14 +104,10 @@ def judge_things(scene: Scene, hand: Hand, spec: ContactSpec | None = None) -> d
     if scene.table is not None:
         support = find_table(scene.points, scene.viewpoint, scene.table, None)[0]
         over = support.covers(scene.points[scene.labels > 0].cpu().double(), SEGMENT.overhang)
-        off = {
-            label: Status.OFF_TABLE
-            for label in found
-            if not bool(over[labels == label].double().mean() > 0.5)
-        }
-        found |= {
-            label: status for label, status in off.items() if found[label] is not Status.FEW_PIXELS
-        }
+        for label, status in found.items():
+            share = float(over[labels == label].double().mean())
+            if status is not Status.FEW_PIXELS and not share > JUDGE.on_support:
+                found[label] = Status.OFF_TABLE
     return found
 
 
@@ -70,8 +125,8 @@ def _judge(
         return Status.CUT_OFF
     if bounded and _is_see_through(pixels, scene.image.depth):
         return Status.NO_DEPTH
-    top, higher = points[:, 2].quantile(torch.tensor([0.98, 0.9]).to(points)).tolist()
-    if scene.table is not None and higher < spec.least_height:
+    top, high = points[:, 2].quantile(torch.tensor([JUDGE.top, JUDGE.high]).to(points)).tolist()
+    if scene.table is not None and high < spec.least_height:
         return Status.TOO_LOW
     above = points[points[:, 2] > top - 2 * spec.fingertip_radius, :2]
     return Status.TOO_WIDE if _thickness(above, spec.fingertip_radius / 2) > span else Status.OK
@@ -90,9 +145,9 @@ def _is_cut(pixels: Tensor, shape: tuple[int, ...]) -> bool:
     for axis in (0, 1):
         for depth in (pixels[:, axis], shape[axis] - 1 - pixels[:, axis]):
             along = pixels[depth <= 1, 1 - axis]
-            if len(along) >= 5 and int(along.max() - along.min()) > int(
-                depth.max()
-            ):  # fewer pixels are noise
+            if len(along) < JUDGE.border:
+                continue
+            if int(along.max() - along.min()) > int(depth.max()):
                 return True
     return False
 
@@ -129,23 +184,18 @@ def hand_span(hand: Hand) -> float:
     random postures.
     """
     if "span" not in hand.derived:
-        draw = torch.rand(
-            5000,
-            hand.dof,
-            generator=torch.Generator().manual_seed(0),
-            dtype=torch.float64,
-            device="cpu",
-        )
-        pads, normals = hand.fingertips(
-            hand.lower + draw.to(hand.lower) * (hand.upper - hand.lower)
-        )
+        generator = torch.Generator().manual_seed(0)
+        size = (SPAN.postures, hand.dof)
+        draw = torch.rand(*size, generator=generator, dtype=torch.float64, device="cpu")
+        joints = hand.lower + draw.to(hand.lower) * (hand.upper - hand.lower)
+        pads, normals = hand.fingertips(joints)
+        # (b, f, f, 3): from each pad to each other
         way = pads[:, None] - pads[:, :, None]
         distance = torch.linalg.vector_norm(way, dim=-1)
-        cosine = (normals[:, :, None] * way).sum(-1) / distance.clamp_min(1e-9)
+        cosine = (normals[:, :, None] * way).sum(-1) / distance.clamp_min(SPAN.least_distance)
         facing = cosine >= hand.tips.cone.cos()[:, None]
-        hand.derived["span"] = float(
-            torch.where(facing & facing.transpose(1, 2), distance, 0.0).max()
-        )
+        mutual = facing & facing.transpose(1, 2)
+        hand.derived["span"] = float(torch.where(mutual, distance, 0.0).max())
     return hand.derived["span"]
 
 
@@ -153,7 +203,7 @@ def is_vague(shape: ShapeGP) -> bool:
     """Return whether the standard deviation somewhere on the estimated surface exceeds half the
     object's size.
     """
-    return float(extract_surface(shape, 24).std_m.quantile(0.99)) > shape.scale
+    return float(extract_surface(shape, VAGUE.cells).std_m.quantile(VAGUE.worst)) > shape.scale
 
 
 def order_by_ease(scene: Scene) -> list[int]:
@@ -167,48 +217,40 @@ def order_by_ease(scene: Scene) -> list[int]:
     """
     from scipy.spatial import ConvexHull, KDTree
 
-    # [m] more room or height makes nothing easier; side of a column of points
-    room = 0.06
-    height = 0.08
-    side = 0.01
-    points, labels, rank = *(x.numpy() for x in _stand_upright(scene)), {}
-    cells = np.floor(points / (side / 2)).astype(np.int64)
-    some = np.unique(
-        ((cells + 2**15) @ (1, 2**16, 2**32)) * (labels.max(initial=0) + 1) + labels,
-        return_index=True,
-    )[1]
+    points, labels = (x.numpy() for x in _stand_upright(scene))
+    # one point of each object in a cell is enough
+    cells = np.floor(points / (EASE.side / 2)).astype(np.int64)
+    places = (cells + EASE.columns // 2) @ (1, EASE.columns, EASE.columns**2)
+    some = np.unique(places * (labels.max(initial=0) + 1) + labels, return_index=True)[1]
     points = points[some]
     labels = labels[some]
-    column = (cells[some, :2] // 2) @ (1, 2**16)
+    column = (cells[some, :2] // 2) @ (1, EASE.columns)
     column = np.unique(column, return_inverse=True)[1]
+    rank = dict[int, tuple[bool, float]]()
     for label in scene.things:
-        own = points[labels == label]
-        others = labels != label
-        near = others & (np.abs(points - own.mean(0)) < np.ptp(own, 0) + room).all(1)
-        gap = (
-            KDTree(points[near]).query(own, distance_upper_bound=room)[0].min()
-            if near.any()
-            else room
-        )
+        mine = labels == label
+        own = points[mine]
+        near = ~mine & (np.abs(points - own.mean(0)) < np.ptp(own, 0) + EASE.room).all(1)
+        gap = EASE.room
+        if near.any():
+            gap = KDTree(points[near]).query(own, distance_upper_bound=EASE.room)[0].min()
+        # the lowest point of the object in each column: what is clearly higher lies above it
         top = np.full(column.max() + 1, np.inf)
-        np.minimum.at(top, column[labels == label], own[:, 2])
-        above = np.unique(column[others & (points[:, 2] > top[column] + side)])
-        covered = len(above) / len(np.unique(column[labels == label]))
-        own_height = np.quantile(own[:, 2], 0.95) if scene.table is not None else height
+        np.minimum.at(top, column[mine], own[:, 2])
+        above = np.unique(column[~mine & (points[:, 2] > top[column] + EASE.side)])
+        covered = len(above) / len(np.unique(column[mine]))
+        height = EASE.height if scene.table is None else np.quantile(own[:, 2], EASE.top)
+        # how much of it the camera sees
         pixels = scene.pixels[scene.rows_of(label)]
-        pixel = float(scene.image.depth[tuple(pixels.T)].median()) / float(
-            scene.image.intrinsics[0, 0]
-        )
+        pixel = float(scene.image.depth[tuple(pixels.T)].median()) / scene.image.focal
         seen = len(pixels) * pixel**2 / (3 * math.pi * TIP_RADIUS**2)
-        convex = (
-            len(pixels) / ConvexHull(pixels.cpu().numpy(), qhull_options="QJ").volume
-            if len(pixels) > 2
-            else 0.0
-        )
+        convex = 0.0
+        if len(pixels) > 2:
+            outline = ConvexHull(pixels.cpu().numpy(), qhull_options="QJ")
+            convex = len(pixels) / outline.volume
         clear = min(FLAT_RADII[0] / pixel, 1.0) + min(seen, 1.0) + min(convex, 1.0)
-        ease = (
-            min(gap / room, 1.0) + min(own_height / height, 1.0) - min(5.0 * covered, 1.0) + clear
-        )
+        free = min(gap / EASE.room, 1.0) + min(height / EASE.height, 1.0)
+        ease = free - min(EASE.covered * covered, 1.0) + clear
         radius = np.linalg.norm(own - (own.min(0) + own.max(0)) / 2, axis=1).max()
         rank[label] = (radius > largest_known() or scene.image.at_border(pixels), -ease)
     return sorted(rank, key=rank.__getitem__)

@@ -26,6 +26,19 @@ from torchgrasp.values.planning import Certificate, Contacts, Grasps, PointCloud
 Result = TypeVar("Result")
 
 
+@dataclasses.dataclass(frozen=True)
+class ManyNumbers:
+    """Numbers of plans of many clouds."""
+
+    stack: int = 128
+    """Clouds that a device plans at once; of more it would wait longer for the shapes."""
+    patience: float = 3600.0
+    """Time after which a worker process gives up a cloud [s]."""
+
+
+MANY = ManyNumbers()
+
+
 def plan_many(clouds: Sequence[PointCloud], workers: int, given: dict[str, Any]) -> list[Grasps]:
     """Plan for each cloud on its device; a bad cloud does not affect the others.
 
@@ -60,7 +73,7 @@ def plan_stacks(
     The objects of the next stack are prepared while the device plans. A refused cloud, which is
     an empty set of grasps, stays as it is.
     """
-    most = 128  # clouds at once: of more the device would wait longer for the shapes
+    most = MANY.stack
     budget = requests[0].time_budget if requests else None
     deadline = math.inf if budget is None else time.monotonic() + budget
     stack = _take(prepared, most)
@@ -178,11 +191,10 @@ def _each(
         yield from map(call, requests)
         return
     hand = requests[0].hand
-    source = HandSource(
-        hand.source.option, hand.source.urdf_path, hand.source.sha256
-    )  # without the caches
+    # without the caches
+    source = HandSource(hand.source.option, hand.source.urdf_path, hand.source.sha256)
     tasks = ((call, source, pack(dict(vars(request), hand=None))) for request in requests)
-    with contextlib.closing(run_tasks(_call, tasks, workers, 3600.0)) as results:
+    with contextlib.closing(run_tasks(_call, tasks, workers, MANY.patience)) as results:
         for found in results:
             yield _refused(hand, found.sentence) if isinstance(found, Status) else unpack(found)
 

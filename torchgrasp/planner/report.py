@@ -15,6 +15,19 @@ from torchgrasp.shape.estimate import surface_deviation
 from torchgrasp.values.planning import Grasps, format_success
 
 
+@dataclasses.dataclass(frozen=True)
+class ReportNumbers:
+    """Numbers of what is told of the estimated shape."""
+
+    vertices: int = 500
+    """The surface is judged at about so many vertices, at most twice as many."""
+    certain: float = 0.004
+    """Standard deviation [m] below which the surface is certain: it moves a contact little."""
+
+
+REPORT = ReportNumbers()
+
+
 class Report:
     """Reports progress to the observer: each stage once with the results of all batches, and the
     end of each batch.
@@ -27,26 +40,25 @@ class Report:
         self.objects = objects
         self.batches = batches
         self.planned = planned
-        self.heard = (
-            objects.request.observer is not None
-        )  # without an observer nothing is stored or counted
+        # without an observer nothing is stored or counted
+        self.heard = objects.request.observer is not None
         self.parts: dict[str, list[Any]] = {"plan": [], "certify": [], "query": []}
-        self.ended = self.offered = self.closed = 0
+        self.ended = 0
+        self.offered = 0
+        self.closed = 0
 
     def shape(self) -> None:
-        """Report the estimated shape, and the fraction of its surface with a standard deviation
-        below 4 mm.
-        """
+        """Report the estimated shape, and the fraction of its surface that is certain."""
         if not self.heard:
             return
         shape = self.objects.each[0].shape
         vertices = self.objects.each[0].surface.vertices
-        jet = shape.jet(shape.normalise(vertices[:: len(vertices) // 500 + 1]))
+        some = vertices[:: len(vertices) // REPORT.vertices + 1]
+        jet = shape.jet(shape.normalise(some))
         std_m = shape.std_factor * shape.scale * surface_deviation(jet.variance, jet.gradient)
-        certain = float((std_m < 0.004).double().mean())
-        self.objects.tell(
-            "shape", f"{len(shape.x)} points, {certain:.0%} of the surface certain to 4 mm", shape
-        )
+        certain = float((std_m < REPORT.certain).double().mean())
+        told = f"{certain:.0%} of the surface certain to {1000.0 * REPORT.certain:g} mm"
+        self.objects.tell("shape", f"{len(shape.x)} points, {told}", shape)
 
     def note(self, stage: str, value: Any, offered: int = 0) -> None:
         """Store the result of one stage of one batch; `offered` is how many contact sets stage
@@ -59,7 +71,8 @@ class Report:
                 value, row=value.row + self.closed - len(self.parts["certify"][-1])
             )
         elif stage == "certify":
-            self.offered, self.closed = self.offered + offered, self.closed + len(value)
+            self.offered += offered
+            self.closed += len(value)
         self.parts[stage].append(value)
         if len(self.parts[stage]) == self.planned:
             self._tell(stage)

@@ -26,13 +26,38 @@ from torchgrasp.geometry.linalg import unit
 from torchgrasp.scene.image import DepthImage
 from torchgrasp.scene.scene import Scene
 
-SPACING = 0.005  # spacing [m] of the voxels: a third of a finger's width
-# how far [m] voxels extend around the target's points, and above everything
-SIDEWAYS = 0.25
-ABOVE = 0.04
-# space this far [m] in front of a measured depth is free: three standard deviations of the noise
-NOISE = 0.004
-LOW = 0.01  # height [m] above the table below which unlabelled pixels show the table
+
+@dataclasses.dataclass(frozen=True)
+class OccupancyNumbers:
+    """Numbers of the estimate of full space; lengths are in metres."""
+
+    spacing: float = 0.005
+    """Spacing of the voxels: a third of a finger's width."""
+    sideways: float = 0.25
+    """Voxels extend so far around the target's points."""
+    above: float = 0.04
+    """Voxels extend so far above everything."""
+    noise: float = 0.004
+    """Space farther in front of a measured depth is free: three deviations of the noise."""
+    low: float = 0.01
+    """Unlabelled pixels lower than this above the table show the table."""
+    rim: int = 6
+    """Unlabelled pixels so near the target's in the image [px] may be its own: masks are off."""
+    rim_depth: float = 0.02
+    """Unlabelled pixels so near the target's in depth may be its own."""
+    flying: int = 20
+    """Groups of fewer unlabelled pixels are flying pixels, and no object."""
+    gap: int = 8
+    """Pixels without depth so near measured ones [px] are filled: rims and dropouts."""
+    first: float = 0.02
+    """Quantile of an object's points at which its extent begins."""
+    last: float = 0.98
+    """Quantile of an object's points at which its extent ends."""
+    least: float = 0.002
+    """Least probability of a hidden place."""
+
+
+OCCUPANCY = OccupancyNumbers()
 MODEL = Path(__file__).with_name("occupancy.json")
 """File with the knots and weights of the occupancy model, and with the data to which they were
 fitted.
@@ -105,7 +130,7 @@ def cast_shadows(scene: Scene, target: int) -> Shadows:
     the target.
     """
     image = scene.image
-    (row, column) = scene.pixels.unbind(-1)
+    row, column = scene.pixels.unbind(-1)
     depth = image.depth.double()
     owner = torch.full(image.depth.shape, -1, dtype=torch.int64)
     points = depth.new_full((*depth.shape, 3), torch.nan)
@@ -113,21 +138,20 @@ def cast_shadows(scene: Scene, target: int) -> Shadows:
     owner[row, column] = scene.labels
     own = owner == target
     if scene.table is not None:
-        loose = (owner == 0) & (points[..., 2] > LOW)
+        loose = (owner == 0) & (points[..., 2] > OCCUPANCY.low)
         gap, nearest = find_nearest(own)
-        # Masks are off by some pixels: unlabelled pixels near the target's, in the image and in
-        # depth, are its own.
-        rim = loose & (gap <= 6) & ((depth - depth.reshape(-1)[nearest]).abs() <= 0.02)
+        # unlabelled pixels near the target's, in the image and in depth, are its own
+        step = (depth - depth.reshape(-1)[nearest]).abs()
+        rim = loose & (gap <= OCCUPANCY.rim) & (step <= OCCUPANCY.rim_depth)
         numbered: Any = ndimage.label((loose & ~rim).numpy())
         parts = torch.from_numpy(numbered[0]).long()
-        large = (torch.bincount(parts.reshape(-1)) >= 20)[parts]  # fewer are flying pixels
-        owner = torch.where(
-            rim, target, torch.where(loose, torch.where(large, -1 - parts, -1), owner)
-        )
+        large = (torch.bincount(parts.reshape(-1)) >= OCCUPANCY.flying)[parts]
+        owner = torch.where(loose, torch.where(large, -1 - parts, -1), owner)
+        owner = torch.where(rim, target, owner)
     gap, nearest = find_nearest(owner != -1)
-    depth, owner = (
-        torch.where(gap <= 8, x.reshape(-1)[nearest], x) for x in (depth, owner)
-    )  # rims and dropouts
+    near = gap <= OCCUPANCY.gap
+    depth = torch.where(near, depth.reshape(-1)[nearest], depth)
+    owner = torch.where(near, owner.reshape(-1)[nearest], owner)
     return Shadows(image, depth, owner, points)
 
 
@@ -156,35 +180,44 @@ def shadow_features(
     * The point's distance from the object's middle, over the object's width.
     """
     own = shadows.points[(shadows.owner == owner) & torch.isfinite(shadows.points[..., 2])]
+    # (n, 2): along the view, and across it
     toward = unit(shadows.image.obj_from_camera[:2, 3].double() - own[:, :2].mean(0))
     axes = torch.stack([toward, torch.stack([-toward[1], toward[0]])], -1)
     seen = own[:, :2] @ axes
     level = points[:, :2].double() @ axes
-    low, high = torch.quantile(seen, seen.new_tensor([0.02, 0.98]), dim=0)
-    (deep, wide), front = (high - low + SPACING).tolist(), high[0]
+    ends = seen.new_tensor([OCCUPANCY.first, OCCUPANCY.last])
+    low, high = torch.quantile(seen, ends, dim=0)
+    deep, wide = (high - low + OCCUPANCY.spacing).tolist()
+    front = high[0]
+    middle = (low[1] + high[1]) / 2
 
-    corner = torch.floor(own[:, :2].amin(0) / SPACING).long() - 1
-    count = torch.floor(own[:, :2].amax(0) / SPACING).long() - corner + 2
+    def mirrored(size: float) -> Float[Tensor, "n"]:
+        centre = axes @ torch.stack([front - size / 2, middle])
+        return shadows.look(torch.cat([2 * centre - points[:, :2], points[:, 2:]], -1))[0]
+
+    behind, _ = shadows.look(points)
+    under = _tops(own, points[:, :2].double()) - points[:, 2]
+    across = (level[:, 1] - middle).abs() / wide
+    along = (front - level[:, 0]) / deep
+    mirrors = mirrored(deep), mirrored(max(deep, wide))
+    return torch.stack([behind / wide, under, *mirrors, along, across], -1)
+
+
+def _tops(own: Float[Tensor, "m 3"], places: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
+    """Return the height [m] of an object's points in the column of each place; -1 outside."""
+    corner = torch.floor(own[:, :2].amin(0) / OCCUPANCY.spacing).long() - 1
+    count = torch.floor(own[:, :2].amax(0) / OCCUPANCY.spacing).long() - corner + 2
 
     def column(xy: Float[Tensor, "n 2"]) -> Int[Tensor, "n"]:
-        cell = torch.minimum((torch.floor(xy / SPACING).long() - corner).clamp_min(0), count - 1)
-        return cell[:, 0] * count[1] + cell[:, 1]  # outside, a cell of the empty border
+        # outside, a cell of the empty border
+        cell = (torch.floor(xy / OCCUPANCY.spacing).long() - corner).clamp_min(0)
+        cell = torch.minimum(cell, count - 1)
+        return cell[:, 0] * count[1] + cell[:, 1]
 
     top = own.new_full((int(count[0] * count[1]),), -1.0)
     top.scatter_reduce_(0, column(own[:, :2]), own[:, 2], "amax")
-    top = torch.from_numpy(ndimage.maximum_filter(top.reshape(count.tolist()).numpy(), 3)).reshape(
-        -1
-    )
-
-    def mirrored(size: float) -> Float[Tensor, "n"]:
-        middle = axes @ torch.stack([front - size / 2, (low[1] + high[1]) / 2])
-        return shadows.look(torch.cat([2 * middle - points[:, :2], points[:, 2:]], -1))[0]
-
-    behind, _ = shadows.look(points)
-    under = top[column(points[:, :2].double())] - points[:, 2]
-    across = (level[:, 1] - (low[1] + high[1]) / 2).abs() / wide
-    mirrors = mirrored(deep), mirrored(max(deep, wide))
-    return torch.stack([behind / wide, under, *mirrors, (front - level[:, 0]) / deep, across], -1)
+    grid = ndimage.maximum_filter(top.reshape(count.tolist()).numpy(), 3)
+    return torch.from_numpy(grid).reshape(-1)[column(places)]
 
 
 @functools.cache
@@ -200,10 +233,10 @@ def probability(kind: str, features: Float[Tensor, "n f"]) -> Float[Tensor, "n"]
     function of each.
     """
     model = load_occupancy_model()[kind]
-    odds = torch.full_like(features[:, 0], load_occupancy_model()[kind]["bias"])
+    odds = torch.full_like(features[:, 0], model["bias"])
     for x, knots, values in zip(features.unbind(-1), model["knots"], model["values"], strict=True):
         odds += torch.from_numpy(np.interp(x.numpy(), knots, values)).to(odds)
-    return torch.sigmoid(odds).clamp_min(0.002)
+    return torch.sigmoid(odds).clamp_min(OCCUPANCY.least)
 
 
 @checked
@@ -225,25 +258,23 @@ def estimate_occupancy(scene: Scene, target: int) -> Occupancy:
     scene = settle(scene, torch.device("cpu"))
     if not bool(scene.rows_of(target).any()):
         raise BadArgument("target", target, f"one of the labels {scene.things}")
-    things = (
-        (scene.labels > 0)
-        if scene.table is None
-        else (scene.points[:, 2] > LOW) | scene.rows_of(target)
-    )
+    things = scene.labels > 0
+    if scene.table is not None:
+        things = (scene.points[:, 2] > OCCUPANCY.low) | scene.rows_of(target)
     points = scene.points[scene.rows_of(target)].double()
     others = scene.points[things].double()
-    low = points.amin(0) - SIDEWAYS
-    high = points.amax(0) + SIDEWAYS
+    low = points.amin(0) - OCCUPANCY.sideways
+    high = points.amax(0) + OCCUPANCY.sideways
     near = ((others >= low) & (others <= high))[:, :2].all(1)
     low[2] = 0.0 if scene.table is not None else float(others[near, 2].min())
-    high[2] = float(others[near, 2].max()) + ABOVE
-    origin = (torch.floor(low / SPACING) + 0.5) * SPACING
-    shape = torch.ceil((high - origin) / SPACING).long().tolist()
-    empty = Occupancy(origin, SPACING, torch.zeros(shape, dtype=torch.float64))
+    high[2] = float(others[near, 2].max()) + OCCUPANCY.above
+    origin = (torch.floor(low / OCCUPANCY.spacing) + 0.5) * OCCUPANCY.spacing
+    shape = torch.ceil((high - origin) / OCCUPANCY.spacing).long().tolist()
+    empty = Occupancy(origin, OCCUPANCY.spacing, torch.zeros(shape, dtype=torch.float64))
     centres = empty.centres.reshape(-1, 3)
     shadows = cast_shadows(scene, target)
     behind, owner = shadows.look(centres)
-    hidden = torch.nonzero((owner == -1) | ((owner != 0) & (behind > -NOISE)))[:, 0]
+    hidden = torch.nonzero((owner == -1) | ((owner != 0) & (behind > -OCCUPANCY.noise)))[:, 0]
     whose = owner[hidden]
     full = empty.probability.reshape(-1)
     for thing in whose.unique().tolist():

@@ -26,6 +26,23 @@ from torchgrasp.scene.table_image import TableImage
 from torchgrasp.values.planning import PointCloud
 
 
+@dataclasses.dataclass(frozen=True)
+class SceneNumbers:
+    """Numbers by which places and parts of objects are found in a scene."""
+
+    front: float = 0.01
+    """Points of a cloud farther behind their pixel's depth [m] belong to something hidden."""
+    click: float = 3.0
+    """Largest distance [px] of a clicked pixel from a measured one."""
+    touch: float = 0.01
+    """Largest distance [m] of a given point from a measured one."""
+    part: float = 0.1
+    """Share of an object's pixels beyond a crease that may be another object."""
+
+
+SCENE = SceneNumbers()
+
+
 @checked
 @dataclasses.dataclass(frozen=True)
 class Scene(Value):
@@ -183,7 +200,7 @@ class Scene(Value):
         image, pixels = image_of_cloud(points, viewpoint, planes[0].normal.double())
         row, column = pixels.unbind(-1)
         depth = ((points - viewpoint) @ image.obj_from_camera[:3, 2]) - image.depth[row, column]
-        front = depth < 0.01  # [m]; other points belong to something hidden behind the pixel
+        front = depth < SCENE.front
 
         def to_image(values: Tensor | None) -> Tensor | None:
             if values is None:
@@ -218,15 +235,14 @@ class Scene(Value):
         if place.shape not in ((2,), (3,)) or not bool(torch.isfinite(place).all()):
             raise BadArgument("point", repr(target), "a pixel (u, v) or a point (x, y, z)")
         if len(place) == 2:
-            # pixels
-            distance = torch.linalg.vector_norm(self.pixels.double() - place.flip(0), dim=-1)
-            reach = 3.0
+            offset = self.pixels.double() - place.flip(0)
+            reach = SCENE.click
             text = f"pixel ({place[0]:g}, {place[1]:g})"
         else:
-            # [m]
-            distance = torch.linalg.vector_norm(self.points.double() - place, dim=-1)
-            reach = 0.01
+            offset = self.points.double() - place
+            reach = SCENE.touch
             text = f"point ({', '.join(f'{x:.3f}' for x in place.tolist())}) m"
+        distance = torch.linalg.vector_norm(offset, dim=-1)
         nearest = int(distance.argmin())
         if float(distance[nearest]) > reach:
             raise BadArgument("point", f"nothing measured at {text}", "a place on an object")
@@ -257,7 +273,7 @@ class Scene(Value):
         parts = cut_creases(self.image, points, labels)
         for k in (k for k in self.things if k not in self.given):
             sizes = parts[labels == k].unique(return_counts=True)[1]
-            if int((sizes > 0.1 * sizes.sum()).sum()) > 1:
+            if int((sizes > SCENE.part * sizes.sum()).sum()) > 1:
                 found.append(
                     f"object {k} has a crease: if it is several objects, give a mask of the one to grasp"
                 )
