@@ -31,7 +31,15 @@ from torchgrasp.foundation.base import row_numbers
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.rules import ANY, Positive
 from torchgrasp.geometry.frames import skew
-from torchgrasp.geometry.linalg import GOLDEN_ANGLE, eye_like, fibonacci_sphere, norm, unit
+from torchgrasp.geometry.linalg import (
+    GOLDEN_ANGLE,
+    dot,
+    eye_like,
+    fibonacci_sphere,
+    matvec,
+    norm,
+    unit,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,7 +119,7 @@ def tangential_ratio(
     """Return the ratio of tangential to normal force at each contact; infinite where a force does
     not push.
     """
-    push = -(forces * normals).sum(-1)
+    push = -dot(forces, normals)
     tangential = norm(forces + push[..., None] * normals)
     return torch.where(push > 0, tangential / push.clamp_min(BALANCE.pushing), torch.inf)
 
@@ -158,7 +166,7 @@ def least_friction_forces(
             wanted = preferred.clamp(min=BALANCE.least_preferred)
         forces = central_forces(p, n, wanted, BALANCE.slack)
     forces = forces.to(points).reshape(points.shape)
-    push = -(forces * normals).sum(-1)
+    push = -dot(forces, normals)
     return forces * (strongest / push.amax(-1))[..., None, None]
 
 
@@ -171,9 +179,9 @@ def _search_forces(
     push everywhere.
     """
     sides = points[:, [1, 2, 0]] - points
-    sides = sides / ((sides * sides).sum(-1) ** 0.5)[..., None]
+    sides = sides / (dot(sides, sides) ** 0.5)[..., None]
     basis = pull_signs(3, points.device).T[..., None] * sides[:, :, None]
-    push = -(basis * normals[:, None]).sum(-1)
+    push = -dot(basis, normals[:, None])
     slide = (basis + push[..., None] * normals[:, None]).reshape(-1, 3, 9).swapaxes(1, 2)
     push = push.swapaxes(1, 2)  # (b, 3, 3): normal force at each contact by each push
     weights, found = _improve(
@@ -191,7 +199,7 @@ def forces_near(points: Vectors, normals: Vectors, weights: Float[Tensor, "b p"]
     found that pushes at all contacts.
     """
     pairs = internal_forces(points)
-    push = -(pairs * normals[:, None]).sum(-1)
+    push = -dot(pairs, normals[:, None])
     slide = (pairs + push[..., None] * normals[:, None]).flatten(2)
     weights, found = _improve(
         push.mT, slide.mT, weights, _near_steps(weights.shape[1], push.device), None
@@ -230,7 +238,7 @@ def _improve(
         costs = torch.where(least > BALANCE.pushing, ratio + uneven, torch.inf)
         best = costs.argmin(-1)
         weights = tried[row, :, best]
-        weights = weights / (weights * weights).sum(-1)[:, None] ** 0.5
+        weights = weights / dot(weights, weights)[:, None] ** 0.5
     return weights, torch.isfinite(costs[row, best])
 
 
@@ -280,7 +288,7 @@ def central_forces(
     pushes = push[..., :, None] * push[..., None, :]
     slides = slide.mT @ slide
     start = torch.einsum("bfik,bfi->bk", basis, -preferred[..., None] * normals)
-    pulls = ~((push @ start[..., None])[..., 0] > 0).all(1)
+    pulls = ~(matvec(push, start) > 0).all(1)
     # Where the preferred forces would pull somewhere, a linear programme finds a start.
     wrench = wrenches(points[pulls], normals[pulls], BALANCE.max_friction, edges=BALANCE.edges)
     phi, _ = solve_closure_lp(wrench.flatten(1, 2))
@@ -296,7 +304,7 @@ def central_forces(
     for _ in range(BALANCE.steps):
         cone = tau.square()[:, None, None, None] * pushes - slides  # (b, f, k, k)
         half = (cone @ z[:, None, :, None])[..., 0]
-        height = (half * z[:, None]).sum(-1, keepdim=True)
+        height = dot(half, z[:, None], keepdim=True)
         scaled = 2 * half / height
         gradient = linear - scaled.sum(1)
         hessian = scaled.mT @ scaled - (2 * cone / height[..., None]).sum(1)
@@ -309,7 +317,7 @@ def central_forces(
         normal, tangential = _size(push, slide, tried)
         widest = tau[:, None, None] * normal
         logs = ((widest - tangential).log() + (widest + tangential).log()).sum(-1)
-        value = (tried @ linear[..., None])[..., 0] - logs
+        value = matvec(tried, linear) - logs
         best = torch.where(torch.isfinite(value), value, torch.inf).argmin(1)
         z = tried[row, best]
         ratio = _needed(push, slide, z)

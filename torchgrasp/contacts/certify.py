@@ -31,7 +31,7 @@ from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import is_known
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import degenerate
-from torchgrasp.geometry.linalg import norm
+from torchgrasp.geometry.linalg import dot, matvec, norm
 from torchgrasp.values.planning import Certificate, Contacts
 from torchgrasp.values.specs import ContactSpec
 
@@ -129,7 +129,7 @@ class _Proof(torch.autograd.Function):
     def jvp(ctx: Any, *grad_inputs: Any) -> tuple[Tensor | None, ...]:
         """Return the change of the margin; of other fields it is NaN."""
         wrench, phi, dual = ctx.saved_tensors
-        change = _Once.apply(-((phi[:, None] @ grad_inputs[0])[:, 0] * dual).sum(-1), wrench)
+        change = _Once.apply(-dot((phi[:, None] @ grad_inputs[0])[:, 0], dual), wrench)
         unknown = torch.full_like(change, torch.nan)
         return change, unknown, unknown, None, unknown[:, None].repeat(1, 6), None, None
 
@@ -188,7 +188,7 @@ def _prove(wrench: Float[Tensor, "b m 6"]) -> tuple[Tensor, ...]:
         margin[row], residual[row], dual, balance = solve_by_highs(wrench[row].cpu().numpy())
         phi[row] = balance.to(phi)
         witness[row] = witness[row] if dual is None else torch.from_numpy(dual).to(witness)
-    product = (wrench @ witness[..., None])[..., 0]
+    product = matvec(wrench, witness)
     dual = witness / (product - product.amin(-1, keepdim=True)).sum(-1, keepdim=True)
     dual = torch.where(margin.isinf()[:, None], torch.nan, dual)
     return margin, residual, witness, phi, dual
@@ -202,7 +202,7 @@ def bound_margin(
     """
     # With g_k = w.w_k and phi >= s: 0 = sum phi g >= s sum g + (1 - m s) min g, hence s <= -min g /
     # sum(g - min g).
-    product = (wrench @ witness[..., None])[..., 0]
+    product = matvec(wrench, witness)
     least = product.amin(-1)
     return -least / (product - least[:, None]).sum(-1)
 

@@ -20,7 +20,7 @@ from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import FINITE, Range, Seed
 from torchgrasp.foundation.threads import single_threaded
-from torchgrasp.geometry.linalg import norm, unit
+from torchgrasp.geometry.linalg import dot, norm, unit
 from torchgrasp.shape.estimate import surface_deviation
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.posterior import combined_covariance, symmetric_root
@@ -157,7 +157,7 @@ def node_covariance(
     fingertip's width.
     """
     width = FOOTPRINT / shape.scale
-    along = (points * normals).sum(-1)
+    along = dot(points, normals)
     half_chord = (along**2 + (shape.domain_radius - width) ** 2 - (points**2).sum(-1)).sqrt()
     nodes = torch.maximum(
         torch.minimum(nodes, (half_chord - along)[..., None]), -(half_chord + along)[..., None]

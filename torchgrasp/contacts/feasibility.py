@@ -33,7 +33,7 @@ from torchgrasp.contacts.solver import project
 from torchgrasp.foundation.base import Batch, flatnonzero, spread
 from torchgrasp.foundation.errors import Status
 from torchgrasp.geometry.frames import degenerate
-from torchgrasp.geometry.linalg import eye_like, norm, unit
+from torchgrasp.geometry.linalg import dot, eye_like, matvec, norm, unit
 from torchgrasp.shape.estimate import surface_deviation
 from torchgrasp.values.planning import ContactPlan, Contacts
 
@@ -73,7 +73,7 @@ def normal_variation(
         there = unit(surface.mean_and_gradient(around.flatten(0, 1))[1]).view_as(around)
         here = normals[own][:, None].expand_as(there)
         sine = norm(torch.linalg.cross(here, there))
-        variation[own] = torch.atan2(sine, (here * there).sum(-1)).amax(-1)
+        variation[own] = torch.atan2(sine, dot(here, there)).amax(-1)
     return variation
 
 
@@ -94,7 +94,7 @@ class FlatnessConstraint(Batch):
         """Return the constraint values at points near `at`, from the linear model; one row per
         contact set.
         """
-        return self.value + (self.by_points @ (points - self.at).flatten(1)[..., None])[..., 0]
+        return self.value + matvec(self.by_points, (points - self.at).flatten(1))
 
 
 def flatness_constraint(

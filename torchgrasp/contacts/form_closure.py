@@ -27,7 +27,7 @@ from torch import Tensor
 
 from torchgrasp.foundation.base import at_once, flatnonzero, in_chunks
 from torchgrasp.geometry.frames import degenerate, subsets
-from torchgrasp.geometry.linalg import eye_like, norm, unit
+from torchgrasp.geometry.linalg import dot, eye_like, norm, unit
 
 Vectors = Float[Tensor, "b f 3"]  # points or normals of the contacts in every row
 Guess = Float[Tensor, "b m"] | None  # coefficients of the first wrenches of each cone
@@ -86,7 +86,7 @@ def tangents(points: Vectors, normals: Vectors) -> Vectors:
     stand_in = torch.linalg.cross(axis, normals)
     if points.shape[1] > 3:
         away = points[:, None] - points[:, :, None]
-        away = away - (away * normals[:, :, None]).sum(-1, keepdim=True) * normals[:, :, None]
+        away = away - dot(away, normals[:, :, None], keepdim=True) * normals[:, :, None]
         far, farthest = norm(away).max(-1, keepdim=True)
         stand_in = torch.where(far**2 > SEAM * size, _take(away, farthest), stand_in)
     seam = ~(length > SEAM * size) | (size == 0)
@@ -344,7 +344,7 @@ def most_opposing(
     arm = (points - centre) / radius
     force, torque = witness[:, None].expand(-1, points.shape[1], -1).split(3, -1)
     motion = force + torch.linalg.cross(torque, arm)
-    along = (motion * normals).sum(-1, keepdim=True)
+    along = dot(motion, normals, keepdim=True)
     sideways = motion - along * normals
     length = norm(sideways, keepdim=True)
     push = -normals - friction * sideways / torch.where(length == 0, 1.0, length)

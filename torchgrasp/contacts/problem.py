@@ -21,8 +21,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.contacts.form_closure import Vectors
-from torchgrasp.foundation.base import Batch, map_tensors, spread
-from torchgrasp.geometry.linalg import eye_like, norm
+from torchgrasp.foundation.base import FINGERTIPS, Batch, map_tensors, spread
+from torchgrasp.geometry.linalg import dot, eye_like, norm
 from torchgrasp.shape.batch import ShapeBatch
 from torchgrasp.shape.estimate import MeanJet, SurfaceJet
 from torchgrasp.values.specs import ContactSpec
@@ -141,8 +141,9 @@ def split_unknowns(x: Float[Tensor, "b u"]) -> tuple[Vectors, Float[Tensor, "b p
     """Split each vector of u unknowns into f contact points (f, 3) and the tensions of all p pairs
     of contacts.
     """
-    # u = 3 f + f (f - 1) / 2, solved for f.
-    fingertips = (math.isqrt(25 + 8 * x.shape[1]) - 5) // 2
+    # the unknowns of the possible numbers of fingertips
+    counts = {3 * f + f * (f - 1) // 2: f for f in range(FINGERTIPS[0], FINGERTIPS[1] + 1)}
+    fingertips = counts[x.shape[1]]
     return x[:, : 3 * fingertips].unflatten(1, (fingertips, 3)), x[:, 3 * fingertips :]
 
 
@@ -308,7 +309,7 @@ class ContactProblem:
         )
         cones, cones_by_x = self._cones(points, tension, jet)
         distances, distances_by_x = self._distances(points, jet.normals, centre_by_point)
-        beyond = ((points * points).sum(-1) - edge**2) / (2 * edge)
+        beyond = (dot(points, points) - edge**2) / (2 * edge)
         beyond_by_x = own(points / spread(ball, points))
         values = [cones, (jet.variance - threshold) / half_slope, beyond, distances]
         jacobians = [
@@ -371,7 +372,7 @@ class ContactProblem:
         force, sides = forces_from_tensions(points, tension)
         size = norm(force, keepdim=True)
         direction = force / size
-        outward = (normals * direction).sum(-1, keepdim=True)
+        outward = dot(normals, direction, keepdim=True)
         by_force = (normals - outward * direction) / size
         steep = norm(jet.gradient, keepdim=True)
         across = (
@@ -385,7 +386,7 @@ class ContactProblem:
         between[:, first, second] = between[:, second, first] = tension
         blocks = between[..., None] * by_force[:, :, None]
         blocks[:, at, at] = by_point - between.sum(2, keepdim=True) * by_force
-        along = (by_force[:, :, None] * sides[:, None]).sum(-1)
+        along = dot(by_force[:, :, None], sides[:, None])
         by_tension = along * pull_signs(len(at), points.device).to(points)
         cosine = 1 / math.sqrt(1 + self.friction**2)
         return outward[..., 0] + cosine + CONE_MARGIN, torch.cat([blocks.flatten(2), by_tension], 2)

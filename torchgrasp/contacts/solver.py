@@ -23,7 +23,7 @@ from torchgrasp.contacts.problem import (
     triple_mean_jet,
 )
 from torchgrasp.foundation.base import Batch
-from torchgrasp.geometry.linalg import norm
+from torchgrasp.geometry.linalg import dot, matvec, norm
 from torchgrasp.geometry.optim import (
     Damping,
     Linearisation,
@@ -148,7 +148,7 @@ class Descent(Minimisation[State, LinearConstraints]):
         if self.stage.exact:
             return State(points, tension, triple_jet(shape, points))
         slope = state.jet.variance_gradient
-        variance = state.jet.variance + (slope * (points - state.points)).sum(-1)
+        variance = state.jet.variance + dot(slope, points - state.points)
         mean = triple_mean_jet(shape, points)
         return State(
             points, tension, SurfaceJet(**vars(mean), variance=variance, variance_gradient=slope)
@@ -177,7 +177,7 @@ class Descent(Minimisation[State, LinearConstraints]):
 
 def promised_decrease(model: LinearConstraints, x: Step) -> Float[Tensor, "a"]:
     """Return the decrease of the cost that the linear model predicts for a step x."""
-    linear = model.residual + (model.weighted_jacobian @ x[..., None])[..., 0]
+    linear = model.residual + matvec(model.weighted_jacobian, x)
     return (model.residual.square().sum(1) - linear.square().sum(1)) / 2
 
 

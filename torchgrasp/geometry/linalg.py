@@ -24,6 +24,18 @@ def norm(v: Float[Tensor, "*b d"], keepdim: bool = False) -> Float[Tensor, "*c"]
     return torch.linalg.vector_norm(v, dim=-1, keepdim=keepdim)
 
 
+def dot(
+    a: Float[Tensor, "*b d"], b: Float[Tensor, "*c d"], keepdim: bool = False
+) -> Float[Tensor, "*e"]:
+    """Return the dot products of vectors, which lie along the last axis."""
+    return (a * b).sum(-1, keepdim=keepdim)
+
+
+def matvec(matrix: Float[Tensor, "*b m n"], v: Float[Tensor, "*c n"]) -> Float[Tensor, "*e m"]:
+    """Return the products of matrices and vectors."""
+    return (matrix @ v[..., None])[..., 0]
+
+
 def eye_like(n: int, like: Tensor) -> Float[Tensor, "n n"]:
     """Return the identity matrix of n rows, with the dtype and on the device of a tensor."""
     return torch.eye(n, dtype=like.dtype, device=like.device)

@@ -17,7 +17,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.rules import ANY, Length, Rows, show
 from torchgrasp.geometry.frames import rotate
-from torchgrasp.geometry.linalg import norm, unit
+from torchgrasp.geometry.linalg import dot, norm, unit
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, link_clearance
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
@@ -188,9 +188,7 @@ def measure_errors(
         target = tip_targets(hand, contacts)
     error = norm(spatial.points(hand.tips.index, touching) - target)
     pads = spatial.pads.permute(2, 1, 0)
-    angle = torch.acos(
-        (-(pads * contacts.normals).sum(-1)).clamp(-1.0, 1.0)
-    )  # from the inward normal
+    angle = torch.acos((-dot(pads, contacts.normals)).clamp(-1.0, 1.0))  # from the inward normal
     links, depth, table = link_clearance(spatial, world, tips_touch=True)
     between = hand.self_clearance(configuration.joints)
     lower = hand.lower.to(error) - CHECKS.limits
@@ -313,7 +311,7 @@ def centred_friction(contacts: Contacts) -> Float[Tensor, "g"]:
     contacts' centroid.
     """
     inward = unit(contacts.points.mean(1, keepdim=True) - contacts.points)
-    cosine = -(inward * contacts.normals).sum(-1)
+    cosine = -dot(inward, contacts.normals)
     sine = norm(torch.linalg.cross(inward, contacts.normals))
     return (sine / cosine.clamp_min(CHECKS.least_cosine)).amax(1)
 

@@ -15,6 +15,7 @@ from torch import Tensor
 from torchgrasp.foundation.base import Value, row_numbers, settle
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.rules import Range
+from torchgrasp.geometry.frames import real
 from torchgrasp.geometry.plane import Plane, as_plane
 from torchgrasp.geometry.signed_distance import DistanceField, SignedDistanceField
 from torchgrasp.hand.collision_shapes import CollisionSpheres
@@ -75,9 +76,7 @@ class Obstacles(Value):
         outside = distances[levels.index(full)]
         inside = distance_to(probability < full, occupancy.spacing)
         field = SignedDistanceField(occupancy.origin.double(), occupancy.spacing, outside - inside)
-        return cls(
-            field, distances.float(), torch.tensor(levels, dtype=torch.float64, device="cpu"), hard
-        ).to(device)
+        return cls(field, distances.float(), real(levels), hard).to(device)
 
     @checked
     def likelihood(

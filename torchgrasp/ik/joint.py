@@ -36,7 +36,7 @@ from torchgrasp.foundation.base import (
     spread,
 )
 from torchgrasp.foundation.checks import checked
-from torchgrasp.geometry.linalg import eye_like
+from torchgrasp.geometry.linalg import dot, eye_like
 from torchgrasp.geometry.optim import LeastSquares, Residuals, levenberg_marquardt
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.attempts import Attempts, assign, best_first, best_grasps, try_best_seeds
@@ -105,7 +105,7 @@ class JointState(Batch):
         )
         motion = by_points.unflatten(1, self.points.shape[1:])
         points = self.points + motion
-        variance = self.variance + (self.variance_gradient * motion).sum(-1)
+        variance = self.variance + dot(self.variance_gradient, motion)
         tension = normalise_tensions(points, self.tension + by_tension)
         moved = self.configuration.integrate(hand, by_hand)
         return JointState(moved, points, tension, variance, self.variance_gradient)

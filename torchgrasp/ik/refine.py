@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.geometry.linalg import eye_like
+from torchgrasp.geometry.linalg import dot, eye_like
 from torchgrasp.geometry.optim import SOLVED, LeastSquares, Residuals, levenberg_marquardt
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.clearance import CLEARANCE, MILLIMETRE, CollisionWorld, along, clearance_rows
@@ -61,8 +61,8 @@ def tip_rows(
     g = len(target)
     centres = spatial.tips.permute(2, 1, 0)
     pads = spatial.pads.permute(2, 1, 0)
-    outside = tips.cone.cos().to(pads) + (pads * normals).sum(
-        -1
+    outside = tips.cone.cos().to(pads) + dot(
+        pads, normals
     )  # the contact direction is the inward normal
     weight = PAD_WEIGHT * (outside > 0).to(pads)
     axes = eye_like(3, pads).expand(g, len(tips), 3, 3) * (TIP_WEIGHT / MILLIMETRE)

@@ -26,7 +26,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Count, Positive, Seed
 from torchgrasp.geometry.frames import apply, degenerate, inverse, rigid, rotate, virtual_frame
-from torchgrasp.geometry.linalg import eye_like, norm
+from torchgrasp.geometry.linalg import dot, eye_like, norm
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.candidates import Reachable, ask_reachable
 from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, collision_cost
@@ -341,7 +341,7 @@ def _query(
     points = contacts.points.double()[row[:, None], permutation]
     normals = contacts.normals.double()[row[:, None], permutation]
     tip_error = norm(apply(obj_from_hand, tips) - points)
-    wrong_side = (rotate(obj_from_hand, tip_normals) * normals).sum(-1).mean(-1) > SEEDS.wrong_side
+    wrong_side = dot(rotate(obj_from_hand, tip_normals), normals).mean(-1) > SEEDS.wrong_side
     order = lexical_order(row, wrong_side.int(), tip_error.amax(-1))
     seeds = IKSeeds(joints, obj_from_hand, row, permutation, energy[row, assignment], tip_error)
     return seeds[order].to(contacts.points.dtype)

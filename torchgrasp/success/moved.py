@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchgrasp.contacts.balance import forces_near, internal_forces
 from torchgrasp.geometry.frames import apply, rotate
-from torchgrasp.geometry.linalg import fibonacci_sphere, norm
+from torchgrasp.geometry.linalg import dot, fibonacci_sphere, matvec, norm
 from torchgrasp.geometry.signed_distance import DistanceField
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values.planning import Contacts, Grasps
@@ -80,11 +80,11 @@ def touch_moved(
     start = before - rotate(pose, moved[None]).transpose(0, 1)[:, :, None]  # (d, g, f, 3)
     points, normals, found = trace(field, start, way.expand_as(start), hand.tips.radius.to(forces))
     pairs = internal_forces(grasps.contacts.points.to(forces)).flatten(2).mT
-    weights = (torch.linalg.pinv(pairs) @ forces.nan_to_num(0.0).flatten(1)[..., None])[..., 0]
+    weights = matvec(torch.linalg.pinv(pairs), forces.nan_to_num(0.0).flatten(1))
     points = points.flatten(0, 1)
     normals = normals.flatten(0, 1)
     pressed = forces_near(points, normals, weights.repeat(count, 1))
-    push = -(pressed * normals).sum(-1).amax(-1)
+    push = -dot(pressed, normals).amax(-1)
     touched = found.all(-1) & torch.isfinite(push).view(found.shape[:2])
     return MovedContacts(Contacts(points, normals), pressed / push[:, None, None], touched)
 

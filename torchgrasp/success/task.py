@@ -13,7 +13,7 @@ from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Force, Range
-from torchgrasp.geometry.frames import apply, rotate
+from torchgrasp.geometry.frames import apply, real, rotate
 from torchgrasp.geometry.plane import Plane
 
 
@@ -143,7 +143,7 @@ def loads_of(
         corners = torch.tensor([*itertools.product((-1.0, 1.0), repeat=3)]) / math.sqrt(3)
         # Mixtures of these vectors fill the unit ball.
         around = TASKS.around * torch.cat([corners, axes, -axes])  # (14, 3)
-        weight = torch.tensor([[0.0, 0.0, -TASKS.gravity * mass]], dtype=torch.float64)
+        weight = real([[0.0, 0.0, -TASKS.gravity * mass]])
         # Without the vector that points up, mixtures fill the ball up to 120 degrees from straight
         # down.
         loads = {

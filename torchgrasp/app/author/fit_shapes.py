@@ -23,6 +23,7 @@ from torchgrasp.geometry.mesh import load_triangles
 from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.urdf import LinkShape, Urdf
 
+MEBIBYTE = 2**20  # [bytes]
 MESH_KINDS = (".stl", ".obj", ".ply", ".dae", ".glb")
 
 
@@ -90,7 +91,9 @@ def mesh_file(urdf: Urdf, name: str, folder: Path) -> Path:
             if not file.is_relative_to(base):
                 why = why or "outside, perhaps by a symbolic link"
             elif file.is_file() and file.stat().st_size > MESH_BYTES:
-                why = why or f"of {file.stat().st_size} bytes, more than {MESH_BYTES >> 20} MiB"
+                why = (
+                    why or f"of {file.stat().st_size} bytes, more than {MESH_BYTES // MEBIBYTE} MiB"
+                )
             elif file.is_file():
                 return file
             else:
@@ -114,7 +117,7 @@ def shape_points(urdf: Urdf, folder: Path) -> dict[str, tuple[Points, ...]]:
     size = sum(mesh_file(urdf, name, folder).stat().st_size for name in names)
     if size > HAND_MESH_BYTES:
         raise urdf.wrong(
-            f"meshes of {size} bytes", f"meshes of at most {HAND_MESH_BYTES >> 20} MiB in all"
+            f"meshes of {size} bytes", f"meshes of at most {HAND_MESH_BYTES // MEBIBYTE} MiB in all"
         )
     meshes = {name: _read_points(urdf, name, folder) for name in sorted(names)}
     found = {}

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.foundation.errors import BadArgument
-from torchgrasp.geometry.frames import rigid, rotation_from_rpy
+from torchgrasp.geometry.frames import real, rigid, rotation_from_rpy
 from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.kinematics import chain_from_urdf, map_directions, map_points, pose_in_carrier
 from torchgrasp.hand.urdf import Joint, Link, LinkShape, Triple, Urdf
@@ -190,8 +190,7 @@ def _motion(urdf: Urdf, tip: str, core: Vector) -> tuple[Joint, Vector, Vector]:
                 arm = arm - (arm @ axis) * axis
                 reach = max(float(np.linalg.norm(arm)), PADS.short_arm)
                 return joint, motion / length, arm / reach
-        origin = torch.tensor(joint.xyz, dtype=torch.float64)
-        above_from_link = rigid(rotation_from_rpy(joint.rpy), origin)
+        above_from_link = rigid(rotation_from_rpy(joint.rpy), real(joint.xyz))
         tip_from_above = tip_from_above @ np.linalg.inv(above_from_link.numpy())
     raise BadArgument("tips", tip, "links that a joint moves")
 

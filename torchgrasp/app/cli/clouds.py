@@ -25,6 +25,7 @@ from torchgrasp.export import check_surface_path, largest_std, save_surface
 from torchgrasp.foundation.checks import check_tensor
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Range, Seed
+from torchgrasp.geometry.frames import real
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import as_plane
 from torchgrasp.shape.completion.silhouette import silhouettes
@@ -110,7 +111,7 @@ class CloudCut(Command):
         if self.box is not None:
             box = check_tensor("--box", torch.tensor(self.box).double(), (6,)).reshape(2, 3)
         up = self.view.vertical
-        up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64) if up is None else up
+        up = real([0.0, 0.0, 1.0]) if up is None else up
         thing, plane = clouds.cut_object(file.cloud, up, near, box, self.gap)
         clouds.save_cloud(thing, self.out, plane)
         inputs.print_notes(file.notes)

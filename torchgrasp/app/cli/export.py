@@ -30,6 +30,7 @@ from torchgrasp.values.planning import Grasps, PointCloud
 from torchgrasp.values.specs import ContactSpec, TrialSpec
 
 Unit = Literal["m", "cm", "mm"]
+UNITS: dict[Unit, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}  # [m]
 TEXTS: dict[str, Callable[..., str]] = {
     "json": formats.format_grasps,
     "mujoco": formats.format_keyframes,
@@ -238,7 +239,7 @@ class Import(Command):
         """Read the grasps in a given quaternion order and unit, and certify their contacts."""
         with naming(path="FILE"):
             joints, poses, opened = formats.read_foreign(self.file, hand, self.joints, quaternion)
-        poses[:, :3, 3] *= {"m": 1.0, "cm": 0.01, "mm": 0.001}[unit]
+        poses[:, :3, 3] *= UNITS[unit]
         with naming(joints="FILE"):
             spec = ContactSpec(friction=self.friction, friction_margin=1.0)
             return formats.grasps_from_joints(hand, joints, poses, opened, spec, self.std)

@@ -21,7 +21,6 @@ from torchgrasp.app.report.run_data import Run, verdict
 from torchgrasp.app.report.viewer import VIEW, write_viewer
 from torchgrasp.cloud.agreement import check_mesh, check_stand
 from torchgrasp.cloud.pose import find_plausible
-from torchgrasp.contacts.region import Region
 from torchgrasp.data.shipped import DATA, list_objects, load_object
 from torchgrasp.evaluation.lift import close_hand
 from torchgrasp.export import save_surface
@@ -35,7 +34,7 @@ from torchgrasp.geometry.plane import as_plane
 from torchgrasp.geometry.signed_distance import FIELD_SPACING, field_from_surface
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import hand_of
-from torchgrasp.planner.explain import explain_empty
+from torchgrasp.planner.explain import Explanation, explain_empty
 from torchgrasp.planner.graspable import judge_things
 from torchgrasp.planner.grasps import plan_grasps
 from torchgrasp.planner.objects import take_target
@@ -140,7 +139,7 @@ class Grasp(Command):
             import_rerun()
         scene = is_scene(path)
         self._check_choice(scene)
-        _ = self._where  # refused before any work
+        _ = self._task  # refused before any work
         hand, among = inputs.load_fingers(self.hand, self.fingers)
         grasp = self._grasp_scene if scene else self._grasp_cloud
         return grasp(path, out, hand, among)
@@ -192,43 +191,17 @@ class Grasp(Command):
             origin += " (lowest point)" * (table is not None and view.table is None)
             camera = "camera known" if cloud.viewpoint is not None else "camera estimated"
             progress.end("cloud", f"{len(cloud)} points, {camera}, {origin}")
-            options = {
-                "fingers": among,
-                "mode": self.mode,
-                "observer": progress.end,
-                **self._task(),
-            }
-            grasps = plan_grasps(
-                cloud, hand, spec, self.starts, self.seed, **options, time_budget=self.time_budget
-            )
-            explanation = None
-            if not bool((grasps.status == Status.OK).any()):
-                explanation = explain_empty(cloud, hand, spec, self.starts, self.seed, **options)
-            hand = hand_of(grasps, hand)
+            grasps, explanation = self._plan(cloud, hand, spec, among, progress)
             name = inputs.object_name(path if mesh is None else mesh)
-            surface = extract_surface(progress.values["shape"])
-            plan = progress.values["plan"]
-            stages = tuple(progress.stages)
-            costs = self._costs(grasps, hand, progress.values["shape"])
-            run = Run(
-                name,
-                path,
-                cloud,
-                hand,
-                spec,
-                surface,
-                grasps,
-                stages,
-                plan,
-                explanation=explanation,
-                costs=costs,
-            )
+            shape = progress.values["shape"]
+            run = self._gather(name, path, cloud, hand, spec, grasps, shape, progress, explanation)
+            surface = run.surface
             if self.close and true_mesh is not None and len(run.executable):
                 felt = field_from_surface(surface.vertices, surface.faces, FIELD_SPACING)
                 trial = TrialSpec(friction=self.friction, mass=self.mass)
                 options = {"parts": parts, "table": plane, "surface": felt}
                 closure = close_hand(
-                    run.executable[0], hand, true_mesh, trial, seed=self.seed, **options
+                    run.executable[0], run.hand, true_mesh, trial, seed=self.seed, **options
                 )
                 progress.end(
                     "closing", f"{closure.time[-1]:.1f} s simulated, {closure.status.name.lower()}"
@@ -242,29 +215,69 @@ class Grasp(Command):
             0 if (run.closure is not None and run.closure.held if self.close else executable) else 1
         )
 
-    def _costs(self, grasps: Grasps, hand: Hand, shape: ShapeGP) -> tuple[str, ...]:
-        """Return what lowers the success of the best executable grasp most, in sentences."""
-        best = grasps[grasps.status == Status.OK][:1]
-        return tuple(
-            x.sentence
-            for grasp in best
-            for x in explain_success(grasp, hand, shape, GraspTask(self.mass))
+    def _plan(
+        self,
+        source: PointCloud | Scene,
+        hand: Hand,
+        spec: ContactSpec,
+        among: Among,
+        progress: StageProgress,
+    ) -> tuple[Grasps, Explanation | None]:
+        """Return the grasps of a cloud or of a scene's target; if none is executable, also what
+        would help.
+        """
+        given = (source, hand, spec, self.starts, self.seed)
+        options: dict[str, Any] = {"fingers": among, "mode": self.mode, "observer": progress.end}
+        options |= self._task
+        grasps = plan_grasps(*given, **options, time_budget=self.time_budget or None)
+        if bool((grasps.status == Status.OK).any()):
+            return grasps, None
+        return grasps, explain_empty(*given, **options)
+
+    def _gather(
+        self,
+        name: str,
+        path: Path,
+        cloud: PointCloud,
+        hand: Hand,
+        spec: ContactSpec,
+        grasps: Grasps,
+        shape: ShapeGP,
+        progress: StageProgress,
+        explanation: Explanation | None,
+        scene: Scene | None = None,
+    ) -> Run:
+        """Return the run, with what lowers the success of its best executable grasp most."""
+        hand = hand_of(grasps, hand)
+        costs = [
+            cost.sentence
+            for best in grasps[grasps.status == Status.OK][:1]
+            for cost in explain_success(best, hand, shape, self._task["task"])
+        ]
+        return Run(
+            name,
+            path,
+            cloud,
+            hand,
+            spec,
+            extract_surface(shape),
+            grasps,
+            tuple(progress.stages),
+            progress.values.get("plan"),
+            scene=scene,
+            explanation=explanation,
+            costs=tuple(costs),
         )
 
+    @functools.cached_property
     def _task(self) -> dict[str, Any]:
-        """Return the options of the planner that say what the grasps must do."""
+        """The options of the planner that say what the grasps must do, and where."""
         return {
             "task": GraspTask(self.mass),
             "promise": self.promise,
             "resist": self.resist or None,
-            **self._where,
-        }
-
-    @functools.cached_property
-    def _where(self) -> dict[str, Region | None]:
-        """The regions of --keep and --avoid."""
-        return {
-            name: inputs.read_region(f"--{name}", getattr(self, name)) for name in ("keep", "avoid")
+            "keep": inputs.read_region("--keep", self.keep),
+            "avoid": inputs.read_region("--avoid", self.avoid),
         }
 
     def _true_mesh(self, path: Path) -> Path | None:
@@ -307,41 +320,20 @@ class Grasp(Command):
                 advice += [judged.sentence] if judged is not Status.OK else []
             for sentence in advice:
                 print(f"advice  {sentence}")
-            options = {"fingers": among, "observer": progress.end, **self._task()}
             explanation = None
             if scene.target is not None:
-                grasps = plan_grasps(scene, hand, spec, self.starts, self.seed, **options)
+                grasps, explanation = self._plan(scene, hand, spec, among, progress)
                 shape = progress.values["shape"]
-                if not bool((grasps.status == Status.OK).any()):
-                    explanation = explain_empty(
-                        scene, hand, spec, self.starts, self.seed, **options
-                    )
             else:
                 best = self._find_easiest(scene, hand, spec, among, progress)
                 if best is None:
                     return 1
                 scene, grasps, shape = best
             spec = dataclasses.replace(spec, table=scene.table)
-            hand = hand_of(grasps, hand)
             cloud = take_target(scene, self.seed)
             name = f"object {scene.target}"
-            surface = extract_surface(shape)
-            stages = tuple(progress.stages)
-            plan = progress.values.get("plan")
-            costs = self._costs(grasps, hand, shape)
-            run = Run(
-                name,
-                path,
-                cloud,
-                hand,
-                spec,
-                surface,
-                grasps,
-                stages,
-                plan,
-                scene=scene,
-                explanation=explanation,
-                costs=costs,
+            run = self._gather(
+                name, path, cloud, hand, spec, grasps, shape, progress, explanation, scene
             )
             progress.end("report", self._write(out, run))
         return 0 if print_grasps(run) else 1
@@ -406,7 +398,7 @@ class Grasp(Command):
         """Plan for the objects of a scene until one is easy; return the scene with it as target,
         grasps and shape.
         """
-        options = {"fingers": among, "enough": ENOUGH, **self._task()}
+        options = {"fingers": among, "enough": ENOUGH, **self._task}
         plan = plan_scene(scene, hand, spec, self.starts, self.seed, **options)
         for thing in plan.things:
             count = 0 if thing.grasps is None else len(thing.grasps)

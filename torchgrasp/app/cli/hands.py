@@ -35,7 +35,7 @@ from torchgrasp.files import format_columns, hold_file, render, temporary_folder
 from torchgrasp.foundation.base import count_status
 from torchgrasp.foundation.errors import BadArgument, GraspError, OutputError, Status
 from torchgrasp.foundation.rules import Range, Seed
-from torchgrasp.geometry.linalg import norm
+from torchgrasp.geometry.linalg import dot, norm
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import read_hand_toml
 from torchgrasp.hand.load import find_hand
@@ -242,7 +242,7 @@ def find_warnings(hand: Hand, joints: torch.Tensor) -> list[str]:
         )
     points, normals = hand.fingertips(joints[free])
     inward = points.mean(1, keepdim=True) - points
-    cosine = (normals * inward).sum(-1) / norm(inward)  # (n, f)
+    cosine = dot(normals, inward) / norm(inward)  # (n, f)
     facing = (cosine > TRIAL.facing).double().mean(0)
     for name, seen in zip(hand.finger_names, facing.tolist(), strict=True):
         if seen < TRIAL.least_facing:

@@ -25,7 +25,7 @@ from torchgrasp.data.shipped import DATA, list_objects
 from torchgrasp.files import hold_folder
 from torchgrasp.foundation.checks import check_tensor
 from torchgrasp.foundation.errors import BadArgument, MissingExtra, OutputError
-from torchgrasp.geometry.frames import apply, rotate
+from torchgrasp.geometry.frames import apply, real, rotate
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane, as_plane
 from torchgrasp.hand.hand import Hand
@@ -77,7 +77,7 @@ class ViewOptions:
         """The vertical as a unit vector; None means z."""
         if self.up is None:
             return None
-        vector = check_tensor("--up", torch.tensor(self.up, dtype=torch.float64), (3,))
+        vector = check_tensor("--up", real(self.up), (3,))
         if not bool(vector.any()):
             raise BadArgument("--up", "a vector of length zero", "the direction that points up")
         return unit(vector)
@@ -188,7 +188,7 @@ def read_table(table: tuple[float, ...]) -> Plane | float:
         raise BadArgument(
             "--table", f"{len(table)} numbers", "a height, or four: a normal and its distance"
         )
-    numbers = check_tensor("--table", torch.tensor(table, dtype=torch.float64), (len(table),))
+    numbers = check_tensor("--table", real(table), (len(table),))
     if len(numbers) == 1:
         return float(numbers[0])
     length = torch.linalg.vector_norm(numbers[:3])
@@ -220,9 +220,7 @@ def read_region(name: str, text: str | None) -> Region | None:
     """
     with naming(mesh=name, low=name, high=name):
         try:
-            numbers = torch.tensor(
-                [float(word) for word in (text or "").split()], dtype=torch.float64
-            )
+            numbers = real([float(word) for word in (text or "").split()])
         except ValueError:
             return Region.mesh(Path(str(text)))
         if text is not None and len(numbers) != 6:

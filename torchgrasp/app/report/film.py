@@ -10,13 +10,13 @@ import torch
 
 from torchgrasp.app.report import canvas as paint
 from torchgrasp.app.report.canvas import Direction
-from torchgrasp.app.report.run_data import explain_loss, first_touches, moments_of
+from torchgrasp.app.report.run_data import explain_loss, first_touches, mass_centre, moments_of
 from torchgrasp.app.report.solids import solids_from_hand
 from torchgrasp.app.report.stills import add_solids, to_array
 from torchgrasp.evaluation.causes import moved_in_hand, tick_of
 from torchgrasp.foundation.base import flatnonzero
 from torchgrasp.foundation.lazy import trimesh
-from torchgrasp.geometry.frames import apply
+from torchgrasp.geometry.frames import apply, real
 from torchgrasp.geometry.linalg import norm
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values.closing import ClosureResult
@@ -86,7 +86,7 @@ def draw_film(
     """
     from matplotlib.figure import Figure
 
-    moments = moments_of(closure, _centre(mesh), hand.tips.names)
+    moments = moments_of(closure, mass_centre(mesh), hand.tips.names)
     plots = _list_plots(mesh, hand, closure)
     time = to_array(closure.time)
     count = len(moments)
@@ -147,17 +147,13 @@ def describe_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult) -
         return "once" if count == 1 else f"{count} times"
 
     order = ", ".join(hand.tips.names[finger] for finger in closure.contact_order) or "none"
-    lost = explain_loss(closure, _centre(mesh), hand.tips.names)
+    lost = explain_loss(closure, mass_centre(mesh), hand.tips.names)
     stops = closure.stops
     attempts = closure.attempts
     on_its_way = f" On its way the hand touched something {times(stops)}." if stops else ""
     again = f" The hand closed {times(attempts)}." if attempts > 1 else ""
     end = (lost or "The object was held.") + on_its_way + again
     return f"In the order of touch: {order}. {end}"
-
-
-def _centre(mesh: "trimesh.Trimesh") -> torch.Tensor:
-    return torch.tensor(np.array(mesh.center_mass), dtype=torch.float64)
 
 
 def _draw_stills(
@@ -172,7 +168,7 @@ def _draw_stills(
     finite = flatnonzero(known)
     # of a simulation that diverged, the last state before
     at = torch.stack([finite[finite <= tick][-1] for tick in ticks])
-    vertices = torch.tensor(np.array(mesh.vertices), dtype=torch.float64)
+    vertices = real(np.array(mesh.vertices))
     faces = np.asarray(mesh.faces)
     places = to_array(apply(closure.object_pose[at].double(), vertices))
     hands = [
@@ -233,11 +229,11 @@ def _list_plots(
         f"{order.index(k) + 1}. {name}" if k in order else f"never: {name}"
         for k, name in enumerate(names)
     ]
-    distance, turn = moved_in_hand(closure, _centre(mesh))
+    distance, turn = moved_in_hand(closure, mass_centre(mesh))
     before = torch.arange(len(closure.time)) < tick_of(closure, 2)
     slip = to_array((1e3 * distance).masked_fill(before, torch.nan))
     degrees = to_array(torch.rad2deg(turn).masked_fill(before, torch.nan))
-    middle = _centre(mesh).expand(len(closure.time), 1, 3)
+    middle = mass_centre(mesh).expand(len(closure.time), 1, 3)
     centres = apply(closure.object_pose.double(), middle)[:, 0]  # (t, 3)
     moved = 1e3 * to_array(norm(centres - centres[0]))
     height = 1e3 * to_array(closure.hand_pose[:, 2, 3])

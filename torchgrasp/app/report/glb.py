@@ -10,7 +10,7 @@ import numpy as np
 
 from torchgrasp.app.report.canvas import FULL, OBJECT, color_std, rgb
 from torchgrasp.app.report.solids import link_poses, solids_by_link
-from torchgrasp.app.report.stills import to_array
+from torchgrasp.app.report.stills import mesh_arrays, to_array
 from torchgrasp.control.reference import check_single
 from torchgrasp.files import write_file
 from torchgrasp.foundation.checks import checked
@@ -86,10 +86,11 @@ def _solid(body: "Surface | trimesh.Trimesh") -> "trimesh.Trimesh":
     if not isinstance(body, Surface):
         return trimesh.Trimesh(body.vertices, body.faces, visual=_paint(OBJECT), process=False)
     colors, _ = color_std(to_array(body.std_m))
+    vertices, faces, normals = mesh_arrays(body)
     return trimesh.Trimesh(
-        to_array(body.vertices),
-        body.faces.cpu().numpy(),
-        vertex_normals=to_array(body.normals),
+        vertices,
+        faces,
+        vertex_normals=normals,
         vertex_colors=np.uint8(FULL * _linear(colors)),
         process=False,
     )

@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.app.report.canvas import FINGERS, FULL, OBJECT, color_std, rgb
-from torchgrasp.app.report.run_data import Run, moments_of
+from torchgrasp.app.report.run_data import Run, mass_centre, moments_of
 from torchgrasp.app.report.solids import link_poses, solids_by_link
-from torchgrasp.app.report.stills import to_array
+from torchgrasp.app.report.stills import mesh_arrays, to_array
 from torchgrasp.app.report.viewer import POSTURES, pose_postures
 from torchgrasp.files import write_file
 from torchgrasp.foundation.checks import checked
@@ -91,12 +90,7 @@ class _Recorder:
         cloud = rr.Points3D(to_array(run.cloud.points), colors=_bytes(CLOUD_COLOR))
         self._log(f"{ROOT}/cloud", cloud)
         shades, _ = color_std(to_array(run.surface.std_m))
-        surface = self._mesh(
-            to_array(run.surface.vertices),
-            run.surface.faces.cpu().numpy(),
-            to_array(run.surface.normals),
-            vertex_colors=np.uint8(FULL * shades),
-        )
+        surface = self._mesh(*mesh_arrays(run.surface), vertex_colors=np.uint8(FULL * shades))
         self._log(f"{ROOT}/surface", surface)
         if not len(run.executable):
             return
@@ -149,8 +143,7 @@ class _Recorder:
         for finger, name in enumerate(names):
             curve = rr.Scalars.columns(scalars=to_array(closure.forces[:, finger]))
             self._send(f"force/{name}", time, curve)
-        centre = torch.tensor(np.array(upright.mesh.center_mass))
-        moments = moments_of(upright.closure, centre, names)
+        moments = moments_of(upright.closure, mass_centre(upright.mesh), names)
         at = "time", "duration", seconds[[moment.tick for moment in moments]]
         self._send("moments", at, rr.TextLog.columns(text=[moment.name for moment in moments]))
 

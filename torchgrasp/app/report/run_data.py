@@ -5,6 +5,7 @@ import math
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -17,7 +18,7 @@ from torchgrasp.foundation.base import count_status, flatnonzero
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import Status
 from torchgrasp.foundation.lazy import trimesh
-from torchgrasp.geometry.frames import apply, inverse
+from torchgrasp.geometry.frames import apply, inverse, real
 from torchgrasp.geometry.linalg import norm
 from torchgrasp.geometry.plane import move, upright_frame
 from torchgrasp.hand.hand import Hand
@@ -125,7 +126,7 @@ def closing_sentence(run: Run) -> str:
     if not closure.held:
         reason = closure.status.sentence
         return f"The {run.hand.name} hand did not hold the {run.object_name}: {reason}."
-    centre = torch.tensor([*mesh.center_mass, 1.0], dtype=torch.float64)
+    centre = real([*mesh.center_mass, 1.0])
     rise = float((closure.object_pose[-1] - closure.object_pose[0])[2] @ centre)
     moved, angle = closure.object_motion
     return (
@@ -160,6 +161,11 @@ def _too_low(run: Run) -> str:
     if height >= needed:
         return ""
     return f": it is {1e3 * height:.0f} mm high, and this hand needs {1e3 * needed:.0f} mm"
+
+
+def mass_centre(mesh: "trimesh.Trimesh") -> Float[Tensor, "3"]:
+    """Return the centre of mass [m] of a closed mesh."""
+    return real(np.array(mesh.center_mass))
 
 
 class Moment(NamedTuple):

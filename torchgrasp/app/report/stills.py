@@ -13,7 +13,7 @@ from torchgrasp.app.report.canvas import Direction
 from torchgrasp.app.report.solids import PARKED, Solid, finger_of_links, solids_from_hand
 from torchgrasp.foundation.base import flatnonzero
 from torchgrasp.foundation.lazy import Image
-from torchgrasp.geometry.linalg import norm, unit
+from torchgrasp.geometry.linalg import dot, norm, unit
 from torchgrasp.hand.hand import Hand
 from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.surface import Surface
@@ -74,11 +74,10 @@ def draw_surface(surface: Surface, direction: Direction, table: float | None = N
     """Return a PNG of the estimated surface seen from `direction`, coloured by its standard
     deviation [mm].
     """
-    vertices = to_array(surface.vertices)
-    faces = surface.faces.cpu().numpy()
+    vertices, faces, normals = mesh_arrays(surface)
     colors, most = paint.color_std(to_array(surface.std_m))
     canvas = paint.Canvas()
-    canvas.add_mesh(vertices, faces, colors, to_array(surface.normals))
+    canvas.add_mesh(vertices, faces, colors, normals)
     canvas.add_table(vertices, table)
     bar = "standard deviation of the surface [mm]", 1e3 * most, "viridis"
     return canvas.render_png(vertices, direction, bar=bar)
@@ -195,7 +194,7 @@ def opposed_posture(hand: Hand, joints: Float[Tensor, "n h"]) -> Float[Tensor, "
     points, normals = hand.fingertips(joints)
     inward = points.mean(1, keepdim=True) - points
     # the worst finger counts: how well its pad faces the others, and how far away it is
-    facing = (normals * unit(inward)).sum(-1).amin(1)
+    facing = dot(normals, unit(inward)).amin(1)
     apart = norm(inward).amax(1)
     score = facing - APART * apart
     free = hand.self_clearance(joints) > 0
@@ -240,6 +239,11 @@ def to_array(value: Float[Tensor, "*b"]) -> np.ndarray:
     return value.detach().cpu().double().numpy()
 
 
+def mesh_arrays(surface: Surface) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return vertices (v, 3), faces (t, 3) and vertex normals (v, 3) of an estimated surface."""
+    return to_array(surface.vertices), surface.faces.cpu().numpy(), to_array(surface.normals)
+
+
 def _grasp(
     surface: Surface, hand: Hand, grasp: Grasps
 ) -> tuple[paint.Canvas, Float[np.ndarray, "n 3"]]:
@@ -259,9 +263,7 @@ def _add_object(
     canvas: paint.Canvas, surface: Surface, transparent: bool = False
 ) -> Float[np.ndarray, "n 3"]:
     """Add the estimated surface in the colour of an object; return its vertices."""
-    vertices = to_array(surface.vertices)
-    faces = surface.faces.cpu().numpy()
-    normals = to_array(surface.normals)
+    vertices, faces, normals = mesh_arrays(surface)
     canvas.add_mesh(vertices, faces, paint.OBJECT, normals, transparent=transparent)
     return vertices
 

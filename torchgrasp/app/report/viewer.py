@@ -28,9 +28,9 @@ from torchgrasp.app.report.page import (
     grasp_rows,
     render,
 )
-from torchgrasp.app.report.run_data import Run, moments_of, verdict
+from torchgrasp.app.report.run_data import Run, mass_centre, moments_of, verdict
 from torchgrasp.app.report.solids import link_poses, solids_of_links
-from torchgrasp.app.report.stills import facing, to_array, view_of
+from torchgrasp.app.report.stills import facing, mesh_arrays, to_array, view_of
 from torchgrasp.control.finger_forces import squeeze
 from torchgrasp.data.accept import CloudLike, HandLike, as_cloud
 from torchgrasp.files import write_file
@@ -64,6 +64,7 @@ class ViewerNumbers:
 
 
 VIEWER = ViewerNumbers()
+STARTING = 100  # last letters of the library in which it would start its own viewer
 COLUMNS = (0, 1, 5, 3)  # of `grasp_columns`: rank, success, margin, clearance
 MORE_COLUMNS = 6  # the first of the others that a page shows: standard deviation, task margin
 POSTURES = ("approach", "pre-grasp", "grasp", "squeeze")
@@ -144,7 +145,7 @@ def three() -> str:
     scripts = "\n".join(re.findall(r"<script[^>]*>(.*?)</script>", template, re.DOTALL))
     # Browsers read line ends as \n before they compare a script with its digest.
     library = re.sub(r"init\(\);\s*$", "", re.sub(r"\r\n?", "\n", scripts))
-    if "TrackballControls" not in library or "init();" in library[-100:]:
+    if "TrackballControls" not in library or "init();" in library[-STARTING:]:
         raise RuntimeError("the installed trimesh has another viewer than trimesh 4.5 to 5.2")
     return library
 
@@ -202,14 +203,13 @@ def _surface(run: Run) -> dict[str, object]:
     """Return the estimated surface with standard deviations and colours, as a dict of arrays made
     by `pack`.
     """
-    surface = run.surface
     std_m = to_array(run.surface.std_m)
-    vertices = to_array(surface.vertices)
-    kept, faces = thin_mesh(vertices, surface.faces.cpu().numpy())
+    vertices, faces, normals = mesh_arrays(run.surface)
+    kept, faces = thin_mesh(vertices, faces)
     colors, most = color_std(std_m)
     ramp = map_colors(np.linspace(0.0, 1.0, VIEWER.ramp), "viridis")
     return {
-        **_mesh(vertices[kept], faces, to_array(surface.normals)[kept]),
+        **_mesh(vertices[kept], faces, normals[kept]),
         "std": pack(std_m[kept]),
         "colors": pack(np.round(FULL * colors[kept]), "u1"),
         "most_mm": 1e3 * most,
@@ -253,8 +253,6 @@ def _replay(run: Run, closure: ClosureResult) -> dict[str, object]:
     forces at all ticks.
     """
     assert run.mesh is not None
-    centre = torch.tensor(np.array(run.mesh.center_mass), dtype=torch.float64)
-    names = run.hand.tips.names
     ticks = thin_rows(len(closure.time), VIEWER.ticks)
     vertices = np.asarray(run.mesh.vertices)
     kept, faces = thin_mesh(vertices, np.asarray(run.mesh.faces))
@@ -264,7 +262,7 @@ def _replay(run: Run, closure: ClosureResult) -> dict[str, object]:
     hand_pose = closure.hand_pose[ticks].double()
     trace = closure.trace
     moments = []
-    for moment in moments_of(closure, centre, names):
+    for moment in moments_of(closure, mass_centre(run.mesh), run.hand.tips.names):
         nearest = int(np.abs(ticks - moment.tick).argmin())
         moments.append((nearest, moment.name))
     return {
