@@ -95,10 +95,9 @@ def grasp_map(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 6 n"]:
     centroid.
     """
     arms = points - points.mean(-2, keepdim=True)
-    eye = eye_like(3, points).expand(*arms.shape[:-2], 3, 3)
-    return torch.cat(
-        [torch.cat([eye] * arms.shape[-2], -1), torch.cat(skew(arms).unbind(-3), -1)], -2
-    )
+    force = eye_like(3, points).expand(*arms.shape, 3)
+    # one block (6, 3) of force and torque for each contact, side by side
+    return torch.cat(torch.cat([force, skew(arms)], -2).unbind(-3), -1)
 
 
 def internal_forces(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b p f 3"]:
@@ -110,7 +109,8 @@ def internal_forces(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b p f 3"
     f = points.shape[-2]
     first, second = contact_pairs(f, points.device)
     sides = unit(points[..., second, :] - points[..., first, :])
-    return pull_signs(f, points.device).to(points).T[..., None] * sides[..., None, :]
+    signs = pull_signs(f, points.device).to(points).T  # (p, f)
+    return signs[..., None] * sides[..., None, :]
 
 
 def tangential_ratio(
@@ -121,7 +121,8 @@ def tangential_ratio(
     """
     push = -dot(forces, normals)
     tangential = norm(forces + push[..., None] * normals)
-    return torch.where(push > 0, tangential / push.clamp_min(BALANCE.pushing), torch.inf)
+    ratio = tangential / push.clamp_min(BALANCE.pushing)
+    return torch.where(push > 0, ratio, torch.inf)
 
 
 @checked
@@ -152,13 +153,13 @@ def least_friction_forces(
     >>> least_friction_forces(points, normals, 2.0)[0, :, 0].round(decimals=2)
     tensor([ 1.,  1., -2.])
     """
-    rows = (-1, *points.shape[-2:])
-    p = points.double().reshape(rows)
-    n = normals.double().reshape(rows)
+    f = points.shape[-2]
+    p = points.double().reshape(-1, f, 3)
+    n = normals.double().reshape(-1, f, 3)
     if preferred is not None:
         preferred = (preferred / preferred.amax(-1, keepdim=True)).double()
-        preferred = preferred.expand(points.shape[:-1]).reshape(-1, points.shape[-2])
-    if points.shape[-2] == 3:
+        preferred = preferred.expand(points.shape[:-1]).reshape(-1, f)
+    if f == 3:
         forces = _search_forces(p, n, preferred)
     else:
         wanted = p.new_ones(p.shape[:-1])
@@ -179,14 +180,15 @@ def _search_forces(
     push everywhere.
     """
     sides = points[:, [1, 2, 0]] - points
-    sides = sides / (dot(sides, sides) ** 0.5)[..., None]
-    basis = pull_signs(3, points.device).T[..., None] * sides[:, :, None]
+    length = dot(sides, sides, keepdim=True) ** 0.5
+    signs = pull_signs(3, points.device).T  # (p, f)
+    basis = signs[..., None] * (sides / length)[:, :, None]
     push = -dot(basis, normals[:, None])
-    slide = (basis + push[..., None] * normals[:, None]).reshape(-1, 3, 9).swapaxes(1, 2)
+    slide = basis + push[..., None] * normals[:, None]
+    slide = slide.reshape(-1, 3, 9).swapaxes(1, 2)
     push = push.swapaxes(1, 2)  # (b, 3, 3): normal force at each contact by each push
-    weights, found = _improve(
-        push, slide, torch.zeros_like(push[:, 0]), _search_steps(push.device), preferred
-    )
+    start = torch.zeros_like(push[:, 0])
+    weights, found = _improve(push, slide, start, _search_steps(push.device), preferred)
     forces = (weights[:, None] @ basis.reshape(-1, 3, 9)).reshape(-1, 3, 3)
     return torch.where(found[:, None, None], forces, torch.nan)
 
@@ -201,12 +203,10 @@ def forces_near(points: Vectors, normals: Vectors, weights: Float[Tensor, "b p"]
     pairs = internal_forces(points)
     push = -dot(pairs, normals[:, None])
     slide = (pairs + push[..., None] * normals[:, None]).flatten(2)
-    weights, found = _improve(
-        push.mT, slide.mT, weights, _near_steps(weights.shape[1], push.device), None
-    )
-    return torch.where(
-        found[:, None, None], torch.einsum("bp,bpfi->bfi", weights, pairs), torch.nan
-    )
+    steps = _near_steps(weights.shape[1], push.device)
+    weights, found = _improve(push.mT, slide.mT, weights, steps, None)
+    forces = torch.einsum("bp,bpfi->bfi", weights, pairs)
+    return torch.where(found[:, None, None], forces, torch.nan)
 
 
 def _improve(
@@ -226,7 +226,8 @@ def _improve(
         tried = weights[:, :, None] + steps
         normal = push @ tried
         across = slide @ tried
-        tangential = (across * across).unflatten(1, (-1, 3)).sum(2)  # (b, f, s)
+        squares = (across * across).unflatten(1, (-1, 3))  # (b, f, 3, s)
+        tangential = squares.sum(2)
         ratio = (tangential / (normal * normal)).amax(1) ** 0.5
         least = normal.amin(1)
         most = normal.amax(1)
@@ -238,7 +239,7 @@ def _improve(
         costs = torch.where(least > BALANCE.pushing, ratio + uneven, torch.inf)
         best = costs.argmin(-1)
         weights = tried[row, :, best]
-        weights = weights / dot(weights, weights)[:, None] ** 0.5
+        weights = weights / dot(weights, weights, keepdim=True) ** 0.5
     return weights, torch.isfinite(costs[row, best])
 
 
@@ -292,40 +293,43 @@ def central_forces(
     # Where the preferred forces would pull somewhere, a linear programme finds a start.
     wrench = wrenches(points[pulls], normals[pulls], BALANCE.max_friction, edges=BALANCE.edges)
     phi, _ = solve_closure_lp(wrench.flatten(1, 2))
-    found = (phi.unflatten(1, wrench.shape[1:3])[..., None] * wrench[..., :3]).sum(2)
-    found = torch.where((phi.amin(-1) > 0)[:, None, None], found, torch.nan)
-    start = start.index_put((pulls,), torch.einsum("bfik,bfi->bk", basis[pulls], found))
+    size = phi.unflatten(1, wrench.shape[1:3])
+    found = (size[..., None] * wrench[..., :3]).sum(2)
+    pushing = (phi.amin(-1) > 0)[:, None, None]
+    found = torch.where(pushing, found, torch.nan)
+    found = torch.einsum("bfik,bfi->bk", basis[pulls], found)
+    start = start.index_put((pulls,), found)
     linear = (2 / preferred[..., None] * push).sum(1)
-    z = start * (2 * points.shape[1] / (linear * start).sum(1))[:, None]
+    # the scale at which the linear part is best
+    z = start * (2 * points.shape[1] / dot(linear, start, keepdim=True))
     ratio = _needed(push, slide, z)
     tau = BALANCE.first * ratio + slack
     row = row_numbers(z)
     lengths = 2 ** torch.arange(BALANCE.lengths, device=z.device).to(z)
     for _ in range(BALANCE.steps):
         cone = tau.square()[:, None, None, None] * pushes - slides  # (b, f, k, k)
-        half = (cone @ z[:, None, :, None])[..., 0]
+        half = matvec(cone, z[:, None])
         height = dot(half, z[:, None], keepdim=True)
         scaled = 2 * half / height
         gradient = linear - scaled.sum(1)
         hessian = scaled.mT @ scaled - (2 * cone / height[..., None]).sum(1)
         factor, _ = torch.linalg.cholesky_ex(hessian)
         step = -torch.cholesky_solve(gradient[..., None], factor)[..., 0]
-        decrement = (-(gradient * step).sum(1)).clamp(min=0).sqrt()
+        decrement = (-dot(gradient, step)).clamp(min=0).sqrt()
         # Multiples of a step that is safe for every self-concordant function.
         safe = lengths / (1 + decrement[:, None])
         tried = z[:, None] + safe[..., None] * step[:, None]  # (b, l, k)
         normal, tangential = _size(push, slide, tried)
         widest = tau[:, None, None] * normal
-        logs = ((widest - tangential).log() + (widest + tangential).log()).sum(-1)
-        value = matvec(tried, linear) - logs
+        logs = (widest - tangential).log() + (widest + tangential).log()
+        value = matvec(tried, linear) - logs.sum(-1)
         best = torch.where(torch.isfinite(value), value, torch.inf).argmin(1)
         z = tried[row, best]
         ratio = _needed(push, slide, z)
         # Farther from the centre tau would fall faster than the steps can follow.
-        tau = torch.where(
-            decrement < 1.0, ratio + (BALANCE.kept * (tau - ratio)).clamp(min=slack), tau
-        )
-    return (basis @ z[:, None, :, None])[..., 0]
+        lower = ratio + (BALANCE.kept * (tau - ratio)).clamp(min=slack)
+        tau = torch.where(decrement < 1.0, lower, tau)
+    return matvec(basis, z[:, None])
 
 
 def _size(
@@ -334,7 +338,8 @@ def _size(
     """Return the sizes of normal and tangential forces at all contacts, for l vectors z of
     null-space coordinates.
     """
-    tangential = (slide.flatten(1, 2) @ z.mT).unflatten(1, slide.shape[1:3])  # (b, f, 3, l)
+    tangential = slide.flatten(1, 2) @ z.mT
+    tangential = tangential.unflatten(1, slide.shape[1:3])  # (b, f, 3, l)
     return z @ push.mT, torch.linalg.vector_norm(tangential, dim=2).mT
 
 

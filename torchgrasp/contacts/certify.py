@@ -22,6 +22,7 @@ from torchgrasp.contacts.form_closure import (
     MIN_RANK_RATIO,
     Vectors,
     rank_ratio,
+    residual_of,
     solve_closure_lp,
     wrenches,
 )
@@ -74,8 +75,9 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
     tensor([True])
     """
     spec = ContactSpec() if spec is None else spec
-    points, normals = (x.double() for x in (check_contacts(contacts).points, contacts.normals))
-    wrench = wrenches(points, check_unit(normals), spec.planned_friction, spec.edges)
+    points = check_contacts(contacts).points.double()
+    normals = check_unit(contacts.normals.double())
+    wrench = wrenches(points, normals, spec.planned_friction, spec.edges)
     return Certificate(*_Proof.apply(wrench.flatten(1, 2), degenerate(points))[:5])
 
 
@@ -116,34 +118,39 @@ class _Proof(torch.autograd.Function):
         """Return the derivative in the wrenches; raise `BadArgument` unless it is of the margin
         alone.
         """
-        margin, wrench, phi, dual = grads[0], *ctx.saved_tensors
+        margin = grads[0]
+        wrench, phi, dual = ctx.saved_tensors
         if any(x is not None for x in grads[1:]):
             raise BadArgument(
                 "contacts", "a derivative of another field of the certificate", "one of its margin"
             )
         if margin is None:
             return None, None
-        return _Once.apply(-margin[:, None, None] * phi[..., None] * dual[:, None], wrench), None
+        derivative = -margin[:, None, None] * phi[..., None] * dual[:, None]
+        return _Once.apply(derivative, wrench), None
 
     @staticmethod
     def jvp(ctx: Any, *grad_inputs: Any) -> tuple[Tensor | None, ...]:
         """Return the change of the margin; of other fields it is NaN."""
         wrench, phi, dual = ctx.saved_tensors
-        change = _Once.apply(-dot((phi[:, None] @ grad_inputs[0])[:, 0], dual), wrench)
+        balance = (phi[:, None] @ grad_inputs[0])[:, 0]  # (b, 6)
+        change = _Once.apply(-dot(balance, dual), wrench)
         unknown = torch.full_like(change, torch.nan)
-        return change, unknown, unknown, None, unknown[:, None].repeat(1, 6), None, None
+        witness = unknown[:, None].repeat(1, 6)
+        return change, unknown, unknown, None, witness, None, None
 
     @staticmethod
     def vmap(
         info: Any, in_dims: tuple[int | None, ...], *args: Tensor
     ) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
         """Prove the sets of all values of an axis together."""
-        pairs = zip(args, in_dims, strict=True)
-        rows = [
-            x.expand(info.batch_size, *x.shape) if k is None else x.movedim(k, 0) for x, k in pairs
-        ]
+        rows = []
+        for x, axis in zip(args, in_dims, strict=True):
+            same = axis is None  # for all values
+            rows.append(x.expand(info.batch_size, *x.shape) if same else x.movedim(axis, 0))
         proof = _Proof.apply(*(x.flatten(0, 1) for x in rows))
-        return tuple(x.unflatten(0, rows[0].shape[:2]) for x in proof), (0,) * len(proof)
+        size = rows[0].shape[:2]
+        return tuple(x.unflatten(0, size) for x in proof), (0,) * len(proof)
 
 
 class _Once(torch.autograd.Function):
@@ -177,19 +184,22 @@ def _prove(wrench: Float[Tensor, "b m 6"]) -> tuple[Tensor, ...]:
     the multipliers.
     """
     phi, witness = solve_closure_lp(wrench)
-    residual = (phi[:, None] @ wrench)[:, 0].abs().amax(-1)
+    residual = residual_of(wrench, phi)
     margin = phi.amin(-1)
     upper = bound_margin(wrench, witness)
     unbalanced = upper < -1 / GAP
     margin = torch.where(unbalanced, -torch.inf, margin)
     residual = torch.where(unbalanced, torch.inf, residual)
-    proven = (residual <= EXACT) & (upper - margin <= GAP) & ((margin - MIN_MARGIN).abs() > 2 * GAP)
+    proven = (residual <= EXACT) & (upper - margin <= GAP)
+    proven &= (margin - MIN_MARGIN).abs() > 2 * GAP
     for row in flatnonzero(~(proven | unbalanced)).tolist():
-        margin[row], residual[row], dual, balance = solve_by_highs(wrench[row].cpu().numpy())
+        margin[row], residual[row], found, balance = solve_by_highs(wrench[row].cpu().numpy())
         phi[row] = balance.to(phi)
-        witness[row] = witness[row] if dual is None else torch.from_numpy(dual).to(witness)
+        if found is not None:
+            witness[row] = torch.from_numpy(found).to(witness)
     product = matvec(wrench, witness)
-    dual = witness / (product - product.amin(-1, keepdim=True)).sum(-1, keepdim=True)
+    above = product - product.amin(-1, keepdim=True)
+    dual = witness / above.sum(-1, keepdim=True)
     dual = torch.where(margin.isinf()[:, None], torch.nan, dual)
     return margin, residual, witness, phi, dual
 
@@ -232,10 +242,10 @@ def solve_by_highs(wrench: np.ndarray) -> tuple[float, float, np.ndarray | None,
     phi = solution.x[:m] + solution.x[m]
     dual = solution.eqlin.marginals[:6]
     length = np.linalg.norm(dual)
-    witness = (
-        -dual / length if length > 0 else None
-    )  # no multipliers: the balance of wrenches costs no margin
-    return float(solution.x[m]), float(np.abs(phi @ wrench).max()), witness, torch.from_numpy(phi)
+    # without multipliers the balance of wrenches costs no margin
+    witness = -dual / length if length > 0 else None
+    residual = float(np.abs(phi @ wrench).max())
+    return float(solution.x[m]), residual, witness, torch.from_numpy(phi)
 
 
 def check_unit(normals: Vectors) -> Vectors:

@@ -20,6 +20,7 @@ from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import FINITE, Range, Seed
 from torchgrasp.foundation.threads import single_threaded
+from torchgrasp.geometry.frames import real
 from torchgrasp.geometry.linalg import dot, norm, unit
 from torchgrasp.shape.estimate import surface_deviation
 from torchgrasp.shape.gp import ShapeGP
@@ -49,24 +50,19 @@ class LinePosterior(Batch):
 
     points: Vectors  # planned contacts x, in normalised units
     normals: Vectors  # outward unit normals n
-    deviation: Float[
-        Tensor, "b f"
-    ]  # of the surface at each contact; t of nodes and grid points is a multiple of it
-    distance: Float[
-        Tensor, "b f 23"
-    ]  # mean of d at the grid points of each line, from outside to inside
+    # of the surface at each contact; t of nodes and grid points is a multiple of it
+    deviation: Float[Tensor, "b f"]
+    # mean of d at the grid points of each line, from outside to inside
+    distance: Float[Tensor, "b f 23"]
     slope: Float[Tensor, "b f 5 3"]  # mean of w at the five nodes of each line
-    root: Float[
-        Tensor, "b z z"
-    ]  # of the covariance of the z = 20 f values (d, w) at all nodes, by line, then by node
+    # of the covariance of the z = 20 f values (d, w) at all nodes, by line, then by node
+    root: Float[Tensor, "b z z"]
 
 
 @functools.cache
 def grid() -> Float[Tensor, "23"]:
     """Return the 23 grid positions on a line, in standard deviations, from outside to inside."""
-    return torch.tensor(
-        [*OUTER_GRID, *(-t for t in reversed(OUTER_GRID[:-1]))], dtype=torch.float64, device="cpu"
-    )
+    return real([*OUTER_GRID, *(-t for t in reversed(OUTER_GRID[:-1]))])
 
 
 def interpolation(at: Float[Tensor, "*b"], nodes: Float[Tensor, "k"]) -> Float[Tensor, "*b k"]:
@@ -75,18 +71,23 @@ def interpolation(at: Float[Tensor, "*b"], nodes: Float[Tensor, "k"]) -> Float[T
     """
     held = torch.minimum(torch.maximum(at, nodes[-1]), nodes[0])[..., None]
     gaps = nodes[:-1] - nodes[1:]
-    share = ((nodes[:-1] - held) / gaps).clamp(0, 1)  # how far each gap has been passed
-    return torch.cat([torch.ones_like(held), share], -1) - torch.cat(
-        [share, torch.zeros_like(held)], -1
-    )
+    # how far each gap has been passed
+    share = ((nodes[:-1] - held) / gaps).clamp(0, 1)
+    begun = torch.cat([torch.ones_like(held), share], -1)
+    return begun - torch.cat([share, torch.zeros_like(held)], -1)
 
 
 def well_inside(shape: ShapeGP, contacts: Contacts) -> Bool[Tensor, "b"]:
     """Return a mask of the contact sets inside the shape's domain, at least half a fingertip's
     width from its edge.
     """
-    radius = norm(shape.normalise(contacts.points.detach().double().to(shape.device)))
+    radius = norm(_normalised_points(shape, contacts))
     return (radius + FOOTPRINT / shape.scale <= shape.domain_radius).all(-1)
+
+
+def _normalised_points(shape: ShapeGP, contacts: Contacts) -> Vectors:
+    """Return contact points in the normalised units of a shape, on its device."""
+    return shape.normalise(contacts.points.detach().double().to(shape.device))
 
 
 def line_posterior(shape: ShapeGP, contacts: Contacts) -> LinePosterior:
@@ -96,7 +97,7 @@ def line_posterior(shape: ShapeGP, contacts: Contacts) -> LinePosterior:
     f = check_contacts(contacts).fingertips
     for name, value in (("points", contacts.points), ("normals", contacts.normals)):
         check_tensor(f"contacts.{name}", value, (len(contacts), f, 3))
-    points = shape.normalise(contacts.points.detach().double().to(shape.device))
+    points = _normalised_points(shape, contacts)
     normals = check_unit(contacts.normals.detach().double().to(shape.device))
     if not bool(well_inside(shape, contacts).all()):
         raise BadArgument(
@@ -133,18 +134,25 @@ def _along_lines(
     covariances.
     """
     jet = shape.jet(points.flatten(0, 1))
-    deviation = factor * surface_deviation(jet.variance, jet.gradient).reshape(points.shape[:2])
+    deviation = surface_deviation(jet.variance, jet.gradient)
+    deviation = factor * deviation.reshape(points.shape[:2])
     nodes = deviation[..., None] * torch.tensor(NODES, device="cpu").to(deviation)
     values = 4 * len(NODES) * points.shape[1]
     covariance = points.new_empty(len(points), values, values)
     for rows in row_numbers(points).split(LINES):
         covariance[rows] = node_covariance(shape, points[rows], normals[rows], nodes[rows])
-    slope = shape.mean_and_gradient(
-        (points[:, :, None] + nodes[..., None] * normals[:, :, None]).reshape(-1, 3)
-    )[1]
+    _, slope = shape.mean_and_gradient(_on_lines(points, normals, nodes).reshape(-1, 3))
     t = deviation[..., None] * grid().to(deviation)
-    distance = shape.mean((points[:, :, None] + t[..., None] * normals[:, :, None]).reshape(-1, 3))
-    return deviation, distance.reshape(t.shape), slope.reshape(*nodes.shape, 3), covariance
+    distance = shape.mean(_on_lines(points, normals, t).reshape(-1, 3))
+    slope = slope.reshape(*nodes.shape, 3)
+    return deviation, distance.reshape(t.shape), slope, covariance
+
+
+def _on_lines(
+    points: Vectors, normals: Vectors, t: Float[Tensor, "b f n"]
+) -> Float[Tensor, "b f n 3"]:
+    """Return the points x + t n of the lines through the contacts x along their normals n."""
+    return points[:, :, None] + t[..., None] * normals[:, :, None]
 
 
 def node_covariance(
@@ -158,23 +166,23 @@ def node_covariance(
     """
     width = FOOTPRINT / shape.scale
     along = dot(points, normals)
-    half_chord = (along**2 + (shape.domain_radius - width) ** 2 - (points**2).sum(-1)).sqrt()
-    nodes = torch.maximum(
-        torch.minimum(nodes, (half_chord - along)[..., None]), -(half_chord + along)[..., None]
-    )
+    inner = (shape.domain_radius - width) ** 2
+    half_chord = (along**2 + inner - (points**2).sum(-1)).sqrt()
+    nodes = torch.minimum(nodes, (half_chord - along)[..., None])
+    nodes = torch.maximum(nodes, -(half_chord + along)[..., None])
     first = tangents(points, normals)
-    axes = torch.stack(
-        [normals, first, torch.linalg.cross(normals, first)], 2
-    )  # (b, line, axis, 3)
-    around = torch.cat([torch.zeros_like(axes[:, :, :1]), axes, -axes], 2) * width
-    places = points[:, :, None] + nodes[..., None] * normals[:, :, None]
+    second = torch.linalg.cross(normals, first)
+    axes = torch.stack([normals, first, second], 2)  # (b, line, axis, 3)
+    both = torch.cat([axes, -axes], 2)
+    around = torch.cat([torch.zeros_like(axes[:, :, :1]), both], 2) * width
+    places = _on_lines(points, normals, nodes)
     queries = places[:, :, :, None] + around[:, :, None]  # (b, line, node, 7, 3)
+    # of the seven values around a node: its own distance, and a difference along each axis
     weights = points.new_zeros(*points.shape[:2], 4, 7)
     weights[..., 0, 0] = 1.0
-    weights[..., 1:, 1:] = torch.cat([axes, -axes], 2).mT / (2 * width)
-    return combined_covariance(
-        shape, queries.flatten(1, 2), weights.repeat_interleave(len(NODES), 1)
-    )
+    weights[..., 1:, 1:] = both.mT / (2 * width)
+    weights = weights.repeat_interleave(len(NODES), 1)
+    return combined_covariance(shape, queries.flatten(1, 2), weights)
 
 
 TouchPoints = Float[Tensor, "b n f 3"]
@@ -191,20 +199,21 @@ def first_contact(
     deviation = drawn.unflatten(-1, (lines.points.shape[1], len(NODES), 4))
     t = grid().to(drawn)
     nodes = torch.tensor(NODES, device="cpu").to(drawn)
-    distance = lines.distance[:, None] + deviation[..., 0] @ interpolation(t, nodes).T
+    between = deviation[..., 0] @ interpolation(t, nodes).T
+    distance = lines.distance[:, None] + between  # (b, n, f, 23)
     crosses = (distance[..., :-1] > 0) & (distance[..., 1:] <= 0)
     far = torch.where(crosses, t[:-1].abs(), torch.inf)
     nearest, before = far.min(-1, keepdim=True)
     high = distance.gather(-1, before)
     low = distance.gather(-1, before + 1)
-    stop = torch.lerp(t[before], t[before + 1], high / (high - low))
+    passed = high / (high - low)
+    stop = torch.lerp(t[before], t[before + 1], passed)
     stop = torch.where(torch.isinf(nearest), torch.nan, stop)
     weights = interpolation(stop, nodes)  # (b, n, f, 1, k)
     slope = lines.slope[:, None] + deviation[..., 1:]
     motion = stop * lines.deviation[:, None, :, None]
-    return lines.points[:, None] + motion * lines.normals[:, None], unit(
-        (weights @ slope)[..., 0, :]
-    )
+    points = lines.points[:, None] + motion * lines.normals[:, None]
+    return points, unit((weights @ slope)[..., 0, :])
 
 
 @checked
@@ -275,10 +284,10 @@ def closed_share(lines: LinePosterior, friction: float, n: int, seed: int) -> Fl
     for start in range(0, n, at_once):
         size = min(at_once, n - start), lines.root.shape[-1]
         standard = torch.randn(size, dtype=torch.float64, generator=generator, device="cpu")
-        for rows in torch.arange(len(lines), device=count.device).split(
-            max(judged // len(standard), 1)
-        ):
-            points, normals = first_contact(lines[rows], standard.to(count) @ lines.root[rows])
+        parts = row_numbers(count).split(max(judged // len(standard), 1))
+        for rows in parts:
+            drawn = standard.to(count) @ lines.root[rows]
+            points, normals = first_contact(lines[rows], drawn)
             balance = None if guess is None else guess[rows].repeat_interleave(len(standard), 0)
             closed = closed_exact(points.flatten(0, 1), normals.flatten(0, 1), friction, balance)
             count[rows] += closed.unflatten(0, points.shape[:2]).sum(1)

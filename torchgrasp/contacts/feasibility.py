@@ -16,6 +16,7 @@ from torchgrasp.contacts.form_closure import (
     Vectors,
     cone_edges,
     rank_ratio,
+    residual_of,
     solve_closure_lp,
     tangents,
     wrenches,
@@ -70,7 +71,8 @@ def normal_variation(
         own = torch.nonzero(own & among).unbind(1)
         surface = rows_of(wall, own[0])
         around = project(surface, ring[own], steps=1)
-        there = unit(surface.mean_and_gradient(around.flatten(0, 1))[1]).view_as(around)
+        _, gradient = surface.mean_and_gradient(around.flatten(0, 1))
+        there = unit(gradient).view_as(around)
         here = normals[own][:, None].expand_as(there)
         sine = norm(torch.linalg.cross(here, there))
         variation[own] = torch.atan2(sine, dot(here, there)).amax(-1)
@@ -139,10 +141,11 @@ def _wall_constraint(
     change = there.normal_jacobian.view(*ring.shape, 3) @ ring_by_point - normal_jacobian
     slope = (direction[..., None, :] @ change)[..., 0, :]
     own = eye_like(points.shape[1], points)
-    by_points = (
-        torch.einsum("bkij,il->bkilj", spread(radius, slope) * slope, own).flatten(3).flatten(1, 2)
-    )
-    value = spread(radius, points[:, 0]) * (chord - 2 * math.sin(INSIDE * flatness / 2)).flatten(1)
+    slope = spread(radius, slope) * slope
+    by_points = torch.einsum("bkij,il->bkilj", slope, own)
+    by_points = by_points.flatten(3).flatten(1, 2)  # (b, k f, 3 f)
+    over = chord - 2 * math.sin(INSIDE * flatness / 2)
+    value = spread(radius, points[:, 0]) * over.flatten(1)
     return FlatnessConstraint(value, by_points, points)
 
 
@@ -164,17 +167,18 @@ def check_feasibility(shape: ShapeLike, problem: ContactProblem, points: Vectors
     wrench = torch.where(finite[:, None, None, None], wrench, 0.0)
     flat = wrench.flatten(1, 2)
     coefficients, _ = solve_closure_lp(flat)
-    residual = (coefficients[:, None] @ flat)[:, 0].abs().amax(-1)
-    closed = finite & (residual <= BALANCED) & (coefficients.amin(-1) >= MIN_MARGIN)
+    closed = finite & (residual_of(flat, coefficients) <= BALANCED)
+    closed &= coefficients.amin(-1) >= MIN_MARGIN
     closed &= rank_ratio(wrench) >= MIN_RANK_RATIO  # 0 / 0 of a row that is not finite is False
 
     apart = norm(problem.sides(points, normals)).amin(-1) * scale
     room = problem.room(points, normals)
+    sure = (jet.variance >= 0) & (jet.variance < spec.max_variance)
     good = {
         Status.OUT_OF_DOMAIN: norm(points).amax(-1) <= shape.domain_radius,
         Status.OFF_SURFACE: (jet.distance.abs() <= ON_SURFACE).all(-1),
         Status.OUTSIDE: within(problem, points).all(-1),
-        Status.TOO_UNCERTAIN: ((jet.variance >= 0) & (jet.variance < spec.max_variance)).all(-1),
+        Status.TOO_UNCERTAIN: sure.all(-1),
         Status.BELOW_TABLE: (room >= 0).all(-1),
         Status.TOO_CLOSE: apart >= spec.least_separation,
         Status.DEGENERATE: ~degenerate(points),
@@ -184,11 +188,9 @@ def check_feasibility(shape: ShapeLike, problem: ContactProblem, points: Vectors
         # before.
         rows = flatnonzero(torch.stack(list(good.values())).all(0))
         ring = problem.rows(rows).ring
-        flat_rows = (
-            normal_variation(rows_of(shape, rows), points[rows], normals[rows], ring).amax(-1)
-            <= spec.flatness
-        )
-        good[Status.NOT_FLAT] = torch.ones_like(closed).index_put((rows,), flat_rows)
+        variation = normal_variation(rows_of(shape, rows), points[rows], normals[rows], ring)
+        is_flat = variation.amax(-1) <= spec.flatness
+        good[Status.NOT_FLAT] = torch.ones_like(closed).index_put((rows,), is_flat)
     good[Status.NOT_CLOSED] = closed
     deviation = surface_deviation(jet.variance, jet.gradient)
     std_m = spread(shape.std_factor * scale, deviation) * deviation
@@ -204,7 +206,8 @@ def within(problem: ContactProblem, points: Float[Tensor, "*b 3"]) -> Bool[Tenso
     """
     if problem.beyond is None:
         return torch.ones_like(points[..., 0], dtype=torch.bool)
-    return (problem.beyond(points.flatten(0, -2)) < BORDER).view(points.shape[:-1])
+    inside = problem.beyond(points.flatten(0, -2)) < BORDER
+    return inside.view(points.shape[:-1])
 
 
 def first_violation(good: dict[Status, Bool[Tensor, "b"]]) -> Int[Tensor, "b"]:
@@ -213,4 +216,5 @@ def first_violation(good: dict[Status, Bool[Tensor, "b"]]) -> Int[Tensor, "b"]:
     """
     met = torch.stack(list(good.values()))
     codes = torch.tensor([*good, Status.OK], device=met.device)
-    return codes[torch.where(met.all(0), len(good), (~met).to(torch.uint8).argmax(0))]
+    first = (~met).to(torch.uint8).argmax(0)
+    return codes[torch.where(met.all(0), len(good), first)]

@@ -27,7 +27,7 @@ from torch import Tensor
 
 from torchgrasp.foundation.base import at_once, flatnonzero, in_chunks
 from torchgrasp.geometry.frames import degenerate, subsets
-from torchgrasp.geometry.linalg import dot, eye_like, norm, unit
+from torchgrasp.geometry.linalg import dot, eye_like, matvec, norm, unit
 
 Vectors = Float[Tensor, "b f 3"]  # points or normals of the contacts in every row
 Guess = Float[Tensor, "b m"] | None  # coefficients of the first wrenches of each cone
@@ -59,10 +59,15 @@ def centre_and_radius(points: Vectors) -> tuple[Float[Tensor, "b 1 3"], Float[Te
     would be 0.
     """
     centre = points.mean(-2, keepdim=True)
-    radius = torch.linalg.vector_norm(points - centre, dim=(-2, -1), keepdim=True) / math.sqrt(
-        points.shape[-2]
-    )
+    size = torch.linalg.vector_norm(points - centre, dim=(-2, -1), keepdim=True)
+    radius = size / math.sqrt(points.shape[-2])
     return centre, torch.where(radius == 0, 1.0, radius)
+
+
+def scaled_arms(points: Vectors) -> Vectors:
+    """Return the points about their centroid, divided by their root-mean-square radius."""
+    centre, radius = centre_and_radius(points)
+    return (points - centre) / radius
 
 
 def tangents(points: Vectors, normals: Vectors) -> Vectors:
@@ -73,11 +78,11 @@ def tangents(points: Vectors, normals: Vectors) -> Vectors:
     weighted by area. The tangent is arbitrary where no plane gives one and friction cannot give
     closure.
     """
-    first, second, third = subsets(points.shape[1], 3, points.device).unbind(1)
-    plane = torch.linalg.cross(
-        points[:, second] - points[:, first], points[:, third] - points[:, first]
-    )  # (b, k, 3)
-    inside = torch.linalg.cross(plane[:, None], normals[:, :, None])  # (b, f, k, 3)
+    corners = subsets(points.shape[1], 3, points.device)
+    first, second, third = (points[:, corner] for corner in corners.unbind(1))
+    plane = torch.linalg.cross(second - first, third - first)  # (b, k, 3)
+    outward = normals[:, :, None]
+    inside = torch.linalg.cross(plane[:, None], outward)  # (b, f, k, 3)
     length, best = norm(inside).max(-1, keepdim=True)
     inside = _take(inside, best)
     size = norm(plane).amax(-1)[:, None, None]
@@ -86,16 +91,18 @@ def tangents(points: Vectors, normals: Vectors) -> Vectors:
     stand_in = torch.linalg.cross(axis, normals)
     if points.shape[1] > 3:
         away = points[:, None] - points[:, :, None]
-        away = away - dot(away, normals[:, :, None], keepdim=True) * normals[:, :, None]
+        away = away - dot(away, outward, keepdim=True) * outward
         far, farthest = norm(away).max(-1, keepdim=True)
-        stand_in = torch.where(far**2 > SEAM * size, _take(away, farthest), stand_in)
+        distinct = far**2 > SEAM * size
+        stand_in = torch.where(distinct, _take(away, farthest), stand_in)
     seam = ~(length > SEAM * size) | (size == 0)
     return unit(torch.where(seam, stand_in, inside))
 
 
 def _take(vectors: Float[Tensor, "b f k 3"], index: Int[Tensor, "b f 1"]) -> Vectors:
     """Return the vector with the given index among the k vectors at each contact."""
-    return vectors.gather(2, index[..., None].expand(-1, -1, 1, 3))[:, :, 0]
+    at = index[..., None].expand(-1, -1, 1, 3)
+    return vectors.gather(2, at)[:, :, 0]
 
 
 def cone_edges(
@@ -104,9 +111,10 @@ def cone_edges(
     """Return the edges of linearised friction cones: forces of normal component 1; the first leans
     along `tangent`.
     """
-    angle = torch.arange(edges, dtype=normals.dtype, device=normals.device) * (2 * math.pi / edges)
+    edge = torch.arange(edges, dtype=normals.dtype, device=normals.device)
+    angle = edge[:, None] * (2 * math.pi / edges)
     other = torch.linalg.cross(normals, tangent)
-    lean = angle.cos()[:, None] * tangent[..., None, :] + angle.sin()[:, None] * other[..., None, :]
+    lean = angle.cos() * tangent[..., None, :] + angle.sin() * other[..., None, :]
     return friction * lean - normals[..., None, :]
 
 
@@ -120,8 +128,12 @@ def wrenches(
     root-mean-square radius.
     """
     force = cone_edges(normals, tangents(points, normals), friction, edges)
-    centre, radius = centre_and_radius(points)
-    arm = ((points - centre) / radius)[:, :, None].expand_as(force)
+    arm = scaled_arms(points)[:, :, None]
+    return with_torque(force, arm.expand_as(force))
+
+
+def with_torque(force: Float[Tensor, "*b 3"], arm: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 6"]:
+    """Return wrenches: forces, then the torques that they have at their arms."""
     return torch.cat([force, torch.linalg.cross(arm, force)], -1)
 
 
@@ -153,9 +165,9 @@ def _solve(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b m"], Float[
     b, m, _ = wrench.shape
     mean = wrench.mean(1)
     found, index, multiplier = maximise(mean, m * (mean[:, None] - wrench))
-    margin = 1 / m - multiplier.sum(1)
-    phi = margin[:, None].expand(b, m).scatter_add(1, index, m * multiplier)
-    return phi, found / torch.linalg.vector_norm(found, dim=1, keepdim=True)
+    margin = 1 / m - multiplier.sum(1, keepdim=True)
+    phi = margin.expand(b, m).scatter_add(1, index, m * multiplier)
+    return phi, unit(found)
 
 
 def maximise(
@@ -183,20 +195,20 @@ def maximise(
         # Leave along the edge on which the objective grows fastest; the multiplier of a bound may
         # not be negative.
         gain = torch.where(artificial, multiplier.abs(), -multiplier)
-        most, leaving = torch.where(
-            artificial & (gain > OPTIMAL), gain + ARTIFICIAL_GAIN, gain
-        ).max(1)
+        rising = artificial & (gain > OPTIMAL)
+        most, leaving = torch.where(rising, gain + ARTIFICIAL_GAIN, gain).max(1)
         running = running & (most > OPTIMAL)
         if k % every == 0 and not bool(running.any()):
             break
-        sign = torch.where(artificial & (multiplier > 0), 1.0, -1.0)[row, leaving]
+        backward = artificial & (multiplier > 0)
+        sign = torch.where(backward, 1.0, -1.0)[row, leaving]
         edge = inverse[row, :, leaving]
         step = sign[:, None] * edge
-        rate = (bounds @ step[:, :, None])[:, :, 0]
-        blocking = rate > BLOCKING * torch.linalg.vector_norm(step, dim=1, keepdim=True)
-        blocking.scatter_(
-            1, tight.clamp(min=0), blocking.gather(1, tight.clamp(min=0)) & artificial
-        )
+        rate = matvec(bounds, step)
+        blocking = rate > BLOCKING * norm(step, keepdim=True)
+        # a tight bound blocks nothing
+        index = tight.clamp(min=0)
+        blocking.scatter_(1, index, blocking.gather(1, index) & artificial)
         length, entering = torch.where(blocking, slack / rate, torch.inf).min(1)
         unbounded = running & torch.isinf(length)
         ray = torch.where(unbounded[:, None], step, ray)
@@ -207,20 +219,21 @@ def maximise(
         change = (normal[:, None] @ inverse)[:, 0]
         pivot = change[row, leaving]
         change[row, leaving] -= 1.0
-        updated = inverse - (edge / pivot[:, None])[:, :, None] * change[:, None]
+        scaled = edge / pivot[:, None]
+        updated = inverse - scaled[:, :, None] * change[:, None]
         inverse = torch.where(running[:, None, None], updated, inverse)
-        tight[row, leaving] = torch.where(running, entering, tight[row, leaving])
+        before = tight[row, leaving]
+        tight[row, leaving] = torch.where(running, entering, before)
     # From the tight rows alone, so that the roundings of the pivots are gone.
     artificial = tight < 0
     index = tight.clamp(min=0)
-    identity = eye_like(d, bounds)
-    basis = torch.where(
-        artificial[:, :, None], identity, bounds.gather(1, index[:, :, None].expand(b, d, d))
-    )
+    chosen = bounds.gather(1, index[:, :, None].expand(b, d, d))
+    basis = torch.where(artificial[:, :, None], eye_like(d, bounds), chosen)
     vertex, _ = torch.linalg.solve_ex(basis, (~artificial).to(bounds))
     multiplier, _ = torch.linalg.solve_ex(basis.mT, objective)
     multiplier = torch.where(artificial, 0.0, multiplier)
-    return torch.where((ray != 0).any(1, keepdim=True), ray, vertex), index, multiplier
+    unbounded = (ray != 0).any(1, keepdim=True)
+    return torch.where(unbounded, ray, vertex), index, multiplier
 
 
 def closed_exact(
@@ -240,7 +253,12 @@ def first_balance(points: Vectors, normals: Vectors, friction: float) -> Float[T
     """Return coefficients that balance wrenches of few cone edges with the greatest margin;
     arbitrary if none do.
     """
-    return solve_closure_lp(wrenches(points, normals, friction, FIRST_EDGES).flatten(1, 2))[0]
+    return solve_closure_lp(_first_wrenches(points, normals, friction))[0]
+
+
+def _first_wrenches(points: Vectors, normals: Vectors, friction: float) -> Float[Tensor, "b m 6"]:
+    """Return the wrenches of few edges of all friction cones."""
+    return wrenches(points, normals, friction, FIRST_EDGES).flatten(1, 2)
 
 
 def _closed_in_plane(points: Vectors, normals: Vectors, friction: float) -> Bool[Tensor, "b"]:
@@ -251,20 +269,20 @@ def _closed_in_plane(points: Vectors, normals: Vectors, friction: float) -> Bool
     these angles must positively span all planar wrenches: no plane through two of the wrenches has
     the others on one side.
     """
-    centre, radius = centre_and_radius(points)
-    arm = (points - centre) / radius
-    across = unit(torch.linalg.cross(arm[:, 1] - arm[:, 0], arm[:, 2] - arm[:, 0]))
-    along = unit(arm[:, 1] - arm[:, 0])
+    arm = scaled_arms(points)
+    first, second, third = arm.unbind(1)
+    across = unit(torch.linalg.cross(second - first, third - first))
+    along = unit(second - first)
     basis = torch.stack([along, torch.linalg.cross(across, along)], -1)  # (b, 3, 2)
     inward = -normals @ basis
     position = arm @ basis
     projected = norm(inward)
     cone = math.cos(math.atan(friction))
-    rows = flatnonzero(
-        (projected > cone).all(-1)
-    )  # the others have a cone that the plane does not cut
+    # the others have a cone that the plane does not cut
+    rows = flatnonzero((projected > cone).all(-1))
+    half = torch.arccos(cone / projected[rows])
     closed = points.new_zeros(len(points), dtype=torch.bool)
-    closed[rows] = _spans_plane(inward[rows], position[rows], torch.arccos(cone / projected[rows]))
+    closed[rows] = _spans_plane(inward[rows], position[rows], half)
     return closed
 
 
@@ -278,11 +296,11 @@ def _spans_plane(
     """
     middle = torch.atan2(inward[..., 1], inward[..., 0])
     angle = torch.stack([middle - half, middle + half], -1)  # (b, 3, 2)
-    c = angle.cos()
-    s = angle.sin()
-    planar = torch.stack(
-        [c, s, position[..., 0, None] * s - position[..., 1, None] * c], -1
-    ).flatten(1, 2)
+    cosine = angle.cos()
+    sine = angle.sin()
+    x, y = position[..., None].unbind(-2)
+    planar = torch.stack([cosine, sine, x * sine - y * cosine], -1)
+    planar = planar.flatten(1, 2)  # (b, 6, 3): forces in the plane and their torque
     first, second = subsets(6, 2, inward.device).unbind(-1)
     plane = torch.linalg.cross(planar[:, first], planar[:, second])  # (b, 15, 3)
     side = plane @ planar.mT  # (b, 15, 6)
@@ -300,8 +318,9 @@ def _closed_by_proof(
     closed = points.new_zeros(len(points), dtype=torch.bool)
     if friction == 0:  # forces along normals may balance, but only seven or more span all wrenches
         return closed
-    rows = flatnonzero((torch.isfinite(points) & torch.isfinite(normals)).flatten(1).all(1))
-    wrench = wrenches(points[rows], normals[rows], friction, FIRST_EDGES).flatten(1, 2)
+    finite = torch.isfinite(points) & torch.isfinite(normals)
+    rows = flatnonzero(finite.flatten(1).all(1))
+    wrench = _first_wrenches(points[rows], normals[rows], friction)
     if guess is not None:
         phi = guess[rows]  # corrected to balance the wrenches
         weighted = phi.square()[..., None] * wrench
@@ -328,7 +347,12 @@ def _balances(wrench: Float[Tensor, "b m 6"], phi: Float[Tensor, "b m"]) -> Bool
     """Return for each contact set whether the coefficients `phi` are positive and sum its wrenches
     to zero.
     """
-    return ((phi[:, None] @ wrench)[:, 0].abs().amax(-1) <= BALANCED) & (phi.amin(-1) > BALANCED)
+    return (residual_of(wrench, phi) <= BALANCED) & (phi.amin(-1) > BALANCED)
+
+
+def residual_of(wrench: Float[Tensor, "b m 6"], phi: Float[Tensor, "b m"]) -> Float[Tensor, "b"]:
+    """Return the largest number, by its size, of the sum of wrenches with coefficients `phi`."""
+    return (phi[:, None] @ wrench)[:, 0].abs().amax(-1)
 
 
 def most_opposing(
@@ -340,14 +364,12 @@ def most_opposing(
     A witness is a wrench that disproves force closure: its products with all contact wrenches are
     at least 0.
     """
-    centre, radius = centre_and_radius(points)
-    arm = (points - centre) / radius
-    force, torque = witness[:, None].expand(-1, points.shape[1], -1).split(3, -1)
+    arm = scaled_arms(points)
+    force, torque = witness[:, None].expand(*points.shape[:2], 6).split(3, -1)
     motion = force + torch.linalg.cross(torque, arm)
     along = dot(motion, normals, keepdim=True)
     sideways = motion - along * normals
     length = norm(sideways, keepdim=True)
     push = -normals - friction * sideways / torch.where(length == 0, 1.0, length)
-    return -(along + friction * length)[..., 0], torch.cat(
-        [push, torch.linalg.cross(arm, push)], -1
-    )
+    least = -(along + friction * length)[..., 0]
+    return least, with_torque(push, arm)

@@ -98,12 +98,14 @@ def walls_at(shape: AnyShape, points: Vectors) -> list[tuple[AnyShape, Bool[Tens
     if len(walls) == 1:
         return [(walls[0], points.new_ones(points.shape[:2], dtype=torch.bool))]
     owner = getattr(shape, "wall_at")(points.flatten(0, 1))  # noqa: B009
-    return list(zip(walls, owner.unflatten(0, points.shape[:2]).unbind(-1), strict=True))
+    masks = owner.unflatten(0, points.shape[:2]).unbind(-1)
+    return list(zip(walls, masks, strict=True))
 
 
 def triple_jet(shape: ShapeLike, points: Vectors) -> SurfaceJet:
     """Return mean and variance of the signed distance, with their derivatives, at all contacts."""
-    return map_tensors(lambda x: x.unflatten(0, points.shape[:2]), shape.jet(points.flatten(0, 1)))
+    jet = shape.jet(points.flatten(0, 1))
+    return map_tensors(lambda x: x.unflatten(0, points.shape[:2]), jet)
 
 
 def triple_mean_jet(shape: ShapeLike, points: Vectors) -> MeanJet:
@@ -111,9 +113,8 @@ def triple_mean_jet(shape: ShapeLike, points: Vectors) -> MeanJet:
     computed if possible.
     """
     jet = getattr(shape, "mean_jet", shape.jet)(points.flatten(0, 1))
-    return MeanJet(
-        *(x.unflatten(0, points.shape[:2]) for x in (jet.distance, jet.gradient, jet.hessian))
-    )
+    values = jet.distance, jet.gradient, jet.hessian
+    return MeanJet(*(x.unflatten(0, points.shape[:2]) for x in values))
 
 
 @functools.cache
@@ -184,14 +185,12 @@ def forces_from_tensions(
     """
     first, second = contact_pairs(points.shape[1], points.device)
     sides = points[:, second] - points[:, first]
-    return pull_signs(points.shape[1], points.device).to(points) @ (
-        tension[..., None] * sides
-    ), sides
+    signs = pull_signs(points.shape[1], points.device).to(points)
+    return signs @ (tension[..., None] * sides), sides
 
 
-Bounds = tuple[
-    Float[Tensor, "b k"], Float[Tensor, "b k u"]
-]  # values that should be <= 0, with Jacobian
+# values that should be <= 0, with Jacobian
+Bounds = tuple[Float[Tensor, "b k"], Float[Tensor, "b k u"]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -226,9 +225,8 @@ class ContactProblem:
         table = spec.plane
         up = None
         floor = 0.0
-        scale, radius = (
-            x if isinstance(x, Tensor) else float(x) for x in (shape.scale, shape.domain_radius)
-        )
+        sizes = shape.scale, shape.domain_radius
+        scale, radius = (x if isinstance(x, Tensor) else float(x) for x in sizes)
         if table is not None:
             up = table.normal.to(device_of(shape))
             foot = table.offset * table.normal
@@ -237,16 +235,14 @@ class ContactProblem:
             else:
                 floor = float(shape.normalise(foot) @ table.normal)
         separation = spec.least_separation / scale
-        separation = (
-            separation.clamp_min(LEAST_SIDE)
-            if isinstance(separation, Tensor)
-            else max(separation, LEAST_SIDE)
-        )
+        if isinstance(separation, Tensor):
+            separation = separation.clamp_min(LEAST_SIDE)
+        else:
+            separation = max(separation, LEAST_SIDE)
         ring = (spec.ring_radius if ring_radius is None else ring_radius) / scale
         friction = spec.planned_friction * math.cos(math.pi / spec.edges)
-        beyond = (
-            None if (region := spec.region) is None else lambda x: region(shape.metres(x)) / scale
-        )
+        region = spec.region
+        beyond = None if region is None else lambda x: region(shape.metres(x)) / scale
         return cls(
             spec,
             friction,
@@ -301,12 +297,10 @@ class ContactProblem:
         threshold = self.spec.max_variance * INSIDE
         ball = self.domain_radius * INSIDE
         edge = spread(ball, tension)
-        half_slope = (
-            2 * threshold**0.5
-        )  # slope of the variance at the threshold, for a linear standard deviation
-        centre_by_point = (
-            identity + spread(self.tip_radius, jet.normal_jacobian) * jet.normal_jacobian
-        )
+        # slope of the variance at the threshold, for a linear standard deviation
+        half_slope = 2 * threshold**0.5
+        tilt = jet.normal_jacobian
+        centre_by_point = identity + spread(self.tip_radius, tilt) * tilt
         cones, cones_by_x = self._cones(points, tension, jet)
         distances, distances_by_x = self._distances(points, jet.normals, centre_by_point)
         beyond = (dot(points, points) - edge**2) / (2 * edge)
@@ -339,8 +333,9 @@ class ContactProblem:
         assert self.beyond is not None
         step = DIFFERENCE
         sides = step * torch.cat([torch.eye(3), -torch.eye(3), torch.zeros(1, 3)]).to(points)
-        found = self.beyond((points[:, :, None] + sides).flatten(0, 2)).view(*points.shape[:2], 7)
-        return found[..., 6], (found[..., :3] - found[..., 3:6]) / (2 * step)
+        found = self.beyond((points[:, :, None] + sides).flatten(0, 2))
+        ahead, behind, here = found.view(*points.shape[:2], 7).split([3, 3, 1], -1)
+        return here[..., 0], (ahead - behind) / (2 * step)
 
     def _distances(
         self, points: Vectors, normals: Vectors, centre_by_point: Float[Tensor, "b f 3 3"]
@@ -357,9 +352,8 @@ class ContactProblem:
         blocks[:, pair, first] = (along @ centre_by_point[:, first])[..., 0, :]
         blocks[:, pair, second] = -(along @ centre_by_point[:, second])[..., 0, :]
         by_tension = points.new_zeros(len(points), len(pair), len(pair))
-        return spread(self.separation / INSIDE, length) - length, torch.cat(
-            [blocks.flatten(2), by_tension], 2
-        )
+        short = spread(self.separation / INSIDE, length) - length
+        return short, torch.cat([blocks.flatten(2), by_tension], 2)
 
     def _cones(self, points: Vectors, tension: Float[Tensor, "b p"], jet: SurfaceJet) -> Bounds:
         """Return by how much each force is outside its friction cone, as a difference of cosines,
@@ -375,21 +369,20 @@ class ContactProblem:
         outward = dot(normals, direction, keepdim=True)
         by_force = (normals - outward * direction) / size
         steep = norm(jet.gradient, keepdim=True)
-        across = (
-            direction - outward * normals
-        ) / steep  # (1 - n n^T) u / |g|, which the Hessian carries to the point
+        # (1 - n n^T) u / |g|, which the Hessian carries to the point
+        across = (direction - outward * normals) / steep
         by_point = (across[..., None, :] @ jet.hessian)[..., 0, :]
         first, second = contact_pairs(len(at), points.device)
-        between = tension.new_zeros(
-            len(points), len(at), len(at)
-        )  # the tension between two contacts
+        # the tension between two contacts
+        between = tension.new_zeros(len(points), len(at), len(at))
         between[:, first, second] = between[:, second, first] = tension
         blocks = between[..., None] * by_force[:, :, None]
         blocks[:, at, at] = by_point - between.sum(2, keepdim=True) * by_force
         along = dot(by_force[:, :, None], sides[:, None])
         by_tension = along * pull_signs(len(at), points.device).to(points)
         cosine = 1 / math.sqrt(1 + self.friction**2)
-        return outward[..., 0] + cosine + CONE_MARGIN, torch.cat([blocks.flatten(2), by_tension], 2)
+        excess = outward[..., 0] + cosine + CONE_MARGIN
+        return excess, torch.cat([blocks.flatten(2), by_tension], 2)
 
 
 def _by_own_point(slope: Vectors, unknowns: int) -> Float[Tensor, "b f u"]:

@@ -82,14 +82,13 @@ class Region(Value):
             )
         middle = (low + high).double() / 2
         half = (high - low).double() / 2
-        frame = (
-            torch.eye(4, dtype=torch.float64)
-            if obj_from_box is None
-            else inverse(obj_from_box.double())
-        )
+        frame = torch.eye(4, dtype=torch.float64)
+        if obj_from_box is not None:
+            frame = inverse(obj_from_box.double())
 
         def distance(points: Tensor) -> Tensor:
-            beyond = (apply(frame.to(points), points) - middle.to(points)).abs() - half.to(points)
+            local = apply(frame.to(points), points) - middle.to(points)
+            beyond = local.abs() - half.to(points)
             return norm(beyond.clamp_min(0)) + beyond.amax(-1).clamp_max(0)
 
         return cls(distance)

@@ -26,6 +26,7 @@ from torchgrasp.contacts.form_closure import (
     wrenches,
 )
 from torchgrasp.foundation.base import row_numbers
+from torchgrasp.geometry.linalg import dot
 from torchgrasp.values.specs import ContactSpec
 
 
@@ -55,11 +56,12 @@ def resist_loads(
     count = loads.shape[1]
     centre, radius = centre_and_radius(points)
     force, torque = loads.split(3, -1)
-    about = torch.cat([force, torque - torch.linalg.cross(centre.expand_as(force), force)], -1)
-    unit = (
-        torch.cat([torch.ones_like(radius), radius], 1).repeat_interleave(3, 1).mT
-    )  # of wrenches in Eq. (13)
-    edge = strength[..., None, None] * wrenches(points, normals, spec.planned_friction, spec.edges)
+    torque = torque - torch.linalg.cross(centre.expand_as(force), force)
+    about = torch.cat([force, torque], -1)
+    # of wrenches in Eq. (13): (b, 1, 6)
+    unit = torch.cat([torch.ones_like(radius), radius], 1).repeat_interleave(3, 1).mT
+    edge = wrenches(points, normals, spec.planned_friction, spec.edges)
+    edge = strength[..., None, None] * edge
     edge = torch.cat([edge, torch.zeros_like(edge[:, :, :1])], 2)  # the last is no push
     goal = (-about / unit).flatten(0, 1)
     rows = row_numbers(goal).split(GRASPS_PER_CHUNK)
@@ -80,17 +82,15 @@ def _solve(
     own = torch.eye(f).to(edge)  # the unknowns are y and u_i = 2f z_i - 1
     above = torch.cat([2 * f * edge, -own[:, None].expand(r, f, e, f)], -1).flatten(1, 2)
     total = torch.cat([edge.new_zeros(6), edge.new_full((f,), 1 / f)]).expand(r, 1, -1)
-    found, tight, weight = maximise(
-        torch.cat([goal, goal.new_zeros(r, f)], 1), torch.cat([above, total], 1)
-    )
-    share = goal.new_zeros(r, f * e + 1).scatter_add(1, tight, weight)[:, :-1].view(r, f, e, 1)
+    objective = torch.cat([goal, goal.new_zeros(r, f)], 1)
+    found, tight, weight = maximise(objective, torch.cat([above, total], 1))
+    share = goal.new_zeros(r, f * e + 1).scatter_add(1, tight, weight)
+    share = share[:, :-1].view(r, f, e, 1)
     made = (2 * f * share * edge).sum(2)
     gauge = weight.sum(1)
     y = found[:, :6]
-    exact = (
-        ((made.sum(1) - goal).abs().amax(1) <= BALANCED)
-        & (weight.amin(1) >= -BALANCED)
-        & (gauge > 0)
-    )
+    exact = (made.sum(1) - goal).abs().amax(1) <= BALANCED
+    exact &= (weight.amin(1) >= -BALANCED) & (gauge > 0)
     margin = torch.where(exact, 1 / gauge, 0.0)
-    return margin, y / (goal * y).sum(1, keepdim=True), made[..., :3] * margin[:, None, None]
+    twist = y / dot(goal, y, keepdim=True)
+    return margin, twist, made[..., :3] * margin[:, None, None]

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.contacts.feasibility import normal_variation, within
@@ -91,11 +91,11 @@ def drawn_starts(
     sets of candidate contacts, because the centroid of contacts on flat surface may lie far from
     the object's centre.
     """
-    (spec, candidates), generator = settled, torch.Generator().manual_seed(seed)
+    spec, candidates = settled
+    generator = torch.Generator().manual_seed(seed)
     if candidates is not None:
-        draw(
-            shape, spec, (CANDIDATE_TRIPLES, 3), generator
-        )  # the rows are drawn after the candidates
+        # the rows are drawn after the candidates
+        draw(shape, spec, (CANDIDATE_TRIPLES, 3), generator)
     for count in sizes:
         if candidates is None:
             drawn = draw(shape, spec, (count, spec.fingertips), generator)
@@ -121,10 +121,8 @@ def settle_flatness(shape: ShapeLike, spec: ContactSpec, seed: int) -> FlatCandi
     for radius in FLAT_RADII if spec.flat_radius is None else (spec.flat_radius,):
         settled = dataclasses.replace(spec, flat_radius=radius)
         ring = radius / float(shape.scale)
-        flat = (
-            normal_variation(shape, points, normals, ring, good)
-            < CANDIDATE_FLATNESS * spec.flatness
-        )
+        variation = normal_variation(shape, points, normals, ring, good)
+        flat = variation < CANDIDATE_FLATNESS * spec.flatness
         if int(flat.sum()) >= spec.fingertips and radius not in (spec.flat_radius, FLAT_RADII[-1]):
             generator = torch.Generator().manual_seed(seed)
             _, closed = candidate_rows(problem, points[flat], normals[flat], SURVEYED, generator)
@@ -207,23 +205,20 @@ def candidate_rows(
     rows = []
     missing = starts
     f = problem.spec.fingertips
-    drawn = DRAWN_PER_START * starts, f
+
+    def choose(sets: int) -> Int[Tensor, "s f"]:
+        drawn = torch.randint(len(points), (sets, f), generator=generator, device="cpu")
+        return drawn.to(points.device)
+
     for _ in range(ROUNDS):
-        choice = torch.randint(len(points), drawn, generator=generator, device="cpu").to(
-            points.device
-        )
+        choice = choose(DRAWN_PER_START * starts)
         apart = norm(problem.sides(points[choice], normals[choice])).amin(-1)
         choice = choice[apart > problem.separation]
-        closed = choice[closed_exact(points[choice], normals[choice], problem.friction)][:missing]
-        rows.append(points[closed])
-        missing -= len(closed)
+        closed = closed_exact(points[choice], normals[choice], problem.friction)
+        kept = choice[closed][:missing]
+        rows.append(points[kept])
+        missing -= len(kept)
         if missing == 0:
             break
-    rows.append(
-        points[
-            torch.randint(len(points), (missing, f), generator=generator, device="cpu").to(
-                points.device
-            )
-        ]
-    )
+    rows.append(points[choose(missing)])
     return torch.cat(rows), starts - missing
