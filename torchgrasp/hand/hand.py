@@ -232,21 +232,17 @@ class Hand(Value):
         fingertips.
         """
         if backend == "torchgrasp":
-            (_, frames), (contact, normal, _) = (
-                self.tips.frames(self._columns(joints)),
-                self.tips.in_carriers,
-            )
+            _, frames = self.tips.frames(self._columns(joints))
+            contact, normal, _ = self.tips.in_carriers
         else:
             poses = chain_poses(self.chain, self.tree.joint_names, self._columns(joints))
-            frames = poses[
-                [self.chain.frame_to_idx[link] for link in self.tips.links], :, :3
-            ].permute(2, 3, 0, 1)
-            frames = frames.to(joints)
+            links = [self.chain.frame_to_idx[link] for link in self.tips.links]
+            frames = poses[links, :, :3].permute(2, 3, 0, 1).to(joints)
             contact = self.tips.contact
             normal = self.tips.normal
-        return _rows(map_points(frames, contact), joints), _rows(
-            map_directions(frames, normal), joints
-        )
+        points = map_points(frames, contact)
+        normals = map_directions(frames, normal)
+        return _rows(points, joints), _rows(normals, joints)
 
     @checked(gradients=True)
     def tip_centres(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b f 3"]:
@@ -271,25 +267,30 @@ class Hand(Value):
         else:
             contact = at.reshape(-1, len(self.tips), 3).permute(2, 1, 0)
         # a finger's contact moves with the joints above it, and they with the actuated joints
-        moves = self.tree.moves[self.tips.index][:, :, None] * self.actuated.coupling
+        coupling = self.actuated.coupling
+        moves = self.tree.moves[self.tips.index][:, :, None] * coupling  # (f, j, h)
         finger, joint, actuated = torch.nonzero(moves, as_tuple=True)
-        ratio = self.actuated.coupling.to(contact)[joint, actuated][:, None]
+        ratio = coupling.to(contact)[joint, actuated][:, None]
         child = frames.index_select(2, chains.child[joint])
         axes = map_directions(child, chains.axis[joint]) * ratio
-        (ax, ay, az), (x, y, z) = axes, contact.index_select(1, finger) - child[:, 3]
+        ax, ay, az = axes
+        x, y, z = contact.index_select(1, finger) - child[:, 3]
         column = torch.stack([ay * z - az * y, az * x - ax * z, ax * y - ay * x])
         if chains.slides:
-            column = torch.where(self.tree.prismatic[joint][:, None] > 0, axes, column)
-        summed = contact.new_zeros(3, len(self.tips) * self.dof, contact.shape[2])
+            slides = self.tree.prismatic[joint][:, None] > 0
+            column = torch.where(slides, axes, column)
+        f = len(self.tips)
+        summed = contact.new_zeros(3, f * self.dof, contact.shape[2])
         summed = summed.index_add(1, finger * self.dof + actuated, column)
-        return _rows(summed.unflatten(1, (len(self.tips), self.dof)).movedim(2, 0), joints)
+        summed = summed.unflatten(1, (f, self.dof)).movedim(2, 0)
+        return _rows(summed, joints)
 
     @checked(gradients=True)
     def sphere_centres(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b s 3"]:
         """Return the centres [m] of the `collision_spheres` in the palm's frame."""
         spheres = self.collision_spheres
-        frames = self.tree.frames(self._columns(joints))
-        return _rows(map_points(frames.index_select(2, spheres.link_index), spheres.center), joints)
+        frames = self.tree.frames(self._columns(joints)).index_select(2, spheres.link_index)
+        return _rows(map_points(frames, spheres.center), joints)
 
     @checked(gradients=True)
     def self_clearance(
@@ -309,9 +310,8 @@ class Hand(Value):
         self.actuated.check(joints)
         rows = joints.reshape(-1, joints.shape[-1])
         frames = (self.tree.frames(self._columns(part)) for part in rows.split(chunk))
-        return torch.cat([self.self_collision.clearance(x, below) for x in frames]).reshape(
-            joints.shape[:-1]
-        )
+        found = [self.self_collision.clearance(x, below) for x in frames]
+        return torch.cat(found).reshape(joints.shape[:-1])
 
     @property
     def self_pairs(self) -> tuple[tuple[str, str], ...]:
@@ -329,6 +329,5 @@ def _rows(columns: Tensor, joints: Float[Tensor, "*b h"]) -> Tensor:
     """Return a tensor with reversed axes, so that postures come first, in the batch shape of
     `joints`.
     """
-    return columns.permute(tuple(range(columns.ndim))[::-1]).reshape(
-        *joints.shape[:-1], *columns.shape[-2::-1]
-    )
+    rows = columns.permute(tuple(range(columns.ndim))[::-1])
+    return rows.reshape(*joints.shape[:-1], *rows.shape[1:])

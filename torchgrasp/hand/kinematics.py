@@ -104,14 +104,10 @@ class KinematicTree(Value):
         """Return the unit axis and a point [m] of every joint in the root's frame, given the link
         poses.
         """
-        child = (
-            poses.reshape(-1, *poses.shape[-3:])[..., :3, :]
-            .permute(2, 3, 1, 0)
-            .index_select(2, self.child)
-        )
-        axes, origins = (
-            x.permute(2, 1, 0) for x in (map_directions(child, self.axis), child[:, 3])
-        )
+        frames = poses.reshape(-1, *poses.shape[-3:])[..., :3, :].permute(2, 3, 1, 0)
+        child = frames.index_select(2, self.child)  # (3, 4, j, n)
+        axes = map_directions(child, self.axis).permute(2, 1, 0)
+        origins = child[:, 3].permute(2, 1, 0)
         size = (*poses.shape[:-3], len(self.child), 3)
         return axes.reshape(size), origins.reshape(size)
 
@@ -151,8 +147,9 @@ class FreeMotion(Value):
         slides = tree.prismatic[own]
         root = flatnonzero(tree.places == 0).expand(6)
         link = torch.cat([root, tree.child[own]])
-        turning = torch.cat([0 * axes, axes, tree.axis[own] * (1 - slides[:, None])])
-        sliding = torch.cat([axes, 0 * axes, tree.axis[own] * slides[:, None]])
+        slides = slides[:, None]
+        turning = torch.cat([0 * axes, axes, tree.axis[own] * (1 - slides)])
+        sliding = torch.cat([axes, 0 * axes, tree.axis[own] * slides])
         groups = [
             *markers,
             (link, torch.zeros_like(turning), 1.0),
@@ -160,23 +157,25 @@ class FreeMotion(Value):
             (link, sliding, 0.0),
         ]
         at = torch.cat([links for links, _, _ in groups])
-        local = [
-            torch.cat([x, torch.full_like(x[:, :1], kind)], 1).to(axes) for _, x, kind in groups
-        ]
+        # homogeneous coordinates: the last is 1 for points, 0 for directions
+        local = []
+        for _, x, kind in groups:
+            last = torch.full_like(x[:, :1], kind)
+            local.append(torch.cat([x, last], 1).to(axes))
         product = axes.new_zeros(len(at), 4, len(tree.link_names))
         product[row_numbers(at), :, at] = torch.cat(local)
         moves = torch.cat([axes.new_ones(len(tree.moves), 6), tree.moves[:, own]], 1)
         whole = torch.block_diag(eye(6), coupling[own])
-        same = whole.shape[0] == whole.shape[1] and torch.equal(whole, eye(len(whole)))
-        return cls(product.flatten(1), tuple(len(x) for x in local), moves, None if same else whole)
+        if torch.equal(whole, eye(len(whole))):
+            whole = None
+        return cls(product.flatten(1), tuple(map(len, local)), moves, whole)
 
     def place(self, frames: Float[Tensor, "3 4 l n"]) -> tuple[Float[Tensor, "3 p n"], ...]:
         """Return the coordinates of each group of markers in the root's frame, given all link
         frames.
         """
-        return torch.bmm(self.product.to(frames).expand(3, -1, -1), frames.flatten(1, 2)).split(
-            self.sizes, 1
-        )
+        product = self.product.to(frames).expand(3, -1, -1)
+        return torch.bmm(product, frames.flatten(1, 2)).split(self.sizes, 1)
 
 
 def map_points(
@@ -195,7 +194,8 @@ def map_directions(
     each of them.
     """
     x, y, z = local.to(frames)[:, :, None].unbind(1)
-    return torch.addcmul(torch.addcmul(frames[:, 0] * x, frames[:, 1], y), frames[:, 2], z)
+    mapped = torch.addcmul(frames[:, 0] * x, frames[:, 1], y)
+    return torch.addcmul(mapped, frames[:, 2], z)
 
 
 def chain_from_urdf(urdf: Urdf) -> "pytorch_kinematics.Chain":
@@ -204,11 +204,8 @@ def chain_from_urdf(urdf: Urdf) -> "pytorch_kinematics.Chain":
     """
     frame = pytorch_kinematics.frame
     with torch.device("cpu"):  # the library makes some tensors on torch's default device
-        frames = {
-            urdf.root: frame.Frame(
-                urdf.root, frame.Link(urdf.root), frame.Joint(dtype=torch.float64)
-            )
-        }
+        still = frame.Joint(dtype=torch.float64)
+        frames = {urdf.root: frame.Frame(urdf.root, frame.Link(urdf.root), still)}
         for j in urdf.joints:
             place = rigid(rotation_from_rpy(j.rpy), real(j.xyz))
             ranges = (j.lower, j.upper), (-j.velocity, j.velocity), (-j.effort, j.effort)
@@ -230,13 +227,11 @@ def tree_from_urdf(
     model: Any = chain or chain_from_urdf(urdf)  # it declares no types
     index = model.frame_to_idx
     paths = [path.tolist() for path in model.parents_indices]
-    part = {
-        k for name in (index if ends is None else (urdf.root, *ends)) for k in paths[index[name]]
-    }
+    named = index if ends is None else (urdf.root, *ends)
+    part = {k for name in named for k in paths[index[name]]}
     at = [k for x in urdf.links if (k := index[x.name]) in part]
-    levels = [
-        [k for k in at if len(paths[k]) == d] for d in range(1, 1 + max(len(paths[k]) for k in at))
-    ]
+    deepest = max(len(paths[k]) for k in at)
+    levels = [[k for k in at if len(paths[k]) == depth] for depth in range(1, 1 + deepest)]
     order = [k for level in levels for k in level]
     names = [j.name for j in urdf.movable]
     moved = model.get_joint_parameter_names()
@@ -244,6 +239,11 @@ def tree_from_urdf(
     slides = model.joint_type_indices == 2
     joints = [moved.index(name) for name in names]
     frames = [own.index(k) for k in joints]
+    parents = [
+        levels[depth - 1].index(paths[k][-2]) if depth else 0
+        for depth, level in enumerate(levels)
+        for k in level
+    ]
     new: Any = functools.partial(torch.tensor, device="cpu")
     return KinematicTree(
         link_names=tuple(model.idx_to_frame[k] for k in at),
@@ -254,13 +254,7 @@ def tree_from_urdf(
         moves=real([[float(k in paths[link]) for k in frames] for link in at]),
         tables=torch.stack([_tables(model, k) for k in order], -1)[..., None],
         joint=new([joints.index(own[k]) if own[k] >= 0 else 0 for k in order]),
-        parent=new(
-            [
-                levels[d - 1].index(paths[k][-2]) if d else 0
-                for d, level in enumerate(levels)
-                for k in level
-            ]
-        ),
+        parent=new(parents),
         level_sizes=tuple(map(len, levels)),
         places=new([order.index(k) for k in at]),
         slides=bool(slides[at].any()),
@@ -293,8 +287,10 @@ def pose_in_carrier(
     *above, carrier = chain.parents_indices[chain.frame_to_idx[link]].tolist()
     pose = _tables(chain, 0)[0]
     while above and chain.joint_indices[carrier] < 0:
-        step = _tables(chain, carrier)[0]
-        pose = torch.cat([step[:, :3] @ pose[:, :3], step[:, :3] @ pose[:, 3:] + step[:, 3:]], 1)
+        rotation, position = _tables(chain, carrier)[0].split([3, 1], 1)
+        turned = rotation @ pose[:, :3]
+        moved = rotation @ pose[:, 3:] + position
+        pose = torch.cat([turned, moved], 1)
         carrier = above.pop()
     return chain.idx_to_frame[carrier], pose
 

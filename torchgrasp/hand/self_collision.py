@@ -16,22 +16,28 @@ from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Range, is_known
 from torchgrasp.hand.kinematics import map_points
 
-Bound = Annotated[
-    float, Range(-torch.inf, torch.inf, "a number")
-]  # largest separation [m] that is needed exactly
-Placed = tuple[
-    Float[Tensor, "3 3 s n"], Float[Tensor, "3 s n"]
-]  # axes and centres of shapes in the palm's frame
+# largest separation [m] that is needed exactly
+Bound = Annotated[float, Range(-torch.inf, torch.inf, "a number")]
+# axes and centres of shapes in the palm's frame
+Placed = tuple[Float[Tensor, "3 3 s n"], Float[Tensor, "3 s n"]]
 LEAST_SQUARE = 1e-24  # least squared length [m2]: the derivative of its root is finite
 PARALLEL_EDGES = 1e-10  # squared sine below which edges are parallel
-Parts = list[tuple[int, slice]]
-"""Each kind of pair, named by its number of spheres, with the slice of this kind among pairs sorted
-by kind.
-"""
-Push = Callable[[Int[Tensor, " c"]], tuple[Float[Tensor, "3 c"], Float[Tensor, "3 c"]]]
-"""Function of pair indices; it returns the directions in which second shapes leave the first, and
-contact points.
-"""
+Pushed = tuple[Float[Tensor, "3 c"], Float[Tensor, "3 c"]]
+"""The directions in which second shapes leave the first, and contact points."""
+Push = Callable[[Int[Tensor, " c"]], Pushed]
+"""Function of pair indices that returns how these pairs are pushed apart."""
+
+
+class Chosen(NamedTuple):
+    """Chosen pairs of shapes in some postures, sorted by pair: entry i is `pair[i]` in posture
+    `row[i]`.
+
+    `parts` holds each kind of pair, named by its number of spheres, with the slice of its entries.
+    """
+
+    pair: Int[Tensor, " k"]
+    row: Int[Tensor, " k"]
+    parts: list[tuple[int, slice]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,22 +79,22 @@ class SelfCollision(Value):
             inscribed = self.half.amin(1) + self.radius
             limit = (distance - self._sums(inscribed, distance)).amin(0).clamp_max(below)
             near = distance - self._sums(self._bounding, distance) <= limit
-            dense = not torch.compiler.is_compiling() and not is_known(
-                near
-            )  # torch.vmap cannot select entries
-            every = near.new_ones(near.shape, dtype=torch.bool) if dense else near
-            pair, row, parts = self._choose(every)
-        apart = self._separations(shapes, pair, row, parts)
-        apart = torch.where(near[pair, row], apart, torch.inf) if dense else apart
-        return least.scatter_reduce(0, row, apart, "amin")
+            # torch.vmap cannot select entries: all are chosen, by a mask that it does not see
+            dense = not torch.compiler.is_compiling() and not is_known(near)
+            every = torch.ones(near.shape, dtype=torch.bool, device=near.device) if dense else near
+            chosen = self._choose(every)
+        apart = self._separations(shapes, chosen)
+        if dense:
+            apart = torch.where(near[chosen.pair, chosen.row], apart, torch.inf)
+        return least.scatter_reduce(0, chosen.row, apart, "amin")
 
     @checked
     def separations(self, frames: Float[Tensor, "3 4 l n"], below: Bound) -> Float[Tensor, "p n"]:
         """Return each pair's signed separation [m] in each posture; above `below` it is that of
         bounding spheres.
         """
-        shapes, apart, pair, row, parts = self._near(frames, below)
-        return apart.index_put((pair, row), self._separations(shapes, pair, row, parts))
+        shapes, apart, chosen = self._near(frames, below)
+        return apart.index_put(chosen[:2], self._separations(shapes, chosen))
 
     @checked
     def pushes(
@@ -100,7 +106,7 @@ class SelfCollision(Value):
         A wrench is the derivative of a separation by a twist (translation, rotation) of the second
         shape. The last wrench is zero, and belongs to separations above `below`.
         """
-        shapes, apart, pair, row, parts = self._near(frames, below)
+        shapes, apart, (pair, row, parts) = self._near(frames, below)
         separation = apart.new_zeros(len(pair))
         wrench = apart.new_zeros(6, len(pair) + 1)
         for kind, at in parts:
@@ -113,9 +119,8 @@ class SelfCollision(Value):
             if len(close):
                 force, point = push(close)
                 force = force * is_close[close].to(force)
-                wrench[:, at.start + close] = torch.cat(
-                    [force, torch.linalg.cross(point, force, dim=0)]
-                )
+                torque = torch.linalg.cross(point, force, dim=0)
+                wrench[:, at.start + close] = torch.cat([force, torque])
         number = torch.full_like(apart, len(pair), dtype=torch.long)
         number[pair, row] = row_numbers(pair)
         return apart.index_put((pair, row), separation), number, wrench
@@ -125,7 +130,7 @@ class SelfCollision(Value):
         """Return the number of pairs, over all postures, whose bounding spheres are nearer than
         `below`.
         """
-        return len(self._near(frames, below)[2])
+        return len(self._near(frames, below)[2].pair)
 
     @checked
     def only(self, kept: Bool[Tensor, " p"]) -> "SelfCollision":
@@ -137,10 +142,8 @@ class SelfCollision(Value):
 
     def link_pairs(self) -> list[tuple[int, int]]:
         """Return the link indices of each pair of links that is tested."""
-        return [
-            (int(one), int(two))
-            for one, two in torch.unique(self.link[self.pairs].sort(1).values, dim=0)
-        ]
+        links = self.link[self.pairs].sort(1).values
+        return [(one, two) for one, two in torch.unique(links, dim=0).tolist()]
 
     def _place(self, frames: Float[Tensor, "3 4 l n"]) -> Placed:
         """Return the shapes' axes and centres in the palm's frame, given the link frames."""
@@ -148,21 +151,16 @@ class SelfCollision(Value):
             raise BadArgument("frames", f"{frames.shape[2]} links", f"at least {self._links} links")
         links = frames.index_select(2, self.link)
         rotation = self.rotation.to(frames)[..., None]
-        axes = (
-            links[:, 0, None] * rotation[0]
-            + links[:, 1, None] * rotation[1]
-            + links[:, 2, None] * rotation[2]
-        )
+        axes = links[:, 0, None] * rotation[0]
+        axes = axes + links[:, 1, None] * rotation[1]
+        axes = axes + links[:, 2, None] * rotation[2]
         return axes, map_points(links, self.center)
 
     def _near(
         self, frames: Float[Tensor, "3 4 l n"], below: float
-    ) -> tuple[Placed, Float[Tensor, "p n"], Int[Tensor, " k"], Int[Tensor, " k"], Parts]:
+    ) -> tuple[Placed, Float[Tensor, "p n"], Chosen]:
         """Return the placed shapes, the separations [m] of the bounding spheres of each pair, and
-        the near ones.
-
-        Two index vectors hold the pair and the posture of each separation that is less than
-        `below`.
+        those pairs for which it is less than `below`.
         """
         if not torch.compiler.is_compiling() and not is_known(frames):
             raise BadArgument(
@@ -171,7 +169,7 @@ class SelfCollision(Value):
         shapes = self._place(frames)
         distance = self._distances(shapes[1])
         apart = distance - self._sums(self._bounding, distance)
-        return shapes, apart, *self._choose(apart < below)
+        return shapes, apart, self._choose(apart < below)
 
     def _distances(self, center: Float[Tensor, "3 s n"]) -> Float[Tensor, "p n"]:
         """Return the distance [m] between the centres of the two shapes of each pair."""
@@ -194,29 +192,18 @@ class SelfCollision(Value):
         """Return for each pair of shapes the sum of their radii, given the `radius` of every shape."""
         return radius[self.pairs].sum(1, keepdim=True).to(like)
 
-    def _choose(
-        self, near: Bool[Tensor, "p n"]
-    ) -> tuple[Int[Tensor, " k"], Int[Tensor, " k"], Parts]:
-        """Return the pairs and postures of a mask, sorted by pair, and the slice of each kind of
-        pair.
-        """
-        ends = (
-            torch.stack([part.sum() for part in near.split(self.kinds)]).cumsum(0).tolist()
-        )  # the only wait
+    def _choose(self, near: Bool[Tensor, "p n"]) -> Chosen:
+        """Return the pairs and postures of a mask."""
+        counts = torch.stack([part.sum() for part in near.split(self.kinds)])
+        ends = counts.cumsum(0).tolist()  # the only wait
         pair, row = torch.nonzero_static(near, size=ends[-1]).unbind(1)
-        bounds = itertools.pairwise((0, *ends))
-        return (
-            pair,
-            row,
-            [(kind, slice(low, high)) for kind, (low, high) in enumerate(bounds) if high > low],
-        )
+        slices = [slice(low, high) for low, high in itertools.pairwise((0, *ends))]
+        parts = [(kind, at) for kind, at in enumerate(slices) if at.stop > at.start]
+        return Chosen(pair, row, parts)
 
-    def _separations(
-        self, shapes: Placed, pair: Int[Tensor, " k"], row: Int[Tensor, " k"], parts: Parts
-    ) -> Float[Tensor, " k"]:
-        """Return separations [m] of pairs of shapes; entry i is of pair `pair[i]` in posture
-        `row[i]`.
-        """
+    def _separations(self, shapes: Placed, chosen: Chosen) -> Float[Tensor, " k"]:
+        """Return the separations [m] of chosen pairs of shapes."""
+        pair, row, parts = chosen
         found = [self._of_kind(kind, shapes, pair[at], row[at])[0] for kind, at in parts]
         return torch.cat(found) if found else shapes[1].new_zeros(0)
 
@@ -230,33 +217,32 @@ class SelfCollision(Value):
         half, radius, bounding = (x.to(gap) for x in (self.half.T, self.radius, self._bounding))
         if kind == 1:
 
-            def from_box(
-                at: Int[Tensor, " c"],
-            ) -> tuple[Float[Tensor, "3 c"], Float[Tensor, "3 c"]]:
-                local = _inside(two[:, :, at], gap[:, at])
+            def from_box(at: Int[Tensor, " c"]) -> Pushed:
                 axes = two[:, :, at]
+                local = _inside(axes, gap[:, at])
                 out = local.abs() - half[:, second[at]]
-                inside = (torch.arange(3, device=out.device)[:, None] == out.argmax(0)).to(out)
-                slope = torch.where((out > 0).any(0), out.clamp_min(0), inside)
+                # inside the box, the nearest face counts
+                nearest = row_numbers(out)[:, None] == out.argmax(0)
+                slope = torch.where((out > 0).any(0), out.clamp_min(0), nearest.to(out))
                 slope = torch.where(local < 0, -slope, slope)
                 # any turn about the sphere's centre is free
-                return (axes * (slope / _length(slope))).sum(1), place[:, at] - gap[:, at]
+                return (axes * _unit(slope)).sum(1), place[:, at] - gap[:, at]
 
-            return box_distance(_inside(two, gap).T, half[:, second].T) - radius[first], from_box
+            outside = box_distance(_inside(two, gap).T, half[:, second].T)
+            return outside - radius[first], from_box
         apart = _length(gap) - bounding[first] - bounding[second]
         if kind == 2:
-            return apart, lambda at: (gap[:, at] / _length(gap[:, at]), place[:, at])
+            return apart, lambda at: (_unit(gap[:, at]), place[:, at])
         boxes = BoxPairs(one, two, gap, half[:, first], half[:, second])
         along = boxes.along_axes()
         separation = along.amax(0)
 
-        def between_boxes(
-            at: Int[Tensor, " c"],
-        ) -> tuple[Float[Tensor, "3 c"], Float[Tensor, "3 c"]]:
-            push, arm = BoxPairs(*(x[..., at] for x in boxes)).push(along[:, at].argmax(0))
+        def between_boxes(at: Int[Tensor, " c"]) -> Pushed:
+            some = BoxPairs(*(x[..., at] for x in boxes))
+            push, arm = some.push(along[:, at].argmax(0))
             far = apart[at] > separation[at]
-            direct = gap[:, at] / _length(gap[:, at])
-            return torch.where(far, direct, push), place[:, at] + torch.where(far, 0.0, arm)
+            push = torch.where(far, _unit(gap[:, at]), push)
+            return push, place[:, at] + torch.where(far, 0.0, arm)
 
         return torch.maximum(apart, separation), between_boxes
 
@@ -275,8 +261,9 @@ class SelfCollision(Value):
         one = first * n + row
         two = second * n + row
         place = center.index_select(1, two)
+        gap = place - center.index_select(1, one)
         axes = rotation.index_select(2, one), rotation.index_select(2, two)
-        return (first, second), axes, place, place - center.index_select(1, one)
+        return (first, second), axes, place, gap
 
 
 def _inside(axes: Float[Tensor, "3 3 k"], v: Float[Tensor, "3 k"]) -> Float[Tensor, "3 k"]:
@@ -286,8 +273,14 @@ def _inside(axes: Float[Tensor, "3 3 k"], v: Float[Tensor, "3 k"]) -> Float[Tens
 
 def _length(v: Float[Tensor, "3 *b"]) -> Float[Tensor, "*b"]:
     """Return the lengths of vectors; the derivative of the length of a zero vector is 0."""
-    squared = torch.addcmul(torch.addcmul(v[0] * v[0], v[1], v[1]), v[2], v[2])
+    x, y, z = v
+    squared = torch.addcmul(torch.addcmul(x * x, y, y), z, z)
     return torch.sqrt(squared.clamp_min(LEAST_SQUARE))
+
+
+def _unit(v: Float[Tensor, "3 *b"]) -> Float[Tensor, "3 *b"]:
+    """Return unit vectors in the directions of vectors; zero vectors stay zero."""
+    return v / _length(v)
 
 
 class BoxPairs(NamedTuple):
@@ -316,47 +309,46 @@ class BoxPairs(NamedTuple):
         by_a = t.abs() - half_a - (size * half_b).sum(1)
         by_b = u.abs() - half_b - (size * half_a[:, None]).sum(0)
         # axis i of a cross axis j of b; the other two axes of a box follow by rolling
-        next_t, last_t, next_a, last_a = (
-            x.roll(k, 0)[:, None] for x in (t, half_a) for k in (-1, 1)
-        )
+        next_t, last_t = (t.roll(k, 0)[:, None] for k in (-1, 1))
+        next_a, last_a = (half_a.roll(k, 0)[:, None] for k in (-1, 1))
         along = last_t * rotation.roll(-1, 0) - next_t * rotation.roll(1, 0)
         reach = next_a * size.roll(1, 0) + last_a * size.roll(-1, 0)
-        reach = reach + half_b.roll(-1, 0) * size.roll(1, 1) + half_b.roll(1, 0) * size.roll(-1, 1)
+        reach = reach + half_b.roll(-1, 0) * size.roll(1, 1)
+        reach = reach + half_b.roll(1, 0) * size.roll(-1, 1)
         sine = 1 - rotation * rotation
         crossing = sine > PARALLEL_EDGES  # the normals of the faces cover parallel edges
         by_edges = (along.abs() - reach) * torch.rsqrt(torch.where(crossing, sine, 1.0))
-        return torch.cat([by_a, by_b, torch.where(crossing, by_edges, -torch.inf).flatten(0, 1)])
+        by_edges = torch.where(crossing, by_edges, -torch.inf).flatten(0, 1)  # (9, k)
+        return torch.cat([by_a, by_b, by_edges])
 
-    def push(self, best: Int[Tensor, " k"]) -> tuple[Float[Tensor, "3 k"], Float[Tensor, "3 k"]]:
+    def push(self, best: Int[Tensor, " c"]) -> Pushed:
         """Return the unit vector of axis `best` towards the second box, and the contact point from
         its centre [m].
         """
         a, b, gap, half_a, half_b = self
         best = best[None]
         edges = best >= 6
-        i = torch.where(best >= 6, (best - 6) // 3, best.clamp_max(2))
+        i = torch.where(edges, (best - 6) // 3, best.clamp_max(2))
         j = torch.where(edges, (best - 6) % 3, (best - 3).clamp(0, 2))
-        along_a, along_b = (x.gather(1, at.expand(3, 1, -1))[:, 0] for x, at in ((a, i), (b, j)))
-        push = torch.where(
-            edges,
-            torch.linalg.cross(along_a, along_b, dim=0),
-            torch.where(best < 3, along_a, along_b),
-        )
-        push = push / _length(push)
+        along_a = a.gather(1, i.expand(3, 1, -1))[:, 0]
+        along_b = b.gather(1, j.expand(3, 1, -1))[:, 0]
+        crossed = torch.linalg.cross(along_a, along_b, dim=0)
+        push = torch.where(edges, crossed, torch.where(best < 3, along_a, along_b))
+        push = _unit(push)
         push = torch.where((push * gap).sum(0) < 0, -push, push)
         reach_a = _inside(a, push).sign() * half_a
         reach_b = _inside(b, push).sign() * half_b
-        reach_a = reach_a.scatter(
-            0, i, torch.where(edges, 0.0, reach_a.gather(0, i))
-        )  # anywhere along an edge
+        # anywhere along an edge
+        reach_a = reach_a.scatter(0, i, torch.where(edges, 0.0, reach_a.gather(0, i)))
         reach_b = reach_b.scatter(0, j, torch.where(edges, 0.0, reach_b.gather(0, j)))
         of_a = (a * reach_a).sum(1)
         of_b = -(b * reach_b).sum(1)
         between = gap + of_b - of_a
         cosine = (along_a * along_b).sum(0)
         beyond = (between * along_b).sum(0) - cosine * (between * along_a).sum(0)
-        crossed = of_b - beyond / (1 - cosine * cosine) * along_b
-        return push, torch.where(edges, crossed, torch.where(best < 3, of_b, of_a - gap))
+        touch = of_b - beyond / (1 - cosine * cosine) * along_b
+        corner = torch.where(best < 3, of_b, of_a - gap)
+        return push, torch.where(edges, touch, corner)
 
 
 def box_distance(points: Float[Tensor, "*b 3"], half: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
@@ -371,4 +363,5 @@ def box_distance(points: Float[Tensor, "*b 3"], half: Float[Tensor, "*b 3"]) -> 
     outside = squared > 0
     inside = torch.maximum(torch.maximum(ox, oy), oz)
     # the root's derivative is infinite at 0; there the largest coordinate is the distance
-    return torch.where(outside, torch.sqrt(torch.where(outside, squared, 1.0)), inside)
+    root = torch.sqrt(torch.where(outside, squared, 1.0))
+    return torch.where(outside, root, inside)
