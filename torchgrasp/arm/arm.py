@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.data.accept import HandLike, as_hand
-from torchgrasp.foundation.base import Value, flatnonzero
+from torchgrasp.foundation.base import Value, flatnonzero, row_numbers
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Pose, Seed
@@ -92,9 +92,8 @@ class Arm(Value):
     @checked
     def tip_poses(self, obj_from_hand: Float[Tensor, "k 4 4"]) -> Float[Tensor, "3 4 k"]:
         """Return the poses of the tip, in the base's frame, that put the hand at given poses."""
-        base_from_tip = (
-            inverse(self.obj_from_base) @ obj_from_hand.to(self.lower) @ inverse(self.tip_from_hand)
-        )
+        base_from_hand = inverse(self.obj_from_base) @ obj_from_hand.to(self.lower)
+        base_from_tip = base_from_hand @ inverse(self.tip_from_hand)
         return base_from_tip[:, :3].permute(1, 2, 0).contiguous()
 
     @checked
@@ -109,10 +108,10 @@ class Arm(Value):
         child = frames.index_select(2, self.tree.child)
         axes = map_directions(child, self.tree.axis)
         slides = self.tree.prismatic[:, None] > 0
-        place = torch.where(
-            slides, axes, torch.linalg.cross(axes, tip[:, 3, None] - child[:, 3], dim=0)
-        )
-        return tip, torch.cat([place / MILLIMETRE, LEVER * torch.where(slides, 0.0, axes)])
+        turning = torch.linalg.cross(axes, tip[:, 3, None] - child[:, 3], dim=0)
+        place = torch.where(slides, axes, turning)
+        turn = torch.where(slides, 0.0, axes)
+        return tip, torch.cat([place / MILLIMETRE, LEVER * turn])
 
     @checked
     def sphere_centres(self, joints: Float[Tensor, "n k"]) -> Float[Tensor, "3 s k"]:
@@ -120,21 +119,24 @@ class Arm(Value):
         frames = self.tree.frames(joints.contiguous()).index_select(2, self.link)
         pose = self.obj_from_base
         centres = map_points(frames, self.center)
-        return (pose[:3, :3] @ centres.flatten(1)).view_as(centres) + pose[:3, 3, None, None]
+        turned = (pose[:3, :3] @ centres.flatten(1)).view_as(centres)
+        return turned + pose[:3, 3, None, None]
 
     @checked
     def overlaps(self, centres: Float[Tensor, "3 s k"]) -> Bool[Tensor, "p k"]:
         """Return which `pairs` of spheres overlap in each posture, given the centres [m]."""
         one, two = self.pairs.unbind(1)
         gap = centres.index_select(1, one) - centres.index_select(1, two)
-        return (gap * gap).sum(0) < (self.radius[one] + self.radius[two]).square()[:, None]
+        reach = self.radius[one] + self.radius[two]
+        return (gap * gap).sum(0) < reach.square()[:, None]
 
 
 def features(tip: Float[Tensor, "3 4 k"]) -> Float[Tensor, "k 12"]:
     """Return numbers of each pose whose distance is a distance [mm]; a small turn counts as its
     angle times `LEVER`.
     """
-    return torch.cat([tip[:, 3] / MILLIMETRE, LEVER / math.sqrt(2) * tip[:, :3].flatten(0, 1)]).T
+    turn = LEVER / math.sqrt(2) * tip[:, :3].flatten(0, 1)
+    return torch.cat([tip[:, 3] / MILLIMETRE, turn]).T
 
 
 @checked
@@ -183,25 +185,20 @@ def load_arm(
             f"joint {followers[0]} that follows another",
             "joints that each have a drive, up to the tip",
         )
-    way = [
+    way = tuple(
         dataclasses.replace(j, lower=max(j.lower, -turn), upper=min(j.upper, turn))
-        for j in whole.joints_above(tip)
-    ]
-    chain = dataclasses.replace(
-        whole,
-        links=(named[whole.root], *(named[j.child] for j in reversed(way))),
-        joints=tuple(reversed(way)),
+        for j in reversed(whole.joints_above(tip))
     )
-    if bare := [
-        link.name for link in chain.links if any(shape.kind == "mesh" for shape in link.shapes)
-    ]:
-        raise whole.wrong(
-            f"link {bare[0]} with a mesh",
-            "boxes, cylinders or spheres, as torchgrasp.app.author.clean_arm writes",
-        )
+    links = (named[whole.root], *(named[j.child] for j in way))
+    for link in links:
+        if any(shape.kind == "mesh" for shape in link.shapes):
+            raise whole.wrong(
+                f"link {link.name} with a mesh",
+                "boxes, cylinders or spheres, as torchgrasp.app.author.clean_arm writes",
+            )
+    chain = dataclasses.replace(whole, links=links, joints=way)
     tree = tree_from_urdf(chain)
     joints = chain.movable
-    one = real([[float(i == j) for j in range(4)] for i in range(4)])
     lower, upper, speed = real([(j.lower, j.upper, j.velocity or math.pi) for j in joints]).T
     generator = torch.Generator().manual_seed(seed)
     drawn = torch.rand(ARM.postures, len(joints), generator=generator, dtype=torch.float64)
@@ -209,9 +206,8 @@ def load_arm(
     # Each direction of a joint once.
     reach = ((upper - lower) / 2).clamp_max(math.pi)
     library = (lower + upper) / 2 + share * reach
-    base, mount = (
-        one if x is None else x.to("cpu", torch.float64) for x in (obj_from_base, tip_from_hand)
-    )
+    same = torch.eye(4, dtype=torch.float64, device="cpu")
+    base, mount = (same if x is None else x.to(same) for x in (obj_from_base, tip_from_hand))
     link, center, radius, palm = _spheres(chain, hand.to("cpu", torch.float64), mount)
     above = tree.moves.sum(1).long()[link]  # the number of joints that move each sphere
     moving = flatnonzero((above > 0) & ~palm)
@@ -257,10 +253,7 @@ def _spheres(
     palm = hand.collision_spheres.finger == -1
     centres = apply(tip_from_hand, hand.sphere_centres(hand.lower)[palm])
     last = real([len(chain.links) - 1.0]).expand(len(centres), 1)
-    every = torch.cat(
-        [
-            real(rows).reshape(-1, 5),
-            torch.cat([last, centres, hand.collision_spheres.radius[palm, None]], 1),
-        ]
-    )
-    return every[:, 0].long(), every[:, 1:4], every[:, 4], torch.arange(len(every)) >= len(rows)
+    radius = hand.collision_spheres.radius[palm, None]
+    of_palm = torch.cat([last, centres, radius], 1)
+    link, center, radius = torch.cat([real(rows).reshape(-1, 5), of_palm]).split([1, 3, 1], 1)
+    return link[:, 0].long(), center, radius[:, 0], row_numbers(link) >= len(rows)

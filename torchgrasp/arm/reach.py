@@ -78,10 +78,9 @@ def with_arm(
     """
     rows = flatnonzero(grasps.status == Status.OK)
     way, found, least = follow_grasps(arm, hand, grasps[rows], world, up)
-    status = grasps.status.index_put(
-        (rows[~found],), torch.tensor(int(Status.UNREACHABLE)).to(grasps.status)
-    )
-    joints = way.new_zeros(len(grasps), way.shape[2]).index_copy(0, rows, way[:, COARSE_STEPS + 1])
+    status = grasps.status.index_fill(0, rows[~found], int(Status.UNREACHABLE))
+    joints = way.new_zeros(len(grasps), way.shape[2])
+    joints = joints.index_copy(0, rows, way[:, COARSE_STEPS + 1])
     ease = least.new_zeros(len(grasps), 2).index_copy(0, rows, least)
     return dataclasses.replace(grasps, status=status, arm=joints, ease=ease)
 
@@ -98,24 +97,25 @@ def follow_grasps(
     poses = way_of(hand, grasps, world, up).to(arm.lower)
     starts = REACH.starts
     at = COARSE_STEPS + 1
-    (g, w) = poses.shape[:2]
+    g, w = poses.shape[:2]
     tips = arm.tip_poses(poses.flatten(0, 1)).unflatten(2, (g, w))  # (3, 4, g, w)
-    near = _nearest(arm, tips[..., at], starts).flatten()
-    joints, solved = solve_tips(
-        arm, arm.library[near].T, tips[..., at].repeat_interleave(starts, 2)
-    )
+    target = tips[..., at]
+    near = _nearest(arm, target, starts).flatten()
+    joints, solved = solve_tips(arm, arm.library[near].T, target.repeat_interleave(starts, 2))
 
     def clear(path: Float[Tensor, "g w n"]) -> tuple[Bool[Tensor, "g"]]:
         return (_is_clear(arm, path, world),)
 
     solved &= in_chunks(clear, joints.T[:, None], REACH.postures)[0]
-    ease = torch.where(solved, measure_ease(arm, joints).prod(1), -1.0).view(g, starts)
+    ease = torch.where(solved, measure_ease(arm, joints).prod(1), -1.0)
+    ease = ease.view(g, starts)
     way = poses.new_zeros(g, w, len(joints))
     found = solved.new_zeros(g)
     least = poses.new_zeros(g, 2)
     # The easiest posture first; a grasp that has its way is done.
     for choice in ease.argsort(dim=1, descending=True, stable=True).unbind(1):
-        rows = flatnonzero(~found & (ease.gather(1, choice[:, None])[:, 0] >= 0))
+        able = ease.gather(1, choice[:, None])[:, 0] >= 0
+        rows = flatnonzero(~found & able)
         if not len(rows):
             break
         start = joints[:, rows * starts + choice[rows]]  # (n, k)
@@ -125,7 +125,8 @@ def follow_grasps(
         path = path[good]
         way[rows] = path
         found[rows] = True
-        least[rows] = measure_ease(arm, path.flatten(0, 1).T).view(-1, w, 2).amin(1)
+        along_way = measure_ease(arm, path.flatten(0, 1).T)
+        least[rows] = along_way.view(-1, w, 2).amin(1)
     return way, found, least
 
 
@@ -139,7 +140,8 @@ def way_of(
     """
     closed = grasps.obj_from_hand
     opened = opened_pose(hand, grasps.pregrasp, closed, world.plane)
-    share = torch.linspace(0, 1, COARSE_STEPS + 1, device="cpu").to(closed)[:, None]
+    share = torch.linspace(0, 1, COARSE_STEPS + 1, device="cpu")
+    share = share.to(closed)[:, None]
     up = (up if world.plane is None else world.plane.normal).to(closed)
     before, after = (x[:, None].repeat(1, len(share), 1, 1) for x in (opened, closed))
     before[..., :3, 3] -= APPROACH_DISTANCE * (1 - share) * grasps.approach[:, None]
@@ -177,8 +179,10 @@ def _is_clear(arm: Arm, path: Float[Tensor, "g w n"], world: CollisionWorld) -> 
     links = centres[:, arm.moving].permute(2, 3, 1, 0)
     radius = arm.radius[arm.moving]
     clear = torch.ones_like(path[:, 0, 0], dtype=torch.bool)
-    if world.plane is not None:  # what only slides, as a base on a rail, may stand on the table
-        turns = (arm.tree.moves @ (1 - arm.tree.prismatic))[arm.link[arm.moving]] > 0
+    if world.plane is not None:
+        # what only slides, as a base on a rail, may stand on the table
+        turning = arm.tree.moves @ (1 - arm.tree.prismatic)  # (l,)
+        turns = turning[arm.link[arm.moving]] > 0
         height = along(links[:, :, turns], world.plane) - radius[turns]
         clear &= height.flatten(1).amin(1) >= world.plane.offset
     if world.field is not None:  # a lifted object is not in the way
@@ -200,9 +204,11 @@ def measure_ease(arm: Arm, joints: Float[Tensor, "n k"]) -> Float[Tensor, "k 2"]
     lower = arm.lower[:, None]
     upper = arm.upper[:, None]
     motion = arm.tip_motion(joints)[1]
-    room = (2 * torch.minimum(joints - lower, upper - joints) / (upper - lower)).amin(0)
-    jacobian = torch.cat([motion[:3] * MILLIMETRE, motion[3:] / LEVER]).permute(2, 0, 1)
-    return torch.stack([room, torch.linalg.det(jacobian @ jacobian.mT).clamp_min(0).sqrt()], 1)
+    room = 2 * torch.minimum(joints - lower, upper - joints) / (upper - lower)
+    jacobian = torch.cat([motion[:3] * MILLIMETRE, motion[3:] / LEVER])
+    jacobian = jacobian.permute(2, 0, 1)  # (k, 6, n)
+    squared = torch.linalg.det(jacobian @ jacobian.mT)
+    return torch.stack([room.amin(0), squared.clamp_min(0).sqrt()], 1)
 
 
 def _nearest(arm: Arm, target: Float[Tensor, "3 4 k"], count: int) -> Int[Tensor, "k s"]:
@@ -252,16 +258,21 @@ def solve_tips(
         error = error[left]
         normal = (motion[:, :, None] * motion[:, None]).sum(0)
         normal.diagonal().T.add_(error / 2 + 1)
-        step, _ = torch.linalg.solve_ex(normal.permute(2, 0, 1), (motion * gap[:, None]).sum(0).T)
-        turned = joints[:, rows] + step.T
+        slope = (motion * gap[:, None]).sum(0)
+        turn, _ = torch.linalg.solve_ex(normal.permute(2, 0, 1), slope.T)
+        turned = joints[:, rows] + turn.T
         joints[:, rows] = turned.clamp(lower, upper)
     return joints, done
 
 
 def _gap(tip: Float[Tensor, "3 4 k"], target: Float[Tensor, "3 4 k"]) -> Float[Tensor, "6 k"]:
     """Return the translation [mm] from tips to targets, and the rotation vector times `LEVER`."""
-    axis = torch.linalg.cross(tip[:, :3], target[:, :3], dim=0).sum(1) / 2
+    now = tip[:, :3]
+    wanted = target[:, :3]
+    axis = torch.linalg.cross(now, wanted, dim=0).sum(1) / 2
     sine = torch.linalg.vector_norm(axis, dim=0)
-    cosine = ((tip[:, :3] * target[:, :3]).sum((0, 1)) - 1) / 2
-    turn = axis * (torch.atan2(sine, cosine) / sine.clamp_min(REACH.rounding))
-    return torch.cat([(target[:, 3] - tip[:, 3]) / MILLIMETRE, LEVER * turn])
+    cosine = ((now * wanted).sum((0, 1)) - 1) / 2
+    angle = torch.atan2(sine, cosine)
+    turn = axis * (angle / sine.clamp_min(REACH.rounding))
+    move = (target[:, 3] - tip[:, 3]) / MILLIMETRE
+    return torch.cat([move, LEVER * turn])
