@@ -106,6 +106,15 @@ def seen_cylinder() -> "PointCloud":
     return PointCloud(points[seen], normals[seen], camera)
 
 
+@pytest.fixture
+def few_postures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw libraries of few postures: those of four fingers cost more than the rest of a plan."""
+    from torchgrasp.ik.seeds import SeedNumbers
+
+    few = SeedNumbers(postures=2000, many_postures=3000)
+    monkeypatch.setattr("torchgrasp.ik.seeds.SEEDS", few)
+
+
 BALL = '<collision><geometry><sphere radius="0.01"/></geometry></collision>'
 BODY = '<inertial><mass value="0.1"/><inertia ixx="1e-4" ixy="0" ixz="0" iyy="1e-4" iyz="0" izz="1e-4"/></inertial>'
 

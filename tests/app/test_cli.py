@@ -19,6 +19,7 @@ from torchgrasp.app.cli.inputs import check_folder
 from torchgrasp.data.shipped import DATA
 from torchgrasp.evaluation.summary import ViewScore
 from torchgrasp.foundation.errors import MissingExtra
+from torchgrasp.planner.explain import ExplainNumbers
 
 VIEW = str(DATA / "cylinder" / "view.ply")
 MESH = str(DATA / "cylinder" / "mesh.ply")
@@ -306,7 +307,8 @@ def test_a_misspelt_name_is_answered_with_the_nearest_one(
     assert refusal(*words).endswith(f"; did you mean {near}?\n")
 
 
-def test_an_empty_result_names_what_would_help(tmp_path, run_command):
+def test_an_empty_result_names_what_would_help(tmp_path, run_command, monkeypatch):
+    monkeypatch.setattr("torchgrasp.planner.explain.EXPLAIN", ExplainNumbers(trials=1))
     options = ["--starts", "5", "--friction", "0", "--table", "0", "--no-report"]
     code, out, _ = run_command("grasp", VIEW, "--hand", "barrett", "--out", tmp_path, *options)
     assert code == 1 and [p.name for p in tmp_path.iterdir()] == ["grasps.safetensors"]

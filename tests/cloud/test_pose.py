@@ -71,8 +71,9 @@ POSES = {  # a wrong pose of a right one, what is said
 }
 
 
-@pytest.mark.parametrize("view", VIEWS)
-@pytest.mark.parametrize("name", POSES)
+@pytest.mark.parametrize(
+    ("name", "view"), [(name, [*VIEWS][k % len(VIEWS)]) for k, name in enumerate(POSES)]
+)
 def test_a_wrong_pose_is_told_by_what_contradicts_it(name, view):
     depth, pose = seen(view)
     assert len(right(view).things) == 2
@@ -96,7 +97,7 @@ def test_a_cloud_of_a_mask_is_told_the_same(name):
         cloud_from_depth(depth, INTRINSICS, near, POSES[name][0](pose))
 
 
-@pytest.mark.parametrize("elevation", [75.0, 80.0, 86.0])
+@pytest.mark.parametrize("elevation", [75.0, 86.0])
 def test_an_inverse_pose_is_told_by_a_table_a_few_degrees_from_level(elevation):
     pose = look_at(20.0, elevation, 0.7)
     depth = render_depth([box((0.06, 0.05, 0.1)), box((0.05, 0.05, 0.06), (0.05, 0.14))], pose)[0]

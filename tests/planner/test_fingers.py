@@ -30,6 +30,7 @@ from torchgrasp.hand import hand_of
 from torchgrasp.planner.ranking import expected_success
 from torchgrasp.planner.request import finger_sets
 
+pytestmark = pytest.mark.usefixtures("few_postures")
 SPEC = ContactSpec(table=0.0)
 ALL = ("index", "middle", "ring", "thumb")
 
