@@ -92,10 +92,8 @@ class GraspController:
         holding = holding or default_holding(reference.sensor, closing)
         check_modes(reference.sensor, closing, holding)
         if approach and not (self.options.stops and can_guard(reference)):
-            allowed = (
-                "0 without stops, or without a table, a surface and a direction in the reference"
-            )
-            raise BadArgument("approach", approach, allowed)
+            lacking = "stops, or without a table, a surface and a direction in the reference"
+            raise BadArgument("approach", approach, f"0 without {lacking}")
         self._make_hold = choose_holding(reference.hand, holding)
         self.mode: ClosingMode = closing
         self.path = STILL  # displacement [m] of the palm's path by a new view
@@ -108,18 +106,17 @@ class GraspController:
         self.attempts = 0
         self.stops = 0
         self.length = approach
-        self.judges = (
-            self.options.attempts > 1 and reference.table is not None
-        )  # the grasp, before the lift
-        self.felt: list[Touches] = []  # at each stop, and in each closing that is judged
-        self.guard = (
-            GuardedApproach(reference, self.options, approach, self.felt) if approach else None
-        )
+        # whether the grasp is judged before the lift
+        self.judges = self.options.attempts > 1 and reference.table is not None
+        # at each stop, and in each closing that is judged
+        self.felt = list[Touches]()
+        self.guard = None
+        if approach:
+            self.guard = GuardedApproach(reference, self.options, approach, self.felt)
         self._make_closing = functools.partial(make_closing, reference, self.mode, self.options)
         self._begin(self._make_closing())
-        self.targets = Targets(
-            reference.expand(reference.pregrasp), self.path + reference.rise, approach
-        )
+        opened = reference.expand(reference.pregrasp)
+        self.targets = Targets(opened, self.path + reference.rise, approach)
 
     def _begin(self, closing: Closing) -> None:
         """Start a new attempt to close the hand, controlled by `closing`, and count it."""
@@ -175,11 +172,11 @@ class GraspController:
         """
         reference = self.planned
         if self.guard is None or self.guard.left < self.guard.length:
-            raise BadArgument(
-                "cloud", "a view of the object after the start of the approach", "one before it"
-            )
+            found = "a view of the object after the start of the approach"
+            raise BadArgument("cloud", found, "one before it")
         assert reference.surface is not None and reference.table is not None
         moved = relocate(reference.surface, cloud, reference.table.moved(reference.obj_from_hand))
+        # the object's motion in the hand's frame; the palm follows its shift alone
         in_hand = inverse(reference.obj_from_hand) @ moved @ reference.obj_from_hand
         centre = reference.gains.target.mean(0)
         self.path = apply(in_hand, centre[None])[0] - centre
@@ -198,20 +195,17 @@ class GraspController:
         shape = len(self.reference.normals), 3, len(self.targets.joints)
         found = tuple(observation.jacobian.shape)
         if found != shape or observation.tactile.reading.shape != shape[:1]:
-            raise BadArgument(
-                "observation", f"fingertips, 3 and joints {found}", f"those of the hand, {shape}"
-            )
-        check_device(
-            "observation", observation.joints.device, "the controller", self.targets.joints.device
-        )
+            told = f"fingertips, 3 and joints {found}"
+            raise BadArgument("observation", told, f"those of the hand, {shape}")
+        device = self.targets.joints.device
+        check_device("observation", observation.joints.device, "the controller", device)
         if self.guard is not None:
             self.targets = self._approach(self.guard, observation, period)
         elif self.reopening is not None:
             self.targets = self._reopen(self.reopening, period)
         else:
-            self.targets = Targets(
-                self._close_or_hold(observation, period), self.path + self.closing.palm
-            )
+            joints = self._close_or_hold(observation, period)
+            self.targets = Targets(joints, self.path + self.closing.palm)
             self._judge(observation)
         return self.targets
 
@@ -223,7 +217,8 @@ class GraspController:
         if guard.done:
             self.guard = None
             self.stops = self.stops + guard.stops
-            if (guard.stops or self.attempts > 1) and isinstance(self.closing, UncertaintyClosing):
+            located = guard.stops or self.attempts > 1
+            if located and isinstance(self.closing, UncertaintyClosing):
                 self.closing.begin_at(guard.displacement, guard.palm)
         return Targets(self.targets.joints, self.path + guard.palm, guard.left)
 
@@ -231,53 +226,54 @@ class GraspController:
         """Return the joint targets of the closing controller, or of the hold controller once
         closing has ended.
         """
-        over = self.closing.done or self.time >= CLOSING_TIME
+        closing = self.closing
         if self.hold is not None:
             self.pressed += period
-            missed = isinstance(self.closing, UncertaintyClosing) and not bool(
-                self.closing.touched.all()
-            )
-            if missed and self.check is not None and not self.check.judged:
-                return (
-                    self.targets.joints
-                )  # without a finger that opposes them, pressing ones push the object away
+            judging = self.check is not None and not self.check.judged
+            if judging and isinstance(closing, UncertaintyClosing):
+                if not bool(closing.touched.all()):
+                    # without a finger that opposes them, pressing ones push the object away
+                    return self.targets.joints
             return self.hold(observation, period)
-        if not over or not self.closing.feels:
+        over = closing.done or self.time >= CLOSING_TIME
+        if not over or not closing.feels:
             if self.judges:
                 if self.time == 0.0:
-                    self.felt.append(
-                        Touches(self.reference, torch.zeros(0, 4, dtype=torch.float64))
-                    )
-                self.felt[-1].add(observation, self.closing.palm)
+                    nothing = torch.zeros(0, 4, dtype=torch.float64)
+                    self.felt.append(Touches(self.reference, nothing))
+                self.felt[-1].add(observation, closing.palm)
             self.time += period
-            return self.closing(observation, period)
+            return closing(observation, period)
+        # the closing has ended: this tick makes the hold, and keeps the targets
         if self._make_hold is None:
-            assert isinstance(self.closing, LawClosing)
-            self.hold = self.closing.press()
+            assert isinstance(closing, LawClosing)
+            self.hold = closing.press()
         else:
             self.hold = self._make_hold(self.reference, observation, self.targets.joints)
         if self.judges:
-            assert isinstance(self.closing, UncertaintyClosing)
+            assert isinstance(closing, UncertaintyClosing)
             last = self.attempts >= self.options.attempts
-            found = self.closing.displacement, self.closing.palm
-            self.check = GraspCheck(self.reference, *found, last, self.felt)
+            self.check = GraspCheck(
+                self.reference, closing.displacement, closing.palm, last, self.felt
+            )
         return self.targets.joints
 
     def _judge(self, observation: Observation) -> None:
-        """Start to reopen the hand if the check of the pressing grasp found that a lift would fail."""
+        """Start to reopen the hand if the check of the pressing grasp found that a lift would
+        fail.
+        """
         if self.check is None:
             return
         self.check(observation, self.pressed)
         if self.check.judged and not self.check.secure:
             assert isinstance(self.closing, UncertaintyClosing)
+            # a hand with an approach moves its palm in the next one
             reach = 0.0 if self.length else self.options.palm_reach
             palm = self.closing.palm
-            raised = bool(self.reference.rise.any())
-            begun = (
-                palm
-                if bool(observation.tactile.contact.any()) and not raised
-                else self.closing.begun
-            )
+            begun = self.closing.begun
+            touches = bool(observation.tactile.contact.any())
+            if touches and not bool(self.reference.rise.any()):
+                begun = palm
             self.reopening = Reopening(
                 self.reference, self.check.displacement, observation.joints, palm, begun, reach
             )

@@ -67,10 +67,8 @@ def desired_forces(
 def contacts_in_hand(grasps: Grasps) -> tuple[Float[Tensor, "g f 3"], Float[Tensor, "g f 3"]]:
     """Return the planned contact points [m] and outward normals of grasps, in the hand's frame."""
     hand_from_obj = inverse(grasps.obj_from_hand.double())
-    contacts = grasps.contacts
-    return apply(hand_from_obj, contacts.points.double()), rotate(
-        hand_from_obj, contacts.normals.double()
-    )
+    points = apply(hand_from_obj, grasps.contacts.points.double())
+    return points, rotate(hand_from_obj, grasps.contacts.normals.double())
 
 
 class Squeeze(NamedTuple):
@@ -116,14 +114,15 @@ def check_same_hand(hand: Hand, grasps: Grasps) -> None:
     finger names.
     """
     names = grasps.meta.get("finger_names", ",".join(hand.finger_names)).split(",")
-    if tuple(names) != hand.finger_names or grasps.contacts.fingertips != len(names):
-        found = f"{grasps.contacts.fingertips} contacts a row, of the fingers {', '.join(names)}"
-        allowed = f"those of the hand: {', '.join(hand.finger_names)}; `hand_of(grasps)` loads the fingers of grasps"
-        raise BadArgument("grasps", found, allowed)
-    if grasps.joints.shape[-1] != hand.dof:
-        raise BadArgument(
-            "grasps", f"{grasps.joints.shape[-1]} joints", f"the {hand.dof} joints of {hand.name}"
-        )
+    count = grasps.contacts.fingertips
+    if tuple(names) != hand.finger_names or count != len(names):
+        found = f"{count} contacts a row, of the fingers {', '.join(names)}"
+        ours = ", ".join(hand.finger_names)
+        advice = "`hand_of(grasps)` loads the fingers of grasps"
+        raise BadArgument("grasps", found, f"those of the hand: {ours}; {advice}")
+    joints = grasps.joints.shape[-1]
+    if joints != hand.dof:
+        raise BadArgument("grasps", f"{joints} joints", f"the {hand.dof} joints of {hand.name}")
 
 
 def press(

@@ -105,15 +105,13 @@ def damped_inverse(
 ) -> Float[Tensor, "*b h m"]:
     """Return the damped inverse J^T (J J^T + damping I)^-1 of a Jacobian; `damping` is in m^2."""
     m, h = jacobian.shape[-2:]
+    eye = torch.eye(min(m, h), dtype=jacobian.dtype, device=jacobian.device)
     transposed = jacobian.transpose(-1, -2)
+    # the smaller of both products is solved
     if m <= h:
-        normal = jacobian @ transposed + damping * torch.eye(
-            m, dtype=jacobian.dtype, device=jacobian.device
-        )
+        normal = jacobian @ transposed + damping * eye
         return torch.linalg.solve(normal, jacobian).transpose(-1, -2)
-    normal = transposed @ jacobian + damping * torch.eye(
-        h, dtype=jacobian.dtype, device=jacobian.device
-    )
+    normal = transposed @ jacobian + damping * eye
     return torch.linalg.solve(normal, transposed)
 
 

@@ -107,9 +107,8 @@ class ClosingReference(Value):
         contacts = grasp.contacts
         check_tensor("grasp.contacts.points", contacts.points, (1, len(hand.tips), 3))
         check_tensor("grasp.contacts.normals", contacts.normals, (1, len(hand.tips), 3))
-        std_m = check_tensor("grasp.contacts.std_m", contacts.std_m, (1, len(hand.tips))).to(
-            "cpu", torch.float64
-        )
+        std_m = check_tensor("grasp.contacts.std_m", contacts.std_m, (1, len(hand.tips)))
+        std_m = std_m.to("cpu", torch.float64)
         if stability is not None:
             hand.require_three("stability", "a model of stability")
         hand = hand.to("cpu", torch.float64)
@@ -123,51 +122,43 @@ class ClosingReference(Value):
         if stability is not None:
             tips = points[0] + hand.tips.radius[:, None] * normals[0]
             preferred = stability.preferred_forces(tips, force).forces[None]
-            deviation = (
-                stability.preferred_forces(tips).covariance.diagonal()[None].sqrt()
-            )  # a given force has none
+            # a given force has no deviation, so that none is given
+            covariance = stability.preferred_forces(tips).covariance
+            deviation = covariance.diagonal()[None].sqrt()
             sure = math.hypot(law.FORCE_FLOOR, float(deviation.min()))
         desired = finger_forces.desired_forces(points, normals, force, preferred)
         covariance = law.surface_covariance(normals, std_m)
-        jacobian = hand.jacobian(grasp.joints, points)
-        compliance = finger_forces.tip_compliance(
-            jacobian, normals, finger_forces.joint_stiffness(hand)
-        )
+        jacobian = hand.jacobian(grasp.joints, points)  # (1, f, 3, h)
+        stiffness = finger_forces.joint_stiffness(hand)
+        compliance = finger_forces.tip_compliance(jacobian, normals, stiffness)
         force_covariance = law.force_covariance(desired, normals, deviation)
+        force_rate = law.FORCE_BANDWIDTH * sure**2 * compliance
         gains = ClosingGains(
             target=points[0],
             covariance=covariance[0],
             position_gain=law.position_gain(covariance)[0],
-            force_gain=law.force_gain(force_covariance, law.FORCE_BANDWIDTH * sure**2 * compliance)[
-                0
-            ],
+            force_gain=law.force_gain(force_covariance, force_rate)[0],
             desired_force=desired[0],
             force_source="analytic" if stability is None else "stability",
         )
-        squeeze = finger_forces.press(
+        pressed = finger_forces.press(
             grasp.joints, jacobian, desired, finger_forces.joint_stiffness(hand, kp)
-        ).joints
-        pose = grasp.obj_from_hand[0]
-        opened = grasp.pregrasp[0]
-        joints = grasp.joints[0]
+        )
+        # in the hand's frame
         direction = rotate(inverse(grasp.obj_from_hand), grasp.approach[:, None])[0, 0]
-        approach = (
-            unit(direction) if bool((direction != 0.0).any()) else None
-        )  # in the hand's frame
-        plan = cls(
+        return cls(
             hand,
             finger_forces.drive_stiffness(hand, kp),
-            pose,
-            opened,
-            joints,
-            squeeze[0],
-            normals[0],
-            gains,
-            approach,
+            obj_from_hand=grasp.obj_from_hand[0],
+            pregrasp=grasp.pregrasp[0],
+            joints=grasp.joints[0],
+            squeeze=pressed.joints[0],
+            normals=normals[0],
+            gains=gains,
+            approach=unit(direction) if bool((direction != 0.0).any()) else None,
+            distance_variance=_distance_variance(grasp),
+            friction=_number(grasp, "friction") or ContactSpec.friction,
         )
-        friction = _number(grasp, "friction")
-        told = {} if friction is None else {"friction": friction}
-        return dataclasses.replace(plan, distance_variance=_distance_variance(grasp), **told)
 
     def as_printed(self) -> "ClosingReference":
         """Return the plan with Sigma_cov and K_P of Eqs. (26) and (27) as the paper prints them,
@@ -177,9 +168,8 @@ class ClosingReference(Value):
         """
         if self.distance_variance is None:
             found = "'paper' without f_cov, the variance of the signed distance [m^2]"
-            raise BadArgument(
-                "closing", found, "grasps of `plan_grasps`, whose metadata hold unit_m"
-            )
+            allowed = "grasps of `plan_grasps`, whose metadata hold unit_m"
+            raise BadArgument("closing", found, allowed)
         covariance = law.printed_covariance(self.normals, self.distance_variance)
         gains = dataclasses.replace(
             self.gains, covariance=covariance, position_gain=law.position_gain(covariance)
@@ -240,9 +230,8 @@ class ClosingReference(Value):
 def check_single(grasp: Grasps) -> None:
     """Raise `BadArgument` unless there is exactly one grasp."""
     if len(grasp) != 1:
-        raise BadArgument(
-            "grasp", f"{len(grasp)} rows", "exactly one: index the grasps, as in grasps[0]"
-        )
+        allowed = "exactly one: index the grasps, as in grasps[0]"
+        raise BadArgument("grasp", f"{len(grasp)} rows", allowed)
 
 
 def next_target(
@@ -264,9 +253,8 @@ def next_target(
     step = law.joint_step(jacobian, velocity, period, reference.joints - target)
     step = step * min(1.0, fastest * period / max(float(step.abs().max()), law.TINY))
     joints = reference.pick(observation.joints)
-    return reference.clamp(
-        torch.minimum(torch.maximum(target + step, joints - lead), joints + lead)
-    )
+    near = torch.minimum(torch.maximum(target + step, joints - lead), joints + lead)
+    return reference.clamp(near)
 
 
 def _distance_variance(grasp: Grasps) -> Float[Tensor, "f"] | None:
@@ -282,7 +270,8 @@ def _distance_variance(grasp: Grasps) -> Float[Tensor, "f"] | None:
 
 def _number(grasp: Grasps, name: str) -> float | None:
     """Return a positive number from the metadata of a grasp, or None if they lack it."""
-    if (text := grasp.meta.get(name)) is None:
+    text = grasp.meta.get(name)
+    if text is None:
         return None
     try:
         number = float(text)

@@ -101,9 +101,8 @@ class StabilityModel(Value):
             mean[others] = part.mean()
             covariance[[[i] for i in others], others] = part.covariance()
         forces = mean.exp()
-        return PreferredForces(
-            forces, forces[:, None] * covariance * forces, rest.marginal(STIFFNESS).mean().exp()
-        )
+        springs = rest.marginal(STIFFNESS).mean().exp()
+        return PreferredForces(forces, forces[:, None] * covariance * forces, springs)
 
     @checked(gradients=True)
     def log_odds(self, state: Float[Tensor, "*b 9"]) -> Float[Tensor, "*b"]:
@@ -111,21 +110,17 @@ class StabilityModel(Value):
         and forces.
         """
         stable, others = self._without_lengths
-        judged = torch.cat([state[..., :3], state[..., 6:]], -1)
-        return (
-            stable.log_prob(judged)
-            - others.log_prob(judged)
-            + math.log(self.share / (1 - self.share))
-        )
+        judged = torch.cat([state[..., :3], state[..., 6:]], -1)  # (*b, 6)
+        ratio = stable.log_prob(judged) - others.log_prob(judged)
+        return ratio + math.log(self.share / (1 - self.share))
 
     @functools.cached_property
     def _without_lengths(self) -> tuple[GaussianMixture, GaussianMixture]:
         """The models of stable and of other grasps over stiffness and forces, without fingertip
         distances.
         """
-        return self.stable.marginal((*STIFFNESS, *FORCES)), self.others.marginal(
-            (*STIFFNESS, *FORCES)
-        )
+        left = (*STIFFNESS, *FORCES)
+        return self.stable.marginal(left), self.others.marginal(left)
 
     @checked
     def save(self, path: Path | str) -> Path:
