@@ -66,17 +66,6 @@ class GraspController:
             allow them; "impedance" for more than three fingertips; modes that need more than the
             sensor measures; an approach whose options allow no stops, or whose plan lacks a table,
             a surface or tactile fingertips.
-
-    >>> from torchgrasp import load_hand
-    >>> from torchgrasp import ClosingReference
-    >>> from torchgrasp.control import no_contact, observe
-    >>> from torchgrasp.data.shipped import load_shipped_grasp
-    >>> hand = load_hand("allegro")
-    >>> controller = GraspController(ClosingReference.from_grasp(hand, load_shipped_grasp("jug", "allegro")))
-    >>> joints = controller.reference.pregrasp  # of a robot: read its encoders and fingertips at each tick
-    >>> targets = controller.step(observe(hand, joints, no_contact()), period=1 / 200)
-    >>> targets.joints.shape, controller.closed
-    (torch.Size([16]), False)
     """
 
     @checked

@@ -96,7 +96,8 @@ def squeeze(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None 
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
-    >>> squeeze(load_hand("barrett"), load_shipped_grasp("jug", "barrett")).forces.norm(dim=-1).round(decimals=1)
+    >>> pressed = squeeze(load_hand("barrett"), load_shipped_grasp("jug", "barrett"))
+    >>> pressed.forces.norm(dim=-1).round(decimals=1)
     tensor([[2., 2., 4.]], dtype=torch.float64)
     """
     check_same_hand(hand, grasps)

@@ -340,7 +340,7 @@ class GripHold:
         return np.concatenate([lifted * self.up + side, torque])
 
     def _adapt(self, observation: Observation, period: float) -> None:
-        """Update the friction estimate by sliding fingers, and reduce forces that are not needed."""
+        """Update the friction estimate by sliding fingers; reduce forces that are not needed."""
         tactile = observation.tactile
         slides = (tactile.sliding.numpy() > GRIP.slow) & tactile.contact.numpy()
         self.slid = np.where(slides, self.slid + period, 0.0)

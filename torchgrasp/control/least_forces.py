@@ -37,9 +37,9 @@ class BarrierNumbers:
     beyond the noise.
     """
     growth: float = 0.02
-    """Least share of the internal forces that is added if the load has grown; others are doubled."""
+    """Least share of the internal forces that is tried beside none; each other is twice the last."""
     growths: int = 9
-    """Shares of the internal forces that are tried beside none."""
+    """Number of these shares."""
     margin: float = 1.25
     """Least ratio of the coefficient to that which the internal forces need: below it the forces
     would grow huge.

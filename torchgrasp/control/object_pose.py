@@ -297,7 +297,7 @@ def _bounded_cost(distance: Float[Tensor, "*m"]) -> Float[Tensor, "*m"]:
 
 
 def _square(half: float, pitch: float) -> Float[Tensor, "m 2"]:
-    """Return the points of a square grid with spacing `pitch` from -half to half on both axes [m]."""
+    """Return the points of a square grid of spacing `pitch` from -half to half on both axes [m]."""
     most = round(half / pitch)
     line = torch.arange(-most, most + 1, dtype=torch.float64) * pitch
     return torch.cartesian_prod(line, line)

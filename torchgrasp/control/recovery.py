@@ -365,13 +365,6 @@ class LiftCheck:
     table's normal. The hand will lose the object if two fingertips slide along it in the first 20
     mm of the lift. Only touches count for binary sensors, or without a table. Broken sensors count
     as touching.
-
-    >>> from torchgrasp import load_hand
-    >>> from torchgrasp.control import no_contact, observe
-    >>> from torchgrasp.data.shipped import load_shipped_grasp
-    >>> reference = ClosingReference.from_grasp(load_hand("allegro"), load_shipped_grasp("jug", "allegro"))
-    >>> LiftCheck(reference)(observe(reference.hand, reference.joints, no_contact()), height=0.02, period=0.01)
-    True
     """
 
     @checked

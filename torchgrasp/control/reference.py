@@ -54,12 +54,6 @@ class ClosingReference(Value):
         distance_variance: variance [m^2] of the signed distance at each contact (f_cov in Eq. 12 of
             the paper); None if it is unknown. The closing "paper" needs it.
         friction: coefficient of friction that the grasp was planned for.
-
-    >>> from torchgrasp import load_hand
-    >>> from torchgrasp.data.shipped import load_shipped_grasp
-    >>> reference = ClosingReference.from_grasp(load_hand("barrett"), load_shipped_grasp("jug", "barrett"))
-    >>> reference.joints.shape, reference.expand(reference.joints).shape
-    (torch.Size([4]), torch.Size([8]))
     """
 
     hand: Hand

@@ -1,4 +1,4 @@
-"""A second look at an object: how far it has moved along its table since its surface was estimated."""
+"""A second look at an object: how far it has moved since its surface was estimated."""
 
 import dataclasses
 

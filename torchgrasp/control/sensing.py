@@ -78,7 +78,8 @@ def feel_torques(
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
-    >>> reference = ClosingReference.from_grasp(load_hand("barrett"), load_shipped_grasp("jug", "barrett"))
+    >>> grasp = load_shipped_grasp("jug", "barrett")
+    >>> reference = ClosingReference.from_grasp(load_hand("barrett"), grasp)
     >>> feel_torques(no_contact(), reference, torch.ones(3, 3, 8), torch.zeros(8), 0.01).contact
     tensor([False, False, False])
     """
@@ -155,14 +156,6 @@ class FingertipSensor:
 
     The closing plan has the sensor model. The `generator` draws the noise; without one there is no
     noise.
-
-    >>> from torchgrasp import load_hand
-    >>> from torchgrasp.data.shipped import load_shipped_grasp
-    >>> reference = ClosingReference.from_grasp(load_hand("barrett"), load_shipped_grasp("jug", "barrett"))
-    >>> push, here = torch.tensor([2.0, 0.0, 0.0]).double(), reference.normals
-    >>> truth = TipContact(push, -push[:, None] * here, here, here)
-    >>> FingertipSensor(reference)(truth, torch.ones(3, 3, 8).double(), period=0.01).contact
-    tensor([ True, False, False])
     """
 
     def __init__(
@@ -207,11 +200,15 @@ class FingertipSensor:
             self.switched = torch.where(self.switched, stays, report.reading >= SWITCH_ON)
             report = feel_flags(report, self.switched)
         if not self.whole:
-            nothing = no_contact(fingers=len(self.alive))
-            column = self.alive[:, None]
-            silence = lambda x, no: torch.where(self.alive if x.ndim == 1 else column, x, no)  # noqa: E731
-            report = map_tensors(silence, report, nothing)
+            report = map_tensors(self._silence, report, no_contact(fingers=len(self.alive)))
         late = round(self.model.delay / max(period, 1 / SAMPLING_RATE))
         if self.sensed.reading is not before.reading:  # a sample is held until the next one
             self.reports = [*self.reports, report][-late - 1 :]
         return self.reports[0]
+
+    def _silence(self, sensed: Tensor, nothing: Tensor) -> Tensor:
+        """Return readings (f,) or (f, n), replaced by those without contact where a sensor is
+        dead.
+        """
+        alive = self.alive if sensed.ndim == 1 else self.alive[:, None]
+        return torch.where(alive, sensed, nothing)

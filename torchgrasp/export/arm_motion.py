@@ -30,10 +30,6 @@ class ArmMotion(Value):
 
     `phases` names the times at which the hand is above its pre-grasp, at the pre-grasp, at the
     grasp, presses (its joints are then targets), and has lifted the object.
-
-    >>> motion = ArmMotion(("a", "b"), torch.tensor([0.0, 1.0]), torch.zeros(1, 2, 2), {"above": 0, "pregrasp": 1})
-    >>> motion.positions[0, motion.phases["pregrasp"]]
-    tensor([0., 0.])
     """
 
     joint_names: tuple[str, ...]
@@ -53,7 +49,8 @@ def plan_motion(
     points up. Raises `BadArgument` for grasps without postures of this arm where it stands, and the
     errors of `format_grasps`.
 
-    >>> motion = plan_motion(arm, hand, plan_grasps(cloud, hand, spec, arm=arm)[:1])  # doctest: +SKIP
+    >>> grasps = plan_grasps(cloud, hand, spec, arm=arm)  # doctest: +SKIP
+    >>> motion = plan_motion(arm, hand, grasps[:1])  # doctest: +SKIP
     >>> motion.phases  # doctest: +SKIP
     {'above': 0, 'pregrasp': 8, 'grasp': 9, 'squeeze': 10, 'lift': 18}
     """

@@ -58,8 +58,8 @@ def read_foreign(
     | file | what is read |
     | --- | --- |
     | `.json` of `format_grasps` | joints by name, pose, pre-grasp |
-    | `.json` with `pose` and `dofs` (MultiGripperGrasp) | lists of seven numbers and of joints, in the `order` given |
-    | `.npz` with `grasp_qpos` (DexGraspBench) | rows of pose and joints; `pregrasp_qpos`, if it is there |
+    | `.json` with `pose` and `dofs` (MultiGripperGrasp) | lists of 7 numbers, joints in `order` |
+    | `.npz` with `grasp_qpos` (DexGraspBench) | rows of pose and joints; `pregrasp_qpos`, if any |
 
     Args:
         hand: the grasping hand. For the Allegro hand DexGraspBench's frame and joint order are
@@ -220,7 +220,8 @@ def grasps_from_joints(
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("barrett")
     >>> joints = torch.tensor([[0.0, 1.2, 1.2, 1.2]], dtype=torch.float64)
-    >>> grasps_from_joints(hand, joints, torch.eye(4, dtype=torch.float64)[None]).contacts.points.shape
+    >>> pose = torch.eye(4, dtype=torch.float64)[None]
+    >>> grasps_from_joints(hand, joints, pose).contacts.points.shape
     torch.Size([1, 3, 3])
     """
     hand = hand.to("cpu", torch.float64)

@@ -72,7 +72,8 @@ def save_dexgraspbench(
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> hand, grasp = load_hand("allegro"), load_shipped_grasp("jug", "allegro")
-    >>> [file.name for file in save_dexgraspbench(hand, grasp, tempfile.mkdtemp(), "assets/object/jug")]
+    >>> files = save_dexgraspbench(hand, grasp, tempfile.mkdtemp(), "assets/object/jug")
+    >>> [file.name for file in files]
     ['0.npy']
     """
     bench_from_root, order = bench_frame(hand)
@@ -108,7 +109,8 @@ def format_graspgen(grasps: Grasps, object_path: str) -> str:
 
     >>> import json
     >>> from torchgrasp.data.shipped import load_shipped_grasp
-    >>> json.loads(format_graspgen(load_shipped_grasp("jug", "barrett"), "meshes/jug.obj"))["object"]
+    >>> text = format_graspgen(load_shipped_grasp("jug", "barrett"), "meshes/jug.obj")
+    >>> json.loads(text)["object"]
     {'file': 'meshes/jug.obj', 'scale': 1.0}
     """
     rows = {

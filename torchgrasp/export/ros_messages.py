@@ -35,7 +35,7 @@ class _Dumper(yaml.SafeDumper):
     """
 
     def ignore_aliases(self, data: Any) -> bool:
-        """Return True, so that a list that occurs twice is written twice instead of as a reference."""
+        """Return True, so that a list that occurs twice is written twice, not as a reference."""
         return True
 
     def represent_number(self, number: float) -> yaml.ScalarNode:
@@ -213,7 +213,8 @@ def _document(hand: Hand, what: str, documents: Iterable[Any]) -> str:
     file = hand.urdf_path.name
     heading = (
         f"# {what}, for the {hand.name} hand, by torchgrasp\n"
-        f"# metres, radians, newtons, N m; quaternions by name; frame {OBJECT_FRAME!r}: that of the planned cloud\n"
+        "# metres, radians, newtons, N m; quaternions by name; "
+        f"frame {OBJECT_FRAME!r}: that of the planned cloud\n"
         f"# the hand's frame is link {root!r} of {file}; joints in the order of joint_names\n"
     )
     return heading + yaml.dump_all(
