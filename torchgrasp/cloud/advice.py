@@ -8,18 +8,40 @@ from torch import Tensor
 
 from torchgrasp.cloud.agreement import check_foot
 from torchgrasp.cloud.neighbours import find_inliers, nearest
-from torchgrasp.cloud.parts import LAYER, find_second_body
+from torchgrasp.cloud.parts import PARTS, find_ground, find_second_body
 from torchgrasp.cloud.prepare import FACING, share_facing
 from torchgrasp.cloud.viewpoint import UNSEEN, share_unseen
 from torchgrasp.foundation.base import Value
-from torchgrasp.foundation.errors import BadArgument, NoSupport
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import spatial
 from torchgrasp.geometry.linalg import Points, Vector, unit
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.geometry.support_planes import SUPPORTS, find_supports
 from torchgrasp.values.planning import PointCloud
 
-FEWEST = 50  # fewest points that show whether a camera is right, or whether pixels fly off rims
+
+@dataclasses.dataclass(frozen=True)
+class AdviceNumbers:
+    """At what a cloud contradicts its camera, its vertical or its table."""
+
+    fewest: int = 50
+    """Fewest points that show whether a camera is right, or whether pixels fly off rims."""
+    narrow: float = 0.06
+    """Least width [m] of a level plane that is a table left in."""
+    level: float = 0.97
+    """Cosine between its normal and the vertical below which the normal is told: 14 degrees."""
+    down: float = 0.15
+    """Greatest share of visible normals that point down; a camera above a table sees fewer."""
+    ahead: float = 0.6
+    """A camera in the origin looks along z if the cosine to the cloud is above this."""
+    z_up: float = 0.9
+    """The vertical is z above this cosine, as where none was given."""
+    along: float = 0.8
+    """An outlier flies if it is off the others along the ray: above this cosine."""
+    flying: float = 0.02
+    """Share of flying pixels, over all points, that is worth advice."""
+
+
+ADVICE = AdviceNumbers()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,113 +64,91 @@ class Advice(Value):
 def judge_view(
     cloud: PointCloud, clean: PointCloud, up: Vector, table: Plane | None, stands: bool = True
 ) -> list[Advice]:
-    """Return advice on a cloud's camera, vertical and table, and on other bodies left in; refusals
-    come first.
+    """Return advice on a cloud's camera, vertical, table and pixels, and on other bodies left in;
+    refusals come first.
 
     `clean` is the cloud cleaned, with outward normals and perhaps an estimated viewpoint. A `table`
     of None is assumed at the lowest point. `stands` tells whether the object stands on a table.
     """
-    assert clean.normals is not None
     points = clean.points.double()
-    normals = clean.normals.double()
     given = cloud.viewpoint is not None
     eye = None if clean.viewpoint is None else clean.viewpoint.double()
     facing = 1.0
     if cloud.viewpoint is not None and cloud.normals is not None:
         facing = share_facing(cloud.points, cloud.normals, cloud.viewpoint)
-    advice = _judge_facing(facing)
-    if not advice and eye is not None:
-        advice = _judge_camera(clean, given)
+    seeing = eye if facing >= FACING else None
     # An estimate may be on the wrong side of a table, but not where it is the origin of a camera's
     # frame.
-    trusted = eye is not None and facing >= FACING and (given or not bool(eye.any()))
-    support = _find_support(
-        points, eye.reshape(-1, 3).mean(0) if trusted and eye is not None else None, up
-    )
+    trusted = seeing if seeing is None or given or not bool(seeing.any()) else None
+    support = find_ground(points, trusted, up, ADVICE.narrow)
+    ground = None if support is None else support.plane
+
+    found = [_judge_facing(facing)]
+    if eye is not None and found == [None]:
+        found.append(_judge_camera(clean, given))
     if stands and table is not None:
-        try:
-            check_foot(cloud, table)
-        except BadArgument as error:
-            found = f"a table that contradicts the cloud, {error.found}"
-            advice.append(Advice(found, f"--table, {error.allowed}", True))
-    if stands and eye is not None and facing >= FACING:
-        advice += _judge_height(points, eye, given, up, table, support and support[0])
-        down = float((normals @ up < -0.5).double().mean())
-        if (
-            given and not any(a.refused for a in advice) and down > 0.15
-        ):  # a camera above a table sees fewer
-            found = f"a vertical {_triple(up)} that {down:.0%} of the visible normals contradict: they point down"
-            advice.append(Advice(found, "the vertical of the cloud's frame: --up X Y Z", False))
-    if support is not None:
-        normal = support[0].normal
-        found = f"a plane under the object, a table left in, with {support[1]:.0%} of the points"
-        turn = f" --up {_triple(normal, ' ')}, its normal," if float(normal @ up) < 0.97 else ""
-        advice.append(
-            Advice(found, f"the object alone: torchgrasp cloud cut CLOUD{turn} --out FILE", True)
-        )
-    body = find_second_body(points, up, float(nearest(points, 2)[0][:, -1].median()))
-    if body is not None:
-        found = f"two bodies that stand apart, the second of {float(body.double().mean()):.0%} of the points"
-        x, y, z = points[~body].mean(0).tolist()
-        fix = f"one object: torchgrasp cloud cut CLOUD --point {x:.3f} {y:.3f} {z:.3f} --out FILE"
-        advice.append(Advice(found, fix, True))
-    return sorted(advice, key=lambda a: not a.refused)
+        found.append(_judge_table(cloud, table))
+    if stands and seeing is not None:
+        found.append(_judge_height(points, seeing, given, up, table, ground))
+        if given and not any(advice and advice.refused for advice in found):
+            found.append(_judge_vertical(clean, up))
+    if ground is not None:
+        found.append(_judge_ground(points, ground, up))
+    found.append(_judge_bodies(points, up))
+    if clean.viewpoint is not None and clean.viewpoint.ndim == 1:
+        found.append(_judge_pixels(cloud, clean.viewpoint))
+    advice = [one for one in found if one is not None]
+    return sorted(advice, key=lambda one: not one.refused)
 
 
-def _find_support(points: Points, eye: Vector | None, up: Vector) -> tuple[Plane, float] | None:
-    """Return the plane of a table that was left in the cloud, and its share of the points; None if
-    there is none.
-    """
-    for sky, width in ((up, 0.06), *([(None, SUPPORTS.least_width)] if eye is not None else [])):
-        try:
-            plane = find_supports(points, eye, sky, least_width=width)[0].plane
-        except NoSupport:
-            continue
-        return plane, float((plane.height(points).abs() < LAYER).double().mean())
-    return None
-
-
-def _judge_facing(facing: float) -> list[Advice]:
+def _judge_facing(facing: float) -> Advice | None:
     """Return advice if too few normals face the camera: nearly all do in a single view, half on a
     whole surface.
     """
     if facing < 1 - FACING:
+        found = f"normals of which {1 - facing:.0%} point away from the camera"
         fix = "outward normals, or none (--no-normals), or the true --viewpoint X Y Z"
-        return [Advice(f"normals of which {1 - facing:.0%} point away from the camera", fix, True)]
+        return Advice(found, fix, True)
     if facing < FACING:
-        found = f"a viewpoint that {facing:.0%} of the normals face: it is ignored, the cloud taken for a whole surface"
-        return [
-            Advice(found, "the true --viewpoint X Y Z of a single view, or --no-viewpoint", False)
-        ]
-    return []
+        ignored = "it is ignored, the cloud taken for a whole surface"
+        found = f"a viewpoint that {facing:.0%} of the normals face: {ignored}"
+        fix = "the true --viewpoint X Y Z of a single view, or --no-viewpoint"
+        return Advice(found, fix, False)
+    return None
 
 
-def _judge_camera(clean: PointCloud, given: bool) -> list[Advice]:
+def _judge_camera(clean: PointCloud, given: bool) -> Advice | None:
     """Return advice if a camera, `given` by the user or else estimated, cannot have seen the points
     of its view.
     """
     worst = (0.0, 0.0)
     for view in clean.split_views():
-        if view.viewpoint is not None and view.normals is not None and len(view) >= FEWEST:
-            shares = share_unseen(
-                view.points.double(), view.normals.double(), view.viewpoint.double()
-            )
-            worst = max(worst, shares, key=lambda s: max(UNSEEN.excess(s)))
-    edge_on, behind = worst
-    if max(UNSEEN.excess(worst)) <= 1:
-        return []
-    what = f"has {behind:.0%} of them behind others"
-    if UNSEEN.excess(worst)[0] > UNSEEN.excess(worst)[1]:
-        what = f"sees {edge_on:.0%} of them edge-on"
+        eye = view.viewpoint
+        if eye is not None and view.normals is not None and len(view) >= ADVICE.fewest:
+            shares = share_unseen(view.points.double(), view.normals.double(), eye.double())
+            worst = max(worst, shares, key=lambda shares: max(UNSEEN.excess(shares)))
+    edge_on, behind = UNSEEN.excess(worst)
+    if max(edge_on, behind) <= 1:
+        return None
+    what = f"has {worst[1]:.0%} of them behind others"
+    if edge_on > behind:
+        what = f"sees {worst[0]:.0%} of them edge-on"
+    found = f"an estimated camera that the points contradict: it {what}"
+    fix = "a single view with its --viewpoint X Y Z, or outward normals"
     if given:
         found = f"a viewpoint that the points contradict: a camera there {what}"
-        return [
-            Advice(
-                found, "the true camera, --viewpoint X Y Z, or an estimate, --no-viewpoint", True
-            )
-        ]
-    found = f"an estimated camera that the points contradict: it {what}"
-    return [Advice(found, "a single view with its --viewpoint X Y Z, or outward normals", False)]
+        fix = "the true camera, --viewpoint X Y Z, or an estimate, --no-viewpoint"
+    return Advice(found, fix, given)
+
+
+def _judge_table(cloud: PointCloud, table: Plane) -> Advice | None:
+    """Return advice if a table lies above the object's foot."""
+    try:
+        check_foot(cloud, table)
+    except BadArgument as error:
+        found = f"a table that contradicts the cloud, {error.found}"
+        return Advice(found, f"--table, {error.allowed}", True)
+    return None
 
 
 def _judge_height(
@@ -158,7 +158,7 @@ def _judge_height(
     up: Vector,
     table: Plane | None,
     ground: Plane | None,
-) -> list[Advice]:
+) -> Advice | None:
     """Return advice if the camera is below the table, or below the lowest point if the table is
     unknown.
     """
@@ -166,14 +166,13 @@ def _judge_height(
     normal = up if table is None else table.normal.double()
     below = lowest - float((eye @ normal).min())
     if below < 0:
-        return []
+        return None
     level = "the lowest point" if table is None else "the table"
     place = f"{below:.2f} m below {level} along the vertical {_triple(normal)}"
+
     centre = points.mean(0)
-    forward = (
-        float(centre[2]) > 0.6 * float(torch.linalg.vector_norm(centre)) and float(up[2]) > 0.9
-    )
-    if forward and not bool(eye.any()):
+    ahead = float(centre[2]) > ADVICE.ahead * float(torch.linalg.vector_norm(centre))
+    if ahead and float(up[2]) > ADVICE.z_up and not bool(eye.any()):
         axis = torch.tensor([0.0, -1.0, 0.0])
         why = "for a level camera"
         if ground is not None:
@@ -183,36 +182,65 @@ def _judge_height(
         options = f"{'' if given else '--viewpoint 0 0 0 '}--up {_triple(axis, ' ')}"
         fix = f"a vertical that points up: {options} ({why}), or --camera-pose FILE"
         fix += "" if given else "; or, if z points up, --up 0 0 1"
-        return [Advice(found, fix, True)]
+        return Advice(found, fix, True)
     if not given:
-        return [Advice(f"an estimated camera {place}", "the true camera: --viewpoint X Y Z", False)]
-    fix = f"a camera above it: --viewpoint X Y Z; or, if {_triple(up)} points down, --up {_triple(-up, ' ')}"
-    return [Advice(f"a camera {place}", fix, True)]
+        return Advice(f"an estimated camera {place}", "the true camera: --viewpoint X Y Z", False)
+    other = f"if {_triple(up)} points down, --up {_triple(-up, ' ')}"
+    fix = f"a camera above it: --viewpoint X Y Z; or, {other}"
+    return Advice(f"a camera {place}", fix, True)
 
 
-def judge_pixels(cloud: PointCloud, viewpoint: Vector) -> list[Advice]:
+def _judge_vertical(clean: PointCloud, up: Vector) -> Advice | None:
+    """Return advice if many of the normals that the camera sees point down, by over 30 degrees."""
+    assert clean.normals is not None
+    down = float((clean.normals.double() @ up < -0.5).double().mean())
+    if down <= ADVICE.down:
+        return None
+    found = f"a vertical {_triple(up)} that {down:.0%} of the visible normals contradict"
+    fix = "the vertical of the cloud's frame: --up X Y Z"
+    return Advice(f"{found}: they point down", fix, False)
+
+
+def _judge_ground(points: Points, ground: Plane, up: Vector) -> Advice:
+    """Return advice on a table that was left in the cloud."""
+    share = float((ground.height(points).abs() < PARTS.layer).double().mean())
+    found = f"a plane under the object, a table left in, with {share:.0%} of the points"
+    turn = ""
+    if float(ground.normal @ up) < ADVICE.level:
+        turn = f" --up {_triple(ground.normal, ' ')}, its normal,"
+    return Advice(found, f"the object alone: torchgrasp cloud cut CLOUD{turn} --out FILE", True)
+
+
+def _judge_bodies(points: Points, up: Vector) -> Advice | None:
+    """Return advice on a second body that was left in the cloud."""
+    body = find_second_body(points, up, float(nearest(points, 2)[0][:, -1].median()))
+    if body is None:
+        return None
+    share = float(body.double().mean())
+    found = f"two bodies that stand apart, the second of {share:.0%} of the points"
+    x, y, z = points[~body].mean(0).tolist()
+    cut = f"torchgrasp cloud cut CLOUD --point {x:.3f} {y:.3f} {z:.3f} --out FILE"
+    return Advice(found, f"one object: {cut}", True)
+
+
+def _judge_pixels(cloud: PointCloud, viewpoint: Vector) -> Advice | None:
     """Return advice if many outliers are flying pixels: they lie before or behind other points on
     camera rays.
     """
     points = cloud.points.double()
     inlier = find_inliers(points)
-    if bool(inlier.all()) or int(inlier.sum()) < FEWEST:
-        return []
+    if bool(inlier.all()) or int(inlier.sum()) < ADVICE.fewest:
+        return None
     stray = points[~inlier]
     _, index = spatial.KDTree(points[inlier].numpy()).query(stray.numpy())
     away = stray - points[inlier][torch.from_numpy(index)]
     along = (unit(away) * unit(stray - viewpoint.double())).sum(-1).abs()
-    flying = float((along > 0.8).double().sum()) / len(points)
-    if flying < 0.02:
-        return []
+    flying = float((along > ADVICE.along).double().sum()) / len(points)
+    if flying < ADVICE.flying:
+        return None
     found = f"flying pixels at rims, {flying:.0%} of the points"
-    return [
-        Advice(
-            found,
-            "none, for a sharper outline: torchgrasp cloud thin CLOUD --voxel 0.001 --out FILE",
-            False,
-        )
-    ]
+    thin = "torchgrasp cloud thin CLOUD --voxel 0.001 --out FILE"
+    return Advice(found, f"none, for a sharper outline: {thin}", False)
 
 
 def _triple(vector: Tensor, between: str = ", ") -> str:

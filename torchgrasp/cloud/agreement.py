@@ -1,5 +1,7 @@
 """Checks that the cloud, mesh, contacts and table of one object do not contradict each other."""
 
+import dataclasses
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -11,6 +13,27 @@ from torchgrasp.geometry.linalg import Points, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.plane_fit import assume_noise
 from torchgrasp.values.planning import PointCloud
+
+
+@dataclasses.dataclass(frozen=True)
+class AgreementNumbers:
+    """How far the cloud, mesh, contacts and table of one object may be apart."""
+
+    drawn: int = 300
+    """Most points whose distances are measured,"""
+    drawn_of_cloud: int = 500
+    """and most points of a cloud to which they are measured."""
+    slack: float = 0.01
+    """Greatest distance [m] of points from their mesh, beside the noise."""
+    share: float = 0.2
+    """Greatest share of points that may be farther."""
+    lowest: float = 0.02
+    """Share of the points of an object that may be lower than its foot: outliers."""
+    foot: float = 0.015
+    """Greatest height [m] of a foot above or below its table, beside the noise."""
+
+
+AGREEMENT = AgreementNumbers()
 
 
 def check_agreement(
@@ -28,7 +51,7 @@ def check_agreement(
     mesh or the cloud.
     """
     points = points.detach().cpu().double()
-    points = points[draw_rows(len(points), 300)]
+    points = points[draw_rows(len(points), AGREEMENT.drawn)]
     if isinstance(other, PointCloud):
         distance = _distance_behind(points, other)
         surface = "the cloud or behind it"
@@ -39,29 +62,26 @@ def check_agreement(
         surface = "the mesh's surface"
     far = distance > slack
     if float(far.double().mean()) > share:
-        found = (
-            f"{int(far.sum())} of {len(far)} about {1e3 * float(distance[far].median()):.0f} mm off"
-        )
-        raise BadArgument(
-            name, found, f"{what} within {1e3 * slack:.0f} mm of {surface}: one frame, in metres"
-        )
+        off = float(distance[far].median())
+        found = f"{int(far.sum())} of {len(far)} about {1e3 * off:.0f} mm off"
+        allowed = f"{what} within {1e3 * slack:.0f} mm of {surface}: one frame, in metres"
+        raise BadArgument(name, found, allowed)
 
 
 def check_mesh(cloud: PointCloud, mesh: "trimesh.Trimesh", name: str = "mesh") -> None:
     """Raise `BadArgument` if many points of an object's cloud do not lie on the object's mesh."""
-    check_agreement(name, cloud.points, "the cloud's points", mesh, 0.01 + 2 * _noise(cloud), 0.2)
+    slack = AGREEMENT.slack + 2 * _noise(cloud)
+    check_agreement(name, cloud.points, "the cloud's points", mesh, slack, AGREEMENT.share)
 
 
 def check_foot(cloud: PointCloud, table: Plane) -> None:
     """Raise `BadArgument` for a table that lies above the lowest points of its object."""
-    foot = float(table.height(cloud.points.double().cpu()).quantile(0.02))
-    if -foot > 0.015 + 2 * _noise(cloud):
+    height = table.height(cloud.points.double().cpu())
+    foot = float(height.quantile(AGREEMENT.lowest))
+    if -foot > AGREEMENT.foot + 2 * _noise(cloud):
         found = f"one {-1e3 * foot:.0f} mm above the object's foot"
-        raise BadArgument(
-            "table",
-            found,
-            f"a table under the object's points, at least {-1e3 * foot:.0f} mm lower",
-        )
+        allowed = f"a table under the object's points, at least {-1e3 * foot:.0f} mm lower"
+        raise BadArgument("table", found, allowed)
 
 
 def check_stand(mesh: "trimesh.Trimesh", table: Plane, name: str = "mesh") -> None:
@@ -69,8 +89,9 @@ def check_stand(mesh: "trimesh.Trimesh", table: Plane, name: str = "mesh") -> No
     sinks into it.
     """
     foot = float(table.height(torch.tensor(mesh.vertices, dtype=torch.float64)).min())
-    if abs(foot) > 0.015:
-        found = f"one whose foot is {1e3 * abs(foot):.0f} mm {'above' if foot > 0 else 'below'} the table"
+    if abs(foot) > AGREEMENT.foot:
+        side = "above" if foot > 0 else "below"
+        found = f"one whose foot is {1e3 * abs(foot):.0f} mm {side} the table"
         raise BadArgument(name, found, "a mesh that stands on the table, in the frame of both")
 
 
@@ -86,11 +107,12 @@ def _distance_behind(points: Float[Tensor, "n 3"], cloud: PointCloud) -> Float[T
     """Return each point's distance [m] from a cloud and the space hidden behind it, as deep as the
     cloud is long.
     """
-    rows = draw_rows(len(cloud), 500)
+    rows = draw_rows(len(cloud), AGREEMENT.drawn_of_cloud)
     seen = cloud.points[rows].double().cpu()
     length = float(torch.linalg.vector_norm(seen.amax(0) - seen.amin(0)))
-    away = points[:, None] - seen
-    if cloud.viewpoint is None:  # the space around the cloud counts as hidden
+    away = points[:, None] - seen  # (n, m, 3)
+    # Without a camera, the space around the cloud counts as hidden.
+    if cloud.viewpoint is None:
         return (torch.linalg.vector_norm(away, dim=-1).amin(1) - length / 2).clamp_min(0)
     eye = cloud.viewpoint.double().cpu()
     ray = unit(seen - (eye if eye.ndim == 1 else eye[rows]))

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.cloud.advice import Advice, judge_pixels, judge_view
+from torchgrasp.cloud.advice import Advice, judge_view
 from torchgrasp.cloud.check import FEW_POINTS, remove_duplicates
 from torchgrasp.cloud.neighbours import draw_rows, find_inliers, fit_local_planes, is_flat, nearest
 from torchgrasp.cloud.prepare import (
@@ -24,9 +24,36 @@ from torchgrasp.files import render
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument
-from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.linalg import Vector, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.values.planning import PointCloud
+
+
+@dataclasses.dataclass(frozen=True)
+class ReportNumbers:
+    """How a cloud is measured, and which measures are worth advice."""
+
+    measured: int = 50_000
+    """Most points at which spacing, noise and outliers are measured."""
+    viewed: int = 5000
+    """Most of these points that serve the advice on camera, vertical, table and bodies."""
+    neighbours: int = 9
+    """The point itself and a raster's eight neighbours."""
+    least: float = 1e-12
+    """Keeps the size of a voxel finite."""
+    long: float = 0.4
+    """Greatest length [m] of an object for a hand."""
+    outliers: float = 0.05
+    """Greatest share of outliers."""
+    sparse: float = 0.1
+    """Greatest spacing of the points, over the length."""
+    noise: float = 0.003
+    """Greatest noise [m]."""
+    flipped: float = 0.03
+    """Greatest share of flipped normals."""
+
+
+REPORT = ReportNumbers()
 
 
 @checked
@@ -75,44 +102,33 @@ def diagnose_cloud(
     >>> diagnose_cloud(PointCloud(0.1 * torch.rand(500, 3), viewpoint=torch.tensor([0.0, 0.0, 1.0]))).copies
     0
     """
-    most = 50_000  # most points at which spacing, noise and outliers are measured
     vertical = torch.tensor([0.0, 0.0, 1.0]) if up is None else check_tensor("up", up, (3,)).cpu()
     cloud = cloud.to("cpu")
     table = None if table is None else table.to("cpu")
     if not bool(vertical.any()):
         raise BadArgument("up", "a vector of length zero", "the direction that points up")
+    vertical = unit(vertical.double())
     whole = remove_duplicates(cloud)
     points = whole.points.double()
-    rows = draw_rows(len(whole), most)
-    distance, _ = nearest(points, 9, rows)  # the point itself and a raster's eight neighbours
-    area = math.pi * distance[:, -1] ** 2  # of the disc that holds the neighbours
+    rows = draw_rows(len(whole), REPORT.measured)
     some = whole.select(rows)
-    view = some.select(draw_rows(len(some), 5000))
-    check = (
-        None
-        if view.normals is None
-        else compare_normals(view.points.double(), view.normals.double())
-    )
-    if check is not None and not check.oriented:
-        view = PointCloud(view.points, None, view.viewpoint)
-    vertical = unit(vertical.double())
-    guessed = view
-    angle = 0.0
-    if view.viewpoint is None:
-        seen = view.points.double()[find_inliers(view.points.double())]
-        eye, likely = guess_viewpoint(seen, fit_local_planes(seen)[0], vertical, assumed=up is None)
-        if (
-            view.normals is None
-            or share_facing(view.points, view.normals, eye.to(view.points)) >= FACING
-        ):
-            guessed = dataclasses.replace(view, viewpoint=eye.to(view.points))
-            angle = likely
+
+    view = some.select(draw_rows(len(some), REPORT.viewed))
+    check = None
+    if view.normals is not None:
+        check = compare_normals(view.points.double(), view.normals.double())
+        if not check.oriented:
+            view = PointCloud(view.points, None, view.viewpoint)
+    guessed, angle = _guess_camera(view, vertical, assumed=up is None)
     clean = clean_cloud(guessed)
     # Clean normals face the viewpoint by construction; given normals may be those of a whole
     # surface.
     judged = clean if view.normals is None else view
     viewpoint = clean.viewpoint if judged.viewpoint is None else judged.viewpoint
     assert judged.normals is not None
+
+    distance, _ = nearest(points, REPORT.neighbours, rows)  # (m, 9)
+    area = math.pi * distance[:, -1] ** 2  # of the disc that holds the neighbours
     x, y, z = (points.amax(0) - points.amin(0)).tolist()
     report = CloudReport(
         points=len(cloud),
@@ -130,9 +146,23 @@ def diagnose_cloud(
         advice=(),
     )
     advice = judge_view(view, clean, vertical, table, stands)
-    if clean.viewpoint is not None and clean.viewpoint.ndim == 1:
-        advice += judge_pixels(view, clean.viewpoint)
     return dataclasses.replace(report, advice=(*advice, *_advise(report, is_flat(points), angle)))
+
+
+def _guess_camera(view: PointCloud, up: Vector, assumed: bool) -> tuple[PointCloud, float]:
+    """Return a view with its viewpoint, guessed if it is unknown, and the angle [deg] of the guess.
+
+    A guess that too few of the given normals face is dropped.
+    """
+    if view.viewpoint is not None:
+        return view, 0.0
+    points = view.points.double()
+    seen = points[find_inliers(points)]
+    eye, angle = guess_viewpoint(seen, fit_local_planes(seen)[0], up, assumed)
+    eye = eye.to(view.points)
+    if view.normals is not None and share_facing(view.points, view.normals, eye) < FACING:
+        return view, 0.0
+    return dataclasses.replace(view, viewpoint=eye), angle
 
 
 @checked
@@ -151,42 +181,34 @@ def _advise(report: CloudReport, flat: bool, angle: float) -> list[Advice]:
     """
     longest = max(report.size)
     outliers = report.outliers / report.points
-    given = report.viewpoint_given
-    voxel = 1.0 / math.sqrt(max(report.density * MAX_POINTS / report.points, 1e-12))
+    density = report.density * MAX_POINTS / report.points
+    voxel = 1.0 / math.sqrt(max(density, REPORT.least))
     check = report.normals
+    oriented = check is None or check.oriented
     flipped = 0.0 if check is None else float(check.flipped.double().mean())
     cut = "torchgrasp cloud cut CLOUD --out FILE"
     thin = f"torchgrasp cloud thin CLOUD --voxel {voxel:.2g} --out FILE"
+    scene = f"a length of {longest:.2f} m, large for a hand, as of a whole scene"
     many = f"{report.points} points, of which {MAX_POINTS} are used"
+    far = f"{outliers:.0%} of the points far from the others"
     few = f"fewer than {FEW_POINTS} points, too few for a shape"
     sparse = f"{1e3 * report.spacing:.0f} mm between points, so that the shape is mostly guessed"
-    guess = f"a camera whose position is a guess, {f'to {angle:.0f} degrees' if angle < 180 else 'on weak evidence'}"
+    blurred = f"{1e3 * report.noise:.1f} mm of noise, which blur the normals"
+    plane = "points all in one plane, so that the thickness is a guess"
+    turned = f"{flipped:.0%} flipped normals"
+    sure = f"to {angle:.0f} degrees" if angle < 180.0 else "on weak evidence"
+    guess = f"a camera whose position is a guess, {sure}"
+    guessed = report.viewpoint is not None and not report.viewpoint_given
     rules = [
-        (
-            longest > 0.4,
-            f"a length of {longest:.2f} m, large for a hand, as of a whole scene",
-            f"one object: {cut}",
-        ),
+        (longest > REPORT.long, scene, f"one object: {cut}"),
         (report.points > 2 * MAX_POINTS, many, f"as many: {thin}"),
-        (outliers > 0.05, f"{outliers:.0%} of the points far from the others", f"none: {thin}"),
+        (outliers > REPORT.outliers, far, f"none: {thin}"),
         (report.points - report.copies < FEW_POINTS, few, "a denser cloud"),
-        (report.spacing > 0.1 * longest, sparse, "a denser cloud"),
-        (
-            report.noise > 0.003,
-            f"{1e3 * report.noise:.1f} mm of noise, which blur the normals",
-            "a nearer camera",
-        ),
-        (flat, "points all in one plane, so that the thickness is a guess", "a view of two sides"),
-        (
-            bool(check and check.oriented) and flipped > 0.03,
-            f"{flipped:.0%} flipped normals",
-            "none: --no-normals",
-        ),
-        (
-            bool(check and not check.oriented),
-            "normals of random signs, which are ignored",
-            "none: --no-normals",
-        ),
-        (report.viewpoint is not None and not given, guess, "--viewpoint X Y Z"),
+        (report.spacing > REPORT.sparse * longest, sparse, "a denser cloud"),
+        (report.noise > REPORT.noise, blurred, "a nearer camera"),
+        (flat, plane, "a view of two sides"),
+        (oriented and flipped > REPORT.flipped, turned, "none: --no-normals"),
+        (not oriented, "normals of random signs, which are ignored", "none: --no-normals"),
+        (guessed, guess, "--viewpoint X Y Z"),
     ]
     return [Advice(found, fix, False) for applies, found, fix in rules if applies]

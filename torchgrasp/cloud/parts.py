@@ -1,5 +1,7 @@
 """The parts of a cloud: one object on a support, and bodies that lie apart."""
 
+import contextlib
+import dataclasses
 from typing import Annotated
 
 import numpy as np
@@ -12,18 +14,40 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import NoSupport, TooFewPoints
 from torchgrasp.foundation.lazy import spatial
 from torchgrasp.foundation.rules import Range
-from torchgrasp.geometry.linalg import number_components
+from torchgrasp.geometry.linalg import Points, Vector, number_components
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.geometry.support_planes import SupportPlane, find_supports
+from torchgrasp.geometry.support_planes import SUPPORTS, SupportPlane, find_supports
 from torchgrasp.values.planning import PointCloud
 
-# least half thickness [m] of a support's layer, for the noise of a depth camera at half a metre
-LAYER = 0.004
-# least distance [m] between bodies; a bent or hidden surface of one body leaves smaller gaps
-GAP = 0.04
+
+@dataclasses.dataclass(frozen=True)
+class PartNumbers:
+    """What belongs to the support of a scene, and what to one body."""
+
+    layer: float = 0.004
+    """Least half thickness [m] of a support's layer: the noise of a depth camera at half a metre."""
+    near: float = 0.02
+    """Points within this distance [m] of the support show its noise."""
+    noises: float = 5.0
+    """Half thickness of the layer, in median distances of those points."""
+    gap: float = 0.04
+    """Least distance [m] between bodies; a bent or hidden surface leaves smaller gaps."""
+    spacings: float = 4.0
+    """The same in spacings of the points, for sparse clouds."""
+    share: float = 0.1
+    """Least share of the points in a second body; fewer are left over from its cut."""
+    lowest: float = 0.02
+    """Share of the points of a body that may be lower than its foot: outliers."""
+    foot: float = 0.015
+    """A body stands on the ground if its foot is lower than this [m]."""
+    around: float = 0.5
+    """Greatest distance [m] of an object's points from a place on or near it."""
 
 
-def label_bodies(points: Float[Tensor, "n 3"], gap: float = GAP) -> Int[Tensor, "n"]:
+PARTS = PartNumbers()
+
+
+def label_bodies(points: Float[Tensor, "n 3"], gap: float = PARTS.gap) -> Int[Tensor, "n"]:
     """Return the group number of each point; groups are more than `gap` [m] apart, and group 0 is
     the largest.
     """
@@ -32,9 +56,8 @@ def label_bodies(points: Float[Tensor, "n 3"], gap: float = GAP) -> Int[Tensor, 
     # One point of each cell of a quarter of the gap, so that dense clouds have few pairs.
     cells = torch.floor((points - points.amin(0)) / (gap / 4)).long()
     size = cells.amax(0) + 1
-    _, group = torch.unique(
-        (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2], return_inverse=True
-    )
+    number = (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]
+    _, group = torch.unique(number, return_inverse=True)
     first = first_of_each(group)
     pairs = spatial.KDTree(points[first].numpy()).query_pairs(gap, output_type="ndarray")
     label = number_components(pairs, len(first))[group.numpy()]
@@ -48,15 +71,18 @@ def find_second_body(
     """Return a mask of the points of a second body that stands apart on the same ground; None if
     there is none.
     """
-    label = label_bodies(points, max(GAP, 4 * spacing))
+    label = label_bodies(points, max(PARTS.gap, PARTS.spacings * spacing))
     height = points @ up
+    ground = height.min()
+
+    def stands(body: Bool[Tensor, "n"]) -> bool:
+        return float(height[body].quantile(PARTS.lowest) - ground) < PARTS.foot
+
+    if not stands(label == 0):
+        return None
     for k in range(1, int(label.max()) + 1):
         body = label == k
-        low = (
-            height[body].quantile(0.02) - height.min(),
-            height[label == 0].quantile(0.02) - height.min(),
-        )
-        if float(body.double().mean()) >= 0.1 and max(float(x) for x in low) < 0.015:
+        if float(body.double().mean()) >= PARTS.share and stands(body):
             return body
     return None
 
@@ -67,7 +93,7 @@ def cut_object(
     up: Float[Tensor, "3"],
     point: Float[Tensor, "3"] | None = None,
     box: Float[Tensor, "2 3"] | None = None,
-    gap: Annotated[float, Range(0.001, 1.0)] = GAP,
+    gap: Annotated[float, Range(0.001, 1.0)] = PARTS.gap,
 ) -> tuple[PointCloud, Plane | None]:
     """Return the points of one object that stands on a support, and the support's plane if one was
     found.
@@ -95,15 +121,14 @@ def cut_object(
     if box is not None:
         keep &= ((points >= box.amin(0)) & (points <= box.amax(0))).all(1)
     if point is not None:
-        keep &= torch.linalg.vector_norm(points - point, dim=-1) < 0.5
+        keep &= torch.linalg.vector_norm(points - point, dim=-1) < PARTS.around
     cloud = _select(cloud, keep, "points in the box and near the point")
-    support = _find_support(cloud, up)
+    support = find_ground(cloud.points, cloud.viewpoint, up)
     if support is not None:
         height = support.plane.height(cloud.points.double())
-        spread = float(
-            height[height.abs() < 0.02].abs().median().nan_to_num()
-        )  # of the noise of the support
-        cloud = _select(cloud, height > max(LAYER, 5 * spread), "points above the plane")
+        noise = float(height[height.abs() < PARTS.near].abs().median().nan_to_num())
+        layer = max(PARTS.layer, PARTS.noises * noise)
+        cloud = _select(cloud, height > layer, "points above the plane")
     points = cloud.points.double()
     label = label_bodies(points, gap)
     if point is not None:
@@ -111,25 +136,26 @@ def cut_object(
     else:
         over = label if support is None else label[support.covers(points)]
         wanted = int((over if len(over) else label).mode().values)
-    return _select(
-        cloud, label == wanted, "points of the object"
-    ), None if support is None else support.plane
+    object_ = _select(cloud, label == wanted, "points of the object")
+    return object_, None if support is None else support.plane
 
 
-def _find_support(cloud: PointCloud, up: Float[Tensor, "3"]) -> SupportPlane | None:
-    """Return the plane on which a scene's objects stand: nearly level, else any that the camera
-    looks down on.
+def find_ground(
+    points: Points,
+    eye: Float[Tensor, "*views 3"] | None,
+    up: Vector,
+    level_width: float = SUPPORTS.least_width,
+) -> SupportPlane | None:
+    """Return the plane on which objects stand: a nearly level one of at least `level_width` [m],
+    else any that the cameras look down on.
     """
-    eye = (
-        cloud.viewpoint
-        if cloud.viewpoint is None or cloud.viewpoint.ndim == 1
-        else cloud.viewpoint.mean(0)
+    middle = None if eye is None else eye.reshape(-1, 3).mean(0)
+    kinds = (
+        [(up, level_width)] if middle is None else [(up, level_width), (None, SUPPORTS.least_width)]
     )
-    for sky in (up, *([None] if eye is not None else [])):
-        try:
-            return find_supports(cloud.points, eye, sky)[0]
-        except NoSupport:
-            continue
+    for sky, width in kinds:
+        with contextlib.suppress(NoSupport):
+            return find_supports(points, middle, sky, width)[0]
     return None
 
 
