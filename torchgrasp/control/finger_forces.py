@@ -15,7 +15,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Force, Positive, check_dense
 from torchgrasp.geometry.frames import apply, inverse, rotate
-from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.hand import Actuator, Hand
 from torchgrasp.values.planning import Grasps
 
 
@@ -139,11 +139,19 @@ def press(
     return Squeeze(joints + torques / stiffness, forces, torques)
 
 
+def stiff_drives(hand: Hand, kp: float | None) -> dict[str, Actuator]:
+    """Return the drives of a hand by joint; `kp` [N m/rad], if given, is the stiffness of all."""
+    if kp is None:
+        return hand.actuators
+    return {name: drive._replace(kp=kp) for name, drive in hand.actuators.items()}
+
+
 def drive_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, " j"]:
     """Return the drive stiffness [N m/rad] of every joint of the URDF: `kp` if given, else the
     hand's own.
     """
-    kps = [hand.actuators[name].kp if kp is None else kp for name in hand.tree.joint_names]
+    drives = stiff_drives(hand, kp)
+    kps = [drives[name].kp for name in hand.tree.joint_names]
     return torch.tensor(kps, dtype=torch.float64, device="cpu")
 
 
@@ -152,7 +160,8 @@ def joint_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, "h"]:
     the hand's own.
     """
     coupling = hand.actuated.coupling
-    return (coupling**2 * drive_stiffness(hand, kp).to(coupling)[:, None]).sum(0)
+    stiffness = drive_stiffness(hand, kp).to(coupling)
+    return (coupling**2 * stiffness[:, None]).sum(0)
 
 
 def tip_compliance(

@@ -168,7 +168,8 @@ def held_forces(
     normals = reference.normals
     forces = gains.desired_force
     sensed = observation.tactile
-    if bool(torch.isfinite(sensed.points).all()) and bool(torch.isfinite(sensed.normals).all()):
+    placed = torch.isfinite(sensed.points) & torch.isfinite(sensed.normals)
+    if bool(placed.all()):
         push = -(forces * normals).sum(-1)
         preferred = push[None] if gains.force_source == "stability" else None
         balanced = least_friction_forces(
@@ -239,7 +240,8 @@ class GripHold:
         self.radius = hand.tips.radius.numpy()
         self.solver = LeastForces(forces.copy(), effort, max_force)
         push = np.abs((forces * self.normals).sum(-1))  # (f,)
-        self.planned = np.maximum(push, GRIP.planned * max(float(push.max()), GRIP.least_push))
+        largest = max(float(push.max()), GRIP.least_push)
+        self.planned = np.maximum(push, GRIP.planned * largest)
         # the closing has pressed so hard
         self.grip = np.minimum(push, max_force)
         self.felt = np.zeros((len(push), 3))
@@ -412,7 +414,8 @@ def push_reserve(
     The push acts at `arm` [m] from the middle of the contacts. The fingers share it like springs of
     equal stiffness.
     """
-    pushes = np.concatenate([np.eye(3), np.cross(arm, np.eye(3)).T])  # (6, 3): of three sides
+    sides = np.eye(3)
+    pushes = np.concatenate([sides, np.cross(arm, sides).T])  # (6, 3): wrenches
     share = (contacts.inverse @ pushes).reshape(-1, 3, 3)
     along = np.einsum("fi,fij->fj", normals, share)
     across = share - normals[:, :, None] * along[:, None]

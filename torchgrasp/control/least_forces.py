@@ -143,11 +143,13 @@ class LeastForces:
         push = -(np.eye(count)[:, :, None] * normals / self.most).reshape(count, -1)
         torque = jacobian.reshape(3 * count, -1).T / self.effort[:, None]
         limits = np.concatenate([torque, push])
-        gap = BARRIER.gap * (float(np.linalg.norm(load[:3])) + float(floor.sum()))
+        carried = float(np.linalg.norm(load[:3]))
+        gap = BARRIER.gap * (carried + float(floor.sum()))
         barrier = _Barrier(contacts, normals, limits, load, gap, reserve)
         # the load may have grown: internal forces are added
         growth = np.concatenate([[0.0], BARRIER.growth * 2.0 ** np.arange(BARRIER.growths)])
-        tried = barrier.place(self.forces) + growth[:, None] * barrier.place(self.start, 0.0)
+        internal = barrier.place(self.start, 0.0)
+        tried = barrier.place(self.forces) + growth[:, None] * internal  # (g, k)
         ratios = friction_ratios(contacts.inner(self.start), normals)
         needed = BARRIER.margin * float(ratios.max())
         friction = max(friction, needed) if math.isfinite(needed) else friction
@@ -239,8 +241,8 @@ class _Barrier:
             self.floor = np.maximum(np.minimum(floor, BARRIER.lower * push[-1]), 0.0)
         self.reserve = np.minimum(self.reserve, self.floor)
         left = push - self.reserve
-        ratio = np.where(left > 0, across / np.maximum(left, BARRIER.least), np.inf).max(-1)
-        ratio = np.where(above, ratio, np.inf)
+        ratios = np.where(left > 0, across / np.maximum(left, BARRIER.least), np.inf)
+        ratio = np.where(above, ratios.max(-1), np.inf)
         least = float(ratio.min())
         if least >= friction:
             friction = max(friction, BARRIER.raised * least)
@@ -255,11 +257,13 @@ class _Barrier:
         """
         n = z @ self.push.T + self.push_0
         t = z @ self.tau.T + self.tau_0
-        cone = self.squared * (n - self.reserve) ** 2 + n * n - (self.forces(z) ** 2).sum(-1)
+        lengths = (self.forces(z) ** 2).sum(-1)
+        cone = self.squared * (n - self.reserve) ** 2 + n * n - lengths
         inside = ((cone > 0) & (n > self.floor)).all(-1)
         logs = np.log(cone).sum(-1) + np.log(n - self.floor).sum(-1)
-        over = BARRIER.penalty * (np.maximum(np.abs(t) - BARRIER.knee, 0.0) ** 2).sum(-1)
-        return np.where(inside, n.sum(-1) + over - self.gap * logs, np.inf)
+        over = np.maximum(np.abs(t) - BARRIER.knee, 0.0)
+        penalty = BARRIER.penalty * (over**2).sum(-1)
+        return np.where(inside, n.sum(-1) + penalty - self.gap * logs, np.inf)
 
     def newton(self, z: Float[Array, " k"]) -> tuple[Float[Array, " k"], float]:
         """Return Newton's step at coordinates z, and the Newton decrement, which measures how far

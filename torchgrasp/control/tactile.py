@@ -137,7 +137,8 @@ def measure(
     """
     check_device("truth", truth.forces.device, "the tactile state", tactile.lagged.device)
     sliding = torch.zeros_like(truth.normal_force) if truth.sliding is None else truth.sliding
-    force = torch.cat([truth.normal_force[..., None], truth.forces, sliding[..., None]], dim=-1)
+    parts = [truth.normal_force[..., None], truth.forces, sliding[..., None]]
+    force = torch.cat(parts, dim=-1)  # (*b, f, 5)
     lagged = smooth(tactile.lagged, force, TACTILE.cutoff, period)
     age = tactile.age + period
     interval = 1 / SAMPLING_RATE
@@ -249,6 +250,8 @@ def joint_jacobian(
     joints were coupled.
     """
     axes, origins = hand.tree.joint_axes(hand.tree.poses(joints[None])[0])
-    turning = torch.linalg.cross(axes.expand(len(points), -1, 3), points[:, None] - origins)
+    arms = points[:, None] - origins  # (f, j, 3)
+    turning = torch.linalg.cross(axes.expand_as(arms), arms)
     columns = torch.where(hand.tree.prismatic[:, None] > 0, axes, turning)
-    return (columns * hand.tree.moves[hand.tips.index][:, :, None]).transpose(1, 2)
+    moves = hand.tree.moves[hand.tips.index]  # (f, j)
+    return (columns * moves[:, :, None]).transpose(1, 2)

@@ -61,7 +61,8 @@ def plan_motion(
         raise BadArgument("grasps", found, "executable grasps of plan_grasps(arm=)")
     near = COARSE_STEPS
     poses = way_of(hand.to("cpu", torch.float64), grasps, CollisionWorld(table=grasps.table))
-    tips = arm.tip_poses(poses.flatten(0, 1)).unflatten(2, poses.shape[:2])
+    tips = arm.tip_poses(poses.flatten(0, 1))
+    tips = tips.unflatten(2, poses.shape[:2])
     way, _ = track(arm, grasps.arm.T.contiguous(), tips)  # (g, 2 near + 1, n)
     postures = named_postures(hand, grasps, force, kp)[1]
     opened, closed, pressed = (

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.control.finger_forces import stiff_drives
 from torchgrasp.control.holding import PUSH
 from torchgrasp.control.protocol import POSE_TIME
 from torchgrasp.export.postures import named_postures, quaternion
@@ -49,6 +50,7 @@ USD = {"isaaclab": ("hand.usda", "object.usda"), "usd": ("hand.usda", "object.us
 """Files in USD's text format, by player."""
 UPRIGHT = 1e-12  # largest difference of a normal's z from 1 on a table that counts as level
 ORIGIN = (0.0, 0.0, 0.0)
+AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -162,8 +164,9 @@ def stand(surface: Surface, table: Plane | None) -> Surface:
     """
     if table is None:
         return surface
-    below = table.height(surface.vertices).clamp(max=0)[:, None] * table.normal.to(surface.vertices)
-    return dataclasses.replace(surface, vertices=surface.vertices - below)
+    vertices = surface.vertices
+    below = table.height(vertices).clamp(max=0)[:, None] * table.normal.to(vertices)
+    return dataclasses.replace(surface, vertices=vertices - below)
 
 
 def _world_from_obj(grasps: Grasps, mesh: "trimesh.Trimesh") -> Float[Tensor, "4 4"]:
@@ -183,11 +186,9 @@ def _scene(
     link.
     """
     reach = spec.approach + spec.lift_height + PLAY.room
-    axes = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-    slides = [Slide(f"mount_{x}", axis, -reach, reach, 0.0) for x, axis in axes.items()]
-    drives = {
-        name: x if spec.kp is None else x._replace(kp=spec.kp) for name, x in hand.actuators.items()
-    }
+    axes = zip("xyz", AXES, strict=True)
+    slides = [Slide(f"mount_{x}", axis, -reach, reach, 0.0) for x, axis in axes]
+    drives = stiff_drives(hand, spec.kp)
     mass = spec.mass if spec.density is None else spec.density * float(mesh.volume)
     return SceneSpec(
         hand.urdf_path,
@@ -367,7 +368,7 @@ def _pose(of: "Joint | LinkShape") -> np.ndarray:
 
 def _along(axis: Sequence[float]) -> np.ndarray:
     """Return a rotation (3, 3) that turns the x axis to a unit axis."""
-    return spatial.transform.Rotation.align_vectors([axis], [(1.0, 0.0, 0.0)])[0].as_matrix()
+    return spatial.transform.Rotation.align_vectors([axis], AXES[:1])[0].as_matrix()
 
 
 def _mesh_file(mesh: "trimesh.Trimesh", kind: str) -> bytes:

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.control.finger_forces import Squeeze, squeeze
+from torchgrasp.control.finger_forces import Squeeze, squeeze, stiff_drives
 from torchgrasp.control.protocol import POSE_TIME
 from torchgrasp.files import format_json
 from torchgrasp.foundation.checks import checked
@@ -122,9 +122,7 @@ def format_grasps(
         },
         "actuated": actuated,
         "rename": dict(rename or {}),
-        "stiffness": {
-            names[joint]: drive.kp if kp is None else kp for joint, drive in hand.actuators.items()
-        },
+        "stiffness": {names[joint]: x.kp for joint, x in stiff_drives(hand, kp).items()},
         "strongest_normal_force": force,
         "time": {"pregrasp": 0.0, "grasp": POSE_TIME, "squeeze": 2 * POSE_TIME},
         "provenance": grasps.meta,
@@ -217,13 +215,12 @@ def format_keyframes(
             control = [float(postures[targets][joint][row]) for joint in order]
             qpos = [*position.tolist(), *quaternion(pose), *joints]
             keys.append((f"grasp_{row}_{name}", qpos, control))
-    drives = {name: x if kp is None else x._replace(kp=kp) for name, x in hand.actuators.items()}
     known = {
         "name": hand.name,
         "nested": nested,
         "pose": np.eye(4),
         "order": order,
-        "drives": drives,
+        "drives": stiff_drives(hand, kp),
         "keys": keys,
     }
     root = ET.fromstring(render_mjcf("robot.xml", **known, free=True))

@@ -197,9 +197,8 @@ def shared_forces(points: Rows, wrench: Float[Tensor, "*b 6"], most: Float[Tenso
     """Return the smallest fingertip forces [N] that exert a wrench, all scaled down if one would
     exceed `most` [N].
     """
-    forces = (torch.linalg.pinv(grasp_map(points)) @ wrench[..., None])[..., 0].unflatten(
-        -1, (3, 3)
-    )
+    shared = (torch.linalg.pinv(grasp_map(points)) @ wrench[..., None])[..., 0]
+    forces = shared.unflatten(-1, (3, 3))
     largest = torch.linalg.vector_norm(forces, dim=-1).amax(-1)
     return forces * (most / torch.maximum(largest, most))[..., None, None]
 
@@ -210,9 +209,8 @@ def spring_forces(
     """Return the forces [N] of springs along the sides of the triangle of fingertips, with rest
     `lengths` [m].
     """
-    return torch.einsum(
-        "...k,...kci->...ci", stiffness * (side_lengths(points) - lengths), internal_forces(points)
-    )
+    tension = stiffness * (side_lengths(points) - lengths)
+    return torch.einsum("...k,...kci->...ci", tension, internal_forces(points))
 
 
 def side_lengths(points: Rows) -> Float[Tensor, "*b 3"]:
