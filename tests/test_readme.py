@@ -46,7 +46,7 @@ def test_python_of_the_readme_and_the_guides_runs(code, tmp_path, monkeypatch, s
 
 @pytest.mark.slow
 @pytest.mark.sim
-def test_the_guide_to_hands_runs_as_it_stands(tmp_path, monkeypatch, capsys):
+def test_the_guide_to_hands_runs_as_it_stands(tmp_path, monkeypatch, capsys, few_postures):
     """A draft, its check, a mend by hand, a held object, a file for the robot; with fewer starts."""
     from torchgrasp.app import cli
 

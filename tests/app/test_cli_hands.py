@@ -25,7 +25,7 @@ def barrett(tmp_path):
 
 
 @pytest.fixture(autouse=True)
-def few_starts(monkeypatch):
+def few_starts(monkeypatch, few_postures):
     """Try a hand with little work."""
     monkeypatch.setattr("torchgrasp.app.cli.hands.TRIAL", HandTrial(starts=4))
 

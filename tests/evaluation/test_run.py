@@ -190,7 +190,7 @@ def test_grasps_of_an_earlier_call_keep_the_reason_why_there_are_none(folder, tm
 @pytest.mark.sim
 @pytest.mark.filterwarnings("ignore")
 def test_each_view_is_grasped_with_the_fingers_that_were_chosen_for_it(
-    folder, tmp_path, monkeypatch
+    folder, tmp_path, monkeypatch, few_postures
 ):
     """Here most fingers always win, which are others than the hand's own; later trials find them by
     the files.

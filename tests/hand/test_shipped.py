@@ -14,7 +14,6 @@ from torchgrasp.hand.collision_shapes import collision_pairs
 from torchgrasp.hand.hand_toml import read_hand_toml
 from torchgrasp.hand.load import hands_folder, load_hand
 from torchgrasp.hand.urdf import read_urdf
-from torchgrasp.ik.seeds import SeedNumbers
 from torchgrasp.testing import check_hand, random_joints
 
 README = (hands_folder() / "README.md").read_text("utf-8")
@@ -111,9 +110,8 @@ def test_the_pairs_of_links_that_can_meet_are_in_the_file(name):
 
 @pytest.mark.sim
 @pytest.mark.parametrize("name", ["shadow", "allegro_left"])
-def test_a_planned_grasp_holds_the_cylinder(name, monkeypatch):
+def test_a_planned_grasp_holds_the_cylinder(name, few_postures):
     pytest.importorskip("sapien")
-    monkeypatch.setattr("torchgrasp.ik.seeds.SEEDS", SeedNumbers(postures=1000, many_postures=1000))
     hand = load_hand(name)
     thing = load_object("cylinder")
     best = plan_grasps(thing.view, hand, ContactSpec(table=0.0), starts=8)[0]

@@ -82,7 +82,7 @@ def test_ordinary_tasks_are_lighter_and_keep_the_planned_friction():
 def test_the_best_grasp_is_tried_for_each_ordinary_task_on_families_that_calibrate(
     tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(runner, "STARTS", 20)
+    monkeypatch.setattr(runner, "STARTS", 8)
     monkeypatch.setattr(runner, "TASKS", 1)
     number = next(k for k in range(0, 400, 4) if family_of(k) in CALIBRATING)
     data = run_trials("allegro", 4, tmp_path, 0, first=number, best=True)
@@ -96,7 +96,7 @@ def test_the_best_grasp_is_tried_for_each_ordinary_task_on_families_that_calibra
 
 @pytest.mark.sim
 def test_trials_are_kept_and_read_with_their_tasks(tmp_path, monkeypatch):
-    monkeypatch.setattr(runner, "STARTS", 20)
+    monkeypatch.setattr(runner, "STARTS", 8)
     monkeypatch.setattr(runner, "BEST", 1)
     monkeypatch.setattr(runner, "SPREAD", 0)
     data = run_trials("allegro", 1, tmp_path, 0)
