@@ -290,7 +290,8 @@ def _joint_colors(hand: Hand) -> list[str]:
     finger_of_link = finger_of_links(hand)
     finger_of_joint = [finger_of_link[hand.tree.link_names[k]] for k in hand.tree.child.tolist()]
     moved = [
-        {finger_of_joint[j] for j in flatnonzero(row).tolist()} for row in hand.actuated.coupling.T
+        {finger_of_joint[j] for j in flatnonzero(row != 0).tolist()}
+        for row in hand.actuated.coupling.T
     ]
     colors = {PARKED: paint.HAND, **dict(enumerate(paint.FINGERS))}
     return [colors[min(fingers)] if len(fingers) == 1 else paint.HAND for fingers in moved]
