@@ -352,7 +352,8 @@ def order_changes(changes: list[Change], funnel: Funnel) -> list[Change]:
         own = (1 - EXPLAIN.beside) * funnel.share(change.cures)
         weight[k] = own + EXPLAIN.beside * funnel.share(beside)
     least = EXPLAIN.least * max(weight.values(), default=0.0)
-    return [changes[k] for k in sorted(weight, key=lambda k: -weight[k]) if 0 < weight[k] >= least]
+    ordered = sorted(weight, key=lambda k: -weight[k])
+    return [changes[k] for k in ordered if 0 < weight[k] >= least]
 
 
 def try_request(

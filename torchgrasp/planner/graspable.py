@@ -125,7 +125,8 @@ def _judge(
         return Status.CUT_OFF
     if bounded and _is_see_through(pixels, scene.image.depth):
         return Status.NO_DEPTH
-    top, high = points[:, 2].quantile(torch.tensor([JUDGE.top, JUDGE.high]).to(points)).tolist()
+    parts = torch.tensor([JUDGE.top, JUDGE.high]).to(points)
+    top, high = points[:, 2].quantile(parts).tolist()
     if scene.table is not None and high < spec.least_height:
         return Status.TOO_LOW
     above = points[points[:, 2] > top - 2 * spec.fingertip_radius, :2]
@@ -163,7 +164,8 @@ def _is_see_through(pixels: Tensor, depth: Float[Tensor, "h w"]) -> bool:
     reach = np.logical_or.accumulate
     down = reach(part, 0) & reach(part[::-1], 0)[::-1]
     right = reach(part, 1) & reach(part[:, ::-1], 1)[:, ::-1]
-    return int(((down | right) & (depth[box].cpu().numpy() == 0)).sum()) > len(pixels)
+    gaps = (down | right) & (depth[box].cpu().numpy() == 0)
+    return int(gaps.sum()) > len(pixels)
 
 
 def _thickness(points: Float[Tensor, "n 2"], cell: float) -> float:
@@ -230,7 +232,8 @@ def order_by_ease(scene: Scene) -> list[int]:
     for label in scene.things:
         mine = labels == label
         own = points[mine]
-        near = ~mine & (np.abs(points - own.mean(0)) < np.ptp(own, 0) + EASE.room).all(1)
+        beside = np.abs(points - own.mean(0)) < np.ptp(own, 0) + EASE.room
+        near = ~mine & beside.all(1)
         gap = EASE.room
         if near.any():
             gap = KDTree(points[near]).query(own, distance_upper_bound=EASE.room)[0].min()

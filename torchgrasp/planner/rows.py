@@ -328,13 +328,15 @@ def choose(
     nearest = torch.full_like(likely, torch.inf, dtype=x.dtype)
     if len(before):
         earlier, held = _table(rows.cloud[before], clouds)  # (c, e)
-        gaps = (x[:, :, None] - points[before[earlier]][:, None]).square().sum(-1)  # (c, m, e)
+        # (c, m, e)
+        gaps = (x[:, :, None] - points[before[earlier]][:, None]).square().sum(-1)
         nearest = torch.where(held[:, None], gaps, torch.inf).amin(2)
     picks = list[Tensor]()
     for _ in range(min(most, index.shape[1])):
         # the first of the largest
-        picks.append(torch.where(likely, nearest, -1.0).argmax(1, keepdim=True))
-        one = x.gather(1, picks[-1][..., None].expand(-1, -1, x.shape[2]))
+        pick = torch.where(likely, nearest, -1.0).argmax(1, keepdim=True)
+        picks.append(pick)
+        one = x.gather(1, pick[..., None].expand(-1, -1, x.shape[2]))
         nearest = torch.minimum(nearest, (x - one).square().sum(-1))
     chosen = index.gather(1, torch.cat(picks, 1))
     known = torch.arange(chosen.shape[1], device=index.device) < likely.sum(1, keepdim=True)

@@ -70,7 +70,7 @@ def cut_creases(
         pixels_a_metre = image.focal / float(image.depth[box][torch.from_numpy(mask)].median())
         own = _divide(seen[box], mask, pixels_a_metre * CREASE.reach, least)
         # parts that meet at no concave angle are one
-        joined = [(a, b) for a, b in _borders(own) if not _is_concave(own, seen[box], a, b)]
+        joined = [pair for pair in _borders(own) if not _is_concave(own, seen[box], *pair)]
         pairs = np.array(joined, dtype=np.int64).reshape(-1, 2)
         own = number_components(pairs, int(own.max()) + 1)[own]
         new = torch.from_numpy(own.astype(np.int64))
@@ -110,22 +110,24 @@ def _find_creases(points: np.ndarray, mask: np.ndarray, step: int) -> np.ndarray
     """
     width = step | 1
     share = np.maximum(ndimage.uniform_filter(mask.astype(float), width), CREASE.least_share)
-    axes = [
-        ndimage.uniform_filter(np.where(mask, points[..., k], 0.0), width) / share for k in range(3)
-    ]
-    smooth = np.stack(axes, -1)
+    smooth = np.empty_like(points)
+    for k in range(3):
+        total = ndimage.uniform_filter(np.where(mask, points[..., k], 0.0), width)
+        smooth[..., k] = total / share
     normal, known = _normals(smooth, mask, max(1, step // 2))
     crease = np.zeros_like(mask)
     for down, right in WAYS:
         after = (round(step * down), round(step * right))
         before = (-after[0], -after[1])
-        chord = np.roll(smooth, before, (0, 1)) - np.roll(smooth, after, (0, 1))
+        start, first, first_known = (np.roll(x, after, (0, 1)) for x in (smooth, normal, known))
+        end, last, last_known = (np.roll(x, before, (0, 1)) for x in (smooth, normal, known))
+        chord = end - start
         length = np.linalg.norm(chord, axis=-1) + CREASE.least_length
-        first = (np.roll(normal, after, (0, 1)) * chord).sum(-1) / length
-        second = -(np.roll(normal, before, (0, 1)) * chord).sum(-1) / length
-        ends = np.roll(known, after, (0, 1)) & np.roll(known, before, (0, 1))
-        bent = np.minimum(first, second) > CREASE.bend
-        crease |= ends & bent & (length < CREASE.chord)
+        # how much each side rises towards the camera along the chord
+        rise = (first * chord).sum(-1) / length
+        fall = -(last * chord).sum(-1) / length
+        bent = np.minimum(rise, fall) > CREASE.bend
+        crease |= first_known & last_known & bent & (length < CREASE.chord)
     return crease
 
 
@@ -149,7 +151,8 @@ def _borders(parts: np.ndarray) -> list[tuple[int, int]]:
     found = []
     for one, other in ((parts[1:], parts[:-1]), (parts[:, 1:], parts[:, :-1])):
         differ = (one != other) & (one > 0) & (other > 0)
-        found.append(np.sort(np.stack([one[differ], other[differ]], -1), -1))
+        pairs = np.stack([one[differ], other[differ]], -1)
+        found.append(np.sort(pairs, -1))
     pairs, count = np.unique(np.concatenate(found), axis=0, return_counts=True)
     return [(int(a), int(b)) for a, b in pairs[count >= CREASE.border]]
 

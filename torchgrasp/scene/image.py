@@ -124,9 +124,11 @@ class DepthImage(Value):
         depth = self.depth.numpy()
         padded = np.pad(np.where(depth > 0, depth, np.nan), 1, constant_values=np.nan)
         squares = np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).reshape(*depth.shape, 9)
-        ranked = np.sort(squares, axis=-1)  # NaN last
+        # NaN are last (h, w, 9)
+        ranked = np.sort(squares, axis=-1)
         count = np.isfinite(squares).sum(-1)
-        middle = np.take_along_axis(ranked, np.maximum(count - 1, 0)[..., None] // 2, -1)[..., 0]
+        place = np.maximum(count - 1, 0) // 2
+        middle = np.take_along_axis(ranked, place[..., None], -1)[..., 0]
         known = (count >= IMAGE.squares) & (depth > 0)
         found = np.where(known, np.nan_to_num(middle), depth)
         return dataclasses.replace(self, depth=torch.from_numpy(found))
@@ -161,8 +163,10 @@ def label_radii(points: Float[Tensor, "h w 3"], labels: Int[Tensor, "h w"]) -> F
     label = labels.reshape(-1)
     own = points.reshape(-1, 3)
     count = torch.bincount(label).clamp_min(1)
+    # (k, 3)
     mean = torch.stack([torch.bincount(label, weights=x) / count for x in own.unbind(-1)], -1)
-    return (torch.bincount(label, weights=(own - mean[label]).square().sum(-1)) / count).sqrt()
+    squared = (own - mean[label]).square().sum(-1)
+    return (torch.bincount(label, weights=squared) / count).sqrt()
 
 
 def image_of_cloud(
@@ -186,7 +190,8 @@ def image_of_cloud(
     # (n, 2), at a depth of 1
     flat = camera[:, :2] / camera[:, 2:]
     widest = math.tan(math.radians(PROJECTION.widest))
-    if not bool((camera[:, 2] > 0).all()) or float(flat.norm(dim=-1).max()) > widest:
+    ahead = bool((camera[:, 2] > 0).all())
+    if not ahead or float(flat.norm(dim=-1).max()) > widest:
         allowed = f"a view within {PROJECTION.widest:g} degrees of its middle"
         raise BadArgument("cloud", "points all around the camera", allowed)
     low = flat.amin(0)
@@ -194,15 +199,18 @@ def image_of_cloud(
     extent = (high - low).clamp_min(PROJECTION.least_extent)
     # a pixel covers about two points of the filled part of the view
     cells = ((flat - low) / extent * (PROJECTION.cells - PROJECTION.inset)).long()
-    filled = len((cells[:, 0] * PROJECTION.cells + cells[:, 1]).unique()) / PROJECTION.cells**2
+    cell = cells[:, 0] * PROJECTION.cells + cells[:, 1]
+    filled = len(cell.unique()) / PROJECTION.cells**2
     pixel = math.sqrt(2 * float(extent.prod()) * filled / len(points))
     pixel = max(pixel, float(extent.max()) / PROJECTION.most_steps)
     width, height = (int(side) + 1 for side in (extent / pixel).tolist())
     middle = (low + high) / 2
-    centre = torch.tensor([(width - 1) / 2, (height - 1) / 2], dtype=points.dtype) - middle / pixel
-    k = torch.tensor(
-        [[1 / pixel, 0, centre[0]], [0, 1 / pixel, centre[1]], [0, 0, 1]], dtype=torch.float64
-    )
+    size = torch.tensor([width, height], dtype=points.dtype)
+    centre = (size - 1) / 2 - middle / pixel
+    k = torch.eye(3, dtype=torch.float64)
+    k[0, 0] = 1 / pixel
+    k[1, 1] = 1 / pixel
+    k[:2, 2] = centre
     column, row = torch.round(flat / pixel + centre).long().unbind(-1)
     pixels = torch.stack([row.clamp(0, height - 1), column.clamp(0, width - 1)], -1)
     # of several points in a pixel the nearest is seen

@@ -165,9 +165,9 @@ def _runs(mask: Mapping[str, Any], shape: tuple[int, ...], name: str) -> Bool[Te
         raise BadArgument(
             name, f"{type(error).__name__} ({error}) in run lengths", allowed
         ) from error
-    return torch.from_numpy(
-        np.repeat(np.arange(len(runs)) % 2 == 1, runs).reshape(shape[::-1]).T.copy()
-    )
+    # every second run is inside
+    column = np.repeat(np.arange(len(runs)) % 2 == 1, runs)
+    return torch.from_numpy(column.reshape(shape[::-1]).T.copy())
 
 
 def _run_lengths(text: bytes) -> list[int]:

@@ -119,9 +119,8 @@ class Shadows(Value):
         seen = ahead & (column >= 0) & (column < width) & (row >= 0) & (row < height)
         pixel = torch.where(seen, row * width + column, 0)
         owner = torch.where(seen, self.owner.reshape(-1)[pixel], -1)
-        behind = (
-            (z - self.depth.reshape(-1)[pixel]) * torch.linalg.vector_norm(camera, dim=-1) / safe
-        )
+        deeper = z - self.depth.reshape(-1)[pixel]
+        behind = deeper * torch.linalg.vector_norm(camera, dim=-1) / safe
         return behind, owner
 
 
@@ -193,7 +192,8 @@ def shadow_features(
 
     def mirrored(size: float) -> Float[Tensor, "n"]:
         centre = axes @ torch.stack([front - size / 2, middle])
-        return shadows.look(torch.cat([2 * centre - points[:, :2], points[:, 2:]], -1))[0]
+        other = torch.cat([2 * centre - points[:, :2], points[:, 2:]], -1)
+        return shadows.look(other)[0]
 
     behind, _ = shadows.look(points)
     under = _tops(own, points[:, :2].double()) - points[:, 2]
@@ -274,7 +274,8 @@ def estimate_occupancy(scene: Scene, target: int) -> Occupancy:
     centres = empty.centres.reshape(-1, 3)
     shadows = cast_shadows(scene, target)
     behind, owner = shadows.look(centres)
-    hidden = torch.nonzero((owner == -1) | ((owner != 0) & (behind > -OCCUPANCY.noise)))[:, 0]
+    inside = (owner != 0) & (behind > -OCCUPANCY.noise)
+    hidden = torch.nonzero((owner == -1) | inside)[:, 0]
     whose = owner[hidden]
     full = empty.probability.reshape(-1)
     for thing in whose.unique().tolist():

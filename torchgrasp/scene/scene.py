@@ -133,16 +133,12 @@ class Scene(Value):
             notes += check_sizes(
                 points[measured], found[measured], image.obj_from_camera, supports[0].plane
             )
-        planes = tuple(support.plane for support in supports)
         pixels = torch.nonzero(measured)
-        target = None if mask is None else 1
+        planes = tuple(support.plane for support in supports)
         scene = cls(
-            points[measured], found[measured], image, pixels, planes[0], target, planes[1:], notes
+            points[measured], found[measured], image, pixels, planes[0], None, planes[1:], notes
         )
-        scene = dataclasses.replace(
-            scene, given=scene.things if given is not None else () if inside is None else (1,)
-        )
-        return scene if point is None else scene.select(point)
+        return scene._chosen(given is not None, inside is not None, point)
 
     @classmethod
     @checked
@@ -212,11 +208,17 @@ class Scene(Value):
         view = TableImage.of(image, supports[0])
         found, notes = label_image(view, to_image(given), to_image(inside))
         own = torch.where(front, found[row, column], 0)
-        target = None if inside is None else 1
-        scene = cls(points, own, image, pixels, planes[0], target, planes[1:], notes)
-        scene = dataclasses.replace(
-            scene, given=scene.things if given is not None else () if inside is None else (1,)
-        )
+        scene = cls(points, own, image, pixels, planes[0], None, planes[1:], notes)
+        return scene._chosen(given is not None, inside is not None, point)
+
+    def _chosen(self, labelled: bool, masked: bool, point: Any) -> "Scene":
+        """Return the scene with the target that a mask or a point chooses, and with the labels that
+        the user gave.
+        """
+        given = self.things if labelled else ()
+        scene = dataclasses.replace(self, given=given)
+        if masked:
+            scene = dataclasses.replace(self, target=1, given=(1,))
         return scene if point is None else scene.select(point)
 
     @checked

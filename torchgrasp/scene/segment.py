@@ -158,7 +158,8 @@ def _components(smooth: TableImage, core: Tensor) -> Int[Tensor, "h w"]:
     for down, right in NEIGHBOURS:
         a = (slice(0, h - down), slice(max(0, -right), w - max(0, right)))
         b = (slice(down, h), slice(max(0, right), w - max(0, -right)))
-        joined = core[a] & core[b] & ((depth[a] - depth[b]).abs() < smooth.jump[a])
+        step = (depth[a] - depth[b]).abs()
+        joined = core[a] & core[b] & (step < smooth.jump[a])
         edges.append(torch.stack([index[a][joined], index[b][joined]]))
     pairs = torch.cat(edges, 1).T.numpy()
     number = torch.from_numpy(number_components(pairs, h * w).astype(np.int64))
@@ -195,23 +196,27 @@ def _filled(view: TableImage, labels: Tensor) -> Int[Tensor, "h w"]:
     ndimage.label((view.measured & (labels == 0)).numpy(), output=holes)
     whole = labels.clone()
     boxes: list[tuple[slice, slice]] = ndimage.find_objects(holes)
-    for number, (rows, columns) in enumerate(boxes, start=1):
+    for number, inner in enumerate(boxes, start=1):
         # with a border of two pixels, in which the objects around the hole are seen
-        box = (
-            slice(max(0, rows.start - 2), rows.stop + 2),
-            slice(max(0, columns.start - 2), columns.stop + 2),
-        )
+        box = _widened(inner, 2)
         hole = torch.from_numpy(holes[box] == number)
-        if int(hole.sum()) < SEGMENT.few:
+        count = int(hole.sum())
+        # a hole at the image border may be open
+        if count < SEGMENT.few or int(hole[1:-1, 1:-1].sum()) < count:
             continue
         near = torch.from_numpy(ndimage.binary_dilation(hole.numpy(), iterations=2))
         around = labels[box][near & ~hole]
         names = around[around > 0].unique()
-        edge = bool(hole[0].any() | hole[-1].any() | hole[:, 0].any() | hole[:, -1].any())
         # a hole whose floor is the table is no part of its object, such as a ring
-        if len(names) == 1 and not edge and float(view.height[box][hole].median()) > SEGMENT.floor:
+        if len(names) == 1 and float(view.height[box][hole].median()) > SEGMENT.floor:
             whole[box] = torch.where(hole, names, whole[box])
     return whole
+
+
+def _widened(box: tuple[slice, slice], margin: int) -> tuple[slice, slice]:
+    """Return the box of an image with a margin [px] on all sides, as far as the image reaches."""
+    rows, columns = (slice(max(0, side.start - margin), side.stop + margin) for side in box)
+    return rows, columns
 
 
 def count_labels(labels: Tensor, length: int = 0) -> Int[Tensor, "k"]:
@@ -242,11 +247,7 @@ def _is_noise(view: TableImage, deviations: Tensor, labels: Int[Tensor, "h w"], 
         return True
     # only pixels about the object matter from here on
     margin = SEGMENT.margin
-    row, column = torch.nonzero(mine).T
-    box = (
-        slice(max(0, int(row.min()) - margin), int(row.max()) + margin + 1),
-        slice(max(0, int(column.min()) - margin), int(column.max()) + margin + 1),
-    )
+    box = _widened(ndimage.find_objects(mine.byte().numpy())[0], margin)
     pixel = float((view.image.depth[mine] / view.image.focal).median())
     mine = mine[box]
     inside = np.asarray(ndimage.distance_transform_edt(mine.numpy()))
@@ -255,7 +256,7 @@ def _is_noise(view: TableImage, deviations: Tensor, labels: Int[Tensor, "h w"], 
     near = torch.from_numpy(ndimage.binary_dilation(mine.numpy(), iterations=margin))
     large = count_labels(labels)[labels[box]] > SEGMENT.larger * int(mine.sum())
     around = near & (labels[box] > 0) & ~mine & large
+    if not bool(around.any()):
+        return False
     points = view.points[box]
-    return (
-        bool(around.any()) and float(torch.cdist(points[around], points[mine]).min()) < MERGE.reach
-    )
+    return float(torch.cdist(points[around], points[mine]).min()) < MERGE.reach
