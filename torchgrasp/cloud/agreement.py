@@ -103,7 +103,7 @@ def _noise(cloud: PointCloud) -> float:
     return float(assume_noise(cloud.points.double().cpu(), eye).median())
 
 
-def _distance_behind(points: Float[Tensor, "n 3"], cloud: PointCloud) -> Float[Tensor, "n"]:
+def _distance_behind(points: Points, cloud: PointCloud) -> Float[Tensor, "n"]:
     """Return each point's distance [m] from a cloud and the space hidden behind it, as deep as the
     cloud is long.
     """

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.cloud.depth import cloud_from_depth
-from torchgrasp.cloud.pose import check_rigid
+from torchgrasp.cloud.pose import Transform, check_rigid
 from torchgrasp.cloud.sensor import Image, SensorName, SensorNoise, add_noise, find_sensor
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import MeshError
@@ -20,7 +20,6 @@ from torchgrasp.foundation.rules import Range, Seed
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
 from torchgrasp.values.planning import PointCloud
 
-Transform = Float[Tensor, "4 4"]
 # columns, rows and focal length [px] of the default camera
 WIDTH = 640
 HEIGHT = 480

@@ -6,7 +6,7 @@ import dataclasses
 from typing import Annotated
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from torch import Tensor
 
 from torchgrasp.cloud.neighbours import find_inliers
@@ -15,6 +15,7 @@ from torchgrasp.foundation.errors import BadArgument, SuspiciousScale, TooFewPoi
 from torchgrasp.foundation.lazy import spatial
 from torchgrasp.foundation.limits import MAX_EXTENT, MIN_EXTENT
 from torchgrasp.foundation.rules import Range
+from torchgrasp.geometry.linalg import Points
 from torchgrasp.values.planning import PointCloud
 
 MIN_POINTS = 4  # fewest distinct points from which a surface can be estimated
@@ -114,7 +115,7 @@ def remove_outliers(cloud: PointCloud) -> PointCloud:
     return cloud.select(find_inliers(cloud.points.double()))
 
 
-def _check_distinct(points: Float[Tensor, "n 3"], rows: Int[Tensor, "m"]) -> None:
+def _check_distinct(points: Points, rows: Int[Tensor, "m"]) -> None:
     """Raise an error if the distinct points, at the indices `rows`, are too few, or if all points
     lie on a line.
     """
@@ -126,7 +127,7 @@ def _check_distinct(points: Float[Tensor, "n 3"], rows: Int[Tensor, "m"]) -> Non
         raise BadArgument("points", f"{len(points)} points on one line", "points of a surface")
 
 
-def _check(cloud: PointCloud) -> Float[Tensor, "n 3"]:
+def _check(cloud: PointCloud) -> Points:
     """Return the cloud's points, or raise an error if its extent is implausible or a normal has
     length zero.
     """
@@ -159,7 +160,7 @@ def _guess_unit(extent: float) -> str:
     return in_cm if extent < CLOUD.longest else f"in mm ({extent / 1000.0:.3g} m: --unit mm)"
 
 
-def _distinct_rows(points: Float[Tensor, "n 3"]) -> Int[Tensor, "m"]:
+def _distinct_rows(points: Points) -> Int[Tensor, "m"]:
     """Return the indices of the distinct points, ascending; of coincident points only the first
     counts.
     """

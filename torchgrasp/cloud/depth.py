@@ -10,17 +10,19 @@ from torch import Tensor
 
 from torchgrasp.cloud.check import MIN_POINTS, check_cloud
 from torchgrasp.cloud.intrinsics import (
+    Matrix,
     as_tensor,
     check_intrinsics,
     describe_array,
     parse_intrinsics,
 )
 from torchgrasp.cloud.pose import check_view, read_camera_pose
+from torchgrasp.cloud.sensor import Image
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, TooFewPoints
 from torchgrasp.foundation.rules import Positive
 from torchgrasp.geometry.frames import apply, rotate
-from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.linalg import Points, unit
 from torchgrasp.values.planning import PointCloud
 
 Array = Tensor | np.ndarray
@@ -111,9 +113,7 @@ def cloud_from_depth(
     return check_cloud(PointCloud(points.to(dtype), None, viewpoint.to(dtype), frustum.to(dtype)))
 
 
-def _points(
-    z_image: Float[Tensor, "h w"], k: Float[Tensor, "3 3"], keep: Bool[Tensor, "h w"]
-) -> Float[Tensor, "n 3"]:
+def _points(z_image: Image, k: Matrix, keep: Bool[Tensor, "h w"]) -> Points:
     """Return the points [m], in the camera's frame, of the pixels in the mask `keep`."""
     row, column = torch.nonzero(keep, as_tuple=True)
     z = z_image[keep]
@@ -122,7 +122,7 @@ def _points(
     return torch.stack([x, y, z], -1)  # (n, 3)
 
 
-def frustum_of_image(intrinsics: Float[Tensor, "3 3"], size: Sequence[int]) -> Float[Tensor, "4 3"]:
+def frustum_of_image(intrinsics: Matrix, size: Sequence[int]) -> Float[Tensor, "4 3"]:
     """Return the inward unit normals of a camera's frustum, for an image (h, w): left, right, top,
     bottom side.
     """
@@ -135,7 +135,7 @@ def frustum_of_image(intrinsics: Float[Tensor, "3 3"], size: Sequence[int]) -> F
 @checked
 def read_depth(
     depth: Array, intrinsics: object, mask: Array | None = None, depth_unit: Positive | None = None
-) -> tuple[Float[Tensor, "h w"], Float[Tensor, "3 3"], Bool[Tensor, "h w"] | None]:
+) -> tuple[Image, Matrix, Bool[Tensor, "h w"] | None]:
     """Check the arguments of `cloud_from_depth`; return depth [m] (0 if not measured), intrinsics
     [px] and mask.
     """
@@ -167,7 +167,7 @@ def read_depth(
     return metres, k, inside.to(image.device)
 
 
-def _in_metres(image: Tensor, unit: float | None) -> Float[Tensor, "h w"]:
+def _in_metres(image: Tensor, unit: float | None) -> Image:
     """Return a depth image in float64 [m], 0 where nothing was measured; refuse depths that cannot
     be metres.
     """

@@ -30,7 +30,7 @@ from torchgrasp.values.planning import PointCloud
 
 
 @dataclasses.dataclass(frozen=True)
-class ReportNumbers:
+class DiagnosisNumbers:
     """How a cloud is measured, and which measures are worth advice."""
 
     measured: int = 50_000
@@ -53,7 +53,7 @@ class ReportNumbers:
     """Greatest share of flipped normals."""
 
 
-REPORT = ReportNumbers()
+DIAGNOSIS = DiagnosisNumbers()
 
 
 @checked
@@ -85,7 +85,7 @@ class CloudReport(Value):
 @checked
 def diagnose_cloud(
     cloud: PointCloud,
-    up: Float[Tensor, "3"] | None = None,
+    up: Vector | None = None,
     table: Plane | None = None,
     stands: bool = True,
 ) -> CloudReport:
@@ -110,10 +110,10 @@ def diagnose_cloud(
     vertical = unit(vertical.double())
     whole = remove_duplicates(cloud)
     points = whole.points.double()
-    rows = draw_rows(len(whole), REPORT.measured)
+    rows = draw_rows(len(whole), DIAGNOSIS.measured)
     some = whole.select(rows)
 
-    view = some.select(draw_rows(len(some), REPORT.viewed))
+    view = some.select(draw_rows(len(some), DIAGNOSIS.viewed))
     check = None
     if view.normals is not None:
         check = compare_normals(view.points.double(), view.normals.double())
@@ -127,7 +127,7 @@ def diagnose_cloud(
     viewpoint = clean.viewpoint if judged.viewpoint is None else judged.viewpoint
     assert judged.normals is not None
 
-    distance, _ = nearest(points, REPORT.neighbours, rows)  # (m, 9)
+    distance, _ = nearest(points, DIAGNOSIS.neighbours, rows)  # (m, 9)
     area = math.pi * distance[:, -1] ** 2  # of the disc that holds the neighbours
     x, y, z = (points.amax(0) - points.amin(0)).tolist()
     report = CloudReport(
@@ -182,7 +182,7 @@ def _advise(report: CloudReport, flat: bool, angle: float) -> list[Advice]:
     longest = max(report.size)
     outliers = report.outliers / report.points
     density = report.density * MAX_POINTS / report.points
-    voxel = 1.0 / math.sqrt(max(density, REPORT.least))
+    voxel = 1.0 / math.sqrt(max(density, DIAGNOSIS.least))
     check = report.normals
     oriented = check is None or check.oriented
     flipped = 0.0 if check is None else float(check.flipped.double().mean())
@@ -200,14 +200,14 @@ def _advise(report: CloudReport, flat: bool, angle: float) -> list[Advice]:
     guess = f"a camera whose position is a guess, {sure}"
     guessed = report.viewpoint is not None and not report.viewpoint_given
     rules = [
-        (longest > REPORT.long, scene, f"one object: {cut}"),
+        (longest > DIAGNOSIS.long, scene, f"one object: {cut}"),
         (report.points > 2 * MAX_POINTS, many, f"as many: {thin}"),
-        (outliers > REPORT.outliers, far, f"none: {thin}"),
+        (outliers > DIAGNOSIS.outliers, far, f"none: {thin}"),
         (report.points - report.copies < FEW_POINTS, few, "a denser cloud"),
-        (report.spacing > REPORT.sparse * longest, sparse, "a denser cloud"),
-        (report.noise > REPORT.noise, blurred, "a nearer camera"),
+        (report.spacing > DIAGNOSIS.sparse * longest, sparse, "a denser cloud"),
+        (report.noise > DIAGNOSIS.noise, blurred, "a nearer camera"),
         (flat, plane, "a view of two sides"),
-        (oriented and flipped > REPORT.flipped, turned, "none: --no-normals"),
+        (oriented and flipped > DIAGNOSIS.flipped, turned, "none: --no-normals"),
         (not oriented, "normals of random signs, which are ignored", "none: --no-normals"),
         (guessed, guess, "--viewpoint X Y Z"),
     ]

@@ -47,7 +47,7 @@ class PartNumbers:
 PARTS = PartNumbers()
 
 
-def label_bodies(points: Float[Tensor, "n 3"], gap: float = PARTS.gap) -> Int[Tensor, "n"]:
+def label_bodies(points: Points, gap: float = PARTS.gap) -> Int[Tensor, "n"]:
     """Return the group number of each point; groups are more than `gap` [m] apart, and group 0 is
     the largest.
     """
@@ -65,9 +65,7 @@ def label_bodies(points: Float[Tensor, "n 3"], gap: float = PARTS.gap) -> Int[Te
     return torch.from_numpy(order[label]).to(device)
 
 
-def find_second_body(
-    points: Float[Tensor, "n 3"], up: Float[Tensor, "3"], spacing: float
-) -> Bool[Tensor, "n"] | None:
+def find_second_body(points: Points, up: Vector, spacing: float) -> Bool[Tensor, "n"] | None:
     """Return a mask of the points of a second body that stands apart on the same ground; None if
     there is none.
     """
@@ -90,8 +88,8 @@ def find_second_body(
 @checked
 def cut_object(
     cloud: PointCloud,
-    up: Float[Tensor, "3"],
-    point: Float[Tensor, "3"] | None = None,
+    up: Vector,
+    point: Vector | None = None,
     box: Float[Tensor, "2 3"] | None = None,
     gap: Annotated[float, Range(0.001, 1.0)] = PARTS.gap,
 ) -> tuple[PointCloud, Plane | None]:

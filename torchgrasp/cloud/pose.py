@@ -21,6 +21,7 @@ from torchgrasp.geometry.linalg import Points, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.support_planes import SupportPlane, find_table
 
+Transform = Float[Tensor, "4 4"]
 UNIT = "depth in metres: depth_unit (--depth-unit) says how many metres a count is"
 FIXES = {
     (3, 4): "add the row 0 0 0 1",
@@ -106,7 +107,7 @@ POSE = PoseNumbers()
 SIZES = SizeNumbers()
 
 
-def check_rigid(name: str, pose: Tensor) -> Float[Tensor, "4 4"]:
+def check_rigid(name: str, pose: Tensor) -> Transform:
     """Return the given pose if it is rigid to 1e-4; else raise `BadArgument`, which names the
     fault.
     """
@@ -118,7 +119,7 @@ def check_rigid(name: str, pose: Tensor) -> Float[Tensor, "4 4"]:
     return pose
 
 
-def _describe_fault(pose: Float[Tensor, "4 4"]) -> str:
+def _describe_fault(pose: Transform) -> str:
     """Return, as the end of a sentence, why a matrix is no rigid transform, and the fix."""
     if bool(pose[3, :3].any()) and not bool(pose[:3, 3].any()):
         return ", a transposed pose: give its transpose"
@@ -136,7 +137,7 @@ def _describe_fault(pose: Float[Tensor, "4 4"]) -> str:
     return f"{found}: take U @ Vh of its SVD"
 
 
-def read_camera_pose(pose: Tensor | np.ndarray) -> Float[Tensor, "4 4"]:
+def read_camera_pose(pose: Tensor | np.ndarray) -> Transform:
     """Return the pose of a camera in float64; refuse a pose that is not rigid or of another unit."""
     try:
         read = torch.as_tensor(pose).double()
@@ -149,7 +150,7 @@ def read_camera_pose(pose: Tensor | np.ndarray) -> Float[Tensor, "4 4"]:
     return read
 
 
-def _check_distance(pose: Float[Tensor, "4 4"], distance: float, most: float, what: str) -> None:
+def _check_distance(pose: Transform, distance: float, most: float, what: str) -> None:
     """Refuse a pose as not in metres if `what`, such as the camera, is over `most` [m] from the
     frame's origin.
     """
@@ -162,7 +163,7 @@ def _check_distance(pose: Float[Tensor, "4 4"], distance: float, most: float, wh
         raise BadArgument("camera_pose", f"{what} {distance:.4g} m from the origin", allowed)
 
 
-def read_pose(name: str, path: Path | str) -> Float[Tensor, "4 4"]:
+def read_pose(name: str, path: Path | str) -> Transform:
     """Return the rigid transform in a .npy file, or in a .txt file with four rows of four numbers."""
     data, suffix = read_suffixed(name, path, (".npy", ".txt"))
     try:
@@ -176,7 +177,7 @@ def read_pose(name: str, path: Path | str) -> Float[Tensor, "4 4"]:
 
 def find_plausible(
     points: Points,
-    pose: Float[Tensor, "4 4"],
+    pose: Transform,
     table: Plane | float | None,
     up: object,
     known_unit: bool,
@@ -206,7 +207,7 @@ def find_plausible(
     return supports
 
 
-def check_view(points: Points, pose: Float[Tensor, "4 4"], up: object, known_unit: bool) -> None:
+def check_view(points: Points, pose: Transform, up: object, known_unit: bool) -> None:
     """Raise `BadArgument` if a table in the view contradicts the camera's pose or the unit of the
     depth.
     """
@@ -214,7 +215,7 @@ def check_view(points: Points, pose: Float[Tensor, "4 4"], up: object, known_uni
         _check_supports(find_table(points, pose[:3, 3], None, None), pose, up, known_unit)
 
 
-def _is_own(pose: Float[Tensor, "4 4"]) -> bool:
+def _is_own(pose: Transform) -> bool:
     """Return whether a pose is nearly the identity, so that the frame is the camera's, where z need
     not be up.
     """
@@ -223,7 +224,7 @@ def _is_own(pose: Float[Tensor, "4 4"]) -> bool:
 
 
 def _check_supports(
-    supports: tuple[SupportPlane, ...], pose: Float[Tensor, "4 4"], up: object, known_unit: bool
+    supports: tuple[SupportPlane, ...], pose: Transform, up: object, known_unit: bool
 ) -> None:
     """Refuse a pose that contradicts the planes on which objects stand, or a camera too high above
     the first one.
@@ -237,9 +238,7 @@ def _check_supports(
         raise BadArgument("depth", f"a camera {height:.3g} m above the table", UNIT)
 
 
-def _check_normals(
-    supports: tuple[SupportPlane, ...], pose: Float[Tensor, "4 4"], up: object
-) -> None:
+def _check_normals(supports: tuple[SupportPlane, ...], pose: Transform, up: object) -> None:
     """Refuse a pose with the table upside down, or tilted where another pose convention would make
     it level.
     """
@@ -295,9 +294,7 @@ def _check_given_table(points: Points, plane: Plane) -> None:
         raise BadArgument("table", found, allowed)
 
 
-def check_sizes(
-    points: Points, labels: Tensor, pose: Float[Tensor, "4 4"], plane: Plane
-) -> tuple[str, ...]:
+def check_sizes(points: Points, labels: Tensor, pose: Transform, plane: Plane) -> tuple[str, ...]:
     """Refuse a depth unit that makes objects too large or small for a hand; return a note if the
     camera is high.
     """
@@ -320,7 +317,7 @@ def check_sizes(
     return (note,) * high
 
 
-def _is_scaled(pose: Float[Tensor, "4 4"], plane: Plane, height: float) -> bool:
+def _is_scaled(pose: Transform, plane: Plane, height: float) -> bool:
     """Return whether a wrong unit explains the table's place: counts of 0.25 mm read as millimetres
     put a camera four times too high above a table near z = 0.
     """

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchgrasp.cloud.check import check_cloud, remove_duplicates
 from torchgrasp.cloud.neighbours import find_inliers, fit_local_planes, fit_quadrics, nearest
-from torchgrasp.cloud.pose import check_rigid
+from torchgrasp.cloud.pose import Transform, check_rigid
 from torchgrasp.cloud.viewpoint import guess_viewpoint
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
@@ -215,7 +215,7 @@ def share_facing(points: Points, normals: Points, viewpoint: Float[Tensor, "*vie
 
 @checked
 def merge_clouds(
-    clouds: Sequence[PointCloud], poses: Sequence[Float[Tensor, "4 4"]] | Float[Tensor, "k 4 4"]
+    clouds: Sequence[PointCloud], poses: Sequence[Transform] | Float[Tensor, "k 4 4"]
 ) -> PointCloud:
     """Return one cloud of several views in a common frame, with the normal and the camera position
     of each point.
@@ -255,7 +255,7 @@ def merge_clouds(
     return check_cloud(PointCloud(points, torch.cat(normals), viewpoint, frustum))
 
 
-def _view_in_frame(cloud: PointCloud, obj_from_cloud: Float[Tensor, "4 4"]) -> PointCloud:
+def _view_in_frame(cloud: PointCloud, obj_from_cloud: Transform) -> PointCloud:
     """Return a view, with unit normals, transformed into the frame of the merged cloud."""
     cloud = estimate_normals(cloud) if cloud.normals is None else cloud
     assert cloud.normals is not None

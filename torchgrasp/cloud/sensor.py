@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.cloud.intrinsics import as_tensor
+from torchgrasp.cloud.intrinsics import Matrix, as_tensor
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
@@ -202,8 +202,8 @@ def add_noise(
 
 
 def estimate_noise(
-    depth: Float[Tensor, "h w"],
-    intrinsics: Float[Tensor, "3 3"],
+    depth: Image,
+    intrinsics: Matrix,
     table: Plane,
     on_table: Bool[Tensor, "h w"],
 ) -> SensorNoise | None:
