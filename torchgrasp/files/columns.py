@@ -19,10 +19,12 @@ SHOWN_LINE = 60
 
 
 def find_columns(names: Sequence[str], columns: Sequence[np.ndarray]) -> dict[str, Any]:
-    """Return `points` (n, 3), their `normals` or None, and the `other` names, of columns by name.
+    """Return the coordinates and normals in a table whose columns have names, as a dictionary.
 
-    Names are x, y, z, nx, ny, nz in any case, or as in normal_x. Of a column (n, k) the first
-    number counts.
+    `points` (n, 3) are the columns x, y and z. `normals` (n, 3) are nx, ny and nz, or None. `other`
+    lists the names of the other columns. Capitals, and names such as normal_x, are understood. Each
+    of the `columns` is an array (n,) or (n, k), of which the first number counts. Raises
+    `Malformed` for a missing or double column.
     """
     places = dict[str, int]()
     other = list[str]()
@@ -51,11 +53,19 @@ def find_columns(names: Sequence[str], columns: Sequence[np.ndarray]) -> dict[st
 def read_fields(
     data: bytes, fields: Sequence[tuple[str, int]], count: int, order: str = "", last: bool = True
 ) -> list[np.ndarray]:
-    """Return the numbers (count, n) of each field, given its type and n. Without an `order` of
-    bytes, data are text.
+    """Return an array (count, n) for each field of a table with `count` lines, one for each point.
 
-    Little memory beyond the numbers is used. Raises `Malformed` for too little data, or a longer
-    row or another row where nothing should follow the `last` row.
+    Little memory beyond the numbers is used.
+
+    Args:
+        data: the table, as text or in binary form.
+        fields: for each field the NumPy type code of a number, and the number n of its values.
+        count: number of lines.
+        order: byte order of binary data, "<" or ">"; "" means that the data are text.
+        last: whether the table ends the data; otherwise anything may follow it.
+
+    Raises `Malformed` for too little data. With `last`, binary data of a further line raise it, too,
+    and so does a first line of text with a wrong number of values.
     """
     if not 0 <= count <= CLOUD_POINTS:
         raise Malformed(f"{count} points, not up to {CLOUD_POINTS}")
@@ -93,11 +103,11 @@ def read_fields(
 
 
 def parse_text(data: bytes, suffix: str) -> dict[str, Any]:
-    """Return a text's columns by the names in its first line, or `columns` if there are three or
-    six without names.
+    """Return the columns of a text, as `find_columns` does, by the names in its first line.
 
-    A first line of one number counts the rows. In `.xyzi` and `.pts` files an intensity may follow
-    x, y and z.
+    Without names there must be three or six columns, and the dictionary holds one array `columns`
+    (n, 3) or (n, 6). A first line of one number counts the lines. In files with the `suffix` .xyzi or .pts an
+    intensity may follow x, y and z, and then a colour. Raises `Malformed` for other texts.
     """
     names, table = _read_text(data)
     rows, width = table.shape
@@ -118,17 +128,17 @@ def parse_text(data: bytes, suffix: str) -> dict[str, Any]:
 
 
 def read_lines(data: bytes) -> Float[np.ndarray, "rows columns"]:
-    """Return a text's numbers, one row for each line; blanks, commas or semicolons separate the
-    numbers.
+    """Return the numbers of a text as an array with one row for each line.
 
-    `#` or `//` starts a comment. A first line of words is left out.
+    Blanks, commas or semicolons separate the numbers. `#` or `//` starts a comment. A first line of
+    words is left out. Raises `Malformed` for other texts.
     """
     return _read_text(data)[1]
 
 
 def _read_text(data: bytes) -> tuple[list[str], Float[np.ndarray, "rows columns"]]:
-    """Return a text's numbers, and the words of a line above them that names the columns or counts
-    the rows.
+    """Return two things: the words of a first line that names the columns or counts the lines, and
+    the numbers.
     """
     comment: str = ""
     shown: str = ""

@@ -38,8 +38,10 @@ DTYPES = (torch.float32, torch.float64, torch.int64, torch.bool)  # dtypes in ou
 
 
 class Field(NamedTuple):
-    """A value in a JSON or TOML file, with the file's `path` and the `place` in it; `refuse` makes
-    errors about it.
+    """A value in a JSON or TOML file, with its place in the file.
+
+    `path` is the file. `place` names the field, such as `objects.cup`, "" for the whole file.
+    `refuse(found, allowed)` makes the error for a bad value.
     """
 
     path: Path
@@ -57,8 +59,8 @@ class Field(NamedTuple):
         return self.refuse(f"{self.path}: {self.place or 'the file'} = {shown}", allowed)
 
     def entries(self, *required: str) -> "dict[str, Field]":
-        """Return the fields of a JSON object by name; raise an error if it lacks one of the
-        `required` names.
+        """Return the entries of a JSON object as fields, by name; raise the error of `wrong` if one
+        of the `required` names is missing.
         """
         if not isinstance(self.value, dict):
             raise self.wrong("an object { }")
@@ -71,7 +73,9 @@ class Field(NamedTuple):
         }
 
     def items(self, most: int = 1000) -> "list[Field]":
-        """Return the items of a list as fields; raise an error if there are more than `most`."""
+        """Return the items of a list as fields; raise the error of `wrong` for more than `most`
+        items.
+        """
         if not isinstance(self.value, list) or len(self.value) > most:
             raise self.wrong(f"a list of at most {most}")
         return [
@@ -79,13 +83,17 @@ class Field(NamedTuple):
         ]
 
     def text(self, most: int = JSON_LETTERS) -> str:
-        """Return the value as a text of at most `most` letters."""
+        """Return the value as a text of at most `most` letters; raise the error of `wrong` for
+        another value.
+        """
         if not isinstance(self.value, str) or len(self.value) > most:
             raise self.wrong(f"a text of at most {most} letters")
         return self.value
 
     def number(self, low: float = -sys.float_info.max, high: float = sys.float_info.max) -> float:
-        """Return the value as a number in [low, high]; by default any finite number."""
+        """Return the value as a number in [low, high], by default any finite number; else raise the
+        error of `wrong`.
+        """
         number = self.value
         if (
             isinstance(number, bool)
@@ -102,13 +110,15 @@ class Field(NamedTuple):
     def numbers(
         self, count: int, low: float = -sys.float_info.max, high: float = sys.float_info.max
     ) -> list[float]:
-        """Return the value as a list of `count` numbers in [low, high]."""
+        """Return the value as a list of `count` numbers in [low, high]; else raise the error of
+        `wrong`.
+        """
         if not isinstance(self.value, list) or len(self.value) != count:
             raise self.wrong(f"{count} numbers")
         return [x.number(low, high) for x in self.items(count)]
 
     def whole(self, low: int, high: int) -> int:
-        """Return the value as a whole number in [low, high]."""
+        """Return the value as a whole number in [low, high]; else raise the error of `wrong`."""
         if (
             isinstance(self.value, bool)
             or not isinstance(self.value, int)
@@ -119,8 +129,10 @@ class Field(NamedTuple):
 
 
 def read_json(path: Path, refuse: Refuse, allowed: str, most: int = JSON_BYTES) -> Field:
-    """Read a JSON file (UTF-8, at most `most` bytes, no NaN) as a field; raise the error of
-    `refuse` for others.
+    """Return the content of a JSON file as a field.
+
+    The file is in UTF-8, has at most `most` bytes, and no NaN or infinity. For another file the
+    error `refuse(found, allowed)` is raised; `allowed` says what is expected.
     """
     data = read_bounded(path, most, allowed, refuse)
     try:
@@ -131,23 +143,26 @@ def read_json(path: Path, refuse: Refuse, allowed: str, most: int = JSON_BYTES) 
 
 
 def _refuse_constant(name: str) -> float:
-    """Raise an error for NaN and Infinity, which Python's reader would accept."""
+    """Raise `ValueError` for NaN and Infinity, which Python's reader would accept."""
     raise ValueError(f"{name}, which is no JSON")
 
 
 def save_tensors(
     path: Path | str, kind: str, tensors: dict[str, Tensor], meta: dict[str, str]
 ) -> Path:
-    """Write tensors and metadata to a safetensors file that names its `kind`; raise `OutputError`
-    if this fails.
+    """Write tensors and metadata by name to a safetensors file of a `kind`; return its path.
+
+    Raises `OutputError` if the file cannot be written.
     """
     # as bytes, since a full disk then is an OSError, which save_file makes an error of its own
     return write_file(path, pack_tensors(kind, tensors, meta))
 
 
 def pack_tensors(kind: str, tensors: dict[str, Tensor], meta: dict[str, str]) -> bytes:
-    """Return the bytes of a safetensors file that names its `kind`; equal tensors and metadata give
-    equal bytes.
+    """Return the bytes of a safetensors file with tensors and metadata by name.
+
+    The metadata also name the `kind` of the file and the version of its layout. Equal tensors and
+    metadata give equal bytes.
     """
     contiguous = {
         name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()
@@ -163,10 +178,11 @@ def pack_tensors(kind: str, tensors: dict[str, Tensor], meta: dict[str, str]) ->
 def load_tensors(
     path: Path | str, kind: str, names: set[str], optional: Collection[str] = ()
 ) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Read tensors by name and the metadata from a safetensors file of a `kind`.
+    """Return the tensors and the metadata of a safetensors file of a `kind`, each by name.
 
-    The file must hold the tensors `names`, and may hold those in `optional`; other files raise
-    `ModelFileError`.
+    The file must hold the tensors `names`, and may hold those in `optional`. Raises
+    `ModelFileError` for a missing or broken file, another kind or version, other tensors, and
+    numbers that are not finite or above `LARGEST_NUMBER`.
     """
     allowed = names.union(optional)
     refuse = functools.partial(ModelFileError, "path")
@@ -199,11 +215,11 @@ def load_tensors(
 def read_value(
     path: Path | str, kind: str, of: type[SomeValue], **rest: Any
 ) -> tuple[SomeValue, dict[str, str]]:
-    """Read a value and metadata from a safetensors file of a `kind`; raise `ModelFileError` for
-    other shapes or types.
+    """Return a value of class `of`, and the metadata by name, from a safetensors file of a `kind`.
 
-    The tensors have the names of the fields of class `of`. `rest` gives its other fields; they may
-    keep their defaults.
+    The tensors of the file have the names of the fields of class `of`. `rest` gives the fields that
+    are no tensors; those left out keep their defaults. Raises the errors of `load_tensors`, and
+    `ModelFileError` for a tensor whose shape or dtype is not that of the field's annotation.
     """
     fields = _tensor_fields(of)
     optional = {name for name, kinds in fields.items() if type(None) in kinds}
@@ -260,8 +276,10 @@ def _is_value(hint: Any) -> bool:
 
 
 class Recent(Generic[Item]):
-    """A cache of the last few items that were read, each with a number; a copy in another process
-    starts empty.
+    """A cache of the last items that were read, each by its number.
+
+    `most` is the number of items kept, and `kept` holds them. A copy in another process starts
+    empty.
     """
 
     def __init__(self, most: int) -> None:
@@ -269,7 +287,7 @@ class Recent(Generic[Item]):
         self.kept: dict[int, Item] = {}
 
     def get(self, number: int, read: Callable[[int], Item]) -> Item:
-        """Return an item by number; read it if it is not in the cache."""
+        """Return the item of a number; `read(number)` reads it if it is not in the cache."""
         item = self.kept.pop(number, None)
         item = read(number) if item is None else item
         self.kept[number] = item  # now the last one

@@ -29,11 +29,11 @@ LOCK = ".lock"  # name of the lock file in a folder. It holds the process and ho
 
 
 def write_file(path: Path | str, content: str | bytes | Callable[[IO[bytes]], object]) -> Path:
-    """Write text (as UTF-8), bytes, or what a function writes to a file object, atomically; return
-    the path.
+    """Write a file atomically, and return its path.
 
-    A missing folder is created. `OutputError` is raised if the folder cannot be written, or the
-    disk is full.
+    `content` is text (written as UTF-8), bytes, or a function that writes bytes to the file object
+    that it is given. A missing folder is created. Raises `OutputError` if the folder cannot be
+    written, or the disk is full.
     """
     path = Path(path)
     data = content.encode() if isinstance(content, str) else content
@@ -74,12 +74,13 @@ def remove_file(path: Path) -> None:
 
 
 class Malformed(ValueError):
-    """What is wrong with a file's content, as a sentence of ours."""
+    """The content of a file is malformed; the message is a sentence of this library."""
 
 
 def explain(error: Exception) -> str:
-    """Return what is wrong with a file that a parser failed on; sentences of other libraries are
-    left out.
+    """Return a sentence that says what is wrong with a file on which a parser raised `error`.
+
+    For errors of other libraries the sentence is a general one.
     """
     return str(error) if isinstance(error, Malformed) else "a content that is broken or cut off"
 
@@ -93,14 +94,18 @@ def is_file(path: Path | str) -> bool:
 
 
 def read_bytes(path: Path | str) -> bytes:
-    """Return the content of a file, cut at its reported size, because some system files never end."""
+    """Return the content of a file, at most as many bytes as its reported size: some system files
+    never end.
+    """
     with Path(path).open("rb") as file:
         return file.read(os.fstat(file.fileno()).st_size)
 
 
 def read_bounded(path: Path | str, most: int, allowed: str, refuse: Refuse) -> bytes:
-    """Return the content of a regular file of at most `most` bytes; raise the error of `refuse` for
-    other files.
+    """Return the content of a regular file of at most `most` bytes.
+
+    For another file, and a pointer of Git LFS, the error `refuse(found, allowed)` is raised;
+    `allowed` says what is expected.
     """
     check_file(path, most, allowed, refuse)
     try:
@@ -113,7 +118,10 @@ def read_bounded(path: Path | str, most: int, allowed: str, refuse: Refuse) -> b
 
 
 def check_file(path: Path | str, most: int, allowed: str, refuse: Refuse) -> None:
-    """Raise the error of `refuse` unless a path is a regular file of at most `most` bytes."""
+    """Raise an error unless a path is a regular file of at most `most` bytes.
+
+    The error is `refuse(found, allowed)`; `allowed` says what is expected.
+    """
     if not is_file(path):
         raise refuse(f"{path}, which is no file", allowed)
     if (size := Path(path).stat().st_size) > most:
@@ -126,7 +134,7 @@ def sha256(path: Path | str) -> str:
 
 
 def format_json(value: Any) -> str:
-    """Return a value as JSON text; a status becomes its name, NaN and infinity become null."""
+    """Return a value as JSON text; a status is written as its name, NaN and infinity as null."""
     return json.dumps(_plain(value), indent=1)
 
 
@@ -144,8 +152,9 @@ def _plain(value: Any) -> Any:
 def render(
     template: Path, filters: Mapping[str, Callable[..., object]] | None = None, **values: Any
 ) -> str:
-    """Return a text from a template of Jinja and values; texts that are put into HTML or XML are
-    escaped.
+    """Return the text of a Jinja template whose variables have the given `values`.
+
+    `filters` are further filters of Jinja by name. Texts that are put into HTML or XML are escaped.
     """
     engine = template_engine(template.parent)
     engine.filters |= filters or {}
@@ -154,7 +163,7 @@ def render(
 
 @functools.cache
 def template_engine(folder: Path) -> "jinja2.Environment":
-    """Return the template engine of a folder."""
+    """Return the Jinja environment that loads templates from a folder."""
     loader = jinja2.FileSystemLoader(folder)
     escape = jinja2.select_autoescape(("html", "js", "css", "xml.jinja"))
     return jinja2.Environment(
@@ -167,8 +176,9 @@ def template_engine(folder: Path) -> "jinja2.Environment":
 
 
 def format_columns(rows: Sequence[Sequence[str]], left: Collection[int] = ()) -> str:
-    """Return rows of cells as aligned lines of text; columns are right-aligned except the indices
-    in `left`.
+    """Return rows of cells as aligned lines of text, one for each row.
+
+    Columns are right-aligned; those with an index in `left` are left-aligned.
     """
     longest = [max(map(len, column)) for column in zip(*rows, strict=True)]
     widths = [-width if k in left else width for k, width in enumerate(longest)]
@@ -176,15 +186,19 @@ def format_columns(rows: Sequence[Sequence[str]], left: Collection[int] = ()) ->
 
 
 def format_line(cells: Sequence[object], widths: Sequence[int]) -> str:
-    """Return one row of cells as a line of text; a column of negative width is left-aligned."""
+    """Return cells as one line of text, each as wide as `widths` says in characters.
+
+    A cell of negative width is left-aligned, one of positive width right-aligned.
+    """
     columns = zip(cells, widths, strict=True)
     return "  ".join(f"{cell!s:{'<' if w < 0 else '>'}{abs(w)}}" for cell, w in columns).rstrip()
 
 
 @contextlib.contextmanager
 def hold_folder(folder: Path) -> Iterator[None]:
-    """Create and lock a folder within the context; remove half-written files. A folder in use
-    raises `OutputError`.
+    """Create and lock a folder within the context, and remove half-written files in it.
+
+    Raises `OutputError` for a folder that another run has locked, or that cannot be written.
     """
     with _hold("folder", folder, folder / LOCK):
         _remove_parts(folder.rglob(f".*{ENDING}"))
@@ -193,8 +207,10 @@ def hold_folder(folder: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def hold_file(path: Path) -> Iterator[None]:
-    """Lock a file within the context by a lock file beside it; remove half-written copies of
-    broken-off runs.
+    """Lock a file within the context, by a lock file beside it.
+
+    Half-written copies of the file, which an interrupted run left, are removed. Raises
+    `OutputError` for a file that another run has locked, or that cannot be written.
     """
     with _hold("path", path, path.with_name(f".{path.name}{LOCK}")):
         _remove_parts(
@@ -204,8 +220,11 @@ def hold_file(path: Path) -> Iterator[None]:
 
 
 def begin_folder(path: Path, content: str, what: str) -> None:
-    """Write a file that describes its folder; raise `OutputError` if the folder holds other files
-    or other content.
+    """Write the file `path` with a text `content` that describes its folder.
+
+    Nothing is written if the file has this content already. Raises `OutputError` if it has another
+    content, or if the folder holds other files but not this one. `what` names the folder's objects
+    in errors.
     """
     check_begun(path)
     if not path.exists():
@@ -219,7 +238,10 @@ def begin_folder(path: Path, content: str, what: str) -> None:
 
 
 def check_begun(path: Path) -> None:
-    """Raise `OutputError` if the folder of a describing file has other files and not this one."""
+    """Raise `OutputError` if the folder of the file `path` holds other files, but not this one.
+
+    Lock files and half-written files do not count.
+    """
     folder = path.parent
     if not path.exists() and {*folder.glob("*")} - {folder / LOCK, *folder.glob(f".*{ENDING}")}:
         raise OutputError("folder", f"{folder}, which holds other files", "an empty folder")
@@ -227,7 +249,7 @@ def check_begun(path: Path) -> None:
 
 @contextlib.contextmanager
 def temporary_folder() -> Iterator[Path]:
-    """Create a temporary folder, and remove it at the end of the context."""
+    """Yield a temporary folder; it is removed at the end of the context."""
     with tempfile.TemporaryDirectory(prefix="torchgrasp-", ignore_cleanup_errors=True) as folder:
         yield Path(folder)
 
@@ -274,8 +296,8 @@ def _holder(path: Path) -> str:
 
 
 def _remove_parts(paths: Iterator[Path]) -> None:
-    """Remove half-written files of an interrupted run; the lock ensures that no run is writing
-    them.
+    """Remove the half-written files of an interrupted run; the folder's lock ensures that no other
+    run is writing.
     """
     for part in list(paths):
         with contextlib.suppress(OSError):

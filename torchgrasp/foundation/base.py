@@ -1,4 +1,8 @@
-"""The base classes of all values: frozen dataclasses of tensors, and batches of them."""
+"""The base classes of all values: frozen dataclasses of tensors, and batches of them.
+
+The tensors of a batch share their first axis. What belongs to one index of this axis is a row, such
+as one grasp.
+"""
 
 import dataclasses
 import functools
@@ -29,10 +33,12 @@ SomeBatch = TypeVar("SomeBatch", bound="Batch")
 
 
 def map_tensors(function: Callable[..., Tensor], *values: SomeValue) -> SomeValue:
-    """Apply a function to the tensors that several values have in the same field; return a value of
-    the results.
+    """Return a value whose tensors are a function of the tensors in the same field of several
+    values.
 
-    Values in fields are mapped, too. Fields without tensors are copied from the first value.
+    `function` is called with one tensor from each of the `values`, which are of one class. Values
+    in fields are mapped, too. Fields without tensors are copied from the first value. Raises
+    `BadArgument` if a field holds a tensor in some of the values only.
     """
 
     def merge(name: str, *found: Any) -> Any:
@@ -56,8 +62,10 @@ def map_tensors(function: Callable[..., Tensor], *values: SomeValue) -> SomeValu
 
 
 class kept(functools.cached_property[Kept]):
-    """A cached property of tensors. Inside a transform of torch.func it keeps none: they would mean
-    nothing later.
+    """A cached property whose value is a tensor, or holds tensors.
+
+    Inside a transform of torch.func nothing is cached, because the tensors of the transform are
+    invalid after it.
     """
 
     def __get__(self, instance: Any, owner: Any = None) -> Any:
@@ -73,8 +81,9 @@ class Value:
     """Base class of all values: frozen dataclasses of tensors. `.to()` returns a copy on another
     device or dtype.
 
-    Values are equal if all their numbers are, on one device; NaN equals NaN. Copies and pickled
-    values keep no caches.
+    Two values are equal if they are of one class and all their fields are equal. Equal tensors have
+    the same shape, dtype, device and numbers; NaN equals NaN. Copies and pickled values do not keep
+    cached properties.
     """
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -100,8 +109,8 @@ class Value:
         return tuple(getattr(self, f.name) for f in dataclasses.fields(self) if f.compare)  # pyright: ignore
 
     def __repr__(self) -> str:
-        """Return the fields in at most 12 lines: types and shapes of tensors, numbers of small
-        tensors.
+        """Return the fields as text of at most 12 lines: types and shapes of tensors, and the
+        numbers of small tensors.
         """
         fields = [f for f in dataclasses.fields(self) if f.repr]  # pyright: ignore[reportArgumentType]
         parts = [*self._about(), *(f"{f.name}={_short(getattr(self, f.name))}" for f in fields)]
@@ -111,15 +120,15 @@ class Value:
         return "\n".join(lines if len(lines) <= LINES else [*lines[: LINES - 1], "    ...)"])
 
     def _about(self) -> list[str]:
-        """Return what the text of a value begins with, before the fields."""
+        """Return texts that precede the fields in the text of a value."""
         return []
 
     def to(self: SomeValue, *args: Any, **kwargs: Any) -> SomeValue:
         """Return the value on another device or in another floating dtype; integer tensors keep
         their dtype.
 
-        Raises `BadArgument` if the device does not exist, or the dtype is neither float32 nor
-        float64.
+        The arguments are those of `torch.Tensor.to`. Raises `BadArgument` if the device does not
+        exist, or the dtype is neither float32 nor float64.
         """
         check_moved(*args, **kwargs)
 
@@ -131,7 +140,7 @@ class Value:
 
 
 def _same(one: Any, other: Any) -> bool:
-    """Return whether two fields of values are equal."""
+    """Return whether two fields of values are equal; NaN equals NaN."""
     if isinstance(one, Tensor) and isinstance(other, Tensor):
         alike = (one.shape, one.dtype, one.device) == (other.shape, other.dtype, other.device)
         return alike and bool(((one == other) | ((one != one) & (other != other))).all())
@@ -187,8 +196,10 @@ def _digits(value: Any) -> str:
 
 
 class Batch(Value):
-    """A value whose tensors share their first axis, the rows. An index selects rows; `len` is their
-    number.
+    """A value whose tensors share their first axis: a row is what belongs to one index of this
+    axis.
+
+    `batch[index]` returns a batch of some rows, and `len(batch)` the number of rows.
     """
 
     def __len__(self) -> int:
@@ -211,8 +222,9 @@ class Batch(Value):
         return (self[i] for i in range(len(self)))
 
     def raise_for_status(self: SomeBatch) -> SomeBatch:
-        """Return this batch if the status of every row is `Status.OK`; else raise `FailedRows` with
-        the counts.
+        """Return this batch if every row has `Status.OK`; else raise `FailedRows`.
+
+        The error states how many rows have each other status.
         """
         counts = count_status(getattr(self, "status"))  # noqa: B009
         failed = {s: k for s, k in counts.items() if s is not Status.OK}
@@ -224,8 +236,9 @@ class Batch(Value):
 
 
 def read_rows(rows: Any, count: int) -> slice | Tensor:
-    """Convert any index of a batch of `count` rows to a slice or a tensor; raise the errors of
-    `Batch.__getitem__`.
+    """Return any index of a batch of `count` rows as a slice, or as a tensor of indices (k,).
+
+    `rows` is what `Batch.__getitem__` accepts; the errors are those of that method.
     """
     refused = BadArgument(
         "rows", show(rows), "an index, a slice, a mask of all rows or a tensor of indices"
@@ -253,7 +266,9 @@ def read_rows(rows: Any, count: int) -> slice | Tensor:
 
 
 def join(parts: Sequence[SomeBatch]) -> SomeBatch:
-    """Concatenate the rows of batches; fields without tensors are copied from the first batch."""
+    """Return batches concatenated along the rows; fields without tensors are copied from the first
+    batch.
+    """
     return map_tensors(lambda *tensors: torch.cat(tensors), *parts)
 
 
@@ -267,17 +282,18 @@ def pick(choose: Bool[Tensor, "b"], new: SomeBatch, old: SomeBatch) -> SomeBatch
 
 
 def put(whole: SomeBatch, at: Int[Tensor, "a"], part: SomeBatch) -> SomeBatch:
-    """Return the batch `whole` after its rows at the indices `at` are replaced by the rows of
-    `part`.
+    """Return a copy of the batch `whole` in which the rows of `part` replace the rows at the
+    indices `at`.
     """
     return map_tensors(lambda rows, new: rows.index_copy(0, at, new), whole, part)
 
 
 def spread(value: float | Tensor, like: Tensor, own: int = 0) -> float | Tensor:
-    """Return a number, or one value for each row, with axes added so that it applies to all of
-    `like` of its row.
+    """Return `value` with axes of size 1 added, so that it broadcasts with the tensor `like`.
 
-    A value of each row has `own` axes itself.
+    A number is returned as it is. A tensor holds one value for each index of the first axis of
+    `like`. Each of these values has `own` axes, which match the last axes of `like`: `value` (b, 3)
+    becomes (b, 1, 3) for `like` (b, n, 3) and `own` 1.
     """
     if not isinstance(value, Tensor) or not value.ndim:
         return value
@@ -285,8 +301,10 @@ def spread(value: float | Tensor, like: Tensor, own: int = 0) -> float | Tensor:
 
 
 def at_once(x: Tensor, size: int) -> int:
-    """Return how many rows of `x` to work on at once: `size` on a CPU, whose cache then holds all
-    temporaries.
+    """Return how many rows of the tensor `x` to process at a time.
+
+    The number is `size` on a CPU, whose cache then holds all temporaries, and `ROWS_ON_GPU` times
+    `size` on an accelerator.
     """
     return size if x.device.type == "cpu" else ROWS_ON_GPU * size
 
@@ -294,8 +312,11 @@ def at_once(x: Tensor, size: int) -> int:
 def in_chunks(
     evaluate: Callable[[Tensor], tuple[Any, ...]], x: Tensor, size: int
 ) -> tuple[Any, ...]:
-    """Evaluate a function on chunks of `size` rows of x, which bounds the memory; return the joined
-    outputs.
+    """Return the outputs of a function for all rows of `x`, computed in chunks of `size` rows to
+    save memory.
+
+    `evaluate` takes a tensor (at most `size`, ...), and returns tensors with as many rows. The
+    outputs of the chunks are concatenated.
     """
     if len(x) <= size:
         return evaluate(x)
@@ -303,7 +324,7 @@ def in_chunks(
 
 
 def row_numbers(rows: Tensor) -> Int[Tensor, "n"]:
-    """Return the numbers 0 to n - 1 of the n rows of a tensor, on its device."""
+    """Return the integers 0 to n - 1 for the n rows of a tensor, on its device."""
     return torch.arange(len(rows), device=rows.device)
 
 
@@ -313,8 +334,9 @@ def flatnonzero(mask: Bool[Tensor, "n"]) -> Int[Tensor, "k"]:
 
 
 def lexical_order(*keys: Tensor) -> Int[Tensor, "g"]:
-    """Return the indices that sort rows ascending by the first key; ties are sorted by the next
-    key.
+    """Return the indices that sort g rows ascending by the first key, equal ones by the next key.
+
+    Each key holds a number for each row (g,).
     """
     order = torch.argsort(keys[-1], stable=True)
     for key in reversed(keys[:-1]):
@@ -323,8 +345,11 @@ def lexical_order(*keys: Tensor) -> Int[Tensor, "g"]:
 
 
 def rank_in_group(group: Int[Tensor, "g"], *keys: Tensor) -> Int[Tensor, "g"]:
-    """Return the rank (from 0) of each row in its group, sorted ascending by the first key, ties by
-    the next key.
+    """Return the rank (from 0) of each row in its group, ascending by the first key, then by the
+    next keys.
+
+    `group` is the index of each row's group. Each key holds a number for each row (g,); without
+    keys the order of the rows counts.
     """
     order = lexical_order(group, *keys)
     grouped = group[order].contiguous()
@@ -348,7 +373,7 @@ def named_tensors(value: Value, prefix: str = "") -> dict[str, Tensor]:
 
 
 def settle(value: SomeValue, device: torch.device) -> SomeValue:
-    """Return a value moved to a device; a value that is already there is returned itself, with its
+    """Return a value on a device; a value that is already there is returned itself, with its
     caches.
     """
     return (
@@ -359,8 +384,10 @@ def settle(value: SomeValue, device: torch.device) -> SomeValue:
 
 
 def check_device(name: str, found: torch.device, beside: str, wanted: torch.device) -> None:
-    """Raise `BadArgument` unless the device `found` of argument `name` is the one `wanted` by
+    """Raise `BadArgument` unless argument `name`, on the device `found`, is on the same device as
     argument `beside`.
+
+    `wanted` is the device of `beside`.
     """
     if found != wanted:
         raise BadArgument(
@@ -369,7 +396,7 @@ def check_device(name: str, found: torch.device, beside: str, wanted: torch.devi
 
 
 def count_status(status: Int[Tensor, "*b"]) -> dict[Status, int]:
-    """Return the number of rows with each status, as a dict that begins with the most frequent
+    """Return the number of rows with each status code, as a dict that begins with the most frequent
     status.
     """
     codes, counts = torch.unique(status, return_counts=True)

@@ -53,8 +53,15 @@ _thread = threading.local()  # `inside` is True while this thread is in a checke
 
 @dataclasses.dataclass
 class _Call:
-    """The state while the arguments of one call are checked: options, axis sizes found so far,
-    tensors to test.
+    """The state while the arguments of one call are checked.
+
+    Args:
+        gradients: whether tensors may require a gradient.
+        deep: whether the fields of values are checked.
+        strict: whether numbers must be finite also in fields annotated `ANY`.
+        sizes: the sizes of axes found so far, by their letters.
+        finite: tensors whose numbers must be finite, by the argument's name.
+        rigid: tensors that must be rigid transforms, by the argument's name.
     """
 
     gradients: bool
@@ -65,8 +72,8 @@ class _Call:
     rigid: dict[str, Tensor] = dataclasses.field(default_factory=dict[str, Tensor])
 
     def check_numbers(self) -> None:
-        """Raise `BadArgument` if a tensor to test has NaN or infinity, or a transform to test is
-        not rigid.
+        """Raise `BadArgument` if a tensor in `finite` has NaN or infinity, or one in `rigid` is no
+        rigid transform.
         """
         for tensors, test, allowed in (
             (self.finite, torch.isfinite, "finite numbers"),
@@ -206,8 +213,10 @@ def _refuse_gradients(name: str, value: Any) -> None:
 
 
 def read_number(name: str, value: Any, kind: Any, allowed: Range | None) -> Any:
-    """Return a value as int, float or bool; raise `BadArgument` if it is of another kind or outside
-    the range.
+    """Return a value as int, float or bool, which `kind` names.
+
+    Raises `BadArgument` if the value is of another kind or outside the range `allowed`; None allows
+    every number. Errors call the value by `name`.
     """
     number: Any = value
     if kind is bool:
@@ -403,8 +412,10 @@ def _option(hint: Any, key: str) -> Any:
 
 
 def check_tensor(name: str, value: Any, shape: tuple[int | None, ...]) -> Tensor:
-    """Return a finite floating-point tensor of a shape, in which None allows any size, or raise
+    """Return `value` if it is a finite floating-point tensor of the given shape; else raise
     `BadArgument`.
+
+    A None in `shape` allows any size of this axis. Errors call the tensor by `name`.
     """
     call = _Call(gradients=True)
     _read_tensor(

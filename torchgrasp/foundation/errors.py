@@ -12,7 +12,7 @@ from torchgrasp.foundation.limits import MESSAGE_LETTERS
 
 
 class GraspError(Exception):
-    """Base of all errors of torchgrasp.
+    """Base class of all errors of torchgrasp.
 
     >>> from torchgrasp import load_hand
     >>> try:
@@ -28,8 +28,10 @@ class GraspError(Exception):
 
 
 class BadArgument(GraspError, ValueError):
-    """An argument has a wrong shape, type or range; the message says what was found and what is
-    allowed.
+    """An argument has a wrong shape, type or range.
+
+    `argument` is its name, `found` what was given, and `allowed` a text that says what is expected;
+    the message holds all three.
     """
 
     def __init__(self, argument: str, found: object, allowed: str):
@@ -56,8 +58,8 @@ class NoSupport(BadArgument):
 
 
 class CloudFileError(BadArgument):
-    """A point-cloud file is missing or empty, or its content is not of the format that its suffix
-    names.
+    """A point-cloud file is missing or empty, or its content does not have the format of its
+    suffix.
     """
 
 
@@ -70,9 +72,7 @@ class HandFileError(BadArgument):
 
 
 class ModelFileError(BadArgument):
-    """A safetensors file is missing or truncated, or does not hold the tensors expected of its
-    kind.
-    """
+    """A safetensors file is missing or truncated, or lacks the tensors that its kind needs."""
 
 
 class DatasetError(BadArgument):
@@ -84,8 +84,9 @@ class OutputError(BadArgument):
 
 
 class MissingExtra(GraspError, ImportError):
-    """A package that an optional feature needs is not installed; the message names the extra to
-    install.
+    """A package that an optional feature needs is not installed.
+
+    `package` is its name, and `extra` the extra of torchgrasp that installs it.
     """
 
     def __init__(self, package: str, extra: str):
@@ -105,7 +106,10 @@ class NoWorkers(GraspError, RuntimeError):
 
 
 class IndefiniteCovariance(GraspError, ValueError):
-    """A covariance matrix is not positive definite. The library never adds jitter."""
+    """A covariance matrix is not positive definite; `smallest_eigenvalue` is its least eigenvalue.
+
+    The library never adds a multiple of the identity (jitter) to make a matrix positive definite.
+    """
 
     def __init__(self, what: str, smallest_eigenvalue: float, fix: str):
         super().__init__(
@@ -133,7 +137,7 @@ class BrokenLaw(GraspError, AssertionError):
 
 
 class FailedRows(GraspError):
-    """Some rows of a batch failed; `Batch.raise_for_status` raises this error."""
+    """Rows of a batch failed, such as some grasps; `Batch.raise_for_status` raises this error."""
 
 
 class CloudWarning(UserWarning):
@@ -141,11 +145,13 @@ class CloudWarning(UserWarning):
 
 
 class CutOff(CloudWarning):
-    """The object reaches the border of the image."""
+    """The object reaches the border of the image, so a part of it may be missing."""
 
 
 class Gap(CloudWarning):
-    """A region within the outline has no points: a hole, or a reflecting patch."""
+    """A region within the object's outline in the image has no points: a hole, or a reflecting
+    patch.
+    """
 
 
 class TwoBodies(CloudWarning):
@@ -157,7 +163,7 @@ class FewPoints(CloudWarning):
 
 
 class Flat(CloudWarning):
-    """All points lie in one plane, so that the thickness is a guess."""
+    """All points of the cloud lie in one plane, so the estimated thickness is a guess."""
 
 
 class Status(enum.IntEnum):

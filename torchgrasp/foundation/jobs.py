@@ -34,17 +34,18 @@ def run_tasks(
     workers: Annotated[int, Range(0, 1024)] = 1,
     limit: Annotated[float, Range(0.001, math.inf)] = 60.0,
 ) -> Generator[Result | Status, None, None]:
-    """Run `function(*task)` for each task in worker processes; yield the results in the order of
-    the tasks.
+    """Yield the results of `function(*task)` for all tasks, which run in worker processes, in the
+    order of the tasks.
 
-    Each task runs on one thread of a separate process. A task that exceeds the limit gives
-    `Status.TIMED_OUT`. A task whose process dies twice gives `Status.WORKER_DIED`. The error of a
-    task is raised in place of its result. All workers end when the caller stops iterating. Raises
-    `NoWorkers` if no process can start.
+    Each task runs on one thread of a separate process. A task that takes longer than `limit` [s]
+    gives `Status.TIMED_OUT`. A task whose process dies twice gives `Status.WORKER_DIED`. The error
+    of a task is raised in place of its result. All workers end when the caller stops iterating.
+    Raises `NoWorkers` if no process can start.
 
-    Each worker imports the module of the function, but not the caller's script, unless the function
-    is of the script. Tasks must hold no tensors, because processes would share them: see `pack`. If
-    `workers` is 0, the tasks run in this process, without the `limit` [s] on the time of a task.
+    Each worker imports the module of the function. It runs the caller's script only if the function
+    is defined there. Tasks must hold no tensors, because processes would share them: see `pack`. If
+    `workers`, the number of processes, is 0, the tasks run in this process, without a limit on
+    their time.
     """
     return _in_order(_run(function, tasks, workers, limit))
 
@@ -52,8 +53,9 @@ def run_tasks(
 def run_as_they_end(
     function: Callable[..., Result], tasks: Iterable[Task], workers: int, limit: float
 ) -> Generator[tuple[int, Result | Status], None, None]:
-    """Run tasks like `run_tasks`, but yield the index and the result of each task as soon as it
-    ends.
+    """Run tasks like `run_tasks`; yield the index and the result of each task as soon as it ends.
+
+    `workers` is the number of processes, and `limit` [s] the longest time of a task.
     """
     with contextlib.closing(_run(function, tasks, workers, limit)) as results:
         for number, ended in results:
@@ -178,7 +180,7 @@ class _Process(SpawnProcess):
     """
 
     def start(self) -> None:
-        """Start the process without the name of the script."""
+        """Start the process without the path of the caller's script."""
         with _starting:
             known = spawn.get_preparation_data
             spawn.get_preparation_data = lambda name: {
@@ -191,7 +193,7 @@ class _Process(SpawnProcess):
 
 
 class _Apart(SpawnContext):
-    """The way in which `_Process` starts."""
+    """A way to start processes: each is a `_Process`."""
 
     Process = _Process
 
@@ -210,8 +212,10 @@ def _begin(function: Callable[..., Any]) -> None:
 
 
 class _Packed(NamedTuple):
-    """A tensor as array with the name of its device, or the attributes of a dataclass, cached ones
-    among them.
+    """A tensor or a dataclass in a form for another process.
+
+    `kind` is the name of the tensor's device, or the class of the dataclass. `content` is the
+    tensor as an array, or the packed attributes of the dataclass, cached ones too.
     """
 
     kind: type | str
@@ -219,10 +223,10 @@ class _Packed(NamedTuple):
 
 
 def pack(value: Any, known: dict[int, Any] | None = None) -> Any:
-    """Return a value for another process: arrays in place of tensors, which processes would share;
-    see `unpack`.
+    """Return a value in a form for another process; `unpack` restores it.
 
-    `known` holds by identity what was packed before, so that what a value holds twice is sent once.
+    NumPy arrays take the place of tensors, which processes would share. `known` maps the `id` of
+    each packed object to its packed form, so that an object that occurs twice is sent once.
     """
     known = {} if known is None else known
     if id(value) in known:
@@ -237,7 +241,7 @@ def pack(value: Any, known: dict[int, Any] | None = None) -> Any:
 
 
 def unpack(packed: Any) -> Any:
-    """Return the value that `pack` packed, with its tensors on their devices."""
+    """Return the value whose packed form `pack` made, with its tensors on their devices."""
     if not isinstance(packed, _Packed):
         return _map_items(unpack, packed)
     if isinstance(packed.kind, str):

@@ -22,8 +22,9 @@ from torchgrasp.foundation.limits import NAME_BYTES, PATH_BYTES, SHOWN_LETTERS
 
 
 class Range(NamedTuple):
-    """A rule in an annotation: a number must lie in [`low`, `high`]. `words` describe the range in
-    errors.
+    """A rule in an annotation: a number must lie in [`low`, `high`].
+
+    `words` describe the range in errors; without words the two bounds do.
     """
 
     low: float
@@ -32,16 +33,22 @@ class Range(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """Annotation of a field that holds a batch, with as many rows as the axis `letter` of the other
-    fields is long.
+    """A rule in an annotation: a field holds a batch of as many rows as the other fields.
+
+    This number is the size of the axis `letter` in the shapes of the other fields.
     """
 
     letter: str
 
 
 class Taken(NamedTuple):
-    """A rule in an annotation called `alias`: `read`, given an argument and its name, makes a value
-    of a `kind`.
+    """A rule in an annotation: an argument of several types is converted to a value of one type.
+
+    Args:
+        alias: name of the annotation.
+        kind: type of the converted value.
+        words: description of the allowed arguments for errors.
+        read: function that returns the converted value, given the argument and its name.
     """
 
     alias: str
@@ -88,7 +95,7 @@ NUMBERS = {
 
 
 def describe(hint: Any) -> str:
-    """Return in words which arguments an annotation allows."""
+    """Return a text that says which arguments an annotation allows."""
     origin = typing.get_origin(hint)
     inside = typing.get_args(hint)
     if origin is Annotated and isinstance(inside[1], Range):
@@ -131,8 +138,10 @@ def is_tensor(hint: Any) -> bool:
 
 
 def fits(axes: list[str], shape: tuple[int, ...], sizes: dict[str, Any]) -> bool:
-    """Return whether a shape matches the axes of a jaxtyping annotation; record the size of each
-    letter in `sizes`.
+    """Return whether a shape matches the axes of a jaxtyping annotation.
+
+    `axes` are the words of the annotation, such as ["*b", "3"]. `sizes` holds the known size of
+    each axis by its letter; new letters are added.
     """
     for k in [k for k, axis in enumerate(axes) if axis[0] in "*."]:
         letter = axes[k].lstrip("*#")
@@ -163,8 +172,10 @@ def fits(axes: list[str], shape: tuple[int, ...], sizes: dict[str, Any]) -> bool
 
 
 def check_dense(name: str, value: Tensor, gradients: bool) -> None:
-    """Raise `BadArgument` if a tensor is sparse, nested or meta, or transformed by torch while
-    `gradients` is false.
+    """Raise `BadArgument` if a tensor is sparse, nested or meta, or has the negative bit.
+
+    Without `gradients` also a tensor that requires a gradient, or is inside torch.vmap, is refused.
+    Errors call the tensor by `name`.
     """
     if value.layout is not torch.strided or value.is_nested or value.is_meta:
         found = "no numbers (meta)" if value.is_meta else f"a layout of {value.layout}"
@@ -194,8 +205,8 @@ def _levels(value: Tensor) -> list[Tensor]:
 
 
 def is_tracked(value: Tensor) -> bool:
-    """Return whether derivatives are taken by a tensor: by autograd, in forward mode, or by
-    torch.func.
+    """Return whether torch computes derivatives with respect to a tensor: by autograd, in forward
+    mode, or by torch.func.
     """
     levels = _levels(value)
     if any(x.requires_grad or functorch.is_gradtrackingtensor(x) for x in levels):
@@ -206,8 +217,8 @@ def is_tracked(value: Tensor) -> bool:
 
 
 def is_known(value: Tensor) -> bool:
-    """Return whether Python may test the numbers of a tensor: not inside torch.vmap or
-    torch.compile.
+    """Return whether Python may test the numbers of a tensor; inside torch.vmap or torch.compile it
+    may not.
     """
     return not (
         torch.compiler.is_compiling() or any(map(functorch.is_batchedtensor, _levels(value)))
@@ -215,8 +226,8 @@ def is_known(value: Tensor) -> bool:
 
 
 def show(value: Any) -> str:
-    """Return a text that shows a wrong argument: a number or text itself, the shape of a tensor, or
-    the type.
+    """Return a text that shows a wrong argument: a number or text itself, the shape and dtype of a
+    tensor, or the type.
     """
     if isinstance(value, Tensor):
         return f"a tensor of shape {tuple(value.shape)} and {value.dtype}"
@@ -228,8 +239,9 @@ def show(value: Any) -> str:
 
 
 def is_rigid(a_from_b: Float[Tensor, "*b 4 4"]) -> Bool[Tensor, "*b"]:
-    """Return a mask of the matrices that are a right-handed rotation (up to float32 rounding) and a
-    translation.
+    """Return a mask of the matrices that are rigid transforms.
+
+    Each has a right-handed rotation, up to rounding in float32, and the last row 0 0 0 1.
     """
     x, y, z = a_from_b[..., :3, :3].double().unbind(-2)
     rotation = torch.stack([x, y, z], -2)
@@ -254,8 +266,10 @@ def check_moved(*args: Any, **kwargs: Any) -> None:
 
 
 def check_path(name: str, path: Path | str) -> None:
-    """Raise `BadArgument` for a path that no file can have: it has a NUL or a lone surrogate, or is
-    too long.
+    """Raise `BadArgument` for a path that no file can have: with a NUL, half a character, or too
+    many bytes.
+
+    Errors call the path by `name`.
     """
     try:
         raw = os.fsencode(path)

@@ -24,8 +24,9 @@ them.
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """Let torch use one thread, and the CPU by default, within the context; restore both
-    afterwards.
+    """Let torch use one thread, and the CPU as default device, within the context.
+
+    Both settings are restored afterwards.
     """
     if getattr(_here, "inside", False):
         yield
@@ -51,8 +52,10 @@ def one_thread() -> Iterator[None]:
 
 
 def single_threaded(function: Function) -> Function:
-    """Return the function, which runs within `one_thread`; a generator, while it computes each
-    item.
+    """Return a function that runs `function` within `one_thread`.
+
+    A generator function runs within `one_thread` while it computes each item, and not between
+    items.
     """
 
     @functools.wraps(function)
