@@ -26,7 +26,7 @@ SensorName = Literal["realsense", "kinect_v1", "azure", "zivid"]
 
 
 @dataclasses.dataclass(frozen=True)
-class RimNumbers:
+class FaultNumbers:
     """Where a depth camera errs beside the random noise: at rims and in corners."""
 
     background: float = 100.0
@@ -73,7 +73,7 @@ class StillNumbers:
     """Greatest share of pixels that differ; noise and flying pixels change fewer."""
 
 
-RIMS = RimNumbers()
+FAULTS = FaultNumbers()
 ESTIMATE = EstimateNumbers()
 STILL = StillNumbers()
 
@@ -177,17 +177,17 @@ def add_noise(
         noisy = noisy + sensor.sigma(noisy) * own
     noisy = noisy + patches(sensor.bias, sensor.bias_width)
     # Other surfaces, and the background, next to a pixel make it a rim.
-    full = torch.where(measured, depth, RIMS.background).numpy()
-    far = torch.from_numpy(ndimage.maximum_filter(full, RIMS.width))
-    near = torch.from_numpy(ndimage.minimum_filter(full, RIMS.width))
-    rim = (far - depth > RIMS.jump) | (depth - near > RIMS.jump)
+    full = torch.where(measured, depth, FAULTS.background).numpy()
+    far = torch.from_numpy(ndimage.maximum_filter(full, FAULTS.width))
+    near = torch.from_numpy(ndimage.minimum_filter(full, FAULTS.width))
+    rim = (far - depth > FAULTS.jump) | (depth - near > FAULTS.jump)
     flies = rim & (uniform() < sensor.flying)
     noisy = noisy + torch.where(flies, -sensor.flight * torch.log1p(-uniform()), 0.0)
     # Light by way of the walls of a corner takes longer.
     if sensor.multipath:
-        around = torch.from_numpy(ndimage.gaussian_filter(depth.numpy(), RIMS.corner))
+        around = torch.from_numpy(ndimage.gaussian_filter(depth.numpy(), FAULTS.corner))
         excess = (depth - around).clamp_min(0.0)
-        noisy = noisy + sensor.multipath * torch.where(excess < RIMS.deepest, excess, 0.0)
+        noisy = noisy + sensor.multipath * torch.where(excess < FAULTS.deepest, excess, 0.0)
     # Pixels fade at grazing angles, and behind what hides them from the second eye.
     angle = torch.rad2deg(torch.arccos(cosine.clamp(0.0, 1.0)))
     low, high = sensor.grazing
