@@ -16,10 +16,17 @@ from torch import Tensor
 
 from torchgrasp.foundation.base import Value, at_once, rank_in_group, spread
 from torchgrasp.foundation.errors import BadArgument
-from torchgrasp.shape.estimate import MeanJet, SurfaceJet
+from torchgrasp.shape.estimate import MeanAndGradient, MeanJet, Moments, SurfaceJet
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.jets import Weighted, evaluate_jet, evaluate_mean, evaluate_mean_jet
-from torchgrasp.shape.kernel import Kernel, cross_covariance, differentiate_thin_plate, thin_plate
+from torchgrasp.shape.kernel import (
+    CovarianceRows,
+    Kernel,
+    Queries,
+    cross_covariance,
+    differentiate_thin_plate,
+    thin_plate,
+)
 from torchgrasp.shape.posterior import CHUNK
 
 Evaluate = Callable[[Tensor, Tensor], tuple[Tensor, ...]]
@@ -46,61 +53,66 @@ class Walls(Value):
     psi: Float[Tensor, "w"]
 
     @classmethod
-    def of(cls, shapes: Sequence[ShapeGP], device: torch.device) -> "Walls":
+    def of(
+        cls,
+        shapes: Sequence[ShapeGP],
+        device: torch.device,
+    ) -> "Walls":
         """Stack the posteriors of shapes, each of one surface, on a device, which inverts the
         Cholesky factors.
         """
         near = max(shape.n_oriented for shape in shapes)
         n = near + max(len(shape.x) - shape.n_oriented for shape in shapes)
-        x, a, b = (shapes[0].x.new_zeros(len(shapes), *size) for size in ((n, 3), (n,), (near, 3)))
-        factor = torch.eye(n + 3 * near, dtype=x.dtype, device=device).repeat(len(shapes), 1, 1)
-        place_of = torch.zeros(len(shapes), n + 3 * near, dtype=torch.long, device=x.device)
+        size = n + 3 * near
+        x = shapes[0].x.new_zeros(len(shapes), n, 3)
+        a = x.new_zeros(len(shapes), n)
+        b = x.new_zeros(len(shapes), near, 3)
+        psi = x.new_tensor([shape.psi for shape in shapes])
+        counts = x.new_tensor([len(shape.factor) for shape in shapes])
+        factor = torch.eye(size, dtype=x.dtype, device=device).repeat(len(shapes), 1, 1)
+        place_of = torch.zeros(len(shapes), size, dtype=torch.long, device=x.device)
         for w, shape in enumerate(shapes):
             oriented = torch.arange(shape.n_oriented, device=x.device)
-            place = torch.cat(
-                [oriented, near + torch.arange(len(shape.x) - len(oriented), device=x.device)]
-            )
+            others = torch.arange(len(shape.x) - len(oriented), device=x.device)
+            place = torch.cat([oriented, near + others])
             rows = torch.cat([place, *(n + k * near + oriented for k in range(3))])
             x[w, place], a[w, place], b[w, oriented], _ = shape.weighted
             factor[w, : len(rows), : len(rows)] = shape.factor.to(device)
-            missing = torch.ones(len(place_of[w]), dtype=torch.bool, device=x.device).index_fill(
-                0, rows, False
-            )
+            # rows of what is missing come last
+            missing = torch.ones(size, dtype=torch.bool, device=x.device)
+            missing = missing.index_fill(0, rows, False)
             place_of[w] = torch.cat([shape.ordered(rows), torch.nonzero(missing)[:, 0]])
-        psi, counts = (
-            x.new_tensor(y) for y in zip(*((s.psi, len(s.factor)) for s in shapes), strict=True)
-        )
-        x, a, b, psi, place_of = (y.to(device) for y in (x, a, b, psi, place_of))
-        known = (
-            torch.arange(n + 3 * near, device=device) < counts.to(device)[:, None]
-        )  # no column for what is missing
-        inverse = torch.linalg.solve_triangular(
-            factor.mT, torch.diag_embed(known.to(factor)), upper=True
-        )
-        whitener = torch.empty_like(inverse).scatter_(
-            1, place_of[..., None].expand_as(inverse), inverse
-        )
+        x, a, b, psi, counts, place_of = (y.to(device) for y in (x, a, b, psi, counts, place_of))
+        # no column for what is missing
+        known = torch.arange(size, device=device) < counts[:, None]
+        columns = torch.diag_embed(known.to(factor))
+        inverse = torch.linalg.solve_triangular(factor.mT, columns, upper=True)
+        place_of = place_of[..., None].expand_as(inverse)
+        whitener = torch.empty_like(inverse).scatter_(1, place_of, inverse)
         return cls(x, a, b, whitener, psi)
 
     def weighted(self, wall: Int[Tensor, "q"]) -> Weighted:
         """Return the observations and weights of the surface of each query point."""
         psi = self.psi[wall, None]
-        kernel = Kernel(
-            partial(thin_plate, psi=psi), closed_form=partial(differentiate_thin_plate, psi)
-        )
+        fast = partial(differentiate_thin_plate, psi)
+        kernel = Kernel(partial(thin_plate, psi=psi), closed_form=fast)
         return Weighted(self.x[wall], self.a[wall], self.b[wall], kernel)
 
     def whiten(
-        self, wall: Int[Tensor, "q"], rows: Float[Tensor, "q rows"]
-    ) -> Float[Tensor, "q rows"]:
+        self,
+        wall: Int[Tensor, "q"],
+        rows: CovarianceRows,
+    ) -> CovarianceRows:
         """Return rows of covariances with the observations of each row's surface, whitened; see
         `Posterior.whiten`.
         """
         return self._together(wall, rows, lambda own, matrix: (own @ matrix,))[0]
 
     def explain(
-        self, wall: Int[Tensor, "q"], rows: Float[Tensor, "q rows"]
-    ) -> tuple[Float[Tensor, "q"], Float[Tensor, "q rows"]]:
+        self,
+        wall: Int[Tensor, "q"],
+        rows: CovarianceRows,
+    ) -> tuple[Float[Tensor, "q"], CovarianceRows]:
         """Return what the observations of each row's surface explain; see `Posterior.explain`."""
 
         def explain(own: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor]:
@@ -110,7 +122,10 @@ class Walls(Value):
         return self._together(wall, rows, explain)  # pyright: ignore[reportReturnType]
 
     def _together(
-        self, wall: Int[Tensor, "q"], rows: Float[Tensor, "q rows"], function: Evaluate
+        self,
+        wall: Int[Tensor, "q"],
+        rows: CovarianceRows,
+        function: Evaluate,
     ) -> tuple[Tensor, ...]:
         """Return a function of the rows of each surface, (w, m, rows), and the surfaces' whiteners,
         for all rows.
@@ -121,9 +136,8 @@ class Walls(Value):
             found, group = torch.unique(wall, return_inverse=True)
             matrix = matrix[found]
         slot = rank_in_group(group)
-        padded = rows.new_zeros(
-            len(matrix), int(torch.bincount(group, minlength=1).max()), rows.shape[1]
-        )
+        most = int(torch.bincount(group, minlength=1).max())
+        padded = rows.new_zeros(len(matrix), most, rows.shape[1])
         padded[group, slot] = rows
         return tuple(x[group, slot] for x in function(padded, matrix))
 
@@ -156,7 +170,11 @@ class ShapeBatch(Value):
     hollow: bool
 
     @classmethod
-    def of(cls, shapes: Sequence[ShapeGP], device: torch.device | None = None) -> "ShapeBatch":
+    def of(
+        cls,
+        shapes: Sequence[ShapeGP],
+        device: torch.device | None = None,
+    ) -> "ShapeBatch":
         """Stack shapes, with one row for each, on a device, by default theirs; refuse another
         kernel by name.
         """
@@ -164,23 +182,28 @@ class ShapeBatch(Value):
             form = shape.kernel.closed_form
             if not (isinstance(form, partial) and form.func is differentiate_thin_plate):
                 raise BadArgument("shapes", "a shape with another kernel", "thin-plate kernels")
-        outer = [s.walls[0] for s in shapes]
-        inner = [s.walls[1] for s in shapes if len(s.walls) > 1]
-        own = torch.arange(len(shapes), device="cpu")
+        outer = [shape.walls[0] for shape in shapes]
+        inner = [shape.walls[1] for shape in shapes if len(shape.walls) > 1]
         device = shapes[0].device if device is None else device
-        second = torch.tensor([len(s.walls) > 1 for s in shapes], device="cpu")
-        wall = torch.stack(
-            [own, torch.where(second, len(shapes) - 1 + second.cumsum(0), own)], 1
-        ).to(device)
-        numbers = [
-            [getattr(s, name) for s in shapes] for name in ("scale", "domain_radius", "std_factor")
-        ]
-        scales, radii, factors = (
-            torch.tensor(x, dtype=torch.float64, device=device) for x in numbers
+        own = torch.arange(len(shapes), device="cpu")
+        second = torch.tensor([len(shape.walls) > 1 for shape in shapes], device="cpu")
+        after = len(shapes) - 1 + second.cumsum(0)
+        wall = torch.stack([own, torch.where(second, after, own)], 1)  # (c, 2)
+
+        def number(name: str) -> Float[Tensor, "c"]:
+            values = [getattr(shape, name) for shape in shapes]
+            return torch.tensor(values, dtype=torch.float64, device=device)
+
+        return cls(
+            Walls.of([*outer, *inner], device),
+            wall.to(device),
+            torch.stack([shape.center for shape in shapes]).double().to(device),
+            number("scale"),
+            number("domain_radius"),
+            number("std_factor"),
+            own.to(device),
+            bool(inner),
         )
-        centers = torch.stack([s.center for s in shapes]).double().to(device)
-        surfaces = Walls.of([*outer, *inner], device)
-        return cls(surfaces, wall, centers, scales, radii, factors, own.to(device), bool(inner))
 
     @property
     def device(self) -> torch.device:
@@ -216,16 +239,22 @@ class ShapeBatch(Value):
         """Return the shapes of some of the rows."""
         return dataclasses.replace(self, owner=self.owner[index])
 
-    def normalise(self, points: Float[Tensor, "b *k 3"]) -> Float[Tensor, "b *k 3"]:
+    def normalise(
+        self,
+        points: Float[Tensor, "b *k 3"],
+    ) -> Float[Tensor, "b *k 3"]:
         """Return points [m] of each row in the normalised frame of its cloud."""
         center = spread(self.centers[self.owner].to(points), points, 1)
         return (points - center) / spread(self.scale.to(points), points)
 
-    def metres(self, x: Float[Tensor, "b *k 3"]) -> Float[Tensor, "b *k 3"]:
+    def metres(
+        self,
+        x: Float[Tensor, "b *k 3"],
+    ) -> Float[Tensor, "b *k 3"]:
         """Return normalised points of each row in metres."""
         return x * spread(self.scale, x) + spread(self.centers[self.owner], x, 1)
 
-    def wall_at(self, x: Float[Tensor, "q 3"]) -> Bool[Tensor, "q walls"]:
+    def wall_at(self, x: Queries) -> Bool[Tensor, "q walls"]:
         """Return a mask (points, walls): which of the `walls` is the surface at each normalised
         point.
         """
@@ -234,34 +263,32 @@ class ShapeBatch(Value):
         own = self._surface_at(x) == self._wall(x)[:, 0]
         return torch.stack([own, ~own], 1)
 
-    def mean_and_gradient(
-        self, x: Float[Tensor, "q 3"]
-    ) -> tuple[Float[Tensor, "q"], Float[Tensor, "q 3"]]:
+    def mean_and_gradient(self, x: Queries) -> MeanAndGradient:
         """Return the mean signed distance and its gradient at normalised points."""
-        return self._evaluate(
-            lambda part, wall: evaluate_mean(self.surfaces.weighted(wall), part, gradient=True), x
-        )  # pyright: ignore
 
-    def mean_jet(self, x: Float[Tensor, "q 3"]) -> MeanJet:
+        def evaluate(part: Tensor, wall: Tensor) -> tuple[Tensor, ...]:
+            return evaluate_mean(self.surfaces.weighted(wall), part, gradient=True)
+
+        return self._evaluate(evaluate, x)  # pyright: ignore[reportReturnType]
+
+    def mean_jet(self, x: Queries) -> MeanJet:
         """Return the mean distance with first and second derivatives at normalised points."""
-        found = self._evaluate(
-            lambda part, wall: evaluate_mean_jet(self.surfaces.weighted(wall), part)[0], x
-        )
-        return MeanJet(*found)
 
-    def jet(self, x: Float[Tensor, "q 3"]) -> SurfaceJet:
+        def evaluate(part: Tensor, wall: Tensor) -> tuple[Tensor, ...]:
+            return evaluate_mean_jet(self.surfaces.weighted(wall), part)[0]
+
+        return MeanJet(*self._evaluate(evaluate, x))
+
+    def jet(self, x: Queries) -> SurfaceJet:
         """Return mean and variance of the distance with their derivatives at normalised points."""
 
         def evaluate(part: Tensor, wall: Tensor) -> tuple[Tensor, ...]:
-            return evaluate_jet(
-                self.surfaces.weighted(wall), part, partial(self.surfaces.explain, wall)
-            )
+            explain = partial(self.surfaces.explain, wall)
+            return evaluate_jet(self.surfaces.weighted(wall), part, explain)
 
         return SurfaceJet(*self._evaluate(evaluate, x))
 
-    def estimate(
-        self, x: Float[Tensor, "q 3"]
-    ) -> tuple[Float[Tensor, "q 4"], Float[Tensor, "q 4 4"]]:
+    def estimate(self, x: Queries) -> Moments:
         """Return mean and covariance of distance and gradient at normalised points, Eqs. (7)-(8) of
         the paper.
         """
@@ -271,19 +298,18 @@ class ShapeBatch(Value):
             zero = torch.zeros_like(part)
             rows = cross_covariance(of.kernel, part, of.x, of.b.shape[1]).transpose(0, 1)
             weights = torch.cat([of.a, of.b.mT.flatten(1)], 1)
-            whitened = self.surfaces.whiten(wall.repeat_interleave(4), rows.flatten(0, 1)).view_as(
-                rows
-            )
+            walls = wall.repeat_interleave(4)
+            whitened = self.surfaces.whiten(walls, rows.flatten(0, 1)).view_as(rows)
             prior = cross_covariance(of.kernel, zero, zero[:, None], 1).transpose(0, 1)
             return (rows @ weights[..., None])[..., 0], prior - whitened @ whitened.mT
 
         return self._evaluate(evaluate, x)  # pyright: ignore[reportReturnType]
 
-    def _wall(self, x: Float[Tensor, "q 3"]) -> Int[Tensor, "q 2"]:
+    def _wall(self, x: Queries) -> Int[Tensor, "q 2"]:
         """Return the outer and the inner surface of the cloud of each point."""
         return self.wall[self.owner].repeat_interleave(len(x) // max(len(self.owner), 1), 0)
 
-    def _surface_at(self, x: Float[Tensor, "q 3"]) -> Int[Tensor, "q"]:
+    def _surface_at(self, x: Queries) -> Int[Tensor, "q"]:
         """Return the surface that applies at each point: of a hollow object the one with the
         greater mean distance.
         """
@@ -294,12 +320,14 @@ class ShapeBatch(Value):
         def mean(part: Tensor, wall: Tensor) -> tuple[Tensor, ...]:
             return evaluate_mean(self.surfaces.weighted(wall), part, gradient=False)
 
-        return torch.where(
-            self._evaluate(mean, x, inner)[0] > self._evaluate(mean, x, outer)[0], inner, outer
-        )
+        within = self._evaluate(mean, x, inner)[0] > self._evaluate(mean, x, outer)[0]
+        return torch.where(within, inner, outer)
 
     def _evaluate(
-        self, evaluate: Evaluate, x: Float[Tensor, "q 3"], wall: Tensor | None = None
+        self,
+        evaluate: Evaluate,
+        x: Queries,
+        wall: Tensor | None = None,
     ) -> tuple[Tensor, ...]:
         """Return the results of a function of points and surfaces, for chunks of points, joined."""
         wall = self._surface_at(x) if wall is None else wall

@@ -10,11 +10,11 @@ import math
 from typing import Literal
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.foundation.base import Value, map_tensors
-from torchgrasp.geometry.linalg import cholesky
+from torchgrasp.geometry.linalg import Points, cholesky
 from torchgrasp.shape.estimate import Observations
 from torchgrasp.shape.kernel import Kernel, covariance_rows, cross_covariance, gram
 from torchgrasp.shape.posterior import Posterior
@@ -26,9 +26,8 @@ def posterior_given(observations: Observations, kernel: Kernel) -> Posterior:
     """Return the posterior given observations, by one Cholesky factorisation of their covariance."""
     observations = observations.with_normals_first()
     y, noise = observations.rows()
-    matrix = gram(kernel, observations.x, int(observations.has_normal.sum())) + torch.diag_embed(
-        noise
-    )
+    near = int(observations.has_normal.sum())
+    matrix = gram(kernel, observations.x, near) + torch.diag_embed(noise)
     factor = cholesky(matrix, "the covariance K + sigma^2 I", kernel.remedy)
     weights = torch.cholesky_solve(y[:, None], factor)[:, 0]
     return Posterior(observations.x, observations.has_normal, weights, factor, None, kernel)
@@ -42,20 +41,21 @@ def check_kernel(posterior: Posterior, least_noise: float) -> None:
     posterior = map_tensors(torch.detach, posterior)
     if longest_distance(posterior.x) > kernel.diameter:
         matrix = gram(kernel, posterior.x, posterior.n_oriented)
-        matrix.diagonal().add_(
-            least_noise**2
-        )  # greater noise of some observations can hide an indefinite K
+        # greater noise of some observations can hide an indefinite K
+        matrix.diagonal().add_(least_noise**2)
         cholesky(matrix, "the covariance K", kernel.remedy)
 
 
-def longest_distance(x: Float[Tensor, "n 3"]) -> float:
+def longest_distance(x: Points) -> float:
     """Return the longest distance between any two points."""
     x = x.detach()
     return float(torch.cdist(x, x, compute_mode="donot_use_mm_for_euclid_dist").max())
 
 
 def append_observations(
-    old: Posterior, new: Observations, shared: Float[Tensor, "n c"] | None = None
+    old: Posterior,
+    new: Observations,
+    shared: Float[Tensor, "n c"] | None = None,
 ) -> Posterior:
     """Return the posterior given the old and the `new` observations; it equals conditioning on all
     at once.
@@ -76,16 +76,14 @@ def append_observations(
         own[: len(new.x), : len(new.x)] += shared @ shared.T
     before = torch.linalg.solve_triangular(old.factor, old.ordered(cross), upper=False)
     corner = cholesky(own - before.T @ before, "the covariance of new observations", kernel.remedy)
-    factor = torch.cat(
-        [torch.cat([old.factor, torch.zeros_like(before)], 1), torch.cat([before.T, corner], 1)]
-    )
+    above = torch.cat([old.factor, torch.zeros_like(before)], 1)
+    factor = torch.cat([above, torch.cat([before.T, corner], 1)])
 
     # L^-1 y of the old rows is L^T times their weights; the observed numbers themselves need not be
     # kept.
     whitened = old.factor.T @ old.ordered(old.weights)
-    rest = torch.linalg.solve_triangular(corner, (y - before.T @ whitened)[:, None], upper=False)[
-        :, 0
-    ]
+    rest = (y - before.T @ whitened)[:, None]
+    rest = torch.linalg.solve_triangular(corner, rest, upper=False)[:, 0]
     return _extend(old, new, factor, torch.cat([whitened, rest]))
 
 
@@ -116,12 +114,11 @@ def select_points(
     x = candidates.x
     start = posterior_given(known, kernel)
     n = len(x)
-    budget = min(budget, len(x))
+    budget = min(budget, n)
     old = len(start.factor)
-    rows = len(start.factor) + 4 * budget
-    factor = x.new_zeros(
-        rows, rows
-    ).T  # by columns, as the solver wants it: it copies any other matrix
+    rows = old + 4 * budget
+    # by columns, as the solver wants it: it copies any other matrix
+    factor = x.new_zeros(rows, rows).T
     factor[:old, :old] = start.factor
     with_known = start.cross(x)
     whitened = x.new_empty(rows, n + 1)  # L^-1 [K(observed, distances of candidates), y]
@@ -141,19 +138,17 @@ def select_points(
             break
         p = torch.argmax(free + _score(criterion, variance, error), keepdim=True)
         end = old + 4 * count
-        new = slice(old + 4 * count, old + 4 * count + 4)
+        new = slice(end, end + 4)
         # (d, w) of the pick with (d, w) of every candidate; rows of the factor go pick by pick
         with_all = cross_covariance(kernel, x[p], x, n).view(4, 4, n)
         with_picks = with_all[:, :, picks[:count]].permute(2, 1, 0).reshape(4 * count, 4)
         cross = torch.cat([with_known[:, p].squeeze(1).T, with_picks])
         before = torch.linalg.solve_triangular(factor[:end, :end], cross, upper=False)
         own = prior + torch.diag(noise[p][0])
-        corner = cholesky(
-            own - before.T @ before, "the covariance of a picked point", kernel.remedy
-        )
-        left = torch.cat([with_all[:, 0], values[p].T], 1).addmm_(
-            before.T, whitened[:end], alpha=-1.0
-        )
+        own = own - before.T @ before
+        corner = cholesky(own, "the covariance of a picked point", kernel.remedy)
+        left = torch.cat([with_all[:, 0], values[p].T], 1)
+        left.addmm_(before.T, whitened[:end], alpha=-1.0)
         factor[new, :end] = before.T
         factor[new, new] = corner
         whitened[new] = torch.linalg.solve_triangular(corner, left, upper=False)
@@ -164,14 +159,16 @@ def select_points(
         count += 1
     picks = picks[:count]
     rows = old + 4 * count
+    factor = factor[:rows, :rows]
     by_pick = torch.arange(4 * count, device=x.device).reshape(4, count).T.flatten()
-    return Selection(
-        picks, _extend(start, candidates[picks], factor[:rows, :rows], whitened[:rows, n], by_pick)
-    )
+    new = candidates[picks]
+    return Selection(picks, _extend(start, new, factor, whitened[:rows, n], by_pick))
 
 
 def _score(
-    criterion: Criterion, variance: Float[Tensor, "n"], error: Float[Tensor, "n"]
+    criterion: Criterion,
+    variance: Float[Tensor, "n"],
+    error: Float[Tensor, "n"],
 ) -> Float[Tensor, "n"]:
     """Return a score of each candidate point: the higher, the more an observation of the point
     would tell.
@@ -201,18 +198,14 @@ def _extend(
     points = torch.argsort(~has, stable=True)
     place = torch.argsort(points)
     near = int(has.sum())
-    # Rows of the old and of the new observations after joining: distances of all points, then
-    # normals by component
-    row = [
-        torch.cat([at] + [len(has) + c * near + mine for c in range(3)])
-        for at, mine in (
-            (x, x[own])
-            for x, own in ((place[:n], posterior.has_normal), (place[n:], new.has_normal))
-        )
-    ]
-    order = torch.cat(
-        [posterior.ordered(row[0]), row[1] if new_order is None else row[1][new_order]]
-    )
+
+    # rows of some points after joining: distances of all points, then normals by component
+    def rows(at: Int[Tensor, "n"], has_normal: Bool[Tensor, "n"]) -> Int[Tensor, "rows"]:
+        return torch.cat([at, *(len(has) + c * near + at[has_normal] for c in range(3))])
+
+    old = posterior.ordered(rows(place[:n], posterior.has_normal))
+    fresh = rows(place[n:], new.has_normal)
+    order = torch.cat([old, fresh if new_order is None else fresh[new_order]])
     solved = torch.linalg.solve_triangular(factor.T, whitened[:, None], upper=True)[:, 0]
     weights = solved[torch.argsort(order)]
     return Posterior(

@@ -9,6 +9,12 @@ from torch import Tensor
 from torchgrasp.foundation.base import Batch, Value
 from torchgrasp.foundation.checks import checked
 from torchgrasp.geometry.linalg import Points, unit
+from torchgrasp.shape.kernel import Queries
+
+MeanAndGradient = tuple[Float[Tensor, "q"], Queries]
+"""The mean signed distance at each query point, and its gradient."""
+Moments = tuple[Float[Tensor, "q 4"], Float[Tensor, "q 4 4"]]
+"""Mean and covariance of distance and gradient (d, w) at each query point."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,14 +30,20 @@ class Normalisation(Value):
     scale: float
 
     @checked(gradients=True)
-    def normalise(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
+    def normalise(
+        self,
+        points: Float[Tensor, "*b 3"],
+    ) -> Float[Tensor, "*b 3"]:
         """Return points [m], given in the cloud's frame, in the normalised frame (centred and
         scaled).
         """
         return (points - self.center.to(points)) / self.scale
 
     @checked(gradients=True)
-    def metres(self, x: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
+    def metres(
+        self,
+        x: Float[Tensor, "*b 3"],
+    ) -> Float[Tensor, "*b 3"]:
         """Return normalised points in the cloud's frame [m]."""
         return x * self.scale + self.center.to(x)
 
@@ -48,9 +60,9 @@ class Observations(Batch):
     12
     """
 
-    x: Float[Tensor, "n 3"]
+    x: Points
     distance: Float[Tensor, "n"]
-    normal: Float[Tensor, "n 3"]
+    normal: Points
     has_normal: Bool[Tensor, "n"]
     distance_noise: Float[Tensor, "n"]
     normal_noise: Float[Tensor, "n"]
@@ -76,7 +88,10 @@ class Observations(Batch):
 
 
 def on_surface(
-    x: Points, normals: Points, noise: Float[Tensor, "n"], normal_noise: float
+    x: Points,
+    normals: Points,
+    noise: Float[Tensor, "n"],
+    normal_noise: float,
 ) -> Observations:
     """Return observations of points on the surface (distance 0) with their normals."""
     yes = torch.ones(len(x), dtype=torch.bool, device=x.device)
@@ -86,7 +101,9 @@ def on_surface(
 
 
 def off_surface(
-    x: Float[Tensor, "n 3"], distance: Float[Tensor, "n"], noise: float
+    x: Points,
+    distance: Float[Tensor, "n"],
+    noise: float,
 ) -> Observations:
     """Return observations of signed distances at points off the surface, without normals."""
     no = torch.zeros(len(x), dtype=torch.bool, device=x.device)
@@ -155,7 +172,8 @@ class ShapeDerivatives(Value):
 
 
 def surface_deviation(
-    variance: Float[Tensor, "*b"], gradient: Float[Tensor, "*b 3"]
+    variance: Float[Tensor, "*b"],
+    gradient: Float[Tensor, "*b 3"],
 ) -> Float[Tensor, "*b"]:
     """Return the standard deviation of the surface along its normal, linearised from the distance's
     variance.

@@ -126,7 +126,7 @@ the table is known.
 `scripts/train.py bands DIR` fits them.
 """
 Part = tuple[Observations, Tensor | None]  # observations, and the errors that their distances share
-FreeSpace = tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]
+FreeSpace = tuple[Points, Float[Tensor, "n"]]
 """Normalised points in free space, and least signed distances there."""
 
 
@@ -147,7 +147,9 @@ class ExtraObservations(Value):
 
 
 def paper_support(
-    seen: PreparedCloud, noise: float, generator: torch.Generator
+    seen: PreparedCloud,
+    noise: float,
+    generator: torch.Generator,
 ) -> ExtraObservations:
     """Return the additional observations of the paper: the centre, and random points outside (Sec.
     3.1).
@@ -161,7 +163,7 @@ def paper_support(
     return ExtraObservations(Normalisation(center, scale), off_surface(x, distance, noise), noise)
 
 
-def frame_around(points: Float[Tensor, "n 3"]) -> Normalisation:
+def frame_around(points: Points) -> Normalisation:
     """Return the normalised frame of points: origin in the centre of their box, farthest point at
     distance 1.
     """
@@ -170,7 +172,10 @@ def frame_around(points: Float[Tensor, "n 3"]) -> Normalisation:
 
 
 def camera_support(
-    seen: PreparedCloud, completion: Completion | None, noise: float, table: float | None
+    seen: PreparedCloud,
+    completion: Completion | None,
+    noise: float,
+    table: float | None,
 ) -> ExtraObservations:
     """Return the observations that are added to the points of the cloud, with distances that are
     true to scale.
@@ -233,7 +238,11 @@ def _observe_rim(outline: Outlines, frame: Normalisation, normal_noise: float) -
 
 
 def observe(
-    frame: Normalisation, points: Points, normals: Points, noise: float, normal_noise: float
+    frame: Normalisation,
+    points: Points,
+    normals: Points,
+    noise: float,
+    normal_noise: float,
 ) -> Observations:
     """Return observations of surface points [m] with normals; `noise` is their deviation [m] along
     the normals.
@@ -254,7 +263,11 @@ class Middle(Value):
 
 
 def vessel_supports(
-    cloud: PointCloud, vessel: Vessel, outline: Outlines, table: float, noise: float
+    cloud: PointCloud,
+    vessel: Vessel,
+    outline: Outlines,
+    table: float,
+    noise: float,
 ) -> tuple[ExtraObservations, ExtraObservations, Middle]:
     """Return additional observations of a vessel's outer and inner surface, and points in the
     middle of its wall.
@@ -272,7 +285,10 @@ def vessel_supports(
     sphere = frame.metres(OUTSIDE.radius * fibonacci_sphere(OUTSIDE.points))
 
     def support(
-        points: Points, distance: Float[Tensor, "n"], parts: list[Part], rows: Bool[Tensor, "rows"]
+        points: Points,
+        distance: Float[Tensor, "n"],
+        parts: list[Part],
+        rows: Bool[Tensor, "rows"],
     ) -> ExtraObservations:
         anchors = off_surface(frame.normalise(points), distance / frame.scale, noise)
         on_device = tuple(
@@ -312,7 +328,10 @@ def vessel_supports(
 
 
 def _middle(
-    cloud: PointCloud, vessel: Vessel, walls: tuple[Wall, Wall], frame: Normalisation
+    cloud: PointCloud,
+    vessel: Vessel,
+    walls: tuple[Wall, Wall],
+    frame: Normalisation,
 ) -> Middle:
     """Return points in the middle of a vessel's wall, half its thickness off the surfaces, without
     the rim.
@@ -343,7 +362,10 @@ def _observe_hidden(frame: Normalisation, wall: HiddenWall) -> Part:
 
 
 def free_space(
-    outline: Outlines, frame: Normalisation, table: float | None = None, reach: float = 1.0
+    outline: Outlines,
+    frame: Normalisation,
+    table: float | None = None,
+    reach: float = 1.0,
 ) -> FreeSpace:
     """Return points in free space, and lower bounds of their signed distance, out to the normalised
     radius `reach`.
@@ -370,7 +392,9 @@ def free_space(
 
 
 def free_space_violations(
-    shape: ShapeGP, x: Float[Tensor, "n 3"], least: Float[Tensor, "n"]
+    shape: ShapeGP,
+    x: Points,
+    least: Float[Tensor, "n"],
 ) -> Tensor:
     """Return the indices of some free-space points that lie well inside the shape, the worst
     first.
@@ -381,7 +405,11 @@ def free_space_violations(
     return rows[pick_apart(x[rows], FREE.violations)]
 
 
-def _points_beside(outline: Silhouette, origin: Float[Tensor, "3"], scale: float) -> Points:
+def _points_beside(
+    outline: Silhouette,
+    origin: Float[Tensor, "3"],
+    scale: float,
+) -> Points:
     """Return points [m] on camera rays beside the outline, over the object's depth."""
     # the depth is 0 beyond the image
     depth = float(outline.depth[outline.depth > 0].median())

@@ -150,7 +150,12 @@ class FitOptions:
     criterion: Criterion = "variance"
 
 
-def fit_upright(cloud: PointCloud, seed: int, table: float | None, options: FitOptions) -> ShapeGP:
+def fit_upright(
+    cloud: PointCloud,
+    seed: int,
+    table: float | None,
+    options: FitOptions,
+) -> ShapeGP:
     """Fit the shape to a cloud without duplicates in a frame whose z axis is up; `table` is the
     table's height [m].
     """
@@ -308,12 +313,12 @@ def _warn_of_ambiguity(cloud: PointCloud, outline: Outlines, on_table: bool) -> 
 
 def _warn(kind: type[Warning], sentence: str) -> None:
     """Show a warning that names the line of the user's code that called the library."""
-    frames: list[FrameType] = [frame := sys._getframe()]
-    while (frame := frame.f_back) is not None:
-        frames.append(frame)
-    own = [
-        level
-        for level, x in enumerate(frames, 1)
-        if x.f_globals.get("__name__", "").startswith("torchgrasp.")
-    ]
-    warnings.warn(sentence, kind, stacklevel=own[-1] + 1)
+    frame: FrameType | None = sys._getframe()
+    level = 0
+    last = 0  # level of the outermost frame of the library
+    while frame is not None:
+        level += 1
+        if frame.f_globals.get("__name__", "").startswith("torchgrasp."):
+            last = level
+        frame = frame.f_back
+    warnings.warn(sentence, kind, stacklevel=last + 1)

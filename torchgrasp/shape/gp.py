@@ -19,12 +19,14 @@ from torchgrasp.geometry.plane import move
 from torchgrasp.shape.conditioning import append_observations
 from torchgrasp.shape.estimate import (
     JointEstimate,
+    Moments,
     Normalisation,
     Observations,
     ShapeDerivatives,
     on_surface,
     surface_deviation,
 )
+from torchgrasp.shape.kernel import Queries
 from torchgrasp.shape.posterior import Posterior, symmetric_root
 from torchgrasp.values.planning import PointCloud, ShapeEstimate
 
@@ -112,14 +114,17 @@ class ShapeGP(Posterior, Normalisation):
         return (self,)
 
     @checked(gradients=True)
-    def wall_at(self, x: Float[Tensor, "q 3"]) -> Bool[Tensor, "q walls"]:
+    def wall_at(self, x: Queries) -> Bool[Tensor, "q walls"]:
         """Return a mask (points, walls): which of the `walls` is the surface at each normalised
         point.
         """
         return torch.ones(len(x), 1, dtype=torch.bool, device=x.device)
 
     @checked(gradients=True)
-    def contains(self, points: Float[Tensor, "*b 3"]) -> Bool[Tensor, "*b"]:
+    def contains(
+        self,
+        points: Float[Tensor, "*b 3"],
+    ) -> Bool[Tensor, "*b"]:
         """Return which points [m] lie in the domain, where the posterior is valid."""
         return torch.linalg.vector_norm(self.normalise(points), dim=-1) <= self.domain_radius
 
@@ -191,7 +196,10 @@ class ShapeGP(Posterior, Normalisation):
 
     @checked(gradients=True)
     def sample(
-        self, points: Float[Tensor, "k 3"], n: Annotated[int, Range(0, 1_000_000)], seed: Seed = 0
+        self,
+        points: Float[Tensor, "k 3"],
+        n: Annotated[int, Range(0, 1_000_000)],
+        seed: Seed = 0,
     ) -> Float[Tensor, "n k 4"]:
         """Draw n joint samples of distance and gradient, in normalised units, at up to 1000 points
         [m].
@@ -279,7 +287,11 @@ class ShapeGP(Posterior, Normalisation):
             cloud=move(self.cloud, b_from_a),
         )
 
-    def _queries(self, points: Float[Tensor, "*b 3"], reach: float = 1.0) -> Float[Tensor, "q 3"]:
+    def _queries(
+        self,
+        points: Float[Tensor, "*b 3"],
+        reach: float = 1.0,
+    ) -> Queries:
         """Return query points [m] as normalised points (q, 3); raise `BadArgument` beyond `reach`
         radii of domain.
         """
@@ -297,9 +309,7 @@ class ShapeGP(Posterior, Normalisation):
             raise BadArgument("points", f"{found}, {distance}", allowed)
         return x
 
-    def _estimate_or_prior(
-        self, x: Float[Tensor, "q 3"]
-    ) -> tuple[Float[Tensor, "q 4"], Float[Tensor, "q 4 4"]]:
+    def _estimate_or_prior(self, x: Queries) -> Moments:
         """Return the results of `estimate`; outside the domain a growing distance with the prior's
         covariance.
 
@@ -322,11 +332,17 @@ class ShapeGP(Posterior, Normalisation):
         return torch.where(outside, grown, mean), spread
 
 
-def _reshape(rows: Float[Tensor, "q *c"], points: Float[Tensor, "*b 3"]) -> Tensor:
+def _reshape(
+    rows: Float[Tensor, "q *c"],
+    points: Float[Tensor, "*b 3"],
+) -> Tensor:
     """Return rows in the dtype, on the device and with the batch shape of the points."""
     return rows.to(points).reshape(points.shape[:-1] + rows.shape[1:])
 
 
-def common_fields(value: Value, kind: type[Value]) -> dict[str, Any]:
+def common_fields(
+    value: Value,
+    kind: type[Value],
+) -> dict[str, Any]:
     """Return the fields, by name, that a value shares with the class `kind`."""
     return {f.name: getattr(value, f.name) for f in dataclasses.fields(kind)}  # pyright: ignore[reportArgumentType]

@@ -15,9 +15,18 @@ from torchgrasp.foundation.base import map_tensors
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.rules import Pose
 from torchgrasp.shape.completion.silhouette import pick_apart
-from torchgrasp.shape.estimate import JointEstimate, MeanJet, Observations, SurfaceJet, off_surface
+from torchgrasp.shape.estimate import (
+    JointEstimate,
+    MeanAndGradient,
+    MeanJet,
+    Moments,
+    Observations,
+    SurfaceJet,
+    off_surface,
+)
 from torchgrasp.shape.extra_observations import Middle
 from torchgrasp.shape.gp import ShapeGP, common_fields
+from torchgrasp.shape.kernel import Queries
 from torchgrasp.values.planning import PointCloud
 
 Found = TypeVar("Found")
@@ -66,10 +75,10 @@ class HollowShape(ShapeGP):
         """Return the vessel with two surfaces that share a normalised frame; `cloud` holds the seen
         points of both.
         """
-        radius = min(outer.domain_radius, inner.domain_radius)
-        return cls(
-            **common_fields(outer, ShapeGP) | {"cloud": cloud, "domain_radius": radius}, inner=inner
-        )
+        fields = common_fields(outer, ShapeGP)
+        fields["cloud"] = cloud
+        fields["domain_radius"] = min(outer.domain_radius, inner.domain_radius)
+        return cls(**fields, inner=inner)
 
     @cached_property
     def outer(self) -> ShapeGP:
@@ -82,7 +91,7 @@ class HollowShape(ShapeGP):
         return self.outer, self.inner
 
     @checked(gradients=True)
-    def wall_at(self, x: Float[Tensor, "q 3"]) -> Bool[Tensor, "q walls"]:
+    def wall_at(self, x: Queries) -> Bool[Tensor, "q walls"]:
         """Return a mask (points, 2): whether the outer or the inner surface applies at each
         normalised point.
         """
@@ -90,28 +99,24 @@ class HollowShape(ShapeGP):
         return torch.stack([~inner, inner], 1)
 
     @checked(gradients=True)
-    def mean(self, x: Float[Tensor, "q 3"]) -> Float[Tensor, "q"]:
+    def mean(self, x: Queries) -> Float[Tensor, "q"]:
         """Return the mean signed distance at normalised points."""
         return torch.maximum(self.outer.mean(x), self.inner.mean(x))
 
     @checked(gradients=True)
-    def mean_and_gradient(
-        self, x: Float[Tensor, "q 3"]
-    ) -> tuple[Float[Tensor, "q"], Float[Tensor, "q 3"]]:
+    def mean_and_gradient(self, x: Queries) -> MeanAndGradient:
         """Return the mean signed distance and its gradient at normalised points."""
         (a, slope_a), (b, slope_b) = (wall.mean_and_gradient(x) for wall in self.walls)
         return torch.maximum(a, b), torch.where((b > a)[:, None], slope_b, slope_a)
 
     @checked(gradients=True)
-    def estimate(
-        self, x: Float[Tensor, "q 3"]
-    ) -> tuple[Float[Tensor, "q 4"], Float[Tensor, "q 4 4"]]:
+    def estimate(self, x: Queries) -> Moments:
         """Return mean and covariance of distance and gradient (d, w) at normalised points."""
         parts, merge = self._by_wall(x, lambda wall, own: wall.estimate(own))
         return tuple(map(merge, *parts))  # pyright: ignore[reportReturnType]
 
     @checked(gradients=True)
-    def jet(self, x: Float[Tensor, "q 3"]) -> SurfaceJet:
+    def jet(self, x: Queries) -> SurfaceJet:
         """Return mean and variance of the signed distance with their derivatives, at normalised
         points.
         """
@@ -119,7 +124,7 @@ class HollowShape(ShapeGP):
         return map_tensors(merge, *parts)
 
     @checked(gradients=True)
-    def mean_jet(self, x: Float[Tensor, "q 3"]) -> MeanJet:
+    def mean_jet(self, x: Queries) -> MeanJet:
         """Return the mean signed distance with its derivatives, at normalised points."""
         parts, merge = self._by_wall(x, lambda wall, own: wall.mean_jet(own))
         return map_tensors(merge, *parts)
@@ -127,11 +132,13 @@ class HollowShape(ShapeGP):
     @checked(gradients=True)
     def joint_at(self, x: Float[Tensor, "k 3"]) -> JointEstimate:
         """Return the joint posterior of distance and gradient (d, w) at normalised points."""
-        parts = [wall.joint_at(x) for wall in self.walls]
+        outer = self.outer.joint_at(x)
+        inner = self.inner.joint_at(x)
         owner = self.wall_at(x)
-        mean = torch.where(owner[:, 1:], parts[1].mean, parts[0].mean)
+        mean = torch.where(owner[:, 1:], inner.mean, outer.mean)
+        # points of different surfaces have independent errors
         own = [rows[:, None] & rows for rows in owner.repeat_interleave(4, 0).T]
-        return JointEstimate(mean, parts[0].covariance * own[0] + parts[1].covariance * own[1])
+        return JointEstimate(mean, outer.covariance * own[0] + inner.covariance * own[1])
 
     @checked
     def append(self, new: Observations) -> "HollowShape":
@@ -148,7 +155,9 @@ class HollowShape(ShapeGP):
         return self.join(outer, self.inner.moved(b_from_a), outer.cloud)
 
     def _by_wall(
-        self, x: Float[Tensor, "q 3"], evaluate: Callable[[ShapeGP, Tensor], Found]
+        self,
+        x: Queries,
+        evaluate: Callable[[ShapeGP, Tensor], Found],
     ) -> tuple[list[Found], Callable[..., Tensor]]:
         """Evaluate each wall at the points where it applies; also return a function that merges
         results in order.
@@ -159,9 +168,8 @@ class HollowShape(ShapeGP):
             return walls, lambda a, b: torch.where(inner.reshape(-1, *[1] * (a.ndim - 1)), b, a)
         rows = [torch.nonzero(own)[:, 0] for own in self.wall_at(x).T]
         back = torch.argsort(torch.cat(rows))
-        return [
-            evaluate(w, x[own]) for w, own in zip(self.walls, rows, strict=True)
-        ], lambda *y: torch.cat(y)[back]
+        walls = [evaluate(wall, x[own]) for wall, own in zip(self.walls, rows, strict=True)]
+        return walls, lambda *parts: torch.cat(parts)[back]
 
 
 def tie_walls(shape: HollowShape, middle: Middle) -> HollowShape:

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.shape.kernel import Kernel, separations
+from torchgrasp.shape.kernel import CovarianceRows, Kernel, Queries, separations
 
 
 class Weighted(NamedTuple):
@@ -25,9 +25,8 @@ class Weighted(NamedTuple):
     kernel: Kernel
 
 
-Explain = Callable[
-    [Tensor], tuple[Tensor, Tensor]
-]  # `Posterior.explain`, for the points of a chunk
+# `Posterior.explain`, for the points of a chunk
+Explain = Callable[[Tensor], tuple[Tensor, Tensor]]
 Values = Float[Tensor, "q n"]
 Kernels = tuple[list[Tensor], Values, Values, Float[Tensor, "q near"]]
 """Components of the differences from the observed points, k, k', and k'' for the points with
@@ -35,12 +34,14 @@ normals.
 """
 
 
-def evaluate_mean(of: Weighted, x: Float[Tensor, "q 3"], gradient: bool) -> tuple[Tensor, ...]:
+def evaluate_mean(
+    of: Weighted,
+    x: Queries,
+    gradient: bool,
+) -> tuple[Tensor, ...]:
     """Return the mean distance and, if asked for, its gradient at some points."""
-    # the points with normals come first
-    near = of.b.shape[-2]
-    together = of.x.ndim == 2
-    if together:
+    near = of.b.shape[-2]  # the points with normals come first
+    if of.x.ndim == 2:
         distances = torch.cdist(x, of.x, compute_mode="donot_use_mm_for_euclid_dist")
     else:
         distances = separations(x, of.x)[1]
@@ -55,7 +56,8 @@ def evaluate_mean(of: Weighted, x: Float[Tensor, "q 3"], gradient: bool) -> tupl
 
 
 def evaluate_mean_jet(
-    of: Weighted, x: Float[Tensor, "q 3"]
+    of: Weighted,
+    x: Queries,
 ) -> tuple[tuple[Tensor, Tensor, Tensor], Kernels]:
     """Return the fields of `MeanJet` at some points, and kernel values that the variance needs."""
     known, a, b, kernel = of
@@ -72,17 +74,21 @@ def evaluate_mean_jet(
     outer[:, :near].addcmul_(third[:, :near], along, value=-1.0)
     distance = _dot(k, a) - (near_first * along).sum(1)
     gradient = _sum_differences(c, x, known) - _times(near_first, b)
-    rows = [
-        0.5 * _sum_differences(outer * part, x, known) - _times(near_second * part[:, :near], b)
-        for part in d
-    ]
-    half = torch.stack(rows, 1)
+    rows = []
+    for part in d:
+        bent = 0.5 * _sum_differences(outer * part, x, known)
+        rows.append(bent - _times(near_second * part[:, :near], b))
+    half = torch.stack(rows, 1)  # (q, 3, 3)
     hessian = half + half.mT
     hessian.diagonal(dim1=1, dim2=2).add_(c.sum(1, keepdim=True))
     return (distance, gradient, hessian), (d, k, first, near_second)
 
 
-def evaluate_jet(of: Weighted, x: Float[Tensor, "q 3"], explain: Explain) -> tuple[Tensor, ...]:
+def evaluate_jet(
+    of: Weighted,
+    x: Queries,
+    explain: Explain,
+) -> tuple[Tensor, ...]:
     """Return the fields of `SurfaceJet` at some points; `explain` is that of their posterior."""
     mean, (d, k, first, near_second) = evaluate_mean_jet(of, x)
     n = of.x.shape[-2]
@@ -95,13 +101,18 @@ def evaluate_jet(of: Weighted, x: Float[Tensor, "q 3"], explain: Explain) -> tup
     along = (near_d[0] * u[0]).addcmul_(near_d[1], u[1]).addcmul_(near_d[2], u[2])
     c = first * s
     c[:, :near].addcmul_(near_second, along, value=-1.0)
-    slope = _sum_differences(c, x, of.x) - torch.stack(
-        [(near_first * part).sum(1) for part in u], 1
-    )
-    return *mean, of.kernel.profile(x.new_zeros(len(x), 1))[:, 0] - explained, -2.0 * slope
+    normals = torch.stack([(near_first * part).sum(1) for part in u], 1)
+    slope = _sum_differences(c, x, of.x) - normals
+    variance = of.kernel.profile(x.new_zeros(len(x), 1))[:, 0] - explained
+    return *mean, variance, -2.0 * slope
 
 
-def distance_rows(d: list[Tensor], k: Values, first: Values, near: int) -> Float[Tensor, "q rows"]:
+def distance_rows(
+    d: list[Tensor],
+    k: Values,
+    first: Values,
+    near: int,
+) -> CovarianceRows:
     """Return the covariance of distances with all observations: k, then -k' d for each component of
     the normals.
     """
@@ -109,17 +120,25 @@ def distance_rows(d: list[Tensor], k: Values, first: Values, near: int) -> Float
 
 
 def _sum_differences(
-    c: Values, x: Float[Tensor, "q 3"], y: Float[Tensor, "*q n 3"]
-) -> Float[Tensor, "q 3"]:
+    c: Values,
+    x: Queries,
+    y: Float[Tensor, "*q n 3"],
+) -> Queries:
     """Return sum_j c_j (x - y_j) for each point x, by a matrix product."""
     return x * c.sum(1, keepdim=True) - _times(c, y)
 
 
-def _times(rows: Float[Tensor, "q n"], matrix: Float[Tensor, "*q n m"]) -> Float[Tensor, "q m"]:
+def _times(
+    rows: Float[Tensor, "q n"],
+    matrix: Float[Tensor, "*q n m"],
+) -> Float[Tensor, "q m"]:
     """Return rows times a matrix, or each row times a matrix of its own."""
     return rows @ matrix if matrix.ndim == 2 else (rows[:, None] @ matrix)[:, 0]
 
 
-def _dot(rows: Values, weights: Float[Tensor, "*q n"]) -> Float[Tensor, "q"]:
+def _dot(
+    rows: Values,
+    weights: Float[Tensor, "*q n"],
+) -> Float[Tensor, "q"]:
     """Return the products of rows with a vector, or of each row with a vector of its own."""
     return torch.mv(rows, weights) if weights.ndim == 1 else torch.linalg.vecdot(rows, weights)

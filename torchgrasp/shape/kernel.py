@@ -17,11 +17,16 @@ from torch import Tensor
 
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.rules import LEAST, Positive, Range, is_known, is_tracked
+from torchgrasp.geometry.linalg import Points
 
 Profile = Callable[[Tensor], Tensor]
 """A radial kernel k(r), elementwise, smooth where r > 0 and four times so at 0 from the right, with
 k'(0) = 0.
 """
+Queries = Float[Tensor, "q 3"]
+"""Query points, normalised."""
+CovarianceRows = Float[Tensor, "q rows"]
+"""A row of covariances with all observations for each query point."""
 KernelName = Literal["thin_plate", "matern52", "rbf"]
 Orders = Annotated[int, Range(1, 4)]  # how many of k and its derivatives
 # length over psi of the Matern kernel whose gradients have the prior variance 6 psi
@@ -72,7 +77,11 @@ class Kernel:
     closed_form: Callable[[Tensor, int], tuple[Tensor, ...]] | Literal[False] = False
 
     @checked(gradients=True)
-    def derivatives(self, r: Float[Tensor, "*s"], count: Orders) -> tuple[Float[Tensor, "*s"], ...]:
+    def derivatives(
+        self,
+        r: Float[Tensor, "*s"],
+        count: Orders,
+    ) -> tuple[Float[Tensor, "*s"], ...]:
         """Return the first `count` (1 to 4) of k and its derivatives by r^2 / 2, elementwise; see
         `differentiate`.
         """
@@ -89,7 +98,9 @@ def is_plain(*tensors: Tensor) -> bool:
 
 
 def differentiate(
-    profile: Profile, u: Float[Tensor, "*s"], count: int
+    profile: Profile,
+    u: Float[Tensor, "*s"],
+    count: int,
 ) -> tuple[Float[Tensor, "*s"], ...]:
     """Return k and its derivatives by u = r^2 / 2, by autograd, `count` in all, at most 4.
 
@@ -124,7 +135,11 @@ def differentiate(
     return tuple(torch.where(near, a, b) for a, b in zip(series, values, strict=False))
 
 
-def _differentiate_by_distance(profile: Profile, r: Tensor, order: int) -> list[Tensor]:
+def _differentiate_by_distance(
+    profile: Profile,
+    r: Tensor,
+    order: int,
+) -> list[Tensor]:
     """Return the profile k(r) and its derivatives by r up to an order, elementwise and
     differentiable.
     """
@@ -139,7 +154,10 @@ def _differentiate_by_distance(profile: Profile, r: Tensor, order: int) -> list[
     return [*values, slope]
 
 
-def thin_plate(r: Float[Tensor, "*s"], psi: float | Float[Tensor, "*p"]) -> Float[Tensor, "*s"]:
+def thin_plate(
+    r: Float[Tensor, "*s"],
+    psi: float | Float[Tensor, "*p"],
+) -> Float[Tensor, "*s"]:
     """Return 2 r^3 - 3 psi r^2 + psi^3, Eq. (6) of the paper: it is a covariance in a ball of
     diameter 3/4 psi.
     """
@@ -163,7 +181,11 @@ def thin_plate_kernel(psi: Positive, closed_form: bool = True) -> Kernel:
     return Kernel(partial(thin_plate, psi=psi), psi / (4.0 / 3.0), remedy, fast)
 
 
-def differentiate_thin_plate(psi: float | Tensor, r: Tensor, count: int) -> tuple[Tensor, ...]:
+def differentiate_thin_plate(
+    psi: float | Tensor,
+    r: Tensor,
+    count: int,
+) -> tuple[Tensor, ...]:
     """Return k and its derivatives by r^2 / 2 of the thin plate kernel in closed form, `count` in
     all.
     """
@@ -233,7 +255,10 @@ def kernel_by_name(name: KernelName, psi: Positive) -> Kernel:
 
 
 def cross_covariance(
-    kernel: Kernel, x: Float[Tensor, "q 3"], y: Float[Tensor, "*q n 3"], n_oriented: int
+    kernel: Kernel,
+    x: Queries,
+    y: Float[Tensor, "*q n 3"],
+    n_oriented: int,
 ) -> Float[Tensor, "4 q rows"]:
     """Return the covariance of distance and gradient at x with the observations at y, Eqs. (2)-(5)
     of the paper.
@@ -269,7 +294,10 @@ def cross_covariance(
 
 
 def _differentiable_cross_covariance(
-    kernel: Kernel, x: Float[Tensor, "q 3"], y: Float[Tensor, "n 3"], n_oriented: int
+    kernel: Kernel,
+    x: Queries,
+    y: Points,
+    n_oriented: int,
 ) -> Float[Tensor, "4 q rows"]:
     """Return the result of `cross_covariance` by operations without side effects, differentiable to
     any order.
@@ -288,7 +316,8 @@ def _differentiable_cross_covariance(
 
 
 def separations(
-    x: Float[Tensor, "q 3"], y: Float[Tensor, "*q n 3"]
+    x: Queries,
+    y: Float[Tensor, "*q n 3"],
 ) -> tuple[list[Tensor], Float[Tensor, "q n"]]:
     """Return the three components of x - y for all pairs, and the distances |x - y|, without
     cancellation.
@@ -301,7 +330,7 @@ def separations(
 
 def covariance_rows(
     kernel: Kernel,
-    x: Float[Tensor, "n 3"],
+    x: Points,
     n_oriented: int,
     y: Float[Tensor, "m 3"],
     other_oriented: int,
@@ -315,6 +344,10 @@ def covariance_rows(
     return torch.cat([block[0], block[1:, :n_oriented].flatten(0, 1)])
 
 
-def gram(kernel: Kernel, x: Float[Tensor, "n 3"], n_oriented: int) -> Float[Tensor, "rows rows"]:
+def gram(
+    kernel: Kernel,
+    x: Points,
+    n_oriented: int,
+) -> Float[Tensor, "rows rows"]:
     """Return the covariance matrix of observations, of which the first `n_oriented` have normals."""
     return covariance_rows(kernel, x, n_oriented, x, n_oriented)

@@ -13,7 +13,8 @@ from torchgrasp.foundation.base import Value, at_once, in_chunks
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import IndefiniteCovariance
 from torchgrasp.foundation.rules import is_known
-from torchgrasp.shape.estimate import JointEstimate, MeanJet, SurfaceJet
+from torchgrasp.geometry.linalg import Points
+from torchgrasp.shape.estimate import JointEstimate, MeanAndGradient, MeanJet, Moments, SurfaceJet
 from torchgrasp.shape.jets import (
     Weighted,
     distance_rows,
@@ -22,7 +23,9 @@ from torchgrasp.shape.jets import (
     evaluate_mean_jet,
 )
 from torchgrasp.shape.kernel import (
+    CovarianceRows,
     Kernel,
+    Queries,
     cross_covariance,
     differentiate,
     gram,
@@ -63,7 +66,7 @@ class Posterior(Value):
     reuse buffers.
     """
 
-    x: Float[Tensor, "n 3"]  # observed points, those with normals first
+    x: Points  # observed points, those with normals first
     has_normal: Bool[Tensor, "n"]
     # (K + noise)^-1 y of the observed y: all distances, then the normals by component
     weights: Float[Tensor, "rows"]
@@ -89,12 +92,15 @@ class Posterior(Value):
         return int(self.has_normal.sum())
 
     @checked(gradients=True)
-    def ordered(self, rows: Shaped[Tensor, "rows *c"]) -> Shaped[Tensor, "rows *c"]:
+    def ordered(
+        self,
+        rows: Shaped[Tensor, "rows *c"],
+    ) -> Shaped[Tensor, "rows *c"]:
         """Return rows, given in the order of `weights`, in the order of the rows of `factor`."""
         return rows if self.order is None else rows[self.order]
 
     @checked(gradients=True)
-    def mean(self, x: Float[Tensor, "q 3"]) -> Float[Tensor, "q"]:
+    def mean(self, x: Queries) -> Float[Tensor, "q"]:
         """Return the mean signed distance at normalised points."""
         if not self._is_plain(x):
             return self.distance_rows(x) @ self.weights
@@ -102,9 +108,7 @@ class Posterior(Value):
         return in_chunks(mean, x, CHUNK.mean)[0]
 
     @checked(gradients=True)
-    def mean_and_gradient(
-        self, x: Float[Tensor, "q 3"]
-    ) -> tuple[Float[Tensor, "q"], Float[Tensor, "q 3"]]:
+    def mean_and_gradient(self, x: Queries) -> MeanAndGradient:
         """Return the mean signed distance and its gradient at normalised points; see `jet`."""
         if not self._is_plain(x):
             distance, *slope = (self.cross(x) @ self.weights).unbind(0)
@@ -113,9 +117,7 @@ class Posterior(Value):
         return in_chunks(mean, x, at_once(x, CHUNK.gradient))  # pyright: ignore[reportReturnType]
 
     @checked(gradients=True)
-    def estimate(
-        self, x: Float[Tensor, "q 3"]
-    ) -> tuple[Float[Tensor, "q 4"], Float[Tensor, "q 4 4"]]:
+    def estimate(self, x: Queries) -> Moments:
         """Return mean and covariance of distance and gradient at normalised points, Eqs. (7)-(8) of
         the paper.
         """
@@ -143,7 +145,7 @@ class Posterior(Value):
         return in_chunks(evaluate, x, size)  # pyright: ignore[reportReturnType]
 
     @checked(gradients=True)
-    def jet(self, x: Float[Tensor, "q 3"]) -> SurfaceJet:
+    def jet(self, x: Queries) -> SurfaceJet:
         """Return mean and variance of the distance with their derivatives at normalised points, in
         closed form.
 
@@ -159,7 +161,7 @@ class Posterior(Value):
         return SurfaceJet(*in_chunks(evaluate, x, at_once(x, CHUNK.jet)))
 
     @checked(gradients=True)
-    def mean_jet(self, x: Float[Tensor, "q 3"]) -> MeanJet:
+    def mean_jet(self, x: Queries) -> MeanJet:
         """Return the mean distance with first and second derivatives at normalised points, at less
         cost than `jet`.
         """
@@ -190,7 +192,7 @@ class Posterior(Value):
         return cross_covariance(self.kernel, here, here, 1)[:, 0]
 
     @checked(gradients=True)
-    def distance_rows(self, x: Float[Tensor, "q 3"]) -> Float[Tensor, "q rows"]:
+    def distance_rows(self, x: Queries) -> CovarianceRows:
         """Return the covariance of the distances at normalised points with all observations, one
         row per point.
         """
@@ -203,7 +205,7 @@ class Posterior(Value):
         return distance_rows(d, k, first, self.n_oriented)
 
     @checked(gradients=True)
-    def whiten(self, rows: Float[Tensor, "q rows"]) -> Float[Tensor, "q rows"]:
+    def whiten(self, rows: CovarianceRows) -> CovarianceRows:
         """Return rows of covariances with all observations, times L^-T of the Cholesky factor L.
 
         The dot product of two results is the covariance that the observations explain.
@@ -215,8 +217,9 @@ class Posterior(Value):
 
     @checked
     def explain(
-        self, rows: Float[Tensor, "q rows"]
-    ) -> tuple[Float[Tensor, "q"], Float[Tensor, "q rows"]]:
+        self,
+        rows: CovarianceRows,
+    ) -> tuple[Float[Tensor, "q"], CovarianceRows]:
         """Return the variance k A k that observations explain, and k A, for rows k of covariances
         with them.
 
@@ -234,7 +237,7 @@ class Posterior(Value):
         return torch.linalg.vecdot(whitened, whitened), solved
 
     @checked(gradients=True)
-    def cross(self, x: Float[Tensor, "q 3"]) -> Float[Tensor, "4 q rows"]:
+    def cross(self, x: Queries) -> Float[Tensor, "4 q rows"]:
         """Return the covariance of distance and gradient (d, w) at normalised points with all
         observations.
         """
@@ -252,7 +255,7 @@ class Posterior(Value):
         return Weighted(self.x, self.weights[:n], normals, self.kernel)
 
 
-def _differentiable_jet(posterior: Posterior, x: Float[Tensor, "q 3"]) -> tuple[Tensor, ...]:
+def _differentiable_jet(posterior: Posterior, x: Queries) -> tuple[Tensor, ...]:
     """Return the fields of `SurfaceJet` for one chunk of points by autograd of mean and variance."""
 
     def total(x: Tensor) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]:
@@ -266,7 +269,9 @@ def _differentiable_jet(posterior: Posterior, x: Float[Tensor, "q 3"]) -> tuple[
 
 
 def combined_covariance(
-    posterior: Posterior, x: Float[Tensor, "b g p 3"], weights: Float[Tensor, "#b #g m p"]
+    posterior: Posterior,
+    x: Float[Tensor, "b g p 3"],
+    weights: Float[Tensor, "#b #g m p"],
 ) -> Float[Tensor, "b v v"]:
     """Return the covariance of weighted sums of distances: m sums for each of g groups of p points,
     so v = g m sums.
@@ -287,7 +292,9 @@ def combined_covariance(
 
 
 def symmetric_root(
-    covariance: Float[Tensor, "*b k k"], prior: float, fix: str
+    covariance: Float[Tensor, "*b k k"],
+    prior: float,
+    fix: str,
 ) -> Float[Tensor, "*b k k"]:
     """Return the symmetric square root of covariance matrices, unique even with equal eigenvalues.
 

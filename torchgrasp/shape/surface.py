@@ -97,7 +97,8 @@ class Surface(Value):
 @checked
 @single_threaded
 def extract_surface(
-    shape: ShapeGP, resolution: Annotated[int, Range(8, 256)] = SURFACE.resolution
+    shape: ShapeGP,
+    resolution: Annotated[int, Range(8, 256)] = SURFACE.resolution,
 ) -> Surface:
     """Return the surface, where the mean distance is zero (Eq. 9 of the paper), by marching cubes
     and Newton steps.
@@ -144,7 +145,8 @@ def collision_field(shape: ShapeGP, mesh: Mesh) -> SignedDistanceField:
 
 
 def _trace_walls(
-    shape: ShapeGP, resolution: int
+    shape: ShapeGP,
+    resolution: int,
 ) -> list[tuple[Float[Tensor, "v 3"], Int[Tensor, "f 3"]]]:
     """Return vertices (normalised) and faces of each wall; the indices in faces count the vertices
     of all walls.
@@ -155,7 +157,9 @@ def _trace_walls(
 
 
 def _trace_wall(
-    whole: ShapeGP, number: int, resolution: int
+    whole: ShapeGP,
+    number: int,
+    resolution: int,
 ) -> tuple[Float[Tensor, "v 3"], Int[Tensor, "f 3"]]:
     """Return vertices (normalised) and faces of one wall, cut off where the wall leaves the
     material.
@@ -207,7 +211,12 @@ def _trace_wall(
     return x, faces if bool(outward) else faces.flip(1)
 
 
-def _grid(shape: ShapeGP, radius: float, step: float, cells: int) -> np.ndarray:
+def _grid(
+    shape: ShapeGP,
+    radius: float,
+    step: float,
+    cells: int,
+) -> np.ndarray:
     """Return the mean signed distance at the nodes of a cubic grid, which starts at -radius; NaN
     outside the ball.
 
@@ -216,7 +225,10 @@ def _grid(shape: ShapeGP, radius: float, step: float, cells: int) -> np.ndarray:
     """
     line = -radius + step * torch.arange(cells + 1, dtype=torch.float64, device=shape.x.device)
 
-    def mean(stride: int, nodes: tuple[np.ndarray, ...]) -> np.ndarray:
+    def mean(
+        stride: int,
+        nodes: tuple[np.ndarray, ...],
+    ) -> np.ndarray:
         axes = [line[stride * torch.tensor(axis, device=line.device)] for axis in nodes]
         return shape.mean(torch.stack(axes, -1)).cpu().numpy()
 
@@ -246,14 +258,21 @@ def _grid(shape: ShapeGP, radius: float, step: float, cells: int) -> np.ndarray:
 
 
 def newton_step(
-    value: Float[Tensor, "n"], gradient: Points, longest: float, least_slope: float = 0.0
+    value: Float[Tensor, "n"],
+    gradient: Points,
+    longest: float,
+    least_slope: float = 0.0,
 ) -> Points:
     """Return the Newton steps along the gradients to the zero level, each at most `longest` long."""
     step = -value / (gradient * gradient).sum(-1).clamp_min(least_slope)
     return limit_norm(step[:, None] * gradient, longest)
 
 
-def _carry_cloud(corners: np.ndarray, faces: np.ndarray, shape: ShapeGP) -> np.ndarray:
+def _carry_cloud(
+    corners: np.ndarray,
+    faces: np.ndarray,
+    shape: ShapeGP,
+) -> np.ndarray:
     """Return a mask of the faces in connected pieces to which enough points of the cloud are
     nearest.
     """
@@ -267,7 +286,8 @@ def _carry_cloud(corners: np.ndarray, faces: np.ndarray, shape: ShapeGP) -> np.n
 @checked
 @single_threaded
 def surface_field(
-    shape: ShapeGP, spacing: Annotated[float, Range(0.001, 0.02)] = FIELD_SPACING
+    shape: ShapeGP,
+    spacing: Annotated[float, Range(0.001, 0.02)] = FIELD_SPACING,
 ) -> SignedDistanceField:
     """Return the signed distance field of a shape's estimated surface, to locate the object by
     touch.

@@ -213,7 +213,8 @@ def _round_body(
 
 
 def _fit_axis(
-    points: Points, normals: Points
+    points: Points,
+    normals: Points,
 ) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"], float]:
     """Return a point [m] and the direction of the axis that most lines along the normals meet, and
     the fit's cost.
@@ -251,7 +252,9 @@ def _fit_axis(
 
 
 def _frame(
-    center: Float[Tensor, "3"], direction: Float[Tensor, "3"], outline: Outlines
+    center: Float[Tensor, "3"],
+    direction: Float[Tensor, "3"],
+    outline: Outlines,
 ) -> Float[Tensor, "4 4"]:
     """Return the transform to a frame at `center` with z along the axis and, if possible, x towards
     the cameras.

@@ -147,7 +147,9 @@ class Completion(Value):
 
 
 def correlated_errors(
-    points: Float[Tensor, "m 3"], shared: Float[Tensor, "m c"], local: Float[Tensor, "m"] | float
+    points: Float[Tensor, "m 3"],
+    shared: Float[Tensor, "m c"],
+    local: Float[Tensor, "m"] | float,
 ) -> Float[Tensor, "m k"]:
     """Return errors [m] of points, one column per independent cause: the shared errors, then a
     smooth random field.
@@ -162,7 +164,11 @@ def correlated_errors(
 
 
 @checked
-def complete_cloud(cloud: PointCloud, table: float | None = None, budget: Count = 50) -> Completion:
+def complete_cloud(
+    cloud: PointCloud,
+    table: float | None = None,
+    budget: Count = 50,
+) -> Completion:
     """Return at most `budget` points of the hidden side, from the cloud's symmetry, with their
     uncertainty.
 
@@ -209,7 +215,10 @@ def complete_cloud(cloud: PointCloud, table: float | None = None, budget: Count 
     planes = torch.cat([part.planes for part in parts])
     images = sorted(_mirror(parts), key=lambda image: -image.score)
 
-    def allowed(image: _Image, apart: float = HIDDEN.new) -> Bool[Tensor, "n"]:
+    def allowed(
+        image: _Image,
+        apart: float = HIDDEN.new,
+    ) -> Bool[Tensor, "n"]:
         hidden = _hidden(scorer, image.points, apart)
         if scorer.table is None:
             return hidden
@@ -261,7 +270,13 @@ class _Image(Batch):
     shared: Float[Tensor, "n planes near"]
 
     @classmethod
-    def of(cls, scorer: SymmetryScorer, points: Tensor, normals: Tensor, n_planes: int) -> "_Image":
+    def of(
+        cls,
+        scorer: SymmetryScorer,
+        points: Tensor,
+        normals: Tensor,
+        n_planes: int,
+    ) -> "_Image":
         """Return unmirrored points as an image of infinite score, without errors."""
         axes = 2 if scorer.upright else 3  # of the planes near a plane
         shared = points.new_zeros(len(points), n_planes, MIRROR.near**axes)
@@ -315,7 +330,10 @@ def _mirror(parts: list[_Part]) -> list[_Image]:
 
 
 def _mirror_in(
-    scorer: SymmetryScorer, number: int, plane: Mirror, score: float
+    scorer: SymmetryScorer,
+    number: int,
+    plane: Mirror,
+    score: float,
 ) -> Callable[[_Image], _Image]:
     """Return a function that mirrors points in a plane; how images in nearby planes differ gives
     the points' errors.
@@ -391,7 +409,11 @@ def merge_hidden(
     return merged
 
 
-def _hidden(scorer: SymmetryScorer, points: Points, apart: float = HIDDEN.new) -> Bool[Tensor, "n"]:
+def _hidden(
+    scorer: SymmetryScorer,
+    points: Points,
+    apart: float = HIDDEN.new,
+) -> Bool[Tensor, "n"]:
     """Tell which points are hidden in every view, not below the table, and farther than `apart` [m]
     from the cloud.
     """

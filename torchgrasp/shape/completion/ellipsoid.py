@@ -62,15 +62,18 @@ ELLIPSOID = EllipsoidNumbers()
 class Ellipsoid:
     """An ellipsoid fitted to a cloud: points [m] and normals spread over all of it."""
 
-    points: Float[Tensor, "n 3"]
-    normals: Float[Tensor, "n 3"]
+    points: Points
+    normals: Points
     # standard deviations [m] along the normals, one column per independent error
     deviations: Float[Tensor, "n 9"]
     misfit: float  # RMS distance [m] of the cloud from the ellipsoid
 
 
 def find_ellipsoid(
-    points: Points, normals: Points, outline: Outlines, table: float | None
+    points: Points,
+    normals: Points,
+    outline: Outlines,
+    table: float | None,
 ) -> Ellipsoid | None:
     """Return the ellipsoid, nearly a ball, that fits the whole cloud, or None if there is none.
 
@@ -162,7 +165,10 @@ class _Fit:
             parts.append(np.maximum(bottom, 0.0) / ELLIPSOID.table)
         return np.concatenate(parts, 1)
 
-    def distance_and_normal(self, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def distance_and_normal(
+        self,
+        parameters: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return the first-order distance [m] of the points from k ellipsoids, and the ellipsoids'
         normals there.
         """
@@ -179,7 +185,10 @@ def _length(vectors: np.ndarray) -> np.ndarray:
     return np.sqrt(np.einsum("...i,...i->...", vectors, vectors))[..., None]
 
 
-def _support(parameters: np.ndarray, across: np.ndarray) -> np.ndarray:
+def _support(
+    parameters: np.ndarray,
+    across: np.ndarray,
+) -> np.ndarray:
     """Return how far [m] k ellipsoids extend from the origin along m unit vectors, as (k, m)."""
     reach = across @ _exponential(parameters[:, 3:])
     return parameters[:, :3] @ across.T + _length(reach)[..., 0]

@@ -13,7 +13,7 @@ from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import ndimage, spatial
 from torchgrasp.foundation.rules import Pose
 from torchgrasp.geometry.frames import apply, rotate
-from torchgrasp.geometry.linalg import across, farthest_points, unit
+from torchgrasp.geometry.linalg import Points, across, farthest_points, unit
 from torchgrasp.values.planning import PointCloud
 
 
@@ -69,7 +69,10 @@ BEHIND = BehindNumbers()
 TIE = 2e-9  # relative difference of squared distances by rounding: the frame must not decide
 
 
-def pick_apart(points: Float[Tensor, "n d"], count: int) -> Int[Tensor, "picks"]:
+def pick_apart(
+    points: Float[Tensor, "n d"],
+    count: int,
+) -> Int[Tensor, "picks"]:
     """Return the indices of at most `count` points far apart, the same ones in every frame."""
     return farthest_points(points, count, tie=TIE)
 
@@ -93,13 +96,19 @@ class Silhouette(Value):
     gap: float
 
     @checked(gradients=True)
-    def hull_distance(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
+    def hull_distance(
+        self,
+        points: Float[Tensor, "*b 3"],
+    ) -> Float[Tensor, "*b"]:
         """Return the signed distance [m] of points to the visual hull, positive outside."""
         outside, _, depth = self._look_up(points)
         return outside * depth
 
     @checked(gradients=True)
-    def violation(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
+    def violation(
+        self,
+        points: Float[Tensor, "*b 3"],
+    ) -> Float[Tensor, "*b"]:
         """Return how far [m] points are outside the outline or in front of the visible surface; 0
         if hidden.
         """
@@ -118,7 +127,10 @@ class Silhouette(Value):
             self, viewpoint=viewpoint, axes=axes, rim=rim, rim_normals=rim_normals
         )
 
-    def _look_up(self, points: Float[Tensor, "*b 3"]) -> tuple[Tensor, Tensor, Tensor]:
+    def _look_up(
+        self,
+        points: Float[Tensor, "*b 3"],
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Return each point's distance to the outline at depth 1, the depth [m] seen there, and its
         own depth [m].
         """
@@ -164,20 +176,29 @@ class Outlines(Value):
         return Outlines(tuple(view.moved(b_from_a) for view in self.views))
 
     @checked(gradients=True)
-    def hull_distance(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
+    def hull_distance(
+        self,
+        points: Float[Tensor, "*b 3"],
+    ) -> Float[Tensor, "*b"]:
         """Return the signed distance [m] of points to the visual hull of all views, positive
         outside.
         """
         return torch.stack([view.hull_distance(points) for view in self.views]).amax(0)
 
     @checked(gradients=True)
-    def violation(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
+    def violation(
+        self,
+        points: Float[Tensor, "*b 3"],
+    ) -> Float[Tensor, "*b"]:
         """Return the worst violation [m] of any view: how far points lie outside the outline or
         before the surface.
         """
         return torch.stack([view.violation(points) for view in self.views]).amax(0)
 
-    def hides(self, points: Float[Tensor, "*b 3"]) -> Bool[Tensor, "*b"]:
+    def hides(
+        self,
+        points: Float[Tensor, "*b 3"],
+    ) -> Bool[Tensor, "*b"]:
         """Return a mask of the points that may be on the hidden side: no view excludes them, within
         a tolerance.
         """
@@ -259,7 +280,11 @@ def silhouette(view: PointCloud) -> Silhouette:
     )
 
 
-def _find_holes(gaps: np.ndarray, measured: np.ndarray, grown: float) -> np.ndarray:
+def _find_holes(
+    gaps: np.ndarray,
+    measured: np.ndarray,
+    grown: float,
+) -> np.ndarray:
     """Return the cells of gaps that are over twice as wide as all surface around them.
 
     The surface is the mask `measured`, which was grown by so many cells.
@@ -298,7 +323,7 @@ def _beyond_image(
     return beyond
 
 
-def _check_view(points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]) -> None:
+def _check_view(points: Points, viewpoint: Float[Tensor, "3"]) -> None:
     """Raise `BadArgument` for points that no camera at the viewpoint can see at once."""
     forward = (points.amax(0) + points.amin(0)) / 2 - viewpoint
     behind = int(((points - viewpoint) @ forward <= 0).sum())
@@ -322,7 +347,8 @@ def _check_view(points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]) -> 
 
 
 def _project(
-    points: Float[Tensor, "n 3"], viewpoint: Float[Tensor, "3"]
+    points: Points,
+    viewpoint: Float[Tensor, "3"],
 ) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "n 2"], Float[Tensor, "n"]]:
     """Return the axes of a camera that faces the points, and the points' image positions at depth 1
     and depths [m].

@@ -114,8 +114,8 @@ class SymmetryScorer:
     a body of revolution.
     """
 
-    points: Float[Tensor, "n 3"]
-    normals: Float[Tensor, "n 3"]
+    points: Points
+    normals: Points
     outline: Outlines
     table: Plane | None
     upright: bool
@@ -168,7 +168,11 @@ class SymmetryScorer:
         """Longest side of the cloud's bounding box [m]."""
         return float((self.points.amax(0) - self.points.amin(0)).max())
 
-    def nearest(self, points: Tensor, limit: float = math.inf) -> tuple[Tensor, Tensor]:
+    def nearest(
+        self,
+        points: Tensor,
+        limit: float = math.inf,
+    ) -> tuple[Tensor, Tensor]:
         """Return distance [m] and index of the nearest cloud point; infinity and 0 if none is
         within the limit.
         """
@@ -177,7 +181,10 @@ class SymmetryScorer:
         index = torch.from_numpy(np.where(np.isinf(distance), 0, index)).reshape(shape)
         return torch.from_numpy(distance).reshape(shape), index
 
-    def score(self, planes: Float[Tensor, "p 4"]) -> tuple[Float[Tensor, "p"], Float[Tensor, "p"]]:
+    def score(
+        self,
+        planes: Float[Tensor, "p 4"],
+    ) -> tuple[Float[Tensor, "p"], Float[Tensor, "p"]]:
         """Return the scores of planes n.x = o, given as (n, o), and their violations of free space
         in [0, 1].
 
@@ -197,7 +204,10 @@ class SymmetryScorer:
         return match - 2.0 * violation, violation
 
 
-def find_planes(scorer: SymmetryScorer, turned: bool = False) -> tuple[Mirrors, Float[Tensor, "p"]]:
+def find_planes(
+    scorer: SymmetryScorer,
+    turned: bool = False,
+) -> tuple[Mirrors, Float[Tensor, "p"]]:
     """Return the mirror planes of a cloud, best first, and their scores.
 
     On a table, the search tries only vertical planes. A plane perpendicular to the best one is
@@ -253,7 +263,9 @@ def find_planes(scorer: SymmetryScorer, turned: bool = False) -> tuple[Mirrors, 
 
 
 def find_plane_through_axis(
-    scorer: SymmetryScorer, center: Float[Tensor, "2"], part: Points
+    scorer: SymmetryScorer,
+    center: Float[Tensor, "2"],
+    part: Points,
 ) -> tuple[Float[Tensor, "1 4"], Float[Tensor, "1"]]:
     """Return the mirror plane of an attached part, such as a handle, through the axis at `center`,
     and its score.
@@ -270,7 +282,10 @@ def find_plane_through_axis(
 
 
 def planes_near(
-    scorer: SymmetryScorer, plane: Mirror, angles: Float[Tensor, "t"], shifts: Float[Tensor, "s"]
+    scorer: SymmetryScorer,
+    plane: Mirror,
+    angles: Float[Tensor, "t"],
+    shifts: Float[Tensor, "s"],
 ) -> Mirrors:
     """Return planes near a plane: rotated by `angles` [rad], if upright about z only, and shifted
     by `shifts` [m].
@@ -288,14 +303,16 @@ def planes_near(
     return torch.cat([normals.repeat_interleave(len(shifts), 0), offsets], 1)
 
 
-def _level_directions(n: int) -> Float[Tensor, "n 3"]:
+def _level_directions(n: int) -> Points:
     """Return n horizontal unit vectors, evenly spaced over half a circle."""
     angle = torch.arange(n, dtype=torch.float64, device="cpu") * math.pi / n
     return torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], -1)
 
 
 def _plane_grid(
-    scorer: SymmetryScorer, directions: Directions, count: int = SEARCH.offsets
+    scorer: SymmetryScorer,
+    directions: Directions,
+    count: int = SEARCH.offsets,
 ) -> Float[Tensor, "d k 4"]:
     """Return planes with the given normals, each at `count` offsets over the cloud's extent."""
     along = scorer.points @ directions.T
@@ -309,7 +326,9 @@ def _plane_grid(
 
 
 def _pick_planes(
-    scores: Float[Tensor, "d k"], directions: Directions, across: View
+    scores: Float[Tensor, "d k"],
+    directions: Directions,
+    across: View,
 ) -> list[tuple[int, int]]:
     """Return (direction, offset) indices of the best planes, unlike in direction, that map seen
     points to hidden.
@@ -336,7 +355,10 @@ def _hides(directions: Directions, across: View) -> Bool[Tensor, "d"]:
 
 
 def _across_plane(
-    scorer: SymmetryScorer, planes: list[Mirror], grid: Float[Tensor, "d k 4"], across: View
+    scorer: SymmetryScorer,
+    planes: list[Mirror],
+    grid: Float[Tensor, "d k 4"],
+    across: View,
 ) -> list[Mirror]:
     """Return the best plane that faces the view; none if `planes` has one or all violate free
     space.
@@ -349,7 +371,10 @@ def _across_plane(
 
 
 def _square_plane(
-    scorer: SymmetryScorer, planes: list[Mirror], best: Mirror, across: View
+    scorer: SymmetryScorer,
+    planes: list[Mirror],
+    best: Mirror,
+    across: View,
 ) -> list[Mirror]:
     """Return the best vertical plane at right angles to `best`.
 
@@ -362,7 +387,11 @@ def _square_plane(
     return _best_plane(scorer, _plane_grid(scorer, direction, SEARCH.fine_offsets)[0], -math.inf)
 
 
-def _best_plane(scorer: SymmetryScorer, planes: Mirrors, least: float) -> list[Mirror]:
+def _best_plane(
+    scorer: SymmetryScorer,
+    planes: Mirrors,
+    least: float,
+) -> list[Mirror]:
     """Return the plane of the greatest score above `least` that does not violate free space, or
     none.
     """

@@ -107,7 +107,11 @@ class Vessel(Value):
     body: Bool[Tensor, "n"]  # mask of the points on either wall, without handles, rim and floor
 
 
-def find_vessel(points: Points, normals: Points, numbers: VesselNumbers = VESSEL) -> Vessel | None:
+def find_vessel(
+    points: Points,
+    normals: Points,
+    numbers: VesselNumbers = VESSEL,
+) -> Vessel | None:
     """Return the open vessel that a cloud shows, or None if it shows no vessel.
 
     Normals of an inner wall point to the axis. Both walls are fitted at once: the outer radius is a
@@ -196,7 +200,11 @@ class Wall(Value):
 
 
 def complete_walls(
-    cloud: PointCloud, vessel: Vessel, outline: Outlines, table: float, numbers: WallNumbers = WALL
+    cloud: PointCloud,
+    vessel: Vessel,
+    outline: Outlines,
+    table: float,
+    numbers: WallNumbers = WALL,
 ) -> tuple[Wall, Wall]:
     """Return the outer and the inner wall of a vessel on a table of height `table` [m].
 
@@ -260,7 +268,10 @@ def _turn(wall: HiddenWall, vessel: Vessel, numbers: WallNumbers) -> HiddenWall:
 
 
 def _disc(
-    vessel: Vessel, height: float, radius: float, rings: tuple[tuple[float, int], ...]
+    vessel: Vessel,
+    height: float,
+    radius: float,
+    rings: tuple[tuple[float, int], ...],
 ) -> HiddenWall:
     """Return points at one height, normals up, on rings about the axis: each (share of `radius`,
     number of points).
@@ -279,7 +290,11 @@ def _disc(
 
 
 def _merge(
-    seen: Points, outline: Outlines, parts: list[HiddenWall], vessel: Vessel, least: float
+    seen: Points,
+    outline: Outlines,
+    parts: list[HiddenWall],
+    vessel: Vessel,
+    least: float,
 ) -> HiddenWall:
     """Return the hidden points of the parts, between rim and `least` height, apart from seen and
     earlier points.
