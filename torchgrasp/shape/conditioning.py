@@ -141,7 +141,8 @@ def select_points(
         new = slice(end, end + 4)
         # (d, w) of the pick with (d, w) of every candidate; rows of the factor go pick by pick
         with_all = cross_covariance(kernel, x[p], x, n).view(4, 4, n)
-        with_picks = with_all[:, :, picks[:count]].permute(2, 1, 0).reshape(4 * count, 4)
+        with_picks = with_all[:, :, picks[:count]]
+        with_picks = with_picks.permute(2, 1, 0).reshape(4 * count, 4)
         cross = torch.cat([with_known[:, p].squeeze(1).T, with_picks])
         before = torch.linalg.solve_triangular(factor[:end, :end], cross, upper=False)
         own = prior + torch.diag(noise[p][0])
@@ -160,7 +161,8 @@ def select_points(
     picks = picks[:count]
     rows = old + 4 * count
     factor = factor[:rows, :rows]
-    by_pick = torch.arange(4 * count, device=x.device).reshape(4, count).T.flatten()
+    by_pick = torch.arange(4 * count, device=x.device)
+    by_pick = by_pick.reshape(4, count).T.flatten()
     new = candidates[picks]
     return Selection(picks, _extend(start, new, factor, whitened[:rows, n], by_pick))
 

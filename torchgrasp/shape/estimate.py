@@ -78,9 +78,8 @@ class Observations(Batch):
     @property
     def least_noise(self) -> float:
         """The least standard deviation of the noise of all observed values."""
-        return float(
-            torch.cat([self.distance_noise, self.normal_noise[self.has_normal]]).detach().min()
-        )
+        every = torch.cat([self.distance_noise, self.normal_noise[self.has_normal]])
+        return float(every.detach().min())
 
     def with_normals_first(self) -> "Observations":
         """Return the observations in another order: first those with normals."""
@@ -135,7 +134,8 @@ class MeanJet(Batch):
         """
         n = self.normals
         steep = torch.linalg.vector_norm(self.gradient, dim=-1)[..., None, None]
-        return (self.hessian - n[..., :, None] * (n[..., None, :] @ self.hessian)) / steep
+        along = n[..., :, None] * (n[..., None, :] @ self.hessian)
+        return (self.hessian - along) / steep
 
 
 @dataclasses.dataclass(frozen=True)

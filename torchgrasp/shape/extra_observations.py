@@ -10,7 +10,13 @@ from torchgrasp.cloud.prepare import PreparedCloud
 from torchgrasp.foundation.base import Value, join
 from torchgrasp.geometry.linalg import Points, fibonacci_sphere, unit
 from torchgrasp.shape.completion.complete import HIDDEN, Completion, Kind, correlated_errors
-from torchgrasp.shape.completion.silhouette import OUTLINE, Outlines, Silhouette, pick_apart
+from torchgrasp.shape.completion.silhouette import (
+    OUTLINE,
+    Outlines,
+    Silhouette,
+    find_middle,
+    pick_apart,
+)
 from torchgrasp.shape.completion.symmetry import AXIS
 from torchgrasp.shape.completion.vessel import (
     VESSEL,
@@ -167,8 +173,9 @@ def frame_around(points: Points) -> Normalisation:
     """Return the normalised frame of points: origin in the centre of their box, farthest point at
     distance 1.
     """
-    center = (points.amin(0) + points.amax(0)) / 2
-    return Normalisation(center, float(torch.linalg.vector_norm(points - center, dim=-1).max()))
+    center = find_middle(points)
+    scale = float(torch.linalg.vector_norm(points - center, dim=-1).max())
+    return Normalisation(center, scale)
 
 
 def camera_support(
@@ -248,7 +255,8 @@ def observe(
     the normals.
     """
     x = frame.normalise(points.to(frame.center))
-    return on_surface(x, normals.to(x), torch.full_like(x[:, 0], noise / frame.scale), normal_noise)
+    deviation = torch.full_like(x[:, 0], noise / frame.scale)
+    return on_surface(x, normals.to(x), deviation, normal_noise)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -307,7 +315,8 @@ def vessel_supports(
 
     surface = torch.cat([cloud.points[outer.seen], hidden.points])
     middle = (axis + 0.5 * (table + vessel.rim) * up)[None]
-    depth = torch.minimum(torch.cdist(middle, surface).amin(1), middle[:, 2] - table)
+    depth = torch.cdist(middle, surface).amin(1)
+    depth = torch.minimum(depth, middle[:, 2] - table)
     clear = torch.cat([-depth, torch.cdist(sphere, surface).amin(1)])
     rim = _observe_rim(outline, frame, NOISE.vessel_rim_normal)
     parts = [rim, _observe_hidden(frame, hidden)]
@@ -321,7 +330,8 @@ def vessel_supports(
     heights = torch.tensor(places, dtype=torch.float32, device="cpu").double()
     inside = axis + heights[:, None] * up
     around = sphere[sphere[:, 2] < vessel.rim]
-    clear = torch.cat([torch.cdist(inside, surface).amin(1), -torch.cdist(around, surface).amin(1)])
+    clear = torch.cdist(inside, surface).amin(1)
+    clear = torch.cat([clear, -torch.cdist(around, surface).amin(1)])
     parts = [_observe_hidden(frame, inner.hidden)]
     space = support(torch.cat([inside, around]), clear, parts, inner.seen)
     return body, space, _middle(cloud, vessel, (outer, inner), frame).to(device)
@@ -387,8 +397,11 @@ def free_space(
             points = torch.cat([points, torch.cat([ground, height], 1)])
             least = torch.cat([least, torch.full_like(ground[:, 0], below)])
     x = (points - origin) / scale
-    keep = (torch.linalg.vector_norm(x, dim=-1) < FREE.radius) & (least > FREE.least)
-    return reach * x[keep].to(frame.center), least[keep].to(frame.center) / frame.scale
+    near = torch.linalg.vector_norm(x, dim=-1) < FREE.radius
+    keep = near & (least > FREE.least)
+    x = x[keep].to(frame.center)
+    least = least[keep].to(frame.center)
+    return reach * x, least / frame.scale
 
 
 def free_space_violations(

@@ -88,7 +88,8 @@ class ShapeGP(Posterior, Normalisation):
         """Return the shape of a posterior in a normalised frame; its domain follows from kernel and
         observations.
         """
-        reach = DOMAIN.reach * float(torch.linalg.vector_norm(posterior.x.detach(), dim=-1).max())
+        away = torch.linalg.vector_norm(posterior.x.detach(), dim=-1)
+        reach = DOMAIN.reach * float(away.max())
         radius = min(posterior.kernel.diameter / 2.0, reach)
         fields = common_fields(posterior, Posterior) | common_fields(frame, Normalisation)
         return cls(**fields, psi=psi, domain_radius=radius, std_factor=std_factor, cloud=cloud)
@@ -317,7 +318,8 @@ class ShapeGP(Posterior, Normalisation):
         domain's diameter of the centre a ball of the domain's size holds both, and in such a ball
         the kernel is a covariance.
         """
-        outside = (torch.linalg.vector_norm(x.detach(), dim=-1) > self.domain_radius)[:, None]
+        length = torch.linalg.vector_norm(x.detach(), dim=-1, keepdim=True)
+        outside = length > self.domain_radius
         if not (is_known(outside) and bool(outside.any())):
             return self.estimate(x)
         # with finite derivatives at points inside, too

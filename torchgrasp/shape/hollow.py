@@ -106,8 +106,10 @@ class HollowShape(ShapeGP):
     @checked(gradients=True)
     def mean_and_gradient(self, x: Queries) -> MeanAndGradient:
         """Return the mean signed distance and its gradient at normalised points."""
-        (a, slope_a), (b, slope_b) = (wall.mean_and_gradient(x) for wall in self.walls)
-        return torch.maximum(a, b), torch.where((b > a)[:, None], slope_b, slope_a)
+        a, slope_a = self.outer.mean_and_gradient(x)
+        b, slope_b = self.inner.mean_and_gradient(x)
+        slope = torch.where((b > a)[:, None], slope_b, slope_a)
+        return torch.maximum(a, b), slope
 
     @checked(gradients=True)
     def estimate(self, x: Queries) -> Moments:
@@ -146,7 +148,9 @@ class HollowShape(ShapeGP):
         applies there.
         """
         outer, inner = self.wall_at(new.x).T
-        return self.join(self.outer.append(new[outer]), self.inner.append(new[inner]), self.cloud)
+        new_outer = self.outer.append(new[outer])
+        new_inner = self.inner.append(new[inner])
+        return self.join(new_outer, new_inner, self.cloud)
 
     @checked
     def moved(self, b_from_a: Pose) -> "HollowShape":

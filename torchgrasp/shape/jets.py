@@ -46,7 +46,8 @@ def evaluate_mean(
     else:
         distances = separations(x, of.x)[1]
     k, first, *second = of.kernel.derivatives(distances, 3 if gradient else 2)
-    along = _times(x, of.b.mT) - (of.x[..., :near, :] * of.b).sum(-1)
+    offset = (of.x[..., :near, :] * of.b).sum(-1)
+    along = _times(x, of.b.mT) - offset
     distance = _dot(k, of.a) - (first[:, :near] * along).sum(1)
     if not gradient:
         return (distance,)
@@ -67,7 +68,10 @@ def evaluate_mean_jet(
     near_first = first[:, :near]
     near_second = second[:, :near]
     offset = (known[..., :near, :] * b).sum(-1)
-    along = torch.addmm(offset, x, b.T, beta=-1.0) if b.ndim == 2 else _times(x, b.mT) - offset
+    if b.ndim == 2:
+        along = torch.addmm(offset, x, b.T, beta=-1.0)
+    else:
+        along = _times(x, b.mT) - offset
     c = torch.mul(first, a)
     c[:, :near].addcmul_(near_second, along, value=-1.0)
     outer = second * a
@@ -98,7 +102,8 @@ def evaluate_jet(
     explained, solved = explain(distance_rows(d, k, first, near))
     s = solved[:, :n]
     u = solved[:, n:].unflatten(1, (3, near)).unbind(1)
-    along = (near_d[0] * u[0]).addcmul_(near_d[1], u[1]).addcmul_(near_d[2], u[2])
+    along = near_d[0] * u[0]
+    along.addcmul_(near_d[1], u[1]).addcmul_(near_d[2], u[2])
     c = first * s
     c[:, :near].addcmul_(near_second, along, value=-1.0)
     normals = torch.stack([(near_first * part).sum(1) for part in u], 1)
@@ -116,7 +121,8 @@ def distance_rows(
     """Return the covariance of distances with all observations: k, then -k' d for each component of
     the normals.
     """
-    return torch.cat([k, *(-(part[:, :near] * first[:, :near]) for part in d)], 1)
+    slope = first[:, :near]
+    return torch.cat([k, *(-(part[:, :near] * slope) for part in d)], 1)
 
 
 def _sum_differences(

@@ -189,7 +189,8 @@ def differentiate_thin_plate(
     """Return k and its derivatives by r^2 / 2 of the thin plate kernel in closed form, `count` in
     all.
     """
-    values = [(2.0 * r).sub_(3.0 * psi).mul_(r).mul_(r).add_(psi**3), (6 * r).sub_(6 * psi)]
+    k = (2.0 * r).sub_(3.0 * psi).mul_(r).mul_(r).add_(psi**3)
+    values = [k, (6 * r).sub_(6 * psi)]
     if count > 2:
         inverse = torch.reciprocal(r).masked_fill_(r == 0, 0.0)
         values.append(6 * inverse)
@@ -303,7 +304,8 @@ def _differentiable_cross_covariance(
     any order.
     """
     d = x[:, None] - y
-    k, first, second = (f[..., None] for f in differentiate(kernel.profile, (d * d).sum(-1) / 2, 3))
+    u = (d * d).sum(-1) / 2
+    k, first, second = (f[..., None] for f in differentiate(kernel.profile, u, 3))
     near = d[:, :n_oriented]
     slope = -first[:, :n_oriented]
     one = torch.eye(3, dtype=x.dtype, device=x.device)
@@ -325,7 +327,9 @@ def separations(
     With a leading axis, `y` holds the points that each x is compared with.
     """
     d = [x[:, m, None] - y[..., m] for m in range(3)]
-    return d, (d[0] * d[0]).addcmul_(d[1], d[1]).addcmul_(d[2], d[2]).sqrt_()
+    square = d[0] * d[0]
+    square.addcmul_(d[1], d[1]).addcmul_(d[2], d[2])
+    return d, square.sqrt_()
 
 
 def covariance_rows(

@@ -180,8 +180,8 @@ class Posterior(Value):
         mean = (cross @ self.weights).T
         by_point = self.ordered(cross.transpose(0, 1).flatten(0, 1).T)
         whitened = torch.linalg.solve_triangular(self.factor, by_point, upper=False)
-        prior = gram(self.kernel, x, k)
-        prior = prior.reshape(4, k, 4, k).permute(1, 0, 3, 2).reshape(4 * k, 4 * k)
+        prior = gram(self.kernel, x, k).reshape(4, k, 4, k)
+        prior = prior.permute(1, 0, 3, 2).reshape(4 * k, 4 * k)
         return JointEstimate(mean, prior - whitened.T @ whitened)
 
     def prior_block(self) -> Float[Tensor, "4 4"]:
@@ -199,7 +199,8 @@ class Posterior(Value):
         if not self._is_plain(x):
             d = x[:, None] - self.x
             k, first = differentiate(self.kernel.profile, (d * d).sum(-1) / 2, 2)
-            return torch.cat([k, -(first[..., None] * d)[:, : self.n_oriented].mT.flatten(1)], 1)
+            slope = (first[..., None] * d)[:, : self.n_oriented]
+            return torch.cat([k, -slope.mT.flatten(1)], 1)
         d, r = separations(x, self.x)
         k, first = self.kernel.derivatives(r, 2)
         return distance_rows(d, k, first, self.n_oriented)
@@ -230,8 +231,9 @@ class Posterior(Value):
         solved = torch.zeros_like(rows)
         first = 0
         for block in self.whiteners:
-            solved[:, : len(block)].addmm_(whitened[:, first : first + block.shape[1]], block.T)
-            first += block.shape[1]
+            end = first + block.shape[1]
+            solved[:, : len(block)].addmm_(whitened[:, first:end], block.T)
+            first = end
         if self.order is not None:
             solved = torch.empty_like(solved).index_copy(1, self.order, solved)
         return torch.linalg.vecdot(whitened, whitened), solved
@@ -313,5 +315,6 @@ def symmetric_root(
     # Newton's steps change the derivatives alone
     for _ in range(0 if is_plain(covariance) else 2):
         rest = vectors.mT @ (covariance - root @ root) @ vectors
-        root = root + vectors @ (rest / (roots[..., None] + roots[..., None, :])) @ vectors.mT
+        rest = rest / (roots[..., None] + roots[..., None, :])
+        root = root + vectors @ rest @ vectors.mT
     return root

@@ -239,7 +239,8 @@ def _grid(
     size = (cells // stride + 1,) * 3
     every = np.indices(size).reshape(3, -1)
     values = mean(stride, tuple(every)).reshape(size)
-    climb = max(float(np.abs(np.diff(values, axis=axis)).max()) for axis in range(3))
+    climbs = [np.abs(np.diff(values, axis=axis)).max() for axis in range(3)]
+    climb = float(max(climbs))
     steepest = SURFACE.steeper * climb / (stride * step)
     while stride > 1:
         # over the corners of each cell
@@ -276,7 +277,8 @@ def _carry_cloud(
     """Return a mask of the faces in connected pieces to which enough points of the cloud are
     nearest.
     """
-    label = number_components(np.concatenate([faces[:, :2], faces[:, 1:]]), len(corners))
+    edges = np.concatenate([faces[:, :2], faces[:, 1:]])
+    label = number_components(edges, len(corners))
     cloud = shape.normalise(shape.cloud.points.to(shape.x)).cpu().numpy()
     _, nearest = spatial.KDTree(corners).query(cloud)
     share = np.bincount(label[nearest], minlength=label.max() + 1) / len(cloud)

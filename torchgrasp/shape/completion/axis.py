@@ -168,7 +168,8 @@ def _lines_from_above(points: Points, normals: Points) -> _Lines:
     """Return the lines through points along their normals, projected onto the horizontal plane."""
     slope = torch.linalg.vector_norm(normals[:, :2], dim=1)
     steep = slope > AXIS_FIT.steep
-    level = torch.where(steep[:, None], normals[:, :2] / slope[:, None], 0.0)
+    level = normals[:, :2] / slope[:, None]
+    level = torch.where(steep[:, None], level, 0.0)
     across = torch.stack([-level[:, 1], level[:, 0]], 1)
     return _Lines(slope, steep, level, across, (across * points[:, :2]).sum(1))
 

@@ -130,7 +130,8 @@ class Completion(Value):
     def moved(self, b_from_a: Pose) -> "Completion":
         """Return the completion transformed from frame a to frame b."""
         normals = rotate(b_from_a, self.planes[:, :3])
-        planes = torch.cat([normals, self.planes[:, 3:] + normals @ b_from_a[:3, 3:]], 1)
+        offsets = self.planes[:, 3:] + normals @ b_from_a[:3, 3:]
+        planes = torch.cat([normals, offsets], 1)
         points = apply(b_from_a, self.points)
         turned = rotate(b_from_a, self.normals)
         outline = self.outline.moved(b_from_a)
@@ -318,8 +319,8 @@ def _mirror(parts: list[_Part]) -> list[_Image]:
             normals = torch.cat([normals, scorer.outline.rim_normals])
         original = _Image.of(scorer, points, normals, total)
         mirrors = [
-            _mirror_in(scorer, before + i, plane, score)
-            for i, (plane, score) in enumerate(zip(part.planes, part.scores.tolist(), strict=True))
+            _mirror_in(scorer, before + i, plane, float(part.scores[i]))
+            for i, plane in enumerate(part.planes)
         ]
         once = [mirror(original) for mirror in mirrors]
         images += once
@@ -380,7 +381,8 @@ def _back_of_bars(scorer: SymmetryScorer, n_planes: int) -> _Image:
     at = points[rows]
     width = width[rows]
     around = points[near[rows]]
-    bar = torch.linalg.svd(around - around.mean(1, keepdim=True), full_matrices=False).Vh[:, 0]
+    around = around - around.mean(1, keepdim=True)  # (k, neighbours, 3)
+    bar = torch.linalg.svd(around, full_matrices=False).Vh[:, 0]
     # of several views, the one that faces the bar most
     rays = at[:, None] - torch.stack([view.viewpoint for view in scorer.outline.views])
     facing = (rays * scorer.normals[rows, None]).sum(-1).argmin(1)

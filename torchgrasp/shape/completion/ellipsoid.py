@@ -117,9 +117,10 @@ class _Fit:
     def solve(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the 9 fitted parameters and their covariance matrix."""
         # a ball by linear least squares is the first guess
-        rows = np.concatenate([2 * self.points, np.ones_like(self.points[:, :1])], 1)
-        ball = np.linalg.lstsq(rows, (self.points**2).sum(1), rcond=None)[0]
-        longest = np.ptp(self.points, axis=0).max()
+        points = self.points
+        rows = np.concatenate([2 * points, np.ones_like(points[:, :1])], 1)
+        ball = np.linalg.lstsq(rows, (points**2).sum(1), rcond=None)[0]
+        longest = np.ptp(points, axis=0).max()
         radius = np.sqrt(max(ball[3] + ball[:3] @ ball[:3], 0.0))
         radius = np.log(np.clip(radius, longest * ELLIPSOID.least_radius, longest))
         start = np.concatenate([ball[:3], radius * np.eye(3)[UPPER]])
@@ -197,7 +198,9 @@ def _support(
 def _symmetric(entries: np.ndarray) -> np.ndarray:
     """Return the symmetric matrices with the given upper entries (k, 6)."""
     matrix = np.zeros((len(entries), 3, 3))
-    matrix[:, UPPER[0], UPPER[1]] = matrix[:, UPPER[1], UPPER[0]] = entries
+    row, column = UPPER
+    matrix[:, row, column] = entries
+    matrix[:, column, row] = entries
     return matrix
 
 

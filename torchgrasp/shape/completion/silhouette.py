@@ -69,6 +69,11 @@ BEHIND = BehindNumbers()
 TIE = 2e-9  # relative difference of squared distances by rounding: the frame must not decide
 
 
+def find_middle(points: Points) -> Float[Tensor, "3"]:
+    """Return the centre of the box around points."""
+    return (points.amax(0) + points.amin(0)) / 2
+
+
 def pick_apart(
     points: Float[Tensor, "n d"],
     count: int,
@@ -237,7 +242,8 @@ def silhouette(view: PointCloud) -> Silhouette:
     extent = float(size.max())
     cell = max(spacing / OUTLINE.fine, extent / OUTLINE.cells)
     margin = int(np.ceil(disc / cell)) + int(OUTLINE.margin * extent / cell) + 2
-    shape = tuple(np.ceil(size / cell).astype(int)[::-1] + 2 * margin + 1)
+    nodes = np.ceil(size / cell).astype(int)[::-1]
+    shape = tuple(nodes + 2 * margin + 1)
     corner = low - margin * cell
     column, row = np.round((pixels - corner) / cell).astype(int).T
     # of pixels that share a cell the nearest to the camera is written last
@@ -251,7 +257,8 @@ def silhouette(view: PointCloud) -> Silhouette:
     measured = _distance(raster == 0) * cell <= disc
     grown = np.asarray(ndimage.binary_fill_holes(measured))
     gaps = grown & ~measured
-    gap = 2 * (float(_distance(gaps).max()) * cell + disc) * bool(gaps.any())
+    widest = float(_distance(gaps).max()) * cell
+    gap = 2 * (widest + disc) * bool(gaps.any())
     grown &= ~_find_holes(gaps, measured, disc / cell)
     inside = _distance(grown) * cell > OUTLINE.shrink * spacing
     unseen = _beyond_image(view.frustum, axes, corner, cell, grown, disc)
@@ -315,7 +322,9 @@ def _beyond_image(
     if frustum is None:
         return beyond
     row, column = np.indices(mask.shape)
-    rays = np.stack([corner[0] + cell * column, corner[1] + cell * row, np.ones(mask.shape)], -1)
+    x = corner[0] + cell * column
+    y = corner[1] + cell * row
+    rays = np.stack([x, y, np.ones(mask.shape)], -1)  # (h, w, 3)
     for side in frustum.double().cpu().numpy() @ axes.T:
         past = rays @ side < margin * np.linalg.norm(side[:2])
         if (past & mask).sum() * cell**2 > margin**2:  # more than a stray pixel
@@ -325,7 +334,7 @@ def _beyond_image(
 
 def _check_view(points: Points, viewpoint: Float[Tensor, "3"]) -> None:
     """Raise `BadArgument` for points that no camera at the viewpoint can see at once."""
-    forward = (points.amax(0) + points.amin(0)) / 2 - viewpoint
+    forward = find_middle(points) - viewpoint
     behind = int(((points - viewpoint) @ forward <= 0).sum())
     if behind:
         found = f"{viewpoint.tolist()} m, with {behind} of {len(points)} points beside or behind it"
@@ -338,7 +347,7 @@ def _check_view(points: Points, viewpoint: Float[Tensor, "3"]) -> None:
     depth = depth[:, None]
     deeper = depth - depth[torch.from_numpy(index), 0] - torch.from_numpy(apart) * depth  # (n, k)
     points = points.double().cpu()
-    radius = torch.linalg.vector_norm(points - (points.amax(0) + points.amin(0)) / 2, dim=-1).max()
+    radius = torch.linalg.vector_norm(points - find_middle(points), dim=-1).max()
     share = float((deeper.amax(1) > BEHIND.radius * radius).double().mean())
     if share > BEHIND.share:
         found = f"{share:.0%} of the points behind others, which no camera sees at once"
@@ -355,7 +364,7 @@ def _project(
     """
     points = points.double().cpu()
     viewpoint = viewpoint.double().cpu()
-    forward = unit((points.amax(0) + points.amin(0)) / 2 - viewpoint)
+    forward = unit(find_middle(points) - viewpoint)
     axes = torch.stack([*across(forward), forward])  # right, down, forward
     local = (points - viewpoint) @ axes.T
     return axes, local[:, :2] / local[:, 2:], local[:, 2]
@@ -393,5 +402,7 @@ def _rim(
     ray = np.concatenate([position, np.ones((len(position), 1))], -1)
     # The cone's normal is perpendicular to the ray and to the outline's tangent, and leans with the
     # slope.
-    across = np.concatenate([slope, -(slope * position).sum(-1, keepdims=True)], -1)
-    return ray * depth[:, None], across / np.linalg.norm(across, axis=-1, keepdims=True)
+    lean = -(slope * position).sum(-1, keepdims=True)
+    across = np.concatenate([slope, lean], -1)
+    across = across / np.linalg.norm(across, axis=-1, keepdims=True)
+    return ray * depth[:, None], across

@@ -21,7 +21,7 @@ from torchgrasp.geometry.linalg import (
     unit,
 )
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.shape.completion.silhouette import Outlines, pick_apart, silhouettes
+from torchgrasp.shape.completion.silhouette import Outlines, find_middle, pick_apart, silhouettes
 from torchgrasp.values.planning import PointCloud
 
 
@@ -161,7 +161,7 @@ class SymmetryScorer:
     @property
     def center(self) -> Tensor:
         """Centre of the cloud's bounding box [m]."""
-        return (self.points.amax(0) + self.points.amin(0)) / 2
+        return find_middle(self.points)
 
     @property
     def size(self) -> float:
@@ -195,7 +195,8 @@ class SymmetryScorer:
         turned = reflect_directions(normals, planes[:, None])
         distance, index = self.nearest(mirrored, SYMMETRY.far * SYMMETRY.match)
         agreement = (turned * self.normals[index]).sum(-1).clamp_min(0)
-        match = (torch.exp(-0.5 * (distance / SYMMETRY.match) ** 2) * agreement).mean(-1)
+        near = torch.exp(-0.5 * (distance / SYMMETRY.match) ** 2)
+        match = (near * agreement).mean(-1)
         depth = self.outline.violation(mirrored)
         if self.table is not None:
             depth = depth + (-self.table.height(mirrored)).clamp_min(0)
@@ -226,7 +227,8 @@ def find_planes(
     # points.
     across = unit(view) if float(torch.linalg.vector_norm(view)) > SEARCH.one_side else None
     grid = _plane_grid(scorer, directions)  # (d, k, 4)
-    scores = scorer.score(grid.reshape(-1, 4))[0].reshape(grid.shape[:2])
+    scores, _ = scorer.score(grid.reshape(-1, 4))
+    scores = scores.reshape(grid.shape[:2])
     if not scorer.upright:
         rim = (scorer.outline.rim @ directions.T).median(0).values
         away = (grid[..., 3] - rim[:, None]) / (SEARCH.rim_distance * scorer.size)
@@ -273,9 +275,11 @@ def find_plane_through_axis(
     A plane across which the part extends less is preferred, even if half of the part is hidden.
     """
     normals = _level_directions(SEARCH.level_through_axis)
-    planes = torch.cat([normals, (normals[:, :2] @ center)[:, None]], -1)
+    level = normals[:, :2]
+    planes = torch.cat([normals, (level @ center)[:, None]], -1)
     arm = part[:, :2] - center
-    extent = (arm @ normals[:, :2].T).square().mean(0) / arm.square().sum(1).mean()
+    extent = (arm @ level.T).square().mean(0)
+    extent = extent / arm.square().sum(1).mean()
     scores, _ = scorer.score(planes)
     best = (scores - extent).argmax()
     return planes[best][None], scores[best][None]
@@ -322,7 +326,8 @@ def _plane_grid(
     half = ((high - low) / 2).clamp_min(SEARCH.least_extent * scorer.size)
     steps = torch.linspace(-1, 1, count, dtype=torch.float64, device="cpu")
     offsets = middle[:, None] + half[:, None] * steps  # (d, count)
-    return torch.cat([directions[:, None].expand(-1, count, -1), offsets[..., None]], -1)
+    normals = directions[:, None].expand(-1, count, -1)
+    return torch.cat([normals, offsets[..., None]], -1)
 
 
 def _pick_planes(
@@ -335,7 +340,8 @@ def _pick_planes(
     """
     best, offset = scores.max(1)
     hides = _hides(directions, across)
-    order = [i for i in torch.argsort(best, descending=True, stable=True).tolist() if hides[i]]
+    order = torch.argsort(best, descending=True, stable=True)
+    order = order[hides[order]].tolist()
     chosen: list[int] = []
     for i in order:
         if len(chosen) == SEARCH.most or best[i] <= best[order[0]] - SEARCH.within:

@@ -151,7 +151,9 @@ def find_vessel(
 
     wall = steep & (facing.abs() > numbers.level)
     body = wall & (miss.abs() < numbers.on_body)
-    within = (points[:, :2].amin(0) < center) & (center < points[:, :2].amax(0))
+    low = points[:, :2].amin(0)
+    high = points[:, :2].amax(0)
+    within = (low < center) & (center < high)
     thickness = float(found[numbers.terms])
     if not numbers.thinnest < thickness < numbers.thickest:
         return None
@@ -279,7 +281,8 @@ def _disc(
     places = []
     for share, count in rings:
         angle = torch.arange(count).to(vessel.center) * (2 * math.pi / count)
-        places.append(share * radius * torch.stack([angle.cos(), angle.sin()], 1) + vessel.center)
+        ring = torch.stack([angle.cos(), angle.sin()], 1)
+        places.append(share * radius * ring + vessel.center)
     level = torch.cat(places)
     points = torch.cat([level, torch.full_like(level[:, :1], height)], 1)
     up = torch.zeros_like(points)
