@@ -23,7 +23,7 @@ Criterion = Literal["variance", "error", "both"]
 
 
 def posterior_given(observations: Observations, kernel: Kernel) -> Posterior:
-    """Return the posterior given observations, by one Cholesky factorisation of their covariance."""
+    """Return the posterior given observations, by one Cholesky factor of their covariance."""
     observations = observations.with_normals_first()
     y, noise = observations.rows()
     near = int(observations.has_normal.sum())

@@ -140,7 +140,7 @@ class MeanJet(Batch):
 
 @dataclasses.dataclass(frozen=True)
 class SurfaceJet(MeanJet):
-    """The mean distance with first and second derivatives, and its variance with first derivatives."""
+    """The mean distance with two derivatives, and its variance with one."""
 
     variance: Float[Tensor, "*b"]
     variance_gradient: Float[Tensor, "*b 3"]

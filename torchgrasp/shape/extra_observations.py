@@ -1,4 +1,4 @@
-"""Observations besides the seen points: points inside and outside, the hidden side, and free space."""
+"""Observations besides the seen points: inside and outside, on the hidden side, in free space."""
 
 import dataclasses
 

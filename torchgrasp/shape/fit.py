@@ -121,7 +121,8 @@ def fit_shape(
 
     >>> from torchgrasp.geometry.linalg import unit
     >>> ball = unit(torch.randn(400, 3, generator=torch.Generator().manual_seed(0)))
-    >>> fit_shape(PointCloud(0.04 * ball, ball)).predict(torch.tensor([0.0, 0.0, 0.04])).distance.abs() < 0.02
+    >>> shape = fit_shape(PointCloud(0.04 * ball, ball))
+    >>> shape.predict(torch.tensor([0.0, 0.0, 0.04])).distance.abs() < 0.02
     tensor(True)
     """
     cloud = as_cloud(cloud, "cloud")
@@ -167,7 +168,8 @@ def fit_upright(
     elif is_flat(cloud.points):
         _warn(
             Flat,
-            "the points lie in one plane, to their noise: the thickness is a guess; give a view of two sides",
+            "the points lie in one plane, to their noise: the thickness is a guess; "
+            "give a view of two sides",
         )
     generator = torch.Generator("cpu").manual_seed(seed)
     noise = options.noise
@@ -266,7 +268,8 @@ def condition(
         std_factor: ratio of the surface's true deviations to the posterior's standard deviations.
         kernel: a name (see `kernel_by_name`), or any `Kernel` of normalised distances.
 
-    >>> x, noise = torch.cat([torch.eye(3), -torch.eye(3)]).double() / 2, torch.full((6,), 0.01).double()
+    >>> x = torch.cat([torch.eye(3), -torch.eye(3)]).double() / 2
+    >>> noise = torch.full((6,), 0.01).double()
     >>> seen = Observations(x, 0 * noise, 2 * x, noise > 0, noise, noise)
     >>> shape = condition(seen, Normalisation(torch.zeros(3).double(), 0.05), PointCloud(0.05 * x))
     >>> shape.predict(0.05 * x[:2]).distance.abs() < 0.01
@@ -292,7 +295,8 @@ def _warn_of_ambiguity(cloud: PointCloud, outline: Outlines, on_table: bool) -> 
     if outline.cut:
         _warn(
             CutOff,
-            "the border of the image cuts the object off: the part beyond it is a guess; turn the camera",
+            "the border of the image cuts the object off: the part beyond it is a guess; "
+            "turn the camera",
         )
     if outline.gap > SHAPE.gap:
         width = f"a gap of {1e3 * outline.gap:.0f} mm in the view"
@@ -307,7 +311,8 @@ def _warn_of_ambiguity(cloud: PointCloud, outline: Outlines, on_table: bool) -> 
             share = float(body.double().mean())
             _warn(
                 TwoBodies,
-                f"two bodies that stand apart, the second of {share:.0%} of the points: give one of them",
+                f"two bodies that stand apart, the second of {share:.0%} of the points: "
+                "give one of them",
             )
 
 

@@ -65,8 +65,10 @@ class ShapeGP(Posterior, Normalisation):
     >>> from torchgrasp import fit_shape, load_object
     >>> view = load_object("jug").view
     >>> shape, points = fit_shape(view), view.points[:4]
-    >>> bool(shape.contains(points).all()), shape.joint(points).covariance.shape, shape.sample(points, n=10).shape
-    (True, torch.Size([16, 16]), torch.Size([10, 4, 4]))
+    >>> bool(shape.contains(points).all()), shape.joint(points).covariance.shape
+    (True, torch.Size([16, 16]))
+    >>> shape.sample(points, n=10).shape
+    torch.Size([10, 4, 4])
     """
 
     psi: float
@@ -245,7 +247,8 @@ class ShapeGP(Posterior, Normalisation):
 
         >>> ball = unit(torch.randn(400, 3, generator=torch.Generator().manual_seed(0)))
         >>> from torchgrasp import fit_shape
-        >>> touched = fit_shape(PointCloud(0.04 * ball, ball)).update(torch.tensor([[0.0, 0.0, 0.045]]))
+        >>> touch = torch.tensor([[0.0, 0.0, 0.045]])
+        >>> touched = fit_shape(PointCloud(0.04 * ball, ball)).update(touch)
         >>> touched.predict(torch.tensor([0.0, 0.0, 0.045])).distance.abs() < 0.01
         tensor(True)
         """
@@ -304,7 +307,8 @@ class ShapeGP(Posterior, Normalisation):
         if is_known(outside) and bool(outside.any()):
             first = int(torch.nonzero(outside)[0])
             where = "outside the domain" if reach == 1.0 else "far outside the domain"
-            found = f"{int(outside.sum())} of {len(flat)} points {where}, the first {flat[first].tolist()} m"
+            count = int(outside.sum())
+            found = f"{count} of {len(flat)} points {where}, the first {flat[first].tolist()} m"
             distance = f"{float(away[first]) * self.scale:.4g} m from the centre"
             allowed = f"points within {radius * self.scale:.4g} m of {self.center.tolist()} m"
             raise BadArgument("points", f"{found}, {distance}", allowed)
@@ -347,4 +351,5 @@ def common_fields(
     kind: type[Value],
 ) -> dict[str, Any]:
     """Return the fields, by name, that a value shares with the class `kind`."""
-    return {f.name: getattr(value, f.name) for f in dataclasses.fields(kind)}  # pyright: ignore[reportArgumentType]
+    names = [f.name for f in dataclasses.fields(kind)]  # pyright: ignore[reportArgumentType]
+    return {name: getattr(value, name) for name in names}

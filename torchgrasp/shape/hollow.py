@@ -62,7 +62,8 @@ class HollowShape(ShapeGP):
     >>> import trimesh
     >>> from torchgrasp import fit_shape
     >>> from torchgrasp.cloud import look_at, partial_view
-    >>> cup = trimesh.creation.revolve([[0, 0], [0.04, 0], [0.04, 0.09], [0.034, 0.09], [0.034, 0.006], [0, 0.006]])
+    >>> outer = [[0, 0], [0.04, 0], [0.04, 0.09]]
+    >>> cup = trimesh.creation.revolve([*outer, [0.034, 0.09], [0.034, 0.006], [0, 0.006]])
     >>> type(fit_shape(partial_view(cup, look_at(0.0, 35.0, target=cup)), table=0.0)).__name__
     'HollowShape'
     """

@@ -176,7 +176,10 @@ def thin_plate_kernel(psi: Positive, closed_form: bool = True) -> Kernel:
     >>> kernel.diameter
     1.5
     """
-    remedy = "use a psi_scale of at least 1.34: the thin plate kernel is a covariance only within 3/4 psi"
+    remedy = (
+        "use a psi_scale of at least 1.34: "
+        "the thin plate kernel is a covariance only within 3/4 psi"
+    )
     fast = closed_form and partial(differentiate_thin_plate, psi)
     return Kernel(partial(thin_plate, psi=psi), psi / (4.0 / 3.0), remedy, fast)
 
@@ -353,5 +356,5 @@ def gram(
     x: Points,
     n_oriented: int,
 ) -> Float[Tensor, "rows rows"]:
-    """Return the covariance matrix of observations, of which the first `n_oriented` have normals."""
+    """Return the covariance matrix of observations; the first `n_oriented` have normals."""
     return covariance_rows(kernel, x, n_oriented, x, n_oriented)

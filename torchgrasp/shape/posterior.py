@@ -36,7 +36,10 @@ from torchgrasp.shape.kernel import (
 
 @dataclasses.dataclass(frozen=True)
 class ChunkNumbers:
-    """How many points are worked on at once: on a CPU the temporaries of a chunk stay in the cache."""
+    """How many points are worked on at once.
+
+    On a CPU the temporaries of a chunk stay in the cache.
+    """
 
     mean: int = 2048
     gradient: int = 512
@@ -258,7 +261,7 @@ class Posterior(Value):
 
 
 def _differentiable_jet(posterior: Posterior, x: Queries) -> tuple[Tensor, ...]:
-    """Return the fields of `SurfaceJet` for one chunk of points by autograd of mean and variance."""
+    """Return the fields of `SurfaceJet` at some points by autograd of mean and variance."""
 
     def total(x: Tensor) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]:
         mean, spread = posterior.estimate(x)

@@ -264,7 +264,7 @@ def newton_step(
     longest: float,
     least_slope: float = 0.0,
 ) -> Points:
-    """Return the Newton steps along the gradients to the zero level, each at most `longest` long."""
+    """Return Newton steps along the gradients to the zero level, each at most `longest` long."""
     step = -value / (gradient * gradient).sum(-1).clamp_min(least_slope)
     return limit_norm(step[:, None] * gradient, longest)
 

@@ -136,7 +136,7 @@ def find_axis(scorer: SymmetryScorer) -> tuple[Float[Tensor, "4 4"], Revolution]
 
 
 def find_revolution(points: Points, normals: Points) -> Revolution | None:
-    """Return the upright body of revolution to which most points belong, or None if there is none."""
+    """Return the upright body of revolution to which most points belong, or None."""
     lines = _lines_from_above(points, normals)
     center = _fit_to_lines(points, lines)
 

@@ -151,7 +151,7 @@ class Silhouette(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Outlines(Value):
-    """The silhouettes of all views of one object; the object lies within the outline of every view."""
+    """The silhouettes of all views of one object, which lies within the outline of every view."""
 
     views: tuple[Silhouette, ...]
 

@@ -79,7 +79,7 @@ class PlaneSearchNumbers:
     square_apart: float = 0.42
     """Cosine with a square plane above which a plane replaces it."""
     violation: float = 0.15
-    """Greatest mean violation of free space, in [0, 1], of a plane that the cloud cannot confirm."""
+    """Greatest mean violation of free space, in [0, 1], of a plane that no point confirms."""
     slope: float = 0.15
     """A plane near the best one of so much less score matches only because it is near."""
     end_score: float = 0.4
@@ -410,7 +410,7 @@ def _best_plane(
 
 
 def _refine(scorer: SymmetryScorer, plane: Mirror) -> Mirror:
-    """Return the plane of the best score nearby, after grid searches, each narrower than the last."""
+    """Return the plane of the best score nearby, after ever narrower grid searches."""
     steps = torch.tensor([-1.0, 0.0, 1.0], dtype=plane.dtype, device="cpu")
     for width in SEARCH.widths:
         angles = SEARCH.angle * width * steps
