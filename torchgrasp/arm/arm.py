@@ -44,6 +44,7 @@ class ArmNumbers:
 
 
 ARM = ArmNumbers()
+TipPoses = Float[Tensor, "3 4 k"]  # of the tip in k postures, in the frame of the base
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,16 +91,14 @@ class Arm(Value):
         return self.obj_from_base @ self.tree.poses(joints)[:, -1] @ self.tip_from_hand
 
     @checked
-    def tip_poses(self, obj_from_hand: Float[Tensor, "k 4 4"]) -> Float[Tensor, "3 4 k"]:
+    def tip_poses(self, obj_from_hand: Float[Tensor, "k 4 4"]) -> TipPoses:
         """Return the poses of the tip, in the base's frame, that put the hand at given poses."""
         base_from_hand = inverse(self.obj_from_base) @ obj_from_hand.to(self.lower)
         base_from_tip = base_from_hand @ inverse(self.tip_from_hand)
         return base_from_tip[:, :3].permute(1, 2, 0).contiguous()
 
     @checked
-    def tip_motion(
-        self, joints: Float[Tensor, "n k"]
-    ) -> tuple[Float[Tensor, "3 4 k"], Float[Tensor, "6 n k"]]:
+    def tip_motion(self, joints: Float[Tensor, "n k"]) -> tuple[TipPoses, Float[Tensor, "6 n k"]]:
         """Return the tip's poses, and its motion by each joint: translation [mm], rotation times
         `LEVER`.
         """
@@ -131,7 +130,7 @@ class Arm(Value):
         return (gap * gap).sum(0) < reach.square()[:, None]
 
 
-def features(tip: Float[Tensor, "3 4 k"]) -> Float[Tensor, "k 12"]:
+def features(tip: TipPoses) -> Float[Tensor, "k 12"]:
     """Return numbers of each pose whose distance is a distance [mm]; a small turn counts as its
     angle times `LEVER`.
     """

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.arm.arm import LEVER, Arm, features
+from torchgrasp.arm.arm import LEVER, Arm, TipPoses, features
 from torchgrasp.foundation.base import flatnonzero, in_chunks
 from torchgrasp.foundation.errors import Status
 from torchgrasp.geometry.optim import SOLVED
@@ -211,7 +211,7 @@ def measure_ease(arm: Arm, joints: Float[Tensor, "n k"]) -> Float[Tensor, "k 2"]
     return torch.stack([room.amin(0), squared.clamp_min(0).sqrt()], 1)
 
 
-def _nearest(arm: Arm, target: Float[Tensor, "3 4 k"], count: int) -> Int[Tensor, "k s"]:
+def _nearest(arm: Arm, target: TipPoses, count: int) -> Int[Tensor, "k s"]:
     """Return the indices of the `count` postures of the library whose tips are nearest to each
     target.
     """
@@ -228,7 +228,7 @@ def _nearest(arm: Arm, target: Float[Tensor, "3 4 k"], count: int) -> Int[Tensor
 def solve_tips(
     arm: Arm,
     start: Float[Tensor, "n k"],
-    target: Float[Tensor, "3 4 k"],
+    target: TipPoses,
     steps: int = REACH.steps,
     solved: float = REACH.solved,
 ) -> tuple[Float[Tensor, "n k"], Bool[Tensor, "k"]]:
@@ -265,7 +265,7 @@ def solve_tips(
     return joints, done
 
 
-def _gap(tip: Float[Tensor, "3 4 k"], target: Float[Tensor, "3 4 k"]) -> Float[Tensor, "6 k"]:
+def _gap(tip: TipPoses, target: TipPoses) -> Float[Tensor, "6 k"]:
     """Return the translation [mm] from tips to targets, and the rotation vector times `LEVER`."""
     now = tip[:, :3]
     wanted = target[:, :3]

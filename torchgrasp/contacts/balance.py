@@ -26,7 +26,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.contacts.form_closure import Vectors, centre_and_radius, solve_closure_lp, wrenches
-from torchgrasp.contacts.problem import contact_pairs, pull_signs
+from torchgrasp.contacts.problem import Tensions, contact_pairs, pull_signs
 from torchgrasp.foundation.base import row_numbers
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.rules import ANY, Positive
@@ -193,7 +193,7 @@ def _search_forces(
     return torch.where(found[:, None, None], forces, torch.nan)
 
 
-def forces_near(points: Vectors, normals: Vectors, weights: Float[Tensor, "b p"]) -> Vectors:
+def forces_near(points: Vectors, normals: Vectors, weights: Tensions) -> Vectors:
     """Return balanced forces of little friction whose shares on the `internal_forces` are near
     given `weights`.
 
@@ -212,10 +212,10 @@ def forces_near(points: Vectors, normals: Vectors, weights: Float[Tensor, "b p"]
 def _improve(
     push: Float[Tensor, "b f p"],
     slide: Float[Tensor, "b n p"],
-    weights: Float[Tensor, "b p"],
+    weights: Tensions,
     rounds: Iterable[Float[Tensor, "p s"]],
     preferred: Float[Tensor, "b f"] | None,
-) -> tuple[Float[Tensor, "b p"], Bool[Tensor, "b"]]:
+) -> tuple[Tensions, Bool[Tensor, "b"]]:
     """Return the weights of least cost in rounds of tried steps, of length 1, and whether they push
     everywhere.
     """

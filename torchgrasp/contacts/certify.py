@@ -21,6 +21,7 @@ from torchgrasp.contacts.form_closure import (
     MIN_MARGIN,
     MIN_RANK_RATIO,
     Vectors,
+    Wrenches,
     rank_ratio,
     residual_of,
     solve_closure_lp,
@@ -87,7 +88,7 @@ class _Proof(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(wrench: Float[Tensor, "b m 6"], flat: Bool[Tensor, "b"]) -> tuple[Tensor, ...]:
+    def forward(wrench: Wrenches, flat: Bool[Tensor, "b"]) -> tuple[Tensor, ...]:
         """Return the fields of the certificate, phi and multipliers; NaN for wrenches that are not
         finite.
         """
@@ -179,7 +180,7 @@ class _Once(torch.autograd.Function):
     jvp = backward
 
 
-def _prove(wrench: Float[Tensor, "b m 6"]) -> tuple[Tensor, ...]:
+def _prove(wrench: Wrenches) -> tuple[Tensor, ...]:
     """Return for m wrenches the margin of force closure, the residual |W phi|, a witness, phi, and
     the multipliers.
     """
@@ -204,9 +205,7 @@ def _prove(wrench: Float[Tensor, "b m 6"]) -> tuple[Tensor, ...]:
     return margin, residual, witness, phi, dual
 
 
-def bound_margin(
-    wrench: Float[Tensor, "b m 6"], witness: Float[Tensor, "b 6"]
-) -> Float[Tensor, "b"]:
+def bound_margin(wrench: Wrenches, witness: Float[Tensor, "b 6"]) -> Float[Tensor, "b"]:
     """Return the upper bound of the closure margin that each direction `witness` in wrench space
     proves, or NaN.
     """

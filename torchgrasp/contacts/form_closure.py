@@ -30,7 +30,9 @@ from torchgrasp.geometry.frames import degenerate, subsets
 from torchgrasp.geometry.linalg import dot, eye_like, matvec, norm, unit
 
 Vectors = Float[Tensor, "b f 3"]  # points or normals of the contacts in every row
-Guess = Float[Tensor, "b m"] | None  # coefficients of the first wrenches of each cone
+Wrenches = Float[Tensor, "b m 6"]  # force, then torque
+Coefficients = Float[Tensor, "b m"]  # of the wrenches
+Guess = Coefficients | None  # coefficients of the first wrenches of each cone
 SEAM = 1e-9  # least length of a tangent, as a share of the triangle's: above rounding
 LOOKS_ON_GPU = 16  # pivots on a GPU between two looks at whether any programme goes on
 # largest |W phi| of balanced coefficients: above rounding in float64, far below any wrench (about
@@ -146,8 +148,8 @@ def rank_ratio(wrench: Float[Tensor, "b f e 6"]) -> Float[Tensor, "b"]:
 
 
 def solve_closure_lp(
-    wrench: Float[Tensor, "b m 6"],
-) -> tuple[Float[Tensor, "b m"], Float[Tensor, "b 6"]]:
+    wrench: Wrenches,
+) -> tuple[Coefficients, Float[Tensor, "b 6"]]:
     """Return for each grasp the coefficients phi that balance its m wrenches with the greatest
     margin, and a witness.
 
@@ -158,7 +160,7 @@ def solve_closure_lp(
     return in_chunks(_solve, wrench, at_once(wrench, GRASPS_PER_CHUNK))  # pyright: ignore[reportReturnType]
 
 
-def _solve(wrench: Float[Tensor, "b m 6"]) -> tuple[Float[Tensor, "b m"], Float[Tensor, "b 6"]]:
+def _solve(wrench: Wrenches) -> tuple[Coefficients, Float[Tensor, "b 6"]]:
     """Return the result of `solve_closure_lp`, from the dual programme in the six unknowns of a
     wrench.
     """
@@ -249,14 +251,14 @@ def closed_exact(
     return _closed_by_proof(points, normals, friction, guess) & ~degenerate(points)
 
 
-def first_balance(points: Vectors, normals: Vectors, friction: float) -> Float[Tensor, "b m"]:
+def first_balance(points: Vectors, normals: Vectors, friction: float) -> Coefficients:
     """Return coefficients that balance wrenches of few cone edges with the greatest margin;
     arbitrary if none do.
     """
     return solve_closure_lp(_first_wrenches(points, normals, friction))[0]
 
 
-def _first_wrenches(points: Vectors, normals: Vectors, friction: float) -> Float[Tensor, "b m 6"]:
+def _first_wrenches(points: Vectors, normals: Vectors, friction: float) -> Wrenches:
     """Return the wrenches of few edges of all friction cones."""
     return wrenches(points, normals, friction, FIRST_EDGES).flatten(1, 2)
 
@@ -343,14 +345,14 @@ def _closed_by_proof(
     return closed
 
 
-def _balances(wrench: Float[Tensor, "b m 6"], phi: Float[Tensor, "b m"]) -> Bool[Tensor, "b"]:
+def _balances(wrench: Wrenches, phi: Coefficients) -> Bool[Tensor, "b"]:
     """Return for each contact set whether the coefficients `phi` are positive and sum its wrenches
     to zero.
     """
     return (residual_of(wrench, phi) <= BALANCED) & (phi.amin(-1) > BALANCED)
 
 
-def residual_of(wrench: Float[Tensor, "b m 6"], phi: Float[Tensor, "b m"]) -> Float[Tensor, "b"]:
+def residual_of(wrench: Wrenches, phi: Coefficients) -> Float[Tensor, "b"]:
     """Return the largest number, by its size, of the sum of wrenches with coefficients `phi`."""
     return (phi[:, None] @ wrench)[:, 0].abs().amax(-1)
 

@@ -38,6 +38,7 @@ CONE_MARGIN = 0.02
 LEAST_SIDE = 0.05
 
 
+Tensions = Float[Tensor, "b p"]  # of all p pairs of contacts in every row
 PerRow = float | Float[Tensor, "b"]
 """A number, or one number for each row."""
 
@@ -138,7 +139,7 @@ def pull_signs(fingertips: int, device: torch.device) -> Float[Tensor, "f p"]:
     return (at == pairs[0]).double() - (at == pairs[1]).double()
 
 
-def split_unknowns(x: Float[Tensor, "b u"]) -> tuple[Vectors, Float[Tensor, "b p"]]:
+def split_unknowns(x: Float[Tensor, "b u"]) -> tuple[Vectors, Tensions]:
     """Split each vector of u unknowns into f contact points (f, 3) and the tensions of all p pairs
     of contacts.
     """
@@ -178,7 +179,7 @@ class Constraints(Batch):
 
 
 def forces_from_tensions(
-    points: Vectors, tension: Float[Tensor, "b p"]
+    points: Vectors, tension: Tensions
 ) -> tuple[Vectors, Float[Tensor, "b p 3"]]:
     """Return the forces at the contacts, and the vector of each pair; a pair pulls by tension times
     vector.
@@ -284,9 +285,7 @@ class ContactProblem:
         first, second = contact_pairs(points.shape[-2], points.device)
         return centres[..., second, :] - centres[..., first, :]
 
-    def constraints(
-        self, points: Vectors, tension: Float[Tensor, "b p"], jet: SurfaceJet
-    ) -> Constraints:
+    def constraints(self, points: Vectors, tension: Tensions, jet: SurfaceJet) -> Constraints:
         """Evaluate all constraints and their Jacobians; `jet` holds signed distance and variance at
         the points.
         """
@@ -355,7 +354,7 @@ class ContactProblem:
         short = spread(self.separation / INSIDE, length) - length
         return short, torch.cat([blocks.flatten(2), by_tension], 2)
 
-    def _cones(self, points: Vectors, tension: Float[Tensor, "b p"], jet: SurfaceJet) -> Bounds:
+    def _cones(self, points: Vectors, tension: Tensions, jet: SurfaceJet) -> Bounds:
         """Return by how much each force is outside its friction cone, as a difference of cosines,
         with derivatives.
         """

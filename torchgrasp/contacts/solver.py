@@ -15,6 +15,7 @@ from torchgrasp.contacts.problem import (
     ContactProblem,
     ShapeLike,
     SurfaceJet,
+    Tensions,
     contact_pairs,
     forces_from_tensions,
     rows_of,
@@ -78,7 +79,7 @@ class State(Batch):
     """
 
     points: Vectors
-    tension: Float[Tensor, "b p"]
+    tension: Tensions
     jet: SurfaceJet
 
 
@@ -202,7 +203,7 @@ def start_state(shape: ShapeLike, points: Vectors) -> State:
     return State(points, equal_tensions(points), triple_jet(shape, points))
 
 
-def equal_tensions(points: Vectors) -> Float[Tensor, "b p"]:
+def equal_tensions(points: Vectors) -> Tensions:
     """Return equal tensions for all pairs of contacts; the force at each contact then points to the
     centroid.
 
@@ -212,7 +213,7 @@ def equal_tensions(points: Vectors) -> Float[Tensor, "b p"]:
     return normalise_tensions(points, points.new_ones(len(points), pairs))
 
 
-def normalise_tensions(points: Vectors, tension: Float[Tensor, "b p"]) -> Float[Tensor, "b p"]:
+def normalise_tensions(points: Vectors, tension: Tensions) -> Tensions:
     """Return the tensions, scaled so that the mean size of the contact forces that they cause is 1."""
     force, _ = forces_from_tensions(points, tension)
     return tension / norm(force).mean(-1, keepdim=True)

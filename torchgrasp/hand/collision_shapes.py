@@ -8,6 +8,7 @@ prism of twelve sides.
 """
 
 import dataclasses
+import functools
 import itertools
 import math
 from collections.abc import Iterable, Mapping
@@ -22,7 +23,7 @@ from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.limits import HAND_SEPARATIONS, HAND_SHAPE_PAIRS
 from torchgrasp.geometry.frames import real, rotation_from_rpy
 from torchgrasp.hand.hand_toml import HandSpec
-from torchgrasp.hand.kinematics import tree_from_urdf
+from torchgrasp.hand.kinematics import Frames, tree_from_urdf
 from torchgrasp.hand.self_collision import SelfCollision
 from torchgrasp.hand.urdf import LinkShape, Mimic, Triple, Urdf
 
@@ -88,10 +89,8 @@ def spheres_from_urdf(urdf: Urdf, spec: HandSpec) -> CollisionSpheres:
             centers, radius = cover(shape, cell, 0.0 if touching else COVER.bulge)
             rows += [(index, center, radius, finger, touching) for center in centers]
     link_index, center, radius, finger, touching = zip(*rows, strict=True)
-    link_index, finger, touching = (
-        torch.tensor(x, device="cpu") for x in (link_index, finger, touching)
-    )
-    return CollisionSpheres(link_index, real(center), real(radius), finger, touching)
+    own = functools.partial(torch.tensor, device="cpu")
+    return CollisionSpheres(own(link_index), real(center), real(radius), own(finger), own(touching))
 
 
 def cover(shape: LinkShape, cell: float, bulge: float) -> tuple[list[Triple], float]:
@@ -104,8 +103,9 @@ def cover(shape: LinkShape, cell: float, bulge: float) -> tuple[list[Triple], fl
     thin = min(size)
     single = [x == thin and x < COVER.single_layer for x in size]
     counts = [1 if one else max(1, round(x / cell)) for x, one in zip(size, single, strict=True)]
-    half = [x / n / 2 for x, n in zip(size, counts, strict=True)]
-    thinnest = min((x / 2 for x, n in zip(size, counts, strict=True) if n == 1), default=math.inf)
+    cells = list(zip(size, counts, strict=True))
+    half = [x / n / 2 for x, n in cells]
+    thinnest = min((x / 2 for x, n in cells if n == 1), default=math.inf)
     radius = min(math.hypot(*half) - COVER.sunk, thinnest + bulge)
     centers = []
     for place in itertools.product(*(range(n) for n in counts)):
@@ -130,9 +130,8 @@ def self_collision_from_urdf(urdf: Urdf, pairs: Iterable[tuple[str, str]] | None
     but neighbours.
     """
     names = [x.name for x in urdf.links]
-    tested = {
-        frozenset(pair) for pair in (itertools.combinations(names, 2) if pairs is None else pairs)
-    }
+    listed = itertools.combinations(names, 2) if pairs is None else pairs
+    tested = {frozenset(pair) for pair in listed}
     if pairs is None:
         tested -= {frozenset((j.parent, j.child)) for j in urdf.joints}
     shapes = [
@@ -149,27 +148,34 @@ def self_collision_from_urdf(urdf: Urdf, pairs: Iterable[tuple[str, str]] | None
         for j in places
         if j >= i and frozenset((names[i], names[j])) in tested
     ]
-    if (many := sum(len(places[i]) * len(places[j]) for i, j in meeting)) > HAND_SHAPE_PAIRS:
+    many = sum(len(places[i]) * len(places[j]) for i, j in meeting)
+    if many > HAND_SHAPE_PAIRS:
         found = f"{many} pairs of shapes to test for collisions"
         raise urdf.wrong(
             found, f"at most {HAND_SHAPE_PAIRS} pairs, where a cylinder counts as six shapes"
         )
-    kinds: tuple[list[tuple[int, int]], ...] = ([], [], [])
-    for one, two in sorted(
+    near = sorted(
         (one, two) for i, j in meeting for one in places[i] for two in places[j] if two > one
-    ):
-        spheres = radius[one] > 0, radius[two] > 0
-        kinds[sum(spheres)].append((two, one) if spheres == (False, True) else (one, two))
+    )
+    boxes = list[tuple[int, int]]()
+    mixed = list[tuple[int, int]]()
+    spheres = list[tuple[int, int]]()
+    for one, two in near:
+        if radius[one] > 0 and radius[two] > 0:
+            spheres.append((one, two))
+        elif radius[two] > 0:
+            mixed.append((two, one))  # the sphere comes first
+        else:
+            (mixed if radius[one] > 0 else boxes).append((one, two))
+    sorted_pairs = torch.tensor([*boxes, *mixed, *spheres], dtype=torch.long, device="cpu")
     return SelfCollision(
         link=torch.tensor(link, device="cpu"),
         rotation=torch.stack(rotation, -1),
         center=real(center),
         half=real(half),
         radius=real(radius),
-        pairs=torch.tensor([*kinds[0], *kinds[1], *kinds[2]], dtype=torch.long, device="cpu").view(
-            -1, 2
-        ),
-        kinds=(len(kinds[0]), len(kinds[1]), len(kinds[2])),
+        pairs=sorted_pairs.view(-1, 2),
+        kinds=(len(boxes), len(mixed), len(spheres)),
     )
 
 
@@ -184,10 +190,10 @@ def _parts(shape: LinkShape) -> list[tuple[Float[Tensor, "3 3"], Triple, Triple,
         return [(rotation, shape.xyz, shape.half, 0.0)]
     boxes = 6
     step = math.pi / boxes
-    corner = (
-        2 * shape.size[0] / (1 + math.cos(step / 2))
-    )  # as far outside the circle as the sides are inside
-    half = (corner * math.cos(step / 2), corner * math.sin(step / 2), shape.size[1] / 2)
+    radius, length = shape.size
+    # as far outside the circle as the sides are inside
+    corner = 2 * radius / (1 + math.cos(step / 2))
+    half = (corner * math.cos(step / 2), corner * math.sin(step / 2), length / 2)
     return [
         (rotation @ rotation_from_rpy((0.0, 0.0, k * step)), shape.xyz, half, 0.0)
         for k in range(boxes)
@@ -205,9 +211,8 @@ def collision_pairs(
     shapes = self_collision_from_urdf(urdf, None)
     if not len(shapes.pairs):
         return []
-    links, owner = torch.unique(
-        shapes.link[shapes.pairs].sort(1).values, dim=0, return_inverse=True
-    )
+    of_pairs = shapes.link[shapes.pairs].sort(1).values
+    links, owner = torch.unique(of_pairs, dim=0, return_inverse=True)
     met, near = torch.zeros(2, len(links), dtype=torch.float64, device=links.device)
     done = 0
     for look in draw_postures(urdf, coupling, n, seed).split(LOOK, 1):
@@ -232,15 +237,11 @@ def collision_pairs(
         shapes = shapes.only(kept)
         owner = owner[kept]
         _limit_near(urdf, shapes, chunks[0], n - done, HAND_SEPARATIONS)
-    return [
-        (tree.link_names[i], tree.link_names[j])
-        for i, j in links[(near > 0) & (met <= ALWAYS * n)].tolist()
-    ]
+    colliding = links[(near > 0) & (met <= ALWAYS * n)].tolist()
+    return [(tree.link_names[i], tree.link_names[j]) for i, j in colliding]
 
 
-def _limit_near(
-    urdf: Urdf, shapes: SelfCollision, frames: Float[Tensor, "3 4 l n"], ahead: int, most: int
-) -> None:
+def _limit_near(urdf: Urdf, shapes: SelfCollision, frames: Frames, ahead: int, most: int) -> None:
     """Raise `HandFileError` if `ahead` postures like those of `frames` need over `most` measured
     separations.
     """
@@ -260,7 +261,8 @@ def draw_postures(
     joints follow.
     """
     movable = {j.name: j for j in urdf.movable}
-    unknown = sorted(({*coupling} | {mimic.source for mimic in coupling.values()}) - set(movable))
+    named = {*coupling} | {mimic.source for mimic in coupling.values()}
+    unknown = sorted(named - set(movable))
     if unknown:
         raise BadArgument("coupling", unknown[0], f"joints of the URDF: {sorted(movable)}")
     share = np.random.default_rng(seed).random((len(movable), n))

@@ -17,6 +17,7 @@ from torchgrasp.foundation.rules import ANY, is_known
 from torchgrasp.geometry.frames import real
 from torchgrasp.hand.hand_toml import HandSpec
 from torchgrasp.hand.kinematics import (
+    Frames,
     KinematicTree,
     map_directions,
     map_points,
@@ -109,9 +110,8 @@ def joints_from_files(spec: HandSpec, urdf: Urdf) -> ActuatedJoints:
     own = [j for f in spec.fingers for j in f.joints]
     leaders = [spec.coupling[j].source for j in own if j in spec.coupling]
     names = tuple(dict.fromkeys([*(j for j in own if j not in spec.coupling), *leaders]))
-    limits = real([[movable[n].lower, movable[n].upper] for n in names]) + real(
-        [spec.limit_margin, -spec.limit_margin]
-    )
+    margin = spec.limit_margin
+    limits = real([[movable[n].lower, movable[n].upper] for n in names]) + real([margin, -margin])
     for name, (low, high) in zip(names, limits.tolist(), strict=True):
         if not low < high:
             found = (
@@ -168,9 +168,8 @@ class Fingertips(Value):
         """The half angle [rad] of each pad's cone: the tip may touch only within this angle of the
         pad's axis.
         """
-        angles = self.radius.new_tensor(
-            [ROUND_PAD, FLAT_PAD], dtype=torch.float32
-        )  # as when results were published
+        # float32, as when results were published
+        angles = self.radius.new_tensor([ROUND_PAD, FLAT_PAD], dtype=torch.float32)
         return torch.where(self.radius > 0, *angles).to(self.radius)
 
     @kept
@@ -181,13 +180,13 @@ class Fingertips(Value):
         tip's carrier link.
         """
         pose = self.carrier_from_tip
-        contact, center = (map_points(pose, x)[..., 0].T for x in (self.contact, self.center))
-        return contact, map_directions(pose, self.normal)[..., 0].T, center
+        contact = map_points(pose, self.contact)[..., 0].T
+        normal = map_directions(pose, self.normal)[..., 0].T
+        center = map_points(pose, self.center)[..., 0].T
+        return contact, normal, center
 
     @checked(gradients=True)
-    def frames(
-        self, values: Float[Tensor, "j n"]
-    ) -> tuple[Float[Tensor, "3 4 l n"], Float[Tensor, "3 4 f n"]]:
+    def frames(self, values: Float[Tensor, "j n"]) -> tuple[Frames, Float[Tensor, "3 4 f n"]]:
         """Return the poses (3 x 4) of all links of `chains` and of the carriers, given all joint
         positions (j, n).
         """

@@ -23,6 +23,8 @@ from torchgrasp.geometry.frames import real, rigid, rotation_from_rpy, skew
 from torchgrasp.geometry.linalg import eye_like
 from torchgrasp.hand.urdf import Urdf
 
+Frames = Float[Tensor, "3 4 l n"]  # poses (3 x 4) of l links in n postures
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class KinematicTree(Value):
@@ -63,7 +65,7 @@ class KinematicTree(Value):
     @checked(gradients=True)
     def frames(
         self, values: Float[Tensor, "j n"], root: Float[Tensor, "3 4 n"] | None = None
-    ) -> Float[Tensor, "3 4 l n"]:
+    ) -> Frames:
         """Return every link's pose (3 x 4) in the root's frame, given the joint positions (j, n) of
         n postures.
 
@@ -170,7 +172,7 @@ class FreeMotion(Value):
             whole = None
         return cls(product.flatten(1), tuple(map(len, local)), moves, whole)
 
-    def place(self, frames: Float[Tensor, "3 4 l n"]) -> tuple[Float[Tensor, "3 p n"], ...]:
+    def place(self, frames: Frames) -> tuple[Float[Tensor, "3 p n"], ...]:
         """Return the coordinates of each group of markers in the root's frame, given all link
         frames.
         """

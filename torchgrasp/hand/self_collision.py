@@ -14,7 +14,7 @@ from torchgrasp.foundation.base import Value, flatnonzero, kept, row_numbers
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Range, is_known
-from torchgrasp.hand.kinematics import map_points
+from torchgrasp.hand.kinematics import Frames, map_points
 
 # largest separation [m] that is needed exactly
 Bound = Annotated[float, Range(-torch.inf, torch.inf, "a number")]
@@ -64,9 +64,7 @@ class SelfCollision(Value):
     kinds: tuple[int, int, int]
 
     @checked(gradients=True)
-    def clearance(
-        self, frames: Float[Tensor, "3 4 l n"], below: Bound = torch.inf
-    ) -> Float[Tensor, " n"]:
+    def clearance(self, frames: Frames, below: Bound = torch.inf) -> Float[Tensor, " n"]:
         """Return each posture's least signed separation [m]: infinite if no pairs are tested,
         inexact above `below`.
         """
@@ -89,7 +87,7 @@ class SelfCollision(Value):
         return least.scatter_reduce(0, chosen.row, apart, "amin")
 
     @checked
-    def separations(self, frames: Float[Tensor, "3 4 l n"], below: Bound) -> Float[Tensor, "p n"]:
+    def separations(self, frames: Frames, below: Bound) -> Float[Tensor, "p n"]:
         """Return each pair's signed separation [m] in each posture; above `below` it is that of
         bounding spheres.
         """
@@ -98,7 +96,7 @@ class SelfCollision(Value):
 
     @checked
     def pushes(
-        self, frames: Float[Tensor, "3 4 l n"], below: Bound
+        self, frames: Frames, below: Bound
     ) -> tuple[Float[Tensor, "p n"], Int[Tensor, "p n"], Float[Tensor, "6 k"]]:
         """Return the pairs' separations [m], the index of each pair's wrench, and the wrenches, one
         in each column.
@@ -126,7 +124,7 @@ class SelfCollision(Value):
         return apart.index_put((pair, row), separation), number, wrench
 
     @checked(gradients=True)
-    def count_near(self, frames: Float[Tensor, "3 4 l n"], below: Bound) -> int:
+    def count_near(self, frames: Frames, below: Bound) -> int:
         """Return the number of pairs, over all postures, whose bounding spheres are nearer than
         `below`.
         """
@@ -145,7 +143,7 @@ class SelfCollision(Value):
         links = self.link[self.pairs].sort(1).values
         return [(one, two) for one, two in torch.unique(links, dim=0).tolist()]
 
-    def _place(self, frames: Float[Tensor, "3 4 l n"]) -> Placed:
+    def _place(self, frames: Frames) -> Placed:
         """Return the shapes' axes and centres in the palm's frame, given the link frames."""
         if frames.shape[2] < self._links:
             raise BadArgument("frames", f"{frames.shape[2]} links", f"at least {self._links} links")
@@ -156,9 +154,7 @@ class SelfCollision(Value):
         axes = axes + links[:, 2, None] * rotation[2]
         return axes, map_points(links, self.center)
 
-    def _near(
-        self, frames: Float[Tensor, "3 4 l n"], below: float
-    ) -> tuple[Placed, Float[Tensor, "p n"], Chosen]:
+    def _near(self, frames: Frames, below: float) -> tuple[Placed, Float[Tensor, "p n"], Chosen]:
         """Return the placed shapes, the separations [m] of the bounding spheres of each pair, and
         those pairs for which it is less than `below`.
         """

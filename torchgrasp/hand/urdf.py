@@ -199,10 +199,8 @@ def _place(origin: Any, element: ET.Element | None) -> tuple[Triple, Triple]:
     """
     if origin is None or element is None:
         return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    (x, y, z), (roll, pitch, yaw) = (
-        origin[:3, 3].tolist(),
-        map(float, element.attrib["rpy"].split()),
-    )
+    x, y, z = origin[:3, 3].tolist()
+    roll, pitch, yaw = map(float, element.attrib["rpy"].split())
     return (x, y, z), (roll, pitch, yaw)
 
 

@@ -35,7 +35,7 @@ from torchgrasp.ik.candidates import (
     GraspProblem,
     check_candidates,
 )
-from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, along
+from torchgrasp.ik.clearance import MILLIMETRE, CollisionWorld, table_clearance
 from torchgrasp.ik.configuration import Configuration
 from torchgrasp.ik.refine import ITERATIONS, grasp_residuals, refine, tip_targets
 from torchgrasp.values.planning import Contacts, Grasps, IKSeeds
@@ -138,7 +138,8 @@ def best_grasps(attempts: Attempts[Grasps]) -> tuple[Grasps, Int[Tensor, "t"]]:
 
     def keys(grasps: Grasps) -> tuple[Tensor, Tensor]:
         failed = ~executable(grasps)
-        return failed.int() + (failed & (grasps.status < Status.OUT_OF_REACH)).int(), -grasps.score
+        bad_contacts = failed & (grasps.status < Status.OUT_OF_REACH)
+        return failed.int() + bad_contacts.int(), -grasps.score
 
     return attempts.best(keys)
 
@@ -254,9 +255,10 @@ class CobylaRun:
         """Return joints, link frames and hand pose, Eq. (24), at COBYLA's `x`, and whether the tips
         span a frame.
         """
+        hand = self.hand
         step = COBYLA.angle * torch.from_numpy(np.array(x, dtype=float)).to(self.points)
-        joints = (self.first + step).clamp(self.hand.lower.to(step), self.hand.upper.to(step))
-        frames = self.hand.tree.frames(self.hand.expand_joints(joints)[:, None].contiguous())
+        joints = (self.first + step).clamp(hand.lower.to(step), hand.upper.to(step))
+        frames = hand.tree.frames(hand.expand_joints(joints)[:, None].contiguous())
         tips = self.tips(frames)
         if bool(degenerate(tips)):
             return joints, frames, torch.eye(4, device="cpu").to(tips), False
@@ -266,9 +268,8 @@ class CobylaRun:
         """Return the contact points [m] of the fingertips in the hand's frame, given the link
         frames.
         """
-        return map_points(frames.index_select(2, self.hand.tips.index), self.hand.tips.contact)[
-            ..., 0
-        ].T
+        tips = self.hand.tips
+        return map_points(frames.index_select(2, tips.index), tips.contact)[..., 0].T
 
     def evaluate(self, x: np.ndarray) -> tuple[float, np.ndarray]:
         """Return the sum of tip distances from contacts [mm], and the clearances less 0.5 mm, which
@@ -278,9 +279,8 @@ class CobylaRun:
         if self.last is None or self.last[0] != key:
             _, frames, pose, framed = self.place(x)
             error = norm(apply(pose, self.tips(frames)) - self.points).sum() / MILLIMETRE
-            room = (torch.stack(self.clearances(frames, pose)) / MILLIMETRE).clamp_max(
-                COBYLA.far
-            ) - 0.5
+            room = torch.stack(self.clearances(frames, pose)) / MILLIMETRE
+            room = room.clamp_max(COBYLA.far) - 0.5
             self.last = key, float(error) if framed else 1e3, room.cpu().numpy()
         return self.last[1:]
 
@@ -293,21 +293,20 @@ class CobylaRun:
         finger and to each fingertip; from the table to the hand; from obstacles to the hand. Those
         that the world lacks are left out.
         """
+        world = self.world
         spheres = self.hand.collision_spheres
-        radius = self.hand.collision_spheres.radius.to(pose)
+        radius = spheres.radius.to(pose)
         local = map_points(frames.index_select(2, spheres.link_index), spheres.center)[..., 0].T
         centres = apply(pose, local)
         found = [self.hand.self_collision.clearance(frames, COBYLA.far * MILLIMETRE)[0]]
-        if self.world.field is not None:
-            outside = self.world.field.query(centres)[0] - radius
+        if world.field is not None:
+            outside = world.field.query(centres)[0] - radius
             found += [outside[group].amin() for group in self.groups]
             found += list((outside[spheres.touching] + TIP_PENETRATION).unbind())
-        if self.world.plane is not None:
-            found.append(
-                (along(centres, self.world.plane) - radius).amin() - self.world.plane.offset
-            )
-        if self.world.obstacles is not None and self.world.guarded:
-            found.append((self.world.obstacles.field.query(centres)[0] - radius).amin())
+        if world.plane is not None:
+            found.append(table_clearance(centres, radius, world.plane))
+        if world.obstacles is not None and world.guarded:
+            found.append((world.obstacles.field.query(centres)[0] - radius).amin())
         return found
 
     def solve(self) -> Configuration:

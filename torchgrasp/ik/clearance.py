@@ -100,9 +100,8 @@ def distance_to(region: Bool[Tensor, "x y z"], spacing: float) -> Float[Tensor, 
     from scipy.ndimage import distance_transform_edt
 
     if not bool(region.any()):
-        return torch.full(
-            region.shape, spacing * sum(region.shape), dtype=torch.float64, device="cpu"
-        )
+        far = spacing * sum(region.shape)
+        return torch.full(region.shape, far, dtype=torch.float64, device="cpu")
     steps = torch.from_numpy(np.asarray(distance_transform_edt(~region.numpy())))
     return (spacing * (steps - 0.5)).clamp_min(0.0)
 
@@ -131,11 +130,9 @@ class CollisionWorld(Value):
     def plane(self) -> Plane | None:
         """The table as a plane, on the device of the distance fields, or None without a table."""
         plane = as_plane(self.table)
-        return (
-            plane
-            if plane is None or not self.fields
-            else settle(plane, self.fields[0].nodes.device)
-        )
+        if plane is None or not self.fields:
+            return plane
+        return settle(plane, self.fields[0].nodes.device)
 
     @property
     def fields(self) -> tuple[DistanceField, ...]:
@@ -171,6 +168,13 @@ def along(points: Float[Tensor, "*b 3"], plane: Plane) -> Float[Tensor, "*b"]:
     return points @ plane.normal.to(points)
 
 
+def table_clearance(
+    centres: Float[Tensor, "*b s 3"], radius: Float[Tensor, "s"], table: Plane
+) -> Float[Tensor, "*b"]:
+    """Return the least clearance [m] of s spheres from a table."""
+    return (along(centres, table) - radius).amin(-1) - table.offset
+
+
 def collision_cost(
     centres: Float[Tensor, "*b s 3"], spheres: CollisionSpheres, world: CollisionWorld
 ) -> Float[Tensor, "*b"]:
@@ -184,12 +188,8 @@ def collision_cost(
         deficit = deficit * ~spheres.touching if field is world.field else deficit
         cost = cost + deficit.clamp_min(0).square().sum(-1)
     if world.plane is not None:
-        deficit = (
-            world.plane.offset
-            + CLEARANCE * ~spheres.touching
-            + radius
-            - along(centres, world.plane)
-        )
+        wanted = world.plane.offset + CLEARANCE * ~spheres.touching + radius
+        deficit = wanted - along(centres, world.plane)
         cost = cost + deficit.clamp_min(0).square().sum(-1)
     return cost / MILLIMETRE**2
 
@@ -203,14 +203,12 @@ def clearance_rows(
     pairs = spatial.hand.self_collision
     moves = spatial.hand.motion.moves
     separation, number, wrench = pairs.pushes(spatial.obj_from_link, SELF_CLEARANCE)
-    separation, index = separation.T.topk(
-        min(HINGES, len(pairs.pairs)), dim=1, largest=False, sorted=False
-    )
+    count = min(HINGES, len(pairs.pairs))
+    separation, index = separation.T.topk(count, dim=1, largest=False, sorted=False)
     wrench = wrench.T[number.T.gather(1, index)] / -MILLIMETRE
     first, second = moves[pairs.link[pairs.pairs]].to(wrench).unbind(1)
-    between = ResidualRows(
-        (SELF_CLEARANCE - separation).clamp_min(0) / MILLIMETRE, wrench, (second - first)[index]
-    )
+    lack = (SELF_CLEARANCE - separation).clamp_min(0) / MILLIMETRE
+    between = ResidualRows(lack, wrench, (second - first)[index])
     return [between, *sphere_rows(spatial, world, tips_touch)]
 
 
@@ -232,22 +230,19 @@ def sphere_rows(
         found.append(coarse)
     if world.plane is not None:
         height = along(centres, world.plane) - radius - world.plane.offset
-        found.append(
-            height + CLEARANCE * spheres.touching if tips_touch else height
-        )  # contacts tell how low tips are
+        # contacts tell how low tips are
+        found.append(height + CLEARANCE * spheres.touching if tips_touch else height)
     if not found:
         return []
-    coarse, index = torch.stack(found, 1).topk(
-        min(HINGES, len(radius)), dim=2, largest=False, sorted=False
-    )
+    count = min(HINGES, len(radius))
+    coarse, index = torch.stack(found, 1).topk(count, dim=2, largest=False, sorted=False)
     points = centres[row_numbers(centres)[:, None, None], index]
     clearance = []
     direction = []
     for k, field in enumerate(world.fields):
         distance, gradient = field.query(points[:, k])
-        clearance.append(
-            distance - radius[index[:, k]] + torch.where(torch.isinf(coarse[:, k]), 1.0, 0.0)
-        )
+        left_out = torch.where(torch.isinf(coarse[:, k]), 1.0, 0.0)
+        clearance.append(distance - radius[index[:, k]] + left_out)
         direction.append(gradient)
     if world.plane is not None:
         clearance.append(coarse[:, -1])
@@ -255,7 +250,8 @@ def sphere_rows(
     clearance = torch.cat(clearance, 1)
     direction = torch.cat(direction, 1)
     direction = direction * ((clearance < CLEARANCE).to(centres) / -MILLIMETRE)[..., None]
-    wrench = torch.cat([direction, torch.linalg.cross(points.flatten(1, 2), direction)], -1)
+    torque = torch.linalg.cross(points.flatten(1, 2), direction)
+    wrench = torch.cat([direction, torque], -1)
     moves = motion.moves[spheres.link_index].to(centres)[index.flatten(1)]
     return [ResidualRows((CLEARANCE - clearance).clamp_min(0) / MILLIMETRE, wrench, moves)]
 
@@ -278,4 +274,4 @@ def link_clearance(
     links = clearance[:, ~spheres.touching].amin(1) if tips_touch else clearance.amin(1)
     if world.plane is None:
         return [links, tips, torch.full_like(tips, math.inf)]
-    return [links, tips, (along(centres, world.plane) - radius).amin(1) - world.plane.offset]
+    return [links, tips, table_clearance(centres, radius, world.plane)]

@@ -17,6 +17,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Poses
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
+from torchgrasp.geometry.linalg import matvec
 from torchgrasp.geometry.optim import Residuals
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.kinematics import map_points
@@ -46,9 +47,11 @@ class Configuration(Batch):
             )
         rotation = self.obj_from_hand[:, :3, :3]
         position = self.obj_from_hand[:, :3, 3]
-        joints = (self.joints + step[:, 6:]).clamp(hand.lower.to(position), hand.upper.to(position))
-        position = position + (rotation @ step[:, :3, None])[..., 0]
-        return Configuration(joints, rigid(rotation @ rotation_from_vector(step[:, 3:6]), position))
+        joints = self.joints + step[:, 6:]
+        joints = joints.clamp(hand.lower.to(position), hand.upper.to(position))
+        position = position + matvec(rotation, step[:, :3])
+        turned = rotation @ rotation_from_vector(step[:, 3:6])
+        return Configuration(joints, rigid(turned, position))
 
 
 class ResidualRows(NamedTuple):

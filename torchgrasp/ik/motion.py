@@ -15,7 +15,7 @@ from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import across, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.hand.hand import Hand
-from torchgrasp.ik.clearance import CollisionWorld, Obstacles, along
+from torchgrasp.ik.clearance import CollisionWorld, Obstacles, along, table_clearance
 from torchgrasp.ik.configuration import Configuration, SpatialJacobian
 from torchgrasp.values.planning import Grasps
 
@@ -65,9 +65,8 @@ def find_approach(
     centres = SpatialJacobian.at(hand, opened).sphere_centres
     radius = spheres.radius.to(centres)
     candidates = approach_directions(hand, opened, world.plane)
-    coarse = torch.stack(
-        [_clearance(centres, radius, d, world, exact=False) for d in candidates.unbind(1)], 1
-    )
+    tried = [_clearance(centres, radius, d, world, exact=False) for d in candidates.unbind(1)]
+    coarse = torch.stack(tried, 1)
     chosen = candidates[:, 0].clone()
     clearance = torch.full_like(coarse[:, 0], -math.inf)
     for choice in torch.argsort(coarse, dim=1, descending=True, stable=True).unbind(1):
@@ -106,10 +105,10 @@ def opened_pose(
         return obj_from_hand
     gap = MOTION.gap
     centres = apply(obj_from_hand, hand.sphere_centres(joints))
-    lowest = (
-        along(centres, table) - table.offset - hand.collision_spheres.radius.to(centres)
-    ).amin(1)
-    rise = torch.where((lowest < 0) & (gap - lowest <= MOTION.most), gap - lowest, 0.0)
+    radius = hand.collision_spheres.radius.to(centres)
+    lowest = (along(centres, table) - table.offset - radius).amin(1)
+    needed = gap - lowest
+    rise = torch.where((lowest < 0) & (needed <= MOTION.most), needed, 0.0)
     pose = obj_from_hand.clone()
     pose[:, :3, 3] += rise[:, None] * table.normal.to(pose)
     return pose
@@ -128,7 +127,8 @@ def approach_directions(
     angle = number * (2 * math.pi / MOTION.tilted)
     sideways = torch.cos(angle) * first + torch.sin(angle) * second
     tilted = math.cos(MOTION.tilt) * axis + math.sin(MOTION.tilt) * sideways  # (k, 3)
-    directions = rotate(pose, torch.cat([axis[None], tilted]).expand(len(pose), -1, -1))
+    every = torch.cat([axis[None], tilted])
+    directions = rotate(pose, every.expand(len(pose), -1, -1))
     if table is None:
         return directions
     # Minus alone would make negative zeros.
@@ -147,10 +147,7 @@ def _clearance(
     nearest grid nodes.
     """
     steps = FINE_STEPS if exact else COARSE_STEPS
-    back = torch.arange(1, steps + 1, dtype=centres.dtype, device=centres.device) * (
-        APPROACH_DISTANCE / steps
-    )
-    path = (centres[:, None] - back[:, None, None] * direction[:, None, None]).flatten(1, 2)
+    path = _approach(centres, direction, steps).flatten(1, 2)
     radius = radius.repeat(steps)
     least = torch.full_like(path[:, 0, 0], math.inf)
     for field in world.fields:
@@ -159,17 +156,23 @@ def _clearance(
         # Only spheres that may have the least clearance are interpolated.
         if exact:
             near = field.query(path[row_numbers(path), first])[0] - radius[first]
-            row, sphere = torch.nonzero(
-                coarse < near[:, None] + MOTION.nodes * spread(field.spacing, coarse), as_tuple=True
-            )
+            within = near[:, None] + MOTION.nodes * spread(field.spacing, coarse)
+            row, sphere = torch.nonzero(coarse < within, as_tuple=True)
             closer = field.rows(row).query(path[row, sphere])[0] - radius[sphere]
             near = near.scatter_reduce(0, row, closer, "amin")
         least = torch.minimum(least, near)
     if world.plane is not None:
-        least = torch.minimum(
-            least, (along(path, world.plane) - radius).amin(1) - world.plane.offset
-        )
+        least = torch.minimum(least, table_clearance(path, radius, world.plane))
     return least
+
+
+def _approach(
+    centres: Spheres, direction: Float[Tensor, "g 3"], steps: int
+) -> Float[Tensor, "g k s 3"]:
+    """Return the centres [m] of a hand's spheres at k equal steps back along its approach."""
+    step = torch.arange(1, steps + 1, device=centres.device).to(centres)
+    back = step * (APPROACH_DISTANCE / steps)
+    return centres[:, None] - back[:, None, None] * direction[:, None, None]
 
 
 def motion_clearance(
@@ -181,11 +184,8 @@ def motion_clearance(
     assert world.obstacles is not None
     up = UP if world.plane is None else world.plane.normal
     centres = torch.cat([_closing(hand, opened, closed), _lift(hand, closed, up)], 1)
-    return (
-        (world.obstacles.field.query(centres)[0] - hand.collision_spheres.radius.to(centres))
-        .flatten(1)
-        .amin(1)
-    )
+    gap = world.obstacles.field.query(centres)[0] - hand.collision_spheres.radius.to(centres)
+    return gap.flatten(1).amin(1)
 
 
 @checked
@@ -202,12 +202,7 @@ def collision_probability(
     closed = Configuration(grasps.joints, grasps.obj_from_hand)
     raised = opened_pose(hand, grasps.pregrasp, grasps.obj_from_hand, table)
     opened = Configuration(grasps.pregrasp, raised)
-    back = torch.arange(1, COARSE_STEPS + 1, device="cpu").to(raised) * (
-        APPROACH_DISTANCE / COARSE_STEPS
-    )
-    approach = (
-        _centres(hand, opened)[:, None] - back[:, None, None] * grasps.approach[:, None, None]
-    )
+    approach = _approach(_centres(hand, opened), grasps.approach, COARSE_STEPS)
     centres = torch.cat([approach, _closing(hand, opened, closed), _lift(hand, closed, UP)], 1)
     radius = hand.collision_spheres.radius.to(centres).repeat(centres.shape[1])
     return obstacles.likelihood(centres.flatten(1, 2), radius)
@@ -218,9 +213,9 @@ def lift_clearance(vertices: Float[Tensor, "v 3"], obstacles: Obstacles) -> floa
     """Return the least clearance [m] of the lifted object from obstacles; far below 0 if an
     obstacle lies on it.
     """
-    return (
-        float(obstacles.field.query(_lifted(vertices, UP))[0].min()) if len(vertices) else math.inf
-    )
+    if not len(vertices):
+        return math.inf
+    return float(obstacles.field.query(_lifted(vertices, UP))[0].min())
 
 
 def _closing(hand: Hand, opened: Configuration, closed: Configuration) -> Float[Tensor, "g k s 3"]:
@@ -250,7 +245,8 @@ def _lifted(points: Float[Tensor, "*b 3"], up: Float[Tensor, "3"]) -> Float[Tens
     """Return points [m] at k heights of a lift along `up`."""
     count = MOTION.lift_steps
     height = torch.arange(1, count + 1, device="cpu").to(points) * (MOTION.lift / count)
-    return points + (height[:, None] * up.to(points)).reshape(-1, *[1] * (points.ndim - 1), 3)
+    rise = height[:, None] * up.to(points)
+    return points + rise.reshape(-1, *[1] * (points.ndim - 1), 3)
 
 
 def _centres(hand: Hand, configuration: Configuration) -> Float[Tensor, "g s 3"]:

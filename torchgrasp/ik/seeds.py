@@ -126,7 +126,7 @@ class PostureLibrary(Value):
         )
         joints = joints[~degenerate(triangle_of(hand.tip_centres(joints)))]
         centres = hand.tip_centres(joints)
-        (_, pads) = hand.fingertips(joints)
+        _, pads = hand.fingertips(joints)
         vf_from_hand = inverse(tips_frame(centres))
         centres = apply(vf_from_hand, centres)
         pads = rotate(vf_from_hand, pads)
@@ -146,8 +146,8 @@ def triangle_of(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 3 3"]:
     """
     if points.shape[-2] == 3:
         return points
-    between = points[..., 1:-1, :].mean(-2, keepdim=True)
-    return torch.cat([points[..., :1, :], between, points[..., -1:, :]], -2)
+    first, middle, last = points.split([1, points.shape[-2] - 2, 1], -2)
+    return torch.cat([first, middle.mean(-2, keepdim=True), last], -2)
 
 
 def tips_frame(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 4 4"]:
@@ -163,9 +163,8 @@ def feature(
     centres: Float[Tensor, "*b f 3"], pads: Float[Tensor, "*b f 3"]
 ) -> Float[Tensor, "*b d"]:
     """Return the feature vector of a posture: tip centres and pad axes, each divided by its scale."""
-    return (
-        torch.cat([centres / SEEDS.length_scale, pads / SEEDS.cosine_scale], -1).flatten(-2).float()
-    )
+    scaled = torch.cat([centres / SEEDS.length_scale, pads / SEEDS.cosine_scale], -1)
+    return scaled.flatten(-2).float()
 
 
 @checked
@@ -237,9 +236,8 @@ def nearest_postures(
             for some in (slice(n_seeds), slice(n_seeds, None)):
                 short = flatnonzero(reached.sum(1) < n_seeds)
                 poses = obj_from_hand[short[:, None], best[short, some]]
-                reached[short, some] = ask_reachable(reachable, poses.flatten(0, 1)).reshape(
-                    poses.shape[:2]
-                )
+                answers = ask_reachable(reachable, poses.flatten(0, 1))
+                reached[short, some] = answers.reshape(poses.shape[:2])
             kept = reached & (reached.cumsum(1) <= n_seeds)
             b = at.expand_as(best)[kept]
             best = best[kept]
@@ -272,7 +270,8 @@ def _energies(wanted: Wanted, given: Given, framed: Bool[Tensor, "r p"]) -> Floa
     """Return half the squared distance between the features of contacts and postures; infinite
     where not `framed`.
     """
-    energy = wanted.square().sum(-1)[..., None] / 2 + given.square().sum(-1) / 2 - wanted @ given.T
+    squares = wanted.square().sum(-1)[..., None] / 2 + given.square().sum(-1) / 2
+    energy = squares - wanted @ given.T
     return torch.where(framed[..., None], energy, torch.inf)
 
 
@@ -327,8 +326,10 @@ def _query(
     q = code.q[row, assignment]
     joints = mixture.joints(q)[:, None]
     if n_seeds > 1:
-        joints = torch.cat([joints, mixture.modes(q, n_seeds - 1)[0]], dim=1)
-    joints = joints.clamp(hand.lower.to(joints), hand.upper.to(joints)).flatten(0, 1)
+        modes, _ = mixture.modes(q, n_seeds - 1)
+        joints = torch.cat([joints, modes], dim=1)
+    joints = joints.clamp(hand.lower.to(joints), hand.upper.to(joints))
+    joints = joints.flatten(0, 1)
     row = row.repeat_interleave(n_seeds)
     assignment = assignment.repeat_interleave(n_seeds)
     tips, tip_normals = hand.fingertips(joints)

@@ -46,11 +46,8 @@ def lever_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "*b 3"]) -> 
     if points.shape[1] > 3:
         triples = subsets(points.shape[1], 3, points.device)
         each = center if center.ndim == 1 else center.repeat_interleave(len(triples), 0)
-        return (
-            lever_arm(points[:, triples].flatten(0, 1), each)
-            .unflatten(0, (len(points), len(triples)))
-            .amin(1)
-        )
+        arms = lever_arm(points[:, triples].flatten(0, 1), each)
+        return arms.unflatten(0, (len(points), len(triples))).amin(1)
     sides = points.roll(-1, dims=1) - points
     longest = norm(sides).argmax(1)[:, None, None].expand(-1, 1, 3)
     along = unit(sides.gather(1, longest)[:, 0])
@@ -105,7 +102,8 @@ def greatest_force(
     torque; NaN for NaN.
     """
     jacobian, pushes, effort = _levers(hand, grasps, grasps.contacts, forces)
-    return (effort / torch.einsum("gfih,gfi->gh", jacobian, pushes).abs()).amin(1)
+    torque = torch.einsum("gfih,gfi->gh", jacobian, pushes)
+    return (effort / torque.abs()).amin(1)
 
 
 def strength_of(
@@ -115,7 +113,8 @@ def strength_of(
     `most` [N].
     """
     jacobian, pushes, effort = _levers(hand, held, contacts, -contacts.normals)
-    alone = (effort / torch.einsum("gfih,gfi->gfh", jacobian, pushes).abs()).amin(2)
+    torque = torch.einsum("gfih,gfi->gfh", jacobian, pushes)
+    alone = (effort / torque.abs()).amin(2)
     return alone.nan_to_num(0.0).clamp(0.0, most)  # a contact that is unknown has no strength
 
 

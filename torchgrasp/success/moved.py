@@ -72,10 +72,8 @@ def touch_moved(
     sizes = (numbers * MOVED.turn % 1.0) ** (1 / 3)  # even in the ball
     moved = MOVED.radius * (sizes[:, None] * fibonacci_sphere(count)).to(forces)
     pose = grasps.obj_from_hand.to(forces)
-    before, after = (
-        apply(pose, hand.tip_centres(q).to(forces)) for q in (grasps.pregrasp, grasps.joints)
-    )
-    path = after - before
+    before = apply(pose, hand.tip_centres(grasps.pregrasp).to(forces))
+    path = apply(pose, hand.tip_centres(grasps.joints).to(forces)) - before
     way = path / norm(path, keepdim=True).clamp_min(MOVED.still)
     start = before - rotate(pose, moved[None]).transpose(0, 1)[:, :, None]  # (d, g, f, 3)
     points, normals, found = trace(field, start, way.expand_as(start), hand.tips.radius.to(forces))

@@ -26,7 +26,8 @@ def is_covered(features: Float[Tensor, "g k"]) -> Bool[Tensor, "g"]:
     """
     rows = [FEATURES.index(name) for name in DOMAIN]
     least, most = load_success_model(features.device).range[rows].T
-    return ((features[:, rows] >= least) & (features[:, rows] <= most)).all(1)
+    found = features[:, rows]
+    return ((found >= least) & (found <= most)).all(1)
 
 
 def largest_known() -> float:
@@ -45,11 +46,8 @@ def grade(grasps: Grasps, log_odds: Float[Tensor, "k"], known: Bool[Tensor, "k"]
     score[good] = log_odds.to(score)
     interval = torch.zeros_like(score)[:, None].repeat(1, 2)
     supported = torch.ones_like(score, dtype=torch.bool)
-    bounds = (
-        load_success_model(log_odds.device)
-        .interval(log_odds)
-        .where(known[:, None], log_odds.new_tensor([0.0, 1.0]))
-    )
+    bounds = load_success_model(log_odds.device).interval(log_odds)
+    bounds = bounds.where(known[:, None], log_odds.new_tensor([0.0, 1.0]))
     interval[good] = bounds.to(score)
     supported[good] = known
     return dataclasses.replace(grasps, score=score, interval=interval, known=supported)
