@@ -64,17 +64,14 @@ class CampaignSpec(Value):
         bad licence.
         """
         trials = self.trials
-        if trials.planned or trials.complete or trials.fingers is not None:
-            found = next(
-                name for name in ("planned", "complete", "fingers") if getattr(trials, name)
-            )
-            raise BadArgument(
-                "trials", f"{found} = {getattr(trials, found)!r}", "views that are planned on anew"
-            )
+        for name in ("planned", "complete", "fingers"):
+            value = getattr(trials, name)
+            if value not in (False, None):
+                found = f"{name} = {value!r}"
+                raise BadArgument("trials", found, "views that are planned on anew")
         if not self.licence.isprintable() or not 0 < len(self.licence) <= LONGEST_LICENCE:
-            raise BadArgument(
-                "licence", repr(self.licence), f"a line of 1 to {LONGEST_LICENCE} letters"
-            )
+            allowed = f"a line of 1 to {LONGEST_LICENCE} letters"
+            raise BadArgument("licence", repr(self.licence), allowed)
 
     @property
     def test(self) -> Protocol:
@@ -134,8 +131,10 @@ def run_campaign(
     place = Path(objects).resolve()
     test = spec.test
     rows = _list_jobs(place, spec)
-    of_hand = {"name": hand.name, "option": hand.source.option, "sha256": hand.source.sha256}
-    of_hand |= {
+    of_hand = {
+        "name": hand.name,
+        "option": hand.source.option,
+        "sha256": hand.source.sha256,
         "joint_names": ", ".join(hand.joint_names),
         "finger_names": ", ".join(hand.finger_names),
     }
@@ -165,23 +164,14 @@ def run_campaign(
         size = spec.jobs_in_shard
         meta = campaign.meta
         for k, own in itertools.groupby(numbers, lambda j: j // size):
-            shard = [
-                j
-                for j in range(k * size, min((k + 1) * size, len(rows)))
-                if rows[j].status is Status.OK
-            ]
-            plan = OnGpu(
-                plan_jobs, (meta, [views[j] for j in shard], test, spec.trials, spec.device)
-            )
-            for j in own:  # a shard has one plan, whichever of its jobs are left
-                yield (
-                    views[j],
-                    test,
-                    spec.trials,
-                    meta,
-                    None if spec.device == "cpu" else plan,
-                    shard.index(j),
-                )
+            jobs = range(k * size, min((k + 1) * size, len(rows)))
+            shard = [j for j in jobs if rows[j].status is Status.OK]
+            plan = None
+            if spec.device != "cpu":  # a shard has one plan, whichever of its jobs are left
+                of_shard = [views[j] for j in shard]
+                plan = OnGpu(plan_jobs, (meta, of_shard, test, spec.trials, spec.device))
+            for j in own:
+                yield views[j], test, spec.trials, meta, plan, shard.index(j)
 
     return carry_out(campaign, Path(folder), work, observer)
 
@@ -196,11 +186,9 @@ def _list_jobs(objects: Path, spec: CampaignSpec) -> tuple[JobRow, ...]:
             rows.append(JobRow(short(ascii(name)), "", Status.BAD_OBJECT, short(str(entry))))
         else:
             of_object = JobRow(name, "", family=entry.family, group=entry.group)
-            rows += [
-                of_object._replace(view=view) for view in entry.list_views(most=spec.trials.views)
-            ]
-            if not entry.views:
-                rows.append(
-                    of_object._replace(status=Status.BAD_OBJECT, note="the manifest names no view")
-                )
+            names = entry.list_views(most=spec.trials.views)
+            rows += [of_object._replace(view=view) for view in names]
+            if not names:
+                note = "the manifest names no view"
+                rows.append(of_object._replace(status=Status.BAD_OBJECT, note=note))
     return tuple(rows)

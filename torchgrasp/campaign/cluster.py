@@ -42,9 +42,8 @@ def versions() -> dict[str, str]:
     """Return the installed versions of `PACKAGES`; "none" for a package that is not installed."""
     from torchgrasp import __version__
 
-    found = dict.fromkeys(PACKAGES, "none") | {
-        "torchgrasp": __version__
-    }  # of the source; an installation may be older
+    found: dict[str, str] = dict.fromkeys(PACKAGES, "none")
+    found["torchgrasp"] = __version__  # of the source; an installation may be older
     for name in PACKAGES[1:]:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             found[name] = importlib.metadata.version(name)
@@ -55,7 +54,8 @@ def check_versions(meta: dict[str, str]) -> None:
     """Raise `BadArgument` unless this machine has the software of the machine that began the
     campaign.
     """
-    if (here := json.dumps(versions())) != meta["versions"]:
+    here = json.dumps(versions())
+    if here != meta["versions"]:
         raise BadArgument("workers", f"one with {here}", f"workers with {meta['versions']}")
 
 
@@ -93,17 +93,16 @@ def run_job(
     check_versions(meta)
     hand = view.load_hand()
     if hand.source.sha256 != view.hand.sha256:
-        raise BadArgument(
-            "hand", f"{view.hand.urdf_path} with other files", "the same hand on every machine"
-        )
+        found = f"{view.hand.urdf_path} with other files"
+        raise BadArgument("hand", found, "the same hand on every machine")
+    plan = plans[place] if isinstance(plans, list) else None
     try:
-        shard = _work(view, hand, protocol, spec, plans[place] if isinstance(plans, list) else None)
+        shard = _work(view, hand, protocol, spec, plan)
     except (MissingExtra, OutputError, MemoryError, OSError):
         raise
     except Exception as error:  # of the library: a week of other jobs shall not end with it
-        row = JobRow(
-            view.object, view.view, Status.BROKEN, short(f"{type(error).__name__}: {error}")
-        )
+        note = short(f"{type(error).__name__}: {error}")
+        row = JobRow(view.object, view.view, Status.BROKEN, note)
         shard = empty_shard(row, hand, protocol.noise.draws)
     return pack_shard(shard, meta)
 
@@ -115,46 +114,37 @@ def _work(
     simulation.
     """
     score, cloud, found = plan_view(view, protocol, spec, plan)
-    row = JobRow(
-        view.object, view.view, score.refusal, short(score.note), score.family, score.group
-    )
+    note = short(score.note)
+    row = JobRow(view.object, view.view, score.refusal, note, score.family, score.group)
+    draws = protocol.noise.draws
     if cloud is None or found is None:
-        return empty_shard(row, hand, protocol.noise.draws)
+        return empty_shard(row, hand, draws)
     ranks = choose_rows(len(found), spec.grasps, spec.ranks)
-    grasps = found[ranks]
-    draws = range(protocol.noise.draws)
-    tries = [
-        try_grasp(view, found[rank], protocol, spec, (rank, draw))
-        for rank in ranks
-        for draw in draws
-    ]
-    passed = torch.tensor([x.passed for x in tries], dtype=torch.bool).reshape(
-        len(ranks), len(draws)
+    passed = torch.zeros(len(ranks), draws, dtype=torch.bool)
+    outcome = torch.zeros(passed.shape, dtype=torch.int64)
+    for k, rank in enumerate(ranks):
+        for draw in range(draws):
+            tried = try_grasp(view, found[rank], protocol, spec, (rank, draw))
+            passed[k, draw] = tried.passed
+            outcome[k, draw] = int(tried.status)
+    row = row._replace(
+        executable=len(found),
+        points=len(cloud),
+        grasps=len(ranks),
+        passed=int(passed.sum()),
+        meta=found.meta,
     )
-    outcome = torch.tensor([int(x.status) for x in tries], dtype=torch.int64).reshape(passed.shape)
-    eye = (
-        torch.zeros(3, dtype=torch.float64) if cloud.viewpoint is None else cloud.viewpoint.double()
-    )
-    counts = {
-        "executable": len(found),
-        "points": len(cloud),
-        "grasps": len(ranks),
-        "passed": int(passed.sum()),
-    }
-    row = row._replace(**counts, meta=found.meta)
-    return Shard((row,), Records(cloud.points.double(), eye[None], grasps, passed, outcome))
+    eye = torch.zeros(3) if cloud.viewpoint is None else cloud.viewpoint
+    points = cloud.points.double()
+    return Shard((row,), Records(points, eye.double()[None], found[ranks], passed, outcome))
 
 
 def empty_shard(row: JobRow, hand: Hand, draws: int) -> Shard:
     """Return the data of a job that has neither a cloud nor grasps, as a shard."""
     points = torch.zeros(0, 3, dtype=torch.float64)
+    eye = torch.zeros(1, 3, dtype=torch.float64)
     tried = torch.zeros(0, draws, dtype=torch.int64)
-    return Shard(
-        (row,),
-        Records(
-            points, torch.zeros(1, 3, dtype=torch.float64), no_grasps(hand), tried.bool(), tried
-        ),
-    )
+    return Shard((row,), Records(points, eye, no_grasps(hand), tried.bool(), tried))
 
 
 def run_on_cluster(
@@ -194,9 +184,8 @@ def run_on_cluster(
                     call = _bounded, new.function, limit, f"{run}-plan-{number}", *new.task
                     plan = new, client.submit(*call, pure=False, priority=1, resources={"GPU": 1})
                 given = (plan[1] if isinstance(x, OnGpu) else x for x in task)
-                future = client.submit(
-                    _bounded, function, limit, f"{run}-{number}", *given, pure=False
-                )
+                call = _bounded, function, limit, f"{run}-{number}", *given
+                future = client.submit(*call, pure=False)
                 futures[future] = number
                 ended.add(future)
 
@@ -211,9 +200,8 @@ def run_on_cluster(
                     result = Status.TIMED_OUT if late else Status.WORKER_DIED
                 except CancelledError as error:
                     found = f"{address!r}, which ended during the work"
-                    raise BadArgument(
-                        "workers", found, "a scheduler that goes on; the same call continues"
-                    ) from error
+                    allowed = "a scheduler that goes on; the same call continues"
+                    raise BadArgument("workers", found, allowed) from error
                 del future  # results that were yielded leave the memory
                 submit(1)
                 yield number, result

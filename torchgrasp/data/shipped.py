@@ -14,19 +14,13 @@ from torchgrasp.scene.file import read_scene
 from torchgrasp.scene.scene import Scene
 from torchgrasp.values.planning import Grasps, PointCloud
 
-DATA = (
-    Path(__file__).parent / "assets"
-)  # `<name>/mesh.ply`, `<name>/parts.npz` and `<name>/view.ply`
+# `<name>/mesh.ply`, `<name>/parts.npz` and `<name>/view.ply`
+DATA = Path(__file__).parent / "assets"
 SCENE = DATA / "scene.npz"  # a depth image of the objects on a table, with labels, camera and table
-MASSES = {
-    "cylinder": 0.15,
-    "jug": 0.20,
-    "rabbit": 0.10,
-    "spray": 0.15,
-}  # masses [kg] of the objects
-GRASPED = {
-    (name, hand) for name in ("cylinder", "jug") for hand in ("allegro", "barrett")
-}  # of the shipped grasps
+# masses [kg] of the objects
+MASSES = {"cylinder": 0.15, "jug": 0.20, "rabbit": 0.10, "spray": 0.15}
+# objects and hands of the shipped grasps
+GRASPED = {(name, hand) for name in ("cylinder", "jug") for hand in ("allegro", "barrett")}
 
 
 @checked

@@ -18,7 +18,7 @@ from torchgrasp.evaluation.trial import GraspTrial
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import Status
 from torchgrasp.foundation.lazy import trimesh
-from torchgrasp.geometry.frames import apply, inverse, rotation_angle
+from torchgrasp.geometry.frames import apply, inverse, real, rotation_angle
 from torchgrasp.geometry.linalg import norm
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.values.closing import ClosureResult
@@ -61,7 +61,7 @@ def _sizes(
     """
     mesh = read_mesh(trial.truth.mesh)
     truth = trial.truth
-    up = torch.tensor([0.0, 0.0, 1.0]).double()
+    up = real([0.0, 0.0, 1.0])
     if truth.table is not None:
         up = truth.table.normal.double()
     centre = torch.tensor(mesh.center_mass.tolist()).double()

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.geometry.frames import inverse, rigid
-from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.linalg import norm, unit
 from torchgrasp.geometry.plane import FINE, Plane, to_upright
 from torchgrasp.values.planning import Grasps
 
@@ -25,7 +25,7 @@ def world_frame(table: Plane, obj_from_hand: Float[Tensor, "4 4"]) -> Float[Tens
     z = unit(table.normal.double())
     origin = obj_from_hand[:3, 3]
     level = [axis - (axis @ z) * z for axis in obj_from_hand[:3, :2].unbind(-1)]
-    x = unit(level[0] if torch.linalg.vector_norm(level[0]) > 0.5 else level[1])
+    x = unit(level[0] if norm(level[0]) > 0.5 else level[1])
     axes = torch.stack([x, torch.linalg.cross(z, x), z], -1)
     return rigid(axes, origin - table.height(origin) * z)
 

@@ -17,7 +17,7 @@ from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.foundation.rules import Count, Length, Pose, Range, Seed
-from torchgrasp.geometry.frames import inverse, rigid, rotation_from_vector
+from torchgrasp.geometry.frames import inverse, real, rigid, rotation_from_vector
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.success.task import GraspTask
 from torchgrasp.values.planning import Grasps
@@ -239,7 +239,7 @@ def draw_object_poses(
     pivot = pivot.to("cpu", torch.float64)
     generator = torch.Generator().manual_seed(seed)
     drawn = 2 * torch.rand(count, 3, generator=generator, dtype=torch.float64) - 1
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    up = real([0.0, 0.0, 1.0])
     rotation = rotation_from_vector(noise.rotation * drawn[:, :1] * up)
     shift = noise.translation * drawn[:, [1, 2, 2]] * (1 - up)
     return rigid(rotation, shift + pivot - rotation @ pivot)
@@ -261,7 +261,7 @@ def draw_error(
     """
     if protocol.pull is not None:
         return draw_hand_errors(protocol.noise, 1, seed)[0]
-    pivot = torch.tensor(mesh.center_mass.tolist(), dtype=torch.float64)
+    pivot = real(mesh.center_mass.tolist())
     pose = draw_object_poses(protocol.noise, pivot, 1, seed)[0]
     return error_from_object_pose(grasp.obj_from_hand[0].to(pose), pose)
 

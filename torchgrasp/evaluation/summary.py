@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.evaluation.intervals import Share, count_by, share_over
-from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.base import Value, flatnonzero
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import Status
 from torchgrasp.foundation.rules import Count, Measured
@@ -138,21 +138,17 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
     attempts = [attempt for score in scores for attempt in score.attempts]
     spent = [*(score.seconds for score in scores), *(a.seconds for a in attempts)]
     names = sorted({score.object for score in scores})
-    by_object = {
-        name: _shares([score for score in scores if score.object == name]) for name in names
-    }
+    by_object = {name: _shares([s for s in scores if s.object == name]) for name in names}
     groups = sorted({score.group for score in scores if score.group})
     most = max((attempt.tries for attempt in attempts), default=1)
-    known = [
-        (score.unit, a) for score in scores for a in score.attempts if not math.isnan(a.predicted)
-    ]
+    tried = [(score.unit, a) for score in scores for a in score.attempts]
+    known = [(unit, a) for unit, a in tried if not math.isnan(a.predicted)]
     predicted = torch.tensor([attempt.predicted for _, attempt in known], dtype=torch.float64)
     passed = torch.tensor([attempt.passed for _, attempt in known], dtype=torch.bool)
     reasons_of = {"planning": Counter(s.refusal.name for s in scores if s.refusal is not Status.OK)}
     for stage, reasons in STAGES.items():
-        reasons_of[stage] = Counter(
-            a.status.name for a in attempts if not a.passed and a.status in reasons
-        )
+        failed = [a for a in attempts if not a.passed and a.status in reasons]
+        reasons_of[stage] = Counter(a.status.name for a in failed)
     return {
         **_shares(scores),
         "tries": [sum(a.passed and a.tries == k for a in attempts) for k in range(1, most + 1)],
@@ -275,7 +271,7 @@ def _bins(
     at = (predicted * 10).long().clamp(0, 9)
     bins = []
     for k in at.unique().tolist():
-        rows: list[int] = torch.nonzero(at == k)[:, 0].tolist()
+        rows: list[int] = flatnonzero(at == k).tolist()
         counts = count_by((units[row], bool(passed[row])) for row in rows)
         bins.append(Bin(k / 10, (k + 1) / 10, float(predicted[rows].mean()), share_over(counts)))
     return bins

@@ -78,9 +78,8 @@ def evaluate(
     for name, entry in read_entries(objects, spec.only).items():
         if isinstance(entry, DatasetError):
             note = " ".join(str(entry).split())
-            refused.append(
-                ViewScore(ascii(name), "", 0, math.nan, refusal=Status.BAD_OBJECT, note=note)
-            )
+            bad = ViewScore(ascii(name), "", 0, math.nan, refusal=Status.BAD_OBJECT, note=note)
+            refused.append(bad)
         else:
             names = entry.list_views(spec.complete, spec.views)
             views += [ObjectView(Path(objects), name, view, hand.source) for view in names]
@@ -101,28 +100,23 @@ def _evaluate(
         shelf = stack.enter_context(temporary_folder()) if folder is None else Path(folder)
         if folder is not None and not spec.planned:  # grasps that are only read need no lock
             stack.enter_context(hold_folder(shelf))
-        plans = run_tasks(
-            _plan, [(view, shelf, protocol, spec) for view in views], workers, PLAN_LIMIT
-        )
-        scores = [
-            dataclasses.replace(view.score, seconds=math.nan, refusal=plan)
-            if isinstance(plan, Status)
-            else plan
-            for view, plan in zip(views, plans, strict=True)
-        ]
+        tasks = [(view, shelf, protocol, spec) for view in views]
+        scores: list[ViewScore] = []
+        for view, plan in zip(views, run_tasks(_plan, tasks, workers, PLAN_LIMIT), strict=True):
+            if isinstance(plan, Status):
+                plan = dataclasses.replace(view.score, seconds=math.nan, refusal=plan)
+            scores.append(plan)
+        # Every attempt is a task: one that hangs costs its view no other.
         rows = [choose_rows(score.executable, spec.grasps, spec.ranks) for score in scores]
         places = [list(itertools.product(chosen, range(protocol.noise.draws))) for chosen in rows]
-        tasks = [
-            (view, shelf, protocol, spec, *at)
-            for view, some in zip(views, places, strict=True)
-            for at in some
-        ]
-        with contextlib.closing(run_tasks(_try, tasks, workers, TRIAL_LIMIT)) as results:
+        tries = [(*task, *at) for task, some in zip(tasks, places, strict=True) for at in some]
+        with contextlib.closing(run_tasks(_try, tries, workers, TRIAL_LIMIT)) as results:
             for score, some in zip(scores, places, strict=True):
-                tried = [(at, next(results)) for at in some]
-                attempts = (
-                    ProtocolResult(*at, False, x) if isinstance(x, Status) else x for at, x in tried
-                )
+                attempts = list[ProtocolResult]()
+                for at in some:
+                    found = next(results)
+                    lost = isinstance(found, Status)
+                    attempts.append(ProtocolResult(*at, False, found) if lost else found)
                 yield dataclasses.replace(score, attempts=tuple(attempts))
 
 
@@ -144,7 +138,6 @@ def _try(
     `draw`.
     """
     grasps = load_grasps(view.file(shelf))
-    others = [
-        k for k in range(len(grasps)) if k != row and protocol.tries > 1
-    ]  # tried where the lift fails
+    # tried where the lift fails
+    others = [k for k in range(len(grasps)) if k != row and protocol.tries > 1]
     return try_grasp(view, grasps[[row, *others]], protocol, spec, (row, draw))

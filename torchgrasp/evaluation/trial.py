@@ -25,6 +25,7 @@ from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.foundation.rules import Pose, Seed
 from torchgrasp.geometry.frames import inverse
+from torchgrasp.geometry.linalg import norm
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand
@@ -134,7 +135,7 @@ class TrialDriver:
             )
             reference = dataclasses.replace(reference, obj_from_hand=pose)
         hand.check_joints(grasp.pregrasp)
-        length = float(torch.linalg.vector_norm(grasp.approach))
+        length = float(norm(grasp.approach))
         if spec.approach and not abs(length - 1) < TRIALS.unit_error:
             found = f"an approach along {grasp.approach[0].tolist()}"
             raise BadArgument("grasp", found, "a unit vector")

@@ -43,6 +43,7 @@ from torchgrasp.values.planning import Grasps, PointCloud
 from torchgrasp.values.specs import ContactSpec
 
 REFUSAL = "refusal"  # key of the metadata of saved grasps with the reason why a view has none
+MOST_FRICTION = 1.0  # that grasps are planned for, below the friction of some protocols
 Ranks = Literal["best", "spread"]
 """Which grasps of a view are tried: the best grasps, or the same number of grasps spread over all
 ranks.
@@ -148,9 +149,8 @@ def plan_views(
             clouds[k] = read_view(view.objects, view.object, view.view).to(where)
     name = torch.cuda.get_device_name(where) if where.type == "cuda" else device
     try:
-        for k, found in zip(
-            clouds, _plan(list(clouds.values()), views[0], protocol, spec), strict=True
-        ):
+        plans = _plan(list(clouds.values()), views[0], protocol, spec)
+        for k, found in zip(clouds, plans, strict=True):
             good = dataclasses.replace(found, meta=found.meta | {"device": name})
             planned[k] = good[found.status == Status.OK].to("cpu")
     except Exception as error:  # of the library: a cloud that breaks it costs no other its grasps
@@ -164,12 +164,8 @@ def _plan(
     cloud: Any, view: ObjectView, protocol: Protocol, spec: EvaluationSpec, **more: Any
 ) -> Any:
     """Plan grasps on the cloud of a view, or on several clouds."""
-    most_friction = (
-        1.0  # largest friction that grasps are planned for, below the friction of some protocols
-    )
-    contacts = ContactSpec(
-        friction=min(protocol.trial.friction, most_friction), table=Plane.horizontal(0.0)
-    )
+    friction = min(protocol.trial.friction, MOST_FRICTION)
+    contacts = ContactSpec(friction=friction, table=Plane.horizontal(0.0))
     more |= {"fingers": spec.fingers, "task": protocol.task}
     return plan_grasps(cloud, view.load_hand(), contacts, spec.starts, spec.seed, **more)
 
@@ -186,9 +182,8 @@ def plan_view(
     score = view.score
     started = time.process_time()
     try:
-        mesh, _ = _read_solid(
-            view.objects, view.object
-        )  # a bad mesh is refused before planning; its parts are cached
+        # A bad mesh is refused before planning; its parts are cached.
+        mesh, _ = _read_solid(view.objects, view.object)
         cloud = read_view(view.objects, view.object, view.view)
         check_mesh(cloud, mesh)
         check_stand(mesh, Plane.horizontal(0.0))
@@ -208,9 +203,8 @@ def plan_view(
     except GraspError as error:
         note = " ".join(str(error).split())
         spent = time.process_time() - started
-        return PlannedView(
-            dataclasses.replace(score, refusal=Status.BAD_OBJECT, note=note, seconds=spent)
-        )
+        bad = {"refusal": Status.BAD_OBJECT, "note": note, "seconds": spent}
+        return PlannedView(dataclasses.replace(score, **bad))
     grasps = found[found.status == Status.OK]
     status = found.status if len(found) else stages["plan"].status
     failed = count_status(status[status != Status.OK])
@@ -228,10 +222,8 @@ def plan_view(
 def _read_planned(path: Path, score: ViewScore, cloud: PointCloud, hand: Hand) -> PlannedView:
     """Read the grasps of a view that an earlier call planned with the same cloud and hand."""
     grasps = load_grasps(path)
-    if (grasps.meta.get("cloud_sha256"), grasps.meta.get("hand_sha256")) != (
-        digest(cloud),
-        hand.source.sha256,
-    ):
+    made = {"cloud_sha256": digest(cloud), "hand_sha256": hand.source.sha256}
+    if {key: grasps.meta.get(key) for key in made} != made:
         raise BadArgument("folder", f"{path} of another cloud or hand", "grasps of this view")
     reason = Status.__members__.get(grasps.meta.get(REFUSAL, ""), Status.OUT_OF_REACH)
     refusal = Status.OK if len(grasps) else reason
@@ -251,27 +243,24 @@ def try_grasp(
     seed = seed_of(spec.seed, view.object, view.view, *at)
     trial = protocol.trial
     during = protocol.displaced == "approach"
-    surface = None
     error = None if during else draw_error(protocol, grasp, mesh, seed)
     slide = draw_slide(protocol.noise, seed) if during else None
+    seen = view.objects, view.object, view.view
+    surface = None
     if trial.table and (trial.components.stops or trial.components.attempts > 1):
-        surface = _fit_surface(view.objects, view.object, view.view)
-    camera = (
-        _camera_of(read_view(view.objects, view.object, view.view)) if protocol.relook else None
-    )
+        surface = _fit_surface(*seen)
+    camera = _camera_of(read_view(*seen)) if protocol.relook else None
     truth = Truth(mesh, parts, error, slide=slide, camera=camera)
     attempt = GraspTrial(hand, grasp, truth, seed_of(seed, "touch"), surface=surface)
-    return dataclasses.replace(
-        run_protocol(attempt, protocol, *at), predicted=float(grasp.success[0])
-    )
+    found = run_protocol(attempt, protocol, *at)
+    return dataclasses.replace(found, predicted=float(grasp.success[0]))
 
 
 def _camera_of(cloud: PointCloud) -> Float[Tensor, "4 4"]:
     """Return the pose of a camera at the viewpoint of a cloud that looks at the cloud."""
     if cloud.viewpoint is None:
-        raise BadArgument(
-            "relook", "a view without the camera's position", "views with a viewpoint"
-        )
+        found = "a view without the camera's position"
+        raise BadArgument("relook", found, "views with a viewpoint")
     middle = cloud.points.double().mean(0)
     x, y, z = (cloud.viewpoint.double().reshape(-1, 3)[0] - middle).tolist()
     azimuth = math.atan2(y, x)

@@ -26,9 +26,8 @@ class FieldBatch(DistanceField):
 
     nodes: Float[Tensor, "n"]  # the values of all fields, one after another
     places: Float[Tensor, "c 4"]  # origin and spacing [m] of the nodes of each field
-    steps: Int[
-        Tensor, "c 14"
-    ]  # of each field: last nodes, strides on x and y, first value, steps to a cell's corners
+    # of each field: last nodes, strides on x and y, first value, steps to a cell's corners
+    steps: Int[Tensor, "c 14"]
     owner: Int[Tensor, "r"]  # the field of each row
 
     @classmethod

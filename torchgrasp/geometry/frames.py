@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchgrasp.foundation.errors import DegenerateContacts
 from torchgrasp.foundation.rules import is_known
-from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.linalg import eye_like, norm, unit
 
 FLAT = 1e-3
 """Height of a contact triangle over its longest side below which noise turns its frame."""
@@ -26,13 +26,13 @@ def rigid(
 ) -> Float[Tensor, "*b 4 4"]:
     """Return the homogeneous 4 x 4 transform with a given rotation and translation [m]."""
     top = torch.cat([rotation, translation[..., None]], dim=-1)
-    bottom = torch.eye(4, dtype=top.dtype, device=top.device)[3]
+    bottom = eye_like(4, top)[3]
     return torch.cat([top, bottom.expand(*top.shape[:-2], 1, 4)], dim=-2)
 
 
 def inverse(a_from_b: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
     """Return the inverse `b_from_a` of a rigid transform `a_from_b`."""
-    rotation = a_from_b[..., :3, :3].transpose(-1, -2)
+    rotation = a_from_b[..., :3, :3].mT
     return rigid(rotation, -(rotation @ a_from_b[..., :3, 3:])[..., 0])
 
 
@@ -40,31 +40,31 @@ def apply(
     a_from_b: Float[Tensor, "*#b 4 4"], points: Float[Tensor, "*#b n 3"]
 ) -> Float[Tensor, "*#b n 3"]:
     """Map points from frame b to frame a by the rigid transform `a_from_b`."""
-    return points @ a_from_b[..., :3, :3].transpose(-1, -2) + a_from_b[..., None, :3, 3]
+    return points @ a_from_b[..., :3, :3].mT + a_from_b[..., None, :3, 3]
 
 
 def rotate(
     a_from_b: Float[Tensor, "*#b 4 4"], directions: Float[Tensor, "*#b n 3"]
 ) -> Float[Tensor, "*#b n 3"]:
     """Rotate directions from frame b to frame a; the translation of `a_from_b` is ignored."""
-    return directions @ a_from_b[..., :3, :3].transpose(-1, -2)
+    return directions @ a_from_b[..., :3, :3].mT
 
 
 def skew(v: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
     """Return the skew-symmetric matrix of the cross product with v: `skew(v) @ w == v x w`."""
     x, y, z = v.unbind(-1)
     o = torch.zeros_like(x)
-    return torch.stack([torch.stack(row, -1) for row in ((o, -z, y), (z, o, -x), (-y, x, o))], -2)
+    rows = ((o, -z, y), (z, o, -x), (-y, x, o))
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
 def rotation_from_vector(v: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
     """Return the rotation by |v| radians about v (the exponential map), smooth at v = 0."""
-    angle = torch.linalg.vector_norm(v, dim=-1)[..., None, None]
+    angle = norm(v)[..., None, None]
     # Rodrigues: sin x / x, and (1 - cos x) / x^2 = half^2 / 2
     turn = skew(v)
     half = torch.sinc(angle / (2 * math.pi))
-    identity = torch.eye(3, dtype=v.dtype, device=v.device)
-    return identity + torch.sinc(angle / math.pi) * turn + half * half / 2 * (turn @ turn)
+    return eye_like(3, v) + torch.sinc(angle / math.pi) * turn + half * half / 2 * (turn @ turn)
 
 
 def real(numbers: Any) -> Tensor:
@@ -88,7 +88,7 @@ def rotation_angle(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
     """Return the angle [rad] of rotation matrices, accurate near 0 and near pi."""
     axis = (rotation - rotation.mT)[..., [2, 0, 1], [1, 2, 0]]
     trace = rotation.diagonal(dim1=-2, dim2=-1).sum(-1)
-    return torch.atan2(torch.linalg.vector_norm(axis, dim=-1), trace - 1)
+    return torch.atan2(norm(axis), trace - 1)
 
 
 def subsets(count: int, size: int, device: torch.device) -> Int[Tensor, "k s"]:
@@ -106,9 +106,9 @@ def degenerate(points: Float[Tensor, "*b f 3"]) -> Bool[Tensor, "*b"]:
     """
     corners = points[..., subsets(points.shape[-2], 3, points.device), :]  # (*b, k, 3, 3)
     sides = corners - corners.roll(1, dims=-2)
-    longest = torch.linalg.vector_norm(sides, dim=-1).amax((-1, -2))
+    longest = norm(sides).amax((-1, -2))
     normals = torch.linalg.cross(sides[..., 0, :], sides[..., 1, :])
-    doubled_area = torch.linalg.vector_norm(normals, dim=-1).amax(-1)
+    doubled_area = norm(normals).amax(-1)
     return ~(doubled_area > FLAT * longest**2)
 
 

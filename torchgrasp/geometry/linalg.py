@@ -51,9 +51,9 @@ def unit_of_any(v: Float[Tensor, "*b d"]) -> Float[Tensor, "*b d"]:
     or underflow.
     """
     exponent = torch.frexp(v.abs().amax(-1, keepdim=True)).exponent - 1
-    return unit(
-        v / torch.pow(torch.full_like(v[..., :1], 2.0), exponent)
-    )  # a power of two rounds nothing
+    # A power of two rounds nothing.
+    power = torch.pow(torch.full_like(v[..., :1], 2.0), exponent)
+    return unit(v / power)
 
 
 def across(normal: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b 3"], Float[Tensor, "*b 3"]]:
@@ -69,9 +69,8 @@ def number_components(pairs: np.ndarray, count: int) -> np.ndarray:
     """Return the number, from 0, of the connected component of each of `count` nodes, given (e, 2)
     pairs of nodes.
     """
-    links = sparse.coo_array(
-        (np.ones(len(pairs), dtype=bool), (pairs[:, 0], pairs[:, 1])), shape=(count, count)
-    )
+    linked = np.ones(len(pairs), dtype=bool)
+    links = sparse.coo_array((linked, (pairs[:, 0], pairs[:, 1])), shape=(count, count))
     return sparse.csgraph.connected_components(links, directed=False)[1]
 
 
@@ -90,7 +89,7 @@ def fibonacci_sphere(
 
 def limit_norm(v: Float[Tensor, "*b d"], longest: float) -> Float[Tensor, "*b d"]:
     """Return the vectors, shortened to the length `longest` where they are longer."""
-    return v * (longest / torch.linalg.vector_norm(v, dim=-1, keepdim=True).clamp_min(longest))
+    return v * (longest / norm(v, keepdim=True).clamp_min(longest))
 
 
 def solve_least_squares(
@@ -144,9 +143,8 @@ def farthest_points(
     used. `distance` is Euclidean by default.
     """
     every = points.detach().cpu()
-    x = np.ascontiguousarray(
-        every.numpy().T
-    )  # NumPy is an order of magnitude faster than torch for few points
+    # NumPy is an order of magnitude faster than torch for few points.
+    x = np.ascontiguousarray(every.numpy().T)
 
     def gaps(one: Tensor) -> np.ndarray:
         if distance is not None:

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.foundation.base import Batch, named_tensors, pick, put
+from torchgrasp.foundation.base import Batch, flatnonzero, named_tensors, pick, put
 
 SOLVED = 0.1  # sum of squared residuals at which a row of `LeastSquares` ends
 CHECK_EVERY = 6  # steps between two looks for ended problems on an accelerator: the host waits
@@ -90,7 +90,7 @@ def levenberg_marquardt(
         x, taken = problem.step(model, damping)
         going = going & taken
         if k % every == 0:
-            left = torch.nonzero(going)[:, 0]  # the only wait for the device
+            left = flatnonzero(going)  # the only wait for the device
             if not len(left):
                 break
             if len(left) < len(going):

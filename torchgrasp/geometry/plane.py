@@ -16,8 +16,8 @@ from torchgrasp.foundation.base import SomeValue, Value, map_tensors
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Pose
-from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
-from torchgrasp.geometry.linalg import unit
+from torchgrasp.geometry.frames import apply, inverse, real, rigid, rotate
+from torchgrasp.geometry.linalg import norm, unit
 
 GRID = 2.0**-20  # spacing [m] of rounded points: far above the rounding errors of a transform
 FINE = GRID**1.5  # spacing of rounded numbers of about size 1: a billionth
@@ -50,7 +50,7 @@ class Plane(Value):
     offset: float
 
     def __post_init__(self) -> None:
-        length = float(torch.linalg.vector_norm(self.normal))
+        length = float(norm(self.normal))
         if not abs(length - 1) < UNIT_ERROR:
             raise BadArgument("normal", f"a vector of length {length:g}", "a unit vector")
 
@@ -58,7 +58,7 @@ class Plane(Value):
     @checked
     def horizontal(cls, height: float) -> "Plane":
         """Return the plane z = height [m]."""
-        return cls(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64, device="cpu"), float(height))
+        return cls(real([0.0, 0.0, 1.0]), float(height))
 
     @checked(gradients=True)
     def height(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
@@ -132,11 +132,11 @@ def upright_frame(
         z = z if float((offset @ z).pow(3).sum()) >= 0 else -z
     if eye is not None:
         level = eye - (eye @ z) * z
-        steep = LEAST_TILT * torch.linalg.vector_norm(eye)
-        eye = level if torch.linalg.vector_norm(level) > steep else None
+        steep = LEAST_TILT * norm(eye)
+        eye = level if norm(level) > steep else None
     if eye is None:
         level = offset - (offset @ z)[:, None] * z
-        eye = level[torch.linalg.vector_norm(level, dim=1).argmax()]
+        eye = level[norm(level).argmax()]
     x = unit(eye - (eye @ z) * z)
     return rigid(torch.stack([x, torch.linalg.cross(z, x), z], -1), centre)
 
@@ -145,9 +145,9 @@ def to_upright(
     points: Float[Tensor, "*b 3"], obj_from_upright: Float[Tensor, "4 4"]
 ) -> Float[Tensor, "*b 3"]:
     """Return points [m] in the upright frame, rounded to multiples of the fine step `GRID` [m]."""
-    return _round(
-        apply(inverse(obj_from_upright).to(points.device), points.double().reshape(-1, 3))
-    ).reshape_as(points)
+    upright_from_obj = inverse(obj_from_upright).to(points.device)
+    moved = apply(upright_from_obj, points.double().reshape(-1, 3))
+    return _round(moved).reshape_as(points)
 
 
 def round_upright(value: SomeValue, obj_from_upright: Float[Tensor, "4 4"]) -> SomeValue:

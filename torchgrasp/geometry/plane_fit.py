@@ -10,8 +10,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.foundation.base import row_numbers
 from torchgrasp.foundation.lazy import spatial
-from torchgrasp.geometry.linalg import Points, Vector
+from torchgrasp.geometry.linalg import Points, Vector, norm
 
 
 @dataclasses.dataclass(frozen=True)
@@ -154,9 +155,9 @@ def _propose(
     beside = [some[near.gather(1, k)[:, 0]] for k in pick]
     a, b, c = torch.cat([points[drawn], torch.stack([some, *beside])], 1)
     normal = torch.linalg.cross(b - a, c - a)
-    double_area = torch.linalg.vector_norm(normal, dim=-1)
-    sides = torch.stack([(b - a).norm(dim=-1), (c - a).norm(dim=-1), (c - b).norm(dim=-1)])
-    height = double_area / sides.amax(0).clamp_min(PLANES.least_side)
+    double_area = norm(normal)
+    longest = norm(torch.stack([b - a, c - a, c - b])).amax(0)
+    height = double_area / longest.clamp_min(PLANES.least_side)
     wide = height > PLANES.least_height * view.noise.median()
     normal = normal[wide] / double_area[wide, None]
     offset = (normal * a[wide]).sum(-1)
@@ -178,7 +179,7 @@ def _held(
     else 0.
     """
     held = torch.empty(len(normals), len(points), device="cpu")
-    for rows in torch.arange(len(normals), device="cpu").split(PLANES.at_once):
+    for rows in row_numbers(normals).split(PLANES.at_once):
         height = normals[rows] @ points.T - offsets[rows, None]
         held[rows] = (height.abs_() < 2 * noise).float()
     return held

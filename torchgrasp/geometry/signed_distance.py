@@ -15,6 +15,7 @@ from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import spatial, trimesh
 from torchgrasp.foundation.rules import Range
+from torchgrasp.geometry.linalg import norm
 from torchgrasp.geometry.mesh import closest_on_triangles
 
 FIELD_SPACING = 0.004  # spacing [m] of nodes with an error below that of an estimated surface
@@ -126,7 +127,7 @@ class DistanceField(Value, abc.ABC):
         beyond = (position - inside) * spacing
         # The norm of a zero vector has no second derivative.
         outside = (beyond != 0).any(-1, keepdim=True)
-        length = torch.linalg.vector_norm(torch.where(outside, beyond, 1.0), dim=-1, keepdim=True)
+        length = norm(torch.where(outside, beyond, 1.0), keepdim=True)
         away = torch.where(outside, length, 0.0)[..., 0]
         gradient = torch.where(beyond != 0, 0.0, slope) + beyond / length
         return torch.lerp(y[0], y[1], fx) + away, gradient

@@ -16,7 +16,7 @@ import torch.distributed
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchgrasp.foundation.base import Value, row_numbers
+from torchgrasp.foundation.base import Value, flatnonzero, row_numbers
 from torchgrasp.foundation.errors import BadArgument, IndefiniteCovariance
 from torchgrasp.geometry.linalg import eye_like
 from torchgrasp.posture_model.gaussian import whitening_matrices
@@ -221,7 +221,7 @@ def coefficients_from_components(components: Components) -> Float[Tensor, "m f"]
     means = components.means
     d = components.means.shape[1]
     whitening = whitening_matrices(components.covariances)
-    precision = whitening.transpose(-1, -2) @ whitening
+    precision = whitening.mT @ whitening
     linear = (precision @ means[..., None])[..., 0]
     log_scale = whitening.diagonal(dim1=-2, dim2=-1).log().sum(-1)
     constant = (
@@ -268,7 +268,7 @@ def maximisation(
         )
         raise IndefiniteCovariance(what, smallest, "use fewer components or more samples")
     weights[collapsed] = 0
-    for k in collapsed.nonzero()[:, 0].tolist():
+    for k in flatnonzero(collapsed).tolist():
         heaviest = int(weights.argmax())
         spread, axes = torch.linalg.eigh(covariances[heaviest])
         half = 0.5 * spread[-1].sqrt() * axes[:, -1]

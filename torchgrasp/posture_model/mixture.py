@@ -18,6 +18,7 @@ from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument, ModelFileError, Status
 from torchgrasp.foundation.rules import ANY, Count, is_known
 from torchgrasp.geometry.frames import degenerate, real, virtual_frame
+from torchgrasp.geometry.linalg import norm
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import find_hand
 from torchgrasp.posture_model.gaussian import PARAMETERS, GaussianMixture, map_rows, of_parameters
@@ -50,10 +51,9 @@ def encode_fingertips(
     and so on. Fingertips have the same code as the contacts that they touch. Mirror images have
     this code too: check every match.
     """
-    lengths = torch.linalg.vector_norm(points - points.mean(-2, keepdim=True), dim=-1)
-    cosines = torch.stack(
-        [(n * m).sum(-1) for n, m in itertools.combinations(normals.unbind(-2), 2)], dim=-1
-    )
+    lengths = norm(points - points.mean(-2, keepdim=True))
+    pairs = itertools.combinations(normals.unbind(-2), 2)
+    cosines = torch.stack([(n * m).sum(-1) for n, m in pairs], dim=-1)
     return torch.cat([lengths, cosines], dim=-1)
 
 
@@ -70,12 +70,12 @@ def encode(contacts: Contacts | tuple[Tensor, Tensor]) -> ContactCode:
     >>> encode((torch.eye(3)[None], torch.eye(3)[None])).q.shape
     torch.Size([1, 6, 6])
     """
-    points, normals = (
-        (contacts.points, contacts.normals) if isinstance(contacts, Contacts) else contacts
-    )
+    if isinstance(contacts, Contacts):
+        contacts = contacts.points, contacts.normals
+    points, normals = contacts
     check_tensor("points", points, (None, 3, 3))
     check_tensor("normals", normals, (len(points), 3, 3))
-    lengths = torch.linalg.vector_norm(normals, dim=-1)
+    lengths = norm(normals)
     error = (lengths - 1).abs()
     if is_known(lengths) and bool((error > UNIT_ERROR).any()):
         worst = lengths.flatten()[error.argmax()].item()
@@ -191,7 +191,7 @@ class GraspMixture(GaussianMixture):
         Sigma_q^-1 in Eq. (23).
         """
         whitening = self._code.whitening.matrix
-        return self.covariances[:, :-6, -6:].double() @ whitening.transpose(-1, -2) @ whitening
+        return self.covariances[:, :-6, -6:].double() @ whitening.mT @ whitening
 
     @of_parameters
     def _stacked_regression(self) -> Float[Tensor, "k h"]:

@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.foundation.base import Batch, Value
+from torchgrasp.foundation.base import Batch, Value, flatnonzero
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Range, Seed
@@ -64,7 +64,7 @@ def can_close(points: Float[Tensor, "n f 3"], normals: Float[Tensor, "n f 3"]) -
     """
     closed = torch.zeros(len(points), dtype=torch.bool, device=points.device)
     for three in itertools.combinations(range(points.shape[1]), 3):
-        rows = torch.nonzero(~closed)[:, 0]
+        rows = flatnonzero(~closed)
         closed[rows] = _close_triples(points[rows][:, three], normals[rows][:, three])
     return closed
 

@@ -13,6 +13,7 @@ from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Count
+from torchgrasp.geometry.frames import real
 from torchgrasp.posture_model.em import EmRule, start_components
 from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, PAPER_ENERGY, GraspMixture
 from torchgrasp.posture_model.sample import HandSamples
@@ -145,5 +146,4 @@ def growing_bic(
         log_likelihood = float(fit.log_likelihood[-1] - scale.log().sum())  # in the samples' units
         criterion.append(information_criterion(fit.components, len(samples), log_likelihood))
         observer(m)
-    found = torch.tensor(criterion, dtype=torch.float64, device="cpu")
-    return BicCurve(torch.arange(1, most + 1, device="cpu"), found)
+    return BicCurve(torch.arange(1, most + 1, device="cpu"), real(criterion))

@@ -33,9 +33,8 @@ class MujocoScene(SimulatedScene):
         try:
             self.model = model = mujoco.MjModel.from_xml_string(text)
         except ValueError as error:
-            raise HandFileError(
-                "urdf", f"{spec.urdf_path}: {error}", "a hand that MuJoCo can simulate"
-            ) from error
+            found = f"{spec.urdf_path}: {error}"
+            raise HandFileError("urdf", found, "a hand that MuJoCo can simulate") from error
         self.data = mujoco.MjData(model)
         self.body = model.body(OBJECT).id
         urdf = spec.urdf
@@ -49,9 +48,8 @@ class MujocoScene(SimulatedScene):
         self._body_of = model.geom_bodyid.tolist()
         self._wrench = np.zeros(6)
         parents = model.body_parentid.tolist()
-        self._map_contacts(
-            [0], (parents[tip] if model.body_jntnum[tip] == 0 else None for tip in self.tips)
-        )
+        rigid = model.body_jntnum == 0
+        self._map_contacts([0], (parents[tip] if rigid[tip] else None for tip in self.tips))
         self._begin()
 
     def _write(self, spec: SceneSpec) -> str:
@@ -70,17 +68,6 @@ class MujocoScene(SimulatedScene):
             data.qpos[self.model.joint(slide.name).qposadr[0]] = slide.start
             self._move_mount(slide.name, slide.start, 0.0)
         self._mujoco.mj_step1(self.model, data)
-
-    def restart(self, spec: SceneSpec) -> None:
-        """Change to the start of another scene that differs in the hand's joints and pose alone."""
-        self.spec = spec
-        model = self.model
-        pose = spec.world_from_hand
-        model.body_pos[self.root] = pose[:3, 3]
-        self._mujoco.mju_mat2Quat(model.body_quat[self.root], pose[:3, :3].ravel())
-        self._mujoco.mj_setConst(model, self.data)
-        self._mujoco.mj_resetData(model, self.data)
-        self._begin()
 
     def _advance(self) -> Iterator[tuple[int, int, tuple[int, np.ndarray, np.ndarray]]]:
         """Advance by one timestep; yield each pair of bodies that touch, with number, axes and
@@ -113,9 +100,8 @@ class MujocoScene(SimulatedScene):
         self, contact: tuple[int, np.ndarray, np.ndarray], sign: float
     ) -> list[tuple[float, list[float]]]:
         """Return size and numbers of MuJoCo's contact point, as a list of one."""
-        k, axes, place = (
-            contact  # the axes in rows; the first points from the first body to the second
-        )
+        # The axes are in rows; the first points from the first body to the second.
+        k, axes, place = contact
         wrench = self._wrench
         self._mujoco.mj_contactForce(self.model, self.data, k, wrench)
         size = max(float(wrench[0]), 0.0) * self.timestep
@@ -167,9 +153,8 @@ class MujocoScene(SimulatedScene):
     def penetration(self) -> float:
         """Return the largest depth [m] by which the hand penetrates another body or itself."""
         deepest = 0.0
-        for (first, second), distance in zip(
-            self.data.contact.geom, self.data.contact.dist, strict=True
-        ):
+        found = self.data.contact
+        for (first, second), distance in zip(found.geom, found.dist, strict=True):
             if not {self._body_of[first], self._body_of[second]} <= self._place_of.keys():
                 deepest = max(deepest, -float(distance))
         return deepest
@@ -184,9 +169,8 @@ class MujocoScene(SimulatedScene):
 
     def _move_mount(self, joint: str, target: float, speed: float) -> None:
         """Set target [m] and target speed [m/s] of a joint of the mount."""
-        self.data.ctrl[self.model.actuator(joint).id] = (
-            target + speed * MOUNT_DRIVE.kd / MOUNT_DRIVE.kp
-        )
+        ahead = speed * MOUNT_DRIVE.kd / MOUNT_DRIVE.kp
+        self.data.ctrl[self.model.actuator(joint).id] = target + ahead
 
 
 def import_mujoco() -> Any:
@@ -235,11 +219,8 @@ def nest_links(urdf: Urdf) -> list[tuple[Link, Joint | None, int]]:
     while waiting:
         found.append(waiting.pop())
         depth, name, _ = found[-1]
-        waiting += [
-            (depth + 1, joint.child, joint)
-            for joint in reversed(urdf.joints)
-            if joint.parent == name
-        ]
+        ahead = [joint for joint in reversed(urdf.joints) if joint.parent == name]
+        waiting += [(depth + 1, joint.child, joint) for joint in ahead]
     depths = [*(depth for depth, _, _ in found[1:]), 0]
     return [
         (links[name], joint, depth - after + 1)

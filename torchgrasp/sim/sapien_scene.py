@@ -40,9 +40,8 @@ class SapienScene(SimulatedScene):
             sapien, physx, spec.gravity, spec.timestep, spec.patch > 0.0
         )
         slick = physx.PhysxMaterial(spec.body_friction, spec.body_friction, 0.0)
-        both = (
-            2 * spec.friction - spec.body_friction
-        )  # PhysX averages the coefficients of two bodies
+        # PhysX averages the coefficients of two bodies.
+        both = 2 * spec.friction - spec.body_friction
         grip = physx.PhysxMaterial(both, both, 0.0)
         if spec.table:
             place(sapien, self.scene, "table", table(sapien, physx, slick), spec.table_height)

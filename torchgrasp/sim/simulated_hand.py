@@ -83,9 +83,8 @@ class SimulatedHand:
         self.sent = scene.joints()
         names = reference.hand.tree.joint_names
         centres = reference.hand.tips.center.double()
-        self._centres = torch.cat(
-            [centres, torch.ones(fingers, 1, dtype=torch.float64)], dim=-1
-        ).numpy()
+        ones = torch.ones(fingers, 1, dtype=torch.float64)
+        self._centres = torch.cat([centres, ones], dim=-1).numpy()  # (f, 4)
         self._to_scene = np.array([names.index(name) for name in scene.joint_names])
         self._from_scene = np.array([scene.joint_names.index(name) for name in names])
 
@@ -95,15 +94,13 @@ class SimulatedHand:
         observation at its end.
         """
         if len(targets.joints) != len(self._to_scene):
-            raise BadArgument(
-                "targets", f"{len(targets.joints)} joints", f"all {len(self._to_scene)} of the URDF"
-            )
+            allowed = f"all {len(self._to_scene)} of the URDF"
+            raise BadArgument("targets", f"{len(targets.joints)} joints", allowed)
         self.sent = targets.joints.numpy()[self._to_scene]
         self.scene.drive(self.sent)
         palm = targets.palm.numpy()
-        last = (
-            palm if self._palm is None else self._palm
-        )  # the scene begins where the palm is first sent
+        # The scene begins where the palm is first sent.
+        last = palm if self._palm is None else self._palm
         if palm.any() or last.any():
             rotation = self.scene.hand_pose()[:3, :3]
             self.scene.shift(rotation @ palm, rotation @ (palm - last) / self.period)

@@ -28,16 +28,13 @@ class StepContacts:
 
     impulse: np.ndarray  # normal impulse on the object (f, 3) [N s], without friction
     moment: np.ndarray  # contact points weighted by the size of their impulse (f, 3) [N s m]
-    weight: (
-        np.ndarray
-    )  # sum of the impulse sizes (f,) [N s]; `moment / weight` is the mean contact point
-    finger: (
-        np.ndarray
-    )  # whether each finger touches (f,), with its tip or with the link that carries the tip
+    # sum of the impulse sizes (f,) [N s]; `moment / weight` is the mean contact point
+    weight: np.ndarray
+    # whether each finger touches (f,), with its tip or with the link that carries the tip
+    finger: np.ndarray
     force: np.ndarray  # of each fingertip on the object (f, 3) [N], friction included
-    stray: (
-        np.ndarray
-    )  # sums of other impulses (3,) [N s]: hand on neighbours, hand on table, links on object
+    # sums of other impulses (3,) [N s]: hand on neighbours, hand on table, links on object
+    stray: np.ndarray
 
 
 class SimulatedScene(abc.ABC):
@@ -81,9 +78,13 @@ class SimulatedScene(abc.ABC):
         for first, second, contact in self._advance():
             if (first in self._place_of) == (second in self._place_of):
                 continue
-            link, other, sign = (
-                (second, first, -1.0) if first in self._place_of else (first, second, 1.0)
-            )
+            link = first
+            other = second
+            sign = 1.0
+            if first in self._place_of:
+                link = second
+                other = first
+                sign = -1.0
             touching = self._finger_of.get(link) if other == self.body else None
             if touching is None:
                 stray[self._place_of[other]] += sum(size for size, _ in self._read(contact, sign))
@@ -92,9 +93,8 @@ class SimulatedScene(abc.ABC):
                 if size > 0.0:
                     finger[touching] = True
                     if link == self.tips[touching]:
-                        row = sums[
-                            touching
-                        ]  # of Python's numbers, which are faster than short arrays
+                        # Python's numbers are faster than short arrays.
+                        row = sums[touching]
                         for column, number in enumerate(numbers):
                             row[column] += number
         found = np.array(sums)
