@@ -34,7 +34,7 @@ class FrictionNumbers:
     std: float = 0.2
     """Standard deviation of the estimate at the start."""
     least_std: float = 0.03
-    """Least standard deviation: below it the estimate would no longer follow."""
+    """Least standard deviation of the estimate; larger: it follows later readings more."""
     least: float = 0.15
     """Least coefficient at the start; a finger that sticks raises it."""
     most: float = 1.5

@@ -61,7 +61,7 @@ class BarrierNumbers:
     least: float = 1e-12
     """Least normal force [N] by which is divided."""
     ridge: float = 1e-9
-    """Added to the diagonal of the Hessian, which may be singular."""
+    """Added to the diagonal of the Hessian before it is solved."""
 
 
 BARRIER = BarrierNumbers()

@@ -54,7 +54,7 @@ class GraspCheckNumbers:
     """The numbers of the check of a pressing grasp."""
 
     first: float = 0.1
-    """Time [s] of pressing after which touches are averaged: the forces have risen."""
+    """Time [s] of pressing from which touches are averaged."""
     last: float = 0.3
     """Time [s] of pressing until which touches are averaged."""
     misplaced: float = 0.008

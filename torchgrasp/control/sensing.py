@@ -98,7 +98,7 @@ def feel_torques(
     sensed = measure(tactile, pushes, reference.normals, radius, period)
     if sensed.reading is tactile.reading:
         return sensed
-    # where the noise of torques makes a force noisier than that of a fingertip, flags turn later
+    # thresholds of flags grow where torques tell a force less surely than a tactile fingertip
     along = torch.einsum("fc,fcj->fj", reference.normals, forces_by)
     factor = along.norm(dim=-1) * TORQUE_NOISE / NOISE
     factor = (factor * reference.sensor.noise).clamp_min(1.0)

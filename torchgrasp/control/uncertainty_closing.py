@@ -164,7 +164,7 @@ class UncertaintyClosing:
         if self.waits:
             self.touched = self.touched | contact
             contact = self.touched
-        # a finger that has passed its contact goes on along the normal
+        # a finger that has passed its contact is not pulled back
         error = error + ahead.clamp_max(0.0)[:, None] * normals
         share = torch.where(contact | rests, 1.0, blend(error, gains.covariance))
         self.share = share

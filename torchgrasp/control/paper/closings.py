@@ -37,7 +37,7 @@ GRASP_STIFFNESS = 100.0  # stiffness [N/m] of the spring along each side of the 
 
 @dataclasses.dataclass(frozen=True)
 class PositionNumbers:
-    """The numbers of the position controller, as in the paper but for the depth."""
+    """The numbers of the position controller; the paper prints no gains."""
 
     depth: float = 0.02
     """Distance [m] of the goal behind the planned contact."""
