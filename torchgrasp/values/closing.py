@@ -17,13 +17,13 @@ from torchgrasp.foundation.rules import ANY, Measured, Range
 @checked
 @dataclasses.dataclass(frozen=True)
 class ClosingGains(Value):
-    """Targets and gains of the closing controller for each finger, in the hand's frame (Eqs. 26-28
-    of the paper).
+    """Targets and gains of the closing controller for f fingers, in the hand's frame (Eqs. 26-28 of
+    the paper).
 
-    `target` [m] is the planned position of a contact, `covariance` [m^2] its uncertainty.
+    `target` [m] is the planned position of each contact, `covariance` [m^2] its uncertainty.
     `position_gain` [1/s] and `force_gain` [m/(s N)] are diagonals of gain matrices. `desired_force`
-    [N] is the contact force to reach. `force_source` is "analytic", or "stability" if the stability
-    model chose among the balanced forces.
+    [N] is the contact force on the object to reach. `force_source` is "analytic", or "stability" if
+    the stability model chose among the balanced forces.
 
     >>> from torchgrasp import closing_gains, load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -41,8 +41,8 @@ class ClosingGains(Value):
 
 
 class ObjectMotion(NamedTuple):
-    """Motion of an object in the hand: `distance` [m] of its centre, and the `angle` [rad] of its
-    rotation.
+    """Motion of an object in the hand: `distance` [m] by which its centre moved, and `angle` [rad]
+    of its rotation.
 
     >>> slip = ObjectMotion(distance=0.004, angle=0.1)
     >>> f"{1000 * slip.distance:g} mm, {57.3 * slip.angle:.0f} degrees"
@@ -58,16 +58,16 @@ class ObjectMotion(NamedTuple):
 class Disturbance(Value):
     """Unintended contacts of the hand in a simulated trial, of three kinds.
 
-    The three columns are contacts with neighbours, with the table, and contacts of links other than
-    fingertips with the object.
+    Entry 0 is for contacts with neighbours, and entry 1 for contacts with the table. Entry 2 is for
+    contacts of other links than fingertips with the object.
 
     Args:
         first_touch: time [s] of the first contact; infinite if there is none.
         impulse: sum of the normal impulses [N s].
         force: largest mean normal force [N] in a control tick.
         early: whether the first of these contacts was before a fingertip touched the object.
-        neighbour_pose: transform that has moved each of m neighbours from its start to its place at
-            each tick.
+        neighbour_pose: rigid transforms [m] in the frame of the grasp, for t ticks and m
+            neighbours. Each moves a neighbour from its start to its place at the tick.
     """
 
     first_touch: Annotated[Float[Tensor, "3"], ANY]
@@ -80,12 +80,13 @@ class Disturbance(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class ClosingTrace(Value):
-    """True contacts at every control tick, and estimates of the controller, in the hand's frame.
+    """True contacts of f fingertips, and estimates of the controller, at t control ticks, in the
+    hand's frame.
 
     Args:
-        forces: forces [N] on the object, with friction.
+        forces: contact forces [N] on the object, with friction.
         points: contact points [m]; NaN without contact.
-        normals: outward unit normals; NaN without contact.
+        normals: outward unit normals of the object; NaN without contact.
         sliding: speed [m/s] of each fingertip along the surface.
         blend: weight lambda of Eq. (26), 0 for position and 1 for force control; NaN if the control
             law was not active.
@@ -107,21 +108,21 @@ class ClosingTrace(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class ClosureResult(Value):
-    """The result of closing a hand on the true object in simulation; NaN if the trial ended before
-    a measurement.
+    """The result of closing a hand on the true object in simulation, recorded at t control ticks.
+
+    Numbers that were not measured before the trial ended are NaN. Poses are rigid transforms [m].
 
     Args:
         held: whether the object was lifted with the hand and slipped little.
         status: `OK`, or the reason why it was not held.
-        time: times [s] of the control ticks.
-        forces: normal force [N] of each fingertip.
+        time: times [s] at which the control ticks ended.
+        forces: normal force [N] of each of f fingertips.
         object_pose: pose of the object in the frame of the grasp.
         hand_pose: pose of the hand in the frame of the grasp.
-        joints: positions [rad] of every joint of the URDF, in the order of `joint_names`.
-        targets: positions [rad] to which the drives of these joints were sent in the tick that
-            ended.
+        joints: positions [rad] of all j joints of the URDF, in the order of `joint_names`.
+        targets: positions [rad] that were the targets of the drives of these joints in the tick.
         joint_names: names of the joints.
-        contact_order: the fingers in the order of their first contacts.
+        contact_order: indices of the fingers that touched, in the order of their first contacts.
         object_motion: motion of the object in the hand from the pre-grasp to the end.
         pushed: motion of the object from the pre-grasp until all fingers touched, or the closing
             ended.
@@ -129,15 +130,15 @@ class ClosureResult(Value):
         rise: height [m] by which the object's centre has risen at the end.
         unbalanced: norm of the sum of the fingertip forces before the lift, relative to the sum of
             their norms.
-        slip: motion of the object in the hand after the hand has pressed.
+        slip: motion of the object in the hand from the end of pressing to the end.
         start_overlap: depth [m] by which the opened hand penetrates the object or the table at the
             start.
         disturbance: unintended contacts of the hand.
         trace: contacts and estimates at every tick.
         phases: times [s] at which the hand arrived, all fingers touched, and the hand pressed; NaN
             if never.
-        stops: how often the approaching hand stopped at a contact.
-        attempts: how often the hand closed.
+        stops: number of stops of the approaching hand at a contact.
+        attempts: number of closings of the hand.
         seconds: wall time [s] of the trial.
     """
 
@@ -181,8 +182,8 @@ class ClosingOptions(Value):
             all contact targets.
         palm_reach: largest displacement [m] of the palm, which follows the estimated object pose; 0
             means that the palm does not move.
-        stops: how often the approaching hand may stop at an unexpected contact and move sideways; 0
-            means never.
+        stops: largest number of stops at an unexpected contact, after which the approaching hand
+            moves sideways; 0 means none.
         attempts: largest number of closings: on a known table the hand closes again if the grasp
             seems too weak to lift.
 
@@ -208,12 +209,14 @@ class ClosingOptions(Value):
 
 
 NO_OPTIONS = ClosingOptions(wait=False, pose_estimate=False, palm_reach=0.0, stops=0, attempts=1)
-"""All options off: the paper's own control law."""
+"""The paper's own control law: all options are off."""
 
 
 def choose_options(closing: str, options: ClosingOptions | None) -> ClosingOptions:
-    """Return the options of a closing mode, by default all on; raise `BadArgument` for a mode that
-    takes no options.
+    """Return the options of the closing mode `closing`.
+
+    In the modes "uncertainty" and "fixed" these are the given `options`, or `ClosingOptions()` for
+    None. In other modes they are `NO_OPTIONS`; given options raise `BadArgument`.
     """
     if closing in ("uncertainty", "fixed"):
         return ClosingOptions() if options is None else options
@@ -235,7 +238,7 @@ class SensorModel(Value):
             a BioTac. "torque": only the force, from the torques of the finger's joints. "binary":
             only whether the tip touches.
         delay: age [s] of the readings, rounded to whole samples of the sensor.
-        noise: factor that multiplies the usual noise of the sensor.
+        noise: factor (no unit) that multiplies the usual noise of the sensor.
         dead: names of the fingers whose sensor is known to be broken.
 
     Raises `BadArgument` for a number outside its range, or an unknown kind.
@@ -251,5 +254,5 @@ class SensorModel(Value):
 
     @property
     def full(self) -> bool:
-        """Whether all fingers sense force, position and sliding."""
+        """Whether the sensors of all fingers measure force, position and sliding."""
         return self.kind == "tactile" and not self.dead

@@ -2,8 +2,8 @@
 `torchgrasp.values.specs`.
 
 A value is a frozen dataclass of tensors: it never changes, and `.to()` returns a new one. Lengths
-are in metres. Positions are in the frame of the cloud ("obj") unless stated otherwise. `a_from_b`
-maps coordinates of frame b into a.
+are in metres, angles in radians. Positions are in the frame of the cloud ("obj") unless stated
+otherwise. `a_from_b` is a rigid transform (4, 4) [m] that maps coordinates of frame b into a.
 
 Letters in shapes: n points, b batch rows, g grasps, f fingertips (three to five), e friction-cone
 edges, h actuated joints, t time steps.
@@ -31,7 +31,7 @@ class PointCloud(Value):
     """The measured surface points of one object, with optional normals and camera positions.
 
     Args:
-        points: surface points [m], at least 4.
+        points: n surface points [m], at least 4.
         normals: outward normals of any length, or None.
         viewpoint: position of the camera [m], or of each point's camera; None if it is unknown.
         frustum: inward unit normals of the four sides of the camera's view, or of each point's
@@ -60,9 +60,9 @@ class PointCloud(Value):
 
     @checked
     def select(self, rows: Int[Tensor, "m"] | Bool[Tensor, "n"]) -> "PointCloud":
-        """Return a cloud of some of the points, with their normals and viewpoints.
+        """Return a cloud of some of the points, with their normals, viewpoints and frustums.
 
-        The `rows` are a mask, or indices in the wanted order.
+        `rows` is a mask of the points, or holds m indices in the wanted order.
         """
         normals = self.normals
         eye = self.viewpoint
@@ -92,13 +92,13 @@ class PointCloud(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class ShapeEstimate(Value):
-    """The estimated shape at query points: posterior of signed distance and normal (Eqs. 7-8 of the
-    paper).
+    """The estimated shape at query points: signed distance and normal with their uncertainty (Eqs.
+    7-8 of the paper).
 
-    `distance`, its `variance`, and the `covariance` of distance and gradient are in the normalised
-    units of the paper: one unit is `shape.scale` metres. `normal` is the unit gradient of the mean
-    distance. `std_m` [m] is the calibrated standard deviation of the surface: that of the distance,
-    divided by the slope of the mean.
+    `distance`, its `variance`, and the `covariance` of distance (index 0) and gradient (1 to 3) are
+    in the normalised units of the paper: one unit is `shape.scale` metres. `normal` is the unit
+    gradient of the mean distance. `std_m` [m] is the calibrated standard deviation of the surface:
+    that of the distance, divided by the slope of the mean.
     """
 
     distance: Float[Tensor, "*b"]
@@ -111,9 +111,9 @@ class ShapeEstimate(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class Contacts(Batch):
-    """Contact sets of three to five contacts, one for each fingertip: `points` [m] and outward unit
-    `normals`.
+    """Sets of three to five contacts, one contact for each fingertip.
 
+    `points` [m] are the contact points on the object, and `normals` its outward unit normals there.
     `variance` (Eq. 12, normalised units) and `std_m` [m] are the uncertainty of the surface at the
     contacts, or None if it is unknown, as for contacts of another planner. All tensors have one
     dtype.
@@ -144,7 +144,7 @@ class Contacts(Batch):
         return self.points.shape[-2]
 
     def require_std(self) -> Float[Tensor, "b f"]:
-        """Return `std_m`; raise `BadArgument` if the contacts have none."""
+        """Return `std_m` [m]; raise `BadArgument` if it is None."""
         if self.std_m is None:
             raise BadArgument(
                 "contacts.std_m",
@@ -159,9 +159,10 @@ class Contacts(Batch):
 class ContactPlan(Batch):
     """Planned contact sets, one for each initial guess, in the order of the guesses.
 
-    `coefficients` are phi of Eq. (13) of the paper: weights of the edges of the friction cones at
-    which the forces balance. `quality` is Eq. (14), the distance [m] of the contacts' centroid from
-    the cloud's centre; less is better.
+    `coefficients` (no unit, with sum 1) are phi of Eq. (13) of the paper: weights of the edges of
+    the friction cones at which the forces balance. `quality` is Eq. (14), the distance [m] of the
+    contacts' centroid from the cloud's centre; less is better. `status` holds a `Status` code for
+    each contact set.
     """
 
     contacts: Annotated[Contacts, Rows("b")]
@@ -177,17 +178,18 @@ class Certificate(Batch):
     `certify` makes it.
 
     The columns of W are the wrenches along the edges of the friction cones, with torques divided by
-    the radius of the contacts; phi are their coefficients. `margin` is the largest s with W phi =
-    0, sum phi = 1, phi >= s. `rank_ratio` is the smallest over the largest singular value of W.
-    `residual` is the largest |W phi|. `closed`, which means force closure, needs margin > 0 and
-    full rank, because coincident or collinear contacts satisfy Eq. (13) too. `witness` is a unit
-    wrench w with w . v >= -margin for every column v of W. Without force closure no contact force
-    opposes w.
+    the radius of the contacts; phi are their coefficients. W, phi and the first five fields have no
+    unit. `margin` is the largest s with W phi = 0, sum phi = 1, phi >= s. `rank_ratio` is the
+    smallest over the largest singular value of W. `residual` is the largest |W phi|. `closed`,
+    which means force closure, needs a margin > 0 and full rank, because coincident or collinear
+    contacts satisfy Eq. (13) too. `witness` is a unit wrench w with w . v >= -margin for every
+    column v of W. Without force closure no contact force opposes w.
 
-    With `resist`, contacts resist `task_margin` times the `task_load` t, of the task's wrenches [N,
-    N m] the worst, about their centroid. `task_forces` [N], of normal forces up to `task_strength`
-    [N], balance so much of it. `task_twist` y with y . t = -1 proves that no such forces balance
-    more: none have a greater power along y.
+    With `resist`, a task has several loads; `task_load` t (3 forces [N], 3 torques [N m]) is the
+    one that the contacts resist least, about their centroid. They resist `task_margin` (no unit)
+    times t. `task_forces` [N], with normal forces up to `task_strength` [N], balance this multiple
+    of t. `task_twist` y [1/N, 1/(N m)] with y . t = -1 proves that no such forces balance more:
+    none have a greater power along y. Without `resist` these fields are None.
     """
 
     margin: Annotated[Float[Tensor, "b"], ANY]
@@ -205,13 +207,13 @@ class Certificate(Batch):
 @checked
 @dataclasses.dataclass(frozen=True)
 class ContactCode(Value):
-    """The code q of sets of three contacts, the same in every frame; one for each of six finger
-    assignments (Eq. 18).
+    """The code q of sets of three contacts, which is the same in every frame (Eq. 18).
 
-    q holds the distances [m] of the contacts from their centroid, then the cosines between their
-    normals. `obj_from_vf` is the pose of a frame that the contacts define. In assignment k finger i
-    touches contact `permutation[k, i]`. Contact sets on a line or in a point have NaN and a
-    `status` other than OK.
+    Axis 1 counts the six assignments of contacts to fingers. In assignment k finger i touches
+    contact `permutation[k, i]`. `q` holds 3 distances [m] of the contacts from their centroid, then
+    3 cosines between their normals. `obj_from_vf` [m] is the pose of the virtual frame that the
+    contacts define. Contact sets on a line or in a point have NaN, and a `status` code other than
+    OK.
     """
 
     q: Annotated[Float[Tensor, "b 6 6"], ANY]
@@ -223,13 +225,14 @@ class ContactCode(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class IKSeeds(Batch):
-    """Initial guesses for inverse kinematics: postures whose fingertips are placed on contacts (Eq.
-    24 of the paper).
+    """Initial guesses for inverse kinematics: g postures whose fingertips are placed on contacts
+    (Eq. 24 of the paper).
 
-    `row` is the index of the contact set, `permutation` the contact of each finger. `energy` is the
-    misfit of the posture, the least f_i of Eq. (21) or half the squared feature distance of a
-    library posture; less is better. `tip_error` [m] is the distance of each fingertip from its
-    contact.
+    `joints` [rad] are in the order of `hand.joint_names`, and `obj_from_hand` [m] is the hand's
+    pose. `row` is the index of the contact set. Finger i is placed on contact `permutation[k, i]`
+    of the set of guess k. `energy` (no unit; less is better) is the misfit of the posture, the
+    least f_i of Eq. (21) or half the squared feature distance of a library posture. `tip_error` [m]
+    is the distance of each fingertip from its contact.
     """
 
     joints: Float[Tensor, "g h"]
@@ -245,16 +248,24 @@ class IKSeeds(Batch):
 class Grasps(Batch):
     """Grasps: hand configurations with their contacts, certificates and checks, best first.
 
-    Finger i touches contact i. `pregrasp` are the joints of the opened hand, which is at the same
-    pose or, where its links would be in the table, above it (`ik.opened_pose`). `approach` is the
-    unit direction in which the opened hand moves straight there. `clearance` [m] is the least
+    `joints` [rad] are in the order of `hand.joint_names`, and `obj_from_hand` [m] is the hand's
+    pose. Finger i touches contact i of `contacts`, which was contact `permutation[k, i]` of the
+    contact set that the planner found for grasp k. `pregrasp` [rad] are the joints of the opened
+    hand, which is at the same pose or, where its links would be in the table, above it
+    (`ik.opened_pose`). `approach` is the unit direction, in the frame of the cloud, in which the
+    opened hand moves straight there.
+
+    `tip_error` [m] is the distance of each fingertip from its contact. `clearance` [m] is the least
     distance of the links from the estimated surface, from each other and from the table; fingertips
     may touch the surface. `normal_angle` [rad] is the angle between pad axis and contact direction.
-    `score` is the log-odds of the predicted success, which ranks the grasps; `interval` bounds the
-    share of such grasps that held in trials (95 % over families). `known` tells for which grasps
-    trials support the prediction; None means for all. `meta` holds names, units, hashes and the
-    seed as text. With an arm, `arm` are its joints [rad], and `ease` its least joint margin and
-    manipulability on the way (`torchgrasp.arm`).
+    `certificate` proves force closure, and `status` holds a `Status` code. `score` is the log-odds
+    of the predicted success, which ranks the grasps. `interval` bounds the share of such grasps
+    that held in trials (95 % over families). `known` tells for which grasps trials support the
+    prediction; None means for all. `meta` holds names, units, hashes and the seed as text.
+
+    With an arm, `arm` are its joints [rad]. `ease` holds the least joint margin (share of half a
+    joint's range) and the least manipulability, sqrt(det(J J^T)) [m^3], on the way
+    (`torchgrasp.arm`).
 
     Each index keeps the batch axis: `grasps[0]` is a batch of one, and `grasps[0].joints[0]` are
     its joints. For all joints of the hand see `Hand.expand`, for a 3D page
@@ -295,8 +306,8 @@ class Grasps(Batch):
 
     @property
     def best(self) -> "Grasps":
-        """The first executable grasp, a batch of one. Raises `FailedRows` with the reasons if there
-        is none.
+        """The first executable grasp, as a batch of one. Raises `FailedRows` with the reasons if
+        there is none.
         """
         good = self.status == Status.OK
         if not len(self):
@@ -314,22 +325,24 @@ class Grasps(Batch):
 
     @property
     def table(self) -> Plane | None:
-        """The table that the planner was given, in the frame of the grasps; None if it had none, or
-        is unknown.
+        """The table that the planner was given, in the frame of the grasps; None if there was none,
+        or it is unknown.
         """
         return None if (text := self.meta.get("table", "none")) == "none" else read_plane(text)
 
     @checked
     def save(self, path: Path | str) -> None:
-        """Write the grasps as a safetensors file, atomically; `load_grasps` reads it. Raises
-        `OutputError`.
+        """Write the grasps as a safetensors file, atomically; `load_grasps` reads it.
+
+        Raises `OutputError` if the file cannot be written.
         """
         save_tensors(path, "grasps", named_tensors(self), self.meta)
 
 
 def format_success(success: "Grasps | float") -> str:
-    """Return a predicted success as a percentage, or "unknown" for NaN; of grasps, the success of
-    the first.
+    """Return a predicted success as a percentage, or "unknown" for NaN.
+
+    `success` is a probability, or grasps, of which the first counts.
     """
     number = float(success.success[0]) if isinstance(success, Grasps) else success
     return "unknown" if number != number else f"{number:.0%}"

@@ -31,8 +31,8 @@ is used.
 @checked
 @dataclasses.dataclass(frozen=True)
 class ContactSpec(Value):
-    """The constraints on three to five contacts (Eqs. 10-14). `ContactSpec.paper()` returns those
-    of the paper.
+    """The constraints on sets of three to five contacts (Eqs. 10-14). `ContactSpec.paper()` returns
+    those of the paper.
 
     The estimated surface differs from the true one, so the defaults keep larger margins than the
     paper: a lower friction, a flat surface, and a distance between fingertips.
@@ -42,7 +42,8 @@ class ContactSpec(Value):
         edges: number of edges of the linearised friction cone, at least 3.
         max_variance: largest variance of the surface at a contact, S_thresh of Eq. (12), in
             normalised units.
-        friction_margin: contacts are planned and certified with `friction * friction_margin`.
+        friction_margin: share of the friction that is planned with: contacts are planned and
+            certified with `friction * friction_margin`.
         separation: least distance between the centres of two fingertips [m]; by default their
             diameter plus 2 mm. Contacts on opposite sides of a thin object may be closer.
         flatness: largest angle [rad] between the normals at a contact and on a ring around it; None
@@ -88,32 +89,37 @@ class ContactSpec(Value):
 
     @property
     def planned_friction(self) -> float:
-        """The friction with which contacts are planned and certified."""
+        """The coefficient of friction with which contacts are planned and certified."""
         return self.friction * self.friction_margin
 
     @property
     def fingertip_radius(self) -> float:
-        """The radius [m] of the fingertips."""
+        """The radius [m] of the fingertips; `TIP_RADIUS` if the field `tip_radius` is None."""
         return TIP_RADIUS if self.tip_radius is None else self.tip_radius
 
     @property
     def ring_radius(self) -> float:
-        """The radius [m] around a contact within which the surface must be flat."""
+        """The radius [m] around a contact within which the surface must be flat.
+
+        It is the largest of `FLAT_RADII` if the field `flat_radius` is None.
+        """
         return FLAT_RADII[0] if self.flat_radius is None else self.flat_radius
 
     @property
     def least_separation(self) -> float:
-        """The least distance [m] between the centres of two fingertips."""
+        """The least distance [m] between the centres of two fingertips, also where the field
+        `separation` is None.
+        """
         wider = 2 * max(self.fingertip_radius - TIP_RADIUS, 0.0)
         return SEPARATION + wider if self.separation is None else self.separation
 
     @property
     def least_height(self) -> float:
-        """The least height [m] of an object that fingertips on the table can touch: on its wall, or
-        on its upper rim.
+        """The least height [m] of an object that fingertips on the table can grasp.
 
-        A rim of radius q and a fingertip of radius r touch with a normal of slope s if h = (r +
-        q)(1 - s). Rims count unless `flat_radius` is given; q is the least of `FLAT_RADII`.
+        They touch its wall or its upper rim. A rim of radius q and a fingertip of radius r touch at
+        the height (r + q)(1 - s), where s is the slope of the normal. Rims count unless
+        `flat_radius` is given; q is the least of `FLAT_RADII`.
         """
         if self.flat_radius is not None:
             return self.fingertip_radius + self.flat_radius
@@ -122,8 +128,11 @@ class ContactSpec(Value):
 
     @checked
     def for_fingertips(self, radius: float) -> "ContactSpec":
-        """Return the spec with `tip_radius` set to a radius [m], at least `TIP_RADIUS`, unless it
-        is set already.
+        """Return the spec with the `tip_radius` of a hand whose fingertips have the given `radius`
+        [m].
+
+        The new `tip_radius` is at least `TIP_RADIUS`. A spec whose `tip_radius` is not None is
+        returned as it is.
 
         >>> wide = ContactSpec().for_fingertips(0.015)
         >>> points = ContactSpec(tip_radius=0.0).for_fingertips(0.015)
@@ -138,13 +147,14 @@ class ContactSpec(Value):
 
     @checked
     def relaxed(self, below: Length, radius: Length) -> "Iterator[ContactSpec]":
-        """Yield specs for an object without grasps: flat areas smaller than `below` [m], then the
-        object's upper rim.
+        """Yield weaker constraints for an object without grasps, the strictest first.
 
-        A fingertip on the table touches the rim of a low object with an inclined normal. The
-        estimated rim is rounder than the true one, so its normals are steeper. Therefore the
-        margins of friction and of the fingertips' `radius` [m] are spent step by step. A given
-        `flat_radius` is kept: then there are no such specs.
+        The first specs need flat areas of radii smaller than `below` [m]. If there is a table, the
+        last specs allow contacts on the object's upper rim: a fingertip on the table touches the
+        rim of a low object with an inclined normal. The estimated rim is rounder than the true one,
+        so its normals are steeper. Therefore the margins of friction and of the fingertips'
+        `radius` [m] are given up step by step. If `flatness` is None, or `flat_radius` is not None,
+        there are no such specs.
 
         >>> relaxed = ContactSpec(table=0.0).relaxed(0.003, 0.0096)
         >>> [round(spec.planned_friction, 1) for spec in relaxed]
@@ -178,6 +188,8 @@ class ContactSpec(Value):
     ) -> "ContactSpec":
         """Return the paper's constraints: full friction, contacts above the table, no least
         separation or flatness.
+
+        The arguments are those of `ContactSpec`.
 
         >>> ContactSpec.paper(friction=0.8).planned_friction, ContactSpec.paper().flatness
         (0.8, None)
@@ -241,7 +253,7 @@ class TrialSpec(Value):
         mass: mass of the object [kg].
         friction: coefficient of friction of every contact.
         table_friction: coefficient of friction between object and table; by default `friction`.
-        gravity: gravity [m/s^2].
+        gravity: acceleration by gravity [m/s^2].
         approach: length [m] of the straight path to the pre-grasp; 0 means that the hand starts
             there.
         lift_height: height of the lift [m].
@@ -313,7 +325,7 @@ class TrialSpec(Value):
 
     @property
     def pressing(self) -> HoldingMode:
-        """The holding, also where the field `holding` is None."""
+        """The holding mode: the field `holding`, or the default mode if it is None."""
         default = default_holding(self.sensor, self.closing) if self.force is None else "force"
         return self.holding or default
 
@@ -324,20 +336,22 @@ class TrialSpec(Value):
 
     @property
     def components(self) -> ClosingOptions:
-        """The options of the closing mode; all are off for a mode that has no options."""
+        """The options of the closing mode; all are off in a mode that takes no options."""
         return choose_options(self.closing, self.options)
 
 
 def default_holding(sensor: SensorModel, closing: ClosingMode) -> HoldingMode:
-    """Return the holding "grip", or "force" after closings without tactile fingertips or without
-    `ClosingOptions`.
+    """Return the default holding mode: "grip" or "force".
+
+    It is "grip" if all fingertips are tactile, none is dead, and the closing is "uncertainty" or
+    "fixed".
     """
     return "grip" if sensor.full and closing in ("fixed", "uncertainty") else "force"
 
 
 def check_modes(sensor: SensorModel, closing: str, holding: str) -> None:
-    """Raise `BadArgument` if the closing and holding modes do not combine, or need more than the
-    sensor measures.
+    """Raise `BadArgument` if closing and holding mode do not combine, or need more than the sensor
+    measures.
     """
     if holding == "law" and closing not in ("fixed", "uncertainty", "paper"):
         raise BadArgument(
