@@ -15,22 +15,25 @@ from torchgrasp.shape.surface import collision_field, extract_mesh
 
 
 class EstimatedBody(NamedTuple):
-    """What the planner knows of an object, or of the object of each row, in an upright frame: its z
-    axis points up.
+    """The planner's estimate of one object, or of one object for each row of a batch.
+
+    For a batch, `shape`, `field` and the four numbers hold one value for each row. All is in an
+    upright frame: z points up.
     """
 
-    shape: ShapeGP | ShapeBatch
-    field: DistanceField  # of the estimated surface
+    shape: ShapeGP | ShapeBatch  # the estimated shape
+    field: DistanceField  # signed distances [m] from the estimated surface
     center: Float[
         Tensor, "*b 3"
     ]  # the mean [m] of the surface's vertices, which is taken for the centre of mass
-    size: PerRow  # half the size [m]: the length of a normalised unit
+    size: PerRow  # half the size [m] of the object: the length of a normalised unit
     height: PerRow  # extent [m] along z
-    breadth: PerRow  # lesser deviation [m] of the vertices in the plane across z
+    # standard deviation [m] of the vertices along their horizontal principal axis of less extent
+    breadth: PerRow
 
     @classmethod
     def of(cls, shape: ShapeGP) -> "EstimatedBody":
-        """Return the body of a shape in an upright frame."""
+        """Return the body of a shape that is given in an upright frame."""
         mesh = extract_mesh(shape)
         return cls.around(shape, mesh.vertices, collision_field(shape, mesh))
 
@@ -38,8 +41,8 @@ class EstimatedBody(NamedTuple):
     def around(
         cls, shape: ShapeGP, vertices: Float[Tensor, "v 3"], field: DistanceField
     ) -> "EstimatedBody":
-        """Return the body of a shape with the given vertices [m] of its surface, and distances from
-        the surface.
+        """Return the body of a shape, given the `vertices` [m] and the distance `field` of its
+        surface.
         """
         center = vertices.mean(0)
         rise = vertices[:, 2].amax() - vertices[:, 2].amin()
@@ -47,7 +50,10 @@ class EstimatedBody(NamedTuple):
         return cls(shape, field, center, shape.scale, float(rise), float(deviations[1]))
 
     def rows(self, index: Int[Tensor, "k"]) -> "EstimatedBody":
-        """Return the bodies of some of the rows; a single body is that of all rows."""
+        """Return the bodies of the rows with the given indices.
+
+        If the body is one object for all rows, it is returned as it is.
+        """
         numbers = (
             x[index] if isinstance(x, Tensor) and x.ndim else x
             for x in (self.size, self.height, self.breadth)

@@ -1,4 +1,4 @@
-"""What decides whether a grasp holds its task: numbers that physics names, one column each, in SI
+"""The features of a grasp from which its success in a task is predicted: physical quantities in SI
 units.
 """
 
@@ -39,7 +39,7 @@ CAUSES: dict[str, dict[str, str]] = {
         "open loop": "1",
     },
 }
-"""The features with their units, by what they tell about."""
+"""The features of a grasp with their units, by the cause of failure that they describe."""
 # All features, in the order of the columns.
 FEATURES = tuple(name for names in CAUSES.values() for name in names)
 GRIP = 15.0  # greatest force [N] that a hand which grips as the load asks for may need
@@ -47,7 +47,7 @@ GRIP = 15.0  # greatest force [N] that a hand which grips as the load asks for m
 
 @dataclasses.dataclass(frozen=True)
 class FeatureNumbers:
-    """The numbers of the features."""
+    """The numbers of the features: loads, and bounds of forces."""
 
     slippery: float = 0.5
     """Share of the friction coefficient that a slippery object has."""
@@ -69,11 +69,13 @@ MEASURES = FeatureNumbers()
 def measure_grasps(
     hand: Hand, body: EstimatedBody, grasps: Grasps, friction: float, task: GraspTask, lifted: bool
 ) -> Float[Tensor, "g k"]:
-    """Return the `FEATURES` of each grasp for a task, at the friction coefficient `friction`.
+    """Return the k `FEATURES` of each grasp for a task, one column for each feature.
 
-    Body and grasps are in an upright frame; `body` may be that of each grasp. `lifted` tells
-    whether the task is a lift or pulls. A force to spare is the logarithm of the fingers' strength
-    over the force needed. "force needed", "force to spare" and "slippery" are at half the friction.
+    Body and grasps are in an upright frame; `body` is one object for all grasps, or one for each.
+    `friction` is the coefficient of friction, and `lifted` says whether the task is a lift;
+    otherwise the object is pulled. A force to spare is the logarithm of the fingers' strength over
+    the force needed. "force needed", "force to spare" and the features named "slippery" are at half
+    the friction.
     """
     contacts = grasps.contacts
     g = len(grasps)
@@ -129,8 +131,11 @@ def _force_for(
     mass: float,
     lifted: bool,
 ) -> Float[Tensor, "m g"]:
-    """Return the force [N] of the strongest finger with which no contact slides under the load, for
-    each friction.
+    """Return the force [N] of the strongest finger at which no contact slides under the load, for m
+    friction coefficients.
+
+    The load is the weight of a `mass` [kg] if the object is `lifted`, and otherwise a pull in any
+    direction.
     """
     numbers = MEASURES
     weight = numbers.gravity * mass if lifted else 0.0
@@ -144,7 +149,7 @@ def _normal_deviation(
     shape: ShapeGP | ShapeBatch, points: Float[Tensor, "g f 3"]
 ) -> Float[Tensor, "g f"]:
     """Return the standard deviation [rad] of the surface's normal at each contact, about the axis
-    of largest one.
+    for which it is largest.
     """
     mean, covariance = shape.estimate(shape.normalise(points).flatten(0, 1))
     normal = unit(mean[:, 1:])

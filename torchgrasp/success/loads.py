@@ -1,5 +1,5 @@
-"""How a grasp carries a load: the forces that it needs, the arm of the load, and the fingers that
-press.
+"""How a grasp carries a load: the forces that it needs, the load's lever arm, and the strength of
+the fingers.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ from torchgrasp.values.planning import Contacts, Grasps, IKSeeds
 
 @dataclasses.dataclass(frozen=True)
 class LoadNumbers:
-    """The numbers of loads."""
+    """The numbers of loads: friction cones, and bounds of forces."""
 
     carrying: float = 2.07
     """Log-odds of success that a lift loses for each factor e on the force for the load."""
@@ -37,11 +37,12 @@ LOADS = LoadNumbers()
 
 
 def lever_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "*b 3"]) -> Float[Tensor, "b"]:
-    """Return the distance of `center` [m], where the load acts, from the longest side of the
-    contacts' triangle.
+    """Return the lever arm (no unit) of a load at `center` [m] on each set of contact `points` [m].
 
-    The distance is divided by the triangle's height over this side, about which the object turns
-    most easily. For more than three contacts, the triangle of the smallest ratio counts.
+    It is the distance of `center` from the longest side of the contacts' triangle, divided by the
+    triangle's height over this side plus `LOADS.torsion`. About this side the object turns most
+    easily. For more than three contacts, the triangle with the smallest result counts. `center` is
+    one point (3,), or one for each set (b, 3).
     """
     if points.shape[1] > 3:
         triples = subsets(points.shape[1], 3, points.device)
@@ -66,15 +67,17 @@ def carrying_force(
     load: Float[Tensor, "3"],
     push: float = 0.0,
 ) -> Float[Tensor, "m b"]:
-    """Return for each of m friction coefficients the least factor s on balanced forces f_0 at which
-    all contacts stick.
+    """Return the least factor s on balanced forces at which all contacts stick, for m friction
+    coefficients and b contact sets.
 
-    Load and push of any direction [N] act at `center`; w is their wrench. Equal springs share it,
-    with the grasp map G:
+    `forces` f_0 [N] balance each other without a load. The `load` [N], and a force of the size
+    `push` [N] in any direction, act at `center` [m], one point or one for each set; w is their
+    wrench. Equal springs share it, with the grasp map G:
 
         f = s f_0 - G^+ w,    y . f >= 0 for all edges y of the cones dual to the friction cones.
 
-    The factor is infinite if the forces do not stick at all, as where no forces balance.
+    The factor has no unit. It is infinite if the forces do not stick at all, as where no forces
+    balance.
     """
     points = contacts.points.to(forces)
     normals = contacts.normals.to(forces)
@@ -98,8 +101,10 @@ def carrying_force(
 def greatest_force(
     hand: Hand, grasps: Grasps, forces: Float[Tensor, "g f 3"]
 ) -> Float[Tensor, "g"]:
-    """Return the factor on balanced contact forces at which the first drive gives its greatest
-    torque; NaN for NaN.
+    """Return the largest factor (no unit) on contact `forces` [N] at which no drive exceeds its
+    greatest torque.
+
+    Forces that are NaN give NaN.
     """
     jacobian, pushes, effort = _levers(hand, grasps, grasps.contacts, forces)
     torque = torch.einsum("gfih,gfi->gh", jacobian, pushes)
@@ -109,8 +114,11 @@ def greatest_force(
 def strength_of(
     hand: Hand, held: Grasps | IKSeeds, contacts: Contacts, most: float
 ) -> Float[Tensor, "g f"]:
-    """Return the greatest normal force [N] of each fingertip alone, by its drives, of at most
-    `most` [N].
+    """Return the greatest normal force [N] that each fingertip alone can press with, at most `most`
+    [N].
+
+    The torques of the finger's drives bound it. `held` gives the posture of the hand, and contact i
+    of `contacts` is that of finger i. It is 0 at a contact that is NaN.
     """
     jacobian, pushes, effort = _levers(hand, held, contacts, -contacts.normals)
     torque = torch.einsum("gfih,gfi->gfh", jacobian, pushes)
@@ -121,8 +129,8 @@ def strength_of(
 def _levers(
     hand: Hand, held: Grasps | IKSeeds, contacts: Contacts, forces: Float[Tensor, "g f 3"]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the Jacobians (g, f, 3, h) of the contacts, forces in the hand's frame, and the
-    drives' efforts (h,).
+    """Return the Jacobians (g, f, 3, h) of the contacts, the forces in the hand's frame, and the
+    drives' greatest torques (h,).
     """
     joints = held.joints
     hand_from_obj = inverse(held.obj_from_hand.to(joints))
@@ -134,10 +142,11 @@ def _levers(
 def log_odds_about(
     grasps: Grasps, centers: Float[Tensor, "c 3"], friction: float, weight: Sequence[float]
 ) -> Float[Tensor, "g c"]:
-    """Return the log-odds of success of grasps for other centres of mass [m] than the first, for
-    which they are ranked.
+    """Return the log-odds of success of g grasps for c centres of mass [m]; the first is that of
+    the grasps' `score`.
 
-    Only the force that carries the load, in the direction `weight`, depends on the centre.
+    Only the force that carries the load depends on the centre. `weight` (3,) is the load [N] in the
+    frame of the grasps, and `friction` the coefficient of friction.
     """
     points = grasps.contacts.points.to(centers)
     normals = grasps.contacts.normals.to(centers)

@@ -1,5 +1,5 @@
-"""The model of success: boosted trees that give a grasp's log-odds of success, and how well they
-have kept their word.
+"""The model of success: boosted trees that predict a grasp's log-odds of success, with the results
+of trials that calibrate it.
 
 `scripts/train.py success` fits the model to trials of authored bodies. Trials of other families
 calibrate it.
@@ -23,13 +23,16 @@ KIND = "success-model"
 
 @dataclasses.dataclass(frozen=True)
 class SuccessModel(Value):
-    """Boosted trees: t trees of m nodes, of which the first is the root. A leaf is its own child."""
+    """Boosted trees that predict success: t trees of m nodes, of which the first is the root.
+
+    Shares and log-odds have no unit. The k features have the units of `CAUSES`.
+    """
 
     feature: Int[Tensor, "t m"]  # the feature that a node reads
     threshold: Float[
         Tensor, "t m"
     ]  # a grasp goes to the first child where the feature is at most this
-    children: Int[Tensor, "t m 2"]
+    children: Int[Tensor, "t m 2"]  # indices of a node's two children; a leaf is its own child
     value: Float[Tensor, "t m"]  # the log-odds that a leaf adds; 0 in other nodes
     start: Float[Tensor, ""]  # log-odds without any tree
     range: Float[Tensor, "k 2"]  # least and greatest value of each feature in the trials
@@ -42,7 +45,7 @@ class SuccessModel(Value):
     ]  # trials of the best grasp for a task: log-odds, 1 if it held, the number of the family
 
     def log_odds(self, features: Float[Tensor, "g k"]) -> Float[Tensor, "g"]:
-        """Return the log-odds of success of grasps with the given `FEATURES`."""
+        """Return the log-odds of success of g grasps with the given `FEATURES`."""
         node = torch.zeros(
             len(features), len(self.feature), dtype=torch.int64, device=features.device
         )
@@ -70,8 +73,10 @@ class SuccessModel(Value):
         return depth
 
     def interval(self, log_odds: Float[Tensor, "*g"]) -> Float[Tensor, "*g 2"]:
-        """Return the bounds of the share of grasps with these log-odds that held, by linear
-        interpolation.
+        """Return the least and the greatest share of grasps with these log-odds that held in
+        trials.
+
+        Both are interpolated linearly between `bands`.
         """
         at = self.bands[:, 0].contiguous()
         low_high = self.bands[:, 1:]
@@ -82,5 +87,5 @@ class SuccessModel(Value):
 
 @functools.cache
 def load_success_model(device: torch.device | str = "cpu") -> SuccessModel:
-    """Load the shipped model of success, in float64."""
+    """Return the shipped model of success in float64, on a device."""
     return read_value(MODEL, KIND, SuccessModel)[0].to(device)

@@ -15,11 +15,12 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.values.planning import Contacts, Grasps
 
 Sets = Float[Tensor, "d g f 3"]
+"""One vector for each of d displacements, g grasps and f fingertips."""
 
 
 @dataclasses.dataclass(frozen=True)
 class MovedNumbers:
-    """The numbers of the displacements and of the search for their contacts."""
+    """The numbers of the displacements, and of the search for contacts of the displaced object."""
 
     count: int = 16
     """Displacements."""
@@ -45,11 +46,14 @@ MOVED = MovedNumbers()
 
 
 class MovedContacts(NamedTuple):
-    """Contact sets of g grasps after each of d displacements, one after another, with balanced
-    `forces`.
+    """Contact sets of g grasps after each of d displacements of the object.
 
-    The strongest force pushes with 1 N. `touched` tells whether all fingers touch the object, and
-    can press it.
+    Args:
+        contacts: contact points [m] and outward normals, f for each set; the d g sets are ordered
+            by displacement, then by grasp.
+        forces: balanced contact forces [N] of these sets, of which the largest normal force is 1 N;
+            NaN if there are none.
+        touched: whether all fingers touch the object, and can press it with balanced forces.
     """
 
     contacts: Contacts
@@ -60,12 +64,12 @@ class MovedContacts(NamedTuple):
 def touch_moved(
     hand: Hand, field: DistanceField, grasps: Grasps, forces: Float[Tensor, "g f 3"]
 ) -> MovedContacts:
-    """Return where the fingers touch the object if the object is displaced, by distances that a
-    hand still finds.
+    """Return the contacts of g grasps if the object is displaced, by distances that a hand still
+    finds.
 
-    The displacements fill a ball, in the axes of the hand. Each fingertip moves on along
-    the line from its pre-grasp to its planned pose until it touches the surface, given by `field`.
-    Balanced `forces` at the planned contacts tell how the fingers share their pushes.
+    The displacements fill a ball, in the axes of the hand. Each fingertip moves along the line from
+    its pre-grasp to its planned pose, and further, until it touches the surface that `field` gives.
+    The balanced `forces` [N] at the planned contacts say in which ratios the fingers push.
     """
     count = MOVED.count
     numbers = torch.arange(count, dtype=torch.float64, device="cpu")
@@ -90,10 +94,14 @@ def touch_moved(
 def trace(
     field: DistanceField, start: Sets, way: Sets, radius: Float[Tensor, "f"]
 ) -> tuple[Sets, Sets, Bool[Tensor, "d g f"]]:
-    """Return where balls that move from `start` [m] along a `way` first touch a surface, its
-    normals, and whether.
+    """Return for each moving ball the surface point [m] that it first touches, the outward unit
+    normal there, and whether it touches.
 
-    This is sphere tracing: a ball moves on by its distance from the surface, up to a longest way.
+    The balls belong to d displacements, g grasps and f fingertips; all tensors but `radius` have
+    the shape (d, g, f, 3), and the mask (d, g, f). Ball f, of a `radius` [m], starts with its
+    centre at `start` [m] and moves along the unit vector `way`, at most `MOVED.length`. A ball that
+    does not touch has the surface point nearest to its end. This is sphere tracing: a ball moves on
+    by its distance from the surface.
     """
     travelled = torch.zeros_like(start[..., 0]).flatten(0, 1)
     shape = start.shape[:-1]

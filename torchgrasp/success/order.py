@@ -17,12 +17,15 @@ from torchgrasp.success.promise import find_promise
 from torchgrasp.values.planning import Grasps
 
 DOMAIN = ("deviation", "size", "height", "friction", "mass", "force")
-"""Features that must be in the range of the trials for a prediction to be known."""
+"""Features that must lie within the range of the trials; otherwise the success of a grasp is
+unknown.
+"""
 
 
 def is_covered(features: Float[Tensor, "g k"]) -> Bool[Tensor, "g"]:
-    """Return a mask of the grasps whose predicted success is supported by trials: `DOMAIN` is in
-    their range.
+    """Return a mask of the grasps whose predicted success trials support.
+
+    Their features named in `DOMAIN` lie within the range of the trials.
     """
     rows = [FEATURES.index(name) for name in DOMAIN]
     least, most = load_success_model(features.device).range[rows].T
@@ -31,15 +34,18 @@ def is_covered(features: Float[Tensor, "g k"]) -> Bool[Tensor, "g"]:
 
 
 def largest_known() -> float:
-    """Return the largest half size [m] (from centre to surface) of objects for which success is
-    predicted.
+    """Return the largest half size [m] of objects for which success is predicted.
+
+    The half size is the length of a normalised unit of the estimated shape.
     """
     return float(load_success_model().range[FEATURES.index("size"), 1])
 
 
 def grade(grasps: Grasps, log_odds: Float[Tensor, "k"], known: Bool[Tensor, "k"]) -> Grasps:
-    """Return grasps with score, interval and `known` of the k executable ones by their log-odds of
-    success.
+    """Return grasps whose k executable ones have a new score, interval and `known`.
+
+    The score is `log_odds`. The interval is that of the success model, or [0, 1] where not `known`.
+    Failed grasps keep their score; their interval is [0, 0], and they count as known.
     """
     good = flatnonzero(grasps.status == Status.OK)
     score = grasps.score.clone()
@@ -54,8 +60,10 @@ def grade(grasps: Grasps, log_odds: Float[Tensor, "k"], known: Bool[Tensor, "k"]
 
 
 def keep_promise(grasps: Grasps, share: float) -> Grasps:
-    """Return grasps, in which executable ones of which a `share` may not hold have the status
-    `NO_PROMISE`.
+    """Return grasps in which executable ones that are not sure enough have the status `NO_PROMISE`.
+
+    Sure enough are grasps with a known success and log-odds of at least the bound that keeps the
+    promise of a `share`. If no bound keeps it, no grasp is sure enough.
     """
     promise = find_promise(share)
     least = math.inf if promise is None else promise.least
@@ -67,11 +75,12 @@ def keep_promise(grasps: Grasps, share: float) -> Grasps:
 
 
 def by_success(grasps: Grasps, *groups: Int[Tensor, "g"]) -> Grasps:
-    """Sort grasps by the `groups`, in each: executable ones with a known success, other executable
-    ones, failed ones.
+    """Return grasps sorted by the indices in `groups`, and within a group by their predicted
+    success.
 
-    Among these the score falls; the greater margin of the certificate decides between equal scores.
-    With an arm, grasps of the same success in whole percents, as it is printed, are sorted by
+    Executable grasps with a known success come first, then other executable ones, then failed ones.
+    Within each of these the score falls; between equal scores, the greater margin of the
+    certificate comes first. With an arm, grasps of equal success in whole per cent are sorted by
     falling product of the numbers in `ease`.
     """
     late = 2 * (grasps.status != Status.OK).int()
@@ -83,8 +92,10 @@ def by_success(grasps: Grasps, *groups: Int[Tensor, "g"]) -> Grasps:
 
 
 def rank_by_variance(grasps: Grasps) -> Grasps:
-    """Sort grasps: executable grasps first, then by increasing sum of the surface variances at
-    contacts (Sec. 6.5).
+    """Return grasps sorted as in the paper (Sec. 6.5): executable ones first, then by increasing
+    sum of the variances at contacts.
+
+    Raises `BadArgument` if the variance of the surface at the contacts is unknown.
     """
     if grasps.contacts.variance is None:
         raise BadArgument(

@@ -26,8 +26,10 @@ BOUNDS = 200  # bounds of the log-odds that are tried, at equal steps
 
 
 class Promise(NamedTuple):
-    """A promise that trials support: the least log-odds of a returned grasp, and the numbers of
-    trials and families.
+    """A promise that trials support.
+
+    `least` is the least log-odds of a returned grasp. `trials` and `families` are the numbers of
+    trials, and of families of bodies in them, that chose it.
     """
 
     least: float
@@ -37,8 +39,8 @@ class Promise(NamedTuple):
 
 @functools.cache
 def find_promise(share: float) -> Promise | None:
-    """Return the promise that a `share` of the returned grasps holds; None if the trials support no
-    bound.
+    """Return the promise that a `share` of the returned grasps, in [0, 1], holds; None if the
+    trials support no bound.
     """
     log_odds, held, family = load_success_model().kept.unbind(1)
     least = least_log_odds(log_odds, held > 0, family.long(), share)
@@ -46,7 +48,7 @@ def find_promise(share: float) -> Promise | None:
 
 
 def describe_promise(share: float) -> str:
-    """Return a promise and what supports it as text."""
+    """Return a text that names the promised `share`, in [0, 1], and the trials that support it."""
     promise = find_promise(share)
     if promise is None:
         return f"{share:g}, which no trials support"
@@ -59,7 +61,12 @@ def describe_promise(share: float) -> str:
 def least_log_odds(
     log_odds: Float[Tensor, "r"], held: Bool[Tensor, "r"], family: Int[Tensor, "r"], share: float
 ) -> float | None:
-    """Return the least bound of the log-odds that keeps the promise of a `share`, or None."""
+    """Return the least bound of the log-odds that keeps the promise of a `share`, or None if there
+    is none.
+
+    Each of the r trials has predicted `log_odds`, `held` (whether the grasp held), and the number
+    of its `family` of bodies.
+    """
     if not len(log_odds):
         return None
     number = family.unique(return_inverse=True)[1]

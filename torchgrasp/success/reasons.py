@@ -1,4 +1,4 @@
-"""What moves the predicted success of a grasp, in words."""
+"""What lowers the predicted success of a grasp, in words."""
 
 import math
 from typing import NamedTuple
@@ -34,8 +34,10 @@ SENTENCES = {
 
 
 class Cost(NamedTuple):
-    """A cause that lowers the log-odds of success by `log_odds`, compared to grasps that held, and
-    a sentence on it.
+    """A cause that lowers the predicted success of a grasp.
+
+    `cause` is a name in `CAUSES`. `log_odds` is by how much the cause lowers the log-odds of
+    success, compared to grasps that held. `sentence` explains it.
     """
 
     cause: str
@@ -50,8 +52,8 @@ def explain_success(
     """Return at most three causes that lower the predicted success of the first grasp most, the
     greatest first.
 
-    The cost of a cause is what the log-odds of success gain if its `CAUSES` take their median among
-    grasps that held.
+    Each cause stands for several features of the success model (`CAUSES`). Its cost is by how much
+    the log-odds rise if these features take their median over grasps that held.
 
     The `shape` is in the frame of the grasps. The `task` is by default `GraspTask()`. Raises
     `BadArgument` for no grasps, or grasps of another planner.
@@ -89,8 +91,10 @@ def explain_success(
 
 
 def measure_again(grasps: Grasps, hand: Hand, shape: ShapeGP, task: GraspTask) -> torch.Tensor:
-    """Return the features of planned grasps, whose metadata name the table and the friction, for
-    any task.
+    """Return the `FEATURES` (g, k) of planned grasps for any task.
+
+    The metadata of the grasps name the table and the friction. The `shape` is in the frame of the
+    grasps.
     """
     frame = inverse(upright_frame(shape.cloud.points, shape.cloud.viewpoint, grasps.table))
     upright = move(grasps, frame)

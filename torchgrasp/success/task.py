@@ -1,4 +1,4 @@
-"""What a grasp must do, which decides whether it holds."""
+"""The task of a grasp: the loads that it must hold."""
 
 import dataclasses
 import itertools
@@ -23,9 +23,9 @@ class GraspTask(Value):
     """What a grasp must do. The predicted success is that of this task.
 
     Args:
-        mass: of the object [kg].
-        force: normal force [N] of the strongest finger. None: the hand that lifts grips as the felt
-            load asks for, and one that is pulled at presses with 4 N.
+        mass: mass of the object [kg].
+        force: normal force [N] of the strongest finger. None: in a lift the hand presses as much as
+            the felt load needs; in pulls it presses with 4 N.
         lift: whether the object is lifted off its table. Otherwise it floats, and is pulled along
             six directions with a force of 10 m/s^2 times its mass. None means a lift if the planner
             knows the table, but not in open loop.
@@ -50,22 +50,26 @@ class GraspTask(Value):
             raise BadArgument("closing", "'open_loop' for a lift", "'uncertainty'")
 
     def describe(self) -> str:
-        """Return the task as text."""
+        """Return the task as a short text."""
         what = "task" if self.lift is None else "lift" if self.lift else "pulls"
         force = "" if self.force is None else f" with {self.force:g} N"
         return f"{what} of {self.mass:g} kg{force}" + (", displaced" if self.displaced else "")
 
     @checked
     def pressing(self, lifted: bool) -> float:
-        """Return the normal force [N] of the strongest finger; 0 where the hand grips as the felt
-        load asks for.
+        """Return the normal force [N] of the strongest finger; 0 if the hand presses as much as the
+        felt load needs.
+
+        `lifted` says whether the task is a lift.
         """
         return self.force or (0.0 if lifted else 4.0)
 
     @checked
     def lifts(self, table: Plane | None) -> bool:
-        """Return whether the object is lifted: as `lift` says, or else if there is a table and no
-        open loop.
+        """Return whether the task is a lift.
+
+        If the field `lift` is None, it is one if there is a `table` and the closing is not
+        "open_loop".
         """
         return table is not None and self.closing != "open_loop" if self.lift is None else self.lift
 
@@ -73,11 +77,10 @@ class GraspTask(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class TaskWrenches(Value):
-    """The loads of an object in a task, each a force [N], weight included, and a torque [N m], in
-    the cloud's frame.
+    """The w loads of an object in a task, in the cloud's frame.
 
-    Torques are about `point` [m], by default the estimated centre. Raises `BadArgument` for no
-    load, or one of zeros.
+    Each of the `wrenches` is a force [N], weight included, and a torque [N m] about `point` [m], by
+    default the estimated centre. Raises `BadArgument` for no load, or one of zeros.
 
     >>> turn = [0.0, 0.0, -2.5, 0.0, 0.0, 0.1]
     >>> back = [0.0, 0.0, -2.5, 0.0, 0.0, -0.1]
@@ -111,7 +114,7 @@ class TaskNumbers:
 TASKS = TaskNumbers()
 TaskName = Literal["lift", "pour", "push"]
 Resist = TaskName | tuple[TaskName, ...] | TaskWrenches
-"""What grasps must resist: `TaskWrenches`, or names of loads at the estimated centre. Without a
+"""What contacts must resist: `TaskWrenches`, or names of loads at the estimated centre. Without a
 table z points up.
 
 * "lift": the weight.
@@ -127,8 +130,16 @@ def loads_of(
     upright_from_obj: Float[Tensor, "4 4"],
     table: bool,
 ) -> Float[Tensor, "w 6"]:
-    """Return the wrenches of a task about the origin of the upright frame, for a `center` [m] in
-    this frame.
+    """Return the w loads of a task as wrenches (force [N], then torque [N m]) about the origin of
+    the upright frame.
+
+    Args:
+        resist: the task, see `Resist`.
+        mass: mass of the object [kg].
+        center: estimated centre of the object [m] in the upright frame.
+        upright_from_obj: transform from the cloud's frame, in which `TaskWrenches` are, to the
+            upright frame.
+        table: whether a table is known; without one, named loads take the cloud's z axis for up.
     """
     if isinstance(resist, TaskWrenches):
         vectors = rotate(upright_from_obj, resist.wrenches.to(center).reshape(-1, 3))
