@@ -275,7 +275,7 @@ def find_seeds(objects: Objects, contacts: Contacts, cloud: CloudIndex) -> IKSee
     return query_mixture(objects.hand, contacts, mixture)
 
 
-def with_costs(objects: Objects, found: Candidates, numbers: ChoiceNumbers = CHOICE) -> Candidates:
+def with_costs(objects: Objects, found: Candidates) -> Candidates:
     """Return the rows with their costs: large if the hand misses them, or the load's arm is long.
 
     If grasps must resist loads, the seeds in which the fingers resist the most come first, and rows
@@ -293,22 +293,20 @@ def with_costs(objects: Objects, found: Candidates, numbers: ChoiceNumbers = CHO
         proof = resist_loads(arms, touched.normals, strength, load, objects.spec)
         share = proof.margin.clamp(max=1)
         weak = weak.scatter_reduce(0, seeds.row, share, "amax")
-        weak = torch.where(weak < 1, numbers.weak * (2 - weak), 0.0)
+        weak = torch.where(weak < 1, CHOICE.weak * (2 - weak), 0.0)
         seeds = seeds[lexical_order(seeds.row, -share)]
-    first = seeds[rank_in_group(seeds.row) < numbers.tried]
+    first = seeds[rank_in_group(seeds.row) < CHOICE.tried]
     reach = objects.reach(contacts, found.certificate, found.cloud)
     residual = seed_costs(reach, first)
     least = torch.full((len(contacts),), torch.inf, dtype=residual.dtype, device=residual.device)
     least = least.scatter_reduce(0, first.row, residual, "amin")
     arm = lever_arm(contacts.points, objects.body.rows(found.cloud).center)
-    missed = least.clamp_min(numbers.touching).log()
-    cost = missed + numbers.lever * (arm + numbers.short).log() + weak
+    missed = least.clamp_min(CHOICE.touching).log()
+    cost = missed + CHOICE.lever * (arm + CHOICE.short).log() + weak
     return dataclasses.replace(found, seeds=seeds, cost=cost)
 
 
-def choose(
-    rows: Candidates, most: int, clouds: int, numbers: ChoiceNumbers = CHOICE
-) -> Int[Tensor, "k"]:
+def choose(rows: Candidates, most: int, clouds: int) -> Int[Tensor, "k"]:
     """Return at most `most` of each cloud's cheapest waiting rows, far from each other.
 
     They lie far from rows that were chosen before, too. Farthest-point sampling runs for all clouds
@@ -322,8 +320,8 @@ def choose(
     # the cheapest rows of each cloud, (c, m)
     table, held = _table(rows.cloud, clouds)
     least, order = torch.where(held, cost[table], torch.inf).sort(dim=1, stable=True)
-    index = table.gather(1, order)[:, : numbers.likely * most]
-    likely = _are_likely(least[:, : numbers.likely * most], most, numbers)
+    index = table.gather(1, order)[:, : CHOICE.likely * most]
+    likely = _are_likely(least[:, : CHOICE.likely * most], most)
     x = points[index]  # (c, m, 3 f)
     nearest = torch.full_like(likely, torch.inf, dtype=x.dtype)
     if len(before):
@@ -344,15 +342,13 @@ def choose(
     return chosen[torch.nonzero(chosen < len(rows))[:, 0]]
 
 
-def _are_likely(
-    cost: Float[Tensor, "*c m"], most: int, numbers: ChoiceNumbers
-) -> Bool[Tensor, "*c m"]:
+def _are_likely(cost: Float[Tensor, "*c m"], most: int) -> Bool[Tensor, "*c m"]:
     """Return for sorted costs a mask of rows to choose from.
 
     Beyond the first `most` only those that resist the task's loads are.
     """
     needed = torch.arange(cost.shape[-1], device=cost.device) < most
-    return torch.isfinite(cost) & ((cost < numbers.weak) | needed)
+    return torch.isfinite(cost) & ((cost < CHOICE.weak) | needed)
 
 
 def _table(cloud: CloudIndex, clouds: int) -> tuple[Int[Tensor, "c m"], Bool[Tensor, "c m"]]:
