@@ -86,13 +86,19 @@ class BalanceNumbers:
 
 BALANCE = BalanceNumbers()
 Push = Float[Tensor, "b f k"]
+"""The map from k coordinates in the null space to normal forces at f contacts, for b contact sets.
+"""
 Slide = Float[Tensor, "b f 3 k"]
-"""The map from coordinates in the null space to normal forces, and to tangential forces."""
+"""The map from k coordinates in the null space to tangential forces (3 components) at f contacts.
+"""
 
 
 def grasp_map(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 6 n"]:
-    """Return the grasp matrix: it maps the forces at f points to total force and torque about their
-    centroid.
+    """Return the grasp matrix (6 x 3 f), which maps forces at f points to their total force and
+    torque.
+
+    The n = 3 f columns are ordered by point, then by axis. The torque is about the centroid of the
+    points.
     """
     arms = points - points.mean(-2, keepdim=True)
     force = eye_like(3, points).expand(*arms.shape, 3)
@@ -101,10 +107,12 @@ def grasp_map(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 6 n"]:
 
 
 def internal_forces(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b p f 3"]:
-    """Return the opposite unit forces between the contacts of each pair; `[..., k, i, :]` acts on
-    contact i in pair k.
+    """Return for each of p pairs of contacts the opposite unit forces that pull the two contacts
+    together.
 
-    The forces of all pairs span all balanced forces, except for four or five contacts in one plane.
+    `[..., k, i, :]` is the force on contact i by pair k, 0 at the other contacts. The order of the
+    pairs is that of `contact_pairs`. The forces of all pairs span all balanced forces, except for
+    four or five contacts in one plane.
     """
     f = points.shape[-2]
     first, second = contact_pairs(f, points.device)
@@ -116,8 +124,10 @@ def internal_forces(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b p f 3"
 def tangential_ratio(
     forces: Float[Tensor, "*b f 3"], normals: Float[Tensor, "*b f 3"]
 ) -> Float[Tensor, "*b f"]:
-    """Return the ratio of tangential to normal force at each contact; infinite where a force does
-    not push.
+    """Return the ratio (no unit) of tangential to normal force at each contact.
+
+    `forces` act on the object, whose outward unit normals are `normals`. The ratio is infinite
+    where a force does not push.
     """
     push = -dot(forces, normals)
     tangential = norm(forces + push[..., None] * normals)
@@ -132,21 +142,21 @@ def least_friction_forces(
     strongest: Positive = 4.0,
     preferred: Annotated[Float[Tensor, "*#b f"], ANY] | None = None,
 ) -> Float[Tensor, "*b f 3"]:
-    """Return balanced fingertip forces on the object [N] that need the least friction.
+    """Return balanced fingertip forces [N] on the object that need the least friction.
 
     Forces of three contacts lie in the friction cones whenever any balanced forces do, except for a
     small error: the search also slightly favours even forces. Forces of four or five contacts may
     need slightly more friction than the least.
 
     Args:
-        points: contacts [m].
+        points: positions [m] of f contacts.
         normals: outward unit normals of the object.
-        strongest: normal force of the strongest finger [N].
-        preferred: ratios of the normal forces to prefer among forces of similar friction; by
-            default they are equal.
+        strongest: normal force [N] of the strongest finger.
+        preferred: ratios (no unit) of the f normal forces to prefer among forces of similar
+            friction; by default they are equal.
 
     Returns:
-        Forces; NaN rows where no balanced forces push at all contacts.
+        Forces; NaN at all contacts of a set where no balanced forces push at each of them.
 
     >>> points = torch.tensor([[[0.0, 1, 0], [0, 0, 0], [1, 0.5, 0]]])
     >>> normals = torch.tensor([[[-1.0, 0, 0], [-1, 0, 0], [1, 0, 0]]])
@@ -176,8 +186,9 @@ def _search_forces(
     normals: Float[Tensor, "b 3 3"],
     preferred: Float[Tensor, "b 3"] | None,
 ) -> Float[Tensor, "b 3 3"]:
-    """Return balanced forces of three contacts that need least friction, of any scale; NaN if none
-    push everywhere.
+    """Return balanced forces of three contacts that need the least friction, of any scale.
+
+    They are NaN where no balanced forces push at all contacts.
     """
     sides = points[:, [1, 2, 0]] - points
     length = dot(sides, sides, keepdim=True) ** 0.5
@@ -194,11 +205,12 @@ def _search_forces(
 
 
 def forces_near(points: Vectors, normals: Vectors, weights: Tensions) -> Vectors:
-    """Return balanced forces of little friction whose shares on the `internal_forces` are near
-    given `weights`.
+    """Return balanced forces (b, f, 3) of little friction whose shares on the `internal_forces` are
+    near `weights`.
 
-    A short search begins with the weights. Forces are of any scale; a row is NaN where none is
-    found that pushes at all contacts.
+    `points` (b, f, 3) are the contacts, `normals` (b, f, 3) the outward unit normals, and `weights`
+    hold a share for each of p pairs. A short search begins with the weights. The forces are of any
+    scale; those of a set are NaN if none are found that push at all contacts.
     """
     pairs = internal_forces(points)
     push = -dot(pairs, normals[:, None])
@@ -216,8 +228,11 @@ def _improve(
     rounds: Iterable[Float[Tensor, "p s"]],
     preferred: Float[Tensor, "b f"] | None,
 ) -> tuple[Tensions, Bool[Tensor, "b"]]:
-    """Return the weights of least cost in rounds of tried steps, of length 1, and whether they push
-    everywhere.
+    """Return the weights of least cost, of length 1, after rounds of a search, and a mask of the
+    sets where they push everywhere.
+
+    `push` and `slide` map weights to normal and tangential forces (n = 3 f numbers). Each of the
+    `rounds` holds the s changes of the weights that it tries.
     """
     row = row_numbers(push)
     best = row
@@ -275,11 +290,13 @@ def _near_steps(pairs: int, device: torch.device) -> tuple[Float[Tensor, "p s"],
 def central_forces(
     points: Vectors, normals: Vectors, preferred: Float[Tensor, "b f"], slack: float
 ) -> Vectors:
-    """Return balanced forces that need nearly the least friction, near the preferred normal forces.
+    """Return balanced forces (b, f, 3) that need nearly the least friction, near the preferred
+    normal forces.
 
-    `slack` is added to the friction coefficient that the forces need: a larger one gives forces
-    nearer to the preferred ones. A row is NaN where no balanced forces push at every contact within
-    the widest cones.
+    `points` (b, f, 3) are the contacts, `normals` (b, f, 3) the outward unit normals. `preferred`
+    are normal forces, which also fix the scale of the result. `slack` is added to the friction
+    coefficient that the forces need: a larger one gives forces nearer to the preferred ones. The
+    forces of a set are NaN where no balanced forces push at every contact within the widest cones.
     """
     wrench = grasp_map(points / centre_and_radius(points)[1])
     null = torch.linalg.qr(wrench.mT, mode="complete").Q[:, :, 6:]

@@ -3,7 +3,7 @@ with a proof.
 
 Positive coefficients phi that balance all contact wrenches prove closure, and bound its margin from
 below. A witness, which is a wrench that no contact opposes, disproves closure, and bounds the
-margin from above. A batched simplex method (module `closure`) finds both. The solver HiGHS decides
+margin from above. A batched simplex method (`form_closure`) finds both. The solver HiGHS decides
 where the two bounds leave the verdict open.
 
 The multipliers y of W phi = 0 are a multiple of the witness. By the envelope theorem a change dW of
@@ -54,6 +54,7 @@ UNIT_TOLERANCE = 1e-3
 def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
     """Prove in float64 whether contact sets have frictional form closure, Eq. (13) of the paper.
 
+    The `contacts` are sets of three to five points [m] with outward unit normals, from any planner.
     The margin is the largest s for which coefficients phi >= s with sum phi = 1 balance the
     wrenches W of all cone edges, W phi = 0; it is -inf if no phi balances them. The friction cones
     have `spec.edges` edges at friction `spec.planned_friction`. A set is `closed` if its margin is
@@ -67,9 +68,8 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
     The margin is differentiable once in points and normals. Where several phi or v are optimal, its
     derivative is that of one of them; where the margin is -inf, its derivative is NaN. A second
     derivative, and one of another field, raise `BadArgument`; in forward mode the latter is NaN.
-    The `contacts` are sets of three to five with outward unit normals, from any planner. Raises
-    `BadArgument` for contacts of a wrong shape, normals that are not of length 1 (to 1e-3), or no
-    `ContactSpec`.
+    Raises `BadArgument` for contacts of a wrong shape, normals that are not of length 1 (to 1e-3),
+    or no `ContactSpec`.
 
     >>> corners = torch.tensor([[[1.0, 0, 0], [-0.6, 0.8, 0], [-0.6, -0.8, 0]]])
     >>> certify(Contacts(corners, corners)).closed
@@ -83,14 +83,18 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
 
 
 class _Proof(torch.autograd.Function):
-    """The fields of a `Certificate` given m wrenches, then phi and multipliers; a `flat` set is on
-    a line.
+    """The proof of force closure as a differentiable function of m wrenches.
+
+    Its results are the first five fields of a `Certificate`, the coefficients phi (b, m), and the
+    multipliers (b, 6) of W phi = 0.
     """
 
     @staticmethod
     def forward(wrench: Wrenches, flat: Bool[Tensor, "b"]) -> tuple[Tensor, ...]:
-        """Return the fields of the certificate, phi and multipliers; NaN for wrenches that are not
-        finite.
+        """Return the fields of the certificate, then phi and the multipliers; NaN for wrenches that
+        are not finite.
+
+        `flat` marks sets whose contacts lie on a line or in a point.
         """
         b, m, _ = wrench.shape
         margin, ratio, residual = (wrench.new_full((b,), torch.nan) for _ in range(3))
@@ -108,7 +112,7 @@ class _Proof(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
-        """Keep what the derivatives need."""
+        """Store the wrenches, phi and the multipliers, which the derivatives need."""
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(output[3], *output[5:])
         ctx.save_for_backward(inputs[0], *output[5:])
@@ -116,8 +120,8 @@ class _Proof(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, None]:
-        """Return the derivative in the wrenches; raise `BadArgument` unless it is of the margin
-        alone.
+        """Return the derivative by the wrenches; raise `BadArgument` unless it is that of the
+        margin alone.
         """
         margin = grads[0]
         wrench, phi, dual = ctx.saved_tensors
@@ -132,7 +136,9 @@ class _Proof(torch.autograd.Function):
 
     @staticmethod
     def jvp(ctx: Any, *grad_inputs: Any) -> tuple[Tensor | None, ...]:
-        """Return the change of the margin; of other fields it is NaN."""
+        """Return the change of each result for a change of the wrenches; only that of the margin is
+        not NaN.
+        """
         wrench, phi, dual = ctx.saved_tensors
         balance = (phi[:, None] @ grad_inputs[0])[:, 0]  # (b, 6)
         change = _Once.apply(-dot(balance, dual), wrench)
@@ -144,7 +150,7 @@ class _Proof(torch.autograd.Function):
     def vmap(
         info: Any, in_dims: tuple[int | None, ...], *args: Tensor
     ) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-        """Prove the sets of all values of an axis together."""
+        """Prove together the contact sets of all entries of the mapped axis."""
         rows = []
         for x, axis in zip(args, in_dims, strict=True):
             same = axis is None  # for all values
@@ -155,22 +161,22 @@ class _Proof(torch.autograd.Function):
 
 
 class _Once(torch.autograd.Function):
-    """A first derivative of the margin, in the `wrench`; to differentiate it again is an error."""
+    """The first derivative of the margin by the `wrench`; a second derivative is an error."""
 
     generate_vmap_rule = True
 
     @staticmethod
     def forward(derivative: Tensor, wrench: Tensor) -> Tensor:
-        """Return the derivative."""
+        """Return a copy of the derivative."""
         return derivative.clone()
 
     @staticmethod
     def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
-        """Keep nothing."""
+        """Store nothing."""
 
     @staticmethod
     def backward(ctx: Any, *_: Any) -> Any:
-        """Raise `BadArgument`."""
+        """Raise `BadArgument`: the margin has no second derivative."""
         raise BadArgument(
             "contacts",
             "a second derivative of the margin",
@@ -181,8 +187,8 @@ class _Once(torch.autograd.Function):
 
 
 def _prove(wrench: Wrenches) -> tuple[Tensor, ...]:
-    """Return for m wrenches the margin of force closure, the residual |W phi|, a witness, phi, and
-    the multipliers.
+    """Return margin (b,), residual |W phi| (b,), witness (b, 6), phi (b, m) and multipliers (b, 6)
+    for m wrenches of each set.
     """
     phi, witness = solve_closure_lp(wrench)
     residual = residual_of(wrench, phi)
@@ -208,6 +214,8 @@ def _prove(wrench: Wrenches) -> tuple[Tensor, ...]:
 def bound_margin(wrench: Wrenches, witness: Float[Tensor, "b 6"]) -> Float[Tensor, "b"]:
     """Return the upper bound of the closure margin that each direction `witness` in wrench space
     proves, or NaN.
+
+    `wrench` holds the m edge wrenches of each contact set. The bound has no unit.
     """
     # With g_k = w.w_k and phi >= s: 0 = sum phi g >= s sum g + (1 - m s) min g, hence s <= -min g /
     # sum(g - min g).
@@ -217,8 +225,11 @@ def bound_margin(wrench: Wrenches, witness: Float[Tensor, "b 6"]) -> Float[Tenso
 
 
 def solve_by_highs(wrench: np.ndarray) -> tuple[float, float, np.ndarray | None, Tensor]:
-    """Return closure margin, residual max |W phi|, witness (None if unknown) and phi of m wrenches,
-    by HiGHS.
+    """Return closure margin, residual max |W phi|, witness (6,) and coefficients phi (m,) of one
+    contact set, by HiGHS.
+
+    `wrench` (m, 6) holds the m edge wrenches, which are the columns of W. The witness is None if it
+    is unknown.
     """
     from scipy.optimize import linprog
 
@@ -248,8 +259,9 @@ def solve_by_highs(wrench: np.ndarray) -> tuple[float, float, np.ndarray | None,
 
 
 def check_unit(normals: Vectors) -> Vectors:
-    """Return the normals; raise `BadArgument` if the length of a normal is not 1. Normals with NaN
-    are accepted.
+    """Return the normals (b, f, 3); raise `BadArgument` if the length of a normal is not 1.
+
+    Normals with NaN are accepted.
     """
     if not is_known(normals):
         return normals
@@ -263,7 +275,7 @@ def check_unit(normals: Vectors) -> Vectors:
 
 
 def check_contacts(contacts: Contacts) -> Contacts:
-    """Return the contacts; raise `BadArgument` if shapes are wrong, or if a set has not 3 to 5
+    """Return the contacts; raise `BadArgument` for wrong shapes, or sets that do not have 3 to 5
     contacts.
     """
     points = contacts.points

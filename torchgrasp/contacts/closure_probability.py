@@ -46,28 +46,34 @@ points.
 class LinePosterior(Batch):
     """The joint Gaussian of signed distance d and its gradient w along the lines x + t n through
     the contacts.
+
+    Lengths are in normalised units; w and `slope` have no unit.
     """
 
-    points: Vectors  # planned contacts x, in normalised units
-    normals: Vectors  # outward unit normals n
-    # of the surface at each contact; t of nodes and grid points is a multiple of it
+    points: Vectors  # planned contacts x (b, f, 3)
+    normals: Vectors  # outward unit normals n (b, f, 3)
+    # standard deviation of the surface at each contact; t of nodes and grid points is given in it
     deviation: Float[Tensor, "b f"]
     # mean of d at the grid points of each line, from outside to inside
     distance: Float[Tensor, "b f 23"]
     slope: Float[Tensor, "b f 5 3"]  # mean of w at the five nodes of each line
-    # of the covariance of the z = 20 f values (d, w) at all nodes, by line, then by node
+    # symmetric root of the covariance of the z = 20 f values (d, w), by line, then by node
     root: Float[Tensor, "b z z"]
 
 
 @functools.cache
 def grid() -> Float[Tensor, "23"]:
-    """Return the 23 grid positions on a line, in standard deviations, from outside to inside."""
+    """Return the 23 grid positions on a line, in standard deviations of the surface, from outside
+    to inside.
+    """
     return real([*OUTER_GRID, *(-t for t in reversed(OUTER_GRID[:-1]))])
 
 
 def interpolation(at: Float[Tensor, "*b"], nodes: Float[Tensor, "k"]) -> Float[Tensor, "*b k"]:
-    """Return the weights of k nodes at positions in descending order, for linear interpolation at
-    positions `at`.
+    """Return the weights (no unit) of k nodes for linear interpolation at the positions `at`.
+
+    `nodes` are the positions of the nodes in descending order. Positions beyond the nodes take the
+    value of the nearest node.
     """
     held = torch.minimum(torch.maximum(at, nodes[-1]), nodes[0])[..., None]
     gaps = nodes[:-1] - nodes[1:]
@@ -78,8 +84,9 @@ def interpolation(at: Float[Tensor, "*b"], nodes: Float[Tensor, "k"]) -> Float[T
 
 
 def well_inside(shape: ShapeGP, contacts: Contacts) -> Bool[Tensor, "b"]:
-    """Return a mask of the contact sets inside the shape's domain, at least half a fingertip's
-    width from its edge.
+    """Return a mask of the contact sets that lie inside the shape's domain.
+
+    Each contact [m] is at least half a fingertip's width from the edge of the domain.
     """
     radius = norm(_normalised_points(shape, contacts))
     return (radius + FOOTPRINT / shape.scale <= shape.domain_radius).all(-1)
@@ -91,7 +98,9 @@ def _normalised_points(shape: ShapeGP, contacts: Contacts) -> Vectors:
 
 
 def line_posterior(shape: ShapeGP, contacts: Contacts) -> LinePosterior:
-    """Return the posterior of the surface along each contact's normal line; errors are as in
+    """Return the posterior of the surface along each contact's normal line.
+
+    The contacts are in metres, the result in normalised units of the shape. Raises the errors of
     `closure_probability`.
     """
     f = check_contacts(contacts).fingertips
@@ -161,8 +170,10 @@ def node_covariance(
     """Return the posterior covariance of signed distance d and gradient w at all nodes of the
     lines.
 
-    Nodes outside the domain are moved to its edge. The gradient is a difference quotient over a
-    fingertip's width.
+    The z = 20 f values of a contact set are ordered by line, then by node, and are d and w along
+    the normal and two tangents. `points` and `normals` (b, f, 3) are normalised contacts and
+    outward unit normals. `nodes` are normalised positions on the lines; those outside the domain
+    are moved to its edge. The gradient is a difference quotient over a fingertip's width.
     """
     width = FOOTPRINT / shape.scale
     along = dot(points, normals)
@@ -186,15 +197,18 @@ def node_covariance(
 
 
 TouchPoints = Float[Tensor, "b n f 3"]
+"""One vector for each of b contact sets, n random surfaces and f fingertips."""
 
 
 def first_contact(
     lines: LinePosterior, drawn: Float[Tensor, "b n z"]
 ) -> tuple[TouchPoints, TouchPoints]:
-    """Return points and normals at which fingertips touch n random surfaces; NaN where a line meets
-    no surface.
+    """Return points (normalised) and outward unit normals at which fingertips touch n random
+    surfaces.
 
-    `drawn` holds the deviations of the random surfaces from the mean, at the nodes of the lines.
+    Both have the shape (b, n, f, 3), and are NaN where a line meets no surface. `drawn` holds the
+    deviations of the random surfaces from the mean, z = 20 f values (d, w) at the nodes of the
+    lines.
     """
     deviation = drawn.unflatten(-1, (lines.points.shape[1], len(NODES), 4))
     t = grid().to(drawn)
@@ -219,8 +233,9 @@ def first_contact(
 @checked
 @dataclasses.dataclass(frozen=True)
 class ClosureProbability(Batch):
-    """The `probability` that each contact set has force closure on the true surface, with its
-    `standard_error`.
+    """The probability that each contact set has force closure on the true surface.
+
+    `standard_error` is that of the `probability`, which is estimated from random surfaces.
 
     >>> ClosureProbability(torch.tensor([0.97]), torch.tensor([0.01])).probability
     tensor([0.9700])
@@ -249,13 +264,13 @@ def closure_probability(
     Args:
         shape: the uncertain shape.
         contacts: sets of 3 to 5 contacts [m] with outward unit normals, inside the domain of the
-            shape. A draw in which a finger meets no surface within 12 standard deviations counts as
-            one without force closure.
+            shape. A random surface that a finger does not meet within 12 standard deviations counts
+            as one without force closure.
         spec: its `friction` is used, the friction coefficient at execution; `planned_friction` is
             not used.
         n: number of random surfaces. The standard error is at most 1 / (2 sqrt(n)): 0.01 for 2500.
-            It is computed for the fraction (k + 1) / (n + 2) if k draws have force closure, and so
-            never 0.
+            It is computed for the fraction (k + 1) / (n + 2) if k surfaces give force closure, and
+            so is never 0.
         seed: random seed.
 
     >>> from torchgrasp import fit_shape, load_object
@@ -271,8 +286,10 @@ def closure_probability(
 
 
 def closed_share(lines: LinePosterior, friction: float, n: int, seed: int) -> Float[Tensor, "b"]:
-    """Return the fraction of n random surfaces, drawn on `lines`, on which each contact set has
-    force closure.
+    """Return the share of n random surfaces, drawn on `lines`, on which each contact set has force
+    closure.
+
+    `friction` is the coefficient of friction, and `seed` that of the random surfaces.
     """
     generator = torch.Generator().manual_seed(seed)
     count = lines.points.new_zeros(len(lines))

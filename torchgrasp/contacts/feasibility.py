@@ -46,7 +46,10 @@ INSIDE = 0.95
 
 
 def ring_directions(normals: Vectors, points: Vectors, n: int) -> Float[Tensor, "b f n 3"]:
-    """Return n unit tangents at each contact, at equal angles around its normal."""
+    """Return n unit tangents at each contact, at equal angles around its normal.
+
+    `points` (b, f, 3) are the contacts, `normals` (b, f, 3) the outward unit normals.
+    """
     return cone_edges(normals, tangents(points, normals), 1.0, n) + normals[:, :, None]
 
 
@@ -60,8 +63,9 @@ def normal_variation(
     """Return for each contact the largest angle [rad] between its normal and the normals on a ring
     around it.
 
-    The ring has the given normalised `radius`. Contacts outside the mask `among` have infinite
-    angles.
+    `points` (b, f, 3) are normalised, `normals` (b, f, 3) unit vectors. The ring has the normalised
+    `radius`, one number, or one for each contact set. Contacts outside the mask `among` have
+    infinite angles; by default all are measured.
     """
     variation = torch.full_like(points[..., 0], math.inf)
     among = torch.ones_like(variation, dtype=torch.bool) if among is None else among
@@ -81,11 +85,12 @@ def normal_variation(
 
 @dataclasses.dataclass(frozen=True)
 class FlatnessConstraint(Batch):
-    """A linear model, near the contact points `at`, of k constraint values that are <= 0 where the
-    surface is flat.
+    """A linear model of k constraint values that are <= 0 where the surface is flat around the
+    contacts.
 
-    `by_points` holds their derivatives by the 3 f coordinates of a contact set. To build this model
-    costs as much as several solver steps, so build it rarely.
+    `value` (normalised lengths) are the values at the normalised contact points `at` (b, f, 3).
+    `by_points` (no unit) holds their derivatives by the x = 3 f coordinates of a contact set. To
+    build this model costs as much as several solver steps, so build it rarely.
     """
 
     value: Float[Tensor, "b k"]
@@ -93,8 +98,10 @@ class FlatnessConstraint(Batch):
     at: Vectors
 
     def values(self, points: Vectors) -> Float[Tensor, "b k"]:
-        """Return the constraint values at points near `at`, from the linear model; one row per
-        contact set.
+        """Return the k constraint values (normalised lengths) of each contact set at `points` near
+        `at`, by the linear model.
+
+        `points` (b, f, 3) are normalised.
         """
         return self.value + matvec(self.by_points, (points - self.at).flatten(1))
 
@@ -102,12 +109,12 @@ class FlatnessConstraint(Batch):
 def flatness_constraint(
     shape: ShapeLike, points: Vectors, flatness: float, radius: PerRow
 ) -> FlatnessConstraint:
-    """Model by how much the normals around each contact differ from its normal beyond the angle
-    `flatness` [rad].
+    """Return a linear model of how far the normals around each contact differ from the contact's
+    normal.
 
-    A value is |n - n_k|, for the normals n at a contact and n_k on a ring of normalised `radius`
-    around it, less the chord of the angle `flatness`. It is multiplied by the ring's radius, and so
-    is a length.
+    A value is |n - n_k|, for the normals n at a contact and n_k on a ring around it, less the chord
+    of the angle `flatness` [rad]. It is multiplied by the ring's `radius`, and so is a normalised
+    length. `points` (b, f, 3) are the normalised contacts at which the model is built.
     """
     (first, _), *others = walls_at(shape, points)
     found = _wall_constraint(first, points, flatness, radius)
@@ -154,8 +161,10 @@ ON_SURFACE = 1e-6  # largest |f_d| of a contact on the surface, normalised: far 
 
 
 def check_feasibility(shape: ShapeLike, problem: ContactProblem, points: Vectors) -> ContactPlan:
-    """Check contact sets at normalised `points`; return them as a plan, with each set's first
-    violated constraint.
+    """Return contact sets at normalised `points` (b, f, 3) as a plan, after a check of all
+    constraints.
+
+    The `status` of a set is that of the first constraint which it violates.
     """
     spec = problem.spec
     scale = shape.scale
@@ -201,8 +210,10 @@ def check_feasibility(shape: ShapeLike, problem: ContactProblem, points: Vectors
 
 
 def within(problem: ContactProblem, points: Float[Tensor, "*b 3"]) -> Bool[Tensor, "*b"]:
-    """Return which normalised points lie in the region where contacts may be; at its border by more
-    than rounding.
+    """Return a mask of the normalised points that lie inside the region where contacts may be.
+
+    Points within rounding (`BORDER`) of the region's surface are not inside. Without a region all
+    points are inside.
     """
     if problem.beyond is None:
         return torch.ones_like(points[..., 0], dtype=torch.bool)
@@ -211,8 +222,11 @@ def within(problem: ContactProblem, points: Float[Tensor, "*b 3"]) -> Bool[Tenso
 
 
 def first_violation(good: dict[Status, Bool[Tensor, "b"]]) -> Int[Tensor, "b"]:
-    """Return the first status, in the dictionary's order, whose condition is false; OK if all are
-    true.
+    """Return for each contact set the first status, in the dictionary's order, whose condition is
+    false.
+
+    `good` holds a mask of the sets that meet the condition of each status. A set that meets all has
+    `Status.OK`.
     """
     met = torch.stack(list(good.values()))
     codes = torch.tensor([*good, Status.OK], device=met.device)

@@ -57,8 +57,10 @@ ROUNDS = 12  # most programmes: more make hardly a verdict sharper
 
 
 def centre_and_radius(points: Vectors) -> tuple[Float[Tensor, "b 1 3"], Float[Tensor, "b 1 1"]]:
-    """Return the centroid and root-mean-square radius of each contact set; the radius is 1 if it
-    would be 0.
+    """Return the centroid and the root-mean-square radius of each contact set, in the unit of the
+    points.
+
+    `points` have the shape (b, f, 3). The radius is 1 if it would be 0.
     """
     centre = points.mean(-2, keepdim=True)
     size = torch.linalg.vector_norm(points - centre, dim=(-2, -1), keepdim=True)
@@ -67,18 +69,22 @@ def centre_and_radius(points: Vectors) -> tuple[Float[Tensor, "b 1 3"], Float[Te
 
 
 def scaled_arms(points: Vectors) -> Vectors:
-    """Return the points about their centroid, divided by their root-mean-square radius."""
+    """Return vectors (b, f, 3) from the centroid to the points, divided by the points'
+    root-mean-square radius.
+    """
     centre, radius = centre_and_radius(points)
     return (points - centre) / radius
 
 
 def tangents(points: Vectors, normals: Vectors) -> Vectors:
-    """Return a unit tangent at each contact, along which the first edge of its friction cone leans.
+    """Return a unit tangent (b, f, 3) at each contact; the first edge of the linearised friction
+    cone leans along it.
 
-    The tangent rotates with the object. It lies in the plane of three contacts; of four or five
-    contacts, the three are taken whose plane is the most perpendicular to the tangent plane,
-    weighted by area. The tangent is arbitrary where no plane gives one and friction cannot give
-    closure.
+    The tangent rotates with the object. With three contacts it lies in their plane. With four or
+    five, it lies in the plane of three of them: those whose plane is most perpendicular to the
+    tangent plane, weighted by the area of their triangle. The tangent is arbitrary where no plane
+    gives one and friction cannot give closure. `points` and outward unit `normals` have the shape
+    (b, f, 3).
     """
     corners = subsets(points.shape[1], 3, points.device)
     first, second, third = (points[:, corner] for corner in corners.unbind(1))
@@ -110,8 +116,10 @@ def _take(vectors: Float[Tensor, "b f k 3"], index: Int[Tensor, "b f 1"]) -> Vec
 def cone_edges(
     normals: Float[Tensor, "*b 3"], tangent: Float[Tensor, "*b 3"], friction: float, edges: int
 ) -> Float[Tensor, "*b e 3"]:
-    """Return the edges of linearised friction cones: forces of normal component 1; the first leans
-    along `tangent`.
+    """Return the e edges of linearised friction cones: forces whose normal component is 1.
+
+    `normals` are outward unit normals. The first edge leans along the unit `tangent`; `friction` is
+    the coefficient of friction.
     """
     edge = torch.arange(edges, dtype=normals.dtype, device=normals.device)
     angle = edge[:, None] * (2 * math.pi / edges)
@@ -126,8 +134,9 @@ def wrenches(
     """Return the wrench (force, then torque) of each edge of all linearised friction cones: w in
     Eq. (13) of the paper.
 
-    The torque is about the contacts' centroid, and lengths are divided by the contacts'
-    root-mean-square radius.
+    `points` and outward unit `normals` have the shape (b, f, 3). The edges have normal component 1
+    and no unit. The torque is about the contacts' centroid, and lengths are divided by the
+    contacts' root-mean-square radius.
     """
     force = cone_edges(normals, tangents(points, normals), friction, edges)
     arm = scaled_arms(points)[:, :, None]
@@ -135,13 +144,15 @@ def wrenches(
 
 
 def with_torque(force: Float[Tensor, "*b 3"], arm: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 6"]:
-    """Return wrenches: forces, then the torques that they have at their arms."""
+    """Return the wrench of each force: the force, then its torque, the cross product of `arm` and
+    `force`.
+    """
     return torch.cat([force, torch.linalg.cross(arm, force)], -1)
 
 
 def rank_ratio(wrench: Float[Tensor, "b f e 6"]) -> Float[Tensor, "b"]:
-    """Return each grasp's ratio of the smallest to the largest singular value of its wrench matrix
-    (6 x f e).
+    """Return for each contact set the ratio of the smallest to the largest singular value of its
+    wrench matrix (6 x f e).
     """
     values = torch.linalg.svdvals(wrench.flatten(1, 2))
     return values[:, -1] / values[:, 0]
@@ -150,8 +161,8 @@ def rank_ratio(wrench: Float[Tensor, "b f e 6"]) -> Float[Tensor, "b"]:
 def solve_closure_lp(
     wrench: Wrenches,
 ) -> tuple[Coefficients, Float[Tensor, "b 6"]]:
-    """Return for each grasp the coefficients phi that balance its m wrenches with the greatest
-    margin, and a witness.
+    """Return for each contact set the coefficients phi that balance its m wrenches with the
+    greatest margin, and a witness.
 
     The margin is the smallest coefficient. The witness, a unit wrench, proves that no margin is
     greater. If no coefficients balance the wrenches, the witness proves that instead, and phi has
@@ -175,12 +186,12 @@ def _solve(wrench: Wrenches) -> tuple[Coefficients, Float[Tensor, "b 6"]]:
 def maximise(
     objective: Float[Tensor, "b d"], bounds: Float[Tensor, "b m d"]
 ) -> tuple[Float[Tensor, "b d"], Int[Tensor, "b d"], Float[Tensor, "b d"]]:
-    """Maximise a.v with c_k.v <= 1 for all k, for objectives a and m bounds c of each row, by the
-    simplex method.
+    """Return the solutions of b linear programmes: maximise a.v with c_k.v <= 1 for m bounds c_k.
 
-    Return the best v, or a direction in which a.v grows for ever; the d tight bounds; and their
-    multipliers. All programmes run at once, until all are optimal. The point v = 0 is feasible, so
-    there is no first phase.
+    `objective` holds a, and `bounds` the c_k, each of d numbers. Three results are returned: the
+    best v, or a direction in which a.v grows without bound; the indices of the d bounds that are
+    tight; and their multipliers. The simplex method runs for all programmes at once, until all are
+    optimal. The point v = 0 is feasible, so there is no first phase.
     """
     b, m, d = bounds.shape
     row = torch.arange(b, device=bounds.device)
@@ -244,7 +255,9 @@ def closed_exact(
     """Return a mask of the contact sets with frictional form closure under round cones; borderline
     sets are not closed.
 
-    `guess` holds wrench coefficients from `first_balance` for similar contacts, which save time.
+    `points` and outward unit `normals` have the shape (b, f, 3), and `friction` is the coefficient
+    of friction. `guess` holds the coefficients (b, m) that `first_balance` gives for similar
+    contacts, which save time.
     """
     if points.shape[1] == 3:
         return _closed_in_plane(points, normals, friction) & ~degenerate(points)
@@ -252,20 +265,22 @@ def closed_exact(
 
 
 def first_balance(points: Vectors, normals: Vectors, friction: float) -> Coefficients:
-    """Return coefficients that balance wrenches of few cone edges with the greatest margin;
-    arbitrary if none do.
+    """Return coefficients that balance the wrenches of m = 4 f cone edges with the greatest margin.
+
+    They are arbitrary if no coefficients balance them. `points` and outward unit `normals` have the
+    shape (b, f, 3).
     """
     return solve_closure_lp(_first_wrenches(points, normals, friction))[0]
 
 
 def _first_wrenches(points: Vectors, normals: Vectors, friction: float) -> Wrenches:
-    """Return the wrenches of few edges of all friction cones."""
+    """Return the wrenches of the m = 4 f edges of friction cones with four edges."""
     return wrenches(points, normals, friction, FIRST_EDGES).flatten(1, 2)
 
 
 def _closed_in_plane(points: Vectors, normals: Vectors, friction: float) -> Bool[Tensor, "b"]:
-    """Return which sets of three contacts have force closure: balanced forces lie in the plane of
-    the contacts.
+    """Return a mask of the sets of three contacts that have force closure: balanced forces lie in
+    the plane of the contacts.
 
     Each friction cone cuts an angle from the plane. The six planar wrenches along the sides of
     these angles must positively span all planar wrenches: no plane through two of the wrenches has
@@ -291,7 +306,7 @@ def _closed_in_plane(points: Vectors, normals: Vectors, friction: float) -> Bool
 def _spans_plane(
     inward: Float[Tensor, "b 3 2"], position: Float[Tensor, "b 3 2"], half: Float[Tensor, "b 3"]
 ) -> Bool[Tensor, "b"]:
-    """Return which sets of three planar cones positively span all planar wrenches.
+    """Return a mask of the sets of three planar cones that positively span all planar wrenches.
 
     A cone has its apex at a `position`, and its axis along `inward`, with an angle `half` [rad]
     between axis and sides.
@@ -314,8 +329,9 @@ def _spans_plane(
 def _closed_by_proof(
     points: Vectors, normals: Vectors, friction: float, guess: Guess
 ) -> Bool[Tensor, "b"]:
-    """Return which sets of four or five contacts have force closure; cones get edges until each
-    verdict is proven.
+    """Return a mask of the sets of four or five contacts that have force closure.
+
+    Cones get edges until each verdict is proven.
     """
     closed = points.new_zeros(len(points), dtype=torch.bool)
     if friction == 0:  # forces along normals may balance, but only seven or more span all wrenches
@@ -353,7 +369,7 @@ def _balances(wrench: Wrenches, phi: Coefficients) -> Bool[Tensor, "b"]:
 
 
 def residual_of(wrench: Wrenches, phi: Coefficients) -> Float[Tensor, "b"]:
-    """Return the largest number, by its size, of the sum of wrenches with coefficients `phi`."""
+    """Return the largest absolute number in the sum of m wrenches with the coefficients `phi`."""
     return (phi[:, None] @ wrench)[:, 0].abs().amax(-1)
 
 
@@ -364,7 +380,8 @@ def most_opposing(
     and that wrench.
 
     A witness is a wrench that disproves force closure: its products with all contact wrenches are
-    at least 0.
+    at least 0. The wrenches have normal force 1, and lengths are divided by the contacts'
+    root-mean-square radius. `points` and outward unit `normals` have the shape (b, f, 3).
     """
     arm = scaled_arms(points)
     force, torque = witness[:, None].expand(*points.shape[:2], 6).split(3, -1)

@@ -28,8 +28,10 @@ from torchgrasp.values.planning import ContactPlan
 from torchgrasp.values.specs import ContactSpec
 
 SEARCH = (Stage(3.0, 0.3, 10), Stage(1.0, 3.0, 6)) * 4 + (Stage(0.3, 0.3, 8), Stage(0.3, 3.0, 8))
-"""Stages from any initial guess: weights of centre and cones, steps. Each kind goes on where the
-other is stuck.
+"""Solver stages from any initial guess: weights of the offset of the centre and of the cones, and
+most steps.
+
+The two kinds of stages alternate, because each goes on where the other is stuck.
 """
 TO_CENTRE = (
     Stage(0.3, 3.0, 8, exact=False),
@@ -48,21 +50,22 @@ def plan_contacts(
     *,
     time_budget: Positive | None = None,
 ) -> ContactPlan:
-    """Plan contact sets, Eqs. (10)-(14) of the paper: `spec.fingertips` contacts for each initial
-    guess, in order.
+    """Return planned contact sets, Eqs. (10)-(14) of the paper, one for each initial guess, in the
+    order of the guesses.
 
-    A failed set carries the `Status` of the first constraint that it violates. If the solver fails
-    from a feasible initial guess, the guess itself is the result. Without `time_budget` the result
-    is deterministic, and the sets from 500 or 1000 initial guesses are the first sets of a plan
-    from more. Raises `BadArgument` for `starts` that are not positive, of a wrong shape, or outside
-    the shape's domain, or another wrong argument.
+    A set has `spec.fingertips` contacts. A failed set carries the `Status` of the first constraint
+    that it violates. If the solver fails from a feasible initial guess, the guess itself is the
+    result. Without `time_budget` the result is deterministic, and the sets from 500 or 1000 initial
+    guesses are the first sets of a plan from more. Raises `BadArgument` for `starts` that are not
+    positive, of a wrong shape, or outside the shape's domain, or another wrong argument.
 
     Args:
         shape: a `ShapeGP`, or another implicit surface with the same methods.
         spec: the constraints on contacts; `ContactSpec()` by default.
-        starts: number of random initial guesses (Sec. 6.2), or the initial contact points [m].
+        starts: number of random initial guesses (Sec. 6.2), or b sets of f initial contact points
+            [m].
         seed: random seed.
-        time_budget: wall time [s] of the call, in which at least 25 starts are planned; by default
+        time_budget: wall time [s] of the call, in which at least 25 guesses are planned; by default
             all are planned.
 
     >>> from torchgrasp import fit_shape, load_object
@@ -86,8 +89,9 @@ def plan_contacts(
 
 
 def stages_for(spec: ContactSpec) -> tuple[Stage, ...]:
-    """Return the solver stages for random initial guesses; they depend on whether contacts must be
-    flat.
+    """Return the solver stages for random initial guesses under the constraints `spec`.
+
+    They depend on whether the surface at contacts must be flat.
     """
     return SEARCH if spec.flatness is None else TO_CENTRE
 
@@ -114,7 +118,11 @@ def _within(seconds: float, firsts: Iterator[Vectors]) -> Iterator[Vectors]:
 def plan_chunk(
     shape: ShapeLike, problem: ContactProblem, first: Vectors, stages: tuple[Stage, ...]
 ) -> ContactPlan:
-    """Return the contact plan from initial guesses on the surface, in normalised units."""
+    """Return the contact plan from initial guesses on the surface, one contact set for each guess.
+
+    `first` (b, f, 3) are the guesses in normalised units, and `stages` the solver's stages before
+    the last one, `FINISH`.
+    """
     state = start_state(shape, first)
     for stage in (*stages, FINISH):
         state = descend(shape, problem, state, stage)

@@ -1,11 +1,13 @@
 """The contact planning problem, Eqs. (10)-(14) of the paper, for a batch of contact sets.
 
 Unknowns x of a contact set are its f normalised points (f, 3) and a tension for each of the p pairs
-of points. Eq. (11) defines the normals. Eq. (13) asks for balanced forces in the friction cones.
-Three forces balance if and only if each force is the sum of the pulls along the two sides at its
-contact [1]. At four or five contacts, pulls between all pairs balance too, and give every balance
-unless the contacts lie in one plane. So W phi = 0 in Eq. (13) holds for all tensions, and one
-inequality for each friction cone is left. Every inequality has the form: value <= 0.
+of points. The two points of a pair pull each other with the force tension times distance. A jet is
+the value of a function at points, together with its derivatives. Eq. (11) defines the normals. Eq.
+(13) asks for balanced forces in the friction cones. Three forces balance if and only if each force
+is the sum of the pulls along the two sides at its contact [1]. At four or five contacts, pulls
+between all pairs balance too, and give every balance unless the contacts lie in one plane. So W phi
+= 0 in Eq. (13) holds for all tensions, and one inequality for each friction cone is left. Every
+inequality has the form: value <= 0.
 
 [1] Yoshikawa and Nagai, IEEE Trans. Robotics and Automation 7, 1991.
 """
@@ -40,7 +42,7 @@ LEAST_SIDE = 0.05
 
 Tensions = Float[Tensor, "b p"]  # of all p pairs of contacts in every row
 PerRow = float | Float[Tensor, "b"]
-"""A number, or one number for each row."""
+"""One number for all contact sets of a batch, or one number for each of them."""
 
 
 @runtime_checkable
@@ -48,8 +50,11 @@ class ShapeLike(Protocol):
     """The interface of a shape with uncertainty: a `ShapeGP`, or another implicit surface.
 
     `scale` [m] is the length of one normalised unit, `domain_radius` (normalised) the radius in
-    which the shape is known, and `std_factor` multiplies standard deviations. `jet` gives signed
-    distance, variance and derivatives. A `ShapeBatch` has these numbers for each row.
+    which the shape is known, and `std_factor` (no unit) multiplies standard deviations. A
+    `ShapeBatch` has one of these numbers for each row. At q normalised points x, `jet` gives the
+    signed distance, its variance and their derivatives; `mean_and_gradient` gives the mean signed
+    distance and its gradient only. `normalise` converts points [m] to normalised ones, and `metres`
+    does the reverse.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> shape = fit_shape(load_object("jug").view)
@@ -75,12 +80,14 @@ AnyShape = TypeVar("AnyShape", bound=ShapeLike)
 
 
 def device_of(shape: ShapeLike) -> torch.device:
-    """Return the device of a shape; the CPU if it has none."""
+    """Return the device of a shape; the CPU if the shape has no attribute `device`."""
     return getattr(shape, "device", torch.device("cpu"))
 
 
 def rows_of(shape: AnyShape, rows: Int[Tensor, "k"]) -> AnyShape:
-    """Return the shapes of some rows; a single shape is the shape of all rows."""
+    """Return the shapes of the rows with the given indices; one shape for all rows is returned as
+    it is.
+    """
     return shape.rows(rows) if isinstance(shape, ShapeBatch) else shape  # pyright: ignore[reportReturnType]
 
 
@@ -92,8 +99,9 @@ def walls_of(shape: AnyShape) -> tuple[AnyShape, ...]:
 
 
 def walls_at(shape: AnyShape, points: Vectors) -> list[tuple[AnyShape, Bool[Tensor, "b f"]]]:
-    """Return each surface (wall) of a shape, together with a mask (b, f) of the contacts that lie
-    on it.
+    """Return each surface (wall) of a shape, with a mask of the contacts that lie on it.
+
+    `points` (b, f, 3) are normalised contacts.
     """
     walls = walls_of(shape)
     if len(walls) == 1:
@@ -104,14 +112,19 @@ def walls_at(shape: AnyShape, points: Vectors) -> list[tuple[AnyShape, Bool[Tens
 
 
 def triple_jet(shape: ShapeLike, points: Vectors) -> SurfaceJet:
-    """Return mean and variance of the signed distance, with their derivatives, at all contacts."""
+    """Return mean and variance of the signed distance, with their derivatives, at contacts.
+
+    `points` (b, f, 3) and the results are normalised; the results have the leading axes (b, f).
+    """
     jet = shape.jet(points.flatten(0, 1))
     return map_tensors(lambda x: x.unflatten(0, points.shape[:2]), jet)
 
 
 def triple_mean_jet(shape: ShapeLike, points: Vectors) -> MeanJet:
-    """Return the mean signed distance and its derivatives at all contacts; the variance is not
+    """Return the mean signed distance, its gradient and Hessian at contacts; the variance is not
     computed if possible.
+
+    `points` (b, f, 3) and the results are normalised; the results have the leading axes (b, f).
     """
     jet = getattr(shape, "mean_jet", shape.jet)(points.flatten(0, 1))
     values = jet.distance, jet.gradient, jet.hessian
@@ -120,7 +133,9 @@ def triple_mean_jet(shape: ShapeLike, points: Vectors) -> MeanJet:
 
 @functools.cache
 def contact_pairs(fingertips: int, device: torch.device) -> Int[Tensor, "2 p"]:
-    """Return the indices of all p pairs of contacts: neighbours (i, i + 1) first, then (i, i + 2)."""
+    """Return the indices of the two contacts of all p pairs: neighbours (i, i + 1) first, then (i,
+    i + 2).
+    """
     order = [
         (i, (i + gap) % fingertips)
         for gap in range(1, fingertips // 2 + 1)
@@ -131,8 +146,10 @@ def contact_pairs(fingertips: int, device: torch.device) -> Int[Tensor, "2 p"]:
 
 @functools.cache
 def pull_signs(fingertips: int, device: torch.device) -> Float[Tensor, "f p"]:
-    """Return for contact i and pair k: 1 if the contact is the first of the pair, -1 if it is the
-    second, else 0.
+    """Return the sign of each contact i in each pair k, with one row for each contact.
+
+    It is 1 if the contact is the first of the pair, -1 if it is the second, and 0 if it is not in
+    the pair.
     """
     pairs = contact_pairs(fingertips, device)
     at = torch.arange(fingertips, device=device)[:, None]
@@ -140,8 +157,10 @@ def pull_signs(fingertips: int, device: torch.device) -> Float[Tensor, "f p"]:
 
 
 def split_unknowns(x: Float[Tensor, "b u"]) -> tuple[Vectors, Tensions]:
-    """Split each vector of u unknowns into f contact points (f, 3) and the tensions of all p pairs
-    of contacts.
+    """Return the two parts of vectors of u unknowns: contact points (b, f, 3), and tensions of p
+    pairs of contacts.
+
+    Both are views of `x`.
     """
     # the unknowns of the possible numbers of fingertips
     counts = {3 * f + f * (f - 1) // 2: f for f in range(FINGERTIPS[0], FINGERTIPS[1] + 1)}
@@ -151,13 +170,15 @@ def split_unknowns(x: Float[Tensor, "b u"]) -> tuple[Vectors, Tensions]:
 
 @dataclasses.dataclass(frozen=True)
 class Constraints(Batch):
-    """Values of all constraints, and their Jacobians by the u unknowns: point coordinates, then
-    tensions.
+    """Values of all constraints, and their Jacobians by the u unknowns: 3 f point coordinates, then
+    p tensions.
 
-    `centre` is the centroid of the f contacts, and `surface` their signed distances from the
-    surface; both should be 0. `bounds` should be <= 0. It holds f friction cones, f variances, f
-    domain limits, p distances between fingertips, with a table f heights, and with a region f
-    distances from it.
+    `centre` (normalised) is the centroid of the f contacts, and `surface` (normalised) their signed
+    distances from the surface; both should be 0. The k numbers in `bounds` should be <= 0. First
+    come f friction cones (differences of cosines), then f variances (the excess over the limit,
+    divided by the slope of the variance there). All further ones are normalised lengths: f domain
+    limits, p distances between fingertips, with a table f heights, and with a region f distances
+    from it.
     """
 
     centre: Float[Tensor, "b 3"]
@@ -169,20 +190,25 @@ class Constraints(Batch):
 
     @property
     def values(self) -> Float[Tensor, "b r"]:
-        """The values of all constraints in one vector: `centre`, `surface` and `bounds`."""
+        """The values of all r = 3 + f + k constraints in one vector: `centre`, `surface` and
+        `bounds`.
+        """
         return torch.cat([self.centre, self.surface, self.bounds], 1)
 
     @property
     def jacobian(self) -> Float[Tensor, "b r u"]:
-        """The Jacobian of all constraint `values` by the u unknowns."""
+        """The Jacobian of the r constraint `values` by the u unknowns."""
         return torch.cat([self.centre_by_x, self.surface_by_x, self.bounds_by_x], 1)
 
 
 def forces_from_tensions(
     points: Vectors, tension: Tensions
 ) -> tuple[Vectors, Float[Tensor, "b p 3"]]:
-    """Return the forces at the contacts, and the vector of each pair; a pair pulls by tension times
-    vector.
+    """Return the forces (b, f, 3) on the object at the contacts, and the vector of each pair.
+
+    The vector of a pair leads from its first to its second contact. The force on the first contact
+    of a pair is tension times vector, that on the second is opposite. `points` have the shape (b,
+    f, 3).
     """
     first, second = contact_pairs(points.shape[1], points.device)
     sides = points[:, second] - points[:, first]
@@ -196,14 +222,16 @@ Bounds = tuple[Float[Tensor, "b k"], Float[Tensor, "b k u"]]
 
 @dataclasses.dataclass(frozen=True)
 class ContactProblem:
-    """The contact planning problem, Eqs. (10)-(14) of the paper, in the normalised units of one
-    shape, or of each row.
+    """The contact planning problem, Eqs. (10)-(14) of the paper, in normalised units.
 
-    `friction` is the coefficient of the largest round cone inside the friction cone with flat sides
-    that `certify` uses. `separation` is the least distance of two fingertip centres, `ring` the
-    radius within which the surface is flat. The table has the normal `up` and the distance `floor`
-    from the origin. `beyond` returns the signed distance of normalised points from the region where
-    contacts may be.
+    The units are those of one shape, or of one shape for each contact set. `spec` holds the
+    constraints in metres; all else is normalised. `friction` is the coefficient of the largest
+    round cone inside the friction cone with flat sides that `certify` uses. `domain_radius` is that
+    of the shape. `separation` is the least distance of two fingertip centres, `tip_radius` the
+    radius of the fingertips, and `ring` the radius within which the surface is flat. The table has
+    the unit normal `up` (None without a table) and the distance `floor` from the origin. `beyond`
+    returns the signed distance (q,) of normalised points (q, 3) from the region where contacts may
+    be, negative inside.
     """
 
     spec: ContactSpec
@@ -220,8 +248,10 @@ class ContactProblem:
     def of(
         cls, shape: ShapeLike, spec: ContactSpec, ring_radius: PerRow | None = None
     ) -> "ContactProblem":
-        """Return the problem of a shape and a contact specification; `ring_radius` [m] is by
-        default the spec's.
+        """Return the problem of a shape and the constraints `spec`.
+
+        `ring_radius` [m] is the radius within which the surface must be flat; by default that of
+        the spec.
         """
         table = spec.plane
         up = None
@@ -257,7 +287,7 @@ class ContactProblem:
         )
 
     def rows(self, index: Int[Tensor, "k"]) -> "ContactProblem":
-        """Return the problems of some of the rows."""
+        """Return the problem of the contact sets with the given indices."""
         names = "domain_radius", "separation", "tip_radius", "ring", "floor"
         own = {name: x[index] for name in names if isinstance(x := getattr(self, name), Tensor)}
         return dataclasses.replace(self, **own) if own else self
@@ -265,8 +295,10 @@ class ContactProblem:
     def room(
         self, points: Float[Tensor, "*b 3"], normals: Float[Tensor, "*b 3"]
     ) -> Float[Tensor, "*b"]:
-        """Return how high (normalised) each contact is above the height at which its round tip
-        touches the table.
+        """Return how high (normalised) each contact is above the height at which its round
+        fingertip touches the table.
+
+        Without a table it is infinite. `points` are normalised, `normals` outward unit normals.
         """
         if self.up is None:
             return torch.full_like(points[..., 0], math.inf)
@@ -280,14 +312,18 @@ class ContactProblem:
     ) -> Float[Tensor, "*b p 3"]:
         """Return the vectors (normalised) from the first to the second fingertip centre of each
         pair of contacts.
+
+        `points` are normalised contacts, `normals` their outward unit normals.
         """
         centres = points + spread(self.tip_radius, normals) * normals
         first, second = contact_pairs(points.shape[-2], points.device)
         return centres[..., second, :] - centres[..., first, :]
 
     def constraints(self, points: Vectors, tension: Tensions, jet: SurfaceJet) -> Constraints:
-        """Evaluate all constraints and their Jacobians; `jet` holds signed distance and variance at
-        the points.
+        """Return the values of all constraints and their Jacobians for b contact sets.
+
+        `points` (b, f, 3) are the normalised contacts, and `jet` holds signed distance and variance
+        with their derivatives there.
         """
         b, f = points.shape[:2]
         unknowns = 3 * f + tension.shape[1]
@@ -339,8 +375,8 @@ class ContactProblem:
     def _distances(
         self, points: Vectors, normals: Vectors, centre_by_point: Float[Tensor, "b f 3 3"]
     ) -> Bounds:
-        """Return by how much each pair of fingertip centres is too close (negative if far enough),
-        with derivatives.
+        """Return by how much each pair of fingertip centres is too close (normalised; negative if
+        far enough), and the derivatives.
         """
         sides = self.sides(points, normals)
         length = norm(sides)
@@ -356,7 +392,7 @@ class ContactProblem:
 
     def _cones(self, points: Vectors, tension: Tensions, jet: SurfaceJet) -> Bounds:
         """Return by how much each force is outside its friction cone, as a difference of cosines,
-        with derivatives.
+        and the derivatives.
         """
         # With u = f / |f| the bound is n.u + cosine. It changes by (1 - u u^T) n / |f| with f, and
         # by u with n.
@@ -385,8 +421,10 @@ class ContactProblem:
 
 
 def _by_own_point(slope: Vectors, unknowns: int) -> Float[Tensor, "b f u"]:
-    """Return the Jacobian by all unknowns of f values, each of which depends (by `slope`) only on
-    its own contact.
+    """Return the Jacobian of f values by all u unknowns, where each value depends only on its own
+    contact.
+
+    `slope` (b, f, 3) holds the derivatives by the coordinates of the contact.
     """
     b, f = slope.shape[:2]
     jacobian = slope.new_zeros(b, f, unknowns)

@@ -33,10 +33,10 @@ Distance = Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n"]]
 @checked
 @dataclasses.dataclass(frozen=True)
 class Region(Value):
-    """A region of space in the frame of the cloud; `distance` is any function of points (n, 3) in
-    float64.
+    """A region of space in the frame of the cloud, as a signed distance.
 
-    Errors call the function by the `name`.
+    `distance` is a function of points (n, 3) [m] in float64; it returns their signed distances (n,)
+    [m], negative inside. Errors call the function by the `name`.
 
     >>> from torchgrasp import load_object
     >>> ball = Region(lambda points: points.norm(dim=-1) - 0.05)
@@ -51,8 +51,9 @@ class Region(Value):
 
     @checked
     def __call__(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return the signed distance [m] of points, negative inside; raise `BadArgument` if it is
-        no finite number.
+        """Return the signed distance [m] of points [m], negative inside the region.
+
+        Raises `BadArgument` if the function does not return one finite number for each point.
         """
         flat = points.detach().double().reshape(-1, 3)
         found = self.distance(flat)
@@ -73,8 +74,11 @@ class Region(Value):
     def box(
         cls, low: Float[Tensor, "3"], high: Float[Tensor, "3"], obj_from_box: Pose | None = None
     ) -> "Region":
-        """Return the box between two corners [m], along the axes of the cloud, or of a frame
+        """Return the box between two corners [m], along the axes of the cloud, or of the frame
         `obj_from_box`.
+
+        `low` holds the least, and `high` the greatest coordinates in this frame. Raises
+        `BadArgument` unless `low` is less than `high` on each axis.
         """
         if not bool((low < high).all()):
             raise BadArgument(
@@ -96,8 +100,10 @@ class Region(Value):
     @classmethod
     @checked
     def mesh(cls, mesh: "trimesh.Trimesh | Path | str") -> "Region":
-        """Return the inside of a closed mesh [m], a file or given; raise the errors of a bad mesh
-        (`MeshError`).
+        """Return the inside of a closed mesh [m] in the frame of the cloud.
+
+        `mesh` is a mesh or a file. Raises `MeshError` for a mesh that is missing, open, or has no
+        volume.
         """
         solid = read_mesh(mesh)
         surface = surface_distance(
@@ -108,11 +114,11 @@ class Region(Value):
     @classmethod
     @checked
     def mask(cls, scene: Scene, mask: Bool[Tensor, "h w"]) -> "Region":
-        """Return what the pixels of a scene's image cover: the cone of their view rays, the seen
-        and the unseen side.
+        """Return the part of space that the pixels of a mask cover in a scene's image.
 
-        So a contact behind a marked part of the object is inside, too. What is out of the image is
-        outside.
+        It is the cone of the view rays of these pixels, on the seen and the unseen side of the
+        object. So a contact behind a marked part of the object is inside, too. Points outside the
+        image are outside. Raises `BadArgument` for a mask of a wrong shape or without pixels.
         """
         image = scene.image
         if mask.shape != image.depth.shape or not bool(mask.any()):
@@ -140,7 +146,10 @@ class Region(Value):
     @classmethod
     @checked
     def rim(cls, cloud: PointCloud, table: Plane | float, share: Fraction = 0.2) -> "Region":
-        """Return the space of the upper `share` of an object's height over its table."""
+        """Return the space of the upper `share`, in [0, 1], of an object's height over its table.
+
+        `table` is a plane, or a height [m] along z, in the frame of the `cloud`.
+        """
         plane = as_plane(table)
         assert plane is not None
         level = (1 - share) * float(plane.height(cloud.points).max())
@@ -150,7 +159,10 @@ class Region(Value):
 def combine(
     keep: Distance | None, avoid: Distance | None, also: Distance | None = None
 ) -> Distance | None:
-    """Return the region inside `keep` and `also` and outside `avoid`; None if none is given."""
+    """Return the region inside `keep` and `also` and outside `avoid`; None if none is given.
+
+    Each is a function of points (n, 3) [m] that returns their signed distances [m], or None.
+    """
     named = ("keep", keep, 1), ("spec.region", also, 1), ("avoid", avoid, -1)
     parts = [
         (Region(x.distance if isinstance(x, Region) else x, name), k)
@@ -165,7 +177,10 @@ def combine(
 
 
 def seen_from(region: Distance | None, obj_from_frame: Float[Tensor, "4 4"]) -> Distance | None:
-    """Return a region of the frame `obj` as a function of points in another frame."""
+    """Return a region of the frame `obj` as a function of points [m] in another frame.
+
+    `obj_from_frame` is the transform from that frame. None stays None.
+    """
     return (
         None
         if region is None

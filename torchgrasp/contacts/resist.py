@@ -31,8 +31,14 @@ from torchgrasp.values.specs import ContactSpec
 
 
 class Resisted(NamedTuple):
-    """For each grasp the multiple s of its worst load t, t and y about the contacts' centroid, and
-    forces for -s t.
+    """The multiple of the worst load that each contact set resists, with a proof.
+
+    Args:
+        margin: the greatest multiple s (no unit) of the load that the contacts resist; 0 if it is
+            not proven.
+        load: the worst load t, a force [N] and a torque [N m] about the contacts' centroid.
+        twist: the proof y [1/N, 1/(N m)] about the centroid, with y . t = -1.
+        forces: contact forces [N] (b, f, 3) that balance s t.
     """
 
     margin: Float[Tensor, "b"]
@@ -48,10 +54,14 @@ def resist_loads(
     loads: Float[Tensor, "b w 6"],
     spec: ContactSpec,
 ) -> Resisted:
-    """Return how much of the worst of w loads (force, then torque about the origin) contacts
-    resist.
+    """Return how much of the worst of w loads each of b contact sets resists.
 
-    `strength` is the greatest normal force [N] of each contact; cones are those of `certify`.
+    Args:
+        points: contacts [m] (b, f, 3).
+        normals: outward unit normals (b, f, 3).
+        strength: greatest normal force [N] of each contact.
+        loads: forces [N], then torques [N m] about the origin.
+        spec: its planned friction and edges define the friction cones, as in `certify`.
     """
     count = loads.shape[1]
     centre, radius = centre_and_radius(points)
@@ -75,8 +85,11 @@ def resist_loads(
 def _solve(
     edge: Float[Tensor, "r f e 6"], goal: Float[Tensor, "r 6"]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the greatest multiple of each wrench `goal` that forces along the edges make, with
-    twist and forces.
+    """Return the greatest multiple of each wrench `goal` that forces along the edges make, a twist,
+    and the forces.
+
+    Their shapes are (r,), (r, 6) and (r, f, 3). `edge` holds for each of f contacts the wrenches of
+    its greatest forces along e edges.
     """
     r, f, e, _ = edge.shape
     own = torch.eye(f).to(edge)  # the unknowns are y and u_i = 2f z_i - 1

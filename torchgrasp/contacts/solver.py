@@ -1,7 +1,9 @@
 """The solver of a `ContactProblem`: Levenberg-Marquardt steps along the surface.
 
 After every step one Newton step on the mean signed distance brings the points back to the surface.
-This projection costs a fraction of a full evaluation, and allows long steps.
+This projection costs a fraction of a full evaluation, and allows long steps. Lengths are
+normalised. Letters in shapes: a contact sets, f contacts and p pairs of a set, r constraints, u
+unknowns (3 f coordinates, then p tensions, which `contacts.problem` explains).
 """
 
 import dataclasses
@@ -53,11 +55,11 @@ BOUNDS = 3.0  # weight of all bounds but the cones, as great as that of the cone
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
-    """A solver stage: at most `steps` steps, with weights for the offset from the `centre` and for
-    friction `cones`.
+    """A solver stage: at most `steps` steps with given weights of the constraints.
 
-    A contact set stops when its step (normalised) is shorter than `settled`. Unless `exact`, the
-    variance of the surface is extrapolated linearly.
+    `centre` and `cones` are the weights (no unit) of the offset from the centre, and of the
+    friction cones. A contact set stops when its step (normalised) is shorter than `settled`. Unless
+    `exact`, the variance of the surface is extrapolated linearly.
     """
 
     centre: float
@@ -74,8 +76,11 @@ FINISH = Stage(
 
 @dataclasses.dataclass(frozen=True)
 class State(Batch):
-    """The solver's state: normalised contact points, the tension of each pair, and the shape's
-    values at the points.
+    """The solver's state for b contact sets of f contacts.
+
+    `points` (b, f, 3) are the normalised contacts. `tension` is that of each of p pairs of contacts
+    (see `contacts.problem`), scaled so that the mean size of the contact forces is 1. `jet` holds
+    signed distance and variance of the surface at the points, with derivatives.
     """
 
     points: Vectors
@@ -85,8 +90,11 @@ class State(Batch):
 
 @dataclasses.dataclass(frozen=True)
 class LinearConstraints(Linearisation):
-    """The linearised constraints: weighted residuals, their weights, and the Jacobian without
-    weights.
+    """The linearised constraints of a contact sets: r weighted residuals, their weights, and the
+    Jacobian.
+
+    `jacobian` holds the derivatives of the constraints, without weights, by the u unknowns. The
+    weights have no unit; `Constraints` gives the units of the rest.
     """
 
     residual: Float[Tensor, "a r"]
@@ -96,21 +104,27 @@ class LinearConstraints(Linearisation):
 
     @property
     def weighted_jacobian(self) -> Float[Tensor, "a r u"]:
-        """The Jacobian of the weighted residuals."""
+        """The Jacobian of the r weighted residuals by the u unknowns."""
         return self.weight[..., None] * self.jacobian
 
 
 @dataclasses.dataclass(frozen=True)
 class Descent(Minimisation[State, LinearConstraints]):
-    """The least-squares problem of one stage: half the sum of squared weighted constraints."""
+    """The least-squares problem of one stage: half the sum of squared weighted constraints is
+    minimised.
+
+    `shape`, `problem` and `stage` are the surface, the constraints and the weights.
+    """
 
     shape: ShapeLike
     problem: ContactProblem
     stage: Stage
 
     def linearise(self, state: State, rows: Int[Tensor, "a"]) -> LinearConstraints:
-        """Evaluate the constraints and their Jacobian at a state; satisfied inequalities have
-        weight 0.
+        """Return the constraints and their Jacobian at a state; satisfied inequalities have weight
+        0.
+
+        `rows` are the indices of the state's contact sets in the batch.
         """
         problem = self.problem.rows(rows)
         constraints = problem.constraints(state.points, state.tension, state.jet)
@@ -125,8 +139,10 @@ class Descent(Minimisation[State, LinearConstraints]):
         return LinearConstraints(cost, residual, weight, constraints.jacobian, inside)
 
     def step(self, model: LinearConstraints, damping: Damping) -> Steps:
-        """Return each contact set's damped step (NaN for a singular matrix), and whether the step
-        is long enough.
+        """Return each contact set's damped step, and whether it is long enough to go on.
+
+        A step has u numbers, and is NaN for a singular matrix. `damping` holds a number for each
+        set.
         """
         jacobian = model.weighted_jacobian
         scale = jacobian.new_ones(1, jacobian.shape[2])
@@ -141,7 +157,10 @@ class Descent(Minimisation[State, LinearConstraints]):
         return x / shrink[:, None], length / shrink > self.stage.settled  # NaN is not longer
 
     def move(self, state: State, x: Step, rows: Int[Tensor, "a"]) -> State:
-        """Return the state after a step x; the contacts move along the surface."""
+        """Return the state after a step x of the unknowns; the contacts move along the surface.
+
+        `rows` are the indices of the state's contact sets in the batch.
+        """
         by_points, by_tension = split_unknowns(x)
         shape = rows_of(self.shape, rows)
         points = project(shape, state.points + by_points, steps=1)
@@ -160,6 +179,8 @@ class Descent(Minimisation[State, LinearConstraints]):
     ) -> Verdict:
         """Return a mask of the steps that lower the cost inside the domain, and the next damping
         (Nielsen's rule).
+
+        `model` is the linear model before the step x, and `trial` that after it.
         """
         kept = (model.cost - trial.cost) / promised_decrease(model, x)
         accepted = (kept > 0) & trial.inside  # NaN is not accepted
@@ -168,8 +189,9 @@ class Descent(Minimisation[State, LinearConstraints]):
         return accepted, torch.where(accepted, eased, (4 * damping).clamp(max=MOST_DAMPING))
 
     def refuse(self, model: LinearConstraints, trial: LinearConstraints) -> LinearConstraints:
-        """Return the model after a rejected step; its Jacobian is the mean of the Jacobians at the
-        step's two ends.
+        """Return the linear model after a rejected step: `model`, with another Jacobian.
+
+        Its Jacobian is the mean of those of `model` before and `trial` after the step.
         """
         # Near an observation a thin plate's normals change abruptly. The mean Jacobian points down
         # along the kink.
@@ -177,19 +199,21 @@ class Descent(Minimisation[State, LinearConstraints]):
 
 
 def promised_decrease(model: LinearConstraints, x: Step) -> Float[Tensor, "a"]:
-    """Return the decrease of the cost that the linear model predicts for a step x."""
+    """Return the decrease of each contact set's cost that the linear model predicts for the step x."""
     linear = model.residual + matvec(model.weighted_jacobian, x)
     return (model.residual.square().sum(1) - linear.square().sum(1)) / 2
 
 
 def descend(shape: ShapeLike, problem: ContactProblem, state: State, stage: Stage) -> State:
-    """Run one solver stage; return the state (contacts and tensions) after it."""
+    """Return the solver's state after one stage that begins with `state`."""
     return levenberg_marquardt(Descent(shape, problem, stage), state, stage.steps)[0]
 
 
 def project(shape: ShapeLike, points: Float[Tensor, "b k 3"], steps: int) -> Float[Tensor, "b k 3"]:
-    """Move normalised points onto the surface, where the signed distance is 0, by Newton steps
-    along the gradient.
+    """Return normalised points, moved onto the surface by Newton steps along the gradient of the
+    signed distance.
+
+    `steps` is the number of Newton steps.
     """
     x = points.flatten(0, 1)
     for _ in range(steps):
@@ -199,21 +223,27 @@ def project(shape: ShapeLike, points: Float[Tensor, "b k 3"], steps: int) -> Flo
 
 
 def start_state(shape: ShapeLike, points: Vectors) -> State:
-    """Return the solver's first state: contacts with equal tensions between all pairs."""
+    """Return the solver's first state at normalised contacts (b, f, 3), with equal tensions between
+    all pairs.
+    """
     return State(points, equal_tensions(points), triple_jet(shape, points))
 
 
 def equal_tensions(points: Vectors) -> Tensions:
-    """Return equal tensions for all pairs of contacts; the force at each contact then points to the
-    centroid.
+    """Return equal tensions for all p pairs of contacts; the force at each contact then points to
+    the centroid.
 
-    A pair of contacts pulls together with its tension times its distance.
+    `points` (b, f, 3) are the normalised contacts. A pair of contacts pulls together with its
+    tension times its distance.
     """
     pairs = contact_pairs(points.shape[1], points.device).shape[1]
     return normalise_tensions(points, points.new_ones(len(points), pairs))
 
 
 def normalise_tensions(points: Vectors, tension: Tensions) -> Tensions:
-    """Return the tensions, scaled so that the mean size of the contact forces that they cause is 1."""
+    """Return the tensions, scaled so that the mean size of the contact forces that they cause is 1.
+
+    `points` (b, f, 3) are the normalised contacts.
+    """
     force, _ = forces_from_tensions(points, tension)
     return tension / norm(force).mean(-1, keepdim=True)

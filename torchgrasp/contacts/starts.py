@@ -38,6 +38,8 @@ STARTS_PER_CHUNK = 500
 def check_starts(shape: ShapeLike, spec: ContactSpec, starts: int | Tensor) -> None:
     """Raise `BadArgument` for initial guesses with a wrong number of contacts, or outside the
     shape's domain.
+
+    `starts` is a number of random guesses, or contact points (b, f, 3) [m].
     """
     if isinstance(starts, Tensor):
         if starts.ndim == 3 and starts.shape[1] != spec.fingertips:
@@ -59,23 +61,25 @@ def check_starts(shape: ShapeLike, spec: ContactSpec, starts: int | Tensor) -> N
 
 
 def given_starts(shape: ShapeLike, starts: Vectors) -> Iterator[Float[Tensor, "_ f 3"]]:
-    """Yield chunks of the caller's initial contact points [m], moved onto the surface, in
+    """Yield the caller's initial contact points [m] in chunks, moved onto the surface, in
     normalised units.
+
+    `starts` have the shape (b, f, 3).
     """
     for points in starts.detach().to(device_of(shape), torch.float64).split(STARTS_PER_CHUNK):
         yield project(shape, draw_in(shape, shape.normalise(points)), steps=6)
 
 
 def start_chunks(starts: int) -> list[int]:
-    """Split a number of initial guesses into chunks that are planned at once; return the size of
-    each chunk.
-    """
+    """Return the sizes of the chunks in which a number of initial guesses is planned."""
     return [min(STARTS_PER_CHUNK, starts - begin) for begin in range(0, starts, STARTS_PER_CHUNK)]
 
 
 class FlatCandidates(NamedTuple):
-    """A specification with a known `flat_radius`, and p candidate contacts on flat surface, with
-    their normals.
+    """Constraints with a known `flat_radius`, and p candidate contacts where the surface is flat.
+
+    `candidates` are the normalised points (p, 3), and the outward unit normals (p, 3) there; None
+    if the surface need not be flat.
     """
 
     spec: ContactSpec
@@ -85,7 +89,8 @@ class FlatCandidates(NamedTuple):
 def drawn_starts(
     shape: ShapeLike, settled: FlatCandidates, sizes: Iterable[int], seed: int
 ) -> Iterator[Float[Tensor, "_ f 3"]]:
-    """Yield random initial guesses on the surface in normalised units, `sizes[k]` at a time.
+    """Yield random initial guesses on the surface in normalised units, `sizes[k]` contact sets at a
+    time.
 
     Without `spec.flatness` the guesses are drawn as in the paper (Sec. 6.2). With flatness they are
     sets of candidate contacts, because the centroid of contacts on flat surface may lie far from
@@ -105,10 +110,10 @@ def drawn_starts(
 
 
 def settle_flatness(shape: ShapeLike, spec: ContactSpec, seed: int) -> FlatCandidates:
-    """Choose `flat_radius` if it is not given, as the largest with which enough guesses have force
-    closure.
+    """Return the constraints with a known `flat_radius`, and candidate contacts.
 
-    The candidates are the points at which the surface is flat, or all points of `survey` if too few
+    A radius that is not given is the largest with which enough guesses have force closure. The
+    candidates are the points at which the surface is flat, or all points of `survey` if too few
     points are flat.
     """
     if spec.flatness is None:
@@ -137,7 +142,7 @@ def draw(
     shape: ShapeLike, spec: ContactSpec, size: tuple[int, int], generator: torch.Generator
 ) -> Float[Tensor, "_ f 3"]:
     """Return random points on the sphere of `spec.start_radius`, in normalised units; `size` is
-    (sets, contacts).
+    (contact sets, contacts of each).
     """
     points = unit(torch.randn(*size, 3, generator=generator, dtype=torch.float64, device="cpu"))
     return (spec.start_radius * points).to(device_of(shape))
@@ -146,8 +151,9 @@ def draw(
 def survey(
     shape: ShapeLike, spec: ContactSpec, generator: torch.Generator
 ) -> Float[Tensor, "_ f 3"]:
-    """Return points all over the surface, from which candidates are chosen; for a vessel, half are
-    on each wall.
+    """Return points (normalised) all over the surface, from which candidates are chosen.
+
+    They come in sets of three. For a vessel, half of them are on each wall.
     """
     walls = walls_of(shape)
     triples = CANDIDATE_TRIPLES * (1 if spec.region is None else 4)  # few of them lie in a region
@@ -158,10 +164,11 @@ def survey(
 
 
 def draw_in(shape: ShapeLike, points: Vectors) -> Vectors:
-    """Move initial guesses that are far from the surface close to the centroid of their contacts.
+    """Return initial guesses, of which those far from the surface are moved close to the centroid
+    of their contacts.
 
-    Points projected from near the centroid spread over the surface around it. Points from afar all
-    end on the nearest surface.
+    `points` (b, f, 3) are normalised. Points projected from near the centroid spread over the
+    surface around it. Points from afar all end on the nearest surface.
     """
     distance, _ = shape.mean_and_gradient(points.flatten(0, 1))
     far = distance.view(points.shape[:2]).abs().amax(-1) > FAR
@@ -174,8 +181,11 @@ def draw_in(shape: ShapeLike, points: Vectors) -> Vectors:
 def qualify(
     shape: ShapeLike, spec: ContactSpec, points: Vectors
 ) -> tuple[Bool[Tensor, "b f"], Vectors]:
-    """Return a mask of usable points (on the surface, of low variance, in the domain, above table),
-    and all normals.
+    """Return a mask of the points at which a contact may lie, and the outward unit normals of the
+    surface at all points.
+
+    `points` (b, f, 3) are normalised. A contact may lie on the surface, where its variance is low,
+    in the domain, above the table, and in the region.
     """
     problem = ContactProblem.of(shape, spec)
     distance, gradient = (
@@ -197,10 +207,12 @@ def candidate_rows(
     starts: int,
     generator: torch.Generator,
 ) -> tuple[Vectors, int]:
-    """Return random sets of candidate contacts, and how many of them have force closure and are
-    well separated.
+    """Return random sets (b, f, 3) of candidate contacts, and how many of them have force closure
+    and are well separated.
 
-    If too few of the drawn sets are such, the rest are any candidates.
+    `points` (p, 3) are the normalised candidates, `normals` (p, 3) their outward unit normals, and
+    `starts` is the number b of sets. If too few of the drawn sets have force closure, the rest are
+    any candidates.
     """
     rows = []
     missing = starts
