@@ -12,9 +12,9 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from torchgrasp.foundation.lazy import Image, ImageDraw, ImageFont, matplotlib, trimesh
 
-Points = Float[np.ndarray, "n 3"]
-Color = tuple[float, float, float]
-Direction = tuple[float, float, float]
+Points = Float[np.ndarray, "n 3"]  # points [m], or colours in [0, 1]
+Color = tuple[float, float, float]  # red, green and blue in [0, 1]
+Direction = tuple[float, float, float]  # (x, y, z) of any length
 FINGERS = (
     "#2f6db5",
     "#23967f",
@@ -69,7 +69,7 @@ class MarkShapes:
 
 @dataclasses.dataclass(frozen=True)
 class Framing:
-    """Where a camera stands that shows a set of corners."""
+    """Numbers that place a camera so that it shows a set of points."""
 
     angle: float = 24.0  # vertical field of view [degrees]: a long lens distorts little
     # least and greatest rise for each metre along the ground: straight down, or up from below the
@@ -85,7 +85,7 @@ class Framing:
 
 @dataclasses.dataclass(frozen=True)
 class RasterNumbers:
-    """How triangles become pixels."""
+    """Numbers of the rendering of triangles to pixels."""
 
     samples: int = 2  # along each axis of a pixel; their mean gives smooth edges
     opacity: float = 0.5  # of transparent triangles
@@ -98,14 +98,17 @@ class RasterNumbers:
 
 @dataclasses.dataclass(frozen=True)
 class Lamps:
-    """Two lamps fixed to the camera, chosen by eye; directions are right, up and back."""
+    """Numbers of two lamps fixed to the camera, chosen by eye.
 
-    ambient: float = 0.52
-    key_strength: float = 0.50
-    fill_strength: float = 0.22
-    shine_strength: float = 0.08
-    key: Direction = (-0.45, 0.65, 0.62)
-    fill: Direction = (0.70, 0.10, 0.60)
+    Strengths are factors of a surface's colour; directions are (right, up, back).
+    """
+
+    ambient: float = 0.52  # brightness without the lamps
+    key_strength: float = 0.50  # brightness that the main lamp adds
+    fill_strength: float = 0.22  # brightness that the second lamp adds
+    shine_strength: float = 0.08  # white that the highlight of the main lamp adds
+    key: Direction = (-0.45, 0.65, 0.62)  # to the main lamp
+    fill: Direction = (0.70, 0.10, 0.60)  # to the second lamp
     shininess: int = 40  # exponent: larger makes the highlight smaller
     least_normal: float = 1e-12  # a face without area has a normal of length 0
 
@@ -114,9 +117,9 @@ class Lamps:
 class BarLayout:
     """Layout of a colour bar at the bottom of a picture [pixels]."""
 
-    side: int = 5  # the bar leaves one such part of the width free on each side
-    top: int = 24  # of the strip, from the bottom of the picture
-    bottom: int = 10
+    side: int = 5  # one part in so many of the width stays free on each side of the bar
+    top: int = 24  # upper end of the strip, from the bottom of the picture
+    bottom: int = 10  # lower end of the strip, likewise
     font: int = 20
     labels: int = 4  # numbers above the strip
     label_rise: int = 4  # of the numbers and of the title above the strip
@@ -135,8 +138,13 @@ PNG_LEVEL = 4  # of compression: higher is slower and hardly smaller
 
 
 class Triangles(NamedTuple):
-    """Triangles by their corners [m], with a normal and a colour in [0, 1] at each; unlit triangles
-    get no shading.
+    """A set of t triangles, each with a normal and a colour at its three corners.
+
+    Attributes:
+        corners: positions of the corners [m].
+        normals: vectors across the surface at the corners, of any length and either sign.
+        colors: red, green and blue at the corners, in [0, 1].
+        lit: mask of the triangles that are shaded; the others keep their colours.
     """
 
     corners: Float[np.ndarray, "t 3 3"]
@@ -146,8 +154,12 @@ class Triangles(NamedTuple):
 
 
 class Camera(NamedTuple):
-    """A pinhole camera: the rows of `frame` are right, up and back; `angle` is the vertical field
-    of view [rad].
+    """A pinhole camera.
+
+    Attributes:
+        position: place of its centre [m].
+        frame: unit vectors to the right, up and back of the camera, one in each row.
+        angle: vertical field of view [rad].
     """
 
     position: Float[np.ndarray, "3"]
@@ -171,8 +183,10 @@ class Canvas:
         transparent: bool = False,
         lit: bool = True,
     ) -> None:
-        """Add a mesh with one colour, or a colour for each vertex; without `normals`, strong bends
-        look sharp.
+        """Add a mesh with one colour "#rrggbb", or with a colour in [0, 1] for each vertex.
+
+        `vertices` [m] have the vertex `normals`; without them, edges with a strong bend look sharp.
+        `faces` (t, 3) are indices of three vertices. With `lit` False the mesh gets no shading.
         """
         corners = vertices[faces]
         bent = sharp_normals(vertices, faces) if normals is None else normals[faces]
@@ -183,7 +197,9 @@ class Canvas:
         (self.transparent if transparent else self.solid).append(triangles)
 
     def add_points(self, points: Points, colors: Points) -> None:
-        """Add points as small balls, each in its colour."""
+        """Add points (n, 3) [m] as small balls; `colors` (n, 3) are red, green and blue in [0,
+        1].
+        """
         # so small on the page that the faces of the balls do not show
         radius = MARKS.point_radius * float(np.linalg.norm(np.ptp(points, axis=0)))
         ball = trimesh.creation.icosphere(subdivisions=0, radius=radius)
@@ -196,8 +212,10 @@ class Canvas:
     def add_arrows(
         self, points: Points, directions: Points, length: float, colors: tuple[str, ...]
     ) -> None:
-        """Add arrows of one length [m] in unit directions, each with its colour and a small ball at
-        its start.
+        """Add n arrows of one `length` [m], each with a small ball at its start.
+
+        `points` (n, 3) [m] are the starts, `directions` (n, 3) unit vectors, and `colors` n texts
+        "#rrggbb".
         """
         sections = MARKS.arrow_sections
         head = trimesh.creation.cone(
@@ -221,11 +239,10 @@ class Canvas:
         height: float | None,
         shadows: Sequence[tuple[np.ndarray, np.ndarray]] = (),
     ) -> None:
-        """Add an unshaded round table top at `height` [m], centred on `corners` in x and y. None
-        adds nothing.
+        """Add an unshaded round table top at `height` z [m]; without a height nothing is added.
 
-        The `shadows` are meshes, by vertices and faces, whose outlines darken the table straight
-        below them.
+        Its centre is that of `corners` (n, 3) [m] in x and y. The `shadows` are meshes, by vertices
+        (v, 3) [m] and faces (t, 3), whose outlines darken the table straight below them.
         """
         if height is None:
             return
@@ -243,7 +260,10 @@ class Canvas:
             self.add_mesh(flat, faces, SHADOW, up, lit=False)
 
     def render(self, camera: Camera, size: tuple[int, int] = SIZE) -> UInt8[np.ndarray, "h w 3"]:
-        """Return the picture that a camera sees, as pixels."""
+        """Return the picture that a camera sees, as red, green and blue of h x w pixels.
+
+        `size` is (w, h) [pixels].
+        """
         return render(
             concatenate(self.solid), concatenate(self.transparent), camera, size, rgb(PAPER)
         )
@@ -251,8 +271,10 @@ class Canvas:
     def render_png(
         self, corners: Points, direction: Direction, bar: tuple[str, float, str] | None = None
     ) -> bytes:
-        """Return a PNG that shows all `corners` [m]; `bar` is title, largest value and colour map
-        of a bar below.
+        """Return a PNG that shows all `corners` (n, 3) [m].
+
+        `direction` points to the camera. `bar` holds title, largest value and colour map of a
+        colour bar below the picture; None means no bar.
         """
         camera = frame_camera(corners, direction, FRAMING.bar_drop if bar else 0.0)
         image = Image.fromarray(self.render(camera))
@@ -264,8 +286,10 @@ class Canvas:
 def frame_camera(
     corners: Points, direction: Direction, drop: float = 0.0, size: tuple[int, int] = SIZE
 ) -> Camera:
-    """Return a camera in `direction` that sees all `corners`; the lowest fraction `drop` of its
-    picture stays empty.
+    """Return a camera in `direction` that sees all `corners` (n, 3) [m], with z up.
+
+    Its slope is limited by `FRAMING`. The lowest fraction `drop` of its picture stays empty; `size`
+    is the width and height of the picture [pixels].
     """
     tangent = np.tan(np.deg2rad(FRAMING.angle) / 2)
     x, y, z = direction
@@ -292,7 +316,10 @@ def frame_camera(
 def sharp_normals(
     vertices: Float[np.ndarray, "v 3"], faces: np.ndarray
 ) -> Float[np.ndarray, "f 3 3"]:
-    """Return a normal for each corner of each face; only edges with a strong bend look sharp."""
+    """Return a unit normal for each corner of each face; only edges with a strong bend look sharp.
+
+    `faces` (f, 3) are indices of three vertices; `vertices` are in metres.
+    """
     mesh = trimesh.Trimesh(vertices, faces)
     smooth = trimesh.graph.smooth_shade(mesh, np.deg2rad(SMOOTH_BEND), facet_minarea=None)
     # the surface was split at its sharp edges, which changed the order of the faces
@@ -316,8 +343,10 @@ def render(
     size: tuple[int, int],
     background: Color,
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the pixels of a picture of opaque triangles; over them lies the nearest layer of
-    transparent triangles.
+    """Return the pixels of a picture of opaque and transparent triangles.
+
+    Of the transparent triangles, only the nearest layer is drawn over the opaque ones. `size` is
+    the width and height (w, h) [pixels]; `background` is red, green and blue in [0, 1].
     """
     samples = RASTER.samples
     width = size[0] * samples
@@ -426,13 +455,17 @@ def rgb(color: str) -> Color:
 
 
 def map_colors(values: Float[np.ndarray, " n"], name: str) -> Points:
-    """Return the colours that the matplotlib colour map `name` gives to values in [0, 1]."""
+    """Return red, green and blue (n, 3), in [0, 1], of `values` in [0, 1].
+
+    `name` is the name of a colour map of matplotlib.
+    """
     return matplotlib.colormaps[name](values)[:, :3]
 
 
 def color_std(std_m: Float[np.ndarray, " n"]) -> tuple[Points, float]:
-    """Return the colours of standard deviations [m], and the one that has the last colour: all but
-    a hundredth.
+    """Return the colours (n, 3) of standard deviations [m], and the value of the last colour [m].
+
+    That value is the 99 % quantile; all greater ones have the same colour.
     """
     highest = float(np.quantile(std_m, STD_QUANTILE)) if len(std_m) else 0.0
     most = max(highest, LEAST_STD)
@@ -440,7 +473,10 @@ def color_std(std_m: Float[np.ndarray, " n"]) -> tuple[Points, float]:
 
 
 def draw_bar(image: Any, title: str, most: float, colors: str) -> None:
-    """Draw a titled colour bar from 0 to `most` at the bottom of a picture."""
+    """Draw a titled colour bar from 0 to `most` at the bottom of a Pillow image.
+
+    `colors` is the name of a colour map of matplotlib; `most` has the unit that the title names.
+    """
     width, height = image.size
     left = width // BAR.side
     right = width - left

@@ -25,10 +25,10 @@ OBJECT_HEADS = ("object", "pass", "with its 95 % interval", "interval", "of", "b
 def write_evaluation(
     path: Path | str, title: str, asked: Mapping[str, object], scores: Sequence[ViewScore]
 ) -> Path:
-    """Write the HTML page with a title, an evaluation's settings by name, and the results of
-    `evaluate`, atomically.
+    """Write the HTML page of an evaluation, atomically; return the path.
 
-    Returns the path. Raises `OutputError` if the file cannot be written.
+    `asked` are the settings of the evaluation by name, and `scores` the results of `evaluate`.
+    Raises `OutputError` if the file cannot be written.
 
     >>> import tempfile
     >>> jug = ViewScore("jug", "view0", 0, 4.0, note="an open surface")
@@ -40,7 +40,10 @@ def write_evaluation(
 
 
 def format_evaluation(title: str, asked: Mapping[str, object], scores: Sequence[ViewScore]) -> str:
-    """Return the HTML page of an evaluation; `asked` are its settings by name."""
+    """Return the HTML page of an evaluation.
+
+    `asked` are the settings of the evaluation by name, and `scores` the results of `evaluate`.
+    """
     summary = summarise(scores)
     groups = {"": summary} | {f"{group}: ": some for group, some in summary["by_group"].items()}
     shares = [
@@ -122,8 +125,10 @@ def _object_rows(
 
 
 def list_causes(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return table rows with each cause of objects not held: its name; its count, in all and by
-    group, and its size.
+    """Return the name and a text for each cause for which objects were not held.
+
+    The text holds the count, in all and by group, and the median size with its unit. `summary` is
+    what `summarise` returned.
     """
     rows = []
     for name, found in summary["causes"].items():
@@ -134,7 +139,11 @@ def list_causes(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def list_figures(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return table rows with counts, mean forces, overlaps, slips and computing times."""
+    """Return label and text of each count, mean force, overlap, slip and computing time of an
+    evaluation.
+
+    The labels hold the units. `summary` is what `summarise` returned.
+    """
     rows = []
     for key, (text, style) in NAMES["figures"].items():
         value = summary[key]

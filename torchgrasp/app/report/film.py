@@ -24,24 +24,26 @@ from torchgrasp.values.closing import ClosureResult
 
 @dataclasses.dataclass(frozen=True)
 class FilmLayout:
-    """Layout of a film strip: stills in a row, and plots below them [pixels; fonts in points]."""
+    """Layout of a film strip: stills side by side, and plots below them [pixels; fonts in
+    points].
+    """
 
     dpi: int = 100
-    width: int = 1680
+    width: int = 1680  # of the strip
     still: int = 340  # height of a still with its title
     title: int = 44  # height of this title
     title_left: float = 0.04  # place of the title, as a share of the still's width
     font: int = 14
     small_font: int = 12  # of the titles of many stills, so that they fit
-    many: int = 6
+    many: int = 6  # stills from which on the small font is used
     tall_plot: int = 200  # height of a plot with a legend
-    plot: int = 110
+    plot: int = 110  # height of a plot without a legend
     plot_gap: int = 50  # above each plot, for its title
     plots_top: int = 62  # between stills and plots, for the letters of the moments
     plots_bottom: int = 60  # for the axis of time
     bottom: int = 76  # height beside stills, plots and their gaps
     left: float = 0.05  # ends of the plots, as shares of the width
-    right: float = 0.985
+    right: float = 0.985  # likewise
     letter_rise: int = 30  # of a letter above the first plot [points]
     touch: int = 12  # size of the mark at a finger's first touch [points]
     far: float = 0.25  # an object this far from its first place [m] is lost, and is not framed
@@ -49,12 +51,12 @@ class FilmLayout:
 
 @dataclasses.dataclass(frozen=True)
 class PlotStyle:
-    """Look of the plots in a film strip [points], and the least ends of their axes."""
+    """Style of the plots in a film strip [points], and the least upper ends of their axes."""
 
     font: int = 13
-    title_gap: int = 9
+    title_gap: int = 9  # between a title and its plot
     ticks: int = 3  # most intervals of the vertical axis
-    line: float = 1.8
+    line: float = 1.8  # width of a line
     wide: float = 4.0  # of the hand's height, which a held object would cover
     handle: float = 1.2  # length of a line in the legend, in font sizes
     legend_top: float = 0.96  # lower end of the legend, as a share of the plot's height
@@ -81,8 +83,10 @@ MOTION_COLORS = {
 def draw_film(
     mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult, direction: Direction
 ) -> bytes:
-    """Return a PNG of the film strip of a closing; `mesh` is the true object [m] in the frame of
-    the grasp.
+    """Return a PNG of the film strip of a closing.
+
+    `mesh` is the true object [m] in the frame of the grasp, where z is up. `direction` points from
+    the object to the camera.
     """
     from matplotlib.figure import Figure
 
@@ -141,7 +145,10 @@ def draw_film(
 
 
 def describe_film(mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult) -> str:
-    """Return the caption of a film strip: the order of touch, when and why the object was lost."""
+    """Return the caption of a film strip: the order of touch, and when and why the object was lost.
+
+    `mesh` is the true object [m] in the frame of the grasp, where z is up.
+    """
 
     def times(count: int) -> str:
         return "once" if count == 1 else f"{count} times"

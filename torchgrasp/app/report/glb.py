@@ -22,10 +22,11 @@ from torchgrasp.values.planning import Grasps
 
 @dataclasses.dataclass(frozen=True)
 class SrgbCurve:
-    """The curve from sRGB to linear light, as IEC 61966-2-1 defines it."""
+    """The curve from sRGB colours to linear light, as IEC 61966-2-1 defines it."""
 
     dark: float = 0.04045  # up to this value the curve is straight
-    slope: float = 12.92
+    slope: float = 12.92  # values of the straight part are divided by it
+    # a larger value v becomes ((v + offset) / (1 + offset)) ** gamma
     offset: float = 0.055
     gamma: float = 2.4
 
@@ -38,13 +39,13 @@ ROUGHNESS = 0.6  # of all parts, from 0, a mirror, to 1: that of matt plastic
 def write_glb(
     path: Path | str, hand: Hand, grasp: Grasps, body: "Surface | trimesh.Trimesh"
 ) -> Path:
-    """Write a hand at a single grasp with the object as one GLB file (binary glTF 2.0, metres, y
-    up), atomically.
+    """Write a hand at a single grasp with the object as one GLB file, atomically.
 
-    The nodes have the names of the hand's links, in the colours of their fingers, and "object". The
-    `body` is a mesh [m] in the frame of the grasp, or the estimated surface, which is coloured by
-    its standard deviation. Returns the path. Raises `BadArgument` if there is not exactly one
-    grasp, `OutputError` if the file cannot be written.
+    The file is binary glTF 2.0, in metres, with y up. Its nodes have the names of the hand's links,
+    in the colours of their fingers, and "object". The `body` is a mesh [m] in the frame of the
+    grasp, or the estimated surface, which is coloured by its standard deviation. Returns the path.
+    Raises `BadArgument` if there is not exactly one grasp, `OutputError` if the file cannot be
+    written.
 
     >>> import tempfile
     >>> from torchgrasp import load_hand, load_object

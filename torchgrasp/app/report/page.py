@@ -18,7 +18,7 @@ from torchgrasp.values.planning import Grasps, format_success
 TEMPLATES = Path(__file__).with_name("templates")  # of all pages
 ASIDE = 60.0  # between the two views of a grasp [degrees]
 FILM_TURN = 20.0  # of the film's view, so that fingers in line do not hide each other [degrees]
-Sections = dict[str, list[tuple[str, bytes]]]
+Sections = dict[str, list[tuple[str, bytes]]]  # captions and PNGs by the title of a section
 GRASP_COLUMNS = (
     "rank",
     "success",
@@ -55,7 +55,9 @@ def write_report(path: Path | str, run: Run, view: str = "") -> Path:
 
 
 def draw_pictures(run: Run) -> Sections:
-    """Draw all pictures of a run; return captions and PNGs by section."""
+    """Draw all pictures of a run; return by the title of each section its pairs of caption and
+    PNG.
+    """
     run = run.upright()
     table = None if run.spec.table is None else 0.0
     view = stills.view_of(run.cloud)
@@ -98,7 +100,11 @@ def draw_pictures(run: Run) -> Sections:
 
 
 def format_page(run: Run, pictures: Sections, view: str = "") -> str:
-    """Return the HTML report of a run, with a link to its 3D page `view`."""
+    """Return the HTML report of a run.
+
+    `pictures` is what `draw_pictures` returned. `view` is the address of the 3D page that is
+    linked, or "" for none.
+    """
     funnel = run.explanation.funnel.stages if run.explanation else ()
     trials = run.explanation.trials if run.explanation else ()
     outcomes = []
@@ -135,14 +141,17 @@ def format_page(run: Run, pictures: Sections, view: str = "") -> str:
 
 
 def grasp_columns(grasps: Grasps) -> tuple[str, ...]:
-    """Return the titles of the columns of `grasp_rows`: `GRASP_COLUMNS`, and what of the task's
-    loads is resisted.
+    """Return the titles of the columns of `grasp_rows`.
+
+    These are `GRASP_COLUMNS` and, for grasps planned for a task, "task margin".
     """
     return (*GRASP_COLUMNS, *["task margin"] * (grasps.certificate.task_margin is not None))
 
 
 def grasp_rows(grasps: Grasps, most: int = 10) -> list[tuple[str, ...]]:
-    """Return the first grasps as text, in the order of `grasp_columns`."""
+    """Return the texts of the cells of each of the first `most` grasps, in the order of
+    `grasp_columns`.
+    """
     rows = []
     for rank, grasp in enumerate(grasps[:most], 1):
         std_m = grasp.contacts.std_m
@@ -163,12 +172,13 @@ def grasp_rows(grasps: Grasps, most: int = 10) -> list[tuple[str, ...]]:
 
 
 def encode_base64(data: bytes) -> str:
-    """Return bytes as text for a page."""
+    """Return bytes as base64 text, as pages embed them."""
     return base64.b64encode(data).decode("ascii")
 
 
 def render(template: str, **values: Any) -> str:
-    """Return a page from a template and values; values of type `markupsafe.Markup` are inserted as
-    HTML.
+    """Return a page made from the file `template` of the folder `TEMPLATES` and values by name.
+
+    Values of type `markupsafe.Markup` are inserted as HTML; others are escaped.
     """
     return files.render(TEMPLATES / template, **values)

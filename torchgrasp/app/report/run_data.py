@@ -38,14 +38,23 @@ CREEP = 0.01  # fingertips that stick slide more slowly than this [m/s]
 class Run:
     """The inputs and results of one planning run, which a report shows.
 
+    Clouds, surface, grasps, mesh and scene are in one frame [m].
+
     Args:
         object_name: name of the object in titles and sentences.
         source: file of the cloud or the scene.
-        stages: name, result and wall time [s] of each stage.
-        mesh: the true object [m], in the frame of the cloud.
+        cloud: the cloud that was planned on.
+        hand: the hand of the grasps.
+        spec: the numbers of the contacts, such as the table and the friction.
+        surface: the estimated surface of the object.
+        grasps: all grasps of the plan, failed ones included, best first.
+        stages: name, result in words and wall time [s] of each stage.
+        plan: the contacts that were planned; None if they are unknown.
+        mesh: the true object.
         closure: result of closing on the true object; only with `mesh`.
         scene: the scene that the cloud was cut from.
-        costs: what lowers the predicted success of the best grasp most.
+        explanation: why no grasp is executable, and what would help.
+        costs: sentences on what lowers the predicted success of the best grasp most.
     """
 
     object_name: str
@@ -75,11 +84,14 @@ class Run:
 
     @property
     def good(self) -> bool:
-        """Whether the object was held; without a closing, whether a grasp is executable."""
+        """Whether the object was held or, without a closing, whether a grasp is executable."""
         return bool(self.closure.held) if self.closure is not None else len(self.executable) > 0
 
     def upright(self) -> "Run":
-        """Return the run in the upright frame of its cloud and table, where z is up."""
+        """Return the run in the upright frame of its cloud and table, where z is up.
+
+        A table has the height z = 0 there. `spec` stays as it is.
+        """
         obj_from_upright = upright_frame(self.cloud.points, self.cloud.viewpoint, self.spec.plane)
         upright_from_obj = inverse(obj_from_upright)
         mesh = self.mesh
@@ -116,8 +128,10 @@ def verdict(run: Run) -> str:
 
 
 def closing_sentence(run: Run) -> str:
-    """Return a sentence that says whether the object was held, how far it rose, and how it moved in
-    the hand.
+    """Return one sentence with the result of the closing on the true object.
+
+    If the object was held, it says how far it rose [m], and how it moved in the hand [mm, deg];
+    otherwise why not.
     """
     upright = run.upright()
     closure = upright.closure
@@ -136,7 +150,7 @@ def closing_sentence(run: Run) -> str:
 
 
 def refusal(run: Run) -> str:
-    """Return a sentence that says why no grasp is executable: each reason with its count."""
+    """Return one sentence that says why no grasp is executable: each reason with its count."""
     head = f"The {run.hand.name} hand has no executable grasp of the {run.object_name}"
     if len(run.grasps):
         failed = run.grasps.status
@@ -169,33 +183,36 @@ def mass_centre(mesh: "trimesh.Trimesh") -> Float[Tensor, "3"]:
 
 
 class Moment(NamedTuple):
-    """A key moment of a closing: the index of its control tick, and its name."""
+    """A key moment of a closing: the index of its control tick, and its name in the film strip."""
 
     tick: int
     name: str
 
     @property
     def color(self) -> str:
-        """The colour of the moment's title and line in the film strip."""
+        """The colour "#rrggbb" of the moment's title and line in the film strip."""
         return ALARM if self.name == LOST else INK
 
 
 def touching(closure: ClosureResult) -> Bool[Tensor, "t f"]:
-    """Return a mask of the fingertips that touch the object at each control tick."""
+    """Return a mask (t, f) of the fingertips that touch the object at each of t control ticks."""
     return closure.trace.normals.isfinite().all(-1)
 
 
 def first_touches(closure: ClosureResult) -> list[int]:
-    """Return the control tick at which each finger first touched the object, in the order of these
-    touches.
+    """Return the index of the control tick at which each finger first touched the object.
+
+    The order is that of `closure.contact_order`; fingers that never touched are left out.
     """
     touched = touching(closure)
     return [int(touched[:, finger].int().argmax()) for finger in closure.contact_order]
 
 
 def find_loss(closure: ClosureResult, centre: Float[Tensor, "3"]) -> int | None:
-    """Return the tick at which the object was pushed away, put down, let go or slipped too far;
-    None if it was held.
+    """Return the index of the control tick at which the object was lost; None if it was held.
+
+    Lost is an object that was pushed away, put down, let go, or slipped too far. `centre` is its
+    centre of mass [m] in the frame of the grasp, where z is up.
     """
     if closure.held:
         return None
@@ -222,8 +239,11 @@ def find_loss(closure: ClosureResult, centre: Float[Tensor, "3"]) -> int | None:
 def explain_loss(
     closure: ClosureResult, centre: Float[Tensor, "3"], fingers: tuple[str, ...]
 ) -> str:
-    """Return a sentence on when and in which phase the object was lost, and which finger failed
-    first; "" if held.
+    """Return a sentence on when and in which phase the object was lost, and on the cause.
+
+    The cause is the finger that failed first, or the status of the closing. `centre` is the
+    object's centre of mass [m] in the frame of the grasp, where z is up; `fingers` are the names of
+    the fingers. The text is "" if the object was held.
     """
     tick = find_loss(closure, centre)
     if tick is None:
@@ -278,7 +298,11 @@ def _first_to_go(closure: ClosureResult, tick: int, fingers: tuple[str, ...]) ->
 def moments_of(
     closure: ClosureResult, centre: Float[Tensor, "3"], fingers: tuple[str, ...]
 ) -> list[Moment]:
-    """Return the key moments that the film strip of a closing shows, in order."""
+    """Return the key moments that the film strip of a closing shows, in the order of time.
+
+    `centre` is the object's centre of mass [m] in the frame of the grasp, where z is up; `fingers`
+    are the names of the fingers.
+    """
     found = [Moment(tick_of(closure, 0), "open hand")]
     if closure.contact_order:
         first = fingers[closure.contact_order[0]]

@@ -32,7 +32,7 @@ UNMEASURED, ELSEWHERE, SUPPORT, OTHER_SUPPORT, OBSTACLE = range(len(KINDS))
 
 @dataclasses.dataclass(frozen=True)
 class SceneInk:
-    """How the pixels of a scene are shaded, chosen by eye; factors darken a colour."""
+    """Numbers of the shading of a scene's pixels, chosen by eye; factors darken a colour."""
 
     size: int = 1200  # of the longer side of the picture [pixels]
     hatches: int = 160  # stripes over the width, on obstacles
@@ -43,16 +43,16 @@ class SceneInk:
     line_width: float = 1.2  # [pixels]
     widest_pixel: float = 0.3  # part of a square; lines of smaller squares would run together
     gap: int = 5  # [pixels]: missing pixels in a square of this side have no rim
-    rim: int = 3  # [pixels]
-    rim_factor: float = 0.5
-    target_rim: int = 5
+    rim: int = 3  # width of the dark rim of an object [pixels]
+    rim_factor: float = 0.5  # factor of the rim
+    target_rim: int = 5  # width of the white rim of the target [pixels]
     noise: float = 3.0  # standard deviations of the noise that a support's pixels may lie off it
     blur: float = 1.5  # standard deviation [pixels] that smooths the depth before its slopes
     nearest: float = 1e-3  # least depth [m]
     least: float = 1e-6  # least weight, slope and range, so that nothing is divided by 0
     lamp: tuple[float, float, float] = (-0.5, 0.0, -0.8)  # added to the way up: right, down, ahead
-    ambient: float = 0.45
-    lit: float = 0.65
+    ambient: float = 0.45  # brightness without the lamp
+    lit: float = 0.65  # brightness that the lamp adds at most
     haze: float = 0.15  # share of the brightness that the farthest pixels lose
     outliers: tuple[float, float] = (0.01, 0.99)  # quantiles of depth between which it grows
 
@@ -61,14 +61,14 @@ class SceneInk:
 class SceneText:
     """Layout of the numbers on objects and of the legend [pixels]."""
 
-    font: int = 24
+    font: int = 24  # size of the legend's text, and the least of a number
     number: float = 1.1  # size of a number, in radii of the largest circle in its object
-    largest_number: int = 54
-    stroke: int = 3
-    row: int = 40
+    largest_number: int = 54  # largest size of a number
+    stroke: int = 3  # width of the dark rim of a number
+    row: int = 40  # height of a line of the legend
     swatch: int = 28  # width of the colour beside a text
-    swatch_top: int = 8  # of the colour, in its row
-    swatch_bottom: int = 32
+    swatch_top: int = 8  # upper end of the colour, in its row
+    swatch_bottom: int = 32  # lower end of the colour, in its row
     round: int = 5  # radius of its corners
     text: int = 40  # left end of the text, from the left end of the colour
     left: int = 16
@@ -85,10 +85,10 @@ TEXT = SceneText()
 
 @checked
 def draw_scene(scene: Scene, path: Path | str) -> Path:
-    """Write a picture of a scene as PNG: the support, numbered objects, obstacles, unmeasured
-    pixels and a legend.
+    """Write a picture of a scene as PNG to `path`, and return the path.
 
-    Raises `OutputError` if the file cannot be written.
+    It shows the support, numbered objects, obstacles, unmeasured pixels and a legend. Raises
+    `OutputError` if the file cannot be written.
 
     >>> import tempfile
     >>> from torchgrasp import load_scene
@@ -99,7 +99,7 @@ def draw_scene(scene: Scene, path: Path | str) -> Path:
 
 
 def encode_scene(scene: Scene) -> bytes:
-    """Return the picture of a scene as PNG, as `draw_scene` writes it."""
+    """Return the bytes of the picture of a scene as PNG, as `draw_scene` writes it."""
     kinds, labels = sort_pixels(scene)
     h, w = labels.shape
     palette = np.stack([rgb(color) for color in (*KINDS.values(), *OBJECTS)])
@@ -128,8 +128,9 @@ def encode_scene(scene: Scene) -> bytes:
 
 
 def sort_pixels(scene: Scene) -> tuple[Int[np.ndarray, "h w"], Int[np.ndarray, "h w"]]:
-    """Return each pixel's index in `KINDS` and its object's label. The index counts only where the
-    label is 0.
+    """Return the index in `KINDS` of each pixel, and the label of its object.
+
+    The index counts only where the label is 0, on no object.
     """
     image = scene.image
     labels = scene.pixel_labels.cpu().numpy()

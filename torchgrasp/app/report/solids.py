@@ -21,18 +21,25 @@ TILTS = 7  # rings around its rounded edges
 
 
 class Solid(NamedTuple):
-    """A mesh of one collision shape with vertex normals, and the indices of its link and finger."""
+    """The mesh of one collision shape of a hand, in the frame of its link.
+
+    Attributes:
+        vertices: corners [m].
+        faces: indices of the three vertices of each of t triangles, (t, 3).
+        normals: outward unit normals at the vertices.
+        link: index of the link in `hand.tree.link_names`.
+    """
 
     vertices: Float[np.ndarray, "v 3"]
     faces: np.ndarray
     normals: Float[np.ndarray, "v 3"]
     link: int
-    # `PARKED` if the link belongs to no grasping finger, such as the palm, or to several
+    # index of its finger; `PARKED` if it belongs to no grasping finger, or to several
     finger: int
 
     @property
     def color(self) -> str:
-        """The colour of the finger, or of the palm."""
+        """The colour "#rrggbb" of the finger, or of the palm."""
         return HAND if self.finger == PARKED else FINGERS[self.finger]
 
 
@@ -48,9 +55,7 @@ def solids_of_links(hand: Hand) -> list[Solid]:
 
 
 def solids_by_link(hand: Hand) -> dict[str, Solid]:
-    """Return by link name the collision shapes of each link that has some, as one mesh in the frame
-    of the link.
-    """
+    """Return one mesh by link name for each link with collision shapes, in the link's frame."""
     found = {}
     solids = solids_of_links(hand)
     for link, name in enumerate(hand.tree.link_names):
@@ -76,8 +81,10 @@ def link_poses(
     names: tuple[str, ...],
     obj_from_hand: Float[Tensor, "n 4 4"],
 ) -> Float[Tensor, "n l 4 4"]:
-    """Return the poses of all links in the object's frame; `names` are the names of the `joints`
-    [rad].
+    """Return the poses obj_from_link [m] of all l links, in the order of `hand.tree.link_names`.
+
+    `joints` holds n postures of all joints of the URDF [rad], whose names are `names`, in any
+    order. `obj_from_hand` holds the n poses of the hand in the object's frame [m].
     """
     values = joints[:, [names.index(n) for n in hand.tree.joint_names]].double()
     return obj_from_hand.double()[:, None] @ hand.tree.poses(values)
@@ -89,8 +96,10 @@ def solids_from_hand(
     names: tuple[str, ...],
     obj_from_hand: Float[Tensor, "4 4"],
 ) -> list[Solid]:
-    """Return the collision shapes of a hand as meshes in the object's frame; `names` name the
-    `joints` [rad].
+    """Return the collision shapes of a hand at a posture as meshes in the object's frame [m].
+
+    `joints` [rad] are the positions of all joints of the URDF, whose names are `names`, in any
+    order. `obj_from_hand` is the hand's pose [m].
     """
     poses = link_poses(hand, joints[None], names, obj_from_hand[None])[0].cpu().numpy()
     placed = []
@@ -102,8 +111,9 @@ def solids_from_hand(
 
 
 def finger_of_links(hand: Hand) -> dict[str, int]:
-    """Return by link name the index of the finger that the link belongs to; `PARKED` for no finger
-    or several.
+    """Return by link name the index of the finger that the link belongs to.
+
+    The index is `PARKED` for a link that belongs to no grasping finger, or to several.
     """
     moves = hand.tree.moves.bool().cpu()
     finger_of = {}
@@ -116,8 +126,10 @@ def finger_of_links(hand: Hand) -> dict[str, int]:
 
 @functools.lru_cache(maxsize=512)  # a hand is drawn many times
 def round_shape(shape: LinkShape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return vertices, faces and vertex normals of a collision shape with rounded edges, in its
-    link's frame.
+    """Return vertices, faces and vertex normals of a collision shape with rounded edges.
+
+    Vertices (v, 3) [m] and outward unit normals (v, 3) are in the frame of the link. Faces (t, 3)
+    hold the indices of the vertices of t triangles.
     """
     fineness = BALL_FINENESS if shape.kind == "sphere" else 1
     ball = np.asarray(trimesh.creation.icosphere(subdivisions=fineness, radius=1.0).vertices)

@@ -1,4 +1,8 @@
-"""Pictures as PNGs: of a cloud, an estimated surface, contacts, a grasp, a scene and a hand."""
+"""Pictures as PNGs: of a cloud, an estimated surface, contacts, a grasp, a scene and a hand.
+
+A direction (x, y, z) points from what is shown to the camera; its length does not matter. All
+pictures but those of a hand alone are in a frame where z is up.
+"""
 
 import dataclasses
 import io
@@ -22,7 +26,7 @@ from torchgrasp.values.planning import Contacts, Grasps, PointCloud
 
 @dataclasses.dataclass(frozen=True)
 class StillLayout:
-    """What is shown in stills, and how large."""
+    """Limits and sizes of what stills show."""
 
     most_points: int = 3000  # of a cloud: more would hide each other
     least_height: float = 1e-12  # [m]: a flat cloud has one colour
@@ -38,17 +42,17 @@ class StillLayout:
 class HandSheet:
     """Layout of the picture of a hand: four stills, and below them the ranges of the joints."""
 
-    eye: Direction = (1.0, -0.9, 0.5)
+    eye: Direction = (1.0, -0.9, 0.5)  # to the camera, in the hand's frame
     aside: float = 110.0  # the other side from which the posture is seen [degrees]
     width: float = 13.5  # [inches]
     height: float = 10.8  # of the stills [inches]
     row: float = 0.3  # height for each joint [inches]
-    dpi: int = 100
-    font: int = 14
+    dpi: int = 100  # [pixels per inch]
+    font: int = 14  # of the titles [points]
     bar: float = 0.4  # height of the bar of a joint, in rows
     margin: float = 0.02  # beside the widest range, as a share of it
     mark: int = 16  # length of the mark of the posture [points]
-    mark_width: int = 3
+    mark_width: int = 3  # [points]
 
 
 STILLS = StillLayout()
@@ -58,8 +62,9 @@ FREE = 10.0  # a posture without collision is better than any with one
 
 
 def draw_cloud(cloud: PointCloud, table: float | None = None) -> bytes:
-    """Return a PNG of a cloud from its camera, coloured by height; `table` is the height [m] of the
-    table.
+    """Return a PNG of a cloud as its camera sees it, coloured by height.
+
+    `table` is the height z of the table [m]; None means no table.
     """
     points = _thinned(to_array(cloud.points), STILLS.most_points)
     height = points[:, 2] - points[:, 2].min()
@@ -71,8 +76,9 @@ def draw_cloud(cloud: PointCloud, table: float | None = None) -> bytes:
 
 
 def draw_surface(surface: Surface, direction: Direction, table: float | None = None) -> bytes:
-    """Return a PNG of the estimated surface seen from `direction`, coloured by its standard
-    deviation [mm].
+    """Return a PNG of the estimated surface, coloured by its standard deviation [mm].
+
+    `direction` points to the camera. `table` is the height z of the table [m]; None means no table.
     """
     vertices, faces, normals = mesh_arrays(surface)
     colors, most = paint.color_std(to_array(surface.std_m))
@@ -86,7 +92,10 @@ def draw_surface(surface: Surface, direction: Direction, table: float | None = N
 def draw_contacts(
     surface: Surface, contacts: Contacts, direction: Direction, table: float | None = None
 ) -> bytes:
-    """Return a PNG of the contacts of the first grasp, with normals, on the estimated surface."""
+    """Return a PNG of the contacts of the first grasp, with normals, on the estimated surface.
+
+    `direction` points to the camera. `table` is the height z of the table [m]; None means no table.
+    """
     canvas = paint.Canvas()
     vertices = _add_object(canvas, surface, transparent=True)
     _add_contacts(canvas, contacts)
@@ -97,7 +106,10 @@ def draw_contacts(
 def draw_grasp(
     surface: Surface, hand: Hand, grasp: Grasps, direction: Direction, table: float | None = None
 ) -> bytes:
-    """Return a PNG of the hand of the first grasp on the estimated surface."""
+    """Return a PNG of the hand of the first grasp on the estimated surface, with its contacts.
+
+    `direction` points to the camera. `table` is the height z of the table [m]; None means no table.
+    """
     canvas, corners = _grasp(surface, hand, grasp)
     canvas.add_table(corners, table)
     return canvas.render_png(corners, direction)
@@ -106,8 +118,10 @@ def draw_grasp(
 def draw_among(
     scene: Scene, surface: Surface, hand: Hand, grasp: Grasps, direction: Direction
 ) -> bytes:
-    """Return a PNG of the hand of the first grasp on the target, among the measured points of other
-    objects.
+    """Return a PNG of the hand of the first grasp on the target, among the other objects.
+
+    The other objects are shown by their measured points. The `scene` is in an upright frame with
+    its table at z = 0. `direction` points to the camera.
     """
     canvas, corners = _grasp(surface, hand, grasp)
     others = (scene.labels > 0) & ~scene.rows_of()
@@ -124,8 +138,10 @@ def draw_among(
 
 
 def draw_hand(hand: Hand, joints: Float[Tensor, "h"]) -> bytes:
-    """Return a PNG of a hand with pad normals and palm axes at a posture and both limits, and of
-    the joint ranges.
+    """Return a PNG of a hand at a posture and at both limits, and of the joints' ranges.
+
+    `joints` [rad] is the posture of the h actuated joints. Arrows show the pad normals and the axes
+    of the palm.
     """
     from matplotlib.figure import Figure
 
@@ -165,8 +181,10 @@ def draw_hand(hand: Hand, joints: Float[Tensor, "h"]) -> bytes:
 
 
 def draw_posture(hand: Hand, joints: Float[Tensor, "h"], eye: Direction) -> bytes:
-    """Return a PNG of a hand at a posture [rad], with its fingertip normals and the axes of its
-    palm.
+    """Return a PNG of a hand at a posture, with its fingertip normals and the axes of its palm.
+
+    `joints` [rad] are the positions of the h actuated joints; `eye` is the direction to the camera,
+    in the hand's frame.
     """
     solids = solids_from_hand(
         hand, hand.expand_joints(joints), hand.tree.joint_names, torch.eye(4).to(joints)
@@ -188,8 +206,10 @@ def draw_posture(hand: Hand, joints: Float[Tensor, "h"], eye: Direction) -> byte
 
 
 def opposed_posture(hand: Hand, joints: Float[Tensor, "n h"]) -> Float[Tensor, "h"]:
-    """Return that of n postures in which the fingertip pads face each other best, without collision
-    if possible.
+    """Return the posture in which the fingertip pads face each other best.
+
+    It is one of the n postures `joints` of the h actuated joints [rad], without self-collision if
+    there is one.
     """
     points, normals = hand.fingertips(joints)
     inward = points.mean(1, keepdim=True) - points
@@ -202,8 +222,9 @@ def opposed_posture(hand: Hand, joints: Float[Tensor, "n h"]) -> Float[Tensor, "
 
 
 def view_of(cloud: PointCloud) -> Direction:
-    """Return the direction from a cloud to its camera, or a fixed direction if the camera is
-    unknown.
+    """Return the direction from the centroid of a cloud to its first camera.
+
+    If the camera is unknown, it is a fixed direction from the front.
     """
     first = cloud.split_views()[0].viewpoint
     if first is None:
@@ -213,8 +234,9 @@ def view_of(cloud: PointCloud) -> Direction:
 
 
 def facing(grasp: Grasps) -> Direction:
-    """Return a viewing direction across the contact normals, from which all fingers of the first
-    grasp are visible.
+    """Return a direction to the camera from which all fingers of the first grasp are visible.
+
+    It is horizontally across the contact normals, raised a little, in a frame where z is up.
     """
     normals = grasp.contacts.normals[0, :, :2].detach().cpu().double()
     press = torch.linalg.eigh(normals.T @ normals).eigenvectors[:, 1]
@@ -240,7 +262,11 @@ def to_array(value: Float[Tensor, "*b"]) -> np.ndarray:
 
 
 def mesh_arrays(surface: Surface) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return vertices (v, 3), faces (t, 3) and vertex normals (v, 3) of an estimated surface."""
+    """Return the vertices, faces and vertex normals of an estimated surface.
+
+    Vertices (v, 3) are in metres, faces (t, 3) hold indices of three vertices, and normals (v, 3)
+    are outward unit vectors.
+    """
     return to_array(surface.vertices), surface.faces.cpu().numpy(), to_array(surface.normals)
 
 
@@ -278,7 +304,7 @@ def _add_contacts(canvas: paint.Canvas, contacts: Contacts) -> None:
 
 
 def add_solids(canvas: paint.Canvas, solids: list[Solid]) -> None:
-    """Add the links of a hand to a canvas."""
+    """Add the links of a hand to a canvas, each in its colour."""
     for solid in solids:
         canvas.add_mesh(solid.vertices, solid.faces, solid.color, solid.normals)
 

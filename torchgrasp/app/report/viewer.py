@@ -51,10 +51,12 @@ VIEW = "view.html"  # name of the page beside the report
 
 @dataclasses.dataclass(frozen=True)
 class ViewerNumbers:
-    """Most of what a page holds, so that it has a few megabytes, and how it begins."""
+    """Limits of what a page holds, so that it has a few megabytes, and numbers of its first
+    view.
+    """
 
-    grasps: int = 20
-    points: int = 10_000
+    grasps: int = 20  # best grasps that are shown
+    points: int = 10_000  # of a cloud
     faces: int = 40_000  # of a mesh
     ticks: int = 120  # of a replay
     cells: int = 256  # along the diagonal of a mesh, where it is thinned first
@@ -99,11 +101,11 @@ def write_viewer(path: Path | str, run: Run) -> Path:
 def show_grasps(
     cloud: CloudLike, grasps: Grasps, hand: HandLike | None = None, browser: bool = True
 ) -> Path:
-    """Write the 3D page of grasps to a temporary file, open it in the browser, and return its path.
+    """Write the 3D page of grasps to a temporary file, and open it in the browser; return its path.
 
-    `cloud` is that of the plan, as in `plan_grasps`; the page's surface is estimated anew. `hand`
-    is needed for grasps of a hand that is not shipped. Without a `browser` the page is only
-    written.
+    `cloud` is the cloud that was planned on, in any form that `plan_grasps` takes. The surface on
+    the page is estimated anew from it. `hand` is needed for grasps of a hand that is not shipped.
+    With `browser` False the page is only written.
 
     >>> from torchgrasp import load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -136,8 +138,10 @@ def format_viewer(run: Run) -> str:
 
 @functools.cache
 def three() -> str:
-    """Return the JavaScript of the library three.js with its mouse controls, from the package
-    trimesh.
+    """Return the JavaScript of the library three.js with its mouse controls.
+
+    It is part of the package trimesh. Raises `RuntimeError` for a version of trimesh with another
+    viewer.
     """
     archive = resources.files("trimesh") / "resources" / "templates" / "viewer.zip"
     with archive.open("rb") as file, zipfile.ZipFile(file) as opened:
@@ -151,7 +155,7 @@ def three() -> str:
 
 
 def describe(run: Run) -> dict[str, Any]:
-    """Return the contents of the 3D page as a dictionary for JSON, in an upright frame."""
+    """Return the contents of the 3D page as a dictionary for JSON, in an upright frame [m]."""
     frame = inverse(upright_frame(run.cloud.points, run.cloud.viewpoint, run.spec.plane))
     sentence = verdict(run)
     run = run.upright()
@@ -233,9 +237,10 @@ def _grasps(hand: Hand, grasps: Grasps) -> dict[str, object]:
 
 
 def pose_postures(hand: Hand, grasps: Grasps) -> Float[Tensor, "g p l 4 4"]:
-    """Return the poses of all links in the object's frame, in each of the `POSTURES` of each grasp.
+    """Return the poses obj_from_link [m] of all l links, in each of the p `POSTURES` of g grasps.
 
-    The result has the shape (grasps, postures, links, 4, 4).
+    The result has the shape (grasps, postures, links, 4, 4); links are in the order of
+    `hand.tree.link_names`.
     """
     pose = grasps.obj_from_hand.double()
     opened = grasps.pregrasp.double()
@@ -282,8 +287,9 @@ def _replay(run: Run, closure: ClosureResult) -> dict[str, object]:
 
 
 def pack(values: np.ndarray, kind: str = "f4") -> dict[str, object]:
-    """Return an array for JSON: its number format (f4, u4 or u1, little-endian), shape, and bytes
-    in base64.
+    """Return an array as a dictionary for JSON: "kind", "shape", and "data", its bytes in base64.
+
+    `kind` is the number format, little-endian: "f4", "u4" or "u1".
     """
     data = np.ascontiguousarray(values).astype(f"<{kind}").tobytes()
     return {"kind": kind, "shape": list(values.shape), "data": encode_base64(data)}
@@ -294,8 +300,10 @@ def thin_mesh(
     faces: Int[np.ndarray, "f 3"],
     most: int = VIEWER.faces,
 ) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, "g 3"]]:
-    """Return the indices of the vertices to keep, one in each cell of a grid, and at most `most`
-    faces between them.
+    """Return the indices of the k vertices to keep, and the g faces between them.
+
+    There are at most `most` faces. A mesh with more keeps one vertex in each cell of a grid;
+    `vertices` are in metres. The faces returned hold indices of the kept vertices.
     """
     kept = np.arange(len(vertices))
     thinned = faces
@@ -314,7 +322,7 @@ def thin_mesh(
 
 
 def thin_rows(count: int, most: int) -> Int[np.ndarray, " k"]:
-    """Return the indices of at most `most` rows, evenly spread from the first to the last."""
+    """Return at most `most` of the indices 0 to `count` - 1, evenly spread from first to last."""
     if count <= most:
         return np.arange(count)
     return np.round(np.linspace(0, count - 1, most)).astype(np.int64)
