@@ -23,7 +23,7 @@ from torchgrasp.foundation.limits import CLOUD_BYTES
 from torchgrasp.foundation.rules import Pose
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
 from torchgrasp.geometry.linalg import Points, Vector, unit
-from torchgrasp.geometry.plane import GRID
+from torchgrasp.geometry.plane import FINE
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,8 +60,6 @@ class ProjectionNumbers:
 
 IMAGE = ImageNumbers()
 PROJECTION = ProjectionNumbers()
-# grid [m] of a camera's rounded pose
-POSE_GRID = GRID**1.5
 
 
 @checked
@@ -98,7 +96,7 @@ class DepthImage(Value):
             inverse(obj_from_upright.double()).to(self.obj_from_camera.device)
             @ self.obj_from_camera.double()
         )
-        return dataclasses.replace(self, obj_from_camera=torch.round(pose / POSE_GRID) * POSE_GRID)
+        return dataclasses.replace(self, obj_from_camera=torch.round(pose / FINE) * FINE)
 
     def points(self) -> Float[Tensor, "h w 3"]:
         """Return the point [m] of every pixel; the camera's position where nothing was measured."""

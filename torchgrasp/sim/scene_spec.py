@@ -29,8 +29,8 @@ SHIFT_JOINTS = ("torchgrasp_shift_x", "torchgrasp_shift_y", "torchgrasp_shift_z"
 
 
 @dataclasses.dataclass(frozen=True)
-class SceneNumbers:
-    """The numbers of a scene and its mount."""
+class SimulationNumbers:
+    """Numbers of a simulated scene and of the mount of its hand."""
 
     near: float = 3e-4
     """Height [m] over the table below which vertices lie on it."""
@@ -44,7 +44,7 @@ class SceneNumbers:
     """Bits of a collision mask: MuJoCo's masks are signed numbers of 32 bits."""
 
 
-SCENES = SceneNumbers()
+SIMULATION = SimulationNumbers()
 
 
 @checked
@@ -143,8 +143,8 @@ class SceneSpec:
         """
         if self.mount is not None:
             return list(self.mount)
-        slack = SCENES.slack
-        highest = self.travel + SCENES.lift_slack
+        slack = SIMULATION.slack
+        highest = self.travel + SIMULATION.lift_slack
         slides = [Slide(LIFT_JOINT, (0.0, 0.0, 1.0), -slack, highest, 0.0)]
         length = float(np.linalg.norm(self.approach))
         if length > 0:
@@ -180,7 +180,7 @@ class SceneSpec:
 
         On the facets of a scanned round body, the body would roll away before it is touched.
         """
-        lowest = self.table_height + SCENES.near if self.table else -math.inf
+        lowest = self.table_height + SIMULATION.near if self.table else -math.inf
         found = []
         for body in (self.body, *self.neighbours):
             hulls = [np.array(part.vertices, dtype=float) for part in body.parts]
@@ -249,7 +249,7 @@ def euler_from_rotation(rotation: np.ndarray) -> tuple[float, float, float]:
     sine = -float(rotation[2, 0])
     cosine = math.hypot(float(rotation[0, 0]), float(rotation[1, 0]))
     pitch = math.atan2(sine, cosine)
-    if cosine < SCENES.level:
+    if cosine < SIMULATION.level:
         return 0.0, pitch, math.atan2(-float(rotation[0, 1]), float(rotation[1, 1]))
     roll = math.atan2(float(rotation[2, 1]), float(rotation[2, 2]))
     return roll + 0.0, pitch + 0.0, math.atan2(float(rotation[1, 0]), float(rotation[0, 0]))
@@ -266,7 +266,7 @@ def pair_masks(pairs: Iterable[tuple[str, str]], first: int) -> dict[str, tuple[
     left = [tuple(pair) for pair in pairs]
     kinds = dict.fromkeys((name for pair in left for name in pair), 0)
     hits = dict(kinds)
-    for bit in range(first, SCENES.bits):
+    for bit in range(first, SIMULATION.bits):
         if not left:
             break
         names = [name for pair in left for name in pair]
@@ -277,6 +277,6 @@ def pair_masks(pairs: Iterable[tuple[str, str]], first: int) -> dict[str, tuple[
                 hits[two if one == owner else one] |= 1 << bit
         left = [pair for pair in left if owner not in pair]
     if left:
-        allowed = f"pairs that {SCENES.bits - first} bits distinguish"
+        allowed = f"pairs that {SIMULATION.bits - first} bits distinguish"
         raise HandFileError("self_collision", f"{len(left)} pairs too many", allowed)
     return {name: (kinds[name], hits[name]) for name in kinds}
