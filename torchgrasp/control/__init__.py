@@ -1,5 +1,5 @@
-"""The controller of a real or simulated hand: it turns a grasp and sensor readings into targets of
-joints and palm.
+"""Controllers of a real or simulated hand: from a grasp and sensor readings they compute targets of
+the joints and the palm.
 """
 
 from torchgrasp.values.closing import ClosingGains, ClosingOptions

@@ -1,5 +1,7 @@
-"""The grasp controller: approach that stops at a touch, closing of the fingers, and hold. It needs
-no simulator.
+"""The controller of a grasp: an approach that stops at a touch, then closing, then holding.
+
+It needs no simulator. Vectors are in the frame of the planned hand (its root link), unless said
+otherwise; a tick is one period of control.
 """
 
 import dataclasses
@@ -40,8 +42,8 @@ CLOSING_TIME = 4.0
 
 
 class GraspController:
-    """Close a hand and hold the object: each `step` takes an observation and returns `Targets`, all
-    on the CPU.
+    """Controller that closes a hand and holds the object: each `step` maps an observation to
+    `Targets`, on the CPU.
 
     A closing controller brings the fingers to the object, then a hold controller presses. After
     `PRESSING_TIME` of pressing, `closed` becomes true: the hand may be lifted, but `step` must
@@ -56,9 +58,10 @@ class GraspController:
 
     Args:
         reference: the closing plan.
-        closing, holding, options: modes of closing and holding, and options of the closing, as in
-            `TrialSpec`. The holding None means "grip", or "force" where the closing or the sensor
-            does not allow it.
+        closing: the closing mode, as in `TrialSpec`.
+        holding: the holding mode, as in `TrialSpec`; None means "grip", or "force" where the
+            closing mode or the sensor does not allow "grip".
+        options: options of the closing; None means all on, or all off for a mode without options.
         approach: remaining length [m] of the approach; it is 0 if the hand is at its pre-grasp.
 
     Raises:
@@ -90,7 +93,9 @@ class GraspController:
         self._prepare(self.planned, approach)
 
     def _prepare(self, reference: ClosingReference, approach: float) -> None:
-        """Begin with a plan: first its approach, if there is one, and then its closing."""
+        """Start with a plan: first its approach of length `approach` [m], if that is not 0, and
+        then its closing.
+        """
         self.reference = reference
         self.attempts = 0
         self.stops = 0
@@ -131,15 +136,17 @@ class GraspController:
 
     @property
     def status(self) -> Status:
-        """`OK`, or `TOO_HEAVY` if the hold mode "grip" feels more load than the hand can hold: put
-        the object down.
+        """The hold's status: `OK`, or `TOO_HEAVY` if the mode "grip" feels more load than the hand
+        can hold.
+
+        The object should then be put down.
         """
         return self.hold.status if isinstance(self.hold, GripHold) else Status.OK
 
     @property
     def blend(self) -> Float[Tensor, " f"]:
-        """Each finger's share of force control, from 0 to 1, at the last tick: lambda in Eq. (26)
-        of the paper.
+        """Share of force control (f,) of each finger at the last tick, from 0 to 1: lambda in Eq.
+        (26) of the paper.
 
         The shares are NaN before the first tick, and at ticks at which the control law does not
         command the fingers.
@@ -151,10 +158,10 @@ class GraspController:
 
     @checked
     def relook(self, cloud: PointCloud) -> None:
-        """Move the palm's path to where a new view shows the object; `targets.palm` is then where
-        the path begins.
+        """Shift the approach so that it ends at the object as a new view shows it.
 
-        The palm does not rotate, so the contacts of a turned object are found by touch.
+        `targets.palm` [m] then holds the shift at which the path begins. The palm does not rotate,
+        so the contacts of a turned object are found by touch.
 
         The `cloud` has points [m] of the object alone, in the frame of the grasp. Raises
         `BadArgument` if the hand has no approach, or has begun it.

@@ -22,8 +22,12 @@ from torchgrasp.values.planning import Grasps
 @checked
 @dataclasses.dataclass(frozen=True)
 class PreferredForces(Value):
-    """Typical normal forces [N] of stable grasps, their covariance [N^2], and the typical spring
-    stiffness [N/m].
+    """Typical normal forces of stable grasps of three fingers, with their covariance, and spring
+    stiffnesses.
+
+    `forces` [N] and `covariance` [N^2] are in the order of the hand's fingers. `springs` [N/m] are
+    the stiffnesses of the virtual springs along the sides (0, 1), (1, 2) and (2, 0) of the triangle
+    of fingertips.
     """
 
     forces: Float[Tensor, "3"]
@@ -33,7 +37,7 @@ class PreferredForces(Value):
 
 @runtime_checkable
 class ForcePreference(Protocol):
-    """What chooses among balanced forces that need nearly equal friction, such as a model of
+    """A model that chooses among balanced forces of nearly equal friction, such as a model of
     stability.
     """
 
@@ -42,7 +46,8 @@ class ForcePreference(Protocol):
     ) -> PreferredForces:
         """Return the forces preferred for fingertips with given centres `tips` [m].
 
-        `force` [N] is the normal force of the finger that presses hardest; None leaves it open.
+        `force` [N] is the normal force of the finger that presses hardest; with None the model
+        chooses it.
         """
         ...
 
@@ -56,24 +61,31 @@ def desired_forces(
     """Return balanced fingertip forces [N] on the object that need the least friction
     (`least_friction_forces`).
 
-    The largest normal force is `strongest` [N]; `preferred` are wanted ratios of the normal forces.
-    Where no balanced forces press at every contact, each force is `strongest` along the inward
-    normal.
+    `points` [m] and outward unit `normals` are those of the f contacts, in any frame; the forces
+    are in the same frame. The largest normal force is `strongest` [N]. `preferred` holds wanted
+    normal forces of the fingers, of which only the ratios count; None means equal ones. Where no
+    balanced forces press at every contact, each force is `strongest` along the inward normal.
     """
     balanced = least_friction_forces(points, normals, strongest, preferred)
     return torch.where(torch.isfinite(balanced), balanced, -strongest * normals)
 
 
 def contacts_in_hand(grasps: Grasps) -> tuple[Float[Tensor, "g f 3"], Float[Tensor, "g f 3"]]:
-    """Return the planned contact points [m] and outward normals of grasps, in the hand's frame."""
+    """Return the planned contacts of g grasps in the hand's frame: first the points [m], then the
+    outward unit normals.
+    """
     hand_from_obj = inverse(grasps.obj_from_hand.double())
     points = apply(hand_from_obj, grasps.contacts.points.double())
     return points, rotate(hand_from_obj, grasps.contacts.normals.double())
 
 
 class Squeeze(NamedTuple):
-    """Joint targets [rad] that press on the object in g grasps, the fingertip forces [N] and joint
-    torques [N m].
+    """Joint targets that press on the object in g grasps, with their fingertip forces and joint
+    torques.
+
+    `joints` [rad] are the targets of the h actuated joints. `forces` [N] are those of the f
+    fingertips on the object, in the hand's frame. `torques` [N m] of the actuated joints exert
+    these forces.
     """
 
     joints: Float[Tensor, "g h"]
@@ -90,9 +102,9 @@ def squeeze(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None 
     not differentiable in the contacts.
 
     `force` [N] is the normal force of the strongest finger, `kp` [N m/rad] the stiffness of every
-    joint's drive, by default the hand's own. The hand follows the grasps to their device. Raises
+    joint's drive, None means the hand's own. The hand follows the grasps to their device. Raises
     `BadArgument` for joints or fingers of another hand, a force or stiffness that is not positive,
-    contacts or poses by which derivatives are taken.
+    or contacts or poses that require gradients.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -111,8 +123,9 @@ def squeeze(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None 
 
 
 def check_same_hand(hand: Hand, grasps: Grasps) -> None:
-    """Raise `BadArgument` for grasps whose fingers or joints are not the hand's; grasps may lack
-    finger names.
+    """Raise `BadArgument` if the fingers or joints of grasps are not the hand's.
+
+    Grasps whose metadata name no fingers need only their number.
     """
     names = grasps.meta.get("finger_names", ",".join(hand.finger_names)).split(",")
     count = grasps.contacts.fingertips
@@ -132,23 +145,29 @@ def press(
     forces: Float[Tensor, "g f 3"],
     stiffness: Float[Tensor, " h"],
 ) -> Squeeze:
-    """Return targets [rad] and torques [N m] with which joint drives of a `stiffness` [N m/rad]
-    exert given forces.
+    """Return the joint targets and torques with which position-controlled drives exert given
+    forces.
+
+    `joints` [rad] are the present actuated joints, `jacobian` [m/rad] is that of the contact points
+    by them, `forces` [N] act on the object, and `stiffness` [N m/rad] is that of each actuated
+    joint.
     """
     torques = torch.einsum("gcih,gci->gh", jacobian, forces)
     return Squeeze(joints + torques / stiffness, forces, torques)
 
 
 def stiff_drives(hand: Hand, kp: float | None) -> dict[str, Actuator]:
-    """Return the drives of a hand by joint; `kp` [N m/rad], if given, is the stiffness of all."""
+    """Return the drive of each joint by its name; `kp` [N m/rad], if given, replaces the stiffness
+    of all.
+    """
     if kp is None:
         return hand.actuators
     return {name: drive._replace(kp=kp) for name, drive in hand.actuators.items()}
 
 
 def drive_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, " j"]:
-    """Return the drive stiffness [N m/rad] of every joint of the URDF: `kp` if given, else the
-    hand's own.
+    """Return the drive stiffness [N m/rad] of each of the j joints of the URDF: `kp` if given, else
+    the hand's own.
     """
     drives = stiff_drives(hand, kp)
     kps = [drives[name].kp for name in hand.tree.joint_names]
@@ -156,8 +175,10 @@ def drive_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, " j"]:
 
 
 def joint_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, "h"]:
-    """Return the stiffness [N m/rad] of each actuated joint, coupled joints included; `kp` replaces
-    the hand's own.
+    """Return the stiffness [N m/rad] of each actuated joint, together with the joints coupled to
+    it.
+
+    `kp` [N m/rad], if given, replaces the stiffness of every drive.
     """
     coupling = hand.actuated.coupling
     stiffness = drive_stiffness(hand, kp).to(coupling)
@@ -169,8 +190,10 @@ def tip_compliance(
     normals: Float[Tensor, "*b f 3"],
     stiffness: Float[Tensor, "h"],
 ) -> Float[Tensor, "*b f"]:
-    """Return how far each fingertip yields along its normal per force [m/N], given the joint
-    stiffness [N m/rad].
+    """Return the compliance [m/N] of each fingertip along its contact normal.
+
+    `jacobian` [m/rad] is that of the contact points by the h actuated joints, whose `stiffness` [N
+    m/rad] is given; `normals` are unit vectors.
     """
     along = torch.einsum("...cih,...ci->...ch", jacobian, normals)
     return (along**2 / stiffness).sum(-1)

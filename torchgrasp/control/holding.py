@@ -1,5 +1,8 @@
-"""Hold controllers: press with balanced forces at the contacts, or with the least forces that carry
-the sensed load.
+"""Hold controllers: they press with balanced forces, or with the least forces that carry the sensed
+load.
+
+A load is a wrench of force [N] and torque [N m] about the centroid of the contacts. All vectors are
+in the hand's frame.
 """
 
 import dataclasses
@@ -27,7 +30,7 @@ PUSH = 2.5
 
 @dataclasses.dataclass(frozen=True)
 class FrictionNumbers:
-    """The numbers of the estimate of the friction coefficient."""
+    """Numbers of the estimate of the friction coefficient."""
 
     mean: float = 0.8
     """Estimate at the start."""
@@ -36,16 +39,16 @@ class FrictionNumbers:
     least_std: float = 0.03
     """Least standard deviation of the estimate; larger: it follows later readings more."""
     least: float = 0.15
-    """Least coefficient at the start; a finger that sticks raises it."""
+    """Lower bound of the coefficient at the start; a finger that sticks raises it."""
     most: float = 1.5
-    """Largest estimate."""
+    """Largest coefficient that is estimated."""
     noise: float = 0.4
-    """Noise [N] of a fingertip's force; that of the ratio is this over the normal force."""
+    """Standard deviation [N] of a fingertip's force; over the normal force, that of the ratio."""
 
 
 @dataclasses.dataclass(frozen=True)
 class GripNumbers:
-    """The numbers of the grip that carries the felt load."""
+    """Numbers of the hold "grip", which carries the felt load."""
 
     least_push: float = 0.4
     """Least normal force [N] of a finger: four standard deviations of its reading."""
@@ -56,21 +59,24 @@ class GripNumbers:
     fastest: float = 60.0
     """Largest rate [N/s] of a fingertip's force."""
     room: float = 0.8
-    """Share of the largest force that the floors of a balance may need."""
+    """Share of the largest force up to which least normal forces are demanded of the fingers."""
     near: float = 0.95
-    """Share of the limits of torque and force from which the forces are near them."""
-    # cut-offs [Hz] of the felt normals, forces and load
+    """Share of the limits of torque and force from which the forces count as near the limits."""
     normals: float = 1.0
+    """Cut-off [Hz] of the sensed normals."""
     forces: float = 8.0
+    """Cut-off [Hz] of the sensed forces."""
     load: float = 3.0
+    """Cut-off [Hz] of the sensed load."""
     carried: float = 0.7
     """Cut-off [Hz] of the load that counts as carried; a faster one rocks the object."""
     carries: float = 0.8
-    """Share of the carried load; all of it would press ever harder on a rigid table."""
+    """Share of the carried load that is commanded; with all, a rigid table is pressed ever harder.
+    """
     settled: float = 0.4
     """Time [s] before which the hand may still reopen beside the object."""
     sure: float = 4.0
-    """Rate [1/s] at which the reserve for a push then grows to its whole."""
+    """Rate [1/s] at which the reserve for a push grows after that time."""
     lever: float = 0.1
     """Longest lever [m] at which weight and pushes may turn the object."""
     slow: float = 0.008
@@ -80,13 +86,13 @@ class GripNumbers:
     ratio: float = 2.0
     """Largest ratio of tangential to normal force that the friction estimate sees."""
     growth: float = 1.05
-    """Ratio to the largest load so far above which a load is new."""
+    """Ratio to the largest load so far, above which a load counts as new."""
     steady: float = 0.3
     """Time [s] without a new load after which the load is steady."""
     release: float = 3.0
-    """Rate [1/s] at which forces that are not needed then fall."""
+    """Rate [1/s] at which forces that are not needed fall once the load is steady."""
     changes: float = 2.0
-    """Largest rate [1/s] of the friction coefficient, and half of that of the reserve's share."""
+    """Largest rate [1/s] of the friction coefficient; the reserve's share rises twice as fast."""
     over: float = 0.25
     """Time [s] of sliding with forces at their limits after which the load is too heavy."""
     feedback: float = 4.0
@@ -95,7 +101,7 @@ class GripNumbers:
 
 @dataclasses.dataclass(frozen=True)
 class WeightNumbers:
-    """The numbers of an object's likely weight."""
+    """Numbers from which the likely weight of an object is estimated."""
 
     density: float = 1000.0
     """Density [kg/m^3]: that of water."""
@@ -109,11 +115,15 @@ WEIGHT = WeightNumbers()
 
 
 class ForceHold:
-    """Press with balanced forces at the sensed contacts; `start` holds the joint targets [rad] at
-    the closing's end.
+    """Hold controller that presses with balanced forces at the sensed contacts.
 
     The joints stay compliant. Force feedback changes one common factor on all forces, because a
     separate force loop for each finger would push the object away.
+
+    Args:
+        reference: the closing plan.
+        observation: the observation at the end of the closing.
+        start: targets [rad] of all joints at the end of the closing.
     """
 
     def __init__(
@@ -143,13 +153,16 @@ class ForceHold:
 def keep_targets(
     reference: ClosingReference, observation: Observation, start: Tensor
 ) -> Callable[..., Tensor]:
-    """Return the hold that keeps the joint targets of the closing's end, `start` [rad]."""
+    """Return a hold controller that keeps the joint targets `start` [rad] of the end of the
+    closing.
+    """
     return lambda observation, period: start
 
 
 def regulate(factor: float, observation: Observation, strength: float, period: float) -> float:
-    """Return the common factor on all forces one tick later; it brings the sum of normal forces to
-    `strength` [N].
+    """Return the common `factor` on all forces one tick later, `period` [s] on.
+
+    It changes so that the sum of the sensed normal forces approaches `strength` [N].
     """
     lacking = 1 - float(observation.tactile.reading.sum()) / strength
     return min(max(factor + period * lacking, 0.5), MAX_FACTOR)
@@ -158,11 +171,11 @@ def regulate(factor: float, observation: Observation, strength: float, period: f
 def held_forces(
     reference: ClosingReference, observation: Observation
 ) -> tuple[Float[Tensor, "f 3"], float]:
-    """Return balanced forces [N] on the object, and the sum [N] of their normal parts at tips with
-    a working sensor.
+    """Return balanced forces [N] on the object, and the sum [N] of their normal parts.
 
-    The forces act at the sensed contacts. They sum to a zero wrench. If a finger does not touch, or
-    if no such forces exist that press at every contact, the planned forces are returned.
+    The sum is over fingertips with a working sensor. The forces act at the sensed contacts, and
+    their total wrench is zero. If a finger does not touch, or if no such forces exist that press at
+    every contact, the planned forces are returned.
     """
     gains = reference.gains
     normals = reference.normals
@@ -183,8 +196,8 @@ def held_forces(
 
 
 class FrictionEstimate:
-    """A running estimate of the friction coefficient: mean and standard deviation, common to all
-    fingertips.
+    """A running estimate of the friction coefficient, common to all fingertips: `mean`, standard
+    deviation `std`, bound `least`.
     """
 
     def __init__(self) -> None:
@@ -193,11 +206,11 @@ class FrictionEstimate:
         self.least = FRICTION.least
 
     def update(self, ratio: float, force: float, slides: bool = True) -> None:
-        """Update the estimate by a fingertip's tangential over normal force, and its normal force
-        [N].
+        """Update the estimate by the sensed force of one fingertip.
 
-        A fingertip that sticks shows that friction is at least its ratio; a slide with a smaller
-        ratio is a spin.
+        `ratio` is its tangential over its normal force, `force` [N] its normal force, and `slides`
+        says whether it slides. A fingertip that sticks shows that friction is at least its ratio. A
+        slide with a ratio below `least` is taken for a spin about the normal, and ignored.
         """
         noise = FRICTION.noise * math.hypot(1.0, ratio) / force
         if not slides:
@@ -216,13 +229,18 @@ class FrictionEstimate:
 
 
 class GripHold:
-    """Press with the least forces that carry the load felt by the fingertips, and a push of `PUSH`
-    from any side.
+    """Hold controller that presses with the least forces that carry the sensed load and a push of
+    `PUSH` from any side.
 
-    Until the lifted load is steady, the reserve also covers the largest weight that an object of
-    this size may have. The reserve shrinks where torques or forces would exceed their limits; no
+    Until the lifted load is steady, the forces also allow for the largest weight that an object of
+    this size may have. This reserve shrinks where torques or forces would exceed their limits; no
     force exceeds `reference.max_force`. `status` becomes `TOO_HEAVY` when a fingertip slides
     although the torques or forces have reached their limits.
+
+    Args:
+        reference: the closing plan.
+        observation: the observation at the end of the closing.
+        start: targets [rad] of all joints at the end of the closing.
     """
 
     def __init__(
@@ -265,12 +283,12 @@ class GripHold:
 
     @property
     def weight(self) -> float:
-        """The size of the force [N] with which the object loads the fingertips, as they feel it."""
+        """Size [N] of the filtered force with which the object loads the fingertips."""
         return float(np.linalg.norm(self.load[:3]))
 
     @property
     def sliding(self) -> np.ndarray:
-        """A mask of the fingers that have slid for so long that the filtered forces show the
+        """Mask (f,) of the fingers that have slid long enough for the filtered forces to show the
         friction.
         """
         return self.slid > GRIP.slide
@@ -296,15 +314,15 @@ class GripHold:
         return torch.from_numpy(targets)
 
     def _bounded(self, push: np.ndarray) -> np.ndarray:
-        """Return normal forces [N] of all fingers, reduced where a balance would need forces near
-        the largest.
+        """Return the normal forces `push` (f,) [N], all reduced if a balance with them would need
+        forces near the largest allowed.
         """
         largest = float((push / self.planned).max() * self.planned.max())
         return push * min(1.0, GRIP.room * self.solver.most / max(largest, TINY))
 
     def _feel(self, observation: Observation, period: float) -> tuple[Balance, np.ndarray]:
-        """Filter the sensed forces, load and normals; return the contacts' grasp map and each
-        finger's reserve [N].
+        """Filter the sensed forces, load and normals; return the grasp map of the contacts and the
+        reserve (f,) [N] of each finger.
         """
         normals = _sensed(observation, self.normals)
         self.normals = smooth(self.normals, normals, GRIP.normals, period)
@@ -329,8 +347,8 @@ class GripHold:
         return contacts, self._bounded(reserve)
 
     def _weight(self, load: np.ndarray) -> np.ndarray:
-        """Return the part of a load wrench that weight and, once lifted, pushes of `PUSH` can
-        cause.
+        """Return the part of the wrench `load` (6,) [N, N m] that weight and, once lifted, pushes
+        of `PUSH` can cause.
         """
         if self.up is None:
             return load
@@ -342,7 +360,9 @@ class GripHold:
         return np.concatenate([lifted * self.up + side, torque])
 
     def _adapt(self, observation: Observation, period: float) -> None:
-        """Update the friction estimate by sliding fingers; reduce forces that are not needed."""
+        """Update the friction estimate by the sensed forces of each finger; reduce forces that are
+        not needed.
+        """
         tactile = observation.tactile
         slides = (tactile.sliding.numpy() > GRIP.slow) & tactile.contact.numpy()
         self.slid = np.where(slides, self.slid + period, 0.0)
@@ -372,8 +392,8 @@ class GripHold:
         self.unfelt = self.unfelt * kept
 
     def _judge(self, wanted: np.ndarray, jacobian: np.ndarray, period: float) -> None:
-        """Choose the friction coefficient for the forces of the next tick; judge whether the load
-        is too heavy.
+        """Choose the friction coefficient for the next tick, and judge whether the load is too
+        heavy.
         """
         share = self.solver.share(wanted, self.normals, jacobian)
         fastest = GRIP.changes * period
@@ -389,8 +409,8 @@ class GripHold:
             self.status = Status.TOO_HEAVY
 
     def _command(self, contacts: Balance, wanted: np.ndarray, period: float) -> np.ndarray:
-        """Return the fingertip forces [N] to command: `wanted`, corrected by feedback; new load is
-        taken up slowly.
+        """Return the fingertip forces (f, 3) [N] to command: `wanted`, corrected by feedback; new
+        load is taken up slowly.
         """
         if self.time > RAMP:
             lacking = ((self.felt - wanted) * self.normals).sum(-1)
@@ -408,11 +428,12 @@ class GripHold:
 def push_reserve(
     contacts: Balance, normals: np.ndarray, arm: np.ndarray, friction: float
 ) -> np.ndarray:
-    """Return the normal force [N] that keeps each finger's force in its cone, for a push of 1 N
+    """Return the normal force (f,) [N] that each finger needs in addition against a push of 1 N
     from the worst side.
 
-    The push acts at `arm` [m] from the middle of the contacts. The fingers share it like springs of
-    equal stiffness.
+    With it, the force of the finger stays in its cone of the coefficient `friction`. The push acts
+    at `arm` (3,) [m] from the middle of the `contacts`, whose outward unit `normals` are (f, 3).
+    The fingers share the push like springs of equal stiffness.
     """
     sides = np.eye(3)
     pushes = np.concatenate([sides, np.cross(arm, sides).T])  # (6, 3): wrenches
@@ -426,11 +447,11 @@ def push_reserve(
 def likely_body(
     reference: ClosingReference, numbers: WeightNumbers = WEIGHT
 ) -> tuple[np.ndarray, float]:
-    """Return the object's centre [m] in the hand's frame and its largest likely weight [N], from
-    what a robot knows.
+    """Return an object's likely centre (3,) [m] in the hand's frame, and its largest likely weight
+    [N].
 
     The weight is that of water in the volume of the estimated surface, or else of a ball as wide as
-    the contacts; a small thing may be of metal.
+    the contacts. It is at least that of `numbers.mass`: a small thing may be of metal.
     """
     field = reference.surface
     points = reference.gains.target
@@ -451,13 +472,13 @@ def likely_body(
 
 
 def _limited(vector: np.ndarray, most: float) -> np.ndarray:
-    """Return a vector (3,), shortened to the length `most` if it is longer."""
+    """Return the `vector` (3,), shortened to the length `most` if it is longer."""
     return vector * min(1.0, most / max(float(np.linalg.norm(vector)), TINY))
 
 
 def _sensed(observation: Observation, normals: np.ndarray) -> np.ndarray:
-    """Return the contact normals that the fingertips sense, or the given normals where a fingertip
-    senses none.
+    """Return the contact normals (f, 3) that the fingertips sense, or the given `normals` where a
+    fingertip senses none.
     """
     sensed = observation.tactile.normals.numpy()
     return np.where(np.isfinite(sensed).all(-1, keepdims=True), sensed, normals)

@@ -1,8 +1,9 @@
 """The closing control law (Eqs. 25-28 of the paper): position control far from a contact, force
 control near it.
 
-The gains are inverse to the uncertainty of shape and force. All functions are pure and batched over
-leading axes.
+The gains are inverse to the uncertainty of shape and force. All functions are pure. `*b` stands for
+leading axes, of which the last is usually that of the f fingers. Normals are outward unit vectors,
+and all vectors of a call are in one frame, usually the hand's.
 """
 
 import torch
@@ -11,9 +12,6 @@ from torch import Tensor
 
 from torchgrasp.geometry.linalg import cholesky, limit_norm, squared_mahalanobis
 
-Vectors = Float[Tensor, "*b 3"]
-Numbers = Float[Tensor, "*b"]
-Matrices = Float[Tensor, "*b 3 3"]
 POSITION_FLOOR = 0.005
 """Standard deviation [m], in all directions, of errors of hand pose and joint zeros; it keeps Eq.
 (27) finite.
@@ -32,17 +30,21 @@ TINY = 1e-9  # least length by which a vector is divided
 MAX_STEP = 0.05
 
 
-def surface_covariance(normals: Vectors, std_m: Numbers) -> Matrices:
+def surface_covariance(
+    normals: Float[Tensor, "*b 3"], std_m: Float[Tensor, "*b"]
+) -> Float[Tensor, "*b 3 3"]:
     """Return the covariance [m^2] of each contact's position in the closing "uncertainty": n n^T
     s^2 + floor^2 I.
 
-    n is the contact's normal, s the shape's deviation `std_m`; the floor is the hand's, equal in
-    all directions.
+    n is the contact's normal and s its standard deviation `std_m` [m]. The floor is
+    `POSITION_FLOOR` [m], of the hand's own errors, which are equal in all directions.
     """
     return _normal_covariance(normals, std_m, POSITION_FLOOR)
 
 
-def printed_covariance(normals: Vectors, distance_variance: Numbers) -> Matrices:
+def printed_covariance(
+    normals: Float[Tensor, "*b 3"], distance_variance: Float[Tensor, "*b"]
+) -> Float[Tensor, "*b 3 3"]:
     """Return the covariance [m^2] that Eq. (27) of the paper prints: Sigma_cov = diag(|R f_cov n|).
 
     `distance_variance` [m^2] is f_cov, the variance of the signed distance. `normals` are R n, in
@@ -54,47 +56,58 @@ def printed_covariance(normals: Vectors, distance_variance: Numbers) -> Matrices
 
 
 def force_covariance(
-    forces: Vectors, normals: Vectors, deviation: Numbers | None = None
-) -> Matrices:
+    forces: Float[Tensor, "*b 3"],
+    normals: Float[Tensor, "*b 3"],
+    deviation: Float[Tensor, "*b"] | None = None,
+) -> Float[Tensor, "*b 3 3"]:
     """Return the covariance [N^2] of each contact force (Sigma_fd, Eq. 28 of the paper).
 
     It is the variance of the normal force along the normal, plus the sensor's variance, equal in
-    all directions. `deviation` [N] is the standard deviation of each normal force; by default a
-    tenth of the force.
+    all directions. `forces` [N] are the desired ones. `deviation` [N] is the standard deviation of
+    each normal force; None means a tenth of the force.
     """
     if deviation is None:
         deviation = FORCE_SHARE * (forces * normals).sum(-1)
     return _normal_covariance(normals, deviation, FORCE_FLOOR)
 
 
-def _normal_covariance(normals: Vectors, std: Numbers, floor: float) -> Tensor:
-    """Return covariances (3, 3): the variance `std`^2 along the normal, plus `floor`^2 in all
+def _normal_covariance(
+    normals: Float[Tensor, "*b 3"], std: Float[Tensor, "*b"], floor: float
+) -> Tensor:
+    """Return covariances (*b, 3, 3): the variance `std`^2 along the normal, plus `floor`^2 in all
     directions.
     """
     along = normals[..., :, None] * normals[..., None, :] * std[..., None, None] ** 2
     return along + floor**2 * torch.eye(3, dtype=normals.dtype, device=normals.device)
 
 
-def blend(error: Vectors, covariance: Matrices) -> Numbers:
+def blend(error: Float[Tensor, "*b 3"], covariance: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
     """Return each finger's share of force control, from 0 to 1: lambda = exp(-e^T Sigma_cov^-1 e /
     2), Eq. (26).
 
-    It is 1 at the contact, and near 0 where the position error [m] exceeds the shape's uncertainty.
+    `error` [m] is e, from the fingertip to its contact, and `covariance` [m^2] is Sigma_cov. The
+    share is 1 at the contact, and near 0 where the error exceeds the shape's uncertainty.
     """
     factor = cholesky(covariance, "the covariance of a contact", "add an isotropic floor")
     return torch.exp(-0.5 * squared_mahalanobis(error, factor))
 
 
-def position_gain(covariance: Matrices) -> Vectors:
+def position_gain(covariance: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
     """Return the position gain [1/s] on each axis: a constant over the axis's variance, Eq. (27) of
     the paper.
+
+    `covariance` [m^2] is that of the contact's position.
     """
     return POSITION_RATE * POSITION_FLOOR**2 / covariance.diagonal(dim1=-2, dim2=-1)
 
 
-def force_gain(covariance: Matrices, alpha_f: Numbers | float) -> Vectors:
-    """Return the force gain [m/(s N)] on each axis: alpha_f [m N/s] over the axis's variance, Eq.
+def force_gain(
+    covariance: Float[Tensor, "*b 3 3"], alpha_f: Float[Tensor, "*b"] | float
+) -> Float[Tensor, "*b 3"]:
+    """Return the force gain [m/(s N)] on each axis: `alpha_f` [m N/s] over the axis's variance, Eq.
     (28) of the paper.
+
+    `covariance` [N^2] is that of the contact force.
     """
     diagonal = covariance.diagonal(dim1=-2, dim2=-1)
     return alpha_f[..., None] / diagonal if isinstance(alpha_f, Tensor) else alpha_f / diagonal
@@ -103,7 +116,9 @@ def force_gain(covariance: Matrices, alpha_f: Numbers | float) -> Vectors:
 def damped_inverse(
     jacobian: Float[Tensor, "*b m h"], damping: float = DAMPING
 ) -> Float[Tensor, "*b h m"]:
-    """Return the damped inverse J^T (J J^T + damping I)^-1 of a Jacobian; `damping` is in m^2."""
+    """Return the damped inverse J^T (J J^T + damping I)^-1 of a `jacobian` [m/rad]; `damping` is in
+    m^2.
+    """
     m, h = jacobian.shape[-2:]
     eye = torch.eye(min(m, h), dtype=jacobian.dtype, device=jacobian.device)
     transposed = jacobian.transpose(-1, -2)
@@ -116,18 +131,24 @@ def damped_inverse(
 
 
 def tip_velocity(
-    position_error: Vectors,
-    force_error: Vectors,
-    blend: Numbers,
-    position_gain: Vectors,
-    force_gain: Vectors,
+    position_error: Float[Tensor, "*b 3"],
+    force_error: Float[Tensor, "*b 3"],
+    blend: Float[Tensor, "*b"],
+    position_gain: Float[Tensor, "*b 3"],
+    force_gain: Float[Tensor, "*b 3"],
     together: bool = False,
-) -> Vectors:
+) -> Float[Tensor, "*b 3"]:
     """Return the commanded velocity [m/s] of each fingertip, at most `MAX_SPEED`: the bracket in
     Eq. (25) of the paper.
 
-    The share `blend` of the velocity is force control, the rest position control. With `together`,
-    the limit scales all fingers by one factor, which keeps the ratios of their speeds.
+    Args:
+        position_error: from each fingertip to its contact [m].
+        force_error: desired minus sensed force on the object [N].
+        blend: share of force control, from 0 to 1; the rest is position control.
+        position_gain: gain on each axis [1/s].
+        force_gain: gain on each axis [m/(s N)].
+        together: whether the limit scales all fingers by one factor, which keeps the ratios of
+            their speeds.
     """
     share = blend[..., None]
     velocity = (1 - share) * position_gain * position_error + share * force_gain * force_error
@@ -137,9 +158,13 @@ def tip_velocity(
     return velocity * (MAX_SPEED / fastest.clamp_min(MAX_SPEED))[..., None, None]
 
 
-def stay_above(velocity: Vectors, height: Numbers, up: Float[Tensor, "3"]) -> Vectors:
-    """Return fingertip velocities [m/s], slowed downwards so that tips at `height` [m] over the
-    table stay above it.
+def stay_above(
+    velocity: Float[Tensor, "*b 3"], height: Float[Tensor, "*b"], up: Float[Tensor, "3"]
+) -> Float[Tensor, "*b 3"]:
+    """Return the fingertip velocities [m/s], slowed downwards so that no fingertip enters the
+    table.
+
+    `height` [m] is that of each fingertip over the table, and `up` the table's unit normal.
     """
     lacking = -POSITION_RATE * height.clamp_min(0.0) - velocity @ up
     return velocity + lacking.clamp_min(0.0)[..., None] * up
@@ -152,12 +177,19 @@ def joint_step(
     posture_error: Float[Tensor, "*b h"] | None = None,
     damping: float = DAMPING,
 ) -> Float[Tensor, "*b h"]:
-    """Return the change of the joints [rad] in one tick, which moves the fingertips with the given
-    velocities [m/s].
+    """Return the change [rad] of the actuated joints in one tick that moves the fingertips with a
+    `velocity` [m/s].
 
     Damped least squares over all fingers replace the inverse Jacobian in Eq. (25) of the paper,
-    which coupled fingers lack. Motions that leave the fingertips at rest bring the joints towards
-    the planned posture: `posture_error` [rad] is the planned minus the present joints.
+    which coupled fingers lack. No joint changes by more than `MAX_STEP`.
+
+    Args:
+        jacobian: Jacobian [m/rad] of the f fingertips by the h actuated joints.
+        velocity: commanded velocity of each fingertip.
+        period: period of the tick [s].
+        posture_error: planned minus present joints [rad]. The motions that leave the fingertips at
+            rest reduce it; None means that there are no such motions.
+        damping: damping of the inverse [m^2].
     """
     stacked = jacobian.flatten(-3, -2)
     inverse_jacobian = damped_inverse(stacked, damping)

@@ -7,8 +7,10 @@ coefficient mu and a small weight eps of the barrier, the method minimises
     sum n_i + penalty sum max(|tau_j| / effort_j - knee, 0)^2
         - eps sum [log(mu^2 (n_i - reserve_i)^2 - |t_i|^2) + log(n_i - floor_i)]
 
-over all forces that balance the load. A reserve keeps a force within its cone when a push changes
-the force. It is written in NumPy, whose calls cost less than torch's for small matrices.
+over all forces that balance the load. A reserve is a part of the normal force that does not count
+for friction, so that a force stays within its cone when a push changes it. A load is a wrench (6,):
+force [N], then torque [N m] about the centroid of the contacts. All vectors are in one frame, the
+hand's. It is written in NumPy, whose calls cost less than torch's for small matrices.
 """
 
 import dataclasses
@@ -26,40 +28,40 @@ Array = np.ndarray
 
 @dataclasses.dataclass(frozen=True)
 class BarrierNumbers:
-    """The numbers of the barrier method."""
+    """Numbers of the barrier method."""
 
     penalty: float = 500.0
     """Weight [N] of the penalty on joint torques and normal forces."""
     knee: float = 0.9
     """Share of their limits where the penalty begins."""
     gap: float = 0.01
-    """Weight of the barrier, as a share of load and floors: forces keep a distance from the cones
-    beyond the noise.
+    """Weight of the barrier, as a share of the load and the floors [N]; larger: the forces stay
+    farther from the borders of the cones.
     """
     growth: float = 0.02
-    """Least share of the internal forces that is tried beside none; each other is twice the last."""
+    """Least multiple of the internal forces that is tried besides 0; each next one is twice it."""
     growths: int = 9
-    """Number of these shares."""
+    """Number of these multiples."""
     margin: float = 1.25
-    """Least ratio of the coefficient to that which the internal forces need: below it the forces
-    would grow huge.
+    """Least ratio of the friction coefficient to that which the internal forces need: below it the
+    forces would grow huge.
     """
     steps: int = 8
     """Most Newton steps of one call."""
     strides: int = 8
-    """Lengths of a step that are tried, each twice the one before."""
+    """Number of step lengths that are tried, each twice the one before."""
     solved: float = 0.3
     """Newton decrement at which the steps end."""
     lower: float = 0.5
-    """Share of the found force to which a floor is lowered that no forces reach."""
+    """Share of the found normal force to which a floor is lowered if no forces reach the floor."""
     raised: float = 1.05
-    """Ratio of the coefficient, where it is raised, to the least with which forces were found."""
+    """Ratio of a raised friction coefficient to the least with which forces were found."""
     rank: float = 1e-12
     """Least singular value of a grasp map, as a share of the largest; contacts on one line have
     rank 5.
     """
     least: float = 1e-12
-    """Least normal force [N] by which is divided."""
+    """Least normal force [N] that is used as a divisor."""
     ridge: float = 1e-9
     """Added to the diagonal of the Hessian before it is solved."""
 
@@ -68,11 +70,13 @@ BARRIER = BarrierNumbers()
 
 
 class Balance(NamedTuple):
-    """The grasp map of contacts (matrix from n force components to the wrench), its pseudo-inverse
-    and its null space.
+    """The grasp map of f contacts, with its pseudo-inverse and null space.
 
-    The columns of `free` are a basis of the null space: k internal forces, which exert no wrench. A
-    finger in the air exerts none either, so its force is free.
+    `wrench` maps the n = 3 f components of the forces on the object to force and torque about the
+    contacts' centroid [m]: no unit in the first three lines, [m] in the others. The columns of
+    `inverse` are the least forces for each component of the wrench. The columns of `free` are an
+    orthonormal basis of the null space: k internal forces, which exert no wrench. The columns of
+    `wrench` are 0 for a finger in the air, so its force is free, too.
     """
 
     wrench: Float[Array, "6 n"]
@@ -80,13 +84,15 @@ class Balance(NamedTuple):
     free: Float[Array, "n k"]
 
     def inner(self, forces: Float[Array, "f 3"]) -> Float[Array, "f 3"]:
-        """Return the part of fingertip forces that exerts no wrench."""
+        """Return the part [N] of fingertip `forces` [N] that exerts no wrench."""
         return (self.free @ (self.free.T @ forces.ravel())).reshape(-1, 3)
 
 
 def balance(points: Float[Array, "f 3"], touching: Bool[Array, "f"] | bool = True) -> Balance:
-    """Return the grasp map at contact points [m] that touch, its pseudo-inverse and its null space,
-    from one SVD.
+    """Return the grasp map at contact `points` [m], its pseudo-inverse and its null space, from one
+    SVD.
+
+    `touching` marks the fingers that touch; True means all.
     """
     columns = np.repeat(np.broadcast_to(touching, len(points)), 3)
     wrench = grasp_map(torch.from_numpy(points)).numpy() * columns
@@ -97,8 +103,10 @@ def balance(points: Float[Array, "f 3"], touching: Bool[Array, "f"] | bool = Tru
 
 
 def friction_ratios(forces: Float[Array, "f 3"], normals: Float[Array, "f 3"]) -> Float[Array, "f"]:
-    """Return each finger's ratio of tangential to normal force; the ratio is infinite if the finger
-    does not press.
+    """Return each finger's ratio of tangential to normal force; it is infinite if the finger does
+    not press.
+
+    `forces` [N] act on the object, and `normals` are outward unit vectors.
     """
     push = -(forces * normals).sum(-1)
     slide = np.linalg.norm(forces + push[:, None] * normals, axis=-1)
@@ -106,11 +114,14 @@ def friction_ratios(forces: Float[Array, "f 3"], normals: Float[Array, "f 3"]) -
 
 
 class LeastForces:
-    """A solver for the least fingertip forces [N] that carry a load; each call of `solve` starts
-    from the last forces.
+    """A solver for the least fingertip forces [N] that carry a load; each `solve` starts from the
+    last forces.
 
-    The first call starts from the forces `start`, which press at every contact. `effort` [N m]
-    limits the torque of every joint, `most` [N] limits the normal force of every finger.
+    Args:
+        start: forces (f, 3) [N] on the object from which the first call starts; they press at every
+            contact.
+        effort: largest torque [N m] of each of the j joints of the URDF.
+        most: largest normal force [N] of each finger.
     """
 
     def __init__(self, start: Float[Array, "f 3"], effort: Float[Array, " j"], most: float) -> None:
@@ -129,13 +140,21 @@ class LeastForces:
         floor: Float[Array, "f"],
         reserve: Float[Array, "f"] | float = 0.0,
     ) -> Float[Array, "f 3"]:
-        """Return the least forces [N] that exert the wrench `load`, with normal forces above each
-        finger's `floor` [N].
+        """Return the least forces [N] on the object that exert the wrench `load`.
 
-        Without the normal force `reserve` [N], the forces are within the cones of the coefficient
-        `friction`. If no such forces are found, the coefficient is raised to the least with which
-        forces were found. The coefficient is also at least 1.25 times the one that the internal
-        forces `start` need: below it the forces would grow huge.
+        If no forces satisfy the constraints, the friction coefficient is raised to the least with
+        which forces were found. The coefficient is also at least 1.25 times the one that the
+        internal forces `start` need: below it the forces would grow huge.
+
+        Args:
+            contacts: the grasp map.
+            normals: outward unit normals of the contacts.
+            jacobian: Jacobian [m/rad] of the fingertips by all joints.
+            load: wrench [N, N m] that the forces exert on the object, about the contacts' centroid.
+            friction: coefficient of friction.
+            floor: least normal force [N] of each finger.
+            reserve: part of the normal force [N] that is not counted: the forces without it are
+                within the friction cones.
         """
         floor = np.maximum(floor, reserve)
         count = len(normals)
@@ -178,8 +197,11 @@ class LeastForces:
         normals: Float[Array, "f 3"],
         jacobian: Float[Array, "f 3 j"],
     ) -> float:
-        """Return the largest ratio of a joint torque or normal force to its limit, for given forces
-        [N].
+        """Return the largest ratio of a joint torque or a normal force to its limit, for given
+        forces [N].
+
+        `normals` are outward unit vectors, and `jacobian` [m/rad] is that of the fingertips by all
+        joints.
         """
         torque = np.abs(np.einsum("nij,ni->j", jacobian, forces)) / self.effort
         push = -(forces * normals).sum(-1)
@@ -187,8 +209,8 @@ class LeastForces:
 
 
 class _Barrier:
-    """The objective that the solver minimises, as a function of the k coordinates z of the internal
-    forces.
+    """The objective that the solver minimises, as a function of the k coordinates z [N] of the
+    internal forces.
     """
 
     def __init__(
@@ -213,7 +235,7 @@ class _Barrier:
         self.push_0 = -(normals * self.carried.reshape(self.count, 3)).sum(-1)
 
     def place(self, forces: Float[Array, "f 3"], share: float = 1.0) -> Float[Array, " k"]:
-        """Return z, the coordinates of given forces in the basis of the internal forces.
+        """Return z, the coordinates [N] of given `forces` [N] in the basis of the internal forces.
 
         Before that, `share` times the forces that carry the load is subtracted from the given
         forces.
@@ -252,9 +274,7 @@ class _Barrier:
         return tried[best if math.isfinite(value[best]) else int(ratio.argmin())]
 
     def value(self, z: Float[Array, "g k"]) -> Float[Array, " g"]:
-        """Return the objective at each row of coordinates z; it is infinite outside the friction
-        cones.
-        """
+        """Return the objective [N] at g coordinates z; it is infinite outside the friction cones."""
         n = z @ self.push.T + self.push_0
         t = z @ self.tau.T + self.tau_0
         lengths = (self.forces(z) ** 2).sum(-1)
@@ -266,8 +286,8 @@ class _Barrier:
         return np.where(inside, n.sum(-1) + penalty - self.gap * logs, np.inf)
 
     def newton(self, z: Float[Array, " k"]) -> tuple[Float[Array, " k"], float]:
-        """Return Newton's step at coordinates z, and the Newton decrement, which measures how far
-        the optimum is.
+        """Return Newton's step (k,) at coordinates z, and the Newton decrement, which measures the
+        distance from the optimum.
         """
         gap = self.gap
         push = self.push

@@ -1,4 +1,4 @@
-"""Closings and holds by the names of their modes."""
+"""Closing and hold controllers, by the names of their modes."""
 
 import functools
 from collections.abc import Callable
@@ -25,7 +25,11 @@ from torchgrasp.values.specs import ClosingMode, HoldingMode
 
 
 def choose_preference(hand: Hand, mode: ClosingMode) -> ForcePreference | None:
-    """Return what chooses among balanced forces in a closing mode; None if nothing does."""
+    """Return the model that chooses among balanced forces in a closing mode, or None if the mode
+    has none.
+
+    Raises `BadArgument` for the mode "paper" with a hand of other than three fingers.
+    """
     if mode != "paper":
         return None
     hand.require_three("closing", "'paper', whose model of stability is of three,")
@@ -35,8 +39,10 @@ def choose_preference(hand: Hand, mode: ClosingMode) -> ForcePreference | None:
 def make_closing(
     reference: ClosingReference, mode: ClosingMode, options: ClosingOptions
 ) -> Closing:
-    """Return the controller that closes the hand along the plan `reference`, for a closing mode
-    such as "paper".
+    """Return the controller that closes the hand by the plan `reference`, for a closing mode such
+    as "paper".
+
+    `options` apply to the modes "fixed" and "uncertainty" only.
     """
     match mode:
         case "open_loop":
@@ -56,8 +62,11 @@ def make_closing(
 def choose_holding(
     hand: Hand, mode: HoldingMode
 ) -> Callable[[ClosingReference, Observation, Float[Tensor, " j"]], Step] | None:
-    """Return the function that makes a mode's hold controller; None if the closing controller goes
-    on to hold.
+    """Return the function that makes a mode's hold controller, or None for the mode "law".
+
+    The function takes the plan, the last observation and the joint targets [rad] at the end of the
+    closing. With "law" the closing controller itself goes on to press. Raises `BadArgument` for
+    "impedance" with a hand of other than three fingers.
     """
     if mode == "impedance":
         hand.require_three("holding", "'impedance', whose virtual frame is of three,")

@@ -1,9 +1,10 @@
-"""Estimates of the object's pose from touches: how far the object is displaced from its pose in the
-plan.
+"""Estimates of the object's pose from touches: its displacement from its pose in the plan.
 
-While the fingers close, `ContactPlanes` uses the tangent plane at each planned contact. While the
-hand stands still, `Localization` compares touched points and normals with the estimated surface, so
-that it also finds displacements along the object's own surface.
+A displacement (6,) is a translation [m] of the contacts' centroid and a rotation vector [rad] about
+it, in the frame of the planned hand. While the fingers close, `ContactPlanes` uses the tangent
+plane at each planned contact. While the hand stands still, `Localization` compares touched points
+and normals with the estimated surface, so that it also finds displacements along the object's own
+surface.
 """
 
 import dataclasses
@@ -21,49 +22,52 @@ from torchgrasp.geometry.linalg import across, unit
 
 @dataclasses.dataclass(frozen=True)
 class ContactPlaneNumbers:
-    """The prior of the object's displacement before any touch: mostly along the table."""
+    """Numbers of `ContactPlanes`: the prior of the object's displacement before any touch, mostly
+    along the table.
+    """
 
     shift: float = 0.01
     """Standard deviation [m] of the shift along the table, or in all directions without one."""
     height: float = 0.001
     """Standard deviation [m] of the shift along the table's normal."""
     turn: float = 0.09
-    """Standard deviation [rad] of the turn about the table's normal, or about every axis."""
+    """Standard deviation [rad] of the rotation about the table's normal, or else about all axes."""
     tilt: float = 0.01
     """Standard deviation [rad] of a tilt on the table."""
     missed: float = 0.025
-    """A finger farther [m] beyond its plane has missed the object."""
+    """Largest distance [m] of a finger beyond its plane that counts: farther, it has missed."""
 
 
 @dataclasses.dataclass(frozen=True)
 class LocalizationNumbers:
-    """The numbers of the search for the object from touches."""
+    """Numbers of the search for the object from touches."""
 
     turns: tuple[float, ...] = (-0.24, -0.12, 0.0, 0.12, 0.24)
-    """Turns [rad] that are tried."""
+    """Rotations [rad] about the table's normal that are tried."""
     fine_turns: tuple[float, ...] = (-0.06, 0.0, 0.06)
-    """Turns [rad] that are tried about the best of them."""
+    """Rotations [rad] that are then tried, relative to the best of them."""
     pitch: float = 0.006
     """Distance [m] between the shifts that are tried; the fine search has a quarter of it."""
     farthest: float = 0.072
     """Largest shift [m] on each axis that is tried."""
-    # standard deviations of shift [m] and turn [rad] before any touch
     shift: float = 0.03
+    """Standard deviation [m] of the shift on each axis before any touch."""
     turn: float = 0.15
+    """Standard deviation [rad] of the rotation before any touch."""
     surface: float = 0.004
     """Standard deviation [m] of the estimated surface."""
     normal: float = 0.3
-    """Standard deviation of a sensed normal, a unit vector."""
+    """Standard deviation of each component of a sensed unit normal."""
     gap: float = 0.001
-    """Least distance [m] from the surface of a tip in the air."""
+    """Least distance [m] between the surface and a fingertip in the air."""
     worst: float = 20.0
-    """Bound on the cost of one tip, so that a wrong touch does not decide."""
+    """Largest cost of one fingertip, so that a wrong touch does not decide."""
     older: float = 4.0
-    """Growth of the variance with each later touch, which moves the object by twice the surface's
-    deviation.
+    """Growth of the variance of a touch with each later touch, as a multiple of its own variance:
+    a touch moves the object by twice the surface's deviation.
     """
     empty: float = 80.0
-    """Cost of the object where the hand closed on nothing."""
+    """Cost of a pose at which the hand closed on nothing."""
 
 
 PLANES = ContactPlaneNumbers()
@@ -71,13 +75,13 @@ SEARCH = LocalizationNumbers()
 
 
 class ContactPlanes:
-    """Estimate the object's displacement while the fingers close, from the tangent planes at its
-    contacts.
+    """Estimator of the object's displacement while the fingers close, from the tangent planes at
+    its contacts.
 
     A fingertip that touches measures how far its contact's plane has moved along the normal, with
     the variance of the shape. A fingertip beyond its plane that touches nothing bounds this
     distance. The estimate is the most probable displacement under a Gaussian prior with the mean
-    `expected` [m, rad] (by default 0), in the planned hand's frame.
+    `expected` (6,) [m, rad], in the planned hand's frame; None means a mean of 0.
     """
 
     def __init__(
@@ -101,7 +105,7 @@ class ContactPlanes:
         rotation about it [rad].
 
         `points` [m] are the points of the fingertips that would touch first; `touching` marks
-        fingertips that touch.
+        fingertips that touch. Both are in the order of the hand's fingers.
         """
         off = ((points - self.target) * self.normals).sum(-1)
         beyond = (off - self.rows @ self.expected).clamp_min(-PLANES.missed)
@@ -127,8 +131,8 @@ class ContactPlanes:
 
 
 def _prior(reference: ClosingReference) -> Float[Tensor, "6 6"]:
-    """Return the inverse covariance of the object's displacement before any touch: mostly along the
-    table.
+    """Return the inverse covariance of the object's displacement [m, rad] before any touch: mostly
+    along the table.
     """
     eye = torch.eye(3, dtype=reference.normals.dtype)
     place = eye / PLANES.shift**2
@@ -142,12 +146,12 @@ def _prior(reference: ClosingReference) -> Float[Tensor, "6 6"]:
 
 
 class Touches:
-    """Time averages of the contact points and normals that a resting hand senses, in the frame of
-    the planned hand.
+    """Averages over time of the contact points and normals that a resting hand senses, in the
+    planned hand's frame.
 
     `known` marks fingertips with a working sensor, `felt` marks fingertips that touch and have
-    reported where. With `links`, fingertips that no longer touch count, too; if `links` holds
-    spheres (centres and radii [m]), one touches.
+    reported where. With `links`, fingertips that no longer touch are also in `felt`. If `links` (m,
+    4) holds spheres (centre and radius [m]) of links, one of them touches.
     """
 
     def __init__(
@@ -165,8 +169,8 @@ class Touches:
         self.nothing = not len(self.links)
 
     def add(self, observation: Observation, palm: Float[Tensor, "3"]) -> None:
-        """Add one observation to the averages; `palm` [m] is how far the palm is displaced from its
-        plan.
+        """Add one observation to the averages; `palm` (3,) [m] is the palm's displacement from its
+        planned pose.
         """
         sensed = observation.tactile
         if bool(sensed.contact.any()):
@@ -182,12 +186,12 @@ class Touches:
 
     @property
     def felt(self) -> Bool[Tensor, "f"]:
-        """A mask of the fingertips that touch the object and have reported where they touch."""
+        """Mask (f,) of the fingertips that touch the object and have reported where they touch."""
         return (self.contact | self.kept) & (self.count > 0)
 
     def means(self) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"]]:
-        """Return each fingertip's mean contact point [m] and unit normal; zero for fingertips
-        without contact.
+        """Return each fingertip's mean contact point [m], then its mean unit normal; both are 0
+        without a contact.
         """
         return self.points / self.count.clamp_min(1)[:, None], unit(self.normals)
 
@@ -196,9 +200,9 @@ class Localization:
     """Search for the object displacement that best explains the `touches`; each call tries one
     rotation angle.
 
-    The last touches tell most, because each touch may move the object. Where the hand closed on
-    `nothing`, the object is probably not. `displacement` holds the translation of the contacts'
-    centroid [m] and the rotation about it [rad].
+    Later touches weigh more, because each touch may move the object. The object is probably not
+    where the hand closed on nothing (`Touches.nothing`). The plan `reference` must have a surface
+    and a table.
     """
 
     def __init__(self, reference: ClosingReference, touches: Sequence[Touches]) -> None:
@@ -223,7 +227,9 @@ class Localization:
 
     @property
     def displacement(self) -> Float[Tensor, "6"]:
-        """The best displacement of the object so far: translation [m] and rotation vector [rad]."""
+        """Best displacement (6,) of the object so far: translation of the contacts' centroid [m],
+        rotation vector [rad].
+        """
         return torch.cat([self.shift @ self.axes, self.turn * self.up])
 
     def __call__(self) -> None:
@@ -251,7 +257,7 @@ class Localization:
 
     def _costs(self, shifts: Float[Tensor, "m 2"], turn: float) -> Float[Tensor, "m"]:
         """Return the negative log-probability of each translation [m] along the table, for one
-        rotation [rad].
+        rotation `turn` [rad].
         """
         cost = (shifts / SEARCH.shift).square().sum(-1) + (turn / SEARCH.turn) ** 2  # (m,)
         for age, touches in enumerate(self.touches):
@@ -265,8 +271,8 @@ class Localization:
     def _misfit(
         self, touches: Touches, shifts: Float[Tensor, "m 2"], turn: float
     ) -> Float[Tensor, "m"]:
-        """Return how badly touches fit to each translation [m] along the table, for one rotation
-        [rad].
+        """Return the misfit of `touches` (twice a negative log-probability) at each translation
+        [m], for one rotation [rad].
         """
         felt = touches.felt
         points, normals = touches.means()

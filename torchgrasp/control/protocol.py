@@ -1,4 +1,4 @@
-"""What all closings share: what the controller asks of them, and when a closing has settled."""
+"""The interface of all closing controllers, and the test by which a closing has settled."""
 
 from collections.abc import Callable
 from typing import Protocol, runtime_checkable
@@ -20,11 +20,13 @@ all joints.
 
 @runtime_checkable
 class Closing(Protocol):
-    """A controller that closes the fingers; a call is a `Step`."""
+    """A controller that closes the fingers; a call takes an observation and the time [s] to the
+    next tick, as a `Step`.
+    """
 
     @property
     def palm(self) -> Float[Tensor, "3"]:
-        """How far [m] the palm is displaced from its plan."""
+        """Displacement (3,) [m] of the palm from its planned pose, in the hand's frame."""
         ...
 
     @property
@@ -34,8 +36,9 @@ class Closing(Protocol):
 
     @property
     def feels(self) -> bool:
-        """Whether sensors change its targets; otherwise these press at the end, and no hold
-        follows.
+        """Whether sensor readings change the targets.
+
+        Without sensors, the targets press at the end, and no hold controller follows.
         """
         ...
 
@@ -46,21 +49,21 @@ class Closing(Protocol):
 
 @runtime_checkable
 class LawClosing(Closing, Protocol):
-    """A closing by a control law, which can go on to press."""
+    """A closing controller with a control law that can also press."""
 
     @property
     def share(self) -> Float[Tensor, "f"]:
-        """Each finger's share of force control, from 0 to 1."""
+        """Each finger's share of force control (f,), from 0 to 1."""
         ...
 
     def press(self) -> Step:
-        """Return the step with which the same law presses."""
+        """Return the `Step` with which the same law presses."""
         ...
 
 
 class Settled:
-    """The `time` [s] for which all fingers have touched near their planned contacts with steady
-    forces.
+    """A clock of how long all fingers have touched near their planned contacts, with steady forces:
+    `time` [s].
     """
 
     def __init__(self, reference: ClosingReference) -> None:
@@ -75,8 +78,11 @@ class Settled:
         period: float,
         pressing: bool = True,
     ) -> None:
-        """Add a tick to `time` if all fingers touch and, with `pressing`, press steadily; otherwise
-        set `time` to 0.
+        """Add a tick of `period` [s] to `time` if all fingers touch and, with `pressing`, press
+        steadily.
+
+        Otherwise `time` becomes 0. `touching` marks the fingers that touch, and `share` is each
+        finger's share of force control, which must be at least 0.5 while `pressing`.
         """
         average = observation.tactile.average
         settled = bool(touching.all())
@@ -89,8 +95,8 @@ class Settled:
 
 
 def strongest_lead(reference: ClosingReference) -> Float[Tensor, " h"]:
-    """Return how far [rad] each joint's target is ahead of the joint at the largest torque of its
-    drive.
+    """Return the largest useful lead [rad] of each actuated joint: target minus position at the
+    largest torque of its drive.
     """
     hand = reference.hand
     efforts = [hand.actuators[name].effort for name in hand.tree.joint_names]

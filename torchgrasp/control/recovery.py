@@ -1,7 +1,9 @@
-"""Recovery when the object is not where it was seen: an approach that stops at a touch, a second
-closing, and a check.
+"""Recovery when the object is not where the camera placed it.
 
-The first two locate the object from touches (`Localization`) and move the palm to the object.
+An approach stops at a touch, a hand that is about to fail reopens and closes again, and a lift is
+watched. Approach and reopening locate the object from touches (`Localization`) and move the palm to
+it. Vectors are in the frame of the planned hand; a displacement of the palm is relative to its
+planned pose.
 """
 
 import dataclasses
@@ -30,42 +32,42 @@ PRESSING_TIME = 0.5
 
 @dataclasses.dataclass(frozen=True)
 class ApproachNumbers:
-    """The numbers of the guarded approach."""
+    """Numbers of the guarded approach."""
 
     speed: float = 0.1
-    """Largest speed [m/s]."""
+    """Largest speed [m/s] of the hand."""
     acceleration: float = 1.0
-    """Acceleration and deceleration [m/s^2]."""
+    """Acceleration and deceleration [m/s^2] of the hand."""
     back: float = 0.02
     """Distance [m] by which the hand draws back at a touch."""
     feeling: float = 0.06
     """Time [s] in which touches are averaged."""
     # a link touches where its drive feels more than the noise and the inertia
     start: float = 0.02
-    """Length [m] at the start, far from the object, in which drives feel the inertia alone."""
+    """Length [m] at the start, far from the object, in which drives sense only the inertia."""
     moving: float = 0.05
-    """Speed [m/s] from which drives are believed: the palm has not just stopped."""
+    """Least speed [m/s] of the hand at which the drives' torques count: it has not just stopped."""
     noises: float = 3.0
     """Standard deviations of a joint torque that count as noise."""
 
 
 @dataclasses.dataclass(frozen=True)
 class GraspCheckNumbers:
-    """The numbers of the check of a pressing grasp."""
+    """Numbers of the check of a pressing grasp."""
 
     first: float = 0.1
     """Time [s] of pressing from which touches are averaged."""
     last: float = 0.3
     """Time [s] of pressing until which touches are averaged."""
     misplaced: float = 0.008
-    """Distance [m] between the displacements of object and palm from which the hand opens: twice
+    """Largest distance [m] between the displacements of object and palm in a secure grasp: twice
     the estimate's error.
     """
 
 
 @dataclasses.dataclass(frozen=True)
 class OpeningTimes:
-    """The times of a hand that opens again."""
+    """Times of a hand that opens again."""
 
     opening: float = 0.5
     """Time [s] in which the fingers open."""
@@ -75,18 +77,18 @@ class OpeningTimes:
 
 @dataclasses.dataclass(frozen=True)
 class LostNumbers:
-    """The numbers by which a rising hand loses its object."""
+    """Bounds at which a rising hand counts as having lost its object."""
 
     load: float = 0.2
-    """Load [N] below which hardly any is carried."""
+    """Load [N] along the table's normal below which the object counts as not carried."""
     cutoff: float = 3.0
-    """Cut-off [Hz] of the load."""
+    """Cut-off [Hz] of the low-pass filter of the load."""
     first: float = 0.01
-    """Height [m] from which a missing touch counts."""
+    """Least height [m] of the lift at which missing touches count."""
     low: float = 0.02
-    """Height [m] up to which slides are summed."""
+    """Height [m] of the lift up to which slides are summed."""
     slip: float = 0.0015
-    """Slide [m] of two fingertips from which the hand will lose the object."""
+    """Slide [m] of two fingertips beyond which the hand will lose the object."""
 
 
 APPROACH = ApproachNumbers()
@@ -96,26 +98,34 @@ LOST = LostNumbers()
 
 
 def can_guard(reference: ClosingReference) -> bool:
-    """Return whether the hand can stop at a touch: the plan has approach, table and surface, the
-    tips are tactile.
+    """Return whether the hand can stop at a touch.
+
+    The plan then has an approach, a table and a surface, and its fingertips are tactile.
     """
     needed = reference.approach, reference.table, reference.surface
     return reference.sensor.kind == "tactile" and all(x is not None for x in needed)
 
 
 class GuardedApproach:
-    """Move the opened hand to its pre-grasp, `length` [m] away, and stop it when a finger touches
+    """Controller that moves the opened hand to its pre-grasp, and stops it when a finger touches
     (guarded move).
 
-    Fingertips sense a touch, and other links are felt by the drives of their joints. At a touch the
-    hand draws back at once, so that it pushes the object little. It averages its touch readings,
-    locates the object, moves its palm sideways and goes on. After the last allowed stop the hand
-    ignores touches. A hand that has been reopened (`after`) starts at its pre-grasp, and retreats
-    first.
+    Fingertips sense a touch, and the drives of the joints sense touches of other links. At a touch
+    the hand draws back at once, so that it pushes the object little. It averages its touch
+    readings, locates the object, moves its palm sideways and goes on. After the last allowed stop
+    the hand ignores touches.
 
-    `left` [m] is the remaining length of the approach, `palm` [m] the palm's displacement from its
-    planned path, `stops` the number of stops. The touches of each stop are appended to `felt`.
-    `displacement` holds the object's translation [m] and rotation [rad] at the last touch.
+    `left` [m] is the remaining length of the approach, `palm` (3,) [m] the palm's displacement from
+    its planned path, `stops` the number of stops. `displacement` (6,) holds the object's
+    translation [m] and rotation [rad] at the last touch.
+
+    Args:
+        reference: the closing plan, with an approach, a table and a surface.
+        options: options of the closing.
+        length: distance [m] of the hand from its pre-grasp at the start.
+        felt: list to which the touches of each stop are appended.
+        after: the reopening of the hand, if it has closed before: it then starts at its pre-grasp,
+            and retreats first.
     """
 
     def __init__(
@@ -190,12 +200,14 @@ class GuardedApproach:
             self.left = max(self.left - self.speed * period, 0.0)
 
     def _displaced(self) -> Float[Tensor, "3"]:
-        """Return how far [m] the palm is from its planned pre-grasp."""
+        """Return the palm's displacement [m] from its planned pre-grasp."""
         return self.palm - self.left * self.direction
 
     def _touching_links(self, observation: Observation) -> Float[Tensor, "m 4"]:
-        """Return spheres of links of which one touches, as the drives feel: centres and radii [m];
-        or none.
+        """Return spheres of links of which one touches, judged by the drives: centres and radii
+        [m].
+
+        There are none if no link touches.
         """
         hand = self.reference.hand
         joints = observation.joints
@@ -230,8 +242,8 @@ class GuardedApproach:
                 self._turn_to(self.search.displacement)
 
     def _turn_to(self, displacement: Float[Tensor, "6"]) -> None:
-        """Let the palm follow a displacement of the object, after a retreat as far as the palm then
-        moves.
+        """Let the palm follow a `displacement` [m, rad] of the object, after a retreat as long as
+        the palm's way.
         """
         self.displacement = displacement
         shift = palm_goal(displacement[:3], self.reference.table, self.options.palm_reach)
@@ -241,14 +253,19 @@ class GuardedApproach:
 
 
 class GraspCheck:
-    """Judge a pressing grasp: `judged` turns true when the result is known, `secure` says whether
-    to lift.
+    """Check of a pressing grasp before the lift: `judged` turns true when the result is known.
 
-    `displacement` holds the object's translation [m] and rotation [rad] that the closing estimated.
-    If the plan has table and surface, they are estimated anew from all touches. These are `felt`,
-    of which the last are those of the closing; the touches of the pressing hand replace them.
-    `palm` [m] is the palm's displacement from its plan. In the `last` attempt every grasp counts as
-    secure.
+    `secure` then says whether to lift. `displacement` (6,) holds the object's translation [m] and
+    rotation [rad]: that of the closing, or one estimated anew from all touches if the plan has a
+    table and a surface.
+
+    Args:
+        reference: the closing plan.
+        displacement: displacement of the object [m, rad] that the closing estimated.
+        palm: displacement [m] of the palm from its planned pose.
+        last: whether this is the last attempt, in which every grasp counts as secure.
+        felt: all touches so far. The last ones are those of the closing; those of the pressing hand
+            replace them.
     """
 
     def __init__(
@@ -270,7 +287,7 @@ class GraspCheck:
         self.secure = last
 
     def __call__(self, observation: Observation, pressed: float) -> None:
-        """Average the touches, locate the object, and judge the grasp once `pressed` [s] reaches
+        """Average the touches, locate the object, and judge the grasp when `pressed` [s] reaches
         `PRESSING_TIME`.
         """
         if self.judged or pressed < CHECK.first:
@@ -308,13 +325,21 @@ class GraspCheck:
 
 
 class Reopening:
-    """Open the hand and move its palm to the displaced object; `done` says when the hand may close
-    again.
+    """Controller that opens the hand and moves its palm to the displaced object; `done` says when
+    it may close again.
 
-    The fingers leave the object at the same time, because their targets begin at the measured
-    `joints` [rad]. Meanwhile the palm returns from its displacement `palm` [m] to `begun` [m],
-    where the open hand met nothing. Then it follows the object's `displacement` [m, rad] to at most
-    `reach` [m], or stays if `reach` is 0.
+    The fingers leave the object at the same time, because their targets start at the measured
+    joints. Meanwhile the palm returns to where the open hand touched nothing. Then it follows the
+    object. `palm` (3,) [m] is the palm's present displacement from its planned pose.
+
+    Args:
+        reference: the closing plan.
+        displacement: displacement of the object: translation [m], rotation [rad].
+        joints: measured positions [rad] of all joints.
+        palm: displacement of the closed hand's palm [m].
+        begun: displacement [m] of the palm at which the closing started.
+        reach: largest displacement [m] of the palm along the table; 0 means that the palm stays at
+            `begun`.
     """
 
     def __init__(
@@ -343,8 +368,8 @@ class Reopening:
         return self.time >= OPENING.opening + OPENING.rest
 
     def __call__(self, period: float) -> Float[Tensor, " j"]:
-        """Return the targets of all joints [rad] for the next tick: first the fingers open, then
-        the palm moves.
+        """Return the targets [rad] of all joints for the next tick, `period` [s] later: the fingers
+        open, then the palm moves.
         """
         opens = self.time < OPENING.opening
         if opens or torch.equal(self.palm, self.goal):
@@ -358,8 +383,8 @@ class Reopening:
 
 
 class LiftCheck:
-    """Feel while a closed hand rises, and holds, whether it loses the object; `lost` then stays
-    true.
+    """Check of a closed hand that rises and holds: `lost` turns true, and stays so, when it loses
+    the object.
 
     The object is lost if fewer than two fingertips touch, and these carry hardly any load along the
     table's normal. The hand will lose the object if two fingertips slide along it in the first 20
@@ -396,8 +421,10 @@ class LiftCheck:
 
 
 def palm_goal(shift: Float[Tensor, "3"], table: Plane | None, reach: float) -> Float[Tensor, "3"]:
-    """Return the palm displacement [m] that follows an object's `shift` [m] along the table, up to
-    `reach` [m].
+    """Return the palm's displacement [m] that follows the `shift` [m] of an object along the
+    `table`.
+
+    It is at most `reach` [m] long. Without a table, the whole shift is followed.
     """
     if table is not None:
         up = unit(table.normal)
@@ -408,8 +435,10 @@ def palm_goal(shift: Float[Tensor, "3"], table: Plane | None, reach: float) -> F
 def next_palm(
     palm: Float[Tensor, "3"], goal: Float[Tensor, "3"], period: float
 ) -> Float[Tensor, "3"]:
-    """Return the palm displacement [m] one tick later, on a straight line to its goal at
-    `PALM_SPEED`.
+    """Return the palm's displacement [m] one tick of `period` [s] later, on a straight line to its
+    `goal` [m].
+
+    The palm moves at `PALM_SPEED`.
     """
     way = goal - palm
     longest = PALM_SPEED * period

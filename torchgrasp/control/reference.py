@@ -1,4 +1,7 @@
-"""The closing plan: poses, contacts and controller gains of one grasp in the hand's frame."""
+"""The closing plan: poses, contacts and controller gains of one grasp in the hand's frame.
+
+f counts the fingertips, h the actuated joints, and j all joints of the URDF.
+"""
 
 import dataclasses
 import functools
@@ -29,26 +32,27 @@ from torchgrasp.values.specs import ContactSpec
 @checked
 @dataclasses.dataclass(frozen=True)
 class ClosingReference(Value):
-    """The plan for closing a hand on one grasp, in the hand's frame. Joints are the actuated joints
-    [rad].
+    """The plan for closing a hand on one grasp, in the frame of the planned hand (its root link).
+
+    Joints are the actuated joints [rad], unless said otherwise.
 
     Args:
         hand: the hand, in float64.
         kp: stiffness of every joint's drive [N m/rad], in the order of `hand.tree.joint_names`.
-        obj_from_hand: planned pose of the hand in the frame of the grasp.
+        obj_from_hand: planned pose of the hand in the frame of the grasp [m].
         pregrasp: joints of the opened hand.
         joints: joints of the grasp.
         squeeze: joint targets that press on the object without feedback, from
             `torchgrasp.control.squeeze`.
-        normals: outward normals of the planned contacts.
+        normals: outward unit normals of the planned contacts.
         gains: contacts, controller gains and desired forces, of the closing "uncertainty" unless
             `as_printed`.
         approach: unit vector along which the opened hand moves to its pre-grasp; None means no
             approach.
-        table: the table, which no fingertip enters while it searches, or None if it is unknown.
+        table: the table, which no fingertip enters while it searches; None if it is unknown.
         surface: estimated surface of the object in the frame of the grasp (`surface_field`), with
-            which touches are compared to locate the object. Without it, the tangent planes of the
-            contacts are used.
+            which touches are compared to locate the object. None means that the tangent planes of
+            the contacts are used.
         sensor: sensors of the fingertips.
         max_force: largest normal force [N] of a fingertip; None means no limit.
         distance_variance: variance [m^2] of the signed distance at each contact (f_cov in Eq. 12 of
@@ -82,15 +86,16 @@ class ClosingReference(Value):
         kp: Positive | None = None,
         stability: finger_forces.ForcePreference | None = None,
     ) -> "ClosingReference":
-        """Return the closing plan of one grasp, on the CPU.
+        """Return the closing plan of one grasp, in float64 on the CPU.
 
         Args:
+            hand: the hand.
             grasp: a single grasp, planned for the hand.
             force: normal force of the strongest finger [N].
-            kp: stiffness of every joint's drive [N m/rad]; by default the hand's own.
-            stability: chooses among balanced forces that need nearly equal friction, as the
-                stability model of `load_stability` does, and gives the covariance of the forces;
-                without it the covariance grows with the force.
+            kp: stiffness of every joint's drive [N m/rad]; None means the hand's own.
+            stability: model that chooses among balanced forces of nearly equal friction, and gives
+                the covariance of the forces (`load_stability`). With None, the standard deviation
+                of a force is a tenth of it.
 
         Raises `BadArgument` for not exactly one grasp, joints or fingers of another hand, a force
         or stiffness that is not positive, joints beyond their limits, or numbers in the grasp that
@@ -155,8 +160,8 @@ class ClosingReference(Value):
         )
 
     def as_printed(self) -> "ClosingReference":
-        """Return the plan with Sigma_cov and K_P of Eqs. (26) and (27) as the paper prints them,
-        for closing "paper".
+        """Return the plan for the closing "paper": Sigma_cov and K_P of Eqs. (26) and (27) as the
+        paper prints them.
 
         Raises `BadArgument` if the plan lacks `distance_variance`.
         """
@@ -172,22 +177,25 @@ class ClosingReference(Value):
 
     @checked
     def expand(self, actuated: Annotated[Float[Tensor, " h"], ANY]) -> Float[Tensor, " j"]:
-        """Return the positions of all joints of the URDF [rad], given the actuated joints [rad];
+        """Return the positions [rad] of all joints of the URDF, in their order, given the actuated
+        joints [rad].
+
         NaN is allowed.
         """
         return self.hand.actuated.coupling @ actuated + self.hand.actuated.offset
 
     @checked
     def pick(self, joints: Annotated[Float[Tensor, " j"], ANY]) -> Float[Tensor, " h"]:
-        """Return the actuated joints [rad], given the positions of all joints of the URDF [rad];
+        """Return the actuated joints [rad], given the positions [rad] of all joints of the URDF.
+
         NaN is allowed.
         """
         return joints[self._actuated]
 
     @functools.cached_property
     def rise(self) -> Float[Tensor, "3"]:
-        """How far [m] the opened hand is above its planned pose before it closes, so that no link
-        is in the table.
+        """Displacement [m] of the opened hand from its planned pose before it closes, so that no
+        link is in the table.
         """
         planned = torch.eye(4, dtype=torch.float64)[None]
         return opened_pose(self.hand, self.pregrasp[None], planned, self.table)[0, :3, 3]
@@ -199,8 +207,9 @@ class ClosingReference(Value):
 
     @property
     def alive(self) -> Bool[Tensor, "f"]:
-        """Whether the sensor of each fingertip works; raises `BadArgument` if the plan names an
-        unknown finger.
+        """Mask of the fingertips whose sensor works.
+
+        Raises `BadArgument` if the plan names an unknown finger.
         """
         names = self.hand.finger_names
         dead = self.sensor.dead
@@ -215,14 +224,14 @@ class ClosingReference(Value):
 
     @checked
     def contact_points(self, tips: Float[Tensor, "f 3"]) -> Float[Tensor, "f 3"]:
-        """Return the points [m] where tips with given centres [m] would touch, one tip radius
-        towards the contact.
+        """Return the points [m] where fingertips would touch: one tip radius from their centres
+        `tips` [m], against the normals.
         """
         return tips - self.hand.tips.radius[:, None] * self.normals
 
 
 def check_single(grasp: Grasps) -> None:
-    """Raise `BadArgument` unless there is exactly one grasp."""
+    """Raise `BadArgument` unless `grasp` holds exactly one grasp."""
     if len(grasp) != 1:
         allowed = "exactly one: index the grasps, as in grasps[0]"
         raise BadArgument("grasp", f"{len(grasp)} rows", allowed)
@@ -237,11 +246,19 @@ def next_target(
     period: float,
     fastest: float = math.inf,
 ) -> Float[Tensor, " h"]:
-    """Return the target of the actuated joints [rad] one tick later, at most `lead` [rad] off the
-    measured joints.
+    """Return the targets [rad] of the actuated joints one tick later, within the joint limits.
 
-    No target moves faster than `fastest` [rad/s]: all joints slow down together, so tips keep their
-    directions.
+    No target moves faster than `fastest`: all joints slow down together, so that the fingertips
+    keep their directions.
+
+    Args:
+        reference: the closing plan.
+        target: the present targets [rad].
+        velocity: commanded velocity [m/s] of each fingertip.
+        observation: the present observation.
+        lead: largest difference [rad] between a target and the measured joint.
+        period: time [s] to the next tick.
+        fastest: largest speed [rad/s] of a target.
     """
     jacobian = observation.jacobian @ reference.hand.actuated.coupling
     step = law.joint_step(jacobian, velocity, period, reference.joints - target)
@@ -252,8 +269,9 @@ def next_target(
 
 
 def _distance_variance(grasp: Grasps) -> Float[Tensor, "f"] | None:
-    """Return f_cov [m^2] of one grasp's contacts; `std_m`^2 without a normalised variance, None
-    without its unit.
+    """Return f_cov [m^2] at the contacts of one grasp, or None without the unit of its variance.
+
+    It is `std_m`^2 if the grasp has no normalised variance.
     """
     contacts = grasp.contacts
     unit_m = _number(grasp, "unit_m")
@@ -263,7 +281,7 @@ def _distance_variance(grasp: Grasps) -> Float[Tensor, "f"] | None:
 
 
 def _number(grasp: Grasps, name: str) -> float | None:
-    """Return a positive number from the metadata of a grasp, or None if they lack it."""
+    """Return a positive number from the metadata of a grasp by its `name`, or None if they lack it."""
     text = grasp.meta.get(name)
     if text is None:
         return None
@@ -283,7 +301,7 @@ def closing_gains(
     force: Force = 4.0,
     stability: finger_forces.ForcePreference | None = None,
 ) -> ClosingGains:
-    """Return contact, gains and desired force of each finger for one grasp, in the hand's frame.
+    """Return the target, gains and desired force of each finger for one grasp, in the hand's frame.
 
     The gains are those of the closing "uncertainty"; `ClosingReference.as_printed` has those that
     the paper prints. Arguments and errors are as in `ClosingReference.from_grasp`.

@@ -18,26 +18,26 @@ REACH = 0.08  # largest displacement [m] on each axis of the table that `relocat
 
 @dataclasses.dataclass(frozen=True)
 class RelookNumbers:
-    """The numbers of the search for the moved object."""
+    """Numbers of the search for the moved object."""
 
     scale: float = 0.004
     """Distance [m] from the surface beyond which a point of a new view counts less."""
     points: int = 300
     """Most points of the cloud that are used."""
     shifts: int = 17
-    """Shifts of the grid on each axis of the table, to `REACH`."""
+    """Number of shifts of the grid on each axis of the table, from -`REACH` to `REACH`."""
     turns: int = 7
-    """Turns of the grid."""
+    """Number of rotations of the grid."""
     farthest: float = 0.52
-    """Largest turn [rad] of the grid: 30 degrees."""
+    """Largest rotation [rad] of the grid: 30 degrees."""
     best: int = 16
-    """Motions of the grid from which steps start."""
+    """Number of motions of the grid from which steps start."""
     steps: int = 20
-    """Gauss-Newton steps from each of them."""
+    """Number of Gauss-Newton steps from each of them."""
     longest: tuple[float, float, float] = (0.01, 0.01, 0.1)
-    """Longest step [m, m, rad]."""
+    """Largest change of each component of a motion in one step [m, m, rad]."""
     std: tuple[float, float, float] = (0.05, 0.05, 0.2)
-    """Standard deviations [m, m, rad] of the weak prior."""
+    """Standard deviations of a motion under the weak prior [m, m, rad]."""
 
 
 RELOOK = RelookNumbers()
@@ -48,10 +48,15 @@ def relocate(surface: SignedDistanceField, cloud: PointCloud, table: Plane) -> F
     """Return the motion of an object along its table since its surface was estimated: old points to
     new points.
 
-    The motion minimises the sum of log(1 + (d_i / s)^2), with the signed distances d_i of the new
-    points from the moved surface and s = 4 mm (Cauchy's cost, which outliers hardly move). A grid
-    search to 80 mm and 30 degrees starts Gauss-Newton steps. The `surface` (`surface_field`), a new
-    `cloud` of the object [m] and the `table` are in one frame.
+    It is a rigid transform [m] in the frame of the arguments: a shift along the table and a
+    rotation about its normal. The motion minimises the sum of log(1 + (d_i / s)^2), with the signed
+    distances d_i of the new points from the moved surface and s = 4 mm (Cauchy's cost, which
+    outliers hardly change). A grid search to 80 mm and 30 degrees starts Gauss-Newton steps.
+
+    Args:
+        surface: the estimated surface (`surface_field`).
+        cloud: a new cloud of the object alone [m].
+        table: the table.
     """
     count = min(len(cloud), RELOOK.points)
     rows = torch.linspace(0, len(cloud) - 1, count).round().long()
@@ -71,8 +76,8 @@ def relocate(surface: SignedDistanceField, cloud: PointCloud, table: Plane) -> F
 
 
 class _Registration:
-    """The costs of motions (m, 3) of an object, each a shift along two axes [m] and a turn about
-    the vertical [rad].
+    """The costs of motions (m, 3) of an object: two shifts [m] along the table, and a rotation
+    [rad] about its normal.
     """
 
     def __init__(
@@ -86,17 +91,19 @@ class _Registration:
         self.pivot = surface.origin.double() + surface.spacing * inside
 
     def undo(self, motions: Float[Tensor, "m 3"]) -> Float[Tensor, "m n 3"]:
-        """Return where the seen points were before each motion [m]."""
+        """Return where the n points of the new view were before each of m motions [m]."""
         shifted = self.points - self.pivot - (motions[:, :2] @ self.axes)[:, None]
         return shifted @ rotation_from_vector(motions[:, 2:] * self.up) + self.pivot
 
     def cost(self, distance: Float[Tensor, "m n"]) -> Float[Tensor, "m"]:
-        """Return the sum of Cauchy's costs of signed distances [m]."""
+        """Return the sum of Cauchy's costs of the signed distances [m] of n points, for each of m
+        motions.
+        """
         return (distance / RELOOK.scale).square().log1p().sum(-1)
 
     def step(self, motions: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
-        """Return one Gauss-Newton step from each motion, with a weak prior for what the points do
-        not tell.
+        """Return one Gauss-Newton step from each motion; a weak prior holds motions that the points
+        do not determine.
         """
         longest = motions.new_tensor(RELOOK.longest)
         std = motions.new_tensor(RELOOK.std)

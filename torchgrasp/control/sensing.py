@@ -31,8 +31,8 @@ from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Positive
 
 WAITING_FORCE = 0.3
-"""Largest force [N] of a finger that waits until the others touch, and the reading that stands for
-a binary contact.
+"""Largest force [N] of a finger that waits until the others touch; also the reading [N] of a binary
+sensor in contact.
 """
 TORQUE_NOISE = 0.01  # standard deviation [N m] of a sensed joint torque
 SWITCH_ON = 0.45  # reading [N] at which a binary contact closes; it opens at `TOUCH_ON`
@@ -43,8 +43,9 @@ ALONG_STD = 3.0
 
 @checked
 def feel_flags(tactile: TactileState, touching: Bool[Tensor, "f"]) -> TactileState:
-    """Return the tactile state of fingertips that sense only whether they touch; `tactile` is the
-    last state.
+    """Return the tactile state of fingertips that sense only whether they touch.
+
+    `tactile` is the state at the last tick, and `touching` marks the fingertips that touch.
 
     >>> feel_flags(no_contact(), torch.tensor([True, False, False])).reading
     tensor([0.3000, 0.0000, 0.0000], dtype=torch.float64)
@@ -108,8 +109,8 @@ def feel_torques(
 def _forces_by_torques(
     reference: ClosingReference, jacobian: Float[Tensor, "f 3 j"]
 ) -> Float[Tensor, "f 3 j"]:
-    """Return the matrix that gives each finger's most probable contact force [N] from joint torques
-    [N m].
+    """Return the matrix [1/m] that maps torques [N m] of all joints to each finger's most probable
+    contact force [N].
     """
     along = reference.normals[:, :, None] * reference.normals[:, None]
     across = (TORQUE_NOISE / ACROSS_STD) ** 2
@@ -119,7 +120,7 @@ def _forces_by_torques(
 
 
 class DriveFeel:
-    """Estimate contact forces only from the joint drives: a blocked joint does not reach its
+    """Estimator of contact forces from the joint drives alone: a blocked joint does not reach its
     target.
 
     A drive of stiffness k and damping d exerts the torque k (target - q) - d dq/dt at the joint
@@ -137,8 +138,9 @@ class DriveFeel:
     def __call__(
         self, observation: Observation, targets: Float[Tensor, " j"], period: float
     ) -> Float[Tensor, "f"]:
-        """Return the low-passed normal force [N] of each fingertip, given the joint targets [rad]
-        of the tick.
+        """Return the low-passed normal force (f,) [N] of each fingertip.
+
+        `targets` [rad] are those of all joints in the tick of `period` [s].
         """
         joints = observation.joints
         damped = self.damping * (joints - self.before) / period
@@ -151,11 +153,11 @@ class DriveFeel:
 
 
 class FingertipSensor:
-    """Simulate the fingertip sensors that a `SensorModel` describes: a call takes true contacts,
-    and returns readings.
+    """Simulator of the fingertip sensors that a `SensorModel` describes: a call maps true contacts
+    to readings.
 
-    The closing plan has the sensor model. The `generator` draws the noise; without one there is no
-    noise.
+    The closing plan `reference` has the sensor model. The `generator` draws the noise; None means
+    no noise.
     """
 
     def __init__(
@@ -174,11 +176,11 @@ class FingertipSensor:
     def __call__(
         self, truth: TipContact, jacobian: Float[Tensor, "f 3 j"], period: float
     ) -> TactileState:
-        """Return what the sensors report at the end of a control tick of `period` [s], delayed as
-        the sensor is.
+        """Return what the sensors report at the end of a control tick of `period` [s], with the
+        sensor's delay.
 
-        `truth` holds the true contacts during the tick, `jacobian` is that of the fingertips by all
-        joints [m/rad].
+        `truth` holds the true contacts during the tick, `jacobian` [m/rad] is that of the
+        fingertips by all joints of the URDF.
         """
         reference = self.reference
         before = self.sensed
@@ -207,7 +209,7 @@ class FingertipSensor:
         return self.reports[0]
 
     def _silence(self, sensed: Tensor, nothing: Tensor) -> Tensor:
-        """Return readings (f,) or (f, n), replaced by those without contact where a sensor is
+        """Return the readings `sensed` (f,) or (f, n), with those of `nothing` where a sensor is
         dead.
         """
         alive = self.alive if sensed.ndim == 1 else self.alive[:, None]

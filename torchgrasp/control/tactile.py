@@ -27,7 +27,7 @@ Filtered = TypeVar("Filtered", Tensor, np.ndarray, float)
 
 @dataclasses.dataclass(frozen=True)
 class TactileNumbers:
-    """The numbers of the simulated fingertips; their noise in the normal force is `NOISE`."""
+    """Numbers of the simulated fingertips; their noise in the normal force is `NOISE`."""
 
     cutoff: float = 20.0
     """Cut-off [Hz] of the lag of the sensor."""
@@ -47,11 +47,12 @@ TACTILE = TactileNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class TipContact(Value):
-    """True contacts of f fingertips, averaged over a tick.
+    """True contacts of f fingertips, averaged over a tick, in the hand's frame.
 
-    `forces` [N] act on the object, friction included. `points` [m] and outward `normals` are NaN
-    for tips without contact. `sliding` [m/s] is the speed of each tip along the surface; None means
-    that no tip slides.
+    `normal_force` [N] is that on the object, along the inward normal. `forces` [N] act on the
+    object, friction included. `points` [m] and outward unit `normals` are NaN for tips without
+    contact. `sliding` [m/s] is the speed of each tip along the surface; None means that no tip
+    slides.
     """
 
     normal_force: Float[Tensor, "*b f"]
@@ -64,14 +65,16 @@ class TipContact(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class TactileState(Value):
-    """Readings of f fingertips, and the state of their filters.
+    """Readings of f fingertips in the hand's frame, and the state of their filters.
 
     Args:
         reading: normal force [N].
         forces: full force on the object [N].
         contact: whether the fingertip touches.
-        points, normals: position [m] and outward normal of the contact; NaN without contact.
-        lagged: low-passed normal force [N], full force [N] and sliding speed [m/s].
+        points: position of the contact [m]; NaN without contact.
+        normals: outward unit normal of the contact; NaN without contact.
+        lagged: low-passed normal force [N] (entry 0), full force [N] (1 to 3), sliding speed [m/s]
+            (4).
         average: low-passed normal force [N] that sets the contact flag.
         sliding: sliding speed [m/s].
         age: time [s] since the last sample.
@@ -90,8 +93,10 @@ class TactileState(Value):
 
 @checked
 def no_contact(*batch: Count, fingers: Annotated[int, Range(*FINGERTIPS)] = 3) -> TactileState:
-    """Return the tactile state, with leading axes `batch`, of tips that touch nothing and are
-    sampled at the next tick.
+    """Return the tactile state of fingertips that touch nothing, which are sampled at the next
+    tick.
+
+    `batch` gives the leading axes of its tensors, and `fingers` the number of fingertips.
 
     >>> no_contact().contact
     tensor([False, False, False])
@@ -120,11 +125,12 @@ def measure(
 
     Args:
         tactile: the state at the last tick.
-        pads: outward surface normals at the planned contacts, which direct the noise of tips that
-            touch nothing.
+        truth: true contacts in this tick.
+        pads: outward unit normals of the surface at the planned contacts, which direct the noise of
+            tips that touch nothing.
         radius: radius of the tips [m]; 0 means that they are not round, and 12 mm is assumed.
         period: period of the tick [s].
-        generator: draws the noise; without one there is no noise.
+        generator: draws the noise; None means no noise.
         noise: factor on the standard deviation of the noise.
 
     Raises `BadArgument` for true contacts on another device than the state.
@@ -171,8 +177,8 @@ def measure(
 def flag(
     before: Bool[Tensor, "*b f"], average: Float[Tensor, "*b f"], factor: Float[Tensor, "f"] | float
 ) -> Tensor:
-    """Return contact flags from the flags `before` and the low-passed force `average` [N], with
-    hysteresis.
+    """Return contact flags from the flags `before` and the low-passed normal force `average` [N],
+    with hysteresis.
 
     `factor` multiplies the two thresholds, for noisier sensors.
     """
@@ -180,14 +186,18 @@ def flag(
 
 
 def low_pass(cutoff: float, period: float) -> float:
-    """Return the weight of the new value in a first-order low-pass filter, given cut-off [Hz] and
-    period [s].
+    """Return the weight of a new value in a first-order low-pass filter with a `cutoff` [Hz] and a
+    `period` [s].
     """
     return 1 - math.exp(-2 * math.pi * cutoff * period)
 
 
 def smooth(old: Filtered, new: Filtered, cutoff: float, period: float) -> Filtered:
-    """Return a filtered value one tick later, from its `old` value and the `new` measurement."""
+    """Return a low-passed value one tick later, from its `old` value and a `new` measurement of the
+    same unit.
+
+    The filter has a `cutoff` [Hz] and a `period` [s].
+    """
     return old + low_pass(cutoff, period) * (new - old)
 
 
@@ -196,7 +206,7 @@ class Targets(NamedTuple):
 
     Args:
         joints: targets of all joints of the URDF, in the order of `hand.tree.joint_names` [rad].
-        palm: displacement of the palm [m] from its planned path, in the hand's axes; the palm does
+        palm: displacement of the palm [m] from its planned path, in the hand's frame; the palm does
             not rotate.
         left: remaining length [m] of the approach; it is 0 if the hand is at its pre-grasp.
     """
@@ -209,10 +219,10 @@ class Targets(NamedTuple):
 @checked
 @dataclasses.dataclass(frozen=True)
 class Observation(Value):
-    """What a hand measures at a tick, in the hand's frame.
+    """What a hand measures at a tick, in the hand's frame (its root link).
 
     Args:
-        joints: all joints of the URDF, in the order of `hand.tree.joint_names` [rad].
+        joints: positions [rad] of all joints of the URDF, in the order of `hand.tree.joint_names`.
         tips: centres of the fingertips [m].
         jacobian: Jacobian of these centres with respect to all joints [m/rad].
         tactile: readings of the fingertips.
@@ -226,7 +236,7 @@ class Observation(Value):
 
 @checked
 def observe(hand: Hand, joints: Float[Tensor, " h"], tactile: TactileState) -> Observation:
-    """Return the observation of a robot, from its measured actuated joints [rad] and fingertip
+    """Return the observation of a robot, from its measured actuated `joints` [rad] and fingertip
     readings.
 
     Raises `BadArgument` for joints or fingertips on another device than the hand.
@@ -246,8 +256,11 @@ def observe(hand: Hand, joints: Float[Tensor, " h"], tactile: TactileState) -> O
 def joint_jacobian(
     hand: Hand, joints: Float[Tensor, " j"], points: Float[Tensor, "f 3"]
 ) -> Float[Tensor, "f 3 j"]:
-    """Return the Jacobian [m/rad] of points [m] on the fingertips for all URDF joints, as if no
-    joints were coupled.
+    """Return the Jacobian [m/rad] of `points` [m] on the fingertips by all joints of the URDF, as
+    if none were coupled.
+
+    `joints` [rad] are the positions of all joints, and the points are in the frame of the root
+    link.
     """
     axes, origins = hand.tree.joint_axes(hand.tree.poses(joints[None])[0])
     arms = points[:, None] - origins  # (f, j, 3)

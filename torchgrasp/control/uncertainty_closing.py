@@ -1,5 +1,5 @@
-"""The default closing: a control law like the paper's, extended where the object is not where it
-was seen.
+"""The default closing: a control law like the paper's, extended for an object that is not where the
+camera placed it.
 """
 
 import dataclasses
@@ -30,20 +30,21 @@ PALM_SPEED = 0.04  # largest speed [m/s] of the palm that follows the object
 
 @dataclasses.dataclass(frozen=True)
 class ClosingNumbers:
-    """The numbers of the default closing."""
+    """Numbers of the default closing."""
 
     patience: float = 2.5
     """Longest time [s] from the first touch until the closing ends, even if some finger has not
     touched.
     """
     touch: float = 0.45
-    """Reading [N] of a tactile fingertip that is a touch before the contact flag turns on."""
+    """Reading [N] of a tactile fingertip that counts as a touch before the contact flag turns on.
+    """
     lead: float = 0.04
     """Largest lead [rad] of a waiting finger's target over its joint: it bounds the force of a link
     that is blocked.
     """
     growth: float = 0.25
-    """Time [s] of waiting for others in which this lead grows by its size."""
+    """Time [s] of waiting for the other fingers in which this lead grows by its first value."""
     follows: float = 6.0
     """Gain [1/s] with which the palm follows the object."""
     # of a finger without a sensor
@@ -55,10 +56,10 @@ class ClosingNumbers:
 
 @dataclasses.dataclass(frozen=True)
 class RimNumbers:
-    """The numbers of fingertips that slide along the table to the rim of a low object."""
+    """Numbers of fingertips that slide along the table to the rim of a low object."""
 
     slope: float = 0.25
-    """Least part of the contact's normal along the table's normal."""
+    """Least component of the contact's unit normal along the table's normal."""
     near: float = 0.004
     """Height [m] of a tip below which it is at the table."""
     rate: float = 12.0
@@ -75,7 +76,7 @@ RIM = RimNumbers()
 
 class UncertaintyClosing:
     """The default closing controller: Eqs. (25), (26) and (28) of the paper with
-    `surface_covariance` and extensions.
+    `surface_covariance`, and extensions.
 
     * A finger that does not touch searches along the normal of its planned contact, even beyond the
       contact, but not below the table. A finger that touches is force-controlled, whatever its
@@ -124,8 +125,8 @@ class UncertaintyClosing:
     def begin_at(
         self, displacement: Float[Tensor, "6"], palm: Float[Tensor, "3"]
     ) -> "UncertaintyClosing":
-        """Set the palm's initial displacement [m] and the object's expected displacement [m, rad];
-        return `self`.
+        """Set the palm's initial displacement `palm` [m] and the object's expected `displacement`
+        [m, rad]; return `self`.
         """
         self.planes = ContactPlanes(self.reference, displacement)
         self.palm = palm
@@ -134,8 +135,8 @@ class UncertaintyClosing:
         return self
 
     def press(self) -> "UncertaintyClosing":
-        """Let all fingers, even waiting ones, press with their desired forces; keep the palm at
-        rest; return `self`.
+        """Let all fingers press with their desired forces, waiting ones too; stop the palm; return
+        `self`.
         """
         self.waits = False
         self.reach = 0.0
@@ -196,7 +197,7 @@ class UncertaintyClosing:
     def _follow(
         self, points: Float[Tensor, "f 3"], contact: Bool[Tensor, "f"]
     ) -> tuple[Tensor, Tensor]:
-        """Return the planned contacts [m] on the displaced object (f, 3), and the palm's velocity
+        """Return the planned contacts (f, 3) [m] on the displaced object, then the palm's velocity
         (3,) [m/s].
         """
         if self.planes is None:
@@ -215,10 +216,11 @@ class UncertaintyClosing:
     def _descend(
         self, velocity: Float[Tensor, "f 3"], observation: Observation, period: float
     ) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "3"]]:
-        """Return velocities [m/s] of fingertips in the hand, and of a palm that began raised.
+        """Return the velocities [m/s] of the fingertips in the hand, then that of a palm that
+        started raised.
 
-        Then the fingers move their tips along the table only. The palm moves along its normal, so
-        that no tip is lower than it should be.
+        While the palm is raised, the fingers move their tips along the table only. The palm moves
+        along the table's normal, so that no tip is lower than it should be.
         """
         if not self.raised or self.reference.table is None:
             return velocity, STILL
@@ -239,8 +241,8 @@ class UncertaintyClosing:
         contact: Bool[Tensor, "f"],
         period: float,
     ) -> tuple[Bool[Tensor, "f"], Bool[Tensor, "f"]]:
-        """Return which fingers without a working sensor probably touch, and which of them wait for
-        the others.
+        """Return two masks of fingers without a working sensor: those that probably touch, and
+        those that wait for the others.
         """
         blind = ~self.alive
         if self.drives is None:
@@ -268,8 +270,10 @@ class UncertaintyClosing:
 
 
 def rim_contacts(reference: ClosingReference) -> Bool[Tensor, "f"]:
-    """Return a mask of the contacts that fingertips at the table touch with inclined normals, on
-    the rim above them.
+    """Return a mask of the contacts on the rim of a low object: the fingertips touch them at the
+    table.
+
+    Their normals are inclined upwards. Without a table there are none.
     """
     if reference.table is None:
         return torch.zeros_like(reference.alive)
@@ -285,8 +289,11 @@ def slide_along(
     up: Float[Tensor, "3"],
     low: Bool[Tensor, "f"],
 ) -> Float[Tensor, "f 3"]:
-    """Return fingertip velocities [m/s]; `low` tips at `height` [m] over the table go down, and
-    then keep low.
+    """Return the fingertip velocities [m/s], changed so that the `low` fingertips go down to the
+    table and stay there.
+
+    `height` [m] is that of each fingertip over the table, `up` the table's unit normal, and `low` a
+    mask of the fingertips that slide along the table.
     """
     down = RIM.rate * (RIM.gap - height) - velocity @ up
     return velocity + (down * low)[:, None] * up

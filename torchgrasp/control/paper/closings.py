@@ -1,4 +1,4 @@
-"""Baseline closing controllers: the paper's law (Eqs. 25-28), position control and open loop;
+"""Baseline closing controllers (the paper's law, Eqs. 25-28, position control, open loop), and an
 impedance hold.
 """
 
@@ -27,7 +27,6 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.geometry.frames import degenerate, rigid, virtual_frame
 from torchgrasp.geometry.linalg import limit_norm
 
-Rows = Float[Tensor, "*b 3 3"]
 STOP_FORCE = 0.5  # force [N] at which the position controller stops a finger (Sec. 6.5).
 # stiffness of the virtual frame [N/m, N m/rad]
 TRANSLATION_STIFFNESS = 1200.0
@@ -37,7 +36,7 @@ GRASP_STIFFNESS = 100.0  # stiffness [N/m] of the spring along each side of the 
 
 @dataclasses.dataclass(frozen=True)
 class PositionNumbers:
-    """The numbers of the position controller; the paper prints no gains."""
+    """Numbers of the position controller; the paper prints no gains."""
 
     depth: float = 0.02
     """Distance [m] of the goal behind the planned contact."""
@@ -49,7 +48,7 @@ class PositionNumbers:
 
 @dataclasses.dataclass(frozen=True)
 class UnstableNumbers:
-    """The numbers by which an impedance answers to an unstable grasp."""
+    """Numbers of the impedance's response to an unstable grasp."""
 
     odds: float = 3.0
     """Odds of stability above which a grasp counts as stable."""
@@ -117,8 +116,8 @@ class PositionClosing:
     """The paper's baseline (Table 7): a PI position controller for each fingertip, stopped at
     `STOP_FORCE`.
 
-    The goal lies `depth` [m] behind the planned contact, inside the object. With the paper's depth
-    of 0 a finger may stop before it touches.
+    The goal is `depth` [m] behind the planned contact, inside the object. With the paper's depth of
+    0 a finger may stop before it touches.
     """
 
     palm = STILL
@@ -148,8 +147,8 @@ class PositionClosing:
 
 
 class OpenLoopClosing:
-    """Move the joints from the pre-grasp to the grasp, and on to targets that press, without any
-    sensor.
+    """Closing without sensors: the joints move from the pre-grasp to the grasp, then to targets
+    that press.
     """
 
     palm = STILL
@@ -167,8 +166,9 @@ class OpenLoopClosing:
         return self.advance(period)
 
     def advance(self, period: float) -> Float[Tensor, "*n j"]:
-        """Return the targets [rad] for the next tick of one hand, or of n hands if `poses` are
-        those of n.
+        """Return the targets [rad] of all joints for the next tick, `period` [s] later.
+
+        They are (j,) for one hand, or (n, j) if `poses` holds the postures of n hands.
         """
         self.time += period
         progress = min(self.time / POSE_TIME, 2.0)
@@ -183,8 +183,9 @@ def restoring_wrench(
     """Return the force [N] and torque [N m] of a spring that pulls the fingertips' frame back to
     its `rest` pose.
 
-    `hand_from_vf` is the virtual frame of three fingertips, with its origin at their centroid (Eq.
-    18 of the paper). The torque grows with the sine of the rotation error.
+    `hand_from_vf` [m] is the virtual frame of three fingertips, with its origin at their centroid
+    (Eq. 18 of the paper). The torque is about that centroid, and grows with the sine of the
+    rotation error.
     """
     axes = hand_from_vf[..., :3, :3].mT
     desired = rest[..., :3, :3].mT
@@ -193,9 +194,13 @@ def restoring_wrench(
     return torch.cat([force, ROTATION_STIFFNESS * error], -1)
 
 
-def shared_forces(points: Rows, wrench: Float[Tensor, "*b 6"], most: Float[Tensor, "*b"]) -> Rows:
-    """Return the smallest fingertip forces [N] that exert a wrench, all scaled down if one would
-    exceed `most` [N].
+def shared_forces(
+    points: Float[Tensor, "*b 3 3"], wrench: Float[Tensor, "*b 6"], most: Float[Tensor, "*b"]
+) -> Float[Tensor, "*b 3 3"]:
+    """Return the smallest fingertip forces [N] that exert a `wrench` [N, N m] about the centroid of
+    the `points` [m].
+
+    All are scaled down by one factor if one would exceed `most` [N].
     """
     shared = (torch.linalg.pinv(grasp_map(points)) @ wrench[..., None])[..., 0]
     forces = shared.unflatten(-1, (3, 3))
@@ -204,29 +209,41 @@ def shared_forces(points: Rows, wrench: Float[Tensor, "*b 6"], most: Float[Tenso
 
 
 def spring_forces(
-    points: Rows, lengths: Float[Tensor, "*b 3"], stiffness: Float[Tensor, "*b 3"]
-) -> Rows:
-    """Return the forces [N] of springs along the sides of the triangle of fingertips, with rest
-    `lengths` [m].
+    points: Float[Tensor, "*b 3 3"],
+    lengths: Float[Tensor, "*b 3"],
+    stiffness: Float[Tensor, "*b 3"],
+) -> Float[Tensor, "*b 3 3"]:
+    """Return the forces [N] on three fingertips of springs along the sides of their triangle.
+
+    `points` [m] are the centres of the fingertips. `lengths` [m] are the rest lengths of the sides
+    (0, 1), (1, 2) and (2, 0), and `stiffness` [N/m] is that of each spring.
     """
     tension = stiffness * (side_lengths(points) - lengths)
     return torch.einsum("...k,...kci->...ci", tension, internal_forces(points))
 
 
-def side_lengths(points: Rows) -> Float[Tensor, "*b 3"]:
-    """Return the lengths [m] of the sides (0, 1), (1, 2) and (2, 0) of a triangle."""
+def side_lengths(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
+    """Return the lengths [m] of the sides (0, 1), (1, 2) and (2, 0) of the triangle of `points`
+    [m].
+    """
     return torch.linalg.vector_norm(points.roll(-1, dims=-2) - points, dim=-1)
 
 
 class Impedance:
-    """Hold the object as if springs held three fingertips together and in their place (object-level
-    impedance).
+    """Hold controller with virtual springs that keep three fingertips together and in place
+    (object-level impedance).
 
     The joint targets are q + J^T f / kp for fingertip forces f. At rest f are the desired forces,
     balanced at the sensed contacts. Joint motions that leave the fingertips at rest are suppressed.
-    Springs of stiffness `springs` [N/m], by default `GRASP_STIFFNESS`, act along the sides of the
-    triangle of fingertips. If a `stability` model is given and judges the grasp unstable, forces
-    and stiffness are raised and stay so.
+
+    Args:
+        reference: the closing plan.
+        observation: the observation at the end of the closing.
+        start: targets [rad] of all joints at the end of the closing.
+        springs: stiffness [N/m] of the springs along the sides of the triangle of fingertips; None
+            means `GRASP_STIFFNESS`.
+        stability: model that judges the grasp; if it is unstable, forces and stiffness are raised
+            and stay so. None means no judgement.
     """
 
     def __init__(
@@ -297,16 +314,16 @@ class Impedance:
         return desired + springs + shared_forces(tips, restoring_wrench(frame, self.rest), most)
 
     def _frame(self, tips: Float[Tensor, "3 3"]) -> Float[Tensor, "4 4"]:
-        """Return the frame of the triangle of fingertips, or the last valid frame if the tips are
-        on a line.
+        """Return the frame of the triangle of fingertips [m], or the last valid frame if the tips
+        are on a line.
         """
         if not bool(degenerate(tips)):
             self.frame = virtual_frame(tips)
         return self.frame
 
     def _actuated(self, joints: Float[Tensor, " j"]) -> Float[Tensor, " h"]:
-        """Return the actuated joints [rad] that best explain given positions of all joints,
-        weighted by stiffness.
+        """Return the actuated joints [rad] that best explain the positions `joints` [rad] of all
+        joints, weighted by stiffness.
         """
         weighted = self.coupling * self.reference.kp[:, None]
         return weighted.T @ (joints - self.reference.hand.actuated.offset) / self.stiffness

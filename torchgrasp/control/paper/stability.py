@@ -1,10 +1,10 @@
 """The learned stability model, from the paper's reference [6]: Gaussian mixtures over stiffness,
-size and forces.
+size and forces of grasps.
 
 `scripts/train.py stability` fits two mixtures to simulated pulls, of stable and of unstable grasps.
 The first gives the forces of stable grasps and Sigma_fd of Eq. (28). Both give the probability of
-stability by Bayes' rule: the density of stable grasps alone, as in [6], is low for rare objects,
-too.
+stability by Bayes' rule. The density of stable grasps alone, as in [6], is also low for rare
+objects.
 """
 
 import dataclasses
@@ -45,14 +45,16 @@ PARTS = [
 def state_of(
     springs: Float[Tensor, "*b 3"], lengths: Float[Tensor, "*b 3"], forces: Float[Tensor, "*b 3"]
 ) -> Float[Tensor, "*b 9"]:
-    """Return a grasp's state: logarithms of spring stiffness [N/m], distances [m] of tips to
+    """Return the state of a grasp: logarithms of spring stiffness [N/m], distances [m] of tips to
     centroid, forces [N].
+
+    `springs`, `lengths` and normal `forces` are in the order of the hand's fingers.
     """
     return torch.cat([springs, lengths, forces.clamp_min(LEAST_FORCE)], -1).log()
 
 
 def lengths_of(tips: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
-    """Return the distances [m] of three fingertips' centres from their centroid."""
+    """Return the distances [m] of three fingertips' centres `tips` [m] from their centroid."""
     return torch.linalg.vector_norm(tips - tips.mean(-2, keepdim=True), dim=-1)
 
 
@@ -65,10 +67,10 @@ class StabilityModel(Value):
     others: GaussianMixture  # density of the states of all other grasps
     share: Annotated[
         float, Range(LEAST, 1 - 2**-53, "a number in (0, 1)")
-    ]  # of stable trials: the prior
+    ]  # share of stable trials: the prior
     meta: dict[str, str] = dataclasses.field(
         default_factory=dict[str, str]
-    )  # hand, bodies, trials, seed, scores
+    )  # texts: hand, bodies, trials, seed, scores
 
     def __post_init__(self) -> None:
         for mixture in (self.stable, self.others):
@@ -82,8 +84,8 @@ class StabilityModel(Value):
         """Return the typical forces and stiffness of stable grasps whose fingertips are as far
         apart as the `tips` [m].
 
-        `force` [N] is the normal force of the finger that presses hardest; by default the model
-        chooses it.
+        `force` [N] is the normal force of the finger that presses hardest; None means that the
+        model chooses it.
         """
         lengths = lengths_of(tips.double())
         given: dict[str, float] = dict(zip(LENGTHS, lengths.log().tolist(), strict=True))
@@ -106,8 +108,8 @@ class StabilityModel(Value):
 
     @checked(gradients=True)
     def log_odds(self, state: Float[Tensor, "*b 9"]) -> Float[Tensor, "*b"]:
-        """Return the log-odds that a grasp of given `state` is stable, by Bayes' rule on stiffness
-        and forces.
+        """Return the log-odds that a grasp with the `state` of `state_of` is stable, by Bayes' rule
+        on stiffness and forces.
         """
         stable, others = self._without_lengths
         judged = torch.cat([state[..., :3], state[..., 6:]], -1)  # (*b, 6)
@@ -133,8 +135,10 @@ class StabilityModel(Value):
 
 @checked
 def load_stability(hand: Hand, path: Path | str | None = None) -> StabilityModel | None:
-    """Read the stability model of a hand from `path`, or from `FILE` in its folder; None if that
-    does not exist.
+    """Read the stability model of a hand from `path`; None means `FILE` in the hand's folder.
+
+    Return None if `path` is None and the hand's folder has no such file. Raises `ModelFileError`
+    for a malformed file.
     """
     if path is None:
         path = hand.urdf_path.parent / FILE
