@@ -199,7 +199,7 @@ class Descent(Minimisation[State, LinearConstraints]):
 
 
 def promised_decrease(model: LinearConstraints, x: Step) -> Float[Tensor, "a"]:
-    """Return the decrease of each contact set's cost that the linear model predicts for the step x."""
+    """Return the decrease of each set's cost that the linear model predicts for the step x."""
     linear = model.residual + matvec(model.weighted_jacobian, x)
     return (model.residual.square().sum(1) - linear.square().sum(1)) / 2
 

@@ -20,13 +20,13 @@ class ChangeNumbers:
     frictions: tuple[float, ...] = (0.4, 0.8, 1.2)
     """Coefficients of friction: of smooth plastic, of rubber, of soft silicone."""
     clearly: float = 1.4
-    """A friction is tried from this ratio to the present one on."""
+    """Least ratio of a friction that is tried to the present one."""
     tried: int = 2
-    """Most frictions that are tried."""
+    """Largest number of frictions that are tried."""
     variances: tuple[float, ...] = (0.03, 0.1)
-    """Largest variances of the surface at a contact."""
+    """Largest variances of the surface at a contact, in normalised units."""
     flatnesses: tuple[float, ...] = (0.44, 0.9)
-    """Largest variations of the surface's normal about a contact."""
+    """Largest angles [rad] between the normals at a contact and on a ring around it."""
     margins: tuple[float, ...] = (0.5, 1.0)
     """Shares of the friction that are planned with."""
 
@@ -44,11 +44,15 @@ OF_HAND = frozenset(
 
 @dataclasses.dataclass(frozen=True)
 class Change:
-    """A planning request with one change, which `words` describe.
+    """A planning request with one change.
 
-    If `choice` is true the user can make the change; otherwise it is a change of the world, such as
-    a higher friction. `cures` are the failures that the change could prevent. If `refit` is true,
-    the object's shape is estimated anew.
+    Args:
+        words: description of the change.
+        choice: whether the user can make the change; otherwise it is a change of the world, such as
+            a higher friction.
+        cures: the failures that the change could prevent.
+        request: the request with the change.
+        refit: whether the object's shape must be estimated anew.
     """
 
     words: str
@@ -64,22 +68,23 @@ def _with(request: Request, **fields: Any) -> Request:
 
 
 def list_changes(request: Request) -> list[Change]:
-    """Return all changes of a request, each of one setting, that could give grasps, but not more
-    initial guesses.
+    """Return all changes of a request, each of one setting, that could give grasps.
+
+    A change to more initial guesses is not among them: see `more_starts`.
     """
     kinds = (_regions, _surroundings, _fingers, _limits, _friction, _hands)
     return [change for kind in kinds for change in kind(request)]
 
 
 def more_starts(request: Request, ratio: int) -> Change:
-    """Return the change of settings that makes the planner try so many times the initial guesses."""
+    """Return the change to `ratio` times as many initial guesses as the request has."""
     more = dataclasses.replace(request, starts=ratio * request.starts)
     return Change(f"with {more.starts} starts", True, frozenset(Status), more)
 
 
 def _regions(request: Request) -> Iterator[Change]:
-    """Yield changes that each give up what the user asks of contacts: a region to keep to or avoid,
-    a task's loads.
+    """Yield changes that each give up a demand on contacts: the region to keep to, the region to
+    avoid, or the task's loads.
     """
     for name in ("keep", "avoid", "resist"):
         if getattr(request, name) is not None:

@@ -33,18 +33,18 @@ from torchgrasp.values.specs import ContactSpec, Mode, Ranking
 
 @dataclasses.dataclass(frozen=True)
 class ExplainNumbers:
-    """The bounds on the work of an explanation."""
+    """The bounds on the work of an explanation, and the weights of changes."""
 
     trials: int = 8
-    """Most changes that are tried."""
+    """Largest number of changes that are tried."""
     starts: int = 20
-    """Starts with which a change is tried: one change takes about a second."""
+    """Initial guesses with which a change is tried: one change takes about a second."""
     more: int = 4
-    """Ratio by which more starts are tried; only requests of few starts are tried so."""
+    """Ratio by which more initial guesses are tried; only requests of few guesses are tried so."""
     postures: int = 500
     """Size of the posture library; more take seconds for a hand that often meets itself."""
     judged: int = 5
-    """A plan is judged by the best one in so many of its guesses."""
+    """A plan is judged by its best grasps, one for so many initial guesses."""
     enough: float = 0.8
     """Expected success at which a change is good enough to end the search."""
     beside: float = 0.2
@@ -58,7 +58,14 @@ EXPLAIN = ExplainNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class Losses(Value):
-    """How many `things` (such as contacts) a stage was given, and how many it lost for each reason."""
+    """The number of things that a planning stage lost for each reason.
+
+    Args:
+        stage: name of the stage.
+        things: word for what the stage was given, such as "contacts".
+        given: number of things that the stage was given.
+        lost: number of things lost, by reason, the most frequent first.
+    """
 
     stage: str
     things: str
@@ -72,7 +79,7 @@ class Losses(Value):
 
     @property
     def reasons(self) -> str:
-        """The reasons with their counts, as text."""
+        """The reasons with their counts, as one line of text."""
         return ", ".join(f"{n} {status.name.lower()}" for status, n in self.lost.items())
 
     def __str__(self) -> str:
@@ -86,10 +93,10 @@ class Losses(Value):
 class Funnel(Value):
     """The losses of each planning stage, from random initial guesses to executable grasps.
 
-    Stage "contacts" turns initial guesses into contact sets. Stage "postures" loses the contact
-    sets that no hand posture comes near; the hand tries the most promising of the others. Stage
-    "grasps" turns them into executable grasps; each failure is counted for the check that its best
-    posture fails.
+    `stages` are in the order of planning. Stage "contacts" turns initial guesses into contact sets.
+    Stage "postures" loses the contact sets that no hand posture comes near; the hand tries the most
+    promising of the others. Stage "grasps" turns them into executable grasps; each failure is
+    counted for the check that its best posture fails.
     """
 
     stages: tuple[Losses, ...]
@@ -97,8 +104,10 @@ class Funnel(Value):
     @classmethod
     @checked
     def of(cls, plan: ContactPlan, closed: Certificate, seeds: IKSeeds, grasps: Grasps) -> "Funnel":
-        """Return the losses, counted in the results of the stages "plan", "certify", "query" and
-        "refine".
+        """Return the losses, counted in the results of four planning stages.
+
+        The results are those of the stages "plan", "certify" (only closed contact sets), "query"
+        and "refine".
         """
         far = len(closed) - len(seeds.row.unique())
         stages = (
@@ -123,15 +132,15 @@ class Funnel(Value):
 
     @property
     def reason(self) -> Status:
-        """The most frequent reason why the stage `worst` lost things; `Status.OK` if it lost
+        """The most frequent reason for the losses of the stage `worst`; `Status.OK` if it lost
         nothing.
         """
         return next(iter(self.worst.lost), Status.OK)
 
     @checked
     def share(self, reasons: frozenset[Status]) -> float:
-        """Return the sum over the stages of the fraction that a stage lost for any of the given
-        reasons.
+        """Return the share that the stages lost for any of the given reasons, summed over the
+        stages.
         """
         shares = (
             n / stage.given
@@ -154,11 +163,15 @@ def _failures(status: Int[Tensor, "b"]) -> dict[Status, int]:
 
 @dataclasses.dataclass(frozen=True)
 class Trial(Value):
-    """The result of planning with one change: the number of executable grasps, and their expected
-    success.
+    """The result of planning with one change.
 
-    `words` describe the change. If `choice` is true the user can make it; otherwise it is a change
-    of the world, such as a higher friction.
+    Args:
+        words: description of the change.
+        choice: whether the user can make the change; otherwise it is a change of the world, such as
+            a higher friction.
+        executable: number of executable grasps.
+        expected: mean predicted success, in [0, 1], of the best grasps (`expected_success`).
+        funnel: losses of the planning stages.
     """
 
     words: str
@@ -173,12 +186,15 @@ class Trial(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Explanation(Value):
-    """Why there is no grasp: where grasps were lost, and the results of single changes, the most
-    helpful first.
+    """Why there is no grasp: where grasps were lost, and the results of single changes.
 
-    For each change, grasps were planned from `starts` initial guesses. `left` is the number of
-    changes that the bound on work left out. `str` gives one line for each stage, and a sentence
-    about the best change.
+    Args:
+        starts: number of initial guesses from which grasps were planned with each change.
+        funnel: losses of the planning stages without a change.
+        trials: the results of the changes, the most helpful first.
+        left: number of changes that were not tried, because the work is bounded.
+
+    `str` gives one line for each stage, and a sentence about the best change.
 
     >>> funnel = Funnel((Losses("grasps", "postures", 40, {Status.TABLE_COLLISION: 40}),))
     >>> lower = Trial("if the table were 20 mm lower", choice=True, executable=9, expected=7.5, funnel=funnel)
@@ -199,8 +215,8 @@ class Explanation(Value):
 
     @property
     def advice(self) -> str:
-        """A sentence about the best change and the user's best choice; if no change helps, about
-        the worst stage.
+        """A sentence about the best change and the best one that the user can make; if none helps,
+        about the worst stage.
         """
         if self.funnel.executable:
             return f"There is a grasp: {self.funnel.executable} of {self.starts} starts ended in an executable one."
@@ -260,9 +276,11 @@ def explain_empty(
 
     Args:
         cloud, hand, spec, starts, seed: as in `plan_grasps`.
-        options: the further arguments of `plan_grasps`. The `observer` is called with "funnel" and
-            the `Funnel` of the first plan, then with "change" and the `Trial` of each change. No
-            change begins after `time_budget`.
+        fingers, task, promise, reachable, arm, keep, avoid, resist, mode, ranking, shape: as in
+            `plan_grasps`.
+        observer: function that is called with "funnel" and the `Funnel` of the first plan, then
+            with "change" and the `Trial` of each change.
+        time_budget: wall time [s] after which no change is begun.
 
     >>> from torchgrasp import load_hand, load_object
     >>> spec = ContactSpec(friction=0.0, table=0.0)
@@ -327,7 +345,9 @@ def explain_empty(
 
 
 def _try_change(change: Change, known: Objects | None, tell: Observer) -> Trial:
-    """Return the result of planning with a change, on a known object, and tell it."""
+    """Return the result of planning with a change, on the objects `known` if given, and report it
+    to the observer.
+    """
     funnel, expected, _ = try_request(change.request, known)
     trial = Trial(change.words, change.choice, funnel.executable, expected, funnel)
     tell("change", str(trial), trial)
@@ -335,11 +355,12 @@ def _try_change(change: Change, known: Objects | None, tell: Observer) -> Trial:
 
 
 def order_changes(changes: list[Change], funnel: Funnel) -> list[Change]:
-    """Return the changes that could prevent the most losses, the most helpful first; drop the
-    others.
+    """Return the changes that could prevent the most losses, the most helpful first; the others are
+    left out.
 
-    A change counts fully for the failures that it prevents, and one fifth for other failures of the
-    same stage, because a failed contact set reports only one of its failures.
+    A change counts fully for the failures that it prevents. It counts one fifth for other failures
+    of the same stage, because a failed contact set reports only one of its failures. `funnel` holds
+    the losses without a change.
     """
     contacts = frozenset(status for status in Status if status < Status.OUT_OF_REACH)
     weight = dict[int, float]()
@@ -362,12 +383,18 @@ def try_request(
     first: Observer | None = None,
     numbers: ExplainNumbers = EXPLAIN,
 ) -> tuple[Funnel, float, Objects]:
-    """Plan a request with a small library of postures.
+    """Return the losses, the expected success, and the posed object of a plan with a small library
+    of postures.
 
-    Returns the losses, the expected success, and the object as it was posed last. The object of
-    `known` is used again. Several sets of fingers share the initial guesses. If no contact set is
-    found, the most relaxed constraints are tried, too. The success is that of the best fifth of the
-    guesses. An observer `first` hears "funnel" and the losses of the first plan.
+    The expected success, in [0, 1], is that of the best fifth of the guesses. Several sets of
+    fingers share the initial guesses. If no contact set is found, the most relaxed constraints are
+    tried, too; the object is returned as it was posed last.
+
+    Args:
+        request: the arguments of the plan.
+        known: the object, if it is known from an earlier plan.
+        first: observer that is called with "funnel" and the losses of the first plan.
+        numbers: the bounds on the work.
     """
     told = dict[str, Any]()
     hands = request.hands

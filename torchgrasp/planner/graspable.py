@@ -26,7 +26,7 @@ from torchgrasp.values.specs import FLAT_RADII, TIP_RADIUS, ContactSpec
 
 @dataclasses.dataclass(frozen=True)
 class JudgeNumbers:
-    """Numbers by which an object's image shows that a hand cannot grasp it."""
+    """The bounds by which an object's image shows that a hand cannot grasp it."""
 
     on_support: float = 0.5
     """Least share of an object's points over its support."""
@@ -40,7 +40,7 @@ class JudgeNumbers:
 
 @dataclasses.dataclass(frozen=True)
 class SpanNumbers:
-    """Numbers of the span of a hand."""
+    """The numbers of the search for the span of a hand."""
 
     postures: int = 5000
     """Random postures in which the span of a hand is sought."""
@@ -50,7 +50,7 @@ class SpanNumbers:
 
 @dataclasses.dataclass(frozen=True)
 class VagueNumbers:
-    """Numbers by which an estimated shape is vague."""
+    """The numbers by which an estimated shape counts as vague."""
 
     cells: int = 24
     """Cells to a side of the grid on which the surface is extracted."""
@@ -60,7 +60,7 @@ class VagueNumbers:
 
 @dataclasses.dataclass(frozen=True)
 class EaseNumbers:
-    """Numbers of the order in which objects are planned; lengths are in metres."""
+    """The numbers of the order in which objects are planned; lengths are in metres."""
 
     room: float = 0.06
     """More free space around an object makes nothing easier."""
@@ -84,10 +84,11 @@ EASE = EaseNumbers()
 
 @checked
 def judge_things(scene: Scene, hand: Hand, spec: ContactSpec | None = None) -> dict[int, Status]:
-    """Return for each object's label the first reason why the hand cannot grasp the object, or
-    `Status.OK`.
+    """Return the first reason why the hand cannot grasp each object of a scene, or `Status.OK`, by
+    the object's label.
 
-    The objects are judged from the depth image alone, without planning, in milliseconds.
+    The objects are judged from the depth image alone, without planning, in milliseconds. `spec`
+    holds the constraints on contacts, by default `ContactSpec()`.
 
     >>> from torchgrasp import load_hand, load_scene
     >>> set(judge_things(load_scene(), load_hand("barrett")).values()) == {Status.OK}
@@ -182,8 +183,10 @@ def _thickness(points: Float[Tensor, "n 2"], cell: float) -> float:
 
 
 def hand_span(hand: Hand) -> float:
-    """Return the widest grasp [m]: the largest distance of two pads that face each other, over
-    random postures.
+    """Return the span [m] of a hand: the largest distance of two fingertip pads that face each
+    other.
+
+    It is found among random postures, the same in every call.
     """
     if "span" not in hand.derived:
         generator = torch.Generator().manual_seed(0)
@@ -202,8 +205,9 @@ def hand_span(hand: Hand) -> float:
 
 
 def is_vague(shape: ShapeGP) -> bool:
-    """Return whether the standard deviation somewhere on the estimated surface exceeds half the
-    object's size.
+    """Return whether an estimated shape is so uncertain that it should not be planned with.
+
+    It is if the standard deviation somewhere on the surface exceeds half the object's size.
     """
     return float(extract_surface(shape, VAGUE.cells).std_m.quantile(VAGUE.worst)) > shape.scale
 

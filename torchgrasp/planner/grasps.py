@@ -203,13 +203,15 @@ def stream_grasps(
     shape: ShapeGP | None = None,
     observer: Observer | None = None,
 ) -> Iterator[Grasps]:
-    """Yield the executable grasps of each batch of `plan_grasps` when the batch ends, best first.
+    """Yield the executable grasps of each batch of `plan_grasps` as soon as the batch ends, best
+    first.
 
-    Each grasp has force closure, has passed all checks, and is scored. All batches together,
-    ranked, are the executable grasps of `plan_grasps` with the same arguments. The work stops when
-    the caller stops iterating. In modes other than "joint", and with "auto" fingers, there is one
-    batch. Each batch has at least one grasp; a later one may have a better best grasp. Raises the
-    errors of `plan_grasps`; for a wrong cloud at the first iteration.
+    The arguments are those of `plan_grasps` for one cloud or scene. Each grasp has force closure,
+    has passed all checks, and is scored. All batches together, ranked, are the executable grasps of
+    `plan_grasps` with the same arguments. The work stops when the caller stops iterating. In modes
+    other than "joint", and with "auto" fingers, there is one batch. Each batch has at least one
+    grasp; a later one may have a better best grasp. Raises the errors of `plan_grasps`; for a wrong
+    cloud at the first iteration.
 
     >>> from torchgrasp import load_hand, load_object
     >>> first = next(stream_grasps(load_object("cylinder").view, load_hand("barrett"), starts=40))

@@ -28,10 +28,10 @@ Result = TypeVar("Result")
 
 @dataclasses.dataclass(frozen=True)
 class ManyNumbers:
-    """Numbers of plans of many clouds."""
+    """The numbers of plans of many clouds."""
 
     stack: int = 128
-    """Clouds that a device plans at once; of more it would wait longer for the shapes."""
+    """Clouds that a device plans at once; with more it would wait longer for the shapes."""
     patience: float = 3600.0
     """Time after which a worker process gives up a cloud [s]."""
 
@@ -40,11 +40,13 @@ MANY = ManyNumbers()
 
 
 def plan_many(clouds: Sequence[PointCloud], workers: int, given: dict[str, Any]) -> list[Grasps]:
-    """Plan for each cloud on its device; a bad cloud does not affect the others.
+    """Return the planned grasps of each cloud, on the cloud's device; a bad cloud does not affect
+    the others.
 
-    `given` holds the other arguments of `Request`, common to all clouds. A worker process gives up
-    a cloud after an hour. Where an accelerator plans clouds at once, the worker processes estimate
-    the shapes.
+    `workers` is the number of processes, 0 for none. `given` holds the other arguments of
+    `Request`, common to all clouds. A worker process gives up a cloud after an hour. Where an
+    accelerator plans clouds at once, the worker processes estimate the shapes. Raises `BadArgument`
+    for arguments that only one cloud can have.
     """
     for name in ("shape", "observer", "reachable", "arm", "keep", "avoid"):
         if given.get(name) is not None:
@@ -67,11 +69,11 @@ def plan_many(clouds: Sequence[PointCloud], workers: int, given: dict[str, Any])
 def plan_stacks(
     requests: Sequence[Request], prepared: Iterator[Objects | Grasps], device: torch.device
 ) -> Iterator[Grasps]:
-    """Yield the grasps of posed objects, whose requests differ in their clouds alone, planned at once on
-    a device.
+    """Yield the grasps of each request, whose posed objects a device plans many at a time.
 
-    The objects of the next stack are prepared while the device plans. A refused cloud, which is
-    an empty set of grasps, stays as it is.
+    The requests differ in their clouds alone. `prepared` yields the posed object of each request.
+    It yields an empty set of grasps for a refused cloud, which is passed on. The objects of the
+    next stack are prepared while the device plans.
     """
     most = MANY.stack
     budget = requests[0].time_budget if requests else None
@@ -86,8 +88,9 @@ def plan_stacks(
 
 @checked
 def _take(prepared: Iterator[Objects | Grasps], count: int) -> list[Objects | Grasps]:
-    """Return the next objects of an iterator; in any thread the library does not check its own
-    calls.
+    """Return the next `count` objects of an iterator.
+
+    In any thread the library does not check its own calls.
     """
     return list(itertools.islice(prepared, count))
 
@@ -95,8 +98,9 @@ def _take(prepared: Iterator[Objects | Grasps], count: int) -> list[Objects | Gr
 def estimate_shapes(
     requests: Sequence[Request], workers: int
 ) -> Generator[Objects | Grasps, None, None]:
-    """Yield the posed object of each request on the CPU, or an empty set of grasps for a bad
-    cloud.
+    """Yield the posed object of each request on the CPU, or an empty set of grasps for a bad cloud.
+
+    `workers` is the number of processes, 0 for none.
     """
     return _each(
         _prepare, [dataclasses.replace(x, cloud=x.cloud.to("cpu")) for x in requests], workers
@@ -154,7 +158,7 @@ def _refused(hand: Hand, reason: str) -> Grasps:
 
 
 def no_grasps(hand: Hand) -> Grasps:
-    """Return an empty set of grasps that has the joints and fingers of a hand."""
+    """Return an empty set of grasps with the numbers of joints and fingers of a hand."""
     f = len(hand.tips)
 
     def none(*shape: int) -> torch.Tensor:

@@ -1,7 +1,9 @@
 """The objects of a plan: a batch of c objects, derived once, in three steps: seen, shaped, posed.
 
 `ShapedObject.of` takes the first two steps, which know neither hand nor constraints. `pose` takes
-the third step for one object. `join_objects` makes a batch of posed objects on one device.
+the third step for one object: it adds the hand, the constraints, the initial guesses and the
+obstacles. `join_objects` makes a batch of posed objects on one device. The upright frame of an
+object has a z axis that points up.
 """
 
 import dataclasses
@@ -59,22 +61,25 @@ from torchgrasp.values.specs import ContactSpec
 TARGET_POINTS = 1000
 """Most points of a scene's target that are used: they lie a few millimetres apart."""
 BURIED = 0.003
-"""Depth [m] by which a rising object may enter obstacles further than at rest: noise of the grid."""
+"""Depth [m] by which a rising object may enter obstacles further than at rest: noise of the grid.
+"""
 
 CloudIndex = Int[Tensor, "b"]
-"""The index of the cloud to which each row belongs."""
+"""The index of the object (its cloud) to which each of b contact sets or grasps belongs."""
 Model = tuple[GraspMixture | None, str]
-"""The learned mixture of a mode that uses one, and the SHA-256 of its file or "none"."""
+"""The learned mixture of the mode, or None, and the SHA-256 of its file, or "none"."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ShapedObject:
-    """One object as it was seen, and its estimated shape, in an upright frame (z axis up).
+    """One object as the camera saw it, and its estimated shape, in an upright frame (z axis up).
 
-    `cloud` is in the caller's frame, all else in the upright frame. `table` is the table that the
-    caller or the scene names, in the caller's frame. `obstacles` surround a scene's target. `vague`
-    tells that the cloud hardly shows the object: few points, one plane, or a part beyond the image
-    border.
+    `cloud` and `scene` are what was seen. `cloud` and `table` (a plane, or a height [m] along z)
+    are in the caller's frame, all else in the upright frame. `obj_from_upright` [m] is the
+    transform from the upright frame to the caller's. `shape` is the estimated shape, `surface` its
+    mesh [m] and `body` what predictions of success need. `vague` says that the cloud hardly shows
+    the object: few points, one plane, or a part beyond the image border. `obstacles` surround a
+    scene's target; None without a scene.
     """
 
     cloud: PointCloud
@@ -89,7 +94,7 @@ class ShapedObject:
 
     @classmethod
     def of(cls, request: Request) -> "ShapedObject":
-        """Find the object of a request and its upright frame, and estimate its shape."""
+        """Return the object of a request in its upright frame, with its estimated shape."""
         # seen: the object's points, the table, and the frame in which z points up
         cloud = request.cloud
         spec = request.contact_spec
@@ -125,14 +130,28 @@ class ShapedObject:
 
 @dataclasses.dataclass(frozen=True)
 class Objects:
-    """A batch of c objects, and what a hand may do with them; they share request and hand.
+    """A batch of c posed objects for one hand and one request.
 
-    `given_spec` are the constraints in the caller's frame; `specs` are those of each object in its
-    upright frame, with a known flat radius. `sizes` are those of the plan's batches. `starts` holds
-    the initial guesses of each object,
-    (s, f, 3) in normalised units. The fields from `shape` on have one row for each object, or are
-    the values of a single object. A hand that `descends` may go down while it closes. `postures`
-    is the size of the posture library. `buried`: obstacles prevent that the object is lifted.
+    The fields from `shape` on hold one value for each object, or the value of a single object.
+
+    Args:
+        request: the arguments of the plan.
+        hand: the hand, on the device of the objects.
+        given_spec: the constraints on contacts in the caller's frame.
+        specs: the constraints of each object in its upright frame, with a known flat radius.
+        each: the c objects with their shapes.
+        sizes: the sizes of the plan's batches.
+        starts: the s initial guesses of each object (s, f, 3), normalised.
+        shape: the estimated shapes.
+        constraints: the contact planning problems, in normalised units.
+        body: the bodies for predictions of success.
+        world: what the hand must not touch, in the upright frame.
+        loads: w loads of the task for each object (force [N], torque [N m] about the origin of the
+            upright frame); None if grasps need not resist loads.
+        model: the learned mixture of the mode, and its SHA-256.
+        buried: whether obstacles prevent that the object is lifted.
+        descends: whether the hand may move down while it closes.
+        postures: size of the posture library; None means the default.
     """
 
     request: Request
@@ -158,12 +177,12 @@ class Objects:
 
     @property
     def device(self) -> torch.device:
-        """The device of the objects."""
+        """The device on which the objects are planned."""
         return self.body.center.device
 
     @property
     def spec(self) -> ContactSpec:
-        """The constraints of the first object; those of the others differ in the flat radius."""
+        """The constraints of the first object; the others differ from it only in the flat radius."""
         return self.specs[0]
 
     @property
@@ -174,13 +193,18 @@ class Objects:
 
     @property
     def library(self) -> PostureLibrary:
-        """Random postures of the hand; the hand keeps them."""
+        """The library of random postures of the hand, on the device of the objects; the hand caches
+        it.
+        """
         hand = settle_hand(self.hand, self.each[0].shape.device)
         return settle(PostureLibrary.of(hand, self.postures, self.request.seed), self.device)
 
     @property
     def reachable(self) -> Reachable | None:
-        """The function that says which hand poses arm and user accept, in the upright frame."""
+        """The function that says which hand poses arm and user accept, or None if all are accepted.
+
+        It takes poses (k, 4, 4) [m] in the upright frame, and returns booleans (k,).
+        """
         arm = self.request.arm
         frame = self.each[0].obj_from_upright
         by_arm = None if arm is None else functools.partial(reach_poses, arm)
@@ -192,7 +216,7 @@ class Objects:
         ).all(0)
 
     def relaxed_specs(self) -> Iterator[ContactSpec]:
-        """Yield relaxed constraints of a single object, in the caller's frame."""
+        """Yield weaker and weaker constraints for a single object, in the caller's frame."""
         radius = float(self.hand.tips.radius.max())
         return iter(self.given_spec.relaxed(self.spec.ring_radius, radius))
 
@@ -204,14 +228,20 @@ class Objects:
         postures: int | None = None,
         descends: bool = False,
     ) -> "Objects":
-        """Return the same single object for another request, hand or contact constraints."""
+        """Return the same single object for another request, hand or contact constraints.
+
+        The arguments are those of `pose`.
+        """
         (object_,) = self.each
         return pose(object_, request, hand, self.model, spec, postures, descends)
 
     def reach(
         self, contacts: Contacts, certificate: Certificate, cloud: CloudIndex
     ) -> GraspProblem:
-        """Return the problem of moving the hand onto b contact sets with their certificates."""
+        """Return the problem of moving the hand onto b contact sets with their certificates.
+
+        `cloud` is the index of each contact set's object.
+        """
         center = self.body.rows(cloud).center
         world = self.world.rows(cloud)
         return GraspProblem(
@@ -219,14 +249,19 @@ class Objects:
         )
 
     def slide(self, cloud: CloudIndex) -> JointProblem:
-        """Return the problem of hand and sliding contacts together, for b rows."""
+        """Return the problem in which hand and contacts move together, for b contact sets.
+
+        `cloud` is the index of each contact set's object.
+        """
         constraints = self.constraints.rows(cloud)
         return JointProblem(
             self.hand, rows_of(self.shape, cloud), constraints, self.world.rows(cloud)
         )
 
     def on_arm(self, grasps: Grasps) -> Grasps:
-        """Return grasps with the arm's postures, if there is an arm; unreachable ones have failed."""
+        """Return grasps with the arm's postures, if there is an arm; those that it cannot reach get
+        `UNREACHABLE`.
+        """
         arm = self.request.arm
         if arm is None:
             return grasps
@@ -236,7 +271,9 @@ class Objects:
         return with_arm(arm, self.hand, grasps, self.world, frame[2, :3])
 
     def tell(self, stage: str, message: str, value: Any) -> None:
-        """Report a stage to the observer, with its result in the caller's frame."""
+        """Report a stage to the observer: its name, a line of text, and its result in the caller's
+        frame.
+        """
         if self.request.observer is not None:
             self.request.observer(stage, message, self._moved(value))
 
@@ -276,13 +313,13 @@ class Objects:
         return dataclasses.replace(moved, meta=grasps.meta | meta)
 
     def _moved(self, value: Any) -> Any:
-        """Return a value of any type, moved from the upright frame to the caller's frame."""
+        """Return a value, moved from the upright frame to the caller's frame."""
         frame = self.each[0].obj_from_upright
         return value.moved(frame) if isinstance(value, ShapeGP) else move(value, frame)
 
 
 def pose_request(request: Request, hand: Hand) -> Objects:
-    """Return the single object of a request, ready for the rows of a plan with a hand."""
+    """Return the single object of a request, posed for a hand: see `pose`."""
     model = find_model(request)  # first, so that a missing model is told before any work
     return pose(ShapedObject.of(request), request, hand, model)
 
@@ -300,9 +337,12 @@ def pose(
 
     Args:
         object_: the object, with its shape.
-        request, hand, model: the plan's arguments, its hand, and the mixture of its mode.
+        request: the arguments of the plan.
+        hand: the hand of the plan.
+        model: the learned mixture of the mode, and its SHA-256.
         spec: constraints in the caller's frame; by default the request's, on the object's table.
-        postures, descends: as in `Objects`.
+        postures: size of the posture library; None means the default.
+        descends: whether the hand may move down while it closes.
     """
     shape = object_.shape
     hand = settle_hand(hand, shape.device)
@@ -383,7 +423,9 @@ def join_objects(parts: Sequence[Objects], device: torch.device) -> Objects:
 
 
 def find_model(request: Request) -> Model:
-    """Return the learned mixture of the request's hand, if its mode uses one."""
+    """Return the learned mixture of the request's hand, if its mode uses one, and the SHA-256 of
+    its file.
+    """
     if request.mode == "joint":
         return None, "none"
     folder = request.hand.urdf_path.parent
@@ -394,14 +436,20 @@ def find_model(request: Request) -> Model:
 
 
 def is_vague_cloud(cloud: PointCloud) -> bool:
-    """Return whether a cloud hardly shows its object: few points, one plane, or cut off."""
+    """Return whether a cloud hardly shows its object: it has few points, lies in one plane, or is
+    cut off.
+    """
     in_image = cloud.frustum is not None and cloud.viewpoint is not None
     cut = in_image and silhouettes(cloud.to("cpu")).cut
     return cut or len(cloud) < FEW_POINTS or is_flat(cloud.points)
 
 
 def is_buried(surface: Mesh, obstacles: Obstacles | None) -> bool:
-    """Return whether the rising object would enter obstacles clearly deeper than at rest."""
+    """Return whether obstacles prevent that an object is lifted.
+
+    They do if the rising object would enter them clearly deeper than at rest. `surface` is the
+    object's mesh [m].
+    """
     if obstacles is None or not obstacles.hard:
         return False
     standing = float(obstacles.field.query(surface.vertices)[0].min())
@@ -409,7 +457,7 @@ def is_buried(surface: Mesh, obstacles: Obstacles | None) -> bool:
 
 
 def settle_hand(hand: Hand, device: torch.device) -> Hand:
-    """Return the hand on a device; the hand caches one copy, with its caches, for each device."""
+    """Return the hand on a device; the hand caches one copy for each device."""
     if hand.lower.device != device and device not in hand.derived:
         hand.derived[device] = hand.to(device)
     return hand.derived.get(device, hand)
@@ -417,7 +465,7 @@ def settle_hand(hand: Hand, device: torch.device) -> Hand:
 
 @checked
 def take_target(scene: Scene, seed: Seed) -> PointCloud:
-    """Return at most `TARGET_POINTS` random points of a scene's target.
+    """Return at most `TARGET_POINTS` random points of a scene's target, as a cloud.
 
     Raises `BadArgument` unless the target is the label of an object.
     """
@@ -431,6 +479,6 @@ def take_target(scene: Scene, seed: Seed) -> PointCloud:
 
 
 def digest(cloud: PointCloud) -> str:
-    """Return the SHA-256 of a cloud's points, by which grasps know the cloud of their plan."""
+    """Return the SHA-256 of a cloud's points, by which the metadata of grasps identify the cloud."""
     points = cloud.points.detach().cpu().double().contiguous().numpy()
     return hashlib.sha256(points.tobytes()).hexdigest()

@@ -1,7 +1,8 @@
-"""The loop of the planner: rows of contact sets, in batches, each larger than the last.
+"""The loop of the planner: contact sets in batches, each larger than the last.
 
-`step` reads like this. Find new rows. Choose the most promising. Move the hand onto their fixed
-contacts. Where no posture reaches them, move contacts and hand together ("sliding contacts").
+`step` reads like this. Find new contact sets. Choose the most promising. Move the hand onto their
+fixed contacts. Where no posture reaches them, move contacts and hand together ("sliding contacts").
+A contact set is named by its index in the `Candidates`, its row.
 """
 
 import dataclasses
@@ -43,10 +44,11 @@ FEW_STEPS = 8
 
 
 def plan_objects(objects: Objects, deadline: float) -> Iterator[list[Grasps]]:
-    """Yield the grasps of each batch, one value for each cloud, executable ones first.
+    """Yield the grasps of each batch as a list, with the grasps of each object, executable ones
+    first.
 
-    They are in the upright frame. `meta` says how many initial guesses were planned so far. No
-    batch begins after `deadline`, a time of `time.monotonic`.
+    The grasps are in the upright frame. Their `meta` says how many initial guesses were planned so
+    far. No batch begins after `deadline` [s], a time of `time.monotonic`.
     """
     sizes = objects.sizes
     drawn = draw(objects, [size.starts for size in sizes if size.starts])
@@ -81,9 +83,11 @@ def plan_objects(objects: Objects, deadline: float) -> Iterator[list[Grasps]]:
 def step(
     objects: Objects, rows: Candidates, tried: int, turn: int, last: bool
 ) -> tuple[Candidates, Grasps, CloudIndex]:
-    """Try at most `tried` further rows of each cloud.
+    """Return all contact sets after at most `tried` further ones of each object were tried.
 
-    Returns all rows, the grasps of those that ended now, and the cloud of each grasp.
+    Three results are returned: all contact sets, the grasps of those that ended now, and the index
+    of each grasp's object. `turn` is the number of the batch, from 1, and `last` says whether it is
+    the last one.
     """
     if objects.request.mode != "joint":
         grasps = solve_all(objects, rows)
@@ -101,9 +105,11 @@ def step(
 def try_first(
     objects: Objects, rows: Candidates, fresh: Int[Tensor, "k"]
 ) -> tuple[Candidates, Int[Tensor, "e"]]:
-    """Try rows with few solver steps, for an early grasp; return all rows, and those that ended.
+    """Return all contact sets after some were tried with few solver steps, and the indices of those
+    that ended.
 
-    For a cloud that has no grasp by then, all steps are taken at once.
+    This gives an early grasp. For an object that has no grasp by then, all steps are taken at once.
+    `fresh` are the indices of the contact sets to try.
     """
     rows, solved = solve_fixed(objects, rows, fresh, FEW_STEPS, Row.BEGUN)
     missing = without(rows, solved, len(objects))
@@ -119,10 +125,12 @@ def try_fully(
     before: Int[Tensor, "d"],
     last: bool,
 ) -> tuple[Candidates, Int[Tensor, "e"]]:
-    """Try rows with all solver steps, then with sliding contacts; return all rows, and the ended.
+    """Return all contact sets after some were tried with all solver steps, and the indices of those
+    that ended.
 
-    `before` are rows that ended in this batch already. Sliding has a fixed cost. So it is solved in
-    the last batch, and for a cloud without any grasp in this batch.
+    `now` are the indices of the contact sets to try, and `before` of those that ended in this batch
+    already. Contacts that no posture reaches may slide with the hand. Sliding has a fixed cost. So
+    it is solved in the `last` batch, and for an object without any grasp in this batch.
     """
     clouds = len(objects)
     rows, solved = solve_fixed(objects, rows, now, ITERATIONS, Row.STUCK)
@@ -137,16 +145,21 @@ def try_fully(
 
 
 def without(rows: Candidates, solved: Int[Tensor, "k"], clouds: int) -> Bool[Tensor, "c"]:
-    """Return a mask of the clouds that have no row among those solved."""
+    """Return a mask of the c objects of which no contact set is in `solved`.
+
+    `solved` are indices of contact sets, and `clouds` is the number c of objects.
+    """
     return torch.bincount(rows.cloud[solved], minlength=clouds) == 0
 
 
 def solve_fixed(
     objects: Objects, rows: Candidates, now: Int[Tensor, "k"], steps: int, failed: Row
 ) -> tuple[Candidates, Int[Tensor, "s"]]:
-    """Move the hand onto the fixed contacts of some rows; return all rows, and those solved.
+    """Return all contact sets after the hand moved onto the fixed contacts of some, and the indices
+    of those solved.
 
-    The others keep their best failed grasp and get the status `failed`.
+    `now` are the indices of the contact sets to try with at most `steps` solver steps. Those
+    without a grasp keep their best failed grasp, and get the status `failed`.
     """
     contacts, certificate, seeds = rows.select(now)
     reach = objects.reach(contacts, certificate, rows.cloud[now])
@@ -159,9 +172,11 @@ def solve_fixed(
 def solve_with_sliding(
     objects: Objects, rows: Candidates, now: Int[Tensor, "k"]
 ) -> tuple[Candidates, Int[Tensor, "k"]]:
-    """Move contacts and hand of some rows together; return all rows, and those that ended: all.
+    """Return all contact sets after contacts and hand moved together for some, and the indices of
+    these.
 
-    A row without a grasp keeps its best failed one.
+    `now` are the indices of the contact sets to try. All of them end; those without a grasp keep
+    their best failed one.
     """
     contacts, certificate, seeds = rows.select(now)
     attempts = Attempts(torch.ones_like(certificate.closed), executable)
@@ -174,7 +189,7 @@ def solve_with_sliding(
 
 
 def solve_all(objects: Objects, rows: Candidates) -> Grasps:
-    """Return grasps of all rows, solved contacts first, or as in the paper."""
+    """Return grasps of all contact sets, with the solver of mode "paper" or "contact_first"."""
     reach = objects.reach(rows.contacts, rows.certificate, rows.cloud)
     solve = solve_as_paper if objects.request.mode == "paper" else solve_contact_first
     return solve(reach, rows.seeds)

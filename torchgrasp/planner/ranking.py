@@ -33,10 +33,11 @@ BEST = 20
 
 
 def rank(objects: Objects, grasps: Grasps, cloud: CloudIndex) -> list[Grasps]:
-    """Return the grasps of each cloud in the request's order, scored by log-odds, on the CPU.
+    """Return the grasps of each object in the request's order, scored by log-odds, on the CPU.
 
-    If the object cannot be lifted out of its surroundings, its grasps get the status `BURIED`.
-    Grasps of less success than a promise asks for get `NO_PROMISE`.
+    `cloud` is the index of each grasp's object. If the object cannot be lifted out of its
+    surroundings, its grasps get the status `BURIED`. Grasps of less success than a promise needs
+    get `NO_PROMISE`.
     """
     request = objects.request
     if objects.buried:
@@ -65,7 +66,11 @@ def rank(objects: Objects, grasps: Grasps, cloud: CloudIndex) -> list[Grasps]:
 def predict(
     objects: Objects, grasps: Grasps, cloud: CloudIndex
 ) -> tuple[Float[Tensor, "g"], Tensor]:
-    """Return the log-odds of success of g grasps, and a mask of those that trials support."""
+    """Return the log-odds of success of g grasps, and a mask of the grasps for which trials support
+    them.
+
+    `cloud` is the index of each grasp's object.
+    """
     task = objects.request.grasp_task
     spec = objects.spec
     features = measure_grasps(
@@ -86,7 +91,11 @@ def predict(
 
 
 def prove_resistance(objects: Objects, grasps: Grasps, cloud: CloudIndex) -> Grasps:
-    """Return grasps with the loads that they resist; executable ones that resist too little fail."""
+    """Return grasps whose certificates hold the loads that they resist.
+
+    Executable grasps that resist less than the task's loads get the status `NOT_RESISTED`. `cloud`
+    is the index of each grasp's object.
+    """
     if objects.loads is None:
         return grasps
     contacts = grasps.contacts
@@ -103,14 +112,16 @@ def prove_resistance(objects: Objects, grasps: Grasps, cloud: CloudIndex) -> Gra
 
 
 def rank_together(batches: Sequence[Grasps], ranking: Ranking) -> Grasps:
-    """Return the grasps of all batches, executable ones first, with the last batch's metadata."""
+    """Return the grasps of all batches in the order `ranking`, executable ones first, with the last
+    batch's metadata.
+    """
     ranked = by_success(join(batches))
     ranked = ranked if ranking == "success" else rank_by_variance(ranked)
     return dataclasses.replace(ranked, meta=batches[-1].meta)
 
 
 def expected_success(grasps: Grasps, best: int = BEST) -> float:
-    """Return the mean predicted success of the `best` best executable grasps.
+    """Return the mean predicted success, in [0, 1], of the `best` best executable grasps.
 
     Each grasp that is missing counts as 0.
     """

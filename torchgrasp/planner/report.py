@@ -1,5 +1,5 @@
-"""What the planner tells an observer: each stage once, with the results of all batches, and the end
-of each batch.
+"""Reports of the planner to an observer: each stage once, with the results of all batches, and the
+end of each batch.
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ from torchgrasp.values.planning import Grasps, format_success
 
 @dataclasses.dataclass(frozen=True)
 class ReportNumbers:
-    """Numbers of what is told of the estimated shape."""
+    """The numbers of the report on the estimated shape."""
 
     vertices: int = 500
     """The surface is judged at about so many vertices, at most twice as many."""
@@ -34,8 +34,8 @@ class Report:
     """
 
     def __init__(self, objects: Objects, batches: int, planned: int) -> None:
-        """Take the number of all `batches`, and the number `planned` of those batches that plan new
-        initial guesses.
+        """Prepare the report of a plan of `batches` batches, of which `planned` plan new initial
+        guesses.
         """
         self.objects = objects
         self.batches = batches
@@ -61,8 +61,9 @@ class Report:
         self.objects.tell("shape", f"{len(shape.x)} points, {told}", shape)
 
     def note(self, stage: str, value: Any, offered: int = 0) -> None:
-        """Store the result of one stage of one batch; `offered` is how many contact sets stage
-        "certify" checked.
+        """Store the result of one stage of one batch, and report the stage after its last batch.
+
+        `offered` is the number of contact sets that stage "certify" checked.
         """
         if not self.heard:
             return
@@ -78,8 +79,9 @@ class Report:
             self._tell(stage)
 
     def end_batch(self, grasps: Grasps, last: bool) -> None:
-        """Report that a batch has ended; if it is the `last` one, report the stages not yet
-        reported, too.
+        """Report that a batch has ended with the given grasps.
+
+        If it is the `last` one, the stages that are not yet reported are reported, too.
         """
         if not self.heard:
             return
@@ -106,6 +108,6 @@ class Report:
 
 
 def describe(counts: dict[Status, int]) -> str:
-    """Return how often each status occurs as one line of text, the successes first."""
+    """Return how often each status occurs, as one line of text that begins with the successes."""
     ordered = sorted(counts.items(), key=lambda pair: pair[0] is not Status.OK)
     return ", ".join(f"{n} {s.name.lower()}" for s, n in ordered) or "none"

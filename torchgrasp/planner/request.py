@@ -39,7 +39,7 @@ inside.
 @checked
 @dataclasses.dataclass(frozen=True)
 class Request:
-    """The checked arguments of one call of `plan_grasps`, which explains them."""
+    """The checked arguments of one call of `plan_grasps`, which explains them and their units."""
 
     cloud: PointCloud | Scene
     hand: Hand
@@ -61,8 +61,8 @@ class Request:
     time_budget: Budget | None = None
 
     def __post_init__(self) -> None:
-        """Raise `BadArgument` for an arm of another hand, no load, and a promise that no trials
-        support.
+        """Raise `BadArgument` for an arm of another hand, no load to resist, or a promise for a
+        displaced object.
         """
         if self.arm is not None and self.arm.hand_sha256 != self.hand.source.sha256:
             raise BadArgument(
@@ -76,14 +76,17 @@ class Request:
             raise BadArgument("promise", f"{self.promise:g} for a displaced object", "None")
 
     def tell(self, stage: str, message: str, value: Any) -> None:
-        """Report the result of a stage to the observer, if there is one."""
+        """Report a stage to the observer, if there is one: its name, a line of text, and its
+        result.
+        """
         if self.observer is not None:
             self.observer(stage, message, value)
 
     @property
     def contact_spec(self) -> ContactSpec:
-        """The given constraints on contacts, in the given regions; by default the constraints of
-        the planning mode.
+        """The constraints on contacts, with the regions of `keep` and `avoid`.
+
+        Without a given spec they are those of the planning mode.
         """
         spec = self.spec or (ContactSpec.paper() if self.mode == "paper" else ContactSpec())
         if self.keep is None and self.avoid is None:
@@ -99,21 +102,21 @@ class Request:
 
     @property
     def grasp_task(self) -> GraspTask:
-        """The task for which success is predicted."""
+        """The task for which success is predicted, by default `GraspTask()`."""
         return GraspTask() if self.task is None else self.task
 
     @property
     def hands(self) -> tuple[Hand, ...]:
-        """One hand for each set of fingers that may grasp."""
+        """The hands of the plan, one for each set of fingers that may grasp."""
         return finger_sets(self.hand, self.fingers, self.mode)
 
 
 def finger_sets(hand: Hand, fingers: Fingers | None, mode: Mode = "joint") -> tuple[Hand, ...]:
     """Return one hand for each set of fingers to plan with.
 
-    "auto" gives all sets that the hand declares; a name or number gives that set; None gives the
-    hand as it is. Raises `BadArgument` for fingers that the hand does not have, and for more than
-    three fingers, or "auto", in a mode other than "joint".
+    `fingers` "auto" gives all sets that the hand declares; a name or number gives that set; None
+    gives the hand as it is. Raises `BadArgument` for fingers that the hand does not have, and for
+    more than three fingers, or "auto", in a mode other than "joint".
     """
     if fingers == "auto":
         if mode != "joint":

@@ -1,4 +1,7 @@
-"""The rows of a plan: contact sets that the hand tries, and what happened to each, as a status."""
+"""The contact sets of a plan that the hand tries, and the state of each in the search for grasps.
+
+A contact set is named by its row, which is its index in the `Candidates`.
+"""
 
 import dataclasses
 import enum
@@ -27,10 +30,10 @@ from torchgrasp.values.planning import Certificate, ContactPlan, Contacts, Grasp
 
 
 class Row(enum.IntEnum):
-    """What happened to a row so far."""
+    """The state of a contact set in the search for grasps."""
 
     SEEDED = 0
-    """It has force closure and initial hand postures, and waits."""
+    """The contact set has force closure and initial hand postures, and waits to be tried."""
     BEGUN = 1
     """A few solver steps on its fixed contacts failed."""
     STUCK = 2
@@ -46,15 +49,15 @@ class ChoiceNumbers:
     likely: int = 2
     """Farthest-point sampling takes n sets from the `likely` * n sets of the lowest cost."""
     weak: float = 1e6
-    """Cost of sets that resist less than the task's loads: above all other costs."""
+    """Cost of contact sets that resist less than the task's loads: above all other costs."""
     tried: int = 2
-    """Seeds of a set that its cost looks at: as many as the solver refines."""
+    """Initial postures of a contact set that count for its cost: as many as the solver refines."""
     lever: float = 0.3
     """Weight of the load's lever arm beside the fingertips' errors, both as logarithms."""
     short: float = 0.1
-    """Lever arm [in object sizes] below which a shorter one hardly counts."""
+    """Lever arm (no unit, see `lever_arm`) below which a shorter one hardly counts."""
     touching: float = 1e-3
-    """Squared errors [mm2] below which seeds count as equally near."""
+    """Sum of squared errors [mm2] below which initial postures count as equally near."""
 
 
 CHOICE = ChoiceNumbers()
@@ -62,13 +65,21 @@ CHOICE = ChoiceNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class Candidates:
-    """The rows of a plan: b contact sets with force closure, and what happened to each.
+    """The b contact sets of a plan that have force closure, and the state of each.
 
-    `load` is the wrench [N, N m] of the task, about the centroid, that the greatest forces resist
-    the least. `seeds` are initial hand postures, each with the index of its row. `cost` ranks rows
-    that wait. `cloud` is the index of the row's object, `status` a `Row`, and `turn` the number of
-    the batch in which it was first tried, or 0. `grasp` is the index of a tried row's best grasp in
-    `grasps`, or -1.
+    Args:
+        contacts: the contact sets, points [m] in the upright frame.
+        certificate: the proofs of force closure.
+        seeds: initial hand postures; `seeds.row` is the index of each one's contact set.
+        load: the wrench [N, N m] of the task, about the centroid of the contacts, that the greatest
+            forces resist the least; 0 without loads.
+        cost: cost (no unit; less is better) by which contact sets that wait are chosen.
+        cloud: index of each contact set's object.
+        status: a `Row` for each contact set.
+        turn: number of the batch in which each contact set was first tried, from 1; 0 if it was
+            not.
+        grasp: index in `grasps` of each tried contact set's best grasp, or -1.
+        grasps: the best grasps of the tried contact sets; None if there are none yet.
     """
 
     contacts: Contacts
@@ -92,7 +103,10 @@ class Candidates:
         cost: Float[Tensor, "b"],
         cloud: CloudIndex,
     ) -> "Candidates":
-        """Return rows that wait."""
+        """Return contact sets that wait to be tried.
+
+        The arguments are the fields of the same name.
+        """
         zero = torch.zeros_like(cloud)
         return cls(
             contacts, certificate, seeds, load, cost, cloud, zero + Row.SEEDED, zero, zero - 1
@@ -103,7 +117,11 @@ class Candidates:
         return len(self.cloud)
 
     def find(self, status: Row, clouds: Bool[Tensor, "c"] | None = None) -> Int[Tensor, "k"]:
-        """Return the rows with a status, of some clouds, in the order in which they were tried."""
+        """Return the indices of the contact sets with a status, in the order in which they were
+        tried.
+
+        `clouds` is a mask of c objects whose contact sets count; by default all count.
+        """
         chosen = self.status == status
         if clouds is not None:
             chosen = chosen & clouds[self.cloud]
@@ -111,7 +129,11 @@ class Candidates:
         return rows[torch.argsort(self.turn[rows], stable=True)]
 
     def select(self, rows: Int[Tensor, "k"]) -> tuple[Contacts, Certificate, IKSeeds]:
-        """Return contacts, certificates and seeds of k rows; the seeds' rows count these k."""
+        """Return contacts, certificates and initial postures of the k contact sets with the indices
+        `rows`.
+
+        The `row` of the initial postures is an index among these k.
+        """
         number = rows.new_full((len(self),), -1)
         number[rows] = torch.arange(len(rows), device=rows.device)
         seeds = self.seeds[number[self.seeds.row] >= 0]
@@ -120,11 +142,17 @@ class Candidates:
         return self.contacts[rows], self.certificate[rows], seeds
 
     def begin(self, rows: Int[Tensor, "k"], turn: int) -> "Candidates":
-        """Return the rows after some of them were chosen in the batch `turn`."""
+        """Return the contact sets, with those of the indices `rows` marked as first tried in batch
+        number `turn`.
+        """
         return dataclasses.replace(self, turn=self.turn.index_fill(0, rows, turn))
 
     def put(self, rows: Int[Tensor, "k"], grasps: Grasps, status: Int[Tensor, "k"]) -> "Candidates":
-        """Return the rows after `rows` got their best grasps so far, and a status each."""
+        """Return the contact sets, with the best grasp and the status of those with the indices
+        `rows` replaced.
+
+        `grasps` and `status` hold one grasp and one `Row` for each of the k indices.
+        """
         before = 0 if self.grasps is None else len(self.grasps)
         index = torch.arange(before, before + len(rows), device=rows.device)
         return dataclasses.replace(
@@ -135,13 +163,17 @@ class Candidates:
         )
 
     def best(self, rows: Int[Tensor, "k"]) -> Grasps:
-        """Return the best grasps of rows that were tried."""
+        """Return the best grasps of the contact sets with the indices `rows`, all of which were
+        tried.
+        """
         assert self.grasps is not None
         return self.grasps[self.grasp[rows]]
 
 
 def join_candidates(parts: Sequence[Candidates]) -> Candidates:
-    """Return several groups of rows as one group, in order; only the first may have been tried."""
+    """Return several groups of contact sets as one group, in order; only the first may have been
+    tried.
+    """
     first = 0
     seeds = list[IKSeeds]()
     for part in parts:
@@ -158,10 +190,12 @@ def join_candidates(parts: Sequence[Candidates]) -> Candidates:
 
 
 def draw(objects: Objects, sizes: Sequence[int]) -> Iterator[tuple[ContactPlan, CloudIndex]]:
-    """Yield for each batch the contact plan of its initial guesses, and the cloud of each row.
+    """Yield for each batch the contact plan of its initial guesses, and the index of each contact
+    set's object.
 
-    A CPU plans batch by batch. An accelerator plans all batches before the first, because each
-    launch costs it more than further rows.
+    `sizes` are the numbers of initial guesses in the batches, for each object. A CPU plans batch by
+    batch. An accelerator plans all batches before the first, because each launch costs it more than
+    further contact sets.
     """
     starts = torch.stack(objects.starts)  # (c, s, f, 3)
     clouds = len(objects)
@@ -195,11 +229,18 @@ def find_candidates(
     most: int,
     note: Callable[..., None],
 ) -> Candidates:
-    """Choose at most `most` planned contact sets of each cloud, far apart; return the closed ones.
+    """Return the contact sets with force closure among at most `most` planned ones of each object.
 
-    In mode "paper" with ranking "variance" all sets are chosen, the most certain first. `note` is
-    called with the results of the stages "plan", "certify" and "query". Sets that not even the
-    greatest forces could hold have failed.
+    The sets of an object are chosen far apart. In mode "paper" with ranking "variance" all sets are
+    chosen, the most certain first. Sets that not even the greatest forces could hold have failed.
+
+    Args:
+        objects: the objects of the plan.
+        plan: the planned contact sets.
+        cloud: index of each planned set's object.
+        most: largest number of sets that are chosen for each object.
+        note: function that is called with the name and the result of the stages "plan", "certify"
+            and "query".
     """
     request = objects.request
     load = plan.contacts.points.new_zeros(len(plan), 6)
@@ -228,7 +269,9 @@ def find_candidates(
 def _drop_weak(
     objects: Objects, plan: ContactPlan, cloud: CloudIndex, load: Float[Tensor, "b 6"]
 ) -> tuple[ContactPlan, Float[Tensor, "b 6"]]:
-    """Return the plan, in which sets that cannot resist the task have failed, and the worst loads."""
+    """Return the plan, in which sets that cannot resist the task have failed, and the worst load of
+    each set.
+    """
     assert objects.loads is not None
     rows = torch.nonzero(plan.status == Status.OK)[:, 0]
     points = plan.contacts.points[rows]
@@ -252,7 +295,9 @@ def _spread(plan: ContactPlan, cloud: CloudIndex, most: int, clouds: int) -> Int
 
 @checked
 def spread_rows(plan: ContactPlan, most: Count) -> Int[Tensor, "k"]:
-    """Return at most `most` successful rows of a plan that lie far apart, in ascending order."""
+    """Return the indices of at most `most` successful contact sets of a plan that lie far apart,
+    ascending.
+    """
     rows = torch.nonzero(plan.status == Status.OK)[:, 0]
     if len(rows) <= most:
         return rows
@@ -262,7 +307,8 @@ def spread_rows(plan: ContactPlan, most: Count) -> Int[Tensor, "k"]:
 
 
 def find_seeds(objects: Objects, contacts: Contacts, cloud: CloudIndex) -> IKSeeds:
-    """Return initial hand postures near contacts.
+    """Return initial hand postures near the contacts; `cloud` is the index of each contact set's
+    object.
 
     In mode "joint" they are random postures, in other modes those of the learned model.
     """
@@ -276,11 +322,13 @@ def find_seeds(objects: Objects, contacts: Contacts, cloud: CloudIndex) -> IKSee
 
 
 def with_costs(objects: Objects, found: Candidates) -> Candidates:
-    """Return the rows with their costs: large if the hand misses them, or the load's arm is long.
+    """Return the contact sets with their costs (no unit; less is better).
 
-    If grasps must resist loads, the seeds in which the fingers resist the most come first, and rows
-    without a seed that resists all loads cost more than all other rows. A row without seeds has an
-    infinite cost.
+    A cost is the logarithm of the least sum of squared errors [mm2] of the first `numbers.tried`
+    initial postures. To it is added `numbers.lever` times the logarithm of the load's lever arm. A
+    contact set without initial postures has an infinite cost. If grasps must resist loads, the
+    postures in which the fingers resist the most come first. Then sets without a posture that
+    resists all loads cost more than all other sets.
     """
     contacts = found.contacts
     seeds = found.seeds
@@ -307,10 +355,11 @@ def with_costs(objects: Objects, found: Candidates) -> Candidates:
 
 
 def choose(rows: Candidates, most: int, clouds: int) -> Int[Tensor, "k"]:
-    """Return at most `most` of each cloud's cheapest waiting rows, far from each other.
+    """Return the indices of at most `most` waiting contact sets of each object, of low cost and far
+    from each other.
 
-    They lie far from rows that were chosen before, too. Farthest-point sampling runs for all clouds
-    at once, on their device.
+    They lie far from contact sets that were chosen before, too. `clouds` is the number of objects.
+    Farthest-point sampling runs for all objects at once, on their device.
     """
     if not len(rows):
         return rows.cloud
@@ -343,16 +392,18 @@ def choose(rows: Candidates, most: int, clouds: int) -> Int[Tensor, "k"]:
 
 
 def _are_likely(cost: Float[Tensor, "*c m"], most: int) -> Bool[Tensor, "*c m"]:
-    """Return for sorted costs a mask of rows to choose from.
+    """Return for ascending costs of m contact sets a mask of those to choose from.
 
-    Beyond the first `most` only those that resist the task's loads are.
+    Beyond the first `most`, only contact sets that resist the task's loads are chosen from.
     """
     needed = torch.arange(cost.shape[-1], device=cost.device) < most
     return torch.isfinite(cost) & ((cost < CHOICE.weak) | needed)
 
 
 def _table(cloud: CloudIndex, clouds: int) -> tuple[Int[Tensor, "c m"], Bool[Tensor, "c m"]]:
-    """Return the rows of each cloud in their order, and a mask of the places that hold one."""
+    """Return the indices of the contact sets of each object, in their order, and a mask of the
+    entries that hold one.
+    """
     count = torch.bincount(cloud, minlength=clouds)
     table = cloud.new_zeros(clouds, int(count.max()))
     table[cloud, rank_in_group(cloud)] = torch.arange(len(cloud), device=cloud.device)
@@ -360,13 +411,18 @@ def _table(cloud: CloudIndex, clouds: int) -> tuple[Int[Tensor, "c m"], Bool[Ten
 
 
 def by_cloud(cloud: CloudIndex, clouds: int) -> list[Int[Tensor, "k"]]:
-    """Return the indices of the rows of each cloud, in their order, on the CPU."""
+    """Return for each object the indices of its contact sets, ascending, on the CPU.
+
+    `cloud` is the index of each contact set's object, and `clouds` the number of objects.
+    """
     cloud = cloud.cpu()
     count = torch.bincount(cloud, minlength=clouds)
     return list(torch.argsort(cloud, stable=True).split(count.tolist()))
 
 
 def sorted_points(contacts: Contacts) -> Float[Tensor, "b d"]:
-    """Return each contact set as one vector of 3 f coordinates, its contacts sorted by height."""
+    """Return each contact set as one vector of d = 3 f coordinates [m], its contacts sorted by
+    height.
+    """
     order = torch.argsort(contacts.points[..., 2], dim=1, stable=True)
     return contacts.points.gather(1, order[..., None].expand(-1, -1, 3)).flatten(1)

@@ -1,4 +1,6 @@
-"""The plan of one request: its batches, joined or one by one; of sets of fingers the best set's."""
+"""The plan of one request: all batches together, or one by one. With several sets of fingers, the
+best set's plan counts.
+"""
 
 import dataclasses
 import math
@@ -30,12 +32,14 @@ LIKELY = 0.5
 
 
 def plan_request(request: Request) -> Grasps:
-    """Plan all batches; return their executable grasps, best first, and then the failed grasps."""
+    """Return the grasps of a request: the executable ones, best first, and then the failed ones."""
     return finish(request, list(_plan_batches(request)))
 
 
 def stream_request(request: Request) -> Iterator[Grasps]:
-    """Plan in batches; yield the executable grasps of each batch that has any, the best first."""
+    """Yield the executable grasps of each batch that has any, the best first, as soon as the batch
+    ends.
+    """
     batches = list[Grasps]()
     for grasps in _plan_batches(request):
         batches.append(grasps)
@@ -46,7 +50,7 @@ def stream_request(request: Request) -> Iterator[Grasps]:
 
 
 def finish(request: Request, batches: list[Grasps]) -> Grasps:
-    """Rank the grasps of all batches together, report them to the observer, and return them."""
+    """Return the grasps of all batches, ranked together, and report them to the observer."""
     grasps = rank_together(batches, request.order)
     counts = describe(count_status(grasps.status))
     request.tell("refine", f"{len(grasps)} refined: {counts}", grasps)
@@ -54,18 +58,25 @@ def finish(request: Request, batches: list[Grasps]) -> Grasps:
 
 
 def plan_hand(objects: Objects, deadline: float) -> Iterator[Grasps]:
-    """Yield the grasps of each batch of a single object, with relaxed constraints if need be."""
+    """Yield the grasps of each batch of a single object, with relaxed constraints if no grasp is
+    likely to hold.
+
+    No batch begins after `deadline` [s], a time of `time.monotonic`.
+    """
     batches = (grasps for (grasps,) in plan_objects(objects, deadline))
     yield from relax(objects, batches, deadline)
 
 
 def relax(objects: Objects, batches: Iterator[Grasps], deadline: float) -> Iterator[Grasps]:
-    """Yield batches of a single object; if no grasp is likely to hold, plan with relaxed constraints.
+    """Yield batches of a single object; if no grasp is likely to hold, plan also with relaxed
+    constraints.
 
     A contact set must be flat within the largest of `FLAT_RADII` that the object allows, which can
-    leave few contacts. With relaxed constraints the hand may begin above its pose, too, and go down
-    while it closes (`opened_pose`). The failed grasps are those of the last constraints
-    (`ContactSpec.relaxed`).
+    leave few contacts. With relaxed constraints (`ContactSpec.relaxed`) the hand may begin above
+    its pose, too, and go down while it closes (`opened_pose`). Of earlier constraints, the batches
+    up to the last one with an executable grasp are kept; of the last constraints, all batches.
+    `batches` are those of the first constraints. After `deadline` [s], a time of `time.monotonic`,
+    constraints are no longer relaxed.
     """
     failed = list[Grasps]()
     best = 0.0
@@ -92,7 +103,9 @@ def relax(objects: Objects, batches: Iterator[Grasps], deadline: float) -> Itera
 
 
 def _plan_batches(request: Request) -> Iterator[Grasps]:
-    """Yield the grasps of each batch in the request's frame; sets of fingers give one batch."""
+    """Yield the grasps of each batch in the request's frame; several sets of fingers give one
+    batch.
+    """
     deadline = math.inf
     if request.time_budget is not None:
         deadline = time.monotonic() + request.time_budget

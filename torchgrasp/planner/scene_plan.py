@@ -29,11 +29,17 @@ from torchgrasp.values.specs import ContactSpec
 @checked
 @dataclasses.dataclass(frozen=True)
 class ThingPlan(Value):
-    """The executable grasps of one object in a scene, best first, or the reason why there are none.
+    """The plan of one object in a scene: its executable grasps, or the reason why there are none.
 
-    `success` is the predicted probability that the best grasp succeeds: 0 without grasps, NaN if it
-    is unknown. `shape` is the estimated shape. If the image shows that the object cannot be
-    grasped, `status` is the reason, and nothing was planned.
+    Args:
+        label: label of the object in the scene.
+        success: predicted probability that the best grasp succeeds: 0 without grasps, NaN if it is
+            unknown.
+        grasps: executable grasps, best first; None if there are none.
+        reason: sentence that says why there are no grasps.
+        shape: the estimated shape; None without grasps.
+        status: the reason why the image shows that the object cannot be grasped, or `TOO_VAGUE` for
+            a shape that is too uncertain; otherwise `OK`.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> grasp = load_shipped_grasp("jug", "allegro")
@@ -52,8 +58,9 @@ class ThingPlan(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class ScenePlan(Value):
-    """The plans of all objects in a scene, most probable success first; objects without a grasp
-    come last.
+    """The plans of all objects in a scene, those of most probable success first.
+
+    `things` holds one plan for each object; objects without a grasp come last.
 
     >>> empty = ThingPlan(1, success=0.0, reason="too flat")
     >>> ScenePlan((empty,)).best is None
@@ -64,7 +71,7 @@ class ScenePlan(Value):
 
     @property
     def best(self) -> ThingPlan | None:
-        """The object to grasp first; None if no object has a grasp."""
+        """The plan of the object to grasp first; None if no object has a grasp."""
         return next((thing for thing in self.things if thing.grasps is not None), None)
 
 
@@ -103,8 +110,9 @@ def plan_scene(
         seed: random seed.
         enough: predicted success of a grasp, in [0, 1], at which the remaining objects are not
             planned.
-        options: see `plan_grasps`; `fingers` "auto" chooses for each object. `hand_of` loads the
-            hand of grasps.
+        fingers: as in `plan_grasps`; "auto" chooses for each object, and `hand_of` loads the hand
+            of its grasps.
+        task, promise, reachable, arm, keep, avoid, resist: as in `plan_grasps`.
 
     >>> from torchgrasp import load_hand, load_scene
     >>> plan = plan_scene(load_scene(), load_hand("barrett"), starts=30, enough=0.5)
@@ -152,8 +160,8 @@ def plan_scene(
 
 
 def _plan_thing(scene: Scene, plan: Callable[..., Grasps]) -> ThingPlan:
-    """Plan grasps of a scene's target object with the function `plan`; without a grasp, return the
-    reason.
+    """Return the plan of a scene's target object by the function `plan`, or the reason why it has
+    no grasp.
     """
     assert scene.target is not None
     stages: dict[str, Any] = {}

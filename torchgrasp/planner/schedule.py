@@ -19,27 +19,34 @@ class ScheduleNumbers:
     tried_in_scene: int = 160
     """The same in a scene: fewer, because there the hand tries more postures for each set."""
     offered: int = 4
-    """Planned rows for each row that the hand tries."""
+    """Planned contact sets for each one that the hand tries."""
 
 
 SCHEDULE = ScheduleNumbers()
 
 
 class BatchSize(NamedTuple):
-    """The size of one batch: new initial guesses, and contact sets that the hand tries."""
+    """The numbers of one batch: `starts` new initial guesses, and `tried` contact sets that the
+    hand tries.
+    """
 
     starts: int
     tried: int
 
 
 def batch_sizes(mode: Mode, starts: int, crowded: bool) -> list[BatchSize]:
-    """Return the sizes of the batches; modes other than "joint" have one. `crowded`: in a scene."""
+    """Return the sizes of the batches of a plan with `starts` initial guesses.
+
+    Modes other than "joint" have one batch. `crowded` says whether the object is in a scene, where
+    the hand tries fewer contact sets.
+    """
     most = SCHEDULE.tried_in_scene if crowded else SCHEDULE.tried
     return schedule(starts, most) if mode == "joint" else [BatchSize(starts, most)]
 
 
 def schedule(starts: int, most: int, numbers: ScheduleNumbers = SCHEDULE) -> list[BatchSize]:
-    """Return batches with `starts` guesses and `most` contact sets in all.
+    """Return the sizes of batches with `starts` initial guesses, and `most` contact sets for the
+    hand, in all.
 
     A small remainder joins the last batch.
     """
