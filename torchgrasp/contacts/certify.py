@@ -91,10 +91,11 @@ class _Proof(torch.autograd.Function):
 
     @staticmethod
     def forward(wrench: Wrenches, flat: Bool[Tensor, "b"]) -> tuple[Tensor, ...]:
-        """Return the fields of the certificate, then phi and the multipliers; NaN for wrenches that
-        are not finite.
+        """Return the fields of the certificate, phi and the multipliers of contact sets with m
+        wrenches each.
 
-        `flat` marks sets whose contacts lie on a line or in a point.
+        They are NaN for a `wrench` that is not finite. `flat` marks sets whose contacts lie on a
+        line or in a point.
         """
         b, m, _ = wrench.shape
         margin, ratio, residual = (wrench.new_full((b,), torch.nan) for _ in range(3))

@@ -44,10 +44,10 @@ points.
 
 @dataclasses.dataclass(frozen=True)
 class LinePosterior(Batch):
-    """The joint Gaussian of signed distance d and its gradient w along the lines x + t n through
-    the contacts.
+    """The joint Gaussian of signed distance d and its gradient w along lines through the contacts.
 
-    Lengths are in normalised units; w and `slope` have no unit.
+    The line of a contact x with the normal n holds the points x + t n. Lengths are in normalised
+    units; w and `slope` have no unit.
     """
 
     points: Vectors  # planned contacts x (b, f, 3)

@@ -164,7 +164,7 @@ def check_feasibility(shape: ShapeLike, problem: ContactProblem, points: Vectors
     """Return contact sets at normalised `points` (b, f, 3) as a plan, after a check of all
     constraints.
 
-    The `status` of a set is that of the first constraint which it violates.
+    The `status` of a set is that of the first constraint of `problem` which it violates.
     """
     spec = problem.spec
     scale = shape.scale
@@ -212,8 +212,8 @@ def check_feasibility(shape: ShapeLike, problem: ContactProblem, points: Vectors
 def within(problem: ContactProblem, points: Float[Tensor, "*b 3"]) -> Bool[Tensor, "*b"]:
     """Return a mask of the normalised points that lie inside the region where contacts may be.
 
-    Points within rounding (`BORDER`) of the region's surface are not inside. Without a region all
-    points are inside.
+    `problem.beyond` is the signed distance from the region. Points within rounding (`BORDER`) of
+    its surface are not inside. Without a region all points are inside.
     """
     if problem.beyond is None:
         return torch.ones_like(points[..., 0], dtype=torch.bool)

@@ -131,12 +131,12 @@ def cone_edges(
 def wrenches(
     points: Vectors, normals: Vectors, friction: float, edges: int = 8
 ) -> Float[Tensor, "b f e 6"]:
-    """Return the wrench (force, then torque) of each edge of all linearised friction cones: w in
-    Eq. (13) of the paper.
+    """Return the wrench (force, then torque) of each edge of all linearised friction cones.
 
-    `points` and outward unit `normals` have the shape (b, f, 3). The edges have normal component 1
-    and no unit. The torque is about the contacts' centroid, and lengths are divided by the
-    contacts' root-mean-square radius.
+    They are w in Eq. (13) of the paper. `points` and outward unit `normals` have the shape (b, f,
+    3), and `friction` is the coefficient of friction. The edges have normal component 1 and no
+    unit. The torque is about the contacts' centroid, and lengths are divided by the contacts'
+    root-mean-square radius.
     """
     force = cone_edges(normals, tangents(points, normals), friction, edges)
     arm = scaled_arms(points)[:, :, None]
@@ -151,8 +151,10 @@ def with_torque(force: Float[Tensor, "*b 3"], arm: Float[Tensor, "*b 3"]) -> Flo
 
 
 def rank_ratio(wrench: Float[Tensor, "b f e 6"]) -> Float[Tensor, "b"]:
-    """Return for each contact set the ratio of the smallest to the largest singular value of its
-    wrench matrix (6 x f e).
+    """Return the ratio of the smallest to the largest singular value of each contact set's wrench
+    matrix.
+
+    The matrix (6 x f e) holds the wrenches of the e edges of f friction cones.
     """
     values = torch.linalg.svdvals(wrench.flatten(1, 2))
     return values[:, -1] / values[:, 0]
@@ -268,7 +270,7 @@ def first_balance(points: Vectors, normals: Vectors, friction: float) -> Coeffic
     """Return coefficients that balance the wrenches of m = 4 f cone edges with the greatest margin.
 
     They are arbitrary if no coefficients balance them. `points` and outward unit `normals` have the
-    shape (b, f, 3).
+    shape (b, f, 3), and `friction` is the coefficient of friction.
     """
     return solve_closure_lp(_first_wrenches(points, normals, friction))[0]
 
@@ -369,7 +371,11 @@ def _balances(wrench: Wrenches, phi: Coefficients) -> Bool[Tensor, "b"]:
 
 
 def residual_of(wrench: Wrenches, phi: Coefficients) -> Float[Tensor, "b"]:
-    """Return the largest absolute number in the sum of m wrenches with the coefficients `phi`."""
+    """Return the largest absolute number in the sum of the m wrenches, each multiplied by its
+    coefficient in `phi`.
+
+    `wrench` holds the wrenches of b contact sets; like phi they have no unit.
+    """
     return (phi[:, None] @ wrench)[:, 0].abs().amax(-1)
 
 

@@ -120,8 +120,8 @@ def plan_chunk(
 ) -> ContactPlan:
     """Return the contact plan from initial guesses on the surface, one contact set for each guess.
 
-    `first` (b, f, 3) are the guesses in normalised units, and `stages` the solver's stages before
-    the last one, `FINISH`.
+    `problem` holds the constraints, and `first` (b, f, 3) the guesses in normalised units. `stages`
+    are the solver's stages before the last one, `FINISH`.
     """
     state = start_state(shape, first)
     for stage in (*stages, FINISH):

@@ -92,8 +92,9 @@ def rows_of(shape: AnyShape, rows: Int[Tensor, "k"]) -> AnyShape:
 
 
 def walls_of(shape: AnyShape) -> tuple[AnyShape, ...]:
-    """Return the surfaces of a shape as shapes: the outer and inner wall of an open vessel, else
-    the shape itself.
+    """Return the surfaces of a shape, each as a shape.
+
+    They are the outer and the inner wall of an open vessel, else the shape itself.
     """
     return getattr(shape, "walls", (shape,))
 
@@ -133,8 +134,10 @@ def triple_mean_jet(shape: ShapeLike, points: Vectors) -> MeanJet:
 
 @functools.cache
 def contact_pairs(fingertips: int, device: torch.device) -> Int[Tensor, "2 p"]:
-    """Return the indices of the two contacts of all p pairs: neighbours (i, i + 1) first, then (i,
-    i + 2).
+    """Return the indices of the two contacts of each of p pairs, for a number of fingertips.
+
+    The first row holds the first contacts, the second row the second ones. Neighbours (i, i + 1)
+    come first, then (i, i + 2).
     """
     order = [
         (i, (i + gap) % fingertips)
@@ -146,7 +149,7 @@ def contact_pairs(fingertips: int, device: torch.device) -> Int[Tensor, "2 p"]:
 
 @functools.cache
 def pull_signs(fingertips: int, device: torch.device) -> Float[Tensor, "f p"]:
-    """Return the sign of each contact i in each pair k, with one row for each contact.
+    """Return a sign for each contact i and each pair k of contacts, for a number of fingertips.
 
     It is 1 if the contact is the first of the pair, -1 if it is the second, and 0 if it is not in
     the pair.
@@ -178,7 +181,7 @@ class Constraints(Batch):
     come f friction cones (differences of cosines), then f variances (the excess over the limit,
     divided by the slope of the variance there). All further ones are normalised lengths: f domain
     limits, p distances between fingertips, with a table f heights, and with a region f distances
-    from it.
+    from it. `centre_by_x`, `surface_by_x` and `bounds_by_x` are the Jacobians of the three.
     """
 
     centre: Float[Tensor, "b 3"]
@@ -322,8 +325,8 @@ class ContactProblem:
     def constraints(self, points: Vectors, tension: Tensions, jet: SurfaceJet) -> Constraints:
         """Return the values of all constraints and their Jacobians for b contact sets.
 
-        `points` (b, f, 3) are the normalised contacts, and `jet` holds signed distance and variance
-        with their derivatives there.
+        `points` (b, f, 3) are the normalised contacts, and `tension` is that of each of p pairs of
+        contacts. `jet` holds signed distance and variance with their derivatives at the points.
         """
         b, f = points.shape[:2]
         unknowns = 3 * f + tension.shape[1]

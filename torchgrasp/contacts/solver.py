@@ -90,11 +90,11 @@ class State(Batch):
 
 @dataclasses.dataclass(frozen=True)
 class LinearConstraints(Linearisation):
-    """The linearised constraints of a contact sets: r weighted residuals, their weights, and the
-    Jacobian.
+    """The linearised constraints of a contact sets.
 
-    `jacobian` holds the derivatives of the constraints, without weights, by the u unknowns. The
-    weights have no unit; `Constraints` gives the units of the rest.
+    `residual` holds r constraints times their `weight` (no unit; `Constraints` gives the units of
+    the values). `jacobian` holds the derivatives of the constraints, without weights, by the u
+    unknowns.
     """
 
     residual: Float[Tensor, "a r"]
@@ -141,8 +141,8 @@ class Descent(Minimisation[State, LinearConstraints]):
     def step(self, model: LinearConstraints, damping: Damping) -> Steps:
         """Return each contact set's damped step, and whether it is long enough to go on.
 
-        A step has u numbers, and is NaN for a singular matrix. `damping` holds a number for each
-        set.
+        `model` is the linear model, and `damping` holds a number for each set. A step has u
+        numbers, and is NaN for a singular matrix.
         """
         jacobian = model.weighted_jacobian
         scale = jacobian.new_ones(1, jacobian.shape[2])
@@ -205,7 +205,10 @@ def promised_decrease(model: LinearConstraints, x: Step) -> Float[Tensor, "a"]:
 
 
 def descend(shape: ShapeLike, problem: ContactProblem, state: State, stage: Stage) -> State:
-    """Return the solver's state after one stage that begins with `state`."""
+    """Return the solver's state after one stage that begins with `state`.
+
+    `problem` holds the constraints, and `stage` their weights and the number of steps.
+    """
     return levenberg_marquardt(Descent(shape, problem, stage), state, stage.steps)[0]
 
 
@@ -223,8 +226,10 @@ def project(shape: ShapeLike, points: Float[Tensor, "b k 3"], steps: int) -> Flo
 
 
 def start_state(shape: ShapeLike, points: Vectors) -> State:
-    """Return the solver's first state at normalised contacts (b, f, 3), with equal tensions between
-    all pairs.
+    """Return the solver's first state at normalised contacts, with equal tensions between all
+    pairs.
+
+    `points` have the shape (b, f, 3).
     """
     return State(points, equal_tensions(points), triple_jet(shape, points))
 

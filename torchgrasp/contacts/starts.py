@@ -78,8 +78,8 @@ def start_chunks(starts: int) -> list[int]:
 class FlatCandidates(NamedTuple):
     """Constraints with a known `flat_radius`, and p candidate contacts where the surface is flat.
 
-    `candidates` are the normalised points (p, 3), and the outward unit normals (p, 3) there; None
-    if the surface need not be flat.
+    `spec` holds the constraints. `candidates` are the normalised points (p, 3), and the outward
+    unit normals (p, 3) there; None if the surface need not be flat.
     """
 
     spec: ContactSpec
@@ -92,9 +92,9 @@ def drawn_starts(
     """Yield random initial guesses on the surface in normalised units, `sizes[k]` contact sets at a
     time.
 
-    Without `spec.flatness` the guesses are drawn as in the paper (Sec. 6.2). With flatness they are
-    sets of candidate contacts, because the centroid of contacts on flat surface may lie far from
-    the object's centre.
+    Without flatness in the spec of `settled` the guesses are drawn as in the paper (Sec. 6.2). With
+    flatness they are sets of its candidate contacts, because the centroid of contacts on flat
+    surface may lie far from the object's centre.
     """
     spec, candidates = settled
     generator = torch.Generator().manual_seed(seed)
@@ -141,8 +141,10 @@ def settle_flatness(shape: ShapeLike, spec: ContactSpec, seed: int) -> FlatCandi
 def draw(
     shape: ShapeLike, spec: ContactSpec, size: tuple[int, int], generator: torch.Generator
 ) -> Float[Tensor, "_ f 3"]:
-    """Return random points on the sphere of `spec.start_radius`, in normalised units; `size` is
-    (contact sets, contacts of each).
+    """Return random points on the sphere of `spec.start_radius`, in normalised units.
+
+    `size` is the number of contact sets, and that of contacts in each. `generator` draws the
+    points.
     """
     points = unit(torch.randn(*size, 3, generator=generator, dtype=torch.float64, device="cpu"))
     return (spec.start_radius * points).to(device_of(shape))
@@ -153,7 +155,7 @@ def survey(
 ) -> Float[Tensor, "_ f 3"]:
     """Return points (normalised) all over the surface, from which candidates are chosen.
 
-    They come in sets of three. For a vessel, half of them are on each wall.
+    They come in sets of three. For a vessel, half of them are on each wall. `generator` draws them.
     """
     walls = walls_of(shape)
     triples = CANDIDATE_TRIPLES * (1 if spec.region is None else 4)  # few of them lie in a region
@@ -181,11 +183,11 @@ def draw_in(shape: ShapeLike, points: Vectors) -> Vectors:
 def qualify(
     shape: ShapeLike, spec: ContactSpec, points: Vectors
 ) -> tuple[Bool[Tensor, "b f"], Vectors]:
-    """Return a mask of the points at which a contact may lie, and the outward unit normals of the
-    surface at all points.
+    """Return a mask of the points at which a contact may lie, and the surface's normals at all
+    points.
 
-    `points` (b, f, 3) are normalised. A contact may lie on the surface, where its variance is low,
-    in the domain, above the table, and in the region.
+    `points` (b, f, 3) are normalised; the normals are outward unit vectors. A contact may lie on
+    the surface, where its variance is low, in the domain, above the table, and in the region.
     """
     problem = ContactProblem.of(shape, spec)
     distance, gradient = (
@@ -207,12 +209,12 @@ def candidate_rows(
     starts: int,
     generator: torch.Generator,
 ) -> tuple[Vectors, int]:
-    """Return random sets (b, f, 3) of candidate contacts, and how many of them have force closure
-    and are well separated.
+    """Return random sets (b, f, 3) of candidate contacts, and how many of them are good.
 
+    Good sets have force closure, and contacts far enough from each other, as `problem` demands.
     `points` (p, 3) are the normalised candidates, `normals` (p, 3) their outward unit normals, and
-    `starts` is the number b of sets. If too few of the drawn sets have force closure, the rest are
-    any candidates.
+    `starts` is the number b of sets. If too few of the drawn sets are good, the rest are any
+    candidates. `generator` draws the sets.
     """
     rows = []
     missing = starts

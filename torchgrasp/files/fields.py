@@ -59,8 +59,9 @@ class Field(NamedTuple):
         return self.refuse(f"{self.path}: {self.place or 'the file'} = {shown}", allowed)
 
     def entries(self, *required: str) -> "dict[str, Field]":
-        """Return the entries of a JSON object as fields, by name; raise the error of `wrong` if one
-        of the `required` names is missing.
+        """Return the entries of a JSON object as fields, by name.
+
+        Raises the error of `wrong` if the value is no object, or lacks one of the `required` names.
         """
         if not isinstance(self.value, dict):
             raise self.wrong("an object { }")
@@ -150,7 +151,8 @@ def _refuse_constant(name: str) -> float:
 def save_tensors(
     path: Path | str, kind: str, tensors: dict[str, Tensor], meta: dict[str, str]
 ) -> Path:
-    """Write tensors and metadata by name to a safetensors file of a `kind`; return its path.
+    """Write tensors and metadata (`meta`) by name to a safetensors file of a `kind`; return its
+    path.
 
     Raises `OutputError` if the file cannot be written.
     """
@@ -159,7 +161,7 @@ def save_tensors(
 
 
 def pack_tensors(kind: str, tensors: dict[str, Tensor], meta: dict[str, str]) -> bytes:
-    """Return the bytes of a safetensors file with tensors and metadata by name.
+    """Return the bytes of a safetensors file with tensors and metadata (`meta`) by name.
 
     The metadata also name the `kind` of the file and the version of its layout. Equal tensors and
     metadata give equal bytes.

@@ -346,7 +346,7 @@ def lexical_order(*keys: Tensor) -> Int[Tensor, "g"]:
 
 def rank_in_group(group: Int[Tensor, "g"], *keys: Tensor) -> Int[Tensor, "g"]:
     """Return the rank (from 0) of each row in its group, ascending by the first key, then by the
-    next keys.
+    next.
 
     `group` is the index of each row's group. Each key holds a number for each row (g,); without
     keys the order of the rows counts.
@@ -361,6 +361,8 @@ def rank_in_group(group: Int[Tensor, "g"], *keys: Tensor) -> Int[Tensor, "g"]:
 def named_tensors(value: Value, prefix: str = "") -> dict[str, Tensor]:
     """Return all tensors of a value and of the values in its fields by dotted name, such as
     `contacts.points`.
+
+    `prefix` is put before each name.
     """
     tensors: dict[str, Tensor] = {}
     for field in dataclasses.fields(value):  # pyright: ignore[reportArgumentType]
@@ -405,5 +407,7 @@ def count_status(status: Int[Tensor, "*b"]) -> dict[Status, int]:
 
 
 def check_whole(name: str, value: Any, low: int, high: int) -> None:
-    """Raise `BadArgument` unless a value is a whole number in [low, high]."""
+    """Raise `BadArgument` unless a value is a whole number in [low, high]. Errors call it by
+    `name`.
+    """
     read_number(name, value, int, Range(low, high))

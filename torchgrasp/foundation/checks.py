@@ -91,15 +91,16 @@ def checked(thing: Checked) -> Checked: ...
 @overload
 def checked(*, gradients: bool) -> Callable[[Checked], Checked]: ...
 def checked(thing: Any = None, *, gradients: bool = False) -> Any:
-    """Check the arguments of a function, or the fields of a dataclass when it is made, against
-    their annotations.
+    """Return a function, or the class of a value, that checks its arguments against their
+    annotations.
 
-    NumPy numbers become Python numbers. If an argument is a value, its fields are checked again. In
-    a method, a letter in a shape has the same size as in the fields of the object. A value without
-    `__post_init__` that the library makes from tensors is not checked. With `gradients` True, the
-    function is differentiable: it takes tensors that require a gradient, dual tensors and tensors
-    inside a transform of torch.func, which other functions refuse. Numbers inside torch.vmap and
-    arguments inside torch.compile are not checked. A wrong argument raises `BadArgument`.
+    It is used as a decorator. A class checks its fields when a value is made. NumPy numbers become
+    Python numbers. If an argument is a value, its fields are checked again. In a method, a letter
+    in a shape has the same size as in the fields of the object. A value without `__post_init__`
+    that the library makes from tensors is not checked. With `gradients` True, the function is
+    differentiable: it takes tensors that require a gradient, dual tensors and tensors inside a
+    transform of torch.func, which other functions refuse. Numbers inside torch.vmap and arguments
+    inside torch.compile are not checked. A wrong argument raises `BadArgument`.
     """
     if thing is None:
         return functools.partial(checked, gradients=gradients)

@@ -55,7 +55,8 @@ def run_as_they_end(
 ) -> Generator[tuple[int, Result | Status], None, None]:
     """Run tasks like `run_tasks`; yield the index and the result of each task as soon as it ends.
 
-    `workers` is the number of processes, and `limit` [s] the longest time of a task.
+    `function` is called with each task's arguments. `workers` is the number of processes, and
+    `limit` [s] the longest time of a task.
     """
     with contextlib.closing(_run(function, tasks, workers, limit)) as results:
         for number, ended in results:

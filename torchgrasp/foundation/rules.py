@@ -172,7 +172,7 @@ def fits(axes: list[str], shape: tuple[int, ...], sizes: dict[str, Any]) -> bool
 
 
 def check_dense(name: str, value: Tensor, gradients: bool) -> None:
-    """Raise `BadArgument` if a tensor is sparse, nested or meta, or has the negative bit.
+    """Raise `BadArgument` if the tensor `value` is sparse, nested or meta, or has the negative bit.
 
     Without `gradients` also a tensor that requires a gradient, or is inside torch.vmap, is refused.
     Errors call the tensor by `name`.
@@ -226,8 +226,9 @@ def is_known(value: Tensor) -> bool:
 
 
 def show(value: Any) -> str:
-    """Return a text that shows a wrong argument: a number or text itself, the shape and dtype of a
-    tensor, or the type.
+    """Return a short text that shows a wrong argument.
+
+    It is a number or text itself, the shape and dtype of a tensor, or else the name of the type.
     """
     if isinstance(value, Tensor):
         return f"a tensor of shape {tuple(value.shape)} and {value.dtype}"

@@ -106,8 +106,8 @@ class Funnel(Value):
     def of(cls, plan: ContactPlan, closed: Certificate, seeds: IKSeeds, grasps: Grasps) -> "Funnel":
         """Return the losses, counted in the results of four planning stages.
 
-        The results are those of the stages "plan", "certify" (only closed contact sets), "query"
-        and "refine".
+        `plan` is the result of stage "plan", `closed` that of "certify" (only closed contact sets),
+        `seeds` of "query", and `grasps` of "refine".
         """
         far = len(closed) - len(seeds.row.unique())
         stages = (
@@ -215,8 +215,9 @@ class Explanation(Value):
 
     @property
     def advice(self) -> str:
-        """A sentence about the best change and the best one that the user can make; if none helps,
-        about the worst stage.
+        """A sentence about the best change, and about the best one that the user can make.
+
+        If no change helps, it is about the stage that loses the most.
         """
         if self.funnel.executable:
             return f"There is a grasp: {self.funnel.executable} of {self.starts} starts ended in an executable one."

@@ -182,7 +182,7 @@ class Objects:
 
     @property
     def spec(self) -> ContactSpec:
-        """The constraints of the first object; the others differ from it only in the flat radius."""
+        """The constraints of the first object; the others differ only in the flat radius."""
         return self.specs[0]
 
     @property
@@ -230,7 +230,8 @@ class Objects:
     ) -> "Objects":
         """Return the same single object for another request, hand or contact constraints.
 
-        The arguments are those of `pose`.
+        `spec` holds constraints in the caller's frame, by default those of the request. `postures`
+        and `descends` are as in `pose`.
         """
         (object_,) = self.each
         return pose(object_, request, hand, self.model, spec, postures, descends)
@@ -271,8 +272,10 @@ class Objects:
         return with_arm(arm, self.hand, grasps, self.world, frame[2, :3])
 
     def tell(self, stage: str, message: str, value: Any) -> None:
-        """Report a stage to the observer: its name, a line of text, and its result in the caller's
-        frame.
+        """Report a stage to the observer.
+
+        `stage` is its name, `message` a line of text, and `value` its result, which is moved to the
+        caller's frame.
         """
         if self.request.observer is not None:
             self.request.observer(stage, message, self._moved(value))
@@ -395,7 +398,7 @@ def pose(
 
 
 def join_objects(parts: Sequence[Objects], device: torch.device) -> Objects:
-    """Return posed objects without scenes as one batch on a device."""
+    """Return single posed objects without scenes (`parts`) as one batch on a device."""
     first = parts[0]
     shape = ShapeBatch.of([part.each[0].shape for part in parts], device)
     rings = shape.scales.new_tensor([part.spec.ring_radius for part in parts])
@@ -479,6 +482,6 @@ def take_target(scene: Scene, seed: Seed) -> PointCloud:
 
 
 def digest(cloud: PointCloud) -> str:
-    """Return the SHA-256 of a cloud's points, by which the metadata of grasps identify the cloud."""
+    """Return the SHA-256 of a cloud's points; the metadata of grasps identify the cloud by it."""
     points = cloud.points.detach().cpu().double().contiguous().numpy()
     return hashlib.sha256(points.tobytes()).hexdigest()

@@ -85,9 +85,9 @@ def step(
 ) -> tuple[Candidates, Grasps, CloudIndex]:
     """Return all contact sets after at most `tried` further ones of each object were tried.
 
-    Three results are returned: all contact sets, the grasps of those that ended now, and the index
-    of each grasp's object. `turn` is the number of the batch, from 1, and `last` says whether it is
-    the last one.
+    `rows` are the contact sets before. Three results are returned: all contact sets, the grasps of
+    those that ended now, and the index of each grasp's object. `turn` is the number of the batch,
+    from 1, and `last` says whether it is the last one.
     """
     if objects.request.mode != "joint":
         grasps = solve_all(objects, rows)
@@ -109,7 +109,7 @@ def try_first(
     that ended.
 
     This gives an early grasp. For an object that has no grasp by then, all steps are taken at once.
-    `fresh` are the indices of the contact sets to try.
+    `rows` are all contact sets before, and `fresh` the indices of those to try.
     """
     rows, solved = solve_fixed(objects, rows, fresh, FEW_STEPS, Row.BEGUN)
     missing = without(rows, solved, len(objects))
@@ -128,9 +128,10 @@ def try_fully(
     """Return all contact sets after some were tried with all solver steps, and the indices of those
     that ended.
 
-    `now` are the indices of the contact sets to try, and `before` of those that ended in this batch
-    already. Contacts that no posture reaches may slide with the hand. Sliding has a fixed cost. So
-    it is solved in the `last` batch, and for an object without any grasp in this batch.
+    `rows` are all contact sets before, `now` the indices of those to try, and `before` of those
+    that ended in this batch already. Contacts that no posture reaches may slide with the hand.
+    Sliding has a fixed cost. So it is solved in the `last` batch, and for an object without any
+    grasp in this batch.
     """
     clouds = len(objects)
     rows, solved = solve_fixed(objects, rows, now, ITERATIONS, Row.STUCK)
@@ -147,7 +148,7 @@ def try_fully(
 def without(rows: Candidates, solved: Int[Tensor, "k"], clouds: int) -> Bool[Tensor, "c"]:
     """Return a mask of the c objects of which no contact set is in `solved`.
 
-    `solved` are indices of contact sets, and `clouds` is the number c of objects.
+    `rows` are all contact sets, `solved` indices of some, and `clouds` is the number c of objects.
     """
     return torch.bincount(rows.cloud[solved], minlength=clouds) == 0
 
@@ -155,11 +156,12 @@ def without(rows: Candidates, solved: Int[Tensor, "k"], clouds: int) -> Bool[Ten
 def solve_fixed(
     objects: Objects, rows: Candidates, now: Int[Tensor, "k"], steps: int, failed: Row
 ) -> tuple[Candidates, Int[Tensor, "s"]]:
-    """Return all contact sets after the hand moved onto the fixed contacts of some, and the indices
-    of those solved.
+    """Return all contact sets after the hand moved onto the contacts of some, and the indices of
+    those solved.
 
-    `now` are the indices of the contact sets to try with at most `steps` solver steps. Those
-    without a grasp keep their best failed grasp, and get the status `failed`.
+    The contacts stay fixed. `rows` are all contact sets before, and `now` the indices of those to
+    try with at most `steps` solver steps. Those without a grasp keep their best failed grasp, and
+    get the status `failed`.
     """
     contacts, certificate, seeds = rows.select(now)
     reach = objects.reach(contacts, certificate, rows.cloud[now])
@@ -175,8 +177,8 @@ def solve_with_sliding(
     """Return all contact sets after contacts and hand moved together for some, and the indices of
     these.
 
-    `now` are the indices of the contact sets to try. All of them end; those without a grasp keep
-    their best failed one.
+    `rows` are all contact sets before, and `now` the indices of those to try. All of them end;
+    those without a grasp keep their best failed one.
     """
     contacts, certificate, seeds = rows.select(now)
     attempts = Attempts(torch.ones_like(certificate.closed), executable)
@@ -189,7 +191,10 @@ def solve_with_sliding(
 
 
 def solve_all(objects: Objects, rows: Candidates) -> Grasps:
-    """Return grasps of all contact sets, with the solver of mode "paper" or "contact_first"."""
+    """Return grasps of all contact sets, by the solver of the mode "paper" or "contact_first".
+
+    `rows` are the contact sets.
+    """
     reach = objects.reach(rows.contacts, rows.certificate, rows.cloud)
     solve = solve_as_paper if objects.request.mode == "paper" else solve_contact_first
     return solve(reach, rows.seeds)

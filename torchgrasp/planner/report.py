@@ -29,8 +29,10 @@ REPORT = ReportNumbers()
 
 
 class Report:
-    """Reports progress to the observer: each stage once with the results of all batches, and the
-    end of each batch.
+    """Reports of the progress of a plan to the observer.
+
+    Each stage is reported once with the results of all batches, and the end of each batch is
+    reported.
     """
 
     def __init__(self, objects: Objects, batches: int, planned: int) -> None:
@@ -63,7 +65,8 @@ class Report:
     def note(self, stage: str, value: Any, offered: int = 0) -> None:
         """Store the result of one stage of one batch, and report the stage after its last batch.
 
-        `offered` is the number of contact sets that stage "certify" checked.
+        `stage` is its name, and `value` the result. `offered` is the number of contact sets that
+        stage "certify" checked.
         """
         if not self.heard:
             return

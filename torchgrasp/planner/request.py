@@ -39,7 +39,28 @@ inside.
 @checked
 @dataclasses.dataclass(frozen=True)
 class Request:
-    """The checked arguments of one call of `plan_grasps`, which explains them and their units."""
+    """The checked arguments of one call of `plan_grasps`, which explains them in full.
+
+    Args:
+        cloud: the cloud [m], or the scene, with the object.
+        hand: the hand.
+        spec: the constraints on contacts; None means those of the mode.
+        starts: number of random initial guesses.
+        seed: random seed.
+        fingers: the fingers that grasp; None means those of `hand`.
+        mode: how planned contacts become grasps.
+        ranking: criterion by which grasps are ordered; None means that of the mode.
+        task: what the grasps must do; None means `GraspTask()`.
+        promise: share of the returned grasps that must hold, or None.
+        shape: the object's shape, if it is known.
+        observer: function that is called after each stage.
+        reachable: function that says which hand poses an arm reaches.
+        arm: the arm that carries the hand.
+        keep: region in which all contacts lie.
+        avoid: region in which no contact lies.
+        resist: loads that the contacts must resist.
+        time_budget: wall time [s] after which no batch begins; None means no limit.
+    """
 
     cloud: PointCloud | Scene
     hand: Hand
@@ -76,8 +97,9 @@ class Request:
             raise BadArgument("promise", f"{self.promise:g} for a displaced object", "None")
 
     def tell(self, stage: str, message: str, value: Any) -> None:
-        """Report a stage to the observer, if there is one: its name, a line of text, and its
-        result.
+        """Report a stage to the observer, if there is one.
+
+        `stage` is its name, `message` a line of text, and `value` its result.
         """
         if self.observer is not None:
             self.observer(stage, message, value)

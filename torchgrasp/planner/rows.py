@@ -322,13 +322,13 @@ def find_seeds(objects: Objects, contacts: Contacts, cloud: CloudIndex) -> IKSee
 
 
 def with_costs(objects: Objects, found: Candidates) -> Candidates:
-    """Return the contact sets with their costs (no unit; less is better).
+    """Return the contact sets `found` with their costs (no unit; less is better).
 
     A cost is the logarithm of the least sum of squared errors [mm2] of the first `numbers.tried`
-    initial postures. To it is added `numbers.lever` times the logarithm of the load's lever arm. A
-    contact set without initial postures has an infinite cost. If grasps must resist loads, the
-    postures in which the fingers resist the most come first. Then sets without a posture that
-    resists all loads cost more than all other sets.
+    initial postures. To it is added `numbers.lever` times the logarithm of the load's lever arm
+    (`lever_arm`). A contact set without initial postures has an infinite cost. If grasps must
+    resist loads, the postures in which the fingers resist the most come first. Then sets without a
+    posture that resists all loads cost more than all other sets.
     """
     contacts = found.contacts
     seeds = found.seeds
@@ -356,10 +356,11 @@ def with_costs(objects: Objects, found: Candidates) -> Candidates:
 
 def choose(rows: Candidates, most: int, clouds: int) -> Int[Tensor, "k"]:
     """Return the indices of at most `most` waiting contact sets of each object, of low cost and far
-    from each other.
+    apart.
 
-    They lie far from contact sets that were chosen before, too. `clouds` is the number of objects.
-    Farthest-point sampling runs for all objects at once, on their device.
+    They lie far from contact sets that were chosen before, too. `rows` are all contact sets, and
+    `clouds` is the number of objects. Farthest-point sampling runs for all objects at once, on
+    their device.
     """
     if not len(rows):
         return rows.cloud

@@ -8,7 +8,7 @@ from torchgrasp.values.specs import Mode
 
 @dataclasses.dataclass(frozen=True)
 class ScheduleNumbers:
-    """The numbers of the batches."""
+    """The numbers by which a plan is split into batches."""
 
     first: int = 8
     """Contact sets that the hand tries in the first batch."""
@@ -37,8 +37,8 @@ class BatchSize(NamedTuple):
 def batch_sizes(mode: Mode, starts: int, crowded: bool) -> list[BatchSize]:
     """Return the sizes of the batches of a plan with `starts` initial guesses.
 
-    Modes other than "joint" have one batch. `crowded` says whether the object is in a scene, where
-    the hand tries fewer contact sets.
+    A `mode` other than "joint" has one batch. `crowded` says whether the object is in a scene,
+    where the hand tries fewer contact sets.
     """
     most = SCHEDULE.tried_in_scene if crowded else SCHEDULE.tried
     return schedule(starts, most) if mode == "joint" else [BatchSize(starts, most)]

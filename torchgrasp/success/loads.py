@@ -67,17 +67,16 @@ def carrying_force(
     load: Float[Tensor, "3"],
     push: float = 0.0,
 ) -> Float[Tensor, "m b"]:
-    """Return the least factor s on balanced forces at which all contacts stick, for m friction
-    coefficients and b contact sets.
+    """Return the least factor s on balanced forces at which all contacts stick.
 
-    `forces` f_0 [N] balance each other without a load. The `load` [N], and a force of the size
-    `push` [N] in any direction, act at `center` [m], one point or one for each set; w is their
-    wrench. Equal springs share it, with the grasp map G:
+    The result holds a factor (no unit) for each of m `frictions`, the friction coefficients, and b
+    contact sets. `forces` f_0 [N] balance each other without a load. The `load` [N] acts at
+    `center` [m], one point or one for each set. A force of the size `push` [N] in any direction
+    acts there, too. Their wrench is w. Equal springs share it, with the grasp map G:
 
         f = s f_0 - G^+ w,    y . f >= 0 for all edges y of the cones dual to the friction cones.
 
-    The factor has no unit. It is infinite if the forces do not stick at all, as where no forces
-    balance.
+    The factor is infinite if the forces do not stick at all, as where no forces balance.
     """
     points = contacts.points.to(forces)
     normals = contacts.normals.to(forces)
@@ -142,11 +141,11 @@ def _levers(
 def log_odds_about(
     grasps: Grasps, centers: Float[Tensor, "c 3"], friction: float, weight: Sequence[float]
 ) -> Float[Tensor, "g c"]:
-    """Return the log-odds of success of g grasps for c centres of mass [m]; the first is that of
-    the grasps' `score`.
+    """Return the log-odds of success of g grasps for each of c possible centres of mass.
 
-    Only the force that carries the load depends on the centre. `weight` (3,) is the load [N] in the
-    frame of the grasps, and `friction` the coefficient of friction.
+    `centers` [m] are in the frame of the grasps; the first is the one for which `grasps.score` was
+    predicted. Only the force that carries the load depends on the centre. `weight` (3,) is the load
+    [N] in this frame, and `friction` the coefficient of friction.
     """
     points = grasps.contacts.points.to(centers)
     normals = grasps.contacts.normals.to(centers)

@@ -58,7 +58,7 @@ class SuccessModel(Value):
 
     @functools.cached_property
     def depth(self) -> int:
-        """The number of steps from the root to the deepest leaf."""
+        """The number of steps from the root to the deepest leaf of all trees."""
         reached = torch.zeros(len(self.feature), 1, dtype=torch.int64, device=self.feature.device)
         depth = 0
         trees = row_numbers(self.feature)[:, None]

@@ -94,14 +94,15 @@ def touch_moved(
 def trace(
     field: DistanceField, start: Sets, way: Sets, radius: Float[Tensor, "f"]
 ) -> tuple[Sets, Sets, Bool[Tensor, "d g f"]]:
-    """Return for each moving ball the surface point [m] that it first touches, the outward unit
-    normal there, and whether it touches.
+    """Return for each moving ball the surface point [m] that it first touches, the normal there,
+    and whether it touches.
 
     The balls belong to d displacements, g grasps and f fingertips; all tensors but `radius` have
     the shape (d, g, f, 3), and the mask (d, g, f). Ball f, of a `radius` [m], starts with its
-    centre at `start` [m] and moves along the unit vector `way`, at most `MOVED.length`. A ball that
-    does not touch has the surface point nearest to its end. This is sphere tracing: a ball moves on
-    by its distance from the surface.
+    centre at `start` [m] and moves along the unit vector `way`, at most `MOVED.length`. `field`
+    gives the signed distance [m] from the surface; the normals are outward unit vectors. A ball
+    that does not touch has the surface point nearest to its end. This is sphere tracing: a ball
+    moves on by its distance from the surface.
     """
     travelled = torch.zeros_like(start[..., 0]).flatten(0, 1)
     shape = start.shape[:-1]

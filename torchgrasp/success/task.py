@@ -130,8 +130,8 @@ def loads_of(
     upright_from_obj: Float[Tensor, "4 4"],
     table: bool,
 ) -> Float[Tensor, "w 6"]:
-    """Return the w loads of a task as wrenches (force [N], then torque [N m]) about the origin of
-    the upright frame.
+    """Return the w loads of a task as wrenches: forces [N], then torques [N m] about the upright
+    frame's origin.
 
     Args:
         resist: the task, see `Resist`.

@@ -325,8 +325,8 @@ class Grasps(Batch):
 
     @property
     def table(self) -> Plane | None:
-        """The table that the planner was given, in the frame of the grasps; None if there was none,
-        or it is unknown.
+        """The table that the planner was given, in the frame of the grasps; None without a table,
+        or if it is unknown.
         """
         return None if (text := self.meta.get("table", "none")) == "none" else read_plane(text)
 

@@ -84,7 +84,7 @@ class ContactSpec(Value):
 
     @property
     def plane(self) -> Plane | None:
-        """The table as a plane, or None if there is no table."""
+        """The table as a plane in the cloud's frame, or None if there is no table."""
         return as_plane(self.table)
 
     @property
@@ -189,7 +189,7 @@ class ContactSpec(Value):
         """Return the paper's constraints: full friction, contacts above the table, no least
         separation or flatness.
 
-        The arguments are those of `ContactSpec`.
+        The arguments `friction`, `edges`, `max_variance` and `table` are those of `ContactSpec`.
 
         >>> ContactSpec.paper(friction=0.8).planned_friction, ContactSpec.paper().flatness
         (0.8, None)
@@ -331,7 +331,9 @@ class TrialSpec(Value):
 
     @property
     def strongest(self) -> float:
-        """The normal force [N] of the strongest finger in the closing and in the holding "force"."""
+        """The normal force [N] of the strongest finger in the closing, and in the holding mode
+        "force".
+        """
         return min(4.0, self.max_force or 4.0) if self.force is None else self.force
 
     @property
@@ -341,10 +343,10 @@ class TrialSpec(Value):
 
 
 def default_holding(sensor: SensorModel, closing: ClosingMode) -> HoldingMode:
-    """Return the default holding mode: "grip" or "force".
+    """Return the default holding mode, "grip" or "force", for the sensors and a closing mode.
 
-    It is "grip" if all fingertips are tactile, none is dead, and the closing is "uncertainty" or
-    "fixed".
+    It is "grip" if the `sensor` is tactile at all fingers, none is dead, and the closing is
+    "uncertainty" or "fixed".
     """
     return "grip" if sensor.full and closing in ("fixed", "uncertainty") else "force"
 
