@@ -44,7 +44,7 @@ MOST_ERROR = 1000  # of the list of repairs in an error [characters]
 
 @dataclasses.dataclass(frozen=True)
 class DraftNumbers:
-    """Random postures from which pads are guessed, and drives like those of the shipped hands."""
+    """Numbers of the random postures from which pads are guessed, and of the drives of a draft."""
 
     postures: int = 20_000
     chunk: int = 1000  # postures whose poses are computed at once, to bound the memory
@@ -58,10 +58,12 @@ DRAFT = DraftNumbers()
 
 
 class Draft(NamedTuple):
-    """A first hand.toml, the clean URDF that it refers to, and a sentence for each repair of the
-    URDF.
+    """A first hand.toml for a URDF, and the repaired URDF.
 
-    `urdf` is empty if the published URDF is clean.
+    Attributes:
+        toml: text of the hand.toml.
+        urdf: text of the clean URDF to which it refers; "" if the published URDF is clean.
+        repairs: a sentence for each repair of the URDF.
     """
 
     toml: str
@@ -70,8 +72,13 @@ class Draft(NamedTuple):
 
 
 class Wish(NamedTuple):
-    """The user's choices for a new hand: fingertip links, name, first link of the hand on an arm,
-    folder of meshes.
+    """The user's choices for a new hand; an empty choice is made by the draft.
+
+    Attributes:
+        tips: links of the fingertips in grasp order.
+        name: name of the hand, by default the robot's.
+        root: first link of the hand, where the URDF has an arm, too.
+        meshes: folder of all meshes, by default the URDF's.
     """
 
     tips: tuple[str, ...] = ()
@@ -87,15 +94,15 @@ NO_WISH = Wish()
 def draft_hand(
     path: Path | str, tips: Sequence[str] = (), name: str | None = None, seed: Seed = 0
 ) -> str:
-    """Return the text of a hand.toml for a clean URDF, to be reviewed by the user and checked by
-    `check_hand`.
+    """Return the text of a hand.toml for a clean URDF, for the user to review.
 
-    `tips` are the links of the fingertips in grasp order, first the three of option "default";
-    "four" and "five" add the next ones. By default they are the last links of the branches, in the
-    order in which their pads best face each other. The hand has the `name` of the robot by default.
-    Raises `HandFileError` for a URDF that is missing or malformed, or needs repair by `new_hand`.
-    Raises `BadArgument` for fewer than three tips, more than five, or a tip without a collision
-    shape or a movable joint.
+    `check_hand` checks it. `tips` are the links of the fingertips in grasp order, first the three
+    of option "default"; "four" and "five" add the next ones. By default they are the last links of
+    the branches, in the order in which their pads best face each other. The hand has the `name` of
+    the robot by default. `seed` is that of the random postures from which pads are guessed. Raises
+    `HandFileError` for a URDF that is missing or malformed, or needs repair by `new_hand`. Raises
+    `BadArgument` for fewer than three tips, more than five, or a tip without a collision shape or a
+    movable joint.
 
     >>> from torchgrasp.hand.load import find_hand
     >>> text = draft_hand(find_hand("barrett") / "hand.urdf")
@@ -116,11 +123,11 @@ def new_hand(
     seed: Seed = 0,
     file: str = "hand.urdf",
 ) -> Draft:
-    """Repair a published URDF, and draft a hand.toml for the clean copy, which the user saves as
-    `file`.
+    """Repair a published URDF, and draft a hand.toml for the clean copy.
 
-    Raises the errors of `draft_hand`, and `HandFileError` for a hostile mesh, or a URDF that cannot
-    be repaired.
+    The user saves the clean copy as `file`, which the hand.toml names. `wish` holds the user's
+    choices; `seed` is that of the random postures from which pads are guessed. Raises the errors of
+    `draft_hand`, and `HandFileError` for a mesh that is refused, or a URDF that cannot be repaired.
 
     >>> from torchgrasp import load_hand
     >>> draft = new_hand(load_hand("barrett").urdf_path, Wish(name="mine"))
@@ -305,8 +312,9 @@ def _parked(urdf: Urdf, grasping: set[str]) -> dict[str, float]:
 
 
 def fingertip_links(urdf: Urdf) -> tuple[str, ...]:
-    """Return the fingertip links: the last link with a collision shape on every branch that joints
-    move.
+    """Return the names of the fingertip links of a URDF.
+
+    These are the last links with a collision shape on the branches, if a joint moves them.
     """
     parents = {j.parent for j in urdf.joints}
     shaped = {x.name for x in urdf.links if x.shapes}

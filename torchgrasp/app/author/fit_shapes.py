@@ -29,7 +29,7 @@ MESH_KINDS = (".stl", ".obj", ".ply", ".dae", ".glb")
 
 @dataclasses.dataclass(frozen=True)
 class FitNumbers:
-    """How meshes become boxes, cylinders and balls."""
+    """Numbers of the replacement of meshes by boxes, cylinders and balls."""
 
     points: int = 4000  # on each shape
     seed: int = 0  # of these points
@@ -58,13 +58,15 @@ class FitNumbers:
 
 FIT = FitNumbers()
 MOST_NAME = 80  # of a mesh's name in an error [characters]
-Points = Float[np.ndarray, "_ 3"]  # points, of any count in each use
-Corners = tuple[np.ndarray, np.ndarray]
+Points = Float[np.ndarray, "_ 3"]  # points [m], of any count in each use
+Corners = tuple[np.ndarray, np.ndarray]  # lower and upper corner (3,) of a box [m]
 
 
 def mesh_file(urdf: Urdf, name: str, folder: Path) -> Path:
-    """Return the path of a mesh that a URDF names, also by `package://`; raise `HandFileError`,
-    which says why not.
+    """Return the path of the file of a mesh that a URDF names, also by `package://`.
+
+    `name` is the mesh in the URDF. The file must lie inside `folder`. Raises `HandFileError`, which
+    gives the reason, for a mesh that is missing, outside, too large or in another format.
     """
     base = folder.resolve()
     here = urdf.path.resolve().parent
@@ -110,8 +112,10 @@ def mesh_file(urdf: Urdf, name: str, folder: Path) -> Path:
 
 
 def shape_points(urdf: Urdf, folder: Path) -> dict[str, tuple[Points, ...]]:
-    """Return points [m] on each shape of every link, in the link's frame; raise `HandFileError` for
-    unusable meshes.
+    """Return points (n, 3) [m] on each collision shape of every link, by the name of the link.
+
+    They are in the link's frame, one array for each shape. The meshes lie inside `folder`. Raises
+    `HandFileError` for meshes that are too large, or in a wrong unit.
     """
     names = {shape.file for link in urdf.links for shape in link.shapes if shape.kind == "mesh"}
     size = sum(mesh_file(urdf, name, folder).stat().st_size for name in names)
@@ -142,8 +146,10 @@ def shape_points(urdf: Urdf, folder: Path) -> dict[str, tuple[Points, ...]]:
 
 
 def replace_meshes(urdf: Urdf, points: Mapping[str, tuple[Points, ...]]) -> tuple[Urdf, list[str]]:
-    """Replace every mesh by a few boxes or a cylinder around its points; also return a sentence
-    with the counts.
+    """Return the URDF with a few boxes or a cylinder instead of every mesh, and a report.
+
+    `points` (n, 3) [m] on every shape are those of `shape_points`. The report is one sentence with
+    the counts, or empty without meshes.
     """
     links = []
     count = 0
@@ -165,8 +171,10 @@ def replace_meshes(urdf: Urdf, points: Mapping[str, tuple[Points, ...]]) -> tupl
 
 
 def ball_tip(urdf: Urdf, tip: str, ball: Pad, outward: np.ndarray, points: Points) -> Urdf:
-    """Replace the shapes of a tip by a ball at its end, towards `outward`, and on a long tip boxes
-    up to the ball.
+    """Return the URDF with a ball at the end of the link `tip` instead of its shapes.
+
+    A long tip also gets boxes up to the ball. `ball` is the pad, the unit vector `outward` points
+    to the end of the finger, and `points` (n, 3) [m] lie on the tip, all in its frame.
     """
     link = next(x for x in urdf.links if x.name == tip)
     reach = (points - np.array(ball.center)) @ outward
@@ -222,7 +230,10 @@ def _sample(mesh: "trimesh.Trimesh") -> Points:
 
 
 def fit_shapes(points: Points) -> list[LinkShape]:
-    """Return a few boxes, or a cylinder, that cover the points on a body."""
+    """Return a few boxes, or a cylinder, that cover the points (n, 3) [m] on a body.
+
+    The shapes are in the frame of the points.
+    """
     turn = _axes(points)
     local = points @ turn
     short = float(np.ptp(local, axis=0).max()) < FIT.long

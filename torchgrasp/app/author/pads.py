@@ -26,7 +26,7 @@ from torchgrasp.hand.urdf import Joint, Link, LinkShape, Triple, Urdf
 
 @dataclasses.dataclass(frozen=True)
 class PadNumbers:
-    """How pads are guessed from the motion and the surface of tips."""
+    """Numbers by which pads are guessed from the motion and the surface of tips."""
 
     near_share: float = 0.1  # of random postures, those with the nearest tips, where fingers meet
     # A joint bends to one side if the middle of its range lies farther than this share of it from
@@ -45,7 +45,7 @@ class PadNumbers:
 
 @dataclasses.dataclass(frozen=True)
 class FacingNumbers:
-    """When the pads of three fingers face each other."""
+    """Bounds within which the pads of fingers count as facing each other."""
 
     angle: float = 45.0  # most between a pad's normal and the way to the middle [degrees]
     nearest: float = 0.015  # least and greatest distance of a contact from the middle [m]
@@ -56,12 +56,16 @@ class FacingNumbers:
 PADS = PadNumbers()
 FACING = FacingNumbers()
 Vector = Float[np.ndarray, "3"]
-Points = Float[np.ndarray, "_ 3"]  # points, of any count in each use
+Points = Float[np.ndarray, "_ 3"]  # points [m], of any count in each use
 
 
 class Guess(NamedTuple):
-    """A guess at fingertip pads, the direction of each finger in its tip's frame, and the palm's
-    outward direction.
+    """A guess of the fingertip pads of a hand.
+
+    Attributes:
+        pads: the pad of each fingertip, in the frame of its link.
+        outward: unit vector (3,) from the last joint to the tip of each finger, in the same frame.
+        approach: unit direction (3,) out of the palm, in the frame of the URDF's root.
     """
 
     pads: tuple[Pad, ...]
@@ -75,8 +79,10 @@ def guess_pads(
     tips: Sequence[str],
     surfaces: Mapping[str, Points],
 ) -> Guess:
-    """Guess pads and the way out of the palm from poses of the tips, then the palm, and points on
-    each link [m].
+    """Return guessed pads and the direction out of the palm.
+
+    `frames` are poses (3 x 4) [m] of the links `tips` and, last, of the palm, in n random postures.
+    `surfaces` holds points (k, 3) [m] on each link, by its name, in its frame.
     """
     links = {x.name: i for i, x in enumerate(urdf.links)}
     cores = [_core(urdf, urdf.links[links[tip]], surfaces) for tip in tips]
@@ -113,14 +119,20 @@ def guess_pads(
 
 
 def palm_of(urdf: Urdf, tips: Sequence[str]) -> str:
-    """Return the link from which most fingers start."""
+    """Return the name of the link from which most of the fingers start.
+
+    `tips` are the names of the fingertip links.
+    """
     bases = Counter(urdf.movers(tip)[-1].parent for tip in tips)
     return max(bases, key=lambda name: bases[name])
 
 
 def order_by_facing(frames: Float[Tensor, "3 4 f n"], pads: Sequence[Pad]) -> list[int]:
-    """Return the tips in order, as indices: three whose pads face each other in most postures, then
-    the next best.
+    """Return the indices of the f tips in grasp order.
+
+    First come three whose pads face each other in the largest share of postures; each further one
+    keeps the share largest. `frames` are poses (3 x 4) [m] of the tips in n random postures; `pads`
+    are in the frames of the tips.
     """
     contacts = torch.tensor([pad.contact for pad in pads]).double()
     normals = torch.tensor([pad.normal for pad in pads]).double()

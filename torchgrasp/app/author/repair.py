@@ -16,7 +16,7 @@ from torchgrasp.hand.urdf import Joint, Link, LinkShape, Mimic, Triple, Urdf
 
 @dataclasses.dataclass(frozen=True)
 class RepairNumbers:
-    """What a URDF gets that lacks it, and what is impossible in one."""
+    """Numbers that a URDF gets where it lacks them, and bounds of what is possible."""
 
     # drive [N m, rad/s] of a joint for which the URDF declares none, typical of small hands
     effort: float = 1.0
@@ -34,16 +34,16 @@ class RepairNumbers:
 
 REPAIRS = RepairNumbers()
 BOX = 12  # divisor in the inertia of a solid box
-Step = tuple[Urdf, list[str]]
+Step = tuple[Urdf, list[str]]  # the repaired URDF, and a report: a sentence for each repair
 
 
 def pose_of(part: Joint | LinkShape) -> np.ndarray:
-    """Return the 4 x 4 pose of a joint or a shape in the frame of its parent link."""
+    """Return the pose (4, 4) [m] of a joint or a shape in the frame of its parent link."""
     return trimesh.transformations.compose_matrix(angles=part.rpy, translate=part.xyz)
 
 
 def place(pose: np.ndarray) -> tuple[Triple, Triple]:
-    """Return translation [m] and fixed-axis angles [rad] of a 4 x 4 pose."""
+    """Return translation [m] and fixed-axis angles (roll, pitch, yaw) [rad] of a pose (4, 4)."""
     # of the two triples that mean the same rotation, the smaller
     one = [float(angle) for angle in trimesh.transformations.euler_from_matrix(pose)]
     two = [math.copysign(math.pi, angle) - angle for angle in one]
@@ -55,8 +55,11 @@ def place(pose: np.ndarray) -> tuple[Triple, Triple]:
 
 
 def keep_below(urdf: Urdf, root: str) -> Step:
-    """Return the URDF with only the link `root` and the links below it, such as the hand on an arm;
-    also report it.
+    """Return the URDF with only the link `root` and the links below it, and a report.
+
+    So the hand is cut off an arm. The report is one sentence, or empty if `root` is the first link
+    already. Raises `BadArgument` for an unknown root, and `HandFileError` for a joint that follows
+    one above the root.
     """
     names = {x.name for x in urdf.links}
     if root not in names:
@@ -76,11 +79,10 @@ def keep_below(urdf: Urdf, root: str) -> Step:
 
 
 def merge_frames(urdf: Urdf) -> tuple[Urdf, list[str], dict[str, str]]:
-    """Merge massless links into the links to which they are fixed; last links of a branch with
-    shapes are kept.
+    """Return the URDF with massless links merged into the links to which they are fixed.
 
-    Also return a sentence about the repair, and a dict from each merged link to the link that took
-    it over.
+    A massless link at the end of a branch is kept if it has shapes. The second result is a report,
+    one sentence or none; the third gives for each merged link the link that took it over.
     """
     taken: dict[str, str] = {}
     while True:
@@ -132,7 +134,9 @@ def _moved(link: Link, pose: np.ndarray) -> Link:
 
 
 def fix_wrist(urdf: Urdf, tips: Sequence[str]) -> Step:
-    """Fix the wrist joints, which move all fingertips; more than three such joints are an arm,
+    """Return the URDF with the wrist joints fixed at their rest positions, and a report.
+
+    Wrist joints move all the links `tips`. More than `REPAIRS.most_wrist` such joints are an arm,
     which is cut off.
     """
     movers = urdf.movers(tips[0]) if len(tips) > 2 else []
@@ -163,8 +167,10 @@ def _fixed(joint: Joint, value: float) -> Joint:
 
 
 def repair_joints(urdf: Urdf) -> Step:
-    """Add missing position, effort and velocity limits; make coupled joints follow independent ones
-    within limits.
+    """Return the URDF with complete limits of all joints, and a report.
+
+    Missing limits of position, effort and velocity are added. Coupled joints follow independent
+    ones, within limits. Raises `HandFileError` for a sliding joint without limits.
     """
     joints = {j.name: j for j in urdf.joints}
     done = (
@@ -254,9 +260,9 @@ def _limit_leaders(urdf: Urdf, joints: dict[str, Joint]) -> list[str]:
 
 
 def repair_bodies(urdf: Urdf, surfaces: Mapping[str, np.ndarray]) -> Step:
-    """Replace missing or impossible masses and inertias.
+    """Return the URDF with missing or impossible masses and inertias replaced, and a report.
 
-    `surfaces` are points (n, 3) on each link [m], in its frame.
+    `surfaces` holds points (n, 3) [m] on each link, by its name, in its frame.
     """
     links = []
     weightless = list[str]()

@@ -21,11 +21,10 @@ LOOKS = ("bind_material", "extra", "instance_camera", "instance_light")  # parts
 
 
 def clean_dae(data: bytes) -> tuple[bytes, float]:
-    """Return a COLLADA file with its geometry alone, and its unit [m]; its axes stay as they are,
-    as in ROS.
+    """Return a COLLADA file with its geometry alone, and the size of its unit [m].
 
-    Raises `Malformed` for declarations, skins and nodes that repeat others, and `MissingExtra`
-    without pycollada.
+    Its axes stay as they are, as in ROS. Raises `Malformed` for declarations, for skins, and for
+    nodes that repeat others; `MissingExtra` without pycollada.
     """
     if importlib.util.find_spec("collada") is None:
         raise MissingExtra("pycollada", "meshes")
@@ -58,8 +57,10 @@ def clean_dae(data: bytes) -> tuple[bytes, float]:
 
 
 def check_glb(data: bytes) -> None:
-    """Raise `Malformed` for a .glb file with skins, with compressed or shared geometry, or with too
-    much of it.
+    """Raise `Malformed` for a .glb file with skins, with compressed geometry, or with too many
+    corners.
+
+    At most `MOST_INDICES` corners are allowed, where a mesh counts once for each node that uses it.
     """
     if not data.startswith(MAGIC):
         raise Malformed("no header of a .glb file")

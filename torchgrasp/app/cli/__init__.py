@@ -74,7 +74,10 @@ All commands: torchgrasp --help. To read: README.md and docs/ of the repository.
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; return its exit code. Errors are printed as one sentence on stderr.
+    """Run the command line; return its exit code.
+
+    `arguments` are the words after `torchgrasp`, by default those of this process. Errors are
+    printed as one sentence on stderr.
 
     >>> main(["--version"])
     torchgrasp ...
@@ -89,7 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run_and_exit() -> NoReturn:
-    """Run the command line of this process, and end the process.
+    """Run the command line with the words of this process, and end the process with the exit code.
 
     The first SIGINT or SIGTERM ends the command cleanly. Later signals are ignored, so that the
     command can clean up.
@@ -186,7 +189,7 @@ def _parser() -> SubcommandApp:
 
 
 def format_help() -> str:
-    """Return the help text: all commands in chapters, each with its first sentence."""
+    """Return the help text: all commands in chapters, each with its summary."""
     lines = ["torchgrasp: dexterous fingertip grasps from a partial point cloud", ""]
     for chapter, commands in CHAPTERS.items():
         lines.append(chapter)

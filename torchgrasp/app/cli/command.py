@@ -20,8 +20,9 @@ T = TypeVar("T")
 
 
 class Command:
-    """Base of all commands; `names` maps the names of arguments in the library's errors to fields
-    of the command.
+    """Base of all commands.
+
+    `names` gives, for arguments that the library's errors name, the field of the command.
     """
 
     names: ClassVar[dict[str, str]] = {}
@@ -32,28 +33,35 @@ class Command:
 
 
 def option(default: Any, help: str) -> Any:
-    """Return a dataclass field that is a command-line option, `--its-name`, with a default."""
+    """Return a dataclass field that is a command-line option, `--its-name`, with a default.
+
+    `help` is its help text.
+    """
     return dataclasses.field(default=default, metadata={"help": help})
 
 
 def required(help: str) -> Any:
-    """Return a dataclass field that is a required command-line option."""
+    """Return a dataclass field that is a required command-line option with a `help` text."""
     return dataclasses.field(metadata={"help": help})
 
 
 def positional(help: str) -> Any:
-    """Return a dataclass field that is a positional command-line argument."""
+    """Return a dataclass field that is a positional command-line argument with a `help` text."""
     return dataclasses.field(metadata={"help": help, "positional": True})
 
 
 def nested(default: Any) -> Any:
-    """Return a dataclass field whose own fields are options of the command."""
+    """Return a dataclass field whose own fields are options of the command.
+
+    `default` is a value of a class decorated by `arguments`.
+    """
     return dataclasses.field(default=default, metadata={"nested": True})
 
 
 def arguments(**names: str) -> Callable[[type[T]], type[T]]:
-    """Return a decorator of a command's class; `names` maps arguments in the library's errors to
-    its fields.
+    """Return a decorator that makes a class a frozen dataclass of command-line arguments.
+
+    `names` gives, for arguments that the library's errors name, the field of the class.
     """
 
     def make(cls: type[T]) -> type[T]:
@@ -100,8 +108,10 @@ def _metavar(kind: Any) -> str:
 
 
 def execute(command: Command) -> int:
-    """Check paths and number ranges of a command's arguments, then run it; errors name the
-    command-line options.
+    """Check paths and number ranges of a command's arguments, then run it; return the exit code.
+
+    Errors name the command-line options. Raises `BadArgument` for a number out of its range, or an
+    invalid path.
     """
     fields = {f.name: f for f in dataclasses.fields(command) if "help" in f.metadata}  # pyright: ignore[reportArgumentType]
     options = {
@@ -121,8 +131,9 @@ def execute(command: Command) -> int:
 
 @contextlib.contextmanager
 def naming(**options: str) -> Iterator[None]:
-    """In errors raised within the context, replace argument names by the names of command-line
-    options.
+    """Within the context, replace argument names in errors by the names of command-line options.
+
+    `options` gives the option of each argument by name, as `points="--cloud"`.
     """
     try:
         yield
@@ -134,8 +145,16 @@ def naming(**options: str) -> Iterator[None]:
 
 
 class StageProgress:
-    """Progress output: a line for each finished stage, and on a terminal a bar that names the
-    current stage.
+    """Progress output of a command: a line for each finished stage, and a bar on a terminal.
+
+    The bar names the current stage.
+
+    Args:
+        names: names of the stages in order.
+
+    Attributes:
+        stages: name, message and wall time [s] of each finished stage.
+        values: results of the finished stages by name.
     """
 
     def __init__(self, *names: str) -> None:
@@ -146,8 +165,9 @@ class StageProgress:
         self.bar = make_bar(len(names), "stage", desc=names[0], delay=1)
 
     def end(self, name: str, message: str, value: Any = None) -> None:
-        """Print that the stage `name` has ended, and keep its `value` (result); the bar then shows
-        the next stage.
+        """Print the `message` of the stage `name`, which has ended, with its wall time [s].
+
+        Its result `value` is kept; the bar then shows the next stage.
         """
         now = time.perf_counter()
         self.stages.append((name, message, now - self.began))
@@ -161,5 +181,8 @@ class StageProgress:
 
 
 def make_bar(total: int | None, unit: str, **options: Any) -> tqdm:
-    """Return a tqdm progress bar; it is silent if stderr is not a terminal."""
+    """Return a tqdm progress bar; it is silent if stderr is not a terminal.
+
+    `total` is the number of steps, None if it is unknown; `unit` is the name of a step.
+    """
     return tqdm(total=total, unit=unit, disable=None, leave=False, **options)

@@ -14,10 +14,11 @@ MOST_ERROR = 300  # of the message of a failed download [characters]
 def locate_urdf(
     name: Path, meshes: Path | None, out: Path | None
 ) -> tuple[Path, Path | None, Path | None]:
-    """Return the URDF, the folder of its meshes and the folder to write, from arguments that may
-    name a description.
+    """Return the URDF, the folder of its meshes, and the folder to write.
 
-    Raises `BadArgument` for a name without a URDF, or where the download fails; `MissingExtra`
+    If `name` is a name of robot_descriptions, its files are used, and a folder of this name is
+    written, unless `meshes` or `out` is given. Otherwise the three arguments are returned as they
+    are. Raises `BadArgument` for a name without a URDF, or if the download fails; `MissingExtra`
     without the package.
     """
     if name.exists() or name.suffix or not str(name).isidentifier():

@@ -27,7 +27,10 @@ SIMULATORS: dict[Simulator, str] = {"sapien": "sim", "mujoco": "mujoco"}
 
 
 class Finding(NamedTuple):
-    """One part of the installation, its state, and the fix if something is missing, else ""."""
+    """One part of the installation, its state in words, and the command that repairs it.
+
+    `fix` is "" if nothing is missing.
+    """
 
     part: str
     found: str

@@ -91,8 +91,9 @@ class _Trials(Command):
     seed: Seed = option(0, SEED_HELP)
 
     def trial(self, **changes: Any) -> dict[str, Any]:
-        """Return the options of the simulated trial that the user set, by name; `changes` are
-        further options.
+        """Return by name the options of the simulated trial that the user set.
+
+        `changes` are further options; those that are None are left out.
         """
         changes |= {"closing": self.closing, "simulator": self.simulator}
         return {name: value for name, value in changes.items() if value is not None}
@@ -143,7 +144,10 @@ class Evaluate(_Trials):
     workers: int = option(1, "processes; the results do not depend on their number")
 
     def disturbed(self, test: evaluation.Protocol) -> evaluation.Protocol:
-        """Return a protocol with the displacements, pushes and draws that the user set."""
+        """Return the protocol `test` with the displacements, pushes and draws that the user set.
+
+        Raises `BadArgument` for --displaced with a protocol that does not lift.
+        """
         noise = (
             test.noise if self.draws is None else dataclasses.replace(test.noise, draws=self.draws)
         )
@@ -210,8 +214,9 @@ class Evaluate(_Trials):
 
 
 def list_names(objects: Path, spec: EvaluationSpec) -> list[tuple[str, str]]:
-    """Return pairs of object name and view name for all views; an object without views has the view
-    name "".
+    """Return object name and view name of every view that is evaluated.
+
+    An object without views has one pair with the view name "".
     """
     names = []
     for name, entry in read_entries(objects, spec.only).items():
@@ -222,8 +227,9 @@ def list_names(objects: Path, spec: EvaluationSpec) -> list[tuple[str, str]]:
 
 
 def print_score(score: ViewScore, widths: tuple[int, int] = NAME_WIDTHS) -> None:
-    """Print one line with the result of a view; `widths` are the column widths of the names of
-    object and view.
+    """Print one line with the result of a view.
+
+    `widths` are the widths [characters] of the columns with the names of object and view.
     """
     failed = [attempt.status for attempt in score.attempts if not attempt.passed]
     reasons = ", ".join(
@@ -242,7 +248,9 @@ def _print_cells(cells: tuple[object, ...], widths: tuple[int, int]) -> None:
 
 def print_summary(protocol: str, tried: str, summary: dict[str, Any]) -> None:
     """Print the success rates of all objects and of each group, failures by stage and cause, and
-    means and times.
+    means.
+
+    `protocol` and `tried` are printed as the title; `summary` is what `summarise` returned.
     """
     rows = [(text, format_share(summary[key])) for key, text in SHARE_NAMES.items()]
     for name, group in summary["by_group"].items():

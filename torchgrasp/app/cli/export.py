@@ -164,8 +164,10 @@ class Export(Command):
 
 
 def read_names(words: Sequence[str]) -> dict[str, str] | None:
-    """Return names of joints, given as texts URDF=ROBOT or as the path of a .json file with an
-    object of them.
+    """Return the robot's name of each URDF joint by the joint's name; None without `words`.
+
+    `words` are texts URDF=ROBOT, or the path of one .json file with such an object. Raises
+    `BadArgument` for a joint given twice, and `ModelFileError` for a malformed file.
     """
     if len(words) != 1 or "=" in words[0]:
         pairs = [(joint, name) for joint, _, name in (word.partition("=") for word in words)]

@@ -429,7 +429,10 @@ def print_grasps(run: Run) -> bool:
 
 
 def read_true_mesh(path: Path) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh] | None]":
-    """Read the closed mesh of --mesh; for a shipped object also return its convex parts."""
+    """Return the closed mesh [m] of --mesh and, for a shipped object, its convex parts.
+
+    The parts are None for any other mesh.
+    """
     with naming(path="--mesh", mesh="--mesh"):
         mesh = read_mesh(path)
         digest = sha256(path)

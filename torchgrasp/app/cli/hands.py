@@ -51,7 +51,9 @@ from torchgrasp.testing import check_hand, find_faults, most_met, random_joints
 
 @dataclasses.dataclass(frozen=True)
 class HandTrial:
-    """How a hand is tried, and what is so rare among random postures that it is warned of."""
+    """Numbers of the trial of a hand, and shares of random postures below which there is a
+    warning.
+    """
 
     objects: tuple[str, ...] = ("cylinder", "jug")  # tried in turn
     starts: int = 100  # initial guesses for each object
@@ -67,7 +69,7 @@ class HandTrial:
 
 @dataclasses.dataclass(frozen=True)
 class TrainNumbers:
-    """How a posture model is fitted."""
+    """Numbers of the fit of a posture model."""
 
     tolerance: float = 1e-3  # mean log-likelihood [nats] by which the last step improves the fit
     starts: int = 5
@@ -201,8 +203,10 @@ class HandCheck(Command):
 
 
 def print_faults(hand: str | Path, fingers: str = "default") -> bool:
-    """Print every fault of a hand, for the given fingers and all declared sets; return whether
-    there is any.
+    """Print every fault of a hand; return whether there is any.
+
+    `hand` is a name or folder. The given `fingers` and all sets that hand.toml declares are
+    checked.
     """
     try:
         options = read_hand_toml(find_hand(hand) / "hand.toml", fingers).options
@@ -225,8 +229,9 @@ def describe_sets(hand: Hand) -> str:
 
 
 def find_warnings(hand: Hand, joints: torch.Tensor) -> list[str]:
-    """Return warnings about a hand without faults, each with its fix, from random postures (n, h)
-    [rad].
+    """Return warnings about a hand without faults, each with its fix.
+
+    `joints` (n, h) are n random postures of the h actuated joints [rad].
     """
     warnings = []
     free = hand.self_clearance(joints) > 0
@@ -276,8 +281,9 @@ def _try_objects(hand: Hand, bar: tqdm) -> bool:
 
 
 def describe(hand: Hand, joints: torch.Tensor) -> str:
-    """Return a text about a hand: its joints, its fingers, and statistics of random postures (n, h)
-    [rad].
+    """Return a text about a hand: its joints, its fingers, and statistics of random postures.
+
+    `joints` (n, h) are n random postures of the h actuated joints [rad].
     """
     points, normals = hand.fingertips(joints)
     free = hand.self_clearance(joints) > 0
@@ -402,8 +408,10 @@ class HandTrain(Command):
 
 
 def choose_components(hand: Hand, seed: int, workers: int) -> int:
-    """Return the number of Gaussians with the least BIC on separate random postures; print the BIC
+    """Return the number of Gaussians with the least BIC on separate random postures; print the
     curve.
+
+    `workers` is the number of threads that sample the postures.
     """
     apart = sample_configurations(hand, TRAIN.postures, seed + 1, workers, "grasping")
     with make_bar(TRAIN.most, "fit", desc="components") as bar:

@@ -83,8 +83,11 @@ class ViewOptions:
         return unit(vector)
 
     def read(self, name: str, path: Path, whole: bool = False) -> CloudFile:
-        """Read the cloud file of the argument `name`; `whole` accepts scenes of any size and keeps
-        all points.
+        """Return the cloud file at `path`, as the options say; errors call it by `name`, its
+        argument.
+
+        With `whole`, scenes of any size are accepted, and all points are kept. Raises `BadArgument`
+        for options that exclude each other, and for an unusable cloud.
         """
         if self.viewpoint is not None and (self.no_viewpoint or self.camera_pose is not None):
             raise BadArgument(
@@ -134,8 +137,8 @@ class CloudOptions(ViewOptions):
     no_table: bool = option(False, "there is no table")
 
     def with_table_of(self, file: CloudFile) -> "CloudOptions":
-        """Return the options with the table that a file holds, unless the user gave --table or
-        --no-table.
+        """Return the options with the table of a file, unless the user gave --table or --no-
+        table.
         """
         if file.table is None or self.table is not None or self.no_table:
             return self
@@ -143,8 +146,9 @@ class CloudOptions(ViewOptions):
         return CloudOptions(**known)
 
     def plane(self, cloud: PointCloud) -> Plane | float | None:
-        """Return the table as a plane or a height [m] along z, by default at the lowest point; None
-        means no table.
+        """Return the table as a plane or as a height z [m]; None means no table.
+
+        By default the table is at the lowest point of the cloud that is no outlier.
         """
         table = self.table
         if table is not None and self.no_table:
@@ -163,14 +167,19 @@ class CloudOptions(ViewOptions):
         return given if up is None else Plane(up, given)
 
     def given_vertical(self, plane: Plane | None) -> Tensor | None:
-        """Return the unit vector of --up, else the normal of --table; None if neither is given."""
+        """Return the unit vector of --up, else the normal of --table; None if neither is given.
+
+        `plane` is the table in the frame of the cloud.
+        """
         if self.up is not None or self.table is None or plane is None:
             return self.vertical
         return plane.normal
 
     def judge(self, cloud: PointCloud, table: Plane | float | None) -> tuple[Advice, ...]:
-        """Return advice on the quality of a cloud; raise `BadArgument` if no grasp should be
-        planned on it.
+        """Return advice on the quality of a cloud; raise `BadArgument` if it must not be planned
+        on.
+
+        `table` is a plane, a height z [m], or None for no table.
         """
         plane = as_plane(table)
         up = self.given_vertical(plane)
@@ -183,7 +192,10 @@ class CloudOptions(ViewOptions):
 
 
 def read_table(table: tuple[float, ...]) -> Plane | float:
-    """Return the table as a plane from four numbers, or as a height [m] from one number."""
+    """Return the table as a plane, given four numbers, or as a height [m], given one.
+
+    Four numbers are a vector along the normal, of any length, and the offset d of n . p = d.
+    """
     if len(table) not in (1, 4):
         raise BadArgument(
             "--table", f"{len(table)} numbers", "a height, or four: a normal and its distance"
@@ -215,8 +227,9 @@ def _move(name: str, cloud: PointCloud, pose: Tensor) -> PointCloud:
 
 
 def read_region(name: str, text: str | None) -> Region | None:
-    """Return the box of six numbers in the text of option `name`, or the mesh that it names; None
-    for None.
+    """Return the region that the text of the option `name` describes; None for None.
+
+    The text holds six numbers, two corners of a box [m], or the path of a closed mesh [m].
     """
     with naming(mesh=name, low=name, high=name):
         try:
@@ -231,7 +244,12 @@ def read_region(name: str, text: str | None) -> Region | None:
 
 
 def find_cloud(path: Path, name: str = "CLOUD") -> Path:
-    """Return the path of a cloud; the name of a shipped object gives its noisy view."""
+    """Return the path of a cloud: `path` itself or, for the name of a shipped object, its noisy
+    view.
+
+    Raises `BadArgument` for a word that is neither a file nor a shipped object; `name` is the
+    argument in the error.
+    """
     names = list_objects()
     if path.exists() or path.suffix or len(path.parts) != 1:
         return path
@@ -251,7 +269,10 @@ def print_notes(notes: tuple[str, ...], advice: tuple[Advice, ...] = ()) -> None
 
 
 def check_folder(path: Path) -> None:
-    """Raise `OutputError` if a folder cannot be written, by a test with a temporary file."""
+    """Raise `OutputError` if a folder cannot be written, by a test with a temporary file.
+
+    Folders made for the test are removed.
+    """
     made: list[Path] = []
     try:
         for folder in reversed([path, *path.parents]):
@@ -274,8 +295,10 @@ def check_folder(path: Path) -> None:
 def holding(
     name: str, path: Path | None, hold: Callable[[Path], AbstractContextManager[None]] = hold_folder
 ) -> Iterator[None]:
-    """Lock the folder or file of the option `name` against other runs within the context. None
-    locks nothing.
+    """Within the context, lock the folder or file at `path` against other runs.
+
+    Errors call it by `name`, its option. `hold` locks: a folder by default. A `path` of None locks
+    nothing.
     """
     with contextlib.ExitStack() as held:
         if path is not None:
@@ -285,15 +308,16 @@ def holding(
 
 
 def load_fingers(hand: str, fingers: str) -> tuple[Hand, Literal["auto"] | None]:
-    """Load the hand of --hand with --fingers; also return "auto" if all sets of fingers are to be
-    tried.
+    """Return the hand of --hand with --fingers, and "auto" if all its sets of fingers are tried.
+
+    The second result is None for one set of fingers.
     """
     with naming(hand="--hand", name="--hand", name_or_path="--hand", fingers="--fingers"):
         return (load_hand(hand), "auto") if fingers == "auto" else (load_hand(hand, fingers), None)
 
 
 def describe_table(table: Plane | float) -> str:
-    """Return a text that says where the table is."""
+    """Return a text that says where a table is: a plane, or a height z [m]."""
     if isinstance(table, Plane):
         x, y, z = (0.0 + round(n, 3) for n in table.normal.tolist())
         return f"table at {table.offset:.3f} m along ({x:g}, {y:g}, {z:g})"
@@ -301,7 +325,11 @@ def describe_table(table: Plane | float) -> str:
 
 
 def object_name(path: Path) -> str:
-    """Return a name for the object of a file: that of the file, or of its folder if generic."""
+    """Return a name for the object of a file: the file's name or, if it is generic, the folder's.
+
+    Generic are names such as mesh.ply and view0.ply; of others, as cloud.ply, the text is "object
+    in cloud.ply".
+    """
     if re.fullmatch(r"(mesh|view\d*)(_noisy)?", path.stem):
         return path.resolve().parent.name or "object"
     generic = path.stem in ("cloud", "model", "points", "scan")
@@ -309,7 +337,10 @@ def object_name(path: Path) -> str:
 
 
 def import_simulator(name: Simulator = "sapien") -> None:
-    """Import a simulator; raise an error if it is missing or cannot be loaded."""
+    """Import a simulator, so that later steps do not fail for want of it.
+
+    Raises `MissingExtra` if it is not installed, and `BadArgument` if it cannot be loaded.
+    """
     if importlib.util.find_spec(name) is None:
         raise MissingExtra(name, "sim" if name == "sapien" else name)
     try:
