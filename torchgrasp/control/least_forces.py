@@ -274,7 +274,7 @@ class _Barrier:
         return tried[best if math.isfinite(value[best]) else int(ratio.argmin())]
 
     def value(self, z: Float[Array, "g k"]) -> Float[Array, " g"]:
-        """Return the objective [N] at g coordinates z; it is infinite outside the friction cones."""
+        """Return the objective [N] at g coordinates z: infinite outside the friction cones."""
         n = z @ self.push.T + self.push_0
         t = z @ self.tau.T + self.tau_0
         lengths = (self.forces(z) ** 2).sum(-1)

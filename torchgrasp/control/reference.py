@@ -281,7 +281,7 @@ def _distance_variance(grasp: Grasps) -> Float[Tensor, "f"] | None:
 
 
 def _number(grasp: Grasps, name: str) -> float | None:
-    """Return a positive number from the metadata of a grasp by its `name`, or None if they lack it."""
+    """Return a positive number by `name` from the metadata of a grasp; None if they lack it."""
     text = grasp.meta.get(name)
     if text is None:
         return None

@@ -4,7 +4,7 @@ can collide.
 Spheres give the clearance from object and table: each collision shape is cut into cells, with one
 sphere for each cell. No surface with a radius of curvature above 25 mm reaches a face between the
 spheres. Exact boxes and spheres are tested for self-collision; in this test a cylinder becomes a
-prism of twelve sides.
+prism of twelve sides. A posture is one position of all joints.
 """
 
 import dataclasses
@@ -38,10 +38,12 @@ ALWAYS = 0.98
 
 @dataclasses.dataclass(frozen=True)
 class CoverNumbers:
-    """The numbers of the spheres that cover a hand."""
+    """Numbers of the spheres that cover a hand."""
 
     finger_cell: float = 0.015
-    """Edge [m] of a finger's cells: corners stick farther out of larger cells' spheres."""
+    """Edge [m] of a finger's cells; larger: the corners of a shape stand farther out of its
+    spheres.
+    """
     palm_cell: float = 0.022
     """Edge [m] of the palm's cells."""
     bulge: float = 0.004
@@ -57,10 +59,11 @@ COVER = CoverNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class CollisionSpheres(Value):
-    """Spheres [m] that cover a hand's links, each with its centre in the frame of one link.
+    """Spheres that cover the links of a hand.
 
-    `finger` is the finger's index in grasp order, -1 for the palm, -2 for a finger that does not
-    grasp. `touching` marks the spheres of fingertips.
+    `center` [m] is in the frame of the link with the index `link_index`, in the order of the URDF;
+    `radius` is in metres. `finger` is the index of the sphere's finger in grasp order, -1 for the
+    palm, -2 for a finger that does not grasp. `touching` marks the spheres of fingertips.
 
     >>> from torchgrasp import load_hand
     >>> load_hand("barrett").collision_spheres.center.shape
@@ -75,7 +78,9 @@ class CollisionSpheres(Value):
 
 
 def spheres_from_urdf(urdf: Urdf, spec: HandSpec) -> CollisionSpheres:
-    """Return spheres that cover every collision shape of a URDF."""
+    """Return spheres that cover every collision shape of a URDF; `spec` tells the grasping fingers
+    and their tips.
+    """
     owner = {joint: i for i, f in enumerate(spec.fingers) for joint in f.joints}
     tips = [f.tip_link for f in spec.fingers]
     rows: list[tuple[int, Triple, float, int, bool]] = []
@@ -94,8 +99,11 @@ def spheres_from_urdf(urdf: Urdf, spec: HandSpec) -> CollisionSpheres:
 
 
 def cover(shape: LinkShape, cell: float, bulge: float) -> tuple[list[Triple], float]:
-    """Return the centres and the radius [m] of spheres that cover a shape, one for each cell of
-    about size `cell`.
+    """Return the centres [m] of spheres that cover a shape, in the frame of its link, then their
+    one radius [m].
+
+    There is one sphere for each cell of about the edge `cell` [m]. No sphere stands out of a face
+    by more than `bulge` [m].
     """
     if shape.kind == "sphere":
         return [shape.xyz], shape.size[0]
@@ -126,8 +134,10 @@ def cover(shape: LinkShape, cell: float, bulge: float) -> tuple[list[Triple], fl
 
 
 def self_collision_from_urdf(urdf: Urdf, pairs: Iterable[tuple[str, str]] | None) -> SelfCollision:
-    """Return the exact shapes of a URDF to test the `pairs` of links for collision, by default all
-    but neighbours.
+    """Return the exact shapes of a URDF, and the pairs of them to test for collision.
+
+    `pairs` names the pairs of links to test; None means all but a link and its parent. Raises
+    `HandFileError` for too many pairs of shapes.
     """
     names = [x.name for x in urdf.links]
     listed = itertools.combinations(names, 2) if pairs is None else pairs
@@ -203,8 +213,12 @@ def _parts(shape: LinkShape) -> list[tuple[Float[Tensor, "3 3"], Triple, Triple,
 def collision_pairs(
     urdf: Urdf, coupling: Mapping[str, Mimic], n: int = 20_000, seed: int = 0
 ) -> list[tuple[str, str]]:
-    """Return the pairs of links that collide in some of n random postures but not in nearly all,
-    without neighbours.
+    """Return the names of the pairs of links that collide in some of n random postures, but not in
+    nearly all.
+
+    A link and its parent are no such pair. `coupling` gives the coupled joints by name. Raises
+    `BadArgument` for a bad `n` or unknown joints, and `HandFileError` for too many shapes in one
+    place.
     """
     check_whole("n", n, 1, MOST_POSTURES)
     tree = tree_from_urdf(urdf)
@@ -242,8 +256,8 @@ def collision_pairs(
 
 
 def _limit_near(urdf: Urdf, shapes: SelfCollision, frames: Frames, ahead: int, most: int) -> None:
-    """Raise `HandFileError` if `ahead` postures like those of `frames` need over `most` measured
-    separations.
+    """Raise `HandFileError` if `ahead` postures like those of `frames` need more than `most`
+    measured separations.
     """
     left = shapes.count_near(frames, MEETING_DISTANCE) * ahead // frames.shape[3]
     if left > most:
@@ -257,8 +271,11 @@ def _limit_near(urdf: Urdf, shapes: SelfCollision, frames: Frames, ahead: int, m
 def draw_postures(
     urdf: Urdf, coupling: Mapping[str, Mimic], n: int, seed: int
 ) -> Float[Tensor, "j n"]:
-    """Return random positions of all movable joints (j, n), uniform within the limits; coupled
-    joints follow.
+    """Return n random positions [rad or m] of all movable joints, uniform within the limits;
+    coupled joints follow.
+
+    `coupling` gives the coupled joints by name. Raises `BadArgument` if it names a joint that the
+    URDF lacks.
     """
     movable = {j.name: j for j in urdf.movable}
     named = {*coupling} | {mimic.source for mimic in coupling.values()}

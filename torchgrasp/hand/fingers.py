@@ -36,9 +36,11 @@ touch.
 
 @dataclasses.dataclass(frozen=True)
 class ActuatedJoints(Value):
-    """The joints [rad or m] that move the grasping fingers, and the coupling of all joints to them.
+    """The joints that move the grasping fingers, and the coupling of all joints to them.
 
-    The positions of all movable joints of the URDF are `coupling @ joints + offset`.
+    The positions of all j movable joints of the URDF are `coupling @ joints + offset`, with the h
+    actuated `joints` [rad or m] in the order of `names`. `lower` and `upper` [rad or m] are the
+    limits of the actuated joints. `offset` [rad or m] has the unit of its joint.
 
     >>> from torchgrasp import load_hand
     >>> actuated = load_hand("barrett").actuated
@@ -54,14 +56,18 @@ class ActuatedJoints(Value):
 
     @checked(gradients=True)
     def expand(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b j"]:
-        """Check the actuated joints, and return the positions of all movable joints of the URDF."""
+        """Check the actuated `joints` [rad or m], and return the positions of all movable joints of
+        the URDF.
+
+        Raises `BadArgument` as `check` does.
+        """
         self.check(joints)
         return self.couple(joints)
 
     @checked(gradients=True)
     def couple(self, joints: Annotated[Float[Tensor, "*b h"], ANY]) -> Float[Tensor, "*b j"]:
-        """Return the positions of all movable joints of the URDF, computed from those of the
-        actuated joints.
+        """Return the positions [rad or m] of all movable joints of the URDF, given the actuated
+        `joints`.
 
         The input is not checked, because a check would wait for the GPU.
         """
@@ -71,6 +77,8 @@ class ActuatedJoints(Value):
     def check(self, joints: Tensor, name: str = "joints") -> None:
         """Raise `BadArgument` for joints of a wrong count, dtype or device, for NaN and for
         infinity.
+
+        Errors call the argument `name`.
         """
         if joints.ndim < 1 or joints.shape[-1] != len(self.names):
             allowed = f"{len(self.names)} joints in the last axis: {self.names}"
@@ -82,8 +90,10 @@ class ActuatedJoints(Value):
 
     @checked(gradients=True)
     def check_limits(self, joints: Tensor, name: str = "joints") -> None:
-        """Raise `BadArgument` if `check` does, or if a joint is beyond its limits by more than
-        float32 rounding.
+        """Raise `BadArgument` if `check` does, or if a joint [rad or m] is outside its limits by
+        more than rounding.
+
+        The rounding is that of float32. Errors call the argument `name`.
         """
         self.check(joints, name)
         low = self.lower.to(joints) - ROUNDING
@@ -103,8 +113,11 @@ class ActuatedJoints(Value):
 
 
 def joints_from_files(spec: HandSpec, urdf: Urdf) -> ActuatedJoints:
-    """Return the actuated joints, with those that coupled joints follow; raise `HandFileError` for
-    an empty range.
+    """Return the actuated joints: those of the grasping fingers, and the joints that their coupled
+    joints follow.
+
+    Raises `HandFileError` if the limit margin leaves an empty range, or for a joint that neither
+    grasps nor is parked.
     """
     movable = {j.name: j for j in urdf.movable}
     own = [j for f in spec.fingers for j in f.joints]
@@ -137,11 +150,14 @@ def joints_from_files(spec: HandSpec, urdf: Urdf) -> ActuatedJoints:
 
 @dataclasses.dataclass(frozen=True)
 class Fingertips(Value):
-    """The fingertips in grasp order: names, links, and the contact pad of each in its link's frame.
+    """The fingertips in grasp order: names, links, and the contact pad of each.
 
-    `index` is the index of each tip's link in the whole kinematic tree. Each tip is rigidly
-    attached to a carrier, the last link that a joint moves. `chains` is the part of the tree that
-    leads to the carriers, and `carrier` is the index of each carrier in this part.
+    In the frame of the tip's link, `contact` [m] is the contact point of the pad, `normal` its
+    outward unit normal, and `center` and `radius` [m] those of its sphere; `radius` is 0 for a pad
+    without a sphere. `index` is the index of each tip's link in the whole kinematic tree. Each tip
+    is rigidly attached to a carrier, the last link that a joint moves. `chains` is the part of the
+    tree that leads to the carriers, and `carrier` is the index of each carrier in this part.
+    `carrier_from_tip` holds the poses (3 x 4) [m] of the tips' links in their carriers.
 
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("allegro")
@@ -165,9 +181,7 @@ class Fingertips(Value):
 
     @kept
     def cone(self) -> Float[Tensor, "f"]:
-        """The half angle [rad] of each pad's cone: the tip may touch only within this angle of the
-        pad's axis.
-        """
+        """Half angle [rad] of the cone about each pad's axis within which the tip may touch."""
         # float32, as when results were published
         angles = self.radius.new_tensor([ROUND_PAD, FLAT_PAD], dtype=torch.float32)
         return torch.where(self.radius > 0, *angles).to(self.radius)
@@ -177,7 +191,7 @@ class Fingertips(Value):
         self,
     ) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"], Float[Tensor, "f 3"]]:
         """Contact points [m], unit normals and centres [m] of the pads, each in the frame of the
-        tip's carrier link.
+        tip's carrier.
         """
         pose = self.carrier_from_tip
         contact = map_points(pose, self.contact)[..., 0].T
@@ -187,8 +201,10 @@ class Fingertips(Value):
 
     @checked(gradients=True)
     def frames(self, values: Float[Tensor, "j n"]) -> tuple[Frames, Float[Tensor, "3 4 f n"]]:
-        """Return the poses (3 x 4) of all links of `chains` and of the carriers, given all joint
-        positions (j, n).
+        """Return the poses (3 x 4) [m] of all links of `chains`, then those of the f carriers.
+
+        `values` [rad or m] holds the positions of all joints of the URDF in n postures. The poses
+        are in the root's frame. Raises `BadArgument` for a wrong number of joints.
         """
         if len(values) != (every := len(self.chains.joint_names)):
             raise BadArgument("values", f"{len(values)} joints", f"all {every} joints of the URDF")
@@ -197,8 +213,8 @@ class Fingertips(Value):
 
 
 def tips_from_files(spec: HandSpec, urdf: Urdf, chain: Any) -> Fingertips:
-    """Return the fingertips of the grasping fingers, as hand.toml and the URDF's chain describe
-    them.
+    """Return the fingertips of the grasping fingers, from hand.toml, the URDF and its
+    pytorch-kinematics `chain`.
     """
     links = [x.name for x in urdf.links]
     tips = tuple(f.tip_link for f in spec.fingers)

@@ -29,8 +29,10 @@ from torchgrasp.hand.self_collision import SelfCollision
 
 
 class Actuator(NamedTuple):
-    """Drive of one joint: greatest effort [N m] and velocity [rad/s], stiffness [N m/rad], damping
-    [N m s/rad].
+    """Drive of one joint: greatest effort and velocity, stiffness and damping.
+
+    `effort` is in [N m], `velocity` in [rad/s], `kp` in [N m/rad] and `kd` in [N m s/rad]; for a
+    sliding joint with [N] and [m] in place of [N m] and [rad].
 
     >>> from torchgrasp import load_hand
     >>> load_hand("barrett").actuators["f1_flex"].effort
@@ -44,10 +46,10 @@ class Actuator(NamedTuple):
 
 
 class HandSource(NamedTuple):
-    """The origin of a hand: its option or finger names, its URDF, one SHA-256 of its files, and all
-    its options.
+    """The origin of a hand: its files, and the option by which its fingers were chosen.
 
-    The files are the URDF and the description, `hand.toml`.
+    `option` is an option of hand.toml, or the names of the fingers. `sha256` is one hash of the
+    URDF (`urdf_path`) and of the description, `hand.toml`. `options` are all options of hand.toml.
 
     >>> from torchgrasp import load_hand
     >>> load_hand("allegro").source.options
@@ -64,14 +66,16 @@ class HandSource(NamedTuple):
 class Hand(Value):
     """A robot hand with three to five grasping fingers, in grasp order.
 
-    Positions [m] are in the frame of the palm, the URDF's root link. `approach` is the direction
-    out of the palm.
+    Positions [m] are in the frame of the palm, the URDF's root link. `approach` is the unit vector
+    out of the palm. `actuators` holds the drive of every movable joint of the URDF, by name.
 
     `chain` is the hand's model, a chain of pytorch-kinematics in which every movable joint is
     independent. `tree` and `tips` are compiled from its tensors, so do not change it in place.
 
-    `joints` (.., h) are the actuated joints of the grasping fingers, in the order of `joint_names`.
-    Every method raises `BadArgument` for joints of a wrong count or dtype, and for NaN or infinity.
+    `joints` (*b, h) are the actuated joints [rad, or m for sliding ones] of the grasping fingers,
+    in the order of `joint_names`. f counts the fingertips, j all movable joints, l the links and s
+    the collision spheres. Every method raises `BadArgument` for joints of a wrong count or dtype,
+    and for NaN or infinity.
 
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("barrett")
@@ -101,7 +105,7 @@ class Hand(Value):
         return self.source.urdf_path
 
     def to(self, *args: Any, **kwargs: Any) -> "Hand":
-        """Return the hand on another device or in another floating dtype, with its chain; see
+        """Return the hand, with its chain, on another device or in another floating dtype; see
         `Value.to`.
 
         A hand that is there already is returned itself, without a copy of its chain.
@@ -127,12 +131,12 @@ class Hand(Value):
 
     @functools.cached_property
     def derived(self) -> dict[Any, Any]:
-        """A cache of values that other modules derive from the hand."""
+        """A cache of values that other modules derive from the hand, by keys of their choice."""
         return {}
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the actuated joints."""
+        """Names of the h actuated joints, in the order of all `joints`."""
         return self.actuated.names
 
     @property
@@ -142,7 +146,7 @@ class Hand(Value):
 
     @property
     def tip_radius(self) -> Float[Tensor, "f"]:
-        """Radii of the fingertips [m]; 0 for a flat or pointed tip."""
+        """Radii (f,) [m] of the fingertips; 0 for a flat or pointed tip."""
         return self.tips.radius
 
     @property
@@ -152,18 +156,19 @@ class Hand(Value):
 
     @property
     def lower(self) -> Float[Tensor, " h"]:
-        """Lower limits of the actuated joints [rad]."""
+        """Lower limits [rad, or m for a sliding joint] of the actuated joints."""
         return self.actuated.lower
 
     @property
     def upper(self) -> Float[Tensor, " h"]:
-        """Upper limits of the actuated joints [rad]."""
+        """Upper limits [rad, or m for a sliding joint] of the actuated joints."""
         return self.actuated.upper
 
     @checked
     def require_three(self, argument: str, what: str) -> None:
-        """Raise `BadArgument` about an argument unless the hand has three fingertips, as in the
-        paper.
+        """Raise `BadArgument` unless the hand has three fingertips, as in the paper.
+
+        The error names the `argument`, and `what` was wanted.
         """
         if len(self.tips) != 3:
             raise BadArgument(
@@ -190,11 +195,11 @@ class Hand(Value):
 
     @checked(gradients=True)
     def expand(self, joints: Float[Tensor, "*b h"]) -> dict[str, Float[Tensor, "*b"]]:
-        """Return the positions of all movable joints of the URDF by name, given the actuated
-        joints.
+        """Return the positions [rad or m] of all movable joints of the URDF by name, given the
+        actuated joints.
 
-        A grasp of three fingers of the Allegro has twelve joints; here are also those of the finger
-        that it leaves out.
+        A grasp of three fingers of the Allegro has twelve joints; the result also has those of the
+        finger that does not grasp.
 
         >>> from torchgrasp import load_hand
         >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -205,14 +210,14 @@ class Hand(Value):
 
     @checked(gradients=True)
     def expand_joints(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b j"]:
-        """Return the positions of all movable joints, in the order of `tree.joint_names`, given the
-        actuated joints.
+        """Return the positions [rad or m] of all movable joints, in the order of
+        `tree.joint_names`.
         """
         return self.actuated.expand(joints)
 
     @checked(gradients=True)
     def link_poses(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b l 4 4"]:
-        """Return the pose `hand_from_link` (4 x 4) of every link, in the order of
+        """Return the pose `hand_from_link` (4 x 4) [m] of every link, in the order of
         `tree.link_names`.
         """
         values = self.expand_joints(joints)
@@ -225,8 +230,8 @@ class Hand(Value):
         joints: Float[Tensor, "*b h"],
         backend: Literal["torchgrasp", "pytorch_kinematics"] = "torchgrasp",
     ) -> tuple[Float[Tensor, "*b f 3"], Float[Tensor, "*b f 3"]]:
-        """Return the contact points [m] and outward unit normals of the fingertip pads, in the
-        palm's frame.
+        """Return the contact points [m], then the outward unit normals, of the fingertip pads in
+        the palm's frame.
 
         With `backend="pytorch_kinematics"` the hand's chain itself computes the poses of the
         fingertips.
@@ -246,7 +251,9 @@ class Hand(Value):
 
     @checked(gradients=True)
     def tip_centres(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b f 3"]:
-        """Return the centres [m] of the fingertip spheres; for tips of radius 0 the contact points."""
+        """Return the centres [m] of the fingertip spheres in the palm's frame; for tips of radius 0
+        the contact points.
+        """
         _, carriers = self.tips.frames(self._columns(joints))
         return _rows(map_points(carriers, self.tips.in_carriers[2]), joints)
 
@@ -254,11 +261,11 @@ class Hand(Value):
     def jacobian(
         self, joints: Float[Tensor, "*b h"], at: Float[Tensor, "*b f 3"] | None = None
     ) -> Float[Tensor, "*b f 3 h"]:
-        """Return the Jacobian [m/rad] of the fingertips' contact points with respect to the
-        actuated joints.
+        """Return the Jacobian [m/rad] of the fingertips' contact points by the actuated joints, in
+        the palm's frame.
 
-        `at` are points [m] fixed to the fingertips, such as where round tips touch; by default the
-        contact points.
+        `at` holds points [m] in the palm's frame that are fixed to the fingertips, such as where
+        round tips touch; None means the contact points of the pads.
         """
         chains = self.tips.chains
         frames, carriers = self.tips.frames(self._columns(joints))
@@ -299,7 +306,7 @@ class Hand(Value):
         below: Annotated[float, Range(-math.inf, math.inf)] = math.inf,
         chunk: Count = 1000,
     ) -> Float[Tensor, "*b"]:
-        """Return the least signed separation [m] of the link pairs in hand.toml. It is negative if
+        """Return the least signed separation [m] of the pairs of links in hand.toml; negative if
         links overlap.
 
         A negative value is minus the shortest translation that separates two links. A positive
@@ -320,7 +327,7 @@ class Hand(Value):
         return tuple((names[one], names[two]) for one, two in self.self_collision.link_pairs())
 
     def _columns(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "j n"]:
-        """Return all movable joints of the URDF as columns (j, n), one posture in each column."""
+        """Return the positions [rad or m] of all movable joints as columns: one posture in each."""
         values = self.expand_joints(joints)
         return values.reshape(-1, values.shape[-1]).T.contiguous()
 

@@ -36,8 +36,11 @@ _DOTTED = re.compile(rf"""(?<![\w"'-]){_PART}(?:[ \t]*\.[ \t]*{_PART}){{16}}""")
 
 
 class Pad(NamedTuple):
-    """The touching surface of a fingertip, in its link's frame [m]: a sphere about `center`, or a
-    point (radius 0).
+    """The surface of a fingertip that may touch: a sphere, or a point (radius 0).
+
+    In the frame of the tip's link, `contact` [m] is its contact point, `normal` the outward unit
+    normal there, `center` [m] the centre of the sphere (or the contact point), and `radius` [m] its
+    radius.
     """
 
     contact: Triple
@@ -65,8 +68,8 @@ Fingers = str | int | tuple[str, ...]
 
 
 class Option(NamedTuple):
-    """An option of hand.toml: the grasping fingers, and the positions [rad] of parked joints, which
-    stay fixed.
+    """An option of hand.toml: the grasping fingers, and the positions [rad or m] by name of parked
+    joints, which stay fixed.
     """
 
     fingers: Grasping
@@ -75,7 +78,26 @@ class Option(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class HandSpec:
-    """The content of a hand.toml, with the grasping `fingers` of the chosen `option`."""
+    """The content of a hand.toml, with the grasping `fingers` of the chosen `option`.
+
+    Args:
+        path: path of the hand.toml.
+        name: name of the hand.
+        urdf: path of the URDF, in the same folder.
+        base_link: name of the URDF's root link, the palm.
+        approach: unit vector out of the palm, in the palm's frame.
+        limit_margin: taken off both ends of the range of every actuated joint [rad or m].
+        kp: stiffness of every drive [N m/rad].
+        kd: damping of every drive [N m s/rad].
+        option: name of the chosen option, or of the chosen fingers with commas between.
+        fingers: the grasping fingers, in grasp order.
+        options: all options, by name.
+        all_fingers: all fingers of the hand.
+        parked: positions [rad or m] of the joints that stay fixed, by name.
+        coupling: the coupled joints, by name.
+        pairs: names of the pairs of links to test for self-collision; None if the file lists none.
+        data: the bytes of the file.
+    """
 
     path: Path
     name: str
@@ -100,8 +122,10 @@ class HandSpec:
 
 
 def read_hand_toml(path: Path | str, fingers: Fingers = "default") -> HandSpec:
-    """Read and check a hand.toml; raise `HandFileError`, or `BadArgument` for fingers that the hand
-    lacks.
+    """Read and check a hand.toml, with the chosen grasping `fingers`.
+
+    Raises `HandFileError` for a missing or malformed file, and `BadArgument` for fingers that the
+    hand lacks.
     """
     path = Path(path)
     refuse = functools.partial(HandFileError, "hand.toml")
@@ -236,7 +260,7 @@ def _choose(
     coupling: dict[str, Mimic],
     wanted: Fingers,
 ) -> tuple[str, Option]:
-    """Return name and content of the option for the wanted fingers. If none is declared, the name
+    """Return name and content of the option for the `wanted` fingers. If none is declared, the name
     lists the fingers.
     """
     declared = (
@@ -286,7 +310,7 @@ def _coupling(field: Field) -> dict[str, Mimic]:
 
 
 def _pairs(field: Field) -> tuple[tuple[str, str], ...] | None:
-    """Read the pairs of links to test for self-collision from hand.toml, or None if it gives none."""
+    """Return the pairs of links to test for self-collision, or None if hand.toml lists none."""
     pairs = _entries(field, (), {"pairs": None})["pairs"]
     if pairs.value is None:
         return None

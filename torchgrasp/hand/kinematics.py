@@ -1,8 +1,9 @@
-"""Forward kinematics of a pytorch-kinematics chain, compiled from its tensors: level by level, all
-postures at once.
+"""Forward kinematics of a pytorch-kinematics chain, compiled from its tensors.
 
-The pose of a child link in its parent is `constant + sine sin q + cosine cos q + slide q`, where q
-is the position of the joint between them. The four tables are computed once.
+All postures are computed at once, level by level of the tree. The pose of a child link in its
+parent is `constant + sine sin q + cosine cos q + slide q`, where q [rad or m] is the position of
+the joint between them. The four tables are computed once. Poses (3 x 4) are the upper rows of 4 x 4
+transforms [m]. n counts postures, l links, j joints, p points.
 """
 
 import dataclasses
@@ -31,15 +32,16 @@ class KinematicTree(Value):
     """The kinematic tree of a URDF, or a part of it, as tables; links and joints are in the order
     of the file.
 
-    `child[j]` is the link that joint j moves, or 0 if it is outside this part; `axis` is in that
-    link's frame. `prismatic` is 1 for a sliding joint, and `moves[l, j]` is 1 if joint j moves link
-    l.
+    `child[j]` is the index of the link that joint j moves, or 0 if it is outside this part; `axis`
+    is the unit axis of each joint in that link's frame. `prismatic` is 1 for a sliding joint, and
+    `moves[l, j]` is 1 if joint j moves link l. `slides` says whether any joint is prismatic.
 
-    `tables` hold each link's pose in its parent: its constant part, and factors of sin q, cos q and
-    q. In them, links are sorted by level, the number of joints from the root; `level_sizes` counts
-    the links of each level. `joint` is the index of the joint that moves a link, 0 for a fixed
-    link. `parent` is the index of a link's parent in the level above. `places` are the indices of
-    `link_names` among the sorted links.
+    `tables` hold each link's pose (3 x 4) in its parent: `tables[0]` is the constant part,
+    `tables[1]`, `tables[2]` and `tables[3]` the factors of sin q, cos q and q. In them, links are
+    sorted by level, the number of joints from the root; `level_sizes` counts the links of each
+    level. `joint` is the index of the joint that moves a link, 0 for a fixed link. `parent` is the
+    index of a link's parent in the level above. `places` are the indices of `link_names` among the
+    sorted links.
 
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("barrett")
@@ -66,10 +68,10 @@ class KinematicTree(Value):
     def frames(
         self, values: Float[Tensor, "j n"], root: Float[Tensor, "3 4 n"] | None = None
     ) -> Frames:
-        """Return every link's pose (3 x 4) in the root's frame, given the joint positions (j, n) of
-        n postures.
+        """Return every link's pose (3 x 4) [m] in the root's frame, given joint positions (j, n)
+        [rad or m].
 
-        If `root` gives the poses of the root in another frame, the link poses are in that frame.
+        If `root` gives the n poses of the root in another frame, the link poses are in that frame.
         """
         constant, sine, cosine, slide = self.tables.to(values).unbind()
         local = torch.addcmul(constant, sine, values.sin().index_select(0, self.joint))
@@ -94,7 +96,9 @@ class KinematicTree(Value):
 
     @checked(gradients=True)
     def poses(self, values: Float[Tensor, "n j"]) -> Float[Tensor, "n l 4 4"]:
-        """Return the pose `root_from_link` of every link, given all movable joints [rad or m]."""
+        """Return the pose `root_from_link` [m] of every link, given n positions [rad or m] of all
+        movable joints.
+        """
         frames = self.frames(values.T.contiguous())
         last = eye_like(4, frames)[3, :, None, None].expand(1, 4, *frames.shape[2:])
         return torch.cat([frames, last]).permute(3, 2, 0, 1)
@@ -103,8 +107,8 @@ class KinematicTree(Value):
     def joint_axes(
         self, poses: Float[Tensor, "*b l 4 4"]
     ) -> tuple[Float[Tensor, "*b j 3"], Float[Tensor, "*b j 3"]]:
-        """Return the unit axis and a point [m] of every joint in the root's frame, given the link
-        poses.
+        """Return the unit axis, then a point [m], of every joint in the root's frame, given the
+        link `poses` [m].
         """
         frames = poses.reshape(-1, *poses.shape[-3:])[..., :3, :].permute(2, 3, 1, 0)
         child = frames.index_select(2, self.child)  # (3, 4, j, n)
@@ -116,16 +120,18 @@ class KinematicTree(Value):
 
 @dataclasses.dataclass(frozen=True)
 class FreeMotion(Value):
-    """Tables of how the links of a free-floating hand, and marker points fixed to the links, move
-    in a small step.
+    """Tables of how the links of a free-floating hand, and marker points on them, move in a small
+    step.
 
     The q motions are three translations along the root's axes, three rotations about them, and the
     joints that the actuated joints move. `moves[l, q]` is 1 if motion q moves link l. `coupling`
-    maps a step of pose (six numbers) and actuated joints to the motions; None means the identity.
+    maps a step of d = 6 + h numbers, of pose and actuated joints, to the motions; None means the
+    identity.
 
-    `product` maps all link frames to all markers in one matrix product. The markers come in groups
-    of `sizes`: first the given groups, then the origins of all motions, all rotation axes, and all
-    translation axes. One of the two axes of a motion is zero.
+    `product` maps the frames of all links, as k = 4 l numbers for each coordinate, to all m markers
+    in one matrix product. The markers come in groups of `sizes`: first the given groups, then the
+    origins of all motions, all rotation axes, and all translation axes. One of the two axes of a
+    motion is zero.
     """
 
     product: Float[Tensor, "m k"]
@@ -140,8 +146,10 @@ class FreeMotion(Value):
         coupling: Float[Tensor, "j h"],
         markers: Sequence[tuple[Int[Tensor, "_"], Float[Tensor, "_ 3"], float]],
     ) -> "FreeMotion":
-        """Return the tables for groups of markers: link indices, coordinates, and 1 for points or 0
-        for directions.
+        """Return the tables for groups of markers.
+
+        A group has link indices, coordinates [m] in the frames of these links, and 1 for points or
+        0 for directions. `coupling` is that of `ActuatedJoints`.
         """
         own = flatnonzero((coupling != 0).any(1))
         eye = functools.partial(torch.eye, dtype=tree.axis.dtype, device=tree.axis.device)
@@ -173,8 +181,10 @@ class FreeMotion(Value):
         return cls(product.flatten(1), tuple(map(len, local)), moves, whole)
 
     def place(self, frames: Frames) -> tuple[Float[Tensor, "3 p n"], ...]:
-        """Return the coordinates of each group of markers in the root's frame, given all link
-        frames.
+        """Return the coordinates [m] of each group of markers in the root's frame, given the frames
+        of all links.
+
+        Directions are unit vectors; p is the size of a group.
         """
         product = self.product.to(frames).expand(3, -1, -1)
         return torch.bmm(product, frames.flatten(1, 2)).split(self.sizes, 1)
@@ -183,8 +193,8 @@ class FreeMotion(Value):
 def map_points(
     frames: Float[Tensor, "3 4 p n"], local: Float[Tensor, "p 3"]
 ) -> Float[Tensor, "3 p n"]:
-    """Return points in the root's frame, given the link frames (3 x 4) and one point in each of
-    them.
+    """Return p points [m] in the root's frame, given a link frame (3 x 4) and the point in it,
+    `local` [m], for each.
     """
     return map_directions(frames, local) + frames[:, 3]
 
@@ -192,8 +202,8 @@ def map_points(
 def map_directions(
     frames: Float[Tensor, "3 4 p n"], local: Float[Tensor, "p 3"]
 ) -> Float[Tensor, "3 p n"]:
-    """Return directions in the root's frame, given the link frames (3 x 4) and one direction in
-    each of them.
+    """Return p directions in the root's frame, given a link frame (3 x 4) and the direction in it,
+    `local`, for each.
     """
     x, y, z = local.to(frames)[:, :, None].unbind(1)
     mapped = torch.addcmul(frames[:, 0] * x, frames[:, 1], y)
@@ -201,8 +211,9 @@ def map_directions(
 
 
 def chain_from_urdf(urdf: Urdf) -> "pytorch_kinematics.Chain":
-    """Return a URDF as a pytorch-kinematics chain of independent joints, in float64: its own reader
-    has float32.
+    """Return a URDF as a pytorch-kinematics chain of independent joints, in float64.
+
+    The library's own reader has float32.
     """
     frame = pytorch_kinematics.frame
     with torch.device("cpu"):  # the library makes some tensors on torch's default device
@@ -223,8 +234,10 @@ def chain_from_urdf(urdf: Urdf) -> "pytorch_kinematics.Chain":
 def tree_from_urdf(
     urdf: Urdf, chain: Any = None, ends: Collection[str] | None = None
 ) -> KinematicTree:
-    """Return the kinematic tree of a URDF's chain, or the part of it to the links `ends`, in the
-    order of the URDF.
+    """Return the kinematic tree of a URDF's `chain`, with links in the order of the URDF.
+
+    With `ends`, it is the part of the tree that leads to these links. Without a `chain`, it is
+    made.
     """
     model: Any = chain or chain_from_urdf(urdf)  # it declares no types
     index = model.frame_to_idx
@@ -266,8 +279,10 @@ def tree_from_urdf(
 def chain_poses(
     chain: "pytorch_kinematics.Chain", names: Sequence[str], values: Float[Tensor, "j n"]
 ) -> Float[Tensor, "c n 4 4"]:
-    """Return the poses of a chain's frames by pytorch-kinematics, given the positions of all joints
-    by `names`.
+    """Return the poses [m] of a chain's c frames in n postures, computed by pytorch-kinematics.
+
+    `values` [rad or m] holds the positions of all joints by `names`. Raises `BadArgument` inside
+    torch.vmap.
     """
     if not (torch.compiler.is_compiling() or is_known(values)):
         raise BadArgument(
@@ -283,8 +298,9 @@ def chain_poses(
 def pose_in_carrier(
     chain: "pytorch_kinematics.Chain", link: str
 ) -> tuple[str, Float[Tensor, "3 4"]]:
-    """Return a link's carrier (the nearest link, itself or above, that a joint moves), and the
-    link's pose in it.
+    """Return the name of a link's carrier, then the pose (3 x 4) [m] of the link in it.
+
+    The carrier is the nearest link, the link itself or one above, that a joint moves.
     """
     *above, carrier = chain.parents_indices[chain.frame_to_idx[link]].tolist()
     pose = _tables(chain, 0)[0]

@@ -31,8 +31,8 @@ def hands_folder() -> Path:
 def find_hand(name_or_path: str | Path) -> Path:
     """Return the folder of a hand, given a shipped hand's name, a folder or a hand.toml.
 
-    Raises `HandFileError` for no such hand, or a shipped name that is also a folder in the working
-    directory.
+    Raises `HandFileError` if there is no such hand, or if a shipped hand's name is also a folder in
+    the working directory.
 
     >>> find_hand("allegro").name
     'allegro'
@@ -97,7 +97,10 @@ def load_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
 
 @checked
 def with_fingers(hand: Hand, fingers: Fingers) -> Hand:
-    """Return the same hand, on the same device, with other grasping fingers; see `load_hand`.
+    """Return the same hand, on the same device, with other grasping `fingers`, given as in
+    `load_hand`.
+
+    Raises the errors of `load_hand`.
 
     >>> with_fingers(load_hand("allegro"), 4).finger_names
     ('index', 'middle', 'ring', 'thumb')
@@ -111,7 +114,7 @@ def hand_of(grasps: Grasps, hand: Hand | str | Path | None = None) -> Hand:
     """Return the hand with the fingers for which grasps were planned.
 
     `grasps` may be loaded from a file. `hand` is the same hand with any fingers, its name or its
-    folder; by default the shipped hand that the grasps name. Raises the errors of `load_hand`, and
+    folder; None means the shipped hand that the grasps name. Raises the errors of `load_hand`, and
     `BadArgument` for grasps that name no hand, another hand, or unknown fingers.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -164,8 +167,10 @@ def _check_names(spec: HandSpec, urdf: Urdf) -> None:
 
 
 def _check_mimics_and_shapes(spec: HandSpec, urdf: Urdf) -> None:
-    """Raise `HandFileError` if couplings contradict the URDF, or if a tip or all other links lack
-    collision shapes.
+    """Raise `HandFileError` for couplings that contradict the URDF, and for missing collision
+    shapes.
+
+    Every fingertip needs a shape, and so does at least one other link.
     """
     for joint in urdf.joints:
         if joint.mimic is not None and spec.coupling.get(joint.name) != joint.mimic:

@@ -1,5 +1,5 @@
-"""The safety gate for URDF files: bounded XML without declarations, known elements and finite
-numbers only.
+"""The safety gate for URDF files: it lets through bounded XML without declarations, with known
+elements and finite numbers.
 
 The gate writes the XML anew from the elements listed below, so that other readers see nothing else.
 It opens no other file.
@@ -75,7 +75,7 @@ class BoundedBuilder(ET.TreeBuilder):
         self.depth = self.count = 0
 
     def start(self, tag: Any, attrs: Any) -> Any:
-        """Count an element, and raise `HandFileError` for one too many."""
+        """Count the start of an element; raise `HandFileError` for too many or too deep ones."""
         self.depth = self.depth + 1
         self.count = self.count + 1
         if self.depth > XML_DEPTH or self.count > XML_ELEMENTS:
@@ -84,14 +84,16 @@ class BoundedBuilder(ET.TreeBuilder):
         return super().start(tag, attrs)
 
     def end(self, tag: Any) -> Any:
-        """Leave an element."""
+        """Count the end of an element."""
         self.depth -= 1
         return super().end(tag)
 
 
 def parse_urdf(path: Path, data: bytes) -> ET.Element:
-    """Return the XML tree of a URDF with only links and joints, and with checked numbers, or raise
-    `HandFileError`.
+    """Return the XML tree of a URDF with only links and joints, and with checked numbers.
+
+    `data` are the bytes of the file; `path` is named in errors. Raises `HandFileError` for anything
+    else.
     """
     # also within comments: a declaration may be hidden by a processing instruction that looks like
     # a comment

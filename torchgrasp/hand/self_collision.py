@@ -1,4 +1,9 @@
-"""Exact signed separations between the links of a hand, whose shapes are boxes and spheres."""
+"""Exact signed separations between the links of a hand, whose shapes are boxes and spheres.
+
+s counts shapes, p pairs of shapes, n postures, and k chosen combinations of pair and posture.
+`Frames` (3, 4, l, n) are the poses (3 x 4) [m] of l links in n postures, in any one frame, in which
+positions [m] then are, too.
+"""
 
 import dataclasses
 import itertools
@@ -18,7 +23,7 @@ from torchgrasp.hand.kinematics import Frames, map_points
 
 # largest separation [m] that is needed exactly
 Bound = Annotated[float, Range(-torch.inf, torch.inf, "a number")]
-# axes and centres of shapes in the palm's frame
+# unit axes and centres [m] of s shapes in n postures
 Placed = tuple[Float[Tensor, "3 3 s n"], Float[Tensor, "3 s n"]]
 LEAST_SQUARE = 1e-24  # least squared length [m2]: the derivative of its root is finite
 PARALLEL_EDGES = 1e-10  # squared sine below which edges are parallel
@@ -32,7 +37,7 @@ class Chosen(NamedTuple):
     """Chosen pairs of shapes in some postures, sorted by pair: entry i is `pair[i]` in posture
     `row[i]`.
 
-    `parts` holds each kind of pair, named by its number of spheres, with the slice of its entries.
+    `parts` holds each kind of pair (its number of spheres, 0 to 2), with the slice of its entries.
     """
 
     pair: Int[Tensor, " k"]
@@ -42,10 +47,12 @@ class Chosen(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class SelfCollision(Value):
-    """Boxes (`radius` 0) and spheres (`half` sizes 0) fixed to links [m], and the pairs of shapes
-    to test.
+    """Boxes and spheres fixed to the links of a hand, and the pairs of them to test for collision.
 
-    `pairs` lists box-box pairs, then sphere-box, then sphere-sphere; `kinds` counts each kind.
+    `link` is the index of the link of each shape. In its frame are the axes of a box, the columns
+    of `rotation[:, :, s]`, and the `center` [m]. `half` [m] holds the half sizes of a box, 0 for a
+    sphere; `radius` [m] is that of a sphere, 0 for a box. `pairs` holds the indices of two shapes:
+    first box-box pairs, then sphere-box, then sphere-sphere; `kinds` counts each kind.
 
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("barrett")
@@ -65,8 +72,10 @@ class SelfCollision(Value):
 
     @checked(gradients=True)
     def clearance(self, frames: Frames, below: Bound = torch.inf) -> Float[Tensor, " n"]:
-        """Return each posture's least signed separation [m]: infinite if no pairs are tested,
-        inexact above `below`.
+        """Return the least signed separation [m] of each posture: infinite if there are no pairs to
+        test.
+
+        Separations above `below` [m] may be inexact lower bounds.
         """
         least = frames.new_full(frames.shape[3:], torch.inf)
         if not len(self.pairs):
@@ -88,8 +97,9 @@ class SelfCollision(Value):
 
     @checked
     def separations(self, frames: Frames, below: Bound) -> Float[Tensor, "p n"]:
-        """Return each pair's signed separation [m] in each posture; above `below` it is that of
-        bounding spheres.
+        """Return the signed separation [m] of each pair in each posture.
+
+        Above `below` [m] it is that of bounding spheres.
         """
         shapes, apart, chosen = self._near(frames, below)
         return apart.index_put(chosen[:2], self._separations(shapes, chosen))
@@ -98,11 +108,12 @@ class SelfCollision(Value):
     def pushes(
         self, frames: Frames, below: Bound
     ) -> tuple[Float[Tensor, "p n"], Int[Tensor, "p n"], Float[Tensor, "6 k"]]:
-        """Return the pairs' separations [m], the index of each pair's wrench, and the wrenches, one
-        in each column.
+        """Return the separations [m] of the pairs, the index of each pair's wrench, and the
+        wrenches as columns.
 
-        A wrench is the derivative of a separation by a twist (translation, rotation) of the second
-        shape. The last wrench is zero, and belongs to separations above `below`.
+        A wrench is the derivative of a separation by a twist of the second shape: translation, then
+        rotation about the origin [m/rad]. The last wrench is zero, and belongs to separations above
+        `below` [m].
         """
         shapes, apart, (pair, row, parts) = self._near(frames, below)
         separation = apart.new_zeros(len(pair))
@@ -126,7 +137,7 @@ class SelfCollision(Value):
     @checked(gradients=True)
     def count_near(self, frames: Frames, below: Bound) -> int:
         """Return the number of pairs, over all postures, whose bounding spheres are nearer than
-        `below`.
+        `below` [m].
         """
         return len(self._near(frames, below)[2].pair)
 
@@ -139,12 +150,12 @@ class SelfCollision(Value):
         return dataclasses.replace(self, pairs=self.pairs[kept], kinds=(one, two, three))
 
     def link_pairs(self) -> list[tuple[int, int]]:
-        """Return the link indices of each pair of links that is tested."""
+        """Return the two link indices of each pair of links that is tested."""
         links = self.link[self.pairs].sort(1).values
         return [(one, two) for one, two in torch.unique(links, dim=0).tolist()]
 
     def _place(self, frames: Frames) -> Placed:
-        """Return the shapes' axes and centres in the palm's frame, given the link frames."""
+        """Return the shapes' axes and centres [m] in the frame of the link `frames`."""
         if frames.shape[2] < self._links:
             raise BadArgument("frames", f"{frames.shape[2]} links", f"at least {self._links} links")
         links = frames.index_select(2, self.link)
@@ -155,8 +166,8 @@ class SelfCollision(Value):
         return axes, map_points(links, self.center)
 
     def _near(self, frames: Frames, below: float) -> tuple[Placed, Float[Tensor, "p n"], Chosen]:
-        """Return the placed shapes, the separations [m] of the bounding spheres of each pair, and
-        those pairs for which it is less than `below`.
+        """Return the placed shapes, the separations [m] of all bounding spheres, and the pairs
+        nearer than `below` [m].
         """
         if not torch.compiler.is_compiling() and not is_known(frames):
             raise BadArgument(
@@ -174,22 +185,20 @@ class SelfCollision(Value):
 
     @cached_property
     def _links(self) -> int:
-        """The number of link frames to pass, so that every link with a collision shape is among
-        them.
-        """
+        """Number of link frames that are needed to have every link with a collision shape."""
         return int(self.link.max()) + 1 if len(self.link) else 0
 
     @kept
     def _bounding(self) -> Float[Tensor, " s"]:
-        """The radius [m] of the bounding sphere of each collision shape."""
+        """Radius (s,) [m] of the bounding sphere of each collision shape."""
         return torch.linalg.vector_norm(self.half, dim=1) + self.radius
 
     def _sums(self, radius: Float[Tensor, " s"], like: Tensor) -> Float[Tensor, "p 1"]:
-        """Return for each pair of shapes the sum of their radii, given the `radius` of every shape."""
+        """Return the sum of the radii [m] of each pair of shapes, given that of every shape."""
         return radius[self.pairs].sum(1, keepdim=True).to(like)
 
     def _choose(self, near: Bool[Tensor, "p n"]) -> Chosen:
-        """Return the pairs and postures of a mask."""
+        """Return the pairs and postures that the mask `near` marks."""
         counts = torch.stack([part.sum() for part in near.split(self.kinds)])
         ends = counts.cumsum(0).tolist()  # the only wait
         pair, row = torch.nonzero_static(near, size=ends[-1]).unbind(1)
@@ -206,7 +215,7 @@ class SelfCollision(Value):
     def _of_kind(
         self, kind: int, shapes: Placed, pair: Int[Tensor, " k"], row: Int[Tensor, " k"]
     ) -> tuple[Float[Tensor, " k"], Push]:
-        """Return the separations [m] of pairs of one kind, and a function that returns separating
+        """Return the separations [m] of pairs of one `kind`, and a function that returns separating
         directions.
         """
         (first, second), (one, two), place, gap = self._meet(shapes, pair, row)
@@ -247,8 +256,8 @@ class SelfCollision(Value):
     ) -> tuple[
         tuple[Tensor, Tensor], tuple[Tensor, Tensor], Float[Tensor, "3 k"], Float[Tensor, "3 k"]
     ]:
-        """Return, for chosen pairs: shape indices, axes, centre of the second shape, and vector
-        between the centres.
+        """Return for chosen pairs: two shape indices, two axes, the centre [m] of the second shape,
+        and the vector between the centres [m].
         """
         rotation = shapes[0].flatten(2)
         center = shapes[1].flatten(1)
@@ -280,8 +289,10 @@ def _unit(v: Float[Tensor, "3 *b"]) -> Float[Tensor, "3 *b"]:
 
 
 class BoxPairs(NamedTuple):
-    """Pairs of boxes: axes as columns of `a` and `b`, `gap` from the first centre to the second,
-    half sizes [m].
+    """Values of k pairs of boxes, in one frame.
+
+    The unit axes of the two boxes are the columns of `a[:, :, k]` and `b[:, :, k]`. `gap` [m] is
+    the vector from the first centre to the second; `half_a` and `half_b` [m] are the half sizes.
     """
 
     a: Float[Tensor, "3 3 k"]
@@ -294,8 +305,9 @@ class BoxPairs(NamedTuple):
         """Return the separations [m] along the 15 candidate axes of two boxes (Gottschalk et al.,
         1996).
 
-        The boxes' own axes come first. The largest separation is a lower bound of the distance; a
-        negative one is minus the shortest translation that separates the boxes.
+        The three axes of box a come first, then those of b, then the nine cross products. The
+        largest separation is a lower bound of the distance; a negative one is minus the shortest
+        translation that separates the boxes.
         """
         a, b, gap, half_a, half_b = self
         rotation = (a[:, :, None] * b[:, None]).sum(0)  # b's axes in the frame of a
@@ -318,8 +330,11 @@ class BoxPairs(NamedTuple):
         return torch.cat([by_a, by_b, by_edges])
 
     def push(self, best: Int[Tensor, " c"]) -> Pushed:
-        """Return the unit vector of axis `best` towards the second box, and the contact point from
-        its centre [m].
+        """Return two vectors of each pair: the unit vector of axis `best` towards box b, then the
+        contact point [m].
+
+        The contact point is relative to the centre of box b. `best` is the index of an axis of
+        `along_axes`.
         """
         a, b, gap, half_a, half_b = self
         best = best[None]
@@ -348,8 +363,9 @@ class BoxPairs(NamedTuple):
 
 
 def box_distance(points: Float[Tensor, "*b 3"], half: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-    """Return the signed distance [m] of points from boxes of `half` sizes around the origin,
-    negative inside.
+    """Return the signed distance [m] of `points` [m] from boxes around the origin, negative inside.
+
+    `half` [m] holds the half sizes of each box along x, y and z.
     """
     ox, oy, oz = (points.abs() - half).unbind(-1)
     px = ox.clamp_min(0)

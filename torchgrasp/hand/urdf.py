@@ -1,7 +1,7 @@
-"""A URDF as values: the checked tree of links, joints and collision shapes. Mesh files are not
-opened.
+"""A URDF as values: the checked tree of links, joints and collision shapes.
 
-The gate in `safe_xml` checks a file's bytes; yourdfpy reads the checked elements alone.
+The gate in `safe_xml` checks a file's bytes; yourdfpy reads the checked elements alone. Mesh files
+are not opened.
 """
 
 import dataclasses
@@ -30,7 +30,9 @@ Triple = tuple[float, float, float]
 
 
 class Mimic(NamedTuple):
-    """A coupled joint: its position is `ratio * source + offset`."""
+    """A coupled joint: its position is `ratio` times that of the joint `source`, plus `offset` [rad
+    or m].
+    """
 
     source: str
     ratio: float
@@ -39,10 +41,11 @@ class Mimic(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class LinkShape:
-    """A collision shape of a link: box, sphere, cylinder or mesh.
+    """A collision shape of a link; its `kind` is "box", "sphere", "cylinder" or "mesh".
 
     `size` is (x, y, z) of a box, (radius,) of a sphere, (radius, length) of a cylinder [m]; the
-    scale of a mesh.
+    scale of a mesh. The shape is at `xyz` [m] in the link's frame, turned by `rpy` [rad] about the
+    fixed axes x, y, z. `file` is the file of a mesh, "" for other shapes.
     """
 
     kind: str
@@ -53,7 +56,7 @@ class LinkShape:
 
     @property
     def half(self) -> Triple:
-        """Half sizes [m] of the box around a box, sphere or cylinder."""
+        """Half sizes (x, y, z) [m] of the box around a box, sphere or cylinder."""
         if self.kind == "box":
             return self.size[0] / 2, self.size[1] / 2, self.size[2] / 2
         return (
@@ -65,8 +68,10 @@ class LinkShape:
 
 @dataclasses.dataclass(frozen=True)
 class Link:
-    """A rigid link: mass [kg], centre [m] and inertia (xx, xy, xz, yy, yz, zz) [kg m2] about it,
-    collision shapes.
+    """A rigid link of a URDF.
+
+    `com` [m] is the centre of `mass` [kg] in the link's frame, and `inertia` [kg m^2] holds xx, xy,
+    xz, yy, yz, zz about it, along the link's axes. `shapes` are the collision shapes.
     """
 
     name: str
@@ -78,8 +83,14 @@ class Link:
 
 @dataclasses.dataclass(frozen=True)
 class Joint:
-    """A joint at `xyz` [m], `rpy` [rad] in its parent; limits are 0 if it is fixed, infinite if the
-    URDF has none.
+    """A joint between the links `parent` and `child`; its `kind` is "revolute", "prismatic",
+    "continuous" or "fixed".
+
+    The joint's frame is at `xyz` [m] in the parent's frame, turned by `rpy` [rad] about the fixed
+    axes x, y, z; `axis` is its unit axis in this frame. `lower` and `upper` [rad or m] are the
+    limits, 0 for a fixed joint, infinite if the URDF has none. `effort` [N m or N] and `velocity`
+    [rad/s or m/s] are the greatest ones, 0 if the URDF has none. `mimic` is the coupling, None for
+    an independent joint.
     """
 
     name: str
@@ -97,16 +108,18 @@ class Joint:
 
     @property
     def rest(self) -> float:
-        """The position of the joint if it does not take part in a grasp: zero, or the limit nearest
-        to zero.
+        """Position [rad or m] of the joint if it does not take part in a grasp: zero, or the limit
+        nearest to zero.
         """
         return min(max(0.0, self.lower), self.upper)
 
 
 @dataclasses.dataclass(frozen=True)
 class Urdf:
-    """A checked URDF: `data` holds the bytes of the file, `xml` a copy with only the checked links
-    and joints.
+    """A checked URDF, with its links and joints in the order of the file.
+
+    `root` is the name of the root link. `data` holds the bytes of the file, `xml` a copy with only
+    the checked links and joints.
     """
 
     path: Path
@@ -129,7 +142,7 @@ class Urdf:
 
     @checked
     def joints_above(self, link: str) -> tuple[Joint, ...]:
-        """Return the joints on the way from a link to the root, nearest first."""
+        """Return the joints on the way from the link named `link` to the root, nearest first."""
         above = {j.child: j for j in self.joints}
         chain = []
         while link in above:
@@ -139,14 +152,18 @@ class Urdf:
 
     @checked
     def movers(self, link: str) -> tuple[Joint, ...]:
-        """Return the movable joints on the way from a link to the root, nearest first."""
+        """Return the movable joints on the way from the link named `link` to the root, nearest
+        first.
+        """
         return tuple(j for j in self.joints_above(link) if j.kind != "fixed")
 
 
 @checked
 def read_urdf(path: Path | str) -> Urdf:
-    """Read a URDF that the library can use as it is: without meshes, endless joints and chains of
-    coupled joints.
+    """Read a URDF that the library can use as it is.
+
+    It has no meshes, no joints without limits, and no chains of coupled joints. Raises
+    `HandFileError` for others, and for a missing or malformed file.
     """
     urdf = read_published(path)
     for link in urdf.links:
@@ -164,8 +181,10 @@ def read_urdf(path: Path | str) -> Urdf:
 
 
 def read_published(path: Path | str) -> Urdf:
-    """Read a URDF as its maker published it: meshes, joints without limits and chains of coupled
-    joints are allowed.
+    """Read a URDF as its maker published it: with meshes, joints without limits, and chains of
+    coupled joints.
+
+    Raises `HandFileError` for a missing or malformed file.
     """
     path = Path(path)
     return _parse(
