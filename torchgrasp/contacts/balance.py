@@ -208,8 +208,8 @@ def forces_near(points: Vectors, normals: Vectors, weights: Tensions) -> Vectors
     """Return balanced forces (b, f, 3) of little friction whose shares on the `internal_forces` are
     near `weights`.
 
-    `points` (b, f, 3) are the contacts, `normals` (b, f, 3) the outward unit normals, and `weights`
-    hold a share for each of p pairs. A short search begins with the weights. The forces are of any
+    `points` (b, f, 3) are the contacts, `normals` (b, f, 3) the outward unit normals. `weights` (b,
+    p) hold a share for each of p pairs; a short search begins with them. The forces are of any
     scale; those of a set are NaN if none are found that push at all contacts.
     """
     pairs = internal_forces(points)

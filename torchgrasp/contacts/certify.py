@@ -216,7 +216,7 @@ def bound_margin(wrench: Wrenches, witness: Float[Tensor, "b 6"]) -> Float[Tenso
     """Return the upper bound of the closure margin that each direction `witness` in wrench space
     proves, or NaN.
 
-    `wrench` holds the m edge wrenches of each contact set. The bound has no unit.
+    `wrench` (b, m, 6) holds the m edge wrenches of each contact set. The bound has no unit.
     """
     # With g_k = w.w_k and phi >= s: 0 = sum phi g >= s sum g + (1 - m s) min g, hence s <= -min g /
     # sum(g - min g).

@@ -163,12 +163,13 @@ def rank_ratio(wrench: Float[Tensor, "b f e 6"]) -> Float[Tensor, "b"]:
 def solve_closure_lp(
     wrench: Wrenches,
 ) -> tuple[Coefficients, Float[Tensor, "b 6"]]:
-    """Return for each contact set the coefficients phi that balance its m wrenches with the
-    greatest margin, and a witness.
+    """Return the coefficients phi that balance the m wrenches of each contact set with the greatest
+    margin, and a witness.
 
-    The margin is the smallest coefficient. The witness, a unit wrench, proves that no margin is
-    greater. If no coefficients balance the wrenches, the witness proves that instead, and phi has
-    no meaning. Rounding or too few pivots may spoil both: check them.
+    `wrench` has the shape (b, m, 6), phi (b, m), and the witness (b, 6). The margin is the smallest
+    coefficient. The witness, a unit wrench, proves that no margin is greater. If no coefficients
+    balance the wrenches, the witness proves that instead, and phi has no meaning. Rounding or too
+    few pivots may spoil both: check them.
     """
     return in_chunks(_solve, wrench, at_once(wrench, GRASPS_PER_CHUNK))  # pyright: ignore[reportReturnType]
 
@@ -267,7 +268,8 @@ def closed_exact(
 
 
 def first_balance(points: Vectors, normals: Vectors, friction: float) -> Coefficients:
-    """Return coefficients that balance the wrenches of m = 4 f cone edges with the greatest margin.
+    """Return coefficients (b, m) that balance the wrenches of m = 4 f cone edges with the greatest
+    margin.
 
     They are arbitrary if no coefficients balance them. `points` and outward unit `normals` have the
     shape (b, f, 3), and `friction` is the coefficient of friction.
@@ -371,10 +373,11 @@ def _balances(wrench: Wrenches, phi: Coefficients) -> Bool[Tensor, "b"]:
 
 
 def residual_of(wrench: Wrenches, phi: Coefficients) -> Float[Tensor, "b"]:
-    """Return the largest absolute number in the sum of the m wrenches, each multiplied by its
-    coefficient in `phi`.
+    """Return the largest absolute number in the sum of m wrenches, each multiplied by its
+    coefficient.
 
-    `wrench` holds the wrenches of b contact sets; like phi they have no unit.
+    `wrench` (b, m, 6) holds the wrenches of b contact sets, and `phi` (b, m) their coefficients;
+    both have no unit.
     """
     return (phi[:, None] @ wrench)[:, 0].abs().amax(-1)
 

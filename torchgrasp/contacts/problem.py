@@ -160,10 +160,10 @@ def pull_signs(fingertips: int, device: torch.device) -> Float[Tensor, "f p"]:
 
 
 def split_unknowns(x: Float[Tensor, "b u"]) -> tuple[Vectors, Tensions]:
-    """Return the two parts of vectors of u unknowns: contact points (b, f, 3), and tensions of p
-    pairs of contacts.
+    """Return the two parts of vectors of u unknowns: contact points, and tensions of pairs of
+    contacts.
 
-    Both are views of `x`.
+    The points have the shape (b, f, 3), the tensions (b, p). Both are views of `x`.
     """
     # the unknowns of the possible numbers of fingertips
     counts = {3 * f + f * (f - 1) // 2: f for f in range(FINGERTIPS[0], FINGERTIPS[1] + 1)}
@@ -207,11 +207,12 @@ class Constraints(Batch):
 def forces_from_tensions(
     points: Vectors, tension: Tensions
 ) -> tuple[Vectors, Float[Tensor, "b p 3"]]:
-    """Return the forces (b, f, 3) on the object at the contacts, and the vector of each pair.
+    """Return the forces (b, f, 3) on the object at the contacts, and the vector (b, p, 3) of each
+    pair.
 
     The vector of a pair leads from its first to its second contact. The force on the first contact
     of a pair is tension times vector, that on the second is opposite. `points` have the shape (b,
-    f, 3).
+    f, 3), and `tension` (b, p).
     """
     first, second = contact_pairs(points.shape[1], points.device)
     sides = points[:, second] - points[:, first]
@@ -325,7 +326,7 @@ class ContactProblem:
     def constraints(self, points: Vectors, tension: Tensions, jet: SurfaceJet) -> Constraints:
         """Return the values of all constraints and their Jacobians for b contact sets.
 
-        `points` (b, f, 3) are the normalised contacts, and `tension` is that of each of p pairs of
+        `points` (b, f, 3) are the normalised contacts, and `tension` (b, p) is that of each pair of
         contacts. `jet` holds signed distance and variance with their derivatives at the points.
         """
         b, f = points.shape[:2]

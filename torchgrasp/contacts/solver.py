@@ -78,9 +78,9 @@ FINISH = Stage(
 class State(Batch):
     """The solver's state for b contact sets of f contacts.
 
-    `points` (b, f, 3) are the normalised contacts. `tension` is that of each of p pairs of contacts
-    (see `contacts.problem`), scaled so that the mean size of the contact forces is 1. `jet` holds
-    signed distance and variance of the surface at the points, with derivatives.
+    `points` (b, f, 3) are the normalised contacts. `tension` (b, p) is that of each of p pairs of
+    contacts (see `contacts.problem`), scaled so that the mean size of the contact forces is 1.
+    `jet` holds signed distance and variance of the surface at the points, with derivatives.
     """
 
     points: Vectors
@@ -235,8 +235,8 @@ def start_state(shape: ShapeLike, points: Vectors) -> State:
 
 
 def equal_tensions(points: Vectors) -> Tensions:
-    """Return equal tensions for all p pairs of contacts; the force at each contact then points to
-    the centroid.
+    """Return equal tensions (b, p) for all pairs of contacts; the force at each contact then points
+    to the centroid.
 
     `points` (b, f, 3) are the normalised contacts. A pair of contacts pulls together with its
     tension times its distance.
@@ -246,7 +246,8 @@ def equal_tensions(points: Vectors) -> Tensions:
 
 
 def normalise_tensions(points: Vectors, tension: Tensions) -> Tensions:
-    """Return the tensions, scaled so that the mean size of the contact forces that they cause is 1.
+    """Return the tensions (b, p), scaled so that the mean size of the contact forces that they
+    cause is 1.
 
     `points` (b, f, 3) are the normalised contacts.
     """

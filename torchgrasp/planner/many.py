@@ -158,7 +158,7 @@ def _refused(hand: Hand, reason: str) -> Grasps:
 
 
 def no_grasps(hand: Hand) -> Grasps:
-    """Return an empty set of grasps with the numbers of joints and fingers of a hand."""
+    """Return an empty set of grasps, whose tensors have the axes of the hand's joints and fingers."""
     f = len(hand.tips)
 
     def none(*shape: int) -> torch.Tensor:

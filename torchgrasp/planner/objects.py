@@ -216,7 +216,9 @@ class Objects:
         ).all(0)
 
     def relaxed_specs(self) -> Iterator[ContactSpec]:
-        """Yield weaker and weaker constraints for a single object, in the caller's frame."""
+        """Yield the constraints of `ContactSpec.relaxed` for a single object, in the caller's
+        frame.
+        """
         radius = float(self.hand.tips.radius.max())
         return iter(self.given_spec.relaxed(self.spec.ring_radius, radius))
 

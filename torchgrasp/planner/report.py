@@ -50,7 +50,9 @@ class Report:
         self.closed = 0
 
     def shape(self) -> None:
-        """Report the estimated shape, and the fraction of its surface that is certain."""
+        """Report the estimated shape, and the share of its surface that is certain to
+        `REPORT.certain`.
+        """
         if not self.heard:
             return
         shape = self.objects.each[0].shape

@@ -324,8 +324,8 @@ def find_seeds(objects: Objects, contacts: Contacts, cloud: CloudIndex) -> IKSee
 def with_costs(objects: Objects, found: Candidates) -> Candidates:
     """Return the contact sets `found` with their costs (no unit; less is better).
 
-    A cost is the logarithm of the least sum of squared errors [mm2] of the first `numbers.tried`
-    initial postures. To it is added `numbers.lever` times the logarithm of the load's lever arm
+    A cost is the logarithm of the least sum of squared errors [mm2] of the first `CHOICE.tried`
+    initial postures. To it is added `CHOICE.lever` times the logarithm of the load's lever arm
     (`lever_arm`). A contact set without initial postures has an infinite cost. If grasps must
     resist loads, the postures in which the fingers resist the most come first. Then sets without a
     posture that resists all loads cost more than all other sets.

@@ -181,9 +181,9 @@ class Certificate(Batch):
     the radius of the contacts; phi are their coefficients. W, phi and the first five fields have no
     unit. `margin` is the largest s with W phi = 0, sum phi = 1, phi >= s. `rank_ratio` is the
     smallest over the largest singular value of W. `residual` is the largest |W phi|. `closed`,
-    which means force closure, needs a margin > 0 and full rank, because coincident or collinear
-    contacts satisfy Eq. (13) too. `witness` is a unit wrench w with w . v >= -margin for every
-    column v of W. Without force closure no contact force opposes w.
+    which means force closure, needs a margin clearly above 0 and full rank, because coincident or
+    collinear contacts satisfy Eq. (13) too. `witness` is a unit wrench w with w . v >= -margin for
+    every column v of W. Without force closure no contact force opposes w.
 
     With `resist`, a task has several loads; `task_load` t (3 forces [N], 3 torques [N m]) is the
     one that the contacts resist least, about their centroid. They resist `task_margin` (no unit)
