@@ -26,12 +26,12 @@ __all__ = ["BrokenLaw", "check_hand"]
 
 @dataclasses.dataclass(frozen=True)
 class LawNumbers:
-    """The numbers of the laws."""
+    """Steps and tolerances of the laws that the kinematics of a hand must obey."""
 
     step: float = 1e-6
     """Step [rad] of central differences."""
     jacobian: float = 1e-6
-    """Their largest difference [m/rad] from the Jacobian."""
+    """Largest difference [m/rad] of central differences from the Jacobian."""
     rounding: float = 1e-6
     """Largest error of a joint [rad or m], and of the sum of two principal inertias, relative."""
     outward: float = 1e-4
@@ -52,7 +52,7 @@ def check_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
 
     * `kinematics`: the poses of all links are those of yourdfpy.
     * `jacobian`: the Jacobian of the fingertips equals central differences.
-    * `batch`: the rows of a batch equal single postures, and an empty batch is empty.
+    * `batch`: each posture of a batch gives what it gives alone, and an empty batch is empty.
 
     Raises `BrokenLaw` for the first law that the kinematics break, `HandFileError` for a file that
     breaks a rule, and `BadArgument` if the hand has no such fingers.
@@ -112,8 +112,9 @@ def _check_jacobian(hand: Hand, joints: Float[Tensor, "n h"]) -> None:
 
 
 def find_faults(name_or_path: str | Path, fingers: Fingers = "default") -> Iterator[HandFileError]:
-    """Yield an error for each rule that a hand's files break; raise the error of `load_hand` if it
-    cannot load them.
+    """Yield an error for each rule that the files of a hand break.
+
+    Raises the error of `load_hand` if it cannot load them.
     """
     spec = read_hand_toml(find_hand(name_or_path) / "hand.toml", fingers)
     urdf = read_urdf(spec.urdf)
@@ -124,7 +125,7 @@ def find_faults(name_or_path: str | Path, fingers: Fingers = "default") -> Itera
 
 
 def random_joints(hand: Hand, n: int, seed: int = 0) -> Float[Tensor, "n h"]:
-    """Return n random postures, uniform within the joint limits [rad]."""
+    """Return n random postures of the h actuated joints, uniform within the joint limits [rad]."""
     share = torch.rand(
         n,
         hand.dof,
@@ -136,7 +137,10 @@ def random_joints(hand: Hand, n: int, seed: int = 0) -> Float[Tensor, "n h"]:
 
 
 def most_met(hand: Hand, joints: Float[Tensor, "n h"]) -> tuple[str, str]:
-    """Return the names of the two links of a hand that overlap in the most of n postures."""
+    """Return the names of the two links of a hand that overlap in the most of n postures.
+
+    `joints` (n, h) are positions of the h actuated joints [rad].
+    """
     apart = hand.self_collision.separations(
         hand.tree.frames(hand.expand_joints(joints).T.contiguous()), 0.0
     )
@@ -202,7 +206,11 @@ def _inside(point: np.ndarray, shape: LinkShape) -> bool:
 
 
 def largest_fk_error(hand: Hand, joints: Float[Tensor, "n h"]) -> tuple[float, str]:
-    """Return the largest difference of a pose entry from yourdfpy's, and the link's name."""
+    """Return the largest difference of a pose from yourdfpy's, and the name of its link.
+
+    Differences are those of entries of poses (4, 4): [m], or entries of rotations. `joints` (n, h)
+    are positions of the h actuated joints [rad].
+    """
     urdf = read_urdf(hand.urdf_path)
     poses = hand.link_poses(joints).double()
     robot = yourdfpy.URDF.load(io.BytesIO(urdf.xml), load_meshes=False)

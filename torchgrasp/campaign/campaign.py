@@ -1,4 +1,7 @@
-"""A campaign on a folder of objects: from views to a data set of grasps on disk."""
+"""A campaign on a folder of objects: from views to a data set of grasps on disk.
+
+A job plans and tries the grasps of one view of one object.
+"""
 
 import dataclasses
 import itertools
@@ -88,13 +91,13 @@ def run_campaign(
     workers: Annotated[int, Range(0, 1024)] | str = 0,
     observer: Callable[[JobRow], object] = lambda row: None,
 ) -> GraspShards:
-    """Plan on every view of a folder of objects, try the grasps in simulation, and write a data set
-    of the results.
+    """Plan on every view of a folder of objects, and try the grasps in simulation.
 
-    Each job, one object and view, gives a row: its grasps, or the reason why there are none. A
-    finished job is on disk at once. The same call continues an interrupted run, and retries failed
-    jobs (`WORKER_DIED`, `TIMED_OUT`, `BROKEN`). Equal results give equal bytes, whatever the
-    workers, their order and the interruptions (docs/promises.md, N10, on equal results).
+    The results are written as a data set, which is returned. Each job, one object and view, gives a
+    `JobRow` and its grasps, or the reason why there are none. A finished job is on disk at once.
+    The same call continues an interrupted run, and retries failed jobs (`WORKER_DIED`, `TIMED_OUT`,
+    `BROKEN`). Equal results give equal bytes, whatever the workers, their order and the
+    interruptions (docs/promises.md, N10, on equal results).
 
     Args:
         objects: a folder as in `torchgrasp.data`. On a cluster it has the same path on every

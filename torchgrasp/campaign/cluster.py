@@ -51,8 +51,9 @@ def versions() -> dict[str, str]:
 
 
 def check_versions(meta: dict[str, str]) -> None:
-    """Raise `BadArgument` unless this machine has the software of the machine that began the
-    campaign.
+    """Raise `BadArgument` unless this machine has the software with which the campaign began.
+
+    `meta["versions"]` holds the versions at its start as JSON.
     """
     here = json.dumps(versions())
     if here != meta["versions"]:
@@ -60,15 +61,20 @@ def check_versions(meta: dict[str, str]) -> None:
 
 
 class OnGpu(NamedTuple):
-    """A task of a worker with the resource "GPU", whose result is an argument of other tasks."""
+    """A task for a worker with the resource "GPU", whose result is an argument of other tasks.
+
+    The worker calls `function` with the arguments `task`.
+    """
 
     function: Callable[..., Any]
     task: tuple[Any, ...]
 
 
 def plan_jobs(meta: dict[str, str], *task: Any) -> list[Grasps | None]:
-    """Return `plan_views(*task)`: plans of several jobs for `run_job`, which says what every
-    machine must have.
+    """Return the executable grasps of several jobs, None for a job that could not be planned.
+
+    `task` holds the arguments of `plan_views`. Raises `BadArgument` on a machine whose software
+    differs from `meta["versions"]`.
     """
     check_versions(meta)
     return plan_views(*task)
@@ -82,13 +88,13 @@ def run_job(
     plans: object = None,
     place: int = 0,
 ) -> bytes:
-    """Plan and try the grasps of one job; return the bytes of a shard file that holds only this
-    job.
+    """Plan and try the grasps of one job; return the bytes of a shard file with only this job.
 
-    Every machine must have the same hand and the same software as the machine that began the
-    campaign: `meta` holds the `versions` of the software. A faulty object gives a row with the
-    reason. Errors that are not the object's fault are raised. The job's plan is `plans[place]` if
-    there are `plans`, from `plan_jobs`; they are a status if it took long.
+    `meta` holds the `versions` of the software with which the campaign began; every machine must
+    have them, and the same hand. `plans` is what `plan_jobs` returned, and the job's plan is
+    `plans[place]`. If it is no list (None, or the `Status` of a planning that took too long), the
+    job is planned here. A faulty object gives a `JobRow` with the reason. Errors that are not the
+    object's fault are raised.
     """
     check_versions(meta)
     hand = view.load_hand()
@@ -140,7 +146,10 @@ def _work(
 
 
 def empty_shard(row: JobRow, hand: Hand, draws: int) -> Shard:
-    """Return the data of a job that has neither a cloud nor grasps, as a shard."""
+    """Return the shard of a job that has neither a cloud nor grasps.
+
+    `row` is its outcome, and `draws` the number of trials of each grasp in the campaign.
+    """
     points = torch.zeros(0, 3, dtype=torch.float64)
     eye = torch.zeros(1, 3, dtype=torch.float64)
     tried = torch.zeros(0, draws, dtype=torch.int64)
@@ -150,10 +159,10 @@ def empty_shard(row: JobRow, hand: Hand, draws: int) -> Shard:
 def run_on_cluster(
     function: Callable[..., Result], tasks: Iterable[tuple[Any, ...]], address: str, limit: float
 ) -> Generator[tuple[int, Result | Status], None, None]:
-    """Run tasks on a Dask cluster; yield the index of each task and its result, in the order in
-    which they end.
+    """Run tasks on a Dask cluster, and yield the index and the result of each as it ends.
 
-    A task whose worker dies is given to another worker; after the deaths that the scheduler allows
+    A task holds the arguments of `function`; `address` is that of the scheduler. A task whose
+    worker dies is given to another worker; after the deaths that the scheduler allows
     (`distributed.scheduler.allowed-failures`, 3 by default) it gives `Status.WORKER_DIED`. A task
     that takes longer than `limit` [s] ends its worker, and gives `Status.TIMED_OUT`. The scheduler
     holds `OUTSTANDING` tasks at most, which wait until a worker is free. Successive tasks share an

@@ -35,13 +35,17 @@ a failure.
 
 
 class Campaign(NamedTuple):
-    """The request of a campaign, as in `campaign.json`, and one row for each job (one view of one
-    object).
+    """The request of a campaign, and its jobs; a job is one view of one object.
+
+    Attributes:
+        asked: the request, as in `campaign.json`.
+        rows: object and view of each job; a job with a status other than OK is not run.
+        empty: function that makes the data of a job without grasps, given its row.
     """
 
     asked: dict[str, Any]
-    rows: tuple[JobRow, ...]  # a job whose row has a status other than OK is not run
-    empty: Callable[[JobRow], Shard]  # makes the data of a job without grasps from its row
+    rows: tuple[JobRow, ...]
+    empty: Callable[[JobRow], Shard]
 
     @property
     def text(self) -> str:
@@ -50,7 +54,7 @@ class Campaign(NamedTuple):
 
     @property
     def meta(self) -> dict[str, str]:
-        """The metadata of each shard: hash of the request, and package versions."""
+        """The metadata of each shard: hash of the request, and package versions as JSON."""
         digest = hashlib.sha256(self.text.encode()).hexdigest()
         return {"campaign": digest, "versions": json.dumps(self.asked["versions"])}
 
@@ -61,8 +65,10 @@ def carry_out(
     work: Work,
     observer: Callable[[JobRow], object] = lambda row: None,
 ) -> GraspShards:
-    """Run the jobs that a folder lacks, and write its data set; the observer gets the row of each
-    finished job.
+    """Run the jobs that a folder lacks, and write its data set, which is returned.
+
+    `work` runs jobs, given their indices; see `Work`. `observer` is called with the `JobRow` of
+    each finished job. Raises `OutputError` if the folder holds another campaign or other files.
     """
     with hold_folder(folder):
         begin_folder(folder / ASKED, campaign.text, "campaigns")
@@ -182,7 +188,11 @@ class _Store:
 
 
 def card_of(campaign: Campaign, rows: Sequence[JobRow], digests: list[str]) -> dict[str, Any]:
-    """Return the content of `card.json`, given the rows of all jobs and the SHA-256 of each shard."""
+    """Return the content of `card.json`.
+
+    `rows` are the outcomes of all jobs, and `digests` the SHA-256 of each shard in hexadecimal
+    digits.
+    """
     asked = campaign.asked
     tries = campaign.asked["protocol"]["noise"]["draws"]
     counts = {
