@@ -192,8 +192,8 @@ def tip_compliance(
 ) -> Float[Tensor, "*b f"]:
     """Return the compliance [m/N] of each fingertip along its contact normal.
 
-    `jacobian` [m/rad] is that of the contact points by the h actuated joints, whose `stiffness` [N
-    m/rad] is given; `normals` are unit vectors.
+    `jacobian` [m/rad] is that of the contact points by the h actuated joints, whose `stiffness`
+    [N m/rad] is given; `normals` are unit vectors.
     """
     along = torch.einsum("...cih,...ci->...ch", jacobian, normals)
     return (along**2 / stiffness).sum(-1)

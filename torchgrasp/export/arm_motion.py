@@ -25,11 +25,12 @@ HELD = 1e-3  # largest difference [m, 1] between the poses of the grasps and of 
 @checked
 @dataclasses.dataclass(frozen=True)
 class ArmMotion(Value):
-    """The motions of an arm and its hand through g grasps, at t `times` [s]: `positions` of all
-    joints [rad] by name.
+    """The motions of an arm and its hand through g grasps, at t common times.
 
-    `phases` names the times at which the hand is above its pre-grasp, at the pre-grasp, at the
-    grasp, presses (its joints are then targets), and has lifted the object.
+    `positions` [rad, or m for sliding joints] are those of the j joints of `joint_names`: the
+    arm's, then the hand's. `times` [s] start at 0. `phases` holds the index of a time for each
+    name: "above" (the hand is above its pre-grasp), "pregrasp", "grasp", "squeeze" (it presses; its
+    joints are then targets), and "lift" (it has lifted the object).
     """
 
     joint_names: tuple[str, ...]
@@ -44,9 +45,10 @@ def plan_motion(
 ) -> ArmMotion:
     """Return the motions of arm and hand through executable grasps that were planned with the arm.
 
-    The hand comes straight at 0.1 m/s from 0.1 m, and is lifted by 0.1 m as fast. `force` and `kp`
-    are those of `format_grasps`. The way to the first posture is not planned. Without a table z
-    points up. Raises `BadArgument` for grasps without postures of this arm where it stands, and the
+    The hand comes straight at 0.1 m/s from 0.1 m, and is lifted by 0.1 m as fast. `force` [N] is
+    the normal force of the strongest finger, `kp` [N m/rad] the stiffness of the robot's position
+    control; None means the hand's. The way to the first posture is not planned. Without a table z
+    points up. Raises `BadArgument` for grasps without postures of this arm at its place, and the
     errors of `format_grasps`.
 
     >>> grasps = plan_grasps(cloud, hand, spec, arm=arm)  # doctest: +SKIP
@@ -90,6 +92,8 @@ def plan_motion(
 
 
 def _holds(arm: Arm, joints: Float[Tensor, "g n"], obj_from_hand: Float[Tensor, "g 4 4"]) -> bool:
-    """Return whether joints of an arm are this one's, and it then holds the hand in the poses."""
+    """Return whether `joints` [rad] are those of this arm, with which it holds the hand at the
+    given poses.
+    """
     fits = joints.shape[1] == len(arm.lower)
     return fits and torch.allclose(arm.hand_poses(joints), obj_from_hand, rtol=0.0, atol=HELD)

@@ -40,8 +40,11 @@ Quaternion = Literal["wxyz", "xyzw"]
 
 
 class ForeignGrasps(NamedTuple):
-    """Imported grasps: joints [rad], poses of the hand's root link in the object's frame, pre-grasp
-    joints if known.
+    """Imported grasps of a hand, g in number.
+
+    `joints` [rad] are the actuated joints, in the order of `hand.joint_names`. `obj_from_hand` [m]
+    are the poses of the hand's root link in the object's frame. `pregrasp` [rad] are the joints of
+    the opened hand, or None if the file has none.
     """
 
     joints: Float[Tensor, "g h"]
@@ -53,19 +56,20 @@ class ForeignGrasps(NamedTuple):
 def read_foreign(
     path: Path | str, hand: Hand, order: Sequence[str] = (), quaternion: Quaternion = "wxyz"
 ) -> ForeignGrasps:
-    """Read joints and poses of grasps from the file of another program, or from our own JSON.
+    """Return joints and poses of grasps from the file of another program, or from our own JSON.
 
     | file | what is read |
     | --- | --- |
     | `.json` of `format_grasps` | joints by name, pose, pre-grasp |
     | `.json` with `pose` and `dofs` (MultiGripperGrasp) | lists of 7 numbers, joints in `order` |
-    | `.npz` with `grasp_qpos` (DexGraspBench) | rows of pose and joints; `pregrasp_qpos`, if any |
+    | `.npz` with `grasp_qpos` (DexGraspBench) | lines of pose and joints; `pregrasp_qpos`, if any |
 
     Args:
+        path: the file. Its lengths are in metres, its angles in radians.
         hand: the grasping hand. For the Allegro hand DexGraspBench's frame and joint order are
             known.
         order: names (as in the hand's URDF) of the joints in the file; other names are ignored.
-        quaternion: order of the numbers in a pose, after its position.
+        quaternion: order of the four numbers after the position in a pose.
 
     Raises `ModelFileError` for a missing or malformed file, and `BadArgument` for an order that
     misses a joint.
@@ -99,7 +103,7 @@ def read_foreign(
 
 
 def _read_own(rows: Field, hand: Hand, names: list[str]) -> ForeignGrasps:
-    """Read grasps in the JSON format of `format_grasps`, whose actuated joints have `names`."""
+    """Return the grasps of a file of `format_grasps`, whose actuated joints have `names`."""
     joints = list[list[float]]()
     opened = list[list[float]]()
     poses = list[list[float]]()
@@ -131,8 +135,8 @@ def _table(field: Field, width: int) -> np.ndarray:
 def _read_bench(
     path: Path, hand: Hand, order: tuple[str, ...], quaternion: Quaternion
 ) -> ForeignGrasps:
-    """Read an .npz file in DexGraspBench's format; the file holds one grasp, or one row for each of
-    several grasps.
+    """Return the grasps of an .npz file in DexGraspBench's format: one grasp, or a line for each of
+    several.
     """
     bench_from_root, known = bench_frame(hand)
     order = order or known
@@ -161,7 +165,7 @@ def _read_bench(
 
 
 def _places(hand: Hand, order: tuple[str, ...]) -> list[int]:
-    """Return the index in a file's joint order of each actuated joint; refuse an order that lacks
+    """Return the index in a file's joint `order` of each actuated joint; refuse an order that lacks
     one.
     """
     missing = [name for name in hand.joint_names if name not in order]
@@ -174,8 +178,10 @@ def _places(hand: Hand, order: tuple[str, ...]) -> list[int]:
 
 
 def read_poses(numbers: np.ndarray, quaternion: Quaternion) -> Float[Tensor, "g 4 4"]:
-    """Return pose matrices from rows (g, 7) of a position [m] and a unit quaternion in the given
-    order.
+    """Return pose matrices [m] from `numbers` (g, 7): a position [m], then a unit quaternion in the
+    given order.
+
+    Raises `ModelFileError` for a quaternion that is not of length 1.
     """
     turns = numbers[:, 3:] if quaternion == "xyzw" else numbers[:, [4, 5, 6, 3]]
     far = np.abs(np.linalg.norm(turns, axis=1) - 1) > ROUNDING
@@ -207,13 +213,14 @@ def grasps_from_joints(
     unknown, because no object is known. The approach is the hand's own approach axis.
 
     Args:
+        hand: the hand.
         joints: actuated joints [rad], in the order of `hand.joint_names`.
-        obj_from_hand: poses of the root link of the hand's URDF.
-        pregrasp: joints of the opened hand; by default each tip moves 20 mm off its contact, or as
-            far as limits allow.
-        spec: friction and number of cone edges of the certificate; `ContactSpec()` by default.
+        obj_from_hand: poses [m] of the root link of the hand's URDF, in the object's frame.
+        pregrasp: actuated joints [rad] of the opened hand; None means that each tip moves 20 mm off
+            its contact, or as far as limits allow.
+        spec: friction and number of cone edges of the certificate; None means `ContactSpec()`.
         std_m: standard deviation [m] of the surface at each contact, for closing controllers that
-            use it.
+            use it; None if it is unknown.
 
     Raises `BadArgument` for wrong shapes, joints outside the limits, or poses that are not rigid.
 
@@ -263,8 +270,8 @@ def grasps_from_joints(
 def _open(
     hand: Hand, joints: Float[Tensor, "g h"], away: Float[Tensor, "g f 3"]
 ) -> Float[Tensor, "g h"]:
-    """Return joints at which each fingertip has moved 20 mm off its contact along `away`, if joint
-    limits allow.
+    """Return joints [rad] at which each fingertip has moved 20 mm off its contact along `away`, if
+    joint limits allow.
     """
     for _ in range(OPENING_STEPS):
         jacobian = hand.jacobian(joints).flatten(1, 2)  # (g, 3 f, h)

@@ -1,5 +1,4 @@
-"""Export of grasps for DexGraspBench's evaluator and GraspGen's loader, and of the surface as a
-mesh.
+"""Export of grasps for DexGraspBench's evaluator and GraspGen's loader, and of surfaces as meshes.
 
 DexGraspBench reads each grasp by NumPy's `load` with pickles allowed. The format exists only as a
 pickle, and `save_dexgraspbench` is the one function of torchgrasp that writes one. No function of
@@ -49,7 +48,7 @@ def save_dexgraspbench(
     kp: Positive = 5.0,
 ) -> list[Path]:
     """Write each grasp as a file `folder/0.npy`, `folder/1.npy` and so on, for DexGraspBench's
-    evaluator.
+    evaluator; return their paths.
 
     A file is a dictionary: `obj_path`, `obj_scale` (1), `obj_pose` (identity), and `pregrasp_qpos`,
     `grasp_qpos`, `squeeze_qpos` (23): position [m] and quaternion (w, x, y, z) of the hand, then 16
@@ -103,9 +102,10 @@ def format_graspgen(grasps: Grasps, object_path: str) -> str:
     """Return grasps as the JSON of a GraspGen data set: poses of the hand's root link in the
     object's frame.
 
-    `object_in_gripper` says which grasps are executable. The fields `success` (predicted), `joints`
-    and `joint_names` are our additions. `object_path` is the path of the mesh in the data set; its
-    frame is that of the planned cloud, its scale 1.
+    Lengths are in metres. `object_in_gripper` says which grasps are executable. The fields
+    `success` (predicted probability), `joints` [rad] and `joint_names` are our additions.
+    `object_path` is the path of the mesh in the data set; its frame is that of the planned cloud,
+    its scale 1.
 
     >>> import json
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -126,8 +126,10 @@ def format_graspgen(grasps: Grasps, object_path: str) -> str:
 
 
 def bench_frame(hand: Hand) -> tuple[Float[Tensor, "4 4"], tuple[str, ...]]:
-    """Return the root link's pose in DexGraspBench's hand frame, and its joint order; identity and
-    () if not known.
+    """Return the root link's pose [m] in DexGraspBench's hand frame, then the joint names in the
+    bench's order.
+
+    They are the identity and () for a hand that the bench does not have.
     """
     turn, order = BENCH_HANDS.get(hand.name, ([0.0, 0.0, 0.0, 1.0], ()))
     rotation = torch.from_numpy(spatial.transform.Rotation.from_quat(turn).as_matrix())
@@ -136,11 +138,11 @@ def bench_frame(hand: Hand) -> tuple[Float[Tensor, "4 4"], tuple[str, ...]]:
 
 @checked
 def save_surface(surface: Surface, path: Path | str) -> Path:
-    """Write a surface with its uncertainty as colours to `.ply` (with `std_m` [m] of each vertex)
-    or `.glb`.
+    """Write a surface, with its uncertainty as colours, to a .ply or .glb file; return the path.
 
-    Yellow marks a standard deviation of `largest_std`, violet 0. Raises `OutputError`, and
-    `BadArgument` for another suffix.
+    The suffix of the `path` selects the format; .ply also has `std_m` [m] of each vertex. Yellow
+    marks a standard deviation of `largest_std`, violet 0. Raises `OutputError`, and `BadArgument`
+    for another suffix.
 
     >>> import tempfile
     >>> from torchgrasp import fit_shape, load_object

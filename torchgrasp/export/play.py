@@ -55,23 +55,22 @@ AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 @dataclasses.dataclass(frozen=True)
 class PlayNumbers:
-    """The numbers of a played motion."""
+    """Numbers of a played motion."""
 
     room: float = 0.1
-    """Way [m] of the mount beyond approach and lift."""
+    """Range [m] of the mount beyond approach and lift."""
     speed: float = 0.2
-    """Speed [m/s] of the approach: the mean speed of our trials."""
+    """Speed [m/s] of the approach: the mean speed in our trials."""
     lift: float = 1.0
     """Time [s] of the lift."""
     friction: float = 0.1
     """Least coefficient of friction for which the force is chosen."""
     force: float = 100.0
     """Largest force [N], far beyond what hands exert."""
-    # of the mount's links
     mass: float = 0.1
-    """Mass [kg]."""
+    """Mass [kg] of each link of the mount."""
     inertia: float = 1e-4
-    """Moment of inertia [kg m^2] about every axis."""
+    """Moment of inertia [kg m^2] of each link of the mount, about every axis."""
 
 
 PLAY = PlayNumbers()
@@ -88,24 +87,25 @@ def save_play(
     *,
     parts: "Sequence[trimesh.Trimesh] | None" = None,
 ) -> Path:
-    """Write a folder in which `python play.py 0` plays the first grasp, with the simulator and
-    NumPy alone.
+    """Write a folder in which `python play.py 0` plays the first grasp; return the folder.
+
+    The script needs only the simulator and NumPy.
 
     The hand comes along its approach, closes in open loop, presses, lifts and holds. The script
-    prints one line of JSON: how far the object rose [m], and whether that is half of the lift.
-    `play.json` has the motion, drives, contacts and the object; its text "frames" explains the
-    numbers.
+    prints one line of JSON: how far the object rose [m], and whether that is at least half of the
+    lift. `play.json` has the motion, drives, contacts and the object; its text "frames" explains
+    the numbers.
 
     Args:
         hand: the hand.
         grasps: one or more grasps of the hand.
         folder: the folder to write.
         player: the simulator.
-        mesh: closed mesh of the object [m] in the frame of the grasps; or the estimated surface,
-            which then stands.
-        spec: mass, friction, force, stiffness, heights, times and timestep; `TrialSpec()` by
-            default.
-        parts: convex parts of the mesh; by default they are computed (`convex_parts`).
+        mesh: closed mesh of the object [m] in the frame of the grasps; or the estimated `Surface`,
+            whose points below the table are moved up to it.
+        spec: mass, friction, force, stiffness, heights, times and timestep; None means
+            `TrialSpec()`.
+        parts: convex parts of the mesh; None means that they are computed (`convex_parts`).
 
     Raises `BadArgument` for no grasps or joints of another hand, `MeshError` for an open mesh, and
     `OutputError`.
@@ -159,8 +159,11 @@ def save_play(
 
 
 def stand(surface: Surface, table: Plane | None) -> Surface:
-    """Return an estimate whose points below the table are moved up to it: on its round base it
-    would rock.
+    """Return an estimated surface whose points below the table are moved up to it, along its
+    normal.
+
+    On the round base of an estimate the object would rock. Without a table, the surface is returned
+    as it is.
     """
     if table is None:
         return surface
@@ -211,11 +214,11 @@ def _scene(
 
 @checked
 def pressing_force(spec: TrialSpec, mass: Positive) -> float:
-    """Return the normal force [N] of the strongest finger in play, by default what an object of a
-    `mass` [kg] needs.
+    """Return the normal force [N] of the strongest finger in play: `spec.force`, or by default what
+    the object needs.
 
-    Two opposite fingers then hold the weight and a push of `PUSH` with half of the friction, as
-    planned.
+    With the default, two opposite fingers hold the weight of a `mass` [kg] and a push of `PUSH`
+    with half of the friction. It is at most `spec.max_force`, or else `PLAY.force`.
 
     >>> round(pressing_force(TrialSpec(friction=0.8), 0.25), 1)
     6.2
@@ -233,7 +236,7 @@ def _describe(
     scene: SceneSpec,
     spec: TrialSpec,
 ) -> dict[str, Any]:
-    """Return the values of play.json."""
+    """Return the values of play.json, by name."""
     mount = {slide.name: MOUNT_DRIVE for slide in scene.slides}
     masks = pair_masks(scene.self_pairs, first=1)
     _, postures = named_postures(hand, grasps, pressing_force(spec, scene.mass), spec.kp)
@@ -284,7 +287,7 @@ def _describe(
 
 
 def _principal(inertia: np.ndarray) -> dict[str, list[float]]:
-    """Return the principal moments of an inertia (3, 3) [kg m^2], and the quaternion (w, x, y, z)
+    """Return the principal moments of an `inertia` (3, 3) [kg m^2], and the quaternion (w, x, y, z)
     of its axes.
     """
     moments, axes = np.linalg.eigh(inertia)
@@ -294,10 +297,11 @@ def _principal(inertia: np.ndarray) -> dict[str, list[float]]:
 
 
 def describe_bodies(scene: SceneSpec) -> dict[str, Any]:
-    """Return what USD needs: the parts of the object, and links and joints of hand and mount, all
-    joints at zero.
+    """Return what USD files need, by name: the convex parts of the object, and links and joints of
+    hand and mount.
 
-    Raises `BadArgument` for names of links or joints that USD does not allow.
+    All joints are at zero. Lengths are in metres, masses in kilograms. Raises `BadArgument` for
+    names of links or joints that USD does not allow.
     """
     urdf = scene.urdf
     moment = PLAY.inertia
@@ -359,7 +363,7 @@ def describe_bodies(scene: SceneSpec) -> dict[str, Any]:
 
 
 def _pose(of: "Joint | LinkShape") -> np.ndarray:
-    """Return the pose (4, 4) of a joint or a shape in its link."""
+    """Return the pose (4, 4) [m] of a joint or a shape in its link."""
     pose = np.eye(4)
     pose[:3, :3] = rotation_from_rpy(of.rpy).numpy()
     pose[:3, 3] = of.xyz
@@ -367,11 +371,11 @@ def _pose(of: "Joint | LinkShape") -> np.ndarray:
 
 
 def _along(axis: Sequence[float]) -> np.ndarray:
-    """Return a rotation (3, 3) that turns the x axis to a unit axis."""
+    """Return a rotation (3, 3) that turns the x axis to the unit vector `axis`."""
     return spatial.transform.Rotation.align_vectors([axis], AXES[:1])[0].as_matrix()
 
 
 def _mesh_file(mesh: "trimesh.Trimesh", kind: str) -> bytes:
-    """Return the content of a mesh's file of a kind, as "ply"."""
+    """Return the content of a mesh's file of a `kind`, such as "ply"."""
     content = mesh.export(file_type=kind)
     return content if isinstance(content, bytes) else str(content).encode()

@@ -30,8 +30,8 @@ CONVENTIONS: dict[str, Any] = json.loads(
 )
 """Meaning of the numbers in a JSON file of grasps; the file contains this text."""
 TASK = "task_margin", "task_load", "task_twist", "task_forces", "task_strength"
-"""Fields of the `Certificate`, which explains them, that stand in the file if grasps were planned
-with `resist`.
+"""Fields of the `Certificate`, which explains them. The file has them if grasps were planned with
+`resist`.
 """
 
 
@@ -46,12 +46,14 @@ def format_grasps(
 ) -> str:
     """Return grasps as JSON, together with `CONVENTIONS`, which explain the numbers.
 
-    The hand moves along "approach" to "pose" and its "rise", in its "pregrasp" posture. It closes
-    to "grasp" in the given time, and in the same time again it presses towards "squeeze". All
-    joints move evenly. The strongest finger presses with a normal force of `force` [N]. `kp` is the
-    stiffness of the robot's position control [N m/rad], by default the hand's. `rename` and
-    `flange` are as in `format_moveit`; "flange" stands beside "pose". Raises `BadArgument` for
-    joints of another hand, unknown or equal names, or a force or stiffness that is not positive.
+    In its "pregrasp" posture, the hand moves along "approach" to its "pose", raised by "rise". It
+    closes to "grasp" in the given time, and in the same time again it presses towards "squeeze".
+    All joints move at constant speeds. The strongest finger presses with a normal force of `force`
+    [N]. `kp` is the stiffness of the robot's position control [N m/rad], None means the hand's.
+    `rename` holds the robot's names of joints, by their names in the URDF. `flange` is the pose [m]
+    of the robot's flange in the frame of the root link; its pose is then added as "flange". Raises
+    `BadArgument` for joints of another hand, unknown or equal names, or a force or stiffness that
+    is not positive.
 
     >>> import json
     >>> from torchgrasp import load_hand
@@ -134,8 +136,12 @@ def format_grasps(
 def named_postures(
     hand: Hand, grasps: Grasps, force: float, kp: float | None
 ) -> tuple[Squeeze, dict[str, dict[str, Float[Tensor, "g"]]]]:
-    """Return pressing targets and forces, and the joints [rad] by name of "pregrasp", "grasp" and
-    "squeeze" (CPU).
+    """Return the squeeze of g grasps, then the joint positions [rad] of each posture, by name, on
+    the CPU.
+
+    The postures are "pregrasp", "grasp" and "squeeze"; each has the g positions of every joint of
+    the URDF, by the joint's name. `force` [N] is the normal force of the strongest finger. `kp`
+    [N m/rad] is the stiffness of every drive; None means the hand's.
     """
     hand = hand.to("cpu")
     grasps = grasps.to("cpu")
@@ -150,7 +156,8 @@ def named_postures(
 
 def rename_joints(hand: Hand, rename: Mapping[str, str] | None) -> dict[str, str]:
     """Return the robot's name of each joint of the URDF: those of `rename` first, in its order.
-    Refuse equal names.
+
+    Raises `BadArgument` for joints that the hand lacks, and for equal or empty names.
     """
     given = dict(rename or {})
     ours = hand.tree.joint_names
@@ -163,7 +170,7 @@ def rename_joints(hand: Hand, rename: Mapping[str, str] | None) -> dict[str, str
 
 
 def describe_pose(a_from_b: Float[Tensor, "4 4"]) -> dict[str, list[float]]:
-    """Return a pose as position [m] and unit quaternion (w, x, y, z), by name."""
+    """Return a pose [m] by name, as "position" [m] and unit "quaternion_wxyz"."""
     return {"position": a_from_b[:3, 3].tolist(), "quaternion_wxyz": quaternion(a_from_b)}
 
 
@@ -180,12 +187,12 @@ def format_keyframes(
     """Return the hand as MJCF with four keyframes for each grasp: grasp_0_approach, _pregrasp,
     _grasp, _squeeze.
 
-    The world is the object's frame. `qpos` is the free joint, then the joints of the model; `ctrl`
-    is the targets of the actuators. The text elements "qpos" and "ctrl" name their order. The
-    approach has the joints of the pre-grasp. The squeeze has the joints of the grasp and targets
-    that press. `force` [N] is the normal force of the strongest finger. `kp` is the stiffness of
-    every drive [N m/rad], by default the hand's own. Raises `BadArgument` for joints of another
-    hand, or a force or stiffness that is not positive.
+    The world is the object's frame. `qpos` is the free joint, then the joints of the model [m,
+    rad]; `ctrl` holds the targets [rad] of the actuators. The text elements "qpos" and "ctrl" name
+    their order. The approach has the joints of the pre-grasp. The squeeze has the joints of the
+    grasp and targets that press. `force` [N] is the normal force of the strongest finger. `kp` is
+    the stiffness of every drive [N m/rad]; None means the hand's own. Raises `BadArgument` for
+    joints of another hand, or a force or stiffness that is not positive.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp

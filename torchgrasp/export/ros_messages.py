@@ -24,14 +24,14 @@ from torchgrasp.values.planning import Grasps
 
 NANOSECONDS = 1e9  # in a second
 OBJECT_FRAME = "object"
-"""Name in the messages of the object's frame, which is the frame of the cloud; publish a transform
-of that name.
+"""Name of the object's frame in the messages: the frame of the cloud. Publish a transform of that
+name.
 """
 
 
 class _Dumper(yaml.SafeDumper):
-    """Writes YAML with nine decimals and no exponent in each number, because YAML 1.1 reads 1e-05
-    as a text.
+    """A writer of YAML with nine decimals and no exponent in each number, because YAML 1.1 reads
+    1e-05 as a text.
     """
 
     def ignore_aliases(self, data: Any) -> bool:
@@ -58,19 +58,20 @@ def format_moveit(
     flange: Pose | None = None,
     object_id: str = OBJECT_FRAME,
 ) -> str:
-    """Return grasps as a YAML list of moveit_msgs/Grasp.
+    """Return grasps as a YAML list of moveit_msgs/Grasp, in metres and radians.
 
     `grasp_pose` is the pose in `OBJECT_FRAME` of the root link of the hand's URDF, or of a robot's
-    flange. The pre-grasp posture has positions; the grasp posture closes to the contacts, then to
-    targets that press, with the torques [N m] as effort. `grasp_quality` is the predicted success.
-    The retreat is up: the normal of the plan's table, or z.
+    flange. The pre-grasp posture has joint positions. The grasp posture has the positions at the
+    contacts, then targets that press, with the torques [N m] as effort. `grasp_quality` is the
+    predicted success. The retreat is up: the normal of the plan's table, or z.
 
     Args:
         force: normal force of the strongest finger [N].
-        kp: stiffness of the robot's own position control [N m/rad]; by default the hand's.
+        kp: stiffness of the robot's own position control [N m/rad]; None means the hand's.
         rename: the robot's names of joints, by their names in the URDF; these joints come first, in
-            this order.
-        flange: pose of the robot's flange in the frame of the root link.
+            this order. None keeps all names.
+        flange: pose [m] of the robot's flange in the frame of the root link; None means that poses
+            are those of the root link.
         object_id: id of the object in the planning scene, which the hand may touch.
 
     Raises `BadArgument` for joints of another hand, a force or stiffness that is not positive,
@@ -123,8 +124,11 @@ def format_trajectories(
     """Return a YAML document of trajectory_msgs/JointTrajectory for each grasp: pre-grasp, grasp,
     squeeze.
 
-    The hand must already be at its pose, which `format_moveit` and `format_grasps` give. Arguments
-    and errors are those of `format_moveit`.
+    The hand must already be at its pose, which `format_moveit` and `format_grasps` give. `force`
+    [N] is the normal force of the strongest finger, `kp` [N m/rad] the stiffness of the robot's
+    position control, and `rename` holds the robot's names of joints, by their names in the URDF.
+    Raises `BadArgument` for joints of another hand, a force or stiffness that is not positive, and
+    unknown or equal names.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -139,8 +143,10 @@ def format_trajectories(
 
 @checked
 def format_motion(hand: Hand, motion: ArmMotion) -> str:
-    """Return a YAML document of trajectory_msgs/JointTrajectory, with the joints of arm and hand,
-    for each grasp.
+    """Return a YAML document of trajectory_msgs/JointTrajectory for each grasp, with the joints of
+    arm and hand.
+
+    `motion` comes from `plan_motion`; `hand` is the hand on the arm.
 
     >>> from torchgrasp import load_hand
     >>> motion = ArmMotion(("a",), torch.tensor([0.0, 1.5]), torch.zeros(1, 2, 1), {"above": 0})
@@ -160,8 +166,8 @@ def format_motion(hand: Hand, motion: ArmMotion) -> str:
 def _trajectories(
     hand: Hand, grasps: Grasps, force: float, kp: float | None, rename: Mapping[str, str] | None
 ) -> Iterator[dict[str, Any]]:
-    """Yield for each grasp a trajectory_msgs/JointTrajectory, as a dict, with all joints of the
-    hand.
+    """Yield for each grasp a trajectory_msgs/JointTrajectory, as a dictionary, with all joints of
+    the hand.
     """
     squeezed, postures = named_postures(hand, grasps, force, kp)
     names = rename_joints(hand, rename)
@@ -181,20 +187,20 @@ def _trajectories(
 
 
 def _duration(seconds: float) -> dict[str, int]:
-    """Return a time as a builtin_interfaces/Duration, a dictionary."""
+    """Return a time in `seconds` as a builtin_interfaces/Duration, a dictionary."""
     return {"sec": int(seconds), "nanosec": round(NANOSECONDS * (seconds % 1))}
 
 
 def _pose(obj_from_hand: Float[Tensor, "4 4"]) -> dict[str, Any]:
-    """Return a pose as a geometry_msgs/Pose, a dictionary."""
+    """Return a pose [m] as a geometry_msgs/Pose, a dictionary."""
     w, x, y, z = quaternion(obj_from_hand)
     position = dict(zip("xyz", obj_from_hand[:3, 3].tolist(), strict=True))
     return {"position": position, "orientation": {"x": x, "y": y, "z": z, "w": w}}
 
 
 def _translation(direction: Float[Tensor, "3"]) -> dict[str, Any]:
-    """Return a moveit_msgs/GripperTranslation, as a dict: as far as the approach, of which half
-    must be free.
+    """Return a moveit_msgs/GripperTranslation as a dictionary: as long as the approach, of which
+    half must be free.
     """
     vector = dict(zip("xyz", direction.tolist(), strict=True))
     stamped = {"header": {"frame_id": OBJECT_FRAME}, "vector": vector}

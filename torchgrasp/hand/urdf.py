@@ -30,8 +30,8 @@ Triple = tuple[float, float, float]
 
 
 class Mimic(NamedTuple):
-    """A coupled joint: its position is `ratio` times that of the joint `source`, plus `offset` [rad
-    or m].
+    """A coupled joint: its position is `ratio` times that of the joint `source`, plus `offset`
+    [rad or m].
     """
 
     source: str
