@@ -47,39 +47,45 @@ class BalanceNumbers:
     """The numbers of the search over directions, of the short search, and of the Newton steps."""
 
     directions: int = 1024
-    """Directions that the search tries first."""
+    """Number of directions that the search tries first."""
     neighbours: int = 128
-    """Neighbours of the best direction in each later round."""
+    """Number of neighbours of the best direction in each later round."""
     refinements: int = 12
-    """Later rounds."""
+    """Number of later rounds."""
     shrink: float = 0.55
     """Factor on the radius of the neighbours from round to round."""
     evenness: float = 0.01
-    """Weight of the ratio of the largest to the least normal force, against the tangent needed."""
+    """Weight of the ratio of the largest to the least normal force, relative to the friction
+    coefficient needed.
+    """
     preference: float = 0.2
-    """Weight of the distance from the preferred proportions, against the tangent needed."""
+    """Weight of the distance from the preferred proportions, relative to the friction coefficient
+    needed.
+    """
     near: int = 24
-    """Changes of the weights in each round of the short search."""
+    """Number of changes of the weights in each round of the short search."""
     near_radii: tuple[float, ...] = (0.5, 0.28, 0.15)
-    """Radii of its rounds."""
+    """Lengths of the longest changes in the rounds of the short search."""
     near_least: float = 0.3
-    """Least length of a change, as a share of the radius."""
+    """Length of the shortest change in a round, as a share of the longest."""
     slack: float = 0.04
-    """Tangent that four or five contacts may need beyond the least one, for more even forces."""
+    """Friction that four or five contacts may need beyond the least coefficient, for more even
+    forces.
+    """
     least_preferred: float = 0.05
     """Least preferred normal force, as a share of the largest: every finger has to push."""
     steps: int = 30
-    """Newton steps."""
+    """Number of Newton steps."""
     lengths: int = 5
-    """Lengths of each step that are tried, each twice the one before."""
+    """Number of lengths of each step that are tried, each twice the one before."""
     kept: float = 0.3
     """Share of tau's distance from the needed ratio that each step leaves."""
     first: float = 1.1
     """The first tau, as a multiple of the ratio that the first forces need."""
     max_friction: float = 10.0
-    """Tangent of the widest friction cones in which forces are sought."""
+    """Friction coefficient of the widest cones in which forces are sought."""
     edges: int = 4
-    """Edges of these cones."""
+    """Number of edges of these cones."""
     pushing: float = 1e-12
     """Normal force above which a contact pushes: above rounding."""
 

@@ -28,7 +28,7 @@ class ChangeNumbers:
     flatnesses: tuple[float, ...] = (0.44, 0.9)
     """Largest angles [rad] between the normals at a contact and on a ring around it."""
     margins: tuple[float, ...] = (0.5, 1.0)
-    """Shares of the friction that are planned with."""
+    """Values of `friction_margin`: shares of the friction that are planned with."""
 
 
 CHANGES = ChangeNumbers()

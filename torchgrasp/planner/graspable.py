@@ -35,7 +35,7 @@ class JudgeNumbers:
     high: float = 0.9
     """Quantile of the heights of an object's points that must be high enough for fingertips."""
     border: int = 5
-    """Pixels at the image border of an object that is cut off; fewer are noise."""
+    """Least number of pixels at the image border of an object that is cut off; fewer are noise."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,9 +43,9 @@ class SpanNumbers:
     """The numbers of the search for the span of a hand."""
 
     postures: int = 5000
-    """Random postures in which the span of a hand is sought."""
+    """Number of random postures in which the span of a hand is sought."""
     least_distance: float = 1e-9
-    """A distance of pads that is not 0, for the division [m]."""
+    """Least distance [m] of pads by which is divided: above 0."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,25 +53,27 @@ class VagueNumbers:
     """The numbers by which an estimated shape counts as vague."""
 
     cells: int = 24
-    """Cells to a side of the grid on which the surface is extracted."""
+    """Number of cells along a side of the grid on which the surface is extracted."""
     worst: float = 0.99
     """Quantile of the standard deviations on a surface that counts as the largest."""
 
 
 @dataclasses.dataclass(frozen=True)
 class EaseNumbers:
-    """The numbers of the order in which objects are planned; lengths are in metres."""
+    """The numbers of the order in which objects are planned."""
 
     room: float = 0.06
-    """More free space around an object makes nothing easier."""
+    """Free space [m] around an object above which more makes nothing easier."""
     height: float = 0.08
-    """More height makes nothing easier."""
+    """Height [m] of an object above which more makes nothing easier."""
     side: float = 0.01
-    """Side of a column of points."""
+    """Side [m] of a column of points."""
     top: float = 0.95
     """Quantile of the heights of an object's points that is its height."""
     covered: float = 5.0
-    """Weight of the share of an object that has something above it, at most 1 in all."""
+    """Weight of the share of an object's columns that have something above them; the product counts
+    as at most 1.
+    """
     columns: int = 2**16
     """Cells of the grid along an axis, of which half are at negative coordinates."""
 

@@ -158,7 +158,7 @@ def _refused(hand: Hand, reason: str) -> Grasps:
 
 
 def no_grasps(hand: Hand) -> Grasps:
-    """Return an empty set of grasps, whose tensors have the axes of the hand's joints and fingers."""
+    """Return an empty set of grasps; its tensors have the axes of the hand's joints and fingers."""
     f = len(hand.tips)
 
     def none(*shape: int) -> torch.Tensor:

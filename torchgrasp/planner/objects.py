@@ -59,7 +59,7 @@ from torchgrasp.values.planning import Certificate, Contacts, Grasps, PointCloud
 from torchgrasp.values.specs import ContactSpec
 
 TARGET_POINTS = 1000
-"""Most points of a scene's target that are used: they lie a few millimetres apart."""
+"""Largest number of a scene target's points that are used: they lie a few millimetres apart."""
 BURIED = 0.003
 """Depth [m] by which a rising object may enter obstacles further than at rest: noise of the grid.
 """

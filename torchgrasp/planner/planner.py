@@ -40,7 +40,9 @@ from torchgrasp.planner.schedule import SCHEDULE
 from torchgrasp.values.planning import Grasps
 
 FEW_STEPS = 8
-"""Most solver steps of the first batch, for an early grasp; the second batch takes all steps."""
+"""Largest number of solver steps in the first batch, for an early grasp; the second batch takes all
+steps.
+"""
 
 
 def plan_objects(objects: Objects, deadline: float) -> Iterator[list[Grasps]]:

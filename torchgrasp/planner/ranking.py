@@ -29,7 +29,9 @@ from torchgrasp.values.specs import Ranking
 SURE = 1e-6
 """Probability that stands for 0 in log-odds, so that they stay finite."""
 BEST = 20
-"""Best grasps by which a set of fingers is judged: as many as an evaluation tries of a view."""
+"""Number of best grasps by which a set of fingers is judged: as many as an evaluation tries of a
+view.
+"""
 
 
 def rank(objects: Objects, grasps: Grasps, cloud: CloudIndex) -> list[Grasps]:

@@ -51,7 +51,9 @@ class ChoiceNumbers:
     weak: float = 1e6
     """Cost of contact sets that resist less than the task's loads: above all other costs."""
     tried: int = 2
-    """Initial postures of a contact set that count for its cost: as many as the solver refines."""
+    """Number of a contact set's initial postures that count for its cost: as many as the solver
+    refines.
+    """
     lever: float = 0.3
     """Weight of the load's lever arm beside the fingertips' errors, both as logarithms."""
     short: float = 0.1

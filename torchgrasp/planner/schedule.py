@@ -11,15 +11,15 @@ class ScheduleNumbers:
     """The numbers by which a plan is split into batches."""
 
     first: int = 8
-    """Contact sets that the hand tries in the first batch."""
+    """Number of contact sets that the hand tries in the first batch."""
     growth: int = 6
     """Ratio of the sizes of successive batches."""
     tried: int = 250
-    """Most contact sets that the hand tries."""
+    """Largest number of contact sets that the hand tries."""
     tried_in_scene: int = 160
     """The same in a scene: fewer, because there the hand tries more postures for each set."""
     offered: int = 4
-    """Planned contact sets for each one that the hand tries."""
+    """Number of planned contact sets for each one that the hand tries."""
 
 
 SCHEDULE = ScheduleNumbers()

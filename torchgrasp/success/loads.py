@@ -24,9 +24,9 @@ class LoadNumbers:
     carrying: float = 2.07
     """Log-odds of success that a lift loses for each factor e on the force for the load."""
     torsion: float = 0.01
-    """Lever [m] of the torsion of a contact, beside that of the triangle's height."""
+    """Lever [m] of the torsion of a contact, which is added to the triangle's height."""
     edges: int = 32
-    """Edges of a cone that stands for a friction cone."""
+    """Number of edges of a cone that stands for a friction cone."""
     least_force: float = 0.3
     """Least force [N] that counts in the log-odds."""
     most_force: float = 100.0

@@ -23,23 +23,23 @@ class MovedNumbers:
     """The numbers of the displacements, and of the search for contacts of the displaced object."""
 
     count: int = 16
-    """Displacements."""
+    """Number of displacements."""
     radius: float = 0.02
     """The greatest displacement [m], which a hand still finds."""
     turn: float = 0.618
-    """Step of the sizes' sequence, the golden ratio: sizes fill the ball evenly."""
+    """Step of the sequence of sizes, the golden ratio: the sizes fill the ball evenly."""
     close: float = 3e-4
-    """Distance [m] from the surface that is a touch."""
+    """Distance [m] from the surface that counts as a touch."""
     least: float = 2e-4
-    """Least step [m]."""
+    """Shortest step [m] of a fingertip."""
     length: float = 0.12
     """Longest way [m] of a fingertip."""
     steps: int = 24
-    """Most steps."""
+    """Largest number of steps."""
     still: float = 1e-6
-    """Least path [m] of a fingertip that has a direction."""
+    """Length [m] of a fingertip's path below which it has no direction."""
     flat: float = 1e-9
-    """Least gradient of a distance that has a direction."""
+    """Size of a distance's gradient (no unit) below which it has no direction."""
 
 
 MOVED = MovedNumbers()

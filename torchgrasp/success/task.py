@@ -106,9 +106,9 @@ class TaskNumbers:
     push: float = 2.5
     """Force [N] of a push."""
     around: float = 1.24
-    """Length of the corners and axes of a cube whose mixtures fill the unit ball."""
+    """Length (no unit) of the corners and axes of a cube whose mixtures fill the unit ball."""
     upward: float = 1.2
-    """Length above which such a vector points straight up."""
+    """Length of such a vector along z above which it points straight up."""
 
 
 TASKS = TaskNumbers()
