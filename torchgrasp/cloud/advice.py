@@ -21,14 +21,14 @@ from torchgrasp.values.planning import PointCloud
 
 @dataclasses.dataclass(frozen=True)
 class AdviceNumbers:
-    """At what a cloud contradicts its camera, its vertical or its table."""
+    """Bounds beyond which a cloud contradicts its camera, its vertical or its table."""
 
     fewest: int = 50
     """Fewest points that show whether a camera is right, or whether pixels fly off rims."""
     narrow: float = 0.06
     """Least width [m] of a level plane that is a table left in."""
     level: float = 0.97
-    """Cosine between its normal and the vertical below which the normal is told: 14 degrees."""
+    """Cosine between a table's normal and the vertical, below which advice names the normal."""
     down: float = 0.15
     """Greatest share of visible normals that point down; a camera above a table sees fewer."""
     ahead: float = 0.6
@@ -46,8 +46,12 @@ ADVICE = AdviceNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class Advice(Value):
-    """A fault of a point cloud: the fault `found`, its `fix`, and whether planning is `refused`
-    because of it.
+    """A fault of a point cloud, and how to fix it.
+
+    Attributes:
+        found: the fault in words.
+        fix: what to do, such as the option of a command.
+        refused: whether no grasp is planned on such a cloud.
 
     >>> print(Advice("the cloud is empty", "look again", refused=True))
     the cloud is empty: look again
@@ -64,11 +68,11 @@ class Advice(Value):
 def judge_view(
     cloud: PointCloud, clean: PointCloud, up: Vector, table: Plane | None, stands: bool = True
 ) -> list[Advice]:
-    """Return advice on a cloud's camera, vertical, table and pixels, and on other bodies left in;
-    refusals come first.
+    """Return advice on a cloud's camera, vertical, table and pixels, and on other bodies in it.
 
-    `clean` is the cloud cleaned, with outward normals and perhaps an estimated viewpoint. A `table`
-    of None is assumed at the lowest point. `stands` tells whether the object stands on a table.
+    Refusals come first. `clean` is the cloud without outliers, with outward normals and perhaps an
+    estimated viewpoint. `up` is the unit vector that points up. A `table` of None is assumed at the
+    lowest point. `stands` is whether the object stands on a table.
     """
     points = clean.points.double()
     given = cloud.viewpoint is not None

@@ -17,16 +17,16 @@ from torchgrasp.values.planning import PointCloud
 
 @dataclasses.dataclass(frozen=True)
 class AgreementNumbers:
-    """How far the cloud, mesh, contacts and table of one object may be apart."""
+    """Bounds on how far the cloud, mesh, contacts and table of one object may be apart."""
 
     drawn: int = 300
-    """Most points whose distances are measured,"""
+    """Most points whose distances are measured."""
     drawn_of_cloud: int = 500
-    """and most points of a cloud to which they are measured."""
+    """Most points of a cloud to which these distances are measured."""
     slack: float = 0.01
     """Greatest distance [m] of points from their mesh, beside the noise."""
     share: float = 0.2
-    """Greatest share of points that may be farther."""
+    """Greatest share of points that may be farther from their mesh."""
     lowest: float = 0.02
     """Share of the points of an object that may be lower than its foot: outliers."""
     foot: float = 0.015
@@ -44,11 +44,10 @@ def check_agreement(
     slack: float,
     share: float,
 ) -> None:
-    """Raise `BadArgument` if points lie off a mesh, or off a cloud and the space hidden behind the
-    cloud.
+    """Raise `BadArgument` if points lie off a mesh, or off a cloud and the space hidden behind it.
 
-    At most the fraction `share` of the points may be farther than `slack` [m] from `other`, the
-    mesh or the cloud.
+    At most the fraction `share` of the `points` (n, 3) [m] may be farther than `slack` [m] from
+    `other`, the mesh [m] or the cloud. Errors call the argument `name`, and its points `what`.
     """
     points = points.detach().cpu().double()
     points = points[draw_rows(len(points), AGREEMENT.drawn)]
@@ -69,13 +68,19 @@ def check_agreement(
 
 
 def check_mesh(cloud: PointCloud, mesh: "trimesh.Trimesh", name: str = "mesh") -> None:
-    """Raise `BadArgument` if many points of an object's cloud do not lie on the object's mesh."""
+    """Raise `BadArgument` if many points of an object's cloud do not lie on the object's mesh.
+
+    The mesh [m] is in the frame of the cloud. Errors call it by `name`.
+    """
     slack = AGREEMENT.slack + 2 * _noise(cloud)
     check_agreement(name, cloud.points, "the cloud's points", mesh, slack, AGREEMENT.share)
 
 
 def check_foot(cloud: PointCloud, table: Plane) -> None:
-    """Raise `BadArgument` for a table that lies above the lowest points of its object."""
+    """Raise `BadArgument` for a table that lies above the lowest points of its object.
+
+    The table is in the frame of the cloud.
+    """
     height = table.height(cloud.points.double().cpu())
     foot = float(height.quantile(AGREEMENT.lowest))
     if -foot > AGREEMENT.foot + 2 * _noise(cloud):
@@ -85,8 +90,9 @@ def check_foot(cloud: PointCloud, table: Plane) -> None:
 
 
 def check_stand(mesh: "trimesh.Trimesh", table: Plane, name: str = "mesh") -> None:
-    """Raise `BadArgument` if an object's mesh does not stand on the table, but floats above it or
-    sinks into it.
+    """Raise `BadArgument` if the mesh of an object floats above its table or sinks into it.
+
+    The mesh [m] is in the frame of the table. Errors call it by `name`.
     """
     foot = float(table.height(torch.tensor(mesh.vertices, dtype=torch.float64)).min())
     if abs(foot) > AGREEMENT.foot:

@@ -32,12 +32,12 @@ INTRINSICS = torch.tensor(
 
 @dataclasses.dataclass(frozen=True)
 class RenderNumbers:
-    """What a virtual camera renders."""
+    """Numbers of the rendering by a virtual camera."""
 
     nearest: float = 1e-3
-    """A mesh has a box in the image only if all of it is farther than this from the camera [m]."""
+    """A mesh has a box in the image only if all of it is farther from the camera than this [m]."""
     margin: float = 1e-2
-    """Width [focal lengths] of the margin about that box, for rounding."""
+    """Width [focal lengths] of the margin about the box of a mesh in the image, for rounding."""
     table: float = 0.6
     """Radius [m] of the table."""
 
@@ -52,7 +52,7 @@ def look_at(
     distance: Annotated[float, Range(0.01, 10.0)] = 0.5,
     target: "Float[Tensor, '3'] | trimesh.Trimesh | None" = None,
 ) -> Transform:
-    """Return the pose obj_from_camera (4 x 4) of an upright camera that looks at a target.
+    """Return the pose obj_from_camera (4, 4) [m] of an upright camera that looks at a target.
 
     Args:
         azimuth: direction of the camera, from x towards y [deg].
@@ -123,8 +123,11 @@ def partial_view(
 
 
 def cast_mesh(mesh: "trimesh.Trimesh", obj_from_camera: Transform) -> tuple[Image, Image]:
-    """Return a mesh's depth image [m], and |cosine| between ray and face normal; both are 0 where a
-    ray misses.
+    """Return the exact depth image of a mesh [m], and the cosine of the angle of incidence.
+
+    Both images are (h, w), and 0 where a ray misses. The cosine is the absolute one between ray and
+    face normal. The mesh is in metres, and the pose (4, 4) [m] leads from the default camera's
+    frame to the mesh's.
     """
     if not len(mesh.faces):
         raise MeshError("mesh", "no faces", "a mesh with a surface")
@@ -182,12 +185,12 @@ def render_depth(
     noise: bool | SensorName | SensorNoise = True,
     seed: int = 0,
 ) -> tuple[Image, Int[Tensor, "h w"]]:
-    """Return a depth image [m] of meshes on a table, as the default camera measures it, and true
-    pixel labels.
+    """Return a depth image [m] of meshes on a table, as the default camera measures it, and labels.
 
-    Depth is 0 where nothing was measured. Label 0 is the table or nothing, label k is mesh k - 1.
-    The table is a disc of radius 0.6 m about the origin at the height `table` [m]; None means no
-    table. `noise` is that of `partial_view`.
+    Depth is 0 where nothing was measured. A pixel's true label is 0 for the table or nothing, k for
+    mesh k - 1. The meshes [m] and the pose obj_from_camera (4, 4) [m] are in one frame. The table
+    is a disc of radius 0.6 m about the origin at the height `table` [m]; None means no table.
+    `noise` is that of `partial_view`.
     """
     pose = check_rigid("camera_pose", camera_pose).double()
     depth = torch.full((HEIGHT, WIDTH), torch.inf, dtype=torch.float64)

@@ -24,7 +24,9 @@ FEW_POINTS = 100  # fewer points are a speck of noise, or too coarse for a shape
 
 @dataclasses.dataclass(frozen=True)
 class CloudNumbers:
-    """When points coincide or lie on a line, and of what unit an extent [m] may be."""
+    """Bounds by which points coincide or lie on a line, and by which the unit of an extent is
+    guessed.
+    """
 
     sample: int = 20_000
     """About as many points mostly show that enough are distinct."""
@@ -33,11 +35,11 @@ class CloudNumbers:
     sensor's resolution.
     """
     line: float = 1e-6
-    """Points are on a line if the second spread is less than this, over the first."""
+    """Points are on a line if their second principal spread over the first is less than this."""
     scene: float = 10.0
-    """A smaller extent is that of a scene, or in cm."""
+    """A too large extent below this [m] is that of a scene, or in cm."""
     longest: float = 45.0
-    """A smaller extent is in cm, of an object of 45 cm at most; a larger one is in mm."""
+    """A larger extent below this is in cm, of an object of 45 cm at most; above it is in mm."""
 
 
 CLOUD = CloudNumbers()
@@ -45,15 +47,9 @@ CLOUD = CloudNumbers()
 
 @checked
 def check_cloud(cloud: PointCloud) -> PointCloud:
-    """Return the cloud itself if it is fit for grasp planning, else raise an error. A flat cloud is
-    fit, too.
+    """Return the cloud itself if it is fit for grasp planning, else raise an error.
 
-    Raises:
-        BadArgument: a number that is not finite; a tensor that requires a gradient; points that all
-            coincide or lie on a line; a normal of length zero.
-        TooFewPoints: fewer than 4 distinct points.
-        SuspiciousScale: the longest side of the bounding box is outside [5 mm, 2 m]; the unit is
-            often mm.
+    A flat cloud is fit, too.
 
     >>> check_cloud(PointCloud(torch.rand(50, 3))).viewpoint is None
     True
@@ -66,8 +62,9 @@ def check_cloud(cloud: PointCloud) -> PointCloud:
 
 @checked
 def remove_duplicates(cloud: PointCloud) -> PointCloud:
-    """Check a cloud, and return it without duplicate points, which would count as independent
-    measurements.
+    """Return a cloud without duplicate points, which would count as independent measurements.
+
+    Of coincident points the first is kept. Raises the errors of `check_cloud`.
     """
     points = _check(cloud)
     rows = _distinct_rows(points)
@@ -77,12 +74,11 @@ def remove_duplicates(cloud: PointCloud) -> PointCloud:
 
 @checked
 def voxel_downsample(cloud: PointCloud, voxel: Annotated[float, Range(1e-5, 1.0)]) -> PointCloud:
-    """Return a thinned cloud with one point of each voxel, the nearest to the voxel's centre, in
-    the given order.
+    """Return a thinned cloud with one point of each voxel, in the given order.
 
-    The grid of voxels of side `voxel` [m] starts at the lowest corner of the cloud. Points are not
-    averaged, since a mean may lie inside a thin wall. Raises the errors of `check_cloud`, and
-    `TooFewPoints` if fewer than 4 voxels hold points.
+    It is the point nearest to the voxel's centre. The grid of voxels of side `voxel` [m] starts at
+    the lowest corner of the cloud. Points are not averaged, since a mean may lie inside a thin
+    wall. Raises the errors of `check_cloud`, and `TooFewPoints` if fewer than 4 voxels hold points.
 
     >>> len(voxel_downsample(PointCloud(0.1 * torch.rand(5000, 3)), 0.05)) <= 27
     True
@@ -180,8 +176,9 @@ def _distinct_rows(points: Points) -> Int[Tensor, "m"]:
 
 
 def first_of_each(group: Int[Tensor, "n"]) -> Int[Tensor, "groups"]:
-    """Return the first index of each of the numbers 0, 1, ... in `group`, which holds each point's
-    group number.
+    """Return the index of the first point of each group 0, 1, ...
+
+    `group` holds the group number of each of n points; no number is left out.
     """
     order = torch.arange(len(group), device=group.device)
     first = torch.full_like(order, len(order)).scatter_reduce(0, group, order, "amin")

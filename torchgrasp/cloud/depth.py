@@ -31,18 +31,20 @@ SATURATED = np.iinfo(np.uint16).max
 
 @dataclasses.dataclass(frozen=True)
 class DepthNumbers:
-    """What a depth camera measures, and how an image of another unit is told."""
+    """Bounds of what depth cameras measure, by which an image in another unit is found."""
 
     nearest: float = 0.06
     """Least median depth [m]; depth cameras see nothing nearer."""
     farthest: float = 50.0
     """Greatest depth [m] that depth cameras measure."""
     near: float = 0.05
-    """Least share of the measured pixels within it: fewer are stray ones of another unit."""
+    """Least share of the measured pixels nearer than `farthest`: fewer are stray ones, and the unit
+    is another.
+    """
     millimetres: float = 200.0
-    """A median depth above this [m] is one in mm, else in cm."""
+    """A median depth that is too large is in mm if it is above this [m], else in cm."""
     viewed: int = 5000
-    """About as many points tell whether a table in the view contradicts the pose."""
+    """Number of points, about, by which a table in the view is compared with the pose."""
 
 
 DEPTH = DepthNumbers()
@@ -123,8 +125,10 @@ def _points(z_image: Image, k: Matrix, keep: Bool[Tensor, "h w"]) -> Points:
 
 
 def frustum_of_image(intrinsics: Matrix, size: Sequence[int]) -> Float[Tensor, "4 3"]:
-    """Return the inward unit normals of a camera's frustum, for an image (h, w): left, right, top,
-    bottom side.
+    """Return the inward unit normals of the four sides of a camera's view, in its frame.
+
+    They are those of the left, right, top and bottom side of an image of `size` (h, w) [pixels].
+    The camera's frame has x right, y down and z forward; `intrinsics` (3, 3) are in pixels.
     """
     (fx, _, cx), (_, fy, cy) = intrinsics[:2].tolist()
     height, width = size
@@ -136,8 +140,10 @@ def frustum_of_image(intrinsics: Matrix, size: Sequence[int]) -> Float[Tensor, "
 def read_depth(
     depth: Array, intrinsics: object, mask: Array | None = None, depth_unit: Positive | None = None
 ) -> tuple[Image, Matrix, Bool[Tensor, "h w"] | None]:
-    """Check the arguments of `cloud_from_depth`; return depth [m] (0 if not measured), intrinsics
-    [px] and mask.
+    """Check the arguments of `cloud_from_depth`; return depth, intrinsics and mask.
+
+    The depth (h, w) is in metres, 0 where nothing was measured; the intrinsics (3, 3) are in
+    pixels; the mask (h, w) is None if it was. Raises `BadArgument` as `cloud_from_depth`.
     """
     k, stated, scale = parse_intrinsics(intrinsics)
     image = as_tensor("depth", depth)

@@ -31,16 +31,16 @@ from torchgrasp.values.planning import PointCloud
 
 @dataclasses.dataclass(frozen=True)
 class DiagnosisNumbers:
-    """How a cloud is measured, and which measures are worth advice."""
+    """Numbers of points that are measured in a cloud, and bounds beyond which there is advice."""
 
     measured: int = 50_000
     """Most points at which spacing, noise and outliers are measured."""
     viewed: int = 5000
-    """Most of these points that serve the advice on camera, vertical, table and bodies."""
+    """Most of the measured points that serve the advice on camera, vertical, table and bodies."""
     neighbours: int = 9
-    """The point itself and a raster's eight neighbours."""
+    """Number of nearest points for the density: the point and a raster's eight neighbours."""
     least: float = 1e-12
-    """Keeps the size of a voxel finite."""
+    """Least density [1/m2] by which the size of a voxel is found, so that it is finite."""
     long: float = 0.4
     """Greatest length [m] of an object for a hand."""
     outliers: float = 0.05
@@ -67,19 +67,19 @@ class CloudReport(Value):
     (1000, '0.7 mm', ())
     """
 
-    points: int
-    measured: int  # how many of them are measured
+    points: int  # number of all points
+    measured: int  # number of the points that are measured
     size: tuple[float, float, float]  # sides of the box along the axes [m]
     spacing: float  # median distance to the nearest point [m]
     density: float  # median number of points per square metre
     noise: float  # median rms about local planes [m]
     copies: int  # coincident points
     outliers: int  # points far from their neighbours
-    normals: NormalCheck | None  # of the given normals
+    normals: NormalCheck | None  # agreement of the given normals; None without them
     viewpoint: Float[Tensor, "*points 3"] | None  # [m]; None: a whole surface
-    viewpoint_given: bool  # else it is estimated
+    viewpoint_given: bool  # whether the viewpoint was given; else it is estimated
     facing: float  # share of normals that face the viewpoint
-    advice: tuple[Advice, ...]  # what forbids a grasp comes first
+    advice: tuple[Advice, ...]  # refusals come first
 
 
 @checked
@@ -89,14 +89,14 @@ def diagnose_cloud(
     table: Plane | None = None,
     stands: bool = True,
 ) -> CloudReport:
-    """Measure a cloud, and advise what would improve it.
+    """Return a report on the measured properties of a cloud, with advice on what would improve it.
 
     In a large cloud, 50 000 points are measured; 5000 of them serve the advice on camera, vertical,
     table and bodies.
 
     `up` is a vector of any length that points up; None means z, unless the cloud seems to be in its
-    camera's frame. Without a `table` it is assumed at the lowest point. If the object stands on
-    none (`stands`), the camera may be below it. Raises the errors of `check_cloud`, and
+    camera's frame. A `table` of None is assumed at the lowest point. With `stands` False the object
+    stands on no table, and the camera may be below it. Raises the errors of `check_cloud`, and
     `BadArgument` for a vertical of length zero.
 
     >>> diagnose_cloud(PointCloud(0.1 * torch.rand(500, 3), viewpoint=torch.tensor([0.0, 0.0, 1.0]))).copies
@@ -167,7 +167,7 @@ def _guess_camera(view: PointCloud, up: Vector, assumed: bool) -> tuple[PointClo
 
 @checked
 def format_report(report: CloudReport) -> str:
-    """Return a report as lines for a terminal.
+    """Return a report on a cloud as text of several lines for a terminal.
 
     >>> print(format_report(diagnose_cloud(PointCloud(0.1 * torch.rand(500, 3)))).splitlines()[0])
     points      500

@@ -39,7 +39,7 @@ MODES = (
 
 @dataclasses.dataclass(frozen=True)
 class IntrinsicsNumbers:
-    """What intrinsics are read, and what a camera may have."""
+    """Bounds of the intrinsics that are read, and of what a camera may have."""
 
     most: int = 12
     """Longest list of numbers: that of a 3 x 4 projection."""
@@ -52,23 +52,31 @@ class IntrinsicsNumbers:
     shown: int = 8
     """Most names of a wrong object that an error shows."""
     shown_name: int = 20
-    """Most letters of each of them."""
+    """Most letters of each name in an error."""
     focal: float = 0.15
     """Least focal length over the side of the image: a view of 147 degrees, wider than any."""
     unequal: float = 0.05
     """Greatest difference of fx and fy, over fy, of four numbers in their right order."""
     beside: float = 0.1
-    """Greatest shift of their principal point from the middle, as a share of the side."""
+    """Greatest shift of the principal point from the middle in four such numbers, as a share of the
+    side of the image.
+    """
     farthest: float = 8.0
-    """Greatest such shift of a crop: beyond it, the point belongs to another image."""
+    """Greatest shift of the principal point of a crop from its middle, as a share of the side:
+    beyond it, the point belongs to another image.
+    """
     corner: float = 0.05
     """A crop may reach so far out of the image of its camera, as a share of the side."""
     moved: float = 0.04
     """Least shift of a crop's corner, as a share of the side: a camera's point is off by less."""
     centred: float = 0.05
-    """Greatest shift of the principal point from the middle of a resolution that is guessed."""
+    """Greatest shift of the principal point from the middle of a resolution that is guessed, over
+    half the side.
+    """
     off: float = 0.16
-    """Such a shift in the image itself at which a resolution is guessed: few cameras have more."""
+    """Shift of the principal point from the middle, over half the side, beyond which another
+    resolution is guessed: few cameras have more.
+    """
     same_ratio: float = 0.02
     """Greatest difference of two ratios of sides that count as one."""
 
@@ -77,8 +85,14 @@ LIMITS = IntrinsicsNumbers()
 
 
 class Written(NamedTuple):
-    """Intrinsics as they were written: numbers, image [width, height], metres of a count, and
-    ROS's window.
+    """Intrinsics as a driver or a file writes them.
+
+    Attributes:
+        table: (fx, fy, cx, cy) or a matrix [pixels], of any type of array.
+        size: width and height of the image [pixels].
+        scale: metres of one count of the depth.
+        window: x, y, width and height of ROS's region of interest [pixels], then the binning in x
+            and y; 0 if not set.
     """
 
     table: Any
@@ -88,10 +102,10 @@ class Written(NamedTuple):
 
 
 def parse_intrinsics(value: object) -> tuple[Matrix, list[float] | None, float | None]:
-    """Return the matrix [px] of any form of intrinsics, the image's [width, height] and the metres
-    of a count, if stated.
+    """Return the matrix (3, 3) [pixels] of intrinsics in any form that `cloud_from_depth` takes.
 
-    Raises `BadArgument` for anything else.
+    Second is the [width, height] of the image [pixels], and third the metres of one count of the
+    depth; each is None if it is not stated. Raises `BadArgument` for anything else.
     """
     table, size, scale, window = _read_written(value)
     k = as_tensor("intrinsics", table)
@@ -170,8 +184,9 @@ def _read_written(value: object) -> Written:
 
 
 def _find_matrix(value: object) -> tuple[dict[str, Any], str, Any]:
-    """Return what a description of a camera names, the name of its matrix ("" for four numbers),
-    and the LIMITS.
+    """Return the named values of a description of a camera, the name of its matrix, and the matrix.
+
+    The name is "" for four numbers instead of a matrix.
     """
     inner: Any = value
     if not isinstance(value, Mapping):
@@ -217,8 +232,10 @@ def _is_table(value: object) -> bool:
 
 
 def check_intrinsics(k: Matrix, stated: list[float] | None, size: Sequence[int]) -> None:
-    """Raise `BadArgument` for intrinsics that no camera has, or of another resolution than an image
-    (h, w) or a crop.
+    """Raise `BadArgument` for intrinsics that no camera has, or that are those of another image.
+
+    `k` is the matrix [pixels]; `stated` is the [width, height] that came with it, or None. The
+    image has the `size` (h, w) [pixels], and may be a crop.
     """
     height, width = size
     (fx, _, cx), (_, fy, cy) = k[:2].tolist()
@@ -284,7 +301,9 @@ def _check_size(k: Matrix, stated: list[float] | None, image: Float[Tensor, "2"]
 
 
 def as_tensor(name: str, value: Any) -> Tensor:
-    """Return an array of numbers as a tensor; raise `BadArgument` about `name` for anything else."""
+    """Return an array of numbers as a tensor; raise `BadArgument` about `name` for anything
+    else.
+    """
     if isinstance(value, Tensor):
         return value
     try:

@@ -16,16 +16,18 @@ from torchgrasp.geometry.linalg import Points, unit
 
 @dataclasses.dataclass(frozen=True)
 class NeighbourNumbers:
-    """How many neighbours of a point are looked at, the point itself included, and how."""
+    """Numbers of the neighbours of a point, the point itself included, and of the fits to them."""
 
     spacing: int = 9
     """Neighbours for the spacing: a raster's eight, more than fly off a rim together."""
     outlier: float = 2.5
-    """An outlier is farther from them than so many medians; depth and slope vary views less."""
+    """An outlier is farther from its neighbours than so many medians of this distance; depth and
+    slope vary the distance less.
+    """
     plane: int = 25
-    """About eight for each of a plane's three unknowns."""
+    """Neighbours for a plane: about eight for each of its three unknowns."""
     quadric: int = 30
-    """Five for each of a quadric's six unknowns."""
+    """Neighbours for a quadric: five for each of its six unknowns."""
     width: float = 0.7
     """Width of the weights of neighbours, over the distance of the farthest."""
     ridge: float = 1e-3
@@ -33,18 +35,16 @@ class NeighbourNumbers:
     block: int = 1 << 14
     """Points whose quadrics are fitted at once: bounds the memory for clouds of any size."""
     flat: int = 2000
-    """Most points that tell whether a cloud is flat."""
+    """Most points by which a cloud is found to be flat."""
     thin: float = 1e-3
-    """A cloud without noise is flat below this thickness, over its length."""
+    """A cloud without noise is flat if its thickness over its length is less than this."""
 
 
 NEAR = NeighbourNumbers()
 
 
 def draw_rows(count: int, most: int) -> Int[Tensor, "m"]:
-    """Return at most `most` of the indices 0 to `count` - 1, drawn with a fixed seed, in ascending
-    order.
-    """
+    """Return at most `most` of the indices 0 to `count` - 1, drawn with a fixed seed, ascending."""
     if count <= most:
         return torch.arange(count)
     return torch.randperm(count, generator=torch.Generator().manual_seed(0))[:most].sort().values
@@ -53,10 +53,11 @@ def draw_rows(count: int, most: int) -> Int[Tensor, "m"]:
 def nearest(
     points: Points, k: int, rows: Int[Tensor, "m"] | None = None
 ) -> tuple[Float[Tensor, "m k"], Int[Tensor, "m k"]]:
-    """Return distances and indices of the k nearest points to each point in `rows`, by default to
-    every point.
+    """Return the distances and the indices of the k nearest points to each of m points.
 
-    Each point itself comes first in its row. A cloud of fewer than k points gives fewer columns.
+    Those are the points (n, 3) with the indices `rows`, by default all. Distances have the unit of
+    `points` and ascend; each point itself comes first. A cloud of fewer than k points gives fewer
+    columns.
     """
     array = points.detach().cpu().numpy()
     asked = array if rows is None else array[rows.cpu().numpy()]
@@ -66,16 +67,18 @@ def nearest(
 
 
 def find_inliers(points: Points, rows: Int[Tensor, "m"] | None = None) -> Bool[Tensor, "m"]:
-    """Return a mask of the given points (by default all points) that are not outliers; see
-    `remove_outliers`.
+    """Return a mask of m points that are not outliers, as `remove_outliers` defines them.
+
+    Those are the points (n, 3) with the indices `rows`, by default all.
     """
     spacing = nearest(points, NEAR.spacing, rows)[0][:, 1:].mean(-1)
     return spacing <= NEAR.outlier * spacing.median()
 
 
 def is_flat(points: Points) -> bool:
-    """Return whether a cloud is no thicker than its noise: twice the error of quadrics around the
-    points.
+    """Return whether a cloud (n, 3) is no thicker than its noise.
+
+    The noise is twice the error of quadrics around the points.
     """
     points = points[draw_rows(len(points), NEAR.flat).to(points.device)].double()
     points = points[find_inliers(points)]
@@ -87,8 +90,10 @@ def is_flat(points: Points) -> bool:
 def fit_local_planes(
     points: Points, rows: Int[Tensor, "m"] | None = None
 ) -> tuple[Float[Tensor, "m 3"], Float[Tensor, "m"]]:
-    """Fit a plane around each point in `rows`, by default each point; return normals of any sign
-    and rms errors [m].
+    """Fit a plane around each of m points; return unit normals of either sign, and rms errors.
+
+    Those are the points (n, 3) with the indices `rows`, by default all. The errors have the unit of
+    `points`.
     """
     distance, index = nearest(points, NEAR.plane, rows)
     mean_squares, axes = _principal_axes(points[index], _weigh(distance))
@@ -96,11 +101,11 @@ def fit_local_planes(
 
 
 def fit_quadrics(points: Points) -> tuple[Points, Points, Float[Tensor, "n"]]:
-    """Fit a quadric around each point; return the point moved onto it, the unit normal there, and
-    the rms error [m].
+    """Fit a quadric around each of n points; return the moved point, the unit normal and the error.
 
-    Planes would move the points of a ball of radius r inward by s^2 / 2r, where s is the
-    neighbours' spread.
+    The point (n, 3) is moved onto the quadric, and the normal (n, 3), of either sign, is that of
+    the quadric there. The rms error has the unit of `points`. Planes would move the points of a
+    ball of radius r inward by s^2 / 2r, where s is the neighbours' spread.
     """
     whole = (points, *nearest(points, NEAR.quadric))
     blocks = zip(*(x.split(NEAR.block) for x in whole), strict=True)

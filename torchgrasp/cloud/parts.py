@@ -22,24 +22,24 @@ from torchgrasp.values.planning import PointCloud
 
 @dataclasses.dataclass(frozen=True)
 class PartNumbers:
-    """What belongs to the support of a scene, and what to one body."""
+    """Bounds by which points belong to the support of a scene, or to one body."""
 
     layer: float = 0.004
-    """Least half thickness [m] of a support's layer: the noise of a depth camera at half a metre."""
+    """Least half thickness [m] of a support's layer: a depth camera's noise at half a metre."""
     near: float = 0.02
     """Points within this distance [m] of the support show its noise."""
     noises: float = 5.0
-    """Half thickness of the layer, in median distances of those points."""
+    """Half thickness of the layer, in median distances of the points near the support."""
     gap: float = 0.04
     """Least distance [m] between bodies; a bent or hidden surface leaves smaller gaps."""
     spacings: float = 4.0
-    """The same in spacings of the points, for sparse clouds."""
+    """Least distance between bodies in spacings of the points, for sparse clouds."""
     share: float = 0.1
     """Least share of the points in a second body; fewer are left over from its cut."""
     lowest: float = 0.02
     """Share of the points of a body that may be lower than its foot: outliers."""
     foot: float = 0.015
-    """A body stands on the ground if its foot is lower than this [m]."""
+    """A body stands on the ground if its foot is less than this [m] above the lowest point."""
     around: float = 0.5
     """Greatest distance [m] of an object's points from a place on or near it."""
 
@@ -48,8 +48,9 @@ PARTS = PartNumbers()
 
 
 def label_bodies(points: Points, gap: float = PARTS.gap) -> Int[Tensor, "n"]:
-    """Return the group number of each point; groups are more than `gap` [m] apart, and group 0 is
-    the largest.
+    """Return the body of each of n points, by number; body 0 has the most points.
+
+    Bodies are more than `gap` [m] apart; the points (n, 3) are in metres.
     """
     device = points.device
     points = points.cpu()
@@ -66,8 +67,10 @@ def label_bodies(points: Points, gap: float = PARTS.gap) -> Int[Tensor, "n"]:
 
 
 def find_second_body(points: Points, up: Vector, spacing: float) -> Bool[Tensor, "n"] | None:
-    """Return a mask of the points of a second body that stands apart on the same ground; None if
-    there is none.
+    """Return a mask of the points of a second body on the same ground; None if there is none.
+
+    The points (n, 3) are in metres, `up` is the unit vector that points up, and `spacing` [m] is
+    the distance between neighbouring points.
     """
     label = label_bodies(points, max(PARTS.gap, PARTS.spacings * spacing))
     height = points @ up
@@ -93,7 +96,7 @@ def cut_object(
     box: Float[Tensor, "2 3"] | None = None,
     gap: Annotated[float, Range(0.001, 1.0)] = PARTS.gap,
 ) -> tuple[PointCloud, Plane | None]:
-    """Return the points of one object that stands on a support, and the support's plane if one was
+    """Return the points of one object on a support, and the support's plane, None if none was
     found.
 
     Args:
@@ -144,8 +147,11 @@ def find_ground(
     up: Vector,
     level_width: float = SUPPORTS.least_width,
 ) -> SupportPlane | None:
-    """Return the plane on which objects stand: a nearly level one of at least `level_width` [m],
-    else any that the cameras look down on.
+    """Return the plane on which objects stand; None if there is none.
+
+    It is nearly level and at least `level_width` [m] wide, else any plane on which the cameras look
+    down. The points (n, 3) are in metres. `eye` holds the camera's position [m], or that of each
+    point; None if it is unknown. `up` is the unit vector that points up.
     """
     middle = None if eye is None else eye.reshape(-1, 3).mean(0)
     kinds = (

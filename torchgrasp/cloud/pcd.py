@@ -13,15 +13,18 @@ MOST_NUMBERS = 4096
 LITERALS = 1 << 5
 """A control byte of LZF below this counts literal bytes; its other bits are part of a distance."""
 LETTERS = {"F": "f", "I": "i", "U": "u"}
+"""NumPy's letters of the types."""
 DEFAULT = [0, 0, 0, 1, 0, 0, 0]
-"""NumPy's letters of the types, and the viewpoint that many writers fill in."""
+"""The viewpoint that many writers fill in: position, and quaternion wxyz."""
 
 
 def parse_pcd(data: bytes) -> dict[str, Any]:
-    """Return points, normals and viewpoint of a PCD file, None if missing, and whether the
-    viewpoint is `default`.
+    """Return the arrays of a PCD file by name: "points", "normals", "viewpoint", and whether
+    "default".
 
-    Many writers fill VIEWPOINT with the default `0 0 0 1 0 0 0`, wherever the camera was.
+    Points and normals are (n, 3), the viewpoint is (3,), in the file's unit; what is missing is
+    None. "default" is true if VIEWPOINT is `0 0 0 1 0 0 0`, which many writers fill in, wherever
+    the camera was. Raises `Malformed` for a malformed file.
     """
     header, body = _split_header(data)
     if missing := [word for word in ("FIELDS", "SIZE", "TYPE") if word not in header]:
@@ -95,12 +98,11 @@ def _decompress(body: bytes, kinds: list[np.dtype[Any]], count: int) -> bytes:
 
 
 def decompress(data: bytes, size: int) -> bytes:
-    """Return the `size` bytes to which LZF-compressed data expand; raise `Malformed` for malformed
-    data.
+    """Return the `size` bytes to which LZF-compressed data expand.
 
     A control byte c < 32 is followed by c + 1 literal bytes. A larger c means a copy of (c >> 5) +
     2 earlier bytes; a length of 9 is extended by the next byte. The distance back to the copied
-    bytes has 13 bits.
+    bytes has 13 bits. Raises `Malformed` for malformed data.
     """
     out = bytearray()
     i = 0

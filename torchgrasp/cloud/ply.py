@@ -32,8 +32,11 @@ Property = tuple[str, str, str]  # name, type, and type of the length if it is a
 
 
 def parse_ply(data: bytes) -> dict[str, Any]:
-    """Return points, normals, viewpoint, frustum and table of a PLY file by name, where it has
-    them.
+    """Return the arrays of a PLY file by name, in the file's unit.
+
+    They are "points" and "normals" (n, 3), "viewpoint" (3,), "frustum" (4, 3) and "table" (4,),
+    where the file has them. A mesh gives points on its surface. Raises `Malformed` for a malformed
+    file.
     """
     header, body = _split_header(data)
     encoding = ""
@@ -84,8 +87,10 @@ def format_ply(
     frustum: np.ndarray | None = None,
     table: np.ndarray | None = None,
 ) -> bytes:
-    """Return the bytes of a binary PLY file; comment lines hold the viewpoint, the frustum and the
-    table.
+    """Return the bytes of a binary PLY file of a cloud.
+
+    `points` and `normals` are (n, 3). Comment lines hold the `viewpoint` (3,), the `frustum` (4, 3)
+    of inward normals, and the `table` (4,), normal and offset. Lengths are in metres.
     """
     lines = ["ply", "format binary_little_endian 1.0"]
     for name, numbers in (("viewpoint", viewpoint), ("frustum", frustum), ("table", table)):

@@ -1,4 +1,7 @@
-"""Reading of a depth camera's pose, and checks that the pose is rigid and fits the camera's view."""
+"""Reading of a depth camera's pose, and checks that the pose is rigid and fits the camera's view.
+
+The pose obj_from_camera (4, 4) [m] leads from the camera's frame (x right, y down, z forward).
+"""
 
 import contextlib
 import dataclasses
@@ -36,19 +39,20 @@ OPTICAL = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]).do
 
 @dataclasses.dataclass(frozen=True)
 class PoseNumbers:
-    """By what a view contradicts the pose of its camera, or the unit of its depths."""
+    """Bounds beyond which a view contradicts the pose of its camera, or the unit of its depths."""
 
     scaled: float = 1e-4
     """Greatest difference from orthogonal axes, and of their lengths, of a scaled rotation."""
     farthest: float = 100.0
     """A camera farther from the origin [m] has a pose that is not in metres."""
     farthest_table: float = 10.0
-    """The same of a table, along its normal [m]."""
+    """A table farther from the origin along its normal [m] has a pose that is not in metres."""
     millimetres: float = 200.0
-    """A position above this, not in metres, is in mm; else in cm."""
+    """A position that is too far is in mm if a coordinate is above this, else in cm."""
     shallow: float = 0.15
+    """Least median depth [m] of a view in which a table should have been found."""
     deep: float = 4.0
-    """Least and greatest median depth [m] of a view in which a table should have been found."""
+    """Greatest median depth [m] of such a view."""
     turn: float = 0.985
     """A rotation is nearly none if the diagonal of its matrix is above this: about 10 degrees."""
     shift: float = 0.1
@@ -56,7 +60,7 @@ class PoseNumbers:
     high: float = 4.0
     """Greatest height [m] of a camera above the table if the unit of the depth is assumed."""
     highest: float = 10.0
-    """The same if the unit is given."""
+    """Greatest height [m] of a camera above the table if the unit of the depth is given."""
     tilt: float = 3.0
     """Greatest tilt of a table [deg] that needs no explanation."""
     level: float = 5.0
@@ -64,9 +68,9 @@ class PoseNumbers:
     sloped: float = 15.0
     """A table tilted by less than this [deg], or as far from upside down, may be a slope."""
     drawn: int = 20_000
-    """About as many points tell whether a given table was seen."""
+    """Number of points, about, by which a given table is found to be seen."""
     on_table: float = 0.03
-    """Such points are within this distance of it [m]."""
+    """Points on the table are within this distance of it [m]."""
     seen: float = 0.001
     """Least share of the points on a table that was seen."""
     lowest: float = 0.01
@@ -77,7 +81,9 @@ class PoseNumbers:
 
 @dataclasses.dataclass(frozen=True)
 class SizeNumbers:
-    """What heights of a camera [m] and sizes of objects [m] contradict the unit of the depths."""
+    """Bounds on heights of a camera [m] and sizes of objects [m] by which the depth's unit is
+    checked.
+    """
 
     points: int = 100
     """Fewest points of an object whose size counts."""
@@ -88,19 +94,21 @@ class SizeNumbers:
     near: float = 0.05
     """Greatest difference [m] of a camera's height from that of a known wrong unit."""
     units: tuple[float, ...] = (0.25, 0.1)
-    """Millimetres of a count that are often taken for one."""
+    """Millimetres of one count of the depth that are often read as one millimetre."""
     high: float = 1.0
-    """A camera above this is high: it is noted, and objects of 12 cm may be a fourth as large."""
+    """A camera above this [m] is high: a note says so, and the sizes of objects are checked."""
     large_scaled: float = 0.12
-    """Objects larger than this are too large if the table's height is that of a wrong unit, too."""
+    """Objects larger than this [m] are too large if the table's height is that of a wrong unit."""
     higher: float = 1.5
+    """Height [m] of a camera above which some objects must be smaller than `large`."""
     large: float = 0.2
-    """Objects larger than this are too large under a camera that is higher than this."""
+    """Objects larger than this [m] are too large under a camera higher than `higher`."""
     huge: float = 0.5
-    """Objects larger than this are too large under any high camera."""
+    """Objects larger than this [m] are too large under any high camera."""
     low: float = 0.12
+    """Height [m] of a camera below which some object must be larger than `small`."""
     small: float = 0.03
-    """Objects that are all smaller than this are too small under a camera lower than this."""
+    """Objects that are all smaller than this [m] are too small under a camera lower than `low`."""
 
 
 POSE = PoseNumbers()
@@ -110,6 +118,8 @@ SIZES = SizeNumbers()
 def check_rigid(name: str, pose: Tensor) -> Transform:
     """Return the given pose if it is rigid to 1e-4; else raise `BadArgument`, which names the
     fault.
+
+    Errors call the argument `name`.
     """
     if fix := FIXES.get(tuple(pose.shape)):
         raise BadArgument(name, f"shape {tuple(pose.shape)}", f"a 4 x 4 matrix: {fix}")
@@ -138,7 +148,10 @@ def _describe_fault(pose: Transform) -> str:
 
 
 def read_camera_pose(pose: Tensor | np.ndarray) -> Transform:
-    """Return the pose of a camera in float64; refuse a pose that is not rigid or of another unit."""
+    """Return the pose (4, 4) [m] of a camera in float64.
+
+    Raises `BadArgument` for a pose that is not rigid, or more than 100 m from the origin.
+    """
     try:
         read = torch.as_tensor(pose).double()
     except (TypeError, ValueError) as error:
@@ -164,7 +177,11 @@ def _check_distance(pose: Transform, distance: float, most: float, what: str) ->
 
 
 def read_pose(name: str, path: Path | str) -> Transform:
-    """Return the rigid transform in a .npy file, or in a .txt file with four rows of four numbers."""
+    """Return the rigid transform (4, 4) [m] in a .npy file, or in a .txt file with four lines.
+
+    Each line has four numbers. Raises `BadArgument`, which calls the argument `name`, for another
+    or malformed file.
+    """
     data, suffix = read_suffixed(name, path, (".npy", ".txt"))
     try:
         table = parse_npy(data) if suffix == ".npy" else read_lines(data)
@@ -182,8 +199,13 @@ def find_plausible(
     up: object,
     known_unit: bool,
 ) -> tuple[SupportPlane, ...]:
-    """Return the planes on which objects may stand; refuse a pose or a depth unit that contradicts
-    the view.
+    """Return the planes on which objects may stand, the most plausible first.
+
+    `points` (n, 3) [m] and the `table`, a plane or a height z [m], are in the frame to which the
+    `pose` leads. `up` is the direction against gravity there; with None, planes may face any way,
+    and are compared with z. `known_unit` is whether the user gave the unit of the depth. Raises
+    `BadArgument` for a pose or a unit that the view contradicts, and `NoSupport` if there is no
+    plane.
     """
     eye = pose[:3, 3]
     try:
@@ -208,8 +230,10 @@ def find_plausible(
 
 
 def check_view(points: Points, pose: Transform, up: object, known_unit: bool) -> None:
-    """Raise `BadArgument` if a table in the view contradicts the camera's pose or the unit of the
-    depth.
+    """Raise `BadArgument` if a table in the view contradicts the camera's pose or the depth's unit.
+
+    `points` (n, 3) [m] are in the frame to which the `pose` leads. `up` is the direction against
+    gravity there; None means z. `known_unit` is whether the user gave the unit of the depth.
     """
     with contextlib.suppress(NoSupport):
         _check_supports(find_table(points, pose[:3, 3], None, None), pose, up, known_unit)
@@ -295,8 +319,10 @@ def _check_given_table(points: Points, plane: Plane) -> None:
 
 
 def check_sizes(points: Points, labels: Tensor, pose: Transform, plane: Plane) -> tuple[str, ...]:
-    """Refuse a depth unit that makes objects too large or small for a hand; return a note if the
-    camera is high.
+    """Raise `BadArgument` for a unit of the depth that makes objects too large or small for a hand.
+
+    Returns a note if the camera is high, else nothing. `labels` holds the object of each of the
+    `points` (n, 3) [m], 0 for none; `plane` is the table.
     """
     parts = [points[labels == k] for k in labels.unique().tolist() if k > 0]
     large_enough = [part for part in parts if len(part) >= SIZES.points]

@@ -26,7 +26,7 @@ MAX_POINTS = 2000  # most points to which a shape is fitted: they bound the time
 
 @dataclasses.dataclass(frozen=True)
 class PrepareNumbers:
-    """The views of a cloud, and the distance to which points are moved."""
+    """Bounds on the views of a cloud, and on the distance to which points are moved."""
 
     views: int = 16
     """Most cameras of a cloud."""
@@ -35,21 +35,23 @@ class PrepareNumbers:
     moved: float = 4.5
     """Points farther from the fit, in medians of its errors, are beyond Gaussian noise."""
     least: float = 1e-12
-    """A distance [m] that counts as none, where a fit has no error."""
+    """A distance [m] that counts as 0, where a fit has no error."""
 
 
 @dataclasses.dataclass(frozen=True)
 class NormalNumbers:
-    """How given normals are compared with those of neighbours."""
+    """Numbers of the comparison of given normals with those of neighbours."""
 
     neighbours: int = 9
-    """The point itself and eight neighbours: enough for a majority."""
+    """Number of nearest points: the point itself and eight neighbours, enough for a majority."""
     edge: float = 0.7
     """Signs are not compared below this |cosine|: across an edge of 45 degrees."""
     over: float = 0.3
-    """Nor above this height over the tangent plane, over the distance: behind a thin wall."""
+    """Signs are not compared with a neighbour whose height over the tangent plane, over its
+    distance, is above this: it is behind a thin wall.
+    """
     pairs: int = 20
-    """Fewest pairs that tell; of fewer any share may be chance."""
+    """Fewest pairs of neighbours that count; of fewer any share may be chance."""
     random: float = 0.35
     """Signs of which this share is opposed are not trusted; random ones oppose half."""
     rounded: float = 1e-3
@@ -76,15 +78,18 @@ class PreparedCloud(Value):
     """A checked cloud, and the points and normals to which a shape is fitted."""
 
     cloud: PointCloud  # distinct points [m] with outward normals, in the given dtype
-    points: Points  # at most 2000 of them, in float64
-    normals: Points  # at `points`, of unit length
-    # the camera [m] of all `points`, or of each, and the normals of the sides of its view, if known
+    points: Points  # (n, 3) [m], at most 2000 of these points, in float64
+    normals: Points  # (n, 3), outward unit normals at `points`
+    # position of the camera [m] of all `points`, or of each, if known
+    # inward unit normals of the four sides of the camera's view, or of each point's, if known
     viewpoint: Float[Tensor, "*views 3"] | None
     frustum: Float[Tensor, "*views 4 3"] | None
 
     @property
     def one_sided(self) -> bool:
-        """Whether the cloud shows only what its cameras see, so that the object has a hidden side."""
+        """Whether the cloud shows only what its cameras see, so that the object has a hidden
+        side.
+        """
         eye = self.viewpoint
         return eye is not None and share_facing(self.points, self.normals, eye) >= FACING
 
@@ -93,13 +98,14 @@ class PreparedCloud(Value):
 def prepare_cloud(
     cloud: PointCloud, generator: torch.Generator, clean: bool = True, up: Vector | None = None
 ) -> PreparedCloud:
-    """Check a cloud, and return the points and normals to which a shape is fitted: at most 2000,
-    drawn at random.
+    """Check a cloud, and return the points and normals to which a shape is fitted.
 
-    Normals of random signs are ignored: with them a single view would look like a whole surface. If
-    `clean`, outliers are removed, all normals are fitted anew, and a missing viewpoint is estimated
-    above the object, where `up` points. A viewpoint that too few given normals face is then
-    ignored: the cloud is a whole surface.
+    At most 2000 points are drawn at random by `generator`. Normals of random signs are ignored:
+    with them a single view would look like a whole surface. With `clean`, outliers are removed, all
+    normals are fitted anew, and a missing viewpoint is estimated above the object, where the vector
+    `up` points. A viewpoint that too few given normals face is then ignored: the cloud is a whole
+    surface. Raises the errors of `check_cloud`, `BadArgument` for more than 16 cameras, and
+    `TooFewPoints` for a view of fewer than 10 points.
     """
     cloud = remove_duplicates(cloud)
     normals = cloud.normals
@@ -137,12 +143,11 @@ def prepare_cloud(
 
 @checked
 def estimate_normals(cloud: PointCloud) -> PointCloud:
-    """Return a cloud without duplicate points, with outward unit normals of quadrics fitted around
-    the points.
+    """Return a cloud without duplicate points, with outward unit normals.
 
-    Outward is towards the viewpoint. If the viewpoint is unknown, outward is the side of the given
-    normals. If normals are missing, too, the viewpoint is estimated. Raises the errors of
-    `check_cloud`.
+    They are those of quadrics fitted around the points. Outward is towards the viewpoint. If the
+    viewpoint is unknown, outward is the side of the given normals. If normals are missing, too, the
+    viewpoint is estimated. Raises the errors of `check_cloud`.
 
     >>> estimate_normals(PointCloud(torch.rand(90, 3), viewpoint=torch.tensor([0.5, 0.5, 9.0]))).normals.shape
     torch.Size([90, 3])
@@ -152,8 +157,9 @@ def estimate_normals(cloud: PointCloud) -> PointCloud:
 
 @checked
 def clean_cloud(cloud: PointCloud) -> PointCloud:
-    """Return a cloud without outliers, moved onto quadrics fitted around the points, with outward
-    normals.
+    """Return a cloud without duplicates and outliers, moved onto quadrics around the points.
+
+    Its normals are outward unit normals of the quadrics. Raises the errors of `check_cloud`.
     """
     return _fit_normals(remove_duplicates(cloud), clean=True)
 
@@ -185,8 +191,9 @@ def _fit_normals(cloud: PointCloud, clean: bool, up: Vector | None = None) -> Po
 
 
 def compare_normals(points: Points, normals: Points) -> NormalCheck:
-    """Return how well normals agree among neighbouring points: which are flipped, and whether signs
-    can be trusted.
+    """Return how well normals agree among neighbouring points.
+
+    `points` (n, 3) are in metres; `normals` (n, 3) may have any length.
     """
     distance, index = nearest(points, NORMALS.neighbours)
     others = index[:, 1:]  # (n, 8)
@@ -207,8 +214,10 @@ def compare_normals(points: Points, normals: Points) -> NormalCheck:
 
 
 def share_facing(points: Points, normals: Points, viewpoint: Float[Tensor, "*views 3"]) -> float:
-    """Return the share of normals that face the camera: nearly 1 in a single view, half on a whole
-    surface.
+    """Return the share of normals that face the camera: near 1 in a single view, half all around.
+
+    `points` (n, 3) [m] have the outward `normals` (n, 3); the viewpoint [m] is that of all points,
+    or of each.
     """
     return float((((viewpoint - points) * normals).sum(-1) > 0).double().mean())
 
@@ -217,11 +226,10 @@ def share_facing(points: Points, normals: Points, viewpoint: Float[Tensor, "*vie
 def merge_clouds(
     clouds: Sequence[PointCloud], poses: Sequence[Transform] | Float[Tensor, "k 4 4"]
 ) -> PointCloud:
-    """Return one cloud of several views in a common frame, with the normal and the camera position
-    of each point.
+    """Return one cloud of several views in a common frame, with each point's normal and camera.
 
-    `estimate_normals` gives normals to a view without normals. A view with normals but without
-    viewpoint leaves the result without viewpoint. Points are denser where views overlap;
+    `estimate_normals` gives normals to a view without normals. If a view has normals but no
+    viewpoint, the result has no viewpoint. Points are denser where views overlap;
     `voxel_downsample` evens the density. The rigid `poses` obj_from_cloud (4, 4) [m] lead from the
     frames of the views. Raises `BadArgument` for no cloud, another number of poses, a pose that is
     not rigid, or clouds of several dtypes or devices. The views and the result may raise the errors

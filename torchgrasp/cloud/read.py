@@ -34,18 +34,18 @@ METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 @dataclasses.dataclass(frozen=True)
 class ReadNumbers:
-    """How the arrays of a file are understood."""
+    """Bounds by which the arrays of a file are understood."""
 
     shown: int = 200
     """Most letters of the names of columns in a note."""
     unit: float = 1e-4
-    """Greatest error of the length of a table's normal."""
+    """Greatest error of the unit length of a table's normal."""
     near_unit: float = 0.05
-    """Greatest error of the length of a normal in columns 4 to 6, and"""
+    """Greatest error of the length of a normal in columns 4 to 6."""
     normals: float = 0.9
-    """the least share of such rows by which these columns are normals."""
+    """Least share of lines with such a length by which columns 4 to 6 are normals."""
     drawn: int = 2000
-    """Most points that tell whether a camera was in the origin."""
+    """Most points by which a camera in the origin is judged."""
 
 
 READ = ReadNumbers()
@@ -54,8 +54,12 @@ READ = ReadNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class CloudFile(Value):
-    """A cloud read from a file; `notes` holds a sentence for each kind of data in the file that was
-    left out.
+    """A cloud read from a file, with notes on what was left out.
+
+    Attributes:
+        cloud: the points [m], in float64.
+        notes: a sentence for each kind of data in the file that was left out.
+        table: the table that the file holds, as `save_cloud` writes it; None without one.
 
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp(), "cloud.npy")
@@ -66,7 +70,7 @@ class CloudFile(Value):
 
     cloud: PointCloud
     notes: tuple[str, ...]
-    table: Plane | None = None  # that the file holds, as `save_cloud` writes it
+    table: Plane | None = None
 
 
 @checked
@@ -119,10 +123,10 @@ def read_cloud_file(
     viewpoint: Sequence[float | int] | Tensor | None = None,
     unit: Literal["m", "cm", "mm"] = "m",
 ) -> CloudFile:
-    """Read a cloud of any size, such as a whole scene, with notes on what was left out; see
-    `read_cloud`.
+    """Read a cloud of any size, such as a whole scene, with notes on what was left out.
 
-    Raises `CloudFileError`, `BadArgument` and `TooFewPoints` as `read_cloud`.
+    Formats and arguments are those of `read_cloud`. Raises `CloudFileError`, `BadArgument` and
+    `TooFewPoints` as `read_cloud`.
 
     >>> read_cloud_file("none.ply")
     Traceback (most recent call last):
@@ -166,11 +170,12 @@ def cloud_from_array(
     normals: np.ndarray | None = None,
     viewpoint: np.ndarray | Sequence[float | int] | None = None,
 ) -> PointCloud:
-    """Return a cloud made of NumPy arrays [m]; points that were not measured, and colours, are left
-    out.
+    """Return a cloud made of NumPy arrays [m]; points that were not measured are left out.
 
     `points` are (n, 3), or (h, w, 3) for an image; or have six columns, of which the last three are
-    normals. `normals` have the shape of the points. Raises the errors of `check_cloud`.
+    normals. `normals` have the shape of the points. Colours are left out. `viewpoint` (3,) is the
+    camera's position [m], or (n, 3) that of each point; None if it is unknown. Raises the errors of
+    `check_cloud`.
 
     >>> len(cloud_from_array(np.random.default_rng(0).random((6, 8, 3))))
     48
@@ -185,11 +190,10 @@ def cloud_from_array(
 
 @checked
 def save_cloud(cloud: PointCloud, path: Path | str, table: Plane | None = None) -> Path:
-    """Write a cloud, and its table if given, as `.npz` (exact) or binary `.ply` (float32), in one
-    atomic step.
+    """Write a cloud as `.npz` (exact) or binary `.ply` (float32), atomically; return the path.
 
-    Raises `OutputError`, and `BadArgument` for another suffix, or several views for `.ply`, which
-    has one viewpoint.
+    The file also holds the `table`, if given. Raises `OutputError`, and `BadArgument` for another
+    suffix, or several views for `.ply`, which has one viewpoint.
 
     >>> save_cloud(PointCloud(torch.rand(9, 3)), "cloud.txt")
     Traceback (most recent call last):
@@ -210,8 +214,11 @@ def save_cloud(cloud: PointCloud, path: Path | str, table: Plane | None = None) 
 def make_cloud(
     source: str, arrays: dict[str, Any], viewpoint: Tensor | None = None, scale: float = 1.0
 ) -> CloudFile:
-    """Return a `CloudFile` made of named arrays in units of `scale` metres, without rows that were
-    not measured.
+    """Return a `CloudFile` made of arrays by name, without points that were not measured.
+
+    The arrays are in units of `scale` metres; their names are those of a file's, as "points".
+    `viewpoint` [m] replaces that of the arrays. `source` is the file in errors. Raises
+    `CloudFileError`, `BadArgument` or `TooFewPoints` for arrays that are no cloud.
     """
     notes: list[str] = []
     if "columns" in arrays:

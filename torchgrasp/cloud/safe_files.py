@@ -30,8 +30,9 @@ HEADERS = {
 
 
 def parse_npy(data: bytes) -> np.ndarray:
-    """Return the array of a .npy file; raise `Malformed` for objects and for fewer bytes than its
-    header promises.
+    """Return the array of a .npy file, given its bytes.
+
+    Raises `Malformed` for objects, and for fewer bytes than the header states.
     """
     if not data.startswith(b"\x93NUMPY"):
         raise Malformed("no header of an .npy file")
@@ -48,8 +49,9 @@ def parse_npy(data: bytes) -> np.ndarray:
 
 
 def parse_npz(data: bytes, names: Sequence[str], required: str = "") -> dict[str, np.ndarray]:
-    """Return the arrays of a .npz file by name, all if no `names` are given; raise `Malformed` for
-    a bad file.
+    """Return the arrays of a .npz file by name, given its bytes; all if no `names` are given.
+
+    `required` is an array that the file must hold, "" for none. Raises `Malformed` for a bad file.
     """
     if not zipfile.is_zipfile(io.BytesIO(data)):
         raise Malformed("no archive, as .npz files are")
@@ -65,12 +67,12 @@ def parse_npz(data: bytes, names: Sequence[str], required: str = "") -> dict[str
 
 
 def read_image_file(name: str, path: Path | str) -> Any:
-    """Return the array in an image file: .npy, .npz, .png or .tiff; also .exr for depth, or .json
-    for masks.
+    """Return the array in an image file: .npy, .npz, .png or .tiff, .exr for depth, .json for
+    masks.
 
     The argument `name` "depth" has one channel, and is the array `depth` of a .npz file. The
     argument "mask" may be a picture or several masks, in each form that
-    `torchgrasp.scene.masks.read_labels` takes.
+    `torchgrasp.scene.masks.read_labels` takes. Raises `BadArgument` for another or malformed file.
     """
     masks = name == "mask"
     data, suffix = read_suffixed(
@@ -95,7 +97,7 @@ def read_image_file(name: str, path: Path | str) -> Any:
 
 
 def parse_json(data: bytes) -> Any:
-    """Return the content of a JSON file; raise `Malformed` for a large file."""
+    """Return the content of a JSON file, given its bytes; raise `Malformed` for a large file."""
     if len(data) > JSON_BYTES:
         raise Malformed(f"{len(data)} bytes")
     return json.loads(data)
@@ -104,7 +106,9 @@ def parse_json(data: bytes) -> Any:
 def read_intrinsics(name: str, path: Path | str, image: str = "") -> Any:
     """Return the intrinsics in a .json, .yaml, .npy or .txt file, as `cloud_from_depth` takes them.
 
-    `image` is the number of the image, by which BOP's scene_camera.json names its entry.
+    BOP's scene_camera.json holds an entry for each image; `image` is its number as text, "" for
+    other files. Errors call the argument `name`. Raises `BadArgument` for another or malformed
+    file.
     """
     data, suffix = read_suffixed(name, path, (".json", ".yaml", ".yml", ".npy", ".txt"))
     try:
@@ -126,8 +130,10 @@ def read_intrinsics(name: str, path: Path | str, image: str = "") -> Any:
 
 
 def read_suffixed(name: str, path: Path | str, suffixes: tuple[str, ...]) -> tuple[bytes, str]:
-    """Return the bytes and the suffix of a file; raise `BadArgument` if missing, too large or of
-    another suffix.
+    """Return the bytes and the lower-case suffix of a file.
+
+    Raises `BadArgument`, which calls the argument `name`, for a file that is missing, too large or
+    of none of the `suffixes`.
     """
     path = Path(path)
     allowed = f"a {', '.join(suffixes[:-1])} or {suffixes[-1]} file"

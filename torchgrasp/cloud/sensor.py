@@ -27,14 +27,14 @@ SensorName = Literal["realsense", "kinect_v1", "azure", "zivid"]
 
 @dataclasses.dataclass(frozen=True)
 class FaultNumbers:
-    """Where a depth camera errs beside the random noise: at rims and in corners."""
+    """Numbers of the errors of a depth camera beside the random noise: at rims and in corners."""
 
     background: float = 100.0
-    """Depth [m] that stands for a pixel in which nothing is seen."""
+    """Depth [m] that is assumed for a pixel in which nothing is measured."""
     width: int = 5
     """A rim pixel has the other surface within two pixels: in a square of this side [px]."""
     jump: float = 0.010
-    """Least depth [m] between the two surfaces."""
+    """Least difference in depth [m] between the two surfaces at a rim."""
     corner: float = 8.0
     """Width of the surroundings [px] whose light reaches a corner."""
     deepest: float = 0.01
@@ -43,7 +43,7 @@ class FaultNumbers:
 
 @dataclasses.dataclass(frozen=True)
 class EstimateNumbers:
-    """How noise is estimated from a table, or from depth errors."""
+    """Numbers of the estimate of noise from a table, or from depth errors."""
 
     patch: int = 21
     """Side [px] of the patches whose mean error is the bias."""
@@ -54,7 +54,7 @@ class EstimateNumbers:
     full: float = 0.9
     """Least share of a patch on the table: others are at the feet of objects."""
     least_share: float = 1e-9
-    """Keeps the mean of an empty patch finite."""
+    """Least share of a patch, so that the mean of an empty patch is finite."""
     errors: int = 100
     """Fewest errors to which a model is fitted."""
     groups: int = 8
@@ -65,7 +65,7 @@ class EstimateNumbers:
 
 @dataclasses.dataclass(frozen=True)
 class StillNumbers:
-    """When frames show that camera and scene stood still."""
+    """Bounds by which frames show that camera and scene stood still."""
 
     off: float = 0.02
     """A pixel differs if it is off by more than this, as a share of its depth."""
@@ -81,8 +81,9 @@ STILL = StillNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class SensorNoise(Value):
-    """A model of a depth camera's noise: random noise, depth steps, smooth bias, and faults at rims
-    and corners.
+    """A model of a depth camera's noise: random noise, depth steps, smooth bias, and faults.
+
+    Faults are flying and missing pixels at rims, at grazing angles and in corners.
 
     >>> float(SENSORS["kinect_v1"].sigma(torch.tensor(2.0))) < 0.007
     True
@@ -108,8 +109,9 @@ class SensorNoise(Value):
 
     @checked
     def sigma(self, depth: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-        """Return the standard deviation [m] of the random noise at a depth [m], without bias and
-        steps.
+        """Return the standard deviation [m] of the random noise at a depth [m].
+
+        Bias and steps do not count.
         """
         growth = self.disparity / self.base if self.base else self.growth
         return torch.sqrt(self.floor**2 + (growth * depth * depth) ** 2)
@@ -145,8 +147,9 @@ SENSORS: Mapping[SensorName, SensorNoise] = types.MappingProxyType(
 
 
 def find_sensor(noise: bool | SensorName | SensorNoise) -> SensorNoise | None:
-    """Return the noise of a camera. True means the noise of an active stereo camera; False gives
-    None: no noise.
+    """Return the model of a camera's noise, by name; None for no noise.
+
+    True means the noise of an active stereo camera, False no noise; a model is returned itself.
     """
     if isinstance(noise, bool):
         return ACTIVE_STEREO if noise else None
@@ -156,8 +159,10 @@ def find_sensor(noise: bool | SensorName | SensorNoise) -> SensorNoise | None:
 def add_noise(
     depth: Image, cosine: Image, generator: torch.Generator, sensor: SensorNoise = ACTIVE_STEREO
 ) -> Image:
-    """Return a depth image [m] with a camera's noise, given |cosine| between each ray and the
-    surface normal.
+    """Return a depth image (h, w) [m] with a camera's noise; 0 where nothing is measured.
+
+    `depth` is the exact image [m], 0 where nothing is. `cosine` (h, w) is the absolute cosine
+    between each ray and the surface normal.
     """
     normal = partial(torch.randn, depth.shape, generator=generator, dtype=torch.float64)
     uniform = partial(torch.rand, depth.shape, generator=generator, dtype=torch.float64)
@@ -207,11 +212,11 @@ def estimate_noise(
     table: Plane,
     on_table: Bool[Tensor, "h w"],
 ) -> SensorNoise | None:
-    """Return the noise that a table shows: its random part as `floor` and `growth`, its smooth part
-    as `bias`.
+    """Return the noise that a table shows; None if fewer than 1000 pixels show the table.
 
-    The plane is in the camera's frame. Of the pixels `on_table`, those over 20 mm from the plane do
-    not count. The noise is None if fewer than 1000 pixels show the table.
+    Its random part is `floor` and `growth`, its smooth part `bias`. The depth (h, w) is in metres,
+    the intrinsics are in pixels, and the plane is in the camera's frame. Of the pixels `on_table`,
+    those over 20 mm from the plane do not count.
     """
     row, column = (torch.arange(n, dtype=torch.float64) for n in depth.shape)
     x = (column - intrinsics[0, 2]) / intrinsics[0, 0]
@@ -234,8 +239,9 @@ def estimate_noise(
 
 
 def fit_noise(depth: Float[Tensor, "n"], error: Float[Tensor, "n"]) -> SensorNoise:
-    """Return a noise model whose `floor` and `growth` are fitted robustly to depth errors [m] at
-    given depths [m].
+    """Return a noise model whose `floor` and `growth` are fitted robustly to depth errors.
+
+    `error` holds the errors [m] of n pixels at the depths `depth` [m].
     """
     if len(depth) < ESTIMATE.errors:
         return SensorNoise()
@@ -254,10 +260,10 @@ def _deviation(error: Float[Tensor, "n"]) -> Float[Tensor, ""]:
 
 @checked
 def median_depth(frames: Sequence[Tensor | np.ndarray]) -> Tensor:
-    """Return the median depth of each pixel over several depth images, in which camera and scene
-    stand still.
+    """Return the median depth of each pixel over several depth images.
 
-    Pixels that most frames miss (0, NaN or infinity) are 0. The unit is that of the frames.
+    Camera and scene stand still. Pixels that most frames miss (0, NaN or infinity) are 0. The unit
+    is that of the frames.
 
     The `frames` are images (h, w) of one size and one dtype. Raises `BadArgument` for no frame, for
     frames of several sizes or dtypes, or if camera or scene have moved in one.

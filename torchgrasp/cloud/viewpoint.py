@@ -17,7 +17,7 @@ from torchgrasp.geometry.support_planes import find_supports
 
 @dataclasses.dataclass(frozen=True)
 class UnseenNumbers:
-    """When a camera cannot have seen the points of a view."""
+    """Bounds beyond which a camera cannot have seen the points of a view."""
 
     edge_on: float = 0.15
     """Greatest share of points that a camera sees edge-on."""
@@ -26,27 +26,30 @@ class UnseenNumbers:
     grazing: float = 0.17
     """A surface is seen edge-on if the cosine between ray and normal is below this: 80 degrees."""
     neighbours: int = 6
-    """A point is compared with its neighbours in the image; itself is one of so many."""
+    """Number of nearest points in the image with which a point is compared, itself included."""
     slope: float = 2.0
     """Slopes up to this, depth over width, hide nothing."""
     step: float = 0.1
     """Least step of depth behind which points are hidden, over the radius of the cloud."""
 
     def excess(self, shares: tuple[float, float]) -> tuple[float, float]:
-        """Return the shares edge-on and behind, each over the greatest that is allowed."""
+        """Return two shares of points, each over the greatest that is allowed.
+
+        They are the shares that are seen edge-on, and that lie behind others.
+        """
         return shares[0] / self.edge_on, shares[1] / self.behind
 
 
 @dataclasses.dataclass(frozen=True)
 class GuessNumbers:
-    """How the camera of a view is guessed."""
+    """Numbers of the guess of a view's camera."""
 
     drawn: int = 2000
-    """Most points that tell where the camera was."""
+    """Most points from which the camera is guessed."""
     half_view: float = 50.0
     """Points of a camera in the origin are at most this far from its axis [deg]."""
     far: float = 2.0
-    """Such a cloud is farther from the origin than this, in radii of the cloud."""
+    """A cloud whose camera is in the origin is farther from it than this, in radii of the cloud."""
     directions: int = 400
     """Directions that are tried; they are about 10 degrees apart."""
     above: float = 0.1
@@ -60,17 +63,17 @@ class GuessNumbers:
     least_angle: float = 15.0
     """Least angle [deg] within which a camera is likely."""
     sure: float = 1.0
-    """Least score of a direction that the points tell."""
+    """Least score of a direction that the points show clearly."""
     better: float = 0.5
-    """A place whose score is this much below the best is none from where a view was taken."""
+    """A view was not taken from a place whose score is this much below the best."""
     tangent: float = 0.3
     """Surfaces with a smaller cosine to the ray count less for the bulge, as noise turns them."""
     neighbours: int = 13
-    """The twelfth neighbour measures the density; the point itself is one of so many."""
+    """Number of nearest points, the point itself included; the farthest measures the density."""
     least_cosine: float = 0.1
     """Least cosine between ray and normal for the density, which noise would make infinite."""
     least: float = 1e-12
-    """Keeps quotients and logarithms of zero finite."""
+    """Least value of a divisor, and of a number whose logarithm is taken."""
 
 
 UNSEEN = UnseenNumbers()
@@ -80,14 +83,14 @@ GUESS = GuessNumbers()
 def guess_viewpoint(
     points: Points, normals: Points, up: Vector | None = None, assumed: bool = False
 ) -> tuple[Vector, float]:
-    """Return a camera position [m] that explains a view, and the angle [deg] within which the
-    camera is likely.
+    """Return a camera position [m] that explains a view, and the angle [deg] of its uncertainty.
 
-    Of all directions above the support, the one that explains the points best is taken; the camera
-    is placed along it, 4 radii of the cloud away. The direction `up` is above the support; the
-    normal of a support in the points replaces it. If `up` is None or `assumed`, a guess, the camera
-    may be at the origin, where the points lie in front of it and a camera can have taken the view.
-    An angle of 180 degrees means that the points hardly tell the direction.
+    The camera is likely within this angle; 180 degrees means that the points hardly show the
+    direction. `points` are (n, 3) [m]; `normals` (n, 3) are unit vectors of either sign. Of all
+    directions above the support, the one that explains the points best is taken; the camera is
+    placed along it, 4 radii of the cloud away. The direction `up` is above the support; the normal
+    of a support in the points replaces it. If `up` is None or `assumed`, a guess, the camera may be
+    at the origin, where the points lie in front of it and a camera can have taken the view.
     """
     points, normals = _draw(points, normals)
     centre, radius = _enclose(points)
@@ -125,11 +128,12 @@ def _is_ahead(points: Points, centre: Vector, radius: Float[Tensor, ""]) -> bool
 
 
 def can_see(points: Points, normals: Points, viewpoint: Vector) -> bool:
-    """Return whether a camera at a place [m] can have taken a view.
+    """Return whether a camera at `viewpoint` (3,) [m] can have taken a view.
 
-    Seen from there, points must not hide other points. In addition, one of three conditions must
-    hold: the points are as dense as the camera's pixels; no other place explains the points much
-    better; the camera looks down on a support.
+    From there, points must not hide other points. In addition, one of three conditions must hold:
+    the points are as dense as the camera's pixels; no other place explains the points much better;
+    the camera looks down on a support. `points` are (n, 3) [m]; `normals` (n, 3) are unit vectors
+    of either sign.
     """
     points, normals = _draw(points, normals)
     if max(UNSEEN.excess(share_unseen(points, normals, viewpoint))) > 1:
@@ -185,10 +189,10 @@ def _explain(
 
 
 def share_unseen(points: Points, normals: Points, viewpoint: Vector) -> tuple[float, float]:
-    """Return the share of points that a camera would see edge-on, and the share of points hidden
-    behind others.
+    """Return the share of points that a camera sees edge-on, and the share hidden behind others.
 
-    The second share is 1 if a point lies behind the camera.
+    The second share is 1 if a point lies behind the camera at `viewpoint` (3,) [m]. `points` are
+    (n, 3) [m]; `normals` (n, 3) are unit vectors of either sign.
     """
     ray = unit(points - viewpoint)
     edge_on = float(((ray * normals).sum(-1).abs() < UNSEEN.grazing).double().mean())
