@@ -1,5 +1,8 @@
 """A robot arm that carries a hand: its chain of joints, its collision spheres, and random postures
 to start from.
+
+A posture is one position [rad, or m for sliding joints] of each of the n joints, from the base to
+the tip, the link that carries the hand.
 """
 
 import dataclasses
@@ -23,20 +26,20 @@ from torchgrasp.hand.urdf import Urdf, read_published
 from torchgrasp.ik.clearance import MILLIMETRE
 from torchgrasp.ik.motion import APPROACH_DISTANCE
 
-# Distance [mm] that a turn by one radian counts as: the depth of a hand.
+# distance [mm] as which a rotation by one radian counts: the depth of a hand
 LEVER = APPROACH_DISTANCE / MILLIMETRE
 
 
 @dataclasses.dataclass(frozen=True)
 class ArmNumbers:
-    """The numbers of an arm's spheres and of its library of postures."""
+    """Numbers of an arm's collision spheres and of its library of postures."""
 
     joints: int = 6
-    """Fewest joints that bring a hand to any pose."""
+    """Least number of joints that can bring a hand to any pose."""
     postures: int = 1024
-    """Random postures in the library: one is not far from any pose."""
+    """Number of random postures in the library: one is not far from any pose."""
     tested: int = 200
-    """Postures that tell which spheres overlap by construction."""
+    """Number of postures in which spheres are tested for overlap by construction."""
     cell: float = 0.065
     """Edge [m] of a sphere's cell: one sphere fills a section of a thin link."""
     bulge: float = 0.01
@@ -44,19 +47,35 @@ class ArmNumbers:
 
 
 ARM = ArmNumbers()
-TipPoses = Float[Tensor, "3 4 k"]  # of the tip in k postures, in the frame of the base
+TipPoses = Float[Tensor, "3 4 k"]  # poses [m] of the tip in k postures, in the frame of the base
 
 
 @dataclasses.dataclass(frozen=True)
 class Arm(Value):
-    """A robot arm that carries a hand, from `load_arm`. Postures (k, n) hold n joints [rad], from
-    the base to the tip.
+    """A robot arm that carries a hand, from `load_arm`; n counts its joints, from the base to the
+    tip.
 
-    `urdf` is the chain of links from base to tip. `speed` [rad/s] is the greatest of each joint.
-    The s collision spheres [m] are those of the links, then those of the hand's palm. Those of
-    `moving` links keep clear of objects and, if they turn, of the table; the `pairs` of each other.
-    `library` holds m random postures, with the features of their tips. `hand_sha256` names the
-    files of the hand.
+    Postures (k, n) hold k positions of all joints [rad, or m for sliding ones]. The tip is the link
+    that carries the hand.
+
+    Args:
+        urdf: the chain of links from base to tip.
+        tree: its kinematic tree.
+        lower: lower limits of the joints [rad or m].
+        upper: upper limits of the joints [rad or m].
+        speed: greatest speed of each joint [rad/s or m/s].
+        obj_from_base: pose of the arm's root link in the object's frame, that of the cloud [m].
+        tip_from_hand: pose of the hand's root link in the frame of the tip [m].
+        link: index in `urdf.links` of the link of each of the s collision spheres: those of the
+            links, then those of the hand's palm, which count as the tip's.
+        center: centre of each sphere in the frame of its link [m].
+        radius: radius of each sphere [m].
+        moving: indices of the spheres of links that joints move, without the palm. They keep clear
+            of objects and, unless their links only slide, of the table.
+        pairs: indices of the two spheres of each pair that must not overlap.
+        library: m random postures [rad or m].
+        features: `features` of the tip's pose in each posture of the library [mm].
+        hand_sha256: hash of the files of the hand.
     """
 
     urdf: Urdf = dataclasses.field(repr=False)
@@ -77,30 +96,34 @@ class Arm(Value):
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the joints, from the base to the tip."""
+        """Names of the n joints, from the base to the tip."""
         return self.tree.joint_names
 
     @checked
     def moved(self, b_from_a: Pose) -> "Arm":
-        """Return the arm transformed from frame a to frame b."""
+        """Return the arm transformed by `b_from_a` [m], from frame a to frame b."""
         return dataclasses.replace(self, obj_from_base=b_from_a.to(self.lower) @ self.obj_from_base)
 
     @checked
     def hand_poses(self, joints: Float[Tensor, "k n"]) -> Float[Tensor, "k 4 4"]:
-        """Return the pose `obj_from_hand` of the hand in each posture of the arm."""
+        """Return the pose `obj_from_hand` [m] of the hand in each of k postures of the arm."""
         return self.obj_from_base @ self.tree.poses(joints)[:, -1] @ self.tip_from_hand
 
     @checked
     def tip_poses(self, obj_from_hand: Float[Tensor, "k 4 4"]) -> TipPoses:
-        """Return the poses of the tip, in the base's frame, that put the hand at given poses."""
+        """Return the poses (3, 4, k) [m] of the tip in the base's frame that put the hand at given
+        poses [m].
+        """
         base_from_hand = inverse(self.obj_from_base) @ obj_from_hand.to(self.lower)
         base_from_tip = base_from_hand @ inverse(self.tip_from_hand)
         return base_from_tip[:, :3].permute(1, 2, 0).contiguous()
 
     @checked
     def tip_motion(self, joints: Float[Tensor, "n k"]) -> tuple[TipPoses, Float[Tensor, "6 n k"]]:
-        """Return the tip's poses, and its motion by each joint: translation [mm], rotation times
-        `LEVER`.
+        """Return the tip's poses (3, 4, k) [m] in the base's frame, then its motion by each joint.
+
+        `joints` are k postures, one in each column. The motion is the derivative of the translation
+        [mm], then of the rotation vector times `LEVER` [mm], by the joint.
         """
         frames = self.tree.frames(joints)
         tip = frames[:, :, -1]
@@ -114,7 +137,9 @@ class Arm(Value):
 
     @checked
     def sphere_centres(self, joints: Float[Tensor, "n k"]) -> Float[Tensor, "3 s k"]:
-        """Return the centres [m] of all collision spheres in the object's frame."""
+        """Return the centres [m] of all collision spheres in the object's frame, for k postures in
+        the columns of `joints`.
+        """
         frames = self.tree.frames(joints.contiguous()).index_select(2, self.link)
         pose = self.obj_from_base
         centres = map_points(frames, self.center)
@@ -123,7 +148,9 @@ class Arm(Value):
 
     @checked
     def overlaps(self, centres: Float[Tensor, "3 s k"]) -> Bool[Tensor, "p k"]:
-        """Return which `pairs` of spheres overlap in each posture, given the centres [m]."""
+        """Return a mask of the `pairs` of spheres that overlap in each of k postures, given the
+        `centres` [m].
+        """
         one, two = self.pairs.unbind(1)
         gap = centres.index_select(1, one) - centres.index_select(1, two)
         reach = self.radius[one] + self.radius[two]
@@ -131,8 +158,10 @@ class Arm(Value):
 
 
 def features(tip: TipPoses) -> Float[Tensor, "k 12"]:
-    """Return numbers of each pose whose distance is a distance [mm]; a small turn counts as its
-    angle times `LEVER`.
+    """Return twelve numbers [mm] of each pose (3, 4) whose Euclidean distance is a distance between
+    poses.
+
+    For small rotations it is that of the translation [mm] and the angle times `LEVER` [mm].
     """
     turn = LEVER / math.sqrt(2) * tip[:, :3].flatten(0, 1)
     return torch.cat([tip[:, 3] / MILLIMETRE, turn]).T
@@ -153,12 +182,12 @@ def load_arm(
     Args:
         urdf: path of the file; a joint without limits gets one turn either way.
         hand: the hand on the arm, or its name or folder.
-        tip: the link that carries the hand; by default the one that most joints move, the last of
+        tip: the link that carries the hand; None means the one that most joints move, the last of
             equals.
-        obj_from_base: pose of the arm's root link in the frame of the cloud; by default the same
-            frame.
-        tip_from_hand: pose of the hand's root link in the frame of the tip; by default the same
-            frame.
+        obj_from_base: pose of the arm's root link in the frame of the cloud [m]; None means the
+            identity.
+        tip_from_hand: pose of the hand's root link in the frame of the tip [m]; None means the
+            identity.
         seed: random seed of the postures from which inverse kinematics starts.
 
     Raises `HandFileError` for a URDF that is missing or malformed. On the way to the tip it may
@@ -240,8 +269,10 @@ def load_arm(
 def _spheres(
     chain: Urdf, hand: Hand, tip_from_hand: Float[Tensor, "4 4"]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return link, centre [m] and radius [m] of spheres around an arm's links and the hand's palm,
-    and a palm mask.
+    """Return link index, centre [m] and radius [m] of the spheres around an arm's links and the
+    hand's palm.
+
+    The last result is a mask of the spheres of the palm.
     """
     covers = [
         (k, *cover(shape, ARM.cell, ARM.bulge))

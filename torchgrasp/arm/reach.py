@@ -1,8 +1,9 @@
 """Inverse kinematics of an arm: which hand poses it reaches, and its way through a grasp.
 
 Postures are moved by damped least squares until the hand is in place: first those of the arm's
-library whose tips are nearest, then along a way each from the one before. A way is w poses: the
-straight approach of the opened hand, the grasp, the lift.
+library whose tips are nearest, then along a way each from the one before. A way is w poses of the
+hand: the straight approach of the opened hand, the grasp, the lift. g counts grasps, k postures or
+poses, and n the joints of the arm, whose positions are in [rad, or m for sliding joints].
 """
 
 import dataclasses
@@ -23,16 +24,16 @@ from torchgrasp.values.planning import Grasps
 
 @dataclasses.dataclass(frozen=True)
 class ReachNumbers:
-    """The numbers of an arm's inverse kinematics and of its way through a grasp."""
+    """Numbers of an arm's inverse kinematics and of its way through a grasp."""
 
     tried: int = 4
-    """Postures of the library from which a pose is tried."""
+    """Number of postures of the library from which a pose is tried."""
     tried_steps: int = 8
-    """Most steps from each of them."""
+    """Most steps from each of these postures."""
     starts: int = 8
-    """Postures of the library from which a grasp is tried."""
+    """Number of postures of the library from which a grasp is tried."""
     steps: int = 12
-    """Most steps from each of them."""
+    """Most steps from each of these postures."""
     solved: float = 1e-4
     """Sum of squared errors [mm2] of a tip in place: of a hundredth of a millimetre."""
     way_steps: int = 4
@@ -40,26 +41,28 @@ class ReachNumbers:
     lift: float = 0.1
     """Height [m] of the lift."""
     speed: float = 0.1
-    """Speed [m/s] of the tip on the way, at which no joint may turn faster than it can."""
+    """Speed [m/s] of the tip on the way; a way on which a joint would be too fast is refused."""
     between: int = 8
-    """Every how many poses the links are compared with each other: they come near slowly."""
+    """Number of poses from one comparison of links with each other to the next."""
     postures: int = 256
-    """Postures that are compared at a time, which bounds the memory."""
+    """Number of postures that are compared at a time, which bounds the memory."""
     ways: int = 64
-    """Ways that are checked for collisions at a time."""
+    """Number of ways that are checked for collisions at a time."""
     rounding: float = 1e-12
-    """Least sine of a turn that is divided by: below it, the turn is zero."""
+    """Least sine of a rotation by which is divided: below it, the rotation is zero."""
 
 
 REACH = ReachNumbers()
 Way = tuple[Float[Tensor, "g w n"], Bool[Tensor, "g"], Float[Tensor, "g 2"]]
-"""The postures on the way through each grasp, whether the arm can go it, and its ease, as in
-`Grasps`.
+"""The w postures [rad or m] on the way through each grasp, a mask of the grasps with a way, and the
+ease of the way, as in `Grasps`.
 """
 
 
 def reach_poses(arm: Arm, obj_from_hand: Float[Tensor, "k 4 4"]) -> Bool[Tensor, "k"]:
-    """Return a mask of the hand poses that the arm reaches within its joint limits."""
+    """Return a mask of the k hand poses `obj_from_hand` [m] that the arm reaches within its joint
+    limits.
+    """
     target = arm.tip_poses(obj_from_hand)  # (3, 4, k)
     reached = target.new_zeros(len(obj_from_hand), dtype=torch.bool)
     for start in _nearest(arm, target, REACH.tried).unbind(1):
@@ -73,8 +76,10 @@ def reach_poses(arm: Arm, obj_from_hand: Float[Tensor, "k 4 4"]) -> Bool[Tensor,
 def with_arm(
     arm: Arm, hand: Hand, grasps: Grasps, world: CollisionWorld, up: Float[Tensor, "3"]
 ) -> Grasps:
-    """Return grasps with the postures of the arm; executable ones through which it has no way
-    become `UNREACHABLE`.
+    """Return grasps with the postures of the arm; executable ones without a way of the arm become
+    `UNREACHABLE`.
+
+    `world` holds what the arm must not touch. `up` is the unit vector of the lift without a table.
     """
     rows = flatnonzero(grasps.status == Status.OK)
     way, found, least = follow_grasps(arm, hand, grasps[rows], world, up)
@@ -88,11 +93,13 @@ def with_arm(
 def follow_grasps(
     arm: Arm, hand: Hand, grasps: Grasps, world: CollisionWorld, up: Float[Tensor, "3"] = UP
 ) -> Way:
-    """Return the arm's way through each grasp, zeros if there is none.
+    """Return the arm's way through each grasp; it is zero if there is none.
 
-    It goes through the easiest posture that reaches the grasp, and from which it can follow the
-    whole way: without a jump, a joint beyond its limits, or a collision of its links with the
-    world, each other or the palm.
+    The results are the w postures of the way [rad or m], a mask of the grasps that have a way, and
+    the ease of the way: the least columns of `measure_ease`. The way goes through the easiest
+    posture that reaches the grasp, and from which the arm can follow the whole way: without a jump,
+    a joint beyond its limits, or a collision of its links with the `world`, each other or the palm.
+    `up` is the unit vector of the lift without a table.
     """
     poses = way_of(hand, grasps, world, up).to(arm.lower)
     starts = REACH.starts
@@ -133,10 +140,11 @@ def follow_grasps(
 def way_of(
     hand: Hand, grasps: Grasps, world: CollisionWorld, up: Float[Tensor, "3"] = UP
 ) -> Float[Tensor, "g w 4 4"]:
-    """Return the hand's poses on its way: in the first half it is opened, in the second half it has
-    closed.
+    """Return the hand's poses [m] on its way: in the first half it is opened, in the second half it
+    has closed.
 
-    It is lifted along the normal of the table, or `up` without a table.
+    It is lifted along the normal of the world's table, or along the unit vector `up` without a
+    table.
     """
     closed = grasps.obj_from_hand
     opened = opened_pose(hand, grasps.pregrasp, closed, world.plane)
@@ -152,10 +160,12 @@ def way_of(
 def track(
     arm: Arm, start: Float[Tensor, "n g"], tips: Float[Tensor, "3 4 g w"]
 ) -> tuple[Float[Tensor, "g w n"], Bool[Tensor, "g"]]:
-    """Return postures that follow the tips from the grasp both ways, and whether each does so
-    steadily.
+    """Return postures that follow the tips from the grasp both ways, then a mask of the ways
+    without a jump.
 
-    At the hand's speed no joint may turn faster than it can.
+    `start` are the postures at the grasps, one in each column, and `tips` the poses (3 x 4) [m] of
+    the tip in the base's frame at all w places. On a way without a jump every pose is reached, and
+    no joint turns faster than it can at the hand's speed.
     """
     at = COARSE_STEPS + 1
     path = {at: start}
@@ -172,8 +182,8 @@ def track(
 
 
 def _is_clear(arm: Arm, path: Float[Tensor, "g w n"], world: CollisionWorld) -> Bool[Tensor, "g"]:
-    """Return a mask of the ways on which no link touches the world; of whole ways nor another link
-    or the palm.
+    """Return a mask of the ways on which no link touches the world; on whole ways also no other
+    link or the palm.
     """
     centres = arm.sphere_centres(path.flatten(0, 1).T).unflatten(2, path.shape[:2])
     links = centres[:, arm.moving].permute(2, 3, 1, 0)
@@ -198,8 +208,12 @@ def _is_clear(arm: Arm, path: Float[Tensor, "g w n"], world: CollisionWorld) -> 
 
 
 def measure_ease(arm: Arm, joints: Float[Tensor, "n k"]) -> Float[Tensor, "k 2"]:
-    """Return the least distance of a joint from its limits, as a share of half its range, and the
+    """Return two columns for each of k postures: the least room of a joint, then the
     manipulability.
+
+    The room is a joint's distance from its nearer limit, as a share of half its range. The
+    manipulability is sqrt(det(J J^T)) [m^3] of the Jacobian J of the tip. `joints` [rad or m] holds
+    a posture in each column.
     """
     lower = arm.lower[:, None]
     upper = arm.upper[:, None]
@@ -232,12 +246,13 @@ def solve_tips(
     steps: int = REACH.steps,
     solved: float = REACH.solved,
 ) -> tuple[Float[Tensor, "n k"], Bool[Tensor, "k"]]:
-    """Move postures within their limits until the tips are in place; return them, and whether each
-    tip is.
+    """Return postures moved within their limits until the tips are in place, then a mask of those
+    in place.
 
-    In place means a sum of squared errors below `solved` [mm2], by default of a hundredth of a
-    millimetre. The damping is half the squared error (Sugihara, IEEE Transactions on Robotics 27,
-    2011).
+    `start` holds a posture in each column, `target` the poses [m] of the tips in the base's frame.
+    A tip is in place if the sum of its squared errors is below `solved` [mm2], by default that of a
+    hundredth of a millimetre; a posture makes at most `steps` steps. The damping is half the
+    squared error (Sugihara, IEEE Transactions on Robotics 27, 2011).
     """
     joints = start.clone()
     rows = torch.arange(start.shape[1], device=start.device)
@@ -266,7 +281,9 @@ def solve_tips(
 
 
 def _gap(tip: TipPoses, target: TipPoses) -> Float[Tensor, "6 k"]:
-    """Return the translation [mm] from tips to targets, and the rotation vector times `LEVER`."""
+    """Return the translation [mm] from tips to targets, then the rotation vector times `LEVER`
+    [mm].
+    """
     now = tip[:, :3]
     wanted = target[:, :3]
     axis = torch.linalg.cross(now, wanted, dim=0).sum(1) / 2
