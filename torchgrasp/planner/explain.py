@@ -197,7 +197,7 @@ class Explanation(Value):
     `str` gives one line for each stage, and a sentence about the best change.
 
     >>> funnel = Funnel((Losses("grasps", "postures", 40, {Status.TABLE_COLLISION: 40}),))
-    >>> lower = Trial("if the table were 20 mm lower", choice=True, executable=9, expected=7.5, funnel=funnel)
+    >>> lower = Trial("if the table were 20 mm lower", choice=True, executable=9, expected=0.75, funnel=funnel)
     >>> print(Explanation(50, funnel, (lower,)))
     grasps: 0 of 40 postures (40 table_collision)
     What would help most (1 change tried): if the table were 20 mm lower: 9 executable grasps, from 50 starts.
