@@ -31,15 +31,15 @@ class CreaseNumbers:
     near: float = 0.004
     """Points nearer to the border than this [m] are on the crease, and rounded."""
     far: float = 0.025
-    """Points farther from the border than this [m] do not count for its angle."""
+    """Points farther from the border than this [m] do not count for the angle of a crease."""
     points: int = 20
     """Fewest points of a side whose normal is known."""
     concave: float = 0.5
     """Least sine of the angle by which each fitted side rises above the chord."""
     least_share: float = 1e-9
-    """A share of averaged pixels that is not 0, for the division."""
+    """Least share of averaged pixels, so that nothing is divided by 0."""
     least_length: float = 1e-12
-    """A length that is not 0, for the division [m]."""
+    """Least length [m], so that nothing is divided by 0."""
 
 
 CREASE = CreaseNumbers()
@@ -50,8 +50,10 @@ WAYS = ((1.0, 0.0), (0.0, 1.0), (0.7, 0.7), (0.7, -0.7))
 def cut_creases(
     image: DepthImage, points: Float[Tensor, "h w 3"], pieces: Int[Tensor, "h w"]
 ) -> Int[Tensor, "h w"]:
-    """Cut each piece along its concave creases, and return an image of each pixel's part number, 0
-    for none.
+    """Return the number of the part to which each pixel belongs, 0 for none.
+
+    Each piece, a number > 0 in `pieces` (h, w), is cut into parts along its concave creases.
+    `points` (h, w, 3) [m] are those of the image, in the frame of its pose.
     """
     least = scale_pixels(CREASE.part, pieces)
     # from the camera, so that normals can face it

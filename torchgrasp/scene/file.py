@@ -48,10 +48,10 @@ def read_scene(path: Path | str) -> Scene:
 
 @checked
 def save_scene(scene: Scene, path: Path | str) -> Path:
-    """Write a scene as .npz, atomically: depth in float32, labels, camera, table and target;
-    `read_scene` reads it.
+    """Write a scene as .npz, atomically; `read_scene` reads it. Return the path.
 
-    Raises `OutputError`, and `BadArgument` for another suffix.
+    The file holds depth [m] in float32, labels, camera, table and target. Raises `OutputError`, and
+    `BadArgument` for another suffix.
 
     >>> import tempfile
     >>> from torchgrasp import load_scene

@@ -45,17 +45,17 @@ class ProjectionNumbers:
     """Numbers of the projection of a cloud to an image."""
 
     steep: float = 0.01
-    """Least part of the vertical across the view; below it any direction will do as down."""
+    """Least part of the vertical across the view; below it any direction is taken as down."""
     widest: float = 75.0
     """Widest angle from the middle of a view [deg]."""
     cells: int = 64
     """Cells to a side of a view, of which those with points count as filled."""
     inset: float = 0.001
-    """The last point of a view lies by this share of a cell inside the last cell."""
+    """Share of a cell by which the last point of a view lies inside the last cell."""
     most_steps: int = 1023
     """Most pixels from one side of an image made of a cloud to the other."""
     least_extent: float = 1e-6
-    """Least extent of a view, for the division."""
+    """Least extent of a view at depth 1, so that nothing is divided by 0."""
 
 
 IMAGE = ImageNumbers()
@@ -69,7 +69,7 @@ class DepthImage(Value):
 
     depth: Float[Tensor, "h w"]  # along the optical axis [m], 0 where nothing was measured
     intrinsics: Float[Tensor, "3 3"]  # [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels
-    obj_from_camera: Pose
+    obj_from_camera: Pose  # pose (4, 4) [m] of the camera (x right, y down, z forward)
     bounded: bool = True  # whether its border is the camera's; an image made of a cloud has none
 
     @property
@@ -79,8 +79,9 @@ class DepthImage(Value):
 
     @property
     def frustum(self) -> Float[Tensor, "4 3"] | None:
-        """Inward normals of the sides of the camera's view, in the frame `obj`; None if the image
-        has no border.
+        """Inward unit normals of the four sides of the camera's view: left, right, top, bottom.
+
+        They are in the frame "obj" to which the pose leads; None if the image has no border.
         """
         if not self.bounded:
             return None
@@ -91,7 +92,10 @@ class DepthImage(Value):
 
     @checked
     def to_upright(self, obj_from_upright: Pose) -> "DepthImage":
-        """Return the image with the camera's pose given in an upright frame and rounded."""
+        """Return the image with the pose of the camera in an upright frame, rounded.
+
+        `obj_from_upright` (4, 4) [m] is the pose of the upright frame in the image's frame "obj".
+        """
         pose = (
             inverse(obj_from_upright.double()).to(self.obj_from_camera.device)
             @ self.obj_from_camera.double()
@@ -99,7 +103,10 @@ class DepthImage(Value):
         return dataclasses.replace(self, obj_from_camera=torch.round(pose / FINE) * FINE)
 
     def points(self) -> Float[Tensor, "h w 3"]:
-        """Return the point [m] of every pixel; the camera's position where nothing was measured."""
+        """Return the point [m] of every pixel, in the frame "obj" to which the pose leads.
+
+        Where nothing was measured it is the camera's position.
+        """
         z = self.depth.double()
         k = self.intrinsics.double()
         row = torch.arange(z.shape[0], dtype=z.dtype, device=z.device)[:, None]
@@ -110,14 +117,19 @@ class DepthImage(Value):
         return apply(self.obj_from_camera.double(), camera.reshape(-1, 3)).reshape(*z.shape, 3)
 
     def at_border(self, pixels: Int[Tensor, "n 2"]) -> bool:
-        """Return whether pixels (row, column) of an object reach the border of the camera's image."""
+        """Return whether an object reaches the border of the camera's image.
+
+        `pixels` holds row and column of each of the object's n pixels.
+        """
         last = torch.tensor(self.depth.shape, device=pixels.device) - 1
         reaching = ((pixels <= 1) | (pixels >= last - 1)).any(-1)
         return self.bounded and int(reaching.sum()) >= IMAGE.border_pixels
 
     def without_speckle(self) -> "DepthImage":
-        """Return the image in which each depth is the median of the measured depths in its 3 x 3
-        square of pixels.
+        """Return the image with each depth replaced by the median of the 3 x 3 pixels around it.
+
+        Only measured depths count; a depth with fewer than three of them in this square stays as it
+        is.
         """
         depth = self.depth.numpy()
         padded = np.pad(np.where(depth > 0, depth, np.nan), 1, constant_values=np.nan)
@@ -135,8 +147,10 @@ class DepthImage(Value):
 def read_image(
     depth: Array, intrinsics: object, camera_pose: Array | None, depth_unit: float | None = None
 ) -> DepthImage:
-    """Return a checked depth image in float64 [m]; without a camera pose, its frame is the camera's
-    own.
+    """Return a checked depth image in float64 [m].
+
+    The arguments are those of `cloud_from_depth`; without a camera pose, the frame is the camera's
+    own. Raises `BadArgument` as `cloud_from_depth`, and for fewer than 30 measured pixels.
     """
     z, k, _ = read_depth(depth, intrinsics, depth_unit=depth_unit)
     pose = (
@@ -150,13 +164,19 @@ def read_image(
 
 
 def scale_pixels(count: int, labels: Int[Tensor, "h w"]) -> float:
-    """Return the number of pixels in an image that corresponds to `count` of 640 x 480 pixels."""
+    """Return the number of pixels in an image that corresponds to `count` of 640 x 480 pixels.
+
+    The image has the size of `labels` (h, w).
+    """
     return count * labels.numel() / IMAGE.usual
 
 
 def label_radii(points: Float[Tensor, "h w 3"], labels: Int[Tensor, "h w"]) -> Float[Tensor, "k"]:
-    """Return, for each label, the root mean square distance [m] of the label's points from their
-    mean.
+    """Return the root mean square distance [m] of the points of each label from their mean.
+
+    The k labels are 0, 1, ...
+
+    `labels` holds the label of each of the h x w `points` [m].
     """
     label = labels.reshape(-1)
     own = points.reshape(-1, 3)
@@ -170,11 +190,13 @@ def label_radii(points: Float[Tensor, "h w 3"], labels: Int[Tensor, "h w"]) -> F
 def image_of_cloud(
     points: Points, viewpoint: Vector, up: Vector
 ) -> tuple[DepthImage, Int[Tensor, "n 2"]]:
-    """Return the depth image that a pinhole camera at the viewpoint takes of a cloud, and each
-    point's row and column.
+    """Return the depth image that a camera at the viewpoint takes of a cloud, and each point's
+    pixel.
 
-    The upright camera looks at the middle of the points. A pixel covers about two points and keeps
-    the nearest.
+    A pixel (n, 2) is row and column. The camera is a pinhole, upright, and looks at the middle of
+    the points. A pixel covers about two points and keeps the nearest. `points` (n, 3) and
+    `viewpoint` (3,) are in metres; `up` (3,) is the unit vector that points up. Raises
+    `BadArgument` for points all around the camera.
     """
     forward = unit(unit(points - viewpoint).mean(0))
     down = -up + (up @ forward) * forward
@@ -219,8 +241,9 @@ def image_of_cloud(
 
 
 def read_arrays(path: Path) -> dict[str, Any]:
-    """Return the arrays in a scene's .npz file by name, converted to the types and shapes that a
-    scene needs.
+    """Return the arrays in a scene's .npz file by name, in the types and shapes that a scene needs.
+
+    Raises `CloudFileError` for a file that is missing or malformed.
     """
     typed = {
         "table": (float, 4),

@@ -34,9 +34,9 @@ class MaskNumbers:
     low: float = 0.01
     """Pixels lower than this above the support [m] lie on it."""
     rim: int = 4
-    """Masks are off by so many pixels."""
+    """Number of pixels by which masks are off at their rims."""
     told: float = 0.05
-    """A larger share of a mask's pixels that is removed is told."""
+    """There is a note if a larger share of a mask's pixels is removed."""
 
 
 MASKS = MaskNumbers()
@@ -49,14 +49,14 @@ MOST_BITS = 35
 
 
 def read_labels(labels: Any, shape: tuple[int, ...], name: str = "labels") -> Int[Tensor, "..."]:
-    """Return checked labels of the depth's or the cloud's shape: whole numbers >= 0, where 0 means
-    no object.
+    """Return checked labels in the given shape: whole numbers >= 0, where 0 means no object.
 
-    The labels are numbers of any type in the given shape, or with one more axis of length 1; a
-    picture (h, w, 3 or 4) with a colour for each object, where black and transparent mean no
-    object; a list of masks, where a smaller mask lies above a larger one; a mask as COCO's run
-    lengths {"size": [h, w], "counts": ...}, or in a dict as its "segmentation"; or a dict with a
-    list of "annotations".
+    `shape` is that of the depth (h, w) or of the cloud (n,); errors call the argument `name`. The
+    labels are numbers of any type in this shape, or with one more axis of length 1; a picture (h,
+    w, 3 or 4) with a colour for each object, where black and transparent mean no object; a list of
+    masks, where a smaller mask lies above a larger one; a mask as COCO's run lengths {"size": [h,
+    w], "counts": ...}, or in a dict as its "segmentation"; or a dict with a list of "annotations".
+    Raises `BadArgument` for anything else.
     """
     if isinstance(labels, Mapping) and "annotations" in labels:
         labels = labels["annotations"]
@@ -130,8 +130,10 @@ def _dense(values: Tensor) -> Tensor:
 
 
 def read_mask(mask: Any, shape: tuple[int, ...]) -> Bool[Tensor, "..."]:
-    """Return the boolean mask of one object, in any form that `read_labels` takes; refuse none and
-    several objects.
+    """Return the boolean mask of one object, in the given shape.
+
+    `mask` may be an image (h, w), or have any other form that `read_labels` takes. Raises
+    `BadArgument` if it marks no object, or several.
     """
     labels = read_labels(mask, shape, "mask")
     found = labels[labels > 0].unique()
@@ -198,13 +200,12 @@ def _run_lengths(text: bytes) -> list[int]:
 def label_image(
     view: TableImage, labels: Int[Tensor, "h w"] | None, mask: Bool[Tensor, "h w"] | None
 ) -> tuple[Int[Tensor, "h w"], tuple[str, ...]]:
-    """Return each pixel's label and notes; labels come from given labels, a given mask, or else
-    from segmentation.
+    """Return the label of each pixel, and notes, given labels, a mask or neither.
 
-    Given labels lose pixels on the table and flying pixels. A mask becomes label 1, and loses
-    strips of neighbouring objects, too. Pixels of the mask's object just outside of the mask get
-    label 0. A note tells of each mask that loses a twentieth of its pixels or more. A mask that
-    loses nearly all is a `BadArgument`.
+    Given labels lose pixels on the table and flying pixels. Without labels the image is segmented.
+    A mask becomes label 1, and loses strips of neighbouring objects, too. Pixels of the mask's
+    object just outside of the mask get label 0. A note names each mask that loses a twentieth of
+    its pixels or more. A mask that loses nearly all is a `BadArgument`.
     """
     if labels is not None:
         return _trim_labels(view, labels)
@@ -265,12 +266,12 @@ def label_again(
     given: tuple[int, ...],
     first: int,
 ) -> Int[Tensor, "h w"]:
-    """Return the label of each pixel after another support has replaced the former
-    table.
+    """Return the label of each pixel after another support has replaced the former table.
 
-    Labels that the user gave lose pixels on the support, and gain pixels of their objects that the
-    former table hid. Other objects are segmented again, and each keeps the label of most of its
-    former pixels. The label `first` is assigned before the others.
+    Labels that the user gave (`given`) lose pixels on the support, and gain pixels of their objects
+    that the former table hid. Other objects are segmented again, and each keeps the label of most
+    of its former pixels. The label `first` is assigned before the others. `labels` (h, w) are the
+    labels until now.
     """
     view = TableImage.of(image, support)
     before = TableImage(image, view.points, SupportPlane(former))

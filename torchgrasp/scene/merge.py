@@ -107,8 +107,9 @@ MERGE = MergeNumbers()
 
 
 def merge_pieces(view: TableImage, pieces: Int[Tensor, "h w"]) -> Int[Tensor, "k"]:
-    """Return, for each piece number, the number of the piece's object; 0 for number 0 and for
-    pieces of no object.
+    """Return the number of the object to which each piece belongs; 0 for none.
+
+    Entry i of the result is for the piece with the number i in `pieces` (h, w); 0 is no piece.
     """
     new = torch.zeros(int(pieces.max()) + 1, dtype=torch.long)
     whole = torch.bincount(pieces.reshape(-1))
@@ -151,8 +152,9 @@ def _thinned(
 def find_touching(
     image: DepthImage, points: Float[Tensor, "h w 3"], labels: Int[Tensor, "h w"]
 ) -> list[tuple[int, int]]:
-    """Return the pairs of labels of objects that touch, so that the border between the objects is a
-    guess.
+    """Return the pairs of labels of objects that touch, so that the border between them is a guess.
+
+    `labels` holds the label of each of the h x w `points` [m] of the image, 0 for none.
     """
     names = labels[labels > 0].unique().tolist()
     if len(names) < 2:
@@ -225,8 +227,10 @@ def _gaps(trees: list[Any]) -> np.ndarray:
 
 
 class _Body:
-    """Pieces of one object: their indices, their number of points, some points, and the hull of
-    their footprint.
+    """Pieces of one object: their indices, their number of points, and some of these points.
+
+    Points (n, 3) [m] have z as the height above the table; `hull` is that of their footprint, and
+    `foot` and `top` [m] are their lowest and highest heights without outliers.
     """
 
     def __init__(self, rows: tuple[int, ...], points: Float[Tensor, "n 3"], count: int) -> None:

@@ -70,7 +70,11 @@ class Occupancy(Value):
     """The probability that each voxel is full of something that is neither the target nor the
     table.
 
-    The centre of voxel (i, j, k) is at `origin` + (i, j, k) * `spacing` [m].
+    Attributes:
+        origin: centre [m] of voxel (0, 0, 0), in the scene's upright frame, where z is up.
+        spacing: distance [m] of neighbouring centres; that of voxel (i, j, k) is `origin` + (i, j,
+            k) * `spacing`.
+        probability: probability of each of the x by y by z voxels, in [0, 1].
 
     >>> free = Occupancy(torch.zeros(3), 0.01, torch.zeros(2, 3, 4))
     >>> free.centres[-1, -1, -1]
@@ -83,7 +87,7 @@ class Occupancy(Value):
 
     @property
     def centres(self) -> Float[Tensor, "x y z 3"]:
-        """The centres [m] of the voxels."""
+        """The centres [m] of the x by y by z voxels, in the frame of `origin`."""
         steps = [
             torch.arange(n, dtype=torch.float64) * self.spacing for n in self.probability.shape
         ]
@@ -92,11 +96,15 @@ class Occupancy(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Shadows(Value):
-    """A depth image [m] with small gaps filled, and `owner`: the object that hides the space behind
-    each pixel.
+    """A depth image, and the object that hides the space behind each of its pixels.
 
-    `owner` is 0 for the table, -1 where nothing was measured, an object's label, or another
-    negative number for each object without label. `points` [m] are NaN where nothing was measured.
+    Attributes:
+        image: the image itself, with its camera.
+        depth: its depth [m] with small gaps filled.
+        owner: the label of the object, 0 for the table, -1 where nothing was measured, or another
+            negative number for each object without label.
+        points: the measured point [m] of each pixel, in the frame of the image's pose; NaN where
+            nothing was measured.
     """
 
     image: DepthImage
@@ -105,8 +113,10 @@ class Shadows(Value):
     points: Float[Tensor, "h w 3"]
 
     def look(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], Int[Tensor, "n"]]:
-        """Return how far [m] each point lies behind the measured depth, along its ray, and the
-        owner of its pixel.
+        """Return how far each of n points lies behind the measured depth, and its pixel's owner.
+
+        The distance [m] is along the camera's ray, negative in front of the depth. The points [m]
+        are in the frame of the image's pose; the owner of one outside the image is -1.
         """
         camera = apply(inverse(self.image.obj_from_camera.double()), points.double())
         x, y, z = camera.unbind(-1)
@@ -125,8 +135,10 @@ class Shadows(Value):
 
 
 def cast_shadows(scene: Scene, target: int) -> Shadows:
-    """Return which object hides the space behind each pixel; the scene is in the upright frame of
-    the target.
+    """Return the object that hides the space behind each pixel of a scene.
+
+    The scene is in an upright frame with its table at z = 0. `target` is the label of an object;
+    unlabelled pixels at its rim are taken as its own.
     """
     image = scene.image
     row, column = scene.pixels.unbind(-1)
@@ -155,8 +167,10 @@ def cast_shadows(scene: Scene, target: int) -> Shadows:
 
 
 def find_nearest(pixels: Bool[Tensor, "h w"]) -> tuple[Float[Tensor, "h w"], Int[Tensor, "h w"]]:
-    """Return each pixel's distance [px] to the nearest pixel of a mask, and the flat index of that
-    nearest pixel.
+    """Return each pixel's distance [px] to the nearest pixel of a mask, and that pixel's flat
+    index.
+
+    The flat index is row * w + column. `pixels` is the mask.
     """
     found: Any = ndimage.distance_transform_edt(~pixels.numpy(), return_indices=True)
     row, column = torch.from_numpy(found[1]).long()
@@ -166,10 +180,10 @@ def find_nearest(pixels: Bool[Tensor, "h w"]) -> tuple[Float[Tensor, "h w"], Int
 def shadow_features(
     shadows: Shadows, owner: int, points: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "n 6"]:
-    """Return the features from which the model estimates whether points [m] in the shadow of an
-    object are full.
+    """Return the six features by which the model predicts whether points behind an object are full.
 
-    The features are, in order:
+    `points` (n, 3) [m] are in the upright frame of the scene, with z up; `owner` is the object's
+    number in `shadows`. The features are, in order:
 
     * The depth of the point behind the object's surface, over the object's width.
     * The depth [m] of the point below the object's visible points in the same vertical column.
@@ -222,15 +236,19 @@ def _tops(own: Float[Tensor, "m 3"], places: Float[Tensor, "n 2"]) -> Float[Tens
 
 @functools.cache
 def load_occupancy_model() -> dict[str, Any]:
-    """Return the model's knots and weights for each kind of space: behind the target or an object,
-    or unseen.
+    """Return the model's knots and weights for each kind of space: "target", "thing" and "unseen".
+
+    These are the spaces behind the target, behind another object, and where nothing was measured.
     """
     return json.loads(MODEL.read_text("utf-8"))
 
 
 def probability(kind: str, features: Float[Tensor, "n f"]) -> Float[Tensor, "n"]:
-    """Return the probability that places of a kind are full; log-odds sum a piecewise linear
-    function of each.
+    """Return the probability that n places of a kind are full.
+
+    Their log-odds are a sum of piecewise linear functions, one of each of f features. `kind` is
+    "thing" with the features of `shadow_features`; "target" with the depth behind the surface and
+    the height z [m]; or "unseen" with the height z [m].
     """
     model = load_occupancy_model()[kind]
     odds = torch.full_like(features[:, 0], model["bias"])
@@ -241,13 +259,12 @@ def probability(kind: str, features: Float[Tensor, "n f"]) -> Float[Tensor, "n"]
 
 @checked
 def estimate_occupancy(scene: Scene, target: int) -> Occupancy:
-    """Return the probability that each voxel around the target is full of something other than
-    target and table.
+    """Return the probability that each voxel around the target is full of something else.
 
-    The scene must be in its upright frame, with z up. Space in front of a measured depth is free.
-    Behind an object, a model estimates the probability. Behind the target and outside the image, it
-    is a rough guess from depth and height. All work is on the CPU. Raises `BadArgument` for a
-    target without points.
+    The table does not count. The scene must be in its upright frame, with z up. Space in front of a
+    measured depth is free. Behind an object, a model estimates the probability. Behind the target
+    and outside the image, it is a rough guess from depth and height. All work is on the CPU. Raises
+    `BadArgument` for a target without points.
 
     >>> from torchgrasp import load_scene
     >>> found = estimate_occupancy(load_scene(), target=1)

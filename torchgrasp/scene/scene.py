@@ -50,7 +50,7 @@ class Scene(Value):
 
     Args:
         points: every measured point [m].
-        labels: 1, 2, ... for the objects, 0 for the table and everything else.
+        labels: label of each point: 1, 2, ... for the objects, 0 for the table and everything else.
         image: the camera's depth image, which shows free space and hidden space.
         pixels: row and column of each point in the image.
         table: the plane that the objects stand on, or None if it is unknown.
@@ -257,8 +257,10 @@ class Scene(Value):
 
     @property
     def advice(self) -> tuple[str, ...]:
-        """Problems of the scene, a sentence each: several supports, objects that touch, a target
-        that is cut off.
+        """Problems of the scene, a sentence each.
+
+        They are several supports, objects that touch, creases in an object, and a target that is
+        cut off at the border of the image.
         """
         found = [
             f"objects could also stand on another plane ({plane.describe()}); give it as the table to choose it"
@@ -298,8 +300,9 @@ class Scene(Value):
 
     @property
     def noise(self) -> SensorNoise | None:
-        """The camera's noise, estimated from the table; None if no table is known or too few pixels
-        show it.
+        """The camera's noise, estimated from the table.
+
+        It is None if no table is known or too few pixels show it.
         """
         if self.table is None:
             return None
@@ -316,7 +319,7 @@ class Scene(Value):
 
     @property
     def viewpoint(self) -> Float[Tensor, "3"]:
-        """The camera's position [m]."""
+        """The camera's position [m] in the frame "obj"."""
         return self.image.obj_from_camera[:3, 3]
 
     @property
@@ -326,8 +329,9 @@ class Scene(Value):
 
     @checked
     def rows_of(self, label: int | None = None) -> Bool[Tensor, "n"]:
-        """Return a mask of the points of an object, by default the target; it is all False if there
-        is no target.
+        """Return a mask of the points of the object with a label, by default the target.
+
+        It is all False if there is no target.
         """
         label = self.target if label is None else label
         return (
@@ -338,10 +342,10 @@ class Scene(Value):
 
     @checked
     def cloud(self, label: int | None = None) -> PointCloud:
-        """Return the points of an object, by default the target, with the camera as viewpoint.
+        """Return the points [m] of an object, by default the target, with the camera as viewpoint.
 
-        Raises `BadArgument` for a label without points or no target, and `TooFewPoints` for fewer
-        than 4 points.
+        `label` is that of the object. Raises `BadArgument` for a label without points or no target,
+        and `TooFewPoints` for fewer than 4 points.
         """
         rows = self.rows_of(label)
         frustum = self.image.frustum
@@ -353,8 +357,10 @@ class Scene(Value):
 
     @checked
     def to_upright(self, obj_from_upright: Pose) -> "Scene":
-        """Return the scene in an upright frame, where the table is the plane z = 0; coordinates are
-        rounded.
+        """Return the scene in an upright frame, where the table is the plane z = 0.
+
+        Coordinates are rounded. `obj_from_upright` (4, 4) [m] is the pose of the upright frame in
+        the scene's frame "obj".
         """
         obj_from_upright = obj_from_upright.double()
         return dataclasses.replace(

@@ -19,7 +19,11 @@ from torchgrasp.scene.table_image import TableImage
 
 @dataclasses.dataclass(frozen=True)
 class SegmentNumbers:
-    """Numbers of the segmentation; counts of pixels are those of an image of 640 x 480."""
+    """Numbers of the segmentation.
+
+    Counts of pixels are for an image of 640 x 480, and are scaled to the size of others, unless it
+    is said otherwise.
+    """
 
     risen: float = 2.5
     """Least mean height of an object's pixels, in deviations of the table's noise."""
@@ -38,7 +42,7 @@ class SegmentNumbers:
     high: float = 0.005
     """A tenth of an object's pixels are as high as this [m]; an uneven table is not."""
     high_deviations: float = 4.0
-    """The same pixels are higher than so many deviations of the noise."""
+    """A tenth of an object's pixels are higher than so many deviations of the noise."""
     high_share: float = 0.1
     """Share of an object's pixels that must be high."""
     over: float = 0.2
@@ -71,8 +75,7 @@ NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0))
 
 
 def segment(view: TableImage) -> Int[Tensor, "h w"]:
-    """Return the label of each pixel: 1, 2, ... for objects, the largest first, and 0 for all other
-    pixels.
+    """Return the label of each pixel: 1, 2, ... for objects, the largest first, and 0 for none.
 
     A piece is a connected component of the pixels above the table, without a jump of depth and
     without a crease. Pieces of one object are merged. Pixels at jumps go to the object whose
@@ -119,8 +122,9 @@ def _are_things(view: TableImage, pieces: Tensor, sure: Tensor) -> Bool[Tensor, 
 
 
 def rests_on(view: TableImage) -> Bool[Tensor, "h w"]:
-    """Return a mask of the pixels that rise above the table and lie on a surface; flying pixels are
-    left out.
+    """Return a mask of the pixels that are above the table and on the surface of an object.
+
+    Flying pixels are left out.
     """
     risen = _risen(view)
     return _grown(view, _core(view.smooth, risen).long(), risen) > 0
@@ -220,7 +224,7 @@ def _widened(box: tuple[slice, slice], margin: int) -> tuple[slice, slice]:
 
 
 def count_labels(labels: Tensor, length: int = 0) -> Int[Tensor, "k"]:
-    """Return the number of pixels of each label 0, 1, ..., with at least `length` entries."""
+    """Return the number of pixels of each label 0, 1, ..., at least `length` numbers."""
     return torch.bincount(labels.reshape(-1), minlength=length)
 
 

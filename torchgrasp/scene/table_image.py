@@ -28,9 +28,9 @@ class HeightNumbers:
     jump: float = 0.006
     """Least jump of depth between two surfaces [m], beside that of a slope."""
     slope: float = 2.0
-    """Depth by which a surface may slope from pixel to pixel, over a pixel's width."""
+    """Largest change of depth of one surface from pixel to pixel, over a pixel's width."""
     least_share: float = 1e-9
-    """A share of averaged pixels that is not 0, for the division."""
+    """Least share of averaged pixels, so that nothing is divided by 0."""
 
 
 HEIGHT = HeightNumbers()
@@ -38,7 +38,13 @@ HEIGHT = HeightNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class TableImage(Value):
-    """A depth image, its points [m], and the support of the objects in it."""
+    """A depth image with the support of the objects in it.
+
+    Attributes:
+        image: the depth image.
+        points: the point [m] of each pixel, in the frame to which the image's pose leads.
+        support: plane and visible region of the table, in the same frame.
+    """
 
     image: DepthImage
     points: Float[Tensor, "h w 3"]
@@ -46,12 +52,12 @@ class TableImage(Value):
 
     @classmethod
     def of(cls, image: DepthImage, support: SupportPlane) -> "TableImage":
-        """Return the image above a support, with its points."""
+        """Return the table image of a depth image and a support; its points are computed."""
         return cls(image, image.points(), support)
 
     @property
     def measured(self) -> Bool[Tensor, "h w"]:
-        """The pixels at which a depth was measured."""
+        """Mask of the pixels at which a depth was measured."""
         return self.image.depth > 0
 
     @kept
@@ -66,7 +72,10 @@ class TableImage(Value):
 
     @kept
     def mean_height(self) -> Float[Tensor, "h w"]:
-        """The mean height of the 5 x 5 pixels around each pixel [m]."""
+        """The mean height above the table of the 5 x 5 pixels around each pixel [m].
+
+        Only measured pixels within `HEIGHT.foot` of the table count.
+        """
         near = self.measured & (self.height.abs() < HEIGHT.foot)
         share = torch.from_numpy(ndimage.uniform_filter(near.double().numpy(), HEIGHT.window))
         low = torch.where(near, self.height, 0.0)
@@ -75,13 +84,14 @@ class TableImage(Value):
 
     @kept
     def flat(self) -> Bool[Tensor, "h w"]:
-        """The pixels on the table, which measure its noise."""
+        """Mask of the pixels on the table, which measure its noise."""
         return self.measured & (self.mean_height.abs() < HEIGHT.band)
 
     @kept
     def median_noise(self) -> float:
-        """The noise of mean heights over the squared depth [1/m], from the median: few outliers
-        do not move it. It is 0 if no pixel shows the table.
+        """The standard deviation of mean heights over the squared depth [1/m], from a median.
+
+        A few outliers do not move it. It is 0 if no pixel shows the table.
         """
         if not bool(self.flat.any()):
             return 0.0
@@ -90,11 +100,15 @@ class TableImage(Value):
 
     @kept
     def fitted_noise(self) -> Float[Tensor, "h w"]:
-        """The noise of mean heights at each pixel's depth [m], as a fitted sensor has it."""
+        """The standard deviation [m] of mean heights at each pixel's depth, by a fitted noise
+        model.
+        """
         depth = self.image.depth
         return fit_noise(depth[self.flat], self.mean_height[self.flat]).sigma(depth)
 
     @kept
     def jump(self) -> Float[Tensor, "h w"]:
-        """The least difference in depth [m] between a pixel and another surface beside it."""
+        """The least difference in depth [m] that counts as a jump to another surface, at each
+        pixel.
+        """
         return HEIGHT.jump + HEIGHT.slope * self.image.depth / self.image.focal
