@@ -65,7 +65,11 @@ def _named(read: Callable[[Any], Read]) -> Callable[[Any, str], Read]:
 
 @_named
 def as_cloud(value: Any) -> PointCloud:
-    """Return a value as a cloud, in metres in its own frame; an array's camera is unknown."""
+    """Return a `PointCloud` [m], in its own frame, given any value that `CloudLike` names.
+
+    The value may be a cloud, a `GraspObject`, a file, an array or tensor (n, 3) [m], or a cloud of
+    Open3D or trimesh. An array has no viewpoint. Raises `BadArgument` for anything else.
+    """
     if isinstance(value, PointCloud):
         return value
     if isinstance(value, GraspObject):
@@ -91,7 +95,10 @@ def as_cloud(value: Any) -> PointCloud:
 
 @_named
 def as_scene(value: Any) -> Scene:
-    """Return a value as a scene; a file is read."""
+    """Return a `Scene`, given a scene or the path of a file of `save_scene`.
+
+    Raises `BadArgument` for anything else.
+    """
     if isinstance(value, str | Path):
         return read_scene(value)
     if not isinstance(value, Scene):
@@ -101,15 +108,17 @@ def as_scene(value: Any) -> Scene:
 
 @_named
 def as_seen(value: Any) -> PointCloud | Scene:
-    """Return a value as a scene if it is one or a file of one, else as a cloud."""
+    """Return a `Scene`, given a scene or the path of one; else a `PointCloud`, as `as_cloud`."""
     scene = isinstance(value, Scene) or (isinstance(value, str | Path) and is_scene(Path(value)))
     return as_scene(value, "cloud") if scene else as_cloud(value, "cloud")
 
 
 @_named
 def as_hand(value: Any) -> Hand:
-    """Return a value as a hand; a shipped hand is loaded once, so that what the planner derives
-    from it is kept.
+    """Return a `Hand`, given a hand, the name of a shipped hand, or the folder of another hand.
+
+    A shipped hand is loaded once, so that what the planner derives from it is kept. Raises
+    `BadArgument` for anything else.
     """
     if isinstance(value, Hand):
         return value
@@ -128,14 +137,12 @@ Given = (
     PointCloud | np.ndarray | Float[Tensor, "n 3"] | Path | str | GraspObject | _Open3D | _Trimesh
 )
 CloudLike = Annotated[Given, Taken("CloudLike", PointCloud, CLOUD, as_cloud)]
-"""A cloud, or what becomes one: points are in metres, in the frame of the results; the camera is as
-a rule unknown.
-"""
+"""A value that `as_cloud` takes as a cloud; its points [m] are in the frame of the results."""
 SceneLike = Annotated[Scene | Path | str, Taken("SceneLike", Scene, SCENE, as_scene)]
-"""A scene, or a file of one."""
+"""A scene, or the path of a file of `save_scene`."""
 SeenLike = Annotated[
     Given | Scene, Taken("SeenLike", PointCloud | Scene, f"{CLOUD}, or a Scene", as_seen)
 ]
-"""What a camera saw: a cloud or a scene, or what becomes one."""
+"""A cloud or a scene, or a value that `as_seen` makes one of."""
 HandLike = Annotated[Hand | Path | str, Taken("HandLike", Hand, HAND, as_hand)]
 """A hand, or a name or folder for `load_hand`."""

@@ -25,7 +25,7 @@ from torchgrasp.foundation.lazy import spatial
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values.closing import ClosureResult
 
-Episodes = Sequence[tuple[str, ClosureResult]]
+Episodes = Sequence[tuple[str, ClosureResult]]  # each closing with its task in words
 PERCENTILES = (1, 10, 50, 90, 99)
 """The quantiles that LeRobot's statistics hold."""
 RATE_DECIMALS = 6  # to which rates [Hz] are rounded before they are compared

@@ -43,7 +43,7 @@ MESHES = (".ply", ".stl", ".obj", ".off")
 
 @dataclasses.dataclass(frozen=True)
 class CameraNumbers:
-    """Where the cameras of `write_objects` are."""
+    """Bounds on where the cameras of `write_objects` are."""
 
     lowest: float = 25.0
     """Least angle [deg] above the horizontal."""
@@ -52,7 +52,7 @@ class CameraNumbers:
     distance: float = 0.5
     """Distance [m] from the object."""
     seeds: int = 2**31
-    """Number of seeds of a view's noise."""
+    """Number of different seeds from which that of a view's noise is drawn."""
 
 
 CAMERAS = CameraNumbers()
@@ -62,23 +62,25 @@ CAMERAS = CameraNumbers()
 class ObjectEntry:
     """The description of an object in the manifest of a folder of objects."""
 
-    views: dict[str, tuple[float, ...]]  # camera's position [m] of each view by name, at scale 1
+    views: dict[str, tuple[float, ...]]  # camera's position (3,) [m] by view's name, at scale 1
     scale: float  # scale factor of mesh and clouds
     family: str  # family of similar objects; the object's own name by default
     group: str  # such as "solid", "thin" or "shell"; "" by default
     mass: float | None  # mass [kg] of the real object at any scale, or None
 
     def list_views(self, whole: bool = False, most: int | None = None) -> list[str]:
-        """Return at most `most` names of views, sorted; with `whole`, only `WHOLE`, the view that
-        shows all sides.
+        """Return at most `most` names of views, sorted; by default all.
+
+        With `whole`, the only name is `WHOLE`, that of the view that shows all sides.
         """
         return ([WHOLE] if whole else sorted(self.views))[:most]
 
 
 @checked
 def read_entry(objects: Path | str, name: str) -> ObjectEntry:
-    """Return the description of an object from its folder's manifest; raise `DatasetError` for a
-    bad or missing one.
+    """Return the description of an object from the manifest of a folder of objects.
+
+    Raises `DatasetError` for a bad or missing one.
     """
     return _parse_entry(name, _read_fields(objects, [name])[name])
 
@@ -87,8 +89,10 @@ def read_entry(objects: Path | str, name: str) -> ObjectEntry:
 def read_entries(
     objects: Path | str, only: Sequence[str] = ()
 ) -> dict[str, ObjectEntry | DatasetError]:
-    """Return each object's description from the manifest, sorted by name, or the error of a bad
-    description.
+    """Return each object's description, or the error of a bad one, by name and sorted.
+
+    `only` names the objects; by default it is all in the manifest of the folder. Raises
+    `DatasetError` for a bad manifest.
     """
     found: dict[str, ObjectEntry | DatasetError] = {}
     for name, field in sorted(_read_fields(objects, only).items()):
@@ -127,14 +131,14 @@ def _parse_entry(name: str, field: Field) -> ObjectEntry:
 def write_objects(
     meshes: Path | str, out: Path | str, views: Count = 3, seed: Seed = 0
 ) -> list[str]:
-    """Make a folder of objects from a folder of mesh files; return the objects' names, the file
-    names without suffix.
+    """Make a folder of objects from a folder of mesh files; return the objects' names.
 
-    Each mesh is moved so that its lowest point is at z = 0 and the middle of its box above the
-    origin. Each view is rendered by the depth camera of `partial_view` from a random side. The
-    manifest is written last, so that a folder with a manifest is complete. The `meshes` are closed,
-    in metres, with z up (.ply, .stl, .obj, .off). Raises `DatasetError` for no meshes or two meshes
-    of one name, the errors of `read_mesh`, and `OutputError` if the folder cannot be written.
+    The names are those of the files without suffix. Each mesh is moved so that its lowest point is
+    at z = 0 and the middle of its box above the origin. Each view is rendered by the depth camera
+    of `partial_view` from a random side. The manifest is written last, so that a folder with a
+    manifest is complete. The `meshes` are closed, in metres, with z up (.ply, .stl, .obj, .off).
+    Raises `DatasetError` for no meshes or two meshes of one name, the errors of `read_mesh`, and
+    `OutputError` if the folder cannot be written.
 
     >>> import tempfile, trimesh
     >>> folder = Path(tempfile.mkdtemp())
@@ -211,11 +215,11 @@ def list_views(
 
 @checked
 def read_view(objects: Path | str, name: str, view: str, camera: bool = True) -> PointCloud:
-    """Return the point cloud of a noisy view without normals, with the position of the camera if
-    `camera` is true.
+    """Return the point cloud [m] of a noisy view without normals, with the camera's position.
 
-    Raises `DatasetError` as `read_entry` and for an unknown view, and `CloudFileError` for a bad
-    file.
+    It is in the frame of the object, which rests at z = 0. With `camera` False the camera is left
+    out. The view `WHOLE` has normals and no camera. Raises `DatasetError` as `read_entry` and for
+    an unknown view, and `CloudFileError` for a bad file.
 
     >>> import tempfile, trimesh
     >>> folder = Path(tempfile.mkdtemp())
@@ -238,8 +242,9 @@ def read_view(objects: Path | str, name: str, view: str, camera: bool = True) ->
 
 @checked
 def read_object_mesh(objects: Path | str, name: str) -> "trimesh.Trimesh":
-    """Return the true, closed mesh [m] of an object in a folder; raises the errors of `read_entry`
-    and `read_mesh`.
+    """Return the true, closed mesh [m] of an object in a folder of objects.
+
+    It is in the frame of the object's views. Raises the errors of `read_entry` and `read_mesh`.
 
     >>> import tempfile, trimesh
     >>> folder = Path(tempfile.mkdtemp())

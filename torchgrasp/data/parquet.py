@@ -25,16 +25,16 @@ from torchgrasp.foundation.errors import BadArgument, ModelFileError, Status
 from torchgrasp.foundation.lazy import jinja2
 
 OBJECT = ("object", "view", "family", "group")
-"""Columns of every table that say what a row is about."""
+"""Columns of every table that name the object and the view of a line."""
 
 
 @checked
 def write_parquet(data: GraspShards, folder: Path | str) -> Path:
     """Write a data set as Parquet with cards in Markdown and Croissant; return the folder.
 
-    In `datasets`, `load_dataset(folder)` reads a row for each grasp: the numbers of an item of
+    In `datasets`, `load_dataset(folder)` reads a line for each grasp: the numbers of an item of
     `GraspShards`, with object, view, hand, friction, seed and the status of each try.
-    `load_dataset(folder, "views")` reads a row for each job: its cloud and counts. The joints'
+    `load_dataset(folder, "views")` reads a line for each job: its cloud and counts. The joints'
     names are in the cards, and in the metadata of each file's schema.
 
     Raises `BadArgument` for no grasps, `ModelFileError` for a damaged shard or card, `OutputError`

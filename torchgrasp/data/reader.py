@@ -26,11 +26,14 @@ CARD_BYTES = 256 * 1024**2  # largest card
 
 
 class ShardJob(NamedTuple):
-    """One job of a data set: its row, the cloud (None if no view was read) and the grasps that were
-    tried.
+    """One job of a data set: a view of an object, and the g grasps that were tried on it.
 
-    `passed` and `outcome` (a `Status`) have a row for each grasp, and a column for each simulated
-    trial.
+    Attributes:
+        row: the outcome of the job.
+        cloud: the cloud [m] of the view; None if no view was read.
+        grasps: the grasps, in the frame of the cloud.
+        passed: whether each of d simulated trials of each grasp passed.
+        outcome: the `Status` of each of these trials.
     """
 
     row: JobRow
@@ -48,16 +51,17 @@ class GraspShards:
     `points` (n, 3) and `viewpoint` (3,) of the cloud; `joints` and `pregrasp` (h,), `approach`
     (3,), `obj_from_hand` (4, 4); `contacts` and `normals` (f, 3), `std_m` (f,); `margin` and
     `witness` (6,) as in `Certificate`; `clearance`; `predicted` success; `simulated`, the fraction
-    of simulated trials that passed. `closed` (a bool) tells whether the grasp has force closure,
-    `job` is the index in `jobs`.
+    of simulated trials that passed. `closed` (a bool) is whether the grasp has force closure, `job`
+    is the index in `jobs`.
 
     Args:
         folder: folder of the data set.
         card: content of `card.json`.
-        jobs: a row for each object and view, with or without grasps.
+        jobs: the outcome for each object and view, with or without grasps.
         size: number of jobs in a shard.
         points: number of points of each item's cloud; None means all points, so that clouds may
             differ in size.
+        recent: the shards that were read last, kept in memory.
     """
 
     folder: Path
@@ -71,8 +75,8 @@ class GraspShards:
 
     @functools.cached_property
     def starts(self) -> list[int]:
-        """The index of the first grasp of each job in the data set; the last entry is the total
-        number of grasps.
+        """The index of the first grasp of each job in the data set, then the number of all
+        grasps.
         """
         return list(itertools.accumulate((row.grasps for row in self.jobs), initial=0))
 
@@ -113,11 +117,10 @@ class GraspShards:
 
     @checked
     def job(self, j: Annotated[int, Range(0, MOST)]) -> ShardJob:
-        """Return the cloud, the grasps and the results of trials of job j, in the precision of the
-        file.
+        """Return the cloud, the grasps and the results of trials of the job with the index `j`.
 
-        Raises `IndexError` for no such job, and `ModelFileError` if its file is missing, damaged,
-        or of another campaign.
+        Numbers have the precision of the file. Raises `IndexError` for no such job, and
+        `ModelFileError` if its file is missing, damaged, or of another campaign.
         """
         j = range(len(self.jobs))[j]
         row, records = self.recent.get(j // self.size, self._read).take(j % self.size)
@@ -139,7 +142,7 @@ class GraspShards:
 
 
 def shard_path(folder: Path, k: int) -> Path:
-    """Return the path of the file of shard k in a data set."""
+    """Return the path of the file of the shard with the index `k` in the folder of a data set."""
     return folder / f"shard-{k:06d}.safetensors"
 
 
@@ -147,8 +150,9 @@ def shard_path(folder: Path, k: int) -> Path:
 def read_shards(folder: Path | str, points: Count | None = None) -> GraspShards:
     """Open a data set that a campaign has written; shards are read on demand.
 
-    Of each cloud `points` points are drawn, the same in every call; a smaller cloud repeats points.
-    None means all. Raises `ModelFileError` if the campaign is not finished, or its card is damaged.
+    With `points`, so many points of each cloud are drawn, the same in every call; a smaller cloud
+    repeats points. None means all. Raises `ModelFileError` if the campaign is not finished, or its
+    card is damaged.
 
     >>> import tempfile, trimesh
     >>> from torchgrasp import load_hand

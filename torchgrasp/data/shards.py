@@ -28,13 +28,21 @@ META_LETTERS = 10_000  # letters of an entry of the metadata, which may name all
 
 
 class JobRow(NamedTuple):
-    """The outcome of one job (one view of one object): status, counts of grasps and trials,
-    metadata.
+    """The outcome of one job, which is one view of one object.
 
-    `status` is OK, or the reason why there is no grasp: the most frequent failure, a bad object, or
-    how the process ended. `note` gives details. `executable` grasps were planned; `grasps` of them
-    were kept and tried; `passed` is the number of trials that passed. `points` is the size of the
-    cloud. `meta` is the metadata of its `Grasps`.
+    Attributes:
+        object: name of the object.
+        view: name of the view; "" if the object could not be read, or has no view.
+        status: OK, or the reason why there is no grasp: the most frequent failure, a bad object, or
+            how the process ended.
+        note: details of the status.
+        family: family of similar objects.
+        group: group of objects, such as "solid".
+        executable: number of executable grasps that were planned.
+        points: number of points of the cloud.
+        grasps: number of grasps that were kept and tried.
+        passed: number of simulated trials that passed.
+        meta: metadata of the `Grasps`.
 
     >>> JobRow("mug", "view0", Status.NOT_CLOSED, points=1000).as_json()["status"]
     'NOT_CLOSED'
@@ -53,18 +61,23 @@ class JobRow(NamedTuple):
     meta: dict[str, str] = {}  # noqa: RUF012
 
     def as_json(self) -> dict[str, Any]:
-        """Return the row as a dictionary for JSON."""
+        """Return the fields by name as a dictionary for JSON."""
         return {**self._asdict(), "status": self.status.name}
 
 
 @dataclasses.dataclass(frozen=True)
 class Records(Value):
-    """The results of several jobs (one view of one object each), concatenated in the order of the
-    jobs.
+    """The results of several jobs (one view of one object each), one after the other.
 
-    Letters: p points, j jobs, g grasps, d trials of a grasp. A job without a camera has a viewpoint
-    of zeros. `passed` and `outcome` (a `Status`) are for each simulated trial. Lengths are in
-    metres, in the object's frame.
+    Lengths are in metres, in the object's frame. There are p points and g grasps of j jobs, and d
+    trials of each grasp.
+
+    Attributes:
+        points: points [m] of the clouds of all jobs.
+        viewpoints: position [m] of the camera of each job; zeros without a camera.
+        grasps: grasps of all jobs.
+        passed: whether each simulated trial passed.
+        outcome: `Status` of each simulated trial.
     """
 
     points: Float[Tensor, "p 3"]
@@ -75,13 +88,15 @@ class Records(Value):
 
 
 class Shard(NamedTuple):
-    """The content of a shard file: the rows of several jobs, and the tensors of all these jobs."""
+    """The content of a shard file: the outcomes of several jobs, and the tensors of all these
+    jobs.
+    """
 
     rows: tuple[JobRow, ...]
     records: Records
 
     def take(self, i: int) -> "Shard":
-        """Return a shard that holds only job i."""
+        """Return a shard that holds only the job with the index `i`."""
         row = self.rows[i]
         before = self.rows[:i]
         p = sum(x.points for x in before)
@@ -100,14 +115,17 @@ def join_shards(parts: Sequence[Shard]) -> Shard:
 
 
 def pack_shard(shard: Shard, meta: dict[str, str]) -> bytes:
-    """Return the bytes of the file of a shard; `meta` becomes metadata that identify the campaign."""
+    """Return the bytes of the file of a shard; `meta` becomes metadata that identify the
+    campaign.
+    """
     jobs = json.dumps([row.as_json() for row in shard.rows])
     return pack_tensors(KIND, named_tensors(shard.records), {**meta, "jobs": jobs})
 
 
 def load_shard(path: Path, meta: dict[str, str]) -> Shard:
-    """Read a shard file; raise `ModelFileError` if it is missing or damaged, or its metadata
-    differs from `meta`.
+    """Return the content of a shard file.
+
+    Raises `ModelFileError` if the file is missing or damaged, or its metadata differ from `meta`.
     """
     records, found = read_value(path, KIND, Records)
     if (other := {key: found.get(key) for key in meta}) != meta:
@@ -129,7 +147,10 @@ def load_shard(path: Path, meta: dict[str, str]) -> Shard:
 
 
 def read_row(field: Field, bare: bool = False) -> JobRow:
-    """Read the row of a job from JSON; a `bare` row has no metadata."""
+    """Return the outcome of a job, read from JSON; without metadata if `bare`.
+
+    Raises the error of the field for wrong content.
+    """
     fields = field.entries(*JobRow._fields[: -1 if bare else None])  # the metadata comes last
     texts = {name: fields[name].text() for name in ("object", "view", "note", "family", "group")}
     counted = ("executable", "points", "grasps", "passed")

@@ -26,11 +26,14 @@ GRASPED = {(name, hand) for name in ("cylinder", "jug") for hand in ("allegro", 
 @checked
 @dataclasses.dataclass(frozen=True, eq=False)
 class GraspObject:
-    """An object to grasp with its mass [kg]; all lengths are in metres, and the object rests at z =
-    0 with z up.
+    """An object to grasp, which rests at z = 0 with z up.
 
-    `mesh` is the true, closed surface. In simulation the convex `parts`, whose union is the object,
-    are used. `view` is a noisy point cloud from one side, with its viewpoint.
+    Attributes:
+        name: name of the object.
+        mesh: its true, closed surface [m].
+        parts: convex meshes [m] whose union is the object, for the simulation.
+        view: a noisy point cloud [m] from one side, with its viewpoint.
+        mass: mass [kg].
 
     >>> jug = load_object("jug")
     >>> jug.mass, [f"{1000 * side:.0f} mm" for side in jug.mesh.extents], len(jug.parts)
@@ -55,8 +58,9 @@ def list_objects() -> tuple[str, ...]:
 
 @checked
 def load_object(name: str) -> GraspObject:
-    """Return a shipped object by its name: mesh, mass and a noisy view; raise `BadArgument` for an
-    unknown name.
+    """Return a shipped object by its name: mesh, mass and a noisy view.
+
+    Raises `BadArgument` for an unknown name.
 
     >>> jug = load_object("jug")
     >>> jug.mesh.is_watertight, len(jug.view)
@@ -73,10 +77,10 @@ def load_object(name: str) -> GraspObject:
 
 @checked
 def load_shipped_grasp(name: str, hand: str) -> Grasps:
-    """Return a shipped grasp of a shipped object, to close or draw at once; raise `BadArgument` for
-    an unknown one.
+    """Return a shipped grasp of a shipped object, to close or draw at once.
 
-    The objects are "cylinder" and "jug", the hands "allegro" and "barrett".
+    The objects are "cylinder" and "jug", the hands "allegro" and "barrett". Raises `BadArgument`
+    for others.
 
     >>> grasp = load_shipped_grasp("jug", "barrett")
     >>> grasp.joints.shape, grasp.certificate.closed
@@ -90,7 +94,9 @@ def load_shipped_grasp(name: str, hand: str) -> Grasps:
 
 def load_scene() -> Scene:
     """Return a scene of the shipped objects on a table: a rendered, noisy depth image with true
-    labels; z is up.
+    labels.
+
+    Its frame has z up; lengths are in metres.
 
     >>> load_scene().things
     (1, 2, 3, 4)

@@ -25,8 +25,9 @@ def import_arrow() -> Any:
 
 
 def as_column(rows: Tensor) -> Any:
-    """Return a tensor as a column: for each index of the first axis a number, or fixed lists of
-    numbers.
+    """Return a tensor as a column of Arrow with one entry for each index of the first axis.
+
+    An entry is a number, or fixed lists of numbers if there are more axes.
     """
     arrow = import_arrow()
     column = arrow.array(rows.cpu().reshape(-1).numpy())
@@ -36,15 +37,16 @@ def as_column(rows: Tensor) -> Any:
 
 
 def as_table(columns: Mapping[str, Any], meta: Mapping[str, str]) -> Any:
-    """Return a table of columns by name, of which tensors become `as_column`; its schema has the
-    metadata.
+    """Return a table of Arrow, given its columns by name.
+
+    Tensors become columns by `as_column`; `meta` becomes the metadata of the schema.
     """
     cells = {name: as_column(x) if isinstance(x, Tensor) else x for name, x in columns.items()}
     return import_arrow().table(cells).replace_schema_metadata(dict(meta))
 
 
 def pack_table(table: Any) -> bytes:
-    """Return the bytes of the Parquet file of a table."""
+    """Return the bytes of the Parquet file of a table of Arrow."""
     # Without dictionaries: hardly any number comes twice.
     import_arrow().parquet.write_table(
         table, buffer := io.BytesIO(), compression="zstd", use_dictionary=False
@@ -53,7 +55,10 @@ def pack_table(table: Any) -> bytes:
 
 
 def render_card(template: str, **values: Any) -> str:
-    """Return a text beside the tables, for people or programs, from its template."""
+    """Return the text of a card, for people or programs, made from a template and values by name.
+
+    `template` is a file name in the folder of templates, without ".jinja".
+    """
     return render(
         Path(__file__).parent / "templates" / f"{template}.jinja", Status=Status, **values
     )
@@ -62,8 +67,10 @@ def render_card(template: str, **values: Any) -> str:
 def write_folder(
     folder: Path | str, source: Mapping[str, Any], files: Iterable[tuple[str, str | bytes]]
 ) -> Path:
-    """Write files by name, one by one; `source.json` says what they are made from, and keeps other
-    files out.
+    """Write files by name, one by one; return the folder.
+
+    `files` are pairs of name and content. `source.json` holds `source`, of which the files are
+    made. Raises `OutputError` if the folder holds other files or cannot be written.
     """
     with hold_folder(folder := Path(folder)):
         begin_folder(folder / SOURCE, format_json(source) + "\n", "data")
