@@ -1,5 +1,8 @@
 """Grasp solvers on fixed contacts, which refine initial guesses (seeds) in rounds; also the paper's
 COBYLA solver.
+
+b counts contact sets (one contact for each fingertip), g seeds or grasps, f fingertips, h actuated
+joints.
 """
 
 import dataclasses
@@ -45,7 +48,7 @@ Result = TypeVar("Result", bound=Batch)
 
 @dataclasses.dataclass(frozen=True)
 class CobylaNumbers:
-    """The numbers of the paper's solver."""
+    """Numbers of the paper's solver."""
 
     angle: float = 0.01
     """Unit of the variables [rad]: a fingertip moves by about a millimetre, as the distances do."""
@@ -54,13 +57,13 @@ class CobylaNumbers:
     end: float = 0.05
     """Trust region, in units of the variables, at which COBYLA stops."""
     start: float = 10.0
-    """Trust region with which it starts."""
+    """Trust region at the start, in units of the variables."""
     evaluations: int = 400
-    """Most evaluations."""
+    """Most evaluations of one run."""
     together: int = 10
-    """Seeds that are tried at a time."""
+    """Number of seeds that are tried at a time."""
     grasps: int = 10
-    """Executable grasps that are enough."""
+    """Number of executable grasps that are enough."""
     seeds: int = 300
     """Most seeds that are tried."""
 
@@ -70,15 +73,20 @@ ROWS = 256  # seeds whose costs are computed at a time, which bounds the memory
 
 
 def assign(contacts: Contacts, seeds: IKSeeds) -> Contacts:
-    """Return the contact set of each initial guess (seed), reordered so that contact i belongs to
+    """Return the contact set of each seed, with its contacts reordered so that contact i belongs to
     finger i.
+
+    `contacts` are all sets; `seeds.row` holds the index of each seed's set.
     """
     return map_tensors(lambda x: x[seeds.row[:, None], seeds.permutation], contacts)
 
 
 class Attempts(Generic[Result]):
-    """The results of all refined initial guesses (seeds); `unsolved` marks contact sets that no
-    result `solves` yet.
+    """The results of all refined seeds so far, with the contact sets that still need one.
+
+    `unsolved` is a mask of the b contact sets that have no good result yet; `solves` returns a mask
+    of good ones among k results. `results` are the added groups of results, and `rows` holds for
+    each group the indices of the contact sets.
     """
 
     def __init__(self, unsolved: Bool[Tensor, "b"], solves: Callable[[Result], Bool[Tensor, "k"]]):
@@ -88,14 +96,14 @@ class Attempts(Generic[Result]):
         self.rows = list[Tensor]()
 
     def add(self, results: Result, row: Int[Tensor, "k"]) -> None:
-        """Add results; `row` holds the index of the contact set of each result."""
+        """Add k `results`; `row` holds the index of the contact set of each."""
         self.results.append(results)
         self.rows.append(row)
         self.unsolved = self.unsolved.index_fill(0, row[self.solves(results)], False)
 
     def choose(self, seeds: IKSeeds, rank: Int[Tensor, "g"], first: int, count: int) -> IKSeeds:
-        """Return, of each unsolved contact set, the seeds whose `rank` is from `first` to `first +
-        count - 1`.
+        """Return the seeds of unsolved contact sets whose `rank` within the set is from `first` to
+        `first + count - 1`.
         """
         return seeds[(rank >= first) & (rank < first + count) & self.unsolved[seeds.row]]
 
@@ -106,8 +114,11 @@ class Attempts(Generic[Result]):
         counts: Sequence[int],
         refine: Callable[[IKSeeds], Result],
     ) -> None:
-        """In round k, refine the next `counts[k]` seeds (by `rank`) of each unsolved contact set;
-        add the results.
+        """In round k, refine the next `counts[k]` seeds of each unsolved contact set, and add the
+        results.
+
+        `rank` is the place of each seed among those of its contact set. `refine` returns the
+        results of some seeds.
         """
         first = 0
         for count in counts:
@@ -117,8 +128,10 @@ class Attempts(Generic[Result]):
                 self.add(refine(chosen), chosen.row)
 
     def best(self, keys: Callable[[Result], tuple[Tensor, ...]]) -> tuple[Result, Int[Tensor, "t"]]:
-        """Return each contact set's best result, with the least key (in a tie the next key), and
-        the set's index.
+        """Return the best result of each contact set with results, then the index of that set.
+
+        `keys` returns tensors (k,) for k results. The best result has the least first key; in a tie
+        the next key decides.
         """
         results = join(self.results)
         row = torch.cat(self.rows)
@@ -132,8 +145,10 @@ def executable(grasps: Grasps) -> Bool[Tensor, "g"]:
 
 
 def best_grasps(attempts: Attempts[Grasps]) -> tuple[Grasps, Int[Tensor, "t"]]:
-    """Return each contact set's best grasp, and the set's index: a success, else a failure on valid
-    contacts.
+    """Return the best grasp of each contact set with results, then the index of that set.
+
+    An executable grasp comes first, then one that failed on valid contacts, then others; in a tie
+    the higher score decides.
     """
 
     def keys(grasps: Grasps) -> tuple[Tensor, Tensor]:
@@ -152,8 +167,9 @@ def best_first(grasps: Grasps) -> Grasps:
 def refine_on_contacts(
     problem: GraspProblem, seeds: IKSeeds, steps: int = ITERATIONS, cobyla: bool = False
 ) -> Grasps:
-    """Refine each seed on its fixed contacts; return checked grasps. `cobyla` selects the paper's
-    solver and checks.
+    """Return a checked grasp for each seed, refined on its fixed contacts by at most `steps` steps.
+
+    With `cobyla`, the paper's solver and checks are used, and `steps` is ignored.
     """
     contacts = assign(problem.contacts, seeds)
     start = Configuration(seeds.joints, seeds.obj_from_hand)
@@ -173,7 +189,9 @@ def refine_on_contacts(
 def try_best_seeds(
     problem: GraspProblem, seeds: IKSeeds, steps: int = ITERATIONS
 ) -> Attempts[Grasps]:
-    """Refine the first two seeds of each contact set onto fixed contacts, and return the results."""
+    """Return the results of refining the first two seeds of each contact set on fixed contacts, by
+    at most `steps` steps.
+    """
     attempts = Attempts(torch.ones_like(problem.certificate.closed), executable)
     attempts.refine(
         seeds, rank_in_group(seeds.row), (2,), partial(refine_on_contacts, problem, steps=steps)
@@ -182,8 +200,8 @@ def try_best_seeds(
 
 
 def seed_costs(problem: GraspProblem, seeds: IKSeeds) -> Float[Tensor, "g"]:
-    """Return for each seed the sum of squared errors [mm2] of fingertips and clearances, before any
-    refinement.
+    """Return the cost [mm2] of each seed before any refinement: the sum of squared errors of
+    fingertips and clearances.
     """
     costs = [seeds.energy[:0]]
     every = torch.arange(len(seeds), device=seeds.row.device)
@@ -204,7 +222,8 @@ def seed_costs(problem: GraspProblem, seeds: IKSeeds) -> Float[Tensor, "g"]:
 def solve_contact_first(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
     """Return a checked grasp on fixed contacts for each contact set with seeds, best grasp first.
 
-    Two seeds of each set are refined. If both fail, four more are refined.
+    The two seeds of each set with the least errors are refined. If both fail, the next four are
+    refined.
     """
     seeds = problem.drop_unreachable(seeds)
     attempts = Attempts(torch.ones_like(problem.certificate.closed), executable)
@@ -216,8 +235,9 @@ def solve_contact_first(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
 def refine_by_cobyla(
     hand: Hand, start: Configuration, contacts: Contacts, world: CollisionWorld
 ) -> Configuration:
-    """Move hand configurations onto three contacts each by SciPy's COBYLA; the poses in `start` are
-    not used.
+    """Return hand configurations moved onto three contacts each by SciPy's COBYLA.
+
+    The joints in `start` are the initial ones; its poses are not used.
     """
     if not len(start):
         return start
@@ -229,8 +249,10 @@ def refine_by_cobyla(
 
 
 class CobylaRun:
-    """One run of SciPy's COBYLA from initial `joints` [rad] onto three contact `points` [m]; caches
-    the last values.
+    """One run of SciPy's COBYLA from initial `joints` [rad] onto three contact `points` [m].
+
+    The points are in the object's frame; `world` holds what the hand must not touch. The values at
+    the last evaluated point are cached.
     """
 
     def __init__(
@@ -252,8 +274,11 @@ class CobylaRun:
     def place(
         self, x: np.ndarray
     ) -> tuple[Tensor, Float[Tensor, "3 4 l 1"], Float[Tensor, "4 4"], bool]:
-        """Return joints, link frames and hand pose, Eq. (24), at COBYLA's `x`, and whether the tips
-        span a frame.
+        """Return joints [rad], link frames, hand pose [m] by Eq. (24), and whether the tips span a
+        frame.
+
+        `x` are COBYLA's variables: the changes of the joints in units of `COBYLA.angle`. The link
+        frames (3 x 4) [m] are in the hand's frame.
         """
         hand = self.hand
         step = COBYLA.angle * torch.from_numpy(np.array(x, dtype=float)).to(self.points)
@@ -266,14 +291,16 @@ class CobylaRun:
 
     def tips(self, frames: Float[Tensor, "3 4 l 1"]) -> Float[Tensor, "3 3"]:
         """Return the contact points [m] of the fingertips in the hand's frame, given the link
-        frames.
+        `frames`.
         """
         tips = self.hand.tips
         return map_points(frames.index_select(2, tips.index), tips.contact)[..., 0].T
 
     def evaluate(self, x: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the sum of tip distances from contacts [mm], and the clearances less 0.5 mm, which
+        """Return the sum of the distances [mm] of tips from contacts, then the constraints, which
         must be >= 0.
+
+        These are the clearances [mm] less 0.5 mm, at COBYLA's variables `x`.
         """
         key = np.asarray(x).tobytes()
         if self.last is None or self.last[0] != key:
@@ -291,7 +318,8 @@ class CobylaRun:
 
         They are in this order: between the hand's own links; from the object to the palm, to each
         finger and to each fingertip; from the table to the hand; from obstacles to the hand. Those
-        that the world lacks are left out.
+        for which the world has no part are left out. `frames` are the link frames in the hand's
+        frame, and `pose` [m] is the hand's in the object's frame.
         """
         world = self.world
         spheres = self.hand.collision_spheres
@@ -310,8 +338,9 @@ class CobylaRun:
         return found
 
     def solve(self) -> Configuration:
-        """Return the configuration at which COBYLA stops; raises `DegenerateContacts` for contacts
-        on a line.
+        """Return the configuration at which COBYLA stops.
+
+        Raises `DegenerateContacts` for contacts on a line.
         """
         from scipy.optimize import NonlinearConstraint, minimize
 
@@ -334,8 +363,7 @@ class CobylaRun:
 
 
 def solve_as_paper(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
-    """Find grasps as in the paper: return a checked grasp for each seed that was tried, best grasp
-    first.
+    """Return a checked grasp for each seed that was tried, as in the paper, best grasp first.
 
     Seeds are tried ten at a time, in the order of their contact sets, until 10 grasps are
     executable or 300 were tried.

@@ -26,8 +26,8 @@ from torchgrasp.ik.refine import open_hand, tip_targets
 from torchgrasp.values.planning import Certificate, Contacts, Grasps, IKSeeds
 
 Reachable = Callable[[Tensor], Tensor]
-"""A user's function that takes hand poses in the object's frame (k, 4, 4), and returns which an arm
-reaches (k,).
+"""A user's function of hand poses (k, 4, 4) [m] in the object's frame, which returns a mask (k,) of
+those that an arm reaches.
 """
 PAPER_TOLERANCE = (
     10 * MILLIMETRE
@@ -41,18 +41,18 @@ estimated surface.
 
 @dataclasses.dataclass(frozen=True)
 class CheckNumbers:
-    """The numbers of the checks and of the geometric score."""
+    """Numbers of the checks and of the geometric score."""
 
     angle: float = math.radians(2)
     """Largest angle [rad] of a contact direction outside the pad's cone."""
     limits: float = 1e-9
     """Rounding [rad] by which a joint may pass its limits."""
     least_cosine: float = 1e-3
-    """Forces that hardly push, or pull, need the friction of this cosine."""
+    """Least cosine between a force and the inward normal for which friction is computed."""
     offset: float = 0.02
-    """Distance [m] of the contacts from the centre that costs as much as a friction of one."""
+    """Offset [m] of contacts from the centre that costs as much as a friction coefficient of one."""
     pad_angle: float = 0.8
-    """Angle [rad] off the pads that costs as much as a friction of one."""
+    """Angle [rad] off the pads that costs as much as a friction coefficient of one."""
 
 
 CHECKS = CheckNumbers()
@@ -61,15 +61,23 @@ CHECKS = CheckNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspProblem(Value):
-    """The input of a grasp solver: a hand, contact sets with certificates of force closure, and the
+    """The input of a grasp solver: hand, b contact sets with certificates of force closure,
     collision world.
 
-    Contact sets of several objects have a centre each, and a world that knows the object of each
-    row. Grasps near `center`, the object's centre [m], score higher. The function `reachable` tells
-    which hand poses an arm can reach; without this function, every pose counts as reachable. A hand
-    that `descends` may begin above its pose where its opened links would be in the table
-    (`opened_pose`). Raises `BadArgument` if the contacts lack `std_m`, the surface's standard
-    deviation, by which the pre-grasp opens.
+    Raises `BadArgument` if the contacts lack `std_m`.
+
+    Args:
+        hand: the hand.
+        contacts: the contact sets, in the object's frame [m]; the pre-grasp opens by their `std_m`.
+        certificate: the certificate of each contact set.
+        world: the surroundings of the hand; it may hold one object for all contact sets, or one for
+            each.
+        center: the object's centre [m], (3,), or one for each contact set (b, 3). Grasps near it
+            score higher.
+        reachable: function that returns a mask of the hand poses that an arm can reach; None means
+            that every pose is reachable.
+        descends: whether the hand may begin above its pose where its opened links would be in the
+            table (`opened_pose`).
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -93,7 +101,7 @@ class GraspProblem(Value):
 
     @checked
     def rows(self, index: Int[Tensor, "k"]) -> "GraspProblem":
-        """Return the problem of some of the contact sets."""
+        """Return the problem of the k contact sets with the indices `index`."""
         center = self.center if self.center.ndim == 1 else self.center[index]
         contacts = self.contacts[index]
         certificate = self.certificate[index]
@@ -113,8 +121,9 @@ class GraspProblem(Value):
 
 
 def ask_reachable(reachable: Reachable, obj_from_hand: Float[Tensor, "k 4 4"]) -> Bool[Tensor, "k"]:
-    """Return a mask of the hand poses that the user's function accepts; raise `BadArgument` for a
-    malformed answer.
+    """Return a mask of the k hand poses [m] that the user's function `reachable` accepts.
+
+    Raises `BadArgument` for a malformed answer.
     """
     if not len(obj_from_hand):
         return obj_from_hand.new_zeros(0, dtype=torch.bool)
@@ -135,8 +144,10 @@ def ask_reachable(reachable: Reachable, obj_from_hand: Float[Tensor, "k 4 4"]) -
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspCandidates(Batch):
-    """Hand configurations to check, with contacts, force closure certificates, and the `status` of
-    contact planning.
+    """g hand configurations to check, each with its contacts, in the order of the fingers.
+
+    `certificate` is that of the contacts, and `status` the `Status` of contact planning. Finger i
+    touches contact `permutation[:, i]` of the planned contact set.
     """
 
     configuration: Annotated[Configuration, Rows("g")]
@@ -151,11 +162,12 @@ class GraspCandidates(Batch):
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspErrors(Batch):
-    """Errors of g grasps: each tip's distance from its contact [m], and the contact's angle from
-    the pad's axis [rad].
-
-    `clearance` [m] is the least clearance of the links. `status` tells the first error out of
+    """Errors and clearances of g grasps; `status` is the `Status` of the first error out of
     tolerance.
+
+    `tip_error` [m] is the distance of each of the f tips from its contact, and `normal_angle` [rad]
+    the angle of the contact's inward normal from the pad's axis. `clearance` [m] is the least
+    clearance of the links.
     """
 
     tip_error: Annotated[Float[Tensor, "g f"], ANY]
@@ -173,7 +185,8 @@ def measure_errors(
     rolling: bool = True,
     tolerance: Length = TIP_TOLERANCE,
 ) -> GraspErrors:
-    """Measure the errors and clearances of grasps; `status` tells the first error out of tolerance.
+    """Return the errors and clearances of grasps, of which `contacts` are in the order of the
+    fingers.
 
     With `rolling`, round fingertips may roll on their contacts within the cones of their pads.
     Without `rolling`, as in the paper, each pad must touch with its own contact point, in any
@@ -231,6 +244,8 @@ def check_candidates(
 ) -> Grasps:
     """Return a grasp for each candidate, with pre-grasp, approach and the `Status` of the first
     check that it fails.
+
+    `rolling` and `tolerance` [m] are as in `measure_errors`.
     """
     hand = problem.hand
     world = problem.world
@@ -319,10 +334,11 @@ def centred_friction(contacts: Contacts) -> Float[Tensor, "g"]:
 def score(
     contacts: Contacts, normal_angle: Float[Tensor, "g f"], center: Float[Tensor, "*g 3"]
 ) -> Float[Tensor, "g"]:
-    """Return the geometric score of each grasp, at most 0; a higher score is better.
+    """Return the geometric score of each grasp, at most 0 and without unit; a higher score is
+    better.
 
-    Three things lower it: the contacts' distance from `center` [m], the friction needed, and the
-    angle off the pads.
+    Three things lower it: the distance of the contacts' centroid from `center` [m], the friction
+    coefficient that centred forces need, and the largest `normal_angle` [rad] off the pads.
     """
     offset = norm(contacts.points.mean(1) - center)
     away = offset / CHECKS.offset

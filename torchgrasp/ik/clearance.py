@@ -1,5 +1,7 @@
 """The collision world, and clearances of a hand's links: from object, table, obstacles and each
 other.
+
+Positions [m] are in the object's frame. g counts hands, s their collision spheres.
 """
 
 import dataclasses
@@ -36,9 +38,9 @@ class Obstacles(Value):
     regions.
 
     Args:
-        field: signed distances from the region that counts as occupied, negative inside.
-        distances: for each of the `levels`, the distances from the region that is occupied with at
-            least this probability; 0 inside, on the same grid.
+        field: signed distances [m] from the region that counts as occupied, negative inside.
+        distances: for each of the k `levels`, the distances [m] from the region that is occupied
+            with at least this probability; 0 inside, on the same grid of x y z nodes.
         levels: k probabilities, ascending.
         hard: whether links must not touch the occupied region; otherwise a collision only lowers
             the predicted success.
@@ -82,8 +84,10 @@ class Obstacles(Value):
     def likelihood(
         self, centres: Float[Tensor, "*b s 3"], radius: Float[Tensor, "s"]
     ) -> Float[Tensor, "*b"]:
-        """Return for each set of s spheres [m] the largest occupancy probability of the regions
-        that they touch.
+        """Return the largest occupancy probability of the regions that each set of s spheres
+        touches.
+
+        `centres` [m] and `radius` [m] are those of the spheres.
         """
         met = centres.new_zeros(centres.shape[:-2])
         levels = [*self.levels.tolist(), 1.0]
@@ -94,8 +98,9 @@ class Obstacles(Value):
 
 
 def distance_to(region: Bool[Tensor, "x y z"], spacing: float) -> Float[Tensor, "x y z"]:
-    """Return the distance [m] of each voxel from a region: 0 inside, larger than the grid if the
-    region is empty.
+    """Return the distance [m] of each voxel from the border of a `region`: 0 inside it.
+
+    `spacing` [m] is the edge of a voxel. For an empty region the distance is larger than the grid.
     """
     from scipy.ndimage import distance_transform_edt
 
@@ -109,11 +114,13 @@ def distance_to(region: Bool[Tensor, "x y z"], spacing: float) -> Float[Tensor, 
 @checked
 @dataclasses.dataclass(frozen=True)
 class CollisionWorld(Value):
-    """The surroundings that a hand must not touch: the object's signed distance `field`, a table,
-    and obstacles.
+    """The surroundings that a hand must not touch: the object's distance `field`, a table, and
+    obstacles.
 
-    The table is a plane, or a height [m] along z. A part of the surroundings that does not exist is
-    None. Raises `BadArgument` for a table that is neither a plane nor a height.
+    A part of the surroundings that does not exist is None. The `field` holds signed distances [m]
+    from one object, the same for all hands of a batch, or from one object for each hand. The
+    `table` is a plane, or a height [m] along z. Raises `BadArgument` for a table that is neither a
+    plane nor a height.
 
     >>> CollisionWorld(table=0.02).plane.offset
     0.02
@@ -128,7 +135,7 @@ class CollisionWorld(Value):
 
     @cached_property
     def plane(self) -> Plane | None:
-        """The table as a plane, on the device of the distance fields, or None without a table."""
+        """The table as a plane, on the device of the distance fields; None without a table."""
         plane = as_plane(self.table)
         if plane is None or not self.fields:
             return plane
@@ -136,7 +143,7 @@ class CollisionWorld(Value):
 
     @property
     def fields(self) -> tuple[DistanceField, ...]:
-        """The distance fields of object and obstacles, if any."""
+        """The distance fields of object and obstacles: none, one or both."""
         return tuple(
             x for x in (self.field, self.obstacles and self.obstacles.field) if x is not None
         )
@@ -148,8 +155,9 @@ class CollisionWorld(Value):
 
     @checked
     def rows(self, index: Int[Tensor, "k"]) -> "CollisionWorld":
-        """Return the surroundings of some of the rows of hands; a single object's are those of all
-        rows.
+        """Return the world of some hands: entry i of the result is that of hand `index[i]`.
+
+        A world of one object is the same for all hands, and is returned unchanged.
         """
         if self.field is None or isinstance(self.field, SignedDistanceField):
             return self
@@ -162,8 +170,8 @@ class CollisionWorld(Value):
 
 
 def along(points: Float[Tensor, "*b 3"], plane: Plane) -> Float[Tensor, "*b"]:
-    """Return the coordinates [m] of points along the normal of a plane, before its offset is
-    subtracted.
+    """Return the coordinates [m] of `points` [m] along the unit normal of a `plane`; its offset is
+    not subtracted.
     """
     return points @ plane.normal.to(points)
 
@@ -171,15 +179,19 @@ def along(points: Float[Tensor, "*b 3"], plane: Plane) -> Float[Tensor, "*b"]:
 def table_clearance(
     centres: Float[Tensor, "*b s 3"], radius: Float[Tensor, "s"], table: Plane
 ) -> Float[Tensor, "*b"]:
-    """Return the least clearance [m] of s spheres from a table."""
+    """Return the least clearance [m] of s spheres from a `table`; `centres` and `radius` are in
+    metres.
+    """
     return (along(centres, table) - radius).amin(-1) - table.offset
 
 
 def collision_cost(
     centres: Float[Tensor, "*b s 3"], spheres: CollisionSpheres, world: CollisionWorld
 ) -> Float[Tensor, "*b"]:
-    """Return for each hand the sum of squares [mm2] of the clearance its spheres lack; tips may
-    touch the object.
+    """Return the cost [mm2] of each hand: the sum of squares of the clearances that its spheres
+    lack.
+
+    Fingertips may touch the object. `centres` [m] are those of the hand's `spheres`.
     """
     radius = spheres.radius.to(centres)
     cost = centres.new_zeros(centres.shape[:-2])
@@ -197,8 +209,10 @@ def collision_cost(
 def clearance_rows(
     spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool
 ) -> list[ResidualRows]:
-    """Return residuals [mm]: the lack of the smallest clearances between links and from object,
-    obstacles and table.
+    """Return residuals [mm]: by how much the smallest clearances are less than wanted.
+
+    They are those between links, and from object, obstacles and table. With `tips_touch` the
+    fingertips may touch the object and the table.
     """
     pairs = spatial.hand.self_collision
     moves = spatial.hand.motion.moves
@@ -259,10 +273,10 @@ def sphere_rows(
 def link_clearance(
     spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool
 ) -> list[Float[Tensor, "g"]]:
-    """Return three least clearances [m] of each hand.
+    """Return three least clearances (g,) [m] of each hand.
 
     They are of links from the object (tips are left out if `tips_touch`), of tips from the object,
-    and of all links from the table.
+    and of all links from the table; infinite if there is no such thing.
     """
     spheres = spatial.hand.collision_spheres
     centres = spatial.sphere_centres

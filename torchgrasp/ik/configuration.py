@@ -1,7 +1,9 @@
 """Configurations of a free-floating hand, and Jacobians of points on its links.
 
 A Jacobian is built from wrenches: the derivative of a residual by a joint or pose motion is the
-product of a wrench about the object's origin and the twist of the motion.
+product of a wrench about the object's origin and the twist of the motion. g counts configurations.
+The q motions are three translations along the hand's axes, three rotations about them, and the
+joints that the actuated joints move; d = 6 + h counts pose and actuated joints.
 """
 
 import dataclasses
@@ -26,7 +28,9 @@ from torchgrasp.hand.kinematics import map_points
 @checked
 @dataclasses.dataclass(frozen=True)
 class Configuration(Batch):
-    """Configurations of a free-floating hand: its joints [rad] and its pose in the object's frame."""
+    """Configurations of a free-floating hand: actuated `joints` [rad] and `obj_from_hand`, its pose
+    in the object's frame [m].
+    """
 
     joints: Float[Tensor, "g h"]
     obj_from_hand: Poses
@@ -37,7 +41,7 @@ class Configuration(Batch):
         then joints [rad].
 
         Translation and rotation vector are in the hand's axes. The joints are clamped to their
-        limits.
+        limits. Raises `BadArgument` for a step of another length.
         """
         if step.shape[1] != 6 + self.joints.shape[1]:
             raise BadArgument(
@@ -55,11 +59,12 @@ class Configuration(Batch):
 
 
 class ResidualRows(NamedTuple):
-    """Residuals of g configurations, with the factors of their derivatives by q motions of joints
-    and hand pose.
+    """k residuals of g configurations, with the factors of their derivatives by q motions.
 
-    The derivative by a motion is `wrench` times the twist of the motion where `moves` is 1, and 0
-    where `moves` is 0.
+    `residual` is a weighted length [mm], or a weighted error of a cosine. `wrench` holds its
+    derivatives by a translation [m] and by a rotation [rad] about the object's origin. The
+    derivative by a motion is `wrench` times the twist of the motion where `moves` is 1, and 0 where
+    `moves` is 0.
     """
 
     residual: Float[Tensor, "g k"]
@@ -69,8 +74,13 @@ class ResidualRows(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class SpatialJacobian(Value):
-    """Link frames, sphere centres, tip centres, pad axes and motion twists of g hands, in the
-    object's frame.
+    """The kinematics of a hand at g configurations, in the object's frame, from which Jacobians are
+    computed.
+
+    `obj_from_link` are the poses (3 x 4) [m] of the l links. `spheres` [m] are the centres of the s
+    collision spheres, `tips` [m] those of the f fingertips, and `pads` the unit normals of their
+    pads. `twists` are those of the q motions: the velocity at the object's origin, then the
+    rotation.
     """
 
     hand: Hand
@@ -82,9 +92,7 @@ class SpatialJacobian(Value):
 
     @classmethod
     def at(cls, hand: Hand, configuration: Configuration) -> "SpatialJacobian":
-        """Evaluate the forward kinematics of a hand at g configurations; the result can compute
-        Jacobians.
-        """
+        """Return the kinematics of a hand at g configurations."""
         root = configuration.obj_from_hand[:, :3].permute(1, 2, 0)
         frames = hand.tree.frames(hand.actuated.couple(configuration.joints).T.contiguous(), root)
         spheres, tips, pads, origins, turning, sliding = hand.motion.place(frames)
@@ -94,21 +102,21 @@ class SpatialJacobian(Value):
     def points(
         self, links: Int[Tensor, "k"], local: Float[Tensor, "k 3"]
     ) -> Float[Tensor, "g k 3"]:
-        """Return the positions [m] in the object's frame of k points, each given in the frame of
-        its link.
+        """Return the positions [m] in the object's frame of k points; `local` [m] are their
+        positions in the frames of `links`.
         """
         return map_points(self.obj_from_link.index_select(2, links), local).permute(2, 1, 0)
 
     @property
     def sphere_centres(self) -> Float[Tensor, "g s 3"]:
-        """Centres [m] of the hand's collision spheres."""
+        """Centres [m] of the hand's collision spheres in the object's frame."""
         return self.spheres.permute(2, 1, 0)
 
     def jacobian(
         self, wrench: Float[Tensor, "g k 6"], moves: Float[Tensor, "*g k q"]
     ) -> Float[Tensor, "g k d"]:
-        """Return the derivatives of k residuals by hand pose (6) and joints; the arguments are
-        fields of `ResidualRows`.
+        """Return the derivatives of k residuals by the hand's pose (6) and joints; the arguments
+        are fields of `ResidualRows`.
         """
         by_motion = (wrench @ self.twists.permute(2, 0, 1)) * moves
         coupling = self.hand.motion.coupling
@@ -116,8 +124,6 @@ class SpatialJacobian(Value):
 
 
 def differentiate(spatial: SpatialJacobian, parts: Sequence[ResidualRows]) -> Residuals:
-    """Concatenate several groups of residuals; return them and their Jacobian by hand pose (6) and
-    joints.
-    """
+    """Return the residuals of all `parts`, then their Jacobian by hand pose (6) and joints."""
     residual, wrench, moves = (torch.cat(x, 1) for x in zip(*parts, strict=True))
     return residual, spatial.jacobian(wrench, moves)

@@ -3,7 +3,9 @@ reaches them.
 
 The contact problem (Eqs. 10-13 of the paper, with the margins of `ContactSpec`) and the hand's
 residuals form one least-squares problem. Its unknowns are pose, joints, contact points and
-tensions. A tension is the size of the pull between two contacts; the pulls give the contact forces.
+tensions. A tension, without unit, is the size of the pull between two contacts; the pulls give the
+contact forces. Contact points are normalised: in the shape's frame and unit of length. g counts
+grasps, f fingertips.
 """
 
 import dataclasses
@@ -52,8 +54,10 @@ CONTACT_WEIGHT = 2.0  # weight of a millimetre of the contact problem: contacts 
 
 
 class SlidingStage(NamedTuple):
-    """A solver stage: its steps, whether contacts must be on flat surface, largest cost [mm2] of
-    grasps that go on.
+    """A stage of the solver.
+
+    `steps` is the number of its steps, `flat` says whether contacts must be on flat surface, and
+    `hopeless` [mm2] is the cost from which a grasp is given up after the stage.
     """
 
     steps: int
@@ -63,16 +67,16 @@ class SlidingStage(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class SlidingNumbers:
-    """The numbers of the optimisation of hand and contacts together."""
+    """Numbers of the optimisation of hand and contacts together."""
 
     seeds: int = 2
-    """Seeds of a contact set that are tried: of more, few find another grasp."""
+    """Number of seeds of a contact set that are tried: of more, few find another grasp."""
     rows: int = 512
-    """Seeds that are optimised at a time on a CPU."""
+    """Number of seeds that are optimised at a time on a CPU."""
     most_rows: int = 2**15
-    """The most on an accelerator: the Jacobians of more do not fit into it."""
+    """Largest such number on an accelerator: the Jacobians of more do not fit into its memory."""
     projections: int = 3
-    """Steps onto the surface at the end; the solver leaves contacts within 0.1 mm."""
+    """Number of steps onto the surface at the end; before, contacts are off it by at most 0.1 mm."""
 
 
 SLIDING = SlidingNumbers()
@@ -86,8 +90,12 @@ STAGES = (
 
 @dataclasses.dataclass(frozen=True)
 class JointState(Batch):
-    """Hand configurations, normalised contact points, tensions of contact pairs, extrapolated
-    surface variance.
+    """The unknowns of g grasps: hand configurations, contact points and tensions, with the
+    surface's variance.
+
+    `points` are normalised, and `tension` (no unit) is that of each of the k pairs of contacts.
+    `variance` [squared normalised units] is that of the surface's distance at the points,
+    extrapolated linearly by `variance_gradient` [normalised units].
     """
 
     configuration: Configuration
@@ -97,8 +105,10 @@ class JointState(Batch):
     variance_gradient: Float[Tensor, "g f 3"]
 
     def integrate(self, hand: Hand, step: Float[Tensor, "g d"]) -> "JointState":
-        """Return the state after a `step`: changes of hand pose, joints, contact points and
-        tensions, concatenated.
+        """Return the state after a `step`: changes of hand pose (6), joints, contact points and
+        tensions, in this order.
+
+        The pose and the joints change as in `Configuration.integrate`; the points are normalised.
         """
         by_hand, by_points, by_tension = step.split(
             [6 + hand.dof, self.points[0].numel(), self.tension.shape[1]], 1
@@ -113,8 +123,10 @@ class JointState(Batch):
 
 @dataclasses.dataclass(frozen=True)
 class JointProblem:
-    """The least-squares problem of hand and contacts together: hand, object shape, constraints,
-    collision world.
+    """The least-squares problem of hand and contacts together.
+
+    `shape` is the estimated shape, or a batch of one for each grasp; `contact_problem` holds the
+    constraints of the contacts, and `world` what the hand must not touch.
     """
 
     hand: Hand
@@ -123,14 +135,16 @@ class JointProblem:
     world: CollisionWorld
 
     def rows(self, index: Int[Tensor, "k"]) -> "JointProblem":
-        """Return the problems of some of the rows."""
+        """Return the problems of the grasps with the indices `index`."""
         shape = rows_of(self.shape, index)
         contact_problem = self.contact_problem.rows(index)
         return JointProblem(self.hand, shape, contact_problem, self.world.rows(index))
 
     def residuals(self, state: JointState, flat: FlatnessConstraint | None) -> Residuals:
-        """Return all residuals [mm] and their Jacobian with respect to hand pose, joints, contacts
-        and tensions.
+        """Return all residuals [mm], then their Jacobian by hand pose, joints, contacts and
+        tensions.
+
+        `flat` is the constraint that contacts are on flat surface; None leaves it out.
         """
         hand = self.hand
         shape = self.shape
@@ -162,7 +176,7 @@ class JointProblem:
         self, spatial: SpatialJacobian, jet: SurfaceJet, outside: Bool[Tensor, "g f"]
     ) -> Float[Tensor, "g 4*f 3*f"]:
         """Return the derivatives of tip residuals by contact points; `outside` marks contacts
-        outside pads' cones.
+        outside their pads' cones.
         """
         hand = self.hand
         normals = jet.normals
@@ -179,7 +193,7 @@ class JointProblem:
     def _contact_residuals(
         self, state: JointState, jet: SurfaceJet, flat: FlatnessConstraint | None
     ) -> Residuals:
-        """Return the residuals [mm] of the contacts alone, and their Jacobian; a satisfied
+        """Return the residuals [mm] of the contacts alone, then their Jacobian; a satisfied
         inequality gives 0.
         """
         rows = self.contact_problem.constraints(state.points, state.tension, jet)
@@ -198,8 +212,10 @@ class JointProblem:
     def solve(
         self, configuration: Configuration, points: Float[Tensor, "g f 3"]
     ) -> tuple[Configuration, Float[Tensor, "k f 3"], Int[Tensor, "k"]]:
-        """Optimise hands and contacts together; return configurations, contacts and indices of
+        """Return the optimised hands, then their contacts (k, f, 3), then the indices of the k
         grasps of low cost.
+
+        `configuration` and the normalised `points` are those at the start.
         """
         own = self
         largest = self.contact_problem.spec.flatness
@@ -235,6 +251,8 @@ def solve_sliding(
 ) -> None:
     """Optimise hand and contacts together for each unsolved contact set, and add the checked grasps
     to `attempts`.
+
+    The first `SLIDING.seeds` seeds of each set are tried.
     """
     chosen = attempts.choose(seeds, rank_in_group(seeds.row), 0, SLIDING.seeds)
     size = min(at_once(chosen.row, SLIDING.rows), SLIDING.most_rows)
@@ -260,11 +278,11 @@ def solve_sliding(
 def solve_joint(
     problem: GraspProblem, seeds: IKSeeds, shape: ShapeLike, spec: ContactSpec
 ) -> Grasps:
-    """Optimise a hand posture for each contact set that has seeds; return the checked grasps, best
-    first.
+    """Return checked grasps of the contact sets that have seeds, best first; contacts may slide.
 
     Seeds are tried in their order. If the hand cannot reach the contacts, they slide along the
-    surface and are certified anew. If they fail, the grasp has the `Status` of the contact planner.
+    surface of the `shape` and are certified anew under `spec`. If they fail, the grasp has the
+    `Status` of the contact planner.
 
     >>> from torchgrasp import fit_shape, load_hand, load_object
     >>> from torchgrasp.ik import CollisionWorld, PostureLibrary, nearest_postures

@@ -1,5 +1,7 @@
 """Clearance of a grasp's motion: the straight approach of the opened hand, the closing and the
 lift.
+
+g counts hands, s their collision spheres. A clearance is negative if there is a collision.
 """
 
 import dataclasses
@@ -28,38 +30,38 @@ UP = torch.tensor([0.0, 0.0, 1.0], device="cpu")
 
 @dataclasses.dataclass(frozen=True)
 class MotionNumbers:
-    """The numbers of the opened hand's pose, its approaches and its lift."""
+    """Numbers of the opened hand's pose, its approaches and its lift."""
 
     gap: float = 0.001
     """Clearance [m] from the table of a hand that is raised."""
     most: float = 0.03
-    """Greatest rise [m]."""
+    """Greatest rise [m] of a hand above its pose."""
     tilt: float = math.radians(45)
     """Angle [rad] of the tilted approaches from the hand's axis."""
     tilted: int = 8
     """Number of tilted approaches, at equal angles about the axis."""
     nodes: float = 1.2
-    """Grid spacings by which the nearest node may be wrong about a clearance."""
+    """Largest error of a clearance at the nearest grid node, in grid spacings."""
     closing_steps: int = 6
-    """Postures of the closing hand that are checked."""
+    """Number of postures of the closing hand that are checked."""
     lift_steps: int = 6
-    """Heights of the lift that are checked."""
+    """Number of heights of the lift that are checked."""
     lift: float = 0.1
     """Height [m] of the lift."""
 
 
 MOTION = MotionNumbers()
-Spheres = Float[Tensor, "g s 3"]
 
 
 def find_approach(
     hand: Hand, opened: Configuration, world: CollisionWorld
 ) -> tuple[Float[Tensor, "g 3"], Float[Tensor, "g"]]:
-    """Return for each opened hand the direction of a straight approach, and the least clearance [m]
-    on its path.
+    """Return a unit direction of a straight approach for each opened hand, then the least clearance
+    [m] on its path.
 
     Candidate directions are tried by falling approximate clearance. The first direction without a
-    collision is chosen; if there is none, the direction of the largest clearance.
+    collision is chosen; if there is none, the direction of the largest clearance. Directions are in
+    the object's frame.
     """
     spheres = hand.collision_spheres
     centres = SpatialJacobian.at(hand, opened).sphere_centres
@@ -88,11 +90,12 @@ def opened_pose(
     obj_from_hand: Float[Tensor, "g 4 4"],
     table: Plane | None,
 ) -> Float[Tensor, "g 4 4"]:
-    """Return the pose in which an opened hand comes to its grasp: raised where links would be in
-    the table.
+    """Return the pose [m] in which an opened hand comes to its grasp: raised where links would be
+    in the table.
 
-    Coupled fingers that open may go down, too. A hand that would have to rise by more than 30 mm
-    stays in the table.
+    Coupled fingers can move towards the table as they open. A hand that would have to rise by more
+    than 30 mm is not raised. `joints` [rad] are those of the opened hand, `obj_from_hand` [m] the
+    pose of the grasp.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -117,8 +120,8 @@ def opened_pose(
 def approach_directions(
     hand: Hand, opened: Configuration, table: Plane | None
 ) -> Float[Tensor, "g k 3"]:
-    """Return k candidate approach directions in the object's frame: the hand's axis, tilted axes,
-    down onto a table.
+    """Return k unit candidate directions in the object's frame: the hand's axis, tilted axes, down
+    onto a table.
     """
     pose = opened.obj_from_hand
     axis = unit(hand.approach.to(pose))
@@ -137,7 +140,7 @@ def approach_directions(
 
 
 def _clearance(
-    centres: Spheres,
+    centres: Float[Tensor, "g s 3"],
     radius: Float[Tensor, "s"],
     direction: Float[Tensor, "g 3"],
     world: CollisionWorld,
@@ -167,7 +170,7 @@ def _clearance(
 
 
 def _approach(
-    centres: Spheres, direction: Float[Tensor, "g 3"], steps: int
+    centres: Float[Tensor, "g s 3"], direction: Float[Tensor, "g 3"], steps: int
 ) -> Float[Tensor, "g k s 3"]:
     """Return the centres [m] of a hand's spheres at k equal steps back along its approach."""
     step = torch.arange(1, steps + 1, device=centres.device).to(centres)
@@ -180,6 +183,9 @@ def motion_clearance(
 ) -> Float[Tensor, "g"]:
     """Return the least clearance [m] of each hand from obstacles while the hand closes and is
     lifted.
+
+    The `world` must have obstacles. `closed` and `opened` are the configurations of the grasp and
+    of the opened hand.
     """
     assert world.obstacles is not None
     up = UP if world.plane is None else world.plane.normal
@@ -192,7 +198,7 @@ def motion_clearance(
 def collision_probability(
     hand: Hand, grasps: Grasps, obstacles: Obstacles, table: Plane | None
 ) -> Float[Tensor, "g"]:
-    """Return for each grasp the probability that the hand hits an obstacle during approach, closing
+    """Return the probability that the hand of each grasp hits an obstacle during approach, closing
     and lift along z.
 
     The hand comes to its opened pose above the `table`. The probability is the largest occupancy
@@ -211,7 +217,10 @@ def collision_probability(
 @checked
 def lift_clearance(vertices: Float[Tensor, "v 3"], obstacles: Obstacles) -> float:
     """Return the least clearance [m] of the lifted object from obstacles; far below 0 if an
-    obstacle lies on it.
+    obstacle is on it.
+
+    `vertices` [m] are those of the object, which is lifted along z; without any, the clearance is
+    infinite.
     """
     if not len(vertices):
         return math.inf

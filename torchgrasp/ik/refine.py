@@ -2,8 +2,9 @@
 Levenberg-Marquardt.
 
 The centre of a round fingertip is one radius away from its contact, so that the tip may roll.
-Fingertips of other shapes touch with a fixed point. The contact direction stays inside a cone about
-the pad's axis.
+Fingertips of other shapes touch with a fixed point. The contact direction, the inward normal, stays
+inside a cone about the pad's axis. g counts configurations, f fingertips; contacts are in the order
+of the fingers.
 """
 
 import dataclasses
@@ -28,12 +29,12 @@ ITERATIONS = 30  # most steps of one refinement
 
 @dataclasses.dataclass(frozen=True)
 class OpeningNumbers:
-    """The numbers of the opened hand."""
+    """Numbers of the opened hand."""
 
     gap: float = 0.012
     """Distance [m] that each tip moves off its contact on a certain surface."""
     deviations: float = 3.0
-    """Standard deviations of the surface that it moves on."""
+    """Standard deviations of the surface by which it moves farther."""
     solved: float = 1.0
     """Sum of squared residuals [mm2] of an opened hand: half a millimetre at a tip."""
     steps: int = 12
@@ -45,7 +46,7 @@ OPENING = OpeningNumbers()
 
 def tip_targets(hand: Hand, contacts: Contacts) -> Float[Tensor, "g f 3"]:
     """Return the positions [m] of the fingertip centres when the tips touch: one radius from the
-    contacts.
+    contacts, outward.
     """
     return contacts.points + hand.tips.radius.to(contacts.normals)[:, None] * contacts.normals
 
@@ -53,8 +54,11 @@ def tip_targets(hand: Hand, contacts: Contacts) -> Float[Tensor, "g f 3"]:
 def tip_rows(
     spatial: SpatialJacobian, target: Float[Tensor, "g f 3"], normals: Float[Tensor, "g f 3"]
 ) -> ResidualRows:
-    """Return the fingertips' residuals: three for each tip's position error, then one for each
+    """Return the residuals of fingertips: three [mm] for each position error, then one for each
     contact direction.
+
+    They are weighted by `TIP_WEIGHT` and `PAD_WEIGHT`. `target` [m] holds the wanted centres of the
+    tips, and `normals` the outward unit normals at their contacts.
     """
     tips = spatial.hand.tips
     motion = spatial.hand.motion
@@ -86,11 +90,12 @@ def grasp_residuals(
     world: CollisionWorld | None,
     tips_touch: bool,
 ) -> Residuals:
-    """Return the residuals of tip positions, pad directions and, with a `world`, clearances; and
+    """Return the residuals of tip positions, pad directions and, with a `world`, clearances; then
     their Jacobian.
 
-    `target` holds the wanted tip centres [m]. With `tips_touch` the fingertips may touch the
-    object.
+    `target` [m] holds the wanted tip centres, and `normals` the outward unit normals at the
+    contacts. With `tips_touch` the fingertips may touch the object. The Jacobian is by the hand's
+    pose (6) and joints.
     """
     spatial = SpatialJacobian.at(hand, configuration)
     links = [] if world is None else clearance_rows(spatial, world, tips_touch)
@@ -105,11 +110,11 @@ def refine(
     solved: float = SOLVED,
     steps: int = ITERATIONS,
 ) -> Configuration:
-    """Move hand configurations until finger i touches contact i and, with a `world`, links are
-    clear, if possible.
+    """Return hand configurations moved so that finger i touches contact i and, with a `world`,
+    links are clear.
 
-    A configuration is done when its sum of squared residuals [mm2] is below `solved`, or after
-    `steps` steps.
+    This may fail. A configuration is done when its sum of squared residuals [mm2] is below
+    `solved`, or after `steps` steps.
     """
     target = tip_targets(hand, contacts)
     normals = contacts.normals
@@ -125,8 +130,11 @@ def refine(
 def open_hand(
     hand: Hand, grasp: Configuration, contacts: Contacts, world: CollisionWorld
 ) -> Float[Tensor, "g h"]:
-    """Return the joints [rad] of the opened hand: each tip moves off its contact along the normal;
-    links keep clear.
+    """Return the joints [rad] of the opened hand: each tip is moved off its contact along the
+    normal.
+
+    The links keep clear of the `world`, and the hand's pose stays that of the `grasp`. Raises
+    `BadArgument` if the contacts lack `std_m`.
     """
     normals = contacts.normals
     gap = OPENING.gap + OPENING.deviations * contacts.require_std()

@@ -2,7 +2,8 @@
 learned model.
 
 One matrix product compares all contact sets with thousands of postures. Clearances rank the nearest
-postures.
+postures. r counts contact sets, p assignments of contacts to fingers, s postures, f fingertips, and
+d = 6 f numbers of a feature vector.
 """
 
 import dataclasses
@@ -35,36 +36,33 @@ from torchgrasp.posture_model.mixture import DEFAULT_ENERGY, GraspMixture, check
 from torchgrasp.posture_model.sample import sample_configurations
 from torchgrasp.values.planning import Contacts, IKSeeds
 
-Wanted = Float[Tensor, "r p d"]
-Given = Float[Tensor, "s d"]
-
 
 @dataclasses.dataclass(frozen=True)
 class SeedNumbers:
-    """The numbers of the search for initial guesses."""
+    """Numbers of the search for seeds."""
 
     length_scale: float = 0.01
-    """Distance of tip centres [m] that counts as much as `cosine_scale`."""
+    """Difference of tip centres [m] that counts as much as `cosine_scale`."""
     cosine_scale: float = 0.5
-    """Distance of pad axes that counts as much as `length_scale`."""
+    """Difference of unit pad axes that counts as much as `length_scale`."""
     postures: int = 5000
-    """Random postures in the library of a hand with three fingers."""
+    """Number of random postures in the library of a hand with three fingers."""
     many_postures: int = 20_000
-    """The same for a hand with more fingers, whose contact sets have more shapes."""
+    """This number for a hand with more fingers, whose contact sets have more shapes."""
     candidates: int = 64
-    """Nearest postures of a row whose clearances are measured; also the most seeds of a row."""
+    """Number of nearest postures of a contact set that are checked for clearance."""
     assignments: int = 6
-    """Assignments of contacts to fingers in which a row is compared with the whole library."""
+    """Number of assignments in which a contact set is compared with the whole library."""
     compared: int = 500
-    """Postures of the library that choose these assignments."""
+    """Number of postures of the library by which these assignments are chosen."""
     spare: int = 3
-    """Times as many postures as seeds that an arm is asked for."""
+    """Ratio of the postures whose reachability is asked for to the wanted seeds."""
     wrong_side: float = 0.3
     """Mean cosine of the normals of tips and contacts above which a seed touches from inside."""
     rows: int = 64
-    """Contact sets that are compared with the library at a time, which bounds the memory."""
+    """Number of contact sets that are compared with the library at a time, to bound the memory."""
     queried: int = 256
-    """Contact sets that are asked of the model at a time: they stay in the cache."""
+    """Number of contact sets that are given to the model at a time: they stay in the cache."""
 
 
 SEEDS = SeedNumbers()
@@ -73,11 +71,14 @@ SEEDS = SeedNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class PostureLibrary(Value):
-    """Random postures of a hand, prepared for quick comparison of their fingertips with contact
+    """s random postures of a hand, prepared for quick comparison of their fingertips with contact
     sets.
 
-    The fingertip centres [m] of each posture are given in a frame that they define themselves
-    (`tips_frame`).
+    `joints` [rad] are the actuated joints. The fingertips of each posture define a frame
+    (`tips_frame`): `vf_from_hand` [m] is the hand's pose in it, and `centres` [m] are the centres
+    of the fingertips in it. `feature` (s, 6 f) holds the `feature` vectors, without unit. `spheres`
+    [m] are the centres of the k collision spheres in the hand's frame. Raises `BadArgument` for
+    numbers of joints, tips or spheres that are not the hand's.
 
     >>> from torchgrasp import load_hand
     >>> library = PostureLibrary.of(load_hand("barrett"), count=200)
@@ -89,7 +90,7 @@ class PostureLibrary(Value):
     joints: Float[Tensor, "s h"]
     vf_from_hand: Float[Tensor, "s 4 4"]
     centres: Float[Tensor, "s f 3"]
-    feature: Given
+    feature: Float[Tensor, "s d"]
     spheres: Float[Tensor, "s k 3"]
 
     def __post_init__(self) -> None:
@@ -108,8 +109,10 @@ class PostureLibrary(Value):
     @classmethod
     @checked
     def of(cls, hand: Hand, count: Count | None = None, seed: Seed = 0) -> "PostureLibrary":
-        """Draw random postures within limits and without self-collision; the hand caches the last
-        library of a size.
+        """Return random postures within the joint limits and without self-collision.
+
+        `count` postures are drawn; None means `SEEDS.postures`, or `SEEDS.many_postures` for more
+        than three fingers. The hand caches the last library of each count.
         """
         if count is None:
             count = SEEDS.postures if len(hand.tips) == 3 else SEEDS.many_postures
@@ -120,7 +123,7 @@ class PostureLibrary(Value):
 
     @classmethod
     def _drawn(cls, hand: Hand, count: int, seed: int) -> "PostureLibrary":
-        """Draw `count` random postures; postures whose fingertips lie on a line are left out."""
+        """Return `count` random postures without those whose fingertips are on a line."""
         joints = sample_configurations(hand, count, seed).joints.to(
             hand.lower.device, torch.float64
         )
@@ -141,8 +144,8 @@ class PostureLibrary(Value):
 
 
 def triangle_of(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 3 3"]:
-    """Return a triangle for three to five points: the first point, the centroid of the middle
-    points, and the last.
+    """Return a triangle for three to five points [m]: the first, the centroid of the middle ones,
+    and the last.
     """
     if points.shape[-2] == 3:
         return points
@@ -151,7 +154,7 @@ def triangle_of(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 3 3"]:
 
 
 def tips_frame(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 4 4"]:
-    """Return the frame of three to five points, with the origin at their centroid.
+    """Return the frame [m] of three to five points, with the origin at their centroid.
 
     Its axes are those of the `virtual_frame` of three points: the given ones, or for more than
     three points the corners of the triangle that `triangle_of` returns.
@@ -162,7 +165,11 @@ def tips_frame(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b 4 4"]:
 def feature(
     centres: Float[Tensor, "*b f 3"], pads: Float[Tensor, "*b f 3"]
 ) -> Float[Tensor, "*b d"]:
-    """Return the feature vector of a posture: tip centres and pad axes, each divided by its scale."""
+    """Return the feature vector (d = 6 f) of a posture: tip centres and pad axes, each divided by
+    its scale.
+
+    `centres` [m] and the unit vectors `pads` are in the frame of `tips_frame`.
+    """
     scaled = torch.cat([centres / SEEDS.length_scale, pads / SEEDS.cosine_scale], -1)
     return scaled.flatten(-2).float()
 
@@ -175,15 +182,18 @@ def nearest_postures(
     n_seeds: Count = 8,
     reachable: Reachable | None = None,
 ) -> IKSeeds:
-    """Return the library postures that fit contact sets best, as initial guesses (seeds) placed on
-    the contacts.
+    """Return the postures of the `library` that fit contact sets best, as seeds placed on the
+    contacts.
 
     Each contact set has at most `n_seeds` seeds, best first, or none if its contacts lie on a line.
     The seeds are in the order of the contact sets; Eq. (24) gives their poses. `energy` is half the
-    squared distance between the features of posture and contacts. If the arm cannot reach a pose,
-    the next posture takes its place. Raises `BadArgument` for `n_seeds` that are not in [1, 64], or
-    above six times the number of postures. Contacts on another device than the library, or of
-    another number than fingertips, are refused, too.
+    squared distance between the features of posture and contacts. The `world` ranks them by
+    clearance. If the arm cannot reach a pose by `reachable`, the next posture takes its place; None
+    means that it reaches all.
+
+    Raises `BadArgument` for `n_seeds` that are not in [1, 64], or above six times the number of
+    postures, and for contacts on another device than the library, or of another number than
+    fingertips.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -255,8 +265,8 @@ def nearest_postures(
 
 def _describe(
     centres: Float[Tensor, "r p f 3"], inward: Float[Tensor, "r p f 3"], framed: Bool[Tensor, "r p"]
-) -> tuple[Float[Tensor, "r p 4 4"], Wanted]:
-    """Return frame and features of r contact sets for p assignments to fingers, valid where
+) -> tuple[Float[Tensor, "r p 4 4"], Float[Tensor, "r p d"]]:
+    """Return frames [m], then features of r contact sets for p assignments to fingers, valid where
     `framed` is true.
     """
     stand_in = eye_like(3, centres)
@@ -266,7 +276,9 @@ def _describe(
     return obj_from_vf, feature(apply(vf_from_obj, centres), rotate(vf_from_obj, inward))
 
 
-def _energies(wanted: Wanted, given: Given, framed: Bool[Tensor, "r p"]) -> Float[Tensor, "r p s"]:
+def _energies(
+    wanted: Float[Tensor, "r p d"], given: Float[Tensor, "s d"], framed: Bool[Tensor, "r p"]
+) -> Float[Tensor, "r p s"]:
     """Return half the squared distance between the features of contacts and postures; infinite
     where not `framed`.
     """
@@ -276,10 +288,10 @@ def _energies(wanted: Wanted, given: Given, framed: Bool[Tensor, "r p"]) -> Floa
 
 
 def _likely_assignments(
-    wanted: Wanted, given: Given, framed: Bool[Tensor, "r p"]
+    wanted: Float[Tensor, "r p d"], given: Float[Tensor, "s d"], framed: Bool[Tensor, "r p"]
 ) -> Int[Tensor, "r a"]:
-    """Return the indices of the assignments of contacts to fingers with features nearest to one of
-    the first postures.
+    """Return the indices of the a assignments of contacts to fingers whose features are nearest to
+    one of the first postures.
     """
     if wanted.shape[1] <= SEEDS.assignments:
         return torch.arange(wanted.shape[1], device=wanted.device).expand(len(wanted), -1)
@@ -295,15 +307,15 @@ def query_mixture(
     n_seeds: Count = 8,
     max_energy: Positive = DEFAULT_ENERGY,
 ) -> IKSeeds:
-    """Return initial guesses (seeds) for sets of three contacts from the learned model, Eqs.
-    (21)-(24) of the paper.
+    """Return seeds for sets of three contacts from the learned model `mixture`, Eqs. (21)-(24) of
+    the paper.
 
     An assignment of contacts to fingers is reachable if its energy (Eq. 21) is below `max_energy`.
     Each reachable assignment gives `n_seeds` seeds: the mean joints given the contacts (Eq. 23),
     and the mean joints of the most responsible components. The seeds of a contact set are sorted:
     seeds that touch the surface from outside come first, then by tip error. A contact set without a
-    reachable assignment has no seeds. A model of another hand, joint limits or fingertips is a
-    `BadArgument`.
+    reachable assignment has no seeds. Raises `BadArgument` for a model of another hand, joint
+    limits or fingertips.
     """
     check_compatible(mixture.meta, mixture.joint_names, hand)
     check_whole("n_seeds", n_seeds, 1, len(mixture.weights) + 1)

@@ -1,6 +1,7 @@
 """Inverse kinematics of given contacts: joints and pose of a hand that touches nothing else.
 
-Seeds of the learned model are tried first (Eqs. 21-24), then the nearest random postures.
+Seeds (initial guesses) of the learned model are tried first (Eqs. 21-24), then the nearest random
+postures.
 """
 
 import dataclasses
@@ -32,20 +33,20 @@ Method = Literal["levenberg_marquardt", "cobyla"]
 
 @dataclasses.dataclass(frozen=True)
 class SolveNumbers:
-    """The numbers of the solver for given contacts."""
+    """Numbers of the solver for given contacts."""
 
     solved: float = 1e-6
     """Sum of squared residuals [mm2] at which a seed is done."""
     exact: float = 5e-5
     """Largest tip error [m] of a solution that ends the search."""
     library_seeds: int = 8
-    """Seeds of a contact set from the library."""
+    """Number of seeds of a contact set from the library."""
     learned_seeds: int = 2
-    """Seeds of a reachable assignment from the model: the mean and one component."""
+    """Number of seeds of a reachable assignment from the model: the mean and one component."""
     learned_tries: int = 4
-    """Seeds of a contact set from the model that are refined."""
+    """Number of seeds of a contact set from the model that are refined."""
     part: int = 512
-    """Seeds that are refined at a time: their temporaries stay in the cache."""
+    """Number of seeds that are refined at a time: their temporaries stay in the cache."""
 
 
 SOLVING = SolveNumbers()
@@ -54,11 +55,14 @@ SOLVING = SolveNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class IKSolution(Batch):
-    """A hand configuration for each contact set; finger i touches contact `permutation[:, i]`.
+    """The hand configurations that were found for b contact sets, one for each.
 
-    `tip_error` [m] is each tip's distance from its contact, `normal_angle` [rad] the contact's
-    angle from the pad's axis, and `clearance` [m] the least clearance of the links. `attempts`
-    counts the initial guesses (seeds) that were refined. A contact set without seeds has NaN.
+    `joints` [rad] are the actuated joints, `obj_from_hand` [m] the hand's pose in the frame of the
+    contacts. Finger i touches contact `permutation[:, i]`. `tip_error` [m] is each tip's distance
+    from its contact, `normal_angle` [rad] the angle of the contact direction (the inward normal)
+    from the pad's axis, and `clearance` [m] the least clearance of the links. `attempts` counts the
+    seeds that were refined. `status` is the `Status` of the first error out of tolerance. A contact
+    set without seeds has NaN.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -95,19 +99,18 @@ def solve_ik(
     than three fingertips it refuses a mixture and COBYLA.
 
     Args:
-        contacts: b contact sets, one contact for each fingertip; `std_m` and `variance` are not
-            used.
-        mixture: the hand's learned model; without it, all initial guesses come from `library`.
-        world: object, table and obstacles that the links must not touch; by default, only
+        hand: the hand.
+        contacts: b contact sets, each of one contact [m] for each fingertip; `std_m` and `variance`
+            are not used.
+        mixture: the hand's learned model; None means that all initial guesses come from `library`.
+        world: object, table and obstacles that the links must not touch; None means that only
             self-collision counts.
         method: "cobyla" is the paper's method (Sec. 6.3), which brings each tip's contact point to
             its contact and ignores the contact directions.
-        library: the hand's random postures; by default they are drawn when they are needed.
+        library: the hand's random postures; None means that they are drawn when they are needed.
 
-    Returns:
-        The best configuration for each contact set. With `Status.OK` every tip is within 1 mm of
-            its contact, every
-        contact direction is inside its pad's cone, and every link is clear.
+    The result has the best configuration for each contact set. With `Status.OK` every tip is within
+    1 mm of its contact, every contact direction is inside its pad's cone, and every link is clear.
 
     >>> from torchgrasp.hand.load import load_hand
     >>> points = 0.05 * torch.eye(3)[None].double()
@@ -160,8 +163,8 @@ def solve_ik(
 def _refine_seeds(
     hand: Hand, contacts: Contacts, world: CollisionWorld, method: Method, seeds: IKSeeds
 ) -> IKSolution:
-    """Refine seeds onto their contacts by the given method, and measure the resulting
-    configurations.
+    """Return the measured configurations of seeds that were refined onto their contacts by the
+    given `method`.
     """
     refined = refine_exactly
     rolling = True
@@ -184,8 +187,8 @@ def _refine_seeds(
 def refine_exactly(
     hand: Hand, start: Configuration, contacts: Contacts, world: CollisionWorld
 ) -> Configuration:
-    """Refine configurations with a margin of clearance, then without; keep the second result where
-    links stay clear.
+    """Return configurations refined with a margin of clearance, then without it where links stay
+    clear.
     """
     refined = refine(hand, start, contacts, world, SOLVING.solved)
     settled = refine(hand, refined, contacts, None, SOLVING.solved)
