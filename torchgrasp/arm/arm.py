@@ -111,8 +111,8 @@ class Arm(Value):
 
     @checked
     def tip_poses(self, obj_from_hand: Float[Tensor, "k 4 4"]) -> TipPoses:
-        """Return the poses (3, 4, k) [m] of the tip in the base's frame that put the hand at given
-        poses [m].
+        """Return the poses (3, 4, k) [m] of the tip, in the base's frame, for which the hand is at
+        `obj_from_hand` [m].
         """
         base_from_hand = inverse(self.obj_from_base) @ obj_from_hand.to(self.lower)
         base_from_tip = base_from_hand @ inverse(self.tip_from_hand)
@@ -180,7 +180,7 @@ def load_arm(
     """Load a robot arm that carries a hand from the arm's URDF, for `plan_grasps`.
 
     Args:
-        urdf: path of the file; a joint without limits gets one turn either way.
+        urdf: path of the file; a joint without limits gets [-2 pi, 2 pi] rad.
         hand: the hand on the arm, or its name or folder.
         tip: the link that carries the hand; None means the one that most joints move, the last of
             equals.

@@ -140,8 +140,7 @@ def follow_grasps(
 def way_of(
     hand: Hand, grasps: Grasps, world: CollisionWorld, up: Float[Tensor, "3"] = UP
 ) -> Float[Tensor, "g w 4 4"]:
-    """Return the hand's poses [m] on its way: in the first half it is opened, in the second half it
-    has closed.
+    """Return the w poses [m] of the hand on its way through each grasp: first opened, then closed.
 
     It is lifted along the normal of the world's table, or along the unit vector `up` without a
     table.
@@ -165,7 +164,7 @@ def track(
 
     `start` are the postures at the grasps, one in each column, and `tips` the poses (3 x 4) [m] of
     the tip in the base's frame at all w places. On a way without a jump every pose is reached, and
-    no joint turns faster than it can at the hand's speed.
+    no joint moves faster than it can at the hand's speed.
     """
     at = COARSE_STEPS + 1
     path = {at: start}

@@ -58,9 +58,9 @@ class GraspController:
 
     Args:
         reference: the closing plan.
-        closing: the closing mode, as in `TrialSpec`.
-        holding: the holding mode, as in `TrialSpec`; None means "grip", or "force" where the
-            closing mode or the sensor does not allow "grip".
+        closing: the closing mode, such as "uncertainty" or "paper"; `TrialSpec` explains all.
+        holding: the holding mode, such as "grip" or "force"; `TrialSpec` explains all. None means
+            "grip", or "force" where the closing mode or the sensor does not allow "grip".
         options: options of the closing; None means all on, or all off for a mode without options.
         approach: remaining length [m] of the approach; it is 0 if the hand is at its pre-grasp.
 
@@ -124,7 +124,7 @@ class GraspController:
 
     @property
     def approaching(self) -> bool:
-        """Whether the hand is still on its way to the pre-grasp."""
+        """Whether the opened hand is still on its way to the pre-grasp."""
         return self.guard is not None
 
     @property
@@ -136,10 +136,10 @@ class GraspController:
 
     @property
     def status(self) -> Status:
-        """The hold's status: `OK`, or `TOO_HEAVY` if the mode "grip" feels more load than the hand
+        """The hold's status: `OK`, or `TOO_HEAVY` if the mode "grip" senses more load than the hand
         can hold.
 
-        The object should then be put down.
+        The hand should then set the object down.
         """
         return self.hold.status if isinstance(self.hold, GripHold) else Status.OK
 
@@ -160,8 +160,8 @@ class GraspController:
     def relook(self, cloud: PointCloud) -> None:
         """Shift the approach so that it ends at the object as a new view shows it.
 
-        `targets.palm` [m] then holds the shift at which the path begins. The palm does not rotate,
-        so the contacts of a turned object are found by touch.
+        `targets.palm` [m] then is the displacement at which the new path begins. The palm does not
+        rotate, so the contacts of a turned object are found by touch.
 
         The `cloud` has points [m] of the object alone, in the frame of the grasp. Raises
         `BadArgument` if the hand has no approach, or has begun it.
@@ -182,11 +182,12 @@ class GraspController:
 
     @checked
     def step(self, observation: Observation, period: Period) -> Targets:
-        """Return the targets of joints and palm for the next tick, which comes `period` [s] later.
+        """Return the targets of joints [rad] and palm [m] for the next tick, which comes `period`
+        [s] later.
 
-        In the tick in which the closing ends, the targets do not change: that tick computes the
-        forces of holding. Raises `BadArgument` for an observation of another hand or on a device
-        other than the CPU, or a period out of range.
+        In the tick in which the closing ends, the targets do not change: this tick only prepares
+        the hold. Raises `BadArgument` for an observation of another hand or on a device other than
+        the CPU, or a period out of range.
         """
         shape = len(self.reference.normals), 3, len(self.targets.joints)
         found = tuple(observation.jacobian.shape)

@@ -166,8 +166,8 @@ def stiff_drives(hand: Hand, kp: float | None) -> dict[str, Actuator]:
 
 
 def drive_stiffness(hand: Hand, kp: float | None = None) -> Float[Tensor, " j"]:
-    """Return the drive stiffness [N m/rad] of each of the j joints of the URDF: `kp` if given, else
-    the hand's own.
+    """Return the drive stiffness [N m/rad] of each joint of the URDF: `kp` if given, else the
+    hand's own.
     """
     drives = stiff_drives(hand, kp)
     kps = [drives[name].kp for name in hand.tree.joint_names]

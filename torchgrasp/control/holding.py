@@ -48,7 +48,7 @@ class FrictionNumbers:
 
 @dataclasses.dataclass(frozen=True)
 class GripNumbers:
-    """Numbers of the hold "grip", which carries the felt load."""
+    """Numbers of the hold "grip", which carries the sensed load."""
 
     least_push: float = 0.4
     """Least normal force [N] of a finger: four standard deviations of its reading."""
@@ -428,8 +428,8 @@ class GripHold:
 def push_reserve(
     contacts: Balance, normals: np.ndarray, arm: np.ndarray, friction: float
 ) -> np.ndarray:
-    """Return the normal force (f,) [N] that each finger needs in addition against a push of 1 N
-    from the worst side.
+    """Return the extra normal force (f,) [N] of each finger against a push of 1 N from the worst
+    side.
 
     With it, the force of the finger stays in its cone of the coefficient `friction`. The push acts
     at `arm` (3,) [m] from the middle of the `contacts`, whose outward unit `normals` are (f, 3).

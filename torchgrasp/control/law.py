@@ -36,8 +36,8 @@ def surface_covariance(
     """Return the covariance [m^2] of each contact's position in the closing "uncertainty": n n^T
     s^2 + floor^2 I.
 
-    n is the contact's normal and s its standard deviation `std_m` [m]. The floor is
-    `POSITION_FLOOR` [m], of the hand's own errors, which are equal in all directions.
+    n is the contact's normal, from `normals`, and s its standard deviation `std_m` [m]. The floor
+    is `POSITION_FLOOR` [m], of the hand's own errors, which are equal in all directions.
     """
     return _normal_covariance(normals, std_m, POSITION_FLOOR)
 
@@ -63,8 +63,8 @@ def force_covariance(
     """Return the covariance [N^2] of each contact force (Sigma_fd, Eq. 28 of the paper).
 
     It is the variance of the normal force along the normal, plus the sensor's variance, equal in
-    all directions. `forces` [N] are the desired ones. `deviation` [N] is the standard deviation of
-    each normal force; None means a tenth of the force.
+    all directions. `forces` [N] are the desired ones, and `normals` those of the contacts.
+    `deviation` [N] is the standard deviation of each normal force; None means a tenth of the force.
     """
     if deviation is None:
         deviation = FORCE_SHARE * (forces * normals).sum(-1)
@@ -161,7 +161,7 @@ def tip_velocity(
 def stay_above(
     velocity: Float[Tensor, "*b 3"], height: Float[Tensor, "*b"], up: Float[Tensor, "3"]
 ) -> Float[Tensor, "*b 3"]:
-    """Return the fingertip velocities [m/s], slowed downwards so that no fingertip enters the
+    """Return each fingertip's `velocity` [m/s], slowed downwards so that no fingertip enters the
     table.
 
     `height` [m] is that of each fingertip over the table, and `up` the table's unit normal.

@@ -249,8 +249,8 @@ class _Barrier:
     def choose(
         self, tried: Float[Array, "g k"], friction: float, floor: Float[Array, "f"]
     ) -> Float[Array, " k"]:
-        """Return the best of g coordinates z; if none is feasible, raise friction and lower floors
-        and reserves.
+        """Return the best of g coordinates z; if none is feasible, raise the friction coefficient
+        and lower floors and reserves.
         """
         push = tried @ self.push.T + self.push_0
         forces = self.forces(tried)

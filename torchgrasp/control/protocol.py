@@ -20,8 +20,8 @@ all joints.
 
 @runtime_checkable
 class Closing(Protocol):
-    """A controller that closes the fingers; a call takes an observation and the time [s] to the
-    next tick, as a `Step`.
+    """A controller that closes the fingers; a call is a `Step`: it returns the next targets [rad]
+    of all joints.
     """
 
     @property

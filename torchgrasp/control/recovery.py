@@ -161,7 +161,7 @@ class GuardedApproach:
 
     @property
     def done(self) -> bool:
-        """Whether the hand is at its pre-grasp."""
+        """Whether the hand has reached its pre-grasp."""
         return self.left <= 0.0
 
     def __call__(self, observation: Observation, period: float) -> None:
@@ -253,7 +253,7 @@ class GuardedApproach:
 
 
 class GraspCheck:
-    """Check of a pressing grasp before the lift: `judged` turns true when the result is known.
+    """Check of a pressing grasp before the lift: `judged` becomes true when the result is known.
 
     `secure` then says whether to lift. `displacement` (6,) holds the object's translation [m] and
     rotation [rad]: that of the closing, or one estimated anew from all touches if the plan has a
@@ -383,7 +383,7 @@ class Reopening:
 
 
 class LiftCheck:
-    """Check of a closed hand that rises and holds: `lost` turns true, and stays so, when it loses
+    """Check of a closed hand that rises and holds: `lost` becomes true, and stays so, when it loses
     the object.
 
     The object is lost if fewer than two fingertips touch, and these carry hardly any load along the

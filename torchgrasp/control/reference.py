@@ -219,7 +219,7 @@ class ClosingReference(Value):
 
     @checked
     def clamp(self, actuated: Float[Tensor, " h"]) -> Float[Tensor, " h"]:
-        """Return actuated joints [rad] clamped to their limits."""
+        """Return the `actuated` joints [rad] clamped to their limits."""
         return torch.minimum(torch.maximum(actuated, self.hand.lower), self.hand.upper)
 
     @checked
@@ -304,7 +304,9 @@ def closing_gains(
     """Return the target, gains and desired force of each finger for one grasp, in the hand's frame.
 
     The gains are those of the closing "uncertainty"; `ClosingReference.as_printed` has those that
-    the paper prints. Arguments and errors are as in `ClosingReference.from_grasp`.
+    the paper prints. `force` [N] is the normal force of the strongest finger. `stability` is a
+    model that chooses among balanced forces, or None. Errors are those of
+    `ClosingReference.from_grasp`.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp

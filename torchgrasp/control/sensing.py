@@ -1,5 +1,5 @@
-"""Simpler fingertip sensors than tactile ones: binary contact or joint torques, with delay, noise
-and dead sensors.
+"""Simpler fingertip sensors than tactile ones: binary contact or joint torques; and simulated
+sensors with delay, noise and failures.
 
 A robot with such sensors makes its `TactileState` with `feel_flags` or `feel_torques` instead of
 `measure`.

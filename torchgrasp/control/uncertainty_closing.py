@@ -83,11 +83,11 @@ class UncertaintyClosing:
       position error.
     * Before the first touch the fingers keep pace: all reach their contacts at the same time.
     * A finger without a working sensor rests at its estimated contact until the others touch. Then
-      it searches until its drives feel a contact, or until it is three standard deviations beyond
+      it searches until its drives sense a contact, or until it is three standard deviations beyond
       the contact.
     * Fingertips whose contacts are on the rim of a low object go down to the table, and slide along
       it to the object.
-    * A palm that begins above its planned pose (`ClosingReference.rise`) goes down as far as the
+    * A palm that starts above its planned pose (`ClosingReference.rise`) goes down as far as the
       fingers' arcs go up.
     * The options `wait`, `pose_estimate` and `palm_reach` of `ClosingOptions` act while the fingers
       close.
@@ -289,7 +289,7 @@ def slide_along(
     up: Float[Tensor, "3"],
     low: Bool[Tensor, "f"],
 ) -> Float[Tensor, "f 3"]:
-    """Return the fingertip velocities [m/s], changed so that the `low` fingertips go down to the
+    """Return each fingertip's `velocity` [m/s], changed so that the `low` fingertips go down to the
     table and stay there.
 
     `height` [m] is that of each fingertip over the table, `up` the table's unit normal, and `low` a

@@ -173,7 +173,7 @@ def save_surface(surface: Surface, path: Path | str) -> Path:
 @checked
 def largest_std(surface: Surface) -> float:
     """Return the largest standard deviation [m] of the colour scale: the 99 % quantile over the
-    vertices.
+    surface's vertices.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> from torchgrasp.shape import extract_surface

@@ -297,8 +297,10 @@ def _principal(inertia: np.ndarray) -> dict[str, list[float]]:
 
 
 def describe_bodies(scene: SceneSpec) -> dict[str, Any]:
-    """Return what USD files need, by name: the convex parts of the object, and links and joints of
-    hand and mount.
+    """Return the values for USD files of a `scene`, by name: the object's convex parts, links and
+    joints of the hand.
+
+    The links and joints include those of the mount that carries the hand.
 
     All joints are at zero. Lengths are in metres, masses in kilograms. Raises `BadArgument` for
     names of links or joints that USD does not allow.

@@ -170,7 +170,7 @@ def rename_joints(hand: Hand, rename: Mapping[str, str] | None) -> dict[str, str
 
 
 def describe_pose(a_from_b: Float[Tensor, "4 4"]) -> dict[str, list[float]]:
-    """Return a pose [m] by name, as "position" [m] and unit "quaternion_wxyz"."""
+    """Return the pose `a_from_b` [m] by name, as "position" [m] and unit "quaternion_wxyz"."""
     return {"position": a_from_b[:3, 3].tolist(), "quaternion_wxyz": quaternion(a_from_b)}
 
 

@@ -76,7 +76,7 @@ def format_moveit(
 
     Raises `BadArgument` for joints of another hand, a force or stiffness that is not positive,
     unknown or equal names, or a grasp whose hand goes down while it closes (`opened_pose`), which a
-    message with one pose cannot tell.
+    message with one pose cannot express.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp

@@ -78,7 +78,7 @@ class CollisionSpheres(Value):
 
 
 def spheres_from_urdf(urdf: Urdf, spec: HandSpec) -> CollisionSpheres:
-    """Return spheres that cover every collision shape of a URDF; `spec` tells the grasping fingers
+    """Return spheres that cover every collision shape of a URDF; `spec` names the grasping fingers
     and their tips.
     """
     owner = {joint: i for i, f in enumerate(spec.fingers) for joint in f.joints}
@@ -102,8 +102,8 @@ def cover(shape: LinkShape, cell: float, bulge: float) -> tuple[list[Triple], fl
     """Return the centres [m] of spheres that cover a shape, in the frame of its link, then their
     one radius [m].
 
-    There is one sphere for each cell of about the edge `cell` [m]. No sphere stands out of a face
-    by more than `bulge` [m].
+    There is one sphere for each cell of about the edge `cell` [m]. Each sphere is moved inward
+    until it extends beyond a face by at most `bulge` [m].
     """
     if shape.kind == "sphere":
         return [shape.xyz], shape.size[0]

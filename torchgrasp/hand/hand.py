@@ -68,6 +68,8 @@ class Hand(Value):
 
     Positions [m] are in the frame of the palm, the URDF's root link. `approach` is the unit vector
     out of the palm. `actuators` holds the drive of every movable joint of the URDF, by name.
+    `collision_spheres` cover the links; `self_collision` holds their exact shapes. `source` says
+    from which files the hand was loaded.
 
     `chain` is the hand's model, a chain of pytorch-kinematics in which every movable joint is
     independent. `tree` and `tips` are compiled from its tensors, so do not change it in place.

@@ -50,8 +50,8 @@ class Pad(NamedTuple):
 
 
 class Finger(NamedTuple):
-    """A finger: its joints from the palm outward, the link of its tip, and the pad that touches
-    objects.
+    """A finger: `joints` from the palm outward, the link of its tip (`tip_link`), and the `pad`
+    that may touch objects.
     """
 
     name: str

@@ -29,8 +29,9 @@ Frames = Float[Tensor, "3 4 l n"]  # poses (3 x 4) of l links in n postures
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class KinematicTree(Value):
-    """The kinematic tree of a URDF, or a part of it, as tables; links and joints are in the order
-    of the file.
+    """The kinematic tree of a URDF, or a part of it, as tables.
+
+    Links (`link_names`) and movable joints (`joint_names`) are in the order of the file.
 
     `child[j]` is the index of the link that joint j moves, or 0 if it is outside this part; `axis`
     is the unit axis of each joint in that link's frame. `prismatic` is 1 for a sliding joint, and
@@ -68,7 +69,7 @@ class KinematicTree(Value):
     def frames(
         self, values: Float[Tensor, "j n"], root: Float[Tensor, "3 4 n"] | None = None
     ) -> Frames:
-        """Return every link's pose (3 x 4) [m] in the root's frame, given joint positions (j, n)
+        """Return every link's pose (3 x 4) [m] in the root's frame, given joint positions `values`
         [rad or m].
 
         If `root` gives the n poses of the root in another frame, the link poses are in that frame.
@@ -96,8 +97,8 @@ class KinematicTree(Value):
 
     @checked(gradients=True)
     def poses(self, values: Float[Tensor, "n j"]) -> Float[Tensor, "n l 4 4"]:
-        """Return the pose `root_from_link` [m] of every link, given n positions [rad or m] of all
-        movable joints.
+        """Return the pose `root_from_link` [m] of every link; `values` [rad or m] are n positions
+        of all movable joints.
         """
         frames = self.frames(values.T.contiguous())
         last = eye_like(4, frames)[3, :, None, None].expand(1, 4, *frames.shape[2:])
@@ -193,8 +194,10 @@ class FreeMotion(Value):
 def map_points(
     frames: Float[Tensor, "3 4 p n"], local: Float[Tensor, "p 3"]
 ) -> Float[Tensor, "3 p n"]:
-    """Return p points [m] in the root's frame, given a link frame (3 x 4) and the point in it,
-    `local` [m], for each.
+    """Return p points [m] in the root's frame.
+
+    `frames` holds a link frame (3 x 4) for each point in each of n postures, `local` [m] the point
+    in it.
     """
     return map_directions(frames, local) + frames[:, 3]
 
@@ -202,8 +205,10 @@ def map_points(
 def map_directions(
     frames: Float[Tensor, "3 4 p n"], local: Float[Tensor, "p 3"]
 ) -> Float[Tensor, "3 p n"]:
-    """Return p directions in the root's frame, given a link frame (3 x 4) and the direction in it,
-    `local`, for each.
+    """Return p directions in the root's frame, in the unit of `local`.
+
+    `frames` holds a link frame (3 x 4) for each direction in each of n postures, `local` the
+    direction in it.
     """
     x, y, z = local.to(frames)[:, :, None].unbind(1)
     mapped = torch.addcmul(frames[:, 0] * x, frames[:, 1], y)

@@ -29,7 +29,8 @@ def hands_folder() -> Path:
 
 @checked
 def find_hand(name_or_path: str | Path) -> Path:
-    """Return the folder of a hand, given a shipped hand's name, a folder or a hand.toml.
+    """Return the folder of a hand, given a shipped hand's name, a folder, or the path of a
+    hand.toml.
 
     Raises `HandFileError` if there is no such hand, or if a shipped hand's name is also a folder in
     the working directory.
@@ -64,10 +65,10 @@ def load_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
         name_or_path: a shipped hand, such as "allegro", "barrett", "leap" or "shadow", or the
             folder of another hand.
         fingers: the grasping fingers, as an option of hand.toml: "default", or for the Allegro
-            "four" (all) or "paper_literal" (index, middle and ring); or as a number, for the first
-            option with so many fingers; or as the names of three to five fingers in grasp order.
-            Joints of other fingers are parked where an option parks them, else at zero or the limit
-            nearest to zero.
+            "four" (all) or "paper_literal" (index, middle and ring); or as a number of fingers, for
+            the first option with this number; or as the names of three to five fingers in grasp
+            order. Joints of other fingers are parked where an option parks them, else at zero or
+            the limit nearest to zero.
 
     Raises `HandFileError` if a file is missing or malformed, or the two do not fit, and
     `BadArgument` for unknown fingers.

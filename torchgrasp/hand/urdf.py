@@ -108,8 +108,8 @@ class Joint:
 
     @property
     def rest(self) -> float:
-        """Position [rad or m] of the joint if it does not take part in a grasp: zero, or the limit
-        nearest to zero.
+        """Position [rad or m] of a joint that is not used in a grasp: zero, or the limit nearest to
+        zero.
         """
         return min(max(0.0, self.lower), self.upper)
 
@@ -137,7 +137,7 @@ class Urdf:
 
     @functools.cached_property
     def movable(self) -> tuple[Joint, ...]:
-        """The joints that are not fixed."""
+        """The joints that are not fixed, in the order of the file."""
         return tuple(j for j in self.joints if j.kind != "fixed")
 
     @checked

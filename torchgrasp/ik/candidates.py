@@ -50,9 +50,9 @@ class CheckNumbers:
     least_cosine: float = 1e-3
     """Least cosine between a force and the inward normal for which friction is computed."""
     offset: float = 0.02
-    """Offset [m] of contacts from the centre that costs as much as a friction coefficient of one."""
+    """Offset [m] of contacts from the centre that costs as much as a friction of one."""
     pad_angle: float = 0.8
-    """Angle [rad] off the pads that costs as much as a friction coefficient of one."""
+    """Angle [rad] off the pads that costs as much as a friction of one."""
 
 
 CHECKS = CheckNumbers()
@@ -76,8 +76,8 @@ class GraspProblem(Value):
             score higher.
         reachable: function that returns a mask of the hand poses that an arm can reach; None means
             that every pose is reachable.
-        descends: whether the hand may begin above its pose where its opened links would be in the
-            table (`opened_pose`).
+        descends: whether the opened hand may start above its pose where its opened links would be
+            in the table (`opened_pose`).
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -121,7 +121,8 @@ class GraspProblem(Value):
 
 
 def ask_reachable(reachable: Reachable, obj_from_hand: Float[Tensor, "k 4 4"]) -> Bool[Tensor, "k"]:
-    """Return a mask of the k hand poses [m] that the user's function `reachable` accepts.
+    """Return a mask of the k hand poses `obj_from_hand` [m] that the user's function `reachable`
+    accepts.
 
     Raises `BadArgument` for a malformed answer.
     """
@@ -144,7 +145,8 @@ def ask_reachable(reachable: Reachable, obj_from_hand: Float[Tensor, "k 4 4"]) -
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspCandidates(Batch):
-    """g hand configurations to check, each with its contacts, in the order of the fingers.
+    """Hand configurations to check, g in number, each with its contacts in the order of the
+    fingers.
 
     `certificate` is that of the contacts, and `status` the `Status` of contact planning. Finger i
     touches contact `permutation[:, i]` of the planned contact set.

@@ -211,8 +211,8 @@ def clearance_rows(
 ) -> list[ResidualRows]:
     """Return residuals [mm]: by how much the smallest clearances are less than wanted.
 
-    They are those between links, and from object, obstacles and table. With `tips_touch` the
-    fingertips may touch the object and the table.
+    They are those between links, and from object, obstacles and table. `spatial` are the kinematics
+    of g hands. With `tips_touch` the fingertips may touch the object and the table.
     """
     pairs = spatial.hand.self_collision
     moves = spatial.hand.motion.moves
@@ -229,8 +229,8 @@ def clearance_rows(
 def sphere_rows(
     spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool
 ) -> list[ResidualRows]:
-    """Return the residuals of `clearance_rows` for the clearances of the links from object,
-    obstacles and table.
+    """Return the part of `clearance_rows` for the clearances of links from object, obstacles and
+    table; same arguments.
     """
     spheres = spatial.hand.collision_spheres
     motion = spatial.hand.motion
@@ -276,7 +276,7 @@ def link_clearance(
     """Return three least clearances (g,) [m] of each hand.
 
     They are of links from the object (tips are left out if `tips_touch`), of tips from the object,
-    and of all links from the table; infinite if there is no such thing.
+    and of all links from the table; infinite if the world has no object or no table.
     """
     spheres = spatial.hand.collision_spheres
     centres = spatial.sphere_centres

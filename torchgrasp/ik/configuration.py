@@ -74,8 +74,8 @@ class ResidualRows(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class SpatialJacobian(Value):
-    """The kinematics of a hand at g configurations, in the object's frame, from which Jacobians are
-    computed.
+    """The kinematics of a hand at g configurations, from which Jacobians are computed, in the
+    object's frame.
 
     `obj_from_link` are the poses (3 x 4) [m] of the l links. `spheres` [m] are the centres of the s
     collision spheres, `tips` [m] those of the f fingertips, and `pads` the unit normals of their
@@ -115,8 +115,8 @@ class SpatialJacobian(Value):
     def jacobian(
         self, wrench: Float[Tensor, "g k 6"], moves: Float[Tensor, "*g k q"]
     ) -> Float[Tensor, "g k d"]:
-        """Return the derivatives of k residuals by the hand's pose (6) and joints; the arguments
-        are fields of `ResidualRows`.
+        """Return the derivatives of k residuals by the hand's pose (6) and joints; both arguments
+        are as in `ResidualRows`.
         """
         by_motion = (wrench @ self.twists.permute(2, 0, 1)) * moves
         coupling = self.hand.motion.coupling

@@ -76,7 +76,7 @@ class SlidingNumbers:
     most_rows: int = 2**15
     """Largest such number on an accelerator: the Jacobians of more do not fit into its memory."""
     projections: int = 3
-    """Number of steps onto the surface at the end; before, contacts are off it by at most 0.1 mm."""
+    """Number of steps at the end that move the contacts onto the surface."""
 
 
 SLIDING = SlidingNumbers()
@@ -141,8 +141,8 @@ class JointProblem:
         return JointProblem(self.hand, shape, contact_problem, self.world.rows(index))
 
     def residuals(self, state: JointState, flat: FlatnessConstraint | None) -> Residuals:
-        """Return all residuals [mm], then their Jacobian by hand pose, joints, contacts and
-        tensions.
+        """Return all residuals [mm] of a `state`, then their Jacobian by hand pose, joints,
+        contacts and tensions.
 
         `flat` is the constraint that contacts are on flat surface; None leaves it out.
         """

@@ -198,8 +198,8 @@ def motion_clearance(
 def collision_probability(
     hand: Hand, grasps: Grasps, obstacles: Obstacles, table: Plane | None
 ) -> Float[Tensor, "g"]:
-    """Return the probability that the hand of each grasp hits an obstacle during approach, closing
-    and lift along z.
+    """Return the probability that the hand of each grasp hits one of the `obstacles` in approach,
+    closing or lift along z.
 
     The hand comes to its opened pose above the `table`. The probability is the largest occupancy
     probability of the voxels that the hand sweeps, because hidden voxels behind one object are

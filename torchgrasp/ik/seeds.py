@@ -71,8 +71,8 @@ SEEDS = SeedNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class PostureLibrary(Value):
-    """s random postures of a hand, prepared for quick comparison of their fingertips with contact
-    sets.
+    """Random postures of a hand, s in number, prepared for quick comparison of their fingertips
+    with contact sets.
 
     `joints` [rad] are the actuated joints. The fingertips of each posture define a frame
     (`tips_frame`): `vf_from_hand` [m] is the hand's pose in it, and `centres` [m] are the centres

@@ -61,7 +61,13 @@ def lengths_of(tips: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
 @checked
 @dataclasses.dataclass(frozen=True)
 class StabilityModel(Value):
-    """Two Gaussian mixtures over grasp states of one hand: stable grasps, and all other grasps."""
+    """The learned stability model of one hand: two Gaussian mixtures over the states of grasps
+    (`state_of`).
+
+    `stable` is the density of stable grasps, `others` that of all others. `share` is the prior
+    probability of stable grasps, and `meta` holds texts on the hand, the bodies, trials, seed and
+    scores.
+    """
 
     stable: GaussianMixture  # density of the states of stable grasps
     others: GaussianMixture  # density of the states of all other grasps
@@ -135,7 +141,8 @@ class StabilityModel(Value):
 
 @checked
 def load_stability(hand: Hand, path: Path | str | None = None) -> StabilityModel | None:
-    """Read the stability model of a hand from `path`; None means `FILE` in the hand's folder.
+    """Return the stability model of a hand, read from `path`; None means `FILE` in the hand's
+    folder.
 
     Return None if `path` is None and the hand's folder has no such file. Raises `ModelFileError`
     for a malformed file.
