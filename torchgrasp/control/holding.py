@@ -162,7 +162,8 @@ def keep_targets(
 def regulate(factor: float, observation: Observation, strength: float, period: float) -> float:
     """Return the common `factor` on all forces one tick later, `period` [s] on.
 
-    It changes so that the sum of the sensed normal forces approaches `strength` [N].
+    It changes so that the sum of the sensed normal forces approaches `strength` [N], but stays from
+    0.5 to `MAX_FACTOR`.
     """
     lacking = 1 - float(observation.tactile.reading.sum()) / strength
     return min(max(factor + period * lacking, 0.5), MAX_FACTOR)

@@ -186,7 +186,10 @@ class Touches:
 
     @property
     def felt(self) -> Bool[Tensor, "f"]:
-        """Mask (f,) of the fingertips that touch the object and have reported where they touch."""
+        """Mask (f,) of the fingertips that touch the object and have reported where they touch.
+
+        With `links`, those that have stopped touching are included.
+        """
         return (self.contact | self.kept) & (self.count > 0)
 
     def means(self) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"]]:

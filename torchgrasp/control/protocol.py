@@ -38,7 +38,7 @@ class Closing(Protocol):
     def feels(self) -> bool:
         """Whether sensor readings change the targets.
 
-        Without sensors, the targets press at the end, and no hold controller follows.
+        If not, the targets press at the end, and no hold controller follows.
         """
         ...
 
@@ -62,8 +62,9 @@ class LawClosing(Closing, Protocol):
 
 
 class Settled:
-    """A clock of how long all fingers have touched near their planned contacts, with steady forces:
-    `time` [s].
+    """A clock of how long a closing has settled: `time` [s] for which all fingers have touched.
+
+    With `pressing` they must also be near their planned contacts, with steady forces.
     """
 
     def __init__(self, reference: ClosingReference) -> None:

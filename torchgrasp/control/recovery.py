@@ -388,8 +388,8 @@ class LiftCheck:
 
     The object is lost if fewer than two fingertips touch, and these carry hardly any load along the
     table's normal. The hand will lose the object if two fingertips slide along it in the first 20
-    mm of the lift. Only touches count for binary sensors, or without a table. Broken sensors count
-    as touching.
+    mm of the lift. The load does not count for binary sensors, or without a table. Broken sensors
+    count as touching.
     """
 
     @checked

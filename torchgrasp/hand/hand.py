@@ -138,7 +138,7 @@ class Hand(Value):
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the h actuated joints, in the order of all `joints`."""
+        """Names of the h actuated joints, in the order of `joints`."""
         return self.actuated.names
 
     @property
@@ -170,7 +170,7 @@ class Hand(Value):
     def require_three(self, argument: str, what: str) -> None:
         """Raise `BadArgument` unless the hand has three fingertips, as in the paper.
 
-        The error names the `argument`, and `what` was wanted.
+        The error names the `argument`, and `what` was asked of the hand.
         """
         if len(self.tips) != 3:
             raise BadArgument(

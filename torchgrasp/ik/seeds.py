@@ -111,8 +111,9 @@ class PostureLibrary(Value):
     def of(cls, hand: Hand, count: Count | None = None, seed: Seed = 0) -> "PostureLibrary":
         """Return random postures within the joint limits and without self-collision.
 
-        `count` postures are drawn; None means `SEEDS.postures`, or `SEEDS.many_postures` for more
-        than three fingers. The hand caches the last library of each count.
+        Of `count` drawn postures, those whose fingertips are on a line are left out. As `count`,
+        None means `SEEDS.postures`, or `SEEDS.many_postures` for more than three fingers. The hand
+        caches the last library of each count.
         """
         if count is None:
             count = SEEDS.postures if len(hand.tips) == 3 else SEEDS.many_postures
