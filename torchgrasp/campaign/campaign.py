@@ -107,7 +107,7 @@ def run_campaign(
         spec: options of the campaign; `CampaignSpec()` by default.
         workers: number of processes on this machine, where 0 means this process. Or the address of
             a Dask scheduler, such as "tcp://10.0.0.1:8786", whose workers have one thread each.
-        observer: called with the row of each finished job.
+        observer: called with the `JobRow` of each finished job.
 
     Raises:
         BadArgument: no objects, no scheduler at the address or for "cuda", or a machine with other

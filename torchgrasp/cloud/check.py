@@ -24,9 +24,7 @@ FEW_POINTS = 100  # fewer points are a speck of noise, or too coarse for a shape
 
 @dataclasses.dataclass(frozen=True)
 class CloudNumbers:
-    """Bounds by which points coincide or lie on a line, and by which the unit of an extent is
-    guessed.
-    """
+    """Bounds for points that coincide or lie on a line, and for extents in another unit."""
 
     sample: int = 20_000
     """About as many points mostly show that enough are distinct."""
@@ -178,7 +176,7 @@ def _distinct_rows(points: Points) -> Int[Tensor, "m"]:
 def first_of_each(group: Int[Tensor, "n"]) -> Int[Tensor, "groups"]:
     """Return the index of the first point of each group 0, 1, ...
 
-    `group` holds the group number of each of n points; no number is left out.
+    `group` holds the group's number of each of n points; no group is empty.
     """
     order = torch.arange(len(group), device=group.device)
     first = torch.full_like(order, len(order)).scatter_reduce(0, group, order, "amin")

@@ -301,8 +301,9 @@ def _check_size(k: Matrix, stated: list[float] | None, image: Float[Tensor, "2"]
 
 
 def as_tensor(name: str, value: Any) -> Tensor:
-    """Return an array of numbers as a tensor; raise `BadArgument` about `name` for anything
-    else.
+    """Return an array of numbers as a tensor.
+
+    Raises `BadArgument`, which calls the argument `name`, for anything else.
     """
     if isinstance(value, Tensor):
         return value

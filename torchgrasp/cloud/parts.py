@@ -96,8 +96,9 @@ def cut_object(
     box: Float[Tensor, "2 3"] | None = None,
     gap: Annotated[float, Range(0.001, 1.0)] = PARTS.gap,
 ) -> tuple[PointCloud, Plane | None]:
-    """Return the points of one object on a support, and the support's plane, None if none was
-    found.
+    """Return the points of one object on a support, and the plane of the support.
+
+    The plane is None if none was found.
 
     Args:
         cloud: points [m] of a scene.

@@ -19,12 +19,11 @@ DEFAULT = [0, 0, 0, 1, 0, 0, 0]
 
 
 def parse_pcd(data: bytes) -> dict[str, Any]:
-    """Return the arrays of a PCD file by name: "points", "normals", "viewpoint", and whether
-    "default".
+    """Return the arrays of a PCD file by name, in the file's unit.
 
-    Points and normals are (n, 3), the viewpoint is (3,), in the file's unit; what is missing is
-    None. "default" is true if VIEWPOINT is `0 0 0 1 0 0 0`, which many writers fill in, wherever
-    the camera was. Raises `Malformed` for a malformed file.
+    They are "points" and "normals" (n, 3) and "viewpoint" (3,), None if missing. "default" is
+    whether VIEWPOINT is `0 0 0 1 0 0 0`, which many writers fill in, wherever the camera was.
+    Raises `Malformed` for a malformed file.
     """
     header, body = _split_header(data)
     if missing := [word for word in ("FIELDS", "SIZE", "TYPE") if word not in header]:

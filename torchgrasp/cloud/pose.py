@@ -81,9 +81,7 @@ class PoseNumbers:
 
 @dataclasses.dataclass(frozen=True)
 class SizeNumbers:
-    """Bounds on heights of a camera [m] and sizes of objects [m] by which the depth's unit is
-    checked.
-    """
+    """Bounds on heights of a camera and sizes of objects [m] by which a depth's unit is checked."""
 
     points: int = 100
     """Fewest points of an object whose size counts."""
@@ -116,10 +114,9 @@ SIZES = SizeNumbers()
 
 
 def check_rigid(name: str, pose: Tensor) -> Transform:
-    """Return the given pose if it is rigid to 1e-4; else raise `BadArgument`, which names the
-    fault.
+    """Return the given pose (4, 4) [m] if it is rigid to 1e-4.
 
-    Errors call the argument `name`.
+    Otherwise raises `BadArgument`, which calls the argument `name` and names the fault.
     """
     if fix := FIXES.get(tuple(pose.shape)):
         raise BadArgument(name, f"shape {tuple(pose.shape)}", f"a 4 x 4 matrix: {fix}")
@@ -179,8 +176,8 @@ def _check_distance(pose: Transform, distance: float, most: float, what: str) ->
 def read_pose(name: str, path: Path | str) -> Transform:
     """Return the rigid transform (4, 4) [m] in a .npy file, or in a .txt file with four lines.
 
-    Each line has four numbers. Raises `BadArgument`, which calls the argument `name`, for another
-    or malformed file.
+    Each line has four numbers. Raises `BadArgument`, which calls the argument `name`, for a file of
+    another format, or a malformed one.
     """
     data, suffix = read_suffixed(name, path, (".npy", ".txt"))
     try:
@@ -321,8 +318,8 @@ def _check_given_table(points: Points, plane: Plane) -> None:
 def check_sizes(points: Points, labels: Tensor, pose: Transform, plane: Plane) -> tuple[str, ...]:
     """Raise `BadArgument` for a unit of the depth that makes objects too large or small for a hand.
 
-    Returns a note if the camera is high, else nothing. `labels` holds the object of each of the
-    `points` (n, 3) [m], 0 for none; `plane` is the table.
+    Returns one note if the camera is high, else none. `labels` (n,) holds the object of each of the
+    `points` (n, 3) [m], 0 for none; `plane` is the table. The `pose` leads to their frame.
     """
     parts = [points[labels == k] for k in labels.unique().tolist() if k > 0]
     large_enough = [part for part in parts if len(part) >= SIZES.points]

@@ -65,7 +65,7 @@ NORMALS = NormalNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class NormalCheck(Value):
-    """How well a cloud's given normals agree with the normals of neighbouring points."""
+    """The agreement of a cloud's given normals with those of neighbouring points."""
 
     flipped: Bool[Tensor, "n"]  # whether a normal opposes most of its neighbours' normals
     opposed: float  # share of opposite normals among pairs of neighbours
@@ -87,9 +87,7 @@ class PreparedCloud(Value):
 
     @property
     def one_sided(self) -> bool:
-        """Whether the cloud shows only what its cameras see, so that the object has a hidden
-        side.
-        """
+        """Whether the cloud shows only what its cameras see: the object has a hidden side."""
         eye = self.viewpoint
         return eye is not None and share_facing(self.points, self.normals, eye) >= FACING
 
@@ -214,7 +212,8 @@ def compare_normals(points: Points, normals: Points) -> NormalCheck:
 
 
 def share_facing(points: Points, normals: Points, viewpoint: Float[Tensor, "*views 3"]) -> float:
-    """Return the share of normals that face the camera: near 1 in a single view, half all around.
+    """Return the share of normals that face the camera: nearly 1 in a view, half on a whole
+    surface.
 
     `points` (n, 3) [m] have the outward `normals` (n, 3); the viewpoint [m] is that of all points,
     or of each.

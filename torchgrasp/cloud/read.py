@@ -92,10 +92,10 @@ def read_cloud(
       3), `table` (4,); for several views, `viewpoint` (n, 3) and `frustum` (n, 4, 3).
     * `.npy`: an (n, 3) array, or (n, 6) with normals; colours are left out.
     * `.xyz`, `.txt`, `.csv`, `.asc`, `.pts`, `.xyzi`, `.xyzn`, `.xyzrgb`: the same as text. A first
-      line may name the columns, as in x y z nx ny nz, or count the rows.
+      line may name the columns, as in x y z nx ny nz, or hold the number of points.
 
-    Images (h, w, 3) of points are accepted. Rows with NaN or infinity are left out; so are zero
-    rows, if several.
+    Images (h, w, 3) of points are accepted. Points with NaN or infinity are left out; so are points
+    at (0, 0, 0), if there are several.
 
     Args:
         path: the file.

@@ -67,12 +67,12 @@ def parse_npz(data: bytes, names: Sequence[str], required: str = "") -> dict[str
 
 
 def read_image_file(name: str, path: Path | str) -> Any:
-    """Return the array in an image file: .npy, .npz, .png or .tiff, .exr for depth, .json for
-    masks.
+    """Return the array in a file of a depth image, or of masks.
 
-    The argument `name` "depth" has one channel, and is the array `depth` of a .npz file. The
-    argument "mask" may be a picture or several masks, in each form that
-    `torchgrasp.scene.masks.read_labels` takes. Raises `BadArgument` for another or malformed file.
+    Formats are .npy, .npz, .png and .tiff; also .exr for depth, and .json for masks. The argument
+    `name` "depth" has one channel, and is the array `depth` of a .npz file. The argument "mask" may
+    be a picture or several masks, in each form that `torchgrasp.scene.masks.read_labels` takes.
+    Raises `BadArgument` for a file of another format, or a malformed one.
     """
     masks = name == "mask"
     data, suffix = read_suffixed(
@@ -107,8 +107,8 @@ def read_intrinsics(name: str, path: Path | str, image: str = "") -> Any:
     """Return the intrinsics in a .json, .yaml, .npy or .txt file, as `cloud_from_depth` takes them.
 
     BOP's scene_camera.json holds an entry for each image; `image` is its number as text, "" for
-    other files. Errors call the argument `name`. Raises `BadArgument` for another or malformed
-    file.
+    other files. Errors call the argument `name`. Raises `BadArgument` for a file of another format,
+    or a malformed one.
     """
     data, suffix = read_suffixed(name, path, (".json", ".yaml", ".yml", ".npy", ".txt"))
     try:

@@ -161,7 +161,7 @@ def add_noise(
 ) -> Image:
     """Return a depth image (h, w) [m] with a camera's noise; 0 where nothing is measured.
 
-    `depth` is the exact image [m], 0 where nothing is. `cosine` (h, w) is the absolute cosine
+    `depth` is the exact image [m], 0 where no surface is. `cosine` (h, w) is the absolute cosine
     between each ray and the surface normal.
     """
     normal = partial(torch.randn, depth.shape, generator=generator, dtype=torch.float64)

@@ -33,9 +33,8 @@ class UnseenNumbers:
     """Least step of depth behind which points are hidden, over the radius of the cloud."""
 
     def excess(self, shares: tuple[float, float]) -> tuple[float, float]:
-        """Return two shares of points, each over the greatest that is allowed.
-
-        They are the shares that are seen edge-on, and that lie behind others.
+        """Return the shares of points seen edge-on and hidden behind others, each over its
+        bound.
         """
         return shares[0] / self.edge_on, shares[1] / self.behind
 
@@ -89,8 +88,8 @@ def guess_viewpoint(
     direction. `points` are (n, 3) [m]; `normals` (n, 3) are unit vectors of either sign. Of all
     directions above the support, the one that explains the points best is taken; the camera is
     placed along it, 4 radii of the cloud away. The direction `up` is above the support; the normal
-    of a support in the points replaces it. If `up` is None or `assumed`, a guess, the camera may be
-    at the origin, where the points lie in front of it and a camera can have taken the view.
+    of a support in the points replaces it. If `up` is None or only `assumed`, the camera may be at
+    the origin, where the points lie in front of it and a camera can have taken the view.
     """
     points, normals = _draw(points, normals)
     centre, radius = _enclose(points)

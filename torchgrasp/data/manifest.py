@@ -89,10 +89,9 @@ def read_entry(objects: Path | str, name: str) -> ObjectEntry:
 def read_entries(
     objects: Path | str, only: Sequence[str] = ()
 ) -> dict[str, ObjectEntry | DatasetError]:
-    """Return each object's description, or the error of a bad one, by name and sorted.
+    """Return the description of each object, or the error of a bad one, sorted by name.
 
-    `only` names the objects; by default it is all in the manifest of the folder. Raises
-    `DatasetError` for a bad manifest.
+    `only` names the objects, by default all. Raises `DatasetError` for a bad manifest.
     """
     found: dict[str, ObjectEntry | DatasetError] = {}
     for name, field in sorted(_read_fields(objects, only).items()):

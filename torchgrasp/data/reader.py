@@ -47,12 +47,13 @@ class ShardJob(NamedTuple):
 class GraspShards:
     """A data set of grasps on disk; a map-style dataset for `torch.utils.data.DataLoader`.
 
-    `len` counts the grasps. Item i is a dict of float32 tensors [m, rad] in the object's frame:
-    `points` (n, 3) and `viewpoint` (3,) of the cloud; `joints` and `pregrasp` (h,), `approach`
-    (3,), `obj_from_hand` (4, 4); `contacts` and `normals` (f, 3), `std_m` (f,); `margin` and
-    `witness` (6,) as in `Certificate`; `clearance`; `predicted` success; `simulated`, the fraction
-    of simulated trials that passed. `closed` (a bool) is whether the grasp has force closure, `job`
-    is the index in `jobs`.
+    `len` counts the grasps. Item i is a dict of float32 tensors in the object's frame, for n
+    points, h actuated joints and f fingertips: `points` (n, 3) and `viewpoint` (3,) of the cloud
+    [m]; `joints` and `pregrasp` (h,) [rad], the unit vector `approach` (3,), the pose
+    `obj_from_hand` (4, 4) [m]; `contacts` (f, 3) [m], their outward unit `normals` (f, 3), `std_m`
+    (f,) [m]; `margin` and `witness` (6,) as in `Certificate`; `clearance` [m]; `predicted` success
+    in [0, 1]; `simulated`, the fraction of simulated trials that passed. `closed` (a bool) is
+    whether the grasp has force closure, `job` is the index in `jobs`.
 
     Args:
         folder: folder of the data set.
@@ -75,9 +76,7 @@ class GraspShards:
 
     @functools.cached_property
     def starts(self) -> list[int]:
-        """The index of the first grasp of each job in the data set, then the number of all
-        grasps.
-        """
+        """The index of the first grasp of each job in the data set, then the number of grasps."""
         return list(itertools.accumulate((row.grasps for row in self.jobs), initial=0))
 
     def __len__(self) -> int:

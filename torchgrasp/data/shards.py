@@ -88,9 +88,7 @@ class Records(Value):
 
 
 class Shard(NamedTuple):
-    """The content of a shard file: the outcomes of several jobs, and the tensors of all these
-    jobs.
-    """
+    """The content of a shard file: the outcomes of several jobs, and the tensors of these jobs."""
 
     rows: tuple[JobRow, ...]
     records: Records
@@ -115,8 +113,9 @@ def join_shards(parts: Sequence[Shard]) -> Shard:
 
 
 def pack_shard(shard: Shard, meta: dict[str, str]) -> bytes:
-    """Return the bytes of the file of a shard; `meta` becomes metadata that identify the
-    campaign.
+    """Return the bytes of the file of a shard.
+
+    `meta` becomes metadata of the file that identify the campaign.
     """
     jobs = json.dumps([row.as_json() for row in shard.rows])
     return pack_tensors(KIND, named_tensors(shard.records), {**meta, "jobs": jobs})

@@ -14,8 +14,9 @@ SOURCE = "source.json"  # file that says what a folder of tables is made from
 
 
 def import_arrow() -> Any:
-    """Return the module pyarrow, with `pyarrow.parquet`; raise `MissingExtra` if it is not
-    installed.
+    """Return the module pyarrow, with `pyarrow.parquet`.
+
+    Raises `MissingExtra` if it is not installed.
     """
     try:
         import pyarrow.parquet

@@ -174,9 +174,8 @@ def scale_pixels(count: int, labels: Int[Tensor, "h w"]) -> float:
 def label_radii(points: Float[Tensor, "h w 3"], labels: Int[Tensor, "h w"]) -> Float[Tensor, "k"]:
     """Return the root mean square distance [m] of the points of each label from their mean.
 
-    The k labels are 0, 1, ...
-
-    `labels` holds the label of each of the h x w `points` [m].
+    Entry i of the result is for label i. `labels` holds the label of each of the h x w `points`
+    [m].
     """
     label = labels.reshape(-1)
     own = points.reshape(-1, 3)
@@ -190,8 +189,7 @@ def label_radii(points: Float[Tensor, "h w 3"], labels: Int[Tensor, "h w"]) -> F
 def image_of_cloud(
     points: Points, viewpoint: Vector, up: Vector
 ) -> tuple[DepthImage, Int[Tensor, "n 2"]]:
-    """Return the depth image that a camera at the viewpoint takes of a cloud, and each point's
-    pixel.
+    """Return the depth image of a camera at the viewpoint, and the pixel of each point of a cloud.
 
     A pixel (n, 2) is row and column. The camera is a pinhole, upright, and looks at the middle of
     the points. A pixel covers about two points and keeps the nearest. `points` (n, 3) and

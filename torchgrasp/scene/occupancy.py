@@ -29,7 +29,7 @@ from torchgrasp.scene.scene import Scene
 
 @dataclasses.dataclass(frozen=True)
 class OccupancyNumbers:
-    """Numbers of the estimate of full space; lengths are in metres."""
+    """Numbers of the estimate of occupied space; lengths are in metres."""
 
     spacing: float = 0.005
     """Spacing of the voxels: a third of a finger's width."""
@@ -167,10 +167,10 @@ def cast_shadows(scene: Scene, target: int) -> Shadows:
 
 
 def find_nearest(pixels: Bool[Tensor, "h w"]) -> tuple[Float[Tensor, "h w"], Int[Tensor, "h w"]]:
-    """Return each pixel's distance [px] to the nearest pixel of a mask, and that pixel's flat
-    index.
+    """Return each pixel's distance [px] to the nearest pixel of a mask, and the index of that
+    pixel.
 
-    The flat index is row * w + column. `pixels` is the mask.
+    The index is row * w + column, that in the flattened image. `pixels` is the mask.
     """
     found: Any = ndimage.distance_transform_edt(~pixels.numpy(), return_indices=True)
     row, column = torch.from_numpy(found[1]).long()

@@ -100,9 +100,7 @@ class TableImage(Value):
 
     @kept
     def fitted_noise(self) -> Float[Tensor, "h w"]:
-        """The standard deviation [m] of mean heights at each pixel's depth, by a fitted noise
-        model.
-        """
+        """The standard deviation [m] of mean heights at each pixel's depth, by a fitted model."""
         depth = self.image.depth
         return fit_noise(depth[self.flat], self.mean_height[self.flat]).sigma(depth)
 

@@ -314,7 +314,7 @@ def _parked(urdf: Urdf, grasping: set[str]) -> dict[str, float]:
 def fingertip_links(urdf: Urdf) -> tuple[str, ...]:
     """Return the names of the fingertip links of a URDF.
 
-    These are the last links with a collision shape on the branches, if a joint moves them.
+    These are the last links with a collision shape on the branches that joints move.
     """
     parents = {j.parent for j in urdf.joints}
     shaped = {x.name for x in urdf.links if x.shapes}

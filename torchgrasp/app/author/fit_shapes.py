@@ -146,10 +146,10 @@ def shape_points(urdf: Urdf, folder: Path) -> dict[str, tuple[Points, ...]]:
 
 
 def replace_meshes(urdf: Urdf, points: Mapping[str, tuple[Points, ...]]) -> tuple[Urdf, list[str]]:
-    """Return the URDF with a few boxes or a cylinder instead of every mesh, and a report.
+    """Return the URDF with a few boxes or a cylinder instead of every mesh, and a sentence on it.
 
-    `points` (n, 3) [m] on every shape are those of `shape_points`. The report is one sentence with
-    the counts, or empty without meshes.
+    `points` (n, 3) [m] on every shape are those of `shape_points`. The sentence holds the counts;
+    it is the only one in a list, which is empty without meshes.
     """
     links = []
     count = 0

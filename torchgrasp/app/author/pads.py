@@ -79,10 +79,11 @@ def guess_pads(
     tips: Sequence[str],
     surfaces: Mapping[str, Points],
 ) -> Guess:
-    """Return guessed pads and the direction out of the palm.
+    """Return guessed pads of the fingertips, and the direction out of the palm.
 
-    `frames` are poses (3 x 4) [m] of the links `tips` and, last, of the palm, in n random postures.
-    `surfaces` holds points (k, 3) [m] on each link, by its name, in its frame.
+    `frames` (3, 4, l, n) are poses [m] of the l links `tips` and, last, of the palm, in n random
+    postures, in the frame of the URDF's root. `surfaces` holds points (k, 3) [m] on each link, by
+    its name, in its frame.
     """
     links = {x.name: i for i, x in enumerate(urdf.links)}
     cores = [_core(urdf, urdf.links[links[tip]], surfaces) for tip in tips]
@@ -131,8 +132,8 @@ def order_by_facing(frames: Float[Tensor, "3 4 f n"], pads: Sequence[Pad]) -> li
     """Return the indices of the f tips in grasp order.
 
     First come three whose pads face each other in the largest share of postures; each further one
-    keeps the share largest. `frames` are poses (3 x 4) [m] of the tips in n random postures; `pads`
-    are in the frames of the tips.
+    keeps the share largest. `frames` are poses (3 x 4) [m] of the tips in n random postures, in the
+    frame of the URDF's root; `pads` are in the frames of the tips.
     """
     contacts = torch.tensor([pad.contact for pad in pads]).double()
     normals = torch.tensor([pad.normal for pad in pads]).double()

@@ -55,11 +55,11 @@ def place(pose: np.ndarray) -> tuple[Triple, Triple]:
 
 
 def keep_below(urdf: Urdf, root: str) -> Step:
-    """Return the URDF with only the link `root` and the links below it, and a report.
+    """Return the URDF with only the link `root` and the links below it, and a sentence on it.
 
-    So the hand is cut off an arm. The report is one sentence, or empty if `root` is the first link
-    already. Raises `BadArgument` for an unknown root, and `HandFileError` for a joint that follows
-    one above the root.
+    This cuts a hand off an arm. The list of sentences is empty if `root` is the first link already.
+    Raises `BadArgument` for an unknown root, and `HandFileError` for a joint that follows one above
+    the root.
     """
     names = {x.name for x in urdf.links}
     if root not in names:
@@ -81,8 +81,9 @@ def keep_below(urdf: Urdf, root: str) -> Step:
 def merge_frames(urdf: Urdf) -> tuple[Urdf, list[str], dict[str, str]]:
     """Return the URDF with massless links merged into the links to which they are fixed.
 
-    A massless link at the end of a branch is kept if it has shapes. The second result is a report,
-    one sentence or none; the third gives for each merged link the link that took it over.
+    A massless link at the end of a branch is kept if it has shapes. The second result is a list of
+    one sentence on the merged links, or none; the third gives for each merged link the link that
+    took it over.
     """
     taken: dict[str, str] = {}
     while True:
@@ -134,10 +135,10 @@ def _moved(link: Link, pose: np.ndarray) -> Link:
 
 
 def fix_wrist(urdf: Urdf, tips: Sequence[str]) -> Step:
-    """Return the URDF with the wrist joints fixed at their rest positions, and a report.
+    """Return the URDF with the wrist joints fixed at their rest positions, and a sentence on it.
 
     Wrist joints move all the links `tips`. More than `REPAIRS.most_wrist` such joints are an arm,
-    which is cut off.
+    which is cut off. The list of sentences is empty if there is no such joint.
     """
     movers = urdf.movers(tips[0]) if len(tips) > 2 else []
     common = [j for j in movers if all(j in urdf.movers(tip) for tip in tips)]
@@ -167,7 +168,7 @@ def _fixed(joint: Joint, value: float) -> Joint:
 
 
 def repair_joints(urdf: Urdf) -> Step:
-    """Return the URDF with complete limits of all joints, and a report.
+    """Return the URDF with complete limits of all joints, and a sentence for each repair.
 
     Missing limits of position, effort and velocity are added. Coupled joints follow independent
     ones, within limits. Raises `HandFileError` for a sliding joint without limits.
@@ -260,7 +261,8 @@ def _limit_leaders(urdf: Urdf, joints: dict[str, Joint]) -> list[str]:
 
 
 def repair_bodies(urdf: Urdf, surfaces: Mapping[str, np.ndarray]) -> Step:
-    """Return the URDF with missing or impossible masses and inertias replaced, and a report.
+    """Return the URDF without missing or impossible masses and inertias, and sentences on the
+    repair.
 
     `surfaces` holds points (n, 3) [m] on each link, by its name, in its frame.
     """

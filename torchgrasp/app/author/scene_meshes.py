@@ -57,8 +57,7 @@ def clean_dae(data: bytes) -> tuple[bytes, float]:
 
 
 def check_glb(data: bytes) -> None:
-    """Raise `Malformed` for a .glb file with skins, with compressed geometry, or with too many
-    corners.
+    """Raise `Malformed` for a .glb file with skins, compressed geometry, or too many corners.
 
     At most `MOST_INDICES` corners are allowed, where a mesh counts once for each node that uses it.
     """

@@ -77,9 +77,9 @@ class _DepthCommand(Command):
     def images(self):
         """Return depth image, intrinsics, mask labels and camera pose; what is not given is None.
 
-        The depth image (h, w) is as the file holds it, the median of all files with --frames. The
-        intrinsics are numbers or a matrix, the labels (h, w) integers, and the pose a matrix (4, 4)
-        [m].
+        The depth image (h, w) is in the unit of the file; with --frames it is the median of all
+        files. The intrinsics are numbers or a matrix [pixels], the labels (h, w) integers, and the
+        pose a matrix (4, 4) [m].
         """
         if self.depth_unit is not None and not 0 < self.depth_unit <= 1:
             raise BadArgument(

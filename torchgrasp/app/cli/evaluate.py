@@ -214,7 +214,7 @@ class Evaluate(_Trials):
 
 
 def list_names(objects: Path, spec: EvaluationSpec) -> list[tuple[str, str]]:
-    """Return object name and view name of every view that is evaluated.
+    """Return object name and view name of every view of the folder `objects` that is evaluated.
 
     An object without views has one pair with the view name "".
     """
@@ -248,7 +248,7 @@ def _print_cells(cells: tuple[object, ...], widths: tuple[int, int]) -> None:
 
 def print_summary(protocol: str, tried: str, summary: dict[str, Any]) -> None:
     """Print the success rates of all objects and of each group, failures by stage and cause, and
-    means.
+    times.
 
     `protocol` and `tried` are printed as the title; `summary` is what `summarise` returned.
     """

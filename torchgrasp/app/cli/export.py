@@ -164,9 +164,9 @@ class Export(Command):
 
 
 def read_names(words: Sequence[str]) -> dict[str, str] | None:
-    """Return the robot's name of each URDF joint by the joint's name; None without `words`.
+    """Return a dict from each URDF joint to the robot's name for it; None without `words`.
 
-    `words` are texts URDF=ROBOT, or the path of one .json file with such an object. Raises
+    `words` are texts URDF=ROBOT, or the path of one .json file with an object {URDF: ROBOT}. Raises
     `BadArgument` for a joint given twice, and `ModelFileError` for a malformed file.
     """
     if len(words) != 1 or "=" in words[0]:

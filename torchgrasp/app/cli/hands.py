@@ -51,9 +51,7 @@ from torchgrasp.testing import check_hand, find_faults, most_met, random_joints
 
 @dataclasses.dataclass(frozen=True)
 class HandTrial:
-    """Numbers of the trial of a hand, and shares of random postures below which there is a
-    warning.
-    """
+    """Numbers of the trial of a hand, and least shares of its random postures."""
 
     objects: tuple[str, ...] = ("cylinder", "jug")  # tried in turn
     starts: int = 100  # initial guesses for each object
@@ -408,10 +406,9 @@ class HandTrain(Command):
 
 
 def choose_components(hand: Hand, seed: int, workers: int) -> int:
-    """Return the number of Gaussians with the least BIC on separate random postures; print the
-    curve.
+    """Return the number of Gaussians with the least BIC on separate random postures.
 
-    `workers` is the number of threads that sample the postures.
+    The BIC curve is printed. `workers` is the number of threads that sample the postures.
     """
     apart = sample_configurations(hand, TRAIN.postures, seed + 1, workers, "grasping")
     with make_bar(TRAIN.most, "fit", desc="components") as bar:

@@ -83,11 +83,11 @@ class ViewOptions:
         return unit(vector)
 
     def read(self, name: str, path: Path, whole: bool = False) -> CloudFile:
-        """Return the cloud file at `path`, as the options say; errors call it by `name`, its
-        argument.
+        """Return the cloud in the file at `path`, read as the options say.
 
-        With `whole`, scenes of any size are accepted, and all points are kept. Raises `BadArgument`
-        for options that exclude each other, and for an unusable cloud.
+        Errors call the file by `name`, its argument. With `whole`, scenes of any size are accepted,
+        and all points are kept. Raises `BadArgument` for options that exclude each other, and for
+        an unusable cloud.
         """
         if self.viewpoint is not None and (self.no_viewpoint or self.camera_pose is not None):
             raise BadArgument(
@@ -137,8 +137,8 @@ class CloudOptions(ViewOptions):
     no_table: bool = option(False, "there is no table")
 
     def with_table_of(self, file: CloudFile) -> "CloudOptions":
-        """Return the options with the table of a file, unless the user gave --table or --no-
-        table.
+        """Return the options with the table of a file, if neither --table nor --no-table is
+        given.
         """
         if file.table is None or self.table is not None or self.no_table:
             return self
@@ -176,10 +176,10 @@ class CloudOptions(ViewOptions):
         return plane.normal
 
     def judge(self, cloud: PointCloud, table: Plane | float | None) -> tuple[Advice, ...]:
-        """Return advice on the quality of a cloud; raise `BadArgument` if it must not be planned
-        on.
+        """Return advice on the quality of a cloud.
 
-        `table` is a plane, a height z [m], or None for no table.
+        `table` is a plane, a height z [m], or None for no table. Raises `BadArgument` if no grasp
+        should be planned on the cloud.
         """
         plane = as_plane(table)
         up = self.given_vertical(plane)
@@ -244,11 +244,11 @@ def read_region(name: str, text: str | None) -> Region | None:
 
 
 def find_cloud(path: Path, name: str = "CLOUD") -> Path:
-    """Return the path of a cloud: `path` itself or, for the name of a shipped object, its noisy
-    view.
+    """Return the path of a cloud, which may be given as the name of a shipped object.
 
-    Raises `BadArgument` for a word that is neither a file nor a shipped object; `name` is the
-    argument in the error.
+    The name gives the path of the object's noisy view; any other path is returned itself. Raises
+    `BadArgument` for a word that is neither a file nor a shipped object; errors call the argument
+    `name`.
     """
     names = list_objects()
     if path.exists() or path.suffix or len(path.parts) != 1:
@@ -327,8 +327,8 @@ def describe_table(table: Plane | float) -> str:
 def object_name(path: Path) -> str:
     """Return a name for the object of a file: the file's name or, if it is generic, the folder's.
 
-    Generic are names such as mesh.ply and view0.ply; of others, as cloud.ply, the text is "object
-    in cloud.ply".
+    Generic names are those such as mesh.ply and view0.ply. For cloud.ply and similar files the name
+    is "object in cloud.ply".
     """
     if re.fullmatch(r"(mesh|view\d*)(_noisy)?", path.stem):
         return path.resolve().parent.name or "object"

@@ -157,7 +157,7 @@ class Camera(NamedTuple):
     """A pinhole camera.
 
     Attributes:
-        position: place of its centre [m].
+        position: place of its centre [m], in the frame of the shapes.
         frame: unit vectors to the right, up and back of the camera, one in each row.
         angle: vertical field of view [rad].
     """
@@ -197,8 +197,9 @@ class Canvas:
         (self.transparent if transparent else self.solid).append(triangles)
 
     def add_points(self, points: Points, colors: Points) -> None:
-        """Add points (n, 3) [m] as small balls; `colors` (n, 3) are red, green and blue in [0,
-        1].
+        """Add points (n, 3) [m] as small balls.
+
+        `colors` (n, 3) are red, green and blue in [0, 1].
         """
         # so small on the page that the faces of the balls do not show
         radius = MARKS.point_radius * float(np.linalg.norm(np.ptp(points, axis=0)))

@@ -139,8 +139,7 @@ def list_causes(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def list_figures(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Return label and text of each count, mean force, overlap, slip and computing time of an
-    evaluation.
+    """Return label and text of each number of an evaluation, such as a mean force or a time.
 
     The labels hold the units. `summary` is what `summarise` returned.
     """

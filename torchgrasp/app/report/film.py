@@ -24,9 +24,7 @@ from torchgrasp.values.closing import ClosureResult
 
 @dataclasses.dataclass(frozen=True)
 class FilmLayout:
-    """Layout of a film strip: stills side by side, and plots below them [pixels; fonts in
-    points].
-    """
+    """Layout of a film strip: stills, and plots below them [pixels; fonts in points]."""
 
     dpi: int = 100
     width: int = 1680  # of the strip

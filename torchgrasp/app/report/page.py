@@ -55,9 +55,7 @@ def write_report(path: Path | str, run: Run, view: str = "") -> Path:
 
 
 def draw_pictures(run: Run) -> Sections:
-    """Draw all pictures of a run; return by the title of each section its pairs of caption and
-    PNG.
-    """
+    """Return all pictures of a run: pairs of caption and PNG by the title of their section."""
     run = run.upright()
     table = None if run.spec.table is None else 0.0
     view = stills.view_of(run.cloud)
@@ -149,8 +147,9 @@ def grasp_columns(grasps: Grasps) -> tuple[str, ...]:
 
 
 def grasp_rows(grasps: Grasps, most: int = 10) -> list[tuple[str, ...]]:
-    """Return the texts of the cells of each of the first `most` grasps, in the order of
-    `grasp_columns`.
+    """Return the cells of a table of the first `most` grasps as text, one tuple for each grasp.
+
+    The cells are in the order of `grasp_columns`.
     """
     rows = []
     for rank, grasp in enumerate(grasps[:most], 1):

@@ -211,7 +211,7 @@ def first_touches(closure: ClosureResult) -> list[int]:
 def find_loss(closure: ClosureResult, centre: Float[Tensor, "3"]) -> int | None:
     """Return the index of the control tick at which the object was lost; None if it was held.
 
-    Lost is an object that was pushed away, put down, let go, or slipped too far. `centre` is its
+    An object is lost if it was pushed away, put down, let go, or slipped too far. `centre` is its
     centre of mass [m] in the frame of the grasp, where z is up.
     """
     if closure.held:

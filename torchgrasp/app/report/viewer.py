@@ -51,8 +51,9 @@ VIEW = "view.html"  # name of the page beside the report
 
 @dataclasses.dataclass(frozen=True)
 class ViewerNumbers:
-    """Limits of what a page holds, so that it has a few megabytes, and numbers of its first
-    view.
+    """Limits of what a 3D page holds, and numbers of its first view.
+
+    With these limits a page has a few megabytes.
     """
 
     grasps: int = 20  # best grasps that are shown
@@ -79,9 +80,9 @@ def write_viewer(path: Path | str, run: Run) -> Path:
 
     The page shows the cloud, the surface by its standard deviation, a shell at k standard
     deviations, contacts, four postures of the hand for each of the best 20 grasps, and their motion
-    with the lift. The closing, with its forces, is the film of the first grasp. The address may
-    name a state, as in `view.html#grasp=3&posture=squeeze&sigma=2` or `view.html#tick=50`. Returns
-    the path. Raises `OutputError` if the file cannot be written.
+    with the lift. The closing of the first grasp is replayed with its forces. The address may name
+    a state, as in `view.html#grasp=3&posture=squeeze&sigma=2` or `view.html#tick=50`. Returns the
+    path. Raises `OutputError` if the file cannot be written.
 
     >>> import tempfile
     >>> from torchgrasp import ContactSpec, fit_shape, load_hand, load_object
