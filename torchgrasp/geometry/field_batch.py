@@ -1,5 +1,5 @@
-"""The distance fields of several objects as one: each row of points is asked in the field of its
-own object.
+"""Distance fields of several objects in one value, which finds the distances of points to their own
+objects at once.
 """
 
 import dataclasses
@@ -20,19 +20,24 @@ from torchgrasp.geometry.signed_distance import (
 
 @dataclasses.dataclass(frozen=True)
 class FieldBatch(DistanceField):
-    """The fields of c objects as one: row r of all points that a method is given belongs to field
-    `owner[r]`.
+    """The distance fields of c objects, joined, so that a batch of points can have a field for each
+    entry.
+
+    Points given to a method have the shape (r, ..., 3). Those of entry r of axis 0 belong to the
+    field with the index `owner[r]`.
     """
 
-    nodes: Float[Tensor, "n"]  # the values of all fields, one after another
-    places: Float[Tensor, "c 4"]  # origin and spacing [m] of the nodes of each field
-    # of each field: last nodes, strides on x and y, first value, steps to a cell's corners
+    nodes: Float[Tensor, "n"]  # signed distances [m] of all fields, one after another
+    # origin (x, y, z) [m] of each field, and the spacing [m] of its nodes
+    places: Float[Tensor, "c 4"]
+    # of each field: 3 indices of the last node on each axis, 2 strides on x and y, the place of
+    # the first value in `nodes`, and 8 steps from a cell's first corner to its corners
     steps: Int[Tensor, "c 14"]
-    owner: Int[Tensor, "r"]  # the field of each row
+    owner: Int[Tensor, "r"]  # index of the field of each entry of the batch
 
     @classmethod
     def of(cls, fields: Sequence[SignedDistanceField]) -> "FieldBatch":
-        """Join fields, with one row for each."""
+        """Join c fields to a batch of c entries, where entry k has field k."""
         nodes = torch.cat([x.nodes for x in fields])
         shape = torch.tensor([x.values.shape for x in fields], device="cpu")
         places = torch.stack(
@@ -47,16 +52,16 @@ class FieldBatch(DistanceField):
 
     @property
     def spacing(self) -> Float[Tensor, "r"]:
-        """The spacing [m] of the nodes, of each row."""
+        """The spacing [m] of the nodes of each entry's field."""
         return self._own[0][:, 3]
 
     def rows(self, index: Int[Tensor, "k"]) -> "FieldBatch":
-        """Return the fields of some of the rows of points."""
+        """Return a batch whose entry k has the field of this batch's entry `index[k]`."""
         return dataclasses.replace(self, owner=self.owner[index])
 
     @kept
     def _own(self) -> tuple[Float[Tensor, "r 4"], Int[Tensor, "r 14"]]:
-        """The places and steps of each row."""
+        """The `places` and the `steps` of each entry's field."""
         return self.places[self.owner], self.steps[self.owner]
 
     def _grid(self, points: Float[Tensor, "b *k 3"]) -> Grid:

@@ -18,7 +18,8 @@ from torchgrasp.foundation.rules import is_known
 from torchgrasp.geometry.linalg import eye_like, norm, unit
 
 FLAT = 1e-3
-"""Height of a contact triangle over its longest side below which noise turns its frame."""
+"""Least height of a contact triangle over its longest side: in a flatter one, noise decides the
+direction of the virtual frame."""
 
 
 def rigid(
@@ -31,7 +32,7 @@ def rigid(
 
 
 def inverse(a_from_b: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
-    """Return the inverse `b_from_a` of a rigid transform `a_from_b`."""
+    """Return the inverse `b_from_a` of a rigid transform `a_from_b`, with translations in metres."""
     rotation = a_from_b[..., :3, :3].mT
     return rigid(rotation, -(rotation @ a_from_b[..., :3, 3:])[..., 0])
 
@@ -39,14 +40,17 @@ def inverse(a_from_b: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
 def apply(
     a_from_b: Float[Tensor, "*#b 4 4"], points: Float[Tensor, "*#b n 3"]
 ) -> Float[Tensor, "*#b n 3"]:
-    """Map points from frame b to frame a by the rigid transform `a_from_b`."""
+    """Map points [m] from frame b to frame a by the rigid transform `a_from_b`."""
     return points @ a_from_b[..., :3, :3].mT + a_from_b[..., None, :3, 3]
 
 
 def rotate(
     a_from_b: Float[Tensor, "*#b 4 4"], directions: Float[Tensor, "*#b n 3"]
 ) -> Float[Tensor, "*#b n 3"]:
-    """Rotate directions from frame b to frame a; the translation of `a_from_b` is ignored."""
+    """Rotate directions (vectors of any unit) from frame b to frame a.
+
+    The translation of the rigid transform `a_from_b` is ignored.
+    """
     return directions @ a_from_b[..., :3, :3].mT
 
 
@@ -59,7 +63,10 @@ def skew(v: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
 
 
 def rotation_from_vector(v: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
-    """Return the rotation by |v| radians about v (the exponential map), smooth at v = 0."""
+    """Return the rotation matrix by the angle |v| [rad] about the axis v, the exponential map.
+
+    It is smooth at v = 0.
+    """
     angle = norm(v)[..., None, None]
     # Rodrigues: sin x / x, and (1 - cos x) / x^2 = half^2 / 2
     turn = skew(v)
@@ -68,12 +75,17 @@ def rotation_from_vector(v: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
 
 
 def real(numbers: Any) -> Tensor:
-    """Return numbers as a float64 tensor on the CPU, whatever torch's default dtype and device are."""
+    """Return numbers, such as nested lists, as a float64 tensor on the CPU.
+
+    The default dtype and device of torch are not used.
+    """
     return torch.tensor(numbers, dtype=torch.float64, device="cpu")
 
 
 def rotation_from_rpy(rpy: tuple[float, float, float]) -> Float[Tensor, "3 3"]:
-    """Return the rotation of URDF's fixed-axis roll, pitch and yaw [rad]."""
+    """Return the rotation matrix of roll, pitch and yaw [rad] about the fixed axes x, y, z, as in a
+    URDF.
+    """
     cr, cp, cy = map(math.cos, rpy)
     sr, sp, sy = map(math.sin, rpy)
     rows = [
@@ -85,15 +97,16 @@ def rotation_from_rpy(rpy: tuple[float, float, float]) -> Float[Tensor, "3 3"]:
 
 
 def rotation_angle(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
-    """Return the angle [rad] of rotation matrices, accurate near 0 and near pi."""
+    """Return the angles [rad] of rotation matrices, from 0 to pi, accurate near both ends."""
     axis = (rotation - rotation.mT)[..., [2, 0, 1], [1, 2, 0]]
     trace = rotation.diagonal(dim1=-2, dim2=-1).sum(-1)
     return torch.atan2(norm(axis), trace - 1)
 
 
 def subsets(count: int, size: int, device: torch.device) -> Int[Tensor, "k s"]:
-    """Return all subsets of `size` numbers out of 0 to `count` - 1, one row per subset, in lexical
-    order.
+    """Return all subsets of s = `size` indices out of 0 to `count` - 1.
+
+    Each line of the result is one subset, in ascending order; the k lines are in lexical order.
     """
     if size == count:
         return torch.arange(count, device=device)[None]
@@ -101,8 +114,9 @@ def subsets(count: int, size: int, device: torch.device) -> Int[Tensor, "k s"]:
 
 
 def degenerate(points: Float[Tensor, "*b f 3"]) -> Bool[Tensor, "*b"]:
-    """Return a mask of the contact sets that lie nearly on a line: even the largest contact
-    triangle is too flat.
+    """Return a mask of the contact sets whose f contacts lie nearly on a line.
+
+    Then even their largest triangle is flatter than `FLAT`. The points [m] may be in any frame.
     """
     corners = points[..., subsets(points.shape[-2], 3, points.device), :]  # (*b, k, 3, 3)
     sides = corners - corners.roll(1, dims=-2)
@@ -113,12 +127,12 @@ def degenerate(points: Float[Tensor, "*b f 3"]) -> Bool[Tensor, "*b"]:
 
 
 def virtual_frame(points: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 4 4"]:
-    """Return the pose `a_from_vf` of the virtual frame of three contacts given in frame a, Eqs.
-    (15)-(17) of the paper.
+    """Return the pose `a_from_vf` [m] of the virtual frame of three contacts [m] in frame a.
 
-    The origin is the centroid of the contacts (Eq. 16). The x axis points from the first contact to
-    the third. The z axis is the normal of their plane. Contacts nearly on a line raise
-    `DegenerateContacts`; inside torch.vmap, where numbers are unknown, they give NaN.
+    Eqs. (15)-(17) of the paper define it. The origin is the centroid of the contacts (Eq. 16). The
+    x axis points from the first contact to the third. The z axis is the normal of their plane.
+    Raises `DegenerateContacts` for contacts nearly on a line. Inside torch.vmap, where values are
+    unknown, their pose is NaN instead.
     """
     flat = degenerate(points)
     if not is_known(flat):

@@ -1,5 +1,8 @@
-"""Linear algebra: Cholesky factors, which are checked but never repaired, Mahalanobis distances,
-farthest points.
+"""Linear algebra: vectors, Cholesky factors, Mahalanobis distances, farthest points and
+reflections.
+
+Cholesky factors are checked, but a matrix is never repaired. The functions work in any unit of
+length.
 """
 
 import math
@@ -20,14 +23,18 @@ GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))  # golden section of the full circle
 
 
 def norm(v: Float[Tensor, "*b d"], keepdim: bool = False) -> Float[Tensor, "*c"]:
-    """Return the lengths of vectors, which lie along the last axis."""
+    """Return the Euclidean lengths of vectors along the last axis; `keepdim` keeps this axis with
+    size 1.
+    """
     return torch.linalg.vector_norm(v, dim=-1, keepdim=keepdim)
 
 
 def dot(
     a: Float[Tensor, "*b d"], b: Float[Tensor, "*c d"], keepdim: bool = False
 ) -> Float[Tensor, "*e"]:
-    """Return the dot products of vectors, which lie along the last axis."""
+    """Return the dot products of vectors along the last axis; `keepdim` keeps this axis with size
+    1.
+    """
     return (a * b).sum(-1, keepdim=keepdim)
 
 
@@ -37,18 +44,23 @@ def matvec(matrix: Float[Tensor, "*b m n"], v: Float[Tensor, "*c n"]) -> Float[T
 
 
 def eye_like(n: int, like: Tensor) -> Float[Tensor, "n n"]:
-    """Return the identity matrix of n rows, with the dtype and on the device of a tensor."""
+    """Return the n x n identity matrix, with the dtype and device of the tensor `like`."""
     return torch.eye(n, dtype=like.dtype, device=like.device)
 
 
 def unit(v: Float[Tensor, "*b d"]) -> Float[Tensor, "*b d"]:
-    """Return vectors of length 1 in the direction of `v`; a zero vector gives NaN."""
+    """Return unit vectors in the direction of the vectors `v` along the last axis.
+
+    A zero vector gives NaN.
+    """
     return v / norm(v, keepdim=True)
 
 
 def unit_of_any(v: Float[Tensor, "*b d"]) -> Float[Tensor, "*b d"]:
-    """Return vectors of length 1 in the direction of `v`, even where squared lengths would overflow
-    or underflow.
+    """Return unit vectors in the direction of vectors of any length.
+
+    Unlike `unit`, it also works where squared lengths would overflow or underflow. A zero vector
+    gives NaN.
     """
     exponent = torch.frexp(v.abs().amax(-1, keepdim=True)).exponent - 1
     # A power of two rounds nothing.
@@ -57,8 +69,9 @@ def unit_of_any(v: Float[Tensor, "*b d"]) -> Float[Tensor, "*b d"]:
 
 
 def across(normal: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b 3"], Float[Tensor, "*b 3"]]:
-    """Return two unit vectors perpendicular to each unit normal: (first, second, normal) is a
-    right-handed frame.
+    """Return (first, second): two unit vectors perpendicular to each unit normal.
+
+    The axes first, second and normal are a right-handed frame.
     """
     helper = torch.zeros_like(normal).scatter(-1, normal.abs().argmin(-1, keepdim=True), 1.0)
     first = unit(torch.linalg.cross(normal, helper))
@@ -66,8 +79,9 @@ def across(normal: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b 3"], Float[
 
 
 def number_components(pairs: np.ndarray, count: int) -> np.ndarray:
-    """Return the number, from 0, of the connected component of each of `count` nodes, given (e, 2)
-    pairs of nodes.
+    """Return the index (n,) of the connected component of each node of a graph, counted from 0.
+
+    The graph has n = `count` nodes and the edges `pairs` (e, 2), which hold indices of nodes.
     """
     linked = np.ones(len(pairs), dtype=bool)
     links = sparse.coo_array((linked, (pairs[:, 0], pairs[:, 1])), shape=(count, count))
@@ -77,8 +91,9 @@ def number_components(pairs: np.ndarray, count: int) -> np.ndarray:
 def fibonacci_sphere(
     n: int, angle: float = math.pi * (1 + math.sqrt(5)), start: float = 0.5
 ) -> Float[Tensor, "n 3"]:
-    """Return n unit vectors spread over the sphere, from +z to -z; vector k has the azimuth `angle`
-    * (k + `start`).
+    """Return n unit vectors spread evenly over the sphere, from +z to -z.
+
+    Vector k has the azimuth `angle` * (k + `start`) [rad].
     """
     k = torch.arange(n, dtype=torch.float64, device="cpu")
     z = 1 - (2 * k + 1) / n
@@ -88,24 +103,29 @@ def fibonacci_sphere(
 
 
 def limit_norm(v: Float[Tensor, "*b d"], longest: float) -> Float[Tensor, "*b d"]:
-    """Return the vectors, shortened to the length `longest` where they are longer."""
+    """Return vectors (..., d) shortened to the length `longest` where they are longer, in their own
+    unit.
+    """
     return v * (longest / norm(v, keepdim=True).clamp_min(longest))
 
 
 def solve_least_squares(
     rows: Float[Tensor, "n k"], values: Float[Tensor, "n"]
 ) -> Float[Tensor, "k"]:
-    """Return the shortest vector x that minimises |rows @ x - values|, by the pseudo-inverse."""
+    """Return the shortest vector x that minimises |rows @ x - values|, by the pseudo-inverse.
+
+    `rows` holds n equations for k unknowns, `values` their right sides.
+    """
     # On a CPU the column pivots of torch.linalg.lstsq are undefined: its last digits differ from
     # call to call.
     return torch.linalg.pinv(rows) @ values
 
 
 def cholesky(matrix: Float[Tensor, "*b n n"], what: str, fix: str) -> Float[Tensor, "*b n n"]:
-    """Return the lower Cholesky factor of a matrix, without added jitter.
+    """Return the lower Cholesky factors of symmetric matrices, without added jitter.
 
-    An indefinite matrix raises `IndefiniteCovariance`; its message names the matrix by `what` and
-    suggests the `fix`. Inside torch.vmap, where numbers are unknown, its factor is NaN.
+    Raises `IndefiniteCovariance` for an indefinite matrix; the message calls it `what` and suggests
+    the `fix`. Inside torch.vmap, where values are unknown, its factor is NaN instead.
     """
     factor, info = torch.linalg.cholesky_ex(matrix)
     if not is_known(matrix):
@@ -120,8 +140,9 @@ def cholesky(matrix: Float[Tensor, "*b n n"], what: str, fix: str) -> Float[Tens
 def squared_mahalanobis(
     difference: Float[Tensor, "*b d"], factor: Float[Tensor, "*b d d"]
 ) -> Float[Tensor, "*b"]:
-    """Return the squared Mahalanobis distance d^T S^-1 d of differences d; `factor` is the Cholesky
-    factor of S.
+    """Return the squared Mahalanobis distances x^T S^-1 x of difference vectors x (no unit).
+
+    `factor` is the lower Cholesky factor of the covariance S.
     """
     whitened = torch.linalg.solve_triangular(factor, difference[..., None], upper=False)[..., 0]
     return (whitened * whitened).sum(-1)
@@ -135,12 +156,13 @@ def farthest_points(
     distance: Callable[[Tensor, Tensor], Tensor] | None = None,
     before: Float[Tensor, "m *d"] | None = None,
 ) -> Int[Tensor, "picks"]:
-    """Return the indices of at most `count` points, each the farthest from the points before it,
-    from `first` on.
+    """Return the indices of at most `count` points, each the farthest from all points before it.
 
-    Distances whose relative difference is at most `tie` are equal: the first of equally far points
-    is taken. Points in `before` count as already picked and are not returned; `first` is then not
-    used. `distance` is Euclidean by default.
+    The choice begins with the point of the index `first`. Points whose distances differ by at most
+    the share `tie` count as equally far; the first of them is taken. Points in `before` count as
+    already chosen and are not returned; with any of them, `first` is not used. `distance(points,
+    one)` returns the distances (n,) of all points to one; None means the squared Euclidean
+    distance.
     """
     every = points.detach().cpu()
     # NumPy is an order of magnitude faster than torch for few points.
@@ -164,7 +186,10 @@ def farthest_points(
 
 
 def reflect(points: Float[Tensor, "*b 3"], plane: Float[Tensor, "*c 4"]) -> Float[Tensor, "*d 3"]:
-    """Mirror points across planes n.x = o, given as vectors (n, o) with unit normal n and offset o."""
+    """Return points mirrored across planes n . x = o, given as vectors (n, o).
+
+    n is a unit normal (3), and o the offset in the unit of the points.
+    """
     height = (points * plane[..., :3]).sum(-1, keepdim=True) - plane[..., 3:]
     return points - 2.0 * height * plane[..., :3]
 
@@ -172,7 +197,8 @@ def reflect(points: Float[Tensor, "*b 3"], plane: Float[Tensor, "*c 4"]) -> Floa
 def reflect_directions(
     directions: Float[Tensor, "*b 3"], plane: Float[Tensor, "*c 4"]
 ) -> Float[Tensor, "*d 3"]:
-    """Mirror directions across planes n.x = o, given as vectors (n, o) with unit normal n and
-    offset o.
+    """Return directions mirrored across planes n . x = o, given as vectors (n, o).
+
+    n is a unit normal (3); the offset o is not used.
     """
     return directions - 2.0 * (directions * plane[..., :3]).sum(-1, keepdim=True) * plane[..., :3]

@@ -1,4 +1,4 @@
-"""Triangle meshes: reading and checks, clipping by a field, closest points on triangles."""
+"""Triangle meshes: reading, checks, clipping by a scalar field, and closest points on triangles."""
 
 import contextlib
 import io
@@ -37,8 +37,9 @@ STL_FACE = 50
 
 
 def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
-    """Return a closed triangle mesh [m], read from a file or given, after checks; a bad mesh is
-    never repaired.
+    """Return a closed triangle mesh [m], read from a file or given, after checks.
+
+    A bad mesh is never repaired.
 
     Raises:
         MeshError: the file is no .obj, .off, .ply or .stl file, has no faces, or has too many faces
@@ -74,7 +75,10 @@ def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
 
 
 def check_solid(mesh: "trimesh.Trimesh", name: str) -> None:
-    """Raise `MeshError` unless a mesh encloses a volume; the message calls the mesh `name`."""
+    """Raise `MeshError` unless a mesh [m] encloses a volume, with all faces turned outward.
+
+    The message calls the mesh `name`.
+    """
     if not 0 < len(mesh.faces) <= MESH_FACES:
         allowed = f"a closed mesh of at most {MESH_FACES} triangles"
         raise MeshError("mesh", f"{name} of {len(mesh.faces)} faces", allowed)
@@ -102,10 +106,11 @@ def check_solid(mesh: "trimesh.Trimesh", name: str) -> None:
 def closest_on_triangles(
     points: np.ndarray, triangles: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return, for each point (n, 3), the closest point on its triangle (n, 3 corners, 3), and its
-    feature.
+    """Return (closest, feature): the closest point (n, 3) of triangle i to point i, and where it
+    lies.
 
-    The feature is 0 inside the face, 1 to 3 for the sides ab, bc, ca, and 4 to 6 for the corners a,
+    The `points` (n, 3) and the corners of the `triangles` (n, 3 corners, 3) have the same unit. The
+    feature (n,) is 0 inside the face, 1 to 3 on the sides ab, bc, ca, and 4 to 6 at the corners a,
     b, c.
     """
     a = triangles[:, 0]
@@ -140,11 +145,10 @@ def closest_on_triangles(
 def clip_mesh(
     vertices: np.ndarray, faces: np.ndarray, values: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return vertices and faces of the part of a mesh where a field is negative, and a mask of the
-    vertices on the cut.
+    """Return (vertices, faces, on_cut): the part of a mesh where a scalar field is negative.
 
-    `values` (v,) is the field at the `vertices` (v, 3); it is linear within each of the `faces` (f,
-    3).
+    `on_cut` is a mask of the returned vertices that lie on the cut. `values` (v,) is the field at
+    the `vertices` (v, 3); it is linear within each of the `faces` (f, 3).
     """
     keep = values < 0
     count = keep[faces].sum(1)
@@ -153,8 +157,8 @@ def clip_mesh(
     ends: list[tuple[int, int]] = []
 
     def cross(a: int, b: int) -> int:
-        """Return the index of the new vertex at which the field is zero between the vertices a and
-        b.
+        """Return the index of the new vertex on the edge between the vertices a and b, where the
+        field is 0.
         """
         key = (min(a, b), max(a, b))
         if key not in made:
@@ -180,8 +184,10 @@ def clip_mesh(
 
 
 def load_triangles(data: bytes, suffix: str, **options: Any) -> Any:
-    """Return what `trimesh.load_mesh` reads from bytes; bad bytes and too many faces may raise any
-    exception.
+    """Return what `trimesh.load_mesh` reads from the bytes of a file with the given `suffix`.
+
+    `options` go to `trimesh.load_mesh`. Raises `Malformed` for too many faces; for bad bytes,
+    trimesh may raise any exception.
     """
     data = _geometry(data) if suffix == ".obj" else data
     if (faces := _count_faces(data, suffix)) > MESH_FACES:

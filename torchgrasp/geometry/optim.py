@@ -1,7 +1,7 @@
 """Levenberg-Marquardt for a batch of small problems; each problem has its own state and damping.
 
-`levenberg_marquardt` is the loop. A `Minimisation` defines steps and their acceptance. See Nocedal
-and Wright, Numerical Optimization, ch. 10.
+`levenberg_marquardt` is the loop. A `Minimisation` defines the steps and which are accepted. A
+batch holds a problems of d variables each. See Nocedal and Wright, Numerical Optimization, ch. 10.
 """
 
 import abc
@@ -15,43 +15,45 @@ from torch import Tensor
 
 from torchgrasp.foundation.base import Batch, flatnonzero, named_tensors, pick, put
 
-SOLVED = 0.1  # sum of squared residuals at which a row of `LeastSquares` ends
+SOLVED = 0.1  # sum of squared residuals below which a problem of `LeastSquares` ends
 CHECK_EVERY = 6  # steps between two looks for ended problems on an accelerator: the host waits
 
 
 @dataclasses.dataclass(frozen=True)
 class Linearisation(Batch):
-    """The cost of each problem of a batch at its current state; subclasses add the linear model."""
+    """The costs of the a problems of a batch at their current states; subclasses add the linear
+    model.
+    """
 
-    cost: Float[Tensor, "a"]
+    cost: Float[Tensor, "a"]  # cost that is minimised (no unit)
 
 
-Damping = Float[Tensor, "a"]
-Step = Float[Tensor, "a d"]
+Damping = Float[Tensor, "a"]  # damping of each problem's next step; infinite once it has ended
+Step = Float[Tensor, "a d"]  # changes of the d variables of each problem
 Steps = tuple[Step, Bool[Tensor, "a"]]
-"""The step of each problem, and whether its minimisation goes on."""
+"""The step (a, d) of each problem, and a mask (a,) of the problems whose minimisation goes on."""
 Verdict = tuple[Bool[Tensor, "a"], Damping]
-"""Whether the step of each problem is accepted, and the damping of its next step."""
+"""A mask (a,) of the accepted steps, and the damping (a,) of each problem's next step."""
 State = TypeVar("State", bound=Batch)
 Model = TypeVar("Model", bound=Linearisation)
 
 
 class Minimisation(abc.ABC, Generic[State, Model]):
-    """A batch of minimisation problems: their costs, their steps, and the rule by which a step is
-    accepted.
-    """
+    """A batch of minimisation problems: it defines costs, steps, and which steps are accepted."""
 
     first_damping: float = 1e-2
 
     @abc.abstractmethod
     def linearise(self, state: State, rows: Int[Tensor, "a"]) -> Model:
-        """Return the costs and linear models of the problems with the indices `rows`, at their
-        states.
+        """Return the costs and linear models, at the states `state`, of the problems with the
+        indices `rows`.
         """
 
     @abc.abstractmethod
     def step(self, model: Model, damping: Damping) -> Steps:
-        """Return the steps that solve the damped normal equations, and which problems go on."""
+        """Return the steps that solve the damped normal equations, and a mask of the problems that
+        go on.
+        """
 
     @abc.abstractmethod
     def move(self, state: State, x: Step, rows: Int[Tensor, "a"]) -> State:
@@ -59,12 +61,17 @@ class Minimisation(abc.ABC, Generic[State, Model]):
 
     @abc.abstractmethod
     def judge(self, model: Model, trial: Model, x: Step, damping: Damping) -> Verdict:
-        """Return which steps are accepted, and the next damping, given the models before and after
-        the step.
+        """Return a mask of the accepted steps, and the damping of the next steps.
+
+        `model` is the linear model before the steps `x`, `trial` the one after them, and `damping`
+        that of these steps.
         """
 
     def refuse(self, model: Model, trial: Model) -> Model:
-        """Return the model to use after a rejected step: by default the model before the step."""
+        """Return the model to use after a rejected step: by default the model before the step.
+
+        `trial` is the model after the step.
+        """
         return model
 
 
@@ -72,12 +79,11 @@ class Minimisation(abc.ABC, Generic[State, Model]):
 def levenberg_marquardt(
     problem: Minimisation[State, Model], state: State, steps: int
 ) -> tuple[State, Float[Tensor, "b"]]:
-    """Minimise every problem of a batch by damped Gauss-Newton steps; return final states and
-    costs.
+    """Minimise b problems by damped Gauss-Newton steps; return their final states and costs.
 
-    Every problem takes at most `steps` steps, each with one evaluation. No gradient flows through
-    the minimisation. Problems that have ended leave the batch. An accelerator looks for them in few
-    steps only, because the host waits.
+    Every problem takes at most `steps` steps from its initial `state`, each with one evaluation. No
+    gradient flows through the minimisation. Problems that have ended leave the batch. On an
+    accelerator this is checked only every `CHECK_EVERY` steps, because the host has to wait.
     """
     whole = state
     rows = torch.arange(len(state), device=next(iter(named_tensors(state).values())).device)
@@ -117,13 +123,16 @@ def levenberg_marquardt(
 
 
 Residuals = tuple[Float[Tensor, "g m"], Float[Tensor, "g m d"]]
+"""The m residuals of g problems, and their Jacobian by the d variables."""
 
 
 @dataclasses.dataclass(frozen=True)
 class LinearResiduals(Linearisation):
-    """The residuals of each problem of a batch at its state, and their Jacobian."""
+    """The m residuals of each problem of a batch at its state, and their Jacobian by its d
+    variables.
+    """
 
-    residual: Float[Tensor, "a m"]
+    residual: Float[Tensor, "a m"]  # the cost is the sum of their squares
     jacobian: Float[Tensor, "a m d"]
 
 
@@ -131,12 +140,12 @@ class LinearResiduals(Linearisation):
 class LeastSquares(Minimisation[State, LinearResiduals]):
     """A batch of least-squares problems: the cost is the sum of squared residuals."""
 
-    # with Jacobian, of the problems with given indices
+    # residuals and Jacobian, given the states and the indices of a problems
     residuals: Callable[[State, Int[Tensor, "a"]], Residuals]
-    moved: Callable[[State, Float[Tensor, "a d"]], State]  # the states after given steps
+    moved: Callable[[State, Float[Tensor, "a d"]], State]  # states after steps, given both
     solved: float = SOLVED  # sum of squared residuals below which a problem is solved
-    largest: float = 0.3  # largest change of a variable in one step
-    floor: float = 1e-3  # damping of a joint that moves nothing
+    largest: float = 0.3  # largest change of a variable in one step, in its own unit
+    floor: float = 1e-3  # absolute damping, for a variable that changes no residual
     fall: float = 3.0  # divisor of the damping after an accepted step
     rise: float = 4.0  # factor on the damping after a refused step
     least: float = 1e-6  # least damping
@@ -150,8 +159,9 @@ class LeastSquares(Minimisation[State, LinearResiduals]):
         return LinearResiduals(residual.square().sum(1), residual, jacobian)
 
     def step(self, model: LinearResiduals, damping: Damping) -> Steps:
-        """Return the damped step of each problem, zero if its matrix is singular, and whether the
-        problem goes on.
+        """Return the damped steps, and a mask of the problems that go on.
+
+        The step of a problem with a singular matrix is zero.
         """
         normal = model.jacobian.mT @ model.jacobian
         diagonal = normal.diagonal(dim1=1, dim2=2)
@@ -165,13 +175,16 @@ class LeastSquares(Minimisation[State, LinearResiduals]):
         return x * (self.largest / x.abs().amax(1, keepdim=True).clamp_min(self.largest)), taken
 
     def move(self, state: State, x: Step, rows: Int[Tensor, "a"]) -> State:
-        """Return the states of the problems after the steps `x`."""
+        """Return the states of the problems after the steps `x`; the indices `rows` are not used."""
         return self.moved(state, x)
 
     def judge(
         self, model: LinearResiduals, trial: LinearResiduals, x: Step, damping: Damping
     ) -> Verdict:
-        """Accept a step that lowers the cost; stop a problem that has converged or is stuck."""
+        """Return a mask of the steps that lower the cost, and the damping of the next steps.
+
+        The damping is infinite for a problem that has converged or is stuck, which ends it.
+        """
         better = trial.cost < model.cost
         converged = trial.cost > (1 - self.stalled) * model.cost
         rests = torch.where(better, converged, damping > self.lost)

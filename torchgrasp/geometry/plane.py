@@ -19,23 +19,25 @@ from torchgrasp.foundation.rules import Pose
 from torchgrasp.geometry.frames import apply, inverse, real, rigid, rotate
 from torchgrasp.geometry.linalg import norm, unit
 
-GRID = 2.0**-20  # spacing [m] of rounded points: far above the rounding errors of a transform
-FINE = GRID**1.5  # spacing of rounded numbers of about size 1: a billionth
+GRID = 2.0**-20  # step [m] of rounded points: far above the rounding errors of a transform
+FINE = GRID**1.5  # step of rounded numbers (no unit) of about size 1: a billionth
 POINTS = ("points", "viewpoint", "vertices")
 DIRECTIONS = ("normals", "approach", "witness", "frustum", "task_load", "task_twist", "task_forces")
 POSES = ("obj_from_hand", "obj_from_vf")
 """Names of the fields that change with the coordinate frame, by kind; all other fields are
 invariant.
 """
-LEAST_TILT = 0.05  # least sine of the angle between the vertical and a camera that has an azimuth
+# least sine of the camera's angle to the vertical at which its horizontal direction is used
+LEAST_TILT = 0.05
 UNIT_ERROR = 1e-4  # greatest error of a unit normal's length
-MOST_ABOVE = 0.01  # height [m] of a table above the middle of a cloud: several calibration errors
+# most height [m] of a table above the median height of a cloud: several calibration errors
+MOST_ABOVE = 0.01
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class Plane(Value):
-    """A table plane: the points p with normal . p = offset. Objects stand on the side of the
+    """A table plane: the points p [m] with normal . p = offset. Objects are on the side of the
     normal.
 
     The unit `normal` points up; `offset` is the distance [m] of the plane from the origin along it.
@@ -62,23 +64,28 @@ class Plane(Value):
 
     @checked(gradients=True)
     def height(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return the heights [m] of points above the plane."""
+        """Return the signed heights [m] of points [m] above the plane."""
         return points @ self.normal.to(points) - self.offset
 
     @checked
     def moved(self, b_from_a: Pose) -> "Plane":
-        """Return the plane transformed from frame a to frame b."""
+        """Return the plane in frame b, given the rigid transform `b_from_a` [m] from its own frame
+        a.
+        """
         normal = b_from_a[:3, :3].double() @ self.normal.double()
         return Plane(unit(normal), self.offset + float(normal @ b_from_a[:3, 3].double()))
 
     def describe(self) -> str:
-        """Return normal and offset as text."""
+        """Return normal and offset [m] as text, for example "normal 0 0 1, offset 0.1"."""
         x, y, z = self.normal.tolist()
         return f"normal {x:.9g} {y:.9g} {z:.9g}, offset {self.offset:.9g}"
 
 
 def read_plane(text: str) -> Plane:
-    """Return the plane that `Plane.describe` wrote as a text; raise `BadArgument` for another text."""
+    """Return the plane that a text of `Plane.describe` describes.
+
+    Raises `BadArgument` for any other text.
+    """
     words = text.replace(",", "").split()
     try:
         x, y, z, offset = (float(words[k]) for k in (1, 2, 3, 5))
@@ -88,8 +95,10 @@ def read_plane(text: str) -> Plane:
 
 
 def as_plane(table: Plane | float | None) -> Plane | None:
-    """Return a table as a plane. It is given as a plane or as its height [m] along z; None means no
+    """Return a table as a plane, given as a plane or as its height [m] along z; None means no
     table.
+
+    Raises `BadArgument` for another type or a height that is not finite.
     """
     if table is None or isinstance(table, Plane):
         return table
@@ -103,13 +112,14 @@ def upright_frame(
     viewpoint: Float[Tensor, "*v 3"] | None = None,
     table: Plane | None = None,
 ) -> Float[Tensor, "4 4"]:
-    """Return `obj_from_upright`: the pose of a frame that is fixed to points, camera and table.
+    """Return `obj_from_upright`, the pose [m] of a frame that is fixed to points, camera and table.
 
     The z axis is the table's normal. Without a table, z points to the camera; without both, z is
     the direction in which the points spread least. The x axis is horizontal and points towards the
     camera. If the camera is straight above, x points to the point farthest from the vertical
-    through the points' centroid. The origin is on this vertical, on the table if there is one. A
-    table above most points is a `BadArgument`.
+    through the points' centroid. The origin is on this vertical, on the table if there is one.
+    `viewpoint` [m] is the camera's position, or several, whose mean is taken. Raises `BadArgument`
+    for a table above most points.
     """
     points = points.detach().cpu().double()
     centre = points.mean(0)
@@ -144,15 +154,20 @@ def upright_frame(
 def to_upright(
     points: Float[Tensor, "*b 3"], obj_from_upright: Float[Tensor, "4 4"]
 ) -> Float[Tensor, "*b 3"]:
-    """Return points [m] in the upright frame, rounded to multiples of the fine step `GRID` [m]."""
+    """Return points [m] in the upright frame, rounded to multiples of the small step `GRID` [m].
+
+    `obj_from_upright` is the frame's pose, as `upright_frame` returns it.
+    """
     upright_from_obj = inverse(obj_from_upright).to(points.device)
     moved = apply(upright_from_obj, points.double().reshape(-1, 3))
     return _round(moved).reshape_as(points)
 
 
 def round_upright(value: SomeValue, obj_from_upright: Float[Tensor, "4 4"]) -> SomeValue:
-    """Return a value, such as a cloud, in the upright frame, in float64, each number rounded to
-    multiples of `GRID`.
+    """Return a value, such as a cloud, in the upright frame, in float64 and rounded.
+
+    Every number of its tensors is rounded to a multiple of `GRID`, in its own unit.
+    `obj_from_upright` is the frame's pose.
     """
     return map_tensors(_round, move(value.to(torch.float64), inverse(obj_from_upright)))
 
@@ -167,6 +182,8 @@ def _round(x: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
 def move(value: SomeValue, b_from_a: Float[Tensor, "4 4"]) -> SomeValue:
     """Return a value, such as a cloud or grasps, transformed from frame a to frame b, with lengths
     in metres.
+
+    Fields named in `POINTS`, `DIRECTIONS` or `POSES` change, also in values within the value.
     """
 
     def moved(name: str, x: Any) -> Any:

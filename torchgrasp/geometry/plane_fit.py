@@ -1,4 +1,4 @@
-"""Planes that hold many points of a view: triples of points propose planes, robust least squares
+"""Planes that hold many points of a view: triples of points propose them, and robust least squares
 refines them.
 """
 
@@ -24,17 +24,17 @@ class PlaneNumbers:
     noise_growth: float = 0.0035
     """Growth of the noise with the squared distance [1/m]."""
     distance: float = 0.7
-    """Distance [m] of a camera that is not known."""
+    """Assumed distance [m] of a camera whose position is unknown."""
     planes: int = 8
     """Most planes of a view."""
     scored: int = 2000
-    """Points that score the proposals."""
+    """Most points by which a proposed plane is scored."""
     triples: int = 4000
-    """Proposals by random points, which may be far apart."""
+    """Number of triples of random points, which may be far apart, that propose a plane."""
     neighbours: int = 60
-    """Nearest points from which a proposal by neighbours is drawn."""
+    """Number of nearest points from which a triple of neighbours is drawn."""
     least_height: float = 10.0
-    """Least height of a triangle, over the noise: a lower triangle's normal is noise."""
+    """Least height of a triangle, over the noise: the normal of a lower one is mostly noise."""
     least_side: float = 1e-12
     """Least side [m] that a triangle's area is divided by."""
     at_once: int = 500
@@ -42,29 +42,29 @@ class PlaneNumbers:
     least_share: float = 0.05
     """Least share of the points on a plane."""
     most_tilt: float = 30.0
-    """Greatest angle [deg] between the normal and `up`."""
+    """Greatest angle [deg] between the normal and the upward direction, if that is known."""
     tilt_slack: float = 5.0
-    """Further angle [deg] of a proposal, which the fit may turn back."""
+    """Angle [deg] by which a proposed plane may tilt more, because the fit may tilt it back."""
     reach: float = 0.30
     """Height [m] of objects above a plane."""
     rough: float = 2.5
-    """Scale of the residuals, over the assumed noise, from which a plane is not flat."""
+    """Scale (ratio of measured to assumed noise) from which a surface counts as not flat."""
     smooth: float = 0.2
-    """Least scale of the residuals: points may lie better than the assumed noise."""
+    """Least scale: the points may be more exact than the assumed noise."""
     core: float = 3.0
-    """Greatest distance of a point on a plane, over noise and scale."""
+    """Greatest distance of a point on a plane, over the product of noise and scale."""
     quantile: float = 0.25
     """Quantile of the distances that measures the scale: few points of objects count in it."""
     per_quantile: float = 3.14
-    """Standard deviation over this quantile, for normal residuals."""
+    """Ratio of the standard deviation to this quantile, for normally distributed residuals."""
     tukey: float = 4.685
-    """Residual of no weight, over the scale: with it, Tukey's fit of normal residuals has 95 % of
-    the efficiency of least squares.
+    """Residual, over the scale, from which a point has no weight: with it, Tukey's fit of normally
+    distributed residuals has 95 % of the efficiency of least squares.
     """
     steps: int = 30
     """Most steps of a fit."""
     still: float = 1e-12
-    """Change of a plane below which its fit ends."""
+    """Change of a plane (normal, and offset [m]) below which its fit ends."""
 
 
 PLANES = PlaneNumbers()
@@ -73,7 +73,10 @@ PLANES = PlaneNumbers()
 def assume_noise(
     points: Float[Tensor, "n 3"], eye: Float[Tensor, "3"] | None
 ) -> Float[Tensor, "n"]:
-    """Return the assumed noise [m] of each point; `PLANES.distance` is that of an unknown camera."""
+    """Return the assumed depth noise [m] of each point [m], for a camera at `eye` [m].
+
+    The noise grows with the squared distance. None means an unknown camera, at `PLANES.distance`.
+    """
     if eye is None:
         squared = torch.full((len(points),), PLANES.distance**2, dtype=points.dtype, device="cpu")
     else:
@@ -82,8 +85,14 @@ def assume_noise(
 
 
 class SeenPoints:
-    """One view: points [m] about their centre, their noise [m], camera position `eye`, upward
-    direction `sky`.
+    """The points of one view, in a frame with their mean as origin.
+
+    Args:
+        points: (n, 3) [m].
+        eye: position (3,) [m] of the camera; None if unknown.
+        sky: upward unit vector (3,); None if unknown.
+
+    `noise` (n,) [m] is the assumed noise of the points.
     """
 
     def __init__(self, points: Points, eye: Vector | None, sky: Vector | None) -> None:
@@ -95,8 +104,10 @@ class SeenPoints:
 
 @dataclasses.dataclass(frozen=True)
 class PlaneFit:
-    """A plane normal . p = offset [m] that holds `count` points; `scale` is the ratio of measured
-    to assumed noise.
+    """A plane normal . p = offset that holds many points p [m] of a view.
+
+    `normal` is a unit vector, `offset` is in metres. `count` points lie on the plane, and `scale`
+    is the ratio of their measured to their assumed noise.
     """
 
     normal: Float[Tensor, "3"]
@@ -105,8 +116,10 @@ class PlaneFit:
     count: int
 
     def turned_up(self, view: "SeenPoints") -> "PlaneFit":
-        """Return the plane with its normal turned up, else towards the camera, else to the side
-        with most points.
+        """Return the plane with its normal turned up.
+
+        If the upward direction is unknown, the normal points to the camera; if that is unknown too,
+        to the side with most points.
         """
         if view.sky is not None:
             side = float(self.normal @ view.sky)
@@ -121,8 +134,10 @@ class PlaneFit:
 
 
 def fit_planes(view: SeenPoints, generator: torch.Generator) -> Iterator[PlaneFit]:
-    """Yield at most `PLANES.planes` planes, each with the most points that lie on no plane before
-    it.
+    """Yield at most `PLANES.planes` planes, each the one with most of the points that no earlier
+    plane holds.
+
+    `generator` draws the triples of points that propose planes.
     """
     points = view.points[: PLANES.scored]
     noise = view.noise[: PLANES.scored]

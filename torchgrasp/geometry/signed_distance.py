@@ -19,7 +19,7 @@ from torchgrasp.geometry.linalg import norm
 from torchgrasp.geometry.mesh import closest_on_triangles
 
 FIELD_SPACING = 0.004  # spacing [m] of nodes with an error below that of an estimated surface
-# Share of a cubic at the middle: its four neighbours have the weights -1, 9, 9, -1.
+# A cubic in the middle of four equidistant values has this times the weights -1, 9, 9, -1.
 SIXTEENTH = 1 / 16
 
 
@@ -30,23 +30,23 @@ class FieldNumbers:
     band: float = 0.026
     """Distance [m] within which every second node is exact: the reach of a palm's spheres."""
     near: float = 3.0
-    """Spacings outside the surface within which every node is exact."""
+    """Distance outside the surface, in spacings, within which every node is exact."""
     inward: float = 5.0
-    """Spacings inside the surface within which every node is exact."""
+    """Distance inside the surface, in spacings, within which every node is exact."""
     most_nodes: float = 2e7
     """Most nodes of a grid: 160 MB."""
     least_area: float = 1e-14
     """Least area [m2] of a triangle that counts."""
     sample: float = 0.002
-    """Side [m] of the square for which the surface has one sample."""
+    """Side [m] of the square for which the surface has one sample on average."""
     least_samples: int = 2000
     """Least samples of a surface."""
     most_samples: int = 40_000
     """Most samples of a surface, which bounds the time."""
     few: int = 8
-    """One of so many samples is used for nodes beyond the band."""
+    """For nodes beyond the band, one in this number of samples is used."""
     tried: int = 3
-    """Triangles that are tried for a point within the band."""
+    """Number of triangles that are tried for a point within the band."""
     leaf: int = 32
     """Samples in a leaf of the search tree."""
     at_once: int = 8192
@@ -59,33 +59,39 @@ FIELDS = FieldNumbers()
 
 
 class Grid(NamedTuple):
-    """The grid of points, or of each row of points."""
+    """The grid of nodes in which points are looked up: one for all points, or one for each entry
+    of a batch.
+    """
 
-    origin: Float[Tensor, "*b 3"]  # [m]
-    spacing: float | Float[Tensor, "*b 1"]  # of the nodes [m]
-    last: Int[Tensor, "*b 3"]  # node on each axis
-    stride: Any  # number of values between neighbours on the x and on the y axis
-    first: Any  # place of the first value
-    # steps from the first corner of a cell to all corners, among the values
+    origin: Float[Tensor, "*b 3"]  # position [m] of node (0, 0, 0)
+    spacing: float | Float[Tensor, "*b 1"]  # distance [m] of neighbouring nodes
+    last: Int[Tensor, "*b 3"]  # index of the last node on each axis
+    stride: Any  # two numbers of values, between neighbours on the x and on the y axis
+    first: Any  # index of the grid's first value in `DistanceField.nodes`
+    # index steps in `DistanceField.nodes` from the first corner of a cell to its 8 corners
     corners: Int[Tensor, "8 *b"]
 
 
 class DistanceField(Value, abc.ABC):
-    """Signed distances [m] at the `nodes` of a grid, or of the grids of several objects, one for
-    each row of points.
+    """Signed distances [m] at the `nodes` of a grid, negative inside.
+
+    It holds the grid of one object for all points, or that of an own object for each of r entries.
     """
 
-    nodes: Any  # Float[Tensor, "n"]
-    spacing: Any  # [m], a number or that of each row
+    nodes: Any  # Float[Tensor, "n"] [m], the values of all nodes, those of the z axis contiguous
+    spacing: Any  # distance [m] of neighbouring nodes: a number, or (r,) for each entry
 
     @abc.abstractmethod
     def rows(self, index: Int[Tensor, "k"]) -> "DistanceField":
-        """Return the fields of some of the rows of points; a single field is that of all rows."""
+        """Return the field whose entry k is that of entry `index[k]`; one object's field is
+        unchanged.
+        """
 
     @checked
     def nearest_node(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return the signed distance [m] of the grid node nearest to each point, outside the grid
-        of a border node.
+        """Return the signed distance [m] at the grid node nearest to each point [m].
+
+        For a point outside the grid it is a node at the border.
         """
         grid = self._grid(points)
         node = torch.round((points - grid.origin) / grid.spacing).clamp_min_(0)
@@ -96,13 +102,14 @@ class DistanceField(Value, abc.ABC):
 
     @abc.abstractmethod
     def _grid(self, points: Float[Tensor, "*b 3"]) -> Grid:
-        """Return the grid of the points."""
+        """Return the grid in which the points are looked up."""
 
     @checked(gradients=True)
     def query(
         self, points: Float[Tensor, "*b 3"]
     ) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
-        """Return the interpolated signed distance [m] at each point, and its gradient.
+        """Return (distance, gradient): the interpolated signed distance [m] at each point [m], and
+        its gradient (no unit).
 
         Outside the grid, the distance [m] from the grid is added to the value at the border.
         """
@@ -136,7 +143,10 @@ class DistanceField(Value, abc.ABC):
 @checked
 @dataclasses.dataclass(frozen=True)
 class SignedDistanceField(DistanceField):
-    """Signed distances [m] on a grid, negative inside; node i is at origin + i * spacing.
+    """Signed distances [m] of one object on a grid, negative inside.
+
+    `values` [m] has an axis for each of x, y and z; `values[i]` is at the point origin + i *
+    spacing. `origin` [m] is node (0, 0, 0), `spacing` [m] the distance of neighbouring nodes.
 
     >>> ball = torch.cartesian_prod(*[torch.linspace(-0.1, 0.1, 41)] * 3).norm(dim=1).reshape(41, 41, 41) - 0.05
     >>> distance, gradient = SignedDistanceField(torch.full((3,), -0.1), 0.005, ball).query(torch.tensor([0, 0, 0.08]))
@@ -150,12 +160,12 @@ class SignedDistanceField(DistanceField):
 
     @property
     def nodes(self) -> Float[Tensor, "n"]:
-        """The distances at all nodes."""
+        """The signed distances [m] at all n nodes, those along the z axis contiguous."""
         return self.values.reshape(-1)
 
     @checked
     def rows(self, index: Int[Tensor, "k"]) -> "SignedDistanceField":
-        """Return the fields of some of the rows of points; this one is that of all rows."""
+        """Return this field: one object's field is the same for every entry."""
         return self
 
     @kept
@@ -174,8 +184,10 @@ class SignedDistanceField(DistanceField):
 
 
 def corner_steps(dx: Int[Tensor, "*b"], dy: Int[Tensor, "*b"]) -> Int[Tensor, "8 *b"]:
-    """Return the steps from the first corner of a cell to all eight corners, given the strides on
-    the x and y axis.
+    """Return the index steps from the first corner of a grid cell to its eight corners.
+
+    `dx` and `dy` are the strides: the numbers of values between neighbours on the x and on the y
+    axis. The stride on the z axis is 1.
     """
     corner = torch.arange(8, device=dx.device).view(-1, *[1] * dx.ndim)
     return corner // 4 * dx + corner // 2 % 2 * dy + corner % 2
@@ -188,10 +200,11 @@ def field_from_surface(
     spacing: Annotated[float, Range(0.0001, 0.1)] = 0.003,
     margin: Annotated[float, Range(0.0, 1.0)] = 0.08,
 ) -> SignedDistanceField:
-    """Return the signed distance field of a triangle mesh [m] with outward faces; the mesh may be
-    open.
+    """Return the signed distance field of a triangle mesh with outward faces, which may be open.
 
-    The nodes are `spacing` [m] apart and reach to `margin` [m] around the mesh: at most 2e7 nodes.
+    `vertices` are in metres; `faces` holds the indices of three vertices each. The nodes are
+    `spacing` [m] apart and reach to `margin` [m] around the mesh. Raises `BadArgument` for more
+    than `FIELDS.most_nodes` nodes.
     """
     check_tensor("vertices", vertices, (None, 3))
     surface = _Surface(vertices, faces)
@@ -221,8 +234,10 @@ def field_from_surface(
 
 
 def surface_distance(vertices: Tensor, faces: Tensor) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the signed distance [m] from a triangle mesh [m] with outward faces, as a function of
-    points (n, 3).
+    """Return a function that maps points (n, 3) [m] to their signed distances (n,) [m] from a mesh.
+
+    The mesh has outward faces: `vertices` (v, 3) [m], and `faces` (f, 3), the indices of three
+    vertices each.
     """
     return _Surface(vertices, faces).distance
 
@@ -260,8 +275,8 @@ def _upsample(values: np.ndarray, axis: int) -> np.ndarray:
 
 
 class _Surface:
-    """The triangles of a mesh with a search tree over surface samples, to find the distances of
-    points.
+    """The triangles of a mesh [m], with a search tree over samples of the surface, to find
+    distances to it.
     """
 
     def __init__(self, vertices: Tensor, faces: Tensor):

@@ -1,5 +1,6 @@
-"""Search for supports in a view: planes that objects stand on, each with the region that it covers,
-in any frame.
+"""Search for supports in a view: planes with objects on them, each with the region that it covers.
+
+All points are in one frame, which may be any.
 """
 
 import dataclasses
@@ -34,23 +35,23 @@ class SupportNumbers:
     least_thickness: float = 0.001
     """Distance [m] that is added to the noise: a table is not quite flat."""
     most_through: float = 0.1
-    """Most points seen through a support's region, over the points on it."""
+    """Most points that the camera sees through a support's region, over the points on it."""
     edge: float = 0.05
-    """Border of the region, over its width, through which points may be seen."""
+    """Border of the region, over its width, through which the camera may see points."""
     low: float = 0.06
     """Height [m] below which points of an object stand close to its support."""
     pierced_cell: float = 0.02
     """Width [m] of the columns in which points above and below a support are counted."""
     below: float = 0.2
-    """Least points below a support over those above it, in a column that goes through it."""
+    """Least ratio of points below to points above a support, in a column that goes through it."""
     most_pierced: float = 0.05
     """Greatest share of the low points over a support that continue below it."""
     least_standing: float = 0.001
-    """Least share of the points that stand low on a support, over its region."""
+    """Least share of all points that lie low above a support, over its region."""
     least_low: float = 0.05
-    """Least share of the low points that stand over the region."""
+    """Least share of the low points that lie over the region."""
     steep: float = 0.9
-    """Cosine of the camera's angle to the normal from which objects hide their own feet."""
+    """Cosine of the camera's angle to the normal above which objects hide their lowest points."""
     grazing: float = 5.0
     """Least angle [deg] between the plane and the camera's direction."""
     favour: float = 2.0
@@ -70,7 +71,9 @@ class SupportNumbers:
     least_part: float = 0.02
     """Least size of a group of points, over the largest group."""
     most_open: float = 0.05
-    """Most points seen below the plane between two groups, over the smaller group."""
+    """Most points below the plane that the camera sees between two groups, over the points of the
+    smaller group.
+    """
     least_height: float = 1e-9
     """Least height [m] that a ray to a plane is divided by."""
 
@@ -85,13 +88,15 @@ class SupportPlane:
     """A plane that objects stand on, and its region: the convex hull of the points on it."""
 
     plane: Plane  # the camera is above it
-    # outward unit vector and offset [m] of each; None: unbounded
+    # of each side of the region: outward unit vector u (x, y, z) in the plane, and offset o [m],
+    # with u . p + o < 0 for points p within; None: the region is unbounded
     sides: Float[Tensor, "s 4"] | None = None
-    width: float = math.inf  # smaller width of the region [m]
+    width: float = math.inf  # least width of the region [m]
 
     def covers(self, points: Float[Tensor, "*b 3"], margin: float = 0.0) -> Bool[Tensor, "*b"]:
-        """Return which points lie over the region or at most `margin` [m] beside it; a negative
-        margin shrinks it.
+        """Return a mask of the points [m] over the region, or at most `margin` [m] beside it.
+
+        A negative margin shrinks the region.
         """
         if self.sides is None:
             return torch.ones(points.shape[:-1], dtype=torch.bool, device=points.device)
@@ -102,7 +107,7 @@ class SupportPlane:
         return torch.cat(parts).reshape(points.shape[:-1])
 
     def moved(self, shift: Vector) -> "SupportPlane":
-        """Return the support after a translation [m]."""
+        """Return the support after a translation by `shift` (3,) [m]."""
         plane = Plane(self.plane.normal, self.plane.offset + float(self.plane.normal @ shift))
         sides = self.sides
         if sides is not None:
@@ -113,8 +118,16 @@ class SupportPlane:
 def find_table(
     points: Points, viewpoint: Vector, table: Plane | float | None, up: object
 ) -> tuple[SupportPlane, ...]:
-    """Return the support on a given table, or all supports found in the points, best first; the
-    camera is above.
+    """Return the support on a given table, or all supports found in the points, best first.
+
+    Args:
+        points: (n, 3) [m].
+        viewpoint: position (3,) [m] of the camera.
+        table: the table as a plane, or its height [m] along z; None to search for supports.
+        up: upward direction, three numbers of any length; None if unknown.
+
+    Raises `BadArgument` for a camera below the table, or `up` far from the table's normal;
+    `NoSupport` if none is found.
     """
     plane = as_plane(table)
     direction = None if up is None else torch.as_tensor(up).double().cpu()
@@ -139,16 +152,20 @@ def find_supports(
     up: Vector | None = None,
     least_width: float = SUPPORTS.least_width,
 ) -> tuple[SupportPlane, ...]:
-    """Return the planes that support objects in a view, the most plausible first, each with the
-    region that it covers.
+    """Return the planes that support objects in a view, the most plausible first.
+
+    Args:
+        points: (n, 3) [m].
+        viewpoint: position (3,) [m] of the camera; None if unknown: then the side with more points
+            is the upper one.
+        up: upward direction (3,) of any length; None allows any direction.
+        least_width: least width [m] of a support's region.
 
     Triples of points propose planes. An iterated fit with Tukey's weights refines each plane.
     Objects stand on a support, over its region, and the camera sees nothing through the region. The
     support with the most points low above it comes first; the points count twice if the camera
     looks at the support. Of parallel supports, a higher one as wide as furniture comes first. A
-    rigid motion of all arguments moves the supports alike. Without a camera, the side with more
-    points is the upper one. Without `up`, any direction is allowed. `NoSupport` is raised if there
-    is no support.
+    rigid motion of all arguments moves the supports alike. Raises `NoSupport` if there is none.
     """
     points = check_tensor("points", points, (None, 3)).detach().cpu().double()
     eye = sky = None
@@ -180,11 +197,15 @@ def find_supports(
 def bound(
     plane: Plane, points: Points, on: Bool[Tensor, "n"], eye: Vector | None
 ) -> SupportPlane | None:
-    """Return the support on a plane, with its region, or None if too few points lie on the plane
-    (the mask `on`).
+    """Return the support on a plane, with its region, or None if too few points lie on the plane.
 
-    The region is the convex hull of the largest connected group of these points. Another large
-    group joins it if the camera `eye` sees almost nothing below the plane between the groups: then
+    Args:
+        points: all points (n, 3) [m] of the view.
+        on: mask of the points that lie on the plane.
+        eye: position (3,) [m] of the camera; None if unknown.
+
+    The region is the convex hull of the largest connected group of the points on the plane. Another
+    large group joins it if the camera sees almost nothing below the plane between the groups: then
     an object hides that area.
     """
     if int(on.sum()) < 3:
@@ -220,17 +241,17 @@ def _axes(normal: Vector, points: Points) -> Float[Tensor, "3 2"]:
 
 @dataclasses.dataclass(frozen=True)
 class Hull:
-    """A convex polygon in a plane: its corners [m], and the outward unit normal and offset [m] of
-    each side.
-    """
+    """A convex polygon in a plane."""
 
-    corners: Float[Tensor, "k 2"]
+    corners: Float[Tensor, "k 2"]  # [m]
+    # outward unit normal n (x, y) of each side, and offset o [m], with n . p + o < 0 within
     sides: Float[Tensor, "s 3"]
 
     @classmethod
     def of(cls, points: Float[Tensor, "n 2"]) -> "Hull":
-        """Return the convex hull of points in a plane. If all points lie on a line, no point is
-        inside the hull.
+        """Return the convex hull of points [m] in a plane.
+
+        If all points lie on a line, the hull contains no point.
         """
         try:
             hull = spatial.ConvexHull(points.numpy())
@@ -239,14 +260,15 @@ class Hull:
         return cls(points[torch.from_numpy(hull.vertices).long()], torch.from_numpy(hull.equations))
 
     def holds(self, points: Float[Tensor, "n 2"], margin: float = 0.0) -> Bool[Tensor, "n"]:
-        """Return which points lie in the polygon or at most `margin` [m] outside; a negative margin
-        shrinks it.
+        """Return a mask of the points [m] in the polygon, or at most `margin` [m] outside.
+
+        A negative margin shrinks the polygon.
         """
         return (points @ self.sides[:, :2].T + self.sides[:, 2] < margin).all(-1)
 
     @property
     def width(self) -> float:
-        """The smallest distance [m] of two parallel lines that enclose the polygon."""
+        """The least distance [m] of two parallel lines that enclose the polygon."""
         return -float((self.corners @ self.sides[:, :2].T + self.sides[:, 2]).amin(0).amax())
 
 
@@ -273,11 +295,12 @@ def _parts(flat: Float[Tensor, "n 2"]) -> Iterator[Float[Tensor, "m 2"]]:
 
 
 def cross(plane: Plane, points: Points, eye: Vector | None) -> tuple[Points, Bool[Tensor, "n"]]:
-    """Return where the camera rays through points cross a plane [m], and which points lie behind
-    the plane.
+    """Return where the camera rays through points cross a plane (n, 3) [m], and a mask of the
+    points behind it.
 
-    Without a camera, the points themselves are returned, and only points at most `PLANES.reach` [m]
-    below count.
+    `points` (n, 3) and the camera's position `eye` (3,) are in metres. Without a camera, `eye`
+    None, the points themselves are returned, and those more than `PLANES.reach` [m] below the plane
+    do not count as behind it.
     """
     height = plane.height(points)
     if eye is None:
@@ -289,7 +312,7 @@ def cross(plane: Plane, points: Points, eye: Vector | None) -> tuple[Points, Boo
 
 @dataclasses.dataclass(frozen=True)
 class _Candidate:
-    """A support, its score, and a point in the middle of its region."""
+    """A support, its score (points low above it), and a point [m] in the middle of its region."""
 
     support: SupportPlane
     score: float
