@@ -1,5 +1,6 @@
-"""Sampled hand postures on disk: a folder of chunk files, each drawn from (seed, chunk number),
-written atomically.
+"""Sampled hand postures on disk: a folder of chunk files.
+
+Each chunk is drawn from (seed, index of the chunk) and written atomically.
 """
 
 import dataclasses
@@ -38,7 +39,7 @@ from torchgrasp.posture_model.sample import (
 )
 
 MANIFEST = "samples.json"  # file that describes the samples of a folder
-KEPT = 128  # chunks that stay in memory: all of a million postures, which take 200 MB
+KEPT = 128  # most chunks that stay in memory: those of a million postures, which take 200 MB
 MANIFEST_BYTES = 2**20  # largest manifest
 # the keys of `SampleSpec.meta`
 META_KEYS = ("hand", "fingers", "hand_sha256", "hand_codes", "seed", "sampling")
@@ -47,12 +48,11 @@ Chunk = Annotated[int, Range(0, 1_000_000)]
 
 @dataclasses.dataclass(frozen=True)
 class SampleFolder:
-    """A complete folder of `n` sampled postures in chunk files that are read on demand; `meta` is
-    as in `HandSamples`.
+    """A complete folder of `n` sampled postures in chunk files, which are read on demand.
 
     Iteration yields the chunks as `HandSamples`. By index the folder is a map-style dataset for
-    `torch.utils.data.DataLoader`: item i holds the joints (h,) and the code (6,) of posture i.
-    Recent chunks stay in memory.
+    `torch.utils.data.DataLoader`: item i holds the joints (h,) [rad] and the contact code (6,) of
+    posture i. Recent chunks stay in memory.
 
     >>> import tempfile
     >>> from torchgrasp import load_hand
@@ -63,9 +63,10 @@ class SampleFolder:
     """
 
     folder: Path
-    n: int
-    joint_names: tuple[str, ...]
-    meta: dict[str, str]
+    n: int  # number of postures
+    joint_names: tuple[str, ...]  # names of the h joints, in the order of the hand
+    meta: dict[str, str]  # hand, seed and sampling, as in `HandSamples`
+    # chunks that were read lately
     recent: Recent[HandSamples] = dataclasses.field(
         default_factory=lambda: Recent(KEPT), repr=False, compare=False
     )
@@ -74,8 +75,10 @@ class SampleFolder:
         return self.n
 
     def __getitem__(self, i: int) -> tuple[Tensor, Tensor]:
-        """Return joints and code of posture i; raises `IndexError` beyond the last,
-        `ModelFileError` as `chunk`.
+        """Return the joints (h,) [rad] and the contact code (6,) of posture i.
+
+        Raises `IndexError` beyond the last posture, and `ModelFileError` for a missing or damaged
+        chunk.
         """
         chunk, row = divmod(range(self.n)[operator.index(i)], CHUNK_POSTURES)
         samples = self.recent.get(chunk, self.chunk)
@@ -86,8 +89,10 @@ class SampleFolder:
 
     @checked
     def chunk(self, i: Chunk) -> HandSamples:
-        """Read chunk i; raises `ModelFileError` if it is missing, damaged, or belongs to other
-        samples.
+        """Read the postures of chunk i.
+
+        Raises `ModelFileError` if its file is missing, damaged, or belongs to other samples, and
+        `BadArgument` for an index beyond the last chunk.
         """
         sizes = chunk_sizes(self.n)
         if i >= len(sizes):
@@ -105,8 +110,9 @@ class SampleFolder:
 
     @checked
     def read(self, n: Count | None = None) -> HandSamples:
-        """Read the first `n` postures, or all by default, into memory. Raises `BadArgument` for n
-        outside [1, len].
+        """Read the first `n` postures into memory; None means all.
+
+        Raises `BadArgument` for n outside [1, len].
         """
         n = self.n if n is None else n
         check_whole("n", n, 1, self.n)
@@ -135,14 +141,19 @@ def write_samples(
     workers: Annotated[int, Range(1, 1024)] = 1,
     observer: Callable[[int], object] = lambda count: None,
 ) -> SampleFolder:
-    """Draw random postures of a hand as `sample_configurations` does, and write them to a folder,
-    chunk by chunk.
+    """Draw random postures of a hand, as `sample_configurations` does, and write them to a folder
+    in chunks.
 
-    The same call continues an interrupted run. `workers` threads draw at the same time. The
-    observer is called with the number of postures on disk at the start, then with the number of
-    postures in each new chunk. Raises `BadArgument` for workers outside [1, 1024], or a hand of
-    which almost all postures collide, and `OutputError` if the folder holds other samples, another
-    run is writing it, or the disk is full.
+    Args:
+        spec: number of postures, seed and sampling.
+        folder: folder that is made, or continued after an interrupted run with the same arguments.
+        workers: number of threads that draw at the same time.
+        observer: called with the number of postures on disk at the start, then with the number of
+            postures in each new chunk.
+
+    Raises `BadArgument` for workers outside [1, 1024], or a hand of which almost all postures
+    collide, and `OutputError` if the folder holds other samples, another run is writing it, or the
+    disk is full.
 
     >>> import tempfile
     >>> from torchgrasp import load_hand

@@ -1,10 +1,11 @@
-"""Expectation-maximisation of Gaussian mixtures (Eqs. 19-20), in one process or in each process
-that torchrun started.
+"""Expectation-maximisation of Gaussian mixtures (Eqs. 19-20), in one process or in several.
 
-The log-density of a Gaussian is linear in the features [1, x_i, x_i x_j], so each step is one
-matrix product. Sums of the features, weighted by responsibilities, suffice for the maximisation and
-are small enough to add over processes. The data must have mean 0 and variance 1 in every column;
-otherwise differences of such sums would lose their digits.
+torchrun starts several processes, which each hold a part of the data. The log-density of a Gaussian
+is linear in the f features [1, x_i, x_i x_j] of a data row x (one sample of d numbers), so each
+step is one matrix product. Sums of the features, weighted by responsibilities, suffice for the
+maximisation and are small enough to add over processes. The data must have mean 0 and variance 1 in
+every column; otherwise differences of such sums would lose their digits. All numbers are therefore
+standardised, without unit.
 """
 
 import dataclasses
@@ -24,20 +25,20 @@ from torchgrasp.posture_model.gaussian import whitening_matrices
 
 @dataclasses.dataclass(frozen=True)
 class EmNumbers:
-    """The numbers of expectation-maximisation and of its start by k-means."""
+    """Numbers of expectation-maximisation and of its start by k-means."""
 
     cached_rows: int = 2048
-    """Rows of one pass: their features and responsibilities stay in the cache."""
+    """Number of rows of one pass: their features and responsibilities stay in the cache."""
     device_rows: int = 2**17
-    """Rows of one pass on a GPU, which smaller passes leave idle."""
+    """Number of rows of one pass on a GPU, which smaller passes leave idle."""
     singular: float = 1e-12
-    """A conditional variance of this size is rounding, beside the data's variance of 1."""
+    """Greatest conditional variance that is only rounding; the data's variance is 1."""
     most_reseeds: int = 3
-    """A component that collapses more often shows that the data support fewer components."""
+    """Most times that a component may collapse: with more, the data support fewer components."""
     drawn: int = 20_000
-    """Rows from which k-means++ draws: some hundred for each component."""
+    """Number of rows from which k-means++ draws: some hundred for each component."""
     lloyd_steps: int = 10
-    """Steps of k-means. EM follows, so the clusters need not converge."""
+    """Number of steps of k-means. EM follows, so the clusters need not converge."""
 
 
 EM = EmNumbers()
@@ -45,28 +46,30 @@ EM = EmNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class EmRule:
-    """When a fit ends, and the variance that it adds."""
+    """The bounds that end a fit, and the variance that it adds."""
 
     iterations: int
     """Most steps, including the steps before the start."""
     tolerance: float
     """Least rise [nats] of the mean log-likelihood in a step that goes on."""
     regularisation: float
-    """Added to every variance."""
+    """Added to every variance of a component; the variance of the data is 1."""
 
 
 @dataclasses.dataclass(frozen=True)
 class DataRows:
     """The data rows of one process; several processes form the default group of torch.distributed."""
 
-    rows: Float[Tensor, "n d"]
-    rank: int = 0
-    processes: int = 1
+    rows: Float[Tensor, "n d"]  # n standardised samples of d numbers
+    rank: int = 0  # index of this process
+    processes: int = 1  # number of processes
 
     @staticmethod
     def of(rows: Float[Tensor, "n d"], distributed: bool) -> "DataRows":
-        """Return the shard of this process; raises `BadArgument` if `distributed` is True without a
-        process group.
+        """Return the rows of this process, with its index in the default group of processes if
+        `distributed`.
+
+        Raises `BadArgument` if `distributed` is True without such a group.
         """
         if not distributed:
             return DataRows(rows)
@@ -76,7 +79,7 @@ class DataRows:
         return DataRows(rows, torch.distributed.get_rank(), torch.distributed.get_world_size())
 
     def sum(self, x: Tensor) -> Tensor:
-        """Return the sum of x over all processes; every process gets the same bits."""
+        """Return the sum of the tensor `x` over all processes; every process gets the same bits."""
         if self.processes > 1:
             x = x.clone()
             torch.distributed.all_reduce(x)
@@ -87,7 +90,7 @@ class DataRows:
         return int(self.sum(self.rows.new_tensor(len(self.rows), dtype=torch.int64)))
 
     def lengths(self) -> Int[Tensor, "p"]:
-        """Return the number of rows in each process."""
+        """Return the number of rows in each of the p processes."""
         lengths = self.rows.new_zeros(self.processes, dtype=torch.int64)
         lengths[self.rank] = len(self.rows)
         return self.sum(lengths)
@@ -101,19 +104,22 @@ class Components(Value):
     torch.Size([1, 2])
     """
 
-    weights: Float[Tensor, "m"]
+    weights: Float[Tensor, "m"]  # shares, of sum 1
     means: Float[Tensor, "m d"]
     covariances: Float[Tensor, "m d d"]
 
 
 @dataclasses.dataclass(frozen=True)
 class FitProgress(Value):
-    """The state of a fit. The state and the data determine the next step.
+    """The state of a fit of m Gaussians after t steps; with the data it determines the next step.
 
-    `reseeded` counts how often each component collapsed and was placed anew; the likelihood may
-    fall after that. `log_likelihood` [nats] is the mean over the data before each step. `jumped`:
-    the last step placed a component anew, or the next step sees other rows. `rows` is the number of
-    rows that the last step saw, or 0 before the first step.
+    Attributes:
+        components: the Gaussians.
+        reseeded: how often each of them collapsed and was placed anew; the likelihood may fall
+            after that.
+        log_likelihood: mean over the data [nats] before each step.
+        jumped: whether the last step placed a component anew, or the next step uses other rows.
+        rows: number of rows that the last step used, 0 before the first step.
 
     >>> start = Components(torch.ones(1), torch.zeros(1, 2), torch.eye(2)[None])
     >>> FitProgress(start, torch.zeros(1, dtype=torch.int64), torch.zeros(0)).jumped
@@ -129,18 +135,26 @@ class FitProgress(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Fit(FitProgress):
-    """The result of a fit; the last log-likelihood belongs to the final components."""
+    """The result of a fit; the last value of `log_likelihood` belongs to the final components."""
 
-    converged: bool = False
+    converged: bool = (
+        False  # whether the last step raised the likelihood by less than the tolerance
+    )
 
     def resumed(self) -> FitProgress:
-        """Return the state in which this fit goes on: its last likelihood is not yet known."""
+        """Return the state from which this fit can go on, without the last log-likelihood.
+
+        The next step computes it again.
+        """
         history = self.log_likelihood[:-1]
         return FitProgress(self.components, self.reseeded, history, self.jumped, self.rows)
 
 
 def likeliest(starts: list[FitProgress], fit: Callable[[FitProgress], Fit]) -> FitProgress:
-    """Fit each start, and return the state of the likeliest fit; a single start is not fitted."""
+    """Fit each of the `starts` by the function `fit`, and return the state of the likeliest fit.
+
+    A single start is returned as it is.
+    """
     if len(starts) == 1:
         return starts[0]
     return max(map(fit, starts), key=lambda found: float(found.log_likelihood[-1])).resumed()
@@ -152,9 +166,11 @@ def expectation_maximisation(
     rule: EmRule,
     observer: Callable[[FitProgress], None] = lambda progress: None,
 ) -> Fit:
-    """Fit a mixture by EM steps until the rule ends them.
+    """Fit a mixture by EM steps from the state `start`, until `rule` ends them.
 
-    Raises `IndefiniteCovariance` for an indefinite start, or a component that collapses too often.
+    `shard` holds the data rows of this process; `observer` is called with the state after each
+    step. Raises `IndefiniteCovariance` for a start with an indefinite covariance, or a component
+    that collapses too often.
     """
     n = shard.count()
     state = start
@@ -173,8 +189,10 @@ def expectation_maximisation(
 def expectation(
     shard: DataRows, components: Components
 ) -> tuple[Float[Tensor, "m f"], Float[Tensor, ""]]:
-    """Return for each component the features summed with its responsibilities, and the
-    log-likelihood of all data.
+    """Return (sums, log-likelihood) of all data under m components.
+
+    The sums are the f features of each row, weighted by each component's responsibility for the
+    row. The log-likelihood [nats] is the total of all rows of all processes.
     """
     x = shard.rows
     coefficients = coefficients_from_components(components)
@@ -202,8 +220,10 @@ def expectation(
 def features_from_data(
     x: Float[Tensor, "n d"], out: Float[Tensor, "f n"] | None = None
 ) -> Float[Tensor, "f n"]:
-    """Return the features [1, x_i, x_i x_j (i <= j)] of each row as a column; `out` is the buffer
-    to write into.
+    """Return the f features [1, x_i, x_i x_j (i <= j)] of each of n data rows x, one column for
+    each row.
+
+    `out` is a buffer to write into; None makes a new tensor.
     """
     n, d = x.shape
     out = x.new_empty(1 + d + d * (d + 1) // 2, n) if out is None else out
@@ -215,8 +235,9 @@ def features_from_data(
 
 
 def coefficients_from_components(components: Components) -> Float[Tensor, "m f"]:
-    """Return for each component the coefficients of the features in log(weight) + log N(x | mean,
-    covariance).
+    """Return the coefficients of the f features in each component's log joint density.
+
+    This density is log(weight) + log N(x | mean, covariance).
     """
     means = components.means
     d = components.means.shape[1]
@@ -239,12 +260,17 @@ def coefficients_from_components(components: Components) -> Float[Tensor, "m f"]
 def maximisation(
     sums: Float[Tensor, "m f"], n: int, regularisation: float, reseeded: Int[Tensor, "m"]
 ) -> tuple[Components, Int[Tensor, "m"]]:
-    """Return the maximum-likelihood components from the weighted sums, and how often each has
-    collapsed.
+    """Return the maximum-likelihood components, and how often each has collapsed.
+
+    Args:
+        sums: features of all rows, weighted by each component's responsibilities.
+        n: number of rows.
+        regularisation: added to every variance.
+        reseeded: how often each component has collapsed before.
 
     A component collapses if its covariance is singular or it has fewer than d + 1 rows. It is
-    replaced by half of the heaviest component, split across its longest axis. After `EM.most_reseeds`
-    times, `IndefiniteCovariance` is raised.
+    replaced by half of the heaviest component, split across its longest axis. After
+    `EM.most_reseeds` times, `IndefiniteCovariance` is raised.
     """
     components = components_from_sums(sums, n, regularisation)
     weights = components.weights.clone()
@@ -281,8 +307,9 @@ def maximisation(
 
 
 def components_from_sums(sums: Float[Tensor, "m f"], n: int, regularisation: float) -> Components:
-    """Return weights, means and covariances from the weighted sums of features; NaN for a component
-    without data.
+    """Return weights, means and covariances from the weighted sums of the f features of n rows.
+
+    `regularisation` is added to every variance. A component without data gets NaN.
     """
     # from the number of features, 1 + d + d (d + 1) / 2
     d = round((math.sqrt(8 * sums.shape[1] + 1) - 3) / 2)
@@ -297,8 +324,10 @@ def components_from_sums(sums: Float[Tensor, "m f"], n: int, regularisation: flo
 
 
 def start_components(shard: DataRows, m: int, seed: int, regularisation: float) -> FitProgress:
-    """Return the initial state of a fit: m components from k-means. Raises `BadArgument` for fewer
-    distinct rows.
+    """Return the initial state of a fit: m components from k-means.
+
+    `regularisation` is added to every variance, and `seed` draws the first centres. Raises
+    `BadArgument` for fewer than m distinct rows.
     """
     generator = torch.Generator().manual_seed(seed)
     centres = _plus_plus(_subsample(shard, generator), m, generator)

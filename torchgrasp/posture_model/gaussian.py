@@ -1,5 +1,7 @@
 """A Gaussian mixture over named dimensions: density, samples, marginals and conditionals (Eqs.
 19-20).
+
+Each dimension has its own unit, which is that of the data.
 """
 
 import dataclasses
@@ -18,15 +20,15 @@ from torchgrasp.foundation.rules import Range, Seed, check_dense, is_known
 from torchgrasp.geometry.linalg import cholesky, eye_like
 
 PARAMETERS = ("weights", "means", "covariances")
-ROWS_PER_CHUNK = (
-    8192  # rows evaluated together: bounds the memory of rows x components x dimensions
-)
+# points evaluated together: bounds the memory of points x components x dimensions
+ROWS_PER_CHUNK = 8192
 ROUNDING = 1e-6  # greatest error of the weights' sum, and relative asymmetry of a covariance
 
 
 class of_parameters(kept[Kept]):
-    """A property of a mixture that is kept unless a parameter requires a gradient: an optimiser may
-    change it.
+    """A property of a mixture whose value is kept unless a parameter requires a gradient.
+
+    An optimiser may change such a parameter, so the value is then computed each time.
     """
 
     def __get__(self, instance: Any, owner: Any = None) -> Any:
@@ -37,7 +39,9 @@ class of_parameters(kept[Kept]):
         return super().__get__(instance, owner) if found is None else found
 
     def __set__(self, instance: Any, value: Any) -> None:
-        """Refuse new values; this method also lets Python ask `__get__` for values that are kept."""
+        """Raise `AttributeError`. This method also makes Python call `__get__` for values that are
+        kept.
+        """
         raise AttributeError(self.attrname)
 
 
@@ -57,10 +61,10 @@ class GaussianMixture(Value):
     (tensor(-1.8379), ('b',), torch.Size([5, 2]))
     """
 
-    weights: Float[Tensor, "m"]
-    means: Float[Tensor, "m d"]
-    covariances: Float[Tensor, "m d d"]
-    names: tuple[str, ...]
+    weights: Float[Tensor, "m"]  # shares, of sum 1
+    means: Float[Tensor, "m d"]  # in the units of the dimensions
+    covariances: Float[Tensor, "m d d"]  # in products of these units
+    names: tuple[str, ...]  # of the d dimensions
 
     def __post_init__(self) -> None:
         d = len(self.names)
@@ -92,8 +96,9 @@ class GaussianMixture(Value):
 
     @checked(gradients=True)
     def log_prob(self, x: Float[Tensor, "*b d"]) -> Float[Tensor, "*b"]:
-        """Return the log-density of each row, Eq. (19); raises `BadArgument` for rows that do not
-        have d numbers.
+        """Return the log-density [nats] of each point x (..., d), Eq. (19).
+
+        Raises `BadArgument` for points that do not have d numbers.
         """
         if x.ndim < 1 or x.shape[-1] != len(self.names):
             raise BadArgument("x", f"shape {tuple(x.shape)}", f"rows of {len(self.names)} numbers")
@@ -101,17 +106,19 @@ class GaussianMixture(Value):
 
     @checked(gradients=True)
     def log_joint(self, x: Float[Tensor, "n d"]) -> Float[Tensor, "n m"]:
-        """Return log(weight) + log N(x | mean, covariance), the log joint density, for every row x
-        and component.
+        """Return the log joint density [nats] of each of n points x with each component.
+
+        It is log(weight) + log N(x | mean, covariance).
         """
         density = self.whitening.log_scale - 0.5 * self.whitening.squared(x.double())
         return self.weights.double().log() + density
 
     @checked
     def sample(self, n: Annotated[int, Range(0, 10**8)], seed: Seed = 0) -> Float[Tensor, "n d"]:
-        """Draw n random samples, one in each row; raises `BadArgument` for n or seed out of range.
+        """Draw n random points of the mixture, in the units of its dimensions.
 
-        Samples are not differentiable: parameters that require a gradient are refused.
+        Raises `BadArgument` for n or seed out of range, or a parameter that requires a gradient:
+        samples are not differentiable.
         """
         for name in PARAMETERS:
             check_dense(name, getattr(self, name), gradients=False)
@@ -133,8 +140,9 @@ class GaussianMixture(Value):
 
     @checked(gradients=True)
     def marginal(self, names: Sequence[str]) -> "GaussianMixture":
-        """Return the marginal mixture of the named dimensions, Eq. (22); raises `BadArgument` for
-        an unknown name.
+        """Return the marginal mixture of the named dimensions, in the order of `names`, Eq. (22).
+
+        Raises `BadArgument` for an unknown or repeated name.
         """
         index = self._index(names)
         block = self.covariances.double()[:, index][:, :, index]
@@ -143,11 +151,12 @@ class GaussianMixture(Value):
 
     @checked(gradients=True)
     def condition(self, given: dict[str, float]) -> "GaussianMixture":
-        """Return the mixture of the other dimensions, given the values of some by name, Eq. (23) of
+        """Return the mixture of the other dimensions, given the values of some of them, Eq. (23) of
         the paper.
 
-        Components of weight 0 are left out, except inside torch.vmap. Raises `BadArgument` for
-        unknown names or non-finite values.
+        `given` maps the names of dimensions to values, in their units. Components of weight 0 are
+        left out, except inside torch.vmap. Raises `BadArgument` for unknown names, non-finite
+        values, or if all dimensions are given.
         """
         observed = self._index(tuple(given))
         rest = [i for i in range(len(self.names)) if i not in observed]
@@ -172,20 +181,18 @@ class GaussianMixture(Value):
         return GaussianMixture(weights, means, covariances, names)
 
     def mean(self) -> Float[Tensor, "d"]:
-        """Return the expected value of every dimension."""
+        """Return the expected value of each of the d dimensions, in its unit."""
         return self.weights.double() @ self.means.double()
 
     def covariance(self) -> Float[Tensor, "d d"]:
-        """Return the covariance matrix of the whole mixture."""
+        """Return the covariance matrix of the whole mixture, in products of the dimensions' units."""
         offset = self.means.double() - self.mean()
         within = torch.einsum("m,mij->ij", self.weights.double(), self.covariances.double())
         return within + torch.einsum("m,mi,mj->ij", self.weights.double(), offset, offset)
 
     @of_parameters
     def whitening(self) -> "Whitening":
-        """Each component's whitening matrix, whitened mean and log scale, which make densities
-        quick to evaluate.
-        """
+        """The components in whitened form, which makes densities quick to evaluate."""
         means = self.means.double()
         d = len(self.names)
         matrix = whitening_matrices(self.covariances.double())
@@ -203,16 +210,16 @@ class GaussianMixture(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Whitening:
-    """m Gaussians in whitened form: `matrix` W with W^T W = covariance^-1, `means` W mean, and logs
-    of normalisers.
-    """
+    """The m Gaussians of a mixture in whitened form, without their weights."""
 
-    matrix: Float[Tensor, "m d d"]
-    means: Float[Tensor, "m d"]
-    log_scale: Float[Tensor, "m"]
+    matrix: Float[Tensor, "m d d"]  # lower-triangular W with W^T W = covariance^-1
+    means: Float[Tensor, "m d"]  # W mean (no unit)
+    log_scale: Float[Tensor, "m"]  # log-density [nats] of each Gaussian at its mean
 
     def squared(self, x: Float[Tensor, "n d"]) -> Float[Tensor, "n m"]:
-        """Return the squared Mahalanobis distance of every row from the mean of every component."""
+        """Return the squared Mahalanobis distance (no unit) of each point from the mean of each
+        component.
+        """
         m, d = self.means.shape
         whitened = (x @ self.matrix.reshape(m * d, d).T).reshape(-1, m, d) - self.means
         return (whitened * whitened).sum(-1)
@@ -221,15 +228,20 @@ class Whitening:
 def map_rows(
     function: Callable[[Float[Tensor, "n d"]], Tensor], x: Float[Tensor, "*b d"]
 ) -> Tensor:
-    """Apply a function to all rows in float64, chunk by chunk; batch axes and dtype are as in `x`."""
+    """Return the results of a function at all points x (..., d), computed in float64 in chunks.
+
+    `function` maps points (n, d) to a tensor with n as first axis. The result has the batch axes
+    and the dtype of `x`.
+    """
     chunks = x.reshape(-1, x.shape[-1]).double().split(ROWS_PER_CHUNK)
     y = torch.cat([function(rows) for rows in chunks])
     return y.reshape(x.shape[:-1] + y.shape[1:]).to(x.dtype)
 
 
 def whitening_matrices(covariances: Float[Tensor, "m d d"]) -> Float[Tensor, "m d d"]:
-    """Return for each covariance the lower-triangular W with W^T W = covariance^-1; raises
-    `IndefiniteCovariance`.
+    """Return for each covariance the lower-triangular W with W^T W = covariance^-1.
+
+    Raises `IndefiniteCovariance` for an indefinite matrix.
     """
     fix = "use fewer components or more samples"
     factor = cholesky(covariances, "a component's covariance", fix)

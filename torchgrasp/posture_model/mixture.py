@@ -1,5 +1,8 @@
 """The learned posture model of a hand: a Gaussian mixture over joints and contact codes (Eqs.
 15-23).
+
+A contact code q = (L, N) describes contacts by numbers that no rigid motion changes. The energy of
+a code is half its squared Mahalanobis distance from the nearest component.
 """
 
 import dataclasses
@@ -25,31 +28,31 @@ from torchgrasp.posture_model.gaussian import PARAMETERS, GaussianMixture, map_r
 from torchgrasp.values.planning import ContactCode, Contacts
 
 PERMUTATIONS: tuple[tuple[int, int, int], ...] = tuple(itertools.permutations(range(3)))  # pyright: ignore[reportAssignmentType]
-"""The six assignments of three contacts to three fingers: finger i touches contact
+"""The six assignments of three contacts to three fingers: in assignment k, finger i touches contact
 `PERMUTATIONS[k][i]`.
 """
-# the numbers of a code q = (L, N): three lengths [m], three cosines
+# the numbers of a contact code q = (L, N): three lengths [m], three cosines
 CODE_NAMES = ("L1", "L2", "L3", "N1", "N2", "N3")
 PAPER_ENERGY = 2.0
-"""The paper's greatest energy f_i, Eq. (21), of a code that the hand reaches."""
+"""The paper's greatest mixture energy f_i (no unit), Eq. (21), of a code that the hand reaches."""
 DEFAULT_ENERGY = 6.295793622
-"""The greatest energy of a reached code, by default: half the 95 % quantile of chi-square with 6
-degrees of freedom.
+"""The default greatest energy (no unit) of a code that the hand reaches: half the 95 % quantile of
+chi-square with 6 degrees of freedom.
 """
 UNIT_ERROR = 1e-3  # greatest error of a unit normal's length
-# shares of the joints' range in the postures that identify a hand
+# positions, as shares of the joints' ranges, in the postures that identify a hand
 PROBED = (0.2, 0.5, 0.7)
-WRITTEN = 1e-5  # greatest difference of codes that were written with seven decimals
+WRITTEN = 1e-5  # greatest difference [m, or a cosine] of codes written with seven decimals
 
 
 def encode_fingertips(
     points: Float[Tensor, "*b f 3"], normals: Float[Tensor, "*b f 3"]
 ) -> Float[Tensor, "*b q"]:
-    """Return the rigid-motion-invariant code q = (L, N) of points with unit normals, Eq. (18).
+    """Return the contact code q = (L, N) of f points [m] with unit normals, Eq. (18).
 
     L_i is the distance [m] of point i from the centroid; N holds the cosines n1.n2, n1.n3, n2.n3
-    and so on. Fingertips have the same code as the contacts that they touch. Mirror images have
-    this code too: check every match.
+    and so on of all pairs of normals. No rigid motion changes the code. Fingertips have the same
+    code as the contacts that they touch. Mirror images have this code too: check every match.
     """
     lengths = norm(points - points.mean(-2, keepdim=True))
     pairs = itertools.combinations(normals.unbind(-2), 2)
@@ -59,13 +62,13 @@ def encode_fingertips(
 
 @checked(gradients=True)
 def encode(contacts: Contacts | tuple[Tensor, Tensor]) -> ContactCode:
-    """Return the codes of contact triples for all six assignments of contacts to fingers, Eqs.
-    (15)-(18).
+    """Return the contact codes of b contact triples for all six assignments of contacts to fingers,
+    Eqs. (15)-(18).
 
-    A code is three lengths [m] and three cosines, which no rigid motion changes. Points [m] and
-    unit normals have shape (b, 3, 3). Contacts on a line give NaN and `Status.DEGENERATE`. Codes
-    and frames are differentiable in both. Raises `BadArgument` for wrong shapes, numbers that are
-    not finite, or normals whose length is not 1 within 1e-3.
+    A code is three lengths [m] and three cosines, which no rigid motion changes. Contacts are given
+    as `Contacts`, or as points [m] and unit normals, both (b, 3, 3). Contacts on a line give NaN
+    and `Status.DEGENERATE`. Codes and frames are differentiable in both. Raises `BadArgument` for
+    wrong shapes, numbers that are not finite, or normals whose length is not 1 within 1e-3.
 
     >>> encode((torch.eye(3)[None], torch.eye(3)[None])).q.shape
     torch.Size([1, 6, 6])
@@ -99,8 +102,10 @@ def encode(contacts: Contacts | tuple[Tensor, Tensor]) -> ContactCode:
 
 
 def describe_compatibility(hand: Hand) -> dict[str, str]:
-    """Return metadata that identifies the hand of samples and models: name, fingers, hash of its
-    files, some codes.
+    """Return metadata that identifies the hand of samples and models.
+
+    It holds the hand's name, its fingers, a hash of its files, and the contact codes of three
+    postures.
     """
     codes = " ".join(f"{x:.7f}" for x in _probe_codes(hand).flatten().tolist())
     return {
@@ -112,8 +117,10 @@ def describe_compatibility(hand: Hand) -> dict[str, str]:
 
 
 def check_compatible(meta: dict[str, str], joint_names: tuple[str, ...], hand: Hand) -> None:
-    """Raise `BadArgument` for a model of another hand, or of other fingers, joint limits or
+    """Raise `BadArgument` for the model of another hand, or of other fingers, joint limits or
     fingertips.
+
+    `meta` and `joint_names` are those of the model.
     """
     if joint_names != hand.joint_names:
         raise BadArgument(
@@ -166,7 +173,7 @@ class GraspMixture(GaussianMixture):
     (torch.Size([1, 6]), torch.Size([1, 6, 4]), torch.Size([1, 6, 2, 4]))
     """
 
-    regularisation: float = 0.0
+    regularisation: float = 0.0  # added to each variance, relative to the samples' variance
     meta: dict[str, str] = dataclasses.field(default_factory=dict[str, str])
 
     def __post_init__(self) -> None:
@@ -177,7 +184,7 @@ class GraspMixture(GaussianMixture):
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the joints, in the order of the hand."""
+        """Names of the h joints, in the order of the hand."""
         return self.names[:-6]
 
     @of_parameters
@@ -206,10 +213,10 @@ class GraspMixture(GaussianMixture):
     def energy(
         self, code: ContactCode | Annotated[Float[Tensor, "*b 6"], ANY]
     ) -> Float[Tensor, "*b"]:
-        """Return half the squared Mahalanobis distance of each code from the nearest component, min
-        f_i of Eq. (21).
+        """Return the energy min f_i (no unit) of each contact code, Eq. (21).
 
-        The hand probably reaches a code if this value is below `DEFAULT_ENERGY`, or the paper's
+        It is half the squared Mahalanobis distance of the code from the nearest component. The hand
+        probably reaches a code whose energy is below `DEFAULT_ENERGY`, or the paper's
         `PAPER_ENERGY`. A code that is not finite gives NaN. Where two components are equally near,
         the derivative is the mean of theirs.
         """
@@ -240,12 +247,13 @@ class GraspMixture(GaussianMixture):
     def modes(
         self, q: Annotated[Float[Tensor, "*b 6"], ANY], k: Count
     ) -> tuple[Float[Tensor, "*b k h"], Float[Tensor, "*b k"]]:
-        """Return mean joints [rad] and responsibilities of the k components most responsible for a
-        contact code.
+        """Return (joints, responsibilities) of the k components most responsible for each contact
+        code q.
 
-        The responsibilities are h_i in Eq. (23) of the paper, the largest first. Use them where
-        several postures have the same code: the expected joints may then be none of these postures.
-        Raises `BadArgument` for k outside [1, m].
+        The joints [rad] are each component's mean given the code. The responsibilities (shares) are
+        h_i in Eq. (23) of the paper, the largest first. Use them where several postures have the
+        same code: the expected joints may then be none of these postures. A code that is not finite
+        gives NaN. Raises `BadArgument` for k outside [1, m].
         """
         check_whole("k", k, 1, len(self.weights))
         codes = self._code
@@ -265,8 +273,10 @@ class GraspMixture(GaussianMixture):
 
     @checked
     def save(self, path: Path | str) -> Path:
-        """Write the mixture atomically as safetensors; `load_mixture` reads it. Raises
-        `OutputError`.
+        """Write the mixture atomically as a safetensors file, which `load_mixture` reads; return
+        its path.
+
+        Raises `OutputError` if the file cannot be written.
 
         >>> import tempfile
         >>> file = load_mixture("barrett").save(Path(tempfile.mkdtemp(), "mixture.safetensors"))
@@ -293,10 +303,10 @@ def _map_codes(
 
 @checked
 def load_mixture(name_or_path: Path | str) -> GraspMixture:
-    """Read the learned mixture of a hand, by the hand's name or folder, or by the path of a
-    .safetensors file.
+    """Read the learned mixture of a hand.
 
-    Raises `HandFileError` for an unknown hand, `ModelFileError` for a missing or malformed file.
+    It is given by the hand's name or folder, or by the path of a .safetensors file. Raises
+    `HandFileError` for an unknown hand, `ModelFileError` for a missing or malformed file.
 
     >>> load_mixture("allegro").means.shape
     torch.Size([40, 18])
@@ -317,8 +327,10 @@ def load_mixture(name_or_path: Path | str) -> GraspMixture:
 
 
 def mixture_path(name_or_path: Path | str) -> Path:
-    """Return the path of a mixture: a .safetensors path unchanged, or mixture.safetensors in a
-    hand's folder.
+    """Return the path of a mixture, given by the path of a .safetensors file or by a hand.
+
+    Such a path is returned unchanged. For a hand's name or folder, it is mixture.safetensors in the
+    folder.
     """
     if Path(name_or_path).suffix == ".safetensors":
         return Path(name_or_path)

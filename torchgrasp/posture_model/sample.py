@@ -27,19 +27,19 @@ from torchgrasp.hand.hand import Hand
 from torchgrasp.posture_model.mixture import describe_compatibility, encode_fingertips
 from torchgrasp.values.specs import ContactSpec
 
-ROLL = math.radians(25)  # deviation [rad] of either tilt of a contact direction from the pad's axis
-# directions in the three-dimensional space of internal forces that are tried: 0.25 rad apart
+ROLL = math.radians(25)  # standard deviation [rad] of both tilts of a contact from the pad's axis
+# number of directions in the 3D space of internal forces that are tried: 0.25 rad apart
 BALANCES = 200
 
 
 def roll_contacts(
     hand: Hand, joints: Float[Tensor, "n h"], generator: np.random.Generator
 ) -> tuple[Float[Tensor, "n 3 3"], Float[Tensor, "n 3 3"]]:
-    """Return random contact points [m] and outward normals of fingertips that touch beside the
-    middle of their pads.
+    """Return (points, normals) of random contacts beside the middle of the fingertips' pads.
 
-    Both tilts of a contact direction are Gaussian, truncated to the pad's cone. The contact of a
-    round tip moves along.
+    The points [m] and the pads' outward unit normals are in the hand's frame, for n postures
+    `joints` [rad] of three fingers. Both tilts of a contact direction are Gaussian, truncated to
+    the pad's cone. The contact of a round tip moves along.
     """
     points, axes = hand.fingertips(joints)
     cone = hand.tips.cone.to(axes)
@@ -56,11 +56,12 @@ def roll_contacts(
 
 
 def can_close(points: Float[Tensor, "n f 3"], normals: Float[Tensor, "n f 3"]) -> Bool[Tensor, "n"]:
-    """Return a mask of the postures of which some three contacts can balance forces in the friction
-    cones, Eq. (13).
+    """Return a mask of the n postures of which some three contacts can have force closure, Eq.
+    (13).
 
-    The search tries a grid of forces along the triangle's sides and can miss marginal cases.
-    `normals` point into the object.
+    These contacts can balance forces within their friction cones. The search tries a grid of forces
+    along the triangle's sides and can miss marginal cases. `points` [m] and unit `normals`, which
+    point into the object, are those of the f contacts.
     """
     closed = torch.zeros(len(points), dtype=torch.bool, device=points.device)
     for three in itertools.combinations(range(points.shape[1]), 3):
@@ -85,7 +86,7 @@ def _close_triples(
     return closed.any(1)
 
 
-CHUNK_POSTURES = 10_000  # free postures from one generator; another number gives other postures
+CHUNK_POSTURES = 10_000  # postures kept from one generator; another number gives other postures
 BLOCK_POSTURES = 2_000  # postures that a generator draws at a time; fixed for the same reason
 MAX_SAMPLES = 10**8  # most postures of one set: a hundred times the paper's million (Sec. 6.3).
 LEAST_KEPT = 1e-3
@@ -104,8 +105,7 @@ Sampling = Literal["uniform", "grasping"]
 @checked
 @dataclasses.dataclass(frozen=True)
 class HandSamples(Batch):
-    """Postures of one hand: `joints` [rad], fingertip codes `q` (lengths [m], cosines); `meta`:
-    hand, seed, sampling.
+    """Sampled postures of one hand.
 
     >>> from torchgrasp import load_hand
     >>> samples = sample_configurations(load_hand("barrett"), 50)
@@ -113,38 +113,38 @@ class HandSamples(Batch):
     (torch.Size([50, 4]), torch.Size([50, 10]), 'barrett')
     """
 
-    joints: Float[Tensor, "n h"]
-    q: Float[Tensor, "n q"]
+    joints: Float[Tensor, "n h"]  # [rad], in the order of `joint_names`
+    q: Float[Tensor, "n q"]  # contact codes of the fingertips: lengths [m], then cosines
     joint_names: tuple[str, ...]
+    # hand, seed and sampling
     meta: dict[str, str] = dataclasses.field(default_factory=dict[str, str])
 
     def rows(self) -> Float[Tensor, "n d"]:
-        """Return one row for each posture: its joints, then its code."""
+        """Return d numbers for each posture: its joints [rad], then its contact code."""
         return torch.cat([self.joints, self.q], dim=-1)
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class SampleSpec(Value):
-    """The settings by which `n` postures without self-collision are drawn; `Sampling` lists the
-    ways to draw.
+    """The settings by which `n` postures without self-collision are drawn.
 
-    Chunk i depends only on (seed, i), so a smaller set of samples is the beginning of a larger set.
-    Raises `BadArgument` for values out of range.
+    `Sampling` lists the ways to draw. Chunk i depends only on (seed, i), so a smaller set of
+    samples is the beginning of a larger set. Raises `BadArgument` for values out of range.
 
     >>> from torchgrasp import load_hand
     >>> SampleSpec(1000, seed=7).meta(load_hand("barrett"))["seed"]
     '7'
     """
 
-    n: Annotated[int, Range(1, MAX_SAMPLES)]
+    n: Annotated[int, Range(1, MAX_SAMPLES)]  # number of postures
     seed: Seed = 0
-    sampling: Sampling = "uniform"
+    sampling: Sampling = "uniform"  # which postures are taken
 
     @checked
     def meta(self, hand: Hand) -> dict[str, str]:
-        """Return metadata that identifies the samples: hand, seed and sampling, without the number
-        of samples.
+        """Return metadata that identifies the samples: hand, seed and sampling, but not their
+        number.
         """
         return {**describe_compatibility(hand), "seed": str(self.seed), "sampling": self.sampling}
 
@@ -158,12 +158,12 @@ def sample_configurations(
     sampling: Sampling = "uniform",
     observer: Callable[[int], object] = lambda count: None,
 ) -> HandSamples:
-    """Draw random postures within the joint limits, and keep `n` postures free of self-collision
+    """Draw random postures within the joint limits, and return `n` of them without self-collision
     (Sec. 6.3).
 
-    `SampleSpec` explains n, seed and sampling. The observer is called with the size of every new
-    chunk. Raises `BadArgument` for an argument out of range, or a hand that collides with itself in
-    almost all postures.
+    `SampleSpec` explains n, seed and sampling. `workers` threads draw at the same time. The
+    `observer` is called with the number of postures of every new chunk. Raises `BadArgument` for an
+    argument out of range, or a hand that collides with itself in almost all postures.
 
     >>> from torchgrasp.hand.load import load_hand
     >>> sample_configurations(load_hand("barrett"), 100).q.shape
@@ -182,8 +182,9 @@ def sample_configurations(
 
 
 def chunk_sizes(n: int) -> list[int]:
-    """Split n postures into chunks of `CHUNK_POSTURES`, of which the last has the rest; return the
-    sizes.
+    """Return the numbers of postures of the chunks that n postures are split into.
+
+    Each is `CHUNK_POSTURES`; the last has the rest.
     """
     return [min(CHUNK_POSTURES, n - first) for first in range(0, n, CHUNK_POSTURES)]
 
@@ -191,8 +192,11 @@ def chunk_sizes(n: int) -> list[int]:
 def draw_chunk(
     hand: Hand, spec: SampleSpec, i: int
 ) -> tuple[Float[Tensor, "n h"], Float[Tensor, "n q"], int]:
-    """Return joints [rad] and codes of the postures of chunk i, and how many postures were drawn to
-    find them.
+    """Return (joints, codes, drawn) of chunk i: joints [rad], contact codes, number of postures
+    drawn.
+
+    The n postures of the chunk are those that were kept of all that were drawn. Raises
+    `BadArgument` for a hand of which almost none are kept.
     """
     count = chunk_sizes(spec.n)[i]
     parts = []

@@ -1,5 +1,5 @@
-"""Quality of a learned model: errors on held-out postures (Sec. 6.3), and the BIC by number of
-components (Fig. 6).
+"""Quality of a learned model: errors on held-out postures (Sec. 6.3), and the Bayesian information
+criterion (BIC) by number of components (Fig. 6).
 """
 
 import dataclasses
@@ -24,14 +24,17 @@ from torchgrasp.posture_model.training import (
     standardised_rows,
 )
 
-COMPARED_MODES = 4  # modes of which the nearest is compared: a code has a few postures at most
+# likeliest modes of which the nearest to a posture is compared: a code has only a few postures
+COMPARED_MODES = 4
 GROWING = EmRule(iterations=100, tolerance=1e-3, regularisation=MAX_REGULARISATION)
-"""When each of the growing fits ends."""
+"""The bounds that end each of the fits with one component more than the last."""
 
 
 @dataclasses.dataclass(frozen=True)
 class MixtureScore(Value):
-    """Errors with which a learned model predicts the joints of held-out postures from their codes."""
+    """Errors with which a learned model predicts the h joints of held-out postures from their
+    codes.
+    """
 
     joint_names: tuple[str, ...]
     # mean absolute error of each joint [rad], predicted by the conditional mean, Eq. (23)
@@ -47,12 +50,12 @@ class MixtureScore(Value):
 
     @property
     def mean_error(self) -> float:
-        """Mean absolute error over all joints [rad]."""
+        """The mean absolute error [rad] over all joints and postures."""
         return float(self.error.mean())
 
     def __str__(self) -> str:
-        """Return a table of the errors (Table 5, Fig. 8) and the fraction of codes within reach
-        (Eq. 21).
+        """Return a table of the errors (Table 5, Fig. 8) and the share of codes that the hand
+        reaches (Eq. 21).
         """
         rows = zip(self.joint_names, self.error.tolist(), self.deviation.tolist(), strict=True)
         joints = "\n".join(
@@ -81,7 +84,10 @@ class MixtureScore(Value):
 
 
 def evaluate_mixture(mixture: GraspMixture, samples: HandSamples) -> MixtureScore:
-    """Return the errors of a model on held-out postures; there must be at least two postures."""
+    """Return the errors of a model on held-out postures, which are `samples` of the same hand.
+
+    Raises `BadArgument` for fewer than two postures, or for other joints than the model's.
+    """
     if samples.joint_names != mixture.joint_names:
         allowed = f"the mixture's {mixture.joint_names}"
         raise BadArgument("samples", f"joints {samples.joint_names}", allowed)
@@ -106,10 +112,12 @@ def evaluate_mixture(mixture: GraspMixture, samples: HandSamples) -> MixtureScor
 
 @dataclasses.dataclass(frozen=True)
 class BicCurve(Value):
-    """The Bayesian information criterion (BIC) for each number of components; smaller is better."""
+    """The Bayesian information criterion (BIC) for several numbers of components; smaller is
+    better.
+    """
 
-    components: Int[Tensor, "k"]
-    bic: Float[Tensor, "k"]
+    components: Int[Tensor, "k"]  # numbers of components
+    bic: Float[Tensor, "k"]  # BIC (no unit) of the fit with each of these numbers
 
     def __str__(self) -> str:
         """Return the BIC values as a table, with their minimum."""
@@ -127,13 +135,14 @@ class BicCurve(Value):
 def growing_bic(
     samples: HandSamples, most: Count = 64, observer: Callable[[int], object] = lambda m: None
 ) -> BicCurve:
-    """Return the BIC of 1 to `most` Gaussians (Fig. 6 b, d). Each fit grows from the one before.
+    """Return the BIC of mixtures of 1 to `most` Gaussians (Fig. 6 b, d). Each fit starts from the
+    last.
 
     The heaviest Gaussian of a fit is split across its longest axis, and EM continues. The fits take
     no random number. The criterion belongs to the given postures: more postures support more
     Gaussians. Codes of "uniform" samples are exact functions of the joints, so the BIC falls
-    without end. For "grasping" samples, whose fingertips roll, the BIC has a minimum. The observer
-    is called with each number of Gaussians. Raises errors as `fit_mixture`.
+    without end. For "grasping" samples, whose fingertips roll, the BIC has a minimum. The
+    `observer` is called with each number of Gaussians. Raises errors as `fit_mixture`.
 
     >>> numbers = torch.rand(500, 7, generator=torch.Generator().manual_seed(0))
     >>> growing_bic(HandSamples(numbers[:, :1], numbers[:, 1:], ("knuckle",)), most=3).components

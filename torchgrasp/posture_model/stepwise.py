@@ -1,10 +1,10 @@
-"""EM on growing random subsets: most steps see few rows, and the last steps see all rows (Eqs.
-19-20).
+"""EM on growing random subsets: most steps use few rows, and the last steps all rows (Eqs. 19-20).
 
-The fit to a subset is the start at the next subset, which contains the first and is twice as large.
-Fits that grow by one component each give a criterion for every number of components. Stepwise EM of
-minibatches (Cappe and Moulines 2009, https://doi.org/10.1111/j.1467-9868.2009.00698.x) was tried,
-too: it found less likely mixtures in the same time.
+A row is one sample. The fit to a subset is the start at the next subset, which contains the first
+and is twice as large. Fits that grow by one component each give a criterion for every number of
+components. Stepwise EM of minibatches (Cappe and Moulines 2009,
+https://doi.org/10.1111/j.1467-9868.2009.00698.x) was tried, too: it found less likely mixtures in
+the same time.
 """
 
 import dataclasses
@@ -25,29 +25,29 @@ from torchgrasp.posture_model.em import (
 )
 
 ENOUGH = 8
-"""Greatest subset that compares starts, over the smallest: on fewer rows, the likeliest fit is
-often not the likeliest on all rows.
+"""Size of the greatest subset on which starts are compared, over that of the smallest. On too few
+rows, the likeliest fit is often not the likeliest on all rows.
 """
 
 
 @dataclasses.dataclass(frozen=True)
 class Subsets:
-    """Nested random subsets of the rows of all processes; the processes do not change what a subset
-    contains.
+    """Nested random subsets of the rows of all processes.
 
     `sizes` are the numbers of rows. The last is the number of all rows, every other is half of the
-    next.
+    next, rounded down. What a subset contains does not depend on the number of processes.
     """
 
-    shard: DataRows
+    shard: DataRows  # all rows of this process
     sizes: tuple[int, ...]
-    # of each row of this process in the random order of all rows
+    # index of each row of this process in the random order of all rows; None: only all rows
     place: Int[Tensor, "n"] | None = None
 
     @staticmethod
     def of(shard: DataRows, smallest: int | None, seed: int) -> "Subsets":
-        """Draw subsets of at least `smallest` rows; None, or more than half of the rows, leaves
-        only all rows.
+        """Draw nested subsets of at least `smallest` rows.
+
+        None, or more than half of the rows, gives only the set of all rows.
         """
         n = shard.count()
         least = n if smallest is None else smallest
@@ -59,14 +59,14 @@ class Subsets:
         return Subsets(shard, sizes, own.to(shard.rows.device))
 
     def take(self, size: int) -> DataRows:
-        """Return the rows of this process in the subset of so many rows."""
+        """Return the rows of this process that belong to the subset of `size` rows."""
         if self.place is None or size == self.sizes[-1]:
             return self.shard
         return dataclasses.replace(self.shard, rows=self.shard.rows[self.place < size])
 
 
 def halves(n: int) -> list[int]:
-    """Return n, n / 2, n / 4 and so on, rounded down, to 1."""
+    """Return the whole numbers n, n / 2, n / 4 and so on, rounded down, to 1."""
     return [n >> k for k in range(n.bit_length())]
 
 
@@ -77,8 +77,9 @@ def fit_subsets(
     rule: EmRule,
     observer: Callable[[FitProgress], None] = lambda progress: None,
 ) -> Fit:
-    """Fit a mixture by EM to the subsets of these sizes in turn.
+    """Fit a mixture by EM to the subsets of the given `sizes`, one after another.
 
+    `start` is the state before the first step, and `observer` is called with that after each step.
     The rule bounds the steps on all subsets together. The last log-likelihood is that of the last
     subset.
     """
@@ -90,15 +91,17 @@ def fit_subsets(
 
 
 def fit_smallest(subsets: Subsets, start: FitProgress, rule: EmRule) -> Fit:
-    """Fit a mixture to the smaller subsets, from which the fit to all rows goes on."""
+    """Fit a mixture to the smaller subsets; the fit to all rows can go on from the result."""
     most = ENOUGH * subsets.sizes[0]
     sizes = [size for size in subsets.sizes[:-1] if size <= most] or subsets.sizes
     return dataclasses.replace(fit_subsets(subsets, sizes, start, rule), jumped=True)
 
 
 def growing_fits(shard: DataRows, start: FitProgress, rule: EmRule) -> Iterator[Fit]:
-    """Yield fits without end, each of one component more; each starts from the last, its heaviest
-    component split.
+    """Yield fits without end, each with one component more than the last.
+
+    The first begins at `start`. Each later fit starts from the last, with its heaviest component
+    split.
     """
     n = shard.count()
     while True:

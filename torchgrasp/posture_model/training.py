@@ -34,16 +34,18 @@ MAX_REGULARISATION = 1e-6  # largest variance added to a dimension, relative to 
 
 @dataclasses.dataclass(frozen=True)
 class MixtureNumbers:
-    """The numbers of a fit to samples."""
+    """Numbers of a fit to samples."""
 
     trial_steps: int = 20
-    """Steps of EM before starts are compared; a whole fit takes some hundred."""
+    """Number of EM steps before starts are compared; a whole fit takes some hundred."""
     constant: float = 1e-9
-    """Standard deviation of a number that does not vary, over its size plus one."""
+    """Greatest standard deviation, over 1 + |mean|, of a dimension that counts as constant."""
     same: float = 1e-9
-    """Relative difference of means and deviations of the same data, added in another order."""
+    """Greatest relative difference of means and deviations of the same data, summed in another
+    order.
+    """
     same_zero: float = 1e-12
-    """Difference of such numbers that are nearly zero."""
+    """Greatest absolute difference of such means and deviations, for those near zero."""
 
 
 MIXTURES = MixtureNumbers()
@@ -51,21 +53,20 @@ MIXTURES = MixtureNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
-    """The checkpoint file of one fit; without a `path` there is none. Process 0 writes it, all
-    processes read it.
+    """The checkpoint file of one fit; without a `path` there is none.
 
-    `centre` and `scale`, the data's mean and standard deviation, identify the data; `settings`
-    identify the fit.
+    Process 0 writes it, all processes read it. `centre` and `scale` identify the data, and
+    `settings` the fit.
     """
 
     path: Path | None
-    shard: DataRows
-    centre: Float[Tensor, "d"]
-    scale: Float[Tensor, "d"]
+    shard: DataRows  # data rows of this process
+    centre: Float[Tensor, "d"]  # mean of each dimension of the data, in its unit
+    scale: Float[Tensor, "d"]  # standard deviation of each dimension, in its unit
     settings: dict[str, str]
 
     def save(self, progress: FitProgress) -> None:
-        """Write the state of the fit atomically; raises `OutputError`."""
+        """Write the state of the fit atomically; raise `OutputError` if that fails."""
         if self.path is None or self.shard.rank > 0:
             return
         tensors = {**vars(progress.components), "centre": self.centre, "scale": self.scale}
@@ -74,8 +75,9 @@ class Checkpoint:
         save_tensors(self.path, "em", tensors, meta)
 
     def load(self) -> FitProgress | None:
-        """Return the saved state, or None without a file; raises `ModelFileError`, or `BadArgument`
-        for another fit.
+        """Return the saved state, or None if there is no file.
+
+        Raises `ModelFileError` for a damaged file, or `BadArgument` for that of another fit.
         """
         progress = self._read(self.path) if self.path and self.path.exists() else None
         steps = len(progress.log_likelihood) if progress else 0
@@ -233,7 +235,10 @@ def fit_mixture(
 
 
 def information_criterion(components: Components, n: int, log_likelihood: float) -> float:
-    """Return the BIC of a fit to n samples with this mean log-likelihood [nats]; smaller is better."""
+    """Return the Bayesian information criterion (BIC) of a fit to n samples; smaller is better.
+
+    `log_likelihood` [nats] is the mean over the samples, in their units.
+    """
     m, d = components.means.shape
     parameters = (m - 1) + m * d + m * d * (d + 1) // 2  # of weights, means and full covariances
     return -2 * n * log_likelihood + parameters * math.log(n)
@@ -242,8 +247,13 @@ def information_criterion(components: Components, n: int, log_likelihood: float)
 def standardised_rows(
     samples: HandSamples, components: int, distributed: bool = False
 ) -> tuple[DataRows, Float[Tensor, "d"], Float[Tensor, "d"]]:
-    """Return rows of mean 0 and variance 1, and the original means and deviations; refuse too few
-    samples.
+    """Return (rows, means, deviations): standardised data, and the original mean and deviation of
+    each dimension.
+
+    The rows have mean 0 and variance 1 in each of the d dimensions: the joints [rad], then the
+    code. `distributed`: whether `samples` are only the part of this process. Raises `BadArgument`
+    for codes not of three fingertips, too few samples for so many `components`, or a dimension that
+    does not vary.
     """
     if samples.q.shape[1] != len(CODE_NAMES):
         found = f"codes of {samples.q.shape[1]} numbers"
