@@ -25,19 +25,19 @@ from torchgrasp.values.closing import ClosureResult
 from torchgrasp.values.specs import TrialSpec
 
 CAUSES: dict[str, list[str]] = json.loads(Path(__file__).with_suffix(".json").read_text("utf-8"))
-"""Causes by name: the unit of the size, and a sentence. The first that applies to a trial is its
-cause.
+"""Causes by name, each with the unit of its size and a sentence. The first that applies to a trial
+is the trial's cause.
 """
-SHAPE_OFF = 10.0  # distance [mm] of a planned contact from the true surface
-RAISED = 1e-3  # height [m] below that of the lift from which the hand counts as raised
+SHAPE_OFF = 10.0  # least distance [mm] of a planned contact from the true surface that is a cause
+RAISED = 1e-3  # greatest height [m] by which a raised hand is below the height of the lift
 
 
 @checked
 def find_cause(tries: Sequence[LiftTry], trial: GraspTrial, spec: TrialSpec) -> tuple[str, float]:
-    """Return why the object was not held in the last try of a trial (`CAUSES`), and the size of the
-    cause.
+    """Return (cause, size): why the object was not held in the last try of a trial.
 
-    The result is "" and NaN if the object was held.
+    The cause is a name in `CAUSES`, where the unit of the size is found. They are "" and NaN if the
+    object was held. `tries` are the results of the trial's lifts, and `trial` and `spec` its input.
     """
     truth = trial.truth
     *before, (row, lift) = tries
@@ -93,8 +93,10 @@ def _sizes(
 
 
 def tick_of(lift: ClosureResult, phase: int) -> int:
-    """Return the tick at which phase 0 (approach), 1 (closing) or 2 (pressing) ended; the last tick
-    if it never did.
+    """Return the index of the tick at which a phase of a lift ended.
+
+    The `phase` is 0 (approach), 1 (closing) or 2 (pressing). A phase that never ended gives the
+    last tick.
     """
     end = lift.phases[phase]
     return int((lift.time - end).abs().argmin()) if bool(end.isfinite()) else len(lift.time) - 1
@@ -103,8 +105,11 @@ def tick_of(lift: ClosureResult, phase: int) -> int:
 def moved_in_hand(
     lift: ClosureResult, centre: Float[Tensor, "3"]
 ) -> tuple[Float[Tensor, " t"], Float[Tensor, " t"]]:
-    """Return for each tick how far the object has moved [m] and turned [rad] in the hand since the
-    hand pressed.
+    """Return how far the object has moved [m] and turned [rad] in the hand since the pressing
+    ended.
+
+    Both have one number for each of the t ticks. `centre` [m] is the point of the object whose
+    motion counts, in the frame of the grasp.
     """
     hand_from_object = inverse(lift.hand_pose.double()) @ lift.object_pose.double()
     start = hand_from_object[tick_of(lift, 2)]

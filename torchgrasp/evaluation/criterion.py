@@ -19,37 +19,42 @@ from torchgrasp.values.closing import ObjectMotion
 
 SLIP_DISTANCE = 0.02
 SLIP_ANGLE = math.radians(30)
-"""Motion [m, rad] of the object in the closed hand that counts as slipped."""
+"""Least motion [m] and rotation [rad] of the object in the closed hand that count as a slip."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Tick(Value):
-    """The state of the simulation at one control tick; with a leading axis, the states at all
+    """The state of the simulation at one control tick; with a leading axis t, the states at all
     ticks.
 
-    `touching` is the number of fingers on the object, `centre` [m] its centre of mass. `felt` holds
-    the controller's estimates of friction and load [N], `truth` the true contacts.
+    Poses and points are in the simulator's frame, whose z axis points up. The j joints are in the
+    scene's order.
     """
 
-    time: Float[Tensor, "*t"]
-    object_pose: Float[Tensor, "*t 4 4"]
-    hand_pose: Float[Tensor, "*t 4 4"]
-    neighbour_pose: Float[Tensor, "*t m 4 4"]
-    joints: Float[Tensor, "*t j"]
-    targets: Float[Tensor, "*t j"]
-    touching: Int[Tensor, "*t"]
-    centre: Float[Tensor, "*t 3"]
-    felt: Float[Tensor, "*t 2"]
-    blend: Float[Tensor, "*t f"]
-    truth: TipContact
+    time: Float[Tensor, "*t"]  # since the start [s]
+    object_pose: Float[Tensor, "*t 4 4"]  # [m]
+    hand_pose: Float[Tensor, "*t 4 4"]  # of the hand's root link [m]
+    neighbour_pose: Float[Tensor, "*t m 4 4"]  # of the m neighbours [m]
+    joints: Float[Tensor, "*t j"]  # positions [rad]
+    targets: Float[Tensor, "*t j"]  # targets of the drives [rad]
+    touching: Int[Tensor, "*t"]  # number of fingers on the object
+    centre: Float[Tensor, "*t 3"]  # the object's centre of mass [m]
+    felt: Float[Tensor, "*t 2"]  # friction and load [N] as the controller estimates them
+    blend: Float[Tensor, "*t f"]  # weight lambda of each of f fingers, Eq. (26); a share
+    truth: TipContact  # the true contacts of the fingertips
 
 
 def judge_lift(ticks: Sequence[Tick], pressed: int, judged: int, lift_height: float) -> Status:
-    """Return whether an object was held in a lift of some height [m]: `OK`, `SLIPPED`, `DROPPED` or
-    `NOT_LIFTED`.
+    """Return whether an object was held in a lift: `OK`, `SLIPPED`, `DROPPED` or `NOT_LIFTED`.
 
-    It is held if its centre rose by half of the lift, two fingers touch it in most of the last
-    `judged` ticks, and it slipped less than the limits since the tick `pressed`.
+    Args:
+        ticks: the states at all ticks.
+        pressed: index of the tick at which the pressing ended.
+        judged: number of last ticks in which the fingers must touch the object.
+        lift_height: height of the lift [m].
+
+    The object is held if its centre rose by half of the lift, two fingers touch it in most of the
+    judged ticks, and it slipped less than `SLIP_DISTANCE` and `SLIP_ANGLE` since it was pressed.
     """
     half = 0.5 * lift_height
     rise = [float(tick.centre[2] - ticks[0].centre[2]) for tick in ticks]
@@ -62,8 +67,9 @@ def judge_lift(ticks: Sequence[Tick], pressed: int, judged: int, lift_height: fl
 
 
 def motion_between(first: Tick, last: Tick, in_hand: bool = True) -> ObjectMotion:
-    """Return the motion of the object's centre and its rotation between two ticks, relative to the
-    hand or world.
+    """Return the motion [m] of the object's centre and its rotation [rad] between two ticks.
+
+    They are relative to the hand, or to the world if not `in_hand`.
     """
     eye = torch.eye(4, dtype=torch.float64)
     start, end = (inverse(tick.hand_pose) if in_hand else eye for tick in (first, last))

@@ -17,10 +17,11 @@ from torchgrasp.values.planning import Grasps
 
 
 def world_frame(table: Plane, obj_from_hand: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
-    """Return the pose of the simulator's frame in the frame of the grasp.
+    """Return the pose [m] of the simulator's frame in the frame of the grasp.
 
     The table is at z = 0, the hand above the origin. The x axis is along the hand's x axis, or
-    along the hand's y axis if the former is steeper than 60 degrees.
+    along the hand's y axis if the former is steeper than 60 degrees. `obj_from_hand` is the hand's
+    pose [m] in the frame of the grasp.
     """
     z = unit(table.normal.double())
     origin = obj_from_hand[:3, 3]
@@ -31,7 +32,9 @@ def world_frame(table: Plane, obj_from_hand: Float[Tensor, "4 4"]) -> Float[Tens
 
 
 def to_frame(grasp: Grasps, obj_from_frame: Float[Tensor, "4 4"]) -> Grasps:
-    """Return a grasp, converted to another frame, with rounded numbers."""
+    """Return a grasp, converted to the frame with the pose `obj_from_frame` [m], with rounded
+    numbers.
+    """
     frame_from_obj = inverse(obj_from_frame)
 
     def turn(vectors: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
@@ -48,13 +51,14 @@ def to_frame(grasp: Grasps, obj_from_frame: Float[Tensor, "4 4"]) -> Grasps:
 
 
 def rounded(numbers: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-    """Round numbers of about size 1 to multiples of a billionth."""
+    """Return numbers of about size 1, rounded to multiples of the small step `FINE`."""
     return torch.round(numbers / FINE) * FINE
 
 
 def moved_mesh(mesh: "trimesh.Trimesh", obj_from_world: Float[Tensor, "4 4"]) -> "trimesh.Trimesh":
-    """Return a mesh, converted to the simulator's frame, with vertices rounded to multiples of
-    `GRID`.
+    """Return a mesh [m], converted to the simulator's frame with the pose `obj_from_world` [m].
+
+    Its vertices are rounded to multiples of `GRID` [m].
     """
     vertices = torch.from_numpy(np.array(mesh.vertices, dtype=np.float64))
     moved = to_upright(vertices, obj_from_world).numpy()

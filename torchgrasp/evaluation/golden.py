@@ -19,15 +19,13 @@ from torchgrasp.values.specs import Simulator, TrialSpec
 
 
 class GoldenCase(NamedTuple):
-    """A shipped grasp, its right verdict, how far [m] the hand is from its place, and the mass [kg]
-    of the object.
-    """
+    """A shipped grasp with its right verdict."""
 
-    object: str
-    hand: str
-    held: bool
-    shift: float = 0.0
-    mass: float = 0.1
+    object: str  # name of a shipped object
+    hand: str  # name of a shipped hand
+    held: bool  # whether the object is rightly held
+    shift: float = 0.0  # distance [m] by which the hand is moved back against its approach
+    mass: float = 0.1  # of the object [kg]
 
 
 GOLDEN = (
@@ -43,27 +41,25 @@ GOLDEN = (
         for held, mass in ((True, 0.5), (False, 0.8))
     ),
 )
-"""The test cases: grasps of two hands on two objects, some of which hold the object."""
+"""The test cases: grasps of two hands on two objects. In some of them the object is held."""
 
 
 class GoldenResult(NamedTuple):
-    """A test case, whether the simulated hand held the object, and the wall time of the trial in
-    seconds.
-    """
+    """The outcome of a test case."""
 
     case: GoldenCase
-    held: bool
-    seconds: float
+    held: bool  # whether the simulated hand held the object
+    seconds: float  # wall time of the trial [s]
 
     @property
     def right(self) -> bool:
-        """Whether the simulated hand held or lost the object as expected."""
+        """Whether the verdict of the simulation is that of the test case."""
         return self.held == self.case.held
 
 
 @checked
 def run_golden(simulator: Simulator) -> Iterator[GoldenResult]:
-    """Simulate each test case of `GOLDEN`, and yield its result."""
+    """Simulate each test case of `GOLDEN` in a `simulator`, and yield its result."""
     for case in GOLDEN:
         thing = load_object(case.object)
         hand = load_hand(case.hand)

@@ -19,7 +19,7 @@ from torchgrasp.foundation.rules import Seed
 
 @dataclasses.dataclass(frozen=True)
 class BootstrapNumbers:
-    """How an interval is found."""
+    """Numbers of the bootstrap that finds an interval."""
 
     resamples: int = 10_000  # resamples of the families; more: ends of the interval vary less
     outside: float = 0.05  # probability that the value lies outside the interval
@@ -28,29 +28,29 @@ class BootstrapNumbers:
 
 BOOTSTRAP = BootstrapNumbers()
 Counts = Mapping[str, tuple[int | float, int]]
-"""Passed trials and all trials of each resampled unit, a family or an object. For a mean: sum and
-number of values.
+"""(passed, all): numbers of trials of each resampled unit, by the name of the unit (a family or an
+object). For a mean: (sum, number) of the values.
 """
 
 
 class Share(NamedTuple):
-    """A success rate, mean or difference, with its 95 % interval, and the numbers of trials and of
-    resampled units.
+    """A success rate, mean or difference, with its 95 % interval.
 
     With a single unit the interval is NaN. Without trials all values are NaN.
     """
 
-    value: float
-    low: float
-    high: float
-    total: int
-    units: int
+    value: float  # a share in [0, 1], or a mean or difference in its own unit
+    low: float  # lower end of the interval
+    high: float  # upper end of the interval
+    total: int  # number of trials
+    units: int  # number of resampled units
 
 
 @checked
 def count_by(outcomes: Iterable[tuple[str, bool]]) -> dict[str, tuple[int, int]]:
-    """Return the numbers of passed and of all trials for each unit, given pairs of unit name and
-    outcome.
+    """Return (passed, all), the numbers of trials of each unit, by its name.
+
+    `outcomes` are pairs of a unit's name and whether one trial passed.
     """
     counts: dict[str, tuple[int, int]] = {}
     for name, passed in outcomes:
@@ -65,6 +65,7 @@ def share_over(counts: Counts, seed: Seed = 0) -> Share:
 
     If all trials passed, or none, resampling gives no width. The interval is then the one-sided 95
     % bound of n independent trials, n being the number of units: its lower end is 0.05 ** (1 / n).
+    `seed` draws the resamples.
     """
     found = contrast_over([counts], [1.0], seed)
     if found.units > 1 and found.value in (0.0, 1.0):
@@ -75,12 +76,12 @@ def share_over(counts: Counts, seed: Seed = 0) -> Share:
 
 @checked
 def contrast_over(columns: Sequence[Counts], weights: Sequence[float], seed: Seed = 0) -> Share:
-    """Return a weighted sum of success rates, with a 95 % interval; all rates use the same
-    resampled units.
+    """Return a weighted sum of success rates, with a 95 % interval.
 
-    Each of `columns` holds the counts of one rate. `total` counts the trials of the first column.
-    Resamples in which a column has no trial are left out. The weights 1 and -1 give a difference.
-    An interval of zero width means that the units agree, not that the value is exact.
+    Each of `columns` holds the counts of one rate, and `weights` its weight: 1 and -1 give a
+    difference. All rates use the same resampled units, which `seed` draws. `total` counts the
+    trials of the first column. Resamples in which a column has no trial are left out. An interval
+    of zero width means that the units agree, not that the value is exact.
     """
     names = sorted({name for counts in columns for name, (_, total) in counts.items() if total})
     total = sum(total for _, total in columns[0].values())
@@ -110,7 +111,10 @@ def _combine(sums: Float[Tensor, "*r c 2"], weights: Sequence[float]) -> Float[T
 
 @checked
 def format_share(share: Share, unit: str = "families") -> str:
-    """Return a success rate with its interval as text."""
+    """Return a success rate with its interval as text, in per cent.
+
+    `unit` is the plural name of the resampled units.
+    """
     if math.isnan(share.value):
         return "nothing measured"
     value = f"{100.0 * share.value:.1f} %"

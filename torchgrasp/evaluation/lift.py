@@ -35,23 +35,24 @@ from torchgrasp.values.planning import Grasps
 from torchgrasp.values.specs import TrialSpec
 
 LIFT_TIME = 1.0  # time [s] in which the hand rises
-PUSHED_DISTANCE = 0.05  # motion [m] of the object's centre in the closing that counts as ejected
+# least motion [m] of the object's centre during the closing that counts as ejected
+PUSHED_DISTANCE = 0.05
 
 
 @dataclasses.dataclass(frozen=True)
 class LiftNumbers:
-    """The numbers of a lift and its verdict."""
+    """Numbers of a lift and its verdict."""
 
     shaking: float = 5.0
     """Frequency [Hz] at which the raised hand shakes."""
     judged: float = 0.2
-    """Last seconds in which the fingers must touch the object."""
+    """Time [s] at the end in which the fingers must touch the object."""
     lost: float = 0.5
     """Motion [m] of the object beyond the lift's height that ends the trial."""
     slack: float = 0.03
-    """Distance [m] from the mesh within which contacts of a grasp lie."""
+    """Greatest distance [m] of a grasp's contact from the mesh."""
     share: float = 0.99
-    """Share of the contacts that must lie so."""
+    """Least share of the contacts that lie within this distance."""
 
 
 LIFTS = LiftNumbers()
@@ -138,7 +139,7 @@ def lift_grasp(trial: GraspTrial, spec: TrialSpec | None = None) -> ClosureResul
 
 
 def run_lift(driver: TrialDriver) -> ClosureResult:
-    """Run a lift trial in a fresh scene."""
+    """Run the lift trial of a driver in a fresh scene, and return its record."""
     return _Lift(driver.open()).complete()
 
 

@@ -1,5 +1,6 @@
-"""Settings of the trials that test grasps: lifts, and published pulls at the object without table
-and gravity.
+"""Settings of the trials that test grasps: lifts, and published pulls at the object.
+
+Pulls are without table and gravity.
 """
 
 import dataclasses
@@ -29,26 +30,22 @@ LEAST_MASS = 1e-3  # least mass [kg] of a task, so that no load is zero
 @checked
 @dataclasses.dataclass(frozen=True)
 class PoseNoise(Value):
-    """Random pose errors of at most `translation` [m] along and `rotation` [rad] about each axis;
-    `draws` per grasp.
-    """
+    """The bounds of random pose errors."""
 
-    translation: Length = 0.0
-    rotation: Annotated[float, Range(0.0, math.pi)] = 0.0
-    draws: Count = 1
+    translation: Length = 0.0  # greatest error [m] along each axis
+    rotation: Annotated[float, Range(0.0, math.pi)] = 0.0  # greatest error [rad] about each axis
+    draws: Count = 1  # number of random errors for each grasp
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class PullSpec(Value):
-    """A pull with the force mass x `acceleration` [m/s^2], and the largest motion [m] and rotation
-    [rad] that pass.
-    """
+    """The settings of pulls at a grasped object, and the motion that passes."""
 
-    acceleration: Annotated[float, Range(0.0, 1000.0)]
-    seconds: Annotated[float, Range(0.0, 60.0)]
-    distance: Length
-    angle: Annotated[float, Range(0.0, math.inf)]
+    acceleration: Annotated[float, Range(0.0, 1000.0)]  # force of a pull over the mass [m/s^2]
+    seconds: Annotated[float, Range(0.0, 60.0)]  # time of each pull [s]
+    distance: Length  # greatest motion of the object [m] that passes
+    angle: Annotated[float, Range(0.0, math.inf)]  # greatest rotation [rad] that passes
 
 
 @checked
@@ -183,8 +180,9 @@ PROTOCOLS = {
 
 @checked
 def find_protocol(protocol: Protocol | str) -> Protocol:
-    """Return a protocol, given its name or the protocol itself; raise `BadArgument` for an unknown
-    name.
+    """Return a protocol, given its name or the protocol itself.
+
+    Raises `BadArgument` for an unknown name.
 
     >>> find_protocol("tabletop").trial.friction
     0.6
@@ -198,8 +196,9 @@ def find_protocol(protocol: Protocol | str) -> Protocol:
 
 @checked
 def apply_error(obj_from_hand: Pose, error: Pose | None) -> Float[Tensor, "4 4"]:
-    """Return the true pose of a hand, given its planned pose and the pose error, on the CPU in
-    float64.
+    """Return the true pose of a hand, on the CPU in float64, given its planned pose and pose error.
+
+    The `error` is a rigid transform [m] in the frame of the planned hand; None means no error.
     """
     planned = obj_from_hand.to("cpu", torch.float64)
     if error is None:
@@ -209,8 +208,8 @@ def apply_error(obj_from_hand: Pose, error: Pose | None) -> Float[Tensor, "4 4"]
 
 @checked
 def seed_of(seed: Seed, *names: str | int) -> int:
-    """Return the random seed for one purpose: a hash of the evaluation's seed and the names of the
-    purpose.
+    """Return the random seed for one purpose: a hash of an evaluation's seed and the purpose's
+    names.
 
     Draws for different objects, views, grasps or repetitions are independent of each other and of
     their order.
@@ -221,7 +220,7 @@ def seed_of(seed: Seed, *names: str | int) -> int:
 
 @checked
 def draw_hand_errors(noise: PoseNoise, count: Count, seed: Seed) -> Float[Tensor, "n 4 4"]:
-    """Return random pose errors of the hand, each a transform in the frame of the planned hand."""
+    """Return n = `count` random pose errors of the hand [m], each in the frame of the planned hand."""
     generator = torch.Generator().manual_seed(seed)
     largest = torch.tensor([noise.rotation] * 3 + [noise.translation] * 3, dtype=torch.float64)
     drawn = 2 * torch.rand(count, 6, generator=generator, dtype=torch.float64) - 1
@@ -233,8 +232,9 @@ def draw_hand_errors(noise: PoseNoise, count: Count, seed: Seed) -> Float[Tensor
 def draw_object_poses(
     noise: PoseNoise, pivot: Float[Tensor, "3"], count: Count, seed: Seed
 ) -> Float[Tensor, "n 4 4"]:
-    """Return random displacements of an object along its table and about the vertical through
-    `pivot` [m].
+    """Return n = `count` random displacements [m] of an object on its table, as rigid transforms.
+
+    They are along the table, whose normal is z, and about the vertical through `pivot` [m].
     """
     pivot = pivot.to("cpu", torch.float64)
     generator = torch.Generator().manual_seed(seed)
@@ -246,8 +246,10 @@ def draw_object_poses(
 
 
 def error_from_object_pose(obj_from_hand: Pose, object_pose: Pose) -> Float[Tensor, "4 4"]:
-    """Return the pose error of the hand that is equivalent to a displacement of the object by
-    `object_pose`.
+    """Return the pose error of the hand that is equivalent to a displacement of the object.
+
+    `object_pose` is the displacement and `obj_from_hand` the planned pose, both rigid transforms
+    [m] in the frame of the grasp. The error is in the frame of the planned hand.
     """
     return inverse(obj_from_hand) @ inverse(object_pose) @ obj_from_hand
 
@@ -256,8 +258,10 @@ def error_from_object_pose(obj_from_hand: Pose, object_pose: Pose) -> Float[Tens
 def draw_error(
     protocol: Protocol, grasp: Grasps, mesh: "trimesh.Trimesh", seed: Seed
 ) -> Float[Tensor, "4 4"]:
-    """Return the random pose error of the hand for one trial of a grasp; `seed_of` gives the seed
-    of the trial.
+    """Return the random pose error of the hand [m] for one trial of a grasp, in the hand's frame.
+
+    In a protocol that lifts, it stands for a displacement of the object with the true `mesh` [m].
+    `seed` is that of the trial (`seed_of`).
     """
     if protocol.pull is not None:
         return draw_hand_errors(protocol.noise, 1, seed)[0]
@@ -268,8 +272,9 @@ def draw_error(
 
 @checked
 def draw_slide(noise: PoseNoise, seed: Seed) -> Float[Tensor, "3"]:
-    """Return a random displacement [m] of an object along its table, of at most `noise.translation`
-    on each axis.
+    """Return a random displacement (x, y, 0) [m] of an object along its table.
+
+    It is at most `noise.translation` on each axis.
     """
     level = dataclasses.replace(noise, rotation=0.0)
     return draw_object_poses(level, torch.zeros(3), 1, seed)[0, :3, 3]
@@ -279,8 +284,9 @@ def draw_slide(noise: PoseNoise, seed: Seed) -> Float[Tensor, "3"]:
 def draw_push(
     force: Annotated[float, Range(0.0, 1000.0)], seed: Seed
 ) -> tuple[float, float, float]:
-    """Return a force of the size `force` [N] in a random direction; all directions are equally
-    likely.
+    """Return a force (x, y, z) [N] of the size `force` [N] in a random direction.
+
+    All directions are equally likely.
     """
     generator = torch.Generator().manual_seed(seed)
     x, y, z = (force * unit(torch.randn(3, generator=generator, dtype=torch.float64))).tolist()

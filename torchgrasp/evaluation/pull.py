@@ -31,30 +31,26 @@ INTERVAL = 0.2  # interval [s] at which the pulled object's motion is checked
 class PullResult(Value):
     """The result of a pull trial: whether the object stayed in the hand when pulled in each
     direction.
-
-    `directions` is the number of pulls that were tried, `status` that of the last one. The object's
-    largest motion is `moved` [m] and `turned` [rad]. `force` [N] is the fingers' mean normal force
-    before the first pull, or NaN. `seconds` is CPU time.
     """
 
     passed: bool
-    status: Status
-    directions: int
-    moved: Measured
-    turned: Measured
-    force: Measured
-    seconds: Measured
+    status: Status  # of the last pull
+    directions: int  # number of pulls that were tried
+    moved: Measured  # largest motion of the object [m]
+    turned: Measured  # largest rotation of the object [rad]
+    force: Measured  # mean normal force of the fingers before the first pull [N], or NaN
+    seconds: Measured  # CPU time [s]
 
 
 @checked
 @single_threaded
 def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") -> PullResult:
-    """Close a hand on the true object and pull along the world's axes, from the same grasp, until a
-    pull fails.
+    """Close a hand on the true object, and pull at the object along the world's axes until a pull
+    fails.
 
-    The object's motion includes its motion during the closing. `protocol` may be a name in
-    `PROTOCOLS`. Raises the errors of `close_hand`, and `BadArgument` for an unknown protocol, or a
-    protocol that lifts.
+    Every pull begins from the same grasp. The object's motion includes its motion during the
+    closing. `protocol` may be a name in `PROTOCOLS`. Raises the errors of `close_hand`, and
+    `BadArgument` for an unknown protocol, or a protocol that lifts.
 
     >>> from torchgrasp import load_hand, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -72,7 +68,9 @@ def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") ->
 
 
 def run_pulls(driver: TrialDriver, spec: PullSpec) -> PullResult:
-    """Grasp the object once, and pull it in each direction until one pull fails."""
+    """Run the pull trial of a driver: grasp the object once, and pull it in each direction until
+    one fails.
+    """
     started = time.process_time()
     run = driver.open()
     start = run.scene.object_pose()
@@ -138,12 +136,12 @@ def run_protocol(
     rank: Annotated[int, Range(0, 1000000)] = 0,
     draw: Annotated[int, Range(0, 1000000)] = 0,
 ) -> ProtocolResult:
-    """Run one trial of a grasp, pulls or a lift; the result stores the grasp's `rank` and the pose
-    error's `draw`.
+    """Run one trial of a grasp under a protocol: pulls, or a lift.
 
-    With `protocol.tries` > 1 the trial may hold further grasps, which are tried where a lift fails
-    (`lift_grasps`). A force of the size `protocol.push` in a direction drawn from the trial's seed
-    pushes the lifted object.
+    The result stores the grasp's `rank` among those of its view, and the number `draw` of the pose
+    error. With `protocol.tries` > 1 the trial may hold further grasps, which are tried where a lift
+    fails (`lift_grasps`). A force of the size `protocol.push` [N] in a direction drawn from the
+    trial's seed pushes the lifted object.
     """
     started = time.process_time()
     if protocol.push:

@@ -39,13 +39,14 @@ from torchgrasp.values.specs import TrialSpec
 
 @dataclasses.dataclass(frozen=True)
 class RegraspNumbers:
-    """How far the next grasp differs from those tried, and where a failed object's mass may be."""
+    """Numbers of the choice of another grasp after a failed one."""
 
     gap: float = 0.015  # mean distance [m] of the contacts above which a grasp differs
     turn: float = math.radians(30)  # angle [rad] of the approaches above which a grasp differs
     share: float = 0.35  # share of the mass that may be at one point of the surface
     withdrawal: float = 0.6  # time [s] in which the opened hand withdraws, and the object rests
-    places: int = 64  # points of the surface that are tried for it, at least; fewer if it has fewer
+    # least number of surface points that are tried for this mass; fewer if the surface has fewer
+    places: int = 64
 
 
 REGRASP = RegraspNumbers()
@@ -55,11 +56,11 @@ REGRASP = RegraspNumbers()
 def next_grasp(
     grasps: Grasps, tried: Sequence[int], surface: SignedDistanceField | None = None
 ) -> int:
-    """Return the grasp of `list_others` that most likely holds, given that those `tried` have
+    """Return the index of the grasp of `list_others` that most likely holds, after those `tried`
     failed.
 
-    Without an estimated surface and table, or in another ranking than by success, it is the
-    best-ranked one.
+    `surface` is the estimated surface of the object. Without it or a table, or if the grasps are
+    not ranked by success, it is the best-ranked one.
     """
     others = list_others(grasps, tried)
     if surface is None or grasps.table is None or grasps.meta.get("ranking") != "success":
@@ -69,8 +70,9 @@ def next_grasp(
 
 @checked
 def list_others(grasps: Grasps, tried: Sequence[int]) -> Int[Tensor, "k"]:
-    """Return the rows of the grasps that differ from all `tried`: by 30 degrees in approach, or 15
-    mm in contacts.
+    """Return the indices of the grasps that differ from all `tried` (indices).
+
+    They differ by more than `REGRASP.turn` in approach, or `REGRASP.gap` in contacts.
     """
     approach = grasps.approach
     points = grasps.contacts.points.double()
@@ -99,12 +101,10 @@ def _chances(
 
 
 class LiftTry(NamedTuple):
-    """One try of a trial over several grasps: the row of the grasp that was tried, and the result
-    of its lift.
-    """
+    """One try of a trial over several grasps."""
 
-    row: int
-    result: ClosureResult
+    row: int  # index of the grasp that was tried
+    result: ClosureResult  # of its lift
 
 
 @checked
@@ -112,16 +112,15 @@ class LiftTry(NamedTuple):
 def lift_grasps(
     trial: GraspTrial, spec: TrialSpec | None = None, tries: Count = 3
 ) -> tuple[LiftTry, ...]:
-    """Lift an object with the first grasp of a trial, and with others where a lift fails; return
-    all tries.
+    """Lift an object with the first grasp of a trial, and with others where a lift fails.
 
-    Where the hand feels that the object slides or stays behind (`LiftCheck`), or is too heavy, it
-    goes down, opens and withdraws. The object stays where it then is. The robot expects it where
-    the touches of the last try tell, or looks once more, and tries the grasp of `next_grasp`.
+    The result lists all tries, at most `tries`. Where the hand feels that the object slides or
+    stays behind (`LiftCheck`), or is too heavy, it goes down, opens and withdraws. The object stays
+    where it then is. The robot expects it at the pose that the touches of the last try show, or
+    looks once more, and tries the grasp of `next_grasp`.
 
     The trial's grasps are in the order of preference; the truth's `error` is that of the first
-    grasp. With one of the `tries` the trial is that of `close_hand`. Raises the errors of
-    `close_hand`.
+    grasp. With `tries` 1 the trial is that of `close_hand`. Raises the errors of `close_hand`.
 
     >>> from torchgrasp import load_hand, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -135,7 +134,10 @@ def lift_grasps(
 
 
 def run_lifts(driver: TrialDriver, grasps: Grasps, tries: int) -> tuple[LiftTry, ...]:
-    """Run the trial of the first of several grasps, and trials of others where a lift fails."""
+    """Run the trial of the first of several grasps, and trials of others where a lift fails.
+
+    Return all tries, at most `tries`.
+    """
     tried = [0]
     done = list[LiftTry]()
     while len(tried) < tries and len(list_others(grasps, tried)):

@@ -1,4 +1,4 @@
-"""Summary of an evaluation: success rates, failures by stage, forces, times, calibration of
+"""Summary of an evaluation: success rates, failures by stage, forces, times, and the calibration of
 predicted success.
 """
 
@@ -35,18 +35,21 @@ QUANTILES = (0.5, 0.95)  # the median and a large value, which few exceed
 @checked
 @dataclasses.dataclass(frozen=True)
 class ProtocolResult(Value):
-    """The outcome of one trial of the grasp at `rank`, with the pose error of number `draw`; NaN if
-    not measured.
+    """The outcome of one trial of a grasp; numbers that were not measured are NaN.
 
     Args:
+        rank: rank of the grasp among those of its view.
+        draw: number of the random pose error.
+        passed: whether the trial passed under its protocol.
+        status: how the trial ended.
         moved: motion of the object [m]; in a lift relative to the hand.
         turned: rotation of the object [rad]; in a lift relative to the hand.
         force: mean normal force of the fingers [N].
         overlap: overlap of hand and object at the grasp [m].
-        seconds: CPU time.
+        seconds: CPU time [s].
         slip: motion of the object in the closed hand [m], in a lift.
         slip_angle: rotation of the object in the closed hand [rad], in a lift.
-        predicted: predicted success of the grasp.
+        predicted: predicted probability of success of the grasp.
         tries: number of grasps that were tried; all but `predicted`, `rank` and `overlap` is of the
             last grasp.
         cause: why the object of a lift was not held, a name in `CAUSES`, or "".
@@ -71,7 +74,7 @@ class ProtocolResult(Value):
 
     @property
     def held(self) -> bool:
-        """Whether the status is `OK`: in a lift the object is then held without slip
+        """Whether the status is `OK`. In a lift, the object is then held without slip
         (`close_hand`).
         """
         return self.status is Status.OK
@@ -83,14 +86,16 @@ class ViewScore(Value):
     """The outcome of one view: planning, and the trials of its grasps.
 
     Args:
+        object: name of the object.
+        view: name of the view.
         executable: number of executable grasps.
-        seconds: CPU time of planning.
+        seconds: CPU time of planning [s].
         attempts: results of the grasps that were tried.
         refusal: the most frequent failure if no grasp is executable.
         note: details of the refusal.
         family: family of the object (`torchgrasp.data`), or "".
         group: group of the object, or "".
-        fingers: the grasping fingers.
+        fingers: names of the grasping fingers.
     """
 
     object: str
@@ -106,8 +111,9 @@ class ViewScore(Value):
 
     @property
     def unit(self) -> str:
-        """The unit that confidence intervals resample: the object's family, or the object if it has
-        no family.
+        """The name of the unit that confidence intervals resample: the object's family.
+
+        If the object has no family, it is the object.
         """
         return self.family or self.object
 
@@ -227,23 +233,23 @@ def _mean(values: Iterable[float]) -> float | None:
 
 
 class Bin(NamedTuple):
-    """A calibration bin: predictions in [low, high), their mean, and the success rate of their
+    """A calibration bin: the predictions (probabilities) in [low, high), and the outcome of their
     trials.
     """
 
     low: float
     high: float
-    predicted: float
-    passed: Share
+    predicted: float  # mean prediction
+    passed: Share  # success rate of the trials
 
 
 def judge(
     predicted: Float[Tensor, "n"], passed: Bool[Tensor, "n"], units: Sequence[str]
 ) -> dict[str, float | list[Bin]]:
-    """Return calibration measures of predicted probabilities, given the outcomes.
+    """Return calibration measures, by name, of n predicted probabilities, given whether the trials
+    passed.
 
     Trials with the same name in `units` count as dependent in the bins' confidence intervals.
-
     "predicted" and "passed" are means. "brier" is the mean squared error. "skill" is 1 for perfect
     predictions and 0 for always predicting the mean. "auc" is the area under the ROC curve. "error"
     is the expected calibration error over the "bins".

@@ -40,16 +40,16 @@ from torchgrasp.values.specs import ClosingMode, TrialSpec
 
 @dataclasses.dataclass(frozen=True)
 class TrialNumbers:
-    """The numbers of a trial."""
+    """Numbers of a trial."""
 
     unit_error: float = 1e-4
-    """Greatest error of a unit approach's length."""
+    """Greatest error of the length of the approach, a unit vector."""
     decimals: int = 9
-    """Decimals [m] to which a table's offset is rounded."""
+    """Decimals to which a table's offset [m] is rounded."""
     speed: float = 0.2
     """Mean speed [m/s] of an unguarded approach."""
     relooked: float = 1.5
-    """Distance that the mount yields after a second look, over its reach."""
+    """Ratio of the distance that the mount yields after a second look to its usual reach."""
 
 
 TRIALS = TrialNumbers()
@@ -61,42 +61,43 @@ class Truth:
     """The true world of a trial, which only the simulator gets; the fields are arguments of
     `close_hand`.
 
-    The object slides by `slide` [m] halfway through the approach. `camera` is the pose, in the
-    frame of the grasp, of a depth camera that looks at the object once more before the hand comes
-    to its approach.
+    Lengths are in metres, and all is in the frame of the grasp. A `camera` looks at the object once
+    more before the hand comes to its approach.
     """
 
-    mesh: "trimesh.Trimesh | Path | str"
-    parts: "Sequence[trimesh.Trimesh] | None" = None
-    error: Pose | None = None
-    table: Plane | None = None
-    neighbours: Sequence[Neighbour] = ()
-    slide: Float[Tensor, "3"] | None = None
-    camera: Pose | None = None
+    mesh: "trimesh.Trimesh | Path | str"  # of the object [m]
+    parts: "Sequence[trimesh.Trimesh] | None" = None  # convex parts of the object [m]
+    error: Pose | None = None  # error of the hand's pose [m], in the frame of the planned hand
+    table: Plane | None = None  # below the object
+    neighbours: Sequence[Neighbour] = ()  # other bodies on the table
+    slide: Float[Tensor, "3"] | None = None  # motion of the object halfway through the approach [m]
+    camera: Pose | None = None  # of a depth camera for a second look [m]
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspTrial:
-    """The input of a trial: the truth, and what the robot knows; the fields are arguments of
-    `close_hand`.
+    """The input of a trial: the truth, and what the robot knows.
+
+    The fields are arguments of `close_hand`.
     """
 
     hand: Hand
     grasp: Grasps
     truth: Truth
     seed: Seed = 0
-    told: Plane | None = None
-    surface: SignedDistanceField | None = None
+    told: Plane | None = None  # the table that the controller knows, in the frame of the grasp
+    surface: SignedDistanceField | None = None  # the estimated surface of the object
 
 
 class TrialDriver:
-    """A trial that is checked once and can run any number of times; a wrong one raises the errors
-    of `close_hand`.
+    """A trial that is checked once and can run any number of times.
+
+    A bad trial raises the errors of `close_hand`.
 
     Attributes:
         reference: the closing plan; by default derived from what the robot knows of the trial.
-        obj_from_world: pose of the simulator's frame in the grasp's frame. If there is a true
+        obj_from_world: pose [m] of the simulator's frame in the grasp's frame. If there is a true
             table, the frame is upright on it. Numbers are then rounded, so that results are bitwise
             invariant to rigid motion.
     """
@@ -197,8 +198,9 @@ class TrialDriver:
         return open_scene(spec, self.spec.simulator)
 
     def open(self) -> "TrialRun":
-        """Return a run of the trial in a fresh scene; raises `MissingExtra` if the simulator is not
-        installed.
+        """Return a run of the trial in a fresh scene.
+
+        Raises `MissingExtra` if the simulator is not installed.
         """
         return TrialRun(self)
 
@@ -221,8 +223,18 @@ def derive_reference(
     sensor: SensorModel | None = None,
     max_force: float | None = None,
 ) -> ClosingReference:
-    """Return the closing plan, given all that the robot knows; its table is in the frame of the
-    grasp.
+    """Return the closing plan, given all that the robot knows.
+
+    Args:
+        hand: the hand of the grasp.
+        grasp: a single grasp.
+        table: the table in the frame of the grasp; None if unknown.
+        surface: the estimated surface of the object; None if unknown.
+        closing: the mode of the closing.
+        force: normal force [N] of the strongest finger.
+        kp: stiffness of every joint's drive [N m/rad]; None means the hand's own.
+        sensor: noise of the fingertip sensors; None means that of the plan.
+        max_force: greatest normal force [N] of a fingertip; None means no limit.
     """
     preference = choose_preference(hand, closing)
     plan = ClosingReference.from_grasp(hand, grasp, force, kp, preference)
@@ -233,8 +245,9 @@ def derive_reference(
 
 
 class TrialRun:
-    """One run of a trial in a fresh scene; its phases are iterators that yield after every control
-    tick.
+    """One run of a trial in a fresh scene.
+
+    Its phases are iterators that yield after every control tick.
     """
 
     def __init__(self, driver: TrialDriver) -> None:
@@ -273,14 +286,15 @@ class TrialRun:
 
     @property
     def starts(self) -> bool:
-        """Whether the hand's initial penetration of the object is within the limit, so that the
-        trial starts.
+        """Whether the trial starts: the hand penetrates the object at first by no more than the
+        limit.
         """
         return self.overlap <= self.spec.overlap
 
     def keep(self) -> "Callable[[], TrialRun]":
-        """Return a function that returns runs in the present state of this one, which go on bitwise
-        as this one.
+        """Return a function that returns new runs in the present state of this one.
+
+        They continue bitwise as this one does.
         """
         reopen = self.scene.keep()
         hand = self.robot.reference.hand
@@ -288,8 +302,9 @@ class TrialRun:
         return lambda: copy.deepcopy(kept, {id(self.scene): reopen(), id(hand): hand})
 
     def approach(self) -> Iterator[None]:
-        """Move the opened hand straight to its pre-grasp; in a guarded approach, a touch stops the
-        hand.
+        """Move the opened hand straight to its pre-grasp.
+
+        In a guarded approach, a touch stops the hand.
         """
         half = 0.5 * self.spec.approach
         if self.controller.approaching:
@@ -336,7 +351,7 @@ class TrialRun:
         self.observation = self.robot.tick(targets)
 
     def hold(self, seconds: float) -> None:
-        """Hold the object for a time.
+        """Hold the object for a time `seconds` [s].
 
         A hand that closed in open loop reaches its last targets one tick after its closing ends.
         Then it keeps them, whatever it would observe.
@@ -350,8 +365,9 @@ class TrialRun:
 
     @property
     def felt(self) -> tuple[float, float]:
-        """The controller's estimates of friction coefficient and load [N]; NaN unless it holds in
-        the mode "grip".
+        """The controller's estimates (friction coefficient, load [N]).
+
+        Both are NaN unless it holds in the mode "grip".
         """
         hold = self.controller.hold
         if isinstance(hold, GripHold):
@@ -359,8 +375,8 @@ class TrialRun:
         return math.nan, math.nan
 
     def strained(self) -> bool:
-        """Return whether any joint's drive would need its greatest torque or more to reach its
-        target, or to grip.
+        """Return whether any joint's drive would need its greatest torque to reach its target, or
+        to grip.
         """
         reference = self.robot.reference
         hold = self.controller.hold
@@ -373,8 +389,9 @@ class TrialRun:
 
 
 def smooth_step(time: float) -> tuple[float, float]:
-    """Return position and speed, at a `time` in [0, 1], of a motion from 0 to 1 that starts and
-    ends at rest.
+    """Return (position, speed) of a motion from 0 to 1 that starts and ends at rest.
+
+    The `time` is in [0, 1]; all are without unit.
     """
     return time * time * (3 - 2 * time), 6 * time * (1 - time)
 

@@ -1,5 +1,5 @@
-"""One view of a dataset object: plans grasps on it, and tries them under a protocol on the true
-mesh.
+"""Planning of grasps on one view of a dataset object, and their trials on the true mesh under a
+protocol.
 """
 
 import contextlib
@@ -43,11 +43,10 @@ from torchgrasp.values.planning import Grasps, PointCloud
 from torchgrasp.values.specs import ContactSpec
 
 REFUSAL = "refusal"  # key of the metadata of saved grasps with the reason why a view has none
-MOST_FRICTION = 1.0  # that grasps are planned for, below the friction of some protocols
+# greatest friction coefficient for which grasps are planned; that of some protocols is greater
+MOST_FRICTION = 1.0
 Ranks = Literal["best", "spread"]
-"""Which grasps of a view are tried: the best grasps, or the same number of grasps spread over all
-ranks.
-"""
+"""Which grasps of a view are tried: the "best", or the same number "spread" over all ranks."""
 
 
 @checked
@@ -90,8 +89,10 @@ class EvaluationSpec(Value):
 
 
 def choose_rows(executable: int, most: int, ranks: Ranks) -> list[int]:
-    """Return the indices of the grasps to try: at most `most` of the `executable` grasps, which are
-    in ranked order.
+    """Return the indices of the grasps to try.
+
+    There are at most `most` out of `executable` grasps, which are in ranked order. `ranks` says
+    which: the "best", or as many "spread" over all ranks.
     """
     most = min(most, executable)
     if ranks == "best" or most < 2:
@@ -103,21 +104,21 @@ def choose_rows(executable: int, most: int, ranks: Ranks) -> list[int]:
 class ObjectView:
     """A hand and a view of an object: the input of one planning task, named by their files."""
 
-    objects: Path
-    object: str
-    view: str
-    hand: HandSource
+    objects: Path  # folder of objects
+    object: str  # name of the object
+    view: str  # name of the view
+    hand: HandSource  # files and fingers of the hand
 
     @property
     def score(self) -> ViewScore:
-        """The result for the view before planning: names of object, view, family and group, but no
-        grasps.
+        """The result for the view before planning, without grasps: names of object, view, family
+        and group.
         """
         entry = read_entry(self.objects, self.object)
         return ViewScore(self.object, self.view, 0, 0.0, family=entry.family, group=entry.group)
 
     def file(self, folder: Path) -> Path:
-        """Return the path of the view's grasps in a folder."""
+        """Return the path of the file in a folder that holds the view's grasps."""
         return folder / self.object / f"{self.view}.safetensors"
 
     def load_hand(self) -> Hand:
@@ -126,20 +127,20 @@ class ObjectView:
 
 
 class PlannedView(NamedTuple):
-    """The result of planning on a view: score, cloud and executable grasps; the latter are None for
-    a bad object.
-    """
+    """The result of planning on a view."""
 
     score: ViewScore
-    cloud: PointCloud | None = None
-    grasps: Grasps | None = None
+    cloud: PointCloud | None = None  # of the view [m]; None for a bad object
+    grasps: Grasps | None = None  # that are executable; None for a bad object
 
 
 def plan_views(
     views: Sequence[ObjectView], protocol: Protocol, spec: EvaluationSpec, device: str
 ) -> list[Grasps | None]:
-    """Plan on several views at once on a device; return the executable grasps of each, or None, for
-    `plan_view`.
+    """Plan on several views at once on a torch `device`; return the executable grasps of each.
+
+    The result is None for a view whose cloud cannot be read or planned on; `plan_view` then plans
+    it anew.
     """
     clouds = dict[int, PointCloud]()
     planned = dict[int, Grasps]()
@@ -173,10 +174,10 @@ def _plan(
 def plan_view(
     view: ObjectView, protocol: Protocol, spec: EvaluationSpec, planned: Path | Grasps | None = None
 ) -> PlannedView:
-    """Plan grasps for a protocol on a view, or take those that are `planned`, in a file or by
-    `plan_views`.
+    """Plan grasps for a protocol on a view, or take those that are already `planned`.
 
-    If `plan_views` found none, the view is planned anew, to say why.
+    These are in a file, or returned by `plan_views`. If `plan_views` found none, the view is
+    planned anew, to find out why.
     """
     hand = view.load_hand()
     score = view.score
@@ -235,8 +236,9 @@ def _read_planned(path: Path, score: ViewScore, cloud: PointCloud, hand: Hand) -
 def try_grasp(
     view: ObjectView, grasp: Grasps, protocol: Protocol, spec: EvaluationSpec, at: tuple[int, int]
 ) -> ProtocolResult:
-    """Try the first grasp of a view in simulation; `at` is its rank and the number of the pose
-    error's draw.
+    """Try the first grasp of `grasp` on a view in simulation, and return the result.
+
+    `at` holds the grasp's rank and the number of the pose error's draw.
     """
     hand = hand_of(grasp, view.load_hand())
     mesh, parts = _read_solid(view.objects, view.object)
