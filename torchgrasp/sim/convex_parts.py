@@ -25,7 +25,7 @@ THRESHOLD = 0.05  # concavity of a part below which CoACD cuts no further
 _SEARCH: dict[str, Any] = {"mcts_iterations": 60, "mcts_max_depth": 2, "mcts_nodes": 10}
 """Settings of CoACD's search for cuts, which make it narrower and faster than by default."""
 MOST_PARTS = 1000  # most parts that a caller may give
-DECIMALS = 6  # to which corners are rounded [m] whose hull would not be closed
+DECIMALS = 6  # decimals to which corners [m] are rounded if their hull would not be closed
 _log = logging.getLogger(__name__)
 
 
@@ -33,7 +33,8 @@ _log = logging.getLogger(__name__)
 def convex_parts(
     mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None = None
 ) -> "list[trimesh.Trimesh]":
-    """Return convex parts that together fill a closed mesh; a single part if the mesh is convex.
+    """Return convex parts [m] that together fill a closed mesh [m]; a single part if the mesh is
+    convex.
 
     The parts are cached in the folder `cache`, by default `$XDG_CACHE_HOME/torchgrasp` or
     `~/.cache/torchgrasp`. If the folder cannot be written, a warning is logged. Raises the errors
@@ -69,16 +70,18 @@ def convex_parts(
 def read_solid(
     mesh: "trimesh.Trimesh | Path | str", parts: "Sequence[trimesh.Trimesh] | None"
 ) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh]]":
-    """Read a closed mesh; return it and its convex parts: the given `parts`, or else a convex
-    decomposition.
+    """Read a closed mesh [m]; return it and its convex parts.
+
+    These are the given `parts`, or a convex decomposition if they are None.
     """
     mesh = read_mesh(mesh)
     return mesh, convex_parts(mesh) if parts is None else check_parts(parts)
 
 
 def hull(corners: np.ndarray) -> "trimesh.Trimesh":
-    """Return the convex hull of points; the points are rounded if the mesh of the hull would not be
-    closed.
+    """Return the convex hull of points (n, 3) [m] as a mesh.
+
+    The points are rounded to `DECIMALS` if the mesh of the hull would not be closed.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         body = trimesh.convex.convex_hull(corners)
@@ -88,8 +91,9 @@ def hull(corners: np.ndarray) -> "trimesh.Trimesh":
 
 
 def check_parts(parts: "Sequence[trimesh.Trimesh]") -> "list[trimesh.Trimesh]":
-    """Return the caller's parts as a list; raise `MeshError` if one is not convex, or for none or
-    too many parts.
+    """Return the given convex parts [m] as a list.
+
+    Raises `MeshError` if one is not convex, or for none or too many parts.
     """
     if len(parts) > MOST_PARTS:
         raise MeshError("parts", f"{len(parts)} parts", f"at most {MOST_PARTS}")

@@ -30,8 +30,10 @@ GIBIBYTE = 2**30
 def decompose(
     mesh: "trimesh.Trimesh", search: dict[str, Any]
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return vertices and faces of each convex part of a mesh by CoACD with given settings, within
-    time and memory.
+    """Return the vertices (v, 3) [m] and faces (f, 3) of each convex part of a mesh, cut by CoACD.
+
+    `search` holds CoACD's settings by name. Raises `MissingExtra` without CoACD, and `MeshError`
+    for a mesh that takes too much time or memory.
     """
     from torchgrasp.foundation.errors import MeshError, MissingExtra
 
@@ -60,8 +62,9 @@ def decompose(
 
 
 def main(asked: dict[str, Any]) -> None:
-    """Read a mesh from stdin, cut it within the time and memory of `asked`, and write its convex
-    parts to stdout.
+    """Read a mesh from stdin, cut it by CoACD, and write its convex parts to stdout.
+
+    `asked` holds limits of "seconds" [s] and "memory" [bytes], and the settings of the "search".
     """
     threading.Thread(target=_end_with_parent, args=(os.getppid(),), daemon=True).start()
     _limit(asked["seconds"], asked["memory"])

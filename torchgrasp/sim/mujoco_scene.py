@@ -16,7 +16,7 @@ from torchgrasp.sim.simulated_scene import STILL, SimulatedScene
 
 OBJECT = "torchgrasp_object"
 NEIGHBOUR = "torchgrasp_neighbour_{}"
-"""Names of the object (its body and its free joint), and of the neighbours, which are numbered."""
+"""Names in the model: of the object (its body and its free joint), and of numbered neighbours."""
 
 
 class MujocoScene(SimulatedScene):
@@ -82,7 +82,7 @@ class MujocoScene(SimulatedScene):
         self._mujoco.mj_step1(self.model, self.data)
 
     def skip(self, steps: int) -> None:
-        """Advance by a number of timesteps, of whose contacts nobody asks."""
+        """Advance by a number of timesteps, without reports of contacts."""
         for _ in range(steps):
             if self._diverged():
                 return
@@ -111,8 +111,9 @@ class MujocoScene(SimulatedScene):
         return [(size, [*impulse, *moment, size, *(sign * x for x in force)])]
 
     def keep(self) -> "Callable[[], MujocoScene]":
-        """Return a function that opens scenes in the present state of this one; they share its
-        model.
+        """Return a function that opens scenes in the present state of this one.
+
+        They share its model.
         """
         kept = copy.copy(self.data)
 
@@ -124,26 +125,30 @@ class MujocoScene(SimulatedScene):
         return reopen
 
     def drive(self, targets: np.ndarray) -> None:
-        """Set the target [rad] of every driven joint."""
+        """Set the `targets` (j,) [rad] of the j driven joints."""
         self.data.ctrl[self.motors] = targets
 
     def pull(self, force: np.ndarray, torque: np.ndarray = STILL) -> None:
-        """Apply a force [N] and a torque [N m] to the object, in this and all later steps."""
+        """Apply a force (3,) [N] and a torque (3,) [N m] to the object, in this and all later
+        steps.
+        """
         self.data.xfrc_applied[self.body] = [*force, *torque]
 
     def displace(self, shift: np.ndarray) -> None:
-        """Move the object by a displacement (3,) [m]."""
+        """Move the object by a displacement `shift` (3,) [m]."""
         start = self.model.joint(OBJECT).qposadr[0]
         self.data.qpos[start : start + 3] += shift
         self._mujoco.mj_step1(self.model, self.data)
 
     def joints(self) -> np.ndarray:
-        """Return the position of every driven joint [rad]."""
+        """Return the positions (j,) [rad] of the driven joints."""
         return self.data.qpos[self._positions]
 
     def jacobian(self, points: np.ndarray) -> np.ndarray:
-        """Return the Jacobian (f, 3, j) [m/rad] of one point (world's frame) per fingertip for the
-        driven joints.
+        """Return the Jacobian (f, 3, j) [m/rad] of one point on each fingertip by the driven
+        joints.
+
+        The `points` (f, 3) [m] are in the world's frame.
         """
         jacobian = np.zeros((len(self.tips), 3, self.model.nv))
         for rows, point, tip in zip(jacobian, points, self.tips, strict=True):
@@ -174,7 +179,10 @@ class MujocoScene(SimulatedScene):
 
 
 def import_mujoco() -> Any:
-    """Import and return MuJoCo; its warnings are no longer written to a file, only counted."""
+    """Import and return MuJoCo, with its warnings counted instead of written to a file.
+
+    Raises `MissingExtra` if it is not installed.
+    """
     try:
         import mujoco
     except ImportError as error:
@@ -186,8 +194,9 @@ def import_mujoco() -> Any:
 
 
 def scene_mjcf(spec: SceneSpec) -> str:
-    """Return MuJoCo's XML model of a scene (MJCF), with all joints at zero and a position servo for
-    each joint.
+    """Return MuJoCo's XML model of a scene (MJCF), as text.
+
+    All joints are at zero, and each has a position servo.
     """
     spec.check_drives([joint.name for joint in spec.urdf.movable])
     names = [OBJECT, *(NEIGHBOUR.format(k) for k in range(len(spec.neighbours)))]
@@ -199,7 +208,10 @@ def scene_mjcf(spec: SceneSpec) -> str:
 
 
 def render_mjcf(template: str, **values: Any) -> str:
-    """Return a model in MJCF from a template of this folder; numbers keep their precision."""
+    """Return a model in MJCF, as text, from a template of this folder filled with `values`.
+
+    Numbers keep their precision.
+    """
     filters = {
         "numbers": format_numbers,
         "rotation": lambda rpy: rotation_from_rpy(rpy).numpy(),
@@ -210,8 +222,10 @@ def render_mjcf(template: str, **values: Any) -> str:
 
 
 def nest_links(urdf: Urdf) -> list[tuple[Link, Joint | None, int]]:
-    """Return all links from the root down, each with its joint and the number of bodies that end
-    with it.
+    """Return (link, joint, ends) for all links from the root down, in the order of nested XML.
+
+    `joint` moves the link (None for the root); `ends` is the number of nested bodies that end with
+    it.
     """
     links = {link.name: link for link in urdf.links}
     waiting = [(0, urdf.root, None)]

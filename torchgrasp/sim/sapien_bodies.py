@@ -1,4 +1,4 @@
-"""What a scene in SAPIEN is made of: the world, the table, bodies of convex parts, and the hand on
+"""The contents of a scene in SAPIEN: the world, the table, bodies of convex parts, and the hand on
 its mount.
 
 Settings that differ from SAPIEN's defaults:
@@ -14,6 +14,8 @@ Settings that differ from SAPIEN's defaults:
   contact patches; with 32 iterations a step the object creeps slower than with 10.
 * Convex parts are cooked at a larger scale, and the foot of a finely faceted part is a shape of its
   own.
+
+The arguments `sapien` and `physx` are the modules that `import_sapien` returns.
 """
 
 import dataclasses
@@ -41,10 +43,11 @@ class BodyNumbers:
     """Settings of PhysX for bodies."""
 
     contact_offset: float = 0.002  # distance [m] at which contacts are made before shapes touch
-    iterations: int = 32  # of the solver for positions, in a step; more: held objects creep less
-    scale: float = 0.01  # of a cooked hull to a true one; PhysX drops vertices within 0.7 mm
+    # iterations of the solver for positions in each step; with more, held objects creep less
+    iterations: int = 32
+    scale: float = 0.01  # ratio of true to cooked lengths; PhysX drops vertices within 0.7 mm
     hull: int = 129  # most vertices of a hull of which PhysX keeps all, as it keeps 255 faces
-    foot: int = 100  # lowest vertices of a larger hull, whose foot is a shape of its own
+    foot: int = 100  # number of lowest vertices of a larger hull that make a shape of their own
 
 
 BODIES = BodyNumbers()
@@ -53,7 +56,11 @@ BODIES = BodyNumbers()
 def open_world(
     sapien: Any, physx: Any, gravity: float, timestep: float, patches: bool = False
 ) -> tuple[Any, Any]:
-    """Return an empty physics system and its scene, with given gravity [m/s^2] and timestep [s]."""
+    """Return an empty physics system and its scene.
+
+    `gravity` is in m/s^2, `timestep` in seconds. `patches` selects the solver TGS, which knows
+    contact patches.
+    """
     physx.set_scene_config(
         gravity=np.array([0, 0, -gravity], np.float32), enable_tgs=patches, enable_pcm=True
     )
@@ -70,8 +77,9 @@ def open_world(
 
 
 def place(sapien: Any, scene: Any, name: str, body: Any, height: float = 0.0) -> None:
-    """Add an entity with one body to the scene, with the body's origin at a `height` [m] on the
-    world's z axis.
+    """Add an entity with one body and a `name` to the scene.
+
+    The body's origin is at a `height` [m] on the world's z axis.
     """
     entity = sapien.Entity()
     entity.name = name
@@ -81,8 +89,9 @@ def place(sapien: Any, scene: Any, name: str, body: Any, height: float = 0.0) ->
 
 
 def table(sapien: Any, physx: Any, material: Any) -> Any:
-    """Return the body of the table, a half space; on a box, a rocking object gains energy until it
-    falls over.
+    """Return the body of the table, a half space.
+
+    On a box, a rocking object would gain energy until it falls over.
     """
     body = physx.PhysxRigidStaticComponent()
     top = physx.PhysxCollisionShapePlane(material)
@@ -96,11 +105,11 @@ def table(sapien: Any, physx: Any, material: Any) -> Any:
 def rigid_body(
     sapien: Any, physx: Any, material: Any, spec: Body, hulls: Iterable[np.ndarray], patch: float
 ) -> Any:
-    """Return a dynamic body of uniform density, made of convex hulls; `patch` [m] is the radius of
-    contact patches.
+    """Return a dynamic body of uniform density, made of convex hulls.
 
-    PhysX drops vertices within 0.7 mm of the hull of the others. Therefore it gets hulls a hundred
-    times as large.
+    `spec` gives mass and inertia, `hulls` the vertices (v, 3) [m] of each hull, and `patch` [m] the
+    radius of contact patches. PhysX drops vertices within 0.7 mm of the hull of the others.
+    Therefore it gets hulls a hundred times as large.
     """
     scale = BODIES.scale
     body = physx.PhysxRigidDynamicComponent()
@@ -123,8 +132,10 @@ def rigid_body(
 
 
 def split_hull(hull: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield the vertices of a convex hull; then of its foot, a pyramid, if PhysX keeps not all
-    vertices of the hull.
+    """Yield the vertices (v, 3) [m] of a convex hull, and for a large hull those of its foot.
+
+    PhysX drops vertices of a hull with more than `BODIES.hull`. The foot of such a hull consists of
+    its `BODIES.foot` lowest vertices and the mean of all.
     """
     yield hull
     if len(hull) > BODIES.hull:
@@ -132,7 +143,7 @@ def split_hull(hull: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def mounted_hand(scene: Any, material: Any, spec: SceneSpec) -> Any:
-    """Load the hand on its mount, set it to its initial posture, and return it."""
+    """Load the hand on its mount into a scene, and return it in its initial posture."""
     loader = scene.create_urdf_loader()
     loader.fix_root_link = True
     loader.set_material(material.static_friction, material.dynamic_friction, 0.0)
@@ -167,8 +178,10 @@ def mounted_hand(scene: Any, material: Any, spec: SceneSpec) -> Any:
 
 
 def import_sapien() -> tuple[Any, Any]:
-    """Import and return SAPIEN and its physics; its warning about missing Vulkan, which physics can
-    lack, is hidden.
+    """Import and return SAPIEN and its physics module.
+
+    Its warning about missing Vulkan is hidden, because physics works without. Raises `MissingExtra`
+    if SAPIEN is not installed.
     """
     try:
         with warnings.catch_warnings():

@@ -1,4 +1,4 @@
-"""A simulated scene in SAPIEN: what the hand and the bodies of `sapien_bodies` do in each step."""
+"""A simulated scene in SAPIEN: it moves the hand and the bodies of `sapien_bodies` in each step."""
 
 import functools
 from collections.abc import Callable, Iterator
@@ -106,7 +106,7 @@ class SapienScene(SimulatedScene):
         self.system.step()
 
     def skip(self, steps: int) -> None:
-        """Advance by a number of timesteps, of whose contacts nobody asks."""
+        """Advance by a number of timesteps, without reports of contacts."""
         for _ in range(steps):
             self._simulate()
 
@@ -128,11 +128,10 @@ class SapienScene(SimulatedScene):
                 yield size, [*(-sign * impulse).tolist(), *(size * point.position).tolist(), size]
 
     def step(self) -> StepContacts:
-        """Advance by one timestep and return the sums of the contacts, with forces measured at the
-        tips' base joints.
+        """Advance by one timestep, and return the sums of the hand's contacts during it.
 
-        SAPIEN reports contacts without friction, but the complete wrench at each link's joint, in
-        the joint's frame.
+        The forces are measured at the joints that carry the fingertips. SAPIEN reports contacts
+        without friction, but the complete wrench at each link's joint, in the joint's frame.
         """
         contacts = super().step()
         touching = [i for i, weight in enumerate(contacts.weight.tolist()) if weight > 0.0]
@@ -145,31 +144,35 @@ class SapienScene(SimulatedScene):
 
     @_noted
     def drive(self, targets: np.ndarray) -> None:
-        """Set the target [rad] of every driven joint."""
+        """Set the `targets` (j,) [rad] of the j driven joints."""
         for joint, target in zip(self._driven, targets.tolist(), strict=True):
             joint.set_drive_target(target)
 
     @_noted
     def pull(self, force: np.ndarray, torque: np.ndarray = STILL) -> None:
-        """Apply a force [N] and a torque [N m] to the object, in this and all later steps."""
+        """Apply a force (3,) [N] and a torque (3,) [N m] to the object, in this and all later
+        steps.
+        """
         self._force = np.asarray(force, np.float32)
         self._torque = np.asarray(torque, np.float32)
         self._pulled = bool(self._force.any() or self._torque.any())
 
     @_noted
     def displace(self, shift: np.ndarray) -> None:
-        """Move the object by a displacement (3,) [m]."""
+        """Move the object by a displacement `shift` (3,) [m]."""
         sapien, _ = import_sapien()
         pose = self.body.entity_pose
         self.body.entity.set_pose(sapien.Pose(pose.p + shift, pose.q))
 
     def joints(self) -> np.ndarray:
-        """Return the position of every driven joint [rad]."""
+        """Return the positions (j,) [rad] of the driven joints."""
         return np.asarray(self.hand.get_qpos(), float)[self._places]
 
     def jacobian(self, points: np.ndarray) -> np.ndarray:
-        """Return the Jacobian (f, 3, j) [m/rad] of one point (world's frame) per fingertip for the
-        driven joints.
+        """Return the Jacobian (f, 3, j) [m/rad] of one point on each fingertip by the driven
+        joints.
+
+        The `points` (f, 3) [m] are in the world's frame.
         """
         poses = [link.entity_pose.to_transformation_matrix() for link in self._children]
         frames = np.array(poses, float) @ self._frames
@@ -186,8 +189,9 @@ class SapienScene(SimulatedScene):
 
     @_noted
     def penetration(self) -> float:
-        """Return the largest depth [m] by which the hand penetrates a body or itself, after a step
-        without gravity.
+        """Return the largest depth [m] by which the hand penetrates a body or itself.
+
+        It is measured after a step without gravity.
         """
         bodies = [self.body, *self.neighbours]
         for body in bodies:

@@ -21,8 +21,8 @@ from torchgrasp.hand.urdf import Urdf, read_urdf
 ARMATURE = 1e-3
 LIFT_JOINT = "torchgrasp_lift"
 APPROACH_JOINT = "torchgrasp_approach"
-"""Names of the mount's prismatic joints along the world's z axis, and along the approach; at 0 the
-approach ends.
+"""Names of the mount's prismatic joints: along the world's z axis, and along the approach, which
+ends at position 0.
 """
 SHIFT_JOINTS = ("torchgrasp_shift_x", "torchgrasp_shift_y", "torchgrasp_shift_z")
 """Names of the prismatic joints of a mount that yields, along the world's axes."""
@@ -33,15 +33,15 @@ class SimulationNumbers:
     """Numbers of a simulated scene and of the mount of its hand."""
 
     near: float = 3e-4
-    """Height [m] over the table below which vertices lie on it."""
+    """Height [m] above the table below which a vertex is moved onto the table."""
     slack: float = 0.01
-    """Distance [m] by which a slide of the mount may go beyond its motion."""
+    """Distance [m] by which the limits of the mount's joints exceed their motion."""
     lift_slack: float = 0.05
-    """Height [m] by which the hand may rise beyond its lift."""
+    """Height [m] by which the limit of the lift exceeds its motion."""
     level: float = 1e-9
-    """Cosine of the pitch below which roll and yaw have one axis."""
+    """Cosine of the pitch below which roll and yaw have the same axis."""
     bits: int = 31
-    """Bits of a collision mask: MuJoCo's masks are signed numbers of 32 bits."""
+    """Number of bits of a collision mask: MuJoCo's masks are signed numbers of 32 bits."""
 
 
 SIMULATION = SimulationNumbers()
@@ -52,8 +52,9 @@ SIMULATION = SimulationNumbers()
 class Neighbour:
     """Another body on the simulated table, beside the object to grasp.
 
-    The closed `mesh` [m] is in the frame of the grasp. `parts` are by default its `convex_parts`,
-    and the `mass` [kg] follows from `TrialSpec.mass` or `TrialSpec.density`, as for the object.
+    The closed `mesh` [m] is in the frame of the grasp. `parts` are its convex parts [m], by default
+    those of `convex_parts`. By default, the `mass` [kg] follows from `TrialSpec.mass` or
+    `TrialSpec.density`, as for the object.
     """
 
     mesh: "trimesh.Trimesh"
@@ -64,15 +65,15 @@ class Neighbour:
 @checked
 @dataclasses.dataclass(frozen=True)
 class Body:
-    """A rigid body: its mesh, the convex parts that make up the mesh, and its mass [kg]."""
+    """A rigid body of uniform density."""
 
-    mesh: "trimesh.Trimesh"
-    parts: "Sequence[trimesh.Trimesh]"
-    mass: float
+    mesh: "trimesh.Trimesh"  # [m]
+    parts: "Sequence[trimesh.Trimesh]"  # convex, [m]
+    mass: float  # [kg]
 
     @property
     def inertia(self) -> np.ndarray:
-        """The inertia (3, 3) [kg m^2] about the centre of mass, for uniform density."""
+        """The matrix of inertia (3, 3) [kg m^2] about the centre of mass, for uniform density."""
         return np.asarray(self.mesh.moment_inertia) * (self.mass / self.mesh.volume)
 
 
@@ -82,12 +83,12 @@ class SceneSpec:
 
     Args:
         urdf_path: URDF of the hand.
-        world_from_hand: pose of the hand (4, 4).
+        world_from_hand: pose (4, 4) [m] of the hand's root link at the end of the approach.
         joints: start position of every joint of the URDF by name [rad].
         drives: motor of every joint of the URDF by name.
         tip_links: names of the links of the f fingertips, in the order of the grasp's contacts.
-        mesh: closed mesh of the object, which gives table height, centre of mass and inertia.
-        parts: convex bodies that make up the object.
+        mesh: closed mesh [m] of the object, which gives table height, centre of mass and inertia.
+        parts: convex bodies [m] that make up the object.
         mass: mass of the object [kg].
         friction: friction coefficient of every contact.
         table_friction: friction coefficient of bodies with the table and each other; by default
@@ -138,7 +139,7 @@ class SceneSpec:
 
     @functools.cached_property
     def slides(self) -> list["Slide"]:
-        """The prismatic joints of the mount, which carries the hand; in order from the world to the
+        """The prismatic joints of the mount, which carries the hand, in order from the world to the
         hand.
         """
         if self.mount is not None:
@@ -175,10 +176,10 @@ class SceneSpec:
 
     @property
     def hulls(self) -> list[list[np.ndarray]]:
-        """The vertices (v, 3) of the convex parts of the object and each neighbour; nearly on the
-        table they lie on it.
+        """The vertices (v, 3) [m] of each convex part, first of the object, then of each neighbour.
 
-        On the facets of a scanned round body, the body would roll away before it is touched.
+        Vertices nearly on the table are moved onto it: a scanned round body would otherwise roll
+        away on its facets before it is touched.
         """
         lowest = self.table_height + SIMULATION.near if self.table else -math.inf
         found = []
@@ -205,15 +206,13 @@ WRIST_JOINT = "torchgrasp_wrist"  # name of the fixed joint between mount and ha
 
 
 class Slide(NamedTuple):
-    """A prismatic joint of the mount: name, unit axis in the world's frame, limits [m] and start
-    position [m].
-    """
+    """A prismatic joint of the mount."""
 
     name: str
-    axis: tuple[float, float, float]
-    lower: float
-    upper: float
-    start: float
+    axis: tuple[float, float, float]  # unit vector (x, y, z) in the world's frame
+    lower: float  # limit [m]
+    upper: float  # limit [m]
+    start: float  # initial position [m]
 
 
 def mounted_urdf(spec: SceneSpec) -> str:
@@ -241,10 +240,10 @@ def mounted_urdf(spec: SceneSpec) -> str:
 
 
 def euler_from_rotation(rotation: np.ndarray) -> tuple[float, float, float]:
-    """Return the roll, pitch and yaw [rad] of a rotation, as in URDF: R = Rz(yaw) Ry(pitch)
-    Rx(roll).
+    """Return the roll, pitch and yaw [rad] of a rotation matrix (3, 3), as in a URDF.
 
-    At a pitch of 90 degrees only yaw - roll is determined; roll is then 0.
+    The matrix is R = Rz(yaw) Ry(pitch) Rx(roll). At a pitch of 90 degrees only yaw - roll is
+    determined; roll is then 0.
     """
     sine = -float(rotation[2, 0])
     cosine = math.hypot(float(rotation[0, 0]), float(rotation[1, 0]))

@@ -1,4 +1,6 @@
-"""A simulated scene seen by a controller: joint and palm targets in, observations out."""
+"""A simulated hand as a controller uses it: targets of joints and palm go in, observations come
+out.
+"""
 
 import math
 from typing import Annotated
@@ -21,7 +23,7 @@ def open_scene(spec: SceneSpec, simulator: Simulator = "sapien") -> SimulatedSce
     """Return a fresh scene of a simulator, at its initial state.
 
     Raises `BadArgument` for an unknown simulator, or a joint of the hand without a position or
-    drive. A bad URDF is a `HandFileError`, a simulator that is not installed a `MissingExtra`.
+    drive, `HandFileError` for a bad URDF, and `MissingExtra` for a simulator that is not installed.
 
     >>> from torchgrasp import load_hand, load_object
     >>> jug, hand = load_object("jug"), load_hand("barrett")
@@ -40,18 +42,28 @@ def open_scene(spec: SceneSpec, simulator: Simulator = "sapien") -> SimulatedSce
 
 
 class SimulatedHand:
-    """The simulated hand for a controller: it takes targets, and returns observations of joints and
-    fingertip sensors.
+    """The simulated hand of f fingers for a controller.
 
-    `truth` holds the contacts of the last tick. `force` (f,) are the true normal forces [N],
-    averaged over the tick, `pushes` (f, 3) the full forces. `finger` (f,) tells which fingers
-    touched the object in the last step. `steps` counts steps of the simulator. `sent` (j,) are the
-    targets of the last tick [rad], in the scene's order of joints. `first_touch` is the step of
-    each fingertip's first contact, infinite before it. Three attributes are about the hand's other
-    contacts, with entries for neighbours, table top and target, in this order: `first_stray` is the
-    step of the first contact, `stray` the sum of the impulses [N s], `most_stray` the largest force
-    [N] over a tick. The scene is at its initial state. `control_rate` [Hz] is the rate of ticks.
-    The generator draws the noise of the fingertips; without one there is no noise.
+    It takes targets, and returns observations of the joints and of the fingertips' sensors.
+
+    Args:
+        scene: scene at its initial state.
+        reference: the closing plan.
+        control_rate: rate of the control ticks [Hz].
+        generator: source of the noise of the fingertips' sensors; None means no noise.
+
+    Attributes:
+        truth: the contacts of the last tick.
+        force: true normal forces (f,) [N], averaged over the tick.
+        pushes: full forces (f, 3) [N], averaged over the tick.
+        finger: mask (f,) of the fingers that touched the object in the last step.
+        steps: number of steps of the simulator so far.
+        sent: targets (j,) [rad] of the last tick, in the scene's order of joints.
+        first_touch: number of the step of each fingertip's first contact (f,); infinite before it.
+        first_stray: number of the step of the hand's first other contact (3,): with a neighbour,
+            with the table, and of its links with the object, in this order.
+        stray: sums of the impulses (3,) [N s] of these contacts.
+        most_stray: largest force (3,) [N] of these contacts, averaged over a tick.
     """
 
     def __init__(
@@ -90,8 +102,9 @@ class SimulatedHand:
 
     @checked
     def tick(self, targets: Targets) -> Observation:
-        """Drive joints and palm towards their targets for one control period; return the
-        observation at its end.
+        """Drive joints and palm towards their targets for one control period.
+
+        Return the observation at its end.
         """
         if len(targets.joints) != len(self._to_scene):
             allowed = f"all {len(self._to_scene)} of the URDF"
@@ -129,20 +142,22 @@ class SimulatedHand:
 
     @checked
     def rest(self, ticks: Annotated[int, Range(0, 1000000)]) -> None:
-        """Keep the targets for a number of control ticks that nobody observes."""
+        """Keep the targets for a number of control ticks, without observations."""
         self.scene.skip(ticks * self.substeps)
         self.steps += ticks * self.substeps
 
     def unbalanced(self) -> float:
-        """Return the size of the sum of all fingertip forces over the sum of their sizes; NaN
-        without any forces.
+        """Return the size of the sum of all fingertip forces over the sum of their sizes, in [0,
+        1].
+
+        It is NaN if there are no forces.
         """
         sizes = float(np.linalg.norm(self.pushes, axis=-1).sum())
         return float(np.linalg.norm(self.pushes.sum(0))) / sizes if sizes > 0.0 else math.nan
 
     @checked
     def ticks(self, seconds: Annotated[float, Range(0.0, 1e6)]) -> int:
-        """Return the number of control ticks in a time [s], at least one."""
+        """Return the number of control ticks in a time `seconds` [s], at least one."""
         return max(1, round(seconds / self.period))
 
     def _observe(self, impulse: np.ndarray, moment: np.ndarray, weight: np.ndarray) -> Observation:

@@ -24,7 +24,9 @@ with the object.
 
 @dataclasses.dataclass(frozen=True)
 class StepContacts:
-    """True contacts of f fingers with the object, summed over a simulation step."""
+    """True contacts of f fingers with the object, in the world's frame, summed over a simulation
+    step.
+    """
 
     impulse: np.ndarray  # normal impulse on the object (f, 3) [N s], without friction
     moment: np.ndarray  # contact points weighted by the size of their impulse (f, 3) [N s m]
@@ -40,9 +42,12 @@ class StepContacts:
 class SimulatedScene(abc.ABC):
     """The interface of a simulated scene: table, object, neighbours and hand.
 
-    Arrays are in the world's axes; joints are in the order of `joint_names`. `centre` [m] is the
-    object's centre of mass in its own frame, `timestep` is in seconds. A simulator's subclass sets
-    `joint_names` and the handles of bodies, and calls `_map_contacts`.
+    Arrays are in the world's axes. The j driven joints are in the order of `joint_names`. `centre`
+    (3,) [m] is the object's centre of mass in its own frame, `timestep` is in seconds. A
+    simulator's subclass sets `joint_names` and the handles of bodies: `body` of the object, `root`
+    of the hand's root link, `tips` of the links of the f fingertips in the order of the contacts,
+    and `neighbours` of the other bodies. Then it calls `_map_contacts`, which tells their contacts
+    apart.
     """
 
     joint_names: tuple[str, ...]
@@ -71,7 +76,9 @@ class SimulatedScene(abc.ABC):
                 self._finger_of.setdefault(carrier, i)
 
     def step(self) -> StepContacts:
-        """Advance by one timestep and return the hand's contacts during it, summed per finger."""
+        """Advance by one timestep, and return the hand's contacts during it, summed for each
+        finger.
+        """
         sums = [[0.0] * 10 for _ in self.tips]
         finger = [False] * len(self.tips)
         stray = [0.0] * 3
@@ -109,7 +116,7 @@ class SimulatedScene(abc.ABC):
 
     @abc.abstractmethod
     def skip(self, steps: int) -> None:
-        """Advance by a number of timesteps, of whose contacts nobody asks."""
+        """Advance by a number of timesteps, without reports of contacts."""
 
     @abc.abstractmethod
     def _advance(self) -> Iterable[tuple[Any, Any, Any]]:
@@ -128,39 +135,44 @@ class SimulatedScene(abc.ABC):
 
     @abc.abstractmethod
     def keep(self) -> "Callable[[], SimulatedScene]":
-        """Return a function that opens scenes in the present state of this one, which go on bitwise
-        as this one.
+        """Return a function that opens scenes in the present state of this one.
+
+        They continue bitwise as this one does.
         """
 
     @abc.abstractmethod
     def drive(self, targets: np.ndarray) -> None:
-        """Set the target [rad] of every driven joint."""
+        """Set the `targets` (j,) [rad] of the j driven joints."""
 
     @abc.abstractmethod
     def pull(self, force: np.ndarray, torque: np.ndarray = STILL) -> None:
-        """Apply a force [N] at the object's mass centre and a torque [N m], in this and all later
-        steps.
+        """Apply a force (3,) [N] at the object's centre of mass and a torque (3,) [N m].
+
+        They act in this and all later steps.
         """
 
     @abc.abstractmethod
     def displace(self, shift: np.ndarray) -> None:
-        """Move the object by a displacement (3,) [m], as a person who pushes the object while the
-        hand approaches.
+        """Move the object by a displacement `shift` (3,) [m].
+
+        This is as if a person pushed the object while the hand approaches.
         """
 
     @abc.abstractmethod
     def joints(self) -> np.ndarray:
-        """Return the position of every driven joint [rad]."""
+        """Return the positions (j,) [rad] of the driven joints."""
 
     @abc.abstractmethod
     def jacobian(self, points: np.ndarray) -> np.ndarray:
-        """Return the Jacobian (f, 3, j) [m/rad] of one point (world's frame) per fingertip for the
-        driven joints.
+        """Return the Jacobian (f, 3, j) [m/rad] of one point on each fingertip by the driven
+        joints.
+
+        The `points` (f, 3) [m] are in the world's frame.
         """
 
     @abc.abstractmethod
     def penetration(self) -> float:
-        """Return the largest depth [m] by which the hand, at the start, penetrates another body or
+        """Return the largest depth [m] by which the hand at its start penetrates another body or
         itself.
         """
 
@@ -181,15 +193,17 @@ class SimulatedScene(abc.ABC):
 
     @checked
     def approach(self, left: float, speed: float = 0.0) -> None:
-        """Set how far [m] before the end of its approach the hand shall be (`left`), and its target
-        speed [m/s].
+        """Set the target of the hand's motion along its approach.
+
+        The target is the distance `left` [m] before the end of the approach; its `speed` is in m/s.
         """
         self._move_mount(APPROACH_JOINT, -left, speed)
 
     @checked
     def shift(self, displacement: np.ndarray, velocity: np.ndarray = STILL) -> None:
-        """Set the hand's target displacement (3,) [m] from its path and velocity (3,) [m/s], if the
-        mount yields.
+        """Set the target of the hand's displacement from its path, if the mount yields.
+
+        The target has a `displacement` (3,) [m] and a `velocity` (3,) [m/s].
         """
         for name, vector in (("displacement", displacement), ("velocity", velocity)):
             if vector.shape != (3,) or vector.dtype.kind not in "iuf":
@@ -200,19 +214,20 @@ class SimulatedScene(abc.ABC):
             self._move_mount(joint, target, speed)
 
     def neighbour_poses(self) -> np.ndarray:
-        """Return the poses (m, 4, 4) of the m neighbours in the world's frame."""
+        """Return the poses (m, 4, 4) [m] of the m neighbours in the world's frame."""
         return np.array([self._pose(body) for body in self.neighbours]).reshape(-1, 4, 4)
 
     def object_pose(self) -> np.ndarray:
-        """Return the object's pose (4, 4) in the world's frame."""
+        """Return the object's pose (4, 4) [m] in the world's frame."""
         return self._pose(self.body)
 
     def hand_pose(self) -> np.ndarray:
-        """Return the pose (4, 4) of the hand's root link in the world's frame; it is valid after
-        the first step.
+        """Return the pose (4, 4) [m] of the hand's root link in the world's frame.
+
+        It is valid after the first step.
         """
         return self._pose(self.root)
 
     def tip_poses(self) -> np.ndarray:
-        """Return the poses (f, 4, 4) of the links of the f fingertips in the world's frame."""
+        """Return the poses (f, 4, 4) [m] of the links of the f fingertips in the world's frame."""
         return np.array([self._pose(tip) for tip in self.tips])
