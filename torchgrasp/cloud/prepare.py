@@ -80,9 +80,9 @@ class PreparedCloud(Value):
     cloud: PointCloud  # distinct points [m] with outward normals, in the given dtype
     points: Points  # (n, 3) [m], at most 2000 of these points, in float64
     normals: Points  # (n, 3), outward unit normals at `points`
-    # position of the camera [m] of all `points`, or of each, if known
-    # inward unit normals of the four sides of the camera's view, or of each point's, if known
+    # position of the camera [m] of all `points`, or of each; None if unknown
     viewpoint: Float[Tensor, "*views 3"] | None
+    # inward unit normals of the four sides of the camera's view, or of each point's, if known
     frustum: Float[Tensor, "*views 4 3"] | None
 
     @property

@@ -88,7 +88,12 @@ class Records(Value):
 
 
 class Shard(NamedTuple):
-    """The content of a shard file: the outcomes of several jobs, and the tensors of these jobs."""
+    """The content of a shard file.
+
+    Attributes:
+        rows: the outcomes of several jobs.
+        records: the tensors of all these jobs, in the same order.
+    """
 
     rows: tuple[JobRow, ...]
     records: Records

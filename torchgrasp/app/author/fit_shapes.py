@@ -38,12 +38,11 @@ class FitNumbers:
     least_reach: float = 5e-4  # of a mesh [m]: nothing on a hand is thinner than a fingernail
     # A box of a link or of a fingertip is cut in two if the cut saves this share of the volume of
     # all boxes; smaller gives more boxes.
-    saving: float = 0.12
-    saving_tip: float = 0.04
-    # most boxes of a short and of a long body, and of a long tip behind its ball
-    short_boxes: int = 3
-    long_boxes: int = 8
-    tip_boxes: int = 4
+    saving: float = 0.12  # of a link
+    saving_tip: float = 0.04  # of a fingertip
+    short_boxes: int = 3  # most boxes of a short body
+    long_boxes: int = 8  # most boxes of a long body
+    tip_boxes: int = 4  # most boxes of a long tip, behind its ball
     long: float = 0.08  # least length of a long body [m]
     long_tip: float = 2.6  # a tip is long that is longer than this, in radii of its ball
     places: int = 12  # at which a cut is tried along an axis, with both ends, which are none

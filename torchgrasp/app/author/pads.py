@@ -38,8 +38,8 @@ class PadNumbers:
     beside: float = 0.003  # points of a surface count so near a ray or a plane [m]
     end: float = 0.015  # length of a finger's end, half of whose thickness is the ball's radius [m]
     radii: tuple[float, float] = (0.003, 0.013)  # least and greatest radius of a ball [m]
-    radius_digits: int = 4
-    place_digits: int = 6
+    radius_digits: int = 4  # decimals of the radius of a ball [m]
+    place_digits: int = 6  # decimals of the centre of a ball [m]
     digits: int = 12  # to which all numbers of a pad are rounded
 
 
@@ -48,8 +48,8 @@ class FacingNumbers:
     """Bounds within which the pads of fingers count as facing each other."""
 
     angle: float = 45.0  # most between a pad's normal and the way to the middle [degrees]
-    nearest: float = 0.015  # least and greatest distance of a contact from the middle [m]
-    farthest: float = 0.08
+    nearest: float = 0.015  # least distance of a contact from the middle [m]
+    farthest: float = 0.08  # greatest distance of a contact from the middle [m]
     least: float = 1e-9  # [m], so that nothing is divided by 0
 
 

@@ -18,13 +18,13 @@ from torchgrasp.hand.urdf import Joint, Link, LinkShape, Mimic, Triple, Urdf
 class RepairNumbers:
     """Numbers that a URDF gets where it lacks them, and bounds of what is possible."""
 
-    # drive [N m, rad/s] of a joint for which the URDF declares none, typical of small hands
-    effort: float = 1.0
-    velocity: float = 3.0
+    # drive of a joint for which the URDF declares none, typical of small hands
+    effort: float = 1.0  # [N m]
+    velocity: float = 3.0  # [rad/s]
     most_wrist: int = 3  # joints that move all fingertips: more are an arm
-    # least mass [kg] and edge [m] of a body without mass, so that simulators remain stable
-    least_mass: float = 1e-3
-    least_size: float = 5e-3
+    # least mass and edge of a body without mass, so that simulators remain stable
+    least_mass: float = 1e-3  # [kg]
+    least_size: float = 5e-3  # [m]
     density: float = 500.0  # [kg/m3] of a bounding box: half of it is filled with 1000 kg/m3
     # farthest mass centre and radius of gyration, in half diagonals of the bounding box
     far_out: float = 2.0

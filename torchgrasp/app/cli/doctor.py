@@ -27,9 +27,12 @@ SIMULATORS: dict[Simulator, str] = {"sapien": "sim", "mujoco": "mujoco"}
 
 
 class Finding(NamedTuple):
-    """One part of the installation, its state in words, and the command that repairs it.
+    """One part of the installation and its state.
 
-    `fix` is "" if nothing is missing.
+    Attributes:
+        part: name of the part.
+        found: its state in words.
+        fix: command that repairs it; "" if nothing is missing.
     """
 
     part: str

@@ -55,13 +55,12 @@ class HandTrial:
 
     objects: tuple[str, ...] = ("cylinder", "jug")  # tried in turn
     starts: int = 100  # initial guesses for each object
-    postures: int = 5000
+    postures: int = 5000  # random postures
     some: int = 500  # postures in which the pair of links that meets most often is sought
-    # least shares of random postures of a hand with three fingers that are free, face a pad to the
-    # others, and can hold an object
-    least_free: float = 0.2
-    least_facing: float = 0.02
-    least_closing: float = 0.001
+    # least shares of the random postures of a hand with three fingers
+    least_free: float = 0.2  # of those without self-collision
+    least_facing: float = 0.02  # of those in which a finger's pad faces the others
+    least_closing: float = 0.001  # of those that can hold an object
     facing: float = 0.5  # cosine of the largest angle between a pad that faces and the middle
 
 
@@ -70,7 +69,7 @@ class TrainNumbers:
     """Numbers of the fit of a posture model."""
 
     tolerance: float = 1e-3  # mean log-likelihood [nats] by which the last step improves the fit
-    starts: int = 5
+    starts: int = 5  # k-means initialisations of the fit
     subset: int = 300  # postures for each Gaussian: with fewer, a Gaussian starts by chance
     most: int = 64  # Gaussians that are tried: the paper's figure ends at 60
     postures: int = 40_000  # by which their number is chosen

@@ -51,20 +51,20 @@ class MarkShapes:
 
     point_radius: float = 0.006  # share of the diagonal of all points
     # parts of an arrow, in lengths of the arrow; the shaft ends inside the head
-    head_radius: float = 0.1
-    head_length: float = 0.35
-    head_start: float = 0.65
-    shaft_radius: float = 0.035
-    shaft_length: float = 0.75
-    ball_radius: float = 0.13
+    head_radius: float = 0.1  # of the cone
+    head_length: float = 0.35  # of the cone
+    head_start: float = 0.65  # distance of the cone's base from the arrow's start
+    shaft_radius: float = 0.035  # of the cylinder
+    shaft_length: float = 0.75  # of the cylinder
+    ball_radius: float = 0.13  # of the ball at the arrow's start
     arrow_sections: int = 8  # sides of head and shaft
     table_radius: float = 0.55  # share of the diagonal of all corners seen from above
     table_rim: float = 0.02  # added to the radius [m], so that a small object has a table, too
     table_sections: int = 120  # corners of the round table top
     table_thickness: float = 1e-4  # [m]
     # depths below the true height [m]: the object hides shadows, and shadows hide the table
-    table_depth: float = 1e-3
-    shadow_depth: float = 5e-4
+    table_depth: float = 1e-3  # of the table
+    shadow_depth: float = 5e-4  # of the shadows
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,10 +72,9 @@ class Framing:
     """Numbers that place a camera so that it shows a set of points."""
 
     angle: float = 24.0  # vertical field of view [degrees]: a long lens distorts little
-    # least and greatest rise for each metre along the ground: straight down, or up from below the
-    # table, a camera shows little
-    lowest: float = 0.27
-    highest: float = 0.84
+    # straight down, or up from below the table, a camera shows little
+    lowest: float = 0.27  # least rise of the direction for each metre along the ground
+    highest: float = 0.84  # greatest rise of the direction for each metre along the ground
     margin: float = 1.12  # distance beyond the nearest at which all corners are in view
     level: float = 1e-9  # a direction with less of x and y [m] is vertical
     fallback: tuple[float, float] = (1.0, -0.8)  # x and y instead of a vertical direction
@@ -120,10 +119,10 @@ class BarLayout:
     side: int = 5  # one part in so many of the width stays free on each side of the bar
     top: int = 24  # upper end of the strip, from the bottom of the picture
     bottom: int = 10  # lower end of the strip, likewise
-    font: int = 20
+    font: int = 20  # of numbers and title
     labels: int = 4  # numbers above the strip
-    label_rise: int = 4  # of the numbers and of the title above the strip
-    title_rise: int = 29
+    label_rise: int = 4  # of the numbers above the strip
+    title_rise: int = 29  # of the title above the strip
 
 
 MARKS = MarkShapes()

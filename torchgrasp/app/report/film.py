@@ -26,12 +26,12 @@ from torchgrasp.values.closing import ClosureResult
 class FilmLayout:
     """Layout of a film strip: stills, and plots below them [pixels; fonts in points]."""
 
-    dpi: int = 100
+    dpi: int = 100  # [pixels per inch]
     width: int = 1680  # of the strip
     still: int = 340  # height of a still with its title
     title: int = 44  # height of this title
     title_left: float = 0.04  # place of the title, as a share of the still's width
-    font: int = 14
+    font: int = 14  # of titles and letters
     small_font: int = 12  # of the titles of many stills, so that they fit
     many: int = 6  # stills from which on the small font is used
     tall_plot: int = 200  # height of a plot with a legend
@@ -51,7 +51,7 @@ class FilmLayout:
 class PlotStyle:
     """Style of the plots in a film strip [points], and the least upper ends of their axes."""
 
-    font: int = 13
+    font: int = 13  # of titles and axes
     title_gap: int = 9  # between a title and its plot
     ticks: int = 3  # most intervals of the vertical axis
     line: float = 1.8  # width of a line

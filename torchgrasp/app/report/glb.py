@@ -28,7 +28,7 @@ class SrgbCurve:
     slope: float = 12.92  # values of the straight part are divided by it
     # a larger value v becomes ((v + offset) / (1 + offset)) ** gamma
     offset: float = 0.055
-    gamma: float = 2.4
+    gamma: float = 2.4  # exponent of the curved part
 
 
 SRGB = SrgbCurve()

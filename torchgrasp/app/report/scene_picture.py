@@ -71,7 +71,7 @@ class SceneText:
     swatch_bottom: int = 32  # lower end of the colour, in its row
     round: int = 5  # radius of its corners
     text: int = 40  # left end of the text, from the left end of the colour
-    left: int = 16
+    left: int = 16  # left end of the first column
     gutter: int = 70  # what a column needs beside its widest text
     margin: int = 12  # above and below all rows
     most_objects: int = 12  # named in the legend
