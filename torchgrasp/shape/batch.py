@@ -1,9 +1,9 @@
-"""The shapes of many clouds as one: each row of contacts or of hands belongs to the shape of its
-own cloud.
+"""The shapes of many clouds in one value: each entry of a batch of points belongs to the shape of
+its own cloud.
 
-Stages that work on rows ask a shape for values at the rows' points, and go on with the shape's
-`rows`. A `ShapeGP` is the shape of all its rows. A `ShapeBatch` stacks the observations of c
-clouds, and knows the cloud of each row.
+Stages that work on batches of contacts or hands ask a shape for values at the points of each entry,
+and continue with those of its `rows` that are left. A `ShapeGP` is the one shape of all entries. A
+`ShapeBatch` stacks the observations of c clouds, and knows the cloud of each entry.
 """
 
 import dataclasses
@@ -30,20 +30,22 @@ from torchgrasp.shape.kernel import (
 from torchgrasp.shape.posterior import CHUNK
 
 Evaluate = Callable[[Tensor, Tensor], tuple[Tensor, ...]]
-"""A function of points and the surface of each."""
+"""A function of normalised points (q, 3) and the index of each point's surface (q,)."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Walls(Value):
     """The posteriors of w surfaces with thin-plate kernels; missing observations have the weight 0.
 
+    Each surface has n observed points, the first `near` of them with normals.
+
     Args:
-        x: observed points, those with normals first.
-        a: weight of each observed distance.
-        b: weight of each observed normal, of the first `near` points.
-        whitener: rows of covariances with all observations (distances, then normals by component),
-            times this matrix, are white.
-        psi: length of each kernel.
+        x: observed points, normalised, those with normals first.
+        a: weight of each observed distance (no unit).
+        b: weight of each observed normal (no unit).
+        whitener: matrix that makes covariances white: lines of covariances with all `rows` observed
+            numbers (distances, then normals by component) are multiplied by it.
+        psi: length of each kernel, normalised.
     """
 
     x: Float[Tensor, "w n 3"]
@@ -58,8 +60,9 @@ class Walls(Value):
         shapes: Sequence[ShapeGP],
         device: torch.device,
     ) -> "Walls":
-        """Stack the posteriors of shapes, each of one surface, on a device, which inverts the
-        Cholesky factors.
+        """Stack the posteriors of shapes, each of one surface.
+
+        The `device` inverts the Cholesky factors.
         """
         near = max(shape.n_oriented for shape in shapes)
         n = near + max(len(shape.x) - shape.n_oriented for shape in shapes)
@@ -92,7 +95,9 @@ class Walls(Value):
         return cls(x, a, b, whitener, psi)
 
     def weighted(self, wall: Int[Tensor, "q"]) -> Weighted:
-        """Return the observations and weights of the surface of each query point."""
+        """Return the observations and weights of each query point's surface, which has the index
+        `wall[q]`.
+        """
         psi = self.psi[wall, None]
         fast = partial(differentiate_thin_plate, psi)
         kernel = Kernel(partial(thin_plate, psi=psi), closed_form=fast)
@@ -103,8 +108,10 @@ class Walls(Value):
         wall: Int[Tensor, "q"],
         rows: CovarianceRows,
     ) -> CovarianceRows:
-        """Return rows of covariances with the observations of each row's surface, whitened; see
-        `Posterior.whiten`.
+        """Return covariances with the observations, whitened as by `Posterior.whiten`.
+
+        Line q of `rows` holds covariances with the observations of the surface with the index
+        `wall[q]`.
         """
         return self._together(wall, rows, lambda own, matrix: (own @ matrix,))[0]
 
@@ -113,7 +120,10 @@ class Walls(Value):
         wall: Int[Tensor, "q"],
         rows: CovarianceRows,
     ) -> tuple[Float[Tensor, "q"], CovarianceRows]:
-        """Return what the observations of each row's surface explain; see `Posterior.explain`."""
+        """Return the variance that the observations explain, and k A, as `Posterior.explain` does.
+
+        Line q of `rows` holds the covariances k with the observations of the surface `wall[q]`.
+        """
 
         def explain(own: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor]:
             whitened = own @ matrix
@@ -144,19 +154,22 @@ class Walls(Value):
 
 @dataclasses.dataclass(frozen=True)
 class ShapeBatch(Value):
-    """The shapes of c clouds: row r of all points that a method is given belongs to cloud
-    `owner[r]`.
+    """The shapes of c clouds, for a batch in which each entry belongs to one cloud.
 
-    Numbers of a shape, such as its `scale`, are tensors with one number for each row.
+    Points given to a method have the entries as axis 0; those of entry r belong to the cloud with
+    the index `owner[r]`. Numbers of a shape, such as its `scale`, are tensors with one number for
+    each entry. Distances at normalised points are normalised, too.
 
     Args:
         surfaces: the posteriors of all surfaces: one for each cloud, then the inner ones of open
             vessels.
         wall: the indices of each cloud's outer and inner surface, which are the same if the object
             is not hollow.
-        centers, scales, radii, factors: center [m], scale [m], domain radius and factor of
-            deviations of each cloud.
-        owner: the cloud of each row.
+        centers: center [m] of each cloud.
+        scales: length [m] of one normalised unit of each cloud.
+        radii: domain radius of each cloud, normalised.
+        factors: each cloud's ratio of true deviations to the posterior's standard deviations.
+        owner: index of the cloud of each entry.
         hollow: whether any object is hollow.
     """
 
@@ -175,8 +188,10 @@ class ShapeBatch(Value):
         shapes: Sequence[ShapeGP],
         device: torch.device | None = None,
     ) -> "ShapeBatch":
-        """Stack shapes, with one row for each, on a device, by default theirs; refuse another
-        kernel by name.
+        """Stack c shapes to a batch of c entries, where entry k has shape k.
+
+        `device` is by default that of the shapes. Raises `BadArgument` for a kernel that is no thin
+        plate.
         """
         for shape in shapes:
             form = shape.kernel.closed_form
@@ -212,23 +227,26 @@ class ShapeBatch(Value):
 
     @property
     def scale(self) -> Float[Tensor, "b"]:
-        """The length [m] of one normalised unit, of each row."""
+        """The length [m] of one normalised unit, for each of b entries."""
         return self.scales[self.owner]
 
     @property
     def domain_radius(self) -> Float[Tensor, "b"]:
-        """The radius, normalised, in which the shape is known, of each row."""
+        """The normalised radius within which the shape is known, for each of b entries."""
         return self.radii[self.owner]
 
     @property
     def std_factor(self) -> Float[Tensor, "b"]:
-        """The factor of standard deviations, of each row."""
+        """The ratio of true deviations to the posterior's standard deviations, for each of b
+        entries.
+        """
         return self.factors[self.owner]
 
     @cached_property
     def walls(self) -> "tuple[ShapeBatch, ...]":
-        """The outer surfaces and, if any object is hollow, the inner ones, each as shapes of one
-        surface.
+        """The outer surfaces and, if any object is hollow, the inner ones.
+
+        Each is a batch of shapes of one surface.
         """
         if not self.hollow:
             return (self,)
@@ -236,14 +254,14 @@ class ShapeBatch(Value):
         return tuple(dataclasses.replace(self, wall=side, hollow=False) for side in sides)
 
     def rows(self, index: Int[Tensor, "k"]) -> "ShapeBatch":
-        """Return the shapes of some of the rows."""
+        """Return a batch whose entry k has the shape of this batch's entry `index[k]`."""
         return dataclasses.replace(self, owner=self.owner[index])
 
     def normalise(
         self,
         points: Float[Tensor, "b *k 3"],
     ) -> Float[Tensor, "b *k 3"]:
-        """Return points [m] of each row in the normalised frame of its cloud."""
+        """Return the points [m] of each of b entries in the normalised frame of its cloud."""
         center = spread(self.centers[self.owner].to(points), points, 1)
         return (points - center) / spread(self.scale.to(points), points)
 
@@ -251,20 +269,20 @@ class ShapeBatch(Value):
         self,
         x: Float[Tensor, "b *k 3"],
     ) -> Float[Tensor, "b *k 3"]:
-        """Return normalised points of each row in metres."""
+        """Return the normalised points of each of b entries in the frame of its cloud [m]."""
         return x * spread(self.scale, x) + spread(self.centers[self.owner], x, 1)
 
     def wall_at(self, x: Queries) -> Bool[Tensor, "q walls"]:
-        """Return a mask (points, walls): which of the `walls` is the surface at each normalised
-        point.
-        """
+        """Return a mask of the surface among `walls` that applies at each of q normalised points."""
         if not self.hollow:
             return torch.ones(len(x), 1, dtype=torch.bool, device=x.device)
         own = self._surface_at(x) == self._wall(x)[:, 0]
         return torch.stack([own, ~own], 1)
 
     def mean_and_gradient(self, x: Queries) -> MeanAndGradient:
-        """Return the mean signed distance and its gradient at normalised points."""
+        """Return (distance, gradient): the mean signed distance and its gradient at q normalised
+        points.
+        """
 
         def evaluate(part: Tensor, wall: Tensor) -> tuple[Tensor, ...]:
             return evaluate_mean(self.surfaces.weighted(wall), part, gradient=True)
@@ -272,7 +290,7 @@ class ShapeBatch(Value):
         return self._evaluate(evaluate, x)  # pyright: ignore[reportReturnType]
 
     def mean_jet(self, x: Queries) -> MeanJet:
-        """Return the mean distance with first and second derivatives at normalised points."""
+        """Return the mean distance with first and second derivatives at q normalised points."""
 
         def evaluate(part: Tensor, wall: Tensor) -> tuple[Tensor, ...]:
             return evaluate_mean_jet(self.surfaces.weighted(wall), part)[0]
@@ -280,7 +298,7 @@ class ShapeBatch(Value):
         return MeanJet(*self._evaluate(evaluate, x))
 
     def jet(self, x: Queries) -> SurfaceJet:
-        """Return mean and variance of the distance with their derivatives at normalised points."""
+        """Return mean and variance of the distance with their derivatives at q normalised points."""
 
         def evaluate(part: Tensor, wall: Tensor) -> tuple[Tensor, ...]:
             explain = partial(self.surfaces.explain, wall)
@@ -289,8 +307,8 @@ class ShapeBatch(Value):
         return SurfaceJet(*self._evaluate(evaluate, x))
 
     def estimate(self, x: Queries) -> Moments:
-        """Return mean and covariance of distance and gradient at normalised points, Eqs. (7)-(8) of
-        the paper.
+        """Return mean and covariance of distance and gradient at q normalised points, Eqs. (7)-(8)
+        of the paper.
         """
 
         def evaluate(part: Tensor, wall: Tensor) -> tuple[Tensor, Tensor]:

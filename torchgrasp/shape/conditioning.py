@@ -1,8 +1,8 @@
 """The posterior given observations, Eqs. (7)-(8) of the paper: all at once, added later, or the
 most informative.
 
-Each function builds one Cholesky factor L of K + noise, the covariance of the observed numbers.
-Further observations append rows to L.
+All is in the normalised frame, without units. Each function builds one Cholesky factor L of K +
+noise, the covariance of the observed numbers. Further observations append rows to L.
 """
 
 import dataclasses
@@ -34,8 +34,10 @@ def posterior_given(observations: Observations, kernel: Kernel) -> Posterior:
 
 
 def check_kernel(posterior: Posterior, least_noise: float) -> None:
-    """Raise `IndefiniteCovariance` if observations are farther apart than the kernel allows and K
-    is indefinite.
+    """Raise `IndefiniteCovariance` if the covariance K of the observations is indefinite.
+
+    That can happen if observations are farther apart than the kernel allows. `least_noise` is the
+    least standard deviation of the observations, normalised.
     """
     kernel = posterior.kernel
     posterior = map_tensors(torch.detach, posterior)
@@ -47,7 +49,7 @@ def check_kernel(posterior: Posterior, least_noise: float) -> None:
 
 
 def longest_distance(x: Points) -> float:
-    """Return the longest distance between any two points."""
+    """Return the longest distance between any two of the points (n, 3), in their unit."""
     x = x.detach()
     return float(torch.cdist(x, x, compute_mode="donot_use_mm_for_euclid_dist").max())
 
@@ -57,12 +59,12 @@ def append_observations(
     new: Observations,
     shared: Float[Tensor, "n c"] | None = None,
 ) -> Posterior:
-    """Return the posterior given the old and the `new` observations; it equals conditioning on all
-    at once.
+    """Return the posterior given the old and the `new` observations.
 
-    The Cholesky factor L of the covariance K + noise grows by the rows [B^T, C] with B = L^-1
-    K(old, new). C is the factor of K(new, new) + noise - B^T B. `shared` are correlated errors of
-    the new distances, normalised, one column for each independent cause.
+    It equals conditioning on all at once. The Cholesky factor L of the covariance K + noise grows
+    by the rows [B^T, C] with B = L^-1 K(old, new). C is the factor of K(new, new) + noise - B^T B.
+    `shared` (n, c) holds correlated errors of the n new distances, normalised: a column for each of
+    c independent causes.
     """
     kernel = old.kernel
     if shared is not None:
@@ -89,12 +91,10 @@ def append_observations(
 
 @dataclasses.dataclass(frozen=True)
 class Selection(Value):
-    """The indices of the picked candidates, in the order of picking, and the posterior that
-    includes them.
-    """
+    """The result of a choice of the most informative candidates."""
 
-    picks: Int[Tensor, "picks"]
-    posterior: Posterior
+    picks: Int[Tensor, "picks"]  # indices of the chosen candidates, in the order of their choice
+    posterior: Posterior  # given the known observations and the chosen ones
 
 
 def select_points(
@@ -105,11 +105,17 @@ def select_points(
     criterion: Criterion = "variance",
     stop: float = -math.inf,
 ) -> Selection:
-    """Pick at most `budget` candidates to observe, each the most informative given `known` and
-    earlier picks.
+    """Choose at most `budget` candidates to observe, each the most informative given all before it.
 
-    All candidates have normals. Each pick appends four rows to the Cholesky factor. The selection
-    ends when no candidate's variance exceeds `stop`.
+    Args:
+        candidates: observations to choose from, all with normals.
+        known: observations that are given.
+        kernel: kernel of the posterior.
+        budget: largest number of chosen candidates.
+        criterion: what is greatest at the most informative candidate, as in `fit_shape`.
+        stop: the selection ends when no candidate's variance (squared normalised units) exceeds it.
+
+    Each choice appends four rows to the Cholesky factor.
     """
     x = candidates.x
     start = posterior_given(known, kernel)

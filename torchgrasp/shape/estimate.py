@@ -1,4 +1,8 @@
-"""Value classes of a shape: its normalised frame, its observations and its estimates."""
+"""Value classes of a shape: its normalised frame, its observations and its estimates.
+
+Normalised lengths are in units of a frame's `scale` [m]. A jet is a value at a point with its
+derivatives there.
+"""
 
 import dataclasses
 
@@ -12,14 +16,16 @@ from torchgrasp.geometry.linalg import Points, unit
 from torchgrasp.shape.kernel import Queries
 
 MeanAndGradient = tuple[Float[Tensor, "q"], Queries]
-"""The mean signed distance at each query point, and its gradient."""
+"""The mean signed distance (q,) at each query point, normalised, and its gradient (q, 3)."""
 Moments = tuple[Float[Tensor, "q 4"], Float[Tensor, "q 4 4"]]
-"""Mean and covariance of distance and gradient (d, w) at each query point."""
+"""Mean (q, 4) and covariance (q, 4, 4) of distance and gradient (d, w) at each query point,
+normalised.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
 class Normalisation(Value):
-    """A normalised frame without units: points [m] minus `center` [m], divided by `scale` [m].
+    """A normalised frame without units: points [m] minus `center` (3,) [m], divided by `scale` [m].
 
     >>> frame = Normalisation(torch.tensor([0.0, 0.0, 0.1]), scale=0.05)
     >>> frame.normalise(torch.tensor([0.0, 0.0, 0.15])), frame.metres(torch.tensor([0.0, 0.0, 1.0]))
@@ -34,9 +40,7 @@ class Normalisation(Value):
         self,
         points: Float[Tensor, "*b 3"],
     ) -> Float[Tensor, "*b 3"]:
-        """Return points [m], given in the cloud's frame, in the normalised frame (centred and
-        scaled).
-        """
+        """Return points [m] of the cloud's frame in the normalised frame."""
         return (points - self.center.to(points)) / self.scale
 
     @checked(gradients=True)
@@ -51,25 +55,24 @@ class Normalisation(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class Observations(Batch):
-    """Observed signed distances at points, and observed normals where `has_normal`; all normalised.
-
-    The noises are standard deviations.
+    """Observed signed distances at n points, and observed normals at some of them.
 
     >>> x, some = torch.eye(3), torch.ones(3)
     >>> len(Observations(x, 0 * some, x, some > 0, 0.01 * some, 0.05 * some).rows()[0])
     12
     """
 
-    x: Points
-    distance: Float[Tensor, "n"]
-    normal: Points
-    has_normal: Bool[Tensor, "n"]
-    distance_noise: Float[Tensor, "n"]
-    normal_noise: Float[Tensor, "n"]
+    x: Points  # (n, 3), normalised
+    distance: Float[Tensor, "n"]  # signed distances, normalised, positive outside
+    normal: Points  # (n, 3), outward unit normals
+    has_normal: Bool[Tensor, "n"]  # mask of the points whose normals are observed
+    distance_noise: Float[Tensor, "n"]  # standard deviation of each distance, normalised
+    normal_noise: Float[Tensor, "n"]  # standard deviation of each component of a unit normal
 
     def rows(self) -> tuple[Float[Tensor, "rows"], Float[Tensor, "rows"]]:
-        """Return all observed values and the variances of their noise: first distances, then
-        normals by component.
+        """Return (values, variances): all observed numbers, and the variances of their noise.
+
+        The distances come first, then the normals by component: all x, all y, all z.
         """
         y = torch.cat([self.distance, self.normal[self.has_normal].T.reshape(-1)])
         noise = torch.cat([self.distance_noise, self.normal_noise[self.has_normal].repeat(3)])
@@ -77,12 +80,12 @@ class Observations(Batch):
 
     @property
     def least_noise(self) -> float:
-        """The least standard deviation of the noise of all observed values."""
+        """The least standard deviation of the noise of all observed numbers, normalised."""
         every = torch.cat([self.distance_noise, self.normal_noise[self.has_normal]])
         return float(every.detach().min())
 
     def with_normals_first(self) -> "Observations":
-        """Return the observations in another order: first those with normals."""
+        """Return the observations in another order: those with normals come first."""
         return self[torch.argsort(~self.has_normal, stable=True)]
 
 
@@ -92,7 +95,12 @@ def on_surface(
     noise: Float[Tensor, "n"],
     normal_noise: float,
 ) -> Observations:
-    """Return observations of points on the surface (distance 0) with their normals."""
+    """Return observations of n normalised points on the surface (distance 0) with outward unit
+    normals.
+
+    `noise` is the standard deviation of each distance, normalised, `normal_noise` that of a
+    normal's components.
+    """
     yes = torch.ones(len(x), dtype=torch.bool, device=x.device)
     return Observations(
         x, torch.zeros_like(noise), normals, yes, noise, torch.full_like(noise, normal_noise)
@@ -104,7 +112,10 @@ def off_surface(
     distance: Float[Tensor, "n"],
     noise: float,
 ) -> Observations:
-    """Return observations of signed distances at points off the surface, without normals."""
+    """Return observations of signed distances at n points off the surface, without normals.
+
+    Points, distances and `noise`, the standard deviation of a distance, are normalised.
+    """
     no = torch.zeros(len(x), dtype=torch.bool, device=x.device)
     sigma = torch.full_like(distance, noise)
     return Observations(x, distance, torch.zeros_like(x), no, sigma, sigma)
@@ -118,9 +129,9 @@ class MeanJet(Batch):
     length.
     """
 
-    distance: Float[Tensor, "*b"]
-    gradient: Float[Tensor, "*b 3"]
-    hessian: Float[Tensor, "*b 3 3"]
+    distance: Float[Tensor, "*b"]  # normalised
+    gradient: Float[Tensor, "*b 3"]  # without unit
+    hessian: Float[Tensor, "*b 3 3"]  # per normalised unit
 
     @property
     def normals(self) -> Float[Tensor, "*b 3"]:
@@ -129,8 +140,10 @@ class MeanJet(Batch):
 
     @property
     def normal_jacobian(self) -> Float[Tensor, "*b 3 3"]:
-        """The derivatives of the normals by the points, (1 - n n^T) H / |g|, with normal n, Hessian
-        H, gradient g.
+        """The derivatives of the unit normals by the points, per normalised unit: (1 - n n^T) H /
+        |g|.
+
+        Here n is the normal, H the Hessian and g the gradient.
         """
         n = self.normals
         steep = torch.linalg.vector_norm(self.gradient, dim=-1)[..., None, None]
@@ -140,42 +153,40 @@ class MeanJet(Batch):
 
 @dataclasses.dataclass(frozen=True)
 class SurfaceJet(MeanJet):
-    """The mean distance with two derivatives, and its variance with one."""
+    """The mean signed distance with two derivatives, and its variance with one."""
 
-    variance: Float[Tensor, "*b"]
-    variance_gradient: Float[Tensor, "*b 3"]
+    variance: Float[Tensor, "*b"]  # squared normalised units
+    variance_gradient: Float[Tensor, "*b 3"]  # normalised units
 
 
 @dataclasses.dataclass(frozen=True)
 class JointEstimate(Value):
-    """The joint posterior of distance and gradient (d, w) at k points, normalised, ordered by
-    point.
+    """The joint posterior of distance and gradient (d, w) at k points, normalised.
 
     The gradient w need not have unit length. Points i and j have the block `covariance.reshape(k,
     4, k, 4)[i, :, j]`.
     """
 
     mean: Float[Tensor, "k 4"]
-    covariance: Float[Tensor, "rows rows"]
+    covariance: Float[Tensor, "rows rows"]  # rows = 4 k: (d, w) of point 0, of point 1, ...
 
 
 @dataclasses.dataclass(frozen=True)
 class ShapeDerivatives(Value):
-    """Derivatives of a `ShapeEstimate` by the query point, per metre: `normal[i, j]` is d normal_i
-    / d point_j.
-    """
+    """Derivatives of a `ShapeEstimate` by the query point [m]."""
 
-    distance: Float[Tensor, "*b 3"]
-    normal: Float[Tensor, "*b 3 3"]
-    variance: Float[Tensor, "*b 3"]
-    std_m: Float[Tensor, "*b 3"]
+    distance: Float[Tensor, "*b 3"]  # [normalised units / m]
+    normal: Float[Tensor, "*b 3 3"]  # `normal[i, j]` is d normal_i / d point_j [1/m]
+    variance: Float[Tensor, "*b 3"]  # [squared normalised units / m]
+    std_m: Float[Tensor, "*b 3"]  # [m / m]
 
 
 def surface_deviation(
     variance: Float[Tensor, "*b"],
     gradient: Float[Tensor, "*b 3"],
 ) -> Float[Tensor, "*b"]:
-    """Return the standard deviation of the surface along its normal, linearised from the distance's
-    variance.
+    """Return the standard deviation of the surface along its normal, normalised.
+
+    It is linearised: the root of the distance's `variance` over the length of its `gradient`.
     """
     return variance.sqrt() / torch.linalg.vector_norm(gradient, dim=-1)

@@ -1,4 +1,7 @@
-"""Observations besides the seen points: inside and outside, on the hidden side, in free space."""
+"""Observations besides the seen points: inside and outside, on the hidden side, in free space.
+
+A normalised length is in units of the `scale` [m] of a surface's frame.
+"""
 
 import dataclasses
 
@@ -34,13 +37,13 @@ from torchgrasp.values.planning import PointCloud
 
 @dataclasses.dataclass(frozen=True)
 class OutsideNumbers:
-    """The numbers of the points outside the object."""
+    """Numbers of the points outside the object."""
 
     points: int = 20
     radius: float = 1.2
     """Number of points, and normalised radius of their sphere (Sec. 3.1)."""
     noise: float = 0.3
-    """Deviation, normalised, of a distance: the nearest of sparse points is too far away."""
+    """Standard deviation of a distance, normalised: the nearest of sparse points is too far away."""
 
 
 OUTSIDE = OutsideNumbers()
@@ -48,19 +51,19 @@ OUTSIDE = OutsideNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class ObservationNumbers:
-    """The standard deviations of observations."""
+    """Standard deviations of observations."""
 
     normal: float = 0.05
     rim_normal: float = 0.5
     hidden_normal: float = 0.25
     vessel_rim_normal: float = 0.5
-    """Of unit normals: on the seen side, on the outline, on the hidden side, and on the outline of
-    a vessel.
+    """Standard deviations of unit normals: on the seen side, on the outline, on the hidden side,
+    and on the outline of a vessel.
     """
     rim: float = 0.002
-    """Of a point of the outline [m]."""
+    """Standard deviation of a point of the outline [m]."""
     free: float = 0.003
-    """Of a distance observed in free space [m]: it is only a lower bound."""
+    """Standard deviation of a distance in free space [m], which is only a lower bound."""
 
 
 NOISE = ObservationNumbers()
@@ -68,27 +71,27 @@ NOISE = ObservationNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class FreeNumbers:
-    """The numbers of the points in free space."""
+    """Numbers of the points in free space."""
 
     outline_error: float = 0.005
-    """The object may reach so far [m] beyond its outline: a camera loses rims."""
+    """Distance [m] by which the object may reach beyond its outline: a camera loses rims."""
     radius: float = 1.15
-    """Share of the radius of all points within which free space is probed."""
+    """Ratio of the radius within which free space is probed to that of all points."""
     ground: int = 9
     ground_side: float = 0.9
     """Points along each side of a square below the table, and half its side, normalised."""
     below: tuple[float, ...] = (0.003, 0.012)
-    """Depths [m] of these points."""
+    """Depths [m] of these points below the table."""
     least: float = 0.001
-    """A smaller distance [m] is no constraint."""
+    """Least distance [m] that is a constraint."""
     beside: tuple[float, ...] = (0.008, 0.016)
     """Distances [m] of camera rays from the outline."""
     rays: int = 32
-    """Rays at each distance."""
+    """Number of rays at each distance."""
     depths: int = 13
-    """Points along each ray, over the object's depth."""
+    """Number of points along each ray, over the object's depth."""
     violation: float = 0.002
-    """A point so deep [m] inside the shape violates free space."""
+    """Depth [m] inside the shape from which a point violates free space."""
     violations: int = 16
     """Most such points that are added at once."""
 
@@ -98,15 +101,15 @@ FREE = FreeNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class MiddleNumbers:
-    """The numbers of the points off a vessel's surfaces."""
+    """Numbers of the points off a vessel's surfaces."""
 
     points: int = 150
     """Most points in the middle of the wall."""
     side: float = 0.8
-    """Greatest vertical part of the normals of a side: a floor may be thicker than known."""
+    """Greatest vertical part of the unit normals of a side: a floor may be thicker than known."""
     over: float = 0.5
-    """Height of a point over the rim, in radii: the inner surface, without a lid, still surrounds
-    free space there.
+    """Height of a point above the rim, in radii of the mouth: the inner surface has no lid, so it
+    surrounds free space there, too.
     """
 
 
@@ -131,9 +134,10 @@ the table is known.
 
 `scripts/train.py bands DIR` fits them.
 """
-Part = tuple[Observations, Tensor | None]  # observations, and the errors that their distances share
+# observations of n points, and the correlated errors (n, c) of their distances, normalised
+Part = tuple[Observations, Tensor | None]
 FreeSpace = tuple[Points, Float[Tensor, "n"]]
-"""Normalised points in free space, and least signed distances there."""
+"""Points (n, 3) in free space, and the least signed distances (n,) there, both normalised."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,12 +147,12 @@ class ExtraObservations(Value):
     frame: Normalisation
     # observed distances at points inside and outside the object, without normals
     anchors: Observations
-    normal_noise: float  # standard deviation of the cloud's normals
+    normal_noise: float  # standard deviation of the components of the cloud's unit normals
     # ratio of the surface's true deviations to the posterior's standard deviations
     std_factor: float = 1.0
     parts: tuple[Part, ...] = ()  # observed points of the outline and of the hidden side
     free: FreeSpace | None = None  # points in free space, or None if they are not used
-    rows: Bool[Tensor, "rows"] | None = None  # the cloud's points on this surface; None means all
+    rows: Bool[Tensor, "rows"] | None = None  # mask of the cloud's points on it; None means all
     kind: Kind = "guess"  # how the hidden side was completed, as in `ShapeGP`
 
 
@@ -157,8 +161,11 @@ def paper_support(
     noise: float,
     generator: torch.Generator,
 ) -> ExtraObservations:
-    """Return the additional observations of the paper: the centre, and random points outside (Sec.
-    3.1).
+    """Return the paper's observations besides the cloud: its centre, and random points outside
+    (Sec. 3.1).
+
+    `seen` is the cloud [m], and `noise` the standard deviation of distances (normalised) and
+    normals.
     """
     center = seen.points.mean(0)
     scale = float(torch.linalg.vector_norm(seen.points - center, dim=-1).max())
@@ -170,8 +177,9 @@ def paper_support(
 
 
 def frame_around(points: Points) -> Normalisation:
-    """Return the normalised frame of points: origin in the centre of their box, farthest point at
-    distance 1.
+    """Return the normalised frame of points (n, 3) [m].
+
+    Its origin is in the centre of their box, and its scale is the distance of the farthest point.
     """
     center = find_middle(points)
     scale = float(torch.linalg.vector_norm(points - center, dim=-1).max())
@@ -184,12 +192,11 @@ def camera_support(
     noise: float,
     table: float | None,
 ) -> ExtraObservations:
-    """Return the observations that are added to the points of the cloud, with distances that are
-    true to scale.
+    """Return the observations besides the cloud's points, with distances that are true to scale.
 
-    If the cloud is a view with a `completion`, they include its hidden side and free space. `noise`
-    is the standard deviation of the distance observed inside, normalised; `table` is the table's
-    height [m].
+    If the cloud `seen` [m] is a view with a `completion`, they include its hidden side and free
+    space. `noise` is the standard deviation of the distance observed inside, normalised; `table` is
+    the table's height [m], or None.
     """
     kind: Kind = "whole"
     parts = ()
@@ -251,8 +258,10 @@ def observe(
     noise: float,
     normal_noise: float,
 ) -> Observations:
-    """Return observations of surface points [m] with normals; `noise` is their deviation [m] along
-    the normals.
+    """Return normalised observations of n surface points [m] with outward unit normals.
+
+    `noise` is their standard deviation [m] along the normals, and `normal_noise` that of a normal's
+    components.
     """
     x = frame.normalise(points.to(frame.center))
     deviation = torch.full_like(x[:, 0], noise / frame.scale)
@@ -261,13 +270,11 @@ def observe(
 
 @dataclasses.dataclass(frozen=True)
 class Middle(Value):
-    """Points `x` in the middle of a vessel's wall and its thickness, normalised; `side` masks
-    points off the floor.
-    """
+    """Points in the middle of a vessel's wall, and the thickness of the wall."""
 
-    x: Points
-    side: Bool[Tensor, "n"]
-    thickness: float
+    x: Points  # points (n, 3), normalised
+    side: Bool[Tensor, "n"]  # mask of the points in the sides, not in the floor
+    thickness: float  # of the wall, normalised
 
 
 def vessel_supports(
@@ -277,11 +284,17 @@ def vessel_supports(
     table: float,
     noise: float,
 ) -> tuple[ExtraObservations, ExtraObservations, Middle]:
-    """Return additional observations of a vessel's outer and inner surface, and points in the
-    middle of its wall.
+    """Return (outer, inner, middle): observations of a vessel's two surfaces, and points in its
+    wall.
 
-    `noise` is the standard deviation of the distances observed off the surface, normalised.
-    Distances of the inner surface are positive around the axis.
+    Args:
+        cloud: the seen points [m], with z up.
+        vessel: the vessel that the cloud shows.
+        outline: silhouettes of the views.
+        table: the table's height [m].
+        noise: standard deviation of the distances observed off the surface, normalised.
+
+    The signed distances of the inner surface are positive in the cavity, as in `HollowShape`.
     """
     device = cloud.points.device
     cloud = cloud.to("cpu")
@@ -377,8 +390,13 @@ def free_space(
     table: float | None = None,
     reach: float = 1.0,
 ) -> FreeSpace:
-    """Return points in free space, and lower bounds of their signed distance, out to the normalised
-    radius `reach`.
+    """Return points in free space, and lower bounds of their signed distances, both normalised.
+
+    Args:
+        outline: silhouettes of the views.
+        frame: the normalised frame.
+        table: the table's height [m]; None means no table.
+        reach: normalised radius within which the points lie.
 
     The points lie beside the object's outline, and below the table. A bound becomes an observation
     only where the shape violates it: otherwise the shape would inflate to its visual hull.
@@ -409,8 +427,10 @@ def free_space_violations(
     x: Points,
     least: Float[Tensor, "n"],
 ) -> Tensor:
-    """Return the indices of some free-space points that lie well inside the shape, the worst
+    """Return the indices of some points of free space that lie well inside the shape, the worst
     first.
+
+    `x` are n normalised points, and `least` the lower bounds of their signed distances, normalised.
     """
     short = shape.mean(x) - least
     rows = torch.nonzero(short < -FREE.violation / shape.scale)[:, 0]

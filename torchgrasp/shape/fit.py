@@ -50,17 +50,17 @@ from torchgrasp.values.planning import PointCloud
 
 @dataclasses.dataclass(frozen=True)
 class ShapeNumbers:
-    """The numbers of a shape fit."""
+    """Numbers of a shape fit."""
 
     budget: int = 1000
     """Greatest number of observed points: their factor has 4000 rows."""
     camera: int = 85
     paper: int = 70
-    """Usual numbers of observed points, by the kind of support."""
+    """Default numbers of observed points, with the support "camera" and "paper"."""
     rounds: int = 3
-    """Most rounds in which violated free space is observed."""
+    """Most rounds in which free space that the shape violates is observed."""
     gap: float = 0.025
-    """Width [m] of a gap that misleads a fingertip; a handle's is narrower."""
+    """Least width [m] of a gap that misleads a fingertip; that of a handle is narrower."""
 
 
 SHAPE = ShapeNumbers()
@@ -141,14 +141,14 @@ def fit_shape(
 
 @dataclasses.dataclass(frozen=True)
 class FitOptions:
-    """Options of a shape fit, which are arguments of `fit_shape`."""
+    """Options of a shape fit, with the meaning that they have as arguments of `fit_shape`."""
 
-    noise: float = 0.01
-    budget: int | Literal["sure"] | None = None
-    psi_scale: float = 1.5
-    support: Literal["camera", "paper"] = "camera"
+    noise: float = 0.01  # standard deviation of an observed distance, in radii of the object
+    budget: int | Literal["sure"] | None = None  # number of observed points
+    psi_scale: float = 1.5  # the kernel's length over the longest distance of observed points
+    support: Literal["camera", "paper"] = "camera"  # observations besides the cloud's points
     kernel: KernelName | Kernel = "thin_plate"
-    criterion: Criterion = "variance"
+    criterion: Criterion = "variance"  # what is greatest at the most informative point
 
 
 def fit_upright(
@@ -157,8 +157,9 @@ def fit_upright(
     table: float | None,
     options: FitOptions,
 ) -> ShapeGP:
-    """Fit the shape to a cloud without duplicates in a frame whose z axis is up; `table` is the
-    table's height [m].
+    """Fit the shape to a cloud [m] without duplicates in a frame whose z axis points up.
+
+    `table` is the table's height [m]; None means no table. `seed` is the random seed.
     """
     if table is not None:
         check_foot(cloud, Plane.horizontal(table))

@@ -1,4 +1,4 @@
-"""The shape as a Gaussian process over signed distance and normal, with an interface in metres;
+"""The shape as a Gaussian process over signed distance and normal, with an interface in metres,
 Eqs. (1), (7)-(9).
 """
 
@@ -33,10 +33,10 @@ from torchgrasp.values.planning import PointCloud, ShapeEstimate
 
 @dataclasses.dataclass(frozen=True)
 class DomainNumbers:
-    """The bounds within which a shape is asked."""
+    """Bounds within which a shape answers."""
 
     reach: float = 1.25
-    """Radius of the domain over that of the observations: far from them nothing is known."""
+    """Ratio of the domain's radius to that of the observations: far away nothing is known."""
     joint: int = 1000
     """Most points of one joint posterior: its memory grows with the square of their number."""
 
@@ -87,8 +87,10 @@ class ShapeGP(Posterior, Normalisation):
         psi: Positive,
         std_factor: Positive = 1.0,
     ) -> "ShapeGP":
-        """Return the shape of a posterior in a normalised frame; its domain follows from kernel and
-        observations.
+        """Return the shape of a posterior in the normalised frame `frame`, with the seen points
+        `cloud` [m].
+
+        `psi` is the kernel's length, normalised. The domain follows from kernel and observations.
         """
         away = torch.linalg.vector_norm(posterior.x.detach(), dim=-1)
         reach = DOMAIN.reach * float(away.max())
@@ -106,21 +108,20 @@ class ShapeGP(Posterior, Normalisation):
 
     @property
     def device(self) -> torch.device:
-        """Device of the shape; planners put their points there."""
+        """The device of the shape; planners put their points there."""
         return self.x.device
 
     @property
     def walls(self) -> "tuple[ShapeGP, ...]":
-        """The surfaces that enclose the material, each a shape; an object that is not hollow has
-        only one.
+        """The surfaces that enclose the material, each as a shape of its own.
+
+        An object that is not hollow has only one.
         """
         return (self,)
 
     @checked(gradients=True)
     def wall_at(self, x: Queries) -> Bool[Tensor, "q walls"]:
-        """Return a mask (points, walls): which of the `walls` is the surface at each normalised
-        point.
-        """
+        """Return a mask of the surface among `walls` that applies at each of q normalised points."""
         return torch.ones(len(x), 1, dtype=torch.bool, device=x.device)
 
     @checked(gradients=True)
@@ -128,7 +129,7 @@ class ShapeGP(Posterior, Normalisation):
         self,
         points: Float[Tensor, "*b 3"],
     ) -> Bool[Tensor, "*b"]:
-        """Return which points [m] lie in the domain, where the posterior is valid."""
+        """Return a mask of the points [m] in the domain, where the posterior is valid."""
         return torch.linalg.vector_norm(self.normalise(points), dim=-1) <= self.domain_radius
 
     @checked(gradients=True)
@@ -186,8 +187,8 @@ class ShapeGP(Posterior, Normalisation):
 
     @checked(gradients=True)
     def joint(self, points: Float[Tensor, "k 3"]) -> JointEstimate:
-        """Return the joint posterior of distance and gradient, in normalised units, at up to 1000
-        points [m].
+        """Return the joint posterior of distance and gradient, normalised, at k points [m], at most
+        1000.
 
         Raises the errors of `differentiate`, and `BadArgument` for more points.
         """
@@ -204,8 +205,8 @@ class ShapeGP(Posterior, Normalisation):
         n: Annotated[int, Range(0, 1_000_000)],
         seed: Seed = 0,
     ) -> Float[Tensor, "n k 4"]:
-        """Draw n joint samples of distance and gradient, in normalised units, at up to 1000 points
-        [m].
+        """Draw n joint samples of distance and gradient (d, w), normalised, at k points [m], at
+        most 1000.
 
         Samples of one seed are differentiable in the points twice, unless points coincide.
 
@@ -263,14 +264,17 @@ class ShapeGP(Posterior, Normalisation):
 
     @checked
     def append(self, new: Observations) -> "ShapeGP":
-        """Return the shape given further observations in the normalised frame; kernel and domain do
-        not change.
+        """Return the shape given further observations in the normalised frame.
+
+        Kernel and domain do not change.
         """
         return dataclasses.replace(self, **common_fields(append_observations(self, new), Posterior))
 
     @checked
     def moved(self, b_from_a: Pose) -> "ShapeGP":
-        """Return the shape transformed from frame a to frame b [m]."""
+        """Return the shape in frame b, given the rigid transform `b_from_a` [m] from its own frame
+        a.
+        """
         rotation = b_from_a[:3, :3].to(self.x)
         n = len(self.x)
 
@@ -350,6 +354,6 @@ def common_fields(
     value: Value,
     kind: type[Value],
 ) -> dict[str, Any]:
-    """Return the fields, by name, that a value shares with the class `kind`."""
+    """Return the fields of a value, by name, that the class `kind` has, too."""
     names = [f.name for f in dataclasses.fields(kind)]  # pyright: ignore[reportArgumentType]
     return {name: getattr(value, name) for name in names}

@@ -1,6 +1,4 @@
-"""The shape of an open vessel: an outer body from which the space inside the inner surface is cut
-out.
-"""
+"""The shape of an open vessel: an outer body without the cavity inside its inner surface."""
 
 import dataclasses
 from collections.abc import Callable
@@ -34,16 +32,16 @@ Found = TypeVar("Found")
 
 @dataclasses.dataclass(frozen=True)
 class TieNumbers:
-    """The numbers by which a wall gets its thickness."""
+    """Numbers of the observations that give a vessel's wall its known thickness."""
 
     rounds: int = 3
-    """Most rounds; each observes the points that are farthest off."""
+    """Most rounds; each observes the points with the greatest error of the thickness."""
     points: int = 24
     """Most points of a round."""
     off: float = 0.0005
-    """A wall that differs so much [m] from its thickness is corrected."""
+    """Greatest error [m] of the wall's thickness that is not corrected."""
     noise: float = 0.0007
-    """Deviation [m] of an observed distance that the thickness adds."""
+    """Standard deviation [m] of a distance that is observed because of the thickness."""
 
 
 TIE_WALLS = TieNumbers()
@@ -73,8 +71,9 @@ class HollowShape(ShapeGP):
     @classmethod
     @checked(gradients=True)
     def join(cls, outer: ShapeGP, inner: ShapeGP, cloud: PointCloud) -> "HollowShape":
-        """Return the vessel with two surfaces that share a normalised frame; `cloud` holds the seen
-        points of both.
+        """Return the vessel with two surfaces that share a normalised frame.
+
+        `cloud` holds the seen points [m] of both.
         """
         fields = common_fields(outer, ShapeGP)
         fields["cloud"] = cloud
@@ -93,20 +92,22 @@ class HollowShape(ShapeGP):
 
     @checked(gradients=True)
     def wall_at(self, x: Queries) -> Bool[Tensor, "q walls"]:
-        """Return a mask (points, 2): whether the outer or the inner surface applies at each
-        normalised point.
+        """Return a mask (q, 2) of the surface, outer or inner, that applies at each of q normalised
+        points.
         """
         inner = self.inner.mean(x) > self.outer.mean(x)
         return torch.stack([~inner, inner], 1)
 
     @checked(gradients=True)
     def mean(self, x: Queries) -> Float[Tensor, "q"]:
-        """Return the mean signed distance at normalised points."""
+        """Return the mean signed distance, normalised, at q normalised points."""
         return torch.maximum(self.outer.mean(x), self.inner.mean(x))
 
     @checked(gradients=True)
     def mean_and_gradient(self, x: Queries) -> MeanAndGradient:
-        """Return the mean signed distance and its gradient at normalised points."""
+        """Return (distance, gradient): the mean signed distance and its gradient at q normalised
+        points.
+        """
         a, slope_a = self.outer.mean_and_gradient(x)
         b, slope_b = self.inner.mean_and_gradient(x)
         slope = torch.where((b > a)[:, None], slope_b, slope_a)
@@ -114,7 +115,7 @@ class HollowShape(ShapeGP):
 
     @checked(gradients=True)
     def estimate(self, x: Queries) -> Moments:
-        """Return mean and covariance of distance and gradient (d, w) at normalised points."""
+        """Return mean and covariance of distance and gradient (d, w) at q normalised points."""
         parts, merge = self._by_wall(x, lambda wall, own: wall.estimate(own))
         return tuple(map(merge, *parts))  # pyright: ignore[reportReturnType]
 
@@ -134,7 +135,7 @@ class HollowShape(ShapeGP):
 
     @checked(gradients=True)
     def joint_at(self, x: Float[Tensor, "k 3"]) -> JointEstimate:
-        """Return the joint posterior of distance and gradient (d, w) at normalised points."""
+        """Return the joint posterior of distance and gradient (d, w) at k normalised points."""
         outer = self.outer.joint_at(x)
         inner = self.inner.joint_at(x)
         owner = self.wall_at(x)
@@ -145,8 +146,9 @@ class HollowShape(ShapeGP):
 
     @checked
     def append(self, new: Observations) -> "HollowShape":
-        """Return the shape given further normalised observations; each changes the surface that
-        applies there.
+        """Return the shape given further normalised observations.
+
+        Each observation changes the surface, outer or inner, that applies at its point.
         """
         outer, inner = self.wall_at(new.x).T
         new_outer = self.outer.append(new[outer])
@@ -155,7 +157,9 @@ class HollowShape(ShapeGP):
 
     @checked
     def moved(self, b_from_a: Pose) -> "HollowShape":
-        """Return the shape transformed from frame a to frame b [m]."""
+        """Return the shape in frame b, given the rigid transform `b_from_a` [m] from its own frame
+        a.
+        """
         outer = self.outer.moved(b_from_a)
         return self.join(outer, self.inner.moved(b_from_a), outer.cloud)
 
@@ -180,9 +184,10 @@ class HollowShape(ShapeGP):
 def tie_walls(shape: HollowShape, middle: Middle) -> HollowShape:
     """Return the vessel after adding observations that give its wall the known thickness.
 
-    Two independent surfaces might touch, which tears holes into the wall. In the wall's middle the
-    signed distances from both surfaces must sum to minus the thickness. Where they do not, the less
-    certain surface gets an observed distance that follows from the more certain one.
+    `middle` holds points in the middle of the wall, and the thickness. Two independent surfaces
+    might touch, which tears holes into the wall. In the wall's middle the signed distances from
+    both surfaces must sum to minus the thickness. Where they do not, the less certain surface gets
+    an observed distance that follows from the more certain one.
     """
     x = middle.x
     thickness = middle.thickness

@@ -1,5 +1,6 @@
-"""Mean and variance of the distance at many points, with their derivatives, in closed form; see
-`Posterior.jet`.
+"""Jets in closed form: mean and variance of the distance at many points, with their derivatives.
+
+`Posterior.jet` gives the formulas. All is in normalised units.
 """
 
 from collections.abc import Callable
@@ -13,13 +14,13 @@ from torchgrasp.shape.kernel import CovarianceRows, Kernel, Queries, separations
 
 
 class Weighted(NamedTuple):
-    """What the posterior mean needs: observed points, those with normals first, their weights, and
-    the kernel.
+    """The observed points and weights that determine a posterior mean, and the kernel.
 
-    With a leading axis q each of q query points has a posterior of its own.
+    The first `near` of n points have normals. With a leading axis q each of q query points has a
+    posterior of its own.
     """
 
-    x: Float[Tensor, "*q n 3"]
+    x: Float[Tensor, "*q n 3"]  # observed points, normalised, those with normals first
     a: Float[Tensor, "*q n"]  # weight of each distance
     b: Float[Tensor, "*q near 3"]  # weight of each normal
     kernel: Kernel
@@ -39,7 +40,11 @@ def evaluate_mean(
     x: Queries,
     gradient: bool,
 ) -> tuple[Tensor, ...]:
-    """Return the mean distance and, if asked for, its gradient at some points."""
+    """Return the mean distance at q normalised points and, if asked for by `gradient`, its
+    gradient.
+
+    `of` holds the observations and weights.
+    """
     near = of.b.shape[-2]  # the points with normals come first
     if of.x.ndim == 2:
         distances = torch.cdist(x, of.x, compute_mode="donot_use_mm_for_euclid_dist")
@@ -60,7 +65,10 @@ def evaluate_mean_jet(
     of: Weighted,
     x: Queries,
 ) -> tuple[tuple[Tensor, Tensor, Tensor], Kernels]:
-    """Return the fields of `MeanJet` at some points, and kernel values that the variance needs."""
+    """Return the fields of `MeanJet` at q normalised points, and kernel values for the variance.
+
+    `of` holds the observations and weights.
+    """
     known, a, b, kernel = of
     near = b.shape[-2]  # the points with normals come first
     d, r = separations(x, known)
@@ -93,7 +101,10 @@ def evaluate_jet(
     x: Queries,
     explain: Explain,
 ) -> tuple[Tensor, ...]:
-    """Return the fields of `SurfaceJet` at some points; `explain` is that of their posterior."""
+    """Return the fields of `SurfaceJet` at q normalised points.
+
+    `of` holds the observations and weights; `explain` is `Posterior.explain` of their posterior.
+    """
     mean, (d, k, first, near_second) = evaluate_mean_jet(of, x)
     n = of.x.shape[-2]
     near = near_second.shape[1]
@@ -118,8 +129,14 @@ def distance_rows(
     first: Values,
     near: int,
 ) -> CovarianceRows:
-    """Return the covariance of distances with all observations: k, then -k' d for each component of
-    the normals.
+    """Return the covariance of q distances with all observations: k, then -k' d by component of a
+    normal.
+
+    Args:
+        d: the three components (q, n) of the differences from the n observed points.
+        k: the kernel's values at their lengths.
+        first: the kernel's first derivative k' by r^2 / 2 there.
+        near: number of the observed points with normals, which come first.
     """
     slope = first[:, :near]
     return torch.cat([k, *(-(part[:, :near] * slope) for part in d)], 1)

@@ -1,8 +1,8 @@
 """Radial kernels k(r), and the covariances of signed distances and normals that follow, Eqs.
 (2)-(6) of the paper.
 
-Autograd of the scalar profile k(r) defines all derivatives. A kernel may add a closed form, which
-plain tensors take.
+Distances r are normalised. Autograd of the scalar profile k(r) defines all derivatives. A kernel
+may add a closed form, which plain tensors take. An oriented observation is one with a normal.
 """
 
 import dataclasses
@@ -20,13 +20,13 @@ from torchgrasp.foundation.rules import LEAST, Positive, Range, is_known, is_tra
 from torchgrasp.geometry.linalg import Points
 
 Profile = Callable[[Tensor], Tensor]
-"""A radial kernel k(r), elementwise, smooth where r > 0 and four times so at 0 from the right, with
-k'(0) = 0.
+"""A radial kernel k(r), elementwise. It is smooth where r > 0, four times differentiable at 0 from
+the right, and k'(0) = 0.
 """
 Queries = Float[Tensor, "q 3"]
-"""Query points, normalised."""
+"""Query points (q, 3), normalised."""
 CovarianceRows = Float[Tensor, "q rows"]
-"""A row of covariances with all observations for each query point."""
+"""Covariances (q, rows) of a number at each query point with all observed numbers."""
 KernelName = Literal["thin_plate", "matern52", "rbf"]
 Orders = Annotated[int, Range(1, 4)]  # how many of k and its derivatives
 # length over psi of the Matern kernel whose gradients have the prior variance 6 psi
@@ -35,13 +35,13 @@ MATERN52_LENGTH = math.sqrt(5.0 / 18.0)
 
 @dataclasses.dataclass(frozen=True)
 class ProfileNumbers:
-    """The numbers by which a profile is differentiated near r = 0, where k'(r) / r is 0 / 0."""
+    """Numbers of the derivatives of a profile near r = 0, where k'(r) / r is 0 / 0."""
 
     near_zero: float = 1e-4
-    """Below it k(r) is taken as its Taylor polynomial of degree 4."""
+    """Normalised distance r below which k(r) is replaced by its Taylor polynomial of degree 4."""
     power: float = 1.5
-    """Points with r^2 up to this power of the rounding error coincide: rounding of the third
-    derivative would dominate.
+    """Points coincide if r^2 is at most this power of the rounding error: otherwise rounding of the
+    third derivative would dominate.
     """
 
 
@@ -82,8 +82,10 @@ class Kernel:
         r: Float[Tensor, "*s"],
         count: Orders,
     ) -> tuple[Float[Tensor, "*s"], ...]:
-        """Return the first `count` (1 to 4) of k and its derivatives by r^2 / 2, elementwise; see
-        `differentiate`.
+        """Return the first `count` (1 to 4) of k and its derivatives by r^2 / 2 at distances r,
+        elementwise.
+
+        `differentiate` says more about them.
         """
         if self.closed_form and is_plain(r):
             return self.closed_form(r, count)
@@ -91,8 +93,9 @@ class Kernel:
 
 
 def is_plain(*tensors: Tensor) -> bool:
-    """Return whether torch neither differentiates the tensors nor maps over them, so that buffers
-    may be reused.
+    """Return whether torch neither differentiates the tensors nor maps over them.
+
+    Then buffers may be reused.
     """
     return all(is_known(x) and not is_tracked(x) for x in tensors)
 
@@ -102,7 +105,7 @@ def differentiate(
     u: Float[Tensor, "*s"],
     count: int,
 ) -> tuple[Float[Tensor, "*s"], ...]:
-    """Return k and its derivatives by u = r^2 / 2, by autograd, `count` in all, at most 4.
+    """Return the first `count` (1 to 4) of k and its derivatives by u = r^2 / 2, by autograd.
 
     They are differentiable by u to any order, but at r = 0 only those up to (d/du)^2 k are right.
     Higher ones, and infinite ones, count as 0 there: covariances and their second derivatives
@@ -158,8 +161,9 @@ def thin_plate(
     r: Float[Tensor, "*s"],
     psi: float | Float[Tensor, "*p"],
 ) -> Float[Tensor, "*s"]:
-    """Return 2 r^3 - 3 psi r^2 + psi^3, Eq. (6) of the paper: it is a covariance in a ball of
-    diameter 3/4 psi.
+    """Return the thin plate kernel 2 r^3 - 3 psi r^2 + psi^3 at normalised distances r, Eq. (6).
+
+    It is a covariance in a ball of diameter 3/4 psi.
     """
     # Not factored as (psi - r)^2 (psi + 2 r): its derivative would cancel at r -> 0, where normals
     # need it.
@@ -189,8 +193,9 @@ def differentiate_thin_plate(
     r: Tensor,
     count: int,
 ) -> tuple[Tensor, ...]:
-    """Return k and its derivatives by r^2 / 2 of the thin plate kernel in closed form, `count` in
-    all.
+    """Return the first `count` (1 to 4) of k and its derivatives by r^2 / 2, in closed form.
+
+    The kernel is the thin plate of the length `psi`, and `r` are normalised distances.
     """
     k = (2.0 * r).sub_(3.0 * psi).mul_(r).mul_(r).add_(psi**3)
     values = [k, (6 * r).sub_(6 * psi)]
@@ -205,6 +210,8 @@ def differentiate_thin_plate(
 @checked
 def matern52_kernel(length: Positive, variance: Positive = 1.0) -> Kernel:
     """Return the Matern 5/2 kernel: variance (1 + s + s^2 / 3) exp(-s) with s = sqrt(5) r / length.
+
+    The length is normalised, the variance in squared normalised units.
 
     >>> float(matern52_kernel(1.0).profile(torch.zeros(())))
     1.0
@@ -232,6 +239,8 @@ def matern52_kernel(length: Positive, variance: Positive = 1.0) -> Kernel:
 def rbf_kernel(length: Positive, variance: Positive = 1.0) -> Kernel:
     """Return the squared exponential kernel: variance exp(-r^2 / (2 length^2)).
 
+    The length is normalised, the variance in squared normalised units.
+
     >>> float(rbf_kernel(1.0).profile(torch.zeros(())))
     1.0
     """
@@ -248,8 +257,9 @@ def rbf_kernel(length: Positive, variance: Positive = 1.0) -> Kernel:
 
 @checked
 def kernel_by_name(name: KernelName, psi: Positive) -> Kernel:
-    """Return a kernel by name; all have the prior variance psi^3 of the distance and 6 psi of a
-    gradient component.
+    """Return a kernel by its name, with the length set by `psi`, normalised.
+
+    All have the prior variance psi^3 of the distance and 6 psi of a gradient component.
     """
     if name == "thin_plate":
         return thin_plate_kernel(psi)
@@ -264,11 +274,12 @@ def cross_covariance(
     y: Float[Tensor, "*q n 3"],
     n_oriented: int,
 ) -> Float[Tensor, "4 q rows"]:
-    """Return the covariance of distance and gradient at x with the observations at y, Eqs. (2)-(5)
-    of the paper.
+    """Return the covariance of distance (first) and gradient (x, y, z) at x with the observations
+    at y.
 
-    The blocks are k, k' d, -k' d^T and -k' I - k'' d d^T with d = x - y and derivatives by r^2 / 2.
-    The columns are the distances at all y, then each gradient component at the first `n_oriented`,
+    The q points `x` and n points `y` are normalised. With d = x - y, and derivatives by r^2 / 2,
+    the blocks are k, k' d, -k' d^T and -k' I - k'' d d^T, Eqs. (2)-(5) of the paper. The last axis
+    holds the distances at all y, then each gradient component at the first `n_oriented` points,
     which have normals. With a leading axis, `y` holds the observations of each x.
     """
     if not (kernel.closed_form and is_plain(x, y)):
@@ -324,10 +335,11 @@ def separations(
     x: Queries,
     y: Float[Tensor, "*q n 3"],
 ) -> tuple[list[Tensor], Float[Tensor, "q n"]]:
-    """Return the three components of x - y for all pairs, and the distances |x - y|, without
-    cancellation.
+    """Return (differences, distances): the three components (q, n) of x - y, and |x - y|, of all
+    pairs.
 
-    With a leading axis, `y` holds the points that each x is compared with.
+    They are free of cancellation. With a leading axis, `y` holds the points that each x is compared
+    with.
     """
     d = [x[:, m, None] - y[..., m] for m in range(3)]
     square = d[0] * d[0]
@@ -342,8 +354,10 @@ def covariance_rows(
     y: Float[Tensor, "m 3"],
     other_oriented: int,
 ) -> Float[Tensor, "rows columns"]:
-    """Return the covariance of observations at x and y; the first `n_oriented` and `other_oriented`
-    have normals.
+    """Return the covariance of the observed numbers at normalised points x with those at y.
+
+    The first `n_oriented` points of x and `other_oriented` of y have normals. Distances come first,
+    then normals by component.
     """
     block = cross_covariance(kernel, x, y, other_oriented)
     if n_oriented == len(x):
@@ -356,5 +370,8 @@ def gram(
     x: Points,
     n_oriented: int,
 ) -> Float[Tensor, "rows rows"]:
-    """Return the covariance matrix of observations; the first `n_oriented` have normals."""
+    """Return the covariance matrix of all observed numbers at the normalised points x.
+
+    The first `n_oriented` points have normals. Distances come first, then normals by component.
+    """
     return covariance_rows(kernel, x, n_oriented, x, n_oriented)

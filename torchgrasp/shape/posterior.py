@@ -36,7 +36,7 @@ from torchgrasp.shape.kernel import (
 
 @dataclasses.dataclass(frozen=True)
 class ChunkNumbers:
-    """How many points are worked on at once.
+    """Numbers of points that are worked on at once.
 
     On a CPU the temporaries of a chunk stay in the cache.
     """
@@ -52,7 +52,7 @@ class ChunkNumbers:
     least: int = 64
     """Least points of a chunk on an accelerator."""
     tile: int = 24
-    """Matrix products are fastest with a multiple of so many columns."""
+    """Number of columns; matrix products are fastest with a multiple of it."""
 
 
 CHUNK = ChunkNumbers()
@@ -64,13 +64,13 @@ LEAST_EIGENVALUE = -1e-8
 class Posterior(Value):
     """A Gaussian process given observed distances and normals, in normalised units and float64.
 
-    (d, w) are the signed distance and its gradient. All methods are differentiable, to any order,
-    in the points and in the tensors of the posterior. Plain tensors take faster formulas, which
-    reuse buffers.
+    The observed numbers are `rows`: n distances, and three for each normal. (d, w) are the signed
+    distance and its gradient. All methods are differentiable, to any order, in the points and in
+    the tensors of the posterior. Plain tensors take faster formulas, which reuse buffers.
     """
 
-    x: Points  # observed points, those with normals first
-    has_normal: Bool[Tensor, "n"]
+    x: Points  # observed points (n, 3), those with normals first
+    has_normal: Bool[Tensor, "n"]  # mask of the points with observed normals
     # (K + noise)^-1 y of the observed y: all distances, then the normals by component
     weights: Float[Tensor, "rows"]
     # lower Cholesky factor of K + noise; rows of later observations come last
@@ -99,12 +99,14 @@ class Posterior(Value):
         self,
         rows: Shaped[Tensor, "rows *c"],
     ) -> Shaped[Tensor, "rows *c"]:
-        """Return rows, given in the order of `weights`, in the order of the rows of `factor`."""
+        """Return `rows`, one for each observed number in the order of `weights`, in the order of
+        `factor`.
+        """
         return rows if self.order is None else rows[self.order]
 
     @checked(gradients=True)
     def mean(self, x: Queries) -> Float[Tensor, "q"]:
-        """Return the mean signed distance at normalised points."""
+        """Return the mean signed distance, normalised, at q normalised points."""
         if not self._is_plain(x):
             return self.distance_rows(x) @ self.weights
         mean = partial(evaluate_mean, self.weighted, gradient=False)
@@ -112,7 +114,11 @@ class Posterior(Value):
 
     @checked(gradients=True)
     def mean_and_gradient(self, x: Queries) -> MeanAndGradient:
-        """Return the mean signed distance and its gradient at normalised points; see `jet`."""
+        """Return (distance, gradient): the mean signed distance and its gradient at q normalised
+        points.
+
+        `jet` gives the formula.
+        """
         if not self._is_plain(x):
             distance, *slope = (self.cross(x) @ self.weights).unbind(0)
             return distance, torch.stack(slope, -1)
@@ -121,8 +127,8 @@ class Posterior(Value):
 
     @checked(gradients=True)
     def estimate(self, x: Queries) -> Moments:
-        """Return mean and covariance of distance and gradient at normalised points, Eqs. (7)-(8) of
-        the paper.
+        """Return mean and covariance of distance and gradient at q normalised points, Eqs. (7)-(8)
+        of the paper.
         """
         prior = self.prior_block()
         rows = len(self.factor)
@@ -149,8 +155,8 @@ class Posterior(Value):
 
     @checked(gradients=True)
     def jet(self, x: Queries) -> SurfaceJet:
-        """Return mean and variance of the distance with their derivatives at normalised points, in
-        closed form.
+        """Return mean and variance of the distance with their derivatives at q normalised points,
+        in closed form.
 
         The mean is sum_j (a_j k - k' d.b_j), with d = x - x_j and k' = dk / d(|d|^2 / 2). Here a_j
         is the weight of the distance at the observed point x_j, and b_j that of its normal. The
@@ -165,8 +171,9 @@ class Posterior(Value):
 
     @checked(gradients=True)
     def mean_jet(self, x: Queries) -> MeanJet:
-        """Return the mean distance with first and second derivatives at normalised points, at less
-        cost than `jet`.
+        """Return the mean distance with first and second derivatives at q normalised points.
+
+        It costs less than `jet`.
         """
         size = at_once(x, CHUNK.jet)
         if not self._is_plain(x):
@@ -188,16 +195,17 @@ class Posterior(Value):
         return JointEstimate(mean, prior - whitened.T @ whitened)
 
     def prior_block(self) -> Float[Tensor, "4 4"]:
-        """Return the prior covariance (4, 4) of signed distance and gradient, the same at every
-        point.
+        """Return the prior covariance (4, 4) of signed distance and gradient, normalised.
+
+        It is the same at every point.
         """
         here = self.x.new_zeros(1, 3)
         return cross_covariance(self.kernel, here, here, 1)[:, 0]
 
     @checked(gradients=True)
     def distance_rows(self, x: Queries) -> CovarianceRows:
-        """Return the covariance of the distances at normalised points with all observations, one
-        row per point.
+        """Return the covariance of the distance at each of q normalised points with all
+        observations.
         """
         if not self._is_plain(x):
             d = x[:, None] - self.x
@@ -210,9 +218,10 @@ class Posterior(Value):
 
     @checked(gradients=True)
     def whiten(self, rows: CovarianceRows) -> CovarianceRows:
-        """Return rows of covariances with all observations, times L^-T of the Cholesky factor L.
+        """Return `rows` times L^-T, with the Cholesky factor L of the observations' covariance.
 
-        The dot product of two results is the covariance that the observations explain.
+        Each line of `rows` holds the covariances of one number with all observations. The dot
+        product of two lines of the result is the covariance that the observations explain.
         """
         rows = rows if self.order is None else rows[:, self.order]
         if not self._is_plain(rows):
@@ -224,11 +233,11 @@ class Posterior(Value):
         self,
         rows: CovarianceRows,
     ) -> tuple[Float[Tensor, "q"], CovarianceRows]:
-        """Return the variance k A k that observations explain, and k A, for rows k of covariances
-        with them.
+        """Return the variance k A k that the observations explain, and k A, for each line k of
+        `rows`.
 
-        A is the inverse covariance of the observations. With the whitened row, the variance is a
-        sum of squares.
+        A line holds the covariances of one number with all observations, and A is their inverse
+        covariance. With the whitened line, the variance is a sum of squares.
         """
         whitened = self.whiten(rows)
         solved = torch.zeros_like(rows)
@@ -243,7 +252,7 @@ class Posterior(Value):
 
     @checked(gradients=True)
     def cross(self, x: Queries) -> Float[Tensor, "4 q rows"]:
-        """Return the covariance of distance and gradient (d, w) at normalised points with all
+        """Return the covariance of distance (first) and gradient at q normalised points with all
         observations.
         """
         return cross_covariance(self.kernel, x, self.x, self.n_oriented)
@@ -278,8 +287,10 @@ def combined_covariance(
     x: Float[Tensor, "b g p 3"],
     weights: Float[Tensor, "#b #g m p"],
 ) -> Float[Tensor, "b v v"]:
-    """Return the covariance of weighted sums of distances: m sums for each of g groups of p points,
-    so v = g m sums.
+    """Return the covariance of weighted sums of distances, in squared normalised units.
+
+    `x` holds g groups of p normalised points in each of b entries, and `weights` those of m sums
+    over each group's points. The result covers all v = g m sums of an entry.
     """
     b, g, p, _ = x.shape
     rows = len(posterior.factor)
@@ -301,7 +312,7 @@ def symmetric_root(
     prior: float,
     fix: str,
 ) -> Float[Tensor, "*b k k"]:
-    """Return the symmetric square root of covariance matrices, unique even with equal eigenvalues.
+    """Return the symmetric square roots of covariance matrices, unique even with equal eigenvalues.
 
     Rounding may turn eigenvalues of zero, as of coinciding points, slightly negative; they count as
     zero. More negative ones, relative to the `prior` variance, raise `IndefiniteCovariance`, whose

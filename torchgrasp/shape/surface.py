@@ -1,5 +1,6 @@
-"""The estimated surface, the zero level of the mean distance, Eq. (9) of the paper, as a mesh or a
-distance field.
+"""The estimated surface, Eq. (9) of the paper, as a mesh or a distance field.
+
+It is the zero level of the mean distance.
 """
 
 import dataclasses
@@ -31,7 +32,7 @@ from torchgrasp.shape.gp import ShapeGP
 
 @dataclasses.dataclass(frozen=True)
 class SurfaceNumbers:
-    """The numbers of the extraction of a surface."""
+    """Numbers of the extraction of a surface."""
 
     resolution: int = 48
     """Cells along the domain's diameter."""
@@ -42,15 +43,15 @@ class SurfaceNumbers:
     Blocks that the zero level cannot reach are not refined.
     """
     rounding: float = 1e-12
-    """Nodes on the ball are within it, to this share of its radius."""
+    """Share of the domain's radius by which nodes may be outside the domain."""
     steps: int = 3
     """Most Newton steps of a vertex."""
     least_slope: float = 1e-12
-    """Least squared slope of a step: a bound of a divisor."""
+    """Least squared slope of a step (no unit), which bounds a divisor."""
     settled: float = 1e-4
-    """A vertex that moves less, normalised, is on the surface."""
+    """Normalised motion below which a vertex is on the surface."""
     share: float = 0.02
-    """Least share of the cloud nearest to a sheet of the zero level that is kept."""
+    """Least share of the cloud that is nearest to a piece of the zero level that is kept."""
 
 
 SURFACE = SurfaceNumbers()
@@ -58,7 +59,7 @@ SURFACE = SurfaceNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class NodeNumbers:
-    """The spacing of the field that collisions are checked with, in metres."""
+    """Numbers of the distance field that collisions are checked with, in metres."""
 
     thick: float = 0.04
     """Least side of a thick body, which is not hollow."""
@@ -73,10 +74,7 @@ NODES = NodeNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class Surface(Value):
-    """A triangle mesh of the surface [m]; faces are turned outward, and the mesh is open where it
-    leaves the domain.
-
-    Normals are unit gradients of the mean; `std_m` [m] is the surface's standard deviation.
+    """A triangle mesh of the estimated surface [m]; it is open where it leaves the domain.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> surface = extract_surface(fit_shape(load_object("jug").view), resolution=24)
@@ -84,13 +82,13 @@ class Surface(Value):
     (True, True)
     """
 
-    vertices: Float[Tensor, "v 3"]
-    faces: Int[Tensor, "f 3"]
-    normals: Float[Tensor, "v 3"]
-    std_m: Float[Tensor, "v"]
+    vertices: Float[Tensor, "v 3"]  # [m]
+    faces: Int[Tensor, "f 3"]  # indices of three vertices, turned outward
+    normals: Float[Tensor, "v 3"]  # outward unit gradients of the mean
+    std_m: Float[Tensor, "v"]  # standard deviation of the surface along its normal [m]
 
     def mesh(self) -> "trimesh.Trimesh":
-        """Return vertices and faces as a trimesh mesh."""
+        """Return vertices [m] and faces as a trimesh mesh."""
         return trimesh.Trimesh(self.vertices.cpu().numpy(), self.faces.cpu().numpy(), process=False)
 
 
@@ -100,12 +98,11 @@ def extract_surface(
     shape: ShapeGP,
     resolution: Annotated[int, Range(8, 256)] = SURFACE.resolution,
 ) -> Surface:
-    """Return the surface, where the mean distance is zero (Eq. 9 of the paper), by marching cubes
-    and Newton steps.
+    """Return the estimated surface, by marching cubes and Newton steps, Eq. (9) of the paper.
 
-    `resolution` is the number of cells along the domain's diameter. Separate pieces are left out if
-    they are nearest to less than 2 % of the cloud. Raises `BadArgument` for a resolution outside
-    [8, 256], or a mean distance that is nowhere zero.
+    There the mean distance is zero. `resolution` is the number of cells along the domain's
+    diameter. Separate pieces are left out if they are nearest to less than 2 % of the cloud. Raises
+    `BadArgument` for a resolution outside [8, 256], or a mean distance that is nowhere zero.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> surface = extract_surface(fit_shape(load_object("jug").view, table=0.0), resolution=24)
@@ -122,21 +119,22 @@ def extract_surface(
 
 @dataclasses.dataclass(frozen=True)
 class Mesh(Value):
-    """Vertices [m] and faces of the estimated surface, without normals and variance."""
+    """A triangle mesh of the estimated surface, without normals and deviations."""
 
-    vertices: Float[Tensor, "v 3"]
-    faces: Int[Tensor, "f 3"]
+    vertices: Float[Tensor, "v 3"]  # [m]
+    faces: Int[Tensor, "f 3"]  # indices of three vertices, turned outward
 
 
 def extract_mesh(shape: ShapeGP) -> Mesh:
-    """Return the estimated surface as a mesh, at the default resolution."""
+    """Return the estimated surface as a mesh [m], at the default resolution."""
     x, faces = zip(*_trace_walls(shape, SURFACE.resolution), strict=True)
     return Mesh(shape.metres(torch.cat(x)), torch.cat(faces))
 
 
 def collision_field(shape: ShapeGP, mesh: Mesh) -> SignedDistanceField:
-    """Return the signed distance field of a shape's `extract_mesh`, with nodes as close as thin
-    bodies need.
+    """Return the signed distance field of the mesh of a shape, for collision checks.
+
+    `mesh` is the result of `extract_mesh`. The nodes are closer for thin bodies.
     """
     size = mesh.vertices.amax(0) - mesh.vertices.amin(0)
     thick = float(size.min()) > NODES.thick and len(shape.walls) == 1
@@ -264,7 +262,12 @@ def newton_step(
     longest: float,
     least_slope: float = 0.0,
 ) -> Points:
-    """Return Newton steps along the gradients to the zero level, each at most `longest` long."""
+    """Return Newton steps (n, 3) along the gradients to the zero level, each at most `longest`
+    long.
+
+    `value` is the mean distance at n points; it, `longest` and the steps are normalised. Squared
+    slopes below `least_slope` are raised to it.
+    """
     step = -value / (gradient * gradient).sum(-1).clamp_min(least_slope)
     return limit_norm(step[:, None] * gradient, longest)
 
@@ -291,10 +294,9 @@ def surface_field(
     shape: ShapeGP,
     spacing: Annotated[float, Range(0.001, 0.02)] = FIELD_SPACING,
 ) -> SignedDistanceField:
-    """Return the signed distance field of a shape's estimated surface, to locate the object by
-    touch.
+    """Return the signed distance field of a shape's estimated surface.
 
-    The nodes are `spacing` [m] apart.
+    It serves to locate the object by touch. The nodes are `spacing` [m] apart.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> jug = load_object("jug")
