@@ -30,21 +30,23 @@ from torchgrasp.shape.completion.symmetry import SYMMETRY, SymmetryScorer
 
 @dataclasses.dataclass(frozen=True)
 class AxisNumbers:
-    """The numbers of the fits of an axis."""
+    """Numbers of the fits of an axis."""
 
     half_weight: float = 0.004
     """Distance [m] of a normal's line from the axis at which it has half the weight."""
     first_half_weight: float = 0.02
     narrowing: float = 0.6
-    """This distance in the first step in space, and the factor of its excess from step to step."""
+    """This distance [m] in the first step of the fit of a tilted axis, and the factor by which its
+    excess shrinks from step to step.
+    """
     steep: float = 0.3
-    """Least length of the level part of the normals that fit a vertical axis."""
+    """Least length of the horizontal part of the unit normals that fit a vertical axis."""
     rounds: int = 30
-    """Rounds of the fit of a vertical axis; each has new weights."""
+    """Number of rounds of the fit of a vertical axis; each has new weights."""
     starts: int = 12
-    """Directions, over half a sphere, from which the fit in space starts."""
+    """Number of directions, over half a sphere, from which the fit of a tilted axis starts."""
     steps: int = 12
-    """Gauss-Newton steps of the fit in space."""
+    """Number of Gauss-Newton steps of the fit of a tilted axis."""
     damping: float = 1e-6
     least_diagonal: float = 1e-9
     """Share of the diagonal that is added to it, and least diagonal: a ball leaves the direction
@@ -53,7 +55,7 @@ class AxisNumbers:
     turn: float = 0.3
     """Greatest turn [rad] of a step: misses are linear in small turns only."""
     cost: float = 1.0
-    """Greatest mean of log(1 + (miss / half_weight)^2) of an axis in space."""
+    """Greatest mean of log(1 + (distance / half_weight)^2) of the normals' lines from the axis."""
 
 
 AXIS_FIT = AxisNumbers()
@@ -61,30 +63,34 @@ AXIS_FIT = AxisNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class RoundNumbers:
-    """The numbers by which a body is round."""
+    """Bounds within which a body counts as a body of revolution."""
 
     miss: float = 0.2
     least_radius: float = 0.01
-    """A normal meets the axis if its line passes within this share of the point's radius, or of the
-    least radius [m] if greater.
+    """A normal meets the axis if the distance of its line is at most `miss` times the radius of the
+    point, or times `least_radius` [m] if that is greater.
     """
     roundness: float = 0.055
     error: float = 0.0018
-    """Usual miss of a body's normals: a share of the radius and an error [m]."""
+    """Usual distance of the normals' lines: a share of the radius, and an error [m]."""
     spread: float = 0.075
-    """Greatest RMS of the relative misses of an upright body's normals."""
+    """Greatest RMS distance of the normals' lines, over the radius, of an upright body."""
     body_share: float = 0.6
     """Least share of the cloud on the body; other points are an attached part."""
     near: float = 0.004
-    """Distance [m] of a point from its slice in height, and from the slice's median in radius."""
+    """Greatest distance [m] in height of two points of one slice, and in radius of a point from its
+    slice's median.
+    """
     one_way: float = 0.95
-    """Greatest length of the mean level direction of normals: more is one flat side."""
+    """Greatest length of the mean horizontal unit normal: it is longer for one flat side."""
     turns: int = 12
-    """Parts of a full circle by which the body is turned, to compare it with free space."""
+    """Number of parts of a full circle by which the body is rotated, to compare it with free space.
+    """
     inside: float = 0.003
-    """A turned point so deep [m] in free space or in the table is no part of the object."""
+    """Depth [m] in free space or in the table from which a rotated point is no part of the object.
+    """
     free: float = 0.12
-    """Greatest share of the turned body there."""
+    """Greatest share of such points in the rotated body."""
 
 
 ROUND = RoundNumbers()
@@ -92,19 +98,18 @@ ROUND = RoundNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class Revolution:
-    """A body of revolution about the vertical axis at `center` (x, y) [m]; `body` is the mask of
-    its cloud points.
-    """
+    """A body of revolution about a vertical axis."""
 
-    center: Float[Tensor, "2"]
-    body: Bool[Tensor, "n"]
+    center: Float[Tensor, "2"]  # position (x, y) of the axis [m]
+    body: Bool[Tensor, "n"]  # mask of the cloud's points on the body
 
 
 def find_axis(scorer: SymmetryScorer) -> tuple[Float[Tensor, "4 4"], Revolution] | None:
-    """Return `axis_from_cloud`, the transform to a frame whose z axis is an axis of revolution, and
-    the body about it.
+    """Return (axis_from_cloud, body): the transform to the frame of an axis of revolution, and its
+    body.
 
-    Return None if there is no such body. The axis is fitted to sampled points of the scorer. The
+    The transform is rigid [m], and its frame has the axis as z axis. The result is None if there is
+    no such body. The axis is fitted to the probes of the scorer, which are points of the cloud. The
     body, rotated about the axis, must stay out of the table and of the space that the cameras saw
     to be empty.
     """
@@ -136,7 +141,10 @@ def find_axis(scorer: SymmetryScorer) -> tuple[Float[Tensor, "4 4"], Revolution]
 
 
 def find_revolution(points: Points, normals: Points) -> Revolution | None:
-    """Return the upright body of revolution to which most points belong, or None."""
+    """Return the upright body of revolution to which most points belong, or None.
+
+    `points` (n, 3) [m] and outward unit `normals` (n, 3) are in a frame with z up.
+    """
     lines = _lines_from_above(points, normals)
     center = _fit_to_lines(points, lines)
 
@@ -148,7 +156,10 @@ def find_revolution(points: Points, normals: Points) -> Revolution | None:
 
 
 def fit_axis(points: Points, normals: Points) -> Float[Tensor, "2"]:
-    """Return x and y [m] of the vertical axis that most lines along the surface normals meet."""
+    """Return the position (x, y) [m] of the vertical axis that most of the normals' lines meet.
+
+    `points` (n, 3) [m] and unit `normals` (n, 3) are in a frame with z up.
+    """
     return _fit_to_lines(points, _lines_from_above(points, normals))
 
 
@@ -270,7 +281,9 @@ def _frame(
 
 
 def rotations_about_z(n: int) -> Float[Tensor, "m 3 3"]:
-    """Return the rotations about z by k / n of a full circle, for k from 1 to n - 1."""
+    """Return the m = n - 1 rotation matrices about z by k / n of a full circle, for k from 1 to n -
+    1.
+    """
     angle = torch.arange(1, n, dtype=torch.float64, device="cpu") * (2 * math.pi / n)
     turn = angle.new_zeros(n - 1, 3, 3)
     turn[:, 0, 0] = angle.cos()

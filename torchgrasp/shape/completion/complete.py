@@ -1,5 +1,5 @@
-"""Completion of the hidden side by mirror images of the visible side, and of the bars of a frame by
-their width.
+"""Completion of the hidden side of a view: by mirror images of the visible side, and of the bars of
+a frame by their width.
 """
 
 import dataclasses
@@ -37,20 +37,20 @@ from torchgrasp.values.planning import PointCloud
 
 @dataclasses.dataclass(frozen=True)
 class HiddenNumbers:
-    """The numbers of the points on the hidden side."""
+    """Numbers of the points on the hidden side."""
 
     new: float = 0.006
     """Least distance [m] of a hidden point from the cloud."""
     spacing: float = 0.004
     """Least distance [m] of a hidden point from another one."""
     noise: float = 0.003
-    """Deviation [m] of a mirrored point of an object that is symmetric about that very plane."""
+    """Standard deviation [m] of a mirrored point of an object that is exactly symmetric."""
     part: float = 0.02
     """Length scale [m] of the asymmetry: a part without a mirror image is missing as a whole."""
     foot: float = 0.004
-    """Points so low [m] above the table that look down lie on the face that stands on it."""
+    """Greatest height [m] above the table of points on the face on which the object stands."""
     down: float = -0.7
-    """Greatest vertical part of the normals of this face."""
+    """Greatest vertical part of the unit normals of this face, which point down."""
     attached: int = 20
     """Least points of an attached part, such as a handle."""
 
@@ -60,21 +60,21 @@ HIDDEN = HiddenNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class MirrorNumbers:
-    """The numbers of the errors of mirrored points."""
+    """Numbers of the errors of mirrored points."""
 
     symmetric: float = 0.45
-    """Score of a symmetric object."""
+    """Score from which an object counts as symmetric."""
     asymmetry: float = 0.060
-    """Asymmetry [m] for each 1 of score below."""
+    """Asymmetry [m] for each 1 by which the score is below that of a symmetric object."""
     temperature: float = 0.1
     """A plane's probability is proportional to exp(score / temperature)."""
     near: int = 5
-    """Steps of an axis over the planes near a plane."""
+    """Number of steps along each axis of the grid of planes near a plane."""
     angle: float = 0.15
     shift: float = 0.045
-    """Farthest of these planes: angle [rad], and shift over the size."""
+    """Farthest of these planes: angle [rad], and shift over the size of the cloud."""
     twice: float = 0.05
-    """Loss of score of an image that is mirrored twice: single images come first."""
+    """Score that an image loses if it is mirrored twice: single images come first."""
 
 
 MIRROR = MirrorNumbers()
@@ -82,18 +82,18 @@ MIRROR = MirrorNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class BarNumbers:
-    """The numbers of the bars of a frame."""
+    """Numbers of the bars of a frame."""
 
     thin: float = 0.012
     """Width [m] below which a part is a bar: that of a fingertip."""
     empty: float = 0.5
-    """The middle of a frame lies less deep in the outline than this share of its distance."""
+    """Greatest depth of a frame's middle in the outline, as a share of the middle's distance."""
     neighbours: int = 30
-    """Points from which width and direction are taken, as many as normals are fitted with."""
+    """Number of points that give width and direction; normals are fitted to as many."""
     middle: float = 0.8
-    """Least width at a point, as a share of the bar's: points in its middle."""
+    """Least width at a point in the middle of a bar, as a share of the bar's width."""
     deviation: float = 0.5
-    """Deviation of a point on the far side, as a share of the width."""
+    """Standard deviation of a point on the far side, as a share of the width."""
 
 
 BAR = BarNumbers()
@@ -106,19 +106,19 @@ SomeHidden = TypeVar("SomeHidden", bound=Any)  # a batch with `points` [m]
 
 @dataclasses.dataclass(frozen=True)
 class Completion(Value):
-    """Estimated points of the hidden side, with their errors along the normals.
+    """Estimated m points of the hidden side, with their errors along the normals.
 
     The errors have the covariance noise^2 I + D D^T [m^2], where I is the identity, D is
     `deviations`, and the noise is that of `HiddenNumbers`.
     """
 
-    points: Float[Tensor, "m 3"]
-    normals: Float[Tensor, "m 3"]
-    # standard deviations [m] of the errors that each mirror plane causes
+    points: Float[Tensor, "m 3"]  # [m]
+    normals: Float[Tensor, "m 3"]  # outward unit normals
+    # standard deviations [m] of c errors, which the mirror planes cause
     shared: Float[Tensor, "m c"]
     # standard deviation [m] of a smooth error, because the object is not quite symmetric
     asymmetry: Float[Tensor, "m"]
-    # planes n.x = o, as (n, o); for each part of the object, its best plane is first
+    # p mirror planes n.x = o [m], as (n, o); for each part of the object, its best plane is first
     planes: Float[Tensor, "p 4"]
     # of the planes: 1 if the mirror image lies on the cloud, near 0 if nothing confirms it
     scores: Float[Tensor, "p"]
@@ -128,7 +128,9 @@ class Completion(Value):
 
     @checked
     def moved(self, b_from_a: Pose) -> "Completion":
-        """Return the completion transformed from frame a to frame b."""
+        """Return the completion in frame b, given the rigid transform `b_from_a` [m] from its own
+        frame a.
+        """
         normals = rotate(b_from_a, self.planes[:, :3])
         offsets = self.planes[:, 3:] + normals @ b_from_a[:3, 3:]
         planes = torch.cat([normals, offsets], 1)
@@ -141,8 +143,9 @@ class Completion(Value):
 
     @property
     def deviations(self) -> Float[Tensor, "m k"]:
-        """The correlated errors D [m] of the points along their normals, one column for each
-        independent cause.
+        """The correlated errors D [m] of the m points along their normals.
+
+        There is a column for each of k independent causes.
         """
         return correlated_errors(self.points, self.shared, self.asymmetry)
 
@@ -152,11 +155,10 @@ def correlated_errors(
     shared: Float[Tensor, "m c"],
     local: Float[Tensor, "m"] | float,
 ) -> Float[Tensor, "m k"]:
-    """Return errors [m] of points, one column per independent cause: the shared errors, then a
-    smooth random field.
+    """Return correlated errors [m] of m points [m], a column for each of k independent causes.
 
-    At each point, the field has the standard deviation of the `local` and the `shared` errors
-    together.
+    The `shared` errors [m] come first, then a smooth random field. At each point, the field has the
+    standard deviation of the `local` [m] and the `shared` errors together.
     """
     deviation = torch.sqrt(local**2 + (shared**2).sum(1))
     alike = torch.exp(-0.5 * (torch.cdist(points, points) / HIDDEN.part) ** 2)
@@ -175,10 +177,8 @@ def complete_cloud(
 
     The cloud is mirrored across its best planes and across pairs of them; images in better planes
     come first. A body of revolution and a part attached to it, such as a handle, are mirrored
-    separately, in the frame of the axis.
-
-    The cloud must be clean, with outward normals and viewpoints, or `BadArgument` is raised.
-    `table` is the height [m] of a table with normal z.
+    separately, in the frame of the axis. `table` is the height [m] of a table with normal z, or
+    None. Raises `BadArgument` for a cloud without outward normals or viewpoints.
     """
     if cloud.normals is None or cloud.viewpoint is None:
         needed = "outward normals and viewpoints: see prepare_cloud"
@@ -398,9 +398,11 @@ def merge_hidden(
     allowed: Callable[[SomeHidden], Bool[Tensor, "n"]],
     thin: Callable[[Points], Int[Tensor, "k"]],
 ) -> SomeHidden:
-    """Add to `merged` the points of each part that are `allowed` and not beside earlier points.
+    """Return `merged` with the points of each part added that are `allowed` and not beside earlier
+    points.
 
-    `thin` selects the points of a part to keep: it returns their indices.
+    `allowed(part)` is a mask of the part's points. `thin(points)` returns the indices of the points
+    to keep, given points (n, 3) [m].
     """
     for part in parts:
         new = part[allowed(part)]

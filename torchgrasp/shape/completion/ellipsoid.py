@@ -1,4 +1,4 @@
-"""Balls and fruit: an ellipsoid, nearly a ball, is fitted to the whole cloud.
+"""Ellipsoids for balls and fruit: an ellipsoid, nearly a ball, is fitted to the whole cloud.
 
 Every plane through the centre of a ball is a mirror plane, so mirror planes do not determine its
 depth. The ellipsoid does: the fit uses normals, outline and table, and its covariance gives the
@@ -22,20 +22,21 @@ UPPER = np.triu_indices(3)  # entries of a symmetric matrix that are parameters
 
 @dataclasses.dataclass(frozen=True)
 class EllipsoidNumbers:
-    """The numbers of the fit of an ellipsoid."""
+    """Numbers of the fit of an ellipsoid."""
 
     points: int = 300
     """Most points of the cloud in the fit."""
     independent: int = 60
     independent_rim: int = 8
-    """Points of the cloud and of the outline that count as independent."""
+    """Numbers of points of the cloud and of the outline that count as independent."""
     point: float = 0.001
     slope: float = 0.15
     rim: float = 0.002
     table: float = 0.001
-    """Deviations of a point [m], of its normal, of the outline [m] and of the table [m]."""
+    """Standard deviations of a point [m], of a unit normal, of the outline [m] and of the table [m].
+    """
     elongation: float = 0.03
-    """Deviation of the logarithm of an axis over the mean axis."""
+    """Standard deviation of the logarithm of an axis over the mean axis."""
     misfit: float = 0.00165
     relative_misfit: float = 0.052
     """Greatest RMS distance of the cloud, in metres and in mean radii."""
@@ -44,9 +45,9 @@ class EllipsoidNumbers:
     longest: float = 1.5
     """Greatest ratio of two axes: a longer body is no ball."""
     spread: int = 400
-    """Points over the whole ellipsoid."""
+    """Number of points over the whole ellipsoid."""
     step: float = 1e-5
-    """Step of the parameters from which the errors of these points follow."""
+    """Step of the parameters ([m], or of a logarithm) by which these points are differentiated."""
     least_radius: float = 0.25
     """Least radius of the first ball, over the longest side of the cloud."""
     evaluations: int = 40
@@ -60,11 +61,11 @@ ELLIPSOID = EllipsoidNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class Ellipsoid:
-    """An ellipsoid fitted to a cloud: points [m] and normals spread over all of it."""
+    """An ellipsoid fitted to a cloud, as n points spread over all of it."""
 
-    points: Points
-    normals: Points
-    # standard deviations [m] along the normals, one column per independent error
+    points: Points  # (n, 3) [m]
+    normals: Points  # (n, 3), outward unit normals
+    # standard deviations [m] along the normals, a column for each of 9 independent errors
     deviations: Float[Tensor, "n 9"]
     misfit: float  # RMS distance [m] of the cloud from the ellipsoid
 
@@ -77,7 +78,9 @@ def find_ellipsoid(
 ) -> Ellipsoid | None:
     """Return the ellipsoid, nearly a ball, that fits the whole cloud, or None if there is none.
 
-    The body may have a flat foot: the ellipsoid may reach below the table, but not float above it.
+    `points` (n, 3) [m] and outward unit `normals` (n, 3) are those of the cloud; `table` is the
+    table's height [m], or None. The body may have a flat foot: the ellipsoid may reach below the
+    table, but not float above it.
     """
     rows = pick_apart(points, ELLIPSOID.points)
     fit = _Fit(points[rows].numpy(), normals[rows].numpy(), outline, table)

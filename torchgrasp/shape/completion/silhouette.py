@@ -1,4 +1,8 @@
-"""Silhouettes: the object lies within its outline and behind its visible surface."""
+"""Silhouettes of views: the object lies within its outline and behind its visible surface.
+
+Lengths on the image plane at depth 1 have no unit: a point's position there is that in the image
+over the depth.
+"""
 
 import dataclasses
 
@@ -19,35 +23,37 @@ from torchgrasp.values.planning import PointCloud
 
 @dataclasses.dataclass(frozen=True)
 class OutlineNumbers:
-    """The numbers of outlines; a spacing is that of the pixels at depth 1."""
+    """Numbers of outlines. A spacing is the distance of neighbouring pixels at depth 1."""
 
     grow: float = 2.0
     shrink: float = 1.65
-    """The outline is a union of discs of this radius about the pixels, then shrunk [spacings]."""
+    """The outline is a union of discs of the radius `grow` about the pixels, then shrunk by
+    `shrink`, both in spacings.
+    """
     neighbours: int = 5
-    """Pixels, with the pixel itself, of which the farthest gives the spacing."""
+    """Number of nearest pixels, with the pixel itself, of which the farthest gives the spacing."""
     fine: float = 4.0
-    """Cells on one spacing."""
+    """Number of the raster's cells in one spacing."""
     cells: int = 320
     """Most cells along the object."""
     margin: float = 0.25
     """Margin of the raster, as a share of the object's extent: points beside it are looked up."""
     front: float = 0.002
-    """A point may be this far [m] in front of the visible surface: noise of the camera."""
+    """Distance [m] by which noise may move a point in front of the visible surface."""
     beside: float = 0.001
-    """A hidden point may be this far [m] outside the outline."""
+    """Greatest distance [m] of a hidden point from the outline, outside of it."""
     least_depth: float = 1e-9
-    """Least depth [m] of a point: behind the camera is far outside."""
+    """Least depth [m] of a point: points behind the camera count as far outside."""
     edge: float = 0.75
-    """Cells within which a node lies on a line."""
+    """Greatest distance [cells] of a node that lies on the outline."""
     smooth: float = 3.0
-    """Deviation [cells] of the blur before the slope of the outline is taken."""
+    """Standard deviation [cells] of the blur before the slope of the outline is taken."""
     least_slope: float = 1e-12
-    """Least length of this slope: a bound of a divisor."""
+    """Least length of this slope, which bounds a divisor."""
     rim: int = 16
-    """Points of the outline."""
+    """Most points of the outline."""
     rim_neighbours: int = 4
-    """Pixels beside such a point, whose median depth it gets."""
+    """Number of pixels beside such a point, whose median depth it gets."""
 
 
 OUTLINE = OutlineNumbers()
@@ -55,22 +61,23 @@ OUTLINE = OutlineNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class BehindNumbers:
-    """The numbers by which a cloud is no single view."""
+    """Bounds beyond which a cloud is not a single view."""
 
     share: float = 0.2
     """Greatest share of points behind others."""
     radius: float = 0.3
-    """A point is behind another if it is deeper by this share of the cloud's radius."""
+    """Depth by which a point is behind another, as a share of the cloud's radius."""
     neighbours: int = 6
-    """Pixels, with the pixel itself, that a point is compared with."""
+    """Number of pixels, with the pixel itself, that a point is compared with."""
 
 
 BEHIND = BehindNumbers()
-TIE = 2e-9  # relative difference of squared distances by rounding: the frame must not decide
+# relative difference of squared distances that is rounding, so that no frame decides on the order
+TIE = 2e-9
 
 
 def find_middle(points: Points) -> Float[Tensor, "3"]:
-    """Return the centre of the box around points."""
+    """Return the centre of the box around points (n, 3), in their unit."""
     return (points.amax(0) + points.amin(0)) / 2
 
 
@@ -84,17 +91,20 @@ def pick_apart(
 
 @dataclasses.dataclass(frozen=True)
 class Silhouette(Value):
-    """The outline and visible depth of one view, as rasters on the image plane at depth 1."""
+    """The outline and visible depth of one view, as rasters of h x w nodes on the image plane at
+    depth 1.
+    """
 
-    viewpoint: Float[Tensor, "3"]
-    axes: Float[Tensor, "3 3"]  # right, down and forward axis of the camera, as rows
-    corner: Float[Tensor, "2"]  # first node of the raster, at depth 1
-    cell: float  # spacing of the nodes, at depth 1
+    viewpoint: Float[Tensor, "3"]  # position of the camera, in the frame of the cloud [m]
+    axes: Float[Tensor, "3 3"]  # unit vectors right, down and forward of the camera, one a line
+    corner: Float[Tensor, "2"]  # first node (x, y) of the raster, at depth 1
+    cell: float  # distance of neighbouring nodes, at depth 1
     outside: Float[Tensor, "h w"]  # signed distance to the outline at depth 1, positive outside
     # at each node, the depth [m] of the visible pixel nearest to the node
     depth: Float[Tensor, "h w"]
     rim: Float[Tensor, "k 3"]  # points of the outline [m] at the visible depth
-    rim_normals: Float[Tensor, "k 3"]  # at the rim points, perpendicular to the camera rays
+    # outward unit normals at the points of `rim`, perpendicular to the camera rays
+    rim_normals: Float[Tensor, "k 3"]
     # whether the object reaches the border of the image; points beyond do not count as outside
     cut: bool
     # width [m] of the widest area within the outline without measurements, perhaps a hole, or 0
@@ -105,7 +115,10 @@ class Silhouette(Value):
         self,
         points: Float[Tensor, "*b 3"],
     ) -> Float[Tensor, "*b"]:
-        """Return the signed distance [m] of points to the visual hull, positive outside."""
+        """Return the signed distance [m] of points [m] from the visual hull, positive outside.
+
+        The visual hull is the cone of all camera rays within the outline.
+        """
         outside, _, depth = self._look_up(points)
         return outside * depth
 
@@ -114,8 +127,9 @@ class Silhouette(Value):
         self,
         points: Float[Tensor, "*b 3"],
     ) -> Float[Tensor, "*b"]:
-        """Return how far [m] points are outside the outline or in front of the visible surface; 0
-        if hidden.
+        """Return how far [m] points [m] are outside the outline or in front of the visible surface.
+
+        It is 0 for points that may be hidden.
         """
         outside, visible, depth = self._look_up(points)
         in_front = (visible - depth - OUTLINE.front).clamp_min(0)
@@ -123,7 +137,9 @@ class Silhouette(Value):
 
     @checked
     def moved(self, b_from_a: Pose) -> "Silhouette":
-        """Return the silhouette transformed from frame a to frame b."""
+        """Return the silhouette in frame b, given the rigid transform `b_from_a` [m] from its own
+        frame a.
+        """
         viewpoint = apply(b_from_a, self.viewpoint[None])[0]
         rim = apply(b_from_a, self.rim)
         axes = rotate(b_from_a, self.axes)
@@ -162,7 +178,7 @@ class Outlines(Value):
 
     @property
     def rim_normals(self) -> Float[Tensor, "k 3"]:
-        """Surface normals at the points of `rim`."""
+        """The outward unit normals of the surface at the points of `rim`."""
         return torch.cat([view.rim_normals for view in self.views])
 
     @property
@@ -172,12 +188,14 @@ class Outlines(Value):
 
     @property
     def gap(self) -> float:
-        """The greatest width [m] of any area without measurements within the object's outline."""
+        """The greatest width [m] of an area without measurements within the object's outline, or 0."""
         return max(view.gap for view in self.views)
 
     @checked
     def moved(self, b_from_a: Pose) -> "Outlines":
-        """Return the outlines transformed from frame a to frame b."""
+        """Return the outlines in frame b, given the rigid transform `b_from_a` [m] from their own
+        frame a.
+        """
         return Outlines(tuple(view.moved(b_from_a) for view in self.views))
 
     @checked(gradients=True)
@@ -185,7 +203,7 @@ class Outlines(Value):
         self,
         points: Float[Tensor, "*b 3"],
     ) -> Float[Tensor, "*b"]:
-        """Return the signed distance [m] of points to the visual hull of all views, positive
+        """Return the signed distance [m] of points [m] from the visual hull of all views, positive
         outside.
         """
         return torch.stack([view.hull_distance(points) for view in self.views]).amax(0)
@@ -195,8 +213,9 @@ class Outlines(Value):
         self,
         points: Float[Tensor, "*b 3"],
     ) -> Float[Tensor, "*b"]:
-        """Return the worst violation [m] of any view: how far points lie outside the outline or
-        before the surface.
+        """Return how far [m] points [m] are outside the outline or in front of the visible surface.
+
+        It is that of the worst view, and 0 for points that may be hidden.
         """
         return torch.stack([view.violation(points) for view in self.views]).amax(0)
 
@@ -204,8 +223,9 @@ class Outlines(Value):
         self,
         points: Float[Tensor, "*b 3"],
     ) -> Bool[Tensor, "*b"]:
-        """Return a mask of the points that may be on the hidden side: no view excludes them, within
-        a tolerance.
+        """Return a mask of the points [m] that may be on the hidden side.
+
+        No view excludes them, within a tolerance.
         """
         return (self.hull_distance(points) < OUTLINE.beside) & (
             self.violation(points) < OUTLINE.front
@@ -214,8 +234,9 @@ class Outlines(Value):
 
 @checked
 def silhouettes(cloud: PointCloud) -> Outlines:
-    """Return the silhouette of every view of a cloud; refuse a view without camera, or of both
-    sides of the object.
+    """Return the silhouette of every view of a cloud [m].
+
+    Raises `BadArgument` for a view without viewpoint, or of both sides of the object.
     """
     views = cloud.split_views()
     for view in views:
@@ -226,11 +247,11 @@ def silhouettes(cloud: PointCloud) -> Outlines:
 
 
 def silhouette(view: PointCloud) -> Silhouette:
-    """Return the silhouette of one view, whose points must all lie in front of the camera.
+    """Return the silhouette of one view [m], whose points must all lie in front of the camera.
 
-    A gap within the outline is a hole if it is far wider than the surface around it, as in a frame
-    of bars. Other gaps do not count as free space, because a mirror-like patch is not measured
-    either.
+    A gap within the outline, where nothing was measured, counts as a hole (free space) only if it
+    is far wider than the surface around it, as in a frame of bars. Other gaps do not count as free
+    space: a mirror-like patch is not measured, and leaves a gap, too.
     """
     assert view.viewpoint is not None
     axes, pixels, depths = (t.numpy() for t in _project(view.points, view.viewpoint))

@@ -1,5 +1,9 @@
-"""Mirror planes of a partial cloud: the mirror image must lie on the cloud or be hidden, not in
-free space.
+"""Mirror planes of a partial cloud: a mirror image must lie on the cloud or be hidden, not in free
+space.
+
+A plane n . x = o is given as (n, o), with a unit normal n and an offset o [m]. Its score is 1 if
+the mirror image lies on the cloud, and near 0 if nothing confirms it. Violations of free space
+lower it.
 """
 
 import dataclasses
@@ -27,16 +31,16 @@ from torchgrasp.values.planning import PointCloud
 
 @dataclasses.dataclass(frozen=True)
 class SymmetryNumbers:
-    """The numbers of the score of a mirror plane."""
+    """Numbers of the score of a mirror plane."""
 
     match: float = 0.003
-    """Distance [m] over which a mirrored point stops matching the cloud."""
+    """Length scale [m] of the distances over which a mirrored point stops matching the cloud."""
     far: float = 4.0
-    """A match is sought within so many times this distance."""
+    """Greatest distance of a match, over this length."""
     worst: float = 3.0
-    """Depth in free space, over the same distance, of the greatest violation by a point."""
+    """Depth in free space, over the same length, from which a point's violation is the greatest."""
     probes: int = 150
-    """Points of the cloud that score a plane."""
+    """Most points of the cloud that score a plane."""
     leaf: int = 32
     """Points in a leaf of the tree of all points."""
 
@@ -46,7 +50,7 @@ SYMMETRY = SymmetryNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class PlaneSearchNumbers:
-    """The numbers of the search for mirror planes; cosines are those of normals."""
+    """Numbers of the search for mirror planes; cosines are those of angles between normals."""
 
     sphere: int = 160
     """Directions over a whole sphere, of which half are tried: n and -n are one plane."""
@@ -60,28 +64,34 @@ class PlaneSearchNumbers:
     least_extent: float = 0.15
     """Least half range of the offsets, as a share of the cloud's size."""
     one_side: float = 0.05
-    """Least length of the mean view of one side; shorter: from above, or from several sides."""
+    """Least length of the mean viewing direction of one side. It is shorter for views from above,
+    or from several sides.
+    """
     hides: float = 0.35
     facing: float = 0.7
-    """Cosines with the view: above them a plane hides points, and is frontal."""
+    """Cosines with the viewing direction above which a plane hides points, and is frontal."""
     rim_prior: float = 0.15
     rim_distance: float = 0.25
-    """Loss of score at this distance from the rim, over the size: a view ends near the plane."""
+    """Score that a plane loses, and the distance from the rim, over the size, at which it does: a
+    view ends near the plane.
+    """
     square: float = 0.1
     square_prior: float = 0.1
-    """Greatest cosine of planes at right angles to the best one, and their gain of score."""
+    """Greatest cosine of planes perpendicular to the best one, and the score that these gain."""
     most: int = 4
     """Most planes that are chosen from all directions."""
     within: float = 0.12
-    """Greatest loss of score against the best plane."""
+    """Greatest difference of score from the best plane."""
     apart: float = math.cos(math.radians(25.0))
-    """Cosine of planes that mirror to the same points."""
+    """Cosine above which two planes mirror to the same points."""
     square_apart: float = 0.42
-    """Cosine with a square plane above which a plane replaces it."""
+    """Cosine above which a plane replaces one that is perpendicular to the best plane."""
     violation: float = 0.15
     """Greatest mean violation of free space, in [0, 1], of a plane that no point confirms."""
     slope: float = 0.15
-    """A plane near the best one of so much less score matches only because it is near."""
+    """Difference of score from the best plane with which a plane near it matches only because it
+    is near.
+    """
     end_score: float = 0.4
     """Least score of the plane that mirrors the ends of a body of revolution."""
     widths: tuple[float, ...] = (1.0, 0.5, 0.25)
@@ -96,35 +106,36 @@ SEARCH = PlaneSearchNumbers()
 AXIS = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64, device="cpu")
 Mirror = Float[Tensor, "4"]
 Mirrors = Float[Tensor, "_ 4"]
-"""Mirror planes n.x = o, given as (n, o)."""
+"""Mirror planes (p, 4) with n.x = o, given as (n, o): unit normals, and offsets [m]."""
 Directions = Float[Tensor, "d 3"]
 View = Float[Tensor, "3"] | None
-"""The direction of the view. It is None for views from above or from several sides, where no single
-side is hidden.
+"""The viewing direction, a unit vector (3,). It is None for views from above or from several sides,
+where no single side is hidden.
 """
 
 
 @dataclasses.dataclass(frozen=True)
 class SymmetryScorer:
-    """Scores mirror planes: mirrors some points of the cloud, the probes, and compares them with
-    what is known.
+    """The scorer of mirror planes: it mirrors some points of the cloud and compares them with what
+    is known.
 
-    The probes are the points `rows`. Their images are compared with the cloud, its outlines and the
-    table. `upright` means that all planes are parallel to z: the vertical direction, or the axis of
-    a body of revolution.
+    These points are the probes. Their images are compared with the cloud, its outlines and the
+    table. The z axis of an `upright` scorer is the vertical direction, or the axis of a body of
+    revolution.
     """
 
-    points: Points
-    normals: Points
-    outline: Outlines
-    table: Plane | None
-    upright: bool
-    rows: Int[Tensor, "k"]
+    points: Points  # of the cloud (n, 3) [m]
+    normals: Points  # (n, 3), outward unit normals
+    outline: Outlines  # silhouettes of the views
+    table: Plane | None  # None: no table
+    upright: bool  # whether all planes are parallel to z
+    rows: Int[Tensor, "k"]  # indices of the probes
 
     @classmethod
     def of(cls, cloud: PointCloud, table: float | None) -> "SymmetryScorer":
-        """Return the scorer of a cloud with normals; `table` is its height [m]. Any point may
-        become a probe.
+        """Return the scorer of a cloud [m] with normals, of which any point may become a probe.
+
+        `table` is the table's height [m]; None means no table.
         """
         assert cloud.normals is not None
         plane = None if table is None else Plane.horizontal(table)
@@ -134,7 +145,10 @@ class SymmetryScorer:
         return whole.for_part(every)
 
     def about_axis(self, axis_from_cloud: Float[Tensor, "4 4"]) -> "SymmetryScorer":
-        """Return the scorer in a frame whose z axis is the axis of revolution."""
+        """Return the scorer in a frame whose z axis is the axis of revolution.
+
+        `axis_from_cloud` is the rigid transform [m] to this frame.
+        """
         points = apply(axis_from_cloud, self.points)
         normals = rotate(axis_from_cloud, self.normals)
         table = None if self.table is None else self.table.moved(axis_from_cloud)
@@ -142,15 +156,15 @@ class SymmetryScorer:
         return SymmetryScorer(points, normals, outline, table, True, self.rows)
 
     def for_part(self, rows: Int[Tensor, "k"]) -> "SymmetryScorer":
-        """Return the scorer whose probes are chosen only from the points of the cloud with the
-        indices `rows`.
+        """Return the scorer with probes chosen only from the points of the cloud with the indices
+        `rows`.
         """
         chosen = pick_apart(self.points[rows], SYMMETRY.probes)
         return dataclasses.replace(self, rows=rows[chosen])
 
     @functools.cached_property
     def probes(self) -> tuple[Float[Tensor, "k 3"], Float[Tensor, "k 3"]]:
-        """The points [m] of the cloud that a symmetry is tested on, and their normals."""
+        """The k points [m] of the cloud that a plane is tested on, and their outward unit normals."""
         return self.points[self.rows], self.normals[self.rows]
 
     @functools.cached_property
@@ -160,7 +174,7 @@ class SymmetryScorer:
 
     @property
     def center(self) -> Tensor:
-        """Centre of the cloud's bounding box [m]."""
+        """Centre (3,) [m] of the cloud's bounding box."""
         return find_middle(self.points)
 
     @property
@@ -173,8 +187,10 @@ class SymmetryScorer:
         points: Tensor,
         limit: float = math.inf,
     ) -> tuple[Tensor, Tensor]:
-        """Return distance [m] and index of the nearest cloud point; infinity and 0 if none is
-        within the limit.
+        """Return (distance, index): the distance [m] of points (..., 3) [m] from the nearest cloud
+        point, and the index of this point.
+
+        They are infinity and 0 if no point is within the `limit` [m].
         """
         distance, index = self.tree.query(points.reshape(-1, 3).numpy(), distance_upper_bound=limit)
         shape = points.shape[:-1]
@@ -185,10 +201,10 @@ class SymmetryScorer:
         self,
         planes: Float[Tensor, "p 4"],
     ) -> tuple[Float[Tensor, "p"], Float[Tensor, "p"]]:
-        """Return the scores of planes n.x = o, given as (n, o), and their violations of free space
-        in [0, 1].
+        """Return (scores, violations) of p planes n.x = o, given as (n, o [m]).
 
-        The score is the match of the mirror image with the cloud, minus twice the violation.
+        The score is the match of the mirror image with the cloud, in [0, 1], minus twice the
+        violation. The violation of free space is in [0, 1].
         """
         points, normals = self.probes
         mirrored = reflect(points, planes[:, None])  # (p, k, 3)
@@ -209,7 +225,8 @@ def find_planes(
     scorer: SymmetryScorer,
     turned: bool = False,
 ) -> tuple[Mirrors, Float[Tensor, "p"]]:
-    """Return the mirror planes of a cloud, best first, and their scores.
+    """Return (planes, scores): the mirror planes (n, o [m]) of a cloud, best first, and their
+    scores.
 
     On a table, the search tries only vertical planes. A plane perpendicular to the best one is
     added if none was found near it: its mirror images are hidden, so that the cloud cannot confirm
@@ -269,9 +286,10 @@ def find_plane_through_axis(
     center: Float[Tensor, "2"],
     part: Points,
 ) -> tuple[Float[Tensor, "1 4"], Float[Tensor, "1"]]:
-    """Return the mirror plane of an attached part, such as a handle, through the axis at `center`,
-    and its score.
+    """Return (plane, score): the mirror plane (n, o [m]) of a part attached to a body of
+    revolution, such as a handle.
 
+    It contains the vertical axis at `center` (x, y) [m]. `part` holds the part's points (n, 3) [m].
     A plane across which the part extends less is preferred, even if half of the part is hidden.
     """
     normals = _level_directions(SEARCH.level_through_axis)
@@ -291,8 +309,10 @@ def planes_near(
     angles: Float[Tensor, "t"],
     shifts: Float[Tensor, "s"],
 ) -> Mirrors:
-    """Return planes near a plane: rotated by `angles` [rad], if upright about z only, and shifted
-    by `shifts` [m].
+    """Return the planes near a plane (n, o [m]) for all combinations of t angles and s shifts.
+
+    The plane is rotated by `angles` [rad], about z only if the scorer is upright, and shifted by
+    `shifts` [m] along its normal.
     """
     normal = plane[:3]
     if scorer.upright:

@@ -1,5 +1,7 @@
-"""Open vessels: an outer and an inner wall about a vertical axis; the camera sees the inner wall
+"""Open vessels: an outer and an inner wall about a vertical axis. The camera sees the inner wall
 through the mouth.
+
+All is in a frame with z up, with lengths in metres.
 """
 
 import dataclasses
@@ -20,48 +22,53 @@ from torchgrasp.values.planning import PointCloud
 
 @dataclasses.dataclass(frozen=True)
 class VesselNumbers:
-    """The numbers by which a vessel is found."""
+    """Numbers of the search for a vessel."""
 
     level: float = 0.5
-    """Least length of the level part of a wall's normals: others are of rim, floor and noise."""
+    """Least length of the horizontal part of a wall's unit normals: that of rim, floor and noise is
+    shorter.
+    """
     terms: int = 4
-    """Coefficients of the outer radius as a polynomial of the height: a cubic one."""
+    """Number of coefficients of the outer radius as a polynomial of the height: a cubic one."""
     top: float = 0.98
     """Quantile of the heights that is the top: noise lifts some points above the rim."""
     below_top: float = 0.002
-    """Points so near [m] below the top do not join the fit."""
+    """Height [m] below the top from which points join the fit."""
     rounds: int = 30
-    """Rounds of the fit; each has new weights."""
+    """Number of rounds of the fit; each has new weights."""
     miss: float = 0.006
-    """Miss [m] of half the weight in the last rounds."""
+    """Distance [m] of a point from its wall at which it has half the weight in the last rounds."""
     wider: float = 4.0
-    """The first round has a scale wider by so many times `miss`, as the axis is not yet known."""
+    """Excess of this distance in the first round, over `miss`: the axis is not yet known."""
     narrowing: float = 0.8
-    """Factor of this excess from round to round."""
+    """Factor by which this excess shrinks from round to round."""
     on_body: float = 0.002
-    """Greatest miss [m] of a point of the body: twice a camera's noise."""
+    """Greatest distance [m] of a point of the body from its wall: twice a camera's noise."""
     thinnest: float = 0.0003
     thickest: float = 0.012
-    """A fitted wall [m] outside these bounds is no wall."""
+    """Bounds of the thickness [m] of a fitted wall."""
     floor: float = 0.7
-    """Vertical part of a normal from which a point inside the mouth belongs to the floor."""
+    """Vertical part of a unit normal from which a point inside the mouth belongs to the floor."""
     rim: float = 0.003
-    """Points so near [m] below the rim belong to no wall: their normals depend on both walls."""
+    """Height [m] below the rim within which points belong to no wall: their normals depend on both
+    walls.
+    """
     body_share: float = 0.65
     """Least share of the walls on the body."""
     inner_share: float = 0.09
     outer_share: float = 0.07
     """Least shares of the cloud on either wall."""
     depth: float = 0.012
-    """The inside must be seen so far [m] below the rim: the recess of a lid is no cavity."""
+    """Least depth [m] below the rim to which the inside is seen: the recess of a lid is no cavity.
+    """
     usual: float = 0.0035
     spread: float = 0.0015
-    """Usual thickness [m] of a wall, and its deviation."""
+    """Usual thickness [m] of a wall, and its standard deviation [m]."""
     error: float = 0.0012
-    """Deviation [m] of a fitted thickness."""
+    """Standard deviation [m] of a fitted thickness."""
     least_slope: float = 1e-9
     least_spread: float = 1e-6
-    """Bounds of divisors: of a normal's level part, and of the deviation of heights [m]."""
+    """Bounds of divisors: of a normal's horizontal part, and of the deviation of heights [m]."""
 
 
 VESSEL = VesselNumbers()
@@ -69,23 +76,25 @@ VESSEL = VesselNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class WallNumbers:
-    """The numbers of the hidden parts of a vessel's walls."""
+    """Numbers of the hidden parts of a vessel's walls."""
 
     center: float = 0.0006
     form: float = 0.001
     floor: float = 0.003
-    """Deviations [m] of the axis, of the form and of an unseen floor."""
+    """Standard deviations [m] of the axis, of the form and of an unseen floor."""
     up: float = 0.9
-    """Least vertical part of the normals of a seen floor."""
+    """Least vertical part of the unit normals of a seen floor."""
     floor_points: int = 10
-    """A seen floor has more points than this."""
+    """Number of points that a seen floor must exceed."""
     floor_rings: tuple[tuple[float, int], ...] = ((0.0, 1), (0.4, 5), (0.75, 8))
     lid_rings: tuple[tuple[float, int], ...] = ((0.0, 1), (0.5, 6))
-    """Points of an unseen floor and of a lid: shares of the radius, and points on each ring."""
+    """Rings of points on an unseen floor and on a lid: the radius of each ring as a share of that
+    of the floor or lid, and its number of points.
+    """
     turned: int = 80
-    """Points of a wall that are turned about the axis."""
+    """Most points of a wall that are rotated about the axis."""
     turns: int = 24
-    """Parts of a full circle by which they are turned."""
+    """Number of parts of a full circle by which they are rotated."""
     thinned: int = 200
     """Most hidden points of one part that are compared with other parts."""
     budget: int = 50
@@ -99,7 +108,7 @@ WALL = WallNumbers()
 class Vessel(Value):
     """An open vessel with a vertical axis; lengths in metres."""
 
-    center: Float[Tensor, "2"]  # position (x, y) of the axis
+    center: Float[Tensor, "2"]  # position (x, y) of the axis [m]
     thickness: float  # of the wall, the mean of the fitted and the usual one, weighted by certainty
     radius: float  # outer radius of the mouth
     rim: float  # height of the mouth
@@ -114,9 +123,10 @@ def find_vessel(
 ) -> Vessel | None:
     """Return the open vessel that a cloud shows, or None if it shows no vessel.
 
-    Normals of an inner wall point to the axis. Both walls are fitted at once: the outer radius is a
-    cubic polynomial of the height, and the inner radius is less by the thickness over the length of
-    the normal's horizontal part. Robust weights (Cauchy) ignore handles.
+    `points` (n, 3) [m] and outward unit `normals` (n, 3) are in a frame with z up. Normals of an
+    inner wall point to the axis. Both walls are fitted at once: the outer radius is a cubic
+    polynomial of the height, and the inner radius is less by the thickness over the length of the
+    normal's horizontal part. Robust weights (Cauchy) ignore handles.
     """
     height = points[:, 2]
     slope = torch.linalg.vector_norm(normals[:, :2], dim=1)
@@ -180,25 +190,23 @@ def find_vessel(
 
 @dataclasses.dataclass(frozen=True)
 class HiddenWall(Batch):
-    """Estimated points of a wall that the camera did not see [m], with outward normals.
+    """Estimated points of a wall that the camera did not see.
 
     The columns of `shared` are errors along the normals [m] for one standard deviation of the axis
     position (two columns), the wall's thickness and the floor's height.
     """
 
-    points: Float[Tensor, "m 3"]
-    normals: Float[Tensor, "m 3"]
-    shared: Float[Tensor, "m 4"]
+    points: Float[Tensor, "m 3"]  # [m]
+    normals: Float[Tensor, "m 3"]  # outward unit normals
+    shared: Float[Tensor, "m 4"]  # [m]
 
 
 @dataclasses.dataclass(frozen=True)
 class Wall(Value):
-    """One wall of a vessel: `seen` is the mask of its cloud points, `hidden` holds estimated
-    points.
-    """
+    """One wall of a vessel, seen and hidden."""
 
-    seen: Bool[Tensor, "n"]
-    hidden: HiddenWall
+    seen: Bool[Tensor, "n"]  # mask of the cloud's points on the wall
+    hidden: HiddenWall  # estimated points of it
 
 
 def complete_walls(
@@ -208,7 +216,13 @@ def complete_walls(
     table: float,
     numbers: WallNumbers = WALL,
 ) -> tuple[Wall, Wall]:
-    """Return the outer and the inner wall of a vessel on a table of height `table` [m].
+    """Return the outer and the inner wall of a vessel on a table.
+
+    Args:
+        cloud: the cloud [m] with normals, z up.
+        vessel: the vessel that it shows.
+        outline: silhouettes of the views.
+        table: the table's height [m].
 
     The other side of a seen wall is one thickness away. Parts seen on neither side are estimated by
     rotating the seen parts about the axis.
@@ -240,7 +254,7 @@ def complete_walls(
 
 
 def lid(vessel: Vessel) -> HiddenWall:
-    """Return points of an imagined flat lid that closes the outer surface at the rim."""
+    """Return points on an imagined flat lid, which closes the outer surface at the rim."""
     return _disc(vessel, vessel.rim, vessel.radius, WALL.lid_rings)
 
 
