@@ -108,8 +108,8 @@ def moved_in_hand(
     """Return how far the object has moved [m] and turned [rad] in the hand since the pressing
     ended.
 
-    Both have one number for each of the t ticks. `centre` [m] is the point of the object whose
-    motion counts, in the frame of the grasp.
+    Both have one number for each of the t ticks of the record `lift`. `centre` [m] is the point of
+    the object whose motion counts, in the frame of the grasp.
     """
     hand_from_object = inverse(lift.hand_pose.double()) @ lift.object_pose.double()
     start = hand_from_object[tick_of(lift, 2)]

@@ -67,7 +67,7 @@ def judge_lift(ticks: Sequence[Tick], pressed: int, judged: int, lift_height: fl
 
 
 def motion_between(first: Tick, last: Tick, in_hand: bool = True) -> ObjectMotion:
-    """Return the motion [m] of the object's centre and its rotation [rad] between two ticks.
+    """Return the motion [m] of the object's centre and its rotation [rad] from one tick to another.
 
     They are relative to the hand, or to the world if not `in_hand`.
     """

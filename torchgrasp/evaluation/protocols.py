@@ -51,8 +51,7 @@ class PullSpec(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class Protocol(Value):
-    """The settings of the simulated trials that test a grasp: they pull at the object, or lift it
-    if `pull` is None.
+    """The settings of the simulated trials that test a grasp: pulls at the object, or lifts.
 
     Raises `BadArgument` for a rotation during the approach, or a push or a displacement in a
     protocol of pulls.
@@ -220,7 +219,10 @@ def seed_of(seed: Seed, *names: str | int) -> int:
 
 @checked
 def draw_hand_errors(noise: PoseNoise, count: Count, seed: Seed) -> Float[Tensor, "n 4 4"]:
-    """Return n = `count` random pose errors of the hand [m], each in the frame of the planned hand."""
+    """Return n = `count` random pose errors of the hand [m], each in the frame of the planned hand.
+
+    `noise` bounds them.
+    """
     generator = torch.Generator().manual_seed(seed)
     largest = torch.tensor([noise.rotation] * 3 + [noise.translation] * 3, dtype=torch.float64)
     drawn = 2 * torch.rand(count, 6, generator=generator, dtype=torch.float64) - 1
@@ -234,7 +236,8 @@ def draw_object_poses(
 ) -> Float[Tensor, "n 4 4"]:
     """Return n = `count` random displacements [m] of an object on its table, as rigid transforms.
 
-    They are along the table, whose normal is z, and about the vertical through `pivot` [m].
+    They are along the table, whose normal is z, and about the vertical through `pivot` [m]; `noise`
+    bounds them.
     """
     pivot = pivot.to("cpu", torch.float64)
     generator = torch.Generator().manual_seed(seed)

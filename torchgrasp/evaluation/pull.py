@@ -68,8 +68,9 @@ def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") ->
 
 
 def run_pulls(driver: TrialDriver, spec: PullSpec) -> PullResult:
-    """Run the pull trial of a driver: grasp the object once, and pull it in each direction until
-    one fails.
+    """Run the pull trial of a driver: grasp the object once, and pull it until one pull fails.
+
+    `spec` says how to pull in each direction, and which motion passes.
     """
     started = time.process_time()
     run = driver.open()

@@ -44,8 +44,8 @@ def evaluate(
     folder: Path | None = None,
     workers: Annotated[int, Range(0, 1024)] = 0,
 ) -> Generator[ViewScore, None, None]:
-    """Plan grasps on every view of a folder of objects, try them in simulation, and yield the score
-    of each view.
+    """Yield the score of every view of a folder of objects: grasps are planned, and tried in
+    simulation.
 
     Only the simulator uses the true mesh. An object with bad files or a bad entry gets a score with
     a refusal. Raises `BadArgument` for an unknown protocol or no objects, and `OutputError` if

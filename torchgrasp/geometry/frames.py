@@ -83,8 +83,9 @@ def real(numbers: Any) -> Tensor:
 
 
 def rotation_from_rpy(rpy: tuple[float, float, float]) -> Float[Tensor, "3 3"]:
-    """Return the rotation matrix of roll, pitch and yaw [rad] about the fixed axes x, y, z, as in a
-    URDF.
+    """Return the rotation matrix of `rpy`: roll, pitch and yaw [rad] about the fixed axes x, y, z.
+
+    This is the order of a URDF.
     """
     cr, cp, cy = map(math.cos, rpy)
     sr, sp, sy = map(math.sin, rpy)
@@ -104,7 +105,7 @@ def rotation_angle(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
 
 
 def subsets(count: int, size: int, device: torch.device) -> Int[Tensor, "k s"]:
-    """Return all subsets of s = `size` indices out of 0 to `count` - 1.
+    """Return all subsets of s = `size` indices out of 0 to `count` - 1, on a `device`.
 
     Each line of the result is one subset, in ascending order; the k lines are in lexical order.
     """

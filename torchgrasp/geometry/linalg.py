@@ -39,7 +39,7 @@ def dot(
 
 
 def matvec(matrix: Float[Tensor, "*b m n"], v: Float[Tensor, "*c n"]) -> Float[Tensor, "*e m"]:
-    """Return the products of matrices and vectors."""
+    """Return the products of matrices (m, n) and vectors `v` (n,)."""
     return (matrix @ v[..., None])[..., 0]
 
 

@@ -184,7 +184,8 @@ def clip_mesh(
 
 
 def load_triangles(data: bytes, suffix: str, **options: Any) -> Any:
-    """Return what `trimesh.load_mesh` reads from the bytes of a file with the given `suffix`.
+    """Return what `trimesh.load_mesh` reads from `data`, the bytes of a file with the given
+    `suffix`.
 
     `options` go to `trimesh.load_mesh`. Raises `Malformed` for too many faces; for bad bytes,
     trimesh may raise any exception.

@@ -53,6 +53,8 @@ class Minimisation(abc.ABC, Generic[State, Model]):
     def step(self, model: Model, damping: Damping) -> Steps:
         """Return the steps that solve the damped normal equations, and a mask of the problems that
         go on.
+
+        `model` holds the linear models of the problems, and `damping` the damping of their steps.
         """
 
     @abc.abstractmethod
@@ -154,7 +156,9 @@ class LeastSquares(Minimisation[State, LinearResiduals]):
     stalled: float = 0.02  # relative decrease of the cost below which a problem has converged
 
     def linearise(self, state: State, rows: Int[Tensor, "a"]) -> LinearResiduals:
-        """Return the residuals, their Jacobian and the sum of squared residuals of each problem."""
+        """Return residuals, Jacobian and sum of squared residuals of the problems with the indices
+        `rows`.
+        """
         residual, jacobian = self.residuals(state, rows)
         return LinearResiduals(residual.square().sum(1), residual, jacobian)
 
@@ -183,7 +187,8 @@ class LeastSquares(Minimisation[State, LinearResiduals]):
     ) -> Verdict:
         """Return a mask of the steps that lower the cost, and the damping of the next steps.
 
-        The damping is infinite for a problem that has converged or is stuck, which ends it.
+        `model` holds the residuals before the step, `trial` those after it. The damping is infinite
+        for a problem that has converged or is stuck, which ends it.
         """
         better = trial.cost < model.cost
         converged = trial.cost > (1 - self.stalled) * model.cost

@@ -295,8 +295,8 @@ def _parts(flat: Float[Tensor, "n 2"]) -> Iterator[Float[Tensor, "m 2"]]:
 
 
 def cross(plane: Plane, points: Points, eye: Vector | None) -> tuple[Points, Bool[Tensor, "n"]]:
-    """Return where the camera rays through points cross a plane (n, 3) [m], and a mask of the
-    points behind it.
+    """Return where the camera rays through points cross a plane [m], and a mask of the points
+    behind it.
 
     `points` (n, 3) and the camera's position `eye` (3,) are in metres. Without a camera, `eye`
     None, the points themselves are returned, and those more than `PLANES.reach` [m] below the plane

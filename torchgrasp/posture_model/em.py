@@ -220,10 +220,9 @@ def expectation(
 def features_from_data(
     x: Float[Tensor, "n d"], out: Float[Tensor, "f n"] | None = None
 ) -> Float[Tensor, "f n"]:
-    """Return the f features [1, x_i, x_i x_j (i <= j)] of each of n data rows x, one column for
-    each row.
+    """Return the features [1, x_i, x_i x_j (i <= j)] of each data row x, as a column.
 
-    `out` is a buffer to write into; None makes a new tensor.
+    The data `x` are n rows of d numbers. `out` is a buffer to write into; None makes a new tensor.
     """
     n, d = x.shape
     out = x.new_empty(1 + d + d * (d + 1) // 2, n) if out is None else out

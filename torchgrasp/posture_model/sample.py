@@ -38,8 +38,8 @@ def roll_contacts(
     """Return (points, normals) of random contacts beside the middle of the fingertips' pads.
 
     The points [m] and the pads' outward unit normals are in the hand's frame, for n postures
-    `joints` [rad] of three fingers. Both tilts of a contact direction are Gaussian, truncated to
-    the pad's cone. The contact of a round tip moves along.
+    `joints` [rad] of three fingers. `generator` draws both tilts of a contact direction, which are
+    Gaussian, truncated to the pad's cone. The contact of a round tip moves along.
     """
     points, axes = hand.fingertips(joints)
     cone = hand.tips.cone.to(axes)
@@ -195,8 +195,8 @@ def draw_chunk(
     """Return (joints, codes, drawn) of chunk i: joints [rad], contact codes, number of postures
     drawn.
 
-    The n postures of the chunk are those that were kept of all that were drawn. Raises
-    `BadArgument` for a hand of which almost none are kept.
+    The n postures of the chunk are those that were kept of all that were drawn; `spec` says how.
+    Raises `BadArgument` for a hand of which almost none are kept.
     """
     count = chunk_sizes(spec.n)[i]
     parts = []

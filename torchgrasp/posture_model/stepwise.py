@@ -91,17 +91,20 @@ def fit_subsets(
 
 
 def fit_smallest(subsets: Subsets, start: FitProgress, rule: EmRule) -> Fit:
-    """Fit a mixture to the smaller subsets; the fit to all rows can go on from the result."""
+    """Fit a mixture to the smaller subsets; the fit to all rows can go on from the result.
+
+    `start` is the state before the first step, and `rule` ends the steps.
+    """
     most = ENOUGH * subsets.sizes[0]
     sizes = [size for size in subsets.sizes[:-1] if size <= most] or subsets.sizes
     return dataclasses.replace(fit_subsets(subsets, sizes, start, rule), jumped=True)
 
 
 def growing_fits(shard: DataRows, start: FitProgress, rule: EmRule) -> Iterator[Fit]:
-    """Yield fits without end, each with one component more than the last.
+    """Yield fits to the rows of `shard` without end, each with one component more than the last.
 
     The first begins at `start`. Each later fit starts from the last, with its heaviest component
-    split.
+    split. `rule` ends the steps of each.
     """
     n = shard.count()
     while True:

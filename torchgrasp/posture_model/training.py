@@ -172,6 +172,7 @@ def fit_mixture(
             the same bits.
         distributed: whether `samples` are only the part of this process under torchrun. All
             processes must see the same checkpoint.
+        observer: called with the state of the fit after each step.
 
     >>> import torch
     >>> numbers = torch.rand(500, 7, generator=torch.Generator().manual_seed(0))

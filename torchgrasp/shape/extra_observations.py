@@ -165,7 +165,7 @@ def paper_support(
     (Sec. 3.1).
 
     `seen` is the cloud [m], and `noise` the standard deviation of distances (normalised) and
-    normals.
+    normals. `generator` draws the points.
     """
     center = seen.points.mean(0)
     scale = float(torch.linalg.vector_norm(seen.points - center, dim=-1).max())

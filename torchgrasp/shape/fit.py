@@ -159,7 +159,8 @@ def fit_upright(
 ) -> ShapeGP:
     """Fit the shape to a cloud [m] without duplicates in a frame whose z axis points up.
 
-    `table` is the table's height [m]; None means no table. `seed` is the random seed.
+    `table` is the table's height [m]; None means no table. `seed` is the random seed, and `options`
+    are those of `fit_shape`.
     """
     if table is not None:
         check_foot(cloud, Plane.horizontal(table))

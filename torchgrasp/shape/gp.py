@@ -90,7 +90,8 @@ class ShapeGP(Posterior, Normalisation):
         """Return the shape of a posterior in the normalised frame `frame`, with the seen points
         `cloud` [m].
 
-        `psi` is the kernel's length, normalised. The domain follows from kernel and observations.
+        `psi` is the kernel's length, normalised, and `std_factor` the ratio of the surface's true
+        deviations to the posterior's. The domain follows from kernel and observations.
         """
         away = torch.linalg.vector_norm(posterior.x.detach(), dim=-1)
         reach = DOMAIN.reach * float(away.max())

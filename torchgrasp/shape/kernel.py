@@ -209,7 +209,7 @@ def differentiate_thin_plate(
 
 @checked
 def matern52_kernel(length: Positive, variance: Positive = 1.0) -> Kernel:
-    """Return the Matern 5/2 kernel: variance (1 + s + s^2 / 3) exp(-s) with s = sqrt(5) r / length.
+    """Return the Matern 5/2 kernel variance (1 + s + s^2 / 3) exp(-s), with s = sqrt(5) r / length.
 
     The length is normalised, the variance in squared normalised units.
 

@@ -79,7 +79,7 @@ def read_solid(
 
 
 def hull(corners: np.ndarray) -> "trimesh.Trimesh":
-    """Return the convex hull of points (n, 3) [m] as a mesh.
+    """Return the convex hull of the points `corners` (n, 3) [m] as a mesh.
 
     The points are rounded to `DECIMALS` if the mesh of the hull would not be closed.
     """

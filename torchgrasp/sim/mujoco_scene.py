@@ -82,7 +82,7 @@ class MujocoScene(SimulatedScene):
         self._mujoco.mj_step1(self.model, self.data)
 
     def skip(self, steps: int) -> None:
-        """Advance by a number of timesteps, without reports of contacts."""
+        """Advance by `steps` timesteps, without reports of contacts."""
         for _ in range(steps):
             if self._diverged():
                 return

@@ -89,7 +89,7 @@ def place(sapien: Any, scene: Any, name: str, body: Any, height: float = 0.0) ->
 
 
 def table(sapien: Any, physx: Any, material: Any) -> Any:
-    """Return the body of the table, a half space.
+    """Return the body of the table, a half space of the given `material`.
 
     On a box, a rocking object would gain energy until it falls over.
     """

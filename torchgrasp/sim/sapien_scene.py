@@ -106,7 +106,7 @@ class SapienScene(SimulatedScene):
         self.system.step()
 
     def skip(self, steps: int) -> None:
-        """Advance by a number of timesteps, without reports of contacts."""
+        """Advance by `steps` timesteps, without reports of contacts."""
         for _ in range(steps):
             self._simulate()
 

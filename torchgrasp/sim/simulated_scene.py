@@ -116,7 +116,7 @@ class SimulatedScene(abc.ABC):
 
     @abc.abstractmethod
     def skip(self, steps: int) -> None:
-        """Advance by a number of timesteps, without reports of contacts."""
+        """Advance by `steps` timesteps, without reports of contacts."""
 
     @abc.abstractmethod
     def _advance(self) -> Iterable[tuple[Any, Any, Any]]:

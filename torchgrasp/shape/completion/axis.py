@@ -164,15 +164,16 @@ def fit_axis(points: Points, normals: Points) -> Float[Tensor, "2"]:
 
 
 class _Lines(NamedTuple):
-    """Lines along surface normals, seen from above: each line consists of the points x with across
-    . x = offset [m].
+    """Lines along n surface normals, seen from above.
+
+    A line consists of the points x (2,) [m] with across . x = offset.
     """
 
     slope: Float[Tensor, "n"]  # length of a normal's horizontal part
     steep: Bool[Tensor, "n"]  # whether this part is long enough for a fit
     level: Float[Tensor, "n 2"]  # direction of this part
-    across: Float[Tensor, "n 2"]
-    offset: Float[Tensor, "n"]
+    across: Float[Tensor, "n 2"]  # horizontal unit vector perpendicular to the line
+    offset: Float[Tensor, "n"]  # [m]
 
 
 def _lines_from_above(points: Points, normals: Points) -> _Lines:
@@ -281,8 +282,9 @@ def _frame(
 
 
 def rotations_about_z(n: int) -> Float[Tensor, "m 3 3"]:
-    """Return the m = n - 1 rotation matrices about z by k / n of a full circle, for k from 1 to n -
-    1.
+    """Return the m = n - 1 rotation matrices about z by the multiples of 1 / n of a circle.
+
+    The first is by 1 / n; that by a full circle is left out.
     """
     angle = torch.arange(1, n, dtype=torch.float64, device="cpu") * (2 * math.pi / n)
     turn = angle.new_zeros(n - 1, 3, 3)

@@ -91,8 +91,9 @@ def pick_apart(
 
 @dataclasses.dataclass(frozen=True)
 class Silhouette(Value):
-    """The outline and visible depth of one view, as rasters of h x w nodes on the image plane at
-    depth 1.
+    """The outline and visible depth of one view, as rasters on the image plane at depth 1.
+
+    A raster has h x w nodes.
     """
 
     viewpoint: Float[Tensor, "3"]  # position of the camera, in the frame of the cloud [m]

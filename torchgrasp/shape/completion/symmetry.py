@@ -187,10 +187,9 @@ class SymmetryScorer:
         points: Tensor,
         limit: float = math.inf,
     ) -> tuple[Tensor, Tensor]:
-        """Return (distance, index): the distance [m] of points (..., 3) [m] from the nearest cloud
-        point, and the index of this point.
+        """Return (distance, index) of the cloud point nearest to each of the points (..., 3) [m].
 
-        They are infinity and 0 if no point is within the `limit` [m].
+        The distance is in metres. If no point is within the `limit` [m], they are infinity and 0.
         """
         distance, index = self.tree.query(points.reshape(-1, 3).numpy(), distance_upper_bound=limit)
         shape = points.shape[:-1]
@@ -286,11 +285,12 @@ def find_plane_through_axis(
     center: Float[Tensor, "2"],
     part: Points,
 ) -> tuple[Float[Tensor, "1 4"], Float[Tensor, "1"]]:
-    """Return (plane, score): the mirror plane (n, o [m]) of a part attached to a body of
-    revolution, such as a handle.
+    """Return (plane, score) of the mirror plane (n, o [m]) of a part attached to a body of
+    revolution.
 
-    It contains the vertical axis at `center` (x, y) [m]. `part` holds the part's points (n, 3) [m].
-    A plane across which the part extends less is preferred, even if half of the part is hidden.
+    The part may be a handle, with the points `part` (n, 3) [m]. The plane contains the vertical
+    axis at `center` (x, y) [m]. A plane across which the part extends less is preferred, even if
+    half of the part is hidden.
     """
     normals = _level_directions(SEARCH.level_through_axis)
     level = normals[:, :2]
