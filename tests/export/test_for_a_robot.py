@@ -13,7 +13,14 @@ from scipy.spatial.transform import Rotation
 from tests.pinch import pinch
 from torchgrasp import Plane
 from torchgrasp.app import cli
-from torchgrasp.export import format_grasps, format_moveit, format_trajectories, read_foreign
+from torchgrasp.export import (
+    ArmMotion,
+    format_grasps,
+    format_motion,
+    format_moveit,
+    format_trajectories,
+    read_foreign,
+)
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 
@@ -130,6 +137,48 @@ def test_the_flange_is_where_the_mount_puts_it():
     np.testing.assert_allclose(
         row["pose"]["position"], closed[:3, 3]
     )  # the hand's pose stays beside it
+
+
+def test_trajectories_may_leave_followers_out():
+    """A controller of ros2_control refuses a joint that it does not command."""
+    hand, grasp = pinch("barrett")
+    followers = {"spread_mimic", "f1_distal", "f2_distal", "f3_distal"}
+    every = yaml.safe_load(format_trajectories(hand, grasp))
+    some = yaml.safe_load(format_trajectories(hand, grasp, actuated=True))
+    (message,) = yaml.safe_load(format_moveit(hand, grasp, actuated=True))
+    assert set(every["joint_names"]) - set(some["joint_names"]) == followers
+    assert set(some["joint_names"]) == set(hand.joint_names)
+    for row, point in enumerate(every["points"]):
+        for key in ("positions", "effort"):
+            of = dict(zip(every["joint_names"], point[key], strict=False))
+            kept = [of[joint] for joint in some["joint_names"] if of]
+            assert some["points"][row][key] == kept
+    assert message["grasp_posture"]["joint_names"] == some["joint_names"]
+    names = tuple(hand.tree.joint_names)
+    motion = ArmMotion(("arm", *names), torch.zeros(2), torch.zeros(1, 2, 9), {"above": 0})
+    moved = yaml.safe_load(format_motion(hand, motion, actuated=True))
+    assert moved["joint_names"] == ["arm", *(x for x in names if x not in followers)]
+    assert len(moved["points"][0]["positions"]) == 5
+
+
+def test_parked_joints_stay_where_followers_are_left_out():
+    hand, grasp = pinch("allegro")  # a parked finger, no follower
+    assert format_trajectories(hand, grasp, actuated=True) == format_trajectories(hand, grasp)
+
+
+def test_the_command_tells_followers_and_leaves_them_out(tmp_path, capsys):
+    hand, grasp = pinch("barrett")
+    meta = {"hand": "barrett", "hand_sha256": hand.source.sha256}
+    dataclasses.replace(grasp, meta=meta).save(tmp_path / "g")
+    out = tmp_path / "out"
+    words = ["export", str(tmp_path / "g"), "--out", str(out), "--format"]
+    for kind in ("ros2", "moveit"):
+        assert cli.main([*words, kind]) == 0
+        assert "f3_distal; --actuated" in capsys.readouterr().out and "f3_distal" in out.read_text()
+        assert cli.main([*words, kind, "--actuated"]) == 0
+        assert "note" not in capsys.readouterr().out and "f3_distal" not in out.read_text()
+    assert cli.main([*words, "json", "--actuated"]) == 2
+    assert "--actuated" in capsys.readouterr().err
 
 
 def test_the_command_takes_names_a_file_of_names_and_a_flange(tmp_path, capsys):

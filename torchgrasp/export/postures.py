@@ -20,6 +20,7 @@ from torchgrasp.foundation.lazy import spatial
 from torchgrasp.foundation.rules import Force, Pose, Positive
 from torchgrasp.geometry.frames import rotate
 from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.hand_toml import read_hand_toml
 from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.ik.motion import APPROACH_DISTANCE, opened_pose
 from torchgrasp.sim.mujoco_scene import nest_links, render_mjcf
@@ -167,6 +168,14 @@ def rename_joints(hand: Hand, rename: Mapping[str, str] | None) -> dict[str, str
     if "" in names.values() or len(set(names.values())) < len(names):
         raise BadArgument("rename", ", ".join(names.values()), "a name for each joint")
     return names
+
+
+def follower_joints(hand: Hand) -> tuple[str, ...]:
+    """Return the names in the URDF of the coupled joints, which follow others and have no drive.
+
+    The coupling is that of the hand's `hand.toml`.
+    """
+    return tuple(read_hand_toml(hand.urdf_path.with_name("hand.toml")).coupling)
 
 
 def describe_pose(a_from_b: Float[Tensor, "4 4"]) -> dict[str, list[float]]:

@@ -13,7 +13,12 @@ from torch import Tensor
 
 from torchgrasp.control.protocol import POSE_TIME
 from torchgrasp.export.arm_motion import ArmMotion
-from torchgrasp.export.postures import named_postures, quaternion, rename_joints
+from torchgrasp.export.postures import (
+    follower_joints,
+    named_postures,
+    quaternion,
+    rename_joints,
+)
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Force, Pose, Positive
@@ -57,6 +62,7 @@ def format_moveit(
     rename: Mapping[str, str] | None = None,
     flange: Pose | None = None,
     object_id: str = OBJECT_FRAME,
+    actuated: bool = False,
 ) -> str:
     """Return grasps as a YAML list of moveit_msgs/Grasp, in metres and radians.
 
@@ -73,6 +79,8 @@ def format_moveit(
         flange: pose [m] of the robot's flange in the frame of the root link; None means that poses
             are those of the root link.
         object_id: id of the object in the planning scene, which the hand may touch.
+        actuated: leave out the joints that follow others, which controllers of ros2_control do not
+            command.
 
     Raises `BadArgument` for joints of another hand, a force or stiffness that is not positive,
     unknown or equal names, or a grasp whose hand goes down while it closes (`opened_pose`), which a
@@ -94,6 +102,7 @@ def format_moveit(
     if not torch.equal(opened, grasps.obj_from_hand):
         found = "a hand that goes down while it closes"
         raise BadArgument("grasps", found, "hands that close at one pose")
+    trajectories = _trajectories(hand, grasps, force, kp, rename, actuated)
     messages = [
         {
             "id": f"grasp_{row}",
@@ -107,7 +116,7 @@ def format_moveit(
             "max_contact_force": force,
             "allowed_touch_objects": [object_id],
         }
-        for row, trajectory in enumerate(_trajectories(hand, grasps, force, kp, rename))
+        for row, trajectory in enumerate(trajectories)
     ]
     of = "" if flange is None else ", whose poses are of the flange"
     return _document(hand, f"a list of moveit_msgs/Grasp{of}", [messages])
@@ -120,6 +129,7 @@ def format_trajectories(
     force: Force = 4.0,
     kp: Positive | None = None,
     rename: Mapping[str, str] | None = None,
+    actuated: bool = False,
 ) -> str:
     """Return a YAML document of trajectory_msgs/JointTrajectory for each grasp: pre-grasp, grasp,
     squeeze.
@@ -127,7 +137,8 @@ def format_trajectories(
     The hand must already be at its pose, which `format_moveit` and `format_grasps` give. `force`
     [N] is the normal force of the strongest finger, `kp` [N m/rad] the stiffness of the robot's
     position control, and `rename` holds the robot's names of joints, by their names in the URDF.
-    Raises `BadArgument` for joints of another hand, a force or stiffness that is not positive, and
+    With `actuated`, joints that follow others are left out: controllers of ros2_control refuse
+    their names. Raises `BadArgument` for joints of another hand, a force or stiffness that is not positive, and
     unknown or equal names.
 
     >>> from torchgrasp import load_hand
@@ -137,16 +148,17 @@ def format_trajectories(
     3
     """
     what = "a trajectory_msgs/JointTrajectory for each grasp"
-    documents = _trajectories(hand, grasps, force, kp, rename)
+    documents = _trajectories(hand, grasps, force, kp, rename, actuated)
     return _document(hand, what, documents)
 
 
 @checked
-def format_motion(hand: Hand, motion: ArmMotion) -> str:
+def format_motion(hand: Hand, motion: ArmMotion, actuated: bool = False) -> str:
     """Return a YAML document of trajectory_msgs/JointTrajectory for each grasp, with the joints of
     arm and hand.
 
-    `motion` comes from `plan_motion`; `hand` is the hand on the arm.
+    `motion` comes from `plan_motion`; `hand` is the hand on the arm. With `actuated`, joints of the
+    hand that follow others are left out.
 
     >>> from torchgrasp import load_hand
     >>> motion = ArmMotion(("a",), torch.tensor([0.0, 1.5]), torch.zeros(1, 2, 1), {"above": 0})
@@ -154,23 +166,33 @@ def format_motion(hand: Hand, motion: ArmMotion) -> str:
     '  time_from_start: {sec: 1, nanosec: 500000000}'
     """
     times = [_duration(x) for x in motion.times.tolist()]
+    followers = follower_joints(hand) if actuated else ()
+    kept = [k for k, joint in enumerate(motion.joint_names) if joint not in followers]
+    names = [motion.joint_names[k] for k in kept]
     documents = list[dict[str, Any]]()
-    for rows in motion.positions.tolist():
+    for rows in motion.positions[:, :, kept].tolist():
         timed = zip(rows, times, strict=True)
         points = [{"positions": q, "time_from_start": at} for q, at in timed]
-        documents.append({"joint_names": list(motion.joint_names), "points": points})
+        documents.append({"joint_names": list(names), "points": points})
     what = "a trajectory_msgs/JointTrajectory of arm and hand for each grasp"
     return _document(hand, what, documents)
 
 
 def _trajectories(
-    hand: Hand, grasps: Grasps, force: float, kp: float | None, rename: Mapping[str, str] | None
+    hand: Hand,
+    grasps: Grasps,
+    force: float,
+    kp: float | None,
+    rename: Mapping[str, str] | None,
+    actuated: bool,
 ) -> Iterator[dict[str, Any]]:
     """Yield for each grasp a trajectory_msgs/JointTrajectory, as a dictionary, with all joints of
-    the hand.
+    the hand; with `actuated`, without those that follow others.
     """
     squeezed, postures = named_postures(hand, grasps, force, kp)
-    names = rename_joints(hand, rename)
+    followers = follower_joints(hand) if actuated else ()
+    every = rename_joints(hand, rename)
+    names = {joint: name for joint, name in every.items() if joint not in followers}
     root = read_urdf(hand.urdf_path).root
     for row in range(len(grasps)):
         torque = dict(zip(hand.joint_names, squeezed.torques[row].tolist(), strict=True))

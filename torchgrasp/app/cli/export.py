@@ -19,6 +19,7 @@ from torchgrasp.cloud.agreement import check_agreement
 from torchgrasp.cloud.read import read_cloud
 from torchgrasp.data.shards import load_grasps
 from torchgrasp.export.foreign import Quaternion, read_poses
+from torchgrasp.export.postures import follower_joints
 from torchgrasp.files import read_json, write_file
 from torchgrasp.foundation.errors import BadArgument, ModelFileError, Status
 from torchgrasp.foundation.rules import Count
@@ -105,6 +106,11 @@ class Export(Command):
         "json, moveit, ros2: the robot's joints, as URDF=ROBOT ..., in its order, or a .json file "
         "of such an object",
     )
+    actuated: bool = option(
+        False,
+        "moveit, ros2: leave out the joints that follow others, which ros2_control does not "
+        "command",
+    )
     flange: tuple[float, float, float, float, float, float, float] | None = option(
         None,
         "json, moveit: position [m] and quaternion wxyz of the robot's flange in the hand's "
@@ -125,6 +131,7 @@ class Export(Command):
             "rename": read_names(self.rename),
             "flange": flange,
             "object_id": None if named else self.object,
+            "actuated": self.actuated or None,
         }
         robot = {name: x for name, x in robot.items() if x is not None}
         given = {"mass": self.mass, "friction": self.friction}
@@ -159,6 +166,12 @@ class Export(Command):
                 write_file(self.out, formats.format_graspgen(best, str(self.object)))
             elif self.format in TEXTS:
                 write_file(self.out, TEXTS[self.format](hand, best, force, self.kp, **robot))
+        followers = follower_joints(hand) if "actuated" in texts and not self.actuated else ()
+        if followers:
+            print(
+                f"note: joint_names hold joints that follow others: {', '.join(followers)}; "
+                "--actuated leaves them out, as ros2_control needs"
+            )
         print(f"{len(best)} grasp{'s' * (len(best) != 1)} of the {hand.name} hand: {self.out}")
         return 0 if len(best) else 1
 
