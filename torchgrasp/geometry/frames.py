@@ -32,7 +32,7 @@ def rigid(
 
 
 def inverse(a_from_b: Float[Tensor, "*b 4 4"]) -> Float[Tensor, "*b 4 4"]:
-    """Return the inverse `b_from_a` of a rigid transform `a_from_b`, with translations in metres."""
+    """Return the inverse `b_from_a` of a rigid transform `a_from_b`; translations are in metres."""
     rotation = a_from_b[..., :3, :3].mT
     return rigid(rotation, -(rotation @ a_from_b[..., :3, 3:])[..., 0])
 

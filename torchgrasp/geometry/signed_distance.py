@@ -59,7 +59,10 @@ FIELDS = FieldNumbers()
 
 
 class Grid(NamedTuple):
-    """The grid in which points are looked up: one for all points, or one for each entry of a batch."""
+    """The grid in which points are looked up.
+
+    There is one for all points, or one for each entry of a batch.
+    """
 
     origin: Float[Tensor, "*b 3"]  # position [m] of node (0, 0, 0)
     spacing: float | Float[Tensor, "*b 1"]  # distance [m] of neighbouring nodes

@@ -58,7 +58,10 @@ class EmRule:
 
 @dataclasses.dataclass(frozen=True)
 class DataRows:
-    """The data rows of one process; several processes form the default group of torch.distributed."""
+    """The data rows of one process.
+
+    Several processes form the default group of torch.distributed.
+    """
 
     rows: Float[Tensor, "n d"]  # n standardised samples of d numbers
     rank: int = 0  # index of this process
@@ -135,11 +138,12 @@ class FitProgress(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Fit(FitProgress):
-    """The result of a fit; the last value of `log_likelihood` belongs to the final components."""
+    """The result of a fit; the last value of `log_likelihood` belongs to the final components.
 
-    converged: bool = (
-        False  # whether the last step raised the likelihood by less than the tolerance
-    )
+    `converged`: whether the last step raised the log-likelihood by less than the tolerance.
+    """
+
+    converged: bool = False
 
     def resumed(self) -> FitProgress:
         """Return the state from which this fit can go on, without the last log-likelihood.

@@ -185,7 +185,7 @@ class GaussianMixture(Value):
         return self.weights.double() @ self.means.double()
 
     def covariance(self) -> Float[Tensor, "d d"]:
-        """Return the covariance matrix of the whole mixture, in products of the dimensions' units."""
+        """Return the covariance matrix of the whole mixture, in products of the units."""
         offset = self.means.double() - self.mean()
         within = torch.einsum("m,mij->ij", self.weights.double(), self.covariances.double())
         return within + torch.einsum("m,mi,mj->ij", self.weights.double(), offset, offset)

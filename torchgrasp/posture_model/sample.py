@@ -91,7 +91,9 @@ BLOCK_POSTURES = 2_000  # postures that a generator draws at a time; fixed for t
 MAX_SAMPLES = 10**8  # most postures of one set: a hundred times the paper's million (Sec. 6.3).
 LEAST_KEPT = 1e-3
 BLOCKS = 10
-"""Least share of postures that are kept, after so many blocks: another hand would draw for hours."""
+"""Least share of postures that are kept, and the number of blocks after which it is checked: with
+a smaller share, a hand would draw for hours.
+"""
 Sampling = Literal["uniform", "grasping"]
 """Which of the random postures without self-collision are taken.
 

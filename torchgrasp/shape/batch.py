@@ -273,7 +273,7 @@ class ShapeBatch(Value):
         return x * spread(self.scale, x) + spread(self.centers[self.owner], x, 1)
 
     def wall_at(self, x: Queries) -> Bool[Tensor, "q walls"]:
-        """Return a mask of the surface among `walls` that applies at each of q normalised points."""
+        """Return a mask of the surface among `walls` that applies at each normalised point."""
         if not self.hollow:
             return torch.ones(len(x), 1, dtype=torch.bool, device=x.device)
         own = self._surface_at(x) == self._wall(x)[:, 0]
@@ -298,7 +298,7 @@ class ShapeBatch(Value):
         return MeanJet(*self._evaluate(evaluate, x))
 
     def jet(self, x: Queries) -> SurfaceJet:
-        """Return mean and variance of the distance with their derivatives at q normalised points."""
+        """Return mean and variance of the distance, with derivatives, at q normalised points."""
 
         def evaluate(part: Tensor, wall: Tensor) -> tuple[Tensor, ...]:
             explain = partial(self.surfaces.explain, wall)

@@ -43,7 +43,7 @@ class OutsideNumbers:
     radius: float = 1.2
     """Number of points, and normalised radius of their sphere (Sec. 3.1)."""
     noise: float = 0.3
-    """Standard deviation of a distance, normalised: the nearest of sparse points is too far away."""
+    """Normalised standard deviation of a distance: the nearest of sparse points is too far away."""
 
 
 OUTSIDE = OutsideNumbers()

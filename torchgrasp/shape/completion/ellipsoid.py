@@ -33,8 +33,7 @@ class EllipsoidNumbers:
     slope: float = 0.15
     rim: float = 0.002
     table: float = 0.001
-    """Standard deviations of a point [m], of a unit normal, of the outline [m] and of the table [m].
-    """
+    """Standard deviations of a point [m], a unit normal, the outline [m] and the table [m]."""
     elongation: float = 0.03
     """Standard deviation of the logarithm of an axis over the mean axis."""
     misfit: float = 0.00165

@@ -189,7 +189,7 @@ class Outlines(Value):
 
     @property
     def gap(self) -> float:
-        """The greatest width [m] of an area without measurements within the object's outline, or 0."""
+        """The greatest width [m] of an area without measurements within the outline, or 0."""
         return max(view.gap for view in self.views)
 
     @checked

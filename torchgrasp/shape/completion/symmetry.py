@@ -164,7 +164,7 @@ class SymmetryScorer:
 
     @functools.cached_property
     def probes(self) -> tuple[Float[Tensor, "k 3"], Float[Tensor, "k 3"]]:
-        """The k points [m] of the cloud that a plane is tested on, and their outward unit normals."""
+        """The k points [m] of the cloud that a plane is tested on, and their unit normals."""
         return self.points[self.rows], self.normals[self.rows]
 
     @functools.cached_property
