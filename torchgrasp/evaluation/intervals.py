@@ -36,7 +36,8 @@ object). For a mean: (sum, number) of the values.
 class Share(NamedTuple):
     """A success rate, mean or difference, with its 95 % interval.
 
-    With a single unit the interval is NaN. Without trials all values are NaN.
+    The interval is found by resampling units, such as families of objects. With a single unit it is
+    NaN. Without trials all values are NaN.
     """
 
     value: float  # a share in [0, 1], or a mean or difference in its own unit

@@ -79,7 +79,8 @@ class Truth:
 class GraspTrial:
     """The input of a trial: the truth, and what the robot knows.
 
-    The fields are arguments of `close_hand`.
+    The fields are arguments of `close_hand`. `grasp` holds one grasp of the `hand`, or several in
+    the order of preference for `lift_grasps`. `seed` is that of the random noise.
     """
 
     hand: Hand

@@ -179,7 +179,7 @@ class LeastSquares(Minimisation[State, LinearResiduals]):
         return x * (self.largest / x.abs().amax(1, keepdim=True).clamp_min(self.largest)), taken
 
     def move(self, state: State, x: Step, rows: Int[Tensor, "a"]) -> State:
-        """Return the states of the problems after the steps `x`; the indices `rows` have no effect."""
+        """Return the states of the problems after the steps `x`; `rows` has no effect."""
         return self.moved(state, x)
 
     def judge(

@@ -292,7 +292,10 @@ class GraspMixture(GaussianMixture):
 def _map_codes(
     function: Callable[[Float[Tensor, "n 6"]], Tensor], code: ContactCode | Tensor
 ) -> Tensor:
-    """Apply a function to all codes q; a code that is not finite gives NaN, and spoils no gradient."""
+    """Apply a function to all codes q; a code that is not finite gives NaN.
+
+    Such a code spoils no gradient.
+    """
     q = code.q if isinstance(code, ContactCode) else code
     if q.ndim < 1 or q.shape[-1] != 6:
         raise BadArgument("code", f"shape {tuple(q.shape)}", "rows of 6 numbers, L and N")

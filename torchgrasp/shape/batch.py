@@ -120,9 +120,11 @@ class Walls(Value):
         wall: Int[Tensor, "q"],
         rows: CovarianceRows,
     ) -> tuple[Float[Tensor, "q"], CovarianceRows]:
-        """Return the variance that the observations explain, and k A, as `Posterior.explain` does.
+        """Return the variance k A k that the observations explain, and k A, for each line k of
+        `rows`.
 
-        Line q of `rows` holds the covariances k with the observations of the surface `wall[q]`.
+        Line q holds the covariances k of one number with the observations of the surface `wall[q]`,
+        and A is the inverse covariance of these observations.
         """
 
         def explain(own: Tensor, matrix: Tensor) -> tuple[Tensor, Tensor]:

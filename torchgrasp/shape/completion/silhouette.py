@@ -237,7 +237,7 @@ class Outlines(Value):
 def silhouettes(cloud: PointCloud) -> Outlines:
     """Return the silhouette of every view of a cloud [m].
 
-    Raises `BadArgument` for a view without viewpoint, or of both sides of the object.
+    Raises `BadArgument` for a view without viewpoint, or one that shows both sides of the object.
     """
     views = cloud.split_views()
     for view in views:
