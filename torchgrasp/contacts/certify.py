@@ -66,7 +66,8 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
     are not closed, and their margin and witness are NaN.
 
     The margin is differentiable once in points and normals. Where several phi or v are optimal, its
-    derivative is that of one of them; where the margin is -inf, its derivative is NaN. A second
+    derivative is that of one of them. At its greatest possible value, where all phi are equal, it
+    is 0; where the margin is -inf, it is NaN. Rows that a loss masks spoil no other's. A second
     derivative, and one of another field, raise `BadArgument`; in forward mode the latter is NaN.
     Raises `BadArgument` for contacts of a wrong shape, normals that are not of length 1 (to 1e-3),
     or no `ContactSpec`.
@@ -132,6 +133,9 @@ class _Proof(torch.autograd.Function):
             )
         if margin is None:
             return None, None
+        # a row that is masked adds nothing, even where its derivative is NaN
+        dual = torch.where(margin[:, None] == 0, 0.0, dual)
+        phi = torch.where(margin[:, None] == 0, 0.0, phi)
         derivative = -margin[:, None, None] * phi[..., None] * dual[:, None]
         return _Once.apply(derivative, wrench), None
 
@@ -208,6 +212,9 @@ def _prove(wrench: Wrenches) -> tuple[Tensor, ...]:
     product = matvec(wrench, witness)
     above = product - product.amin(-1, keepdim=True)
     dual = witness / above.sum(-1, keepdim=True)
+    # The greatest possible margin is a peak, where 0 is one of the derivatives.
+    peak = wrench.shape[1] * margin >= 1 - GAP
+    dual = torch.where(peak[:, None], 0.0, dual)
     dual = torch.where(margin.isinf()[:, None], torch.nan, dual)
     return margin, residual, witness, phi, dual
 

@@ -183,7 +183,9 @@ def _solve(wrench: Wrenches) -> tuple[Coefficients, Float[Tensor, "b 6"]]:
     found, index, multiplier = maximise(mean, m * (mean[:, None] - wrench))
     margin = 1 / m - multiplier.sum(1, keepdim=True)
     phi = margin.expand(b, m).scatter_add(1, index, m * multiplier)
-    return phi, unit(found)
+    # Equal coefficients balance the wrenches: every direction proves the greatest margin, 1 / m.
+    level = (found == 0).all(1, keepdim=True)
+    return phi, unit(torch.where(level, wrench[:, 0], found))
 
 
 def maximise(

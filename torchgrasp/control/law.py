@@ -154,7 +154,8 @@ def tip_velocity(
     velocity = (1 - share) * position_gain * position_error + share * force_gain * force_error
     if not together:
         return limit_norm(velocity, MAX_SPEED)
-    fastest = torch.linalg.vector_norm(velocity, dim=-1).amax(-1)
+    moving = torch.where((velocity == 0).all(-1, keepdim=True), velocity.detach(), velocity)
+    fastest = torch.linalg.vector_norm(moving, dim=-1).amax(-1)
     return velocity * (MAX_SPEED / fastest.clamp_min(MAX_SPEED))[..., None, None]
 
 

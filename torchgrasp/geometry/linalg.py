@@ -106,7 +106,9 @@ def limit_norm(v: Float[Tensor, "*b d"], longest: float) -> Float[Tensor, "*b d"
     """Return vectors (..., d) shortened to the length `longest` where they are longer, in their own
     unit.
     """
-    return v * (longest / norm(v, keepdim=True).clamp_min(longest))
+    # a zero vector has no second derivative of its length, which does not count here
+    moving = torch.where((v == 0).all(-1, keepdim=True), v.detach(), v)
+    return v * (longest / norm(moving, keepdim=True).clamp_min(longest))
 
 
 def solve_least_squares(

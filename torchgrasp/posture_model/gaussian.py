@@ -111,7 +111,11 @@ class GaussianMixture(Value):
         It is log(weight) + log N(x | mean, covariance).
         """
         density = self.whitening.log_scale - 0.5 * self.whitening.squared(x.double())
-        return self.weights.double().log() + density
+        weights = self.weights.double()
+        # a weight of 0, as of a softmax that underflows, adds nothing to a derivative
+        positive = weights > 0
+        logs = torch.where(positive, weights, 1.0).log()
+        return torch.where(positive, logs, -torch.inf) + density
 
     @checked
     def sample(self, n: Annotated[int, Range(0, 10**8)], seed: Seed = 0) -> Float[Tensor, "n d"]:

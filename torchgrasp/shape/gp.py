@@ -209,7 +209,8 @@ class ShapeGP(Posterior, Normalisation):
         """Draw n joint samples of distance and gradient (d, w), normalised, at k points [m], at
         most 1000.
 
-        Samples of one seed are differentiable in the points twice, unless points coincide.
+        Samples of one seed are differentiable in the points twice. Where points coincide, the
+        derivatives are those of points that move together.
 
         Raises the errors of `joint`.
         """

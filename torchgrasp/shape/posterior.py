@@ -3,6 +3,7 @@
 """
 
 import dataclasses
+import math
 from functools import cached_property, partial
 
 import torch
@@ -58,6 +59,9 @@ class ChunkNumbers:
 CHUNK = ChunkNumbers()
 # least eigenvalue of a covariance, over the prior variance: less is more than rounding
 LEAST_EIGENVALUE = -1e-8
+# eigenvalue over the prior variance that counts as zero in derivatives: above rounding, and that of
+# points one millionth of the shape's size apart
+SINGULAR = 1e-12
 
 
 @dataclasses.dataclass(frozen=True)
@@ -316,8 +320,8 @@ def symmetric_root(
 
     Rounding may turn eigenvalues of zero, as of coinciding points, slightly negative; they count as
     zero. More negative ones, relative to the `prior` variance, raise `IndefiniteCovariance`, whose
-    message ends with `fix`. The root is differentiable twice where all eigenvalues are positive,
-    and its gradient is NaN elsewhere.
+    message ends with `fix`. The root is differentiable twice. Where eigenvalues are zero, its
+    derivatives are those along covariances of the same rank.
     """
     values, vectors = torch.linalg.eigh(covariance.detach())
     if is_known(values) and values.numel():
@@ -326,9 +330,12 @@ def symmetric_root(
             raise IndefiniteCovariance("the joint covariance", least, fix)
     roots = torch.where(values > 0, values, 0.0).sqrt()
     root = (vectors * roots[..., None, :]) @ vectors.mT
+    if is_plain(covariance):
+        return root
+    both = roots[..., None] + roots[..., None, :]
+    both = torch.where(both > math.sqrt(SINGULAR * prior), both, torch.inf)
     # Newton's steps change the derivatives alone
-    for _ in range(0 if is_plain(covariance) else 2):
+    for _ in range(2):
         rest = vectors.mT @ (covariance - root @ root) @ vectors
-        rest = rest / (roots[..., None] + roots[..., None, :])
-        root = root + vectors @ rest @ vectors.mT
+        root = root + vectors @ (rest / both) @ vectors.mT
     return root
