@@ -190,7 +190,7 @@ def render_depth(
     Depth is 0 where nothing was measured. A pixel's true label is 0 for the table or nothing, k for
     mesh k - 1. The meshes [m] and the pose obj_from_camera (4, 4) [m] are in one frame. The table
     is a disc of radius 0.6 m about the origin at the height `table` [m]; None means no table.
-    `noise` is that of `partial_view`.
+    `noise` and `seed` are those of `partial_view`.
     """
     pose = check_rigid("camera_pose", camera_pose).double()
     depth = torch.full((HEIGHT, WIDTH), torch.inf, dtype=torch.float64)

@@ -96,14 +96,15 @@ class PreparedCloud(Value):
 def prepare_cloud(
     cloud: PointCloud, generator: torch.Generator, clean: bool = True, up: Vector | None = None
 ) -> PreparedCloud:
-    """Check a cloud, and return the points and normals to which a shape is fitted.
+    """Return the checked cloud, and the points and outward unit normals to which a shape is fitted.
 
-    At most 2000 points are drawn at random by `generator`. Normals of random signs are ignored:
-    with them a single view would look like a whole surface. With `clean`, outliers are removed, all
-    normals are fitted anew, and a missing viewpoint is estimated above the object, where the vector
-    `up` points. A viewpoint that too few given normals face is then ignored: the cloud is a whole
-    surface. Raises the errors of `check_cloud`, `BadArgument` for more than 16 cameras, and
-    `TooFewPoints` for a view of fewer than 10 points.
+    `generator` draws at most 2000 of the points. Missing normals are fitted. So are normals of
+    random signs, with which a single view would look like a whole surface. With `clean`, outliers
+    are removed, the other points are moved onto quadrics fitted around them, and all normals are
+    fitted anew. Also with `clean`, a viewpoint that too few given normals face counts as missing.
+    Where normals are fitted, a missing viewpoint is estimated by `guess_viewpoint`; `up` is the
+    upward direction, or None. Raises the errors of `check_cloud`, `BadArgument` for more than 16
+    cameras, and `TooFewPoints` for a view of fewer than 10 points.
     """
     cloud = remove_duplicates(cloud)
     normals = cloud.normals

@@ -97,7 +97,10 @@ def read_image_file(name: str, path: Path | str) -> Any:
 
 
 def parse_json(data: bytes) -> Any:
-    """Return the content of a JSON file, given its bytes; raise `Malformed` for a large file."""
+    """Return the content of a JSON file, given its bytes.
+
+    Raises `Malformed` if there are more than `JSON_BYTES`, and `ValueError` if they are no JSON.
+    """
     if len(data) > JSON_BYTES:
         raise Malformed(f"{len(data)} bytes")
     return json.loads(data)

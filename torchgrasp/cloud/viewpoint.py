@@ -41,7 +41,11 @@ class UnseenNumbers:
 
 @dataclasses.dataclass(frozen=True)
 class GuessNumbers:
-    """Numbers of the guess of a view's camera."""
+    """Numbers of the guess of a view's camera.
+
+    The score of a camera position is how well it explains the bulge of the surface, which is
+    towards the camera, and the density of the points.
+    """
 
     drawn: int = 2000
     """Most points from which the camera is guessed."""
@@ -56,7 +60,8 @@ class GuessNumbers:
     distance: float = 4.0
     """Distance of a guessed camera, in radii of the cloud."""
     density: float = 3.0
-    """Weight of the density beside the bulge; wrong cameras were rarest with it."""
+    """Weight of the density in the score; that of the bulge is 1. It gave the fewest wrong cameras.
+    """
     rival: float = 0.3
     """Directions whose score is less than this below the best are likely, too."""
     least_angle: float = 15.0

@@ -108,7 +108,10 @@ def as_scene(value: Any) -> Scene:
 
 @_named
 def as_seen(value: Any) -> PointCloud | Scene:
-    """Return a `Scene`, given a scene or the path of one; else a `PointCloud`, as `as_cloud`."""
+    """Return a `Scene`, given a scene or the path of one; else a `PointCloud`, as `as_cloud`.
+
+    Raises `BadArgument` for anything else.
+    """
     scene = isinstance(value, Scene) or (isinstance(value, str | Path) and is_scene(Path(value)))
     return as_scene(value, "cloud") if scene else as_cloud(value, "cloud")
 

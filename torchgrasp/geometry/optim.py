@@ -41,7 +41,7 @@ Model = TypeVar("Model", bound=Linearisation)
 class Minimisation(abc.ABC, Generic[State, Model]):
     """A batch of minimisation problems: it defines costs, steps, and which steps are accepted."""
 
-    first_damping: float = 1e-2
+    first_damping: float = 1e-2  # damping of the first step (no unit)
 
     @abc.abstractmethod
     def linearise(self, state: State, rows: Int[Tensor, "a"]) -> Model:

@@ -116,10 +116,10 @@ class PlaneFit:
     count: int
 
     def turned_up(self, view: "SeenPoints") -> "PlaneFit":
-        """Return the plane with its normal turned up.
+        """Return the plane with its normal turned to the upper side.
 
-        If the upward direction is unknown, the normal points to the camera; if that is unknown too,
-        to the side with most points.
+        `view` holds all points of the view. If their upward direction is unknown, the normal points
+        to the camera; if that is unknown too, to the side with most points.
         """
         if view.sky is not None:
             side = float(self.normal @ view.sky)

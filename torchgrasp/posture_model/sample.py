@@ -1,8 +1,8 @@
 """Random postures of a hand without self-collision: the training data of its learned model (Sec.
 4.1).
 
-Round fingertips roll, so "grasping" samples have contacts beside the middle of a pad, which must
-allow force closure.
+Round fingertips roll, so the contacts of "grasping" samples are off the centres of the pads. These
+contacts must allow force closure.
 """
 
 import dataclasses
@@ -35,11 +35,12 @@ BALANCES = 200
 def roll_contacts(
     hand: Hand, joints: Float[Tensor, "n h"], generator: np.random.Generator
 ) -> tuple[Float[Tensor, "n 3 3"], Float[Tensor, "n 3 3"]]:
-    """Return (points, normals) of random contacts beside the middle of the fingertips' pads.
+    """Return (points, normals) of random contacts off the centres of the fingertips' pads.
 
-    The points [m] and the pads' outward unit normals are in the hand's frame, for n postures
-    `joints` [rad] of three fingers. `generator` draws both tilts of a contact direction, which are
-    Gaussian, truncated to the pad's cone. The contact of a round tip moves along.
+    The points [m] and the fingertips' outward unit normals there are in the hand's frame, for n
+    postures `joints` [rad] of three fingers. `generator` tilts each normal at random from the pad's
+    axis, with Gaussian components of the tilt, cut off at the pad's cone. On a round fingertip the
+    contact moves to the point of the sphere with this normal; on a flat pad it stays in place.
     """
     points, axes = hand.fingertips(joints)
     cone = hand.tips.cone.to(axes)
@@ -97,9 +98,9 @@ a smaller share, a hand would draw for hours.
 Sampling = Literal["uniform", "grasping"]
 """Which of the random postures without self-collision are taken.
 
-* "uniform": all postures are taken, as in the paper. Their fingertips touch with the middle of
-  their pads.
-* "grasping": postures are taken whose contacts, where the rolled fingertips touch, can have force
+* "uniform": all postures are taken, as in the paper. Their contacts are at the
+  centres of the pads.
+* "grasping": postures are taken whose random contacts, those of `roll_contacts`, can have force
   closure.
 """
 

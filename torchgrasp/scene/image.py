@@ -45,7 +45,9 @@ class ProjectionNumbers:
     """Numbers of the projection of a cloud to an image."""
 
     steep: float = 0.01
-    """Least part of the vertical across the view; below it any direction is taken as down."""
+    """Least length of the part of the vertical unit vector that lies in the image plane. A view
+    with a shorter one is from straight above: any direction is then taken as down.
+    """
     widest: float = 75.0
     """Widest angle from the middle of a view [deg]."""
     cells: int = 64

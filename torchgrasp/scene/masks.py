@@ -26,7 +26,8 @@ class MaskNumbers:
     most_labels: int = 1000
     """Most objects: more values are those of a photograph."""
     least_share: float = 0.05
-    """Least share of a mask's pixels on its target: a third of a box drawn around an object are."""
+    """Least share of a mask's pixels on its target; in a box drawn around an object it is a third.
+    """
     own_share: float = 0.5
     """A segmented object belongs to a mask that has this share of the object's pixels."""
     mask_share: float = 0.3

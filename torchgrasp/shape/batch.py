@@ -60,9 +60,9 @@ class Walls(Value):
         shapes: Sequence[ShapeGP],
         device: torch.device,
     ) -> "Walls":
-        """Stack the posteriors of shapes, each of one surface.
+        """Return the stacked posteriors of shapes, each of one surface.
 
-        The `device` inverts the Cholesky factors.
+        The Cholesky factors are inverted on the `device`.
         """
         near = max(shape.n_oriented for shape in shapes)
         n = near + max(len(shape.x) - shape.n_oriented for shape in shapes)

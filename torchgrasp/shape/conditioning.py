@@ -105,7 +105,9 @@ def select_points(
     criterion: Criterion = "variance",
     stop: float = -math.inf,
 ) -> Selection:
-    """Choose at most `budget` candidates to observe, each the most informative given all before it.
+    """Return at most `budget` chosen candidates, and the posterior given them.
+
+    Each choice is the most informative candidate, given the known and the earlier chosen ones.
 
     Args:
         candidates: observations to choose from, all with normals.

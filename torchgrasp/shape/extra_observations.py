@@ -43,7 +43,9 @@ class OutsideNumbers:
     radius: float = 1.2
     """Number of points, and normalised radius of their sphere (Sec. 3.1)."""
     noise: float = 0.3
-    """Normalised standard deviation of a distance: the nearest of sparse points is too far away."""
+    """Normalised standard deviation of an observed distance. Distances are those of the nearest
+    surface point; they are too long where these points are sparse.
+    """
 
 
 OUTSIDE = OutsideNumbers()

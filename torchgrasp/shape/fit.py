@@ -109,8 +109,7 @@ def fit_shape(
         kernel: "thin_plate", "matern52" or "rbf", whose length psi sets (`kernel_by_name`); or your
             own `Kernel` of normalised distances.
         criterion: what is greatest at the most informative point: the "variance" of its distance,
-            the "error"
-            |mean distance|, or "both", |error| + 2 sqrt(variance).
+            the "error" |mean distance|, or "both", |error| + 2 sqrt(variance).
 
     Raises:
         BadArgument: an argument out of range; a table above the object's foot; a cloud that
@@ -157,7 +156,7 @@ def fit_upright(
     table: float | None,
     options: FitOptions,
 ) -> ShapeGP:
-    """Fit the shape to a cloud [m] without duplicates in a frame whose z axis points up.
+    """Return the shape fitted to a cloud [m] without duplicates in a frame whose z axis points up.
 
     `table` is the table's height [m]; None means no table. `seed` is the random seed, and `options`
     are those of `fit_shape`.

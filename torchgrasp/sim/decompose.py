@@ -64,7 +64,9 @@ def decompose(
 def main(asked: dict[str, Any]) -> None:
     """Read a mesh from stdin, cut it by CoACD, and write its convex parts to stdout.
 
-    `asked` holds limits of "seconds" [s] and "memory" [bytes], and the settings of the "search".
+    Both are .npz files. The mesh has `vertices` (v, 3) [m] and `faces` (f, 3); the parts have `v0`,
+    `f0`, `v1`, `f1` and so on. `asked` holds limits of "seconds" [s] and "memory" [bytes], and the
+    settings of CoACD by name in "search".
     """
     threading.Thread(target=_end_with_parent, args=(os.getppid(),), daemon=True).start()
     _limit(asked["seconds"], asked["memory"])

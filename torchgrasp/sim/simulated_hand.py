@@ -55,7 +55,8 @@ class SimulatedHand:
     Attributes:
         truth: the contacts of the last tick.
         force: true normal forces (f,) [N], averaged over the tick.
-        pushes: full forces (f, 3) [N], averaged over the tick.
+        pushes: full forces (f, 3) [N] of the fingertips on the object, in the world's frame,
+            averaged over the tick.
         finger: mask (f,) of the fingers that touched the object in the last step.
         steps: number of steps of the simulator so far.
         sent: targets (j,) [rad] of the last tick, in the scene's order of joints.

@@ -58,9 +58,9 @@ class FeatureNumbers:
     least_force: float = 1e-3
     """Least force [N] that counts: its logarithm is finite."""
     most_force: float = 1e3
-    """Greatest force [N] that counts, where no force is enough."""
+    """Greatest force [N] that counts; it also stands for a load that no force can carry."""
     most_spare: float = 2.0
-    """Greatest logarithm of a force to spare that counts in a mean, either way."""
+    """Greatest absolute value of a force to spare, a logarithm, that counts in a mean."""
 
 
 MEASURES = FeatureNumbers()
@@ -69,13 +69,13 @@ MEASURES = FeatureNumbers()
 def measure_grasps(
     hand: Hand, body: EstimatedBody, grasps: Grasps, friction: float, task: GraspTask, lifted: bool
 ) -> Float[Tensor, "g k"]:
-    """Return the k `FEATURES` of each grasp for a task, one column for each feature.
+    """Return the k features of each of g grasps for a task, a column for each name in `FEATURES`.
 
-    Body and grasps are in an upright frame; `body` is one object for all grasps, or one for each.
-    `friction` is the coefficient of friction, and `lifted` says whether the task is a lift;
-    otherwise the object is pulled. A force to spare is the logarithm of the fingers' strength over
-    the force needed. "force needed", "force to spare" and the features named "slippery" are at half
-    the friction.
+    `CAUSES` gives their units; shares and logarithms have none. Body and grasps are in an upright
+    frame; `body` is one object for all grasps, or one for each. `friction` is the coefficient of
+    friction, and `lifted` says whether the task is a lift; otherwise the object is pulled. A force
+    to spare is the logarithm of the fingers' strength over the force needed. "force needed", "force
+    to spare" and the features named "slippery" are at half the friction.
     """
     contacts = grasps.contacts
     g = len(grasps)

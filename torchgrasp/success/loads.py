@@ -22,11 +22,13 @@ class LoadNumbers:
     """The numbers of loads: friction cones, and bounds of forces."""
 
     carrying: float = 2.07
-    """Log-odds of success that a lift loses for each factor e on the force for the load."""
+    """Decrease of a lift's log-odds of success if the force that carries the load grows by a factor
+    e.
+    """
     torsion: float = 0.01
     """Lever [m] of the torsion of a contact, which is added to the triangle's height."""
     edges: int = 32
-    """Number of edges of a cone that stands for a friction cone."""
+    """Number of edges of the pyramid that approximates a friction cone."""
     least_force: float = 0.3
     """Least force [N] that counts in the log-odds."""
     most_force: float = 100.0

@@ -106,9 +106,11 @@ class TaskNumbers:
     push: float = 2.5
     """Force [N] of a push."""
     around: float = 1.24
-    """Length (no unit) of the corners and axes of a cube whose mixtures fill the unit ball."""
+    """Length (no unit) of vectors along the diagonals and axes of a cube, 14 directions: their
+    convex hull contains the unit ball.
+    """
     upward: float = 1.2
-    """Length of such a vector along z above which it points straight up."""
+    """Vectors among these with at least this z point straight up; "pour" leaves them out."""
 
 
 TASKS = TaskNumbers()
@@ -152,11 +154,11 @@ def loads_of(
     else:
         axes = torch.eye(3, dtype=torch.float64)
         corners = torch.tensor([*itertools.product((-1.0, 1.0), repeat=3)]) / math.sqrt(3)
-        # Mixtures of these vectors fill the unit ball.
+        # The convex hull of these vectors contains the unit ball.
         around = TASKS.around * torch.cat([corners, axes, -axes])  # (14, 3)
         weight = real([[0.0, 0.0, -TASKS.gravity * mass]])
-        # Without the vector that points up, mixtures fill the ball up to 120 degrees from straight
-        # down.
+        # Without the vector that points up, the hull contains the part of the ball within 120
+        # degrees of straight down.
         loads = {
             "lift": weight,
             "pour": TASKS.gravity * mass * around[around[:, 2] < TASKS.upward],

@@ -46,11 +46,11 @@ MOST_ERROR = 1000  # of the list of repairs in an error [characters]
 class DraftNumbers:
     """Numbers of the random postures from which pads are guessed, and of the drives of a draft."""
 
-    postures: int = 20_000
+    postures: int = 20_000  # number of random postures
     chunk: int = 1000  # postures whose poses are computed at once, to bound the memory
     rotor: float = 1e-3  # inertia [kg m2] that simulations add to each joint
-    stiffness: float = 4.0  # [1/rad], in efforts of the weakest joint
-    most_stiffness: float = 10.0  # [N m/rad]
+    stiffness: float = 4.0  # stiffness of a drive [1/rad], over the effort of the weakest joint
+    most_stiffness: float = 10.0  # greatest stiffness of a drive [N m/rad]
     damping: float = 0.03  # least time constant [s]: the ratio of damping to stiffness
 
 

@@ -31,11 +31,12 @@ MESH_KINDS = (".stl", ".obj", ".ply", ".dae", ".glb")
 class FitNumbers:
     """Numbers of the replacement of meshes by boxes, cylinders and balls."""
 
-    points: int = 4000  # on each shape
-    seed: int = 0  # of these points
+    points: int = 4000  # number of points on each shape
+    seed: int = 0  # random seed of these points
     fineness: int = 3  # subdivisions of an icosahedron that samples a sphere
     sections: int = 48  # sides of a sampled cylinder
-    least_reach: float = 5e-4  # of a mesh [m]: nothing on a hand is thinner than a fingernail
+    # least value of a mesh's largest coordinate [m]; below it the mesh is in a wrong unit
+    least_reach: float = 5e-4
     # A box of a link or of a fingertip is cut in two if the cut saves this share of the volume of
     # all boxes; smaller gives more boxes.
     saving: float = 0.12  # of a link
@@ -44,15 +45,15 @@ class FitNumbers:
     long_boxes: int = 8  # most boxes of a long body
     tip_boxes: int = 4  # most boxes of a long tip, behind its ball
     long: float = 0.08  # least length of a long body [m]
-    long_tip: float = 2.6  # a tip is long that is longer than this, in radii of its ball
-    places: int = 12  # at which a cut is tried along an axis, with both ends, which are none
+    long_tip: float = 2.6  # least length of a long tip, in radii of its ball
+    places: int = 12  # positions along an axis, with both ends; cuts are tried between the ends
     thinnest: float = 0.008  # least thickness of a part [m]
-    fewest: int = 20  # points of a part: with fewer its size is chance
+    fewest: int = 20  # each part of a cut has more points: the size of fewer is chance
     round_share: float = 0.9  # a cylinder replaces boxes with less than this share of their volume
     turned_share: float = 0.85  # likewise a box that is turned out of the link's axes
     flat: float = 1e-7  # root mean square thickness [m] of a flat body, which has no hull
-    least_size: float = 1e-4  # of a shape [m], so that none is empty
-    digits: int = 6  # to which all numbers are rounded
+    least_size: float = 1e-4  # least side of a shape [m], so that none is empty
+    digits: int = 6  # decimals to which all numbers are rounded
 
 
 FIT = FitNumbers()

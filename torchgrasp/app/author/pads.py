@@ -28,19 +28,20 @@ from torchgrasp.hand.urdf import Joint, Link, LinkShape, Triple, Urdf
 class PadNumbers:
     """Numbers by which pads are guessed from the motion and the surface of tips."""
 
-    near_share: float = 0.1  # of random postures, those with the nearest tips, where fingers meet
+    # share of the random postures, those with the nearest tips, in which fingers meet
+    near_share: float = 0.1
     # A joint bends to one side if the middle of its range lies farther than this share of it from
     # zero.
     one_sided: float = 0.1
     # angle [rad] by which the contact of a round tip is turned from its motion to the finger's end
     tilt: float = math.radians(30)
-    short_arm: float = 1e-3  # a joint whose axis passes a tip nearer than this [m] moves it not
+    short_arm: float = 1e-3  # least distance of a tip from the axis of a joint that moves it [m]
     beside: float = 0.003  # points of a surface count so near a ray or a plane [m]
     end: float = 0.015  # length of a finger's end, half of whose thickness is the ball's radius [m]
     radii: tuple[float, float] = (0.003, 0.013)  # least and greatest radius of a ball [m]
     radius_digits: int = 4  # decimals of the radius of a ball [m]
     place_digits: int = 6  # decimals of the centre of a ball [m]
-    digits: int = 12  # to which all numbers of a pad are rounded
+    digits: int = 12  # decimals to which all numbers of a pad are rounded
 
 
 @dataclasses.dataclass(frozen=True)

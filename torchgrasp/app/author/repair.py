@@ -29,7 +29,7 @@ class RepairNumbers:
     # farthest mass centre and radius of gyration, in half diagonals of the bounding box
     far_out: float = 2.0
     rounding: float = 1e-6  # relative error of inertias, which URDFs write with few digits
-    digits: int = 15  # of an angle [rad], so that short numbers remain short
+    digits: int = 15  # decimals of an angle [rad], so that short numbers remain short
 
 
 REPAIRS = RepairNumbers()

@@ -22,7 +22,8 @@ T = TypeVar("T")
 class Command:
     """Base of all commands.
 
-    `names` gives, for arguments that the library's errors name, the field of the command.
+    `names` maps an argument of the library to the field of the command that gives it, such as
+    {"points": "cloud"}. An error that names the argument is shown with this field's option.
     """
 
     names: ClassVar[dict[str, str]] = {}
@@ -61,7 +62,7 @@ def nested(default: Any) -> Any:
 def arguments(**names: str) -> Callable[[type[T]], type[T]]:
     """Return a decorator that makes a class a frozen dataclass of command-line arguments.
 
-    `names` gives, for arguments that the library's errors name, the field of the class.
+    `names` maps arguments of the library to fields of the class, as `Command.names`.
     """
 
     def make(cls: type[T]) -> type[T]:

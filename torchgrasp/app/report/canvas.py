@@ -86,7 +86,7 @@ class Framing:
 class RasterNumbers:
     """Numbers of the rendering of triangles to pixels."""
 
-    samples: int = 2  # along each axis of a pixel; their mean gives smooth edges
+    samples: int = 2  # number along each axis of a pixel; their mean gives smooth edges
     opacity: float = 0.5  # of transparent triangles
     nearest: float = 1e-6  # least distance from the camera [m]; the scene is framed in front of it
     thinnest: float = 1e-9  # twice the least area [pixels]: seen from its edge, a triangle is thin
@@ -119,7 +119,7 @@ class BarLayout:
     side: int = 5  # one part in so many of the width stays free on each side of the bar
     top: int = 24  # upper end of the strip, from the bottom of the picture
     bottom: int = 10  # lower end of the strip, likewise
-    font: int = 20  # of numbers and title
+    font: int = 20  # size of numbers and title
     labels: int = 4  # numbers above the strip
     label_rise: int = 4  # of the numbers above the strip
     title_rise: int = 29  # of the title above the strip

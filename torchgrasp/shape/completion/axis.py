@@ -36,8 +36,8 @@ class AxisNumbers:
     """Distance [m] of a normal's line from the axis at which it has half the weight."""
     first_half_weight: float = 0.02
     narrowing: float = 0.6
-    """This distance [m] in the first step of the fit of a tilted axis, and the factor by which its
-    excess shrinks from step to step.
+    """The distance of half weight [m] in the first step of the fit of a tilted axis. Its excess
+    over `half_weight` is multiplied by `narrowing` from step to step.
     """
     steep: float = 0.3
     """Least length of the horizontal part of the unit normals that fit a vertical axis."""
@@ -49,11 +49,13 @@ class AxisNumbers:
     """Number of Gauss-Newton steps of the fit of a tilted axis."""
     damping: float = 1e-6
     least_diagonal: float = 1e-9
-    """Share of the diagonal that is added to it, and least diagonal: a ball leaves the direction
-    free, and a prism the place along a side.
+    """Share of the normal equations' diagonal that is added to it, and its least value. A ball does
+    not determine the axis's direction, and a prism not its position along a side.
     """
     turn: float = 0.3
-    """Greatest turn [rad] of a step: misses are linear in small turns only."""
+    """Greatest rotation [rad] of the axis in a step: the lines' distances are linear only in small
+    rotations.
+    """
     cost: float = 1.0
     """Greatest mean of log(1 + (distance / half_weight)^2) of the normals' lines from the axis."""
 
@@ -82,7 +84,8 @@ class RoundNumbers:
     slice's median.
     """
     one_way: float = 0.95
-    """Greatest length of the mean horizontal unit normal: it is longer for one flat side."""
+    """Greatest length of the mean of the horizontal unit normals: one flat side gives a longer one.
+    """
     turns: int = 12
     """Number of parts of a full circle by which the body is rotated, to compare it with free space.
     """

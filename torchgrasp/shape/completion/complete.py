@@ -87,7 +87,9 @@ class BarNumbers:
     thin: float = 0.012
     """Width [m] below which a part is a bar: that of a fingertip."""
     empty: float = 0.5
-    """Greatest depth of a frame's middle in the outline, as a share of the middle's distance."""
+    """Greatest distance of a frame's centre from the outline, inside of it, over the distance of
+    the centre from the cloud.
+    """
     neighbours: int = 30
     """Number of points that give width and direction; normals are fitted to as many."""
     middle: float = 0.8
@@ -157,8 +159,9 @@ def correlated_errors(
 ) -> Float[Tensor, "m k"]:
     """Return correlated errors [m] of m points [m], a column for each of k independent causes.
 
-    The `shared` errors [m] come first, then a smooth random field. At each point, the field has the
-    standard deviation of the `local` [m] and the `shared` errors together.
+    The `shared` errors [m] come first, then the modes of a smooth random field. The field's
+    variance at a point is the sum of the squares of the `local` error [m] and of the `shared`
+    errors there.
     """
     deviation = torch.sqrt(local**2 + (shared**2).sum(1))
     alike = torch.exp(-0.5 * (torch.cdist(points, points) / HIDDEN.part) ** 2)

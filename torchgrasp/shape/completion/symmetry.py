@@ -69,7 +69,9 @@ class PlaneSearchNumbers:
     """
     hides: float = 0.35
     facing: float = 0.7
-    """Cosines with the viewing direction above which a plane hides points, and is frontal."""
+    """Absolute cosines between a plane's normal and the viewing direction: above the first, the
+    mirror images are on the hidden side; above the second, the plane faces the camera.
+    """
     rim_prior: float = 0.15
     rim_distance: float = 0.25
     """Score that a plane loses, and the distance from the rim, over the size, at which it does: a
@@ -89,8 +91,8 @@ class PlaneSearchNumbers:
     violation: float = 0.15
     """Greatest mean violation of free space, in [0, 1], of a plane that no point confirms."""
     slope: float = 0.15
-    """Difference of score from the best plane with which a plane near it matches only because it
-    is near.
+    """A plane with nearly the best plane's normal is dropped if its score is lower than the best by
+    this: it matches the cloud only because it is near the best plane.
     """
     end_score: float = 0.4
     """Least score of the plane that mirrors the ends of a body of revolution."""

@@ -216,13 +216,14 @@ def complete_walls(
     table: float,
     numbers: WallNumbers = WALL,
 ) -> tuple[Wall, Wall]:
-    """Return the outer and the inner wall of a vessel on a table.
+    """Return (outer, inner): the two walls of a vessel on a table, each seen and hidden.
 
     Args:
         cloud: the cloud [m] with normals, z up.
         vessel: the vessel that it shows.
         outline: silhouettes of the views.
         table: the table's height [m].
+        numbers: errors of the hidden parts, and bounds on their numbers of points.
 
     The other side of a seen wall is one thickness away. Parts seen on neither side are estimated by
     rotating the seen parts about the axis.
