@@ -73,8 +73,8 @@ class CloudReport(Value):
     spacing: float  # median distance to the nearest point [m]
     density: float  # median number of points per square metre
     noise: float  # median rms about local planes [m]
-    copies: int  # coincident points
-    outliers: int  # points far from their neighbours
+    copies: int  # number of coincident points
+    outliers: int  # estimated number of points far from their neighbours
     normals: NormalCheck | None  # agreement of the given normals; None without them
     viewpoint: Float[Tensor, "*points 3"] | None  # [m]; None: a whole surface
     viewpoint_given: bool  # whether the viewpoint was given; else it is estimated

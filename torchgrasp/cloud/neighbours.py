@@ -31,7 +31,9 @@ class NeighbourNumbers:
     width: float = 0.7
     """Width of the weights of neighbours, over the distance of the farthest."""
     ridge: float = 1e-3
-    """Weight of flatness beside that of the points: it decides only where points are few."""
+    """Weight of the squared coefficients of a quadric beside the squared errors, of which it
+    penalises all but the constant: it matters only where points are few.
+    """
     block: int = 1 << 14
     """Points whose quadrics are fitted at once: bounds the memory for clouds of any size."""
     flat: int = 2000

@@ -162,7 +162,8 @@ def add_noise(
     """Return a depth image (h, w) [m] with a camera's noise; 0 where nothing is measured.
 
     `depth` is the exact image [m], 0 where no surface is. `cosine` (h, w) is the absolute cosine
-    between each ray and the surface normal.
+    between each ray and the surface normal. `sensor` is the model of the noise, which `generator`
+    draws.
     """
     normal = partial(torch.randn, depth.shape, generator=generator, dtype=torch.float64)
     uniform = partial(torch.rand, depth.shape, generator=generator, dtype=torch.float64)

@@ -77,10 +77,11 @@ def close_hand(
 ) -> ClosureResult:
     """Close a hand on the true object, lift it and hold it, in simulation.
 
-    The opened hand moves straight to its pre-grasp, closes and presses (`GraspController`), rises
-    and holds. The object is **held** if its centre rose by half the lift, two fingers touch it at
-    the end, and it slipped by less than 20 mm and 30 degrees in the closed hand. Equal arguments
-    give bitwise equal results.
+    The result is the record of all control ticks, with a status that says whether the object was
+    held, else why not. The opened hand moves straight to its pre-grasp, closes and presses
+    (`GraspController`), rises and holds. The object is **held** if its centre rose by half the
+    lift, two fingers touch it at the end, and it slipped by less than 20 mm and 30 degrees in the
+    closed hand. Equal arguments give bitwise equal results.
 
     Args:
         grasp: a single grasp.

@@ -48,9 +48,10 @@ def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") ->
     """Close a hand on the true object, and pull at the object along the world's axes until a pull
     fails.
 
-    Every pull begins from the same grasp. The object's motion includes its motion during the
-    closing. `protocol` may be a name in `PROTOCOLS`. Raises the errors of `close_hand`, and
-    `BadArgument` for an unknown protocol, or a protocol that lifts.
+    The result says whether the object stayed in the hand. Every pull begins from the same grasp.
+    The object's motion includes its motion during the closing. `protocol` may be a name in
+    `PROTOCOLS`. Raises the errors of `close_hand`, and `BadArgument` for an unknown protocol, or a
+    protocol that lifts.
 
     >>> from torchgrasp import load_hand, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp

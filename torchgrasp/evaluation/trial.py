@@ -376,8 +376,8 @@ class TrialRun:
         return math.nan, math.nan
 
     def strained(self) -> bool:
-        """Return whether any joint's drive would need its greatest torque to reach its target, or
-        to grip.
+        """Return whether a joint's drive needs at least its greatest torque to reach its target
+        or, in the mode "grip", to grip.
         """
         reference = self.robot.reference
         hold = self.controller.hold

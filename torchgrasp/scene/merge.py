@@ -64,7 +64,7 @@ class MergeNumbers:
     standing_share: float = 0.5
     """A body whose foot is lower than this share of its top stands, too: its foot is hidden."""
     lesser: float = 0.1
-    """A body with a smaller share of the other's points is a part of it, such as a knob."""
+    """A body with fewer points, as a share of the other's, is a part of it, such as a knob."""
     upon: float = 0.01
     """The top of a body upon another is higher by this."""
     upon_foot: float = 0.5

@@ -22,7 +22,9 @@ class HeightNumbers:
     band: float = 0.010
     """Mean heights below this [m], of either sign, measure the noise of the table."""
     foot: float = 0.030
-    """Heights up to this [m] are averaged: at an object's foot, not its distant neighbours."""
+    """Greatest distance [m] from the table of a pixel whose height is averaged: the mean at an
+    object's foot leaves out higher parts.
+    """
     normal: float = 1.4826
     """Standard deviation over the median of the absolute value, of a normal distribution."""
     jump: float = 0.006
@@ -74,7 +76,7 @@ class TableImage(Value):
     def mean_height(self) -> Float[Tensor, "h w"]:
         """The mean height above the table of the 5 x 5 pixels around each pixel [m].
 
-        Only measured pixels within `HEIGHT.foot` of the table count.
+        Only measured pixels within `HEIGHT.foot` of the table count; all others keep their height.
         """
         near = self.measured & (self.height.abs() < HEIGHT.foot)
         share = torch.from_numpy(ndimage.uniform_filter(near.double().numpy(), HEIGHT.window))

@@ -103,9 +103,10 @@ class SimulatedHand:
 
     @checked
     def tick(self, targets: Targets) -> Observation:
-        """Drive joints and palm towards their targets for one control period.
+        """Drive joints and palm towards their targets for one control period; return the
+        observation at its end.
 
-        Return the observation at its end.
+        Raises `BadArgument` unless `targets` are those of all joints of the URDF.
         """
         if len(targets.joints) != len(self._to_scene):
             allowed = f"all {len(self._to_scene)} of the URDF"

@@ -15,17 +15,15 @@ from torchgrasp.shape.surface import collision_field, extract_mesh
 
 
 class EstimatedBody(NamedTuple):
-    """The planner's estimate of one object, or of one object for each row of a batch.
+    """The planner's estimate of one object, or of an object for each row of a batch, as of grasps.
 
-    For a batch, `shape`, `field` and the four numbers hold one value for each row. All is in an
-    upright frame: z points up.
+    For a batch, all fields hold one value for each row. All is in an upright frame: z points up.
     """
 
     shape: ShapeGP | ShapeBatch  # the estimated shape
     field: DistanceField  # signed distances [m] from the estimated surface
-    center: Float[
-        Tensor, "*b 3"
-    ]  # the mean [m] of the surface's vertices, which is taken for the centre of mass
+    # mean [m] of the surface's vertices, which is taken for the centre of mass
+    center: Float[Tensor, "*b 3"]
     size: PerRow  # half the size [m] of the object: the length of a normalised unit
     height: PerRow  # extent [m] along z
     # standard deviation [m] of the vertices along their horizontal principal axis of less extent

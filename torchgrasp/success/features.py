@@ -39,7 +39,18 @@ CAUSES: dict[str, dict[str, str]] = {
         "open loop": "1",
     },
 }
-"""The features of a grasp with their units, by the cause of failure that they describe."""
+"""The features of a grasp with their units, by the cause of failure that they describe.
+
+* "load": the normal force of the strongest finger that the load needs; the logarithm of the
+  fingers' strength over it; the distance of the contacts' centroid from the object's centre.
+* "moved": two such logarithms, and whether the force is enough, as means over displacements of the
+  object (`touch_moved`).
+* "surface": the greatest standard deviations of the surface and of its normal at a contact.
+* "object": `size`, `height` and `breadth` of `EstimatedBody`.
+* "task": the friction coefficient; the mass; the normal force of the strongest finger, 0 if the
+  hand presses as the load needs; then 1 if true, else 0: the object is lifted; it may be
+  displaced; the hand closes in open loop.
+"""
 # All features, in the order of the columns.
 FEATURES = tuple(name for names in CAUSES.values() for name in names)
 GRIP = 15.0  # greatest force [N] that a hand which grips as the load asks for may need

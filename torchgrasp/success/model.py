@@ -29,20 +29,17 @@ class SuccessModel(Value):
     """
 
     feature: Int[Tensor, "t m"]  # the feature that a node reads
-    threshold: Float[
-        Tensor, "t m"
-    ]  # a grasp goes to the first child where the feature is at most this
+    # a grasp goes to the first child where the feature is at most this
+    threshold: Float[Tensor, "t m"]
     children: Int[Tensor, "t m 2"]  # indices of a node's two children; a leaf is its own child
     value: Float[Tensor, "t m"]  # the log-odds that a leaf adds; 0 in other nodes
     start: Float[Tensor, ""]  # log-odds without any tree
     range: Float[Tensor, "k 2"]  # least and greatest value of each feature in the trials
     usual: Float[Tensor, "k"]  # the median of each feature among grasps that held
-    bands: Float[
-        Tensor, "n 3"
-    ]  # log-odds in ascending order, each with the least and greatest share that held there
-    kept: Float[
-        Tensor, "r 3"
-    ]  # trials of the best grasp for a task: log-odds, 1 if it held, the number of the family
+    # log-odds in ascending order, each with the least and greatest share of grasps that held there
+    bands: Float[Tensor, "n 3"]
+    # of each trial of the best grasp for a task: log-odds, 1 if it held, the number of the family
+    kept: Float[Tensor, "r 3"]
 
     def log_odds(self, features: Float[Tensor, "g k"]) -> Float[Tensor, "g"]:
         """Return the log-odds of success of g grasps with the given `FEATURES`."""

@@ -297,8 +297,8 @@ def holding(
 ) -> Iterator[None]:
     """Within the context, lock the folder or file at `path` against other runs.
 
-    Errors call it by `name`, its option. `hold` locks: a folder by default. A `path` of None locks
-    nothing.
+    Errors call it by `name`, its option. `hold(path)` is the context in which it is locked, by
+    default that of a folder. A `path` of None locks nothing.
     """
     with contextlib.ExitStack() as held:
         if path is not None:

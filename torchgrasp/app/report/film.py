@@ -27,7 +27,7 @@ class FilmLayout:
     """Layout of a film strip: stills, and plots below them [pixels; fonts in points]."""
 
     dpi: int = 100  # [pixels per inch]
-    width: int = 1680  # of the strip
+    width: int = 1680  # width of the strip
     still: int = 340  # height of a still with its title
     title: int = 44  # height of this title
     title_left: float = 0.04  # place of the title, as a share of the still's width
@@ -36,13 +36,13 @@ class FilmLayout:
     many: int = 6  # stills from which on the small font is used
     tall_plot: int = 200  # height of a plot with a legend
     plot: int = 110  # height of a plot without a legend
-    plot_gap: int = 50  # above each plot, for its title
-    plots_top: int = 62  # between stills and plots, for the letters of the moments
-    plots_bottom: int = 60  # for the axis of time
+    plot_gap: int = 50  # gap above each plot, for its title
+    plots_top: int = 62  # gap between stills and plots, for the letters of the moments
+    plots_bottom: int = 60  # gap below the plots, for the axis of time
     bottom: int = 76  # height beside stills, plots and their gaps
     left: float = 0.05  # ends of the plots, as shares of the width
     right: float = 0.985  # likewise
-    letter_rise: int = 30  # of a letter above the first plot [points]
+    letter_rise: int = 30  # height of a letter above the first plot [points]
     touch: int = 12  # size of the mark at a finger's first touch [points]
     far: float = 0.25  # an object this far from its first place [m] is lost, and is not framed
 
@@ -55,7 +55,7 @@ class PlotStyle:
     title_gap: int = 9  # between a title and its plot
     ticks: int = 3  # most intervals of the vertical axis
     line: float = 1.8  # width of a line
-    wide: float = 4.0  # of the hand's height, which a held object would cover
+    wide: float = 4.0  # width of the line of the hand's height, which a held object's would cover
     handle: float = 1.2  # length of a line in the legend, in font sizes
     legend_top: float = 0.96  # lower end of the legend, as a share of the plot's height
     room: float = 1.1  # upper end of an axis, in largest values

@@ -28,14 +28,14 @@ from torchgrasp.values.planning import Contacts, Grasps, PointCloud
 class StillLayout:
     """Limits and sizes of what stills show."""
 
-    most_points: int = 3000  # of a cloud: more would hide each other
+    most_points: int = 3000  # most points of a cloud: more would hide each other
     least_height: float = 1e-12  # [m]: a flat cloud has one colour
-    most_others: int = 4000  # points of all neighbours
+    most_others: int = 4000  # most points of all neighbours
     contact_arrow: float = 0.045  # [m], about as long as a fingertip with its pad
     tip_arrow: float = 0.03  # of the pads of a hand alone [m]
     palm_axis: float = 0.6  # length of the axes, as a share of the diagonal of the palm
     unknown_view: Direction = (1.0, -0.8, 0.6)  # from the front, where the camera is unknown
-    grasp_rise: float = 0.4  # of the viewing direction of a grasp, for each metre along the ground
+    grasp_rise: float = 0.4  # rise of the view of a grasp, for each metre along the ground
 
 
 @dataclasses.dataclass(frozen=True)
