@@ -165,9 +165,9 @@ def run_on_cluster(
     worker dies is given to another worker; after the deaths that the scheduler allows
     (`distributed.scheduler.allowed-failures`, 3 by default) it gives `Status.WORKER_DIED`. A task
     that takes longer than `limit` [s] ends its worker, and gives `Status.TIMED_OUT`. The scheduler
-    holds `OUTSTANDING` tasks at most, which wait until a worker is free. Successive tasks share an
-    equal argument `OnGpu`. Without Dask, `MissingExtra` is raised; without a scheduler at the
-    address, `BadArgument`.
+    holds `OUTSTANDING` tasks at most, which wait until a worker is free. An argument `OnGpu` that
+    successive tasks share is computed once. Without Dask, `MissingExtra` is raised; without a
+    scheduler at the address, `BadArgument`.
     """
     try:
         from distributed import CancelledError, Client, Event, KilledWorker, as_completed

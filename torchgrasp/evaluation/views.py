@@ -174,10 +174,10 @@ def _plan(
 def plan_view(
     view: ObjectView, protocol: Protocol, spec: EvaluationSpec, planned: Path | Grasps | None = None
 ) -> PlannedView:
-    """Plan grasps for a protocol on a view, or take those that are already `planned`.
+    """Return the executable grasps of a view for a protocol, with its score.
 
-    These are in a file, or returned by `plan_views`. If `plan_views` found none, the view is
-    planned anew, to find out why.
+    The score says why there are none. `planned` are grasps that exist already: the path of their
+    file, or what `plan_views` returned. None, or a plan without grasps, means to plan them here.
     """
     hand = view.load_hand()
     score = view.score

@@ -37,7 +37,7 @@ class FieldBatch(DistanceField):
 
     @classmethod
     def of(cls, fields: Sequence[SignedDistanceField]) -> "FieldBatch":
-        """Join c fields to a batch of c entries, where entry k has field k."""
+        """Return c fields joined to a batch of c entries, where entry k has field k."""
         nodes = torch.cat([x.nodes for x in fields])
         shape = torch.tensor([x.values.shape for x in fields], device="cpu")
         places = torch.stack(

@@ -117,7 +117,8 @@ def subsets(count: int, size: int, device: torch.device) -> Int[Tensor, "k s"]:
 def degenerate(points: Float[Tensor, "*b f 3"]) -> Bool[Tensor, "*b"]:
     """Return a mask of the contact sets whose f contacts lie nearly on a line.
 
-    Then even their largest triangle is flatter than `FLAT`. The points [m] may be in any frame.
+    Then twice the area of their largest triangle is at most `FLAT` times the square of the longest
+    side. The points [m] may be in any frame.
     """
     corners = points[..., subsets(points.shape[-2], 3, points.device), :]  # (*b, k, 3, 3)
     sides = corners - corners.roll(1, dims=-2)

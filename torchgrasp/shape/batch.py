@@ -190,7 +190,7 @@ class ShapeBatch(Value):
         shapes: Sequence[ShapeGP],
         device: torch.device | None = None,
     ) -> "ShapeBatch":
-        """Stack c shapes to a batch of c entries, where entry k has shape k.
+        """Return c shapes stacked to a batch of c entries, where entry k has shape k.
 
         `device` is by default that of the shapes. Raises `BadArgument` for a kernel that is no thin
         plate.

@@ -15,7 +15,8 @@ Settings that differ from SAPIEN's defaults:
 * Convex parts are cooked at a larger scale, and the foot of a finely faceted part is a shape of its
   own.
 
-The arguments `sapien` and `physx` are the modules that `import_sapien` returns.
+The arguments `sapien` and `physx` are the modules that `import_sapien` returns; a `material` is
+PhysX's material of a surface, with its friction.
 """
 
 import dataclasses

@@ -188,7 +188,7 @@ class SimulatedScene(abc.ABC):
 
     @checked
     def lift(self, height: float, speed: float = 0.0) -> None:
-        """Set the mount's target height [m] and target speed [m/s]."""
+        """Set the mount's target height [m] above its start, and its target speed [m/s]."""
         self._move_mount(LIFT_JOINT, height, speed)
 
     @checked

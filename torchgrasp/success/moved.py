@@ -25,7 +25,7 @@ class MovedNumbers:
     count: int = 16
     """Number of displacements."""
     radius: float = 0.02
-    """The greatest displacement [m], which a hand still finds."""
+    """The greatest displacement [m]: the fingers of a closing hand still reach the object."""
     turn: float = 0.618
     """Step of the sequence of sizes, the golden ratio: the sizes fill the ball evenly."""
     close: float = 3e-4
@@ -49,8 +49,8 @@ class MovedContacts(NamedTuple):
     """Contact sets of g grasps after each of d displacements of the object.
 
     Args:
-        contacts: contact points [m] and outward normals, f for each set; the d g sets are ordered
-            by displacement, then by grasp.
+        contacts: contact points [m] and outward normals in the object's frame, f for each set; the
+            d g sets are ordered by displacement, then by grasp.
         forces: balanced contact forces [N] of these sets, of which the largest normal force is 1 N;
             NaN if there are none.
         touched: whether all fingers touch the object, and can press it with balanced forces.
@@ -64,10 +64,10 @@ class MovedContacts(NamedTuple):
 def touch_moved(
     hand: Hand, field: DistanceField, grasps: Grasps, forces: Float[Tensor, "g f 3"]
 ) -> MovedContacts:
-    """Return the contacts of g grasps if the object is displaced, by distances that a hand still
-    finds.
+    """Return the contacts of g grasps after each of `MOVED.count` displacements of the object.
 
-    The displacements fill a ball, in the axes of the hand. Each fingertip moves along the line from
+    The displacements, at most `MOVED.radius`, fill a ball evenly, in the axes of the hand. The
+    contacts are in the frame of the object, as `field`. Each fingertip moves along the line from
     its pre-grasp to its planned pose, and further, until it touches the surface that `field` gives.
     The balanced `forces` [N] at the planned contacts say in which ratios the fingers push.
     """

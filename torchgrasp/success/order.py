@@ -23,7 +23,7 @@ unknown.
 
 
 def is_covered(features: Float[Tensor, "g k"]) -> Bool[Tensor, "g"]:
-    """Return a mask of the grasps whose predicted success trials support.
+    """Return a mask of the grasps for which trials support the prediction of success.
 
     Their features named in `DOMAIN` lie within the range of the trials.
     """
