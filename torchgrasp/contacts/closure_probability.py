@@ -47,7 +47,10 @@ class LinePosterior(Batch):
     """The joint Gaussian of signed distance d and its gradient w along lines through the contacts.
 
     The line of a contact x with the normal n holds the points x + t n. Lengths are in normalised
-    units; w and `slope` have no unit.
+    units; w and `slope` have no unit. `deviation` is the standard deviation of the surface at each
+    contact, which is the unit of the positions `grid`. `distance` is the mean of d at these 23
+    positions, `slope` the mean of w at five of them, the nodes. `root` is the symmetric root of the
+    covariance of d and w at all nodes (`node_covariance`).
     """
 
     points: Vectors  # planned contacts x (b, f, 3)

@@ -54,13 +54,15 @@ def resist_loads(
     loads: Float[Tensor, "b w 6"],
     spec: ContactSpec,
 ) -> Resisted:
-    """Return how much of the worst of w loads each of b contact sets resists.
+    """Return the greatest multiple of the worst of w loads that each of b contact sets resists.
+
+    The worst load is the one with the least such multiple.
 
     Args:
         points: contacts [m] (b, f, 3).
         normals: outward unit normals (b, f, 3).
         strength: greatest normal force [N] of each contact.
-        loads: forces [N], then torques [N m] about the origin.
+        loads: forces [N], then torques [N m] about the origin of the points' frame.
         spec: its planned friction and edges define the friction cones, as in `certify`.
     """
     count = loads.shape[1]

@@ -153,17 +153,20 @@ class ForceHold:
 def keep_targets(
     reference: ClosingReference, observation: Observation, start: Tensor
 ) -> Callable[..., Tensor]:
-    """Return a hold controller that keeps the joint targets `start` [rad] of the end of the
-    closing.
+    """Return a hold controller that always returns `start`, the joint targets (j,) [rad].
+
+    They are those at the end of the closing. The controller is a function of an observation and a
+    period [s], as `Step`. `reference` and `observation`, which other hold controllers need, are not
+    used.
     """
     return lambda observation, period: start
 
 
 def regulate(factor: float, observation: Observation, strength: float, period: float) -> float:
-    """Return the common `factor` on all forces one tick later, `period` [s] on.
+    """Return the common `factor` (no unit) on all forces one tick of `period` [s] later.
 
-    It changes so that the sum of the sensed normal forces approaches `strength` [N], but stays from
-    0.5 to `MAX_FACTOR`.
+    It is `factor` + `period` (1 - s / `strength`), clamped to [0.5, `MAX_FACTOR`], so that the sum
+    s [N] of the sensed normal forces approaches `strength` [N].
     """
     lacking = 1 - float(observation.tactile.reading.sum()) / strength
     return min(max(factor + period * lacking, 0.5), MAX_FACTOR)

@@ -64,7 +64,7 @@ class LawClosing(Closing, Protocol):
 class Settled:
     """A clock of how long a closing has settled: `time` [s] for which all fingers have touched.
 
-    With `pressing` they must also be near their planned contacts, with steady forces.
+    With `pressing` they must also be under force control, with steady forces (`update`).
     """
 
     def __init__(self, reference: ClosingReference) -> None:
@@ -79,11 +79,11 @@ class Settled:
         period: float,
         pressing: bool = True,
     ) -> None:
-        """Add a tick of `period` [s] to `time` if all fingers touch and, with `pressing`, press
-        steadily.
+        """Add a tick of `period` [s] to `time` if the closing is settled; otherwise set it to 0.
 
-        Otherwise `time` becomes 0. `touching` marks the fingers that touch, and `share` is each
-        finger's share of force control, which must be at least 0.5 while `pressing`.
+        It is settled if all fingers touch and, with `pressing`, each has a `share` of force control
+        of at least 0.5, and an average force (`TactileState.average`) within `NOISE` [N] of that at
+        the last tick that was not settled. `touching` marks the fingers that touch.
         """
         average = observation.tactile.average
         settled = bool(touching.all())

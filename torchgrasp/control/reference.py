@@ -45,8 +45,8 @@ class ClosingReference(Value):
         squeeze: joint targets that press on the object without feedback, from
             `torchgrasp.control.squeeze`.
         normals: outward unit normals of the planned contacts.
-        gains: contacts, controller gains and desired forces, of the closing "uncertainty" unless
-            `as_printed`.
+        gains: targets, controller gains and desired forces (`ClosingGains`) of the closing
+            "uncertainty"; the method `as_printed` returns a plan with those of Eqs. (26) and (27).
         approach: unit vector along which the opened hand moves to its pre-grasp; None means no
             approach.
         table: the table, which no fingertip enters while it searches; None if it is unknown.
@@ -160,10 +160,10 @@ class ClosingReference(Value):
         )
 
     def as_printed(self) -> "ClosingReference":
-        """Return the plan for the closing "paper": Sigma_cov and K_P of Eqs. (26) and (27) as the
-        paper prints them.
+        """Return the same plan with the gains of the closing "paper".
 
-        Raises `BadArgument` if the plan lacks `distance_variance`.
+        Sigma_cov and K_P are those of Eqs. (26) and (27) as the paper prints them. Raises
+        `BadArgument` if the plan lacks `distance_variance`.
         """
         if self.distance_variance is None:
             found = "'paper' without f_cov, the variance of the signed distance [m^2]"

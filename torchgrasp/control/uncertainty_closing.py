@@ -49,9 +49,9 @@ class ClosingNumbers:
     """Gain [1/s] with which the palm follows the object."""
     # of a finger without a sensor
     stalled: float = 0.25
-    """Force [N] of its drives at which it counts as touching."""
+    """Force [N] felt by its drives at which a finger without a sensor counts as touching."""
     deviations: float = 3.0
-    """Standard deviations beyond its estimated contact at which it counts as touching."""
+    """Standard deviations beyond its contact at which such a finger counts as touching."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,8 +125,10 @@ class UncertaintyClosing:
     def begin_at(
         self, displacement: Float[Tensor, "6"], palm: Float[Tensor, "3"]
     ) -> "UncertaintyClosing":
-        """Set the palm's initial displacement `palm` [m] and the object's expected `displacement`
-        [m, rad]; return `self`.
+        """Return this controller, with another initial palm and expected object.
+
+        `palm` [m] is the palm's displacement from its planned pose, and `displacement` the expected
+        translation [m] and rotation vector [rad] of the object.
         """
         self.planes = ContactPlanes(self.reference, displacement)
         self.palm = palm
@@ -135,8 +137,9 @@ class UncertaintyClosing:
         return self
 
     def press(self) -> "UncertaintyClosing":
-        """Let all fingers press with their desired forces, waiting ones too; stop the palm; return
-        `self`.
+        """Return this controller, switched to pressing.
+
+        All fingers, also those that waited, press with their desired forces; the palm stops.
         """
         self.waits = False
         self.reach = 0.0
@@ -289,11 +292,11 @@ def slide_along(
     up: Float[Tensor, "3"],
     low: Bool[Tensor, "f"],
 ) -> Float[Tensor, "f 3"]:
-    """Return each fingertip's `velocity` [m/s], changed so that the `low` fingertips go down to the
-    table and stay there.
+    """Return the fingertips' `velocity` [m/s], changed so that the `low` ones stay at the table.
 
-    `height` [m] is that of each fingertip over the table, `up` the table's unit normal, and `low` a
-    mask of the fingertips that slide along the table.
+    Their velocity along the table's unit normal `up` becomes `RIM.rate` (`RIM.gap` - h), which
+    brings them to the height `RIM.gap` and keeps them there. Here h is `height` [m], that of each
+    fingertip's lowest point over the table. `low` is a mask of the fingertips that slide.
     """
     down = RIM.rate * (RIM.gap - height) - velocity @ up
     return velocity + (down * low)[:, None] * up

@@ -297,11 +297,10 @@ def _principal(inertia: np.ndarray) -> dict[str, list[float]]:
 
 
 def describe_bodies(scene: SceneSpec) -> dict[str, Any]:
-    """Return the values for USD files of a `scene`, by name: the object's convex parts, links and
-    joints of the hand.
+    """Return the values with which the templates of USD files are filled, by name.
 
-    The links and joints include those of the mount that carries the hand.
-
+    They are "parts", the convex parts of the object, and "links" and "joints", those of the hand
+    and of the mount that carries it. Each is a list with one entry for each part, link or joint.
     All joints are at zero. Lengths are in metres, masses in kilograms. Raises `BadArgument` for
     names of links or joints that USD does not allow.
     """

@@ -82,11 +82,11 @@ def assign(contacts: Contacts, seeds: IKSeeds) -> Contacts:
 
 
 class Attempts(Generic[Result]):
-    """The results of all refined seeds so far, with the contact sets that still need one.
+    """The results of all refined seeds so far, and a mask of the contact sets without a good one.
 
-    `unsolved` is a mask of the b contact sets that have no good result yet; `solves` returns a mask
-    of good ones among k results. `results` are the added groups of results, and `rows` holds for
-    each group the indices of the contact sets.
+    `unsolved` is this mask of the b contact sets; `solves` returns a mask (k,) of the good ones
+    among k results. `results` are the added groups of results, such as `Grasps`, and `rows` holds
+    for each group the index of each result's contact set.
     """
 
     def __init__(self, unsolved: Bool[Tensor, "b"], solves: Callable[[Result], Bool[Tensor, "k"]]):
@@ -117,8 +117,8 @@ class Attempts(Generic[Result]):
         """In round k, refine the next `counts[k]` seeds of each unsolved contact set, and add the
         results.
 
-        `rank` is the place of each seed among those of its contact set. `refine` returns the
-        results of some seeds.
+        `rank` is the rank of each seed, from 0, among those of its contact set. `refine` returns
+        one result for each of the seeds that it is given.
         """
         first = 0
         for count in counts:
@@ -169,7 +169,9 @@ def refine_on_contacts(
 ) -> Grasps:
     """Return a checked grasp for each seed, refined on its fixed contacts by at most `steps` steps.
 
-    With `cobyla`, the paper's solver and checks are used, and `steps` is ignored.
+    `problem` holds the contact sets, of which `seeds.row` holds indices. A grasp's `status` is that
+    of the first check that it fails. With `cobyla`, the paper's solver and checks are used, and
+    `steps` is not used.
     """
     contacts = assign(problem.contacts, seeds)
     start = Configuration(seeds.joints, seeds.obj_from_hand)
@@ -189,8 +191,9 @@ def refine_on_contacts(
 def try_best_seeds(
     problem: GraspProblem, seeds: IKSeeds, steps: int = ITERATIONS
 ) -> Attempts[Grasps]:
-    """Return the results of refining the first two seeds of each contact set on fixed contacts, by
-    at most `steps` steps.
+    """Return the checked grasps of the first two seeds of each contact set, as `Attempts`.
+
+    Each seed is refined on its fixed contacts by at most `steps` solver steps.
     """
     attempts = Attempts(torch.ones_like(problem.certificate.closed), executable)
     attempts.refine(
@@ -200,8 +203,10 @@ def try_best_seeds(
 
 
 def seed_costs(problem: GraspProblem, seeds: IKSeeds) -> Float[Tensor, "g"]:
-    """Return the cost [mm2] of each seed before any refinement: the sum of squared errors of
-    fingertips and clearances.
+    """Return the cost [mm2] of each seed before any refinement: the sum of its squared residuals.
+
+    These are the `grasp_residuals`: weighted errors of tip positions, pad directions and
+    clearances.
     """
     costs = [seeds.energy[:0]]
     every = torch.arange(len(seeds), device=seeds.row.device)

@@ -114,13 +114,12 @@ def distance_to(region: Bool[Tensor, "x y z"], spacing: float) -> Float[Tensor, 
 @checked
 @dataclasses.dataclass(frozen=True)
 class CollisionWorld(Value):
-    """The surroundings that a hand must not touch: the object's distance `field`, a table, and
-    obstacles.
+    """The surroundings that a hand must not touch, in the frame of the object.
 
     A part of the surroundings that does not exist is None. The `field` holds signed distances [m]
     from one object, the same for all hands of a batch, or from one object for each hand. The
-    `table` is a plane, or a height [m] along z. Raises `BadArgument` for a table that is neither a
-    plane nor a height.
+    `table` is a plane, or a height [m] along z. The `obstacles` are other bodies of a scene. Raises
+    `BadArgument` for a table that is neither a plane nor a height.
 
     >>> CollisionWorld(table=0.02).plane.offset
     0.02
@@ -209,10 +208,11 @@ def collision_cost(
 def clearance_rows(
     spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool
 ) -> list[ResidualRows]:
-    """Return residuals [mm]: by how much the smallest clearances are less than wanted.
+    """Return residuals [mm]: by how much the smallest clearances are below the least wanted ones.
 
-    They are those between links, and from object, obstacles and table. `spatial` are the kinematics
-    of g hands. With `tips_touch` the fingertips may touch the object and the table.
+    The wanted ones are `SELF_CLEARANCE` between links, which come first, and `CLEARANCE` from
+    object, obstacles and table. A larger clearance gives 0. `spatial` are the kinematics of g
+    hands. With `tips_touch` the fingertips may touch the object and the table.
     """
     pairs = spatial.hand.self_collision
     moves = spatial.hand.motion.moves

@@ -141,10 +141,12 @@ class JointProblem:
         return JointProblem(self.hand, shape, contact_problem, self.world.rows(index))
 
     def residuals(self, state: JointState, flat: FlatnessConstraint | None) -> Residuals:
-        """Return all residuals [mm] of a `state`, then their Jacobian by hand pose, joints,
-        contacts and tensions.
+        """Return all weighted residuals (g, k) of a `state`, then their Jacobian (g, k, d).
 
-        `flat` is the constraint that contacts are on flat surface; None leaves it out.
+        They are the residuals of the hand (`grasp_residuals`), then those of the contacts, times
+        `CONTACT_WEIGHT` and the shape's scale [mm]. The Jacobian is by hand pose (6), joints,
+        contacts and tensions. `flat` is the constraint that contacts are on flat surface; None
+        leaves it out.
         """
         hand = self.hand
         shape = self.shape
@@ -249,10 +251,15 @@ class JointProblem:
 def solve_sliding(
     joint_problem: JointProblem, problem: GraspProblem, seeds: IKSeeds, attempts: Attempts[Grasps]
 ) -> None:
-    """Optimise hand and contacts together for each unsolved contact set, and add the checked grasps
-    to `attempts`.
+    """Optimise hand and contacts together for each unsolved contact set of `attempts`.
 
-    The first `SLIDING.seeds` seeds of each set are tried.
+    The checked grasps are added to `attempts`, except those of too high a cost.
+
+    Args:
+        joint_problem: the least-squares problem of hand and contacts, for each contact set.
+        problem: the contact sets, from whose contacts the optimisation starts, and the checks.
+        seeds: initial hand postures, of which the first `SLIDING.seeds` of each set are tried.
+        attempts: the results so far.
     """
     chosen = attempts.choose(seeds, rank_in_group(seeds.row), 0, SLIDING.seeds)
     size = min(at_once(chosen.row, SLIDING.rows), SLIDING.most_rows)

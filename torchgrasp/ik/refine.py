@@ -54,11 +54,12 @@ def tip_targets(hand: Hand, contacts: Contacts) -> Float[Tensor, "g f 3"]:
 def tip_rows(
     spatial: SpatialJacobian, target: Float[Tensor, "g f 3"], normals: Float[Tensor, "g f 3"]
 ) -> ResidualRows:
-    """Return the residuals of fingertips: three [mm] for each position error, then one for each
-    contact direction.
+    """Return 4 f residuals of fingertips: position errors, then errors of contact directions.
 
-    They are weighted by `TIP_WEIGHT` and `PAD_WEIGHT`. `target` [m] holds the wanted centres of the
-    tips, and `normals` the outward unit normals at their contacts.
+    A position error has three components [mm], times `TIP_WEIGHT`. A contact direction has one
+    residual, times `PAD_WEIGHT`: the cosine of the pad's cone less that of the direction's angle
+    from the pad's axis, or 0 inside the cone. `target` [m] holds the wanted centres of the tips,
+    and `normals` the outward unit normals at their contacts, both in the object's frame.
     """
     tips = spatial.hand.tips
     motion = spatial.hand.motion
@@ -90,12 +91,13 @@ def grasp_residuals(
     world: CollisionWorld | None,
     tips_touch: bool,
 ) -> Residuals:
-    """Return the residuals of tip positions, pad directions and, with a `world`, clearances; then
-    their Jacobian.
+    """Return the weighted residuals (g, k) of each hand, then their Jacobian (g, k, 6 + h).
 
-    `target` [m] holds the wanted tip centres, and `normals` the outward unit normals at the
-    contacts. With `tips_touch` the fingertips may touch the object. The Jacobian is by the hand's
-    pose (6) and joints.
+    They are errors of tip positions [mm], of cosines of pad directions (no unit; `tip_rows`) and,
+    with a `world`, lacking clearances [mm] (`clearance_rows`). The Jacobian is by the hand's pose
+    (6) and its h joints. `target` [m] holds the wanted tip centres, and `normals` the outward unit
+    normals at the contacts, in the object's frame. With `tips_touch` the fingertips may touch the
+    object and the table.
     """
     spatial = SpatialJacobian.at(hand, configuration)
     links = [] if world is None else clearance_rows(spatial, world, tips_touch)
@@ -113,8 +115,8 @@ def refine(
     """Return hand configurations moved so that finger i touches contact i and, with a `world`,
     links are clear.
 
-    This may fail. A configuration is done when its sum of squared residuals [mm2] is below
-    `solved`, or after `steps` steps.
+    The solver may not succeed, so check the result. A configuration is done when the sum of its
+    squared `grasp_residuals` [mm2] is below `solved`, or after `steps` steps.
     """
     target = tip_targets(hand, contacts)
     normals = contacts.normals

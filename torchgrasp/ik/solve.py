@@ -187,8 +187,10 @@ def _refine_seeds(
 def refine_exactly(
     hand: Hand, start: Configuration, contacts: Contacts, world: CollisionWorld
 ) -> Configuration:
-    """Return configurations refined with a margin of clearance, then without it where links stay
-    clear.
+    """Return hand configurations moved from `start` onto their contacts, clear of the `world`.
+
+    Each is refined with a margin of clearance, then anew without regard to clearance. The second
+    result counts where it passes all checks (`measure_errors`), else the first.
     """
     refined = refine(hand, start, contacts, world, SOLVING.solved)
     settled = refine(hand, refined, contacts, None, SOLVING.solved)

@@ -44,7 +44,7 @@ class ExplainNumbers:
     postures: int = 500
     """Size of the posture library; more take seconds for a hand that often meets itself."""
     judged: int = 5
-    """A plan is judged by its best grasps, one for so many initial guesses."""
+    """A plan of n initial guesses is judged by its n / `judged` best grasps."""
     enough: float = 0.8
     """Expected success at which a change is good enough to end the search."""
     beside: float = 0.2
@@ -215,9 +215,11 @@ class Explanation(Value):
 
     @property
     def advice(self) -> str:
-        """A sentence about the best change, and about the best one that the user can make.
+        """A sentence for the user on what would help most.
 
-        If no change helps, it is about the stage that loses the most.
+        If there is a grasp, it says so. Else it names the best change and, if that is a change of
+        the world, such as more friction, also the best one that the user can make. If no change
+        helps, it names the stage that loses the most.
         """
         if self.funnel.executable:
             return f"There is a grasp: {self.funnel.executable} of {self.starts} starts ended in an executable one."
@@ -384,16 +386,17 @@ def try_request(
     first: Observer | None = None,
     numbers: ExplainNumbers = EXPLAIN,
 ) -> tuple[Funnel, float, Objects]:
-    """Return the losses, the expected success, and the posed object of a plan with a small library
-    of postures.
+    """Return losses, expected success and object of a plan with a small library of postures.
 
-    The expected success, in [0, 1], is that of the best fifth of the guesses. Several sets of
-    fingers share the initial guesses. If no contact set is found, the most relaxed constraints are
-    tried, too; the object is returned as it was posed last.
+    The expected success is the mean, in [0, 1], of the best grasps (`expected_success`), one for
+    every `numbers.judged` initial guesses. Several sets of fingers share the initial guesses; the
+    results are those of the best set. If no contact set is found, the most relaxed constraints are
+    tried, too. The object is returned as `pose` made it for the last set of fingers.
 
     Args:
         request: the arguments of the plan.
-        known: the object, if it is known from an earlier plan.
+        known: the object of an earlier plan, whose shape and model are used again; None estimates
+            the shape.
         first: observer that is called with "funnel" and the losses of the first plan.
         numbers: the bounds on the work.
     """

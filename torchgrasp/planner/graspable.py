@@ -207,9 +207,10 @@ def hand_span(hand: Hand) -> float:
 
 
 def is_vague(shape: ShapeGP) -> bool:
-    """Return whether an estimated shape is so uncertain that it should not be planned with.
+    """Return whether an estimated shape is too uncertain to plan with.
 
-    It is if the standard deviation somewhere on the surface exceeds half the object's size.
+    It is if the 99 % quantile (`VAGUE.worst`) of the standard deviation [m] on its surface exceeds
+    half the object's size (`shape.scale`).
     """
     return float(extract_surface(shape, VAGUE.cells).std_m.quantile(VAGUE.worst)) > shape.scale
 

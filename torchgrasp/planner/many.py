@@ -69,11 +69,11 @@ def plan_many(clouds: Sequence[PointCloud], workers: int, given: dict[str, Any])
 def plan_stacks(
     requests: Sequence[Request], prepared: Iterator[Objects | Grasps], device: torch.device
 ) -> Iterator[Grasps]:
-    """Yield the grasps of each request, whose posed objects a device plans many at a time.
+    """Yield the grasps of each request; the device plans a stack of many objects at once.
 
-    The requests differ in their clouds alone. `prepared` yields the posed object of each request.
-    It yields an empty set of grasps for a refused cloud, which is passed on. The objects of the
-    next stack are prepared while the device plans.
+    The requests differ in their clouds alone. `prepared` yields the object of each request
+    (`pose_request`). For a refused cloud it yields an empty set of grasps, which is passed on. The
+    objects of the next stack are prepared while the device plans.
     """
     most = MANY.stack
     budget = requests[0].time_budget if requests else None
@@ -98,9 +98,9 @@ def _take(prepared: Iterator[Objects | Grasps], count: int) -> list[Objects | Gr
 def estimate_shapes(
     requests: Sequence[Request], workers: int
 ) -> Generator[Objects | Grasps, None, None]:
-    """Yield the posed object of each request on the CPU, or an empty set of grasps for a bad cloud.
+    """Yield the object of each request on the CPU, or an empty set of grasps for a bad cloud.
 
-    `workers` is the number of processes, 0 for none.
+    The objects are those of `pose_request`. `workers` is the number of processes, 0 for none.
     """
     return _each(
         _prepare, [dataclasses.replace(x, cloud=x.cloud.to("cpu")) for x in requests], workers

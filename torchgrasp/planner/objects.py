@@ -324,7 +324,10 @@ class Objects:
 
 
 def pose_request(request: Request, hand: Hand) -> Objects:
-    """Return the single object of a request, posed for a hand: see `pose`."""
+    """Return the one object of a request in its upright frame, prepared for a hand.
+
+    `pose` adds the `hand`, the constraints, the initial guesses and the obstacles.
+    """
     model = find_model(request)  # first, so that a missing model is told before any work
     return pose(ShapedObject.of(request), request, hand, model)
 
@@ -338,7 +341,7 @@ def pose(
     postures: int | None = None,
     descends: bool = False,
 ) -> Objects:
-    """Return one object with hand, constraints, initial guesses and obstacles.
+    """Return one object with its hand, constraints, initial guesses and obstacles (upright frame).
 
     Args:
         object_: the object, with its shape.

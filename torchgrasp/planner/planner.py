@@ -85,11 +85,12 @@ def plan_objects(objects: Objects, deadline: float) -> Iterator[list[Grasps]]:
 def step(
     objects: Objects, rows: Candidates, tried: int, turn: int, last: bool
 ) -> tuple[Candidates, Grasps, CloudIndex]:
-    """Return all contact sets after at most `tried` further ones of each object were tried.
+    """Try at most `tried` further contact sets of each object, and return three results.
 
-    `rows` are the contact sets before. Three results are returned: all contact sets, the grasps of
-    those that ended now, and the index of each grasp's object. `turn` is the number of the batch,
-    from 1, and `last` says whether it is the last one.
+    They are all contact sets `rows` with the results, the best grasps of those that ended now, and
+    the index of each grasp's object. `turn` is the number of the batch, from 1, and `last` says
+    whether it is the last one. In a mode other than "joint", `solve_all` solves for all sets, and
+    `rows` stay unchanged.
     """
     if objects.request.mode != "joint":
         grasps = solve_all(objects, rows)
@@ -107,11 +108,11 @@ def step(
 def try_first(
     objects: Objects, rows: Candidates, fresh: Int[Tensor, "k"]
 ) -> tuple[Candidates, Int[Tensor, "e"]]:
-    """Return all contact sets after some were tried with few solver steps, and the indices of those
-    that ended.
+    """Solve for the hand on the contact sets `fresh` with few solver steps, for an early grasp.
 
-    This gives an early grasp. For an object that has no grasp by then, all steps are taken at once.
-    `rows` are all contact sets before, and `fresh` the indices of those to try.
+    Return all contact sets `rows` with the results, then the indices of those that ended. A solved
+    set ends (`Row.ENDED`); a failed one gets `Row.BEGUN`. For an object without a grasp by then,
+    `try_fully` goes on with its sets at once. `fresh` holds indices in `rows`.
     """
     rows, solved = solve_fixed(objects, rows, fresh, FEW_STEPS, Row.BEGUN)
     missing = without(rows, solved, len(objects))
@@ -127,13 +128,13 @@ def try_fully(
     before: Int[Tensor, "d"],
     last: bool,
 ) -> tuple[Candidates, Int[Tensor, "e"]]:
-    """Return all contact sets after some were tried with all solver steps, and the indices of those
-    that ended.
+    """Solve for the hand on the contact sets `now` with all steps, then with sliding contacts.
 
-    `rows` are all contact sets before, `now` the indices of those to try, and `before` of those
-    that ended in this batch already. Contacts that no posture reaches may slide with the hand.
-    Sliding has a fixed cost. So it is solved in the `last` batch, and for an object without any
-    grasp in this batch.
+    Return all contact sets `rows` with the results, then the indices of those that ended in this
+    batch: those in `before`, which ended earlier, and the new ones. A solved set ends
+    (`Row.ENDED`); a failed one gets `Row.STUCK`. In the `last` batch `solve_with_sliding` then
+    tries all stuck sets, and ends them; in other batches only those of objects without a grasp in
+    this batch, because it takes long.
     """
     clouds = len(objects)
     rows, solved = solve_fixed(objects, rows, now, ITERATIONS, Row.STUCK)
@@ -148,9 +149,10 @@ def try_fully(
 
 
 def without(rows: Candidates, solved: Int[Tensor, "k"], clouds: int) -> Bool[Tensor, "c"]:
-    """Return a mask of the c objects of which no contact set is in `solved`.
+    """Return a mask (c,) of the objects of which no contact set is in `solved`.
 
-    `rows` are all contact sets, `solved` indices of some, and `clouds` is the number c of objects.
+    `rows` are all contact sets, `solved` holds indices of some, and `clouds` is the number c of
+    objects.
     """
     return torch.bincount(rows.cloud[solved], minlength=clouds) == 0
 
@@ -158,12 +160,11 @@ def without(rows: Candidates, solved: Int[Tensor, "k"], clouds: int) -> Bool[Ten
 def solve_fixed(
     objects: Objects, rows: Candidates, now: Int[Tensor, "k"], steps: int, failed: Row
 ) -> tuple[Candidates, Int[Tensor, "s"]]:
-    """Return all contact sets after the hand moved onto the contacts of some, and the indices of
-    those solved.
+    """Solve for the hand on the fixed contacts of the sets `now`, with at most `steps` steps.
 
-    The contacts stay fixed. `rows` are all contact sets before, and `now` the indices of those to
-    try with at most `steps` solver steps. Those without a grasp keep their best failed grasp, and
-    get the status `failed`.
+    Return all contact sets `rows` with the results, then the indices of the solved ones. Solved
+    sets get `Row.ENDED` and their executable grasp; the others get the status `failed` and their
+    best failed grasp. `now` holds indices in `rows`.
     """
     contacts, certificate, seeds = rows.select(now)
     reach = objects.reach(contacts, certificate, rows.cloud[now])
@@ -176,11 +177,10 @@ def solve_fixed(
 def solve_with_sliding(
     objects: Objects, rows: Candidates, now: Int[Tensor, "k"]
 ) -> tuple[Candidates, Int[Tensor, "k"]]:
-    """Return all contact sets after contacts and hand moved together for some, and the indices of
-    these.
+    """Solve for hand and sliding contacts together, for the contact sets `now`.
 
-    `rows` are all contact sets before, and `now` the indices of those to try. All of them end;
-    those without a grasp keep their best failed one.
+    Return all contact sets `rows` with the results, then the indices `now` of the tried ones. All
+    tried sets get `Row.ENDED`, and their best grasp so far, which may be a failed one.
     """
     contacts, certificate, seeds = rows.select(now)
     attempts = Attempts(torch.ones_like(certificate.closed), executable)
@@ -193,9 +193,9 @@ def solve_with_sliding(
 
 
 def solve_all(objects: Objects, rows: Candidates) -> Grasps:
-    """Return grasps of all contact sets, by the solver of the mode "paper" or "contact_first".
+    """Return the grasps of all contact sets `rows`, executable ones first, in a single batch.
 
-    `rows` are the contact sets.
+    The mode "paper" uses `solve_as_paper`, the mode "contact_first" `solve_contact_first`.
     """
     reach = objects.reach(rows.contacts, rows.certificate, rows.cloud)
     solve = solve_as_paper if objects.request.mode == "paper" else solve_contact_first

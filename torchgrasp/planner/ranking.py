@@ -68,10 +68,11 @@ def rank(objects: Objects, grasps: Grasps, cloud: CloudIndex) -> list[Grasps]:
 def predict(
     objects: Objects, grasps: Grasps, cloud: CloudIndex
 ) -> tuple[Float[Tensor, "g"], Tensor]:
-    """Return the log-odds of success of g grasps, and a mask of the grasps for which trials support
-    them.
+    """Return the log-odds of success of g grasps, then a mask (g,) of those that trials support.
 
-    `cloud` is the index of each grasp's object.
+    The mask marks grasps whose features are in the range of our trials. With obstacles, the
+    probability of success includes that the hand hits none. `cloud` is the index of each grasp's
+    object.
     """
     task = objects.request.grasp_task
     spec = objects.spec
@@ -93,10 +94,11 @@ def predict(
 
 
 def prove_resistance(objects: Objects, grasps: Grasps, cloud: CloudIndex) -> Grasps:
-    """Return grasps whose certificates hold the loads that they resist.
+    """Return the grasps, with the proof of the loads that they resist in their certificates.
 
-    Executable grasps that resist less than the task's loads get the status `NOT_RESISTED`. `cloud`
-    is the index of each grasp's object.
+    The proof is in the fields `task_margin` to `task_strength` of `Certificate`. Executable grasps
+    with a `task_margin` below 1 get the status `NOT_RESISTED`. Without loads to resist the grasps
+    are returned as they are. `cloud` is the index of each grasp's object.
     """
     if objects.loads is None:
         return grasps

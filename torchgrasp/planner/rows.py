@@ -73,9 +73,9 @@ class Candidates:
         contacts: the contact sets, points [m] in the upright frame.
         certificate: the proofs of force closure.
         seeds: initial hand postures; `seeds.row` is the index of each one's contact set.
-        load: the wrench [N, N m] of the task, about the centroid of the contacts, that the greatest
-            forces resist the least; 0 without loads.
-        cost: cost (no unit; less is better) by which contact sets that wait are chosen.
+        load: of the task's wrenches [N, N m] about the centroid of the contacts, the one that needs
+            the largest share of the greatest finger forces; 0 without loads.
+        cost: cost (no unit; less is better) by which the next contact sets to try are chosen.
         cloud: index of each contact set's object.
         status: a `Row` for each contact set.
         turn: number of the batch in which each contact set was first tried, from 1; 0 if it was
@@ -105,7 +105,7 @@ class Candidates:
         cost: Float[Tensor, "b"],
         cloud: CloudIndex,
     ) -> "Candidates":
-        """Return contact sets that wait to be tried.
+        """Return contact sets of which none was tried: all have the status `SEEDED`.
 
         The arguments are the fields of the same name.
         """
@@ -173,8 +173,9 @@ class Candidates:
 
 
 def join_candidates(parts: Sequence[Candidates]) -> Candidates:
-    """Return several groups of contact sets as one group, in order; only the first may have been
-    tried.
+    """Return several groups of contact sets as one group, in order.
+
+    Only the first group may hold `grasps`, which the result keeps.
     """
     first = 0
     seeds = list[IKSeeds]()
@@ -231,18 +232,21 @@ def find_candidates(
     most: int,
     note: Callable[..., None],
 ) -> Candidates:
-    """Return the contact sets with force closure among at most `most` planned ones of each object.
+    """Return the chosen contact sets that have force closure, with their initial hand postures.
 
-    The sets of an object are chosen far apart. In mode "paper" with ranking "variance" all sets are
-    chosen, the most certain first. Sets that not even the greatest forces could hold have failed.
+    Of the successful sets of each object, at most `most` are chosen, which lie far apart. In mode
+    "paper" with ranking "variance" all are chosen, the most certain first. Chosen sets without
+    force closure are left out. If there are loads, a set that not even the greatest finger forces
+    resist gets the status `NOT_RESISTED` in the plan, and is not chosen. The costs are 0: see
+    `with_costs`.
 
     Args:
         objects: the objects of the plan.
         plan: the planned contact sets.
         cloud: index of each planned set's object.
         most: largest number of sets that are chosen for each object.
-        note: function that is called with the name and the result of the stages "plan", "certify"
-            and "query".
+        note: function that is called with the name and the result of each of the stages "plan",
+            "certify" and "query", such as `Report.note`.
     """
     request = objects.request
     load = plan.contacts.points.new_zeros(len(plan), 6)
@@ -324,13 +328,15 @@ def find_seeds(objects: Objects, contacts: Contacts, cloud: CloudIndex) -> IKSee
 
 
 def with_costs(objects: Objects, found: Candidates) -> Candidates:
-    """Return the contact sets `found` with their costs (no unit; less is better).
+    """Return `found` with the cost of each contact set (no unit; less is better).
 
-    A cost is the logarithm of the least sum of squared errors [mm2] of the first `CHOICE.tried`
-    initial postures. To it is added `CHOICE.lever` times the logarithm of the load's lever arm
-    (`lever_arm`). A contact set without initial postures has an infinite cost. If grasps must
-    resist loads, the postures in which the fingers resist the most come first. Then sets without a
-    posture that resists all loads cost more than all other sets.
+    The cost is log(max(e, `CHOICE.touching`)) + `CHOICE.lever` log(a + `CHOICE.short`). Here e is
+    the least of the `seed_costs` [mm2] of the set's first `CHOICE.tried` initial postures, infinite
+    if it has none, and a its lever arm (`lever_arm`).
+
+    With loads to resist, the initial postures of each set are first sorted by the share of the load
+    that they resist, at most 1, the greatest share first. A set whose postures all resist less than
+    the load costs from `CHOICE.weak` to 2 `CHOICE.weak` more.
     """
     contacts = found.contacts
     seeds = found.seeds
@@ -357,12 +363,11 @@ def with_costs(objects: Objects, found: Candidates) -> Candidates:
 
 
 def choose(rows: Candidates, most: int, clouds: int) -> Int[Tensor, "k"]:
-    """Return the indices of at most `most` waiting contact sets of each object, of low cost and far
-    apart.
+    """Return the indices of the next contact sets to try: at most `most` of each object.
 
-    They lie far from contact sets that were chosen before, too. `rows` are all contact sets, and
-    `clouds` is the number of objects. Farthest-point sampling runs for all objects at once, on
-    their device.
+    Farthest-point sampling chooses them among the untried sets of low cost, far from each other and
+    from the sets that were tried before. `rows` are all contact sets, and `clouds` is the number of
+    objects. All objects are sampled at once, on their device.
     """
     if not len(rows):
         return rows.cloud

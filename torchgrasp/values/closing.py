@@ -41,8 +41,9 @@ class ClosingGains(Value):
 
 
 class ObjectMotion(NamedTuple):
-    """Motion of an object in the hand: `distance` [m] by which its centre moved, and `angle` [rad]
-    of its rotation.
+    """Motion of an object between two times, relative to the hand or to the world.
+
+    `distance` [m] is that by which its centre moved, and `angle` [rad] that of its rotation.
 
     >>> slip = ObjectMotion(distance=0.004, angle=0.1)
     >>> f"{1000 * slip.distance:g} mm, {57.3 * slip.angle:.0f} degrees"
@@ -124,9 +125,9 @@ class ClosureResult(Value):
         joint_names: names of the joints.
         contact_order: indices of the fingers that touched, in the order of their first contacts.
         object_motion: motion of the object in the hand from the pre-grasp to the end.
-        pushed: motion of the object from the pre-grasp until all fingers touched, or the closing
-            ended.
-        before_lift: motion of the object from the start to the lift.
+        pushed: motion of the object in the world from the pre-grasp until all fingers touched, or
+            the closing ended.
+        before_lift: motion of the object in the world from the start to the end of the pressing.
         rise: height [m] by which the object's centre has risen at the end.
         unbalanced: norm of the sum of the fingertip forces before the lift, relative to the sum of
             their norms.
