@@ -242,7 +242,8 @@ def estimate_noise(
 def fit_noise(depth: Float[Tensor, "n"], error: Float[Tensor, "n"]) -> SensorNoise:
     """Return a noise model whose `floor` and `growth` are fitted robustly to depth errors.
 
-    `error` holds the errors [m] of n pixels at the depths `depth` [m].
+    `error` holds the errors [m] of n pixels at the depths `depth` [m]. Fewer than 100 errors give
+    the default model.
     """
     if len(depth) < ESTIMATE.errors:
         return SensorNoise()

@@ -93,8 +93,9 @@ def guess_viewpoint(
     direction. `points` are (n, 3) [m]; `normals` (n, 3) are unit vectors of either sign. Of all
     directions above the support, the one that explains the points best is taken; the camera is
     placed along it, 4 radii of the cloud away. The direction `up` is above the support; the normal
-    of a support in the points replaces it. If `up` is None or only `assumed`, the camera may be at
-    the origin, where the points lie in front of it and a camera can have taken the view.
+    of a support in the points replaces it. Before this search, the origin is tried: it is returned
+    if the points lie in front of it along z and a camera there can have taken the view. With an
+    `up` that is given and not only `assumed`, it is tried only for points below the origin.
     """
     points, normals = _draw(points, normals)
     centre, radius = _enclose(points)

@@ -37,7 +37,8 @@ def find_cause(tries: Sequence[LiftTry], trial: GraspTrial, spec: TrialSpec) -> 
     """Return (cause, size): why the object was not held in the last try of a trial.
 
     The cause is a name in `CAUSES`, where the unit of the size is found. They are "" and NaN if the
-    object was held. `tries` are the results of the trial's lifts, and `trial` and `spec` its input.
+    object was held, or the simulation did not stay finite. `tries` are the results of the trial's
+    lifts, and `trial` and `spec` its input.
     """
     truth = trial.truth
     *before, (row, lift) = tries

@@ -36,8 +36,8 @@ class PullResult(Value):
     passed: bool
     status: Status  # of the last pull
     directions: int  # number of pulls that were tried
-    moved: Measured  # largest motion of the object [m]
-    turned: Measured  # largest rotation of the object [rad]
+    moved: Measured  # largest motion of the object's centre of mass in the world [m]
+    turned: Measured  # largest rotation of the object in the world [rad]
     force: Measured  # mean normal force of the fingers before the first pull [N], or NaN
     seconds: Measured  # CPU time [s]
 

@@ -287,8 +287,8 @@ class TrialRun:
 
     @property
     def starts(self) -> bool:
-        """Whether the trial starts: the hand penetrates the object at first by no more than the
-        limit.
+        """Whether the trial starts: the opened hand penetrates other bodies and itself by at most
+        `TrialSpec.overlap`.
         """
         return self.overlap <= self.spec.overlap
 

@@ -46,7 +46,7 @@ class PlaneNumbers:
     tilt_slack: float = 5.0
     """Angle [deg] by which a proposed plane may tilt more, because the fit may tilt it back."""
     reach: float = 0.30
-    """Height [m] of objects above a plane."""
+    """Greatest height [m] above a plane of the points of objects on it."""
     rough: float = 2.5
     """Scale (ratio of measured to assumed noise) from which a surface counts as not flat."""
     smooth: float = 0.2
@@ -119,7 +119,8 @@ class PlaneFit:
         """Return the plane with its normal turned to the upper side.
 
         `view` holds all points of the view. If their upward direction is unknown, the normal points
-        to the camera; if that is unknown too, to the side with most points.
+        to the camera; if that is unknown too, to the side on which most points are, weighted by
+        their heights up to `PLANES.reach`.
         """
         if view.sky is not None:
             side = float(self.normal @ view.sky)

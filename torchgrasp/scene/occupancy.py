@@ -236,9 +236,11 @@ def _tops(own: Float[Tensor, "m 3"], places: Float[Tensor, "n 2"]) -> Float[Tens
 
 @functools.cache
 def load_occupancy_model() -> dict[str, Any]:
-    """Return the model's knots and weights for each kind of space: "target", "thing" and "unseen".
+    """Return the model of each kind of space, by name: "target", "thing" and "unseen".
 
-    These are the spaces behind the target, behind another object, and where nothing was measured.
+    These are the spaces behind the target, behind another object, and where nothing was measured. A
+    model is a dict: its log-odds are "bias" plus, for each feature, a function that is linear
+    between the "knots", where it has the "values".
     """
     return json.loads(MODEL.read_text("utf-8"))
 
