@@ -49,7 +49,7 @@ class ReachNumbers:
     ways: int = 64
     """Number of ways that are checked for collisions at a time."""
     rounding: float = 1e-12
-    """Least sine of a rotation by which is divided: below it, the rotation is zero."""
+    """Least divisor of a rotation's angle by its sine, so that no division is by 0."""
 
 
 REACH = ReachNumbers()

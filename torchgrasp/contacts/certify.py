@@ -221,9 +221,10 @@ def _prove(wrench: Wrenches) -> tuple[Tensor, ...]:
 
 def bound_margin(wrench: Wrenches, witness: Float[Tensor, "b 6"]) -> Float[Tensor, "b"]:
     """Return the upper bound of the closure margin that each direction `witness` in wrench space
-    proves, or NaN.
+    proves.
 
-    `wrench` (b, m, 6) holds the m edge wrenches of each contact set. The bound has no unit.
+    It is -min(g) / sum(g - min(g)) for the products g of the witness and the m edge wrenches of a
+    contact set, `wrench` (b, m, 6); NaN if all products are 0. The bound has no unit.
     """
     # With g_k = w.w_k and phi >= s: 0 = sum phi g >= s sum g + (1 - m s) min g, hence s <= -min g /
     # sum(g - min g).

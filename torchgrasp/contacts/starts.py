@@ -112,9 +112,10 @@ def drawn_starts(
 def settle_flatness(shape: ShapeLike, spec: ContactSpec, seed: int) -> FlatCandidates:
     """Return the constraints with a known `flat_radius`, and candidate contacts.
 
-    A radius that is not given is the largest with which enough guesses have force closure. The
-    candidates are the points at which the surface is flat, or all points of `survey` if too few
-    points are flat.
+    A radius that is not given is the largest of `FLAT_RADII` with which enough guesses have force
+    closure, or else the least of them. The candidates are the points at which the surface is
+    flat, or all points of `survey` if too few points are flat. They are None if `spec` demands no
+    flatness.
     """
     if spec.flatness is None:
         return FlatCandidates(spec, None)

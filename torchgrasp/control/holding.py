@@ -71,7 +71,8 @@ class GripNumbers:
     carried: float = 0.7
     """Cut-off [Hz] of the load that counts as carried; a faster one rocks the object."""
     carries: float = 0.8
-    """Share of the carried load that is commanded; with all, a rigid table is pressed ever harder.
+    """Share of the carried load that is commanded; with 1, the hand would press a rigid table with
+    ever growing forces.
     """
     settled: float = 0.4
     """Time [s] before which the hand may still reopen beside the object."""

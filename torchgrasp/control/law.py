@@ -138,15 +138,17 @@ def tip_velocity(
     force_gain: Float[Tensor, "*b 3"],
     together: bool = False,
 ) -> Float[Tensor, "*b 3"]:
-    """Return the commanded velocity [m/s] of each fingertip, at most `MAX_SPEED`: the bracket in
-    Eq. (25) of the paper.
+    """Return the commanded velocity [m/s] of each fingertip, the bracket in Eq. (25) of the paper.
+
+    It is (1 - lambda) K_P e_x + lambda C_F e_f for the errors e_x of position and e_f of force,
+    shortened to at most `MAX_SPEED`.
 
     Args:
-        position_error: from each fingertip to its contact [m].
-        force_error: desired minus sensed force on the object [N].
-        blend: share of force control, from 0 to 1; the rest is position control.
-        position_gain: gain on each axis [1/s].
-        force_gain: gain on each axis [m/(s N)].
+        position_error: e_x, from each fingertip to its contact [m].
+        force_error: e_f, desired minus sensed force on the object [N].
+        blend: lambda, the share of force control, from 0 to 1; the rest is position control.
+        position_gain: diagonal of K_P, the gain on each axis [1/s].
+        force_gain: diagonal of C_F, the gain on each axis [m/(s N)].
         together: whether the limit scales all fingers by one factor, which keeps the ratios of
             their speeds.
     """
@@ -162,10 +164,10 @@ def tip_velocity(
 def stay_above(
     velocity: Float[Tensor, "*b 3"], height: Float[Tensor, "*b"], up: Float[Tensor, "3"]
 ) -> Float[Tensor, "*b 3"]:
-    """Return each fingertip's `velocity` [m/s], slowed downwards so that no fingertip enters the
-    table.
+    """Return each fingertip's `velocity` [m/s], limited so that no fingertip enters the table.
 
-    `height` [m] is that of each fingertip over the table, and `up` the table's unit normal.
+    Its component along the table's unit normal `up` is raised to at least -`POSITION_RATE` h with
+    h = max(`height`, 0). The `height` [m] is that of each fingertip's lowest point over the table.
     """
     lacking = -POSITION_RATE * height.clamp_min(0.0) - velocity @ up
     return velocity + lacking.clamp_min(0.0)[..., None] * up

@@ -150,8 +150,9 @@ class Touches:
     planned hand's frame.
 
     `known` marks fingertips with a working sensor, `felt` marks fingertips that touch and have
-    reported where. With `links`, fingertips that no longer touch are also in `felt`. If `links` (m,
-    4) holds spheres (centre and radius [m]) of links, one of them touches.
+    reported where. `links` (m, 4) holds the centres and radii [m] of the collision spheres of links
+    of which one touches the object, as felt by the drives; it may be empty. With `links`,
+    fingertips that no longer touch are also in `felt`; None means that they are not.
     """
 
     def __init__(
@@ -188,7 +189,7 @@ class Touches:
     def felt(self) -> Bool[Tensor, "f"]:
         """Mask (f,) of the fingertips that touch the object and have reported where they touch.
 
-        With `links`, those that have stopped touching are included.
+        If `links` is not None, those that have stopped touching are included.
         """
         return (self.contact | self.kept) & (self.count > 0)
 

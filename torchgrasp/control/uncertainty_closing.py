@@ -273,10 +273,10 @@ class UncertaintyClosing:
 
 
 def rim_contacts(reference: ClosingReference) -> Bool[Tensor, "f"]:
-    """Return a mask of the contacts on the rim of a low object: the fingertips touch them at the
-    table.
+    """Return a mask (f,) of the contacts on the upper rim of a low object.
 
-    Their normals are inclined upwards. Without a table there are none.
+    Their normals are inclined upwards (`RIM.slope`), and the fingertips that touch them are lower
+    than `RIM.near` over the table. Without a table there are none.
     """
     if reference.table is None:
         return torch.zeros_like(reference.alive)
@@ -303,8 +303,10 @@ def slide_along(
 
 
 def with_equal_gains(reference: ClosingReference) -> ClosingReference:
-    """Return the plan with equal gains at all contacts, for the closing "fixed", which ignores
-    uncertainty.
+    """Return the plan with gains that ignore the uncertainty, for the closing "fixed".
+
+    All contacts have the covariance `POSITION_FLOOR`^2 I [m^2] and the position gain
+    `POSITION_RATE` [1/s]. Each finger has its largest force gain on all axes.
     """
     gains = reference.gains
     eye = torch.eye(3, dtype=gains.covariance.dtype).expand_as(gains.covariance)

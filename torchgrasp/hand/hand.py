@@ -170,7 +170,7 @@ class Hand(Value):
     def require_three(self, argument: str, what: str) -> None:
         """Raise `BadArgument` unless the hand has three fingertips, as in the paper.
 
-        The error names the `argument`, and `what` was asked of the hand.
+        The error names the `argument`, and `what`, its value that needs three fingertips.
         """
         if len(self.tips) != 3:
             raise BadArgument(

@@ -50,9 +50,9 @@ class CheckNumbers:
     least_cosine: float = 1e-3
     """Least cosine between a force and the inward normal for which friction is computed."""
     offset: float = 0.02
-    """Offset [m] of contacts from the centre that costs as much as a friction of one."""
+    """Offset [m] of the contacts from the centre that lowers the score by 1, as a friction of 1."""
     pad_angle: float = 0.8
-    """Angle [rad] off the pads that costs as much as a friction of one."""
+    """Angle [rad] from the pad's axis that lowers the score by 1, as a friction of 1."""
 
 
 CHECKS = CheckNumbers()
@@ -339,8 +339,9 @@ def score(
     """Return the geometric score of each grasp, at most 0 and without unit; a higher score is
     better.
 
-    Three things lower it: the distance of the contacts' centroid from `center` [m], the friction
-    coefficient that centred forces need, and the largest `normal_angle` [rad] off the pads.
+    It is -(d / `CHECKS.offset` + mu + a / `CHECKS.pad_angle`). Here d is the distance of the
+    contacts' centroid from `center` [m], mu the friction coefficient that forces towards the
+    centroid need (`centred_friction`), and a the largest `normal_angle` [rad] of a fingertip.
     """
     offset = norm(contacts.points.mean(1) - center)
     away = offset / CHECKS.offset

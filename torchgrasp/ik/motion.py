@@ -90,12 +90,12 @@ def opened_pose(
     obj_from_hand: Float[Tensor, "g 4 4"],
     table: Plane | None,
 ) -> Float[Tensor, "g 4 4"]:
-    """Return the pose [m] in which an opened hand comes to its grasp: raised where links would be
-    in the table.
+    """Return the pose [m] of the opened hand at the end of its approach, in the object's frame.
 
-    Coupled fingers can move towards the table as they open. A hand that would have to rise by more
-    than 30 mm is not raised. `joints` [rad] are those of the opened hand, `obj_from_hand` [m] the
-    pose of the grasp.
+    It is the pose of the grasp, raised along the normal of the `table` where links of the opened
+    hand would be in the table: coupled fingers can move towards the table as they open. A hand that
+    would have to rise by more than 30 mm is not raised. `joints` [rad] are those of the opened
+    hand, `obj_from_hand` [m] is the pose of the grasp.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp

@@ -20,7 +20,7 @@ class ChangeNumbers:
     frictions: tuple[float, ...] = (0.4, 0.8, 1.2)
     """Coefficients of friction: of smooth plastic, of rubber, of soft silicone."""
     clearly: float = 1.4
-    """Least ratio of a friction that is tried to the present one."""
+    """A friction is tried if it is at least this multiple of the present one."""
     tried: int = 2
     """Largest number of frictions that are tried."""
     variances: tuple[float, ...] = (0.03, 0.1)

@@ -45,7 +45,7 @@ class SpanNumbers:
     postures: int = 5000
     """Number of random postures in which the span of a hand is sought."""
     least_distance: float = 1e-9
-    """Least distance [m] of pads by which is divided: above 0."""
+    """Least distance [m] of two pads, so that no division is by 0."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,9 +63,9 @@ class EaseNumbers:
     """The numbers of the order in which objects are planned."""
 
     room: float = 0.06
-    """Free space [m] around an object above which more makes nothing easier."""
+    """Free space [m] around an object above which more space does not raise its rank."""
     height: float = 0.08
-    """Height [m] of an object above which more makes nothing easier."""
+    """Height [m] of an object above which a larger height does not raise its rank."""
     side: float = 0.01
     """Side [m] of a column of points."""
     top: float = 0.95

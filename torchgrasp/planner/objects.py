@@ -262,8 +262,9 @@ class Objects:
         )
 
     def on_arm(self, grasps: Grasps) -> Grasps:
-        """Return grasps with the arm's postures, if there is an arm; those that it cannot reach get
-        `UNREACHABLE`.
+        """Return the grasps, with the arm's postures if there is an arm.
+
+        Executable grasps for which the arm has no way (`with_arm`) get the status `UNREACHABLE`.
         """
         arm = self.request.arm
         if arm is None:
