@@ -76,10 +76,11 @@ def reach_poses(arm: Arm, obj_from_hand: Float[Tensor, "k 4 4"]) -> Bool[Tensor,
 def with_arm(
     arm: Arm, hand: Hand, grasps: Grasps, world: CollisionWorld, up: Float[Tensor, "3"]
 ) -> Grasps:
-    """Return grasps with the postures of the arm; executable ones without a way of the arm become
-    `UNREACHABLE`.
+    """Return grasps with the postures of the arm in their fields `arm` and `ease`.
 
-    `world` holds what the arm must not touch. `up` is the unit vector of the lift without a table.
+    Executable grasps without a way of the arm (`follow_grasps`) get the status `UNREACHABLE`. Both
+    fields are 0 for grasps that were not executable. `world` holds what the arm must not touch.
+    `up` is the unit vector of the lift without a table.
     """
     rows = flatnonzero(grasps.status == Status.OK)
     way, found, least = follow_grasps(arm, hand, grasps[rows], world, up)

@@ -177,17 +177,19 @@ def measure(
 def flag(
     before: Bool[Tensor, "*b f"], average: Float[Tensor, "*b f"], factor: Float[Tensor, "f"] | float
 ) -> Tensor:
-    """Return contact flags from the flags `before` and the low-passed normal force `average` [N],
-    with hysteresis.
+    """Return a mask (*b, f) of the fingertips that touch, with hysteresis.
 
-    `factor` multiplies the two thresholds, for noisier sensors.
+    A fingertip that touched `before` touches while its low-passed normal force `average` [N] is
+    above `TOUCH_ON` / 2 times `factor`; another one touches above `TOUCH_ON` times `factor`. The
+    `factor` (no unit) is greater for noisier sensors.
     """
     return torch.where(before, average > 0.5 * TOUCH_ON * factor, average > TOUCH_ON * factor)
 
 
 def low_pass(cutoff: float, period: float) -> float:
-    """Return the weight of a new value in a first-order low-pass filter with a `cutoff` [Hz] and a
-    `period` [s].
+    """Return the weight w = 1 - exp(-2 pi `cutoff` `period`) of a new value in a low-pass filter.
+
+    The filter is of first order, with a `cutoff` [Hz] and a `period` [s] between values.
     """
     return 1 - math.exp(-2 * math.pi * cutoff * period)
 

@@ -187,8 +187,7 @@ def measure_errors(
     rolling: bool = True,
     tolerance: Length = TIP_TOLERANCE,
 ) -> GraspErrors:
-    """Return the errors and clearances of grasps, of which `contacts` are in the order of the
-    fingers.
+    """Return the errors, clearances and status of g grasps; finger i touches contact i.
 
     With `rolling`, round fingertips may roll on their contacts within the cones of their pads.
     Without `rolling`, as in the paper, each pad must touch with its own contact point, in any

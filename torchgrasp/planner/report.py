@@ -20,7 +20,7 @@ class ReportNumbers:
     """The numbers of the report on the estimated shape."""
 
     vertices: int = 500
-    """Largest number of vertices at which the surface is judged; at least half as many if there are."""
+    """Largest number of vertices at which the surface is judged."""
     certain: float = 0.004
     """Standard deviation [m] below which the surface is certain: it moves a contact little."""
 
