@@ -256,9 +256,9 @@ class GraspCheck:
     """Check of a pressing grasp before the lift: `judged` becomes true when the result is known.
 
     `secure` then says whether to lift: all fingers touch, the palm has followed the object
-    (`CHECK.misplaced`), and forces balance with the planned friction. `displacement` (6,) holds the
-    object's translation [m] and rotation [rad]: that of the closing, or one estimated anew from all
-    touches if the plan has a table and a surface.
+    (`CHECK.misplaced`) and, if all contact points are known, forces balance with the planned
+    friction. `displacement` (6,) holds the object's translation [m] and rotation [rad]: that of the
+    closing, or one estimated anew from all touches if the plan has a table and a surface.
 
     Args:
         reference: the closing plan.
