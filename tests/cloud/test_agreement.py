@@ -6,8 +6,16 @@ import pytest
 import torch
 import trimesh
 
-from torchgrasp.cloud.agreement import check_agreement, check_foot, check_mesh, check_stand
+from torchgrasp import load_object
+from torchgrasp.cloud.agreement import (
+    check_agreement,
+    check_contacts,
+    check_foot,
+    check_mesh,
+    check_stand,
+)
 from torchgrasp.cloud.camera import look_at, partial_view
+from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.values.planning import PointCloud
@@ -78,3 +86,35 @@ def test_contacts_on_the_hidden_side_agree_and_contacts_elsewhere_do_not(camera)
     if camera:  # in space that the camera saw to be free
         with pytest.raises(BadArgument):
             check_agreement("FILE", towards_camera, "contacts", cloud, 0.03, 0.5)
+
+
+def misplaced(way):
+    """The jug in the frame of its grasps, or as strangers give it."""
+    jug = load_object("jug").mesh
+    turn = trimesh.transformations.rotation_matrix
+    return {
+        "right": jug,
+        "a little off": moved(jug, 0.004, 0.004, 0.0),
+        "beside": moved(jug, 0.1, 0.0, 0.0),
+        "a bit beside": moved(jug, 0.0, 0.05, 0.0),
+        "floating": moved(jug, 0.0, 0.0, 0.02),
+        "y up": jug.copy().apply_transform(turn(-torch.pi / 2, [1, 0, 0])),
+        "upside down": jug.copy().apply_transform(turn(torch.pi, [1, 0, 0])),
+        "centred": moved(jug, *-jug.centroid),
+        "in decimetres": jug.copy().apply_scale(10),
+        "another object": load_object("spray").mesh.copy().apply_translation([0.1, 0.0, 0.0]),
+    }[way]
+
+
+WAYS = ("right", "a little off", "beside", "a bit beside", "floating", "y up", "upside down")
+
+
+@pytest.mark.parametrize("hand", ["allegro", "barrett"])
+@pytest.mark.parametrize("way", [*WAYS, "centred", "in decimetres", "another object"])
+def test_a_mesh_that_is_not_where_the_grasp_is_is_told(way, hand):
+    grasp = load_shipped_grasp("jug", hand)
+    assert grasp.table is not None
+    if way in ("right", "a little off"):
+        return check_contacts(grasp, misplaced(way))
+    with pytest.raises(BadArgument, match=r"mesh: .*(within 10 mm of the mesh|foot is \d+ mm)"):
+        check_contacts(grasp, misplaced(way))

@@ -309,7 +309,7 @@ def test_a_mesh_and_a_table_that_contradict_the_grasp_are_told_before_any_work(m
     monkeypatch.setattr("torchgrasp.evaluation.lift.lift_grasp", begin)
     with pytest.raises(
         BadArgument,
-        match=r"mesh: expected a contact of the grasp within 30 mm .* 3 of 3 about \d+ mm",
+        match=r"mesh: expected contacts of grasps within 30 mm .* 3 of 3 about \d+ mm",
     ):
         close_hand(grasp, hand, cylinder((0.0, 0.16)))
     with pytest.raises(BadArgument, match="foot is 54 mm below the table"):

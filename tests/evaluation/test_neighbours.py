@@ -73,7 +73,7 @@ def test_a_neighbour_in_the_way_of_a_finger_is_pushed_before_the_object_is_touch
 def test_fingers_that_close_on_a_neighbour_do_not_hold_the_object(simulator, monkeypatch):
     """The object is out of reach; a body like it stands where the hand closes."""
     monkeypatch.setattr(
-        "torchgrasp.evaluation.lift.check_agreement", lambda *_, **__: None
+        "torchgrasp.evaluation.lift.check_contacts", lambda *_, **__: None
     )  # else it is refused
     result = close_beside(
         simulator, Neighbour(cylinder()), mesh=cylinder((-0.25, 0.0)), options=ONCE

@@ -28,7 +28,7 @@ from torchgrasp.export import save_play
 from torchgrasp.export.play import pressing_force
 from torchgrasp.foundation.errors import BadArgument, MeshError, Status
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
-from torchgrasp.geometry.plane import Plane
+from torchgrasp.geometry.plane import Plane, move
 from torchgrasp.shape import extract_surface
 from torchgrasp.values.specs import TrialSpec
 
@@ -280,12 +280,8 @@ def test_a_tilted_table_is_level_in_the_folder(tmp_path):
         torch.full((3,), 0.1).double(),
     )
     table = Plane.horizontal(0.0).moved(turn)
-    moved = dataclasses.replace(
-        grasp,
-        obj_from_hand=turn @ grasp.obj_from_hand.double(),
-        approach=grasp.approach.double() @ turn[:3, :3].T,
-        meta=grasp.meta | {"table": table.describe()},
-    )
+    meta = grasp.meta | {"table": table.describe()}
+    moved = dataclasses.replace(move(grasp.to(torch.float64), turn), meta=meta)
     mesh = thing.mesh.copy().apply_transform(turn.numpy())
     save_play(hand, moved, tmp_path, "mujoco", mesh, SPEC, parts=[mesh.convex_hull])
     play = json.loads((tmp_path / "play.json").read_text())
@@ -420,3 +416,30 @@ def test_a_glb_counts_the_one_grasp_that_it_holds(tmp_path, capsys):
         cli.main(["export", str(file), "--format", "glb", "--out", str(tmp_path / "jug.glb")]) == 0
     )
     assert capsys.readouterr().out.startswith("1 grasp of")
+
+
+@pytest.mark.parametrize("name", ["glb", "play-mujoco", "usd", "graspgen", "dexgraspbench"])
+def test_an_object_that_is_not_where_the_grasp_is_is_refused(name, tmp_path, capsys):
+    load_shipped_grasp("jug", "allegro").save(tmp_path / "grasps.safetensors")
+    mesh = load_object("jug").mesh.copy()
+    file = tmp_path / "bench" / "mesh" / "simplified.obj"
+    file.parent.mkdir(parents=True)
+    given = tmp_path / "bench" if name == "dexgraspbench" else file
+    call = ["export", str(tmp_path / "grasps.safetensors"), "--format", name]
+    call += ["--object", str(given), "--out", str(tmp_path / "out.glb")]
+    mesh.export(file)
+    if name in ("graspgen", "dexgraspbench", "glb"):  # the others cut the mesh into parts
+        assert cli.main([*call[:-1], str(tmp_path / "right.glb")]) == 0
+    mesh.apply_translation([0.1, 0.0, 0.0]).export(file)
+    assert cli.main(call) == 2
+    told = capsys.readouterr().err
+    assert "--object: expected contacts of grasps within 10 mm of the mesh's surface" in told
+    assert not (tmp_path / "out.glb").exists()
+
+
+def test_parts_that_are_not_those_of_the_mesh_are_refused(tmp_path):
+    thing = load_object("jug")
+    away = [part.copy().apply_translation([0.0, 0.1, 0.0]) for part in thing.parts]
+    given = load_hand("barrett"), load_shipped_grasp("jug", "barrett"), tmp_path, "mujoco"
+    with pytest.raises(MeshError, match=r"parts: .*100 mm off"):
+        save_play(*given, thing.mesh, parts=away)

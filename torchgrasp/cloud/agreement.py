@@ -12,13 +12,15 @@ from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.geometry.linalg import Points, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.plane_fit import assume_noise
-from torchgrasp.values.planning import PointCloud
+from torchgrasp.values.planning import Grasps, PointCloud
 
 
 @dataclasses.dataclass(frozen=True)
 class AgreementNumbers:
     """Bounds on how far the cloud, mesh, contacts and table of one object may be apart."""
 
+    sunk: float = 0.3
+    """Greatest share of a mesh's height below a table that may have been guessed from a view."""
     drawn: int = 300
     """Most points whose distances are measured."""
     drawn_of_cloud: int = 500
@@ -27,6 +29,14 @@ class AgreementNumbers:
     """Greatest distance [m] of points from their mesh, beside the noise."""
     share: float = 0.2
     """Greatest share of points that may be farther from their mesh."""
+    guessed: float = 0.4
+    """Greatest share of contacts that may be farther from their mesh: one of three, on a side that
+    nobody saw.
+    """
+    unseen: float = 0.03
+    """Greatest distance [m] of contacts from a cloud, which is partial, and the space behind it."""
+    unseen_share: float = 0.5
+    """Greatest share of contacts that may be farther from such a cloud."""
     lowest: float = 0.02
     """Share of the points of an object that may be lower than its foot: outliers."""
     foot: float = 0.015
@@ -74,6 +84,38 @@ def check_mesh(cloud: PointCloud, mesh: "trimesh.Trimesh", name: str = "mesh") -
     """
     slack = AGREEMENT.slack + 2 * _noise(cloud)
     check_agreement(name, cloud.points, "the cloud's points", mesh, slack, AGREEMENT.share)
+
+
+def check_contacts(grasps: Grasps, mesh: "trimesh.Trimesh", slack: float = AGREEMENT.slack) -> None:
+    """Raise `BadArgument` if many contacts of grasps are farther than `slack` [m] from their
+    object's mesh.
+
+    The mesh [m] is in the frame of the grasps. A mesh that floats above the table of the grasps, or
+    sinks far into it, is refused, too.
+    """
+    if not len(grasps):
+        return
+    points = grasps.contacts.points.reshape(-1, 3)
+    check_agreement("mesh", points, "contacts of grasps", mesh, slack, AGREEMENT.guessed)
+    if grasps.table is None:
+        return
+    # A table that was guessed from a view may lie above the true foot, but not below it.
+    height = grasps.table.height(torch.tensor(mesh.vertices, dtype=torch.float64))
+    foot = float(height.min())
+    if foot > 0 or -foot > AGREEMENT.sunk * (float(height.max()) - foot):
+        check_stand(mesh, grasps.table)
+
+
+def check_seen(grasps: Grasps, cloud: PointCloud, name: str) -> None:
+    """Raise `BadArgument` if many contacts of grasps lie off the view of their object and the space
+    hidden behind it.
+
+    The cloud is in the frame of the grasps. Errors call the argument `name`.
+    """
+    if len(grasps):
+        points = grasps.contacts.points.reshape(-1, 3)
+        limits = {"slack": AGREEMENT.unseen, "share": AGREEMENT.unseen_share}
+        check_agreement(name, points, "the contacts", cloud, **limits)
 
 
 def check_foot(cloud: PointCloud, table: Plane) -> None:

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.cloud.agreement import check_agreement, check_stand
+from torchgrasp.cloud.agreement import check_contacts, check_stand
 from torchgrasp.control.reference import check_single
 from torchgrasp.data.shipped import GraspObject
 from torchgrasp.evaluation.criterion import Tick, judge_lift, motion_between
@@ -50,9 +50,7 @@ class LiftNumbers:
     lost: float = 0.5
     """Motion [m] of the object beyond the lift's height that ends the trial."""
     slack: float = 0.03
-    """Greatest distance [m] of a grasp's contact from the mesh."""
-    share: float = 0.99
-    """Least share of the contacts that lie within this distance."""
+    """Distance [m] from contacts within which the mesh may lie: objects may be misplaced a bit."""
 
 
 LIFTS = LiftNumbers()
@@ -123,9 +121,7 @@ def close_hand(
         mesh = mesh.mesh
     mesh = read_mesh(mesh)
     hand = hand if isinstance(hand, Hand) else hand_of(grasp, hand)
-    points = grasp.contacts.points[0]
-    limits = {"slack": LIFTS.slack, "share": LIFTS.share}
-    check_agreement("mesh", points, "a contact of the grasp", mesh, **limits)
+    check_contacts(grasp, mesh, LIFTS.slack)
     if table is not None:
         check_stand(mesh, table)
     truth = Truth(mesh, parts, error, table, neighbours, slide)

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.cloud.agreement import check_contacts
 from torchgrasp.control.finger_forces import stiff_drives
 from torchgrasp.control.holding import PUSH
 from torchgrasp.control.protocol import POSE_TIME
@@ -24,6 +25,7 @@ from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import spatial, trimesh
 from torchgrasp.foundation.rules import Positive
 from torchgrasp.geometry.frames import inverse, rotation_from_rpy
+from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import Plane, upright_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.urdf import Joint, Link, LinkShape
@@ -107,8 +109,8 @@ def save_play(
             `TrialSpec()`.
         parts: convex parts of the mesh; None means that they are computed (`convex_parts`).
 
-    Raises `BadArgument` for no grasps or joints of another hand, `MeshError` for an open mesh, and
-    `OutputError`.
+    Raises `BadArgument` for no grasps, joints of another hand, or a mesh that the grasps do not
+    touch; `MeshError` for an open mesh, and `OutputError`.
 
     >>> import tempfile
     >>> from torchgrasp import load_hand, load_object
@@ -127,7 +129,9 @@ def save_play(
     folder = Path(folder)
     if isinstance(mesh, Surface):
         mesh = stand(mesh, grasps.table).mesh()
-    solid, pieces = read_solid(mesh, parts)
+    solid = read_mesh(mesh)
+    check_contacts(grasps, solid)
+    solid, pieces = read_solid(solid, parts)
     world_from_obj = _world_from_obj(grasps, solid)
     if not torch.equal(world_from_obj, torch.eye(4, dtype=torch.float64)):
         motion = world_from_obj.numpy()

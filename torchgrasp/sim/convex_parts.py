@@ -25,6 +25,7 @@ THRESHOLD = 0.05  # concavity of a part below which CoACD cuts no further
 _SEARCH: dict[str, Any] = {"mcts_iterations": 60, "mcts_max_depth": 2, "mcts_nodes": 10}
 """Settings of CoACD's search for cuts, which make it narrower and faster than by default."""
 MOST_PARTS = 1000  # most parts that a caller may give
+LARGEST_MISFIT = 0.01  # difference [m] of the boxes of a mesh and of its parts
 DECIMALS = 6  # decimals to which corners [m] are rounded if their hull would not be closed
 _log = logging.getLogger(__name__)
 
@@ -72,10 +73,20 @@ def read_solid(
 ) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh]]":
     """Read a closed mesh [m]; return it and its convex parts.
 
-    These are the given `parts`, or a convex decomposition if they are None.
+    These are the given `parts`, or a convex decomposition if they are None. Raises `MeshError`
+    for given parts whose box is not that of the mesh.
     """
     mesh = read_mesh(mesh)
-    return mesh, convex_parts(mesh) if parts is None else check_parts(parts)
+    if parts is None:
+        return mesh, convex_parts(mesh)
+    pieces = check_parts(parts)
+    low = np.min([part.bounds[0] for part in pieces], axis=0)
+    high = np.max([part.bounds[1] for part in pieces], axis=0)
+    off = float(np.abs(np.stack([low, high]) - mesh.bounds).max())
+    if off > LARGEST_MISFIT:
+        found = f"parts whose box is {1e3 * off:.0f} mm off that of the mesh"
+        raise MeshError("parts", found, "parts of the mesh, in its frame, in metres")
+    return mesh, pieces
 
 
 def hull(corners: np.ndarray) -> "trimesh.Trimesh":

@@ -15,15 +15,15 @@ from torchgrasp import export as formats
 from torchgrasp.app.cli.command import Command, arguments, naming, option, positional, required
 from torchgrasp.app.cli.inputs import FINGERS_HELP, HAND_HELP, load_fingers
 from torchgrasp.app.report.glb import write_glb
-from torchgrasp.cloud.agreement import check_agreement
+from torchgrasp.cloud.agreement import check_contacts, check_seen
 from torchgrasp.cloud.read import read_cloud
 from torchgrasp.data.shards import load_grasps
 from torchgrasp.export.foreign import Quaternion, read_poses
 from torchgrasp.export.postures import follower_joints
-from torchgrasp.files import read_json, write_file
+from torchgrasp.files import read_bytes, read_json, write_file
 from torchgrasp.foundation.errors import BadArgument, ModelFileError, Status
 from torchgrasp.foundation.rules import Count
-from torchgrasp.geometry.mesh import read_mesh
+from torchgrasp.geometry.mesh import SUFFIXES, load_triangles, read_mesh
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import hand_of
 from torchgrasp.planner.objects import digest
@@ -149,6 +149,9 @@ class Export(Command):
         best = planned[planned.status == Status.OK][: 1 if self.format == "glb" else self.most]
         force = 4.0 if self.force is None else self.force
         body = Path(self.object or shown)
+        if self.format in ("graspgen", "dexgraspbench"):
+            bench = body / "mesh" / "simplified.obj"
+            _check_reached(best, bench if self.format == "dexgraspbench" else body)
         with naming(hand="--format"):
             if plays and len(best):
                 player: Any = self.format.removeprefix("play-")
@@ -176,6 +179,17 @@ class Export(Command):
         return 0 if len(best) else 1
 
 
+def _check_reached(grasps: Grasps, path: Path) -> None:
+    """Refuse an object that a format names if its mesh is on this machine, and the grasps do not
+    touch it.
+    """
+    if path.suffix.lower() not in SUFFIXES or not path.is_file():
+        return
+    mesh = load_triangles(read_bytes(path), path.suffix.lower())
+    with naming(mesh="--object"):
+        check_contacts(grasps, mesh)
+
+
 def read_names(words: Sequence[str]) -> dict[str, str] | None:
     """Return a dict from each URDF joint to the robot's name for it; None without `words`.
 
@@ -196,8 +210,6 @@ def read_names(words: Sequence[str]) -> dict[str, str] | None:
 
 
 FARTHEST = 10  # of a hand from the object's frame [m]: farther is another unit
-SLACK = 0.03  # distance of contacts from the cloud [m]: the cloud is partial
-FAR_SHARE = 0.5  # of the contacts that may be farther away
 
 
 @arguments(order="joints", pregrasp="file", obj_from_hand="file", std_m="std")
@@ -275,9 +287,8 @@ class Import(Command):
 
 def _contradiction(grasps: Grasps, cloud: PointCloud) -> BadArgument | None:
     """Return the error to raise if grasps are not on the cloud, else None."""
-    points = grasps.contacts.points.reshape(-1, 3)
     try:
-        check_agreement("FILE", points, "the contacts", cloud, slack=SLACK, share=FAR_SHARE)
+        check_seen(grasps, cloud, "FILE")
     except BadArgument as error:
         return error
     return None

@@ -11,6 +11,7 @@ import numpy as np
 from torchgrasp.app.report.canvas import FULL, OBJECT, color_std, rgb
 from torchgrasp.app.report.solids import link_poses, solids_by_link
 from torchgrasp.app.report.stills import mesh_arrays, to_array
+from torchgrasp.cloud.agreement import check_contacts
 from torchgrasp.control.reference import check_single
 from torchgrasp.files import write_file
 from torchgrasp.foundation.checks import checked
@@ -44,8 +45,8 @@ def write_glb(
     The file is binary glTF 2.0, in metres, with y up. Its nodes have the names of the hand's links,
     in the colours of their fingers, and "object". The `body` is a mesh [m] in the frame of the
     grasp, or the estimated surface, which is coloured by its standard deviation. Returns the path.
-    Raises `BadArgument` if there is not exactly one grasp, `OutputError` if the file cannot be
-    written.
+    Raises `BadArgument` if there is not exactly one grasp or if it does not touch the mesh,
+    `OutputError` if the file cannot be written.
 
     >>> import tempfile
     >>> from torchgrasp import load_hand, load_object
@@ -56,6 +57,8 @@ def write_glb(
     ['f1_dist', 'f1_med', 'f1_prox']
     """
     check_single(grasp)
+    if not isinstance(body, Surface):
+        check_contacts(grasp, body)
     up = np.array([0.0, 0.0, 1.0]) if grasp.table is None else to_array(grasp.table.normal)
     turn = spatial.transform.Rotation.align_vectors([[0.0, 1.0, 0.0]], [up])[0]
     y_up = np.eye(4)

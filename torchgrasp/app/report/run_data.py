@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.app.report.canvas import ALARM, INK
+from torchgrasp.cloud.agreement import check_contacts
 from torchgrasp.evaluation.causes import moved_in_hand, tick_of
 from torchgrasp.evaluation.criterion import SLIP_ANGLE, SLIP_DISTANCE
 from torchgrasp.evaluation.lift import LIFT_TIME, PUSHED_DISTANCE
@@ -90,13 +91,15 @@ class Run:
     def upright(self) -> "Run":
         """Return the run in the upright frame of its cloud and table, where z is up.
 
-        A table has the height z = 0 there. `spec` stays as it is.
+        A table has the height z = 0 there. `spec` stays as it is. Raises `BadArgument` for a mesh
+        that the grasps do not touch.
         """
         obj_from_upright = upright_frame(self.cloud.points, self.cloud.viewpoint, self.spec.plane)
         upright_from_obj = inverse(obj_from_upright)
         mesh = self.mesh
         closure = self.closure
         if mesh is not None:
+            check_contacts(self.executable, mesh)
             mesh = mesh.copy().apply_transform(upright_from_obj.numpy())
         if closure is not None:
             object_pose = upright_from_obj @ closure.object_pose.double() @ obj_from_upright

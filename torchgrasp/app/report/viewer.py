@@ -31,6 +31,7 @@ from torchgrasp.app.report.page import (
 from torchgrasp.app.report.run_data import Run, mass_centre, moments_of, verdict
 from torchgrasp.app.report.solids import link_poses, solids_of_links
 from torchgrasp.app.report.stills import facing, mesh_arrays, to_array, view_of
+from torchgrasp.cloud.agreement import check_seen
 from torchgrasp.control.finger_forces import squeeze
 from torchgrasp.data.accept import CloudLike, HandLike, as_cloud
 from torchgrasp.files import write_file
@@ -106,7 +107,8 @@ def show_grasps(
 
     `cloud` is the cloud that was planned on, in any form that `plan_grasps` takes. The surface on
     the page is estimated anew from it. `hand` is needed for grasps of a hand that is not shipped.
-    With `browser` False the page is only written.
+    With `browser` False the page is only written. Raises `BadArgument` for a cloud that the grasps
+    do not touch.
 
     >>> from torchgrasp import load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -114,6 +116,7 @@ def show_grasps(
     'view.html'
     """
     cloud = as_cloud(cloud, "cloud")
+    check_seen(grasps, cloud, "cloud")
     table = grasps.table
     surface = extract_surface(fit_shape(cloud, table=table))
     spec = ContactSpec(table=table)
