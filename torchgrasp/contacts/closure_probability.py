@@ -66,8 +66,10 @@ class LinePosterior(Batch):
 
 @functools.cache
 def grid() -> Float[Tensor, "23"]:
-    """Return the 23 grid positions on a line, in standard deviations of the surface, from outside
-    to inside.
+    """Return the 23 grid positions t on the line x + t n through a contact x along its normal n.
+
+    n points outward. The positions fall from 12 (outside) to -12 (inside), unevenly spaced, in
+    standard deviations of the surface at the contact.
     """
     return real([*OUTER_GRID, *(-t for t in reversed(OUTER_GRID[:-1]))])
 

@@ -149,10 +149,10 @@ def contact_pairs(fingertips: int, device: torch.device) -> Int[Tensor, "2 p"]:
 
 @functools.cache
 def pull_signs(fingertips: int, device: torch.device) -> Float[Tensor, "f p"]:
-    """Return a sign for each contact i and each pair k of contacts, for a number of fingertips.
+    """Return the signed incidence matrix of f contacts and their p = f (f - 1) / 2 pairs.
 
-    It is 1 if the contact is the first of the pair, -1 if it is the second, and 0 if it is not in
-    the pair.
+    The pairs are in the order of `contact_pairs`. The sign is 1 where contact i is the first of
+    pair k, -1 where it is the second, and 0 otherwise. `fingertips` is f.
     """
     pairs = contact_pairs(fingertips, device)
     at = torch.arange(fingertips, device=device)[:, None]

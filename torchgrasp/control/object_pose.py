@@ -231,8 +231,10 @@ class Localization:
 
     @property
     def displacement(self) -> Float[Tensor, "6"]:
-        """Best displacement (6,) of the object so far: translation of the contacts' centroid [m],
-        rotation vector [rad].
+        """Best displacement (6,) of the object so far, in the frame of the planned hand.
+
+        First comes the translation [m] of the planned contacts' centroid, then the rotation vector
+        [rad] about this centroid.
         """
         return torch.cat([self.shift @ self.axes, self.turn * self.up])
 

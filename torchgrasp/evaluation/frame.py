@@ -32,8 +32,11 @@ def world_frame(table: Plane, obj_from_hand: Float[Tensor, "4 4"]) -> Float[Tens
 
 
 def to_frame(grasp: Grasps, obj_from_frame: Float[Tensor, "4 4"]) -> Grasps:
-    """Return a grasp, converted to the frame with the pose `obj_from_frame` [m], with rounded
-    numbers.
+    """Return a grasp in the coordinates of another frame.
+
+    `obj_from_frame` [m] is the pose of that frame in the grasp's present frame. Contacts, hand pose
+    and approach are converted; other fields, such as the certificate, are not. Contact points are
+    rounded to multiples of `GRID` [m], all other converted numbers to multiples of `FINE`.
     """
     frame_from_obj = inverse(obj_from_frame)
 

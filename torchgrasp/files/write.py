@@ -74,7 +74,10 @@ def remove_file(path: Path) -> None:
 
 
 class Malformed(ValueError):
-    """The content of a file is malformed; the message is a sentence of this library."""
+    """Raised for malformed content of a file.
+
+    Its message is written by this library for the user; `explain` passes it on unchanged.
+    """
 
 
 def explain(error: Exception) -> str:

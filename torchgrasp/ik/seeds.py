@@ -39,7 +39,9 @@ from torchgrasp.values.planning import Contacts, IKSeeds
 
 @dataclasses.dataclass(frozen=True)
 class SeedNumbers:
-    """Numbers of the search for seeds."""
+    """Parameters of the search for initial guesses (seeds) of hand poses and joints, in a library
+    of random postures or the learned model.
+    """
 
     length_scale: float = 0.01
     """Difference of tip centres [m] that counts as much as `cosine_scale`."""

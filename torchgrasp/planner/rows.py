@@ -165,8 +165,9 @@ class Candidates:
         )
 
     def best(self, rows: Int[Tensor, "k"]) -> Grasps:
-        """Return the best grasps of the contact sets with the indices `rows`, all of which were
-        tried.
+        """Return the best grasp of each of k contact sets, given their indices `rows`.
+
+        Every one of these sets must have been tried.
         """
         assert self.grasps is not None
         return self.grasps[self.grasp[rows]]

@@ -58,9 +58,9 @@ def finish(request: Request, batches: list[Grasps]) -> Grasps:
 
 
 def plan_hand(objects: Objects, deadline: float) -> Iterator[Grasps]:
-    """Yield the grasps of each batch of a single object, with relaxed constraints if no grasp is
-    likely to hold.
+    """Yield the grasps of the one object in `objects`, batch by batch of initial guesses.
 
+    If no grasp is likely to hold, further batches are planned with relaxed constraints (`relax`).
     No batch begins after `deadline` [s], a time of `time.monotonic`.
     """
     batches = (grasps for (grasps,) in plan_objects(objects, deadline))

@@ -69,10 +69,12 @@ class DataRows:
 
     @staticmethod
     def of(rows: Float[Tensor, "n d"], distributed: bool) -> "DataRows":
-        """Return the rows of this process, with its index in the default group of processes if
-        `distributed`.
+        """Return `rows`, this process's own part of the data, with its rank and the number of
+        processes.
 
-        Raises `BadArgument` if `distributed` is True without such a group.
+        The rows are not divided here. If `distributed`, both numbers are those of the default group
+        of torch.distributed; otherwise the process is alone. Raises `BadArgument` if `distributed`
+        is True without such a group.
         """
         if not distributed:
             return DataRows(rows)

@@ -164,9 +164,12 @@ def sample_configurations(
     """Draw random postures within the joint limits, and return `n` of them without self-collision
     (Sec. 6.3).
 
-    `SampleSpec` explains n, seed and sampling. `workers` threads draw at the same time. The
-    `observer` is called with the number of postures of every new chunk. Raises `BadArgument` for an
-    argument out of range, or a hand that collides with itself in almost all postures.
+    `sampling` "uniform" keeps all postures without self-collision. "grasping" keeps only those
+    whose random contacts can have force closure (`Sampling`); it needs a hand with three fingers. A
+    smaller set with the same `seed` is the beginning of a larger one. `workers` threads draw at the
+    same time. The `observer` is called after each chunk with the number of its postures. Raises
+    `BadArgument` for an argument out of range, for "grasping" with another number of fingers, or
+    for a hand of which almost no random posture is kept.
 
     >>> from torchgrasp.hand.load import load_hand
     >>> sample_configurations(load_hand("barrett"), 100).q.shape

@@ -53,7 +53,9 @@ OUTSIDE = OutsideNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class ObservationNumbers:
-    """Standard deviations of observations."""
+    """Standard deviations of what a shape's Gaussian process observes: normals, outline points and
+    free-space distances.
+    """
 
     normal: float = 0.05
     rim_normal: float = 0.5
@@ -65,7 +67,9 @@ class ObservationNumbers:
     rim: float = 0.002
     """Standard deviation of a point of the outline [m]."""
     free: float = 0.003
-    """Standard deviation of a distance in free space [m], which is only a lower bound."""
+    """Standard deviation [m] of a distance from a point in free space to the surface; the distance
+    is only a lower bound.
+    """
 
 
 NOISE = ObservationNumbers()

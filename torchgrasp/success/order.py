@@ -60,10 +60,12 @@ def grade(grasps: Grasps, log_odds: Float[Tensor, "k"], known: Bool[Tensor, "k"]
 
 
 def keep_promise(grasps: Grasps, share: float) -> Grasps:
-    """Return grasps in which executable ones that are not sure enough have the status `NO_PROMISE`.
+    """Return the grasps, in which executable ones that are not reliable enough get the status
+    `NO_PROMISE`.
 
-    Sure enough are grasps with a known success and log-odds of at least the bound that keeps the
-    promise of a `share`. If no bound keeps it, no grasp is sure enough.
+    `share`, in [0, 1], is the promised share of the remaining executable grasps that hold. An
+    executable grasp keeps its status if its success is known and its log-odds are at least the
+    bound that trials give for this share (`find_promise`). Without such a bound, none keeps it.
     """
     promise = find_promise(share)
     least = math.inf if promise is None else promise.least

@@ -22,7 +22,7 @@ UPPER = np.triu_indices(3)  # entries of a symmetric matrix that are parameters
 
 @dataclasses.dataclass(frozen=True)
 class EllipsoidNumbers:
-    """Numbers of the fit of an ellipsoid."""
+    """Parameters and bounds of the least-squares fit of an ellipsoid to a cloud."""
 
     points: int = 300
     """Most points of the cloud in the fit."""
@@ -52,7 +52,9 @@ class EllipsoidNumbers:
     evaluations: int = 40
     """Most evaluations of the fit."""
     forward: float = float(np.sqrt(np.finfo(float).eps))
-    """Step of the finite differences, over a parameter or 1."""
+    """Relative step of the residuals' finite differences: a parameter p is changed by `forward` *
+    max(1, |p|).
+    """
 
 
 ELLIPSOID = EllipsoidNumbers()
