@@ -25,7 +25,7 @@ from torchgrasp.export import (
     read_foreign,
     save_dexgraspbench,
 )
-from torchgrasp.foundation.errors import BadArgument, Status
+from torchgrasp.foundation.errors import BadArgument, GraspFileWarning, Status
 
 yaml = pytest.importorskip("yaml")
 
@@ -234,7 +234,8 @@ def test_multigrippergrasp_needs_the_order_of_its_joints(tmp_path):
         }
         file = tmp_path / "grasps.json"
         file.write_text(json.dumps(content))
-        read = read_foreign(file, hand, order, quaternion)
+        with pytest.warns(GraspFileWarning, match="other"):
+            read = read_foreign(file, hand, order, quaternion)
         torch.testing.assert_close(read.joints, grasp.joints)
         near(read.obj_from_hand, grasp.obj_from_hand, 1e-9)
         assert read.pregrasp is None

@@ -5,6 +5,8 @@ docs/exchange.md converts it.
 """
 
 import functools
+import io
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -17,14 +19,24 @@ from torch import Tensor
 from torchgrasp.cloud.safe_files import parse_npz
 from torchgrasp.contacts.certify import certify
 from torchgrasp.control.law import damped_inverse
+from torchgrasp.export.file_joints import (
+    POSTURE,
+    Column,
+    reach_tips,
+    read_columns,
+    read_order,
+    read_posture,
+    tell,
+)
 from torchgrasp.export.other_formats import bench_frame
 from torchgrasp.files import Field, is_file, read_bytes, read_json
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import BadArgument, ModelFileError, Status
+from torchgrasp.foundation.errors import ModelFileError, Status
 from torchgrasp.foundation.lazy import spatial
 from torchgrasp.foundation.limits import CLOUD_BYTES
-from torchgrasp.foundation.rules import Length, Poses
-from torchgrasp.geometry.frames import apply, rigid, rotate
+from torchgrasp.foundation.rules import Length, Poses, Positive
+from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
+from torchgrasp.geometry.plane import Plane, read_plane
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values.planning import Contacts, Grasps
 from torchgrasp.values.specs import ContactSpec
@@ -35,6 +47,10 @@ ROUNDING = 1e-3  # largest error of a quaternion's length: that of a file of few
 # distance [m] of opened fingertips from their contacts, and linear steps, which reach it to 1 mm
 OPENED = 0.02
 OPENING_STEPS = 4
+POSE_NUMBERS = 7  # of a pose: a position and a quaternion
+# arrays of a DexGraspBench file: read, and those that we know and need not
+BENCH_READ = ("grasp_qpos", "pregrasp_qpos", "obj_pose")
+BENCH_KNOWN = ("obj_path", "obj_scale", "squeeze_qpos")
 _refuse = functools.partial(ModelFileError, "path")  # the error of a bad file of grasps
 Quaternion = Literal["wxyz", "xyzw"]
 
@@ -44,34 +60,51 @@ class ForeignGrasps(NamedTuple):
 
     `joints` [rad] are the actuated joints, in the order of `hand.joint_names`. `obj_from_hand` [m]
     are the poses of the hand's root link in the object's frame. `pregrasp` [rad] are the joints of
-    the opened hand, or None if the file has none.
+    the opened hand, or None if the file has none. `table` is the table under the object, or None
+    if the file has none.
     """
 
     joints: Float[Tensor, "g h"]
     obj_from_hand: Float[Tensor, "g 4 4"]
     pregrasp: Float[Tensor, "g h"] | None
+    table: Plane | None = None
 
 
 @checked
 def read_foreign(
-    path: Path | str, hand: Hand, order: Sequence[str] = (), quaternion: Quaternion = "wxyz"
+    path: Path | str,
+    hand: Hand,
+    order: Sequence[str] = (),
+    quaternion: Quaternion = "wxyz",
+    unit_m: Positive = 1.0,
 ) -> ForeignGrasps:
     """Return joints and poses of grasps from the file of another program, or from our own JSON.
 
     | file | what is read |
     | --- | --- |
-    | `.json` of `format_grasps` | joints by name, pose, pre-grasp |
+    | `.json` of `format_grasps` | joints by name, pose, pre-grasp, table |
     | `.json` with `pose` and `dofs` (MultiGripperGrasp) | lists of 7 numbers, joints in `order` |
     | `.npz` with `grasp_qpos` (DexGraspBench) | lines of pose and joints; `pregrasp_qpos`, if any |
 
+    With `obj_pose` in the file, poses are in the world, and are moved to the object's frame. A
+    wrist that moves from pre-grasp to grasp stays at the grasp here. The fingers of the pre-grasp
+    take up its motion, so that their tips are where the file has them.
+
+    Fingertips are compared with those of all joints in the file. A `GraspFileWarning` tells of
+    values that are not kept, and of joints that bend backward.
+
     Args:
-        path: the file. Its lengths are in metres, its angles in radians.
+        path: the file. Its angles are in radians.
         hand: the grasping hand. For the Allegro hand DexGraspBench's frame and joint order are
             known.
-        order: names (as in the hand's URDF) of the joints in the file; other names are ignored.
+        order: names (as in the hand's URDF) of the joints in the file. `JOINT:FACTOR` or
+            `JOINT:FACTOR:OFFSET` convert a number of another sign, unit or zero [rad]. Values
+            under other names are not read.
         quaternion: order of the four numbers after the position in a pose.
+        unit_m: length [m] of one unit of the positions in the file.
 
-    Raises `ModelFileError` for a missing or malformed file, and `BadArgument` for an order that
+    Raises `ModelFileError` for a missing or malformed file, for joints that fit with another sign
+    only, and for joints that do not follow as the hand's do. Raises `BadArgument` for an order that
     misses a joint.
 
     >>> import tempfile
@@ -85,43 +118,72 @@ def read_foreign(
     True
     """
     path = Path(path)
+    hand = hand.to("cpu", torch.float64)
     if path.suffix.lower() == ".npz":
-        return _read_bench(path, hand, tuple(order), quaternion)
+        return _read_bench(path, hand, tuple(order), quaternion, unit_m)
     file = read_json(path, _refuse, "a JSON file of grasps, or .npz")
     fields = file.entries()
     if "grasps" in fields:
-        renamed = fields["rename"].entries() if "rename" in fields else {}
-        names = [renamed[x].text() if x in renamed else x for x in hand.joint_names]
-        return _read_own(fields["grasps"], hand, names)
+        return _read_own(fields, hand, unit_m)
     content = file.entries("pose", "dofs")
-    places = _places(hand, tuple(order))
-    pose = _table(content["pose"], 7)
-    dofs = _table(content["dofs"], len(order))
+    columns = read_order(hand, order)
+    pose = _table(content["pose"], POSE_NUMBERS)
+    dofs = _table(content["dofs"], len(columns))
     if len(pose) != len(dofs):
         raise _refuse(f"{path}: {len(pose)} poses, {len(dofs)} postures", "as many of either")
-    return ForeignGrasps(torch.tensor(dofs[:, places]), read_poses(pose, quaternion), None)
+    poses = read_poses(pose, quaternion, unit_m)
+    if "obj_pose" in content:
+        world = content["obj_pose"].numbers(POSE_NUMBERS, -FAR, FAR)
+        poses = inverse(read_poses(np.array([world]), quaternion, unit_m)) @ poses
+    joints = read_posture(hand, read_columns(hand, columns, dofs, _refuse), "grasp", _refuse)
+    return ForeignGrasps(joints, poses, None)
 
 
-def _read_own(rows: Field, hand: Hand, names: list[str]) -> ForeignGrasps:
-    """Return the grasps of a file of `format_grasps`, whose actuated joints have `names`."""
-    joints = list[list[float]]()
-    opened = list[list[float]]()
+def _read_own(fields: dict[str, Field], hand: Hand, unit_m: float) -> ForeignGrasps:
+    """Return the grasps of a file of `format_grasps`, given its fields."""
+    renamed = fields["rename"].entries() if "rename" in fields else {}
+    names = {x: renamed[x].text() if x in renamed else x for x in hand.tree.joint_names}
+    needed = [names[x] for x in hand.joint_names]
+    rows = fields["grasps"].items(MOST_GRASPS)
+    postures: dict[str, list[dict[str, Field]]] = {"grasp": [], "pregrasp": []}
     poses = list[list[float]]()
-    for row in rows.items(MOST_GRASPS):
-        fields = row.entries("joints", "pose")
-        postures = fields["joints"].entries("grasp", "pregrasp")
-        pose = fields["pose"]
-        for name, values in (("grasp", joints), ("pregrasp", opened)):
-            posture = postures[name].entries(*names)
-            values.append([posture[joint].number(-FAR, FAR) for joint in names])
-        place = pose.entries("position", "quaternion_wxyz")
+    rises = list[list[float]]()
+    for row in rows:
+        content = row.entries("joints", "pose")
+        found = content["joints"].entries(*postures)
+        for name, taken in postures.items():
+            taken.append(found[name].entries(*needed))
+        place = content["pose"].entries("position", "quaternion_wxyz")
         position = place["position"].numbers(3, -FAR, FAR)
         turn = place["quaternion_wxyz"].numbers(4, -FAR, FAR)
         poses.append([*position, *turn])
-    closed = torch.tensor(joints, dtype=torch.float64).reshape(-1, hand.dof)
-    pregrasp = torch.tensor(opened, dtype=torch.float64).reshape(-1, hand.dof)
-    places = np.array(poses, dtype=float).reshape(-1, 7)
-    return ForeignGrasps(closed, read_poses(places, "wxyz"), pregrasp)
+        rises.append(content["rise"].numbers(3, -FAR, FAR) if "rise" in content else [0.0] * 3)
+    joints = dict[str, Tensor]()
+    for name, taken in postures.items():
+        # a joint that some grasps lack is not compared
+        given = [x for x, theirs in names.items() if all(theirs in row for row in taken)]
+        values = {x: [row[names[x]].number(-FAR, FAR) for row in taken] for x in given}
+        columns = {x: np.array(column, dtype=float) for x, column in values.items()}
+        joints[name] = read_posture(hand, columns, name, _refuse)
+    places = np.array(poses, dtype=float).reshape(-1, POSE_NUMBERS)
+    table = _read_table(fields, np.array(rises), unit_m)
+    return ForeignGrasps(
+        joints["grasp"], read_poses(places, "wxyz", unit_m), joints["pregrasp"], table
+    )
+
+
+def _read_table(fields: dict[str, Field], rises: np.ndarray, unit_m: float) -> Plane | None:
+    """Return the table of a file of `format_grasps`, which raises opened hands; tell of `rises`
+    (g, 3) without one. One unit of lengths is `unit_m` [m].
+    """
+    provenance = fields["provenance"].entries() if "provenance" in fields else {}
+    text = provenance["table"].text() if "table" in provenance else "none"
+    if text != "none":
+        table = read_plane(text)
+        return Plane(table.normal, unit_m * table.offset)
+    if rises.any():
+        tell("opened hands that the file raises start at the grasp's pose: it names no table")
+    return None
 
 
 def _table(field: Field, width: int) -> np.ndarray:
@@ -133,53 +195,100 @@ def _table(field: Field, width: int) -> np.ndarray:
 
 
 def _read_bench(
-    path: Path, hand: Hand, order: tuple[str, ...], quaternion: Quaternion
+    path: Path, hand: Hand, order: tuple[str, ...], quaternion: Quaternion, unit_m: float
 ) -> ForeignGrasps:
     """Return the grasps of an .npz file in DexGraspBench's format: one grasp, or a line for each of
     several.
     """
     bench_from_root, known = bench_frame(hand)
-    order = order or known
-    places = _places(hand, order)
-    width = 7 + len(order)
+    # the signs of a hand whose frame is known are known, too
+    columns = read_order(hand, order) if order else tuple(Column(x, turned=True) for x in known)
+    if not columns:
+        columns = read_order(hand, ())
+    rows = _bench_tables(path, POSE_NUMBERS + len(columns))
+    poses = dict[str, Tensor]()
+    joints = dict[str, Tensor]()
+    for name, table in rows.items():
+        poses[name] = read_poses(table[:, :POSE_NUMBERS], quaternion, unit_m)
+        if name == "obj_pose":
+            continue
+        values = read_columns(hand, columns, table[:, POSE_NUMBERS:], _refuse)
+        joints[name] = read_posture(hand, values, name.removesuffix("_qpos"), _refuse)
+    placed = {name: poses[name] @ bench_from_root for name in joints}
+    if "obj_pose" in poses:
+        placed = {name: inverse(poses["obj_pose"]) @ pose for name, pose in placed.items()}
+    opened = None
+    if "pregrasp_qpos" in joints:
+        wrist = inverse(placed["grasp_qpos"]) @ placed["pregrasp_qpos"]
+        opened = _at_rest(hand, joints["pregrasp_qpos"], wrist)
+    return ForeignGrasps(joints["grasp_qpos"], placed["grasp_qpos"], opened)
+
+
+def _bench_tables(path: Path, width: int) -> dict[str, np.ndarray]:
+    """Return the tables (g, `width`) of grasps in an .npz file of DexGraspBench, and its `obj_pose`
+    (1 or g, 7), by name.
+    """
     try:
         if not is_file(path) or path.stat().st_size > CLOUD_BYTES:
             raise ValueError("no file, or a larger one")
-        tables = parse_npz(read_bytes(path), ("grasp_qpos", "pregrasp_qpos"), "grasp_qpos")
+        data = read_bytes(path)
+        tables = parse_npz(data, BENCH_READ, "grasp_qpos")
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            held = {name.removesuffix(".npy") for name in archive.namelist()}
     except Exception as error:  # zlib, zipfile and NumPy each raise their own
         raise _refuse(f"{path}: {error}", "an .npz of at most 512 MiB with 'grasp_qpos'") from error
+    if others := sorted(held - {*BENCH_READ, *BENCH_KNOWN}):
+        tell(f"{path.name}: not read: {', '.join(others)}")
     for name, table in tables.items():
-        good = table.dtype.kind == "f" and table.ndim in (1, 2) and table.shape[-1] == width
-        if not good or table.size > MOST_GRASPS * width or not np.isfinite(table).all():
+        wanted = POSE_NUMBERS if name == "obj_pose" else width
+        kinds = "fiu" if name == "obj_pose" else "f"
+        good = table.dtype.kind in kinds and table.ndim in (1, 2) and table.shape[-1] == wanted
+        if not good or table.size > MOST_GRASPS * wanted or not np.isfinite(table).all():
             found = f"{path}: {name} of shape {table.shape}, {table.dtype}"
-            allowed = f"finite numbers (g, {width}): seven of the pose, {len(order)} joints"
-            raise _refuse(found, allowed)
-    rows = {name: table.reshape(-1, width).astype(float) for name, table in tables.items()}
-    if len({len(table) for table in rows.values()}) != 1:
-        counts = ", ".join(f"{len(x)} of {name}" for name, x in rows.items())
-        raise _refuse(f"{path}: {counts}", "as many of either")
-    grasp = rows["grasp_qpos"]
-    joints = {name: torch.tensor(x[:, 7:][:, places]) for name, x in rows.items()}
-    poses = read_poses(grasp[:, :7], quaternion) @ bench_from_root
-    return ForeignGrasps(joints["grasp_qpos"], poses, joints.get("pregrasp_qpos"))
+            joints = f", {width - POSE_NUMBERS} joints" * (name != "obj_pose")
+            raise _refuse(found, f"finite numbers (g, {wanted}): seven of the pose{joints}")
+    rows = {
+        name: table.reshape(-1, table.shape[-1]).astype(float) for name, table in tables.items()
+    }
+    counts = {name: len(table) for name, table in rows.items()}
+    if counts.get("obj_pose") == 1:
+        del counts["obj_pose"]
+    if len(set(counts.values())) != 1:
+        found = ", ".join(f"{count} of {name}" for name, count in counts.items())
+        raise _refuse(f"{path}: {found}", "as many of either")
+    return rows
 
 
-def _places(hand: Hand, order: tuple[str, ...]) -> list[int]:
-    """Return the index in a file's joint `order` of each actuated joint; refuse an order that lacks
-    one.
+def _at_rest(
+    hand: Hand, joints: Float[Tensor, "g h"], wrist: Float[Tensor, "g 4 4"]
+) -> Float[Tensor, "g h"]:
+    """Return joints [rad] of opened hands at the grasp's pose whose fingertips are where `joints`
+    have them at the pose `wrist` [m] in the grasp's frame of the hand.
+
+    Where fingers do not reach, they come as near as they can, and this is told.
     """
-    missing = [name for name in hand.joint_names if name not in order]
-    if missing or len(set(order)) != len(order):
-        found = "a name twice"
-        if missing:
-            found = f"{len(order)} names without {', '.join(missing[:4])}"
-        raise BadArgument("order", found, f"each of {', '.join(hand.joint_names)} once")
-    return [order.index(name) for name in hand.joint_names]
+    still = (wrist - torch.eye(4, dtype=wrist.dtype)).abs().amax((1, 2)) < POSTURE.rounding
+    tips = apply(wrist, hand.fingertips(joints)[0])
+    inside = torch.minimum(torch.maximum(joints, hand.lower), hand.upper)
+    reached, left = reach_tips(hand, inside, tips)
+    far = (left > POSTURE.same_tip) & ~still
+    if bool(far.any()):
+        rows = torch.nonzero(far)[:, 0].tolist()
+        tell(
+            f"pregrasp of {len(rows)} of {len(joints)} grasps, the first {rows[0]}: the wrist "
+            "moves to the grasp, ours does not; fingertips are up to "
+            f"{1000 * float(left.max()):.1f} mm off the file's"
+        )
+    return torch.where(still[:, None], joints, reached)
 
 
-def read_poses(numbers: np.ndarray, quaternion: Quaternion) -> Float[Tensor, "g 4 4"]:
-    """Return pose matrices [m] from `numbers` (g, 7): a position [m], then a unit quaternion in the
+def read_poses(
+    numbers: np.ndarray, quaternion: Quaternion, unit_m: float = 1.0
+) -> Float[Tensor, "g 4 4"]:
+    """Return pose matrices [m] from `numbers` (g, 7): a position, then a unit quaternion in the
     given order.
+
+    One unit of the positions is `unit_m` [m].
 
     Raises `ModelFileError` for a quaternion that is not of length 1.
     """
@@ -192,7 +301,7 @@ def read_poses(numbers: np.ndarray, quaternion: Quaternion) -> Float[Tensor, "g 
     matrices = np.zeros((0, 3, 3))
     if len(turns):
         matrices = spatial.transform.Rotation.from_quat(turns).as_matrix()
-    return rigid(torch.tensor(matrices), torch.tensor(numbers[:, :3]))
+    return rigid(torch.tensor(matrices), torch.tensor(unit_m * numbers[:, :3]))
 
 
 @checked
@@ -201,6 +310,7 @@ def grasps_from_joints(
     joints: Float[Tensor, "g h"],
     obj_from_hand: Poses,
     pregrasp: Float[Tensor, "g h"] | None = None,
+    table: Plane | None = None,
     spec: ContactSpec | None = None,
     std_m: Length | None = None,
 ) -> Grasps:
@@ -218,6 +328,8 @@ def grasps_from_joints(
         obj_from_hand: poses [m] of the root link of the hand's URDF, in the object's frame.
         pregrasp: actuated joints [rad] of the opened hand; None means that each tip moves 20 mm off
             its contact, or as far as limits allow.
+        table: the table under the object, in its frame, above which an opened hand stays; None
+            means no table, or an unknown one.
         spec: friction and number of cone edges of the certificate; None means `ContactSpec()`.
         std_m: standard deviation [m] of the surface at each contact, for closing controllers that
             use it; None if it is unknown.
@@ -248,6 +360,8 @@ def grasps_from_joints(
     zeros = torch.zeros(g, f, dtype=torch.float64)
     meta = {"hand": hand.name, "hand_sha256": hand.source.sha256, "units": "metre, radian"}
     meta |= {"joint_names": ",".join(hand.joint_names), "finger_names": ",".join(hand.finger_names)}
+    if table is not None:
+        meta["table"] = table.describe()
     return Grasps(
         joints,
         opened,

@@ -166,6 +166,10 @@ class Flat(CloudWarning):
     """All points of the cloud lie in one plane, so the estimated thickness is a guess."""
 
 
+class GraspFileWarning(UserWarning):
+    """A file of grasps holds values that are not kept, or whose signs look reversed."""
+
+
 class Status(enum.IntEnum):
     """The outcome of one row of a batch, such as one grasp; `sentence` explains the outcome.
 

@@ -2,6 +2,7 @@
 
 import json
 import struct
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -18,6 +19,7 @@ from torchgrasp.cloud.safe_files import read_image_file
 from torchgrasp.data import list_views, read_entries, read_entry
 from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.export import format_grasps, grasps_from_joints, read_foreign
+from torchgrasp.foundation.errors import GraspFileWarning
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.hand.urdf import read_urdf
 
@@ -167,7 +169,9 @@ def foreign(folder: Path) -> list[Case]:
     np.savez(folder / "bench.npz", grasp_qpos=row[None], pregrasp_qpos=row[None])
 
     def read(path: Path) -> None:
-        grasps_from_joints(hand, *read_foreign(path, hand, hand.joint_names))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", GraspFileWarning)
+            grasps_from_joints(hand, *read_foreign(path, hand, hand.joint_names))
 
     return [saved(path, read) for path in sorted(folder.iterdir())]
 

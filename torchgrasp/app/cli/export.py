@@ -5,6 +5,7 @@ programs.
 import functools
 import inspect
 import itertools
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -227,7 +228,9 @@ class Import(Command):
     out: Path = required("file to write")
     fingers: str = option("default", FINGERS_HELP)
     joints: tuple[str, ...] = option(
-        (), "names of the joints in the order of the file, where the file has no names"
+        (),
+        "names of the joints in the order of the file, where the file has no names; JOINT:-1 turns "
+        "a sign, JOINT:FACTOR:OFFSET [rad] converts",
     )
     quaternion: Quaternion = option("wxyz", "order of the numbers of a rotation in the file")
     unit: Unit = option("m", "unit of the positions in the file")
@@ -265,11 +268,10 @@ class Import(Command):
     def _read(self, hand: Hand, quaternion: Quaternion, unit: Unit) -> Grasps:
         """Read the grasps in a given quaternion order and unit, and certify their contacts."""
         with naming(path="FILE"):
-            joints, poses, opened = formats.read_foreign(self.file, hand, self.joints, quaternion)
-        poses[:, :3, 3] *= UNITS[unit]
+            read = formats.read_foreign(self.file, hand, self.joints, quaternion, UNITS[unit])
         with naming(joints="FILE"):
             spec = ContactSpec(friction=self.friction, friction_margin=1.0)
-            return formats.grasps_from_joints(hand, joints, poses, opened, spec, self.std)
+            return formats.grasps_from_joints(hand, *read, spec, self.std)
 
     def _check(self, hand: Hand, grasps: Grasps, cloud: PointCloud) -> None:
         """Refuse grasps that are not on the cloud; the error names options that put them there, if
@@ -279,7 +281,10 @@ class Import(Command):
         if error is None:
             return
         for unit, quaternion in itertools.product(get_args(Unit), get_args(Quaternion)):
-            if _contradiction(self._read(hand, quaternion, unit), cloud) is None:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # the first reading told them
+                other = self._read(hand, quaternion, unit)
+            if _contradiction(other, cloud) is None:
                 mend = f"{error.allowed}, as with --quaternion {quaternion} --unit {unit}"
                 raise BadArgument("FILE", error.found, mend)
         raise error

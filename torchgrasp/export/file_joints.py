@@ -1,0 +1,240 @@
+"""Joints of other programs' files: their order, signs and couplings, held against our own hand.
+
+A file has values for all joints of its hand; we grasp with the actuated ones. What this would lose
+or turn is refused, or told in a `GraspFileWarning`.
+"""
+
+import dataclasses
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.foundation.errors import BadArgument, GraspFileWarning
+from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.kinematics import map_points
+
+Refuse = Callable[[str, str], BadArgument]  # makes the error of a found and an allowed text
+
+
+@dataclasses.dataclass(frozen=True)
+class PostureNumbers:
+    """Numbers that say when a file's posture is our hand's."""
+
+    same_tip: float = 1e-4  # greatest distance [m] of a fingertip from that of the file
+    same_joint: float = 1e-3  # greatest difference [rad or m] of a joint that moves no fingertip
+    backward: float = 0.05  # a joint [rad] that bends less is no sign of a reversed axis
+    short: float = 0.5  # share of the long side of a joint's range: a shorter one is its back
+    reached: float = 1e-6  # distance [m] of a fingertip along each axis that ends a search
+    rounding: float = 1e-6  # a joint [rad or m] may pass its limits by it
+    steps: int = 60  # most steps in which fingers take up the motion of a wrist
+    damping: float = 1e-5  # of the first of these steps [m^2]; larger: shorter steps
+    least_damping: float = 1e-10  # [m^2]
+    most_damping: float = 1.0  # [m^2]
+    shorter: float = 4.0  # factor of the damping after a step that was none
+
+
+POSTURE = PostureNumbers()
+
+
+class Column(NamedTuple):
+    """One joint of a file. Its value in our hand is `factor` times the file's, plus `offset`.
+
+    `offset` is in rad, or in m for a sliding joint. `turned` tells whether the user gave a factor.
+    """
+
+    joint: str
+    factor: float = 1.0
+    offset: float = 0.0
+    turned: bool = False
+
+
+def read_order(hand: Hand, order: Sequence[str]) -> tuple[Column, ...]:
+    """Return the columns of a file, given the words of an `order`: JOINT, JOINT:FACTOR or
+    JOINT:FACTOR:OFFSET.
+
+    A word that starts with no joint of the hand is kept as its name. Raises `BadArgument` for an
+    actuated joint that is missing, a name twice, or a factor that is no number or 0.
+    """
+    columns = list[Column]()
+    for word in order:
+        # the longest joint that starts the word: names may hold colons
+        starts = [x for x in hand.tree.joint_names if word == x or word.startswith(f"{x}:")]
+        joint = max(starts, key=len, default=word)
+        given = word != joint
+        numbers = _numbers(word[len(joint) + 1 :])
+        if given and (not 1 <= len(numbers) <= 2 or numbers[0] == 0):
+            raise BadArgument("order", repr(word), "JOINT, JOINT:FACTOR or JOINT:FACTOR:OFFSET")
+        columns.append(Column(joint, *numbers, turned=given))
+    names = [column.joint for column in columns]
+    missing = [name for name in hand.joint_names if name not in names]
+    if missing or len(set(names)) != len(names):
+        found = "a name twice"
+        if missing:
+            found = f"{len(names)} names without {', '.join(missing[:4])}"
+        raise BadArgument("order", found, f"each of {', '.join(hand.joint_names)} once")
+    return tuple(columns)
+
+
+def _numbers(words: str) -> list[float]:
+    """Return the numbers between colons; none if one is not finite, or no number."""
+    try:
+        numbers = [float(x) for x in words.split(":")]
+    except ValueError:
+        return []
+    return numbers if all(math.isfinite(x) for x in numbers) else []
+
+
+def read_columns(
+    hand: Hand, columns: Sequence[Column], table: np.ndarray, refuse: Refuse
+) -> dict[str, np.ndarray]:
+    """Return the values (g,) [rad or m] of each joint of our hand by name, given the file's `table`
+    (g, columns).
+
+    Tells which values are not read, and which joints bend backward in every grasp. Raises the error
+    of `refuse` for joints beyond their limits that fit with the other sign.
+    """
+    unread = list[str]()
+    turned = dict[str, str]()  # what was found, by JOINT:-1
+    backward = list[str]()
+    values = dict[str, np.ndarray]()
+    limits = zip(hand.lower.tolist(), hand.upper.tolist(), strict=True)
+    ranges = dict(zip(hand.joint_names, limits, strict=True))
+    for place, column in enumerate(columns):
+        found = column.factor * table[:, place] + column.offset
+        if column.joint not in hand.tree.joint_names:
+            unread += [column.joint] * bool(found.any())
+            continue
+        values[column.joint] = found
+        if column.turned or column.joint not in ranges or not len(found):
+            continue
+        low, high = ranges[column.joint]
+        if not _within(-found, low, high):
+            continue
+        span = f"{column.joint} from {found.min():.3g} to {found.max():.3g}"
+        if not _within(found, low, high):
+            turned[f"{column.joint}:-1"] = f"{span} outside [{low:.3g}, {high:.3g}]"
+        elif _is_backward(found, low, high):
+            backward.append(span)
+    if turned:
+        allowed = f"the signs of our URDF, as with {' '.join(turned)} in --joints"
+        raise refuse(", ".join(turned.values()), allowed)
+    if unread:
+        tell(f"{', '.join(unread)}: no joint of the {hand.name} hand, so its values are not read")
+    if backward:
+        tell(
+            f"{', '.join(backward)}: bent backward in every grasp. In --joints, JOINT:-1 turns the "
+            "sign; JOINT:1 keeps it"
+        )
+    return values
+
+
+def _within(values: np.ndarray, low: float, high: float) -> bool:
+    """Return whether all values are in [low, high], up to rounding."""
+    inside = (values >= low - POSTURE.rounding) & (values <= high + POSTURE.rounding)
+    return bool(inside.all())
+
+
+def _is_backward(values: np.ndarray, low: float, high: float) -> bool:
+    """Return whether all values [rad] are on the far shorter side of a range about 0."""
+    forward = values if high >= -low else -values
+    short, long = sorted((-low, high))
+    if short <= 0 or short > POSTURE.short * long:
+        return False
+    return bool((forward <= 0).all() and forward.min() < -POSTURE.backward)
+
+
+def read_posture(
+    hand: Hand, values: dict[str, np.ndarray], what: str, refuse: Refuse
+) -> Float[Tensor, "g h"]:
+    """Return the actuated joints [rad] of the hand on the CPU, given the file's `values` (g,) of
+    its joints by name.
+
+    The fingertips are compared with those of all the file's values. Raises the error of `refuse` if
+    one is more than 0.1 mm off, and names the joint. Values of other fingers that we do not keep
+    are told. `what` names the posture.
+    """
+    joints = torch.tensor(np.stack([values[name] for name in hand.joint_names], axis=1))
+    own = hand.expand_joints(joints)
+    theirs = own.clone()
+    for place, name in enumerate(hand.tree.joint_names):
+        if name in values:
+            theirs[:, place] = torch.tensor(values[name])
+    if not len(joints):
+        return joints
+    off = (_tips(hand, theirs) - _tips(hand, own)).norm(dim=-1).amax(-1)  # (g,)
+    apart = (theirs - own).abs()  # (g, j)
+    moving = hand.tree.moves[hand.tips.index].bool().any(0)  # (j,)
+    row = int(off.argmax())
+    if float(off[row]) > POSTURE.same_tip:
+        joint = int(torch.where(moving, apart[row], -1.0).argmax())
+        found = (
+            f"{what} {row} with {hand.tree.joint_names[joint]} at {float(theirs[row, joint]):.3g}, "
+            f"{float(own[row, joint]):.3g} {_reason(hand, joint)}: a fingertip "
+            f"{1000 * float(off[row]):.1f} mm off"
+        )
+        raise refuse(found, "joints that follow as in the hand; any other name skips a joint")
+    idle = (apart.amax(0) > POSTURE.same_joint) & ~moving
+    names = [x for x, one in zip(hand.tree.joint_names, idle.tolist(), strict=True) if one]
+    if names:
+        tell(
+            f"{what}: {', '.join(names)} move no grasping finger, so the file's values are not "
+            "kept; --fingers chooses others"
+        )
+    return joints
+
+
+def _reason(hand: Hand, joint: int) -> str:
+    """Return why a joint that is not actuated has its value."""
+    leaders = torch.nonzero(hand.actuated.coupling[joint])[:, 0].tolist()
+    if not leaders:
+        return "where the hand parks it"
+    return f"by its coupling to {hand.joint_names[leaders[0]]}"
+
+
+def _tips(hand: Hand, values: Float[Tensor, "g j"]) -> Float[Tensor, "g f 3"]:
+    """Return the contact points [m] of the pads in the palm's frame, given all movable joints."""
+    _, carriers = hand.tips.frames(values.T.contiguous())
+    return map_points(carriers, hand.tips.in_carriers[0]).permute(2, 1, 0)
+
+
+def reach_tips(
+    hand: Hand, joints: Float[Tensor, "g h"], tips: Float[Tensor, "g f 3"]
+) -> tuple[Float[Tensor, "g h"], Float[Tensor, "g"]]:
+    """Return joints [rad] within their limits that bring the pads to `tips` [m] in the palm's
+    frame, and the distance [m] that is left to the farthest.
+
+    The search starts at `joints`.
+    """
+    damping = joints.new_full((len(joints), 1, 1), POSTURE.damping)
+    eye = torch.eye(hand.dof, dtype=joints.dtype)
+    error = (tips - hand.fingertips(joints)[0]).flatten(1)  # (g, 3 f)
+    for _ in range(POSTURE.steps):
+        if not len(error) or float(error.abs().max()) < POSTURE.reached:
+            break
+        jacobian = hand.jacobian(joints).flatten(1, 2)  # (g, 3 f, h)
+        descent = (jacobian.mT @ error[..., None])[..., 0]
+        # joints that press on a limit stay there
+        held = ((joints <= hand.lower) & (descent < 0)) | ((joints >= hand.upper) & (descent > 0))
+        freed = torch.where(held[:, None], 0.0, jacobian)
+        normal = freed.mT @ freed + damping * eye
+        step = torch.linalg.solve(normal, freed.mT @ error[..., None])[..., 0]
+        moved = torch.minimum(torch.maximum(joints + step, hand.lower), hand.upper)
+        missed = (tips - hand.fingertips(moved)[0]).flatten(1)
+        # Levenberg and Marquardt: a worse step is dropped, and the next one is shorter
+        better = (missed.norm(dim=1) < error.norm(dim=1))[:, None]
+        joints = torch.where(better, moved, joints)
+        error = torch.where(better, missed, error)
+        factor = torch.where(better, 1 / POSTURE.shorter, POSTURE.shorter)[..., None]
+        damping = (damping * factor).clamp(POSTURE.least_damping, POSTURE.most_damping)
+    return joints, error.reshape(tips.shape).norm(dim=-1).amax(-1)
+
+
+def tell(sentence: str) -> None:
+    """Warn the caller of the library of what a file holds and we do not keep."""
+    warnings.warn(sentence, GraspFileWarning, stacklevel=3)
