@@ -35,7 +35,7 @@ class ReachNumbers:
     steps: int = 12
     """Most steps from each of these postures."""
     solved: float = 1e-4
-    """Sum of squared errors [mm2] of a tip in place: of a hundredth of a millimetre."""
+    """Sum of squared errors [mm2] at which a tip has reached its place: (0.01 mm)^2."""
     way_steps: int = 4
     """Most steps from one pose of the way to the next."""
     lift: float = 0.1
@@ -49,7 +49,7 @@ class ReachNumbers:
     ways: int = 64
     """Number of ways that are checked for collisions at a time."""
     rounding: float = 1e-12
-    """Least divisor of a rotation's angle by its sine, so that no division is by 0."""
+    """Least sine by which a rotation's angle is divided, so that no division is by 0."""
 
 
 REACH = ReachNumbers()

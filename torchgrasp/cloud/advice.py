@@ -26,7 +26,7 @@ class AdviceNumbers:
     fewest: int = 50
     """Fewest points that show whether a camera is right, or whether pixels fly off rims."""
     narrow: float = 0.06
-    """Least width [m] of a level plane that is a table left in."""
+    """Least width [m] of a level plane that counts as a table left in the cloud."""
     level: float = 0.97
     """Cosine between a table's normal and the vertical, below which advice names the normal."""
     down: float = 0.15

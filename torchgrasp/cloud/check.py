@@ -27,7 +27,7 @@ class CloudNumbers:
     """Bounds for points that coincide or lie on a line, and for extents in another unit."""
 
     sample: int = 20_000
-    """About as many points mostly show that enough are distinct."""
+    """Number of points, about, that are first searched for enough distinct ones."""
     coincident: float = 1e-9
     """Greatest distance of coincident points, over the cloud's extent: above rounding, below any
     sensor's resolution.
@@ -35,7 +35,7 @@ class CloudNumbers:
     line: float = 1e-6
     """Points are on a line if their second principal spread over the first is less than this."""
     scene: float = 10.0
-    """A too large extent below this [m] is that of a scene, or in cm."""
+    """A too large extent below this number is that of a scene in metres, or of an object in cm."""
     longest: float = 45.0
     """A larger extent below this is in cm, of an object of 45 cm at most; above it is in mm."""
 

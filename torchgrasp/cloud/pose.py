@@ -72,7 +72,7 @@ class PoseNumbers:
     on_table: float = 0.03
     """Points on the table are within this distance of it [m]."""
     seen: float = 0.001
-    """Least share of the points on a table that was seen."""
+    """Least share of all points that lie on a given table if the camera saw it."""
     lowest: float = 0.01
     """Share of the points that may be lower than all of the objects."""
     above: float = 0.5
@@ -86,7 +86,7 @@ class SizeNumbers:
     points: int = 100
     """Fewest points of an object whose size counts."""
     smaller: int = 5
-    """One object in so many may be smaller than the size that is judged."""
+    """One object in this number may be smaller than the size that is compared with the bounds."""
     low_table: float = -0.5
     """A table below this [m] may be one that a wrong unit moved down."""
     near: float = 0.05

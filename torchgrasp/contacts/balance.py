@@ -44,7 +44,9 @@ from torchgrasp.geometry.linalg import (
 
 @dataclasses.dataclass(frozen=True)
 class BalanceNumbers:
-    """The numbers of the search over directions, of the short search, and of the Newton steps."""
+    """Parameters of the search for balanced forces over directions, of a short search, and of
+    Newton's method.
+    """
 
     directions: int = 1024
     """Number of directions that the search tries first."""
@@ -63,7 +65,7 @@ class BalanceNumbers:
     needed.
     """
     near: int = 24
-    """Number of changes of the weights in each round of the short search."""
+    """Number of changes of the pairs' weights that each round of the short search tries."""
     near_radii: tuple[float, ...] = (0.5, 0.28, 0.15)
     """Lengths of the longest changes in the rounds of the short search."""
     near_least: float = 0.3

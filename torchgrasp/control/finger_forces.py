@@ -149,8 +149,8 @@ def press(
     forces.
 
     `joints` [rad] are the present actuated joints, `jacobian` [m/rad] is that of the contact points
-    by them, `forces` [N] act on the object, and `stiffness` [N m/rad] is that of each actuated
-    joint.
+    by them, `forces` [N] act on the object, both in one frame, and `stiffness` [N m/rad] is that of
+    each actuated joint.
     """
     torques = torch.einsum("gcih,gci->gh", jacobian, forces)
     return Squeeze(joints + torques / stiffness, forces, torques)

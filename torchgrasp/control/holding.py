@@ -30,7 +30,7 @@ PUSH = 2.5
 
 @dataclasses.dataclass(frozen=True)
 class FrictionNumbers:
-    """Numbers of the estimate of the friction coefficient."""
+    """Parameters of `FrictionEstimate`, the running estimate of the friction coefficient."""
 
     mean: float = 0.8
     """Estimate at the start."""
@@ -48,7 +48,7 @@ class FrictionNumbers:
 
 @dataclasses.dataclass(frozen=True)
 class GripNumbers:
-    """Numbers of the hold "grip", which carries the sensed load."""
+    """Parameters of `GripHold`, the holding mode "grip", which carries the sensed load."""
 
     least_push: float = 0.4
     """Least normal force [N] of a finger: four standard deviations of its reading."""
@@ -93,7 +93,9 @@ class GripNumbers:
     release: float = 3.0
     """Rate [1/s] at which forces that are not needed fall once the load is steady."""
     changes: float = 2.0
-    """Largest rate [1/s] of the friction coefficient; the reserve's share rises twice as fast."""
+    """Largest rate [1/s] of the friction coefficient; the part of the reserve that is
+    applied rises twice as fast.
+    """
     over: float = 0.25
     """Time [s] of sliding with forces at their limits after which the load is too heavy."""
     feedback: float = 4.0
@@ -201,8 +203,10 @@ def held_forces(
 
 
 class FrictionEstimate:
-    """A running estimate of the friction coefficient, common to all fingertips: `mean`, standard
-    deviation `std`, bound `least`.
+    """A running estimate of the friction coefficient, common to all fingertips.
+
+    `mean` is the estimate, `std` its standard deviation, and `least` a lower bound of the
+    coefficient.
     """
 
     def __init__(self) -> None:

@@ -28,7 +28,7 @@ Array = np.ndarray
 
 @dataclasses.dataclass(frozen=True)
 class BarrierNumbers:
-    """Numbers of the barrier method."""
+    """Parameters of the barrier method that finds the least fingertip forces."""
 
     penalty: float = 500.0
     """Weight [N] of the penalty on joint torques and normal forces."""

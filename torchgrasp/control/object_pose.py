@@ -22,8 +22,8 @@ from torchgrasp.geometry.linalg import across, unit
 
 @dataclasses.dataclass(frozen=True)
 class ContactPlaneNumbers:
-    """Numbers of `ContactPlanes`: the prior of the object's displacement before any touch, mostly
-    along the table.
+    """Parameters of `ContactPlanes`, above all its prior of the object's displacement before any
+    touch.
     """
 
     shift: float = 0.01
@@ -40,7 +40,7 @@ class ContactPlaneNumbers:
 
 @dataclasses.dataclass(frozen=True)
 class LocalizationNumbers:
-    """Numbers of the search for the object from touches."""
+    """Parameters of `Localization`, the search for the object's displacement from touches."""
 
     turns: tuple[float, ...] = (-0.24, -0.12, 0.0, 0.12, 0.24)
     """Rotations [rad] about the table's normal that are tried."""
@@ -49,7 +49,7 @@ class LocalizationNumbers:
     pitch: float = 0.006
     """Distance [m] between the shifts that are tried; the fine search has a quarter of it."""
     farthest: float = 0.072
-    """Largest shift [m] on each axis that is tried."""
+    """Largest shift [m] on each of two axes along the table that is tried."""
     shift: float = 0.03
     """Standard deviation [m] of the shift on each axis before any touch."""
     turn: float = 0.15
@@ -101,11 +101,11 @@ class ContactPlanes:
     def displacement(
         self, points: Float[Tensor, "f 3"], touching: Bool[Tensor, "f"]
     ) -> Float[Tensor, "6"]:
-        """Return the most probable displacement: translation of the contacts' centroid [m],
-        rotation about it [rad].
+        """Return the most probable displacement (6,) of the object, in the planned hand's frame.
 
-        `points` [m] are the points of the fingertips that would touch first; `touching` marks
-        fingertips that touch. Both are in the order of the hand's fingers.
+        First comes the translation [m] of the contacts' centroid, then the rotation vector [rad]
+        about it. `points` [m] are the points of the fingertips that would touch first; `touching`
+        marks fingertips that touch. Both are in the order of the hand's fingers.
         """
         off = ((points - self.target) * self.normals).sum(-1)
         beyond = (off - self.rows @ self.expected).clamp_min(-PLANES.missed)

@@ -32,7 +32,7 @@ PRESSING_TIME = 0.5
 
 @dataclasses.dataclass(frozen=True)
 class ApproachNumbers:
-    """Numbers of the guarded approach."""
+    """Parameters of `GuardedApproach`, an approach that stops at a touch."""
 
     speed: float = 0.1
     """Largest speed [m/s] of the hand."""
@@ -48,12 +48,12 @@ class ApproachNumbers:
     moving: float = 0.05
     """Least speed [m/s] of the hand at which the drives' torques count: it has not just stopped."""
     noises: float = 3.0
-    """Standard deviations of a joint torque that count as noise."""
+    """Largest joint torque that counts as noise, in standard deviations of the noise."""
 
 
 @dataclasses.dataclass(frozen=True)
 class GraspCheckNumbers:
-    """Numbers of the check of a pressing grasp."""
+    """Parameters of `GraspCheck`, the check of a pressing grasp before the lift."""
 
     first: float = 0.1
     """Time [s] of pressing from which touches are averaged."""
@@ -67,7 +67,7 @@ class GraspCheckNumbers:
 
 @dataclasses.dataclass(frozen=True)
 class OpeningTimes:
-    """Times of a hand that opens again."""
+    """Times of `Reopening`, in which a hand opens again."""
 
     opening: float = 0.5
     """Time [s] in which the fingers open."""

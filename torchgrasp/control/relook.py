@@ -18,10 +18,10 @@ REACH = 0.08  # largest displacement [m] on each axis of the table that `relocat
 
 @dataclasses.dataclass(frozen=True)
 class RelookNumbers:
-    """Numbers of the search for the moved object."""
+    """Parameters of `relocate`, the search for the object's motion from a new view."""
 
     scale: float = 0.004
-    """Distance [m] from the surface beyond which a point of a new view counts less."""
+    """Scale s [m] of Cauchy's cost: points farther than this from the surface count less."""
     points: int = 300
     """Most points of the cloud that are used."""
     shifts: int = 17

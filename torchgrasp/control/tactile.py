@@ -27,7 +27,7 @@ Filtered = TypeVar("Filtered", Tensor, np.ndarray, float)
 
 @dataclasses.dataclass(frozen=True)
 class TactileNumbers:
-    """Numbers of the simulated fingertips; their noise in the normal force is `NOISE`."""
+    """Parameters of simulated fingertip sensors; the noise of their normal force is `NOISE` [N]."""
 
     cutoff: float = 20.0
     """Cut-off [Hz] of the lag of the sensor."""

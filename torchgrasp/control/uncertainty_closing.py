@@ -30,7 +30,7 @@ PALM_SPEED = 0.04  # largest speed [m/s] of the palm that follows the object
 
 @dataclasses.dataclass(frozen=True)
 class ClosingNumbers:
-    """Numbers of the default closing."""
+    """Parameters of `UncertaintyClosing`, the default closing."""
 
     patience: float = 2.5
     """Longest time [s] from the first touch until the closing ends, even if some finger has not

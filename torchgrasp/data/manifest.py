@@ -52,7 +52,7 @@ class CameraNumbers:
     distance: float = 0.5
     """Distance [m] from the object."""
     seeds: int = 2**31
-    """Number of different seeds from which that of a view's noise is drawn."""
+    """Number of random seeds among which the seed of a view's noise is drawn."""
 
 
 CAMERAS = CameraNumbers()

@@ -41,7 +41,7 @@ class Tick(Value):
     centre: Float[Tensor, "*t 3"]  # the object's centre of mass [m]
     felt: Float[Tensor, "*t 2"]  # friction and load [N] as the controller estimates them
     blend: Float[Tensor, "*t f"]  # weight lambda of each of f fingers, Eq. (26); a share
-    truth: TipContact  # the true contacts of the fingertips
+    truth: TipContact  # the true contacts of the fingertips, in the hand's frame
 
 
 def judge_lift(ticks: Sequence[Tick], pressed: int, judged: int, lift_height: float) -> Status:

@@ -19,7 +19,7 @@ from torchgrasp.foundation.rules import Seed
 
 @dataclasses.dataclass(frozen=True)
 class BootstrapNumbers:
-    """Numbers of the bootstrap that finds an interval."""
+    """Parameters of the bootstrap that finds the confidence interval of a success rate."""
 
     resamples: int = 10_000  # resamples of the families; more: ends of the interval vary less
     outside: float = 0.05  # probability that the value lies outside the interval

@@ -41,7 +41,7 @@ PUSHED_DISTANCE = 0.05
 
 @dataclasses.dataclass(frozen=True)
 class LiftNumbers:
-    """Numbers of a lift and its verdict."""
+    """Parameters of a simulated lift and of its verdict."""
 
     shaking: float = 5.0
     """Frequency [Hz] at which the raised hand shakes."""
@@ -98,8 +98,8 @@ def close_hand(
             (`Grasps.table`).
         surface: estimated surface of the object (`surface_field`), to estimate the object's pose
             from touches. Without it, only the tangent planes of the planned contacts are used.
-        slide: motion [m] of the object along the table, halfway through the approach, unknown to
-            the controller.
+        slide: displacement [m] of the object along the table, in the frame of the grasp, halfway
+            through the approach, unknown to the controller.
 
     Raises:
         BadArgument: not exactly one grasp, joints of another hand, or a pre-grasp outside the joint

@@ -287,7 +287,7 @@ def draw_slide(noise: PoseNoise, seed: Seed) -> Float[Tensor, "3"]:
 def draw_push(
     force: Annotated[float, Range(0.0, 1000.0)], seed: Seed
 ) -> tuple[float, float, float]:
-    """Return a force (x, y, z) [N] of the size `force` [N] in a random direction.
+    """Return a force (x, y, z) [N] of the size `force` [N] in a random direction of the world.
 
     All directions are equally likely.
     """

@@ -43,9 +43,10 @@ class RegraspNumbers:
 
     gap: float = 0.015  # mean distance [m] of the contacts above which a grasp differs
     turn: float = math.radians(30)  # angle [rad] of the approaches above which a grasp differs
-    share: float = 0.35  # share of the mass that may be at one point of the surface
+    share: float = 0.35  # share of the object's mass that may be concentrated at one surface point
     withdrawal: float = 0.6  # time [s] in which the opened hand withdraws, and the object rests
-    # least number of surface points that are tried for this mass; fewer if the surface has fewer
+    # number of surface points, at least, that are tried as the place of this mass (fewer if the
+    # surface has fewer)
     places: int = 64
 
 

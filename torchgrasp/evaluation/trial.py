@@ -40,7 +40,7 @@ from torchgrasp.values.specs import ClosingMode, TrialSpec
 
 @dataclasses.dataclass(frozen=True)
 class TrialNumbers:
-    """Numbers of a trial."""
+    """Parameters of a simulated trial of a grasp."""
 
     unit_error: float = 1e-4
     """Greatest error of the length of the approach, a unit vector."""
@@ -49,7 +49,7 @@ class TrialNumbers:
     speed: float = 0.2
     """Mean speed [m/s] of an unguarded approach."""
     relooked: float = 1.5
-    """Ratio of the distance that the mount yields after a second look to its usual reach."""
+    """Extra range of the hand's mount after a second look, over the largest shift of `relocate`."""
 
 
 TRIALS = TrialNumbers()
@@ -70,7 +70,9 @@ class Truth:
     error: Pose | None = None  # error of the hand's pose [m], in the frame of the planned hand
     table: Plane | None = None  # below the object
     neighbours: Sequence[Neighbour] = ()  # other bodies on the table
-    slide: Float[Tensor, "3"] | None = None  # motion of the object halfway through the approach [m]
+    slide: Float[Tensor, "3"] | None = (
+        None  # displacement [m] of the object halfway through the approach
+    )
     camera: Pose | None = None  # of a depth camera for a second look [m]
 
 

@@ -57,7 +57,7 @@ AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 @dataclasses.dataclass(frozen=True)
 class PlayNumbers:
-    """Numbers of a played motion."""
+    """Parameters of an exported motion that a simulator plays: mount, approach and lift."""
 
     room: float = 0.1
     """Range [m] of the mount beyond approach and lift."""

@@ -48,7 +48,7 @@ Result = TypeVar("Result", bound=Batch)
 
 @dataclasses.dataclass(frozen=True)
 class CobylaNumbers:
-    """Numbers of the paper's solver."""
+    """Parameters of the paper's grasp solver, SciPy's COBYLA."""
 
     angle: float = 0.01
     """Unit of the variables [rad]: a fingertip moves by about a millimetre, as the distances do."""
@@ -61,11 +61,11 @@ class CobylaNumbers:
     evaluations: int = 400
     """Most evaluations of one run."""
     together: int = 10
-    """Number of seeds that are tried at a time."""
+    """Number of initial guesses that are tried at a time."""
     grasps: int = 10
     """Number of executable grasps that are enough."""
     seeds: int = 300
-    """Most seeds that are tried."""
+    """Most initial guesses that are tried."""
 
 
 COBYLA = CobylaNumbers()
@@ -73,16 +73,17 @@ ROWS = 256  # seeds whose costs are computed at a time, which bounds the memory
 
 
 def assign(contacts: Contacts, seeds: IKSeeds) -> Contacts:
-    """Return the contact set of each seed, with its contacts reordered so that contact i belongs to
-    finger i.
+    """Return the contact set of each initial guess, with its contacts reordered so that contact i
+    belongs to finger i.
 
-    `contacts` are all sets; `seeds.row` holds the index of each seed's set.
+    `contacts` are all sets; `seeds.row` holds the index of each guess's set.
     """
     return map_tensors(lambda x: x[seeds.row[:, None], seeds.permutation], contacts)
 
 
 class Attempts(Generic[Result]):
-    """The results of all refined seeds so far, and a mask of the contact sets without a good one.
+    """The results of all refined initial guesses so far, and a mask of the contact sets without a
+    good one.
 
     `unsolved` is this mask of the b contact sets; `solves` returns a mask (k,) of the good ones
     among k results. `results` are the added groups of results, such as `Grasps`, and `rows` holds
@@ -102,8 +103,8 @@ class Attempts(Generic[Result]):
         self.unsolved = self.unsolved.index_fill(0, row[self.solves(results)], False)
 
     def choose(self, seeds: IKSeeds, rank: Int[Tensor, "g"], first: int, count: int) -> IKSeeds:
-        """Return the seeds of unsolved contact sets whose `rank` within the set is from `first` to
-        `first + count - 1`.
+        """Return the initial guesses of unsolved contact sets whose `rank` within the set is from
+        `first` to `first + count - 1`.
         """
         return seeds[(rank >= first) & (rank < first + count) & self.unsolved[seeds.row]]
 
@@ -114,11 +115,11 @@ class Attempts(Generic[Result]):
         counts: Sequence[int],
         refine: Callable[[IKSeeds], Result],
     ) -> None:
-        """In round k, refine the next `counts[k]` seeds of each unsolved contact set, and add the
-        results.
+        """In round k, refine the next `counts[k]` initial guesses of each unsolved contact set, and
+        add the results.
 
-        `rank` is the rank of each seed, from 0, among those of its contact set. `refine` returns
-        one result for each of the seeds that it is given.
+        `rank` is the rank of each guess, from 0, among those of its contact set. `refine` returns
+        one result for each of the guesses that it is given.
         """
         first = 0
         for count in counts:
@@ -167,11 +168,11 @@ def best_first(grasps: Grasps) -> Grasps:
 def refine_on_contacts(
     problem: GraspProblem, seeds: IKSeeds, steps: int = ITERATIONS, cobyla: bool = False
 ) -> Grasps:
-    """Return a checked grasp for each seed, refined on its fixed contacts by at most `steps` steps.
+    """Return a checked grasp for each initial guess, refined on its fixed contacts.
 
-    `problem` holds the contact sets, of which `seeds.row` holds indices. A grasp's `status` is that
-    of the first check that it fails. With `cobyla`, the paper's solver and checks are used, and
-    `steps` is not used.
+    The solver takes at most `steps` steps. `problem` holds the contact sets, of which `seeds.row`
+    holds indices. A grasp's `status` is that of the first check that it fails. With `cobyla`, the
+    paper's solver and checks are used, and `steps` is not used.
     """
     contacts = assign(problem.contacts, seeds)
     start = Configuration(seeds.joints, seeds.obj_from_hand)
@@ -191,9 +192,9 @@ def refine_on_contacts(
 def try_best_seeds(
     problem: GraspProblem, seeds: IKSeeds, steps: int = ITERATIONS
 ) -> Attempts[Grasps]:
-    """Return the checked grasps of the first two seeds of each contact set, as `Attempts`.
+    """Return the checked grasps of the first two initial guesses of each contact set.
 
-    Each seed is refined on its fixed contacts by at most `steps` solver steps.
+    Each guess is refined on its fixed contacts by at most `steps` solver steps.
     """
     attempts = Attempts(torch.ones_like(problem.certificate.closed), executable)
     attempts.refine(
@@ -203,7 +204,8 @@ def try_best_seeds(
 
 
 def seed_costs(problem: GraspProblem, seeds: IKSeeds) -> Float[Tensor, "g"]:
-    """Return the cost [mm2] of each seed before any refinement: the sum of its squared residuals.
+    """Return the cost [mm2] of each initial guess before refinement: the sum of its squared
+    residuals.
 
     These are the `grasp_residuals`: weighted errors of tip positions, pad directions and
     clearances.
@@ -225,9 +227,10 @@ def seed_costs(problem: GraspProblem, seeds: IKSeeds) -> Float[Tensor, "g"]:
 
 @checked
 def solve_contact_first(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
-    """Return a checked grasp on fixed contacts for each contact set with seeds, best grasp first.
+    """Return a checked grasp on fixed contacts for each contact set with initial guesses (`seeds`),
+    best grasp first.
 
-    The two seeds of each set with the least errors are refined. If both fail, the next four are
+    The two guesses of each set with the least errors are refined. If both fail, the next four are
     refined.
     """
     seeds = problem.drop_unreachable(seeds)
@@ -368,9 +371,9 @@ class CobylaRun:
 
 
 def solve_as_paper(problem: GraspProblem, seeds: IKSeeds) -> Grasps:
-    """Return a checked grasp for each seed that was tried, as in the paper, best grasp first.
+    """Return a checked grasp for each initial guess that was tried, as in the paper, best first.
 
-    Seeds are tried ten at a time, in the order of their contact sets, until 10 grasps are
+    The guesses are tried ten at a time, in the order of their contact sets, until 10 grasps are
     executable or 300 were tried.
     """
     seeds = problem.drop_unreachable(seeds)

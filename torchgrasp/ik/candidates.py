@@ -41,7 +41,7 @@ estimated surface.
 
 @dataclasses.dataclass(frozen=True)
 class CheckNumbers:
-    """Numbers of the checks and of the geometric score."""
+    """Parameters of the checks of a candidate grasp and of its geometric score."""
 
     angle: float = math.radians(2)
     """Largest angle [rad] of a contact direction outside the pad's cone."""
@@ -112,7 +112,7 @@ class GraspProblem(Value):
 
     @checked
     def drop_unreachable(self, seeds: IKSeeds) -> IKSeeds:
-        """Return the seeds whose hand poses the arm can reach."""
+        """Return the initial guesses (`seeds`) whose hand poses the arm can reach."""
         return (
             seeds
             if self.reachable is None

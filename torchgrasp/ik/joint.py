@@ -67,12 +67,12 @@ class SlidingStage(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class SlidingNumbers:
-    """Numbers of the optimisation of hand and contacts together."""
+    """Parameters of the optimisation of hand posture and contacts together."""
 
     seeds: int = 2
-    """Number of seeds of a contact set that are tried: of more, few find another grasp."""
+    """Number of tried initial guesses of a contact set: of more, few find another grasp."""
     rows: int = 512
-    """Number of seeds that are optimised at a time on a CPU."""
+    """Number of initial guesses that are optimised at a time on a CPU."""
     most_rows: int = 2**15
     """Largest such number on an accelerator: the Jacobians of more do not fit into its memory."""
     projections: int = 3
@@ -285,11 +285,11 @@ def solve_sliding(
 def solve_joint(
     problem: GraspProblem, seeds: IKSeeds, shape: ShapeLike, spec: ContactSpec
 ) -> Grasps:
-    """Return checked grasps of the contact sets that have seeds, best first; contacts may slide.
+    """Return checked grasps of the contact sets that have initial guesses, best first.
 
-    Seeds are tried in their order. If the hand cannot reach the contacts, they slide along the
-    surface of the `shape` and are certified anew under `spec`. If they fail, the grasp has the
-    `Status` of the contact planner.
+    The guesses, `seeds`, are tried in their order. If the hand cannot reach the contacts, they
+    slide along the surface of the `shape` and are certified anew under `spec`. If they fail, the
+    grasp has the `Status` of the contact planner.
 
     >>> from torchgrasp import fit_shape, load_hand, load_object
     >>> from torchgrasp.ik import CollisionWorld, PostureLibrary, nearest_postures

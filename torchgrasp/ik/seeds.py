@@ -58,9 +58,11 @@ class SeedNumbers:
     compared: int = 500
     """Number of postures of the library by which these assignments are chosen."""
     spare: int = 3
-    """Ratio of the postures whose reachability is asked for to the wanted seeds."""
+    """Ratio of the postures that are checked for reachability to the wanted initial guesses."""
     wrong_side: float = 0.3
-    """Mean cosine of the normals of tips and contacts above which a seed touches from inside."""
+    """Mean cosine of the normals of tips and contacts above which an initial guess touches from
+    inside.
+    """
     rows: int = 64
     """Number of contact sets that are compared with the library at a time, to bound the memory."""
     queried: int = 256
@@ -185,8 +187,8 @@ def nearest_postures(
     n_seeds: Count = 8,
     reachable: Reachable | None = None,
 ) -> IKSeeds:
-    """Return the postures of the `library` that fit contact sets best, as seeds placed on the
-    contacts.
+    """Return the postures of the `library` that fit contact sets best, as initial guesses (seeds)
+    placed on the contacts.
 
     Each contact set has at most `n_seeds` seeds, best first, or none if its contacts lie on a line.
     The seeds are in the order of the contact sets; Eq. (24) gives their poses. `energy` is half the
@@ -310,15 +312,14 @@ def query_mixture(
     n_seeds: Count = 8,
     max_energy: Positive = DEFAULT_ENERGY,
 ) -> IKSeeds:
-    """Return seeds for sets of three contacts from the learned model `mixture`, Eqs. (21)-(24) of
-    the paper.
+    """Return initial guesses (seeds) for sets of three contacts from the learned model `mixture`.
 
-    An assignment of contacts to fingers is reachable if its energy (Eq. 21) is below `max_energy`.
-    Each reachable assignment gives `n_seeds` seeds: the mean joints given the contacts (Eq. 23),
-    and the mean joints of the most responsible components. The seeds of a contact set are sorted:
-    seeds that touch the surface from outside come first, then by tip error. A contact set without a
-    reachable assignment has no seeds. Raises `BadArgument` for a model of another hand, joint
-    limits or fingertips.
+    They follow Eqs. (21)-(24) of the paper. An assignment of contacts to fingers is reachable if
+    its energy (Eq. 21) is below `max_energy`. Each reachable assignment gives `n_seeds` seeds: the
+    mean joints given the contacts (Eq. 23), and the mean joints of the most responsible components.
+    The seeds of a contact set are sorted: seeds that touch the surface from outside come first,
+    then by tip error. A contact set without a reachable assignment has no seeds. Raises
+    `BadArgument` for a model of another hand, joint limits or fingertips.
     """
     check_compatible(mixture.meta, mixture.joint_names, hand)
     check_whole("n_seeds", n_seeds, 1, len(mixture.weights) + 1)

@@ -33,20 +33,22 @@ Method = Literal["levenberg_marquardt", "cobyla"]
 
 @dataclasses.dataclass(frozen=True)
 class SolveNumbers:
-    """Numbers of the solver for given contacts."""
+    """Parameters of the inverse kinematics of given contacts."""
 
     solved: float = 1e-6
-    """Sum of squared residuals [mm2] at which a seed is done."""
+    """Sum of squared residuals [mm2] at which the refinement of an initial guess ends."""
     exact: float = 5e-5
     """Largest tip error [m] of a solution that ends the search."""
     library_seeds: int = 8
-    """Number of seeds of a contact set from the library."""
+    """Number of initial guesses for a contact set from the library."""
     learned_seeds: int = 2
-    """Number of seeds of a reachable assignment from the model: the mean and one component."""
+    """Number of initial guesses for a reachable assignment from the model: the mean and one
+    component.
+    """
     learned_tries: int = 4
-    """Number of seeds of a contact set from the model that are refined."""
+    """Number of initial guesses for a contact set from the model that are refined."""
     part: int = 512
-    """Number of seeds that are refined at a time: their temporaries stay in the cache."""
+    """Number of initial guesses refined at a time: their temporaries stay in the cache."""
 
 
 SOLVING = SolveNumbers()
@@ -61,8 +63,8 @@ class IKSolution(Batch):
     contacts. Finger i touches contact `permutation[:, i]`. `tip_error` [m] is each tip's distance
     from its contact, `normal_angle` [rad] the angle of the contact direction (the inward normal)
     from the pad's axis, and `clearance` [m] the least clearance of the links. `attempts` counts the
-    seeds that were refined. `status` is the `Status` of the first error out of tolerance. A contact
-    set without seeds has NaN.
+    initial guesses that were refined. `status` is the `Status` of the first error out of tolerance.
+    A contact set without initial guesses has NaN.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp

@@ -33,7 +33,7 @@ from torchgrasp.values.specs import ContactSpec, Mode, Ranking
 
 @dataclasses.dataclass(frozen=True)
 class ExplainNumbers:
-    """The bounds on the work of an explanation, and the weights of changes."""
+    """Bounds on the work of explaining why a plan has no grasp, and weights of tried changes."""
 
     trials: int = 8
     """Largest number of changes that are tried."""

@@ -28,15 +28,17 @@ class EmNumbers:
     """Numbers of expectation-maximisation and of its start by k-means."""
 
     cached_rows: int = 2048
-    """Number of rows of one pass: their features and responsibilities stay in the cache."""
+    """Number of samples (data rows) in one pass: their features and responsibilities stay in the
+    cache.
+    """
     device_rows: int = 2**17
-    """Number of rows of one pass on a GPU, which smaller passes leave idle."""
+    """Number of samples in one pass on a GPU, which smaller passes leave idle."""
     singular: float = 1e-12
     """Greatest conditional variance that is only rounding; the data's variance is 1."""
     most_reseeds: int = 3
     """Most times that a component may collapse: with more, the data support fewer components."""
     drawn: int = 20_000
-    """Number of rows from which k-means++ draws: some hundred for each component."""
+    """Number of samples from which k-means++ draws: some hundred for each component."""
     lloyd_steps: int = 10
     """Number of steps of k-means. EM follows, so the clusters need not converge."""
 

@@ -34,7 +34,7 @@ MAX_REGULARISATION = 1e-6  # largest variance added to a dimension, relative to 
 
 @dataclasses.dataclass(frozen=True)
 class MixtureNumbers:
-    """Numbers of a fit to samples."""
+    """Parameters of the fit of a Gaussian mixture to sampled postures."""
 
     trial_steps: int = 20
     """Number of EM steps before starts are compared; a whole fit takes some hundred."""

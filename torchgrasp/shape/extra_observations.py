@@ -37,7 +37,7 @@ from torchgrasp.values.planning import PointCloud
 
 @dataclasses.dataclass(frozen=True)
 class OutsideNumbers:
-    """Numbers of the points outside the object."""
+    """Parameters of the observed points on a sphere around the object."""
 
     points: int = 20
     radius: float = 1.2
@@ -77,7 +77,7 @@ NOISE = ObservationNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class FreeNumbers:
-    """Numbers of the points in free space."""
+    """Parameters of the points in free space at which the object's distance is bounded."""
 
     outline_error: float = 0.005
     """Distance [m] by which the object may reach beyond its outline: a camera loses rims."""
@@ -107,7 +107,7 @@ FREE = FreeNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class MiddleNumbers:
-    """Numbers of the points off a vessel's surfaces."""
+    """Parameters of the observed points in the middle of a vessel's wall and above its rim."""
 
     points: int = 150
     """Most points in the middle of the wall."""

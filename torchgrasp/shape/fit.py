@@ -50,10 +50,12 @@ from torchgrasp.values.planning import PointCloud
 
 @dataclasses.dataclass(frozen=True)
 class ShapeNumbers:
-    """Numbers of a shape fit."""
+    """Parameters of the fit of a shape, a Gaussian process, to a cloud."""
 
     budget: int = 1000
-    """Greatest number of observed points: their factor has 4000 rows."""
+    """Greatest number of observed points; the Cholesky factor of their covariance then has 4000
+    rows.
+    """
     camera: int = 85
     paper: int = 70
     """Default numbers of observed points, with the support "camera" and "paper"."""

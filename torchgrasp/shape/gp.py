@@ -33,7 +33,7 @@ from torchgrasp.values.planning import PointCloud, ShapeEstimate
 
 @dataclasses.dataclass(frozen=True)
 class DomainNumbers:
-    """Bounds within which a shape answers."""
+    """Bounds of the queries of a shape: its domain, and the points of one joint posterior."""
 
     reach: float = 1.25
     """Ratio of the domain's radius to that of the observations: far away nothing is known."""

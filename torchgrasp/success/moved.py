@@ -20,7 +20,9 @@ Sets = Float[Tensor, "d g f 3"]
 
 @dataclasses.dataclass(frozen=True)
 class MovedNumbers:
-    """The numbers of the displacements, and of the search for contacts of the displaced object."""
+    """Parameters of the object's displacements, and of the search for contacts of the displaced
+    object.
+    """
 
     count: int = 16
     """Number of displacements."""

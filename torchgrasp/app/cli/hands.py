@@ -66,13 +66,14 @@ class HandTrial:
 
 @dataclasses.dataclass(frozen=True)
 class TrainNumbers:
-    """Numbers of the fit of a posture model."""
+    """Parameters of the fit of a posture model, a mixture of Gaussians."""
 
-    tolerance: float = 1e-3  # mean log-likelihood [nats] by which the last step improves the fit
+    # least gain [nats] of the mean log-likelihood in a step of EM after which EM goes on
+    tolerance: float = 1e-3
     starts: int = 5  # k-means initialisations of the fit
-    subset: int = 300  # postures for each Gaussian: with fewer, a Gaussian starts by chance
-    most: int = 64  # Gaussians that are tried: the paper's figure ends at 60
-    postures: int = 40_000  # by which their number is chosen
+    subset: int = 300  # postures for each Gaussian in the smallest subset that is fitted
+    most: int = 64  # most Gaussians that are tried: the paper's figure ends at 60
+    postures: int = 40_000  # number by which the number of Gaussians is chosen
 
 
 TRIAL = HandTrial()

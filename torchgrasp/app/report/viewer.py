@@ -58,11 +58,11 @@ class ViewerNumbers:
     """
 
     grasps: int = 20  # best grasps that are shown
-    points: int = 10_000  # of a cloud
-    faces: int = 40_000  # of a mesh
-    ticks: int = 120  # of a replay
-    cells: int = 256  # along the diagonal of a mesh, where it is thinned first
-    coarser: float = 1.2  # larger: fewer rounds of thinning, and fewer faces in the end
+    points: int = 10_000  # most points of a cloud
+    faces: int = 40_000  # most faces of a mesh
+    ticks: int = 120  # most ticks of a replay
+    cells: int = 256  # first grid cells along the diagonal of a mesh that is thinned
+    coarser: float = 1.2  # ratio of the cells' sides in successive rounds of thinning
     rise: float = 0.35  # least rise of the first view for each metre along the ground
     ramp: int = 17  # colours of the bar of standard deviations
 

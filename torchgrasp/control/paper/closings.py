@@ -36,7 +36,7 @@ GRASP_STIFFNESS = 100.0  # stiffness [N/m] of the spring along each side of the 
 
 @dataclasses.dataclass(frozen=True)
 class PositionNumbers:
-    """Numbers of the position controller; the paper prints no gains."""
+    """Parameters of `PositionClosing`; the paper prints no gains."""
 
     depth: float = 0.02
     """Distance [m] of the goal behind the planned contact."""
@@ -184,9 +184,9 @@ def restoring_wrench(
     """Return the force [N] and torque [N m] of a spring that pulls the fingertips' frame back to
     its `rest` pose.
 
-    `hand_from_vf` [m] is the virtual frame of three fingertips, with its origin at their centroid
-    (Eq. 18 of the paper). The torque is about that centroid, and grows with the sine of the
-    rotation error.
+    Both are in the hand's frame, as the two poses [m]. `hand_from_vf` is the virtual frame of three
+    fingertips, with its origin at their centroid (Eq. 18 of the paper). The torque is about that
+    centroid, and grows with the sine of the rotation error.
     """
     axes = hand_from_vf[..., :3, :3].mT
     desired = rest[..., :3, :3].mT
@@ -201,7 +201,8 @@ def shared_forces(
     """Return the smallest fingertip forces [N] that exert a `wrench` [N, N m] about the centroid of
     the `points` [m].
 
-    All are scaled down by one factor if one would exceed `most` [N].
+    Points, forces and wrench are in one frame. All forces are scaled down by one factor if one
+    would exceed `most` [N].
     """
     shared = (torch.linalg.pinv(grasp_map(points)) @ wrench[..., None])[..., 0]
     forces = shared.unflatten(-1, (3, 3))
@@ -214,10 +215,12 @@ def spring_forces(
     lengths: Float[Tensor, "*b 3"],
     stiffness: Float[Tensor, "*b 3"],
 ) -> Float[Tensor, "*b 3 3"]:
-    """Return the forces [N] on three fingertips of springs along the sides of their triangle.
+    """Return the forces [N] that springs along the sides of their triangle exert on three
+    fingertips.
 
-    `points` [m] are the centres of the fingertips. `lengths` [m] are the rest lengths of the sides
-    (0, 1), (1, 2) and (2, 0), and `stiffness` [N/m] is that of each spring.
+    The forces are in the frame of `points` [m], the centres of the fingertips. `lengths` [m] are
+    the rest lengths of the sides (0, 1), (1, 2) and (2, 0), and `stiffness` [N/m] is that of each
+    spring.
     """
     tension = stiffness * (side_lengths(points) - lengths)
     return torch.einsum("...k,...kci->...ci", tension, internal_forces(points))
