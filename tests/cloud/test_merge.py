@@ -1,3 +1,6 @@
+import math
+import re
+
 import pytest
 import torch
 import trimesh
@@ -9,7 +12,7 @@ from torchgrasp.cloud.prepare import clean_cloud, merge_clouds
 from torchgrasp.cloud.read import read_cloud, save_cloud
 from torchgrasp.data.shipped import load_object
 from torchgrasp.foundation.errors import BadArgument, TooFewPoints
-from torchgrasp.geometry.frames import apply, inverse
+from torchgrasp.geometry.frames import apply, inverse, rotation_from_vector
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.values.planning import PointCloud
@@ -115,3 +118,95 @@ def test_merge_clouds_refuses_what_does_not_fit(two_views):
     ):
         with pytest.raises(BadArgument, match=words):
             merge_clouds(clouds, poses)
+
+
+def around(mesh, azimuths, noise="realsense"):
+    return [
+        partial_view(mesh, look_at(a, 40.0, 0.6, mesh), n=700, noise=noise, seed=k)
+        for k, a in enumerate(azimuths)
+    ]
+
+
+def shift(*offset):
+    pose = EYE.clone()
+    pose[:3, 3] = torch.tensor(offset)
+    return pose
+
+
+def turn_about(point, degrees):
+    """Return the turn about a horizontal axis through a point."""
+    pose = EYE.clone()
+    pose[:3, :3] = rotation_from_vector(torch.tensor([math.radians(degrees), 0.0, 0.0]).double())
+    pose[:3, 3] = point - pose[:3, :3] @ point
+    return pose
+
+
+def stated_distances(error):
+    """Return the residual and the limit [mm] that an error names."""
+    return [float(x) for x in re.findall(r"([\d.]+) mm", str(error.value))][::-1]
+
+
+def test_views_of_one_object_that_agree_pass_whatever_the_sensor():
+    sensors = {"cylinder": ("realsense", "kinect_v1"), "spray": ("azure", "zivid")}
+    for name, noises in sensors.items():
+        mesh = load_object(name).mesh
+        for noise in noises:
+            views = around(mesh, (20.0, 95.0, 200.0), noise)
+            assert len(merge_clouds(views, [EYE] * 3)) == 2100
+
+
+@pytest.mark.parametrize("name", ["cylinder", "jug"])
+def test_views_that_disagree_beyond_their_noise_are_refused_with_both_numbers(name):
+    mesh = load_object(name).mesh
+    middle = torch.tensor(mesh.centroid)
+    first, second, third = around(mesh, (0.0, 70.0, 140.0))
+    wrong = (
+        shift(0.02, 0.0, 0.0),
+        shift(0.0, 0.02, 0.0),
+        shift(0.0, 0.0, 0.02),
+        shift(0.08, 0.0, 0.0),
+        shift(0.0, -0.5, 0.0),
+        turn_about(middle, 25.0),
+    )
+    for pose in wrong:
+        with pytest.raises(BadArgument, match="mm apart: check their poses") as error:
+            merge_clouds([first, second], [EYE, pose])
+        residual, limit = stated_distances(error)
+        assert residual > limit > 5.0
+        # any number of views, in any order: the wrong one is named
+        with pytest.raises(BadArgument, match=r"views (0 and 1|1 and 2)"):
+            merge_clouds([third, second, first], [EYE, pose, EYE])
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.25])
+def test_views_of_several_scales_are_refused(factor):
+    first, second = around(load_object("jug").mesh, (0.0, 70.0))
+    scaled = PointCloud(factor * second.points, None, factor * second.viewpoint)
+    with pytest.raises(BadArgument, match="check their poses"):
+        merge_clouds([first, scaled], [EYE, EYE])
+
+
+def test_the_distance_of_views_is_that_of_their_surfaces():
+    """An upward shift is the distance of the two tops."""
+    mesh = load_object("cylinder").mesh
+    views = around(mesh, (0.0, 10.0), noise=False)
+    for metres in (0.015, 0.03):
+        with pytest.raises(BadArgument) as error:
+            merge_clouds(views, [EYE, shift(0.0, 0.0, metres)])
+        assert stated_distances(error)[0] == pytest.approx(1e3 * metres, rel=0.35)
+
+
+def test_views_without_cameras_are_compared_where_they_overlap():
+    mesh = load_object("jug").mesh
+    views = [PointCloud(view.points) for view in around(mesh, (0.0, 70.0))]
+    assert len(merge_clouds(views, [EYE, EYE])) == 1400
+    with pytest.raises(BadArgument, match="check their poses"):
+        merge_clouds(views, [EYE, shift(0.02, 0.0, 0.0)])
+
+
+def test_merged_views_are_compared_one_by_one():
+    first, second, third = around(load_object("jug").mesh, (0.0, 70.0, 140.0))
+    pair = merge_clouds([first, third], [EYE, EYE])
+    assert len(merge_clouds([pair, second], [EYE, EYE])) == 2100
+    with pytest.raises(BadArgument, match="check their poses"):
+        merge_clouds([pair, second], [EYE, shift(0.02, 0.0, 0.0)])

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchgrasp.cloud.agreement import check_views
 from torchgrasp.cloud.check import check_cloud, remove_duplicates
 from torchgrasp.cloud.neighbours import find_inliers, fit_local_planes, fit_quadrics, nearest
 from torchgrasp.cloud.pose import Transform, check_rigid
@@ -232,8 +233,9 @@ def merge_clouds(
     viewpoint, the result has no viewpoint. Points are denser where views overlap;
     `voxel_downsample` evens the density. The rigid `poses` obj_from_cloud (4, 4) [m] lead from the
     frames of the views. Raises `BadArgument` for no cloud, another number of poses, a pose that is
-    not rigid, or clouds of several dtypes or devices. The views and the result may raise the errors
-    of `check_cloud`.
+    not rigid, or clouds of several dtypes or devices. It is raised, too, for views that contradict
+    each other beyond their noise: a pose is wrong, or the object moved. The views and the result
+    may raise the errors of `check_cloud`.
 
     >>> view = PointCloud(0.1 * torch.rand(90, 3), viewpoint=torch.tensor([0.0, 0.0, 1.0]))
     >>> len(merge_clouds([view, view], [torch.eye(4), torch.eye(4)]))
@@ -253,6 +255,7 @@ def merge_clouds(
     views = [_view_in_frame(cloud, pose) for cloud, pose in zip(clouds, poses, strict=True)]
     if len(views) == 1:
         return views[0]
+    _compare_views(clouds, views)
     normals = [v.normals for v in views if v.normals is not None]
     # Each point has its camera: a view's viewpoint and frustum are repeated for its points.
     viewpoints = [v.viewpoint.expand(len(v), 3) for v in views if v.viewpoint is not None]
@@ -261,6 +264,17 @@ def merge_clouds(
     frustum = torch.cat(frustums) if len(frustums) == len(views) else None
     points = torch.cat([v.points for v in views])
     return check_cloud(PointCloud(points, torch.cat(normals), viewpoint, frustum))
+
+
+def _compare_views(clouds: Sequence[PointCloud], views: Sequence[PointCloud]) -> None:
+    """Raise `BadArgument` if views disagree; `views` are the `clouds` in one frame, with normals."""
+    parts = []
+    for cloud, view in zip(clouds, views, strict=True):
+        # an estimated camera tells nothing about what it saw
+        if cloud.viewpoint is None:
+            view = dataclasses.replace(view, viewpoint=None, frustum=None)
+        parts += view.split_views()
+    check_views(parts)
 
 
 def _view_in_frame(cloud: PointCloud, obj_from_cloud: Transform) -> PointCloud:
