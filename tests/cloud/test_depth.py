@@ -343,3 +343,42 @@ def test_a_crop_with_its_own_principal_point_is_no_other_resolution():
             if max(abs(k[2] / 640 - 0.5), abs(k[3] / 480 - 0.5)) > 0.05:
                 read_depth(part, whole)
     assert refused < 8
+
+
+RECTIFIED = [*K[0].tolist(), 0.0, *K[1].tolist(), 0.0, *K[2].tolist(), 0.0]
+SIDES = {"width": 64, "height": 48}
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        {"k": [0.0] * 9, "d": [], "p": RECTIFIED, **SIDES},  # a node that only rectifies
+        {"p": RECTIFIED, **SIDES},
+        {"K": K.ravel().tolist(), "D": [0.0] * 5, "P": RECTIFIED, **SIDES},
+        {"k": K.ravel().tolist(), "d": [1e-5] * 5, "p": [0.0] * 12, **SIDES},
+        SimpleNamespace(k=[0.0] * 9, d=[], p=RECTIFIED, **SIDES),
+    ],
+)
+def test_the_projection_of_a_camera_info_is_read(camera):
+    right = cloud_from_depth(tilted_depth(), K)
+    assert torch.allclose(cloud_from_depth(tilted_depth(), camera).points, right.points)
+
+
+@pytest.mark.parametrize(
+    ("camera", "told"),
+    [
+        ({"k": K.ravel().tolist(), "p": [0.9 * RECTIFIED[0], *RECTIFIED[1:]]}, "beside another P"),
+        ({"k": K.ravel().tolist(), "d": [-0.2, 0.1, 0.0, 0.0, 0.0]}, "beside distortion D"),
+        (
+            {
+                "camera_matrix": {"data": K.ravel().tolist()},
+                "distortion_coefficients": {"data": [-0.2, 0.1, 0.0, 0.0, 0.0]},
+                "projection_matrix": {"data": RECTIFIED},
+            },
+            "beside distortion D",
+        ),
+    ],
+)
+def test_a_camera_info_of_two_images_that_differ_is_told(camera, told):
+    with pytest.raises(BadArgument, match=f"intrinsics: .*of a rectified image, P.*{told}"):
+        cloud_from_depth(tilted_depth(), {**camera, **SIDES})

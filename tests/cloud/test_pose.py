@@ -2,6 +2,7 @@
 
 import functools
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -11,8 +12,12 @@ from tests.make import box
 from torchgrasp import Scene, read_scene, save_scene
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.cloud.depth import cloud_from_depth
-from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.cloud.pose import read_camera_pose, read_pose
+from torchgrasp.cloud.prepare import merge_clouds
+from torchgrasp.foundation.errors import BadArgument, MendedInput
+from torchgrasp.foundation.rules import is_rigid
 from torchgrasp.geometry.frames import inverse, rigid, rotation_from_vector
+from torchgrasp.geometry.plane import Plane
 
 GL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])).double()
 OPTICAL = torch.tensor(
@@ -241,3 +246,54 @@ def test_a_mirrored_image_of_a_level_camera_is_a_right_image_of_another_scene():
     depth, pose = seen()
     mirrored = Scene.from_depth(depth.flip(1), INTRINSICS, pose)
     assert len(mirrored.things) == 2 and abs(mirrored.table.offset) < 0.001
+
+
+def random_pose(seed):
+    generator = torch.Generator().manual_seed(seed)
+    turn = rotation_from_vector(3 * torch.randn(3, generator=generator, dtype=torch.float64))
+    return rigid(turn, torch.tensor([0.3, -0.2, 0.7]).double())
+
+
+@pytest.mark.parametrize("decimals", [3, 4])
+def test_a_pose_of_few_decimals_is_mended_and_told(decimals, tmp_path):
+    for seed in range(40):
+        true = random_pose(seed)
+        rounded = true.numpy().copy()
+        rounded[:3, :3] = rounded[:3, :3].round(decimals)
+        np.savetxt(tmp_path / "pose.txt", rounded, fmt=f"%.{decimals}f")
+        file = tmp_path / "pose.txt"
+        for read, given in ((read_camera_pose, (rounded,)), (read_pose, ("p", file))):
+            with warnings.catch_warnings(record=True) as told:
+                warnings.simplefilter("always")
+                pose = read(*given)
+            off = pose[:3, :3].T @ true[:3, :3]
+            assert bool(is_rigid(pose)) and float((off - torch.eye(3).to(off)).norm()) < 2e-3
+            assert decimals == 4 or told
+            for message in told:
+                assert message.category is MendedInput
+                assert "rounded, 0.0" in str(message.message)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # what was rigid stays as it is
+        assert torch.equal(read_camera_pose(random_pose(0)), random_pose(0))
+
+
+def test_a_pose_beyond_the_angle_is_refused_with_it():
+    pose = random_pose(1).clone()
+    pose[0, 1] += math.radians(1.0)
+    for check in (read_camera_pose, lambda p: merge_clouds([masked()[1]], [p])):
+        with pytest.raises(BadArgument, match=r"0\.\d+ degrees from a rotation, of at most 0.1"):
+            check(pose)
+    with pytest.raises(BadArgument, match=r"0\.\d+ degrees from the nearest rotation"):
+        Plane.horizontal(0.0).moved(pose)
+
+
+def test_views_are_merged_by_poses_of_few_decimals():
+    cloud = masked()[1]
+    poses = [random_pose(0), random_pose(1)]
+    rounded = [torch.round(pose, decimals=3) for pose in poses]
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        merged = merge_clouds([cloud, cloud], rounded)
+    assert [str(x.message).partition(":")[0] for x in told] == ["poses[0]", "poses[1]"]
+    right = merge_clouds([cloud, cloud], poses)
+    assert float((merged.points - right.points).norm(dim=-1).max()) < 2e-3

@@ -88,3 +88,18 @@ def test_a_rendered_scene_in_the_frame_of_its_camera_keeps_the_origin():
     assert can_see(points, fit_local_planes(points)[0], torch.zeros(3).double())
     base = apply(pose, points)  # in the frame of the table, the origin cannot have been the camera
     assert not can_see(base, fit_local_planes(base)[0], torch.zeros(3).double())
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_cloud_of_opengls_camera_is_told_and_others_are_not(known):
+    view = load_object("jug").view
+    eye = view.viewpoint.double()
+    for azimuth in (0.0, 120.0):
+        pose = look_at(azimuth, 30.0, 0.6, load_object("jug").mesh).double()
+        camera = apply(inverse(pose), view.points.double())
+        gl = PointCloud(camera * torch.tensor([1.0, -1.0, -1.0]), None, torch.zeros(3).double())
+        gl = gl if known else PointCloud(gl.points)
+        told = [str(one) for one in diagnose_cloud(gl).advice]
+        assert any("multiply them by diag(1, -1, -1)" in one for one in told)
+    for right in (PointCloud(view.points.double(), None, eye), PointCloud(view.points)):
+        assert not any("diag" in str(one) for one in diagnose_cloud(right).advice)

@@ -1,6 +1,7 @@
 """Advice on a point cloud: each fault that was found, with the command that fixes it."""
 
 import dataclasses
+import math
 
 import torch
 from jaxtyping import Float
@@ -10,7 +11,7 @@ from torchgrasp.cloud.agreement import check_foot
 from torchgrasp.cloud.neighbours import find_inliers, nearest
 from torchgrasp.cloud.parts import PARTS, find_ground, find_second_body
 from torchgrasp.cloud.prepare import FACING, share_facing
-from torchgrasp.cloud.viewpoint import UNSEEN, share_unseen
+from torchgrasp.cloud.viewpoint import GUESS, UNSEEN, share_unseen
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import spatial
@@ -87,8 +88,8 @@ def judge_view(
     support = find_ground(points, trusted, up, ADVICE.narrow)
     ground = None if support is None else support.plane
 
-    found = [_judge_facing(facing)]
-    if eye is not None and found == [None]:
+    found = [_judge_facing(facing), _judge_backward(points, cloud.viewpoint, up)]
+    if eye is not None and found[0] is None:
         found.append(_judge_camera(clean, given))
     if stands and table is not None:
         found.append(_judge_table(cloud, table))
@@ -119,6 +120,28 @@ def _judge_facing(facing: float) -> Advice | None:
         fix = "the true --viewpoint X Y Z of a single view, or --no-viewpoint"
         return Advice(found, fix, False)
     return None
+
+
+def _judge_backward(
+    points: Points, viewpoint: Float[Tensor, "*views 3"] | None, up: Vector
+) -> Advice | None:
+    """Return advice if points lie before a camera in the origin that looks along -z, as OpenGL's.
+
+    `points` are (n, 3) [m]; the `viewpoint` (3,) or (n, 3) [m] is None if it is unknown, and `up`
+    (3,) is the unit vector that points up.
+    """
+    elsewhere = viewpoint is not None and bool(viewpoint.any())
+    if elsewhere or float(up[2]) <= ADVICE.z_up:
+        return None
+    away = torch.linalg.vector_norm(points, dim=-1)
+    radius = torch.linalg.vector_norm(points - points.mean(0), dim=-1).max()
+    far = bool(torch.linalg.vector_norm(points.mean(0)) > GUESS.far * radius)
+    least = math.cos(math.radians(GUESS.half_view))
+    if not far or not bool((-points[:, 2] > least * away).all()):
+        return None
+    found = "points around the negative z axis, as in a camera's frame with y up and z backward"
+    fix = "if it is OpenGL's, multiply them by diag(1, -1, -1) and give --up or --camera-pose"
+    return Advice(found, fix, False)
 
 
 def _judge_camera(clean: PointCloud, given: bool) -> Advice | None:

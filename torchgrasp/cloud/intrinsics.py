@@ -21,7 +21,7 @@ MATRICES = ("k", "cam_k", "camera_matrix", OPEN3D, "cameraintrinsics", "camerama
 """Names of a matrix of intrinsics, or of an object that holds it: of ROS, BOP, Open3D and Zivid."""
 ATTRIBUTES = (
     *MATRICES,
-    *("K", "fx", "fy", "cx", "cy", "ppx", "ppy"),
+    *("P", "p", "D", "d", "coeffs", "K", "fx", "fy", "cx", "cy", "ppx", "ppy"),
     *("width", "height", "roi", "binning_x", "binning_y"),
 )
 """Names of the attributes of an object that describes a camera."""
@@ -77,6 +77,10 @@ class IntrinsicsNumbers:
     """Shift of the principal point from the middle, over half the side, beyond which another
     resolution is guessed: few cameras have more.
     """
+    agree: float = 0.5
+    """Greatest difference [px] of ROS's K and P that say the same."""
+    straight: float = 1e-3
+    """Greatest coefficient of a distortion that moves no pixel by more than a tenth."""
     same_ratio: float = 0.02
     """Greatest difference of two ratios of sides that count as one."""
 
@@ -163,6 +167,7 @@ def _read_written(value: object) -> Written:
         found = f"a {type(value).__name__} of {', '.join(names) or 'nothing'}"
         allowed = "fx, fy, cx and cy, or a matrix K; of a file of many images, the entry of this"
         raise BadArgument("intrinsics", found, f"{allowed} image")
+    table = _choose_of_ros(named, table)
     by_column = key == OPEN3D and isinstance(table, list) and len(table) == 9
     if by_column and table[2] == table[5] == 0:
         table = [table[i::3] for i in range(3)]
@@ -183,6 +188,44 @@ def _read_written(value: object) -> Written:
     return Written(table, size, scale, _read_window(named))
 
 
+def _choose_of_ros(named: Mapping[str, Any], table: Any) -> Any:
+    """Return the matrix of ROS's CameraInfo that holds for a depth image: its K, or P if K is not
+    set.
+
+    Raises `BadArgument` if the raw and the rectified image differ, as only one of them is meant.
+    """
+    rectified = named.get("p", named.get("projection_matrix"))
+    bent = named.get("d", named.get("distortion_coefficients", named.get("coeffs")))
+    rectified, bent = (x.get("data") if isinstance(x, Mapping) else x for x in (rectified, bent))
+    p = _numbers(rectified)
+    k = _numbers(table)
+    given = len(p) == 3 * 4 and p[0] > 0
+    if given and k and not any(k):
+        return rectified
+    differ = False
+    if given and len(k) == 3 * 3:
+        rows = [*p[:3], *p[4:7], *p[8:11]]
+        differ = max(abs(x - y) for x, y in zip(k, rows, strict=True)) > LIMITS.agree
+    distorted = max(map(abs, _numbers(bent)), default=0.0) > LIMITS.straight
+    if distorted or differ:
+        found = f"a K beside another P{', and distortion D' * distorted}"
+        if not differ:
+            found = f"a K beside distortion D {str(_numbers(bent))[:SHOWN_LETTERS]}"
+        allowed = "of a rectified image, P alone; of a raw one, first rectify it"
+        raise BadArgument("intrinsics", found, f"{allowed}; K alone if both agree")
+    return table
+
+
+def _numbers(value: object) -> list[float]:
+    """Return the numbers of a matrix or a list row by row; nothing for anything else."""
+    if value is None:
+        return []
+    try:
+        return np.asarray(value, dtype=np.float64).ravel().tolist()
+    except (TypeError, ValueError):
+        return []
+
+
 def _find_matrix(value: object) -> tuple[dict[str, Any], str, Any]:
     """Return the named values of a description of a camera, the name of its matrix, and the matrix.
 
@@ -200,6 +243,9 @@ def _find_matrix(value: object) -> tuple[dict[str, Any], str, Any]:
         inner = named.pop(key, None)
         if not isinstance(inner, Mapping):
             break
+    if not key and "p" in named and named.get("fx") is None:
+        key = "p"
+        inner = named.pop("p")
     if not key:
         cx = named.get("cx", named.get("ppx"))
         cy = named.get("cy", named.get("ppy"))

@@ -17,9 +17,10 @@ from torchgrasp.cloud.safe_files import parse_npy, read_suffixed
 from torchgrasp.files import explain
 from torchgrasp.files.columns import read_lines
 from torchgrasp.foundation.checks import check_tensor
-from torchgrasp.foundation.errors import BadArgument, NoSupport
+from torchgrasp.foundation.errors import BadArgument, MendedInput, NoSupport
 from torchgrasp.foundation.limits import SHOWN_LETTERS
-from torchgrasp.foundation.rules import RIGID, is_rigid
+from torchgrasp.foundation.rules import RIGID, is_rigid, nearest_rotation
+from torchgrasp.foundation.told import warn_user
 from torchgrasp.geometry.linalg import Points, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.support_planes import SupportPlane, find_table
@@ -41,6 +42,10 @@ OPTICAL = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]).do
 class PoseNumbers:
     """Bounds beyond which a view contradicts the pose of its camera, or the unit of its depths."""
 
+    rounded: float = 0.1
+    """Greatest angle [deg] to the nearest rotation, which is then taken: twice that of three
+    decimals.
+    """
     scaled: float = 1e-4
     """Greatest difference from orthogonal axes, and of their lengths, of a scaled rotation."""
     farthest: float = 100.0
@@ -114,16 +119,23 @@ SIZES = SizeNumbers()
 
 
 def check_rigid(name: str, pose: Tensor) -> Transform:
-    """Return the given pose (4, 4) [m] if it is rigid to 1e-4.
+    """Return the given pose if it is rigid to 1e-4, or the nearest rigid one within 0.1 degrees.
 
-    Otherwise raises `BadArgument`, which calls the argument `name` and names the fault.
+    The latter, as of a file of three decimals, warns with `MendedInput`. Raises `BadArgument` for
+    another pose, with its fault. Messages call the argument `name`.
     """
     if fix := FIXES.get(tuple(pose.shape)):
         raise BadArgument(name, f"shape {tuple(pose.shape)}", f"a 4 x 4 matrix: {fix}")
     check_tensor(name, pose, (4, 4))
-    if not bool(is_rigid(pose)):
+    if bool(is_rigid(pose)):
+        return pose
+    nearest, angle = nearest_rotation(pose[:3, :3])
+    mended = torch.cat([torch.cat([nearest.to(pose), pose[:3, 3:]], -1), pose[3:]])
+    if angle > POSE.rounded or not bool(is_rigid(mended)):
         raise BadArgument(name, f"{pose.tolist()}{_describe_fault(pose.double())}", RIGID)
-    return pose
+    fault = f"{name}: its rotation is rounded, {angle:.1g} degrees from the nearest"
+    warn_user(MendedInput, f"{fault}, which is taken; write six decimals")
+    return mended
 
 
 def _describe_fault(pose: Transform) -> str:
@@ -140,8 +152,9 @@ def _describe_fault(pose: Transform) -> str:
     error = float((axes.T @ axes - torch.eye(3).to(axes)).abs().max())
     if error < POSE.scaled and float(length.max() / length.min()) < 1 + POSE.scaled:
         return f", a rotation times {float(length[0]):.4g}: divide it by its scale"
-    found = f", axes of length {length.tolist()} that are {error:.2g} from orthogonal"
-    return f"{found}: take U @ Vh of its SVD"
+    angle = nearest_rotation(turn)[1]
+    found = f", axes that are {error:.2g} from orthogonal, {angle:.2g} degrees from a rotation"
+    return f"{found}, of at most {POSE.rounded:g}: write six decimals, or take U @ Vh of its SVD"
 
 
 def read_camera_pose(pose: Tensor | np.ndarray) -> Transform:

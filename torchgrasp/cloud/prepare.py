@@ -246,13 +246,14 @@ def merge_clouds(
     if len(poses) != len(clouds):
         found = f"{len(poses)} for {len(clouds)} clouds"
         raise BadArgument("poses", found, "one pose for each cloud")
+    rigid = list[Transform]()
     for i, (cloud, pose) in enumerate(zip(clouds, poses, strict=True)):
         check_cloud(cloud)
-        check_rigid(f"poses[{i}]", pose)
+        rigid.append(check_rigid(f"poses[{i}]", pose))
     types = {(str(c.points.dtype), str(c.points.device)) for c in clouds}
     if len(types) > 1:
         raise BadArgument("clouds", f"points of {sorted(types)}", "one dtype on one device")
-    views = [_view_in_frame(cloud, pose) for cloud, pose in zip(clouds, poses, strict=True)]
+    views = [_view_in_frame(cloud, pose) for cloud, pose in zip(clouds, rigid, strict=True)]
     if len(views) == 1:
         return views[0]
     _compare_views(clouds, views)

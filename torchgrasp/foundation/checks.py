@@ -44,6 +44,7 @@ from torchgrasp.foundation.rules import (
     is_known,
     is_rigid,
     is_tensor,
+    nearest_rotation,
     show,
 )
 
@@ -83,6 +84,9 @@ class _Call:
                 if is_known(x) and not bool((good := test(x)).all()):
                     first = tuple(torch.nonzero(~good)[0].tolist())
                     place = f" at index {list(first)}" if first else ""
+                    if allowed == RIGID:
+                        angle = nearest_rotation(x[first][:3, :3])[1]
+                        place += f", {angle:.2g} degrees from the nearest rotation"
                     raise BadArgument(name, f"{x[first].tolist()}{place}", allowed)
 
 

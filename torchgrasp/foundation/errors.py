@@ -144,6 +144,10 @@ class CloudWarning(UserWarning):
     """A part of a view is ambiguous; the message says where and why."""
 
 
+class MendedInput(UserWarning):
+    """An input has a small fault, and was read with the fault mended; the message names both."""
+
+
 class CutOff(CloudWarning):
     """The object reaches the border of the image, so a part of it may be missing."""
 

@@ -3,6 +3,7 @@
 """
 
 import collections.abc
+import math
 import os
 import sys
 import types
@@ -250,6 +251,23 @@ def is_rigid(a_from_b: Float[Tensor, "*b 4 4"]) -> Bool[Tensor, "*b"]:
     error = (rotation @ rotation.transpose(-1, -2) - eye[:3, :3]).abs().amax((-1, -2))
     right_handed = (torch.linalg.cross(x, y) * z).sum(-1) > 0
     return (error <= ROUNDING) & right_handed & (a_from_b[..., 3, :] == eye[3]).all(-1)
+
+
+def nearest_rotation(turn: Float[Tensor, "3 3"]) -> tuple[Float[Tensor, "3 3"], float]:
+    """Return the rotation nearest to a matrix, and the error of the matrix as an angle [deg].
+
+    The angle is that of the axis which is farthest from the rotation's; its length counts, too.
+    Numbers that are not finite have an angle of infinity.
+    """
+    turn = turn.double()
+    if not bool(torch.isfinite(turn).all()):
+        return torch.eye(3).to(turn), math.inf
+    u, _, vh = torch.linalg.svd(turn)
+    # of the two nearest orthogonal matrices, the one that does not mirror
+    sign = torch.linalg.det(u @ vh).sign()
+    nearest = torch.cat([u[:, :2], sign * u[:, 2:]], -1) @ vh
+    distance = torch.linalg.vector_norm(turn - nearest, dim=0).max()
+    return nearest, math.degrees(float(distance))
 
 
 def check_moved(*args: Any, **kwargs: Any) -> None:

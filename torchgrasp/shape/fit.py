@@ -2,9 +2,6 @@
 
 import dataclasses
 import math
-import sys
-import warnings
-from types import FrameType
 from typing import Annotated, Literal
 
 import torch
@@ -20,6 +17,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, CutOff, FewPoints, Flat, Gap, TwoBodies
 from torchgrasp.foundation.rules import LEAST, Positive, Range, Seed, is_known
 from torchgrasp.foundation.threads import single_threaded
+from torchgrasp.foundation.told import warn_user
 from torchgrasp.geometry.plane import Plane, as_plane, round_upright, upright_frame
 from torchgrasp.shape.completion.complete import complete_cloud
 from torchgrasp.shape.completion.silhouette import Outlines, silhouettes
@@ -167,9 +165,9 @@ def fit_upright(
         check_foot(cloud, Plane.horizontal(table))
     if len(cloud) < FEW_POINTS:
         few = f"{len(cloud)} points, where a shape needs {FEW_POINTS}"
-        _warn(FewPoints, f"{few}: the shape is a guess; give more points")
+        warn_user(FewPoints, f"{few}: the shape is a guess; give more points")
     elif is_flat(cloud.points):
-        _warn(
+        warn_user(
             Flat,
             "the points lie in one plane, to their noise: the thickness is a guess; "
             "give a view of two sides",
@@ -296,14 +294,14 @@ def _warn_of_ambiguity(cloud: PointCloud, outline: Outlines, on_table: bool) -> 
     table.
     """
     if outline.cut:
-        _warn(
+        warn_user(
             CutOff,
             "the border of the image cuts the object off: the part beyond it is a guess; "
             "turn the camera",
         )
     if outline.gap > SHAPE.gap:
         width = f"a gap of {1e3 * outline.gap:.0f} mm in the view"
-        _warn(
+        warn_user(
             Gap, f"{width}: a hole, or a patch that was not measured; the surface there is a guess"
         )
     if on_table:
@@ -312,21 +310,8 @@ def _warn_of_ambiguity(cloud: PointCloud, outline: Outlines, on_table: bool) -> 
         body = find_second_body(points, torch.tensor([0.0, 0.0, 1.0]).to(points), spacing)
         if body is not None:
             share = float(body.double().mean())
-            _warn(
+            warn_user(
                 TwoBodies,
                 f"two bodies that stand apart, the second of {share:.0%} of the points: "
                 "give one of them",
             )
-
-
-def _warn(kind: type[Warning], sentence: str) -> None:
-    """Show a warning that names the line of the user's code that called the library."""
-    frame: FrameType | None = sys._getframe()
-    level = 0
-    last = 0  # level of the outermost frame of the library
-    while frame is not None:
-        level += 1
-        if frame.f_globals.get("__name__", "").startswith("torchgrasp."):
-            last = level
-        frame = frame.f_back
-    warnings.warn(sentence, kind, stacklevel=last + 1)
