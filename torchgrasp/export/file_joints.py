@@ -7,7 +7,7 @@ or turn is refused, or told in a `GraspFileWarning`.
 import dataclasses
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,11 +15,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.files.write import Refuse
 from torchgrasp.foundation.errors import BadArgument, GraspFileWarning
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.kinematics import map_points
-
-Refuse = Callable[[str, str], BadArgument]  # makes the error of a found and an allowed text
 
 
 @dataclasses.dataclass(frozen=True)
