@@ -32,7 +32,7 @@ INTRINSICS = torch.tensor(
 
 @dataclasses.dataclass(frozen=True)
 class RenderNumbers:
-    """Numbers of the rendering by a virtual camera."""
+    """Parameters of the rendering of a mesh and a table by a virtual camera."""
 
     nearest: float = 1e-3
     """A mesh has a box in the image only if all of it is farther from the camera than this [m]."""

@@ -16,7 +16,7 @@ from torchgrasp.geometry.linalg import Points, unit
 
 @dataclasses.dataclass(frozen=True)
 class NeighbourNumbers:
-    """Numbers of the neighbours of a point, the point itself included, and of the fits to them."""
+    """Numbers of neighbours of a point, itself included, and parameters of the fits to them."""
 
     spacing: int = 9
     """Neighbours for the spacing: a raster's eight, more than fly off a rim together."""

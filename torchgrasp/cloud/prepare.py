@@ -41,7 +41,7 @@ class PrepareNumbers:
 
 @dataclasses.dataclass(frozen=True)
 class NormalNumbers:
-    """Numbers of the comparison of given normals with those of neighbours."""
+    """Parameters of the comparison of given normals with those of neighbours."""
 
     neighbours: int = 9
     """Number of nearest points: the point itself and eight neighbours, enough for a majority."""

@@ -27,7 +27,7 @@ SensorName = Literal["realsense", "kinect_v1", "azure", "zivid"]
 
 @dataclasses.dataclass(frozen=True)
 class FaultNumbers:
-    """Numbers of the errors of a depth camera beside the random noise: at rims and in corners."""
+    """Parameters of a depth camera's errors beside random noise: at rims and in corners."""
 
     background: float = 100.0
     """Depth [m] that is assumed for a pixel in which nothing is measured."""
@@ -43,7 +43,7 @@ class FaultNumbers:
 
 @dataclasses.dataclass(frozen=True)
 class EstimateNumbers:
-    """Numbers of the estimate of noise from a table, or from depth errors."""
+    """Parameters of the estimate of a depth camera's noise from a table, or from depth errors."""
 
     patch: int = 21
     """Side [px] of the patches whose mean error is the bias."""

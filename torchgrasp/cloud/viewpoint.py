@@ -41,7 +41,7 @@ class UnseenNumbers:
 
 @dataclasses.dataclass(frozen=True)
 class GuessNumbers:
-    """Numbers of the guess of a view's camera.
+    """Parameters of the search for the unknown camera position of a view.
 
     The score of a camera position is how well it explains the bulge of the surface, which is
     towards the camera, and the density of the points.

@@ -40,7 +40,7 @@ CONE_MARGIN = 0.02
 LEAST_SIDE = 0.05
 
 
-Tensions = Float[Tensor, "b p"]  # of all p pairs of contacts in every row
+Tensions = Float[Tensor, "b p"]  # of all p pairs of contacts in each of b contact sets
 PerRow = float | Float[Tensor, "b"]
 """One number for all contact sets of a batch, or one number for each of them."""
 
@@ -51,7 +51,7 @@ class ShapeLike(Protocol):
 
     `scale` [m] is the length of one normalised unit, `domain_radius` (normalised) the radius in
     which the shape is known, and `std_factor` (no unit) multiplies standard deviations. A
-    `ShapeBatch` has one of these numbers for each row. At q normalised points x, `jet` gives the
+    `ShapeBatch` has one of these numbers for each entry. At q normalised points x, `jet` gives the
     signed distance, its variance and their derivatives; `mean_and_gradient` gives the mean signed
     distance and its gradient only. `normalise` converts points [m] to normalised ones, and `metres`
     does the reverse.
@@ -85,8 +85,9 @@ def device_of(shape: ShapeLike) -> torch.device:
 
 
 def rows_of(shape: AnyShape, rows: Int[Tensor, "k"]) -> AnyShape:
-    """Return the shapes of the rows with the given indices; one shape for all rows is returned as
-    it is.
+    """Return the shapes of the entries with the indices `rows`, from a batch of shapes.
+
+    A single shape, which belongs to all entries, is returned as it is.
     """
     return shape.rows(rows) if isinstance(shape, ShapeBatch) else shape  # pyright: ignore[reportReturnType]
 

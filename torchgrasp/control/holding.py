@@ -104,7 +104,7 @@ class GripNumbers:
 
 @dataclasses.dataclass(frozen=True)
 class WeightNumbers:
-    """Numbers from which the likely weight of an object is estimated."""
+    """Values from which the likely weight of an object is estimated."""
 
     density: float = 1000.0
     """Density [kg/m^3]: that of water."""

@@ -56,7 +56,7 @@ class ClosingNumbers:
 
 @dataclasses.dataclass(frozen=True)
 class RimNumbers:
-    """Numbers of fingertips that slide along the table to the rim of a low object."""
+    """Parameters of fingertips that slide along the table to the rim of a low object."""
 
     slope: float = 0.25
     """Least component of the contact's unit normal along the table's normal."""

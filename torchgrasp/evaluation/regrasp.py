@@ -39,7 +39,7 @@ from torchgrasp.values.specs import TrialSpec
 
 @dataclasses.dataclass(frozen=True)
 class RegraspNumbers:
-    """Numbers of the choice of another grasp after a failed one."""
+    """Parameters by which another grasp is chosen after a failed one."""
 
     gap: float = 0.015  # mean distance [m] of the contacts above which a grasp differs
     turn: float = math.radians(30)  # angle [rad] of the approaches above which a grasp differs

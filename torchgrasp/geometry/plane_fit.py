@@ -17,7 +17,7 @@ from torchgrasp.geometry.linalg import Points, Vector, norm
 
 @dataclasses.dataclass(frozen=True)
 class PlaneNumbers:
-    """The numbers of the search for planes."""
+    """Parameters of the random search for planes in a cloud."""
 
     noise: float = 0.001
     """Assumed noise [m] of a depth camera that is near."""

@@ -25,7 +25,7 @@ SIXTEENTH = 1 / 16
 
 @dataclasses.dataclass(frozen=True)
 class FieldNumbers:
-    """The numbers of a distance field that is made from a mesh."""
+    """Parameters of the computation of a signed distance field from a mesh."""
 
     band: float = 0.026
     """Distance [m] within which every second node is exact: the reach of a palm's spheres."""

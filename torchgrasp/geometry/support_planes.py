@@ -22,7 +22,7 @@ from torchgrasp.geometry.plane_fit import PLANES, PlaneFit, SeenPoints, assume_n
 
 @dataclasses.dataclass(frozen=True)
 class SupportNumbers:
-    """The numbers that decide whether a plane supports objects, and how far it extends."""
+    """Bounds that decide whether a plane supports objects, and how far it extends."""
 
     points: int = 20_000
     """Most points that are used, which bounds the time."""

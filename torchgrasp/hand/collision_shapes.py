@@ -38,7 +38,7 @@ ALWAYS = 0.98
 
 @dataclasses.dataclass(frozen=True)
 class CoverNumbers:
-    """Numbers of the spheres that cover a hand."""
+    """Parameters of the spheres that cover a hand for collision checks."""
 
     finger_cell: float = 0.015
     """Edge [m] of a finger's cells; larger: the corners of a shape stand farther out of its

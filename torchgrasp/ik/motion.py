@@ -30,7 +30,7 @@ UP = torch.tensor([0.0, 0.0, 1.0], device="cpu")
 
 @dataclasses.dataclass(frozen=True)
 class MotionNumbers:
-    """Numbers of the opened hand's pose, its approaches and its lift."""
+    """Parameters of the motion of a grasp: pose of the opened hand, approaches and lift."""
 
     gap: float = 0.001
     """Clearance [m] from the table of a hand that is raised."""

@@ -29,7 +29,7 @@ ITERATIONS = 30  # most steps of one refinement
 
 @dataclasses.dataclass(frozen=True)
 class OpeningNumbers:
-    """Numbers of the opened hand."""
+    """Parameters of the optimisation that opens a hand from its grasp to its pre-grasp."""
 
     gap: float = 0.012
     """Distance [m] that each tip moves off its contact on a certain surface."""

@@ -139,8 +139,8 @@ class Funnel(Value):
 
     @checked
     def share(self, reasons: frozenset[Status]) -> float:
-        """Return the share that the stages lost for any of the given reasons, summed over the
-        stages.
+        """Return the share of each stage's input that was lost for the given reasons, summed over
+        the stages.
         """
         shares = (
             n / stage.given

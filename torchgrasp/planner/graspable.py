@@ -40,7 +40,7 @@ class JudgeNumbers:
 
 @dataclasses.dataclass(frozen=True)
 class SpanNumbers:
-    """The numbers of the search for the span of a hand."""
+    """Parameters of the search for the span of a hand, in random postures."""
 
     postures: int = 5000
     """Number of random postures in which the span of a hand is sought."""
@@ -50,7 +50,7 @@ class SpanNumbers:
 
 @dataclasses.dataclass(frozen=True)
 class VagueNumbers:
-    """The numbers by which an estimated shape counts as vague."""
+    """Parameters by which an estimated shape is judged too uncertain (vague) to be grasped."""
 
     cells: int = 24
     """Number of cells along a side of the grid on which the surface is extracted."""
@@ -60,7 +60,7 @@ class VagueNumbers:
 
 @dataclasses.dataclass(frozen=True)
 class EaseNumbers:
-    """The numbers of the order in which objects are planned."""
+    """Parameters of the order in which the objects of a scene are planned."""
 
     room: float = 0.06
     """Free space [m] around an object above which more space does not raise its rank."""

@@ -28,7 +28,7 @@ Result = TypeVar("Result")
 
 @dataclasses.dataclass(frozen=True)
 class ManyNumbers:
-    """The numbers of plans of many clouds."""
+    """Bounds on plans of many clouds at once."""
 
     stack: int = 128
     """Clouds that a device plans at once; with more it would wait longer for the shapes."""

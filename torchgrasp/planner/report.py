@@ -17,7 +17,7 @@ from torchgrasp.values.planning import Grasps, format_success
 
 @dataclasses.dataclass(frozen=True)
 class ReportNumbers:
-    """The numbers of the report on the estimated shape."""
+    """Parameters of the report on the estimated shape."""
 
     vertices: int = 500
     """Largest number of vertices at which the surface is judged."""

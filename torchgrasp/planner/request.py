@@ -82,8 +82,10 @@ class Request:
     time_budget: Budget | None = None
 
     def __post_init__(self) -> None:
-        """Raise `BadArgument` for an arm of another hand, no load to resist, or a promise for a
-        displaced object.
+        """Raise `BadArgument` for arguments that contradict each other.
+
+        These are an arm of another hand, no load to resist, or a promised share of holding grasps
+        (`promise`) for a displaced object.
         """
         if self.arm is not None and self.arm.hand_sha256 != self.hand.source.sha256:
             raise BadArgument(

@@ -44,7 +44,7 @@ class Row(enum.IntEnum):
 
 @dataclasses.dataclass(frozen=True)
 class ChoiceNumbers:
-    """The numbers by which contact sets are chosen for the hand."""
+    """Parameters by which planned contact sets are chosen for the hand to try."""
 
     likely: int = 2
     """Farthest-point sampling takes n sets from the `likely` * n sets of the lowest cost."""
@@ -115,7 +115,7 @@ class Candidates:
         )
 
     def __len__(self) -> int:
-        """Return the number of rows."""
+        """Return the number of contact sets."""
         return len(self.cloud)
 
     def find(self, status: Row, clouds: Bool[Tensor, "c"] | None = None) -> Int[Tensor, "k"]:

@@ -8,7 +8,7 @@ from torchgrasp.values.specs import Mode
 
 @dataclasses.dataclass(frozen=True)
 class ScheduleNumbers:
-    """The numbers by which a plan is split into batches."""
+    """Parameters by which the contact sets of a plan are split into batches."""
 
     first: int = 8
     """Number of contact sets that the hand tries in the first batch."""
@@ -26,8 +26,9 @@ SCHEDULE = ScheduleNumbers()
 
 
 class BatchSize(NamedTuple):
-    """The numbers of one batch: `starts` new initial guesses, and `tried` contact sets that the
-    hand tries.
+    """The size of a batch of a plan.
+
+    The batch has `starts` new initial guesses, and the hand tries `tried` contact sets.
     """
 
     starts: int

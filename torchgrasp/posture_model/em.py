@@ -25,7 +25,7 @@ from torchgrasp.posture_model.gaussian import whitening_matrices
 
 @dataclasses.dataclass(frozen=True)
 class EmNumbers:
-    """Numbers of expectation-maximisation and of its start by k-means."""
+    """Parameters of expectation-maximisation and of its start by k-means."""
 
     cached_rows: int = 2048
     """Number of samples (data rows) in one pass: their features and responsibilities stay in the

@@ -16,7 +16,7 @@ from torchgrasp.scene.image import DepthImage, scale_pixels
 
 @dataclasses.dataclass(frozen=True)
 class CreaseNumbers:
-    """Numbers of the search for creases."""
+    """Parameters of the search for concave creases, at which touching objects are separated."""
 
     reach: float = 0.012
     """Distance [m] on either side of a crease over which its angle is measured."""

@@ -28,7 +28,7 @@ from torchgrasp.geometry.plane import FINE
 
 @dataclasses.dataclass(frozen=True)
 class ImageNumbers:
-    """Numbers of pixels in depth images."""
+    """Numbers of pixels by which objects in depth images are judged."""
 
     least_pixels: int = 30
     """Fewest pixels of an object: fewer do not show its shape."""
@@ -42,7 +42,7 @@ class ImageNumbers:
 
 @dataclasses.dataclass(frozen=True)
 class ProjectionNumbers:
-    """Numbers of the projection of a cloud to an image."""
+    """Parameters of the depth image that is made from a cloud by projection."""
 
     steep: float = 0.01
     """Least length of the part of the vertical unit vector that lies in the image plane. A view

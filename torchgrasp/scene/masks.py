@@ -21,7 +21,7 @@ from torchgrasp.scene.table_image import TableImage
 
 @dataclasses.dataclass(frozen=True)
 class MaskNumbers:
-    """Numbers of the rules by which given masks and labels are read."""
+    """Bounds by which given masks and labels of objects are read."""
 
     most_labels: int = 1000
     """Most objects: more values are those of a photograph."""

@@ -27,7 +27,7 @@ from torchgrasp.scene.table_image import TableImage
 
 @dataclasses.dataclass(frozen=True)
 class MergeNumbers:
-    """Numbers of the rules by which pieces are one object; lengths are in metres."""
+    """Bounds by which pieces of a segmented image are merged to objects; lengths are in metres."""
 
     gap: float = 0.008
     """Pieces touch where points are nearer than this."""

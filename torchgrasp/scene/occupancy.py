@@ -29,7 +29,7 @@ from torchgrasp.scene.scene import Scene
 
 @dataclasses.dataclass(frozen=True)
 class OccupancyNumbers:
-    """Numbers of the estimate of occupied space; lengths are in metres."""
+    """Parameters of the voxel map of the space around the target; lengths are in metres."""
 
     spacing: float = 0.005
     """Spacing of the voxels: a third of a finger's width."""

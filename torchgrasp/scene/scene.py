@@ -28,7 +28,7 @@ from torchgrasp.values.planning import PointCloud
 
 @dataclasses.dataclass(frozen=True)
 class SceneNumbers:
-    """Numbers by which places and parts of objects are found in a scene."""
+    """Bounds by which clicked pixels, points and parts of objects are found in a scene."""
 
     front: float = 0.01
     """Points of a cloud farther behind their pixel's depth [m] belong to something hidden."""

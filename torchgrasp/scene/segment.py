@@ -19,7 +19,7 @@ from torchgrasp.scene.table_image import TableImage
 
 @dataclasses.dataclass(frozen=True)
 class SegmentNumbers:
-    """Numbers of the segmentation.
+    """Parameters of the segmentation of a depth image into objects on a table.
 
     Counts of pixels are for an image of 640 x 480, and are scaled to the size of others, unless it
     is said otherwise.

@@ -15,7 +15,7 @@ from torchgrasp.scene.image import DepthImage
 
 @dataclasses.dataclass(frozen=True)
 class HeightNumbers:
-    """Numbers of the heights above a table, and of their noise."""
+    """Parameters of the image of heights above a table, and of the noise of these heights."""
 
     window: int = 5
     """Side of the square over which heights are averaged [px]."""

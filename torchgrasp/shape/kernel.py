@@ -35,7 +35,7 @@ MATERN52_LENGTH = math.sqrt(5.0 / 18.0)
 
 @dataclasses.dataclass(frozen=True)
 class ProfileNumbers:
-    """Numbers of the derivatives of a profile near r = 0, where k'(r) / r is 0 / 0."""
+    """Bounds for the derivatives of a profile near r = 0, where k'(r) / r is 0 / 0."""
 
     near_zero: float = 1e-4
     """Normalised distance r below which k(r) is replaced by its Taylor polynomial of degree 4."""

@@ -32,7 +32,7 @@ from torchgrasp.shape.gp import ShapeGP
 
 @dataclasses.dataclass(frozen=True)
 class SurfaceNumbers:
-    """Numbers of the extraction of a surface."""
+    """Parameters of the extraction of a shape's surface as a mesh."""
 
     resolution: int = 48
     """Cells along the domain's diameter."""
@@ -59,7 +59,7 @@ SURFACE = SurfaceNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class NodeNumbers:
-    """Numbers of the distance field that collisions are checked with, in metres."""
+    """Lengths [m] that set the grid of the distance field for collision checks."""
 
     thick: float = 0.04
     """Least side of a thick body, which is not hollow."""

@@ -15,9 +15,9 @@ from torchgrasp.shape.surface import collision_field, extract_mesh
 
 
 class EstimatedBody(NamedTuple):
-    """The planner's estimate of one object, or of an object for each row of a batch, as of grasps.
+    """The planner's estimate of one object, or of the object of each entry of a batch of grasps.
 
-    For a batch, all fields hold one value for each row. All is in an upright frame: z points up.
+    For a batch, all fields hold one value for each entry. All is in an upright frame: z points up.
     """
 
     shape: ShapeGP | ShapeBatch  # the estimated shape
@@ -48,9 +48,9 @@ class EstimatedBody(NamedTuple):
         return cls(shape, field, center, shape.scale, float(rise), float(deviations[1]))
 
     def rows(self, index: Int[Tensor, "k"]) -> "EstimatedBody":
-        """Return the bodies of the rows with the given indices.
+        """Return the bodies of the entries of the batch with the given indices.
 
-        If the body is one object for all rows, it is returned as it is.
+        If the body is one object for all entries, it is returned as it is.
         """
         numbers = (
             x[index] if isinstance(x, Tensor) and x.ndim else x

@@ -58,7 +58,7 @@ GRIP = 15.0  # greatest force [N] that a hand which grips as the load asks for m
 
 @dataclasses.dataclass(frozen=True)
 class FeatureNumbers:
-    """The numbers of the features: loads, and bounds of forces."""
+    """Loads and bounds of forces in the features of the success model."""
 
     slippery: float = 0.5
     """Share of the friction coefficient that a slippery object has."""

@@ -19,7 +19,7 @@ from torchgrasp.values.planning import Contacts, Grasps, IKSeeds
 
 @dataclasses.dataclass(frozen=True)
 class LoadNumbers:
-    """The numbers of loads: friction cones, and bounds of forces."""
+    """Parameters of the forces that carry a load: friction cones, and bounds of forces."""
 
     carrying: float = 2.07
     """Decrease of a lift's log-odds of success if the force that carries the load grows by a factor

@@ -26,7 +26,7 @@ BOUNDS = 200  # bounds of the log-odds that are tried, at equal steps
 
 
 class Promise(NamedTuple):
-    """A promise that trials support.
+    """A promise, supported by trials, of the share of returned grasps that hold.
 
     `least` is the least log-odds of a returned grasp. `trials` and `families` are the numbers of
     trials, and of families of bodies in them, that chose it.
@@ -61,8 +61,10 @@ def describe_promise(share: float) -> str:
 def least_log_odds(
     log_odds: Float[Tensor, "r"], held: Bool[Tensor, "r"], family: Int[Tensor, "r"], share: float
 ) -> float | None:
-    """Return the least bound of the log-odds that keeps the promise of a `share`, or None if there
-    is none.
+    """Return the least bound of the log-odds above which at least a `share` of the grasps holds.
+
+    None means that the trials support no bound. `share` is in [0, 1], and the module says how the
+    bound is chosen.
 
     Each of the r trials has predicted `log_odds`, `held` (whether the grasp held), and the number
     of its `family` of bodies.

@@ -99,7 +99,7 @@ class TaskWrenches(Value):
 
 @dataclasses.dataclass(frozen=True)
 class TaskNumbers:
-    """The numbers of the named tasks."""
+    """Loads of the named tasks, and the directions of pushes."""
 
     gravity: float = 9.81
     """Acceleration [m/s2] of a load."""

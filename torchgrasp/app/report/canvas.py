@@ -84,7 +84,7 @@ class Framing:
 
 @dataclasses.dataclass(frozen=True)
 class RasterNumbers:
-    """Numbers of the rendering of triangles to pixels."""
+    """Parameters of the rendering of triangles to pixels."""
 
     samples: int = 2  # number along each axis of a pixel; their mean gives smooth edges
     opacity: float = 0.5  # of transparent triangles

@@ -48,7 +48,7 @@ class PositionNumbers:
 
 @dataclasses.dataclass(frozen=True)
 class UnstableNumbers:
-    """Numbers of the impedance's response to an unstable grasp."""
+    """Parameters of the response of `Impedance` to an unstable grasp."""
 
     odds: float = 3.0
     """Odds of stability above which a grasp counts as stable."""

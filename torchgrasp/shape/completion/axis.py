@@ -30,7 +30,7 @@ from torchgrasp.shape.completion.symmetry import SYMMETRY, SymmetryScorer
 
 @dataclasses.dataclass(frozen=True)
 class AxisNumbers:
-    """Numbers of the fits of an axis."""
+    """Parameters of the fits of a body's axis of revolution to the normals of its cloud."""
 
     half_weight: float = 0.004
     """Distance [m] of a normal's line from the axis at which it has half the weight."""

@@ -37,7 +37,7 @@ from torchgrasp.values.planning import PointCloud
 
 @dataclasses.dataclass(frozen=True)
 class HiddenNumbers:
-    """Numbers of the points on the hidden side."""
+    """Parameters of the points that complete a cloud on its hidden side."""
 
     new: float = 0.006
     """Least distance [m] of a hidden point from the cloud."""
@@ -60,7 +60,7 @@ HIDDEN = HiddenNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class MirrorNumbers:
-    """Numbers of the errors of mirrored points."""
+    """Parameters of the standard deviation of points that are mirrored to the hidden side."""
 
     symmetric: float = 0.45
     """Score from which an object counts as symmetric."""
@@ -82,7 +82,7 @@ MIRROR = MirrorNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class BarNumbers:
-    """Numbers of the bars of a frame."""
+    """Parameters by which the thin bars of a frame-like object are found and completed."""
 
     thin: float = 0.012
     """Width [m] below which a part is a bar: that of a fingertip."""

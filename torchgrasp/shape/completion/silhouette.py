@@ -23,7 +23,10 @@ from torchgrasp.values.planning import PointCloud
 
 @dataclasses.dataclass(frozen=True)
 class OutlineNumbers:
-    """Numbers of outlines. A spacing is the distance of neighbouring pixels at depth 1."""
+    """Parameters of the outline of a cloud in its camera's image.
+
+    A spacing is the distance of neighbouring pixels at depth 1 (no unit).
+    """
 
     grow: float = 2.0
     shrink: float = 1.65

@@ -31,7 +31,7 @@ from torchgrasp.values.planning import PointCloud
 
 @dataclasses.dataclass(frozen=True)
 class SymmetryNumbers:
-    """Numbers of the score of a mirror plane."""
+    """Parameters of the score by which mirror planes of a cloud are compared."""
 
     match: float = 0.003
     """Length scale [m] of the distances over which a mirrored point stops matching the cloud."""
@@ -50,7 +50,9 @@ SYMMETRY = SymmetryNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class PlaneSearchNumbers:
-    """Numbers of the search for mirror planes; cosines are those of angles between normals."""
+    """Parameters of the search for a cloud's mirror planes; cosines are those
+    of angles between normals.
+    """
 
     sphere: int = 160
     """Directions over a whole sphere, of which half are tried: n and -n are one plane."""

@@ -22,7 +22,7 @@ from torchgrasp.values.planning import PointCloud
 
 @dataclasses.dataclass(frozen=True)
 class VesselNumbers:
-    """Numbers of the search for a vessel."""
+    """Parameters by which an open vessel with two walls is recognised and fitted to a cloud."""
 
     level: float = 0.5
     """Least length of the horizontal part of a wall's unit normals: that of rim, floor and noise is
@@ -76,7 +76,7 @@ VESSEL = VesselNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class WallNumbers:
-    """Numbers of the hidden parts of a vessel's walls."""
+    """Parameters of the points that complete the hidden parts of a vessel's walls."""
 
     center: float = 0.0006
     form: float = 0.001
