@@ -51,7 +51,7 @@ KNOWN = {
     "posture_model/mixture.py": "describe_compatibility",
     "posture_model/sample.py": "_draw_blocks",
     "shape/completion/complete.py": "complete_cloud",
-    "shape/conditioning.py": "_extend append_observations longest_distance posterior_given",
+    "shape/conditioning.py": "_extend append_observations longest_distance posterior_given rows",
     "shape/fit.py": "_warn_of_ambiguity fit_upright",
     "shape/gp.py": "of",
     "shape/posterior.py": "n_oriented",

@@ -304,12 +304,13 @@ def check_intrinsics(k: Matrix, stated: list[float] | None, size: Sequence[int])
     if shift(cx, cy) > LIMITS.farthest:
         found = f"a principal point ({cx:.4g}, {cy:.4g}) px in an image of {width} x {height}"
         raise BadArgument("intrinsics", found, "a crop nearer to it")
-    _check_size(k, stated, k.new_tensor([width, height]))
+    _check_size(k, stated, width, height)
 
 
-def _check_size(k: Matrix, stated: list[float] | None, image: Float[Tensor, "2"]) -> None:
+def _check_size(k: Matrix, stated: list[float] | None, width: int, height: int) -> None:
     """Raise `BadArgument` if intrinsics belong to another resolution than the size of an image."""
-    shown = f"an image of {image[0]:g} x {image[1]:g}"
+    shown = f"an image of {width} x {height}"
+    image = k.new_tensor([width, height])
     centre = 2 * k[:2, 2]
     if stated is not None:
         own = k.new_tensor(stated)
@@ -321,7 +322,7 @@ def _check_size(k: Matrix, stated: list[float] | None, image: Float[Tensor, "2"]
             return
         if torch.equal(own, image):
             return
-        found = f"those of an image of {own[0]:g} x {own[1]:g} px for {shown}"
+        found = f"those of an image of {stated[0]:g} x {stated[1]:g} px for {shown}"
     else:
         # The principal point tells the size of the image, roughly.
         modes = map(k.new_tensor, MODES)
