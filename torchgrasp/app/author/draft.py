@@ -98,11 +98,11 @@ def draft_hand(
 
     `check_hand` checks it. `tips` are the links of the fingertips in grasp order. The hand.toml's
     sets of fingers "default", "four" and "five" have the first three, four and five of them, as far
-    as there are so many. By default the tips are the last links of the branches, in the order in which their pads best face each other. The hand has the `name` of
-    the robot by default. `seed` is that of the random postures from which pads are guessed. Raises
-    `HandFileError` for a URDF that is missing or malformed, or needs repair by `new_hand`. Raises
-    `BadArgument` for fewer than three tips, more than five, or a tip without a collision shape or a
-    movable joint.
+    as there are so many. By default the tips are the last links of the branches, in the order in
+    which their pads best face each other. The hand has the `name` of the robot by default. `seed` is
+    that of the random postures from which pads are guessed. Raises `HandFileError` for a URDF that
+    is missing or malformed, or needs repair by `new_hand`. Raises `BadArgument` for fewer than three
+    tips, more than five, or a tip without a collision shape or a movable joint.
 
     >>> from torchgrasp.hand.load import find_hand
     >>> text = draft_hand(find_hand("barrett") / "hand.urdf")
