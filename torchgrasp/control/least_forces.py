@@ -92,7 +92,8 @@ def balance(points: Float[Array, "f 3"], touching: Bool[Array, "f"] | bool = Tru
     """Return the grasp map at contact `points` [m], its pseudo-inverse and its null space, from one
     SVD.
 
-    `touching` marks the fingers that touch; True means all.
+    The forces that it maps are in the frame of the points. `touching` marks the fingers that touch;
+    True means all.
     """
     columns = np.repeat(np.broadcast_to(touching, len(points)), 3)
     wrench = grasp_map(torch.from_numpy(points)).numpy() * columns
@@ -106,7 +107,7 @@ def friction_ratios(forces: Float[Array, "f 3"], normals: Float[Array, "f 3"]) -
     """Return each finger's ratio of tangential to normal force; it is infinite if the finger does
     not press.
 
-    `forces` [N] act on the object, and `normals` are outward unit vectors.
+    `forces` [N] act on the object, and `normals` are outward unit vectors, both in one frame.
     """
     push = -(forces * normals).sum(-1)
     slide = np.linalg.norm(forces + push[:, None] * normals, axis=-1)

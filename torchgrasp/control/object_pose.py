@@ -124,7 +124,10 @@ class ContactPlanes:
         return found
 
     def moved(self, displacement: Float[Tensor, "6"]) -> Float[Tensor, "f 3"]:
-        """Return the planned contact points [m] after a `displacement` [m, rad] of the object."""
+        """Return the planned contact points [m] after a `displacement` (6,) [m, rad] of the object.
+
+        Both are in the frame of the planned hand.
+        """
         shift = displacement[:3]
         turn = displacement[3:]
         return self.target + shift + torch.linalg.cross(turn.expand_as(self.arms), self.arms)

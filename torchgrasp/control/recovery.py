@@ -117,7 +117,8 @@ class GuardedApproach:
 
     `left` [m] is the remaining length of the approach, `palm` (3,) [m] the palm's displacement from
     its planned path, `stops` the number of stops. `displacement` (6,) holds the object's
-    translation [m] and rotation [rad] at the last touch.
+    translation [m] and rotation vector [rad] at the last touch. Both are in the planned hand's
+    frame.
 
     Args:
         reference: the closing plan, with an approach, a table and a surface.
@@ -257,8 +258,9 @@ class GraspCheck:
 
     `secure` then says whether to lift: all fingers touch, the palm has followed the object
     (`CHECK.misplaced`) and, if all contact points are known, forces balance with the planned
-    friction. `displacement` (6,) holds the object's translation [m] and rotation [rad]: that of the
-    closing, or one estimated anew from all touches if the plan has a table and a surface.
+    friction. `displacement` (6,) holds the object's translation [m] and rotation vector [rad] in
+    the planned hand's frame: that of the closing, or one estimated anew from all touches if the
+    plan has a table and a surface.
 
     Args:
         reference: the closing plan.
@@ -335,7 +337,8 @@ class Reopening:
 
     Args:
         reference: the closing plan.
-        displacement: displacement of the object: translation [m], rotation [rad].
+        displacement: displacement of the object in the planned hand's frame: translation [m],
+            then rotation vector [rad].
         joints: measured positions [rad] of all joints.
         palm: displacement of the closed hand's palm [m].
         begun: displacement [m] of the palm at which the closing started.
@@ -425,7 +428,8 @@ def palm_goal(shift: Float[Tensor, "3"], table: Plane | None, reach: float) -> F
     """Return the palm's displacement [m] that follows the `shift` [m] of an object along the
     `table`.
 
-    It is at most `reach` [m] long. Without a table, the whole shift is followed.
+    It is at most `reach` [m] long. Without a table, the whole shift is followed. All is in the
+    frame of the planned hand.
     """
     if table is not None:
         up = unit(table.normal)

@@ -19,12 +19,12 @@ from torchgrasp.values.specs import Simulator, TrialSpec
 
 
 class GoldenCase(NamedTuple):
-    """A shipped grasp with its right verdict."""
+    """A test case of the simulation: a shipped grasp, and whether it rightly holds its object."""
 
     object: str  # name of a shipped object
     hand: str  # name of a shipped hand
     held: bool  # whether the object is rightly held
-    shift: float = 0.0  # distance [m] by which the hand is moved back against its approach
+    shift: float = 0.0  # distance [m] by which the hand is moved back from the object
     mass: float = 0.1  # of the object [kg]
 
 

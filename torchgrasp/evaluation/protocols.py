@@ -277,7 +277,7 @@ def draw_error(
 def draw_slide(noise: PoseNoise, seed: Seed) -> Float[Tensor, "3"]:
     """Return a random displacement (x, y, 0) [m] of an object along its table.
 
-    It is at most `noise.translation` on each axis.
+    The table's normal is z. The displacement is at most `noise.translation` along x and y.
     """
     level = dataclasses.replace(noise, rotation=0.0)
     return draw_object_poses(level, torch.zeros(3), 1, seed)[0, :3, 3]

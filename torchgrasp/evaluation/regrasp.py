@@ -60,8 +60,8 @@ def next_grasp(
     """Return the index of the grasp of `list_others` that most likely holds, after those `tried`
     failed.
 
-    `surface` is the estimated surface of the object. Without it or a table, or if the grasps are
-    not ranked by success, it is the best-ranked one.
+    `surface` is the estimated surface of the object, in the frame of the grasps. Without it or a
+    table, or if the grasps are not ranked by success, it is the best-ranked one.
     """
     others = list_others(grasps, tried)
     if surface is None or grasps.table is None or grasps.meta.get("ranking") != "success":

@@ -70,9 +70,8 @@ class Truth:
     error: Pose | None = None  # error of the hand's pose [m], in the frame of the planned hand
     table: Plane | None = None  # below the object
     neighbours: Sequence[Neighbour] = ()  # other bodies on the table
-    slide: Float[Tensor, "3"] | None = (
-        None  # displacement [m] of the object halfway through the approach
-    )
+    # displacement [m] of the object halfway through the approach
+    slide: Float[Tensor, "3"] | None = None
     camera: Pose | None = None  # of a depth camera for a second look [m]
 
 

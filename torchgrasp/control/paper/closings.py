@@ -308,8 +308,9 @@ class Impedance:
 
     @checked
     def forces(self, tips: Float[Tensor, "3 3"]) -> Float[Tensor, "3 3"]:
-        """Return the forces [N] of the fingertips on the object, given the centres `tips` [m] of
-        the fingertips.
+        """Return the forces [N] of the fingertips on the object, given their centres `tips` [m].
+
+        Both are in the hand's frame.
         """
         frame = self._frame(tips)
         desired = self.raised * self.factor * self.desired @ frame[:3, :3].T

@@ -45,10 +45,12 @@ PARTS = [
 def state_of(
     springs: Float[Tensor, "*b 3"], lengths: Float[Tensor, "*b 3"], forces: Float[Tensor, "*b 3"]
 ) -> Float[Tensor, "*b 9"]:
-    """Return the state of a grasp: logarithms of spring stiffness [N/m], distances [m] of tips to
-    centroid, forces [N].
+    """Return the state of a grasp: the logarithms of three stiffnesses, three distances and three
+    forces.
 
-    `springs`, `lengths` and normal `forces` are in the order of the hand's fingers.
+    `springs` [N/m] are the stiffnesses of the virtual springs, `lengths` [m] the distances of the
+    fingertips from their centroid, and `forces` [N] the normal forces. All are in the order of the
+    hand's fingers.
     """
     return torch.cat([springs, lengths, forces.clamp_min(LEAST_FORCE)], -1).log()
 
