@@ -32,9 +32,9 @@ class Tick(Value):
     """
 
     time: Float[Tensor, "*t"]  # since the start [s]
-    object_pose: Float[Tensor, "*t 4 4"]  # [m]
-    hand_pose: Float[Tensor, "*t 4 4"]  # of the hand's root link [m]
-    neighbour_pose: Float[Tensor, "*t m 4 4"]  # of the m neighbours [m]
+    object_pose: Float[Tensor, "*t 4 4"]  # pose of the object [m]
+    hand_pose: Float[Tensor, "*t 4 4"]  # pose of the hand's root link [m]
+    neighbour_pose: Float[Tensor, "*t m 4 4"]  # poses of the m neighbours [m]
     joints: Float[Tensor, "*t j"]  # positions [rad]
     targets: Float[Tensor, "*t j"]  # targets of the drives [rad]
     touching: Int[Tensor, "*t"]  # number of fingers on the object

@@ -25,7 +25,7 @@ class GoldenCase(NamedTuple):
     hand: str  # name of a shipped hand
     held: bool  # whether the object is rightly held
     shift: float = 0.0  # distance [m] by which the hand is moved back from the object
-    mass: float = 0.1  # of the object [kg]
+    mass: float = 0.1  # mass of the object [kg]
 
 
 GOLDEN = (

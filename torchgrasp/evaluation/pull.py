@@ -34,7 +34,7 @@ class PullResult(Value):
     """
 
     passed: bool
-    status: Status  # of the last pull
+    status: Status  # how the last pull ended
     directions: int  # number of pulls that were tried
     moved: Measured  # largest motion of the object's centre of mass in the world [m]
     turned: Measured  # largest rotation of the object in the world [rad]

@@ -105,7 +105,7 @@ class LiftTry(NamedTuple):
     """One try of a trial over several grasps."""
 
     row: int  # index of the grasp that was tried
-    result: ClosureResult  # of its lift
+    result: ClosureResult  # record of its lift
 
 
 @checked

@@ -65,14 +65,14 @@ class Truth:
     more before the hand comes to its approach.
     """
 
-    mesh: "trimesh.Trimesh | Path | str"  # of the object [m]
+    mesh: "trimesh.Trimesh | Path | str"  # mesh of the object [m]
     parts: "Sequence[trimesh.Trimesh] | None" = None  # convex parts of the object [m]
     error: Pose | None = None  # error of the hand's pose [m], in the frame of the planned hand
-    table: Plane | None = None  # below the object
+    table: Plane | None = None  # the true table below the object
     neighbours: Sequence[Neighbour] = ()  # other bodies on the table
     # displacement [m] of the object halfway through the approach
     slide: Float[Tensor, "3"] | None = None
-    camera: Pose | None = None  # of a depth camera for a second look [m]
+    camera: Pose | None = None  # pose of a depth camera for a second look [m]
 
 
 @checked

@@ -130,8 +130,8 @@ class PlannedView(NamedTuple):
     """The result of planning on a view."""
 
     score: ViewScore
-    cloud: PointCloud | None = None  # of the view [m]; None for a bad object
-    grasps: Grasps | None = None  # that are executable; None for a bad object
+    cloud: PointCloud | None = None  # the cloud of the view [m]; None for a bad object
+    grasps: Grasps | None = None  # its executable grasps; None for a bad object
 
 
 def plan_views(

@@ -23,7 +23,7 @@ from torchgrasp.hand.kinematics import map_points
 
 @dataclasses.dataclass(frozen=True)
 class PostureNumbers:
-    """Numbers that say when a file's posture is our hand's."""
+    """Bounds by which a file's posture counts as our hand's, and parameters of the fit of fingers."""
 
     same_tip: float = 1e-4  # greatest distance [m] of a fingertip from that of the file
     same_joint: float = 1e-3  # greatest difference [rad or m] of a joint that moves no fingertip
@@ -32,10 +32,12 @@ class PostureNumbers:
     reached: float = 1e-6  # distance [m] of a fingertip along each axis that ends a search
     rounding: float = 1e-6  # a joint [rad or m] may pass its limits by it
     steps: int = 60  # most steps in which fingers take up the motion of a wrist
-    damping: float = 1e-5  # of the first of these steps [m^2]; larger: shorter steps
-    least_damping: float = 1e-10  # [m^2]
-    most_damping: float = 1.0  # [m^2]
-    shorter: float = 4.0  # factor of the damping after a step that was none
+    damping: float = 1e-5  # damping of the first step [m^2]; larger: shorter steps
+    least_damping: float = 1e-10  # least damping [m^2]
+    most_damping: float = 1.0  # greatest damping [m^2]
+    shorter: float = (
+        4.0  # factor of the damping after a rejected step; its inverse after an accepted one
+    )
 
 
 POSTURE = PostureNumbers()

@@ -61,10 +61,10 @@ class GaussianMixture(Value):
     (tensor(-1.8379), ('b',), torch.Size([5, 2]))
     """
 
-    weights: Float[Tensor, "m"]  # shares, of sum 1
-    means: Float[Tensor, "m d"]  # in the units of the dimensions
-    covariances: Float[Tensor, "m d d"]  # in products of these units
-    names: tuple[str, ...]  # of the d dimensions
+    weights: Float[Tensor, "m"]  # probabilities of the m components, of sum 1
+    means: Float[Tensor, "m d"]  # means of the components, in the units of the d dimensions
+    covariances: Float[Tensor, "m d d"]  # their covariances, in products of these units
+    names: tuple[str, ...]  # names of the d dimensions
 
     def __post_init__(self) -> None:
         d = len(self.names)

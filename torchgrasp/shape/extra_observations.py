@@ -280,7 +280,7 @@ class Middle(Value):
 
     x: Points  # points (n, 3), normalised
     side: Bool[Tensor, "n"]  # mask of the points in the sides, not in the floor
-    thickness: float  # of the wall, normalised
+    thickness: float  # thickness of the wall, normalised
 
 
 def vessel_supports(

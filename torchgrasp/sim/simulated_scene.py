@@ -34,7 +34,7 @@ class StepContacts:
     weight: np.ndarray
     # whether each finger touches (f,), with its tip or with the link that carries the tip
     finger: np.ndarray
-    force: np.ndarray  # of each fingertip on the object (f, 3) [N], friction included
+    force: np.ndarray  # force (f, 3) of each fingertip on the object [N], with friction
     # sums of other impulses (3,) [N s]: hand on neighbours, hand on table, links on object
     stray: np.ndarray
 

@@ -39,8 +39,8 @@ class FitNumbers:
     least_reach: float = 5e-4
     # A box of a link or of a fingertip is cut in two if the cut saves this share of the volume of
     # all boxes; smaller gives more boxes.
-    saving: float = 0.12  # of a link
-    saving_tip: float = 0.04  # of a fingertip
+    saving: float = 0.12  # share for a box of a link
+    saving_tip: float = 0.04  # share for a box of a fingertip
     short_boxes: int = 3  # most boxes of a short body
     long_boxes: int = 8  # most boxes of a long body
     tip_boxes: int = 4  # most boxes of a long tip, behind its ball

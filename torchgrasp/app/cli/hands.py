@@ -51,16 +51,16 @@ from torchgrasp.testing import check_hand, find_faults, most_met, random_joints
 
 @dataclasses.dataclass(frozen=True)
 class HandTrial:
-    """Numbers of the trial of a hand, and least shares of its random postures."""
+    """Parameters of the trial of a new hand, and least shares of its random postures."""
 
-    objects: tuple[str, ...] = ("cylinder", "jug")  # tried in turn
+    objects: tuple[str, ...] = ("cylinder", "jug")  # names of the objects that are tried in turn
     starts: int = 100  # initial guesses for each object
     postures: int = 5000  # random postures
     some: int = 500  # postures in which the pair of links that meets most often is sought
     # least shares of the random postures of a hand with three fingers
-    least_free: float = 0.2  # of those without self-collision
-    least_facing: float = 0.02  # of those in which a finger's pad faces the others
-    least_closing: float = 0.001  # of those that can hold an object
+    least_free: float = 0.2  # least share of postures without self-collision
+    least_facing: float = 0.02  # least share in which a finger's pad faces the others
+    least_closing: float = 0.001  # least share that can hold an object
     facing: float = 0.5  # cosine of the largest angle between a pad that faces and the middle
 
 

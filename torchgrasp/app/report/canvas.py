@@ -51,20 +51,20 @@ class MarkShapes:
 
     point_radius: float = 0.006  # share of the diagonal of all points
     # parts of an arrow, in lengths of the arrow; the shaft ends inside the head
-    head_radius: float = 0.1  # of the cone
-    head_length: float = 0.35  # of the cone
-    head_start: float = 0.65  # distance of the cone's base from the arrow's start
-    shaft_radius: float = 0.035  # of the cylinder
-    shaft_length: float = 0.75  # of the cylinder
-    ball_radius: float = 0.13  # of the ball at the arrow's start
+    head_radius: float = 0.1  # radius of the head, a cone
+    head_length: float = 0.35  # length of the head
+    head_start: float = 0.65  # distance of the head's base from the arrow's start
+    shaft_radius: float = 0.035  # radius of the shaft, a cylinder
+    shaft_length: float = 0.75  # length of the shaft
+    ball_radius: float = 0.13  # radius of the ball at the arrow's start
     arrow_sections: int = 8  # sides of head and shaft
     table_radius: float = 0.55  # share of the diagonal of all corners seen from above
     table_rim: float = 0.02  # added to the radius [m], so that a small object has a table, too
     table_sections: int = 120  # corners of the round table top
-    table_thickness: float = 1e-4  # [m]
+    table_thickness: float = 1e-4  # thickness of the table top [m]
     # depths below the true height [m]: the object hides shadows, and shadows hide the table
-    table_depth: float = 1e-3  # of the table
-    shadow_depth: float = 5e-4  # of the shadows
+    table_depth: float = 1e-3  # depth of the table
+    shadow_depth: float = 5e-4  # depth of the shadows
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,8 +86,8 @@ class Framing:
 class RasterNumbers:
     """Parameters of the rendering of triangles to pixels."""
 
-    samples: int = 2  # number along each axis of a pixel; their mean gives smooth edges
-    opacity: float = 0.5  # of transparent triangles
+    samples: int = 2  # number of samples along each axis of a pixel; their mean gives smooth edges
+    opacity: float = 0.5  # opacity of transparent triangles, in [0, 1]
     nearest: float = 1e-6  # least distance from the camera [m]; the scene is framed in front of it
     thinnest: float = 1e-9  # twice the least area [pixels]: seen from its edge, a triangle is thin
     # Triangles that share an edge both cover a centre within this distance [pixels] of it, so that
@@ -106,8 +106,8 @@ class Lamps:
     key_strength: float = 0.50  # brightness that the main lamp adds
     fill_strength: float = 0.22  # brightness that the second lamp adds
     shine_strength: float = 0.08  # white that the highlight of the main lamp adds
-    key: Direction = (-0.45, 0.65, 0.62)  # to the main lamp
-    fill: Direction = (0.70, 0.10, 0.60)  # to the second lamp
+    key: Direction = (-0.45, 0.65, 0.62)  # direction to the main lamp
+    fill: Direction = (0.70, 0.10, 0.60)  # direction to the second lamp
     shininess: int = 40  # exponent: larger makes the highlight smaller
     least_normal: float = 1e-12  # a face without area has a normal of length 0
 
@@ -120,9 +120,9 @@ class BarLayout:
     top: int = 24  # upper end of the strip, from the bottom of the picture
     bottom: int = 10  # lower end of the strip, likewise
     font: int = 20  # size of numbers and title
-    labels: int = 4  # numbers above the strip
-    label_rise: int = 4  # of the numbers above the strip
-    title_rise: int = 29  # of the title above the strip
+    labels: int = 4  # count of the numbers above the strip
+    label_rise: int = 4  # height of these numbers above the strip
+    title_rise: int = 29  # height of the title above the strip
 
 
 MARKS = MarkShapes()

@@ -31,8 +31,8 @@ class FilmLayout:
     still: int = 340  # height of a still with its title
     title: int = 44  # height of this title
     title_left: float = 0.04  # place of the title, as a share of the still's width
-    font: int = 14  # of titles and letters
-    small_font: int = 12  # of the titles of many stills, so that they fit
+    font: int = 14  # size of titles and letters
+    small_font: int = 12  # size of the titles of many stills, so that they fit
     many: int = 6  # stills from which on the small font is used
     tall_plot: int = 200  # height of a plot with a legend
     plot: int = 110  # height of a plot without a legend
@@ -51,8 +51,8 @@ class FilmLayout:
 class PlotStyle:
     """Style of the plots in a film strip [points], and the least upper ends of their axes."""
 
-    font: int = 13  # of titles and axes
-    title_gap: int = 9  # between a title and its plot
+    font: int = 13  # size of titles and of the texts of axes
+    title_gap: int = 9  # gap between a title and its plot
     ticks: int = 3  # most intervals of the vertical axis
     line: float = 1.8  # width of a line
     wide: float = 4.0  # width of the line of the hand's height, which a held object's would cover

@@ -32,16 +32,17 @@ UNMEASURED, ELSEWHERE, SUPPORT, OTHER_SUPPORT, OBSTACLE = range(len(KINDS))
 
 @dataclasses.dataclass(frozen=True)
 class SceneInk:
-    """Numbers of the shading of a scene's pixels, chosen by eye; factors darken a colour."""
+    """Parameters of the shading of a scene's pixels, chosen by eye; factors darken a colour."""
 
-    size: int = 1200  # of the longer side of the picture [pixels]
+    size: int = 1200  # longer side of the picture [pixels]
     hatches: int = 160  # stripes over the width, on obstacles
     hatch: float = 0.8  # factor of every other stripe
     flat: float = 0.6  # least brightness of what is on no object: relief matters most on objects
-    cell: float = 0.1  # squares of the support [m]
+    cell: float = 0.1  # side of the squares drawn on the support [m]
     line: float = 0.25  # share of the colour that lines between squares lose
-    line_width: float = 1.2  # [pixels]
-    widest_pixel: float = 0.3  # part of a square; lines of smaller squares would run together
+    line_width: float = 1.2  # width of these lines [pixels]
+    # widest pixel, as a share of a square, with lines: lines of smaller squares would run together
+    widest_pixel: float = 0.3
     gap: int = 5  # [pixels]: missing pixels in a square of this side have no rim
     rim: int = 3  # width of the dark rim of an object [pixels]
     rim_factor: float = 0.5  # factor of the rim
@@ -72,10 +73,10 @@ class SceneText:
     round: int = 5  # radius of its corners
     text: int = 40  # left end of the text, from the left end of the colour
     left: int = 16  # left end of the first column
-    gutter: int = 70  # what a column needs beside its widest text
-    margin: int = 12  # above and below all rows
-    most_objects: int = 12  # named in the legend
-    least_share: float = 0.002  # of the pixels; a rarer kind is not in the legend
+    gutter: int = 70  # width that a column needs beside its widest text
+    margin: int = 12  # margin above and below all lines of the legend
+    most_objects: int = 12  # most objects that the legend names
+    least_share: float = 0.002  # least share of the pixels of a kind that is in the legend
     top: float = 0.98  # quantile of the heights of an object's points: few outliers
 
 

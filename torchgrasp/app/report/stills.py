@@ -31,10 +31,10 @@ class StillLayout:
     most_points: int = 3000  # most points of a cloud: more would hide each other
     least_height: float = 1e-12  # [m]: a flat cloud has one colour
     most_others: int = 4000  # most points of all neighbours
-    contact_arrow: float = 0.045  # [m], about as long as a fingertip with its pad
-    tip_arrow: float = 0.03  # of the pads of a hand alone [m]
+    contact_arrow: float = 0.045  # length of an arrow at a contact [m]: about a fingertip
+    tip_arrow: float = 0.03  # length of the arrow at a pad of a hand without grasp [m]
     palm_axis: float = 0.6  # length of the axes, as a share of the diagonal of the palm
-    unknown_view: Direction = (1.0, -0.8, 0.6)  # from the front, where the camera is unknown
+    unknown_view: Direction = (1.0, -0.8, 0.6)  # direction to the viewer if the camera is unknown
     grasp_rise: float = 0.4  # rise of the view of a grasp, for each metre along the ground
 
 
@@ -42,13 +42,13 @@ class StillLayout:
 class HandSheet:
     """Layout of the picture of a hand: four stills, and below them the ranges of the joints."""
 
-    eye: Direction = (1.0, -0.9, 0.5)  # to the camera, in the hand's frame
+    eye: Direction = (1.0, -0.9, 0.5)  # direction to the camera, in the hand's frame
     aside: float = 110.0  # the other side from which the posture is seen [degrees]
-    width: float = 13.5  # [inches]
-    height: float = 10.8  # of the stills [inches]
+    width: float = 13.5  # width of the picture [inches]
+    height: float = 10.8  # height of the stills [inches]
     row: float = 0.3  # height for each joint [inches]
     dpi: int = 100  # [pixels per inch]
-    font: int = 14  # of the titles [points]
+    font: int = 14  # size of the titles [points]
     bar: float = 0.4  # height of the bar of a joint, in rows
     margin: float = 0.02  # beside the widest range, as a share of it
     mark: int = 16  # length of the mark of the posture [points]

@@ -128,7 +128,7 @@ class SymmetryScorer:
     revolution.
     """
 
-    points: Points  # of the cloud (n, 3) [m]
+    points: Points  # points (n, 3) of the cloud [m]
     normals: Points  # (n, 3), outward unit normals
     outline: Outlines  # silhouettes of the views
     table: Plane | None  # None: no table

@@ -109,7 +109,8 @@ class Vessel(Value):
     """An open vessel with a vertical axis; lengths in metres."""
 
     center: Float[Tensor, "2"]  # position (x, y) of the axis [m]
-    thickness: float  # of the wall, the mean of the fitted and the usual one, weighted by certainty
+    # thickness of the wall [m]: mean of the fitted and the usual one, weighted by certainty
+    thickness: float
     radius: float  # outer radius of the mouth
     rim: float  # height of the mouth
     inner: Bool[Tensor, "n"]  # mask of the points seen through the mouth
