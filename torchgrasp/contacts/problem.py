@@ -153,7 +153,7 @@ def pull_signs(fingertips: int, device: torch.device) -> Float[Tensor, "f p"]:
     """Return the signed incidence matrix of f contacts and their p = f (f - 1) / 2 pairs.
 
     The pairs are in the order of `contact_pairs`. The sign is 1 where contact i is the first of
-    pair k, -1 where it is the second, and 0 otherwise. `fingertips` is f.
+    pair k, -1 where it is the second, else 0. `fingertips` is f.
     """
     pairs = contact_pairs(fingertips, device)
     at = torch.arange(fingertips, device=device)[:, None]

@@ -148,9 +148,9 @@ def press(
     """Return the joint targets and torques with which position-controlled drives exert given
     forces.
 
-    `joints` [rad] are the present actuated joints, `jacobian` [m/rad] is that of the contact points
-    by them, `forces` [N] act on the object, both in one frame, and `stiffness` [N m/rad] is that of
-    each actuated joint.
+    `joints` [rad] are the present actuated joints, and `jacobian` [m/rad] is that of the contact
+    points by them. `forces` [N] act on the object, in the frame of the Jacobian. `stiffness`
+    [N m/rad] is that of each actuated joint.
     """
     torques = torch.einsum("gcih,gci->gh", jacobian, forces)
     return Squeeze(joints + torques / stiffness, forces, torques)

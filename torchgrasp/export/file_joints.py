@@ -35,9 +35,8 @@ class PostureNumbers:
     damping: float = 1e-5  # damping of the first step [m^2]; larger: shorter steps
     least_damping: float = 1e-10  # least damping [m^2]
     most_damping: float = 1.0  # greatest damping [m^2]
-    shorter: float = (
-        4.0  # factor of the damping after a rejected step; its inverse after an accepted one
-    )
+    # factor of the damping after a rejected step; its inverse after an accepted one
+    shorter: float = 4.0
 
 
 POSTURE = PostureNumbers()

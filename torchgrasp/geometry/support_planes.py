@@ -243,7 +243,7 @@ def _axes(normal: Vector, points: Points) -> Float[Tensor, "3 2"]:
 class Hull:
     """A convex polygon in a plane."""
 
-    corners: Float[Tensor, "k 2"]  # [m]
+    corners: Float[Tensor, "k 2"]  # corners of the polygon, in the plane [m]
     # outward unit normal n (x, y) of each side, and offset o [m], with n . p + o < 0 within
     sides: Float[Tensor, "s 3"]
 

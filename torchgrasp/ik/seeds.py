@@ -39,8 +39,9 @@ from torchgrasp.values.planning import Contacts, IKSeeds
 
 @dataclasses.dataclass(frozen=True)
 class SeedNumbers:
-    """Parameters of the search for initial guesses (seeds) of hand poses and joints, in a library
-    of random postures or the learned model.
+    """Parameters of the search for initial guesses (seeds) of hand poses and joints.
+
+    They come from a library of random postures, or from the learned model.
     """
 
     length_scale: float = 0.01

@@ -84,8 +84,8 @@ class Request:
     def __post_init__(self) -> None:
         """Raise `BadArgument` for arguments that contradict each other.
 
-        These are an arm of another hand, no load to resist, or a promised share of holding grasps
-        (`promise`) for a displaced object.
+        These are an arm of another hand, no load to resist, or a `promise` (the share of returned
+        grasps that hold) for a displaced object.
         """
         if self.arm is not None and self.arm.hand_sha256 != self.hand.source.sha256:
             raise BadArgument(

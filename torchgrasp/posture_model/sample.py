@@ -116,7 +116,7 @@ class HandSamples(Batch):
     (torch.Size([50, 4]), torch.Size([50, 10]), 'barrett')
     """
 
-    joints: Float[Tensor, "n h"]  # [rad], in the order of `joint_names`
+    joints: Float[Tensor, "n h"]  # actuated joints [rad], in the order of `joint_names`
     q: Float[Tensor, "n q"]  # contact codes of the fingertips: lengths [m], then cosines
     joint_names: tuple[str, ...]
     # hand, seed and sampling
@@ -168,8 +168,8 @@ def sample_configurations(
     whose random contacts can have force closure (`Sampling`); it needs a hand with three fingers. A
     smaller set with the same `seed` is the beginning of a larger one. `workers` threads draw at the
     same time. The `observer` is called after each chunk with the number of its postures. Raises
-    `BadArgument` for an argument out of range, for "grasping" with another number of fingers, or
-    for a hand of which almost no random posture is kept.
+    `BadArgument` for an argument out of range or "grasping" with another number of fingers. It is
+    also raised for a hand of which almost no random posture is kept.
 
     >>> from torchgrasp.hand.load import load_hand
     >>> sample_configurations(load_hand("barrett"), 100).q.shape

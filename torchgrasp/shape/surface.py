@@ -82,7 +82,7 @@ class Surface(Value):
     (True, True)
     """
 
-    vertices: Float[Tensor, "v 3"]  # [m]
+    vertices: Float[Tensor, "v 3"]  # corners of the triangles [m]
     faces: Int[Tensor, "f 3"]  # indices of three vertices, turned outward
     normals: Float[Tensor, "v 3"]  # outward unit gradients of the mean
     std_m: Float[Tensor, "v"]  # standard deviation of the surface along its normal [m]
@@ -121,7 +121,7 @@ def extract_surface(
 class Mesh(Value):
     """A triangle mesh of the estimated surface, without normals and deviations."""
 
-    vertices: Float[Tensor, "v 3"]  # [m]
+    vertices: Float[Tensor, "v 3"]  # corners of the triangles [m]
     faces: Int[Tensor, "f 3"]  # indices of three vertices, turned outward
 
 

@@ -67,9 +67,9 @@ class Neighbour:
 class Body:
     """A rigid body of uniform density."""
 
-    mesh: "trimesh.Trimesh"  # [m]
-    parts: "Sequence[trimesh.Trimesh]"  # convex, [m]
-    mass: float  # [kg]
+    mesh: "trimesh.Trimesh"  # mesh of the body [m]
+    parts: "Sequence[trimesh.Trimesh]"  # convex parts of the mesh [m]
+    mass: float  # mass of the body [kg]
 
     @property
     def inertia(self) -> np.ndarray:

@@ -63,9 +63,10 @@ def keep_promise(grasps: Grasps, share: float) -> Grasps:
     """Return the grasps, in which executable ones that are not reliable enough get the status
     `NO_PROMISE`.
 
-    `share`, in [0, 1], is the promised share of the remaining executable grasps that hold. An
-    executable grasp keeps its status if its success is known and its log-odds are at least the
-    bound that trials give for this share (`find_promise`). Without such a bound, none keeps it.
+    `share`, in [0, 1], is the promised share of the remaining executable grasps that hold.
+    `find_promise` gives the bound of the log-odds for this share. An executable grasp keeps its
+    status if its success is known and its log-odds are at least this bound. Without a bound, none
+    keeps it.
     """
     promise = find_promise(share)
     least = math.inf if promise is None else promise.least

@@ -96,13 +96,14 @@ def draft_hand(
 ) -> str:
     """Return the text of a hand.toml for a clean URDF, for the user to review.
 
-    `check_hand` checks it. `tips` are the links of the fingertips in grasp order. The hand.toml's
-    sets of fingers "default", "four" and "five" have the first three, four and five of them, as far
-    as there are so many. By default the tips are the last links of the branches, in the order in
-    which their pads best face each other. The hand has the `name` of the robot by default. `seed` is
-    that of the random postures from which pads are guessed. Raises `HandFileError` for a URDF that
-    is missing or malformed, or needs repair by `new_hand`. Raises `BadArgument` for fewer than three
-    tips, more than five, or a tip without a collision shape or a movable joint.
+    `check_hand` checks it. `tips` are the links of the fingertips in grasp order. They form the
+    hand.toml's sets of fingers: "default" has the first three, "four" the first four, and "five"
+    all five. A set is left out if there are too few tips. By default the tips are the last links of
+    the branches, in the order in which their pads best face each other. The hand has the `name` of
+    the robot by default. `seed` is that of the random postures from which pads are guessed. Raises
+    `HandFileError` for a URDF that is missing or malformed, or needs repair by `new_hand`. Raises
+    `BadArgument` for fewer than three tips, more than five, or a tip without a collision shape or a
+    movable joint.
 
     >>> from torchgrasp.hand.load import find_hand
     >>> text = draft_hand(find_hand("barrett") / "hand.urdf")

@@ -51,7 +51,7 @@ class FacingNumbers:
     angle: float = 45.0  # most between a pad's normal and the way to the middle [degrees]
     nearest: float = 0.015  # least distance of a contact from the middle [m]
     farthest: float = 0.08  # greatest distance of a contact from the middle [m]
-    least: float = 1e-9  # [m], so that nothing is divided by 0
+    least: float = 1e-9  # least divisor [m], so that nothing is divided by 0
 
 
 PADS = PadNumbers()

@@ -19,13 +19,14 @@ class RepairNumbers:
     """Numbers that a URDF gets where it lacks them, and bounds of what is possible."""
 
     # drive of a joint for which the URDF declares none, typical of small hands
-    effort: float = 1.0  # [N m]
-    velocity: float = 3.0  # [rad/s]
+    effort: float = 1.0  # greatest torque [N m]
+    velocity: float = 3.0  # greatest speed [rad/s]
     most_wrist: int = 3  # joints that move all fingertips: more are an arm
     # least mass and edge of a body without mass, so that simulators remain stable
-    least_mass: float = 1e-3  # [kg]
-    least_size: float = 5e-3  # [m]
-    density: float = 500.0  # [kg/m3] of a bounding box: half of it is filled with 1000 kg/m3
+    least_mass: float = 1e-3  # least mass [kg]
+    least_size: float = 5e-3  # least edge [m]
+    # density [kg/m3] of a bounding box, of which half is filled with 1000 kg/m3
+    density: float = 500.0
     # farthest mass centre and radius of gyration, in half diagonals of the bounding box
     far_out: float = 2.0
     rounding: float = 1e-6  # relative error of inertias, which URDFs write with few digits

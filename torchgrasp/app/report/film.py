@@ -26,7 +26,7 @@ from torchgrasp.values.closing import ClosureResult
 class FilmLayout:
     """Layout of a film strip: stills, and plots below them [pixels; fonts in points]."""
 
-    dpi: int = 100  # [pixels per inch]
+    dpi: int = 100  # resolution [pixels per inch]
     width: int = 1680  # width of the strip
     still: int = 340  # height of a still with its title
     title: int = 44  # height of this title
@@ -59,10 +59,11 @@ class PlotStyle:
     handle: float = 1.2  # length of a line in the legend, in font sizes
     legend_top: float = 0.96  # lower end of the legend, as a share of the plot's height
     room: float = 1.1  # upper end of an axis, in largest values
-    least_time: float = 0.1  # [s]
-    least_force: float = 1.0  # [N]
-    least_motion: float = 20.0  # [mm]
-    most_sliding: float = 100.0  # [mm/s]: a lost object slides faster
+    least_time: float = 0.1  # least upper end of the axis of time [s]
+    least_force: float = 1.0  # least upper end of the axis of forces [N]
+    least_motion: float = 20.0  # least upper end of the axis of motions [mm]
+    # greatest upper end of the axis of sliding [mm/s]: a lost object slides faster
+    most_sliding: float = 100.0
 
 
 FILM = FilmLayout()

@@ -43,7 +43,7 @@ class SceneInk:
     line_width: float = 1.2  # width of these lines [pixels]
     # widest pixel, as a share of a square, with lines: lines of smaller squares would run together
     widest_pixel: float = 0.3
-    gap: int = 5  # [pixels]: missing pixels in a square of this side have no rim
+    gap: int = 5  # side [pixels] of the squares in which missing pixels have no rim
     rim: int = 3  # width of the dark rim of an object [pixels]
     rim_factor: float = 0.5  # factor of the rim
     target_rim: int = 5  # width of the white rim of the target [pixels]

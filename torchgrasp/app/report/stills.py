@@ -29,7 +29,8 @@ class StillLayout:
     """Limits and sizes of what stills show."""
 
     most_points: int = 3000  # most points of a cloud: more would hide each other
-    least_height: float = 1e-12  # [m]: a flat cloud has one colour
+    # least divisor [m] of the heights that give colours: a flat cloud has one colour
+    least_height: float = 1e-12
     most_others: int = 4000  # most points of all neighbours
     contact_arrow: float = 0.045  # length of an arrow at a contact [m]: about a fingertip
     tip_arrow: float = 0.03  # length of the arrow at a pad of a hand without grasp [m]
@@ -47,12 +48,12 @@ class HandSheet:
     width: float = 13.5  # width of the picture [inches]
     height: float = 10.8  # height of the stills [inches]
     row: float = 0.3  # height for each joint [inches]
-    dpi: int = 100  # [pixels per inch]
+    dpi: int = 100  # resolution [pixels per inch]
     font: int = 14  # size of the titles [points]
     bar: float = 0.4  # height of the bar of a joint, in rows
     margin: float = 0.02  # beside the widest range, as a share of it
     mark: int = 16  # length of the mark of the posture [points]
-    mark_width: int = 3  # [points]
+    mark_width: int = 3  # width of this mark [points]
 
 
 STILLS = StillLayout()

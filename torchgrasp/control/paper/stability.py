@@ -48,9 +48,9 @@ def state_of(
     """Return the state of a grasp: the logarithms of three stiffnesses, three distances and three
     forces.
 
-    `springs` [N/m] are the stiffnesses of the virtual springs, `lengths` [m] the distances of the
-    fingertips from their centroid, and `forces` [N] the normal forces. All are in the order of the
-    hand's fingers.
+    `springs` [N/m] are the stiffnesses of the virtual springs. `lengths` [m] are the distances of
+    the fingertips from their centroid, and `forces` [N] their normal forces. All are in the order
+    of the hand's fingers.
     """
     return torch.cat([springs, lengths, forces.clamp_min(LEAST_FORCE)], -1).log()
 

@@ -114,7 +114,7 @@ class Completion(Value):
     `deviations`, and the noise is that of `HiddenNumbers`.
     """
 
-    points: Float[Tensor, "m 3"]  # [m]
+    points: Float[Tensor, "m 3"]  # points on the hidden side [m]
     normals: Float[Tensor, "m 3"]  # outward unit normals
     # standard deviations [m] of c errors, which the mirror planes cause
     shared: Float[Tensor, "m c"]

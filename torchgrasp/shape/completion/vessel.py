@@ -197,9 +197,9 @@ class HiddenWall(Batch):
     position (two columns), the wall's thickness and the floor's height.
     """
 
-    points: Float[Tensor, "m 3"]  # [m]
+    points: Float[Tensor, "m 3"]  # hidden points of the wall [m]
     normals: Float[Tensor, "m 3"]  # outward unit normals
-    shared: Float[Tensor, "m 4"]  # [m]
+    shared: Float[Tensor, "m 4"]  # errors of the points by four common causes [m]
 
 
 @dataclasses.dataclass(frozen=True)
