@@ -3,15 +3,16 @@
 import dataclasses
 import itertools
 from collections.abc import Sequence
+from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.cloud.neighbours import draw_rows, nearest
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import spatial, trimesh
-from torchgrasp.geometry.linalg import Points, unit
+from torchgrasp.geometry.linalg import Points, Vector, norm, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.plane_fit import assume_noise
 from torchgrasp.values.planning import Grasps, PointCloud
@@ -108,45 +109,34 @@ def check_agreement(
         raise BadArgument(name, found, allowed)
 
 
-@dataclasses.dataclass(frozen=True)
-class Disagreement:
-    """How far two views, by their places in a list, are apart, and the noise of their cameras."""
-
-    views: tuple[int, int]
-    distance: float
-    noise: float
-    """Distance and noise [m]."""
-
-
-def check_views(views: Sequence[PointCloud]) -> Disagreement | None:
+def check_views(views: Sequence[PointCloud]) -> None:
     """Raise `BadArgument` if two views of one object contradict each other beyond their noise.
 
     The views [m], with normals, are in one frame, each with at most one camera. Points of a view
     may not stand before a surface that the camera of another saw. Without a camera, surfaces that
-    overlap are compared. Views that nowhere meet are refused, too.
-
-    Returns the two views that are farthest apart, over their noise; None if none can be compared.
+    overlap are compared. Views that nowhere meet are refused, too. The error names the two views
+    that are farthest apart, over their noise.
     """
-    worst = None
-    pairs = list(itertools.permutations(range(len(views)), 2))
-    for first, second in pairs:
-        a = views[first]
-        b = views[second]
-        noise = max(_noise(a), _noise(b))
-        distance = _overlap_distance(a, b) if a.viewpoint is None else _height_before(a, b)
-        if distance is None:
-            continue
-        if worst is None or distance / noise > worst.distance / worst.noise:
-            worst = Disagreement((first, second), distance, noise)
-    if worst is not None and worst.distance > VIEWS.refused * worst.noise:
-        _refuse_views(worst.views, worst.distance, VIEWS.refused * worst.noise)
-    for first, second in pairs:
-        gap = float(
-            _distance_behind(_draw_points(views[second]), views[first]).quantile(VIEWS.meet)
-        )
+    noise = [_noise(view) for view in views]
+    apart = dict[tuple[int, int], tuple[float, float]]()  # distance and limit [m] by pair
+    for first, view in enumerate(views):
+        surface = _find_surface(view)
+        for second, other in enumerate(views):
+            if surface is None or second == first:
+                continue
+            distance = surface.distance(other)
+            if distance is not None:
+                limit = VIEWS.refused * max(noise[first], noise[second])
+                apart[first, second] = (distance, limit)
+    worst = max(apart, key=lambda pair: apart[pair][0] / apart[pair][1], default=None)
+    if worst is not None and apart[worst][0] > apart[worst][1]:
+        _refuse_views(worst, *apart[worst])
+    for first, second in itertools.permutations(range(len(views)), 2):
+        other = views[second].points
+        points = other[draw_rows(len(other), VIEWS.drawn)].double().cpu()
+        gap = float(_distance_behind(points, views[first]).quantile(VIEWS.meet))
         if gap > VIEWS.gap:
             _refuse_views((first, second), gap, VIEWS.gap)
-    return worst
 
 
 def _refuse_views(views: tuple[int, int], distance: float, limit: float) -> None:
@@ -157,70 +147,63 @@ def _refuse_views(views: tuple[int, int], distance: float, limit: float) -> None
     raise BadArgument("clouds", found, allowed)
 
 
-def _height_before(a: PointCloud, b: PointCloud) -> float | None:
-    """Return how far [m] points of view b stand before the surface that the camera of view a saw.
+@dataclasses.dataclass(frozen=True)
+class _Seen:
+    """The surface that one view shows, with what is needed to compare other views with it."""
 
-    None if too few points of b are on rays to that surface.
-    """
-    assert a.viewpoint is not None
-    eye = a.viewpoint.double().cpu()
-    surface, normals = _draw_surface(a)
-    # the camera saw only what faces it
-    facing = ((eye - surface) * normals).sum(-1) > 0
-    surface = surface[facing]
-    normals = normals[facing]
-    points = _draw_points(b)
-    if len(surface) < VIEWS.least:
-        return None
-    rays = unit(surface - eye)
-    spacing = float(nearest(rays, VIEWS.neighbours)[0][:, 1:].mean(-1).median())
-    apart, row = _find_nearest(rays, unit(points - eye))
-    met = apart < VIEWS.reach * spacing
-    if int(met.sum()) < VIEWS.least:
-        return None
-    height = ((points - surface[row]) * normals[row]).sum(-1).clamp_min(0)
-    depth = torch.linalg.vector_norm(surface[row] - eye, dim=-1)
-    before = torch.linalg.vector_norm(points - eye, dim=-1) < depth
-    return float(torch.where(before, height, 0.0)[met].quantile(VIEWS.seen))
+    eye: Vector | None  # position of the camera [m]; None if it is unknown
+    points: Points  # points of the surface [m]; of those that face the camera, if it is known
+    normals: Points  # their outward unit normals
+    tree: Any  # a KD tree of the rays from the camera to the points, or of the points
+    spacing: float  # usual distance between neighbours in the tree, in their own unit
 
-
-def _overlap_distance(a: PointCloud, b: PointCloud) -> float | None:
-    """Return the distance [m] of two surfaces where they overlap and face the same way; None if
-    they overlap in too few points.
-    """
-    surface, normals = _draw_surface(a)
-    rows = draw_rows(len(b), VIEWS.drawn)
-    assert b.normals is not None
-    points = b.points[rows].double().cpu()
-    spacing = float(nearest(surface, VIEWS.neighbours)[0][:, 1:].mean(-1).median())
-    apart, row = _find_nearest(surface, points)
-    height = ((points - surface[row]) * normals[row]).sum(-1).abs()
-    beside = (apart.square() - height.square()).clamp_min(0).sqrt()
-    cosine = (b.normals[rows].double().cpu() * normals[row]).sum(-1)
-    overlap = (cosine > VIEWS.same) & (beside < VIEWS.reach * spacing)
-    if int(overlap.sum()) < VIEWS.least:
-        return None
-    return float(height[overlap].quantile(VIEWS.near))
+    def distance(self, view: PointCloud) -> float | None:
+        """Return how far [m] another view contradicts this surface; None if too few points of the
+        view can be compared with it.
+        """
+        rows = draw_rows(len(view), VIEWS.drawn)
+        points = view.points[rows].double().cpu()
+        asked = points if self.eye is None else unit(points - self.eye)
+        apart, row = map(torch.from_numpy, self.tree.query(asked.numpy()))
+        height = ((points - self.points[row]) * self.normals[row]).sum(-1)
+        if self.eye is None:
+            # surfaces that overlap and face the same way
+            assert view.normals is not None
+            height = height.abs()
+            beside = (apart.square() - height.square()).clamp_min(0).sqrt()
+            cosine = (view.normals[rows].double().cpu() * self.normals[row]).sum(-1)
+            compared = (cosine > VIEWS.same) & (beside < VIEWS.reach * self.spacing)
+            share = VIEWS.near
+        else:
+            # the height of what stands before the surface; all else is hidden, and 0
+            before = norm(points - self.eye) < norm(self.points[row] - self.eye)
+            height = torch.where(before, height.clamp_min(0), 0.0)
+            compared = apart < VIEWS.reach * self.spacing
+            share = VIEWS.seen
+        if int(compared.sum()) < VIEWS.least:
+            return None
+        return float(height[compared].quantile(share))
 
 
-def _draw_points(cloud: PointCloud) -> Points:
-    """Return the points [m] of a cloud that are compared with another view, in float64."""
-    return cloud.points[draw_rows(len(cloud), VIEWS.drawn)].double().cpu()
-
-
-def _draw_surface(cloud: PointCloud) -> tuple[Points, Points]:
-    """Return some points [m] of a cloud, and their normals, in float64."""
-    rows = draw_rows(len(cloud), VIEWS.surface)
-    assert cloud.normals is not None
-    return cloud.points[rows].double().cpu(), cloud.normals[rows].double().cpu()
-
-
-def _find_nearest(
-    points: Points, asked: Float[Tensor, "m 3"]
-) -> tuple[Float[Tensor, "m"], Int[Tensor, "m"]]:
-    """Return the distance and the index of the point that is nearest to each asked point."""
-    distance, row = spatial.KDTree(points.numpy()).query(asked.numpy())
-    return torch.from_numpy(distance), torch.from_numpy(row)
+def _find_surface(view: PointCloud) -> _Seen | None:
+    """Return the surface of a view with normals; None if its camera faces too little of it."""
+    rows = draw_rows(len(view), VIEWS.surface)
+    assert view.normals is not None
+    points = view.points[rows].double().cpu()
+    normals = view.normals[rows].double().cpu()
+    eye = None
+    placed = points
+    if view.viewpoint is not None:
+        eye = view.viewpoint.double().cpu()
+        # the camera saw only what faces it
+        facing = ((eye - points) * normals).sum(-1) > 0
+        points = points[facing]
+        normals = normals[facing]
+        placed = unit(points - eye)
+        if len(points) < VIEWS.least:
+            return None
+    spacing = float(nearest(placed, VIEWS.neighbours)[0][:, 1:].mean(-1).median())
+    return _Seen(eye, points, normals, spatial.KDTree(placed.numpy()), spacing)
 
 
 def check_mesh(cloud: PointCloud, mesh: "trimesh.Trimesh", name: str = "mesh") -> None:

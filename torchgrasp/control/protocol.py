@@ -81,9 +81,10 @@ class Settled:
     ) -> None:
         """Add a tick of `period` [s] to `time` if the closing is settled; otherwise set it to 0.
 
-        It is settled if all fingers touch and, with `pressing`, each has a `share` of force control
-        of at least 0.5, and an average force (`TactileState.average`) within `NOISE` [N] of that at
-        the last tick that was not settled. `touching` marks the fingers that touch.
+        It is settled if all fingers touch. With `pressing`, each must also have a `share` of force
+        control of at least 0.5, and a steady force. A force is steady if its average
+        (`TactileState.average`) is within `NOISE` [N] of that at the last tick that was not
+        settled. `touching` marks the fingers that touch.
         """
         average = observation.tactile.average
         settled = bool(touching.all())

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchgrasp.cloud.camera import partial_view
 from torchgrasp.control.controller import GraspController
+from torchgrasp.control.finger_forces import stiff_drives
 from torchgrasp.control.holding import GripHold
 from torchgrasp.control.modes import choose_preference
 from torchgrasp.control.recovery import can_guard
@@ -151,11 +152,8 @@ class TrialDriver:
         """
         spec = self.spec
         truth = self.trial.truth
-        drives = hand.actuators
         rise = self.reference.rise
         body = self._body(truth)
-        if spec.kp is not None:
-            drives = {name: drive._replace(kp=spec.kp) for name, drive in drives.items()}
         true_pose = apply_error(grasp.obj_from_hand[0], truth.error)
         turn = true_pose[:3, :3] @ grasp.obj_from_hand[0, :3, :3].T
         approach = turn @ grasp.approach[0] * spec.approach
@@ -164,7 +162,7 @@ class TrialDriver:
             urdf_path=hand.urdf_path,
             world_from_hand=true_pose.numpy(),
             joints=_by_name(hand, grasp.pregrasp[0]),
-            drives=drives,
+            drives=stiff_drives(hand, spec.kp),
             tip_links=tuple(hand.tips.links),
             mesh=body.mesh,
             parts=list(body.parts),

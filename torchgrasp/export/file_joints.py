@@ -6,17 +6,20 @@ or turn is refused, or told in a `GraspFileWarning`.
 
 import dataclasses
 import math
-import warnings
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.files.write import Refuse
+from torchgrasp.foundation.base import Batch, flatnonzero
 from torchgrasp.foundation.errors import BadArgument, GraspFileWarning
+from torchgrasp.foundation.told import warn_user
+from torchgrasp.geometry.linalg import matvec, norm
+from torchgrasp.geometry.optim import LeastSquares, Residuals, levenberg_marquardt
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.kinematics import map_points
 
@@ -29,14 +32,10 @@ class PostureNumbers:
     same_joint: float = 1e-3  # greatest difference [rad or m] of a joint that moves no fingertip
     backward: float = 0.05  # a joint [rad] that bends less is no sign of a reversed axis
     short: float = 0.5  # share of the long side of a joint's range: a shorter one is its back
-    reached: float = 1e-6  # distance [m] of a fingertip along each axis that ends a search
+    reached: float = 1e-6  # sum of squared errors of the fingertips [mm^2] that ends a search
     rounding: float = 1e-6  # a joint [rad or m] may pass its limits by it
     steps: int = 60  # most steps in which fingers take up the motion of a wrist
-    damping: float = 1e-5  # damping of the first step [m^2]; larger: shorter steps
-    least_damping: float = 1e-10  # least damping [m^2]
-    most_damping: float = 1.0  # greatest damping [m^2]
-    # factor of the damping after a rejected step; its inverse after an accepted one
-    shorter: float = 4.0
+    stalled: float = 1e-4  # relative decrease of the squared errors below which a search ends
 
 
 POSTURE = PostureNumbers()
@@ -125,11 +124,15 @@ def read_columns(
         allowed = f"the signs of our URDF, as with {' '.join(turned)} in --joints"
         raise refuse(", ".join(turned.values()), allowed)
     if unread:
-        tell(f"{', '.join(unread)}: no joint of the {hand.name} hand, so its values are not read")
+        warn_user(
+            GraspFileWarning,
+            f"{', '.join(unread)}: no joint of the {hand.name} hand, so its values are not read",
+        )
     if backward:
-        tell(
+        warn_user(
+            GraspFileWarning,
             f"{', '.join(backward)}: bent backward in every grasp. In --joints, JOINT:-1 turns the "
-            "sign; JOINT:1 keeps it"
+            "sign; JOINT:1 keeps it",
         )
     return values
 
@@ -167,7 +170,7 @@ def read_posture(
             theirs[:, place] = torch.tensor(values[name])
     if not len(joints):
         return joints
-    off = (_tips(hand, theirs) - _tips(hand, own)).norm(dim=-1).amax(-1)  # (g,)
+    off = norm(_tips(hand, theirs) - _tips(hand, own)).amax(-1)  # (g,)
     apart = (theirs - own).abs()  # (g, j)
     moving = hand.tree.moves[hand.tips.index].bool().any(0)  # (j,)
     row = int(off.argmax())
@@ -182,16 +185,17 @@ def read_posture(
     idle = (apart.amax(0) > POSTURE.same_joint) & ~moving
     names = [x for x, one in zip(hand.tree.joint_names, idle.tolist(), strict=True) if one]
     if names:
-        tell(
+        warn_user(
+            GraspFileWarning,
             f"{what}: {', '.join(names)} move no grasping finger, so the file's values are not "
-            "kept; --fingers chooses others"
+            "kept; --fingers chooses others",
         )
     return joints
 
 
 def _reason(hand: Hand, joint: int) -> str:
     """Return why a joint that is not actuated has its value."""
-    leaders = torch.nonzero(hand.actuated.coupling[joint])[:, 0].tolist()
+    leaders = flatnonzero(hand.actuated.coupling[joint] != 0).tolist()
     if not leaders:
         return "where the hand parks it"
     return f"by its coupling to {hand.joint_names[leaders[0]]}"
@@ -203,6 +207,13 @@ def _tips(hand: Hand, values: Float[Tensor, "g j"]) -> Float[Tensor, "g f 3"]:
     return map_points(carriers, hand.tips.in_carriers[0]).permute(2, 1, 0)
 
 
+@dataclasses.dataclass(frozen=True)
+class _Fingers(Batch):
+    """Actuated joints [rad] of g hands whose wrists are fixed."""
+
+    joints: Float[Tensor, "g h"]
+
+
 def reach_tips(
     hand: Hand, joints: Float[Tensor, "g h"], tips: Float[Tensor, "g f 3"]
 ) -> tuple[Float[Tensor, "g h"], Float[Tensor, "g"]]:
@@ -211,30 +222,19 @@ def reach_tips(
 
     The search starts at `joints`.
     """
-    damping = joints.new_full((len(joints), 1, 1), POSTURE.damping)
-    eye = torch.eye(hand.dof, dtype=joints.dtype)
-    error = (tips - hand.fingertips(joints)[0]).flatten(1)  # (g, 3 f)
-    for _ in range(POSTURE.steps):
-        if not len(error) or float(error.abs().max()) < POSTURE.reached:
-            break
-        jacobian = hand.jacobian(joints).flatten(1, 2)  # (g, 3 f, h)
-        descent = (jacobian.mT @ error[..., None])[..., 0]
+
+    def errors(state: _Fingers, rows: Int[Tensor, "a"]) -> Residuals:
+        found = state.joints
+        error = 1000.0 * (hand.fingertips(found)[0] - tips[rows]).flatten(1)  # (a, 3 f) [mm]
+        jacobian = 1000.0 * hand.jacobian(found).flatten(1, 2)  # (a, 3 f, h)
+        slope = matvec(jacobian.mT, error)
         # joints that press on a limit stay there
-        held = ((joints <= hand.lower) & (descent < 0)) | ((joints >= hand.upper) & (descent > 0))
-        freed = torch.where(held[:, None], 0.0, jacobian)
-        normal = freed.mT @ freed + damping * eye
-        step = torch.linalg.solve(normal, freed.mT @ error[..., None])[..., 0]
-        moved = torch.minimum(torch.maximum(joints + step, hand.lower), hand.upper)
-        missed = (tips - hand.fingertips(moved)[0]).flatten(1)
-        # Levenberg and Marquardt: a worse step is dropped, and the next one is shorter
-        better = (missed.norm(dim=1) < error.norm(dim=1))[:, None]
-        joints = torch.where(better, moved, joints)
-        error = torch.where(better, missed, error)
-        factor = torch.where(better, 1 / POSTURE.shorter, POSTURE.shorter)[..., None]
-        damping = (damping * factor).clamp(POSTURE.least_damping, POSTURE.most_damping)
-    return joints, error.reshape(tips.shape).norm(dim=-1).amax(-1)
+        held = ((found <= hand.lower) & (slope > 0)) | ((found >= hand.upper) & (slope < 0))
+        return error, torch.where(held[:, None], 0.0, jacobian)
 
+    def move(state: _Fingers, step: Float[Tensor, "a h"]) -> _Fingers:
+        return _Fingers((state.joints + step).clamp(hand.lower, hand.upper))
 
-def tell(sentence: str) -> None:
-    """Warn the caller of the library of what a file holds and we do not keep."""
-    warnings.warn(sentence, GraspFileWarning, stacklevel=3)
+    problem = LeastSquares(errors, move, solved=POSTURE.reached, stalled=POSTURE.stalled)
+    joints = levenberg_marquardt(problem, _Fingers(joints), POSTURE.steps)[0].joints
+    return joints, norm(tips - hand.fingertips(joints)[0]).amax(-1)

@@ -26,15 +26,16 @@ from torchgrasp.export.file_joints import (
     read_columns,
     read_order,
     read_posture,
-    tell,
 )
 from torchgrasp.export.other_formats import bench_frame
 from torchgrasp.files import Field, is_file, read_bytes, read_json
+from torchgrasp.foundation.base import flatnonzero
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import ModelFileError, Status
+from torchgrasp.foundation.errors import GraspFileWarning, ModelFileError, Status
 from torchgrasp.foundation.lazy import spatial
 from torchgrasp.foundation.limits import CLOUD_BYTES
 from torchgrasp.foundation.rules import Length, Poses, Positive
+from torchgrasp.foundation.told import warn_user
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
 from torchgrasp.geometry.plane import Plane, read_plane
 from torchgrasp.hand.hand import Hand
@@ -182,7 +183,10 @@ def _read_table(fields: dict[str, Field], rises: np.ndarray, unit_m: float) -> P
         table = read_plane(text)
         return Plane(table.normal, unit_m * table.offset)
     if rises.any():
-        tell("opened hands that the file raises start at the grasp's pose: it names no table")
+        warn_user(
+            GraspFileWarning,
+            "opened hands that the file raises start at the grasp's pose: it names no table",
+        )
     return None
 
 
@@ -238,7 +242,7 @@ def _bench_tables(path: Path, width: int) -> dict[str, np.ndarray]:
     except Exception as error:  # zlib, zipfile and NumPy each raise their own
         raise _refuse(f"{path}: {error}", "an .npz of at most 512 MiB with 'grasp_qpos'") from error
     if others := sorted(held - {*BENCH_READ, *BENCH_KNOWN}):
-        tell(f"{path.name}: not read: {', '.join(others)}")
+        warn_user(GraspFileWarning, f"{path.name}: not read: {', '.join(others)}")
     for name, table in tables.items():
         wanted = POSE_NUMBERS if name == "obj_pose" else width
         kinds = "fiu" if name == "obj_pose" else "f"
@@ -273,11 +277,12 @@ def _at_rest(
     reached, left = reach_tips(hand, inside, tips)
     far = (left > POSTURE.same_tip) & ~still
     if bool(far.any()):
-        rows = torch.nonzero(far)[:, 0].tolist()
-        tell(
+        rows = flatnonzero(far).tolist()
+        warn_user(
+            GraspFileWarning,
             f"pregrasp of {len(rows)} of {len(joints)} grasps, the first {rows[0]}: the wrist "
             "moves to the grasp, ours does not; fingertips are up to "
-            f"{1000 * float(left.max()):.1f} mm off the file's"
+            f"{1000 * float(left.max()):.1f} mm off the file's",
         )
     return torch.where(still[:, None], joints, reached)
 

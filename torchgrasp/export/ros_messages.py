@@ -82,9 +82,9 @@ def format_moveit(
         actuated: leave out the joints that follow others, which controllers of ros2_control do not
             command.
 
-    Raises `BadArgument` for joints of another hand, a force or stiffness that is not positive,
-    unknown or equal names, or a grasp whose hand goes down while it closes (`opened_pose`), which a
-    message with one pose cannot express.
+    Raises `BadArgument` for joints of another hand, a force or stiffness that is not positive, or
+    unknown or equal names. A grasp whose hand goes down while it closes (`opened_pose`) is refused,
+    too: a message with one pose cannot express it.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp

@@ -233,8 +233,8 @@ class TrialSpec(Value):
 
     The controller does not know `mass`, `density`, `friction`, `gravity`, `patch` and the numbers
     of the simulator. Raises `BadArgument` for a number outside its range, an unknown closing,
-    holding or simulator, options of a closing that has none, a sensor or force that the closing
-    cannot use, or a control period below one timestep.
+    holding or simulator, or options of a closing that has none. It is raised, too, for a sensor or
+    force that the closing cannot use, and for a control period below one timestep.
 
     Args:
         closing: how the hand closes. "paper": Eqs. 25-28 as written, with forces of the hand's

@@ -80,8 +80,8 @@ def write_viewer(path: Path | str, run: Run) -> Path:
     """Write a run as a 3D page in one HTML file, atomically. The page needs WebGL, but no network.
 
     The page shows the cloud, the surface by its standard deviation, a shell at k standard
-    deviations, contacts, four postures of the hand for each of the best 20 grasps, and their motion
-    with the lift. The closing of the first grasp is replayed with its forces. The address may name
+    deviations, and the contacts. Each of the best 20 grasps has four postures of the hand, and the
+    motion with the lift. The closing of the first grasp is replayed with its forces. The address may name
     a state, as in `view.html#grasp=3&posture=squeeze&sigma=2` or `view.html#tick=50`. Returns the
     path. Raises `OutputError` if the file cannot be written.
 

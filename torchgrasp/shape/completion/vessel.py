@@ -182,7 +182,7 @@ def find_vessel(
         and float((body & ~inner).double().mean()) > numbers.outer_share
         and float(body.sum() / wall.sum()) > numbers.body_share
     )
-    if not enough or float(rim - height[inner].min()) < numbers.depth:
+    if not enough or not math.isfinite(mouth) or float(rim - height[inner].min()) < numbers.depth:
         return None
     usual = 1.0 / (1.0 + (numbers.spread / numbers.error) ** 2)
     thickness = usual * numbers.usual + (1.0 - usual) * thickness
