@@ -290,3 +290,10 @@ def test_the_joints_of_a_hand_are_all_joints_of_its_urdf_and_the_finger_that_res
         hand.joint_names
     )
     assert [float(joints[name]) for name in hand.joint_names] == grasp.joints[0].tolist()
+
+
+@pytest.mark.parametrize("kind", [np.float16, np.float32, np.float64])
+def test_numbers_of_numpy_are_taken_without_a_warning(kind):
+    assert ContactSpec(friction=kind(0.5)).friction == 0.5
+    with pytest.raises(BadArgument, match=r"friction: expected .*got -0\.5"):
+        ContactSpec(friction=kind(-0.5))

@@ -302,6 +302,10 @@ def test_saturated_pixels_and_a_far_plane_are_not_measured():
     for image in (mm, far):
         read = read_depth(image, K)[0]
         assert not read[:20].any() and bool((read[20:] > 0).all())
+    thing = np.full(mm.shape, 1e10, dtype=np.float32)  # a small object, rendered alone
+    thing[:2] = 0.5
+    read = read_depth(thing, K)[0]
+    assert bool((read[:2] == 0.5).all()) and not read[2:].any()
 
 
 MODES = ((640, 480), (848, 480), (1280, 720), (1944, 1200), (512, 424))

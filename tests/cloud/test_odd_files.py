@@ -76,7 +76,7 @@ READ = {
     "plain.pts": (rows(POINTS), False, ""),
     "a.xyzi": (rows(COLOURED[:, :4]), False, "intensity"),
     "a.xyzn": (rows(BOTH), True, ""),
-    "a.xyzrgb": (rows(COLOURED), False, "colours"),
+    "a.xyzrgb": (rows(COLOURED), False, "red, green, blue"),
     "a.asc": ("//X Y Z R G B\n" + rows(COLOURED), False, "R, G, B"),
     "normals.csv": (
         "X;Y;Z;Nx;Ny;Nz;curvature\n" + rows(BOTH[:, [0, 1, 2, 3, 4, 5, 0]], ";"),
@@ -92,6 +92,11 @@ READ = {
         "",
     ),
     "named.npy": (np.rec.fromarrays(POINTS.T, names="x,y,z"), False, ""),
+    "organised.npy": (
+        np.rec.fromarrays(COLOURED.T[:4].reshape(4, 6, 10), names="x,y,z,rgb"),
+        False,
+        "rgb",
+    ),
 }
 TOLD = {
     "semicolons.csv": (

@@ -2,6 +2,7 @@
 
 import functools
 import math
+import re
 import warnings
 
 import numpy as np
@@ -219,7 +220,12 @@ def test_right_poses_raise_no_alarm():
             )
             @ pose
         )
-        assert len(Scene.from_depth(depth, INTRINSICS, tilted).things) == 2
+        found = Scene.from_depth(depth, INTRINSICS, tilted)
+        assert len(found.things) == 2
+        degrees = math.degrees(math.acos(float((tilted @ inverse(pose))[2, 2])))
+        (note,) = found.notes
+        assert abs(float(re.findall(r"tilted by (\d+) degrees", note)[0]) - degrees) < 1
+    assert not right().notes
     assert len(Scene.from_depth(depth, INTRINSICS).things) == 2  # the camera's own frame
     beside = rigid(
         rotation_from_vector(torch.tensor([0.02, 0.0, 0.01]).double()),

@@ -24,7 +24,8 @@ from torchgrasp.values.planning import PointCloud
 
 @pytest.fixture
 def points():
-    return np.random.default_rng(0).uniform(-0.04, 0.04, (60, 3))
+    """On a sphere, whose normals are `unit_rows`."""
+    return 0.04 * unit_rows(60)
 
 
 def unit_rows(n):
@@ -215,6 +216,22 @@ def test_malformed_compressed_data_are_refused_by_name(tmp_path, points, body):
         read_cloud(tmp_path / "a.pcd")
 
 
+@pytest.mark.parametrize("colour", [(1.0, 0, 0), (0, 1.0, 0), (0, 0, 1.0), (0.58, 0.58, 0.58)])
+def test_colours_of_length_1_are_no_normals(tmp_path, colour):
+    """The surface tells them from normals, which are across it, of either sign and with noise."""
+    rng = np.random.default_rng(0)
+    normals = rng.normal(size=(900, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    ball = 0.04 * normals + rng.normal(0, 0.001, (900, 3))
+    np.save(tmp_path / "colours.npy", np.hstack([ball, np.broadcast_to(colour, (900, 3))]))
+    found = read_cloud_file(tmp_path / "colours.npy")
+    assert found.cloud.normals is None and "colours?" in found.notes[0]
+    signs = rng.choice([-1.0, 1.0], (900, 1))
+    np.save(tmp_path / "normals.npy", np.hstack([ball, signs * normals]))
+    found = read_cloud_file(tmp_path / "normals.npy")
+    assert found.cloud.normals is not None and not found.notes
+
+
 def colours(n):
     return np.random.default_rng(2).uniform(0, 1, (n, 3))
 
@@ -390,7 +407,7 @@ def test_headers_that_promise_too_much_are_refused_before_memory_is_taken(tmp_pa
 
 
 def test_columns_whose_squares_overflow_are_no_normals(tmp_path, points):
-    table = np.concatenate([points, np.tile([0.0, 0.0, 1.0], (len(points), 1))], 1)
+    table = np.concatenate([points, unit_rows(60)], 1)
     table[0, 3] = 1e200
     np.save(tmp_path / "table.npy", table)
     assert (

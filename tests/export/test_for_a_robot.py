@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from tests.pinch import pinch
 from torchgrasp import Plane
 from torchgrasp.app import cli
+from torchgrasp.control.protocol import POSE_TIME
 from torchgrasp.export import (
     ArmMotion,
     format_grasps,
@@ -149,16 +150,33 @@ def test_trajectories_may_leave_followers_out():
     assert set(every["joint_names"]) - set(some["joint_names"]) == followers
     assert set(some["joint_names"]) == set(hand.joint_names)
     for row, point in enumerate(every["points"]):
-        for key in ("positions", "effort"):
-            of = dict(zip(every["joint_names"], point[key], strict=False))
-            kept = [of[joint] for joint in some["joint_names"] if of]
-            assert some["points"][row][key] == kept
+        of = dict(zip(every["joint_names"], point["positions"], strict=True))
+        kept = [of[joint] for joint in some["joint_names"]]
+        assert some["points"][row]["positions"] == kept
     assert message["grasp_posture"]["joint_names"] == some["joint_names"]
     names = tuple(hand.tree.joint_names)
     motion = ArmMotion(("arm", *names), torch.zeros(2), torch.zeros(1, 2, 9), {"above": 0})
     moved = yaml.safe_load(format_motion(hand, motion, actuated=True))
     assert moved["joint_names"] == ["arm", *(x for x in names if x not in followers)]
     assert len(moved["points"][0]["positions"]) == 5
+
+
+def test_a_trajectory_starts_where_the_hand_is_and_has_no_efforts():
+    """A point at time 0 is a jump; the trajectory controller of ros2_control refuses efforts."""
+    hand, grasp = pinch("barrett")
+    (message,) = yaml.safe_load(format_moveit(hand, grasp, actuated=True))
+    trajectories = (
+        yaml.safe_load(format_trajectories(hand, grasp)),
+        message["pre_grasp_posture"],
+        message["grasp_posture"],
+    )
+    for trajectory in trajectories:
+        points = trajectory["points"]
+        times = [
+            x["time_from_start"]["sec"] + 1e-9 * x["time_from_start"]["nanosec"] for x in points
+        ]
+        np.testing.assert_allclose(np.diff([0.0, *times]), POSE_TIME, atol=1e-9)
+        assert not any(point["effort"] for point in points)
 
 
 def test_parked_joints_stay_where_followers_are_left_out():

@@ -112,6 +112,19 @@ def test_bad_files_and_a_mesh_of_a_plane_are_refused(tmp_path):
 
 
 @pytest.mark.promise("H2")
+def test_negative_indices_of_an_obj_count_back_from_their_line(tmp_path):
+    """Two boxes, each written as vertices and then faces."""
+    text = ""
+    for height in (0.0, 0.07):
+        one = trimesh.creation.box((0.05, 0.06, 0.04)).apply_translation((0, 0, height))
+        text += "".join("v {:.6f} {:.6f} {:.6f}\n".format(*v) for v in one.vertices)
+        text += "".join("f {0}/{0} {1}/{1} {2}/{2}\n".format(*face - 8) for face in one.faces)
+    (tmp_path / "boxes.obj").write_text(text)
+    mesh = read_mesh(tmp_path / "boxes.obj")
+    np.testing.assert_allclose(mesh.bounds[:, 2], [-0.02, 0.09])
+    assert mesh.volume == pytest.approx(2 * 0.05 * 0.06 * 0.04)
+
+
 @pytest.mark.parametrize("suffix", [".ply", ".stl", ".obj", ".off"])
 def test_a_box_of_every_format_is_read_and_opens_nothing_else(tmp_path, suffix):
     path = tmp_path / f"box{suffix}"

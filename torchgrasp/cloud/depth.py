@@ -1,6 +1,7 @@
 """Point clouds from depth images, and checks of the depth, the intrinsics and the mask."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -43,6 +44,8 @@ class DepthNumbers:
     """
     millimetres: float = 200.0
     """A median depth that is too large is in mm if it is above this [m], else in cm."""
+    background: float = 0.05
+    """Least share of the pixels at the greatest value by which it marks a background, if too far."""
     viewed: int = 5000
     """Number of points, about, by which a table in the view is compared with the pose."""
 
@@ -193,6 +196,10 @@ def _in_metres(image: Tensor, unit: float | None) -> Image:
 
     measured = metres[metres > 0]
     near = measured[measured <= DEPTH.farthest]
+    # Renderers write one large number, such as 1e10, where they see nothing.
+    background = measured == measured.max() if len(near) else measured > math.inf
+    if int(background.sum()) >= DEPTH.background * len(measured):
+        measured = measured[~background]
     if len(near) < DEPTH.near * len(measured):
         middle = float(measured.median())
         name = "cm"

@@ -314,6 +314,19 @@ def _check_normals(supports: tuple[SupportPlane, ...], pose: Transform, up: obje
     raise BadArgument("camera_pose", found, allowed)
 
 
+def tell_tilt(pose: Transform, plane: Plane) -> tuple[str, ...]:
+    """Return one note if a table is tilted from z of the frame to which the `pose` leads, else none.
+
+    A camera's own frame has no such z. `plane` is the table in that frame.
+    """
+    cosine = float(plane.normal[2])
+    tilt = math.degrees(math.acos(min(1.0, max(-1.0, cosine))))
+    if _is_own(pose) or tilt < POSE.sloped:
+        return ()
+    fixes = "a wrong camera_pose, or depth that is no distance, such as a z-buffer, tilts it"
+    return (f"the table is tilted by {tilt:.0f} degrees from z of camera_pose: {fixes}",)
+
+
 def _check_given_table(points: Points, plane: Plane) -> None:
     """Refuse a given table that the camera did not see: it is above most points, or far below all
     points.

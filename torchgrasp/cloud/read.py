@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchgrasp.cloud.check import MIN_POINTS, check_cloud
-from torchgrasp.cloud.neighbours import draw_rows, find_inliers, fit_local_planes
+from torchgrasp.cloud.neighbours import NEAR, draw_rows, find_inliers, fit_local_planes
 from torchgrasp.cloud.pcd import parse_pcd
 from torchgrasp.cloud.ply import format_ply, parse_ply
 from torchgrasp.cloud.safe_files import parse_npy, parse_npz
@@ -23,6 +23,7 @@ from torchgrasp.foundation.base import Value, named_tensors
 from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument, CloudFileError, TooFewPoints
 from torchgrasp.foundation.limits import CLOUD_BYTES, CLOUD_POINTS
+from torchgrasp.geometry.linalg import unit as unit_vectors
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.values.planning import PointCloud
 
@@ -46,6 +47,8 @@ class ReadNumbers:
     """Least share of lines with such a length by which columns 4 to 6 are normals."""
     drawn: int = 2000
     """Most points by which a camera in the origin is judged."""
+    fitted: float = 0.7
+    """Least median cosine between normals and planes fitted to points: others are colours."""
 
 
 READ = ReadNumbers()
@@ -90,7 +93,8 @@ def read_cloud(
       camera in the origin.
     * `.npz`: arrays `points` (n, 3), optionally `normals` (n, 3), `viewpoint` (3,), `frustum` (4,
       3), `table` (4,); for several views, `viewpoint` (n, 3) and `frustum` (n, 4, 3).
-    * `.npy`: an (n, 3) array, or (n, 6) with normals; colours are left out.
+    * `.npy`: an (n, 3) array, or (n, 6) with normals; colours are left out. Columns 4 to 6 without
+      names are normals if they have length 1 and are across planes fitted to the points.
     * `.xyz`, `.txt`, `.csv`, `.asc`, `.pts`, `.xyzi`, `.xyzn`, `.xyzrgb`: the same as text. A first
       line may name the columns, as in x y z nx ny nz, or hold the number of points.
 
@@ -223,6 +227,9 @@ def make_cloud(
     notes: list[str] = []
     if "columns" in arrays:
         arrays = _split_columns(source, arrays, notes)
+        if arrays.get("normals") is not None and not _fit_surface(arrays):
+            del arrays["normals"]
+            notes.append("columns 4 to 6 are across the surface (colours?) and were left out")
     if arrays.get("other"):
         notes.append(f"columns {', '.join(arrays['other'])[: READ.shown]} were left out")
     points = scale * _as_rows(source, "points", arrays["points"])
@@ -302,7 +309,8 @@ def _split_columns(source: str, arrays: dict[str, Any], notes: list[str]) -> dic
     """
     table = np.asarray(arrays["columns"])
     if names := table.dtype.names:
-        return find_columns(names, [table[name] for name in names])
+        pixels = table.reshape(-1)  # an organised cloud (h, w) as well
+        return find_columns(names, [pixels[name] for name in names])
     if table.ndim not in (2, 3) or table.shape[-1] not in (3, 6) or table.dtype.kind not in "fiu":
         found = f"{source}: an array of shape {table.shape} and type {table.dtype}"
         allowed = "real numbers of shape (n, 3) or (n, 6), or (h, w, 3) or (h, w, 6) of an image"
@@ -319,6 +327,19 @@ def _split_columns(source: str, arrays: dict[str, Any], notes: list[str]) -> dic
         else:
             notes.append("columns 4 to 6 are no unit vectors (colours?) and were left out")
     return split
+
+
+def _fit_surface(arrays: dict[str, Any]) -> bool:
+    """Return whether unnamed unit vectors are normals: colours such as pure red have length 1, too."""
+    rows = np.concatenate([arrays[name].reshape(-1, 3) for name in ("points", "normals")], -1)
+    rows = torch.from_numpy(rows.astype(np.float64))
+    rows = rows[torch.isfinite(rows).all(1) & rows[:, 3:].any(1)].unique(dim=0)
+    points = rows[:, :3]
+    if len(points) < NEAR.plane:
+        return True  # too few for planes
+    drawn = draw_rows(len(points), READ.drawn)
+    cosine = (fit_local_planes(points, drawn)[0] * unit_vectors(rows[drawn, 3:])).sum(-1).abs()
+    return float(cosine.median()) > READ.fitted
 
 
 def _find_measured(

@@ -3,7 +3,7 @@ trajectory_msgs/JointTrajectory.
 """
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -79,8 +79,8 @@ def format_moveit(
         flange: pose [m] of the robot's flange in the frame of the root link; None means that poses
             are those of the root link.
         object_id: id of the object in the planning scene, which the hand may touch.
-        actuated: leave out the joints that follow others, which controllers of ros2_control do not
-            command.
+        actuated: leave out efforts and the joints that follow others, which controllers of
+            ros2_control refuse.
 
     Raises `BadArgument` for joints of another hand, a force or stiffness that is not positive, or
     unknown or equal names. A grasp whose hand goes down while it closes (`opened_pose`) is refused,
@@ -102,7 +102,9 @@ def format_moveit(
     if not torch.equal(opened, grasps.obj_from_hand):
         found = "a hand that goes down while it closes"
         raise BadArgument("grasps", found, "hands that close at one pose")
-    trajectories = _trajectories(hand, grasps, force, kp, rename, actuated)
+    # two motions, to the pre-grasp and from there
+    times = POSE_TIME, POSE_TIME, 2 * POSE_TIME
+    trajectories = _trajectories(hand, grasps, force, kp, rename, actuated, times, not actuated)
     messages = [
         {
             "id": f"grasp_{row}",
@@ -137,6 +139,8 @@ def format_trajectories(
     The hand must already be at its pose, which `format_moveit` and `format_grasps` give. `force`
     [N] is the normal force of the strongest finger, `kp` [N m/rad] the stiffness of the robot's
     position control, and `rename` holds the robot's names of joints, by their names in the URDF.
+    The points have no efforts, which controllers of positions refuse; `format_grasps` has the
+    torques.
     With `actuated`, joints that follow others are left out: controllers of ros2_control refuse
     their names. Raises `BadArgument` for joints of another hand, a force or stiffness that is not positive, and
     unknown or equal names.
@@ -148,7 +152,9 @@ def format_trajectories(
     3
     """
     what = "a trajectory_msgs/JointTrajectory for each grasp"
-    documents = _trajectories(hand, grasps, force, kp, rename, actuated)
+    # A point at time 0 would be a jump from wherever the hand is.
+    times = POSE_TIME, 2 * POSE_TIME, 3 * POSE_TIME
+    documents = _trajectories(hand, grasps, force, kp, rename, actuated, times, False)
     return _document(hand, what, documents)
 
 
@@ -185,9 +191,14 @@ def _trajectories(
     kp: float | None,
     rename: Mapping[str, str] | None,
     actuated: bool,
+    times: Sequence[float],
+    pressing: bool,
 ) -> Iterator[dict[str, Any]]:
     """Yield for each grasp a trajectory_msgs/JointTrajectory, as a dictionary, with all joints of
     the hand; with `actuated`, without those that follow others.
+
+    `times` (3,) [s] are those of the pre-grasp, the grasp and the squeeze. If `pressing`, the last
+    has the torques as effort.
     """
     squeezed, postures = named_postures(hand, grasps, force, kp)
     followers = follower_joints(hand) if actuated else ()
@@ -196,14 +207,16 @@ def _trajectories(
     root = read_urdf(hand.urdf_path).root
     for row in range(len(grasps)):
         torque = dict(zip(hand.joint_names, squeezed.torques[row].tolist(), strict=True))
-        efforts = [], [], [torque.get(joint, 0.0) for joint in names]
+        pressed = [torque.get(joint, 0.0) for joint in names] if pressing else []
         points = [
             {
                 "positions": [float(posture[joint][row]) for joint in names],
                 "effort": effort,
-                "time_from_start": _duration(k * POSE_TIME),
+                "time_from_start": _duration(time),
             }
-            for k, (posture, effort) in enumerate(zip(postures.values(), efforts, strict=True))
+            for posture, effort, time in zip(
+                postures.values(), ([], [], pressed), times, strict=True
+            )
         ]
         yield {"header": {"frame_id": root}, "joint_names": list(names.values()), "points": points}
 

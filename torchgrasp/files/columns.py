@@ -16,6 +16,11 @@ from torchgrasp.foundation.limits import CLOUD_POINTS, LINE_LETTERS, TEXT_COLUMN
 # letters of wrong names, and of a wrong line, that an error shows
 SHOWN_NAMES = 200
 SHOWN_LINE = 60
+SIXES = {
+    ".xyzn": ["x", "y", "z", "nx", "ny", "nz"],
+    ".xyzrgb": ["x", "y", "z", "red", "green", "blue"],
+}
+"""Names of the six columns in files whose suffix tells them."""
 
 
 def find_columns(names: Sequence[str], columns: Sequence[np.ndarray]) -> dict[str, Any]:
@@ -108,7 +113,7 @@ def parse_text(data: bytes, suffix: str) -> dict[str, Any]:
     `data` is the content of the file. Without names there must be three or six columns, and the
     dictionary holds one array `columns` (n, 3) or (n, 6). A first line of one number counts the
     lines. In files with the `suffix` .xyzi or .pts an intensity may follow x, y and z, and then a
-    colour. Raises `Malformed` for other texts.
+    colour; in .xyzrgb a colour follows. Raises `Malformed` for other texts.
     """
     names, table = _read_text(data)
     rows, width = table.shape
@@ -116,6 +121,8 @@ def parse_text(data: bytes, suffix: str) -> dict[str, Any]:
         if int(names[0]) != rows:
             raise Malformed(f"{rows} rows, where the first line promises {names[0]}")
         names = []
+    if not names and suffix in SIXES and width == len(SIXES[suffix]):
+        names = SIXES[suffix]
     if not names and suffix in (".xyzi", ".pts") and width in (4, 7):
         names = ["x", "y", "z", "intensity", "red", "green", "blue"][:width]
     if len(names or [0] * width) != width or (not names and width not in (3, 6)):

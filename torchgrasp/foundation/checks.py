@@ -223,14 +223,15 @@ def read_number(name: str, value: Any, kind: Any, allowed: Range | None) -> Any:
     Raises `BadArgument` if the value is of another kind or outside the range `allowed`; None allows
     every number. Errors call the value by `name`.
     """
-    number: Any = value
+    # A comparison of float32 with the ends of a range would overflow.
+    number: Any = value.item() if isinstance(value, np.generic) else value
     if kind is bool:
         good = isinstance(value, bool | np.bool_)
     else:
         good = isinstance(value, Integral if kind is int else Real) and not isinstance(value, bool)
     if good and allowed is not None:  # huge whole numbers are compared as they are
         good = allowed.low <= number <= allowed.high and (
-            abs(number) <= MOST or isinstance(value, float)
+            abs(number) <= MOST or isinstance(number, float)
         )
     if not good:
         raise BadArgument(

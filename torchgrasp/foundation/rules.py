@@ -275,7 +275,7 @@ def check_moved(*args: Any, **kwargs: Any) -> None:
     and float64.
     """
     given = ", ".join([*map(repr, args), *(f"{key}={value!r}" for key, value in kwargs.items())])
-    allowed = "a device, torch.float32 or torch.float64"
+    allowed = "a device of this machine and this build of PyTorch, torch.float32 or torch.float64"
     try:
         moved = torch.empty(0, dtype=torch.float32, device="cpu").to(*args, **kwargs)
     except (RuntimeError, TypeError, ValueError, AssertionError) as error:

@@ -252,7 +252,22 @@ def _read_header(data: bytes) -> int:
 def _geometry(data: bytes) -> bytes:
     """Return only the vertex and face lines of an .obj file, because trimesh is slow with many
     groups or materials.
+
+    A negative index counts back from the vertex above its line; trimesh counts from the last of the
+    file. It is replaced by the index that it means.
     """
     lines = data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ").splitlines()
-    kept = (line for line in map(bytes.strip, lines) if line[:2] in (b"v ", b"f ", b"v\t", b"f\t"))
-    return b"\n".join(line if line[:1] == b"v" else _REFERENCE.sub(b"", line) for line in kept)
+    kept = list[bytes]()
+    vertices = 0
+    for line in map(bytes.strip, lines):
+        if line[:2] in (b"v ", b"v\t"):
+            vertices += 1
+            kept.append(line)
+        elif line[:2] in (b"f ", b"f\t"):
+            face = _REFERENCE.sub(b"", line)
+            if b"-" in face:
+                corners = [int(word) for word in face.split()[1:]]
+                places = [k if k > 0 else vertices + 1 + k for k in corners]
+                face = b" ".join([b"f", *(b"%d" % k for k in places)])
+            kept.append(face)
+    return b"\n".join(kept)

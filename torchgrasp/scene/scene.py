@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.cloud.pose import check_sizes, find_plausible
+from torchgrasp.cloud.pose import check_sizes, find_plausible, tell_tilt
 from torchgrasp.cloud.sensor import SensorNoise, estimate_noise
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
@@ -56,7 +56,8 @@ class Scene(Value):
         table: the plane that the objects stand on, or None if it is unknown.
         target: label of the object to be grasped, or None if none is chosen.
         others: other planes that objects could stand on, the more plausible first.
-        notes: a sentence for each given mask or label from which pixels were removed.
+        notes: a sentence for each given mask or label from which pixels were removed, and for a table
+            or a camera in an unlikely place.
         given: labels whose pixels the user gave, as labels or as a mask; the library found the
             other objects.
 
@@ -133,6 +134,8 @@ class Scene(Value):
             notes += check_sizes(
                 points[measured], found[measured], image.obj_from_camera, supports[0].plane
             )
+        if table is None and up is None:
+            notes += tell_tilt(image.obj_from_camera, supports[0].plane)
         pixels = torch.nonzero(measured)
         planes = tuple(support.plane for support in supports)
         scene = cls(

@@ -109,8 +109,8 @@ class Export(Command):
     )
     actuated: bool = option(
         False,
-        "moveit, ros2: leave out the joints that follow others, which ros2_control does not "
-        "command",
+        "moveit, ros2: leave out the joints that follow others, and moveit's efforts, which "
+        "ros2_control refuses",
     )
     flange: tuple[float, float, float, float, float, float, float] | None = option(
         None,
