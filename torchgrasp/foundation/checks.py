@@ -235,7 +235,7 @@ def read_number(name: str, value: Any, kind: Any, allowed: Range | None) -> Any:
         )
     if not good:
         raise BadArgument(
-            name, show(value), describe(Annotated[kind, allowed] if allowed else kind)
+            name, show(number), describe(Annotated[kind, allowed] if allowed else kind)
         )
     return kind(number)
 
