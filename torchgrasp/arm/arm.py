@@ -158,8 +158,8 @@ class Arm(Value):
 
 
 def features(tip: TipPoses) -> Float[Tensor, "k 12"]:
-    """Return twelve numbers [mm] of each pose (3, 4) whose Euclidean distance is a distance between
-    poses.
+    """Return twelve numbers [mm] for each pose (3, 4); their Euclidean distance is a distance of
+    two poses.
 
     For small rotations it is that of the translation [mm] and the angle times `LEVER` [mm].
     """

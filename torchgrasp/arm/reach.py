@@ -76,11 +76,13 @@ def reach_poses(arm: Arm, obj_from_hand: Float[Tensor, "k 4 4"]) -> Bool[Tensor,
 def with_arm(
     arm: Arm, hand: Hand, grasps: Grasps, world: CollisionWorld, up: Float[Tensor, "3"]
 ) -> Grasps:
-    """Return grasps with the postures of the arm in their fields `arm` and `ease`.
+    """Return grasps with the fields `arm` and `ease`, and the status `UNREACHABLE` where the arm
+    has no way.
 
-    Executable grasps without a way of the arm (`follow_grasps`) get the status `UNREACHABLE`. Both
-    fields are 0 for grasps that were not executable. `world` holds what the arm must not touch.
-    `up` is the unit vector of the lift without a table.
+    `arm` holds the joints [rad or m] of the arm at the grasp. `ease` holds the least room of a
+    joint on the way, and the least manipulability (`measure_ease`). Both are 0 without a way
+    (`follow_grasps`), and for grasps that were not executable. `world` holds what the arm must not
+    touch. Without a table there, the grasp is lifted along the unit vector `up`.
     """
     rows = flatnonzero(grasps.status == Status.OK)
     way, found, least = follow_grasps(arm, hand, grasps[rows], world, up)
@@ -100,7 +102,7 @@ def follow_grasps(
     the ease of the way: the least columns of `measure_ease`. The way goes through the easiest
     posture that reaches the grasp, and from which the arm can follow the whole way: without a jump,
     a joint beyond its limits, or a collision of its links with the `world`, each other or the palm.
-    `up` is the unit vector of the lift without a table.
+    If the `world` has no table, the hand is lifted along the unit vector `up`.
     """
     poses = way_of(hand, grasps, world, up).to(arm.lower)
     starts = REACH.starts
@@ -141,10 +143,12 @@ def follow_grasps(
 def way_of(
     hand: Hand, grasps: Grasps, world: CollisionWorld, up: Float[Tensor, "3"] = UP
 ) -> Float[Tensor, "g w 4 4"]:
-    """Return the w poses [m] of the hand on its way through each grasp: first opened, then closed.
+    """Return w poses obj_from_hand [m] on the hand's way through each grasp: the straight approach,
+    then the lift.
 
-    It is lifted along the normal of the world's table, or along the unit vector `up` without a
-    table.
+    The opened hand approaches in the first half of the poses; the closed hand is lifted in the
+    second half. The lift is along the normal of the world's table, or along the unit vector `up`
+    without a table.
     """
     closed = grasps.obj_from_hand
     opened = opened_pose(hand, grasps.pregrasp, closed, world.plane)
@@ -160,8 +164,8 @@ def way_of(
 def track(
     arm: Arm, start: Float[Tensor, "n g"], tips: Float[Tensor, "3 4 g w"]
 ) -> tuple[Float[Tensor, "g w n"], Bool[Tensor, "g"]]:
-    """Return postures that follow the tips from the grasp both ways, then a mask of the ways
-    without a jump.
+    """Return arm postures along each way, tracked from the grasp both ways, then a mask of the ways
+    without jumps.
 
     `start` are the postures at the grasps, one in each column, and `tips` the poses (3 x 4) [m] of
     the tip in the base's frame at all w places. On a way without a jump every pose is reached, and

@@ -100,8 +100,8 @@ def run_campaign(
     interruptions (docs/promises.md, N10, on equal results).
 
     Args:
-        objects: a folder as in `torchgrasp.data`. On a cluster it has the same path on every
-            machine.
+        objects: a folder of objects with its manifest, as `write_objects` makes it. On a cluster it
+            has the same path on every machine.
         hand: from `load_hand`, with the fingers that grasp.
         folder: folder of the data set; no other run may write to it at the same time.
         spec: options of the campaign; `CampaignSpec()` by default.

@@ -69,9 +69,9 @@ class ViewNumbers:
     refused: float = 3.0
     """Greatest distance of two views, over their noise."""
     meet: float = 0.05
-    """Share of a view's points that lies on the other view, or behind it."""
+    """Least share of a view's points that must lie on the other view, or behind it."""
     gap: float = 0.03
-    """Greatest distance [m] of these points from there."""
+    """Greatest distance [m] at which a point still counts as lying there."""
 
 
 AGREEMENT = AgreementNumbers()

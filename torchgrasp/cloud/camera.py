@@ -54,6 +54,9 @@ def look_at(
 ) -> Transform:
     """Return the pose obj_from_camera (4, 4) [m] of an upright camera that looks at a target.
 
+    The camera's frame has x right, y down and z forward. The vertical is the z axis of the target's
+    frame.
+
     Args:
         azimuth: direction of the camera, from x towards y [deg].
         elevation: angle of the camera above the horizontal [deg], in [-89.9, 89.9].
@@ -102,7 +105,7 @@ def partial_view(
 
     Args:
         mesh: surface of the object, in the object frame [m].
-        camera_pose: transform obj_from_camera (4 x 4), see `look_at`.
+        camera_pose: pose obj_from_camera (4, 4) [m] of the camera, as `look_at` returns it.
         n: number of pixels drawn at random; if there are fewer pixels, all are returned.
         noise: True for the default noise, False for exact depths, the name of a camera, or a
             `SensorNoise`.
@@ -123,11 +126,12 @@ def partial_view(
 
 
 def cast_mesh(mesh: "trimesh.Trimesh", obj_from_camera: Transform) -> tuple[Image, Image]:
-    """Return the exact depth image of a mesh [m], and the cosine of the angle of incidence.
+    """Return a mesh's exact depth image [m] in the default camera, and the cosine of the angle of
+    incidence.
 
-    Both images are (h, w), and 0 where a ray misses. The cosine is the absolute one between ray and
-    face normal. The mesh is in metres, and the pose (4, 4) [m] leads from the default camera's
-    frame to the mesh's.
+    Both images are (`HEIGHT`, `WIDTH`), and 0 where a ray misses. The cosine is the absolute one
+    between ray and face normal. The mesh is in metres. The pose (4, 4) [m] leads from the camera's
+    frame (x right, y down, z forward) to the mesh's.
     """
     if not len(mesh.faces):
         raise MeshError("mesh", "no faces", "a mesh with a surface")
@@ -190,7 +194,8 @@ def render_depth(
     Depth is 0 where nothing was measured. A pixel's true label is 0 for the table or nothing, k for
     mesh k - 1. The meshes [m] and the pose obj_from_camera (4, 4) [m] are in one frame. The table
     is a disc of radius 0.6 m about the origin at the height `table` [m]; None means no table.
-    `noise` and `seed` are those of `partial_view`.
+    `noise` is True for the default noise, False for exact depths, the name of a camera, or a
+    `SensorNoise`. `seed` draws the noise.
     """
     pose = check_rigid("camera_pose", camera_pose).double()
     depth = torch.full((HEIGHT, WIDTH), torch.inf, dtype=torch.float64)

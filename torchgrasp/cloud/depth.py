@@ -146,7 +146,8 @@ def read_depth(
     """Check the arguments of `cloud_from_depth`; return depth, intrinsics and mask.
 
     The depth (h, w) is in metres, 0 where nothing was measured; the intrinsics (3, 3) are in
-    pixels; the mask (h, w) is None without a mask. Raises `BadArgument` as `cloud_from_depth`.
+    pixels; the mask (h, w) is None without a mask. Raises `BadArgument` for what `cloud_from_depth`
+    refuses.
     """
     k, stated, scale = parse_intrinsics(intrinsics)
     image = as_tensor("depth", depth)

@@ -69,7 +69,9 @@ class PoseNumbers:
     tilt: float = 3.0
     """Greatest tilt of a table [deg] that needs no explanation."""
     level: float = 5.0
-    """A table this near to level [deg], or at a third of its tilt, explains another pose."""
+    """Another pose is suggested if with it the table tilts by less than this [deg]. It must also
+    tilt less than a third as much as now.
+    """
     sloped: float = 15.0
     """A table tilted by less than this [deg], or as far from upside down, may be a slope."""
     drawn: int = 20_000
@@ -77,11 +79,12 @@ class PoseNumbers:
     on_table: float = 0.03
     """Points on the table are within this distance of it [m]."""
     seen: float = 0.001
-    """Least share of all points that lie on a given table if the camera saw it."""
+    """Share of all points on a given table from which the camera counts as having seen it."""
     lowest: float = 0.01
     """Share of the points that may be lower than all of the objects."""
     above: float = 0.5
-    """A table is farther than this [m] below all points only by a wrong pose."""
+    """A given table without points on it is wrong if it is farther than this [m] below all points.
+    """
 
 
 @dataclasses.dataclass(frozen=True)
@@ -158,7 +161,7 @@ def _describe_fault(pose: Transform) -> str:
 
 
 def read_camera_pose(pose: Tensor | np.ndarray) -> Transform:
-    """Return the pose (4, 4) [m] of a camera in float64.
+    """Return the pose obj_from_camera (4, 4) [m] of a camera in float64, after checks.
 
     Raises `BadArgument` for a pose that is not rigid, or more than 100 m from the origin.
     """

@@ -103,10 +103,10 @@ def _normalised_points(shape: ShapeGP, contacts: Contacts) -> Vectors:
 
 
 def line_posterior(shape: ShapeGP, contacts: Contacts) -> LinePosterior:
-    """Return the posterior of the surface along each contact's normal line.
+    """Return the joint Gaussian of signed distance and gradient on the normal line of each contact.
 
-    The contacts are in metres, the result in normalised units of the shape. Raises the errors of
-    `closure_probability`.
+    The contacts [m] are in the frame of the cloud, the result is in normalised units of the shape.
+    Raises the errors of `closure_probability`.
     """
     f = check_contacts(contacts).fingertips
     for name, value in (("points", contacts.points), ("normals", contacts.normals)):

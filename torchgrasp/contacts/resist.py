@@ -63,7 +63,7 @@ def resist_loads(
         normals: outward unit normals (b, f, 3).
         strength: greatest normal force [N] of each contact.
         loads: forces [N], then torques [N m] about the origin of the points' frame.
-        spec: its planned friction and edges define the friction cones, as in `certify`.
+        spec: its `planned_friction` and `edges` define the friction cones.
     """
     count = loads.shape[1]
     centre, radius = centre_and_radius(points)

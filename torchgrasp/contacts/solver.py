@@ -90,7 +90,7 @@ class State(Batch):
 
 @dataclasses.dataclass(frozen=True)
 class LinearConstraints(Linearisation):
-    """The linearised constraints of a contact sets.
+    """The linearised constraints of contact sets, a in number.
 
     `residual` holds r constraints times their `weight` (no unit; `Constraints` gives the units of
     the values). `jacobian` holds the derivatives of the constraints, without weights, by the u

@@ -167,11 +167,12 @@ def survey(
 
 
 def draw_in(shape: ShapeLike, points: Vectors) -> Vectors:
-    """Return initial guesses, of which those far from the surface are moved close to the centroid
-    of their contacts.
+    """Return contact sets as initial guesses; sets with a point far from the surface are moved to
+    the origin.
 
-    `points` (b, f, 3) are normalised. Points projected from near the centroid spread over the
-    surface around it. Points from afar all end on the nearest surface.
+    `points` (b, f, 3) are normalised. A set that is moved has its centroid at the origin, and is
+    shrunk to a radius of `NEAR_CENTRE`. Projected from there, its points spread over the surface;
+    from afar all would end on the nearest surface.
     """
     distance, _ = shape.mean_and_gradient(points.flatten(0, 1))
     far = distance.view(points.shape[:2]).abs().amax(-1) > FAR

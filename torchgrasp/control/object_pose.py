@@ -174,7 +174,7 @@ class Touches:
 
     def add(self, observation: Observation, palm: Float[Tensor, "3"]) -> None:
         """Add one observation to the averages; `palm` (3,) [m] is the palm's displacement from its
-        planned pose.
+        planned pose, in the planned hand's frame.
         """
         sensed = observation.tactile
         if bool(sensed.contact.any()):
@@ -234,7 +234,8 @@ class Localization:
 
     @property
     def displacement(self) -> Float[Tensor, "6"]:
-        """Best displacement (6,) of the object so far, in the frame of the planned hand.
+        """The most probable of the displacements (6,) tried so far, in the frame of the planned
+        hand.
 
         First comes the translation [m] of the planned contacts' centroid, then the rotation vector
         [rad] about this centroid.

@@ -70,7 +70,7 @@ def feel_torques(
     Args:
         tactile: the state at the last tick.
         reference: the closing plan; its normals give the direction in which a finger presses.
-        jacobian: Jacobian of the fingertips by all joints [m/rad], as in `Observation`.
+        jacobian: Jacobian [m/rad] of the centres of the fingertips by all joints of the URDF.
         torques: torques of all joints [N m] that contacts cause, without those of weight, friction
             and acceleration.
         period: time since the last readings [s].

@@ -108,7 +108,8 @@ def as_scene(value: Any) -> Scene:
 
 @_named
 def as_seen(value: Any) -> PointCloud | Scene:
-    """Return a `Scene`, given a scene or the path of one; else a `PointCloud`, as `as_cloud`.
+    """Return a `Scene`, given a scene or the path of one; else the `PointCloud` that `as_cloud`
+    makes of the value.
 
     Raises `BadArgument` for anything else.
     """

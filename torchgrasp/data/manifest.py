@@ -217,8 +217,8 @@ def read_view(objects: Path | str, name: str, view: str, camera: bool = True) ->
     """Return the point cloud [m] of a noisy view without normals, with the camera's position.
 
     It is in the frame of the object, which rests at z = 0. With `camera` False the camera is left
-    out. The view `WHOLE` has normals and no camera. Raises `DatasetError` as `read_entry` and for
-    an unknown view, and `CloudFileError` for a bad file.
+    out. The view `WHOLE` has normals and no camera. Raises `DatasetError` for a bad or missing
+    entry, or an unknown view, and `CloudFileError` for a bad file.
 
     >>> import tempfile, trimesh
     >>> folder = Path(tempfile.mkdtemp())

@@ -70,7 +70,7 @@ class Records(Value):
     """The results of several jobs (one view of one object each), one after the other.
 
     Lengths are in metres, in the object's frame. There are p points and g grasps of j jobs, and d
-    trials of each grasp.
+    trials of each grasp. `Shard.rows` says how many points and grasps each job has.
 
     Attributes:
         points: points [m] of the clouds of all jobs.

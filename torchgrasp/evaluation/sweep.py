@@ -53,7 +53,7 @@ def evaluate(
     workers, `MissingExtra` is raised.
 
     Args:
-        objects: a folder as in `torchgrasp.data`.
+        objects: a folder of objects with its manifest, as `write_objects` makes it.
         hand: the hand that grasps.
         protocol: a protocol or its name in `PROTOCOLS`.
         spec: which views and grasps are tried; `EvaluationSpec()` by default.

@@ -65,7 +65,8 @@ class EvaluationSpec(Value):
         planned: use the grasps that an earlier call saved, instead of planning.
         seed: random seed.
         views: largest number of views of each object; None means all views.
-        fingers: as in `plan_grasps`; by default the hand's own fingers.
+        fingers: the fingers that grasp (`load_hand`), by default the hand's own. "auto" takes for
+            each view those most likely to succeed.
     """
 
     grasps: Count = 20

@@ -95,8 +95,9 @@ def read_columns(
     """Return the values (g,) [rad or m] of each joint of our hand by name, given the file's `table`
     (g, columns).
 
-    Tells which values are not read, and which joints bend backward in every grasp. Raises the error
-    of `refuse` for joints beyond their limits that fit with the other sign.
+    A `GraspFileWarning` names the values that are not read, and the joints that bend backward in
+    every grasp. Raises the error of `refuse` for joints beyond their limits that fit with the other
+    sign.
     """
     unread = list[str]()
     turned = dict[str, str]()  # what was found, by JOINT:-1
@@ -158,9 +159,9 @@ def read_posture(
     """Return the actuated joints [rad] of the hand on the CPU, given the file's `values` (g,) of
     its joints by name.
 
-    The fingertips are compared with those of all the file's values. Raises the error of `refuse` if
-    one is more than 0.1 mm off, and names the joint. Values of other fingers that we do not keep
-    are told. `what` names the posture.
+    All values together must put each fingertip where the actuated joints alone put it, to 0.1 mm.
+    Else the error of `refuse` is raised, which names the joint. A `GraspFileWarning` names joints
+    of other fingers, whose values are not kept. `what` names the posture.
     """
     joints = torch.tensor(np.stack([values[name] for name in hand.joint_names], axis=1))
     own = hand.expand_joints(joints)

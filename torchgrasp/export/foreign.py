@@ -91,8 +91,9 @@ def read_foreign(
     wrist that moves from pre-grasp to grasp stays at the grasp here. The fingers of the pre-grasp
     take up its motion, so that their tips are where the file has them.
 
-    Fingertips are compared with those of all joints in the file. A `GraspFileWarning` tells of
-    values that are not kept, and of joints that bend backward.
+    Coupled and parked joints of the file may differ from the hand's, unless a fingertip moves by
+    over 0.1 mm. A `GraspFileWarning` tells of values that are not kept, and of joints that bend
+    backward.
 
     Args:
         path: the file. Its angles are in radians.
@@ -269,7 +270,7 @@ def _at_rest(
     """Return joints [rad] of opened hands at the grasp's pose whose fingertips are where `joints`
     have them at the pose `wrist` [m] in the grasp's frame of the hand.
 
-    Where fingers do not reach, they come as near as they can, and this is told.
+    Where fingers do not reach, they come as near as they can, and a warning says so.
     """
     still = (wrist - torch.eye(4, dtype=wrist.dtype)).abs().amax((1, 2)) < POSTURE.rounding
     tips = apply(wrist, hand.fingertips(joints)[0])

@@ -54,33 +54,39 @@ class SuspiciousScale(BadArgument):
 
 
 class NoSupport(BadArgument):
-    """A scene shows no supporting plane, or more than one."""
+    """No plane is found on which the objects of a scene stand."""
 
 
 class CloudFileError(BadArgument):
-    """A point-cloud file is missing or empty, or its content does not have the format of its
-    suffix.
-    """
+    """A file of a cloud or scene is missing or empty, or its content does not fit its suffix."""
 
 
 class MeshError(BadArgument):
-    """A mesh is missing, open, or has no volume."""
+    """A mesh is missing, malformed, open or without volume, or the convex parts of a body do not
+    fit it.
+    """
 
 
 class HandFileError(BadArgument):
-    """A hand's URDF or hand.toml is missing or malformed, or refers to files outside its folder."""
+    """A URDF or hand.toml is missing, malformed or not supported, or refers to files outside its
+    folder.
+    """
 
 
 class ModelFileError(BadArgument):
-    """A safetensors file is missing or truncated, or lacks the tensors that its kind needs."""
+    """A file of stored results, such as grasps or a model, is missing, malformed, or of another
+    kind.
+    """
 
 
 class DatasetError(BadArgument):
-    """The manifest of a folder of objects is malformed, or names files outside the folder."""
+    """A folder lacks the objects or meshes asked for, or its manifest is malformed or names files
+    outside it.
+    """
 
 
 class OutputError(BadArgument):
-    """An output folder or file cannot be written."""
+    """An output folder or file cannot be written, is in use, or holds something else."""
 
 
 class MissingExtra(GraspError, ImportError):
@@ -141,7 +147,7 @@ class FailedRows(GraspError):
 
 
 class CloudWarning(UserWarning):
-    """A part of a view is ambiguous; the message says where and why."""
+    """Base class of warnings that a cloud shows its object badly; the message says how."""
 
 
 class MendedInput(UserWarning):
@@ -171,7 +177,9 @@ class Flat(CloudWarning):
 
 
 class GraspFileWarning(UserWarning):
-    """A file of grasps holds values that are not kept, or whose signs look reversed."""
+    """A file of grasps was read, but values were left out or changed, or seem to have reversed
+    signs.
+    """
 
 
 class Status(enum.IntEnum):

@@ -43,9 +43,9 @@ def run_tasks(
     Raises `NoWorkers` if no process can start.
 
     Each worker imports the module of the function. It runs the caller's script only if the function
-    is defined there. Tasks must hold no tensors, because processes would share them: see `pack`. If
-    `workers`, the number of processes, is 0, the tasks run in this process, without a limit on
-    their time.
+    is defined there. Tasks must hold no tensors, which processes would share; `pack` replaces them
+    by arrays. If `workers`, the number of processes, is 0, the tasks run in this process, without a
+    limit on their time.
     """
     return _in_order(_run(function, tasks, workers, limit))
 
@@ -53,10 +53,12 @@ def run_tasks(
 def run_as_they_end(
     function: Callable[..., Result], tasks: Iterable[Task], workers: int, limit: float
 ) -> Generator[tuple[int, Result | Status], None, None]:
-    """Run tasks like `run_tasks`; yield the index and the result of each task as soon as it ends.
+    """Run tasks in worker processes; yield the index and the result of each task as soon as it
+    ends.
 
-    `function` is called with each task's arguments. `workers` is the number of processes, and
-    `limit` [s] the longest time of a task.
+    The result is that of `function(*task)`, or a `Status` if the task took too long or its process
+    died (`run_tasks`). `workers` is the number of processes, and `limit` [s] the longest time of a
+    task.
     """
     with contextlib.closing(_run(function, tasks, workers, limit)) as results:
         for number, ended in results:

@@ -1,7 +1,8 @@
 """Levenberg-Marquardt for a batch of small problems; each problem has its own state and damping.
 
 `levenberg_marquardt` is the loop. A `Minimisation` defines the steps and which are accepted. A
-batch holds a problems of d variables each. See Nocedal and Wright, Numerical Optimization, ch. 10.
+batch holds problems of d variables each, a of which go on. See Nocedal and Wright, Numerical
+Optimization, ch. 10.
 """
 
 import abc
@@ -21,9 +22,7 @@ CHECK_EVERY = 6  # steps between two looks for ended problems on an accelerator:
 
 @dataclasses.dataclass(frozen=True)
 class Linearisation(Batch):
-    """The costs of the a problems of a batch at their current states; subclasses add the linear
-    model.
-    """
+    """The costs of a batch of problems at their current states; subclasses add the linear model."""
 
     cost: Float[Tensor, "a"]  # cost that is minimised (no unit)
 
@@ -39,7 +38,7 @@ Model = TypeVar("Model", bound=Linearisation)
 
 
 class Minimisation(abc.ABC, Generic[State, Model]):
-    """A batch of minimisation problems: it defines costs, steps, and which steps are accepted."""
+    """Base class of a batch of minimisation problems: costs, steps, and what is accepted."""
 
     first_damping: float = 1e-2  # damping of the first step (no unit)
 
@@ -51,8 +50,8 @@ class Minimisation(abc.ABC, Generic[State, Model]):
 
     @abc.abstractmethod
     def step(self, model: Model, damping: Damping) -> Steps:
-        """Return the steps that solve the damped normal equations, and a mask of the problems that
-        go on.
+        """Return the step of each problem, from its damped normal equations, and a mask of the
+        problems that go on.
 
         `model` holds the linear models of the problems, and `damping` the damping of their steps.
         """
@@ -142,12 +141,14 @@ class LinearResiduals(Linearisation):
 class LeastSquares(Minimisation[State, LinearResiduals]):
     """A batch of least-squares problems: the cost is the sum of squared residuals."""
 
-    # residuals and Jacobian, given the states and the indices of a problems
+    # function of states, and the indices of their problems: their residuals and Jacobians
     residuals: Callable[[State, Int[Tensor, "a"]], Residuals]
-    moved: Callable[[State, Float[Tensor, "a d"]], State]  # states after steps, given both
+    # function of states and their steps (a, d): the states after the steps
+    moved: Callable[[State, Float[Tensor, "a d"]], State]
     solved: float = SOLVED  # sum of squared residuals below which a problem is solved
     largest: float = 0.3  # largest change of a variable in one step, in its own unit
-    floor: float = 1e-3  # absolute damping, for a variable that changes no residual
+    # damping that is added for every variable, as one may change no residual
+    floor: float = 1e-3
     fall: float = 3.0  # divisor of the damping after an accepted step
     rise: float = 4.0  # factor on the damping after a refused step
     least: float = 1e-6  # least damping

@@ -118,7 +118,8 @@ class SupportPlane:
 def find_table(
     points: Points, viewpoint: Vector, table: Plane | float | None, up: object
 ) -> tuple[SupportPlane, ...]:
-    """Return the support on a given table, or all supports found in the points, best first.
+    """Return the support on a given table, or all supports found in the points, the most plausible
+    first.
 
     Args:
         points: (n, 3) [m].

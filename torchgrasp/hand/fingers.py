@@ -59,7 +59,7 @@ class ActuatedJoints(Value):
         """Check the actuated `joints` [rad or m], and return the positions of all movable joints of
         the URDF.
 
-        Raises `BadArgument` as `check` does.
+        Raises `BadArgument` for what `check` refuses.
         """
         self.check(joints)
         return self.couple(joints)

@@ -107,8 +107,8 @@ class Hand(Value):
         return self.source.urdf_path
 
     def to(self, *args: Any, **kwargs: Any) -> "Hand":
-        """Return the hand, with its chain, on another device or in another floating dtype; see
-        `Value.to`.
+        """Return the hand, with its chain, on another device or in another floating dtype, with the
+        arguments of `torch.Tensor.to`.
 
         A hand that is there already is returned itself, without a copy of its chain.
         """

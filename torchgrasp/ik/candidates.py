@@ -112,7 +112,9 @@ class GraspProblem(Value):
 
     @checked
     def drop_unreachable(self, seeds: IKSeeds) -> IKSeeds:
-        """Return the initial guesses (`seeds`) whose hand poses the arm can reach."""
+        """Return those of the initial guesses `seeds` whose hand poses the function `reachable`
+        accepts.
+        """
         return (
             seeds
             if self.reachable is None
@@ -246,7 +248,8 @@ def check_candidates(
     """Return a grasp for each candidate, with pre-grasp, approach and the `Status` of the first
     check that it fails.
 
-    `rolling` and `tolerance` [m] are as in `measure_errors`.
+    With `rolling`, round fingertips may roll on their contacts (`measure_errors`). `tolerance` [m]
+    is the largest allowed distance of a tip from its contact.
     """
     hand = problem.hand
     world = problem.world

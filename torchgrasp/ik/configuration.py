@@ -115,8 +115,11 @@ class SpatialJacobian(Value):
     def jacobian(
         self, wrench: Float[Tensor, "g k 6"], moves: Float[Tensor, "*g k q"]
     ) -> Float[Tensor, "g k d"]:
-        """Return the derivatives of k residuals by the hand's pose (6) and joints; both arguments
-        are as in `ResidualRows`.
+        """Return the derivatives of k residuals by the d = 6 + h numbers of the hand's pose and
+        joints.
+
+        `wrench` and `moves` are the fields of `ResidualRows`: derivatives by a translation and a
+        rotation, and 1 for each motion that counts.
         """
         by_motion = (wrench @ self.twists.permute(2, 0, 1)) * moves
         coupling = self.hand.motion.coupling

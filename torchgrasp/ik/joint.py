@@ -108,7 +108,8 @@ class JointState(Batch):
         """Return the state after a `step`: changes of hand pose (6), joints, contact points and
         tensions, in this order.
 
-        The pose and the joints change as in `Configuration.integrate`; the points are normalised.
+        The step of the pose is a translation [m] and a rotation vector [rad] in the hand's axes.
+        The points are normalised.
         """
         by_hand, by_points, by_tension = step.split(
             [6 + hand.dof, self.points[0].numel(), self.tension.shape[1]], 1

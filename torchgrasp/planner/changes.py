@@ -70,7 +70,7 @@ def _with(request: Request, **fields: Any) -> Request:
 def list_changes(request: Request) -> list[Change]:
     """Return all changes of a request, each of one setting, that could give grasps.
 
-    A change to more initial guesses is not among them: see `more_starts`.
+    A change to more initial guesses, which `more_starts` makes, is not among them.
     """
     kinds = (_regions, _surroundings, _fingers, _limits, _friction, _hands)
     return [change for kind in kinds for change in kind(request)]

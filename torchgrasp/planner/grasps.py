@@ -125,13 +125,14 @@ def plan_grasps(
         keep, avoid: a `Region` in which all contacts lie, and one in which none lies; or a function
             of points (n, 3) [m] that returns their signed distance [m], negative inside. Contacts
             lie on the estimated surface.
-        resist: what contacts must resist, see `Resist`: "lift", "pour", "push", several of them, or
+        resist: what contacts must resist: "lift", "pour", "push", several of them (`Resist`), or
             `TaskWrenches`. Forces are in the planned friction cones, and of the hand's strength.
             `Grasps.certificate` has the proof; grasps that resist less than all have the status
             `NOT_RESISTED`.
-        mode: see `Mode`; all modes but "joint" need the hand's learned model, and three fingers.
-        ranking: criterion by which grasps are ordered, see `Ranking`; by default "success", in mode
-            "paper" "variance".
+        mode: how contacts become grasps: "joint", "contact_first" or "paper" (`Mode`). All but
+            "joint" need the hand's learned model, and three fingers.
+        ranking: what puts a grasp first: the greatest predicted "success", or the least "variance"
+            of the surface at its contacts. The default is "success", in mode "paper" "variance".
         time_budget: wall time [s] after which no batch begins; `meta["starts"]` is the number of
             planned guesses.
         shape: the object's shape if it is known better than the cloud shows, as after a touch

@@ -233,7 +233,8 @@ class Objects:
         """Return the same single object for another request, hand or contact constraints.
 
         `spec` holds constraints in the caller's frame, by default those of the request. `postures`
-        and `descends` are as in `pose`.
+        is the size of the posture library, None the default. `descends` is whether the hand may
+        move down while it closes.
         """
         (object_,) = self.each
         return pose(object_, request, hand, self.model, spec, postures, descends)

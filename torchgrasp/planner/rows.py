@@ -165,7 +165,8 @@ class Candidates:
         )
 
     def best(self, rows: Int[Tensor, "k"]) -> Grasps:
-        """Return the best grasp of each of k contact sets, given their indices `rows`.
+        """Return the best grasp so far of each of the k contact sets with the indices `rows`, in
+        their order.
 
         Every one of these sets must have been tried.
         """
@@ -238,8 +239,8 @@ def find_candidates(
     Of the successful sets of each object, at most `most` are chosen, which lie far apart. In mode
     "paper" with ranking "variance" all are chosen, the most certain first. Chosen sets without
     force closure are left out. If there are loads, a set that not even the greatest finger forces
-    resist gets the status `NOT_RESISTED` in the plan, and is not chosen. The costs are 0: see
-    `with_costs`.
+    resist gets the status `NOT_RESISTED` in the plan, and is not chosen. The costs are 0 until
+    `with_costs` sets them.
 
     Args:
         objects: the objects of the plan.

@@ -110,8 +110,8 @@ def plan_scene(
         seed: random seed.
         enough: predicted success of a grasp, in [0, 1], at which the remaining objects are not
             planned.
-        fingers: as in `plan_grasps`; "auto" chooses for each object, and `hand_of` loads the hand
-            of its grasps.
+        fingers: the fingers that grasp; "auto" chooses for each object, and `hand_of` loads the
+            hand of its grasps.
         task, promise, reachable, arm, keep, avoid, resist: as in `plan_grasps`.
 
     >>> from torchgrasp import load_hand, load_scene

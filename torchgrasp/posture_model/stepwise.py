@@ -32,7 +32,7 @@ rows, the likeliest fit is often not the likeliest on all rows.
 
 @dataclasses.dataclass(frozen=True)
 class Subsets:
-    """Nested random subsets of the rows of all processes.
+    """Nested random subsets of the data rows of all processes together.
 
     `sizes` are the numbers of rows. The last is the number of all rows, every other is half of the
     next, rounded down. What a subset contains does not depend on the number of processes.
@@ -45,9 +45,10 @@ class Subsets:
 
     @staticmethod
     def of(shard: DataRows, smallest: int | None, seed: int) -> "Subsets":
-        """Draw nested subsets of at least `smallest` rows.
+        """Draw nested random subsets, of at least `smallest` rows, from the rows of all processes.
 
-        None, or more than half of the rows, gives only the set of all rows.
+        If `smallest` is None, or more than half of all rows, the only subset is that of all rows.
+        `shard` holds the rows of this process, and `seed` draws the subsets.
         """
         n = shard.count()
         least = n if smallest is None else smallest

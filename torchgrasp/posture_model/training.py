@@ -153,8 +153,8 @@ def fit_mixture(
     and the Bayesian information criterion (BIC). Codes are exact functions of the joints, so the
     BIC keeps falling with more components: use its elbow, not its minimum. Raises `BadArgument` for
     too few samples, a joint that does not vary, a number out of range, or another fit's checkpoint.
-    A checkpoint that is damaged or cannot be written is a `ModelFileError` or `OutputError`. A
-    component that collapsed more than three times is an `IndefiniteCovariance`.
+    Raises `ModelFileError` for a damaged checkpoint, and `OutputError` for one that cannot be
+    written. Raises `IndefiniteCovariance` if a component collapses more than three times.
 
     Args:
         samples: joints [rad] and fingertip codes of postures of one hand.

@@ -152,7 +152,8 @@ def read_image(
     """Return a checked depth image in float64 [m].
 
     The arguments are those of `cloud_from_depth`; without a camera pose, the frame is the camera's
-    own. Raises `BadArgument` as `cloud_from_depth`, and for fewer than 30 measured pixels.
+    own. Raises `BadArgument` for what `cloud_from_depth` refuses, and for fewer than 30 measured
+    pixels.
     """
     z, k, _ = read_depth(depth, intrinsics, depth_unit=depth_unit)
     pose = (

@@ -24,20 +24,24 @@ class MaskNumbers:
     """Bounds by which given masks and labels of objects are read."""
 
     most_labels: int = 1000
-    """Most objects: more values are those of a photograph."""
+    """Most objects; an image of labels with more values is taken for a photograph, and refused."""
     least_share: float = 0.05
-    """Least share of a mask's pixels on its target; in a box drawn around an object it is a third.
+    """A mask is refused if less than this share of its measured pixels is on objects above the
+    table.
     """
     own_share: float = 0.5
-    """A segmented object belongs to a mask that has this share of the object's pixels."""
+    """A segmented object belongs to the target if at least this share of its pixels is in the mask.
+    """
     mask_share: float = 0.3
-    """A segmented object belongs to a mask if it has this share of the mask's pixels."""
+    """A segmented object also belongs to the target if it fills this share of the mask above the
+    table.
+    """
     low: float = 0.01
-    """Pixels lower than this above the support [m] lie on it."""
+    """Height [m] above the support below which a pixel counts as lying on it."""
     rim: int = 4
-    """Number of pixels by which masks are off at their rims."""
+    """Number of pixels by which the border of a given mask may be off."""
     told: float = 0.05
-    """There is a note if a larger share of a mask's pixels is removed."""
+    """Share of a mask's pixels whose removal is mentioned in a note; a smaller share is not."""
 
 
 MASKS = MaskNumbers()
@@ -205,8 +209,8 @@ def label_image(
 
     Given labels lose pixels on the table and flying pixels. Without labels the image is segmented.
     A mask becomes label 1, and loses strips of neighbouring objects, too. Pixels of the mask's
-    object just outside of the mask get label 0. A note names each mask that loses a twentieth of
-    its pixels or more. A mask that loses nearly all is a `BadArgument`.
+    object just outside of the mask get label 0. A note names each mask that loses more than a
+    twentieth of its pixels. Raises `BadArgument` for a mask that loses nearly all.
     """
     if labels is not None:
         return _trim_labels(view, labels)

@@ -34,7 +34,7 @@ class MergeNumbers:
     touching: int = 3
     """Least number of such points; of fewer, the gap is not known."""
     far: float = 0.05
-    """Parts of one object are nearer than this."""
+    """Greatest distance between parts of one object."""
     spacing: float = 0.0015
     """Distance of the points that are kept of a large piece."""
     dense: int = 3000
@@ -42,7 +42,7 @@ class MergeNumbers:
     small: int = 30
     """Pieces of fewer points are no bodies; they go to the nearest body."""
     points: int = 2000
-    """A body keeps about as many points, at most twice as many."""
+    """Most points that a body keeps; a larger one is thinned."""
     reach: float = 0.02
     """Pieces that meet at two ends are nearer than this: pixels at rims are missing."""
     end_depth: float = 0.01
@@ -88,7 +88,9 @@ class MergeNumbers:
     handle: float = 0.7
     """A floating body of a smaller size, over its neighbour's, may be a handle that is far off."""
     from_above: float = 0.2
-    """Least part in the image of the way down: below it, no edge of a piece is the lower one."""
+    """Least length, in the image, of the unit vector that points down. In a view from above no
+    piece has a lower edge.
+    """
     below: int = 4
     """Distance of the pixel that is below an edge [px]."""
     seen: float = 0.7

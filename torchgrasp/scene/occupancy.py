@@ -34,21 +34,22 @@ class OccupancyNumbers:
     spacing: float = 0.005
     """Spacing of the voxels: a third of a finger's width."""
     sideways: float = 0.25
-    """Voxels extend so far around the target's points."""
+    """Horizontal distance by which the voxels extend beyond the target's points."""
     above: float = 0.04
-    """Voxels extend so far above everything."""
+    """Height by which the voxels extend above the highest point over this area."""
     noise: float = 0.004
-    """Space farther in front of a measured depth is free: three deviations of the noise."""
+    """Space more than this in front of a measured depth is free: three deviations of the noise."""
     low: float = 0.01
     """Unlabelled pixels lower than this above the table show the table."""
     rim: int = 6
-    """Unlabelled pixels so near the target's in the image [px] may be its own: masks are off."""
+    """Distance [px] in the image within which unlabelled pixels may be the target's: masks are off.
+    """
     rim_depth: float = 0.02
-    """Unlabelled pixels so near the target's in depth may be its own."""
+    """Difference of depth within which such pixels are the target's."""
     flying: int = 20
-    """Groups of fewer unlabelled pixels are flying pixels, and no object."""
+    """Least number of connected unlabelled pixels of an object; fewer are flying pixels."""
     gap: int = 8
-    """Pixels without depth so near measured ones [px] are filled: rims and dropouts."""
+    """Distance [px] from measured pixels within which pixels without depth are filled."""
     first: float = 0.02
     """Quantile of an object's points at which its extent begins."""
     last: float = 0.98
@@ -239,8 +240,9 @@ def load_occupancy_model() -> dict[str, Any]:
     """Return the model of each kind of space, by name: "target", "thing" and "unseen".
 
     These are the spaces behind the target, behind another object, and where nothing was measured. A
-    model is a dict: its log-odds are "bias" plus, for each feature, a function that is linear
-    between the "knots", where it has the "values".
+    model is a dict: "bias" is a number, "knots" and "values" hold one list for each feature. The
+    log-odds are "bias" plus one function of each feature, linear between its knots, where it has
+    its values.
     """
     return json.loads(MODEL.read_text("utf-8"))
 

@@ -36,15 +36,15 @@ class SegmentNumbers:
     rounds: int = 12
     """Most rounds in which objects grow into pixels at jumps."""
     few: int = 6
-    """Pieces and holes with fewer pixels are noise, in an image of any size."""
+    """Least number of pixels of a piece or hole that is not noise, in an image of any size."""
     overhang: float = 0.05
     """An object extends this far [m] beyond the visible region of its support, at most."""
     high: float = 0.005
-    """A tenth of an object's pixels are as high as this [m]; an uneven table is not."""
+    """Height [m] from which a pixel counts as high; an uneven table has few such pixels."""
     high_deviations: float = 4.0
-    """A tenth of an object's pixels are higher than so many deviations of the noise."""
+    """A high pixel is also higher than this many deviations of the table's noise."""
     high_share: float = 0.1
-    """Share of an object's pixels that must be high."""
+    """Least share of high pixels among those of an object."""
     over: float = 0.2
     """Least share of an object's pixels over the visible region of its support."""
     vast: float = 0.2
@@ -58,15 +58,15 @@ class SegmentNumbers:
     small: int = 500
     """Objects with fewer pixels may be noise, or a fringe of a large object."""
     uneven: float = 8.0
-    """A small object is higher than so many deviations of the noise."""
+    """Height, in deviations of the table's noise, that pixels of a small object must exceed."""
     uneven_share: float = 0.25
-    """Share of a small object's pixels that must be so high."""
+    """Least share of a small object's pixels that exceed this height; else it is noise."""
     margin: int = 4
     """Distance from a small object at which a large one is sought [px]."""
     fringe: float = 0.005
     """Largest half width of a fringe [m]."""
     larger: int = 10
-    """An object with a fringe has so many times the pixels of the fringe."""
+    """Least ratio of the number of pixels of an object to that of its fringe."""
 
 
 SEGMENT = SegmentNumbers()

@@ -114,7 +114,8 @@ def select_points(
         known: observations that are given.
         kernel: kernel of the posterior.
         budget: largest number of chosen candidates.
-        criterion: what is greatest at the most informative candidate, as in `fit_shape`.
+        criterion: what is greatest at the most informative candidate: "variance", "error" or "both"
+            (`fit_shape`).
         stop: the selection ends when no candidate's variance (squared normalised units) exceeds it.
 
     Each choice appends four rows to the Cholesky factor.

@@ -115,7 +115,7 @@ def fit_shape(
         BadArgument: an argument out of range; a table above the object's foot; a cloud that
             `prepare_cloud` refuses; a view that is not wholly in front of its camera; for "camera"
             a whole surface without normals.
-        TooFewPoints: too few points are left; see `prepare_cloud`.
+        TooFewPoints: fewer than 4 distinct points, or fewer than 10 of one of several views.
         IndefiniteCovariance: `psi_scale` is too small, or the kernel too long for the noise.
 
     >>> from torchgrasp.geometry.linalg import unit
@@ -267,7 +267,7 @@ def condition(
         psi_scale: ratio of the kernel's length psi to the longest distance between observed points;
             the paper's value 1 makes the covariance indefinite.
         std_factor: ratio of the surface's true deviations to the posterior's standard deviations.
-        kernel: a name (see `kernel_by_name`), or any `Kernel` of normalised distances.
+        kernel: a name that `kernel_by_name` takes, or any `Kernel` of normalised distances.
 
     >>> x = torch.cat([torch.eye(3), -torch.eye(3)]).double() / 2
     >>> noise = torch.full((6,), 0.01).double()

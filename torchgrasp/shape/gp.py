@@ -46,8 +46,8 @@ DOMAIN = DomainNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class ShapeGP(Posterior, Normalisation):
-    """The posterior of an object's signed distance function, Eq. (1) of the paper, given
-    observations; see `fit_shape`.
+    """The posterior of an object's signed distance function, Eq. (1) of the paper, as `fit_shape`
+    returns it.
 
     All methods but `update` are differentiable in the points to any order, and twice at observed
     points, where the thin plate's normals have one derivative only. `update` refuses points that

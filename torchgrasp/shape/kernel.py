@@ -172,7 +172,7 @@ def thin_plate(
 
 @checked
 def thin_plate_kernel(psi: Positive, closed_form: bool = True) -> Kernel:
-    """Return the thin plate kernel of the length `psi`, normalised.
+    """Return the thin plate kernel 2 r^3 - 3 psi r^2 + psi^3, with the normalised length `psi`.
 
     Its derivatives are in closed form, or by autograd of the profile if `closed_form` is False.
 
@@ -195,7 +195,7 @@ def differentiate_thin_plate(
 ) -> tuple[Tensor, ...]:
     """Return the first `count` (1 to 4) of k and its derivatives by r^2 / 2, in closed form.
 
-    The kernel is the thin plate of the length `psi`, and `r` are normalised distances.
+    The kernel is `thin_plate`; its length `psi` and the distances `r` are normalised.
     """
     k = (2.0 * r).sub_(3.0 * psi).mul_(r).mul_(r).add_(psi**3)
     values = [k, (6 * r).sub_(6 * psi)]
@@ -257,7 +257,7 @@ def rbf_kernel(length: Positive, variance: Positive = 1.0) -> Kernel:
 
 @checked
 def kernel_by_name(name: KernelName, psi: Positive) -> Kernel:
-    """Return a kernel by its name, with the length set by `psi`, normalised.
+    """Return a kernel by its name; its length follows from `psi`, a normalised length.
 
     All have the prior variance psi^3 of the distance and 6 psi of a gradient component.
     """

@@ -91,8 +91,8 @@ class SceneSpec:
         parts: convex bodies [m] that make up the object.
         mass: mass of the object [kg].
         friction: friction coefficient of every contact.
-        table_friction: friction coefficient of bodies with the table and each other; by default
-            `friction`.
+        table_friction: friction coefficient of objects with the table and with each other; by
+            default `friction`.
         gravity: gravity [m/s^2].
         timestep: timestep of the simulator [s].
         travel: largest height [m] of a lift.
@@ -105,8 +105,9 @@ class SceneSpec:
         self_pairs: pairs of the hand's links that collide with each other.
         yields: largest displacement [m] of the mount along each axis of the world; 0 if the mount
             is stiff.
-        start: displacement [m] of a mount that yields at the beginning.
-        mount: the prismatic joints of the mount, instead of those that lift, approach and yield.
+        start: initial displacement [m] of the mount along each axis of the world, if it yields.
+        mount: all prismatic joints of the mount; None means those that `travel`, `approach` and
+            `yields` need.
     """
 
     urdf_path: Path | str
@@ -166,7 +167,7 @@ class SceneSpec:
 
     @property
     def body_friction(self) -> float:
-        """The friction coefficient of bodies with the table and each other."""
+        """The friction coefficient of objects with the table and with each other."""
         return self.friction if self.table_friction is None else self.table_friction
 
     @property

@@ -29,7 +29,8 @@ class GraspTask(Value):
         lift: whether the object is lifted off its table. Otherwise it floats, and is pulled along
             six directions with a force of 10 m/s^2 times its mass. None means a lift if the planner
             knows the table, but not in open loop.
-        closing: how the hand closes, see `TrialSpec`.
+        closing: how the hand closes: by touch ("uncertainty"), or without sensors, from pre-grasp
+            to grasp to squeeze ("open_loop").
         displaced: whether the object may be elsewhere: up to 30 mm along the table, or 5 mm and 5
             degrees if it floats.
 
@@ -136,7 +137,7 @@ def loads_of(
     frame's origin.
 
     Args:
-        resist: the task, see `Resist`.
+        resist: the loads: "lift", "pour" or "push", several of these names, or `TaskWrenches`.
         mass: mass of the object [kg].
         center: estimated centre of the object [m] in the upright frame.
         upright_from_obj: transform from the cloud's frame, in which `TaskWrenches` are, to the

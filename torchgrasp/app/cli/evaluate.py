@@ -144,7 +144,8 @@ class Evaluate(_Trials):
     workers: int = option(1, "processes; the results do not depend on their number")
 
     def disturbed(self, test: evaluation.Protocol) -> evaluation.Protocol:
-        """Return the protocol `test` with the displacements, pushes and draws that the user set.
+        """Return the protocol `test` with the displacement, push, second look and number of trials
+        that the user set.
 
         Raises `BadArgument` for --displaced with a protocol that does not lift.
         """

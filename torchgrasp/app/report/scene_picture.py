@@ -100,7 +100,7 @@ def draw_scene(scene: Scene, path: Path | str) -> Path:
 
 
 def encode_scene(scene: Scene) -> bytes:
-    """Return the bytes of the picture of a scene as PNG, as `draw_scene` writes it."""
+    """Return the bytes of the PNG picture of a scene that `draw_scene` writes."""
     kinds, labels = sort_pixels(scene)
     h, w = labels.shape
     palette = np.stack([rgb(color) for color in (*KINDS.values(), *OBJECTS)])

@@ -241,10 +241,10 @@ def _grasps(hand: Hand, grasps: Grasps) -> dict[str, object]:
 
 
 def pose_postures(hand: Hand, grasps: Grasps) -> Float[Tensor, "g p l 4 4"]:
-    """Return the poses obj_from_link [m] of all l links, in each of the p `POSTURES` of g grasps.
+    """Return the poses obj_from_link [m] of all links, in each of the four `POSTURES` of g grasps.
 
-    The result has the shape (grasps, postures, links, 4, 4); links are in the order of
-    `hand.tree.link_names`.
+    The postures are, in order, "approach", "pre-grasp", "grasp" and "squeeze". The links are in the
+    order of `hand.tree.link_names`.
     """
     pose = grasps.obj_from_hand.double()
     opened = grasps.pregrasp.double()
