@@ -7,6 +7,7 @@ from torchgrasp.evaluation.pull import PullResult, pull_grasp
 from torchgrasp.evaluation.regrasp import LiftTry, lift_grasps
 from torchgrasp.evaluation.sweep import evaluate
 from torchgrasp.evaluation.summary import ProtocolResult, ViewScore, summarise
+from torchgrasp.evaluation.touch import Touch, measure_touch
 from torchgrasp.evaluation.trial import GraspTrial, Truth
 from torchgrasp.evaluation.views import EvaluationSpec
 
@@ -24,11 +25,13 @@ __all__ = [
     "PullResult",
     "PullSpec",
     "Share",
+    "Touch",
     "Truth",
     "ViewScore",
     "evaluate",
     "find_protocol",
     "lift_grasps",
+    "measure_touch",
     "pull_grasp",
     "summarise",
 ]

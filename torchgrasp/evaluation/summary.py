@@ -54,6 +54,10 @@ class ProtocolResult(Value):
             last grasp.
         cause: why the object of a lift was not held, a name in `CAUSES`, or "".
         size: size of the cause, in the cause's unit.
+        gap_mm: largest gap between a fingertip and the object at the planned posture, before any
+            force and without an error of the pose [mm].
+        deepest_mm: smallest such gap, negative if the fingertip penetrates the object [mm].
+        touch: whether the fingertips then touch, a `Verdict`, or "" if unknown.
     """
 
     rank: int
@@ -71,6 +75,9 @@ class ProtocolResult(Value):
     tries: Count = 1
     cause: str = ""
     size: Measured = math.nan
+    gap_mm: Measured = math.nan
+    deepest_mm: Measured = math.nan
+    touch: str = ""
 
     @property
     def held(self) -> bool:
@@ -133,6 +140,8 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
     * "fingers": counts of views by the grasping fingers.
     * "force_n", "overlap_mm", "plan_cpu_s", "trial_cpu_s": means. "cpu_s": total.
     * "slip_mm", "slip_deg": median and 95 % quantile over the held grasps.
+    * "gap_mm": median and 95 % quantile of the largest gaps before any force. "touch": counts of
+      the verdicts on them (`measure_touch`).
     * "success": calibration of the predictions (`judge`), or None.
 
     >>> held = ProtocolResult(0, 0, True, Status.OK, predicted=0.9)
@@ -172,6 +181,8 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
         ),
         "slip_mm": _quantiles(1e3 * a.slip for a in attempts if a.passed),
         "slip_deg": _quantiles(math.degrees(a.slip_angle) for a in attempts if a.passed),
+        "gap_mm": _quantiles(a.gap_mm for a in attempts),
+        "touch": dict(Counter(a.touch for a in attempts if a.touch).most_common()),
         "plan_cpu_s": _mean(score.seconds for score in scores),
         "trial_cpu_s": _mean(a.seconds for a in attempts),
         "cpu_s": sum(x for x in spent if not math.isnan(x)),

@@ -23,6 +23,7 @@ from torchgrasp.data.shards import load_grasps
 from torchgrasp.evaluation.protocols import Protocol, draw_error, draw_slide, seed_of
 from torchgrasp.evaluation.pull import run_protocol
 from torchgrasp.evaluation.summary import ProtocolResult, ViewScore
+from torchgrasp.evaluation.touch import measure_touch
 from torchgrasp.evaluation.trial import GraspTrial, Truth
 from torchgrasp.foundation.base import Value, count_status
 from torchgrasp.foundation.checks import checked
@@ -256,7 +257,14 @@ def try_grasp(
     truth = Truth(mesh, parts, error, slide=slide, camera=camera)
     attempt = GraspTrial(hand, grasp, truth, seed_of(seed, "touch"), surface=surface)
     found = run_protocol(attempt, protocol, *at)
-    return dataclasses.replace(found, predicted=float(grasp.success[0]))
+    touch = measure_touch(hand, grasp[0], mesh)
+    return dataclasses.replace(
+        found,
+        predicted=float(grasp.success[0]),
+        gap_mm=1000 * float(touch.largest),
+        deepest_mm=1000 * float(touch.deepest),
+        touch=touch.verdicts[0],
+    )
 
 
 def _camera_of(cloud: PointCloud) -> Float[Tensor, "4 4"]:

@@ -237,6 +237,11 @@ def print_score(score: ViewScore, widths: tuple[int, int] = NAME_WIDTHS) -> None
         f"{failed.count(status)} {status.name.lower()}" for status in dict.fromkeys(failed)
     )
     reasons = reasons if score.attempts else score.note or score.refusal.sentence
+    verdicts = [attempt.touch for attempt in score.attempts if attempt.touch]
+    if verdicts:
+        most = max(attempt.gap_mm for attempt in score.attempts if attempt.touch)
+        touching = f"{verdicts.count('touches')}/{len(verdicts)} touch, gap {most:.1f} mm"
+        reasons = "; ".join(filter(None, (touching, reasons)))
     passed = f"{sum(attempt.passed for attempt in score.attempts)}/{len(score.attempts)}"
     cells = (score.object, score.view, score.executable, passed, reasons)
     _print_cells(cells, widths)

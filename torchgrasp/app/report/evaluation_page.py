@@ -10,6 +10,7 @@ from torchgrasp.app.report.page import TEMPLATES, render
 from torchgrasp.evaluation.causes import CAUSES
 from torchgrasp.evaluation.intervals import Share, format_share
 from torchgrasp.evaluation.summary import ViewScore, summarise
+from torchgrasp.evaluation.touch import TOUCH
 from torchgrasp.files import write_file
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import Status
@@ -149,4 +150,8 @@ def list_figures(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         found = value if isinstance(value, tuple | list) else [value]
         texts = ["-" if x is None else format(x, style) for x in found]
         rows.append((text, ", ".join(texts)))
+    if summary["touch"]:
+        texts = [f"{n} {name}" for name, n in summary["touch"].items()]
+        limit = f"{1000 * TOUCH.limit:g} mm"
+        rows.append((f"fingertips before any force, within {limit}", ", ".join(texts)))
     return rows

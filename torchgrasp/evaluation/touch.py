@@ -1,0 +1,146 @@
+"""Whether the fingertips of a grasp touch the object at the planned posture, before any force."""
+
+import dataclasses
+from typing import Annotated, Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.cloud.neighbours import NEAR, nearest
+from torchgrasp.cloud.prepare import estimate_normals
+from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.lazy import spatial, trimesh
+from torchgrasp.foundation.rules import ANY, Length
+from torchgrasp.geometry.frames import apply
+from torchgrasp.geometry.linalg import Points, norm
+from torchgrasp.geometry.signed_distance import surface_distance
+from torchgrasp.hand.hand import Hand
+from torchgrasp.values.planning import Grasps, PointCloud
+
+Verdict = Literal["touches", "apart", "penetrates", "unseen"]
+"""Whether the fingertips of a grasp touch.
+
+* touches: each fingertip is within the limit of the surface.
+* apart: a fingertip is farther off.
+* penetrates: no fingertip is, but one is deeper in the object than the limit.
+* unseen: the cloud does not show the surface at a fingertip; all others touch.
+"""
+
+
+@dataclasses.dataclass(frozen=True)
+class TouchNumbers:
+    """Parameters of the verdict on touching fingertips."""
+
+    limit: float = 0.003
+    """Greatest gap [m] of a fingertip that touches: the usual deviation of an estimated surface."""
+    reach: float = 1.5
+    """A cloud shows the surface at a fingertip within so many spacings of its points."""
+
+
+TOUCH = TouchNumbers()
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class Touch(Value):
+    """The gaps between the f fingertips of g grasps and the object, before any force.
+
+    Attributes:
+        gaps: distances [m] of the pads from the surface; negative where a pad penetrates it, NaN
+            where a cloud does not show the surface.
+        limit: greatest distance [m] of a fingertip that touches.
+    """
+
+    gaps: Annotated[Float[Tensor, "g f"], ANY]
+    limit: Length = TOUCH.limit
+
+    @property
+    def largest(self) -> Float[Tensor, "g"]:
+        """The largest gap of each grasp [m]; NaN if none is known."""
+        return _known(self.gaps.nan_to_num(-torch.inf).amax(-1))
+
+    @property
+    def deepest(self) -> Float[Tensor, "g"]:
+        """The smallest gap of each grasp [m], negative if a pad penetrates; NaN if none is known."""
+        return _known(self.gaps.nan_to_num(torch.inf).amin(-1))
+
+    @property
+    def verdicts(self) -> list[Verdict]:
+        """The verdict on each grasp."""
+        verdicts = list[Verdict]()
+        for gaps in self.gaps:
+            verdict: Verdict = "touches"
+            if bool((gaps > self.limit).any()):
+                verdict = "apart"
+            elif bool((gaps < -self.limit).any()):
+                verdict = "penetrates"
+            elif bool(gaps.isnan().any()):
+                verdict = "unseen"
+            verdicts.append(verdict)
+        return verdicts
+
+
+def _known(extremes: Float[Tensor, "g"]) -> Float[Tensor, "g"]:
+    """Return the extremes of gaps [m], NaN where no gap was known."""
+    return torch.where(extremes.isinf(), torch.nan, extremes)
+
+
+@checked
+def measure_touch(
+    hand: Hand,
+    grasps: Grasps,
+    surface: "trimesh.Trimesh | PointCloud",
+    limit: Length = TOUCH.limit,
+) -> Touch:
+    """Return the gaps between fingertips and an object at the posture of each grasp.
+
+    A gap is the signed distance of the sphere of a pad, or of the contact point of a pad without a
+    sphere, from the surface. Forces, and errors of the pose, are not considered. In a cloud with a
+    viewpoint, what lies behind the seen surface is unknown.
+
+    Args:
+        hand: the hand of the grasps.
+        grasps: g grasps; only `joints` and `obj_from_hand` are used.
+        surface: the object's mesh [m] with faces turned outward, or its cloud [m], in the frame of
+            the grasps.
+        limit: greatest gap [m] of a fingertip that touches.
+
+    Raises `BadArgument` for joints of another hand, and a cloud without normals on which none can
+    be estimated.
+
+    >>> from torchgrasp import load_hand, load_object
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
+    >>> jug, grasp = load_object("jug"), load_shipped_grasp("jug", "allegro")
+    >>> measure_touch(load_hand("allegro"), grasp, jug.mesh, limit=0.01).verdicts
+    ['touches']
+    """
+    hand = hand.to("cpu", torch.float64)
+    joints = hand.check_joints(grasps.joints.detach().double().cpu())
+    centres = apply(grasps.obj_from_hand.detach().double().cpu(), hand.tip_centres(joints))
+    points = centres.reshape(-1, 3)
+    if isinstance(surface, PointCloud):
+        heights = _heights(points, surface, limit)
+    else:
+        vertices = torch.tensor(surface.vertices, dtype=torch.float64)
+        distance = surface_distance(vertices, torch.tensor(surface.faces))
+        heights = torch.from_numpy(distance(points.numpy()))
+    return Touch(heights.reshape(centres.shape[:-1]) - hand.tip_radius, limit)
+
+
+def _heights(points: Points, cloud: PointCloud, limit: float) -> Float[Tensor, "n"]:
+    """Return the heights [m] of points above the surface of a cloud; NaN where it shows none."""
+    cloud = cloud if cloud.normals is not None else estimate_normals(cloud)
+    assert cloud.normals is not None
+    seen = cloud.points.detach().double().cpu()
+    normals = cloud.normals.detach().double().cpu()
+    spacing = float(nearest(seen, NEAR.spacing)[0][:, 1:].mean(-1).median())
+    row = torch.from_numpy(spatial.KDTree(seen.numpy()).query(points.numpy())[1])
+    away = points - seen[row]
+    height = (away * normals[row]).sum(-1)
+    beside = norm(away - height[:, None] * normals[row])
+    shown = beside <= TOUCH.reach * spacing
+    if cloud.viewpoint is not None:
+        shown = shown & (height >= -limit)
+    return torch.where(shown, height, torch.nan)
