@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from torchgrasp import Scene
 from torchgrasp.cloud.depth import cloud_from_depth, read_depth
-from torchgrasp.foundation.errors import BadArgument, SuspiciousScale, TooFewPoints
+from torchgrasp.foundation.errors import BadArgument, MendedInput, SuspiciousScale, TooFewPoints
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 
 K = torch.tensor([[600.0, 0, 30], [0, 550.0, 20], [0, 0, 1]], dtype=torch.float64)
@@ -372,17 +373,127 @@ def test_the_projection_of_a_camera_info_is_read(camera):
     ("camera", "told"),
     [
         ({"k": K.ravel().tolist(), "p": [0.9 * RECTIFIED[0], *RECTIFIED[1:]]}, "beside another P"),
-        ({"k": K.ravel().tolist(), "d": [-0.2, 0.1, 0.0, 0.0, 0.0]}, "beside distortion D"),
+        (
+            {"k": K.ravel().tolist(), "d": [-0.2, 0.1, 0.0, 0.0, 0.0], "p": RECTIFIED},
+            "with distortion D",
+        ),
         (
             {
                 "camera_matrix": {"data": K.ravel().tolist()},
                 "distortion_coefficients": {"data": [-0.2, 0.1, 0.0, 0.0, 0.0]},
                 "projection_matrix": {"data": RECTIFIED},
             },
-            "beside distortion D",
+            "with distortion D",
         ),
     ],
 )
 def test_a_camera_info_of_two_images_that_differ_is_told(camera, told):
     with pytest.raises(BadArgument, match=f"intrinsics: .*of a rectified image, P.*{told}"):
         cloud_from_depth(tilted_depth(), {**camera, **SIDES})
+
+
+SIZE = (48, 64)
+PINHOLE = np.array([[60.0, 0.0, 33.0], [0.0, 55.0, 22.0], [0.0, 0.0, 1.0]])
+PLUMB = {"k1": -0.2, "k2": 0.06, "p1": 0.004, "p2": -0.003, "k3": -0.01}
+RATIONAL = {**PLUMB, "k1": 0.9, "k2": 0.3, "k4": 1.1, "k5": 0.35, "k6": 0.02}
+ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+
+
+def bend(ray, c):
+    """Where a ray meets the image plane at depth 1, as ROS's image_pipeline writes it."""
+    x, y = ray
+    c = {name: c.get(name, 0.0) for name in ORDER}
+    r2 = x**2 + y**2
+    above = 1 + c["k1"] * r2 + c["k2"] * r2**2 + c["k3"] * r2**3
+    radial = above / (1 + c["k4"] * r2 + c["k5"] * r2**2 + c["k6"] * r2**3)
+    return np.array(
+        [
+            x * radial + 2 * c["p1"] * x * y + c["p2"] * (r2 + 2 * x**2),
+            y * radial + c["p1"] * (r2 + 2 * y**2) + 2 * c["p2"] * x * y,
+        ]
+    )
+
+
+def raw_camera(form, c):
+    """The description of a raw camera in the form of a driver."""
+    listed = [c[name] for name in ORDER if name in c]
+    numbers = {"fx": 60.0, "fy": 55.0}
+    middle = {"cx": 33.0, "cy": 22.0}
+    model = "rational_polynomial" if "k4" in c else "plumb_bob"
+    k = PINHOLE.ravel().tolist()
+    return {
+        "ROS": {"k": k, "d": listed, "distortion_model": model, "p": [0.0] * 12},
+        "message": SimpleNamespace(k=k, d=listed, distortion_model=model),
+        "OpenCV": {"camera_matrix": {"data": k}, "distortion_coefficients": {"data": listed}},
+        "RealSense": {
+            **numbers,
+            "ppx": 33.0,
+            "ppy": 22.0,
+            "model": "distortion.brown_conrady",
+            "coeffs": listed,
+        },
+        "Zivid": {
+            "CameraIntrinsics": {
+                "CameraMatrix": {"FX": 60.0, "FY": 55.0, "CX": 33.0, "CY": 22.0},
+                "Distortion": {name.upper(): x for name, x in c.items()},
+            }
+        },
+        "Azure": {**numbers, **middle, "codx": 0.0, "cody": 0.0, **c},
+    }[form]
+
+
+@pytest.mark.parametrize("form", ["ROS", "message", "OpenCV", "RealSense", "Zivid", "Azure"])
+@pytest.mark.parametrize("c", [PLUMB, RATIONAL])
+def test_the_rays_of_a_raw_image_bend_to_its_pixels(form, c):
+    depth = np.random.default_rng(0).uniform(0.4, 0.5, SIZE)
+    with pytest.warns(MendedInput, match="distortion"):
+        cloud = cloud_from_depth(depth, raw_camera(form, c))
+    x, y, z = cloud.points.numpy().T
+    assert np.allclose(z, depth.ravel())
+    u, v = bend((x / z, y / z), c)
+    row, column = (index.ravel() for index in np.indices(SIZE))
+    assert np.abs(60 * u + 33 - column).max() < 1e-2
+    assert np.abs(55 * v + 22 - row).max() < 1e-2
+    # far from what the pinhole alone gives
+    straight = cloud_from_depth(depth, torch.tensor(PINHOLE)).points.numpy()
+    assert np.abs(straight - cloud.points.numpy()).max() > 0.005
+    # the borders of the view, up to their curvature
+    height = (cloud.points @ cloud.frustum.T).reshape(*SIZE, 4)
+    borders = (height[24, 0, 0], height[24, -1, 1], height[0, 32, 2], height[-1, 32, 3])
+    assert max(abs(float(x)) for x in borders) < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("extra", "told"),
+    [
+        ({"d": [0.1, 0.0, 0.0, 0.0], "distortion_model": "equidistant"}, "model equidistant"),
+        ({"d": [0.1, 0.0, 0.0, 0.0], "distortion_model": "fisheye"}, "model fisheye"),
+        ({"coeffs": [0.1] * 5, "model": "Inverse Brown Conrady"}, "model inverse_brown_conrady"),
+        ({"coeffs": [0.1] * 5}, "of no model"),
+        ({"d": [0.1] * 12}, "at most k1 k2 p1 p2 k3 k4 k5 k6"),
+        ({"d": [0.1, 0.2]}, "at most k1"),
+        ({"k1": 0.1, "codx": 0.01}, "at most k1"),
+        ({"d": [-9.0, 0.0, 0.0, 0.0]}, "folds at"),
+        ({"d": [float("nan"), 0.0, 0.0, 0.0]}, "at most k1"),
+    ],
+)
+def test_other_distortions_are_refused_by_name(extra, told):
+    camera = {"k": PINHOLE.ravel().tolist(), **extra}
+    with pytest.raises(BadArgument, match="intrinsics") as error:
+        cloud_from_depth(np.full(SIZE, 0.5), camera)
+    assert told in str(error.value)
+
+
+def test_a_raw_image_of_a_scene_is_refused():
+    with pytest.raises(BadArgument, match="a rectified image"):
+        Scene.from_depth(np.full(SIZE, 0.5), raw_camera("ROS", PLUMB))
+
+
+def test_a_swapped_principal_point_is_named():
+    depth = np.full((480, 640), 0.5)
+    for camera in (
+        (600.0, 600.0, 238.0, 322.0),
+        {"k": [600.0, 0, 238.0, 0, 600.0, 322.0, 0, 0, 1.0], "width": 640, "height": 480},
+    ):
+        with pytest.raises(BadArgument, match="cx of the column before cy of the row"):
+            cloud_from_depth(depth, camera)

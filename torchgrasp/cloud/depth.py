@@ -17,11 +17,13 @@ from torchgrasp.cloud.intrinsics import (
     describe_array,
     parse_intrinsics,
 )
+from torchgrasp.cloud.lens import Lens, describe
 from torchgrasp.cloud.pose import check_view, read_camera_pose
 from torchgrasp.cloud.sensor import Image
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import BadArgument, TooFewPoints
+from torchgrasp.foundation.errors import BadArgument, MendedInput, TooFewPoints
 from torchgrasp.foundation.rules import Positive
+from torchgrasp.foundation.told import warn_user
 from torchgrasp.geometry.frames import apply, rotate
 from torchgrasp.geometry.linalg import Points, unit
 from torchgrasp.values.planning import PointCloud
@@ -64,9 +66,11 @@ def cloud_from_depth(
 ) -> PointCloud:
     """Return the points of a pinhole camera's depth image.
 
-    A pixel (row v, column u) of depth z is the point z ((u - cx) / fx, (v - cy) / fy, 1). The
-    camera's frame has x right, y down and z forward. Depths of 0, NaN, 65535 counts or more than 50
-    m are not measured. The camera is the viewpoint, and the sides of the image give the frustum.
+    A pixel (row v, column u) of depth z is the point z ((u - cx) / fx, (v - cy) / fy, 1). Of a raw
+    image with a polynomial distortion (plumb_bob, rational_polynomial), the ray is found that the
+    lens bends to the pixel, and a `MendedInput` warning tells so. The camera's frame has x right, y
+    down and z forward. Depths of 0, NaN, 65535 counts or more than 50 m are not measured. The
+    camera is the viewpoint, and the sides of the image give the frustum.
 
     Args:
         depth: (h, w) or (h, w, 1), distance along the optical axis: floats in metres, or integers
@@ -74,7 +78,7 @@ def cloud_from_depth(
         intrinsics: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] [pixels], its 9 numbers, or a 3 x 4
             projection matrix. Or (fx, fy, cx, cy) [pixels], or (fx, fy, cx, cy, width, height) with
             the size of the image, which may be a crop. Or the dict or object of ROS (CameraInfo), Open3D,
-            RealSense, Zivid or BOP, with its depth_scale.
+            RealSense, Zivid, Azure Kinect or BOP, with its depth_scale and distortion.
         mask: (h, w), pixels of the object, bool or uint8 (0 is outside); None for all measured
             pixels.
         camera_pose: obj_from_camera (4, 4), rigid; None if the result shall be in the camera's
@@ -85,32 +89,39 @@ def cloud_from_depth(
             the image is compared; None for z.
 
     Raises:
-        BadArgument: depth that is negative or of another unit; intrinsics of another resolution; a
-            mask of another size or without pixels; a pose that is not rigid, is more than 100 m
-            off, or turns a table upside down.
+        BadArgument: depth that is negative or of another unit; intrinsics of another resolution, or
+            with a distortion of another model, such as a fisheye's; a mask of another size or
+            without pixels; a pose that is not rigid, is more than 100 m off, or turns a table
+            upside down.
         TooFewPoints: fewer than 4 measured pixels.
         SuspiciousScale: an extent outside [5 mm, 2 m], as of a scene without a mask.
 
     >>> cloud_from_depth(np.full((48, 64), 500, dtype=np.uint16), (600.0, 600.0, 32.0, 24.0)).viewpoint
     tensor([0., 0., 0.], dtype=torch.float64)
     """
-    z_image, k, inside = read_depth(depth, intrinsics, mask, depth_unit)
+    z_image, k, inside, lens = read_depth(depth, intrinsics, mask, depth_unit)
     seen = z_image > 0
     measured = seen if inside is None else seen & inside
     count = int(measured.sum())
     if count < MIN_POINTS:
         allowed = f"at least {MIN_POINTS} measured pixels in the mask"
         raise TooFewPoints("depth", f"{count} measured pixels", allowed)
-    points = _points(z_image, k, measured)
+    points = _points(z_image, k, measured, lens)
+    if lens is not None:
+        warn_user(
+            MendedInput,
+            f"an image with distortion {describe(lens.coefficients)}, which is taken from its "
+            "rays; leave it out for a rectified image",
+        )
     pose = (torch.eye(4) if camera_pose is None else read_camera_pose(camera_pose)).to(points)
     # Without a mask, the image may show the object alone, without a table.
     if inside is not None:
-        view = apply(pose, _points(z_image, k, seen))
+        view = apply(pose, _points(z_image, k, seen, lens))
         view = view[:: 1 + len(view) // DEPTH.viewed]
         check_view(view, pose.cpu(), up, depth_unit is not None)
 
     viewpoint = pose[:3, 3]
-    frustum = frustum_of_image(k, z_image.shape).to(points)
+    frustum = frustum_of_image(k, z_image.shape, lens).to(points)
     if camera_pose is not None:
         points = apply(pose, points)
         frustum = rotate(pose, frustum)
@@ -118,23 +129,40 @@ def cloud_from_depth(
     return check_cloud(PointCloud(points.to(dtype), None, viewpoint.to(dtype), frustum.to(dtype)))
 
 
-def _points(z_image: Image, k: Matrix, keep: Bool[Tensor, "h w"]) -> Points:
+def _points(
+    z_image: Image, k: Matrix, keep: Bool[Tensor, "h w"], lens: Lens | None = None
+) -> Points:
     """Return the points [m], in the camera's frame, of the pixels in the mask `keep`."""
     row, column = torch.nonzero(keep, as_tuple=True)
     z = z_image[keep]
+    if lens is not None:
+        x, y = lens.rays(k, torch.stack([column, row], -1).to(k)).unbind(-1)
+        return torch.stack([z * x, z * y, z], -1)
     x = z * (column - k[0, 2]) / k[0, 0]
     y = z * (row - k[1, 2]) / k[1, 1]
     return torch.stack([x, y, z], -1)  # (n, 3)
 
 
-def frustum_of_image(intrinsics: Matrix, size: Sequence[int]) -> Float[Tensor, "4 3"]:
+def frustum_of_image(
+    intrinsics: Matrix, size: Sequence[int], lens: Lens | None = None
+) -> Float[Tensor, "4 3"]:
     """Return the inward unit normals of the four sides of a camera's view, in its frame.
 
     They are those of the left, right, top and bottom side of an image of `size` (h, w) [pixels].
-    The camera's frame has x right, y down and z forward; `intrinsics` (3, 3) are in pixels.
+    The camera's frame has x right, y down and z forward; `intrinsics` (3, 3) are in pixels. The
+    sides of an image that a `lens` bends are the planes through the middle of each border.
     """
     (fx, _, cx), (_, fy, cy) = intrinsics[:2].tolist()
     height, width = size
+    if lens is not None:
+        column = (width - 1) / 2
+        row = (height - 1) / 2
+        middles = [[0.0, row], [width - 1, row], [column, 0.0], [column, height - 1]]
+        rays = lens.rays(intrinsics, intrinsics.new_tensor(middles))
+        left, right = rays[:2, 0].tolist()
+        top, bottom = rays[2:, 1].tolist()
+        bent = [[1.0, 0.0, -left], [-1.0, 0.0, right], [0.0, 1.0, -top], [0.0, -1.0, bottom]]
+        return unit(intrinsics.new_tensor(bent))
     sides = [[fx, 0.0, cx], [-fx, 0.0, width - 1 - cx], [0.0, fy, cy], [0.0, -fy, height - 1 - cy]]
     return unit(torch.tensor(sides, dtype=intrinsics.dtype, device=intrinsics.device))
 
@@ -142,14 +170,14 @@ def frustum_of_image(intrinsics: Matrix, size: Sequence[int]) -> Float[Tensor, "
 @checked
 def read_depth(
     depth: Array, intrinsics: object, mask: Array | None = None, depth_unit: Positive | None = None
-) -> tuple[Image, Matrix, Bool[Tensor, "h w"] | None]:
-    """Check the arguments of `cloud_from_depth`; return depth, intrinsics and mask.
+) -> tuple[Image, Matrix, Bool[Tensor, "h w"] | None, Lens | None]:
+    """Check the arguments of `cloud_from_depth`; return depth, intrinsics, mask and distortion.
 
     The depth (h, w) is in metres, 0 where nothing was measured; the intrinsics (3, 3) are in
-    pixels; the mask (h, w) is None without a mask. Raises `BadArgument` for what `cloud_from_depth`
-    refuses.
+    pixels; the mask (h, w) and the distortion are None without one. Raises `BadArgument` for what
+    `cloud_from_depth` refuses.
     """
-    k, stated, scale = parse_intrinsics(intrinsics)
+    k, stated, scale, lens = parse_intrinsics(intrinsics)
     image = as_tensor("depth", depth)
     # one channel
     if image.ndim == 3 and 1 in (image.shape[0], image.shape[-1]):
@@ -165,7 +193,7 @@ def read_depth(
     check_intrinsics(k, stated, image.shape)
     k = k.to(image.device)
     if mask is None:
-        return metres, k, None
+        return metres, k, None, lens
 
     pixels = as_tensor("mask", mask)
     if pixels.shape != image.shape or pixels.dtype not in (torch.bool, torch.uint8):
@@ -174,7 +202,7 @@ def read_depth(
     inside = pixels != 0
     if not bool(inside.any()):
         raise BadArgument("mask", "no pixel inside", "a mask that is not 0 at the object's pixels")
-    return metres, k, inside.to(image.device)
+    return metres, k, inside.to(image.device), lens
 
 
 def _in_metres(image: Tensor, unit: float | None) -> Image:

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.cloud.lens import FIELDS, Lens, numbers_of, read_lens
 from torchgrasp.foundation.checks import check_tensor
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.limits import SHOWN_LETTERS
@@ -21,7 +22,8 @@ MATRICES = ("k", "cam_k", "camera_matrix", OPEN3D, "cameraintrinsics", "camerama
 """Names of a matrix of intrinsics, or of an object that holds it: of ROS, BOP, Open3D and Zivid."""
 ATTRIBUTES = (
     *MATRICES,
-    *("P", "p", "D", "d", "coeffs", "K", "fx", "fy", "cx", "cy", "ppx", "ppy"),
+    *("P", "p", "D", "d", "K", "fx", "fy", "cx", "cy", "ppx", "ppy"),
+    *FIELDS,
     *("width", "height", "roi", "binning_x", "binning_y"),
 )
 """Names of the attributes of an object that describes a camera."""
@@ -79,8 +81,10 @@ class IntrinsicsNumbers:
     """
     agree: float = 0.5
     """Greatest difference [px] of ROS's K and P that say the same."""
-    straight: float = 1e-3
-    """Greatest coefficient of a distortion that moves no pixel by more than a tenth."""
+    swapped: float = 0.05
+    """Greatest shift of a principal point from the middle whose numbers are swapped, as a share of
+    the side.
+    """
     same_ratio: float = 0.02
     """Greatest difference of two ratios of sides that count as one."""
 
@@ -97,21 +101,26 @@ class Written(NamedTuple):
         scale: metres of one count of the depth.
         window: x, y, width and height of ROS's region of interest [pixels], then the binning in x
             and y; 0 if not set.
+        lens: distortion of the image; None for a pinhole's.
     """
 
     table: Any
     size: list[float] | None = None
     scale: float | None = None
     window: Sequence[float] = ()
+    lens: Lens | None = None
 
 
-def parse_intrinsics(value: object) -> tuple[Matrix, list[float] | None, float | None]:
+def parse_intrinsics(
+    value: object,
+) -> tuple[Matrix, list[float] | None, float | None, Lens | None]:
     """Return the matrix (3, 3) [pixels] of intrinsics in any form that `cloud_from_depth` takes.
 
-    Second is the [width, height] of the image [pixels], and third the metres of one count of the
-    depth; each is None if it is not stated. Raises `BadArgument` for anything else.
+    Second is the [width, height] of the image [pixels], third the metres of one count of the depth,
+    and fourth the distortion; each is None if it is not stated. Raises `BadArgument` for anything
+    else.
     """
-    table, size, scale, window = _read_written(value)
+    table, size, scale, window, lens = _read_written(value)
     k = as_tensor("intrinsics", table)
     allowed = "(fx, fy, cx, cy), or a 3 x 3 matrix"
     k = k if k.is_complex() else k.double()
@@ -137,7 +146,7 @@ def parse_intrinsics(value: object) -> tuple[Matrix, list[float] | None, float |
         raise BadArgument("intrinsics", k.tolist(), allowed + ", the transpose" * turned)
     if any(window):
         k, size = _cut(k, size, window)
-    return k, size, scale
+    return k, size, scale, lens
 
 
 def _cut(
@@ -167,7 +176,8 @@ def _read_written(value: object) -> Written:
         found = f"a {type(value).__name__} of {', '.join(names) or 'nothing'}"
         allowed = "fx, fy, cx and cy, or a matrix K; of a file of many images, the entry of this"
         raise BadArgument("intrinsics", found, f"{allowed} image")
-    table = _choose_of_ros(named, table)
+    lens = read_lens(named)
+    table, lens = _choose_of_ros(named, table, lens)
     by_column = key == OPEN3D and isinstance(table, list) and len(table) == 9
     if by_column and table[2] == table[5] == 0:
         table = [table[i::3] for i in range(3)]
@@ -185,45 +195,36 @@ def _read_written(value: object) -> Written:
     elif scale is not None and "ppx" not in named:
         scale = scale / 1000.0
     size = None if width is None or height is None else [float(width), float(height)]
-    return Written(table, size, scale, _read_window(named))
+    return Written(table, size, scale, _read_window(named), lens)
 
 
-def _choose_of_ros(named: Mapping[str, Any], table: Any) -> Any:
-    """Return the matrix of ROS's CameraInfo that holds for a depth image: its K, or P if K is not
-    set.
+def _choose_of_ros(
+    named: Mapping[str, Any], table: Any, lens: Lens | None
+) -> tuple[Any, Lens | None]:
+    """Return the matrix of ROS's CameraInfo that holds for a depth image, and its distortion.
 
-    Raises `BadArgument` if the raw and the rectified image differ, as only one of them is meant.
+    They are K and the `lens`, or P alone if K is not set. Raises `BadArgument` if the raw and the
+    rectified image differ, as only one of them is meant.
     """
     rectified = named.get("p", named.get("projection_matrix"))
-    bent = named.get("d", named.get("distortion_coefficients", named.get("coeffs")))
-    rectified, bent = (x.get("data") if isinstance(x, Mapping) else x for x in (rectified, bent))
-    p = _numbers(rectified)
-    k = _numbers(table)
+    rectified = rectified.get("data") if isinstance(rectified, Mapping) else rectified
+    p = numbers_of(rectified)
+    k = numbers_of(table)
     given = len(p) == 3 * 4 and p[0] > 0
     if given and k and not any(k):
-        return rectified
+        return rectified, None
     differ = False
     if given and len(k) == 3 * 3:
         rows = [*p[:3], *p[4:7], *p[8:11]]
         differ = max(abs(x - y) for x, y in zip(k, rows, strict=True)) > LIMITS.agree
-    distorted = max(map(abs, _numbers(bent)), default=0.0) > LIMITS.straight
-    if distorted or differ:
-        found = f"a K beside another P{', and distortion D' * distorted}"
+    if differ or (lens is not None and given):
+        found = f"a K beside another P{', and distortion D' * (lens is not None)}"
         if not differ:
-            found = f"a K beside distortion D {str(_numbers(bent))[:SHOWN_LETTERS]}"
-        allowed = "of a rectified image, P alone; of a raw one, first rectify it"
-        raise BadArgument("intrinsics", found, f"{allowed}; K alone if both agree")
-    return table
-
-
-def _numbers(value: object) -> list[float]:
-    """Return the numbers of a matrix or a list row by row; nothing for anything else."""
-    if value is None:
-        return []
-    try:
-        return np.asarray(value, dtype=np.float64).ravel().tolist()
-    except (TypeError, ValueError):
-        return []
+            found = "a K with distortion D beside P"
+        raise BadArgument(
+            "intrinsics", found, "of a rectified image, P alone; of a raw one, K and D"
+        )
+    return table, lens
 
 
 def _find_matrix(value: object) -> tuple[dict[str, Any], str, Any]:
@@ -305,6 +306,10 @@ def check_intrinsics(k: Matrix, stated: list[float] | None, size: Sequence[int])
         found = f"a principal point ({cx:.4g}, {cy:.4g}) px in an image of {width} x {height}"
         raise BadArgument("intrinsics", found, "a crop nearer to it")
     _check_size(k, stated, width, height)
+    straight = fits(fx, fy, cx, cy) and shift(cx, cy) <= LIMITS.swapped
+    if not straight and fits(fx, fy, cy, cx) and shift(cy, cx) <= LIMITS.swapped:
+        found = f"a principal point ({cx:.4g}, {cy:.4g}) px in an image of {width} x {height}"
+        raise BadArgument("intrinsics", found, "cx of the column before cy of the row")
 
 
 def _check_size(k: Matrix, stated: list[float] | None, width: int, height: int) -> None:

@@ -63,7 +63,7 @@ class Touch(Value):
 
     @property
     def deepest(self) -> Float[Tensor, "g"]:
-        """The smallest gap of each grasp [m], negative if a pad penetrates; NaN if none is known."""
+        """The smallest gap of each grasp [m], negative if a pad penetrates; NaN if unknown."""
         return _known(self.gaps.nan_to_num(torch.inf).amin(-1))
 
     @property

@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.cloud.depth import Array, frustum_of_image, read_depth
+from torchgrasp.cloud.lens import describe
 from torchgrasp.cloud.pose import read_camera_pose
 from torchgrasp.cloud.safe_files import parse_npz
 from torchgrasp.files import explain, read_bounded
@@ -155,7 +156,11 @@ def read_image(
     own. Raises `BadArgument` for what `cloud_from_depth` refuses, and for fewer than 30 measured
     pixels.
     """
-    z, k, _ = read_depth(depth, intrinsics, depth_unit=depth_unit)
+    z, k, _, lens = read_depth(depth, intrinsics, depth_unit=depth_unit)
+    if lens is not None:
+        found = f"a raw image of a scene, with distortion {describe(lens.coefficients)}"
+        allowed = "a rectified image; `cloud_from_depth` takes a raw one of the object alone"
+        raise BadArgument("intrinsics", found, allowed)
     pose = (
         torch.eye(4, dtype=torch.float64)
         if camera_pose is None
