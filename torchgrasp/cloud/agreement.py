@@ -1,18 +1,15 @@
-"""Checks that the views, mesh, contacts and table of one object do not contradict each other."""
+"""Checks that the cloud, mesh, contacts and table of one object do not contradict each other."""
 
 import dataclasses
-import itertools
-from collections.abc import Sequence
-from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.cloud.neighbours import draw_rows, nearest
+from torchgrasp.cloud.neighbours import draw_rows
 from torchgrasp.foundation.errors import BadArgument
-from torchgrasp.foundation.lazy import spatial, trimesh
-from torchgrasp.geometry.linalg import Points, Vector, norm, unit
+from torchgrasp.foundation.lazy import trimesh
+from torchgrasp.geometry.linalg import Points, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.plane_fit import assume_noise
 from torchgrasp.values.planning import Grasps, PointCloud
@@ -46,36 +43,7 @@ class AgreementNumbers:
     """Greatest height [m] of a foot above or below its table, beside the noise."""
 
 
-@dataclasses.dataclass(frozen=True)
-class ViewNumbers:
-    """Bounds on how far the views of one object may be apart."""
-
-    drawn: int = 400
-    """Most points of a view that are compared with another view."""
-    surface: int = 5000
-    """Most points of the surface that they are compared with."""
-    neighbours: int = 9
-    """Nearest points, the point itself included, that give the spacing of a view's rays."""
-    reach: float = 1.5
-    """A ray meets a surface if the nearest ray of the surface is so many spacings away."""
-    least: int = 20
-    """Fewest compared points that count: fewer are a rim that flies."""
-    seen: float = 0.9
-    """Quantile of the heights before a surface: flying pixels are above it."""
-    near: float = 0.75
-    """Quantile of the distances without a camera, where the wrong neighbours are above it."""
-    same: float = 0.8
-    """Least cosine of two normals of one surface."""
-    refused: float = 3.0
-    """Greatest distance of two views, over their noise."""
-    meet: float = 0.05
-    """Least share of a view's points that must lie on the other view, or behind it."""
-    gap: float = 0.03
-    """Greatest distance [m] at which a point still counts as lying there."""
-
-
 AGREEMENT = AgreementNumbers()
-VIEWS = ViewNumbers()
 
 
 def check_agreement(
@@ -94,7 +62,7 @@ def check_agreement(
     points = points.detach().cpu().double()
     points = points[draw_rows(len(points), AGREEMENT.drawn)]
     if isinstance(other, PointCloud):
-        distance = _distance_behind(points, other)
+        distance = distance_behind(points, other)
         surface = "the cloud or behind it"
     else:
         from trimesh.proximity import closest_point
@@ -109,109 +77,12 @@ def check_agreement(
         raise BadArgument(name, found, allowed)
 
 
-def check_views(views: Sequence[PointCloud]) -> None:
-    """Raise `BadArgument` if two views of one object contradict each other beyond their noise.
-
-    The views [m], with normals, are in one frame, each with at most one camera. Points of a view
-    may not stand before a surface that the camera of another saw. Without a camera, surfaces that
-    overlap are compared. Views that nowhere meet are refused, too. The error names the two views
-    that are farthest apart, over their noise.
-    """
-    noise = [_noise(view) for view in views]
-    apart = dict[tuple[int, int], tuple[float, float]]()  # distance and limit [m] by pair
-    for first, view in enumerate(views):
-        surface = _find_surface(view)
-        for second, other in enumerate(views):
-            if surface is None or second == first:
-                continue
-            distance = surface.distance(other)
-            if distance is not None:
-                limit = VIEWS.refused * max(noise[first], noise[second])
-                apart[first, second] = (distance, limit)
-    worst = max(apart, key=lambda pair: apart[pair][0] / apart[pair][1], default=None)
-    if worst is not None and apart[worst][0] > apart[worst][1]:
-        _refuse_views(worst, *apart[worst])
-    for first, second in itertools.permutations(range(len(views)), 2):
-        other = views[second].points
-        points = other[draw_rows(len(other), VIEWS.drawn)].double().cpu()
-        gap = float(_distance_behind(points, views[first]).quantile(VIEWS.meet))
-        if gap > VIEWS.gap:
-            _refuse_views((first, second), gap, VIEWS.gap)
-
-
-def _refuse_views(views: tuple[int, int], distance: float, limit: float) -> None:
-    """Raise `BadArgument` for two views with a `distance` [m] above the `limit` [m]."""
-    first, second = sorted(views)
-    found = f"views {first} and {second} about {1e3 * distance:.1f} mm apart: check their poses"
-    allowed = f"views of one object that agree within {1e3 * limit:.1f} mm"
-    raise BadArgument("clouds", found, allowed)
-
-
-@dataclasses.dataclass(frozen=True)
-class _Seen:
-    """The surface that one view shows, with what is needed to compare other views with it."""
-
-    eye: Vector | None  # position of the camera [m]; None if it is unknown
-    points: Points  # points of the surface [m]; of those that face the camera, if it is known
-    normals: Points  # their outward unit normals
-    tree: Any  # a KD tree of the rays from the camera to the points, or of the points
-    spacing: float  # usual distance between neighbours in the tree, in their own unit
-
-    def distance(self, view: PointCloud) -> float | None:
-        """Return how far [m] another view contradicts this surface; None if too few points of the
-        view can be compared with it.
-        """
-        rows = draw_rows(len(view), VIEWS.drawn)
-        points = view.points[rows].double().cpu()
-        asked = points if self.eye is None else unit(points - self.eye)
-        apart, row = map(torch.from_numpy, self.tree.query(asked.numpy()))
-        height = ((points - self.points[row]) * self.normals[row]).sum(-1)
-        if self.eye is None:
-            # surfaces that overlap and face the same way
-            assert view.normals is not None
-            height = height.abs()
-            beside = (apart.square() - height.square()).clamp_min(0).sqrt()
-            cosine = (view.normals[rows].double().cpu() * self.normals[row]).sum(-1)
-            compared = (cosine > VIEWS.same) & (beside < VIEWS.reach * self.spacing)
-            share = VIEWS.near
-        else:
-            # the height of what stands before the surface; all else is hidden, and 0
-            before = norm(points - self.eye) < norm(self.points[row] - self.eye)
-            height = torch.where(before, height.clamp_min(0), 0.0)
-            compared = apart < VIEWS.reach * self.spacing
-            share = VIEWS.seen
-        if int(compared.sum()) < VIEWS.least:
-            return None
-        return float(height[compared].quantile(share))
-
-
-def _find_surface(view: PointCloud) -> _Seen | None:
-    """Return the surface of a view with normals; None if its camera faces too little of it."""
-    rows = draw_rows(len(view), VIEWS.surface)
-    assert view.normals is not None
-    points = view.points[rows].double().cpu()
-    normals = view.normals[rows].double().cpu()
-    eye = None
-    placed = points
-    if view.viewpoint is not None:
-        eye = view.viewpoint.double().cpu()
-        # the camera saw only what faces it
-        facing = ((eye - points) * normals).sum(-1) > 0
-        points = points[facing]
-        normals = normals[facing]
-        placed = unit(points - eye)
-        if len(points) < VIEWS.least:
-            return None
-    spacing = float(nearest(placed, VIEWS.neighbours)[0][:, 1:].mean(-1).median())
-    return _Seen(eye, points, normals, spatial.KDTree(placed.numpy()), spacing)
-
-
 def check_mesh(cloud: PointCloud, mesh: "trimesh.Trimesh", name: str = "mesh") -> None:
     """Raise `BadArgument` if many points of an object's cloud do not lie on the object's mesh.
 
     The mesh [m] is in the frame of the cloud. Errors call it by `name`.
     """
-    slack = AGREEMENT.slack + 2 * _noise(cloud)
+    slack = AGREEMENT.slack + 2 * noise_of(cloud)
     check_agreement(name, cloud.points, "the cloud's points", mesh, slack, AGREEMENT.share)
 
 
@@ -254,7 +125,7 @@ def check_foot(cloud: PointCloud, table: Plane) -> None:
     """
     height = table.height(cloud.points.double().cpu())
     foot = float(height.quantile(AGREEMENT.lowest))
-    if -foot > AGREEMENT.foot + 2 * _noise(cloud):
+    if -foot > AGREEMENT.foot + 2 * noise_of(cloud):
         found = f"one {-1e3 * foot:.0f} mm above the object's foot"
         allowed = f"a table under the object's points, at least {-1e3 * foot:.0f} mm lower"
         raise BadArgument("table", found, allowed)
@@ -272,7 +143,7 @@ def check_stand(mesh: "trimesh.Trimesh", table: Plane, name: str = "mesh") -> No
         raise BadArgument(name, found, "a mesh that stands on the table, in the frame of both")
 
 
-def _noise(cloud: PointCloud) -> float:
+def noise_of(cloud: PointCloud) -> float:
     """Return the depth noise [m] that is assumed for a cloud's camera, as the median over the
     points.
     """
@@ -280,7 +151,7 @@ def _noise(cloud: PointCloud) -> float:
     return float(assume_noise(cloud.points.double().cpu(), eye).median())
 
 
-def _distance_behind(points: Points, cloud: PointCloud) -> Float[Tensor, "n"]:
+def distance_behind(points: Points, cloud: PointCloud) -> Float[Tensor, "n"]:
     """Return each point's distance [m] from a cloud and the space hidden behind it, as deep as the
     cloud is long.
     """

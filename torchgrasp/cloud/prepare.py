@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchgrasp.cloud.agreement import check_views
 from torchgrasp.cloud.check import check_cloud, remove_duplicates
 from torchgrasp.cloud.neighbours import find_inliers, fit_local_planes, fit_quadrics, nearest
 from torchgrasp.cloud.pose import Transform, check_rigid
+from torchgrasp.cloud.registration import align_views, compare_views
 from torchgrasp.cloud.viewpoint import guess_viewpoint
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
@@ -85,6 +85,7 @@ class PreparedCloud(Value):
     viewpoint: Float[Tensor, "*views 3"] | None
     # inward unit normals of the four sides of the camera's view, or of each point's, if known
     frustum: Float[Tensor, "*views 4 3"] | None
+    pose_error: Float[Tensor, "n"] | None  # as in `PointCloud` [m], of `points`
 
     @property
     def one_sided(self) -> bool:
@@ -138,7 +139,8 @@ def prepare_cloud(
         precise = precise.select(drawn.to(points.device))
     assert precise.normals is not None
     normals = unit(precise.normals)
-    return PreparedCloud(cloud, precise.points, normals, precise.viewpoint, precise.frustum)
+    fields = precise.viewpoint, precise.frustum, precise.pose_error
+    return PreparedCloud(cloud, precise.points, normals, *fields)
 
 
 @checked
@@ -225,16 +227,25 @@ def share_facing(points: Points, normals: Points, viewpoint: Float[Tensor, "*vie
 
 @checked
 def merge_clouds(
-    clouds: Sequence[PointCloud], poses: Sequence[Transform] | Float[Tensor, "k 4 4"]
+    clouds: Sequence[PointCloud],
+    poses: Sequence[Transform] | Float[Tensor, "k 4 4"],
+    *,
+    align: bool = False,
 ) -> PointCloud:
     """Return one cloud of several views in a common frame, with each point's normal and camera.
 
     `estimate_normals` gives normals to a view without normals. If a view has normals but no
     viewpoint, the result has no viewpoint. Points are denser where views overlap;
     `voxel_downsample` evens the density. The rigid `poses` obj_from_cloud (4, 4) [m] lead from the
-    frames of the views. Raises `BadArgument` for no cloud, another number of poses, a pose that is
-    not rigid, or clouds of several dtypes or devices. It is raised, too, for views that contradict
-    each other beyond their noise: a pose is wrong, or the object moved. The views and the result
+    frames of the views.
+
+    Views are compared. A distance that noise does not explain is told by a `MendedInput`. It
+    becomes the result's `pose_error`, which widens the shape's standard deviations. With `align`,
+    views are moved onto the first by at most 50 mm and 20 degrees, which is told.
+
+    Raises `BadArgument` for no cloud, another number of poses, a pose that is not rigid, or clouds
+    of several dtypes or devices. It is raised, too, for views that contradict each other by more
+    than about three times their noise: a pose is wrong, or the object moved. The views and the result
     may raise the errors of `check_cloud`.
 
     >>> view = PointCloud(0.1 * torch.rand(90, 3), viewpoint=torch.tensor([0.0, 0.0, 1.0]))
@@ -256,7 +267,9 @@ def merge_clouds(
     views = [_view_in_frame(cloud, pose) for cloud, pose in zip(clouds, rigid, strict=True)]
     if len(views) == 1:
         return views[0]
-    _compare_views(clouds, views)
+    if align:
+        views = [_move(view, *moved) for view, moved in zip(views, align_views(views), strict=True)]
+    errors = _compare_views(clouds, views)
     normals = [v.normals for v in views if v.normals is not None]
     # Each point has its camera: a view's viewpoint and frustum are repeated for its points.
     viewpoints = [v.viewpoint.expand(len(v), 3) for v in views if v.viewpoint is not None]
@@ -264,18 +277,38 @@ def merge_clouds(
     frustums = [v.frustum.expand(len(v), 4, 3) for v in views if v.frustum is not None]
     frustum = torch.cat(frustums) if len(frustums) == len(views) else None
     points = torch.cat([v.points for v in views])
-    return check_cloud(PointCloud(points, torch.cat(normals), viewpoint, frustum))
+    pose_error = errors if bool(errors.any()) else None
+    return check_cloud(PointCloud(points, torch.cat(normals), viewpoint, frustum, pose_error))
 
 
-def _compare_views(clouds: Sequence[PointCloud], views: Sequence[PointCloud]) -> None:
-    """Raise `BadArgument` if views disagree; `views` are the `clouds` in one frame, with normals."""
+def _move(view: PointCloud, pose: Transform, error: float) -> PointCloud:
+    """Return a view moved by a pose [m] with a standard deviation `error` [m]."""
+    view = _view_in_frame(view, pose)
+    known = view.points.new_zeros(len(view)) if view.pose_error is None else view.pose_error
+    return dataclasses.replace(view, pose_error=known.clamp_min(error))
+
+
+def _compare_views(clouds: Sequence[PointCloud], views: Sequence[PointCloud]) -> Float[Tensor, "n"]:
+    """Return the standard deviation [m] of each point's view; raise `BadArgument` if views
+    disagree.
+
+    `views` are the `clouds` in one frame, with normals.
+    """
     parts = []
+    places = []  # the rows of each part among all points
+    start = 0
     for cloud, view in zip(clouds, views, strict=True):
         # an estimated camera tells nothing about what it saw
         if cloud.viewpoint is None:
             view = dataclasses.replace(view, viewpoint=None, frustum=None)
         parts += view.split_views()
-    check_views(parts)
+        places += [start + rows for rows in view.view_rows()]
+        start += len(view)
+    given = [v.points.new_zeros(len(v)) if v.pose_error is None else v.pose_error for v in views]
+    errors = torch.cat(given)
+    for rows, error in zip(places, compare_views(parts), strict=True):
+        errors[rows] = errors[rows].clamp_min(error)
+    return errors
 
 
 def _view_in_frame(cloud: PointCloud, obj_from_cloud: Transform) -> PointCloud:
@@ -294,4 +327,5 @@ def _view_in_frame(cloud: PointCloud, obj_from_cloud: Transform) -> PointCloud:
     if frustum is not None:
         turned = rotate(pose, frustum.double().reshape(-1, 3))
         frustum = turned.reshape(frustum.shape).to(dtype)
-    return PointCloud(points.to(dtype), normals.to(dtype), viewpoint, frustum)
+    error = cloud.pose_error
+    return PointCloud(points.to(dtype), normals.to(dtype), viewpoint, frustum, error)

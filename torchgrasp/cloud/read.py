@@ -29,6 +29,8 @@ from torchgrasp.values.planning import PointCloud
 
 TEXTS = (".xyz", ".txt", ".csv", ".asc", ".pts", ".xyzi", ".xyzn", ".xyzrgb")  # tables of numbers
 SUFFIXES = (".ply", ".pcd", ".npz", ".npy", *TEXTS)
+ARRAYS = ("points", "normals", "viewpoint", "frustum", "pose_error", "table")
+"""Arrays of a .npz file that are read."""
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 """Length [m] of each unit of files."""
 
@@ -164,7 +166,7 @@ def _parse(data: bytes, suffix: str) -> dict[str, Any]:
     if suffix == ".pcd":
         return parse_pcd(data)
     if suffix == ".npz":
-        return parse_npz(data, ("points", "normals", "viewpoint", "frustum", "table"), "points")
+        return parse_npz(data, ARRAYS, "points")
     return {"columns": parse_npy(data)} if suffix == ".npy" else parse_text(data, suffix)
 
 
@@ -210,7 +212,8 @@ def save_cloud(cloud: PointCloud, path: Path | str, table: Plane | None = None) 
         raise BadArgument("path", path, "a file ending in .npz or .ply")
     if path.suffix.lower() == ".npz":
         return write_file(path, lambda file: np.savez_compressed(file, **arrays))  # pyright: ignore[reportArgumentType]
-    if cloud.viewpoint is not None and cloud.viewpoint.ndim == 2:
+    several = cloud.viewpoint is not None and cloud.viewpoint.ndim == 2
+    if several or cloud.pose_error is not None:
         raise BadArgument("path", path, "a file ending in .npz, for a cloud of several views")
     return write_file(path, format_ply(**arrays))
 
@@ -238,6 +241,7 @@ def make_cloud(
     # Frustum and default are those of the arrays' own camera.
     default = bool(arrays.get("default")) and viewpoint is None
     frustum = arrays.get("frustum") if viewpoint is None else None
+    error = arrays.get("pose_error")
     if viewpoint is None and arrays.get("viewpoint") is not None:
         viewpoint = scale * _as_rows(source, "viewpoint", arrays["viewpoint"])
         if not bool(torch.isfinite(viewpoint).all()):
@@ -259,7 +263,10 @@ def make_cloud(
     if frustum is not None:
         frustum = _as_numbers(source, "frustum", frustum, (4, 3), (len(points), 4, 3))
         frustum = frustum if frustum.ndim == 2 else frustum[keep]
-    cloud = PointCloud(points[keep], None if normals is None else normals[keep], viewpoint, frustum)
+    if error is not None:
+        error = scale * _as_numbers(source, "pose_error", error, (len(points),))[keep]
+    normals = None if normals is None else normals[keep]
+    cloud = PointCloud(points[keep], normals, viewpoint, frustum, error)
     if default:
         cloud = _judge_default(cloud, notes)
     table = arrays.get("table")

@@ -8,7 +8,7 @@ import torch
 
 from torchgrasp.cloud.agreement import check_foot
 from torchgrasp.cloud.check import FEW_POINTS, remove_duplicates
-from torchgrasp.cloud.neighbours import is_flat, nearest
+from torchgrasp.cloud.neighbours import draw_rows, is_flat, nearest
 from torchgrasp.cloud.parts import find_second_body
 from torchgrasp.cloud.prepare import PreparedCloud, prepare_cloud
 from torchgrasp.data.accept import CloudLike, as_cloud
@@ -59,6 +59,8 @@ class ShapeNumbers:
     """Default numbers of observed points, with the support "camera" and "paper"."""
     rounds: int = 3
     """Most rounds in which free space that the shape violates is observed."""
+    seen: int = 300
+    """Most points at which errors of poses are compared with the shape's deviations."""
     gap: float = 0.025
     """Least width [m] of a gap that misleads a fingertip; that of a handle is narrower."""
 
@@ -205,9 +207,12 @@ def _fit_surface(seen: PreparedCloud, support: ExtraObservations, options: FitOp
         normals = normals[support.rows]
         cloud = PointCloud(points.to(cloud.points), normals.to(cloud.points))
     x = support.frame.normalise(points)
-    candidates = on_surface(
-        x, normals, torch.full_like(x[:, 0], options.noise), support.normal_noise
-    )
+    noise = torch.full_like(x[:, 0], options.noise)
+    error = seen.pose_error
+    if error is not None:
+        error = error if support.rows is None else error[support.rows]
+        noise = torch.hypot(noise, error / support.frame.scale)
+    candidates = on_surface(x, normals, noise, support.normal_noise)
 
     # The kernel's length is that of all candidates, so that one factor grows from the first to the
     # last.
@@ -231,15 +236,19 @@ def _fit_surface(seen: PreparedCloud, support: ExtraObservations, options: FitOp
     check_kernel(posterior, every.least_noise)
     shape = ShapeGP.of(posterior, support.frame, cloud, psi, support.std_factor)
     shape = dataclasses.replace(shape, kind=support.kind)
-    if support.free is None:
-        return shape
-    free, least = support.free
+    free, least = support.free or (x[:0], x[:0, 0])
     for _ in range(SHAPE.rounds):
         rows = free_space_violations(shape, free, least)
         if not len(rows):
             break
         shape = shape.append(off_surface(free[rows], least[rows], NOISE.free / shape.scale))
-    return shape
+    if error is None:
+        return shape
+    # A view's points are off together: no number of them makes the shape more certain than that.
+    rows = draw_rows(len(points), SHAPE.seen).to(points.device)
+    std_m = shape.predict(points[rows]).std_m
+    wider = float((torch.hypot(std_m, error[rows]) / std_m).median())
+    return dataclasses.replace(shape, std_factor=wider * shape.std_factor)
 
 
 @checked(gradients=True)

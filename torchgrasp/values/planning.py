@@ -36,6 +36,8 @@ class PointCloud(Value):
         viewpoint: position of the camera [m], or of each point's camera; None if it is unknown.
         frustum: inward unit normals of the four sides of the camera's view, or of each point's
             camera; None if unknown. An object that reaches a side is cut off there.
+        pose_error: standard deviation [m] of the position of each point's view, which moves its
+            points together; None if the poses are exact.
 
     Raises `BadArgument` for a wrong shape or dtype or numbers that are not finite, `TooFewPoints`
     for fewer than 4 points.
@@ -50,6 +52,7 @@ class PointCloud(Value):
     normals: Float[Tensor, "n 3"] | None = None
     viewpoint: Float[Tensor, "3"] | Float[Tensor, "n 3"] | None = None
     frustum: Float[Tensor, "4 3"] | Float[Tensor, "n 4 3"] | None = None
+    pose_error: Float[Tensor, "n"] | None = None
 
     def __post_init__(self) -> None:
         if len(self.points) < 4:
@@ -60,7 +63,7 @@ class PointCloud(Value):
 
     @checked
     def select(self, rows: Int[Tensor, "m"] | Bool[Tensor, "n"]) -> "PointCloud":
-        """Return a cloud of some of the points, with their normals, viewpoints and frustums.
+        """Return a cloud of some of the points, with all that belongs to them.
 
         `rows` is a mask of the points, or holds m indices in the wanted order.
         """
@@ -73,19 +76,26 @@ class PointCloud(Value):
             normals=None if normals is None else normals[chosen],
             viewpoint=eye if eye is None or eye.ndim == 1 else eye[chosen],
             frustum=frustum if frustum is None or frustum.ndim == 2 else frustum[chosen],
+            pose_error=None if self.pose_error is None else self.pose_error[chosen],
         )
+
+    def view_rows(self) -> list[Int[Tensor, "m"]]:
+        """Return the indices of the points of each camera, in the order of their first points."""
+        if self.viewpoint is None or self.viewpoint.ndim == 1:
+            return [torch.arange(len(self), device=self.points.device)]
+        _, view = self.viewpoint.unique(dim=0, return_inverse=True)
+        return [torch.nonzero(view == k)[:, 0] for k in dict.fromkeys(view.tolist())]
 
     def split_views(self) -> "list[PointCloud]":
         """Return one cloud for each camera, in the order of their first points."""
         if self.viewpoint is None or self.viewpoint.ndim == 1:
             return [self]
-        _, view = self.viewpoint.unique(dim=0, return_inverse=True)
-        parts = [self.select(view == k) for k in dict.fromkeys(view.tolist())]
         views = []
-        for part in parts:
+        for part in map(self.select, self.view_rows()):
             assert part.viewpoint is not None
             sides = part.frustum if part.frustum is None else part.frustum.reshape(-1, 4, 3)[0]
-            views.append(PointCloud(part.points, part.normals, part.viewpoint[0], sides))
+            eye = part.viewpoint[0]
+            views.append(dataclasses.replace(part, viewpoint=eye, frustum=sides))
         return views
 
 

@@ -3,6 +3,7 @@ folders.
 """
 
 import contextlib
+import dataclasses
 import importlib
 import importlib.util
 import re
@@ -99,9 +100,9 @@ class ViewOptions:
             notes = file.notes
             table = file.table
             if self.no_viewpoint:
-                cloud = PointCloud(cloud.points, cloud.normals)
+                cloud = dataclasses.replace(cloud, viewpoint=None, frustum=None)
             if self.no_normals:
-                cloud = PointCloud(cloud.points, None, cloud.viewpoint, cloud.frustum)
+                cloud = dataclasses.replace(cloud, normals=None)
             if self.camera_pose is not None:
                 pose = read_pose("--camera-pose", self.camera_pose)
                 cloud = _move(name, cloud, pose)
@@ -223,7 +224,8 @@ def _move(name: str, cloud: PointCloud, pose: Tensor) -> PointCloud:
         raise BadArgument(name, f"{unseen:.0%} of the points out of a camera's sight", allowed)
     normals = None if cloud.normals is None else rotate(pose, cloud.normals)
     frustum = None if cloud.frustum is None else rotate(pose, cloud.frustum)
-    return PointCloud(apply(pose, cloud.points), normals, pose[:3, 3].clone(), frustum)
+    eye = pose[:3, 3].clone()
+    return PointCloud(apply(pose, cloud.points), normals, eye, frustum, cloud.pose_error)
 
 
 def read_region(name: str, text: str | None) -> Region | None:

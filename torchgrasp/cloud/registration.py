@@ -1,0 +1,378 @@
+"""Comparison of several views of one object, and their registration.
+
+Three decisions matter. First, the distance of two views is that of a motion: the rigid one after
+which they agree best, as the root mean square over the points of how far it moves them along their
+normals. So shifts to and from a camera count alike, turns and scales count, cameras need not be
+known, and slides along a surface that do not change it count nothing. Second, this motion is a most
+likely one: what the overlap does not show stays as given, since the poses are known to some mm.
+Registration with `align` is the same motion, so a package for it would do less: those that we know
+let a bottle spin about its axis. Third, what a camera saw through is empty: points that another
+view has before a surface contradict it, with or without an overlap.
+"""
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchgrasp.cloud.agreement import distance_behind, noise_of
+from torchgrasp.cloud.neighbours import draw_rows, find_inliers, nearest
+from torchgrasp.foundation.errors import BadArgument, MendedInput
+from torchgrasp.foundation.lazy import spatial
+from torchgrasp.foundation.told import warn_user
+from torchgrasp.geometry.frames import rigid, rotation_angle, rotation_from_vector
+from torchgrasp.geometry.linalg import Points, Vector, norm, unit
+from torchgrasp.values.planning import PointCloud
+
+
+@dataclasses.dataclass(frozen=True)
+class ViewNumbers:
+    """Bounds on how far the views of one object may be apart."""
+
+    drawn: int = 400
+    """Most points of a view that are compared with another view."""
+    surface: int = 5000
+    """Most points of the surface that they are compared with."""
+    neighbours: int = 9
+    """Nearest points, the point itself included, that give the spacing of a view's rays."""
+    reach: float = 1.5
+    """A point meets a surface if the nearest point of it is so many spacings away, sideways."""
+    least: int = 20
+    """Fewest compared points that count: fewer are a rim that flies."""
+    seen: float = 0.9
+    """Quantile of the heights before a surface: flying pixels are above it."""
+    same: float = 0.8
+    """Least cosine of two normals of one surface."""
+    refused: float = 2.5
+    """Greatest distance of two views along their normals, over their noise."""
+    shifted: float = 3.0
+    """Greatest shift of a view, or height before what another saw, over their noise."""
+    likely: float = 1.0
+    shown: float = 4.0
+    """Least chi squared of a motion that widens the band, and of one that is told, mended or
+    refused: below the second, noise and bias of the cameras explain it.
+    """
+    vague: float = 1.5
+    """Factor of the limits for a view without a camera, whose noise is a guess."""
+    meet: float = 0.05
+    """Least share of a view's points that must lie on the other view, or behind it."""
+    gap: float = 0.03
+    """Greatest distance [m] at which a point still counts as lying there."""
+
+
+@dataclasses.dataclass(frozen=True)
+class MotionNumbers:
+    """Parameters of the search for the motion that brings two views together."""
+
+    shifted: float = 0.01
+    turned: float = 0.1
+    """Standard deviations of poses [m, rad]: what the overlap does not show stays as given."""
+    repeated: float = 20.0
+    """Points that share one error: a camera's bias is smooth."""
+    first: float = 0.04
+    """Greatest distance [m] of matching points at first."""
+    shrink: float = 0.8
+    """Factor of this distance from step to step."""
+    last: float = 4.0
+    """Greatest distance of matching points in the end, over the noise."""
+    steps: int = 25
+    """Most steps."""
+    still: float = 1e-4
+    """Change [m, rad] below which the search ends."""
+    hidden: float = 0.9
+    """Greatest share of a motion's variance that the overlap does not show."""
+    gaussian: float = 1.4826
+    """Ratio of a standard deviation to the median absolute value."""
+    shift: float = 0.05
+    """Greatest shift [m] that is mended: matching points are to be found."""
+    turn: float = 20.0
+    """Greatest turn [deg] that is mended: normals are to match."""
+
+
+VIEWS = ViewNumbers()
+MOTION = MotionNumbers()
+
+
+@dataclasses.dataclass(frozen=True)
+class Motion:
+    """The motion of a view onto another one, and how far they were apart."""
+
+    pose: Float[Tensor, "4 4"]  # new_from_old [m]
+    shift: float  # length of the shift of the points' mean [m]
+    distance: float  # rms distance [m] over the points, along their normals
+    unsure: float  # rms distance [m] that such a motion may have where the overlap shows none
+    left: float  # deviation [m] of the points from the other view after the motion
+    chi_squared: float  # of the motion: small if noise and bias explain it (no unit)
+
+    @property
+    def error(self) -> float:
+        """The distance [m], with what the overlap does not show; 0 if noise explains it."""
+        return math.hypot(self.distance, self.unsure) if self.chi_squared > VIEWS.likely else 0.0
+
+    @property
+    def shown(self) -> bool:
+        """Whether noise and bias of the cameras do not explain the motion."""
+        return self.chi_squared > VIEWS.shown
+
+
+def compare_views(views: Sequence[PointCloud]) -> list[float]:
+    """Return the standard deviation [m] of each view's pose that the other views show; 0 for none.
+
+    The views [m], with normals, are in one frame, each with at most one camera. Raises
+    `BadArgument` if two contradict each other beyond their noise, and names those that are farthest
+    apart, over their noise. Points of a view may not stand before a surface that the camera of
+    another saw. Views that nowhere meet are refused, too. A motion that noise does not explain is
+    told by a `MendedInput`.
+    """
+    surfaces = [_Surface(view) for view in views]
+    apart = list[tuple[float, float, float, tuple[int, int]]]()  # ratio, distance, limit, views
+    shown = (0.0, (0, 0))  # the greatest error [m] that noise does not explain, and its views
+    errors = [list[float]() for _ in views]  # those that the pairs of each view show
+    for pair in itertools.combinations(range(len(views)), 2):
+        one, other = (surfaces[row] for row in pair)
+        limit = max(one.limit, other.limit)
+        before = max(one.height_before(other), other.height_before(one))
+        motion = _find_motion(one, other)
+        far = before
+        if motion is not None:
+            far = max(before, motion.left, motion.shown * motion.shift)
+            apart.append(_judge(motion.shown * motion.error, VIEWS.refused * limit, pair))
+            shown = max(shown, (motion.shown * motion.error, pair))
+            for row in pair:
+                errors[row].append(motion.error)
+        apart.append(_judge(far, VIEWS.shifted * limit, pair))
+    ratio, distance, limit, pair = max(apart)
+    if ratio > 1:
+        _refuse_views(pair, distance, limit)
+    _check_meeting(views)
+    if shown[0] > 0:
+        first, second = shown[1]
+        said = f"views {first} and {second} are about {1e3 * shown[0]:.1f} mm apart"
+        more = "standard deviations grow by it; align=True moves views together"
+        warn_user(MendedInput, f"{said}: {more}")
+    # Of three views one may be wrong: the lower median of its errors is that of the right ones.
+    return [float(torch.tensor(each or [0.0], dtype=torch.float64).median()) for each in errors]
+
+
+def _judge(
+    distance: float, limit: float, pair: tuple[int, int]
+) -> tuple[float, float, float, tuple[int, int]]:
+    """Return a distance [m] over its limit [m], both, and the pair of views."""
+    return distance / limit, distance, limit, pair
+
+
+def align_views(views: Sequence[PointCloud]) -> list[tuple[Float[Tensor, "4 4"], float]]:
+    """Return a motion new_from_old (4, 4) [m] of each view, after which the views agree best, and
+    its standard deviation [m] along the surface's normals.
+
+    The views [m] have normals and are in one frame. The first stays; each other one is moved onto
+    those that are placed. Motions that noise does not explain are told by a `MendedInput`; for
+    others the view stays. Raises `BadArgument` for a motion beyond 50 mm or 20 degrees.
+    """
+    placed = [views[0]]
+    motions = [(torch.eye(4, dtype=torch.float64, device="cpu"), 0.0)] * len(views)
+    left = list(range(1, len(views)))
+    while left:
+        points = torch.cat([view.points for view in placed])
+        normals = [view.normals for view in placed if view.normals is not None]
+        whole = _Surface(PointCloud(points, torch.cat(normals)), noise_of(placed[0]))
+        surfaces = {k: _Surface(views[k]) for k in left}
+        # the view with the greatest overlap comes first
+        k = max(left, key=lambda row: whole.count_matches(surfaces[row]))
+        left.remove(k)
+        view = views[k]
+        motion = _find_motion(whole, surfaces[k])
+        if motion is not None and motion.shown:
+            motions[k] = (motion.pose, motion.unsure)
+            _tell_motion(k, motion)
+            view = _move(view, motion.pose)
+        placed.append(view)
+    return motions
+
+
+def _move(view: PointCloud, pose: Float[Tensor, "4 4"]) -> PointCloud:
+    """Return a view with its points and normals moved; its camera stays, which is not needed."""
+    assert view.normals is not None
+    turn = pose[:3, :3].to(view.points)
+    points = view.points @ turn.T + pose[:3, 3].to(turn)
+    return dataclasses.replace(view, points=points, normals=view.normals @ turn.T)
+
+
+def _tell_motion(number: int, motion: Motion) -> None:
+    """Tell that a view was moved; raise `BadArgument` if that is too far."""
+    turn = math.degrees(float(rotation_angle(motion.pose[:3, :3])))
+    found = f"view {number} moved by {1e3 * motion.shift:.1f} mm and turned by {turn:.1f} degrees"
+    if motion.shift > MOTION.shift or turn > MOTION.turn:
+        allowed = f"at most {1e3 * MOTION.shift:.0f} mm and {MOTION.turn:.0f} degrees"
+        raise BadArgument("poses", found, f"poses that align=True changes by {allowed}")
+    warn_user(MendedInput, f"align: {found}, onto the views before it")
+
+
+def _refuse_views(views: tuple[int, int], distance: float, limit: float) -> None:
+    """Raise `BadArgument` for two views with a `distance` [m] above the `limit` [m]."""
+    first, second = sorted(views)
+    found = f"views {first} and {second} about {1e3 * distance:.1f} mm apart: check their poses"
+    allowed = f"views of one object that agree within {1e3 * limit:.1f} mm"
+    raise BadArgument("clouds", found, f"{allowed}, or align=True")
+
+
+def _check_meeting(views: Sequence[PointCloud]) -> None:
+    """Raise `BadArgument` for two views that nowhere meet."""
+    for first, second in itertools.permutations(range(len(views)), 2):
+        other = views[second].points
+        points = other[draw_rows(len(other), VIEWS.drawn)].double().cpu()
+        gap = float(distance_behind(points, views[first]).quantile(VIEWS.meet))
+        if gap > VIEWS.gap:
+            _refuse_views((first, second), gap, VIEWS.gap)
+
+
+class _Surface:
+    """The surface that one view shows, with what is needed to compare other views with it.
+
+    `points` (n, 3) [m] have the outward unit `normals` (n, 3). `noise` [m] is that of the camera,
+    by which `limit` [m] is set. `spacing` [m] is the usual distance of neighbours. `drawn` are the
+    rows that are compared.
+    """
+
+    def __init__(self, view: PointCloud, noise: float | None = None) -> None:
+        assert view.normals is not None
+        points = view.points.double().cpu()
+        rows = draw_rows(len(points), VIEWS.surface)
+        kept = rows[find_inliers(points, rows)]
+        self.noise = noise_of(view) if noise is None else noise
+        self.limit = self.noise * (VIEWS.vague if view.viewpoint is None else 1.0)
+        self.points = points[kept]
+        self.normals = view.normals.double().cpu()[kept]
+        self.drawn = draw_rows(len(kept), VIEWS.drawn)
+        self.spacing = _spacing(self.points)
+        self._tree = spatial.KDTree(self.points.numpy())
+        self._eye = None if view.viewpoint is None or view.viewpoint.ndim == 2 else view.viewpoint
+
+    def match(
+        self, points: Points, normals: Points, most: float
+    ) -> tuple[Bool[Tensor, "n"], Float[Tensor, "n"], Points]:
+        """Return (matched, heights [m], normals) of points by their nearest points of the surface.
+
+        Matched points face the same way, have a surface point under or over them, and are at most
+        `most` [m] high.
+        """
+        distance, row = map(torch.from_numpy, self._tree.query(points.numpy()))
+        own = self.normals[row]
+        height = ((points - self.points[row]) * own).sum(-1)
+        beside = (distance.square() - height.square()).clamp_min(0).sqrt()
+        matched = (normals * own).sum(-1) > VIEWS.same
+        matched = matched & (beside < VIEWS.reach * self.spacing) & (height.abs() < most)
+        return matched, height, own
+
+    def count_matches(self, other: "_Surface") -> int:
+        """Return how many compared points of another view match."""
+        rows = other.drawn
+        return int(self.match(other.points[rows], other.normals[rows], MOTION.first)[0].sum())
+
+    def height_before(self, other: "_Surface") -> float:
+        """Return how high [m] another view stands before this surface, as its camera saw it; 0
+        without a camera, or if too few points can be compared.
+        """
+        if self._eye is None:
+            return 0.0
+        eye = self._eye.double().cpu()
+        # the camera saw only what faces it
+        facing = ((eye - self.points) * self.normals).sum(-1) > 0
+        seen = self.points[facing]
+        if len(seen) < VIEWS.least:
+            return 0.0
+        rays: Any = unit(seen - eye)
+        points = other.points[other.drawn]
+        asked = unit(points - eye).numpy()
+        aside, row = map(torch.from_numpy, spatial.KDTree(rays.numpy()).query(asked))
+        height = ((points - seen[row]) * self.normals[facing][row]).sum(-1)
+        before = norm(points - eye) < norm(seen[row] - eye)
+        compared = aside < VIEWS.reach * _spacing(rays)
+        if int(compared.sum()) < VIEWS.least:
+            return 0.0
+        # all that is not before the surface is hidden
+        height = torch.where(before, height.clamp_min(0), 0.0)
+        return float(height[compared].quantile(VIEWS.seen))
+
+
+def _spacing(points: Points) -> float:
+    """Return the usual distance between neighbours, in the unit of the points (n, 3)."""
+    return float(nearest(points, VIEWS.neighbours)[0][:, 1:].mean(-1).median())
+
+
+def _find_motion(fixed: _Surface, view: _Surface) -> Motion | None:
+    """Return the most likely motion of a view onto a fixed one; None if they overlap too little.
+
+    It starts at the given pose, and minimises Tukey's loss of the heights of matching points over
+    the other surface, both ways, with the priors of `MOTION`.
+    """
+    centre = view.points.mean(0)
+    arms = view.points - centre
+    noise = math.hypot(fixed.noise, view.noise)
+    usual = torch.tensor([MOTION.shifted] * 3 + [MOTION.turned] * 3, dtype=torch.float64)
+    prior = usual**-2
+    step = torch.zeros(6, dtype=torch.float64)  # shift [m], turn [rad]
+    most = MOTION.first
+    last = MOTION.last * noise
+    height = torch.empty(0)
+    moments = torch.diag(prior)
+    for _ in range(MOTION.steps):
+        jacobian, height = _linearise(fixed, view, centre, step, most)
+        if len(height) < VIEWS.least:
+            return None
+        weight = (1 - (height / most).square()).square() / (noise**2 * MOTION.repeated)
+        weighted = jacobian * weight[:, None]
+        moments = weighted.T @ jacobian + torch.diag(prior)
+        change = -torch.linalg.solve(moments, weighted.T @ height + prior * step)
+        step = step + change
+        if most == last and float(change.abs().max()) < MOTION.still:
+            break
+        most = max(MOTION.shrink * most, last)
+    along = (_displacement(step, arms) * view.normals).sum(-1)
+    distance = float(along.square().mean().sqrt())
+    # the part of a motion that the overlap does not show, by its variance along the normals
+    by_step = torch.cat([view.normals, torch.linalg.cross(arms, view.normals)], -1)
+    spread = float((by_step * torch.linalg.solve(moments, by_step.T).T).sum())
+    hidden = min(spread / float((by_step.square() / prior).sum()), MOTION.hidden)
+    unsure = distance * math.sqrt(hidden / (1 - hidden))
+    rotation = rotation_from_vector(step[3:])
+    pose = rigid(rotation, centre + step[:3] - rotation @ centre)
+    left = MOTION.gaussian * float(height.abs().median())
+    chi_squared = float(step @ (moments - torch.diag(prior)) @ step)
+    return Motion(pose, float(step[:3].norm()), distance, unsure, left, chi_squared)
+
+
+def _displacement(step: Float[Tensor, "6"], arms: Points) -> Points:
+    """Return how far points at the `arms` [m] move: a shift [m], and a turn [rad] about their
+    middle.
+    """
+    return arms @ rotation_from_vector(step[3:]).T + step[:3] - arms
+
+
+def _linearise(
+    fixed: _Surface, view: _Surface, centre: Vector, step: Float[Tensor, "6"], most: float
+) -> tuple[Float[Tensor, "m 6"], Float[Tensor, "m"]]:
+    """Return (jacobian, heights [m]) of the matching points of two views, of both over the other.
+
+    The view is moved by a `step`: a shift [m], and a turn [rad] about the `centre` [m]. Columns of
+    the jacobian are the derivatives by both.
+    """
+    turn = rotation_from_vector(step[3:])
+    arms = (view.points[view.drawn] - centre) @ turn.T
+    normals = view.normals[view.drawn] @ turn.T
+    over, height, own = fixed.match(arms + centre + step[:3], normals, most)
+    rows = [torch.cat([own, torch.linalg.cross(arms, own)], -1)[over]]
+    heights = [height[over]]
+    # the fixed points in the frame of the view
+    arms = fixed.points[fixed.drawn] - centre - step[:3]
+    normals = fixed.normals[fixed.drawn] @ turn
+    over, height, own = view.match(arms @ turn + centre, normals, most)
+    own = own @ turn.T
+    rows.append(-torch.cat([own, torch.linalg.cross(arms, own)], -1)[over])
+    heights.append(height[over])
+    return torch.cat(rows), torch.cat(heights)
