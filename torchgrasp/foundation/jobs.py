@@ -12,7 +12,6 @@ from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, TimeoutError
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import reduction, spawn
-from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Annotated, Any, NamedTuple, TypeVar
 
 import torch
@@ -132,8 +131,8 @@ def _run_pool(
     pool = ProcessPool(
         min(workers, len(waiting)),
         initializer=_begin,
-        initargs=[function],
-        context=multiprocessing.get_context("spawn") if own else _Apart(),
+        initargs=[function, dict(os.environ)],
+        context=_USUAL if own else _Apart(),
     )
     ended = queue.SimpleQueue[int]()
     running: dict[int, tuple[Task, Future[Result]]] = {}
@@ -177,7 +176,23 @@ def _run_pool(
             pool.join(10.0)
 
 
-class _Process(SpawnProcess):
+def _usual_context() -> Any:
+    """Return the way in which worker processes start, here where processes can be copied or not.
+
+    They are copies of a server process that has imported the library, and has no threads that a
+    copy would lack. On Windows each imports the library itself.
+    """
+    if "forkserver" not in multiprocessing.get_all_start_methods():
+        return multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["torchgrasp"])
+    return context
+
+
+_USUAL = _usual_context()
+
+
+class _Process(_USUAL.Process):
     """A process that does not run the caller's script, which would begin the work anew where it has
     no guard.
     """
@@ -195,14 +210,19 @@ class _Process(SpawnProcess):
                 spawn.get_preparation_data = known
 
 
-class _Apart(SpawnContext):
+class _Apart(type(_USUAL)):
     """A way to start processes: each is a `_Process`."""
 
     Process = _Process
 
 
-def _begin(function: Callable[..., Any]) -> None:
-    """Prepare a worker process: it uses one torch thread, and it ends when its parent process ends."""
+def _begin(function: Callable[..., Any], environment: dict[str, str]) -> None:
+    """Prepare a worker process: it uses one torch thread, and it ends when its parent process ends.
+
+    `environment` holds the variables of the parent process; those of the server may be older.
+    """
+    os.environ.clear()
+    os.environ.update(environment)
     torch.set_num_threads(1)
     parent = multiprocessing.parent_process()
     assert parent is not None
