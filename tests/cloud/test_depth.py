@@ -323,6 +323,16 @@ def test_intrinsics_of_a_mode_are_refused_for_another(size):
                 read_depth(np.full((height, width), 500, dtype=np.uint16), k)
 
 
+@pytest.mark.parametrize("scale", [7.5, 3.75, 5.3, 0.3])
+def test_intrinsics_of_an_image_of_any_other_scale_are_refused_with_the_factor(scale):
+    """Of a colour image beside a depth image, such as that of a phone."""
+    k = (213.0 * scale, 213.0 * scale, 129.6 * scale, 94.2 * scale)
+    with pytest.raises(BadArgument, match=r"all four times ") as refused:
+        read_depth(np.full((192, 256), 500, dtype=np.uint16), k)
+    factor = float(str(refused.value).split("all four times ")[1].split(";")[0])
+    assert factor * scale == pytest.approx(1, abs=0.02)
+
+
 def test_a_crop_with_its_own_principal_point_is_no_other_resolution():
     rng = np.random.default_rng(0)
     depth = np.full((480, 640), 500, dtype=np.uint16)

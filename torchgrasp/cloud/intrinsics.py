@@ -33,8 +33,8 @@ SCALES = (1 / 4, 1 / 3, 1 / 2, 2 / 3, 3 / 4, 4 / 3, 3 / 2, 2, 3, 4)
 """Ratios of two resolutions of one camera."""
 MODES = (
     *((320, 240), (424, 240), (480, 270), (512, 424), (640, 360), (640, 480), (640, 576)),
-    *((848, 480), (960, 540), (1024, 768), (1280, 720), (1280, 960), (1920, 1080)),
-    *((1944, 1200), (2048, 1536)),
+    *((848, 480), (960, 540), (960, 720), (1024, 768), (1280, 720), (1280, 960)),
+    *((1920, 1080), (1920, 1440), (1944, 1200), (2048, 1536)),
 )
 """Resolutions (width, height) [px] of depth cameras."""
 
@@ -74,6 +74,10 @@ class IntrinsicsNumbers:
     centred: float = 0.05
     """Greatest shift of the principal point from the middle of a resolution that is guessed, over
     half the side.
+    """
+    scaled: float = 2.5
+    """A principal point so many times as far out as the middle, or as near, for both sides alike,
+    is that of an image of another scale: an object's crop is not so far from it.
     """
     off: float = 0.16
     """Shift of the principal point from the middle, over half the side, beyond which another
@@ -333,6 +337,9 @@ def _check_size(k: Matrix, stated: list[float] | None, width: int, height: int) 
         modes = map(k.new_tensor, MODES)
         sizes = [image * scale for scale in SCALES]
         sizes += [mode for mode in modes if not torch.equal(mode, image)]
+        scale = centre / image
+        if float(scale.min()) > LIMITS.scaled or float(scale.max()) < 1 / LIMITS.scaled:
+            sizes.append(image * scale.mean())
         near = [m for m in sizes if bool(((centre / m - 1).abs() < LIMITS.centred).all())]
         if not near or float((centre / image - 1).abs().max()) < LIMITS.off:
             return
