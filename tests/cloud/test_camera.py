@@ -68,6 +68,24 @@ def test_an_exact_view_lies_on_the_mesh_and_faces_the_camera(box):
     assert abs(torch.linalg.vector_norm(cloud.viewpoint).item() - 0.5) < 1e-9
 
 
+@pytest.mark.parametrize("kept", ["read before the scaling", "given"])
+def test_a_mesh_with_normals_of_another_shape_is_seen_where_its_faces_are(kept):
+    """Faces of a ball that was stretched: trimesh before 5.2 keeps the ball's normals."""
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.04)
+    old = ball.face_normals.copy()
+    ball.apply_scale([1.0, 1.0, 3.0])
+    fresh = trimesh.Trimesh(ball.vertices, ball.faces, process=False)
+    if kept == "given":
+        old[:20] = fresh.face_normals[:20]  # trimesh refuses normals if one of the first 20 is off
+        ball.face_normals = old
+        assert np.abs(ball.face_normals - fresh.face_normals).max() > 0.3
+    cloud = partial_view(ball, look_at(35.0, 25.0, target=ball), noise=False)
+    # (x / a)^2 + (y / a)^2 + (z / 3 a)^2 = 1, less what the triangles cut off
+    radius = torch.linalg.vector_norm(cloud.points / torch.tensor([1.0, 1.0, 3.0]), dim=-1)
+    assert radius.max() < 0.04 + 1e-9
+    assert radius.min() > 0.039
+
+
 def test_noise_has_the_documented_size_and_is_repeatable(box):
     cloud, again, other = (partial_view(box, look_at(35.0, 25.0), seed=s) for s in (0, 0, 1))
     assert torch.equal(cloud.points, again.points)

@@ -18,6 +18,7 @@ from torchgrasp.foundation.errors import MeshError
 from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.foundation.rules import Range, Seed
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
+from torchgrasp.geometry.mesh import with_true_normals
 from torchgrasp.values.planning import PointCloud
 
 # columns, rows and focal length [px] of the default camera
@@ -135,6 +136,7 @@ def cast_mesh(mesh: "trimesh.Trimesh", obj_from_camera: Transform) -> tuple[Imag
     """
     if not len(mesh.faces):
         raise MeshError("mesh", "no faces", "a mesh with a surface")
+    mesh = with_true_normals(mesh)
     row, column = _pixels()
     x = (column - INTRINSICS[0, 2]) / FOCAL
     y = (row - INTRINSICS[1, 2]) / FOCAL

@@ -75,7 +75,7 @@ def cloud_from_depth(
     Args:
         depth: (h, w) or (h, w, 1), distance along the optical axis: floats in metres, or integers
             (such as uint16) in millimetres.
-        intrinsics: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] [pixels], its 9 numbers, or a 3 x 4
+        intrinsics: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels, its 9 numbers, or a 3 x 4
             projection matrix. Or (fx, fy, cx, cy) [pixels], or (fx, fy, cx, cy, width, height) with
             the size of the image, which may be a crop. Or the dict or object of ROS (CameraInfo), Open3D,
             RealSense, Zivid, Azure Kinect or BOP, with its depth_scale and distortion.

@@ -30,6 +30,7 @@ _REFERENCE = re.compile(rb"/\S*")
 MESH_FILE = f"a mesh file ({', '.join(SUFFIXES)})"
 LEAST_VOLUME = 1e-12  # least volume [m^3] of a body
 LEAST_SPAN = 1e-40  # least squared double area [m4] of a triangle that is divided by
+STALE_NORMAL = 1e-4  # least difference of unit normals that no rounding of a file explains
 # a binary .stl: title, 32-bit count of faces, and bytes of each face
 STL_TITLE = 80
 STL_HEAD = STL_TITLE + 4
@@ -101,6 +102,20 @@ def check_solid(mesh: "trimesh.Trimesh", name: str) -> None:
             f"{name} without inertia, as of a body turned inward",
             "every face turned outward",
         )
+
+
+def with_true_normals(mesh: "trimesh.Trimesh") -> "trimesh.Trimesh":
+    """Return a mesh whose face normals are those of its corners: the same one, or a bare copy.
+
+    trimesh before 5.2 keeps normals that were read before an uneven scaling. It casts rays by them,
+    too. A file may bring wrong normals as well.
+    """
+    corners = np.asarray(mesh.vertices)[mesh.faces]  # (f, 3 corners, 3)
+    normals, valid = trimesh.triangles.normals(corners)
+    off = np.abs(mesh.face_normals[valid] - normals).max(initial=0.0)
+    if off < STALE_NORMAL:
+        return mesh
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
 
 
 def closest_on_triangles(

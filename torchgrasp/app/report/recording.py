@@ -20,6 +20,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import MissingExtra
 from torchgrasp.foundation.lazy import spatial
 from torchgrasp.geometry.frames import apply, inverse, rotate
+from torchgrasp.geometry.mesh import with_true_normals
 from torchgrasp.geometry.plane import upright_frame
 
 ROOT = "world/obj"  # entity of the frame of the cloud, in which all poses of grasps are
@@ -113,9 +114,9 @@ class _Recorder:
         place = f"{ROOT}/closing"
         upright = self.run.upright()
         closure = run.closure
-        mesh = run.mesh
         assert closure is not None
-        assert mesh is not None
+        assert run.mesh is not None
+        mesh = with_true_normals(run.mesh)
         assert upright.closure is not None
         assert upright.mesh is not None
         seconds = to_array(closure.time)
