@@ -299,3 +299,26 @@ def test_try_grasp_passes_the_surface_to_closings_that_compare_contacts_with_it(
     if known:  # the tin's axis is inside, what is 3 cm beside its wall is not
         inside, outside = trial.surface.query(torch.tensor([[0.0, 0, 0.06], [0.06, 0, 0.06]]))[0]
         assert inside < -0.02 and outside > 0.02
+
+
+@pytest.mark.parametrize(("tries", "count"), [(1, 1), (3, 3)])
+def test_a_protocol_of_several_tries_has_the_other_grasps_of_the_view(
+    folder, monkeypatch, tries, count
+):
+    """Both in `evaluate` and in a campaign, which share `try_grasp`; the chosen grasp comes first."""
+    tried = []
+
+    def run(trial, protocol, *at):
+        tried.append(trial.grasp)
+        return GOOD
+
+    monkeypatch.setattr(views, "run_protocol", run)
+    hand = load_hand("allegro")
+    shipped = load_shipped_grasp("jug", "allegro")
+    grasps = shipped[torch.tensor([0, 0, 0])]
+    scores = torch.tensor([0.3, 0.2, 0.1], dtype=torch.float64)
+    grasps = dataclasses.replace(grasps, score=scores)
+    protocol = dataclasses.replace(Protocol("quick", QUICK), tries=tries)
+    view = views.ObjectView(folder, "tin", "view0", hand.source)
+    views.try_grasp(view, grasps, protocol, EvaluationSpec(1), (1, 0))
+    assert tried[0].score.tolist() == pytest.approx([0.2, 0.3, 0.1][:count])

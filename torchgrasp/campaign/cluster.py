@@ -130,7 +130,7 @@ def _work(
     outcome = torch.zeros(passed.shape, dtype=torch.int64)
     for k, rank in enumerate(ranks):
         for draw in range(draws):
-            tried = try_grasp(view, found[rank], protocol, spec, (rank, draw))
+            tried = try_grasp(view, found, protocol, spec, (rank, draw))
             passed[k, draw] = tried.passed
             outcome[k, draw] = int(tried.status)
     row = row._replace(

@@ -137,7 +137,4 @@ def _try(
     """Try the saved grasp with index `row` of a view in simulation, with the pose error of number
     `draw`.
     """
-    grasps = load_grasps(view.file(shelf))
-    # tried where the lift fails
-    others = [k for k in range(len(grasps)) if k != row and protocol.tries > 1]
-    return try_grasp(view, grasps[[row, *others]], protocol, spec, (row, draw))
+    return try_grasp(view, load_grasps(view.file(shelf)), protocol, spec, (row, draw))

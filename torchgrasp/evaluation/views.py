@@ -236,12 +236,15 @@ def _read_planned(path: Path, score: ViewScore, cloud: PointCloud, hand: Hand) -
 
 
 def try_grasp(
-    view: ObjectView, grasp: Grasps, protocol: Protocol, spec: EvaluationSpec, at: tuple[int, int]
+    view: ObjectView, grasps: Grasps, protocol: Protocol, spec: EvaluationSpec, at: tuple[int, int]
 ) -> ProtocolResult:
-    """Try the first grasp of `grasp` on a view in simulation, and return the result.
+    """Try one of the grasps of a view in simulation, and return the result.
 
-    `at` holds the grasp's rank and the number of the pose error's draw.
+    `at` holds the grasp's index and the number of the pose error's draw. The other `grasps` are
+    tried where a lift fails, if the protocol allows further tries.
     """
+    others = [k for k in range(len(grasps)) if k != at[0] and protocol.tries > 1]
+    grasp = grasps[[at[0], *others]]
     hand = hand_of(grasp, view.load_hand())
     mesh, parts = _read_solid(view.objects, view.object)
     seed = seed_of(spec.seed, view.object, view.view, *at)
