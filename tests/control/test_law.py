@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from tests.make import directions
+from tests.pinch import pinch
 from torchgrasp import ClosingReference, closing_gains, load_hand
 from torchgrasp.control.finger_forces import (
     contacts_in_hand,
@@ -252,3 +253,15 @@ def test_reference_approaches_the_forces_that_the_stability_model_prefers():
     assert torch.allclose(led, desired_forces(points, normals, 4.0, wanted), atol=1e-9)
     even, led = (float((-(x * normals).sum(-1) - wanted).norm()) for x in (even, led))
     assert led < 0.9 * even
+
+
+@pytest.mark.parametrize("name", ["allegro", "barrett"])
+def test_a_given_stiffness_counts_as_that_of_a_hand_with_these_drives(name):
+    hand, grasp = pinch(name)
+    drives = {joint: drive._replace(kp=7.0) for joint, drive in hand.actuators.items()}
+    known = ClosingReference.from_grasp(dataclasses.replace(hand, actuators=drives), grasp)
+    given = ClosingReference.from_grasp(hand, grasp, kp=7.0)
+    assert torch.equal(given.gains.force_gain, known.gains.force_gain)
+    assert torch.equal(given.squeeze, known.squeeze)
+    own = ClosingReference.from_grasp(hand, grasp)
+    assert not torch.allclose(given.gains.force_gain, own.gains.force_gain)

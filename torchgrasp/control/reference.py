@@ -128,7 +128,7 @@ class ClosingReference(Value):
         desired = finger_forces.desired_forces(points, normals, force, preferred)
         covariance = law.surface_covariance(normals, std_m)
         jacobian = hand.jacobian(grasp.joints, points)  # (1, f, 3, h)
-        stiffness = finger_forces.joint_stiffness(hand)
+        stiffness = finger_forces.joint_stiffness(hand, kp)
         compliance = finger_forces.tip_compliance(jacobian, normals, stiffness)
         force_covariance = law.force_covariance(desired, normals, deviation)
         force_rate = law.FORCE_BANDWIDTH * sure**2 * compliance
@@ -140,9 +140,7 @@ class ClosingReference(Value):
             desired_force=desired[0],
             force_source="analytic" if stability is None else "stability",
         )
-        pressed = finger_forces.press(
-            grasp.joints, jacobian, desired, finger_forces.joint_stiffness(hand, kp)
-        )
+        pressed = finger_forces.press(grasp.joints, jacobian, desired, stiffness)
         # in the hand's frame
         direction = rotate(inverse(grasp.obj_from_hand), grasp.approach[:, None])[0, 0]
         return cls(
