@@ -12,7 +12,7 @@ from tests.make import near, real
 from tests.pinch import cylinder, pinch
 from torchgrasp.control import squeeze
 from torchgrasp.control.finger_forces import joint_stiffness
-from torchgrasp.evaluation import PROTOCOLS, GraspTrial, PullSpec, Truth, pull_grasp
+from torchgrasp.evaluation import PROTOCOLS, GraspTrial, PullSpec, Truth, lift_grasps, pull_grasp
 from torchgrasp.evaluation.trial import TrialRun
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.geometry.frames import apply, inverse
@@ -144,3 +144,11 @@ def test_a_pull_in_open_loop_is_the_same_whether_the_hand_observes_or_not(monkey
     rests = found()
     monkeypatch.setattr(TrialRun, "hold", observe)
     assert found() == rests
+
+
+def test_a_mesh_in_another_frame_is_refused():
+    hand, grasp = pinch("allegro")
+    off = GraspTrial(hand, grasp, Truth(cylinder((0.2, 0.0))))
+    for run in (pull_grasp, lift_grasps):
+        with pytest.raises(BadArgument, match=r"mesh: .*one frame, in metres.* mm off"):
+            run(off)

@@ -4,6 +4,7 @@ none.
 
 import pytest
 import torch
+import trimesh
 
 from tests.make import load_hand, random_motion, see
 from torchgrasp import (
@@ -11,13 +12,15 @@ from torchgrasp import (
     Region,
     Status,
     explain_empty,
+    fit_shape,
     load_object,
     plan_grasps,
     plan_scene,
 )
-from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument, NoEffect
 from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.geometry.plane import Plane, move
+from torchgrasp.planner.request import Request
 
 HAND = load_hand("barrett")
 VIEW = load_object("jug").view
@@ -77,3 +80,44 @@ def test_a_region_is_of_one_cloud():
             plan_grasps([VIEW, VIEW], HAND, **{name: Region.rim(VIEW, 0.0)})
     with pytest.raises(BadArgument, match=r"spec: .*region"):
         plan_grasps([VIEW, VIEW], HAND, ContactSpec(region=Region.rim(VIEW, 0.0)))
+
+
+FAR = ([0.5, 0.5, 0.0], [0.55, 0.55, 0.1])
+
+
+def corners(low, high):
+    return Region.box(torch.tensor(low), torch.tensor(high))
+
+
+def test_a_box_or_mesh_in_another_frame_is_refused_or_told():
+    tin = trimesh.creation.cylinder(0.03, 0.1)
+    tin.apply_translation([0.5, 0.5, 0.05])
+    scene = see((0.0, 0.0, 0.06, 0.12), (0.0, -0.2, 0.06, 0.14)).select(1)
+    for region in (corners(*FAR), Region.mesh(tin), corners([100.0] * 3, [200.0] * 3)):
+        for seen in (VIEW, scene):
+            with pytest.raises(BadArgument, match=r"keep: .*in the frame of the cloud.* mm off"):
+                plan_grasps(seen, HAND, starts=4, keep=region)
+            with pytest.warns(NoEffect, match="avoid changes nothing: one that is .* mm off"):
+                Request(seen, HAND, avoid=region)
+
+
+def test_a_region_on_the_seen_or_the_hidden_side_is_at_the_object():
+    mesh = load_object("jug").mesh
+    low, high = (torch.tensor(x) for x in mesh.bounds)
+    middle = (low + high) / 2
+    # halves of the body on both sides of its middle, on each axis
+    for axis in range(3):
+        first = high.clone()
+        first[axis] = middle[axis]
+        second = low.clone()
+        second[axis] = middle[axis]
+        for region in (Region.box(low, first), Region.box(second, high), Region.mesh(mesh)):
+            assert Request(VIEW, HAND, keep=region, avoid=region).keep is region
+
+
+def test_a_shape_of_another_frame_is_refused():
+    shape = fit_shape(VIEW)
+    away = torch.eye(4, dtype=torch.float64)
+    away[0, 3] = 0.1
+    with pytest.raises(BadArgument, match=r"shape: .*in the frame of its cloud.* mm off"):
+        plan_grasps(move(VIEW, away), HAND, starts=4, shape=shape)

@@ -1,17 +1,20 @@
 """Checks that the cloud, mesh, contacts and table of one object do not contradict each other."""
 
 import dataclasses
+from collections.abc import Callable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.cloud.neighbours import draw_rows
-from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument, NoEffect
 from torchgrasp.foundation.lazy import trimesh
-from torchgrasp.geometry.linalg import Points, unit
+from torchgrasp.foundation.told import warn_user
+from torchgrasp.geometry.linalg import Points, norm, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.plane_fit import assume_noise
+from torchgrasp.geometry.signed_distance import DistanceField
 from torchgrasp.values.planning import Grasps, PointCloud
 
 
@@ -33,6 +36,10 @@ class AgreementNumbers:
     """Greatest share of contacts that may be farther from their mesh: one of three, on a side that
     nobody saw.
     """
+    astray: float = 0.7
+    """Greatest share of contacts that may be farther in trials, where some grasps may miss."""
+    levels: int = 8
+    """Depths behind each point of a cloud at which a region is sought."""
     unseen: float = 0.03
     """Greatest distance [m] of contacts from a cloud, which is partial, and the space behind it."""
     unseen_share: float = 0.5
@@ -86,9 +93,14 @@ def check_mesh(cloud: PointCloud, mesh: "trimesh.Trimesh", name: str = "mesh") -
     check_agreement(name, cloud.points, "the cloud's points", mesh, slack, AGREEMENT.share)
 
 
-def check_contacts(grasps: Grasps, mesh: "trimesh.Trimesh", slack: float = AGREEMENT.slack) -> None:
-    """Raise `BadArgument` if many contacts of grasps are farther than `slack` [m] from their
-    object's mesh.
+def check_contacts(
+    grasps: Grasps,
+    mesh: "trimesh.Trimesh",
+    slack: float = AGREEMENT.slack,
+    share: float = AGREEMENT.guessed,
+) -> None:
+    """Raise `BadArgument` if more than a `share` of the contacts of grasps are farther than `slack`
+    [m] from their object's mesh.
 
     The mesh [m] is in the frame of the grasps. A mesh that floats above the table of the grasps, or
     sinks far into it, is refused, too.
@@ -96,7 +108,7 @@ def check_contacts(grasps: Grasps, mesh: "trimesh.Trimesh", slack: float = AGREE
     if not len(grasps):
         return
     points = grasps.contacts.points.reshape(-1, 3)
-    check_agreement("mesh", points, "contacts of grasps", mesh, slack, AGREEMENT.guessed)
+    check_agreement("mesh", points, "contacts of grasps", mesh, slack, share)
     if grasps.table is None:
         return
     # A table that was guessed from a view may lie above the true foot, but not below it.
@@ -116,6 +128,46 @@ def check_seen(grasps: Grasps, cloud: PointCloud, name: str) -> None:
         points = grasps.contacts.points.reshape(-1, 3)
         limits = {"slack": AGREEMENT.unseen, "share": AGREEMENT.unseen_share}
         check_agreement(name, points, "the contacts", cloud, **limits)
+
+
+def check_where(name: str, distance: Callable[[Points], Tensor], cloud: PointCloud) -> None:
+    """Refuse a region "keep" that is off a cloud and the space hidden behind it; tell of another.
+
+    The function `distance` returns the signed distances [m] of points [m] in the frame of the
+    cloud. Raises `BadArgument` for the argument `name`.
+    """
+    rows = draw_rows(len(cloud), AGREEMENT.drawn_of_cloud)
+    seen = cloud.points[rows].double().cpu()
+    length = float(norm(seen.amax(0) - seen.amin(0)))
+    space = seen
+    room = AGREEMENT.unseen
+    if cloud.viewpoint is None:
+        room += length / 2
+    else:
+        eye = cloud.viewpoint.double().cpu()
+        ray = unit(seen - (eye if eye.ndim == 1 else eye[rows]))
+        depth = torch.linspace(0, length, AGREEMENT.levels, dtype=seen.dtype)[:, None, None]
+        space = (seen + depth * ray).reshape(-1, 3)
+    off = float(distance(space).min())
+    if off <= room:
+        return
+    found = f"one that is {1e3 * off:.0f} mm off the object's points"
+    allowed = "a region on the object: in the frame of the cloud, in metres"
+    if name == "keep":
+        raise BadArgument(name, found, allowed)
+    warn_user(NoEffect, f"{name} changes nothing: {found}; expected {allowed}")
+
+
+def check_shape(field: DistanceField, cloud: PointCloud) -> None:
+    """Raise `BadArgument` if the points of a cloud lie off the surface of its estimated shape.
+
+    The `field` holds the shape's signed distances [m], in the frame of the cloud.
+    """
+    points = cloud.points[draw_rows(len(cloud), AGREEMENT.drawn)]
+    off = float(field.query(points.to(field.nodes))[0].abs().median())
+    if off > AGREEMENT.slack + 2 * _noise(cloud):
+        found = f"one whose surface is {1e3 * off:.0f} mm off the cloud's points"
+        raise BadArgument("shape", found, "the shape of this object, in the frame of its cloud")
 
 
 def check_foot(cloud: PointCloud, table: Plane) -> None:

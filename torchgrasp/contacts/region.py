@@ -36,7 +36,8 @@ class Region(Value):
     """A region of space in the frame of the cloud, as a signed distance.
 
     `distance` is a function of points (n, 3) [m] in float64; it returns their signed distances (n,)
-    [m], negative inside. Errors call the function by the `name`.
+    [m], negative inside. Errors call the function by the `name`. A `placed` region, a box or a
+    mesh, must be at the object: planning compares it with the cloud.
 
     >>> from torchgrasp import load_object
     >>> ball = Region(lambda points: points.norm(dim=-1) - 0.05)
@@ -48,6 +49,7 @@ class Region(Value):
 
     distance: Distance
     name: str = "distance"
+    placed: bool = False
 
     @checked
     def __call__(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
@@ -95,7 +97,7 @@ class Region(Value):
             beyond = local.abs() - half.to(points)
             return norm(beyond.clamp_min(0)) + beyond.amax(-1).clamp_max(0)
 
-        return cls(distance)
+        return cls(distance, placed=True)
 
     @classmethod
     @checked
@@ -109,7 +111,11 @@ class Region(Value):
         surface = surface_distance(
             torch.tensor(np.array(solid.vertices)), torch.tensor(np.array(solid.faces))
         )
-        return cls(lambda points: torch.from_numpy(surface(points.cpu().numpy())).to(points))
+
+        def distance(points: Tensor) -> Tensor:
+            return torch.from_numpy(surface(points.cpu().numpy())).to(points)
+
+        return cls(distance, placed=True)
 
     @classmethod
     @checked

@@ -15,7 +15,14 @@ from torchgrasp.cloud.agreement import check_contacts, check_stand
 from torchgrasp.control.reference import check_single
 from torchgrasp.data.shipped import GraspObject
 from torchgrasp.evaluation.criterion import Tick, judge_lift, motion_between
-from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, TrialRun, Truth, smooth_step
+from torchgrasp.evaluation.trial import (
+    TRIALS,
+    GraspTrial,
+    TrialDriver,
+    TrialRun,
+    Truth,
+    smooth_step,
+)
 from torchgrasp.foundation.base import map_tensors
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import Status
@@ -49,8 +56,6 @@ class LiftNumbers:
     """Time [s] at the end in which the fingers must touch the object."""
     lost: float = 0.5
     """Motion [m] of the object beyond the lift's height that ends the trial."""
-    slack: float = 0.03
-    """Distance [m] from contacts within which the mesh may lie: objects may be misplaced a bit."""
 
 
 LIFTS = LiftNumbers()
@@ -121,7 +126,7 @@ def close_hand(
         mesh = mesh.mesh
     mesh = read_mesh(mesh)
     hand = hand if isinstance(hand, Hand) else hand_of(grasp, hand)
-    check_contacts(grasp, mesh, LIFTS.slack)
+    check_contacts(grasp, mesh, TRIALS.slack)
     if table is not None:
         check_stand(mesh, table)
     truth = Truth(mesh, parts, error, table, neighbours, slide)

@@ -12,7 +12,7 @@ from torchgrasp.evaluation.causes import find_cause
 from torchgrasp.evaluation.protocols import Protocol, PullSpec, draw_push, find_protocol, seed_of
 from torchgrasp.evaluation.regrasp import run_lifts
 from torchgrasp.evaluation.summary import ProtocolResult
-from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, TrialRun
+from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, TrialRun, check_truth
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status
@@ -65,7 +65,9 @@ def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") ->
     protocol = find_protocol(protocol)
     if protocol.pull is None:
         raise BadArgument("protocol", f"{protocol.name!r}, which lifts", "a protocol that pulls")
-    return run_pulls(TrialDriver(trial, protocol.trial), protocol.pull)
+    driver = TrialDriver(trial, protocol.trial)
+    check_truth(trial)
+    return run_pulls(driver, protocol.pull)
 
 
 def run_pulls(driver: TrialDriver, spec: PullSpec) -> PullResult:

@@ -18,7 +18,14 @@ from torchgrasp.control.tactile import Targets
 from torchgrasp.control.uncertainty_closing import UncertaintyClosing
 from torchgrasp.evaluation.lift import _Lift, run_lift
 from torchgrasp.evaluation.protocols import apply_error, seed_of
-from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, TrialRun, Truth, smooth_step
+from torchgrasp.evaluation.trial import (
+    GraspTrial,
+    TrialDriver,
+    TrialRun,
+    Truth,
+    check_truth,
+    smooth_step,
+)
 from torchgrasp.foundation.base import flatnonzero
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import Status
@@ -131,7 +138,9 @@ def lift_grasps(
     [(0, True)]
     """
     first = dataclasses.replace(trial, grasp=trial.grasp[0])
-    return run_lifts(TrialDriver(first, TrialSpec() if spec is None else spec), trial.grasp, tries)
+    driver = TrialDriver(first, TrialSpec() if spec is None else spec)
+    check_truth(trial)
+    return run_lifts(driver, trial.grasp, tries)
 
 
 def run_lifts(driver: TrialDriver, grasps: Grasps, tries: int) -> tuple[LiftTry, ...]:

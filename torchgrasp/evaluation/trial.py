@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchgrasp.cloud.agreement import AGREEMENT, check_contacts
 from torchgrasp.cloud.camera import partial_view
 from torchgrasp.control.controller import GraspController
 from torchgrasp.control.finger_forces import stiff_drives
@@ -27,6 +28,7 @@ from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.foundation.rules import Pose, Seed
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.linalg import norm
+from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand
@@ -49,6 +51,8 @@ class TrialNumbers:
     """Decimals to which a table's offset [m] is rounded."""
     speed: float = 0.2
     """Mean speed [m/s] of an unguarded approach."""
+    slack: float = 0.03
+    """Distance [m] from contacts within which the mesh may lie: objects may be misplaced a bit."""
     relooked: float = 1.5
     """Extra range of the hand's mount after a second look, over the largest shift of `relocate`."""
 
@@ -91,6 +95,12 @@ class GraspTrial:
     seed: Seed = 0
     told: Plane | None = None  # the table that the controller knows, in the frame of the grasp
     surface: SignedDistanceField | None = None  # the estimated surface of the object
+
+
+def check_truth(trial: GraspTrial) -> None:
+    """Raise `BadArgument` if the grasps of a trial all but miss its mesh, as in another frame."""
+    mesh = read_mesh(trial.truth.mesh)
+    check_contacts(trial.grasp, mesh, TRIALS.slack, AGREEMENT.astray)
 
 
 class TrialDriver:

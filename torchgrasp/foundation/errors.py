@@ -154,6 +154,10 @@ class MendedInput(UserWarning):
     """An input has a small fault, and was read with the fault mended; the message names both."""
 
 
+class NoEffect(UserWarning):
+    """An argument changes nothing, most often because it is in another frame or unit."""
+
+
 class CutOff(CloudWarning):
     """The object reaches the border of the image, so a part of it may be missing."""
 

@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.arm.reach import reach_poses, with_arm
+from torchgrasp.cloud.agreement import check_shape
 from torchgrasp.cloud.check import FEW_POINTS, remove_duplicates
 from torchgrasp.cloud.neighbours import is_flat
 from torchgrasp.contacts.problem import ContactProblem, ShapeLike, rows_of
@@ -116,7 +117,10 @@ class ShapedObject:
         else:
             shape = shape.moved(inverse(frame))
         surface = extract_mesh(shape)
-        body = EstimatedBody.around(shape, surface.vertices, collision_field(shape, surface))
+        field = collision_field(shape, surface)
+        if request.shape is not None:
+            check_shape(field, move(cloud, inverse(frame)))
+        body = EstimatedBody.around(shape, surface.vertices, field)
         # the surroundings of a scene's target
         obstacles = None
         if scene is not None:

@@ -6,7 +6,8 @@ from collections.abc import Callable
 from typing import Annotated, Any
 
 from torchgrasp.arm.arm import Arm
-from torchgrasp.contacts.region import combine
+from torchgrasp.cloud.agreement import check_where
+from torchgrasp.contacts.region import Region, combine
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Count, Range, Seed
@@ -84,8 +85,9 @@ class Request:
     def __post_init__(self) -> None:
         """Raise `BadArgument` for arguments that contradict each other.
 
-        These are an arm of another hand, no load to resist, or a `promise` (the share of returned
-        grasps that hold) for a displaced object.
+        These are an arm of another hand, no load to resist, a box or mesh to keep to that is not at
+        the object, or a `promise` (the share of returned grasps that hold) for a displaced object.
+        A box or mesh to avoid that is not there is told in a `NoEffect` warning.
         """
         if self.arm is not None and self.arm.hand_sha256 != self.hand.source.sha256:
             raise BadArgument(
@@ -95,6 +97,10 @@ class Request:
             )
         if isinstance(self.resist, tuple) and not self.resist:
             raise BadArgument("resist", "no load", "at least one, or None")
+        for name in ("keep", "avoid"):
+            region = getattr(self, name)
+            if isinstance(region, Region) and region.placed:
+                check_where(name, region, self._seen)
         if self.promise is not None and self.grasp_task.displaced:
             raise BadArgument("promise", f"{self.promise:g} for a displaced object", "None")
 
@@ -105,6 +111,13 @@ class Request:
         """
         if self.observer is not None:
             self.observer(stage, message, value)
+
+    @property
+    def _seen(self) -> PointCloud:
+        """All points that the camera saw."""
+        points = self.cloud.points
+        eye = self.cloud.viewpoint
+        return PointCloud(points, viewpoint=None if eye is None else eye.to(points))
 
     @property
     def contact_spec(self) -> ContactSpec:
