@@ -127,7 +127,7 @@ def parse_text(data: bytes, suffix: str) -> dict[str, Any]:
         names = ["x", "y", "z", "intensity", "red", "green", "blue"][:width]
     if len(names or [0] * width) != width or (not names and width not in (3, 6)):
         named = (
-            f"the names {' '.join(names)[:SHOWN_NAMES]!r}"
+            f"the names {' '.join(names)[:SHOWN_NAMES]!r}, not one word for each column"
             if names
             else "no line of names above, such as x y z nx ny nz"
         )
