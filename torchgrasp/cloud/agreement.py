@@ -165,7 +165,7 @@ def check_shape(field: DistanceField, cloud: PointCloud) -> None:
     """
     points = cloud.points[draw_rows(len(cloud), AGREEMENT.drawn)]
     off = float(field.query(points.to(field.nodes))[0].abs().median())
-    if off > AGREEMENT.slack + 2 * _noise(cloud):
+    if off > AGREEMENT.slack + 2 * noise_of(cloud):
         found = f"one whose surface is {1e3 * off:.0f} mm off the cloud's points"
         raise BadArgument("shape", found, "the shape of this object, in the frame of its cloud")
 
