@@ -218,6 +218,32 @@ def test_a_scene_in_usd_is_valid_and_plays_in_newton(tmp_path):
     assert (folder / "motion_0.usda").is_file()
 
 
+@pytest.mark.sim
+def test_newton_has_the_iterations_against_slip_of_our_scene(tmp_path):
+    """Newton's reader of MJCF drops them, so the script sets them on the built model."""
+    python = ROOT / ".beside" / "newton" / "bin" / "python"
+    if not python.exists():
+        pytest.skip("scripts/beside makes .beside/newton")
+    folder = export(tmp_path, "newton", "jug", "barrett", 0.25)
+    script = folder / "play.py"
+    # the built model counts: the motion is left out
+    script.write_text(script.read_text().replace("np.arange(0.0, times[-1], step)", "[]"))
+    code = (
+        f"import runpy; names = runpy.run_path({str(script)!r}, run_name='__main__'); "
+        "print(names['solver'].mj_model.opt.noslip_iterations)"
+    )
+    done = subprocess.run(
+        [str(python), "-W", "ignore", "-c", code],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONPATH": ""},
+    )
+    assert done.returncode == 0, done.stderr
+    scene = ET.parse(folder / "scene.xml").find("option")
+    assert done.stdout.split()[-1] == scene.get("noslip_iterations") == "2"
+
+
 def test_the_drives_have_the_effort_limits_of_the_urdf_and_the_gains_of_the_hand(tmp_path):
     hand = load_hand("allegro")
     limits = {
