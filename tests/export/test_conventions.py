@@ -13,7 +13,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from tests.pinch import pinch
-from torchgrasp import load_hand
+from torchgrasp import load_grasps, load_hand
 from torchgrasp.app import cli
 from torchgrasp.export import format_grasps, grasps_from_joints, read_foreign
 from torchgrasp.foundation.errors import GraspFileWarning, ModelFileError
@@ -252,3 +252,128 @@ def test_the_command_names_the_joint_and_writes_nothing(tmp_path, capsys):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert cli.main([*words, *("theirs" if x == "-" else x for x in skipped)]) in (0, 1)
+
+
+@pytest.mark.parametrize("kind", ["json", "npz", "own"])
+def test_poses_of_another_link_are_moved_to_our_root_by_its_name(tmp_path, kind):
+    hand = load_hand("shadow", "five")
+    names = hand.tree.joint_names
+    every = hand.expand_joints(middle(hand))[0].numpy()
+    place = np.array([0.1, 0.0, 0.2]), Rotation.from_rotvec([0.4, -0.2, 0.3])
+    wanted = tips(hand, every, place)
+    poses = hand.tree.poses(torch.as_tensor(every)[None])[0].numpy()
+    # one fixed to the root or not, and a link of a finger
+    for link in (hand.tree.link_names[1], hand.tips.links[0]):
+        pose = poses[hand.tree.link_names.index(link)]
+        of_link = (
+            place[1].apply(pose[:3, 3]) + place[0],
+            place[1] * Rotation.from_matrix(pose[:3, :3]),
+        )
+        line = row(of_link, every)
+        file = tmp_path / f"a.{'npz' if kind == 'npz' else 'json'}"
+        given = {}
+        if kind == "npz":
+            np.savez(file, grasp_qpos=line)
+            given["root"] = link
+        elif kind == "json":
+            content = {"pose": [line[:7].tolist()], "dofs": [every.tolist()], "root_link": link}
+            file.write_text(json.dumps(content))
+        else:
+            joints = dict(zip(names, every.tolist(), strict=True))
+            at = {"position": line[:3].tolist(), "quaternion_wxyz": line[3:7].tolist()}
+            grasp = {"joints": {"grasp": joints, "pregrasp": joints}, "pose": at}
+            file.write_text(json.dumps({"hand": {"root": link}, "grasps": [grasp]}))
+        read = read_foreign(file, hand, names, **given)
+        assert np.abs(imported(hand, read)[0] - wanted).max() < SAME
+        # the frame that a pose gives, in the place of its name
+        inside = torch.linalg.inv(torch.as_tensor(pose))
+        again = read_foreign(file, hand, names, root=inside)
+        assert np.abs(imported(hand, again)[0] - wanted).max() < SAME
+
+
+@pytest.mark.parametrize("kind", ["json", "own", "given"])
+def test_a_root_link_that_is_none_of_ours_is_refused_by_name(tmp_path, kind):
+    hand = load_hand("barrett")
+    every = hand.expand_joints(middle(hand))[0].numpy()
+    line = row((np.zeros(3), Rotation.identity()), every)
+    content = {"pose": [line[:7].tolist()], "dofs": [every.tolist()]}
+    if kind == "json":
+        content["base_link"] = "forearm"
+    if kind == "own":
+        joints = dict(zip(hand.tree.joint_names, every.tolist(), strict=True))
+        at = {"position": [0.0] * 3, "quaternion_wxyz": [1.0, 0.0, 0.0, 0.0]}
+        grasp = {"joints": {"grasp": joints, "pregrasp": joints}, "pose": at}
+        content = {"hand": {"root": "forearm"}, "grasps": [grasp]}
+    (tmp_path / "a.json").write_text(json.dumps(content))
+    root = "forearm" if kind == "given" else ""
+    with pytest.raises(ModelFileError, match=r"--root.*poses of the link forearm"):
+        read_foreign(tmp_path / "a.json", hand, hand.tree.joint_names, root=root)
+
+
+def test_the_command_takes_the_pose_of_the_root_in_the_frame_of_the_file(tmp_path, capsys):
+    hand = load_hand("barrett")
+    every = hand.expand_joints(middle(hand))[0].numpy()
+    place = np.array([0.0, 0.0, 0.2]), Rotation.from_rotvec([0.1, 0.2, 0.3])
+    turn = Rotation.from_rotvec([0.0, 0.0, 1.0])
+    shift = np.array([0.01, 0.02, 0.03])
+    line = row((place[0] - (place[1] * turn.inv()).apply(shift), place[1] * turn.inv()), every)
+    np.savez(tmp_path / "a.npz", grasp_qpos=line)
+    out = tmp_path / "a.safetensors"
+    words = ["import", str(tmp_path / "a.npz"), "--hand", "barrett", "--out", str(out)]
+    words += ["--joints", *hand.tree.joint_names, "--root"]
+    pose = [*shift, *turn.as_quat(scalar_first=True)]
+    assert cli.main([*words, *map(str, pose)]) in (0, 1)
+    found = load_grasps(out)
+    wanted = tips(hand, every, place)
+    assert np.abs(found.contacts.points[0].numpy() - wanted).max() < SAME
+    assert cli.main([*words, "1", "2"]) == 2
+    assert "--root" in capsys.readouterr().err
+
+
+ORDERS = {
+    "ada-grasp-ctrl, LEAP": ("leap", "four", "1 0 2 3 5 4 6 7 9 8 10 11 12 13 14 15"),
+    "BODex, LEAP, YAML": ("leap", "four", "12 13 14 15 1 0 2 3 5 4 6 7 9 8 10 11"),
+    "BODex, LEAP, URDF": ("leap", "four", "12 13 14 15 0 1 2 3 8 9 10 11 4 5 6 7"),
+    "MultiGripperGrasp, Allegro": (
+        "allegro",
+        "four",
+        "joint_0 joint_12 joint_4 joint_8 joint_1 joint_13 joint_5 joint_9 joint_2 joint_14 "
+        "joint_6 joint_10 joint_3 joint_15 joint_7 joint_11",
+    ),
+    "dex-urdf, left Allegro by place": (
+        "allegro",
+        "four",
+        "joint_8 joint_9 joint_10 joint_11 joint_4 joint_5 joint_6 joint_7 joint_0 joint_1 "
+        "joint_2 joint_3 joint_12 joint_13 joint_14 joint_15",
+    ),
+    "dex-urdf, Barrett": (
+        "barrett",
+        "default",
+        "spread:-1 f1_flex:-1 f1_distal:-1 spread_mimic f2_flex:-1 f2_distal:-1 f3_flex:-1 "
+        "f3_distal:-1",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", ORDERS)
+@pytest.mark.parametrize("kind", ["npz", "json"])
+def test_the_orders_and_signs_of_publishers_are_read(tmp_path, name, kind):
+    hand_name, fingers, words = ORDERS[name]
+    hand = load_hand(hand_name, fingers)
+    share = torch.linspace(0.2, 0.6, hand.dof, dtype=torch.float64)
+    joints = (hand.lower + share * (hand.upper - hand.lower))[None]
+    own = {joint: float(x[0]) for joint, x in hand.expand(joints).items()}
+    pairs = [word.partition(":") for word in words.split()]
+    values = [own[joint] / float(factor or 1) for joint, _, factor in pairs]
+    place = np.array([0.1, 0.0, 0.2]), Rotation.from_rotvec([0.4, -0.2, 0.3])
+    file = tmp_path / f"a.{kind}"
+    line = row(place, values)
+    if kind == "npz":
+        np.savez(file, grasp_qpos=line)
+        turned = Rotation.from_quat([1.0, 0.0, 1.0, 0.0])  # the bench's Allegro hand
+        place = place if hand_name != "allegro" else (place[0], place[1] * turned)
+    else:
+        file.write_text(json.dumps({"pose": [line[:7].tolist()], "dofs": [values]}))
+    read = read_foreign(file, hand, words.split())
+    wanted = tips(hand, hand.expand_joints(joints)[0], place)
+    assert np.abs(imported(hand, read)[0] - wanted).max() < SAME

@@ -34,7 +34,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import GraspFileWarning, ModelFileError, Status
 from torchgrasp.foundation.lazy import spatial
 from torchgrasp.foundation.limits import CLOUD_BYTES
-from torchgrasp.foundation.rules import Length, Poses, Positive
+from torchgrasp.foundation.rules import Length, Pose, Poses, Positive
 from torchgrasp.foundation.told import warn_user
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
 from torchgrasp.geometry.plane import Plane, read_plane
@@ -49,6 +49,7 @@ ROUNDING = 1e-3  # largest error of a quaternion's length: that of a file of few
 OPENED = 0.02
 OPENING_STEPS = 4
 POSE_NUMBERS = 7  # of a pose: a position and a quaternion
+ROOTS = ("root_link", "base_link")  # names of the link whose poses a file has
 # arrays of a DexGraspBench file: read, and those that we know and need not
 BENCH_READ = ("grasp_qpos", "pregrasp_qpos", "obj_pose")
 BENCH_KNOWN = ("obj_path", "obj_scale", "squeeze_qpos")
@@ -78,6 +79,7 @@ def read_foreign(
     order: Sequence[str] = (),
     quaternion: Quaternion = "wxyz",
     unit_m: Positive = 1.0,
+    root: str | Pose = "",
 ) -> ForeignGrasps:
     """Return joints and poses of grasps from the file of another program, or from our own JSON.
 
@@ -104,9 +106,13 @@ def read_foreign(
             under other names are not read.
         quaternion: order of the four numbers after the position in a pose.
         unit_m: length [m] of one unit of the positions in the file.
+        root: the frame of the hand whose poses the file has: a link of our URDF, or the pose [m] of
+            its root link in the publisher's frame. By default it is the link that the file names
+            (`root_link`, `base_link`), the bench's frame of the Allegro hand, or our root link.
 
     Raises `ModelFileError` for a missing or malformed file, for joints that fit with another sign
-    only, and for joints that do not follow as the hand's do. Raises `BadArgument` for an order that
+    only, for joints that do not follow as the hand's do, and for a root link that is none of ours.
+    Raises `BadArgument` for an order that
     misses a joint.
 
     >>> import tempfile
@@ -122,11 +128,11 @@ def read_foreign(
     path = Path(path)
     hand = hand.to("cpu", torch.float64)
     if path.suffix.lower() == ".npz":
-        return _read_bench(path, hand, tuple(order), quaternion, unit_m)
+        return _read_bench(path, hand, tuple(order), quaternion, unit_m, root)
     file = read_json(path, _refuse, "a JSON file of grasps, or .npz")
     fields = file.entries()
     if "grasps" in fields:
-        return _read_own(fields, hand, unit_m)
+        return _read_own(fields, hand, unit_m, root)
     content = file.entries("pose", "dofs")
     columns = read_order(hand, order)
     pose = _table(content["pose"], POSE_NUMBERS)
@@ -138,11 +144,36 @@ def read_foreign(
         world = content["obj_pose"].numbers(POSE_NUMBERS, -FAR, FAR)
         poses = inverse(read_poses(np.array([world]), quaternion, unit_m)) @ poses
     joints = read_posture(hand, read_columns(hand, columns, dofs, _refuse), "grasp", _refuse)
+    named = [content[name].text() for name in ROOTS if name in content]
+    poses = poses @ _link_from_root(hand, joints, root if root != "" else "".join(named[:1]))
     return ForeignGrasps(joints, poses, None)
 
 
-def _read_own(fields: dict[str, Field], hand: Hand, unit_m: float) -> ForeignGrasps:
+def _link_from_root(
+    hand: Hand, joints: Float[Tensor, "g h"], root: str | Pose
+) -> Float[Tensor, "*g 4 4"]:
+    """Return the pose [m] of our root link in the frame `root` of a hand, given its joints [rad].
+
+    Raises `ModelFileError` for the name of a link that the hand does not have.
+    """
+    if isinstance(root, Tensor):
+        return root.double().cpu()
+    if root == "":
+        return torch.eye(4, dtype=torch.float64)
+    links = hand.tree.link_names
+    if root not in links:
+        allowed = f"the pose of our root link in that one (--root), or one of {', '.join(links)}"
+        raise _refuse(f"poses of the link {root}, which is none of ours", allowed)
+    return inverse(hand.link_poses(joints)[:, links.index(root)])
+
+
+def _read_own(
+    fields: dict[str, Field], hand: Hand, unit_m: float, root: str | Pose
+) -> ForeignGrasps:
     """Return the grasps of a file of `format_grasps`, given its fields."""
+    about = fields["hand"].entries() if "hand" in fields else {}
+    if root == "" and "root" in about:
+        root = about["root"].text()
     renamed = fields["rename"].entries() if "rename" in fields else {}
     names = {x: renamed[x].text() if x in renamed else x for x in hand.tree.joint_names}
     needed = [names[x] for x in hand.joint_names]
@@ -169,9 +200,8 @@ def _read_own(fields: dict[str, Field], hand: Hand, unit_m: float) -> ForeignGra
         joints[name] = read_posture(hand, columns, name, _refuse)
     places = np.array(poses, dtype=float).reshape(-1, POSE_NUMBERS)
     table = _read_table(fields, np.array(rises), unit_m)
-    return ForeignGrasps(
-        joints["grasp"], read_poses(places, "wxyz", unit_m), joints["pregrasp"], table
-    )
+    placed = read_poses(places, "wxyz", unit_m) @ _link_from_root(hand, joints["grasp"], root)
+    return ForeignGrasps(joints["grasp"], placed, joints["pregrasp"], table)
 
 
 def _read_table(fields: dict[str, Field], rises: np.ndarray, unit_m: float) -> Plane | None:
@@ -200,7 +230,12 @@ def _table(field: Field, width: int) -> np.ndarray:
 
 
 def _read_bench(
-    path: Path, hand: Hand, order: tuple[str, ...], quaternion: Quaternion, unit_m: float
+    path: Path,
+    hand: Hand,
+    order: tuple[str, ...],
+    quaternion: Quaternion,
+    unit_m: float,
+    root: str | Pose,
 ) -> ForeignGrasps:
     """Return the grasps of an .npz file in DexGraspBench's format: one grasp, or a line for each of
     several.
@@ -220,6 +255,8 @@ def _read_bench(
         values = read_columns(hand, columns, table[:, POSE_NUMBERS:], _refuse)
         joints[name] = read_posture(hand, values, name.removesuffix("_qpos"), _refuse)
     placed = {name: poses[name] @ bench_from_root for name in joints}
+    if root != "":
+        placed = {name: poses[name] @ _link_from_root(hand, joints[name], root) for name in joints}
     if "obj_pose" in poses:
         placed = {name: inverse(poses["obj_pose"]) @ pose for name, pose in placed.items()}
     opened = None

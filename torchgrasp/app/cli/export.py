@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
+from torch import Tensor
 
 from torchgrasp import export as formats
 from torchgrasp.app.cli.command import Command, arguments, naming, option, positional, required
@@ -21,7 +22,7 @@ from torchgrasp.cloud.agreement import check_contacts, check_seen
 from torchgrasp.cloud.read import read_cloud
 from torchgrasp.data.shards import load_grasps
 from torchgrasp.evaluation.touch import TOUCH, Touch, measure_touch
-from torchgrasp.export.foreign import Quaternion, read_poses
+from torchgrasp.export.foreign import POSE_NUMBERS, Quaternion, read_poses
 from torchgrasp.export.postures import follower_joints
 from torchgrasp.files import format_columns, format_json, read_bytes, read_json, write_file
 from torchgrasp.foundation.errors import BadArgument, ModelFileError, Status
@@ -240,6 +241,11 @@ class Import(Command):
     )
     quaternion: Quaternion = option("wxyz", "order of the numbers of a rotation in the file")
     unit: Unit = option("m", "unit of the positions in the file")
+    root: tuple[str, ...] = option(
+        (),
+        "the hand's frame in the file: a link of our URDF, or position [m] and quaternion wxyz of "
+        "our root link in it; by default what the file names, or our root link",
+    )
     cloud: Path | None = option(
         None,
         "the view for which the grasps are, for `torchgrasp evaluate --planned`; the contacts "
@@ -315,7 +321,8 @@ class Import(Command):
     def _read(self, hand: Hand, quaternion: Quaternion, unit: Unit) -> Grasps:
         """Read the grasps in a given quaternion order and unit, and certify their contacts."""
         with naming(path="FILE"):
-            read = formats.read_foreign(self.file, hand, self.joints, quaternion, UNITS[unit])
+            root = _read_root(self.root)
+            read = formats.read_foreign(self.file, hand, self.joints, quaternion, UNITS[unit], root)
         with naming(joints="FILE"):
             spec = ContactSpec(friction=self.friction, friction_margin=1.0)
             return formats.grasps_from_joints(hand, *read, spec, self.std)
@@ -335,6 +342,20 @@ class Import(Command):
                 mend = f"{error.allowed}, as with --quaternion {quaternion} --unit {unit}"
                 raise BadArgument("FILE", error.found, mend)
         raise error
+
+
+def _read_root(words: Sequence[str]) -> str | Tensor:
+    """Return the link, or the pose (4, 4) [m], that the words of --root give; "" for none."""
+    if len(words) < 2:
+        return "".join(words)
+    try:
+        numbers = np.array([[float(word) for word in words]])
+    except ValueError:
+        numbers = np.zeros((1, 0))
+    if numbers.shape[1] != POSE_NUMBERS:
+        raise BadArgument("root", " ".join(words), "a link, or X Y Z QW QX QY QZ")
+    with naming(path="--root"):
+        return read_poses(numbers, "wxyz")[0]
 
 
 def _contradiction(grasps: Grasps, surface: "trimesh.Trimesh | PointCloud") -> BadArgument | None:
