@@ -120,6 +120,9 @@ def test_the_noise_of_a_sensor_is_estimated_from_its_table(name):
     assert estimate_noise(depth, INTRINSICS, table, labels == 1) is None
 
 
+SEEN = look_at(20.0, 45.0, 0.7)
+
+
 def frames(count: int, pose):
     return [render_depth([BRICK], pose, noise="kinect_v1", seed=seed)[0] for seed in range(count)]
 
@@ -149,9 +152,18 @@ def test_the_median_keeps_counts_and_drops_what_most_frames_miss():
 
 
 def test_frames_of_a_moved_camera_or_of_several_sizes_are_refused():
-    still = frames(2, look_at(20.0, 45.0, 0.7))
-    with pytest.raises(BadArgument, match=r"frames: .*stands? still, got frame 3 differs"):
+    still = frames(2, SEEN)
+    assert len(median_depth(still)) == len(still[0])
+    with pytest.raises(BadArgument, match=r"frames: .*stand still .*, got frame 3 differs"):
         median_depth([*still, frames(1, look_at(20.0, 45.0, 0.75))[0]])
+    # 10 mm of the camera, or of the object alone
+    aside = look_at(20.0, 45.0, 0.7)
+    aside[0, 3] += 0.01
+    for mesh, pose in ((BRICK, aside), (BRICK.copy().apply_translation([0.015, 0.0, 0.0]), SEEN)):
+        other = render_depth([mesh], pose, noise="kinect_v1", seed=7)[0]
+        for views in ([*still, other], [still[0], other]):
+            with pytest.raises(BadArgument, match=r"differs by more than .*% of its (pix|patch)"):
+                median_depth(views)
     with pytest.raises(BadArgument, match="one size"):
         median_depth([still[0], still[1][:100]])
     with pytest.raises(BadArgument, match="got none"):
