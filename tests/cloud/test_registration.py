@@ -239,3 +239,19 @@ def test_the_errors_of_poses_are_kept_in_files_and_by_filters(tmp_path):
     bare = PointCloud(merged.points, pose_error=merged.pose_error)
     with pytest.raises(BadArgument, match=r"\.npz"):
         save_cloud(bare, tmp_path / "merged.ply")
+
+
+def test_a_view_that_is_added_to_a_shape_is_compared_with_it():
+    first, second = (view("cylinder", azimuth) for azimuth in (0.0, 40.0))
+    shape = fit_shape(first)
+    points = second.points[::10]
+    right = shape.update(points)  # warnings are errors
+    assert right.std_factor == shape.std_factor
+    with pytest.warns(MendedInput, match=r"points about [\d.]+ mm off the cloud"):
+        near = shape.update(points + torch.tensor([0.0, 0.005, 0.0]))
+    assert float(near.predict(points).std_m.median()) > 0.002
+    for pose in (shifted(0, 0.02), turned(0, 0.0, 1.3)):
+        with pytest.raises(BadArgument, match=r"view within \d\.\d mm .* check its pose"):
+            shape.update(apply(pose, points))
+    # a finger may find the hidden side anywhere
+    assert len(shape.update(torch.tensor([[-0.05, 0.0, 0.0]]).double()).x) == len(shape.x) + 1

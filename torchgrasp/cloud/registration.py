@@ -141,11 +141,11 @@ def compare_views(views: Sequence[PointCloud]) -> list[float]:
         far = before
         if motion is not None:
             far = max(before, motion.left, motion.shown * motion.shift)
-            apart.append(_judge(motion.shown * motion.error, VIEWS.refused * limit, pair))
+            apart.append((*_judge(motion.shown * motion.error, VIEWS.refused * limit), pair))
             shown = max(shown, (motion.shown * motion.error, pair))
             for row in pair:
                 errors[row].append(motion.error)
-        apart.append(_judge(far, VIEWS.shifted * limit, pair))
+        apart.append((*_judge(far, VIEWS.shifted * limit), pair))
     ratio, distance, limit, pair = max(apart)
     if ratio > 1:
         _refuse_views(pair, distance, limit)
@@ -159,11 +159,35 @@ def compare_views(views: Sequence[PointCloud]) -> list[float]:
     return [float(torch.tensor(each or [0.0], dtype=torch.float64).median()) for each in errors]
 
 
-def _judge(
-    distance: float, limit: float, pair: tuple[int, int]
-) -> tuple[float, float, float, tuple[int, int]]:
-    """Return a distance [m] over its limit [m], both, and the pair of views."""
-    return distance / limit, distance, limit, pair
+def compare_with(seen: PointCloud, view: PointCloud) -> float:
+    """Return the standard deviation [m] of a view's pose that what was seen before shows; 0 for
+    none.
+
+    Both have normals and are in one frame [m]. Raises `BadArgument` for a view that is too far off,
+    and tells a distance that noise does not explain by a `MendedInput`.
+    """
+    one = _Surface(seen)
+    motion = _find_motion(one, _Surface(view, one.noise))
+    if motion is None:
+        return 0.0
+    far = motion.shown * motion.shift
+    _, distance, limit = max(
+        _judge(motion.shown * motion.error, VIEWS.refused * one.limit),
+        _judge(max(far, motion.left), VIEWS.shifted * one.limit),
+    )
+    said = f"points about {1e3 * distance:.1f} mm off the cloud of the shape"
+    if distance > limit:
+        allowed = f"a view within {1e3 * limit:.1f} mm of it: check its pose"
+        raise BadArgument("points", said, allowed)
+    if not motion.shown:
+        return 0.0
+    warn_user(MendedInput, f"{said}: standard deviations grow by it; check their pose")
+    return motion.error
+
+
+def _judge(distance: float, limit: float) -> tuple[float, float, float]:
+    """Return a distance [m] over its limit [m], and both."""
+    return distance / limit, distance, limit
 
 
 def align_views(views: Sequence[PointCloud]) -> list[tuple[Float[Tensor, "4 4"], float]]:

@@ -8,7 +8,7 @@ import torch
 
 from torchgrasp.cloud.agreement import check_foot
 from torchgrasp.cloud.check import FEW_POINTS, remove_duplicates
-from torchgrasp.cloud.neighbours import draw_rows, is_flat, nearest
+from torchgrasp.cloud.neighbours import is_flat, nearest
 from torchgrasp.cloud.parts import find_second_body
 from torchgrasp.cloud.prepare import PreparedCloud, prepare_cloud
 from torchgrasp.data.accept import CloudLike, as_cloud
@@ -59,8 +59,6 @@ class ShapeNumbers:
     """Default numbers of observed points, with the support "camera" and "paper"."""
     rounds: int = 3
     """Most rounds in which free space that the shape violates is observed."""
-    seen: int = 300
-    """Most points at which errors of poses are compared with the shape's deviations."""
     gap: float = 0.025
     """Least width [m] of a gap that misleads a fingertip; that of a handle is narrower."""
 
@@ -242,13 +240,7 @@ def _fit_surface(seen: PreparedCloud, support: ExtraObservations, options: FitOp
         if not len(rows):
             break
         shape = shape.append(off_surface(free[rows], least[rows], NOISE.free / shape.scale))
-    if error is None:
-        return shape
-    # A view's points are off together: no number of them makes the shape more certain than that.
-    rows = draw_rows(len(points), SHAPE.seen).to(points.device)
-    std_m = shape.predict(points[rows]).std_m
-    wider = float((torch.hypot(std_m, error[rows]) / std_m).median())
-    return dataclasses.replace(shape, std_factor=wider * shape.std_factor)
+    return shape if error is None else shape.widened(points, error)
 
 
 @checked(gradients=True)

@@ -3,18 +3,21 @@ Eqs. (1), (7)-(9).
 """
 
 import dataclasses
+import math
 from typing import Annotated, Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchgrasp.cloud.neighbours import draw_rows
+from torchgrasp.cloud.registration import VIEWS, compare_with
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Pose, Positive, Range, Seed, check_moved, is_known
 from torchgrasp.geometry.frames import apply
-from torchgrasp.geometry.linalg import cholesky, unit, unit_of_any
+from torchgrasp.geometry.linalg import Points, cholesky, unit, unit_of_any
 from torchgrasp.geometry.plane import move
 from torchgrasp.shape.conditioning import append_observations
 from torchgrasp.shape.estimate import (
@@ -39,6 +42,8 @@ class DomainNumbers:
     """Ratio of the domain's radius to that of the observations: far away nothing is known."""
     joint: int = 1000
     """Most points of one joint posterior: its memory grows with the square of their number."""
+    compared: int = 300
+    """Most points at which errors of poses are compared with the shape's deviations."""
 
 
 DOMAIN = DomainNumbers()
@@ -238,7 +243,8 @@ class ShapeGP(Posterior, Normalisation):
         view.
 
         The result equals the posterior of all observations at once. Kernel, domain and `cloud` do
-        not change.
+        not change. A view, which is 20 points or more, is compared with `cloud`. A distance that
+        noise does not explain is told by a `MendedInput`, and widens the deviations of both.
 
         Args:
             points: surface points [m] in the cloud's frame.
@@ -246,7 +252,8 @@ class ShapeGP(Posterior, Normalisation):
             noise: standard deviation of a point [m] along the normal.
             normal_noise: standard deviation of the components of a unit normal.
 
-        Raises `BadArgument` for a wrong argument, or a point outside the domain.
+        Raises `BadArgument` for a wrong argument, a point outside the domain, or a view that is
+        farther off than `merge_clouds` allows.
 
         >>> ball = unit(torch.randn(400, 3, generator=torch.Generator().manual_seed(0)))
         >>> from torchgrasp import fit_shape
@@ -260,9 +267,32 @@ class ShapeGP(Posterior, Normalisation):
         if normals is not None:
             direction = unit_of_any(normals.to(x))
             check_tensor("normals", direction, (len(x), 3))  # a normal of length 0 has become NaN
-        new = on_surface(x, direction, torch.full_like(x[:, 0], noise / self.scale), normal_noise)
+        error = 0.0
+        if self.cloud.normals is not None and len(x) >= VIEWS.least:
+            facing = self.predict(points).normal if normals is None else unit_of_any(normals)
+            error = compare_with(self.cloud, PointCloud(points.double(), facing.double()))
+        deviation = math.hypot(noise, error) / self.scale
+        new = on_surface(x, direction, torch.full_like(x[:, 0], deviation), normal_noise)
         has_normal = new.has_normal & (normals is not None)
-        return self.append(dataclasses.replace(new, has_normal=has_normal))
+        shape = self.append(dataclasses.replace(new, has_normal=has_normal))
+        return shape if error == 0 else shape.widened(points, torch.full_like(x[:, 0], error))
+
+    @checked
+    def widened(self, points: Points, error: Float[Tensor, "n"]) -> "ShapeGP":
+        """Return the shape with deviations that hold the standard deviations `error` (n,) [m] of
+        views' poses, too.
+
+        The points (n, 3) [m] of a view are off together: no number of them makes the shape more
+        certain than that.
+        """
+        rows = draw_rows(len(points), DOMAIN.compared).to(points.device)
+        std_m = self.predict(points[rows]).std_m
+        wider = float((torch.hypot(std_m, error[rows].to(std_m)) / std_m).median())
+        return self._scale_deviations(wider)
+
+    def _scale_deviations(self, factor: float) -> "ShapeGP":
+        """Return the shape with all standard deviations times a factor."""
+        return dataclasses.replace(self, std_factor=factor * self.std_factor)
 
     @checked
     def append(self, new: Observations) -> "ShapeGP":

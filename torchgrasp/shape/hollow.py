@@ -144,6 +144,11 @@ class HollowShape(ShapeGP):
         own = [rows[:, None] & rows for rows in owner.repeat_interleave(4, 0).T]
         return JointEstimate(mean, outer.covariance * own[0] + inner.covariance * own[1])
 
+    def _scale_deviations(self, factor: float) -> "HollowShape":
+        """Return the shape with all standard deviations of both surfaces times a factor."""
+        inner = dataclasses.replace(self.inner, std_factor=factor * self.inner.std_factor)
+        return dataclasses.replace(self, std_factor=factor * self.std_factor, inner=inner)
+
     @checked
     def append(self, new: Observations) -> "HollowShape":
         """Return the shape given further normalised observations.
