@@ -6,7 +6,9 @@ import functools
 import itertools
 import json
 import os
+import re
 import runpy
+import shutil
 import subprocess
 import sys
 import types
@@ -272,6 +274,33 @@ def test_the_drives_have_the_effort_limits_of_the_urdf_and_the_gains_of_the_hand
     assert {name: float(effort) for name, effort in efforts.items()} == limits
 
 
+def test_links_and_joints_of_a_hand_may_have_any_name(tmp_path):
+    """A link "base" and joints such as "mount_x" and "wrist" are those of many hands."""
+    mujoco = pytest.importorskip("mujoco")
+    source = load_hand("barrett").urdf_path.parent
+    shutil.copytree(source, tmp_path / "hand")
+    names = {"palm": "base", "f1_flex": "mount_x", "f2_flex": "wrist"}
+    for path in (tmp_path / "hand").glob("hand.*"):
+        text = path.read_text()
+        for old, new in names.items():
+            text = text.replace(f'"{old}"', f'"{new}"')
+        path.write_text(text)
+    hand = load_hand(tmp_path / "hand")
+    assert {"mount_x", "wrist"} <= {*hand.joint_names}
+    grasp = load_shipped_grasp("jug", "barrett")
+    grasp = dataclasses.replace(
+        grasp, meta=grasp.meta | {"joint_names": json.dumps(hand.joint_names)}
+    )
+    thing = load_object("jug")
+    for player in ("mujoco", "usd"):
+        save_play(hand, grasp, tmp_path / player, player, thing.mesh, SPEC, parts=thing.parts)
+    mujoco.MjModel.from_xml_path(str(tmp_path / "mujoco" / "scene.xml"))
+    links = re.findall(
+        r'^ {4}def Xform "(\w+)"', (tmp_path / "usd" / "hand.usda").read_text(), re.M
+    )
+    assert "base" in links and len(set(links)) == len(links) > 4
+
+
 def test_the_motion_leads_from_the_approach_to_the_plan_and_up(tmp_path):
     hand = load_hand("barrett")
     grasp = load_shipped_grasp("jug", "barrett")
@@ -283,7 +312,7 @@ def test_the_motion_leads_from_the_approach_to_the_plan_and_up(tmp_path):
     (row,) = play["grasps"]
     planned = {name: float(q) for name, q in hand.expand(grasp.joints[0]).items()}
     targets = {
-        phase: np.array([posture[f"mount_{x}"] for x in "xyz"])
+        phase: np.array([posture[f"torchgrasp_mount_{x}"] for x in "xyz"])
         for phase, posture in row["targets"].items()
     }
     assert {name: row["targets"]["grasp"][name] for name in planned} == pytest.approx(planned)

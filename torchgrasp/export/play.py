@@ -52,6 +52,8 @@ USD = {"isaaclab": ("hand.usda", "object.usda"), "usd": ("hand.usda", "object.us
 """Files in USD's text format, by player."""
 UPRIGHT = 1e-12  # largest difference of a normal's z from 1 on a table that counts as level
 ORIGIN = (0.0, 0.0, 0.0)
+OWN = "torchgrasp_"
+"""Prefix of the mount's links and joints: those of a hand may have any other name."""
 AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
@@ -194,7 +196,7 @@ def _scene(
     """
     reach = spec.approach + spec.lift_height + PLAY.room
     axes = zip("xyz", AXES, strict=True)
-    slides = [Slide(f"mount_{x}", axis, -reach, reach, 0.0) for x, axis in axes]
+    slides = [Slide(f"{OWN}mount_{x}", axis, -reach, reach, 0.0) for x, axis in axes]
     drives = stiff_drives(hand, spec.kp)
     mass = spec.mass if spec.density is None else spec.density * float(mesh.volume)
     return SceneSpec(
@@ -310,20 +312,20 @@ def describe_bodies(scene: SceneSpec) -> dict[str, Any]:
     """
     urdf = scene.urdf
     moment = PLAY.inertia
-    still = Link("base", PLAY.mass, ORIGIN, (moment, 0.0, 0.0, moment, 0.0, moment), ())
+    still = Link(f"{OWN}base", PLAY.mass, ORIGIN, (moment, 0.0, 0.0, moment, 0.0, moment), ())
     # a mount of slides along the axes of the hand's root link carries the hand
-    names = ["base", *(f"{slide.name}_link" for slide in scene.slides)]
+    names = [still.name, *(f"{slide.name}_link" for slide in scene.slides)]
     joints = list[Joint]()
     for x, parent, child in zip(scene.slides, names, names[1:], strict=False):
         slide = Joint(x.name, "prismatic", parent, child, ORIGIN, ORIGIN, x.axis, x.lower, x.upper)
         joints.append(slide)
-    joints.append(Joint("wrist", "fixed", names[-1], urdf.root, ORIGIN, ORIGIN))
+    joints.append(Joint(f"{OWN}wrist", "fixed", names[-1], urdf.root, ORIGIN, ORIGIN))
     joints += urdf.joints
     links = [*(dataclasses.replace(still, name=name) for name in names), *urdf.links]
     if wrong := [x.name for x in (*links, *joints) if not x.name.isidentifier()]:
         allowed = "names of letters, digits and _, which USD allows"
         raise BadArgument("hand", repr(wrong[0]), allowed)
-    poses = {"base": np.eye(4)}
+    poses = {still.name: np.eye(4)}
     left = list(joints)
     while left:
         for joint in [x for x in left if x.parent in poses]:
