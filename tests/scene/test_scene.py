@@ -209,3 +209,17 @@ def test_other_supports_are_told_and_survive_a_file(tmp_path):
     assert (
         on_floor.supports == (scene.supports[1],) and len(on_floor.things) >= 3
     )  # the table, two stools
+
+
+@pytest.mark.parametrize(("foot", "told"), [(0.0, False), (0.1, False), (0.3, True)])
+def test_a_target_far_above_its_table_is_told(foot, told):
+    thing = box([0.06, 0.06, 0.12])
+    thing.apply_translation([0.0, 0.0, foot])
+    camera = look_at(20.0, 45.0, 0.9, torch.tensor([0.0, 0.0, 0.1]).double())
+    depth, labels = render_depth([thing], camera, noise=False)
+    seen = Scene.from_depth(depth, INTRINSICS, camera, mask=labels == 1, table=0.0)
+    notes = [x for x in seen.notes if "may be a floor or a wall" in x]
+    assert len(notes) == told
+    if told:
+        height = float(notes[0].split()[3])
+        assert height == pytest.approx(foot, abs=0.02)

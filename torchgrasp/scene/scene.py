@@ -38,6 +38,12 @@ class SceneNumbers:
     """Largest distance [m] of a given point from a measured one."""
     part: float = 0.1
     """Share of an object's pixels beyond a crease that may be another object."""
+    lowest: float = 0.02
+    """Share of a target's points that may be lower than its foot: outliers."""
+    afloat: float = 0.15
+    """Greatest distance [m] of a target's foot from its table that is not told: things in front of
+    it hide less.
+    """
 
 
 SCENE = SceneNumbers()
@@ -222,7 +228,19 @@ class Scene(Value):
         scene = dataclasses.replace(self, given=given)
         if masked:
             scene = dataclasses.replace(self, target=1, given=(1,))
-        return scene if point is None else scene.select(point)
+        scene = scene if point is None else scene.select(point)
+        return dataclasses.replace(scene, notes=(*scene.notes, *scene._afloat()))
+
+    def _afloat(self) -> tuple[str, ...]:
+        """Return a note if the target is far above its table, as above a floor or before a wall."""
+        if self.target is None or self.table is None:
+            return ()
+        height = self.table.height(self.points[self.rows_of()].double())
+        foot = float(height.quantile(SCENE.lowest))
+        if foot <= SCENE.afloat:
+            return ()
+        where = f"the target begins {foot:.2f} m from the plane that is taken for its table"
+        return (f"{where}, which may be a floor or a wall: give the table",)
 
     @checked
     def select(self, target: int | Sequence[float | int] | Tensor | np.ndarray) -> "Scene":
