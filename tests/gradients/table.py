@@ -119,7 +119,8 @@ def of_mixture(
     logits = draw(2, seed=2)
 
     def function(x: Tensor, means: Tensor, root: Tensor, logits: Tensor = torch.zeros(2)) -> Any:  # noqa: B008
-        covariances = root @ root.mT
+        # root @ root.mT, which autocast would round
+        covariances = (root[..., None, :] * root[..., None, :, :]).sum(-1)
         covariances = (covariances + covariances.mT) / 2
         return query(kind(torch.softmax(logits, 0), means, covariances, names), x)
 

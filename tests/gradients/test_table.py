@@ -17,9 +17,10 @@ from torch import Tensor
 from torch.autograd import forward_ad, gradcheck, gradgradcheck
 from torch.func import grad, hessian, jacfwd, jacrev, jvp, vmap
 
-from tests.gradients.compare import F64, every, near, scalar, slopes
+from tests.gradients.compare import F64, every, near, scalar, slopes, weighted_sum
 from tests.gradients.table import LAW, MASKS, ROWS, Function, Row, draw, outputs, page
 from tests.hostile.arguments import checked_things, required
+from tests.settings import other_settings
 from torchgrasp.foundation.base import Value, map_tensors, named_tensors
 from torchgrasp.foundation.errors import BadArgument
 
@@ -112,24 +113,27 @@ def check_axes(row: Row, f: Function, x: tuple[Tensor, ...]) -> None:
         near(found, tuple(torch.stack([y, y]) for y in outputs(f(*x))))
 
 
-def check_default_device(row: Row, f: Function, x: tuple[Tensor, ...]) -> None:
-    """With another default device, whose tensors have no numbers, nothing changes."""
-    expected = outputs(f(*x))
-    expected_slopes = slopes(f, x)
-    with torch.device("meta"):
-        near(outputs(f(*x)), expected)
-        near(slopes(f, x), expected_slopes)
+def same(found: tuple[Tensor, ...], expected: tuple[Tensor, ...]) -> bool:
+    """Tell whether tensors have the same dtypes and bits; NaN equals NaN."""
+    pairs = zip(found, expected, strict=True)
+    return all(a.dtype == b.dtype and torch.allclose(a, b, 0, 0, equal_nan=True) for a, b in pairs)
 
 
-def check_default_dtype(row: Row, f: Function, x: tuple[Tensor, ...]) -> None:
-    expected = outputs(f(*x))
-    expected_slopes = slopes(f, x)
-    torch.set_default_dtype(F64)
-    try:
-        near(outputs(f(*x)), expected)
-        near(slopes(f, x), expected_slopes)
-    finally:
-        torch.set_default_dtype(torch.float32)
+def check_settings(row: Row, f: Function, x: tuple[Tensor, ...]) -> None:
+    """Under other settings of torch no bit changes; derivatives are taken after them."""
+    public = row in ROWS.values()  # in single precision, which autocast rounds
+    f, x = row.make(torch.float32 if public and "single" not in row.lacks else F64)
+    leaves = tuple(v.clone().requires_grad_() for v in x)
+    expected = outputs(f(*leaves))
+    with other_settings():
+        found = outputs(f(*leaves))
+    assert same(found, expected)
+    derivatives = torch.autograd.grad(weighted_sum(found), leaves)
+    assert same(derivatives, torch.autograd.grad(weighted_sum(expected), leaves))
+    with other_settings(), torch.inference_mode():
+        found = outputs(f(*(v.clone() for v in x)))
+    assert same(found, outputs(f(*x)))
+    assert not public or not any(y.is_inference() for y in found)
 
 
 def check_order_of_calls(row: Row, f: Function, x: tuple[Tensor, ...]) -> None:

@@ -260,7 +260,8 @@ def load_arm(
     )
     met = arm.overlaps(arm.sphere_centres(library[: ARM.tested].T))
     bodies, owner = torch.unique((link + palm)[pairs], dim=0, return_inverse=True)
-    counts = torch.zeros(len(bodies), met.shape[1]).index_add(0, owner, met.float())
+    counts = torch.zeros(len(bodies), met.shape[1], dtype=torch.float32)
+    counts = counts.index_add(0, owner, met.float())
     often = counts.gt(0).float().mean(1)
     # Others touch by construction.
     return dataclasses.replace(arm, pairs=pairs[often[owner] <= ALWAYS])

@@ -152,7 +152,7 @@ def way_of(
     """
     closed = grasps.obj_from_hand
     opened = opened_pose(hand, grasps.pregrasp, closed, world.plane)
-    share = torch.linspace(0, 1, COARSE_STEPS + 1, device="cpu")
+    share = torch.linspace(0, 1, COARSE_STEPS + 1, dtype=torch.float32, device="cpu")
     share = share.to(closed)[:, None]
     up = (up if world.plane is None else world.plane.normal).to(closed)
     before, after = (x[:, None].repeat(1, len(share), 1, 1) for x in (opened, closed))

@@ -166,7 +166,7 @@ def read_camera_pose(pose: Tensor | np.ndarray) -> Transform:
     Raises `BadArgument` for a pose that is not rigid, or more than 100 m from the origin.
     """
     try:
-        read = torch.as_tensor(pose).double()
+        read = torch.as_tensor(pose, dtype=torch.float64)
     except (TypeError, ValueError) as error:
         found = repr(pose)[:SHOWN_LETTERS]
         raise BadArgument("camera_pose", found, "a 4 x 4 matrix of numbers") from error
@@ -281,7 +281,7 @@ def _check_normals(supports: tuple[SupportPlane, ...], pose: Transform, up: obje
     """
     sky = torch.tensor([0.0, 0.0, 1.0]).double()
     if up is not None:
-        sky = unit(torch.as_tensor(up).double().cpu())
+        sky = unit(torch.as_tensor(up, dtype=torch.float64).cpu())
     normals = torch.stack([support.plane.normal.double() for support in supports])
     tilt = math.degrees(math.acos(min(1.0, max(-1.0, float((normals @ sky).max())))))
     if tilt < POSE.tilt:

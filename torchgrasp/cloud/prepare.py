@@ -187,7 +187,7 @@ def _fit_normals(cloud: PointCloud, clean: bool, up: Vector | None = None) -> Po
         if viewpoint is None:
             viewpoint = guess_viewpoint(points.double(), normals, up)[0].to(points.dtype)
         outward = viewpoint.double() - points.double()
-    sign = torch.where((outward * normals).sum(-1, keepdim=True) < 0, -1.0, 1.0)
+    sign = torch.where((outward * normals).sum(-1, keepdim=True) < 0, -1.0, 1.0).to(normals)
     normals = unit(sign * normals).to(points.dtype)
     return dataclasses.replace(cloud, points=points, normals=normals, viewpoint=viewpoint)
 

@@ -150,7 +150,9 @@ def _along_lines(
     jet = shape.jet(points.flatten(0, 1))
     deviation = surface_deviation(jet.variance, jet.gradient)
     deviation = factor * deviation.reshape(points.shape[:2])
-    nodes = deviation[..., None] * torch.tensor(NODES, device="cpu").to(deviation)
+    nodes = deviation[..., None] * torch.tensor(NODES, dtype=torch.float32, device="cpu").to(
+        deviation
+    )
     values = 4 * len(NODES) * points.shape[1]
     covariance = points.new_empty(len(points), values, values)
     for rows in row_numbers(points).split(LINES):
@@ -217,7 +219,7 @@ def first_contact(
     """
     deviation = drawn.unflatten(-1, (lines.points.shape[1], len(NODES), 4))
     t = grid().to(drawn)
-    nodes = torch.tensor(NODES, device="cpu").to(drawn)
+    nodes = torch.tensor(NODES, dtype=torch.float32, device="cpu").to(drawn)
     between = deviation[..., 0] @ interpolation(t, nodes).T
     distance = lines.distance[:, None] + between  # (b, n, f, 23)
     crosses = (distance[..., :-1] > 0) & (distance[..., 1:] <= 0)

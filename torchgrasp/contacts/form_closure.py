@@ -219,7 +219,7 @@ def maximise(
         if k % every == 0 and not bool(running.any()):
             break
         backward = artificial & (multiplier > 0)
-        sign = torch.where(backward, 1.0, -1.0)[row, leaving]
+        sign = torch.where(backward, 1.0, -1.0).to(inverse)[row, leaving]
         edge = inverse[row, :, leaving]
         step = sign[:, None] * edge
         rate = matvec(bounds, step)

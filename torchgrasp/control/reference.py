@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchgrasp.control import finger_forces, law
 from torchgrasp.control.tactile import Observation
-from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.base import Value, kept
 from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import ANY, Force, Pose, Positive, Range
@@ -157,6 +157,7 @@ class ClosingReference(Value):
             friction=_number(grasp, "friction") or ContactSpec.friction,
         )
 
+    @checked
     def as_printed(self) -> "ClosingReference":
         """Return the same plan with the gains of the closing "paper".
 
@@ -190,7 +191,7 @@ class ClosingReference(Value):
         """
         return joints[self._actuated]
 
-    @functools.cached_property
+    @kept
     def rise(self) -> Float[Tensor, "3"]:
         """Displacement [m] of the opened hand from its planned pose before it closes, so that no
         link is in the table.

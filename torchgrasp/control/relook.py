@@ -59,10 +59,10 @@ def relocate(surface: SignedDistanceField, cloud: PointCloud, table: Plane) -> F
         table: the table.
     """
     count = min(len(cloud), RELOOK.points)
-    rows = torch.linspace(0, len(cloud) - 1, count).round().long()
+    rows = torch.linspace(0, len(cloud) - 1, count, dtype=torch.float32).round().long()
     search = _Registration(surface, cloud.points[rows], table)
-    line = torch.linspace(-REACH, REACH, RELOOK.shifts).double()
-    turns = torch.linspace(-RELOOK.farthest, RELOOK.farthest, RELOOK.turns).double()
+    line = torch.linspace(-REACH, REACH, RELOOK.shifts, dtype=torch.float64)
+    turns = torch.linspace(-RELOOK.farthest, RELOOK.farthest, RELOOK.turns, dtype=torch.float64)
     motions = torch.cartesian_prod(line, line, turns)  # (m, 3)
     # distances at grid nodes are rough, but fast
     rough = search.cost(surface.nearest_node(search.undo(motions)))

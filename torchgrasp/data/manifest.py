@@ -164,7 +164,7 @@ def write_objects(
         write_file(folder / "mesh.ply", mesh.export(file_type="ply"))
         poses = dict[str, object]()
         for k in range(views):
-            first, second = torch.rand(2, generator=generator).tolist()
+            first, second = torch.rand(2, generator=generator, dtype=torch.float32).tolist()
             elevation = CAMERAS.lowest + (CAMERAS.highest - CAMERAS.lowest) * second
             camera = look_at(360.0 * first, elevation, CAMERAS.distance, mesh)
             noise = int(torch.randint(CAMERAS.seeds, (1,), generator=generator))

@@ -65,7 +65,7 @@ def _sizes(
     up = real([0.0, 0.0, 1.0])
     if truth.table is not None:
         up = truth.table.normal.double()
-    centre = torch.tensor(mesh.center_mass.tolist()).double()
+    centre = torch.tensor(mesh.center_mass.tolist(), dtype=torch.float64)
     pressed = tick_of(lift, 2)
     poses = lift.object_pose[[0, tick_of(lift, 1), pressed]]
     start, closed, lifted = apply(poses, centre.expand(3, 1, 3))[:, 0]

@@ -280,7 +280,7 @@ def draw_slide(noise: PoseNoise, seed: Seed) -> Float[Tensor, "3"]:
     The table's normal is z. The displacement is at most `noise.translation` along x and y.
     """
     level = dataclasses.replace(noise, rotation=0.0)
-    return draw_object_poses(level, torch.zeros(3), 1, seed)[0, :3, 3]
+    return draw_object_poses(level, torch.zeros(3, dtype=torch.float32), 1, seed)[0, :3, 3]
 
 
 @checked

@@ -393,7 +393,7 @@ class TrialRun:
         if isinstance(hold, GripHold):
             return hold.strained
         hand = reference.hand
-        effort = torch.tensor([hand.actuators[name].effort for name in hand.tree.joint_names])
+        effort = reference.kp.new_tensor([hand.actuators[x].effort for x in hand.tree.joint_names])
         off = (self.controller.targets.joints - self.observation.joints).abs()
         return bool((reference.kp * off >= effort).any())
 

@@ -17,6 +17,7 @@ from torch import Tensor
 from torchgrasp.foundation.checks import read_number
 from torchgrasp.foundation.errors import BadArgument, FailedRows, Status
 from torchgrasp.foundation.rules import Range, check_moved, show
+from torchgrasp.foundation.settings import usual_settings
 
 FINGERTIPS = (
     3,
@@ -49,6 +50,9 @@ def map_tensors(function: Callable[..., Tensor], *values: SomeValue) -> SomeValu
             raise BadArgument(name, "None beside a tensor", "a tensor in every value, or in none")
         return function(*found) if all(tensors) else found[0]
 
+    if torch.is_inference_mode_enabled():  # its tensors could not be differentiated later
+        with torch.inference_mode(False), torch.no_grad():
+            return map_tensors(function, *values)
     kind = type(values[0])
     names = [f.name for f in dataclasses.fields(kind)]  # pyright: ignore[reportArgumentType]
     fields = {name: merge(name, *(getattr(value, name) for value in values)) for name in names}
@@ -70,8 +74,12 @@ class kept(functools.cached_property[Kept]):
 
     def __get__(self, instance: Any, owner: Any = None) -> Any:
         """Return the value of the property."""
-        with torch.inference_mode(False):
-            value = super().__get__(instance, owner)
+        if torch.compiler.is_compiling():  # the compiler cannot trace the settings
+            with torch.inference_mode(False):
+                value = super().__get__(instance, owner)
+        else:
+            with torch.inference_mode(False), usual_settings():
+                value = super().__get__(instance, owner)
         if instance is not None and torch._C._functorch.peek_interpreter_stack() is not None:  # pyright: ignore
             vars(instance).pop(self.attrname, None)
         return value

@@ -47,6 +47,7 @@ from torchgrasp.foundation.rules import (
     nearest_rotation,
     show,
 )
+from torchgrasp.foundation.settings import DEVICES, in_autocast, usual_settings
 
 Checked = TypeVar("Checked", bound=Callable[..., Any])
 _thread = threading.local()  # `inside` is True while this thread is in a checked function
@@ -129,11 +130,24 @@ def _guard(function: Any, owner: Any, gradients: bool, always: Callable[[], bool
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
-        compiling = (
-            gradients and torch.compiler.is_compiling()
-        )  # a compiler traces the function, not the checks
-        if compiling or ((inside := getattr(_thread, "inside", False)) and not always()):
+        # a compiler traces the function, not the checks
+        if gradients and torch.compiler.is_compiling():
+            if not in_autocast():
+                return function(*args, **kwargs)
+            with (
+                torch.autocast(DEVICES[0], enabled=False),
+                torch.autocast(DEVICES[-1], enabled=False),
+            ):
+                return function(*args, **kwargs)
+        inside = getattr(_thread, "inside", False)
+        if inside and not always():
             return function(*args, **kwargs)
+        if inside:
+            return run(args, kwargs, inside)
+        with usual_settings():
+            return run(args, kwargs, inside)
+
+    def run(args: tuple[Any, ...], kwargs: dict[str, Any], inside: bool) -> Any:
         _check_options(signature, kwargs)
         bound = signature.bind(*args, **kwargs)
         shared = _Call(gradients, deep=not inside)
@@ -167,7 +181,8 @@ def _each(items: Generator[Any, Any, Any]) -> Iterator[Any]:
             inside = getattr(_thread, "inside", False)
             _thread.inside = True
             try:
-                item = next(items)
+                with usual_settings():
+                    item = next(items)
             except StopIteration:
                 return
             finally:
@@ -311,6 +326,8 @@ def _read_tensor(name: str, value: Any, hint: Any, call: _Call) -> Tensor:
         raise BadArgument(name, str(value.dtype), " or ".join(map(str, dtypes)))
     check_dense(name, value, call.gradients)
     call.sizes.update(sizes)
+    if value.is_inference():  # torch refuses it where derivatives are taken
+        value = value.clone()
     if kind == "Float":
         call.finite[name] = value
     return value

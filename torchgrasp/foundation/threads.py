@@ -1,8 +1,4 @@
-"""Calls that use one torch thread, and the CPU where no device is named.
-
-On busy cores several threads mostly wait for each other. A default device that a user sets must not
-move tensors that the library makes, such as random draws.
-"""
+"""Calls that use one torch thread: on busy cores several threads mostly wait for each other."""
 
 import contextlib
 import functools
@@ -24,10 +20,7 @@ them.
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """Let torch use one thread, and the CPU as default device, within the context.
-
-    Both settings are restored afterwards.
-    """
+    """Let torch use one thread within the context; the number is restored afterwards."""
     if getattr(_here, "inside", False):
         yield
         return
@@ -38,12 +31,7 @@ def one_thread() -> Iterator[None]:
     _here.inside = True
     torch.set_num_threads(1)
     try:
-        with (
-            contextlib.nullcontext()
-            if torch.get_default_device().type == "cpu"
-            else torch.device("cpu")
-        ):
-            yield
+        yield
     finally:
         with _lock:
             _state["calls"] -= 1

@@ -144,7 +144,7 @@ def fit_planes(view: SeenPoints, generator: torch.Generator) -> Iterator[PlaneFi
     noise = view.noise[: PLANES.scored]
     normals, offsets = _propose(view, generator)
     held = _held(points, noise, normals, offsets)  # (m, n)
-    left = torch.ones(len(points), device="cpu")
+    left = torch.ones(len(points), dtype=torch.float32, device="cpu")
     for _ in range(PLANES.planes if len(held) else 0):
         counts = held @ left
         i = int(counts.argmax())
@@ -194,7 +194,7 @@ def _held(
     """Return a matrix of planes by points: 1 if the point is within twice its noise of the plane,
     else 0.
     """
-    held = torch.empty(len(normals), len(points), device="cpu")
+    held = torch.empty(len(normals), len(points), dtype=torch.float32, device="cpu")
     for rows in row_numbers(normals).split(PLANES.at_once):
         height = normals[rows] @ points.T - offsets[rows, None]
         held[rows] = (height.abs_() < 2 * noise).float()

@@ -131,7 +131,7 @@ def find_table(
     `NoSupport` if none is found.
     """
     plane = as_plane(table)
-    direction = None if up is None else torch.as_tensor(up).double().cpu()
+    direction = None if up is None else torch.as_tensor(up, dtype=torch.float64).cpu()
     if plane is None:
         return find_supports(points, viewpoint, direction)
     if direction is not None and float(unit(direction) @ plane.normal.double()) < 0.5:

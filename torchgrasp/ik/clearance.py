@@ -255,7 +255,7 @@ def sphere_rows(
     direction = []
     for k, field in enumerate(world.fields):
         distance, gradient = field.query(points[:, k])
-        left_out = torch.where(torch.isinf(coarse[:, k]), 1.0, 0.0)
+        left_out = torch.isinf(coarse[:, k]).to(distance)
         clearance.append(distance - radius[index[:, k]] + left_out)
         direction.append(gradient)
     if world.plane is not None:

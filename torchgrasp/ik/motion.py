@@ -25,7 +25,7 @@ APPROACH_DISTANCE = 0.1  # length [m] of the straight approach: about the depth 
 # positions on each candidate path, and on a chosen path
 COARSE_STEPS = 8
 FINE_STEPS = 16
-UP = torch.tensor([0.0, 0.0, 1.0], device="cpu")
+UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float32, device="cpu")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -232,7 +232,7 @@ def _closing(hand: Hand, opened: Configuration, closed: Configuration) -> Float[
     steps.
     """
     # Equal rotations of each joint.
-    shares = torch.linspace(0, 1, MOTION.closing_steps, device="cpu").tolist()
+    shares = torch.linspace(0, 1, MOTION.closing_steps, dtype=torch.float32, device="cpu").tolist()
     ends = (opened.joints, closed.joints)
     poses = (opened.obj_from_hand, closed.obj_from_hand)
     postures = [

@@ -128,7 +128,7 @@ def _judge(
         return Status.CUT_OFF
     if bounded and _is_see_through(pixels, scene.image.depth):
         return Status.NO_DEPTH
-    parts = torch.tensor([JUDGE.top, JUDGE.high]).to(points)
+    parts = torch.tensor([JUDGE.top, JUDGE.high], dtype=torch.float32).to(points)
     top, high = points[:, 2].quantile(parts).tolist()
     if scene.table is not None and high < spec.least_height:
         return Status.TOO_LOW

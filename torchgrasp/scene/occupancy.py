@@ -90,7 +90,8 @@ class Occupancy(Value):
     def centres(self) -> Float[Tensor, "x y z 3"]:
         """The centres [m] of the x by y by z voxels, in the frame of `origin`."""
         steps = [
-            torch.arange(n, dtype=torch.float64) * self.spacing for n in self.probability.shape
+            torch.arange(n, dtype=torch.float64, device=self.origin.device) * self.spacing
+            for n in self.probability.shape
         ]
         return torch.stack(torch.meshgrid(*steps, indexing="ij"), -1) + self.origin.double()
 

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
-from torchgrasp.foundation.base import Value, at_once, in_chunks
+from torchgrasp.foundation.base import Value, at_once, in_chunks, kept
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import IndefiniteCovariance
 from torchgrasp.foundation.rules import is_known
@@ -82,7 +82,7 @@ class Posterior(Value):
     order: Int[Tensor, "rows"] | None  # row in `weights` of each row of `factor`; None if the same
     kernel: Kernel
 
-    @cached_property
+    @kept
     def whiteners(self) -> list[Float[Tensor, "columns width"]]:
         """The inverse L^-T of the transposed Cholesky factor, in blocks of columns without the
         zeros below them.

@@ -154,7 +154,8 @@ def loads_of(
         )
     else:
         axes = torch.eye(3, dtype=torch.float64)
-        corners = torch.tensor([*itertools.product((-1.0, 1.0), repeat=3)]) / math.sqrt(3)
+        signs = [*itertools.product((-1.0, 1.0), repeat=3)]
+        corners = torch.tensor(signs, dtype=torch.float32) / math.sqrt(3)
         # The convex hull of these vectors contains the unit ball.
         around = TASKS.around * torch.cat([corners, axes, -axes])  # (14, 3)
         weight = real([[0.0, 0.0, -TASKS.gravity * mass]])

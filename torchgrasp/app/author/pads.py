@@ -136,8 +136,8 @@ def order_by_facing(frames: Float[Tensor, "3 4 f n"], pads: Sequence[Pad]) -> li
     keeps the share largest. `frames` are poses (3 x 4) [m] of the tips in n random postures, in the
     frame of the URDF's root; `pads` are in the frames of the tips.
     """
-    contacts = torch.tensor([pad.contact for pad in pads]).double()
-    normals = torch.tensor([pad.normal for pad in pads]).double()
+    contacts = torch.tensor([pad.contact for pad in pads], dtype=torch.float64)
+    normals = torch.tensor([pad.normal for pad in pads], dtype=torch.float64)
     points = map_points(frames, contacts)
     directions = map_directions(frames, normals)
 

@@ -107,9 +107,11 @@ class CloudCut(Command):
         near = None
         box = None
         if self.point is not None:
-            near = check_tensor("--point", torch.tensor(self.point).double(), (3,))
+            near = check_tensor("--point", torch.tensor(self.point, dtype=torch.float64), (3,))
         if self.box is not None:
-            box = check_tensor("--box", torch.tensor(self.box).double(), (6,)).reshape(2, 3)
+            box = check_tensor("--box", torch.tensor(self.box, dtype=torch.float64), (6,)).reshape(
+                2, 3
+            )
         up = self.view.vertical
         up = real([0.0, 0.0, 1.0]) if up is None else up
         thing, plane = clouds.cut_object(file.cloud, up, near, box, self.gap)
