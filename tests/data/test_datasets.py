@@ -11,7 +11,7 @@ import trimesh
 from torchgrasp import PointCloud
 from torchgrasp.cloud.read import save_cloud
 from torchgrasp.data import list_views, read_entry, read_object_mesh, read_view, write_objects
-from torchgrasp.foundation.errors import BadArgument, MeshError
+from torchgrasp.foundation.errors import BadArgument, CloudWarning, MeshError, TwoBodies
 
 
 @pytest.fixture
@@ -108,6 +108,23 @@ def test_a_folder_of_meshes_becomes_objects_with_views_that_see_them(tmp_path: P
     write_objects(tmp_path / "meshes", again, views=2)
     for file in sorted(path.relative_to(again) for path in again.rglob("*") if path.is_file()):
         assert (again / file).read_bytes() == (tmp_path / "out" / file).read_bytes()
+
+
+def test_a_normalised_mesh_and_bodies_that_lie_apart_are_told(tmp_path):
+    def make(name, *parts):
+        (tmp_path / name).mkdir()
+        trimesh.util.concatenate(parts).export(tmp_path / name / "thing.ply")
+        return tmp_path / name
+
+    unit = make("unit", trimesh.creation.box((1.0, 0.6, 0.5)))
+    box = trimesh.creation.box((0.05, 0.06, 0.12))
+    apart = make("apart", box, box.copy().apply_translation((0.2, 0, 0)))
+    joined = make("joined", *(box.copy().apply_translation((0.04 * k, 0, 0)) for k in (0, 2, 1)))
+    with pytest.warns(CloudWarning, match=r"1\.00 m long.*suggested_scale"):
+        write_objects(unit, tmp_path / "a", views=1)
+    with pytest.warns(TwoBodies, match="lie apart"):
+        write_objects(apart, tmp_path / "b", views=1)
+    write_objects(joined, tmp_path / "c", views=1)  # without a word
 
 
 def test_no_meshes_two_of_a_name_and_an_open_one_are_refused(tmp_path: Path):

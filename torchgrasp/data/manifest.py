@@ -14,15 +14,17 @@ import functools
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.cloud.read import read_cloud, save_cloud
 from torchgrasp.files import Field, format_json, read_json, write_file
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import DatasetError
+from torchgrasp.foundation.errors import CloudWarning, DatasetError, TwoBodies
 from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.foundation.rules import Count, Seed
+from torchgrasp.foundation.told import warn_user
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.values.planning import PointCloud
 
@@ -53,6 +55,8 @@ class CameraNumbers:
     """Distance [m] from the object."""
     seeds: int = 2**31
     """Number of random seeds among which the seed of a view's noise is drawn."""
+    large: float = 0.4
+    """Longest side [m] of an object that needs no remark: hands span half of it."""
 
 
 CAMERAS = CameraNumbers()
@@ -137,7 +141,8 @@ def write_objects(
     of `partial_view` from a random side. The manifest is written last, so that a folder with a
     manifest is complete. The `meshes` are closed, in metres, with z up (.ply, .stl, .obj, .off).
     Raises `DatasetError` for no meshes or two meshes of one name, the errors of `read_mesh`, and
-    `OutputError` if the folder cannot be written.
+    `OutputError` if the folder cannot be written. Warns of meshes in a normalised unit
+    (`CloudWarning`) and of bodies that lie apart (`TwoBodies`).
 
     >>> import tempfile, trimesh
     >>> folder = Path(tempfile.mkdtemp())
@@ -157,6 +162,7 @@ def write_objects(
     entries = dict[str, object]()
     for path in files:
         mesh = read_mesh(path)
+        _warn_of_object(path.name, mesh)
         low, high = mesh.bounds
         shift = [-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2]]
         mesh = mesh.copy().apply_translation(shift)
@@ -173,6 +179,28 @@ def write_objects(
         entries[path.stem] = {"views": poses}
     write_file(Path(out) / "manifest.json", format_json({"objects": entries}))
     return names
+
+
+def _warn_of_object(name: str, mesh: "trimesh.Trimesh") -> None:
+    """Warn of a mesh that is large for a hand, or has bodies whose boxes lie apart."""
+    longest = float(mesh.extents.max())
+    if longest > CAMERAS.large:
+        fix = 'if it is normalised, scale it, or write "suggested_scale" into the manifest'
+        warn_user(CloudWarning, f"{name} is {longest:.2f} m long, too large for a hand: {fix}")
+    left = [part.bounds for part in mesh.split(only_watertight=False)]
+    joined = left.pop()
+    # bodies whose boxes meet are joined, until none is near the first
+    while near := [k for k, box in enumerate(left) if _meet(joined, box)]:
+        boxes = np.stack([joined, *(left[k] for k in near)])
+        joined = np.stack([boxes[:, 0].min(0), boxes[:, 1].max(0)])
+        left = [box for k, box in enumerate(left) if k not in near]
+    if left:
+        warn_user(TwoBodies, f"{name} has bodies that lie apart, and counts as one rigid object")
+
+
+def _meet(first: np.ndarray, second: np.ndarray) -> bool:
+    """Return whether two boxes (2, 3), lower and upper corner, meet."""
+    return bool((first[0] <= second[1]).all() and (second[0] <= first[1]).all())
 
 
 def _check_name(field: Field, name: str) -> None:

@@ -169,7 +169,7 @@ class Gap(CloudWarning):
 
 
 class TwoBodies(CloudWarning):
-    """The cloud shows two separate bodies."""
+    """The cloud or the mesh shows two separate bodies."""
 
 
 class FewPoints(CloudWarning):
