@@ -11,7 +11,7 @@ import dataclasses
 import functools
 import itertools
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -253,6 +253,31 @@ def collision_pairs(
         _limit_near(urdf, shapes, chunks[0], n - done, HAND_SEPARATIONS)
     colliding = links[(near > 0) & (met <= ALWAYS * n)].tolist()
     return [(tree.link_names[i], tree.link_names[j]) for i, j in colliding]
+
+
+def met_pairs(
+    urdf: Urdf, pairs: Sequence[tuple[str, str]], postures: Float[Tensor, "j n"]
+) -> Bool[Tensor, "p n"]:
+    """Return whether the links of each of p pairs overlap in each of n postures.
+
+    `postures` (j, n) are positions of all movable joints [rad or m], as from `draw_postures`.
+    """
+    tree = tree_from_urdf(urdf)
+    shapes = self_collision_from_urdf(urdf, pairs)
+    met = torch.zeros(len(pairs), postures.shape[1], dtype=torch.long, device="cpu")
+    if not len(shapes.pairs):
+        return met > 0
+    index = {frozenset(pair): row for row, pair in enumerate(pairs)}
+    rows = [
+        index[frozenset(tree.link_names[k] for k in both)]
+        for both in shapes.link[shapes.pairs].tolist()
+    ]
+    owner = torch.tensor(rows, device="cpu")
+    size = max(1, SEPARATIONS // len(owner))
+    for chunk, count in zip(postures.split(size, 1), met.split(size, 1), strict=True):
+        apart = shapes.separations(tree.frames(chunk), 0.0)  # (pairs of shapes, n)
+        count.index_add_(0, owner, (apart < 0).long())
+    return met > 0
 
 
 def _limit_near(urdf: Urdf, shapes: SelfCollision, frames: Frames, ahead: int, most: int) -> None:

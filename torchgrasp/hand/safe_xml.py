@@ -89,11 +89,11 @@ class BoundedBuilder(ET.TreeBuilder):
         return super().end(tag)
 
 
-def parse_urdf(path: Path, data: bytes) -> ET.Element:
+def parse_urdf(path: Path, data: bytes, visual: bool = False) -> ET.Element:
     """Return the XML tree of a URDF with only links and joints, and with checked numbers.
 
-    `data` are the bytes of the file; `path` is named in errors. Raises `HandFileError` for anything
-    else.
+    `data` are the bytes of the file; `path` is named in errors. With `visual`, a link without
+    <collision> has its <visual> in its place. Raises `HandFileError` for anything else.
     """
     # also within comments: a declaration may be hidden by a processing instruction that looks like
     # a comment
@@ -129,9 +129,27 @@ def parse_urdf(path: Path, data: bytes) -> ET.Element:
             raise HandFileError(
                 "urdf", f"{path}: <{element.tag}>", f"<link>, <joint> or one of {sorted(IGNORED)}"
             )
+    for link in _seen_only(robot) if visual else ():
+        for part in link.findall("visual"):
+            part.tag = "collision"
     clean = _clean(path, "", robot)
     clean.set("name", robot.get("name") or "hand")
     return clean
+
+
+def seen_links(data: bytes) -> tuple[str, ...]:
+    """Return the names of the links with a <visual> but no <collision>.
+
+    `data` are the bytes of a file that `parse_urdf` took.
+    """
+    robot = ET.fromstring(data, ET.XMLParser(target=BoundedBuilder()))
+    return tuple(link.get("name", "") for link in _seen_only(robot))
+
+
+def _seen_only(robot: ET.Element) -> list[ET.Element]:
+    """Return the links of a robot with a <visual> but no <collision>."""
+    links = robot.findall("link")
+    return [x for x in links if x.find("visual") is not None and x.find("collision") is None]
 
 
 def _clean(path: Path, where: str, element: ET.Element) -> ET.Element:

@@ -180,27 +180,28 @@ def read_urdf(path: Path | str) -> Urdf:
     return urdf
 
 
-def read_published(path: Path | str) -> Urdf:
+def read_published(path: Path | str, visual: bool = False) -> Urdf:
     """Read a URDF as its maker published it: with meshes, joints without limits, and chains of
     coupled joints.
 
-    Raises `HandFileError` for a missing or malformed file.
+    With `visual`, links without <collision> take their <visual> as collision shapes. Raises
+    `HandFileError` for a missing or malformed file.
     """
     path = Path(path)
     return _parse(
         path,
         read_bounded(path, URDF_BYTES, "a URDF file", functools.partial(HandFileError, "urdf")),
+        visual,
     )
 
 
 @functools.lru_cache(maxsize=16)
-def _parse(path: Path, data: bytes) -> Urdf:
+def _parse(path: Path, data: bytes, visual: bool) -> Urdf:
     """Return a file's bytes as checked values; the latest files are kept, as many callers read the
     same hand again.
     """
-    clean = parse_urdf(
-        path, data
-    )  # links and joints alone, each with all of its names and with finite numbers
+    # links and joints alone, each with all of its names and with finite numbers
+    clean = parse_urdf(path, data, visual)
     xml = ET.tostring(clean)
     robot = yourdfpy.URDF.load(io.BytesIO(xml), build_scene_graph=False, load_meshes=False).robot
     links = tuple(_link(*pair) for pair in zip(robot.links, clean.findall("link"), strict=True))
@@ -343,8 +344,8 @@ def _check_joints(urdf: Urdf) -> None:
             )
         limits = f"joint {j.name} with limits {j.lower:g}, {j.upper:g}"
         if not j.lower < j.upper:
-            swapped = ": are they swapped?" * (j.lower > j.upper)
-            raise urdf.wrong(limits, f"limits with lower < upper{swapped}")
+            cause = "are they swapped?" if j.lower > j.upper else 'else type "fixed"'
+            raise urdf.wrong(limits, f"limits with lower < upper: {cause}")
         if math.isinf(j.lower) != math.isinf(j.upper):
             raise urdf.wrong(limits, "both limits, or none (ROS takes 0 for the missing one)")
         farthest = max(-j.lower, j.upper)

@@ -8,7 +8,7 @@ and the fingertip pads are guessed (`pads`). Every guess is marked in the text.
 import dataclasses
 import functools
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.sax.saxutils import quoteattr
@@ -24,17 +24,20 @@ from torchgrasp.app.author.repair import (
     fix_wrist,
     keep_below,
     merge_frames,
+    merge_markers,
     repair_bodies,
     repair_joints,
 )
+from torchgrasp.app.author.unusual import find_unusual
 from torchgrasp.files import render
 from torchgrasp.foundation.base import FINGERTIPS
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Seed
-from torchgrasp.hand.collision_shapes import collision_pairs, draw_postures
+from torchgrasp.hand.collision_shapes import collision_pairs, draw_postures, met_pairs
 from torchgrasp.hand.hand_toml import Pad
 from torchgrasp.hand.kinematics import tree_from_urdf
+from torchgrasp.hand.safe_xml import seen_links
 from torchgrasp.hand.urdf import REPAIR, SIZES, Mimic, Triple, Urdf, read_published
 
 OPTIONS = {"default": 3, "four": 4, "five": 5}
@@ -52,6 +55,14 @@ class DraftNumbers:
     stiffness: float = 4.0  # stiffness of a drive [1/rad], over the effort of the weakest joint
     most_stiffness: float = 10.0  # greatest stiffness of a drive [N m/rad]
     damping: float = 0.03  # least time constant [s]: the ratio of damping to stiffness
+    trials: int = 1000  # random postures of each set of fingers in which a free one is sought
+    # Where fewer than this share of them are free, pairs of links that meet in at least these
+    # shares are left out: their shapes are too coarse. Real fingers do not meet themselves so often.
+    least_free: float = 0.02
+    most_within: float = 0.25  # pairs of one finger
+    most_between: float = 0.5  # other pairs
+    listed: int = 5  # most pairs that a warning names
+    thin: float = 6e-3  # a fingertip thinner than this [m] may be no fingertip
 
 
 DRAFT = DraftNumbers()
@@ -64,11 +75,14 @@ class Draft(NamedTuple):
         toml: text of the hand.toml.
         urdf: text of the clean URDF to which it refers; "" if the published URDF is clean.
         repairs: a sentence for each repair of the URDF.
+        warnings: a sentence for each number of the URDF that no hand has, and for each guess that
+            is likely wrong; `toml` has them, too.
     """
 
     toml: str
     urdf: str
     repairs: tuple[str, ...]
+    warnings: tuple[str, ...] = ()
 
 
 class Wish(NamedTuple):
@@ -79,12 +93,14 @@ class Wish(NamedTuple):
         name: name of the hand, by default the robot's.
         root: first link of the hand, where the URDF has an arm, too.
         meshes: folder of all meshes, by default the URDF's.
+        visual: links without <collision> take their <visual> as collision shapes.
     """
 
     tips: tuple[str, ...] = ()
     name: str = ""
     root: str = ""
     meshes: Path | None = None
+    visual: bool = False
 
 
 NO_WISH = Wish()
@@ -127,27 +143,34 @@ def new_hand(
     """Repair a published URDF, and draft a hand.toml for the clean copy.
 
     The user saves the clean copy as `file`, which the hand.toml names. `wish` holds the user's
-    choices; `seed` is that of the random postures from which pads are guessed. Raises the errors of
-    `draft_hand`, and `HandFileError` for a mesh that is refused, or a URDF that cannot be repaired.
+    choices; `seed` is that of the random postures from which pads are guessed. Where links meet in
+    nearly all postures, the pairs that cause it are left out of the self-collision, which a warning
+    tells. Raises the errors of `draft_hand`, and `HandFileError` for a mesh that is refused, a URDF
+    without collision shapes, or one that cannot be repaired.
 
     >>> from torchgrasp import load_hand
     >>> draft = new_hand(load_hand("barrett").urdf_path, Wish(name="mine"))
     >>> 'name = "mine"' in draft.toml, draft.repairs
     (True, ())
     """
-    published = read_published(path)
+    published = read_published(path, wish.visual)
+    bare = _bare_links(published, wish.visual)
     # frames are merged twice: a wrist that is fixed leaves new ones
     urdf, below = keep_below(published, wish.root or published.root)
     urdf, merged, taken = merge_frames(urdf)
     urdf, fixed = fix_wrist(urdf, fingertip_links(urdf) or [urdf.root])
     urdf, again, taken_again = merge_frames(urdf)
-    urdf, joints = repair_joints(urdf)
     points = shape_points(urdf, wish.meshes or published.path.parent)
     surfaces = {name: np.concatenate(parts) for name, parts in points.items() if parts}
+    urdf, marked, taken_markers = merge_markers(urdf, surfaces)
+    warnings = find_unusual(urdf, points)
+    urdf, joints = repair_joints(urdf)
     urdf, bodies = repair_bodies(urdf, surfaces)
     # a tip that the user named may have been merged into another link
-    tips = tuple(taken.get(tip, tip) for tip in wish.tips)
-    tips = _checked_tips(urdf, tuple(taken_again.get(tip, tip) for tip in tips))
+    tips = wish.tips
+    for merger in (taken, taken_again, taken_markers):
+        tips = tuple(merger.get(tip, tip) for tip in tips)
+    tips = _checked_tips(urdf, tips, () if wish.visual else bare)
     frames = _frames(urdf, (*tips, palm_of(urdf, tips)), seed)
     guess = guess_pads(urdf, frames, tips, surfaces)
     order = list(range(len(tips)))
@@ -164,12 +187,101 @@ def new_hand(
             balls.append(f"{tip} {1e3 * pad.radius:.1f} mm")
             clean = ball_tip(clean, tip, pad, outward, surfaces[tip])
         chosen[tip] = pad
-    repairs = [*below, *merged, *fixed, *again, *joints, *bodies, *fitted]
+    repairs = [*below, *merged, *fixed, *again, *marked, *joints, *bodies, *fitted]
     if balls:
         repairs.append(f"fingertips touch with a ball in their end, of radius: {', '.join(balls)}")
+    if bare and wish.visual:
+        repairs.append(f"links without <collision> take their <visual>: {', '.join(bare)}")
+    elif bare:
+        warnings.append(
+            f"links with a <visual> but no <collision> touch nothing: {', '.join(bare)} "
+            "(--visual takes their <visual>)"
+        )
+    warnings += _thin_tips(tips, surfaces)
     names = wish.name or urdf.name, file if repairs else published.path.name
-    toml = _toml_text(clean, chosen, sets, guess.approach, names, seed)
-    return Draft(toml, _urdf_text(clean) if repairs else "", tuple(repairs))
+    options = _options(clean, sets)
+    pairs, without = _part_pairs(clean, options, seed)
+    warnings += without
+    toml = _toml_text(clean, chosen, options, guess.approach, names, pairs, warnings)
+    return Draft(toml, _urdf_text(clean) if repairs else "", tuple(repairs), tuple(warnings))
+
+
+def _bare_links(urdf: Urdf, visual: bool) -> tuple[str, ...]:
+    """Return the links with a <visual> but no <collision>.
+
+    Raises `HandFileError` if no link has a collision shape, which names what `visual` would take.
+    """
+    bare = seen_links(urdf.data)
+    if any(x.shapes for x in urdf.links):
+        return bare
+    allowed = "links with a <collision>, or with a <visual> and --visual"
+    if bare and not visual:
+        allowed = f"links with a <collision>; --visual takes the <visual> of {len(bare)} links"
+    raise urdf.wrong("no link with a <collision>", allowed)
+
+
+def _thin_tips(tips: tuple[str, ...], surfaces: dict[str, np.ndarray]) -> list[str]:
+    """Return a warning, or none, that names the fingertips that are thinner than fingers are.
+
+    `surfaces` holds points (n, 3) [m] on each link, by its name.
+    """
+    thick = {tip: float(np.ptp(surfaces[tip], axis=0).min()) for tip in tips}
+    thin = [f"{tip} {1e3 * size:.1f} mm" for tip, size in thick.items() if size < DRAFT.thin]
+    if not thin:
+        return []
+    sizes = ", ".join(thin)
+    return [f"fingertips are thinner than fingers, are they others (--tips)? {sizes}"]
+
+
+def _part_pairs(
+    urdf: Urdf, options: Mapping[str, "Option"], seed: int
+) -> tuple[dict[tuple[str, str], float], list[str]]:
+    """Return the pairs of links to test for collision, each with 0, or with the share of random
+    postures in which it meets if it is left out; then warnings.
+
+    Pairs are left out where some option has hardly a free posture with them.
+    """
+    coupling = _coupling(urdf)
+    pairs = collision_pairs(urdf, coupling, seed=seed)
+    left_out = {pair: 0.0 for pair in pairs}
+    warnings = list[str]()
+    for name, option in options.items():
+        held = tuple(
+            dataclasses.replace(j, lower=option.parked[j.name], upper=option.parked[j.name])
+            if j.name in option.parked
+            else j
+            for j in urdf.joints
+        )
+        still = dataclasses.replace(urdf, joints=held)
+        met = met_pairs(still, pairs, draw_postures(still, coupling, DRAFT.trials, seed))  # (p, n)
+        shares = dict(zip(pairs, met.double().mean(1).tolist(), strict=True))
+        if float((~met.any(0)).double().mean()) >= DRAFT.least_free:
+            continue
+        for (one, two), share in shares.items():
+            chain = {one, *(j.parent for j in urdf.joints_above(one))}
+            chain_of_two = {two, *(j.parent for j in urdf.joints_above(two))}
+            within = two in chain or one in chain_of_two
+            if share >= (DRAFT.most_within if within else DRAFT.most_between):
+                left_out[one, two] = max(left_out[one, two], share)
+        kept = torch.tensor([not left_out[pair] for pair in pairs])
+        free = float((~met[kept].any(0)).double().mean())
+        if free < DRAFT.least_free:
+            others = [pair for pair in pairs if not left_out[pair]]
+            often = sorted(others, key=lambda pair: -shares[pair])[: DRAFT.listed]
+            listed = ", ".join(f"{one} and {two} {shares[one, two]:.0%}" for one, two in often)
+            warnings.append(
+                f"only {free:.1%} of random postures of option {name} are free; most often meet "
+                f"{listed}: make their collision shapes smaller, or take pairs out"
+            )
+    out = {pair: share for pair, share in left_out.items() if share}
+    if out:
+        listed = ", ".join(f"{one} and {two} {share:.0%}" for (one, two), share in out.items())
+        warnings.insert(
+            0,
+            "pairs of links that leave no posture free are left out of [self_collision]; "
+            f"they meet in these shares of random postures: {listed}",
+        )
+    return left_out, warnings
 
 
 @checked
@@ -198,9 +310,27 @@ def _frames(urdf: Urdf, links: tuple[str, ...], seed: int) -> Float[Tensor, "3 4
     return torch.cat([tree.frames(part)[:, :, at] for part in values.split(DRAFT.chunk, 1)], -1)
 
 
-def _checked_tips(urdf: Urdf, tips: tuple[str, ...]) -> tuple[str, ...]:
+class Option(NamedTuple):
+    """A set of fingers that grasp: their tips, and the positions [rad or m] of parked joints."""
+
+    tips: list[str]
+    parked: dict[str, float]
+
+
+def _options(urdf: Urdf, sets: Mapping[str, list[str]]) -> dict[str, Option]:
+    """Return the options of a hand, by name, for sets of fingertip links."""
+    options = {}
+    for name, grasping in sets.items():
+        joints = {j.name for tip in grasping for j in urdf.movers(tip)}
+        options[name] = Option(grasping, _parked(urdf, joints))
+    return options
+
+
+def _checked_tips(urdf: Urdf, tips: tuple[str, ...], bare: tuple[str, ...]) -> tuple[str, ...]:
     """Return the given fingertip links, else those found; raise `BadArgument` if their number or a
     link is unusable.
+
+    `bare` are links without collision shapes that the error names.
     """
     ends = fingertip_links(urdf)
     chosen = tips or ends
@@ -209,6 +339,8 @@ def _checked_tips(urdf: Urdf, tips: tuple[str, ...]) -> tuple[str, ...]:
             "three to five different links in grasp order; "
             f"the branches of {urdf.path} end in {list(ends)}"
         )
+        if bare:
+            wanted += f"; --visual takes the <visual> of links without <collision>: {list(bare)}"
         raise BadArgument("tips", list(tips) or f"a hand of {len(ends)} fingers", wanted)
     shaped = {x.name for x in urdf.links if x.shapes}
     for tip in chosen:
@@ -250,22 +382,16 @@ def _gains(urdf: Urdf) -> tuple[float, float]:
 def _toml_text(
     urdf: Urdf,
     pads: dict[str, Pad],
-    sets: dict[str, list[str]],
+    options: Mapping[str, Option],
     approach: Triple,
     names: tuple[str, str],
-    seed: int,
+    pairs: Mapping[tuple[str, str], float],
+    warnings: Sequence[str],
 ) -> str:
-    """Return the text of a hand.toml from pads by tip, sets of tips by option, and the names of
-    hand and URDF file.
+    """Return the text of a hand.toml from pads by tip, options by name, the names of hand and URDF
+    file, and pairs of links, each with the share with which it is left out.
     """
-    coupling = _coupling(urdf)
     kp, kd = _gains(urdf)
-    chains = {tip: [j.name for j in urdf.movers(tip)[::-1]] for tip in pads}
-    called = {tip: tip.removesuffix("_tip") for tip in pads}
-    options = {}
-    for option, grasping in sets.items():
-        joints = {joint for tip in grasping for joint in chains[tip]}
-        options[option] = ([called[tip] for tip in grasping], _parked(urdf, joints))
     return _render(
         "hand.toml",
         name=names[0],
@@ -274,12 +400,13 @@ def _toml_text(
         approach=approach,
         kp=kp,
         kd=kd,
-        coupling=coupling,
+        coupling=_coupling(urdf),
         options=options,
         pads=pads,
-        names=called,
-        chains=chains,
-        pairs=collision_pairs(urdf, coupling, seed=seed),
+        names={tip: tip.removesuffix("_tip") for tip in pads},
+        chains={tip: [j.name for j in urdf.movers(tip)[::-1]] for tip in pads},
+        pairs=pairs,
+        warnings=warnings,
     )
 
 

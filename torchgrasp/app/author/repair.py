@@ -22,6 +22,7 @@ class RepairNumbers:
     effort: float = 1.0  # greatest torque [N m]
     velocity: float = 3.0  # greatest speed [rad/s]
     most_wrist: int = 3  # joints that move all fingertips: more are an arm
+    marker: float = 6e-3  # a fixed end link is a marker if smaller [m]: no fingertip is so small
     # least mass and edge of a body without mass, so that simulators remain stable
     least_mass: float = 1e-3  # least mass [kg]
     least_size: float = 5e-3  # least edge [m]
@@ -113,6 +114,70 @@ def merge_frames(urdf: Urdf) -> tuple[Urdf, list[str], dict[str, str]]:
         urdf = dataclasses.replace(urdf, links=kept, joints=below)
 
 
+def merge_markers(
+    urdf: Urdf, surfaces: Mapping[str, np.ndarray]
+) -> tuple[Urdf, list[str], dict[str, str]]:
+    """Return the URDF with markers at fingertips merged into the links to which they are fixed.
+
+    A marker is too small to touch an object, as those by which a hand is calibrated. Its mass is
+    kept, and its shapes are left out. `surfaces` holds points (n, 3) [m] on each link, by its name,
+    in its frame. The other results are those of `merge_frames`.
+    """
+    taken: dict[str, str] = {}
+    while marker := _marker(urdf, surfaces):
+        (above,) = (j for j in urdf.joints if j.child == marker.name)
+        moved = _moved(marker, pose_of(above))
+        joints = tuple(
+            _under(j, above) if j.parent == marker.name else j
+            for j in urdf.joints
+            if j is not above
+        )
+        links = tuple(
+            _heavier(x, moved) if x.name == above.parent else x
+            for x in urdf.links
+            if x is not marker
+        )
+        taken = {name: above.parent if to == marker.name else to for name, to in taken.items()}
+        taken[marker.name] = above.parent
+        urdf = dataclasses.replace(urdf, links=links, joints=joints)
+    done = [f"{name} into {to}" for name, to in taken.items()]
+    most = f"{1e3 * REPAIRS.marker:g} mm"
+    told = f"links smaller than {most} at fingertips, markers, are merged: {', '.join(done)}"
+    return urdf, [told] if done else [], taken
+
+
+def _marker(urdf: Urdf, surfaces: Mapping[str, np.ndarray]) -> Link | None:
+    """Return a link with shapes that is fixed, small, moved by a joint, and below which nothing
+    moves or has shapes; None if there is none.
+    """
+    above = {j.child: j for j in urdf.joints}
+    busy = {j.parent for j in urdf.movable} | {
+        j.parent for x in urdf.links if x.shapes for j in urdf.joints_above(x.name)
+    }
+    for link in urdf.links:
+        fixed = link.name in above and above[link.name].kind == "fixed"
+        if not fixed or not link.shapes or link.name in busy or not urdf.movers(link.name):
+            continue
+        if float(np.ptp(surfaces[link.name], axis=0).max()) < REPAIRS.marker:
+            return link
+    return None
+
+
+def _heavier(link: Link, other: Link) -> Link:
+    """Return a link with the mass and inertia of another, in the same frame, added to its own."""
+    if not other.mass > 0 or not link.mass > 0:
+        return link
+    parts = (link, other)
+    com = np.average([x.com for x in parts], axis=0, weights=[x.mass for x in parts])
+    inertia = np.zeros((3, 3))
+    for part in parts:
+        arm = np.array(part.com) - com
+        inertia += _matrix(part.inertia) + part.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    x, y, z = com.tolist()
+    mass = link.mass + other.mass
+    return Link(link.name, mass, (x, y, z), _triangle(inertia), link.shapes)
+
+
 def _under(joint: Joint, above: Joint) -> Joint:
     """Return a joint attached to the parent of a frame that is merged away, with its origin
     adjusted.
@@ -195,7 +260,8 @@ def _add_limits(urdf: Urdf, joints: dict[str, Joint]) -> list[str]:
             raise urdf.wrong(f"joint {j.name} without a limit", wanted)
         joints[j.name] = dataclasses.replace(j, kind="revolute", lower=-math.pi, upper=math.pi)
     return [
-        f"joint {j.name} has no limits: they are set to half a turn either way" for j in endless
+        f"joint {j.name} is continuous or has no limits: they are set to half a turn either way"
+        for j in endless
     ]
 
 

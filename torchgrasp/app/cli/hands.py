@@ -11,6 +11,8 @@ import torch
 from tqdm import tqdm
 
 from torchgrasp.app.author.draft import Wish, new_hand
+from torchgrasp.app.author.fit_shapes import shape_points
+from torchgrasp.app.author.unusual import find_unusual
 from torchgrasp.app.cli.command import (
     Command,
     arguments,
@@ -31,7 +33,7 @@ from torchgrasp.app.cli.inputs import (
 )
 from torchgrasp.app.report.stills import draw_hand, opposed_posture
 from torchgrasp.data.shipped import load_object
-from torchgrasp.files import format_columns, hold_file, render, temporary_folder, write_file
+from torchgrasp.files import format_columns, hold_file, render, write_file
 from torchgrasp.foundation.base import count_status
 from torchgrasp.foundation.errors import BadArgument, GraspError, OutputError, Status
 from torchgrasp.foundation.rules import Range, Seed
@@ -39,6 +41,7 @@ from torchgrasp.geometry.linalg import dot, norm
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import read_hand_toml
 from torchgrasp.hand.load import find_hand
+from torchgrasp.hand.urdf import read_urdf
 from torchgrasp.planner.grasps import plan_grasps
 from torchgrasp.planner.request import finger_sets
 from torchgrasp.posture_model.dataset import write_samples
@@ -99,20 +102,25 @@ class HandNew(Command):
     name: str | None = option(None, "name of the hand; by default the robot's")
     root: str = option("", "first link of the hand, where the URDF has an arm, too")
     meshes: Path | None = option(None, "folder of all meshes; by default the URDF's")
+    visual: bool = option(
+        False, "take the <visual> of links without <collision> as their collision shapes"
+    )
     out: Path | None = option(None, "folder to write; by default the URDF's")
     seed: Seed = option(0, "random seed of the postures from which pads and pairs are guessed")
 
     def run(self) -> int:
-        """Draft, check and write the files of the hand; return the exit code."""
+        """Draft, write and check the files of the hand; return the exit code.
+
+        The draft is written even if it has faults, for the user to edit; the code is then 1.
+        """
         urdf, meshes, out = locate_urdf(self.urdf, self.meshes, self.out)
         folder = urdf.parent if out is None else out
         check_folder(folder)
         clean = (
             "hand.urdf" if (folder / "hand.urdf").resolve() != urdf.resolve() else "hand_clean.urdf"
         )
-        draft = new_hand(
-            urdf, Wish(self.tips, self.name or "", self.root, meshes), self.seed, clean
-        )
+        wish = Wish(self.tips, self.name or "", self.root, meshes, self.visual)
+        draft = new_hand(urdf, wish, self.seed, clean)
         texts = {"hand.toml": draft.toml}
         if draft.urdf or out is not None:
             texts[clean if draft.urdf else urdf.name] = draft.urdf or urdf.read_text(
@@ -125,25 +133,24 @@ class HandNew(Command):
                     f"{folder / file}, which exists",
                     "a folder without this file, as by --out",
                 )
-        with temporary_folder() as trial:
-            for file, text in ({urdf.name: urdf.read_text(encoding="utf-8")} | texts).items():
-                write_file(trial / file, text)
-            if print_faults(trial):
-                print(f"nothing is written; repair {urdf} and try again")
-                return 2
-            hand = check_hand(trial)
-            sets = describe_sets(hand)
         for sentence in draft.repairs:
             print(f"repaired: {sentence}")
+        for sentence in draft.warnings:
+            print(f"warning: {sentence}")
         for file, text in texts.items():
             write_file(folder / file, text)
             print(f"written: {folder / file}")
-        print(f"out of the palm: {[round(x, 2) for x in hand.approach.tolist()]}")
-        print(sets)
         place = (
             folder if folder.is_absolute() else f"./{folder}"
         )  # a plain name may be that of a shipped hand
-        print(f"look over the lines of hand.toml marked CHECK, then: torchgrasp hand check {place}")
+        next_step = f"torchgrasp hand check {place}"
+        hand = _checked(folder)
+        if hand is None:
+            print(f"the draft has these faults: edit its files, then: {next_step}")
+            return 1
+        print(f"out of the palm: {[round(x, 2) for x in hand.approach.tolist()]}")
+        print(describe_sets(hand))
+        print(f"look over the lines of hand.toml marked CHECK, then: {next_step}")
         return 0
 
 
@@ -175,6 +182,9 @@ class HandCheck(Command):
             check_folder(self.out.parent)
             joints = random_joints(sound, TRIAL.postures)
             bar.write(f"{describe(sound, joints)}\n{describe_sets(sound)}")
+            urdf = read_urdf(sound.urdf_path)
+            for warning in find_unusual(urdf, shape_points(urdf, urdf.path.parent)):
+                bar.write(f"warning: {warning}")
             model = find_hand(self.hand) / "mixture.safetensors"
             missing = (
                 f"none; only the modes of the paper need one: torchgrasp hand train {self.hand}"
@@ -198,6 +208,17 @@ class HandCheck(Command):
         if able:
             print("the hand can grasp")
         return 0 if able else 1
+
+
+def _checked(folder: Path) -> Hand | None:
+    """Print every fault of the hand in a folder; return the hand, or None if there is any."""
+    if print_faults(folder):
+        return None
+    try:
+        return check_hand(folder)
+    except GraspError as error:
+        print(f"wrong: {' '.join(str(error).split())}")
+        return None
 
 
 def print_faults(hand: str | Path, fingers: str = "default") -> bool:

@@ -1,0 +1,91 @@
+"""Numbers of a published URDF that no hand has: sizes, masses, ranges, efforts, velocities.
+
+They are placeholders, or in another unit. Nothing is changed: the sentences are warnings.
+"""
+
+import dataclasses
+import math
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+
+from torchgrasp.hand.urdf import Urdf
+
+Bounds = tuple[float, float]  # the least and the greatest usual value
+
+
+@dataclasses.dataclass(frozen=True)
+class UsualNumbers:
+    """Least and greatest values of robot hands, with room on both sides.
+
+    Shipped and published hands of seven makers lie within them.
+    """
+
+    size: Bounds = (1e-3, 0.6)  # longest edge of a link [m]: a forearm is the largest
+    place: Bounds = (0.0, 0.6)  # distance of a joint from the joint before it [m]
+    turn: Bounds = (0.05, 3.6)  # range of a revolute joint [rad]: half a turn and some degrees
+    slide: Bounds = (1e-3, 0.2)  # range of a sliding joint [m]
+    torque: Bounds = (0.01, 50.0)  # effort of a revolute joint [N m]
+    force: Bounds = (0.1, 1000.0)  # effort of a sliding joint [N]
+    turning: Bounds = (0.05, 200.0)  # velocity of a revolute joint [rad/s]
+    sliding: Bounds = (1e-3, 10.0)  # velocity of a sliding joint [m/s]
+    hand_mass: Bounds = (0.05, 4.5)  # [kg]: a Shadow hand with its forearm has 4.3
+    # [kg/m3] of the box around a link's shapes, which may be a part of it: at most that of metals
+    density: Bounds = (20.0, 25_000.0)
+    edge: float = 5e-3  # least edge of this box [m], as flat shapes have no volume
+
+
+USUAL = UsualNumbers()
+
+
+def find_unusual(urdf: Urdf, points: Mapping[str, Sequence[np.ndarray]]) -> list[str]:
+    """Return a sentence for each kind of number of a URDF that no hand has.
+
+    `points` (n, 3) [m] are those on every shape of each link, by its name, in its frame. Numbers
+    that the URDF lacks are not named.
+    """
+    sizes = []
+    dense = []
+    for link in urdf.links:
+        if not points[link.name]:
+            continue
+        size = np.ptp(np.concatenate(points[link.name]), axis=0)
+        sizes.append((link.name, float(size.max())))
+        volume = float(np.prod(np.maximum(size, USUAL.edge)))
+        dense.append((f"{link.name} of {link.mass:.3g} kg", link.mass / volume))
+    mass = sum(x.mass for x in urdf.links)
+    places = [(j.name, math.hypot(*j.xyz)) for j in urdf.joints]
+    named = [
+        ("the size of links", "m", USUAL.size, sizes),
+        ("the distance of joints from the joint before", "m", USUAL.place, places),
+        ("the mass of the whole hand", "kg", USUAL.hand_mass, [(urdf.name, mass)]),
+        ("the density of links", "kg/m3", USUAL.density, dense),
+    ]
+    for slides, kind, units, bounds in (
+        (False, "joints", ("rad", "N m", "rad/s"), (USUAL.turn, USUAL.torque, USUAL.turning)),
+        (True, "sliding joints", ("m", "N", "m/s"), (USUAL.slide, USUAL.force, USUAL.sliding)),
+    ):
+        joints = [j for j in urdf.movable if (j.kind == "prismatic") == slides]
+        values = (
+            [(j.name, j.upper - j.lower) for j in joints],
+            [(j.name, j.effort) for j in joints],
+            [(j.name, j.velocity) for j in joints],
+        )
+        for what, *rest in zip(("range", "effort", "velocity"), units, bounds, values, strict=True):
+            named.append((f"the {what} of {kind}", *rest))
+    found = [_outside(*kind) for kind in named]
+    return [sentence for sentence in found if sentence]
+
+
+def _outside(what: str, unit: str, bounds: Bounds, values: Iterable[tuple[str, float]]) -> str:
+    """Return a sentence that names the values outside their bounds; "" if there is none.
+
+    A value that is zero or infinite is one that the URDF lacks.
+    """
+    least, most = bounds
+    known = [(name, x) for name, x in values if 0 < x < np.inf]
+    odd = [f"{name} {x:.3g}" for name, x in known if not least <= x <= most]
+    if not odd:
+        return ""
+    usual = f"{least:g} to {most:g} {unit}"
+    return f"{what} is that of no hand ({usual}), look over the URDF: {', '.join(odd)}"
