@@ -5,13 +5,21 @@ import importlib
 import inspect
 import pkgutil
 import re
+import sys
 import typing
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.version import Version
 
 import torchgrasp
 from tests.make import run_python
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
 
 ROOT = Path(__file__).parents[1]
 SOURCES = sorted((ROOT / "torchgrasp").rglob("*.py"))
@@ -194,3 +202,28 @@ def test_every_id_is_promised_or_has_its_reason():
         for k in range(int(first), int(last or first) + 1)
     }
     assert PROMISED | told == known and not PROMISED & told
+
+
+def test_the_lowest_versions_are_those_of_the_bounds():
+    """constraints-lowest.txt, with which scripts/lowest runs tests, follows pyproject.toml."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    script = (ROOT / "scripts" / "lowest").read_text()
+    extras = re.search(r'-e "\.\[([\w,]+)\]"', script)
+    assert extras is not None
+    bounds = list[str](project["dependencies"])
+    for extra in extras[1].split(","):
+        bounds += project["optional-dependencies"][extra]
+    lines = (ROOT / "constraints-lowest.txt").read_text().splitlines()
+    listed = [line for line in lines if not line.startswith("#")]
+    assert lowest_of(listed, "==") == lowest_of(bounds, ">=")
+
+
+def lowest_of(lines: list[str], operator: str) -> dict[str, tuple[Version, str]]:
+    """Return version and condition of each package after an operator such as ">="."""
+    found = dict[str, tuple[Version, str]]()
+    for line in lines:
+        requirement = Requirement(line)
+        versions = [one.version for one in requirement.specifier if one.operator == operator]
+        assert len(versions) == 1, line
+        found[requirement.name] = Version(versions[0]), str(requirement.marker)
+    return found
