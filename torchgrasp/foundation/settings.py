@@ -16,7 +16,8 @@ import torch
 
 from torchgrasp.foundation.errors import BadArgument
 
-_accelerator = torch.accelerator.current_accelerator()
+# torch 2.6 raises an error where there is no accelerator
+_accelerator = torch.accelerator.current_accelerator() if torch.accelerator.is_available() else None
 DEVICES = ("cpu",) if _accelerator is None else ("cpu", _accelerator.type)
 """Types of devices whose tensors autocast may round."""
 HIGHEST = "highest"  # torch's name of products of matrices in full float32
