@@ -66,7 +66,7 @@ class ViewNumbers:
 
 
 @dataclasses.dataclass(frozen=True)
-class MotionNumbers:
+class RegistrationNumbers:
     """Parameters of the search for the motion that brings two views together."""
 
     shifted: float = 0.01
@@ -95,7 +95,7 @@ class MotionNumbers:
 
 
 VIEWS = ViewNumbers()
-MOTION = MotionNumbers()
+MOTION = RegistrationNumbers()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,7 +129,7 @@ def compare_views(views: Sequence[PointCloud]) -> list[float]:
     another saw. Views that nowhere meet are refused, too. A motion that noise does not explain is
     told by a `MendedInput`.
     """
-    surfaces = [_Surface(view) for view in views]
+    surfaces = [_ViewSurface(view) for view in views]
     apart = list[tuple[float, float, float, tuple[int, int]]]()  # ratio, distance, limit, views
     shown = (0.0, (0, 0))  # the greatest error [m] that noise does not explain, and its views
     errors = [list[float]() for _ in views]  # those that the pairs of each view show
@@ -166,8 +166,8 @@ def compare_with(seen: PointCloud, view: PointCloud) -> float:
     Both have normals and are in one frame [m]. Raises `BadArgument` for a view that is too far off,
     and tells a distance that noise does not explain by a `MendedInput`.
     """
-    one = _Surface(seen)
-    motion = _find_motion(one, _Surface(view, one.noise))
+    one = _ViewSurface(seen)
+    motion = _find_motion(one, _ViewSurface(view, one.noise))
     if motion is None:
         return 0.0
     far = motion.shown * motion.shift
@@ -204,8 +204,8 @@ def align_views(views: Sequence[PointCloud]) -> list[tuple[Float[Tensor, "4 4"],
     while left:
         points = torch.cat([view.points for view in placed])
         normals = [view.normals for view in placed if view.normals is not None]
-        whole = _Surface(PointCloud(points, torch.cat(normals)), noise_of(placed[0]))
-        surfaces = {k: _Surface(views[k]) for k in left}
+        whole = _ViewSurface(PointCloud(points, torch.cat(normals)), noise_of(placed[0]))
+        surfaces = {k: _ViewSurface(views[k]) for k in left}
         # the view with the greatest overlap comes first
         k = max(left, key=lambda row: whole.count_matches(surfaces[row]))
         left.remove(k)
@@ -255,7 +255,7 @@ def _check_meeting(views: Sequence[PointCloud]) -> None:
             _refuse_views((first, second), gap, VIEWS.gap)
 
 
-class _Surface:
+class _ViewSurface:
     """The surface that one view shows, with what is needed to compare other views with it.
 
     `points` (n, 3) [m] have the outward unit `normals` (n, 3). `noise` [m] is that of the camera,
@@ -293,12 +293,12 @@ class _Surface:
         matched = matched & (beside < VIEWS.reach * self.spacing) & (height.abs() < most)
         return matched, height, own
 
-    def count_matches(self, other: "_Surface") -> int:
+    def count_matches(self, other: "_ViewSurface") -> int:
         """Return how many compared points of another view match."""
         rows = other.drawn
         return int(self.match(other.points[rows], other.normals[rows], MOTION.first)[0].sum())
 
-    def height_before(self, other: "_Surface") -> float:
+    def height_before(self, other: "_ViewSurface") -> float:
         """Return how high [m] another view stands before this surface, as its camera saw it; 0
         without a camera, or if too few points can be compared.
         """
@@ -329,7 +329,7 @@ def _spacing(points: Points) -> float:
     return float(nearest(points, VIEWS.neighbours)[0][:, 1:].mean(-1).median())
 
 
-def _find_motion(fixed: _Surface, view: _Surface) -> Motion | None:
+def _find_motion(fixed: _ViewSurface, view: _ViewSurface) -> Motion | None:
     """Return the most likely motion of a view onto a fixed one; None if they overlap too little.
 
     It starts at the given pose, and minimises Tukey's loss of the heights of matching points over
@@ -379,7 +379,7 @@ def _displacement(step: Float[Tensor, "6"], arms: Points) -> Points:
 
 
 def _linearise(
-    fixed: _Surface, view: _Surface, centre: Vector, step: Float[Tensor, "6"], most: float
+    fixed: _ViewSurface, view: _ViewSurface, centre: Vector, step: Float[Tensor, "6"], most: float
 ) -> tuple[Float[Tensor, "m 6"], Float[Tensor, "m"]]:
     """Return (jacobian, heights [m]) of the matching points of two views, of both over the other.
 

@@ -234,7 +234,7 @@ def _thin_tips(tips: tuple[str, ...], surfaces: dict[str, np.ndarray]) -> list[s
 
 
 def _part_pairs(
-    urdf: Urdf, options: Mapping[str, "Option"], seed: int
+    urdf: Urdf, options: Mapping[str, "FingerSet"], seed: int
 ) -> tuple[dict[tuple[str, str], float], list[str]]:
     """Return the pairs of links to test for collision, each with 0, or with the share of random
     postures in which it meets if it is left out; then warnings.
@@ -310,19 +310,19 @@ def _frames(urdf: Urdf, links: tuple[str, ...], seed: int) -> Float[Tensor, "3 4
     return torch.cat([tree.frames(part)[:, :, at] for part in values.split(DRAFT.chunk, 1)], -1)
 
 
-class Option(NamedTuple):
+class FingerSet(NamedTuple):
     """A set of fingers that grasp: their tips, and the positions [rad or m] of parked joints."""
 
     tips: list[str]
     parked: dict[str, float]
 
 
-def _options(urdf: Urdf, sets: Mapping[str, list[str]]) -> dict[str, Option]:
+def _options(urdf: Urdf, sets: Mapping[str, list[str]]) -> dict[str, FingerSet]:
     """Return the options of a hand, by name, for sets of fingertip links."""
     options = {}
     for name, grasping in sets.items():
         joints = {j.name for tip in grasping for j in urdf.movers(tip)}
-        options[name] = Option(grasping, _parked(urdf, joints))
+        options[name] = FingerSet(grasping, _parked(urdf, joints))
     return options
 
 
@@ -382,7 +382,7 @@ def _gains(urdf: Urdf) -> tuple[float, float]:
 def _toml_text(
     urdf: Urdf,
     pads: dict[str, Pad],
-    options: Mapping[str, Option],
+    options: Mapping[str, FingerSet],
     approach: Triple,
     names: tuple[str, str],
     pairs: Mapping[tuple[str, str], float],
