@@ -77,6 +77,7 @@ READ = {
     "a.xyzi": (rows(COLOURED[:, :4]), False, "intensity"),
     "a.xyzn": (rows(BOTH), True, ""),
     "a.xyzrgb": (rows(COLOURED), False, "red, green, blue"),
+    "counted.asc": ("//X Y Z R G B\n60\n" + rows(COLOURED), False, "R, G, B"),
     "a.asc": ("//X Y Z R G B\n" + rows(COLOURED), False, "R, G, B"),
     "normals.csv": (
         "X;Y;Z;Nx;Ny;Nz;curvature\n" + rows(BOTH[:, [0, 1, 2, 3, 4, 5, 0]], ";"),

@@ -232,6 +232,20 @@ def test_colours_of_length_1_are_no_normals(tmp_path, colour):
     assert found.cloud.normals is not None and not found.notes
 
 
+@pytest.mark.parametrize("face", [600, 880])
+def test_one_colour_is_told_from_normals_though_most_points_lie_on_its_face(tmp_path, face):
+    """Two faces of a box, and the one alone, whose normals are right."""
+    rng = np.random.default_rng(0)
+    box = rng.uniform(0, 0.06, (1000, 3)) + rng.normal(0, 0.0005, (1000, 3))
+    box[:face, 0] = 0.06
+    box[face:, 2] = 0.06
+    red = np.broadcast_to((1.0, 0, 0), (1000, 3))
+    np.save(tmp_path / "red.npy", np.hstack([box, red]))
+    np.save(tmp_path / "face.npy", np.hstack([box, red])[:face])
+    assert read_cloud_file(tmp_path / "red.npy").cloud.normals is None
+    assert read_cloud_file(tmp_path / "face.npy").cloud.normals is not None
+
+
 def colours(n):
     return np.random.default_rng(2).uniform(0, 1, (n, 3))
 

@@ -51,6 +51,10 @@ class ReadNumbers:
     """Most points by which a camera in the origin is judged."""
     fitted: float = 0.7
     """Least median cosine between normals and planes fitted to points: others are colours."""
+    alike: float = 0.999
+    """Least cosine of nearly all normals with their median if they are alike, as one colour is."""
+    across: float = 0.1
+    """Quantile of the cosines with fitted planes that must be as large if all normals are alike."""
 
 
 READ = ReadNumbers()
@@ -345,8 +349,13 @@ def _fit_surface(arrays: dict[str, Any]) -> bool:
     if len(points) < NEAR.plane:
         return True  # too few for planes
     drawn = draw_rows(len(points), READ.drawn)
-    cosine = (fit_local_planes(points, drawn)[0] * unit_vectors(rows[drawn, 3:])).sum(-1).abs()
-    return float(cosine.median()) > READ.fitted
+    given = unit_vectors(rows[drawn, 3:])
+    cosine = (fit_local_planes(points, drawn)[0] * given).sum(-1).abs()
+    usual = unit_vectors(given.median(0).values)
+    alike = float(((given @ usual) > READ.alike).double().mean()) >= READ.normals
+    # most points of one colour may lie on the one face of which it is the normal
+    least = cosine.quantile(READ.across) if alike else cosine.median()
+    return float(least) > READ.fitted
 
 
 def _find_measured(

@@ -127,7 +127,7 @@ def parse_text(data: bytes, suffix: str) -> dict[str, Any]:
         names = ["x", "y", "z", "intensity", "red", "green", "blue"][:width]
     if len(names or [0] * width) != width or (not names and width not in (3, 6)):
         named = (
-            f"the names {' '.join(names)[:SHOWN_NAMES]!r}, not one word for each column"
+            f"the names {' '.join(names)[:SHOWN_NAMES]!r}: one word for each column, as in x y z nx ny nz"
             if names
             else "no line of names above, such as x y z nx ny nz"
         )
@@ -199,8 +199,10 @@ def _read_text(data: bytes) -> tuple[list[str], Float[np.ndarray, "rows columns"
         ) from error
     if not table.size:
         raise Malformed("no numbers")
-    words = [*comment.replace(",", " ").split()]  # also a comment may name the columns
-    return words if not names and {"x", "y", "z"} <= {*map(str.lower, words)} else names, table
+    # Also a comment may name the columns, above a count of the rows or without one.
+    words = [*comment.replace(",", " ").split()]
+    unnamed = not names or names == [str(len(table))]
+    return words if unnamed and {"x", "y", "z"} <= {*map(str.lower, words)} else names, table
 
 
 def _check_line(line: str) -> None:
