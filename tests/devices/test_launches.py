@@ -17,7 +17,7 @@ from torchgrasp.values.planning import PointCloud
 
 KNOWN = {
     "outside": "",
-    "cloud/agreement.py": "_noise check_foot",
+    "cloud/agreement.py": "noise_of check_foot",
     "cloud/check.py": "_check _check_distinct _distinct_rows first_of_each",
     "cloud/neighbours.py": "_fit_block _principal_axes is_flat nearest",
     "cloud/prepare.py": "_fit_normals prepare_cloud share_facing",
