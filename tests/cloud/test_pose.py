@@ -8,6 +8,7 @@ import warnings
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from tests.make import box
 from torchgrasp import Scene, read_scene, save_scene
@@ -303,3 +304,22 @@ def test_views_are_merged_by_poses_of_few_decimals():
     assert [str(x.message).partition(":")[0] for x in told] == ["poses[0]", "poses[1]"]
     right = merge_clouds([cloud, cloud], poses)
     assert float((merged.points - right.points).norm(dim=-1).max()) < 2e-3
+
+
+def test_a_wall_that_is_taken_for_the_table_is_told_by_the_size_of_what_stands_on_it():
+    """Things on slats with gaps, through which the floor is seen, before a wall."""
+
+    def block(size, place):
+        return trimesh.creation.box(size).apply_translation(place)
+
+    slats = [block((0.6, 0.028, 0.014), (0, -0.2 + 0.044 * k, -0.007)) for k in range(10)]
+    wall = block((1.3, 0.02, 1.6), (0, 0.36, 0.1))
+    floor = block((3, 3, 0.02), (0, -0.5, -0.5))
+    thing = block((0.06, 0.05, 0.1), (0, 0, 0.05))
+    pose = look_at(-90.0, 30.0, 0.65)
+    depth = render_depth([*slats, wall, floor, thing], pose, table=None)[0]
+    scene = Scene.from_depth(depth, INTRINSICS)
+    up = pose[:3, :3].double().T @ torch.tensor([0.0, 0.0, 1.0]).double()
+    assert float(scene.table.normal @ up) < 0.2  # the wall
+    assert any("as furniture or a wall" in note for note in scene.notes)
+    assert not Scene.from_depth(*seen()[:1], INTRINSICS).notes

@@ -109,6 +109,10 @@ class SizeNumbers:
     """Height [m] of a camera above which some objects must be smaller than `large`."""
     large: float = 0.2
     """Objects larger than this [m] are too large under a camera higher than `higher`."""
+    furniture: float = 0.6
+    """An object whose box has a longer diagonal [m] is furniture: the plane under it is no table."""
+    ends: float = 0.02
+    """Share of an object's points at each end along an axis that may fly, and do not count."""
     huge: float = 0.5
     """Objects larger than this [m] are too large under any high camera."""
     low: float = 0.12
@@ -367,6 +371,26 @@ def check_sizes(points: Points, labels: Tensor, pose: Transform, plane: Plane) -
             raise BadArgument("depth", found, UNIT)
     note = f"{found}: if it was not so high, depth_unit (--depth-unit) says the metres of a count"
     return (note,) * high
+
+
+def tell_furniture(points: Points, labels: Tensor) -> tuple[str, ...]:
+    """Return one note if an object is as long as furniture, else none.
+
+    Then a wall or the floor may have been taken for the table. `labels` (n,) holds the object of
+    each of the `points` (n, 3) [m], 0 for none.
+    """
+    ends = torch.tensor([SIZES.ends, 1 - SIZES.ends], dtype=torch.float64)
+    longest = 0.0
+    for k in labels.unique().tolist():
+        part = points[labels == k]
+        if k > 0 and len(part) >= SIZES.points:
+            part = part[:: 1 + len(part) // POSE.drawn].double().cpu()
+            low, high = part.quantile(ends, 0)
+            longest = max(longest, float((high - low).norm()))
+    if longest < SIZES.furniture:
+        return ()
+    fix = "is the table a wall or the floor? Give the table, or up"
+    return (f"an object is {longest:.1f} m long, as furniture or a wall: {fix}",)
 
 
 def _is_scaled(pose: Transform, plane: Plane, height: float) -> bool:

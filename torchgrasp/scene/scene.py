@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.cloud.pose import check_sizes, find_plausible, tell_tilt
+from torchgrasp.cloud.pose import check_sizes, find_plausible, tell_furniture, tell_tilt
 from torchgrasp.cloud.sensor import SensorNoise, estimate_noise
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
@@ -140,6 +140,8 @@ class Scene(Value):
             notes += check_sizes(
                 points[measured], found[measured], image.obj_from_camera, supports[0].plane
             )
+        if table is None:
+            notes += tell_furniture(points[measured], found[measured])
         if table is None and up is None:
             notes += tell_tilt(image.obj_from_camera, supports[0].plane)
         pixels = torch.nonzero(measured)
