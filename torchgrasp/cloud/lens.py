@@ -38,6 +38,8 @@ class LensNumbers:
     """Greatest coefficient: larger ones are no polynomial's."""
     steps: int = 20
     """Most Newton steps from a pixel to its ray."""
+    still: float = 1e-6
+    """Step of the search [px] that ends it."""
     same: float = 1e-3
     """Greatest distance [px] of a ray's image from its pixel."""
 
@@ -83,6 +85,8 @@ class Lens(NamedTuple):
             image, jacobian = self.distort(found)
             step = torch.linalg.solve_ex(jacobian, seen - image)[0]
             found = found + step
+            if float((step * focal).abs().max()) < LENS.still:
+                break
         image, jacobian = self.distort(found)
         off = ((image - seen) * focal).abs().amax(-1)
         # the polynomial folds where the determinant changes its sign
@@ -90,8 +94,8 @@ class Lens(NamedTuple):
         good = good & (torch.diagonal(jacobian, dim1=-2, dim2=-1) > 0).all(-1)
         if not bool(good.all()):
             count = int((~good).sum())
-            found = f"a distortion {describe(self.coefficients)} that folds at {count} pixels"
-            raise BadArgument("intrinsics", found, "the coefficients of this camera, or fewer")
+            folded = f"a distortion {describe(self.coefficients)} that folds at {count} pixels"
+            raise BadArgument("intrinsics", folded, "the coefficients of this camera, or fewer")
         return found
 
 

@@ -68,6 +68,11 @@ def nearest(
     return torch.from_numpy(distance).to(points), places.to(points.device)
 
 
+def usual_spacing(points: Points) -> float:
+    """Return the usual distance between neighbours, in the unit of the points (n, 3)."""
+    return float(nearest(points, NEAR.spacing)[0][:, 1:].mean(-1).median())
+
+
 def find_inliers(points: Points, rows: Int[Tensor, "m"] | None = None) -> Bool[Tensor, "m"]:
     """Return a mask of m points that are not outliers, as `remove_outliers` defines them.
 

@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.cloud.agreement import distance_behind, noise_of
-from torchgrasp.cloud.neighbours import draw_rows, find_inliers, nearest
+from torchgrasp.cloud.neighbours import draw_rows, find_inliers, usual_spacing
 from torchgrasp.foundation.errors import BadArgument, MendedInput
 from torchgrasp.foundation.lazy import spatial
 from torchgrasp.foundation.told import warn_user
@@ -38,8 +38,6 @@ class ViewNumbers:
     """Most points of a view that are compared with another view."""
     surface: int = 5000
     """Most points of the surface that they are compared with."""
-    neighbours: int = 9
-    """Nearest points, the point itself included, that give the spacing of a view's rays."""
     reach: float = 1.5
     """A point meets a surface if the nearest point of it is so many spacings away, sideways."""
     least: int = 20
@@ -273,7 +271,7 @@ class _ViewSurface:
         self.points = points[kept]
         self.normals = view.normals.double().cpu()[kept]
         self.drawn = draw_rows(len(kept), VIEWS.drawn)
-        self.spacing = _spacing(self.points)
+        self.spacing = usual_spacing(self.points)
         self._tree = spatial.KDTree(self.points.numpy())
         self._eye = None if view.viewpoint is None or view.viewpoint.ndim == 2 else view.viewpoint
 
@@ -316,17 +314,12 @@ class _ViewSurface:
         aside, row = map(torch.from_numpy, spatial.KDTree(rays.numpy()).query(asked))
         height = ((points - seen[row]) * self.normals[facing][row]).sum(-1)
         before = norm(points - eye) < norm(seen[row] - eye)
-        compared = aside < VIEWS.reach * _spacing(rays)
+        compared = aside < VIEWS.reach * usual_spacing(rays)
         if int(compared.sum()) < VIEWS.least:
             return 0.0
         # all that is not before the surface is hidden
         height = torch.where(before, height.clamp_min(0), 0.0)
         return float(height[compared].quantile(VIEWS.seen))
-
-
-def _spacing(points: Points) -> float:
-    """Return the usual distance between neighbours, in the unit of the points (n, 3)."""
-    return float(nearest(points, VIEWS.neighbours)[0][:, 1:].mean(-1).median())
 
 
 def _find_motion(fixed: _ViewSurface, view: _ViewSurface) -> Motion | None:

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from torchgrasp.cloud.camera import look_at, partial_view
+from torchgrasp.cloud.diagnose import DIAGNOSIS
 from torchgrasp.cloud.read import read_cloud, save_cloud
 from torchgrasp.files import Field, format_json, read_json, write_file
 from torchgrasp.foundation.checks import checked
@@ -55,8 +56,6 @@ class CameraNumbers:
     """Distance [m] from the object."""
     seeds: int = 2**31
     """Number of random seeds among which the seed of a view's noise is drawn."""
-    large: float = 0.4
-    """Longest side [m] of an object that needs no remark: hands span half of it."""
 
 
 CAMERAS = CameraNumbers()
@@ -184,7 +183,7 @@ def write_objects(
 def _warn_of_object(name: str, mesh: "trimesh.Trimesh") -> None:
     """Warn of a mesh that is large for a hand, or has bodies whose boxes lie apart."""
     longest = float(mesh.extents.max())
-    if longest > CAMERAS.large:
+    if longest > DIAGNOSIS.long:
         fix = 'if it is normalised, scale it, or write "suggested_scale" into the manifest'
         warn_user(CloudWarning, f"{name} is {longest:.2f} m long, too large for a hand: {fix}")
     left = [part.bounds for part in mesh.split(only_watertight=False)]

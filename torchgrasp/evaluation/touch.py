@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.cloud.neighbours import NEAR, nearest
+from torchgrasp.cloud.neighbours import usual_spacing
 from torchgrasp.cloud.prepare import estimate_normals
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
@@ -135,12 +135,11 @@ def _heights(points: Points, cloud: PointCloud, limit: float) -> Float[Tensor, "
     assert cloud.normals is not None
     seen = cloud.points.detach().double().cpu()
     normals = cloud.normals.detach().double().cpu()
-    spacing = float(nearest(seen, NEAR.spacing)[0][:, 1:].mean(-1).median())
     row = torch.from_numpy(spatial.KDTree(seen.numpy()).query(points.numpy())[1])
     away = points - seen[row]
     height = (away * normals[row]).sum(-1)
     beside = norm(away - height[:, None] * normals[row])
-    shown = beside <= TOUCH.reach * spacing
+    shown = beside <= TOUCH.reach * usual_spacing(seen)
     if cloud.viewpoint is not None:
         shown = shown & (height >= -limit)
     return torch.where(shown, height, torch.nan)

@@ -128,6 +128,8 @@ def _run_pool(
     own = b"__main__" in bytes(
         reduction.ForkingPickler.dumps(function)
     )  # only the script has the function
+    if _USUAL.get_start_method() == "forkserver":
+        _USUAL.set_forkserver_preload(["torchgrasp"])
     pool = ProcessPool(
         min(workers, len(waiting)),
         initializer=_begin,
@@ -177,16 +179,13 @@ def _run_pool(
 
 
 def _usual_context() -> Any:
-    """Return the way in which worker processes start, here where processes can be copied or not.
+    """Return the way in which worker processes start.
 
     They are copies of a server process that has imported the library, and has no threads that a
     copy would lack. On Windows each imports the library itself.
     """
-    if "forkserver" not in multiprocessing.get_all_start_methods():
-        return multiprocessing.get_context("spawn")
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["torchgrasp"])
-    return context
+    copies = "forkserver" in multiprocessing.get_all_start_methods()
+    return multiprocessing.get_context("forkserver" if copies else "spawn")
 
 
 _USUAL = _usual_context()
