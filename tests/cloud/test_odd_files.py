@@ -116,6 +116,7 @@ TOLD = {
         "6 numbers in the first row, where the header promises 3",
     ),
     "wide.pcd": (pcd("x y z", rows(COLOURED)), "6 numbers in the first row"),
+    "long.pcd": (pcd("x y z", rows(POINTS) + "0.1 0.2 0.3\n"), "more numbers than the 60 points"),
     "double.ply": (
         ply(XYZ, POINTS.tobytes(), "binary_little_endian"),
         "1440 bytes of points, .* promises 720",

@@ -233,14 +233,14 @@ def _improve(
     push: Float[Tensor, "b f p"],
     slide: Float[Tensor, "b n p"],
     weights: Tensions,
-    rounds: Iterable[Float[Tensor, "p s"]],
+    rounds: Iterable[Float[Tensor, "p _"]],
     preferred: Float[Tensor, "b f"] | None,
 ) -> tuple[Tensions, Bool[Tensor, "b"]]:
     """Return the weights of least cost, of length 1, after rounds of a search, and a mask of the
     sets where they push everywhere.
 
     `push` and `slide` map weights to normal and tangential forces (n = 3 f numbers). Each of the
-    `rounds` holds the s changes of the weights that it tries.
+    `rounds` (p, s) holds the s changes of the weights that it tries; s may differ.
     """
     row = row_numbers(push)
     best = row

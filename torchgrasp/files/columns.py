@@ -69,8 +69,8 @@ def read_fields(
         order: byte order of binary data, "<" or ">"; "" means that the data are text.
         last: whether the table ends the data; otherwise anything may follow it.
 
-    Raises `Malformed` for too little data. With `last`, binary data of a further line raise it, too,
-    and so does a first line of text with a wrong number of values.
+    Raises `Malformed` for too little data. With `last`, data of a further line raise it, too, and so
+    does a first line of text with a wrong number of values.
     """
     if not 0 <= count <= CLOUD_POINTS:
         raise Malformed(f"{count} points, not up to {CLOUD_POINTS}")
@@ -101,9 +101,12 @@ def read_fields(
             warnings.simplefilter(
                 "ignore", DeprecationWarning
             )  # at a word that is no number; the count shows it
-            numbers = np.fromstring(data, dtype=np.float64, count=wanted, sep=" ")
+            # one number more, if the table must end there, shows that it goes on
+            numbers = np.fromstring(data, dtype=np.float64, count=wanted + last, sep=" ")
     if len(numbers) < wanted:
         raise Malformed(f"fewer numbers than {count} points have, or a word that is no number")
+    if len(numbers) > wanted:
+        raise Malformed(f"more numbers than the {count} points that the header promises have")
     return np.split(numbers.reshape(count, sum(sizes)), np.cumsum(sizes)[:-1], axis=1)
 
 
