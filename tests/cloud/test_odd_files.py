@@ -116,7 +116,8 @@ TOLD = {
         "6 numbers in the first row, where the header promises 3",
     ),
     "wide.pcd": (pcd("x y z", rows(COLOURED)), "6 numbers in the first row"),
-    "long.pcd": (pcd("x y z", rows(POINTS) + "0.1 0.2 0.3\n"), "more numbers than the 60 points"),
+    "long.pcd": (pcd("x y z", rows(POINTS) + "0.1 0.2 0.3\n"), "183 numbers, more than"),
+    "short.ply": (ply(XYZ, rows(POINTS[:59])), "177 numbers, fewer than the promised 60 points"),
     "double.ply": (
         ply(XYZ, POINTS.tobytes(), "binary_little_endian"),
         "1440 bytes of points, .* promises 720",

@@ -3,6 +3,7 @@
 import io
 import itertools
 import re
+import string
 import warnings
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -95,19 +96,31 @@ def read_fields(
         raise Malformed(
             f"{len(first)} numbers in the first row, where the header promises {sum(sizes)}"
         )
+    # NumPy fills what a text lacks with whatever is in memory, so words are counted first.
+    words = _count_words(data)
+    if words < wanted:
+        raise Malformed(f"{words} numbers, fewer than the promised {count} points have")
+    if last and words > wanted:
+        raise Malformed(f"{words} numbers, more than the promised {count} points have")
     numbers = np.zeros(0)
-    if 0 < 2 * wanted <= len(data) + 1:  # a number has at least a digit and a space
+    if wanted:
         with warnings.catch_warnings():
             warnings.simplefilter(
                 "ignore", DeprecationWarning
             )  # at a word that is no number; the count shows it
-            # one number more, if the table must end there, shows that it goes on
-            numbers = np.fromstring(data, dtype=np.float64, count=wanted + last, sep=" ")
+            numbers = np.fromstring(data, dtype=np.float64, count=wanted, sep=" ")
     if len(numbers) < wanted:
-        raise Malformed(f"fewer numbers than {count} points have, or a word that is no number")
-    if len(numbers) > wanted:
-        raise Malformed(f"more numbers than the {count} points that the header promises have")
+        raise Malformed("a word that is no number")
     return np.split(numbers.reshape(count, sum(sizes)), np.cumsum(sizes)[:-1], axis=1)
+
+
+def _count_words(data: bytes) -> int:
+    """Return the number of words in a text, between which stands any white space of ASCII."""
+    letters = np.frombuffer(data, dtype=np.uint8)
+    blank = np.isin(letters, np.frombuffer(string.whitespace.encode(), dtype=np.uint8))
+    begins = ~blank
+    begins[1:] &= blank[:-1]
+    return int(begins.sum())
 
 
 def parse_text(data: bytes, suffix: str) -> dict[str, Any]:
