@@ -16,6 +16,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BrokenLaw, HandFileError
 from torchgrasp.foundation.lazy import yourdfpy
 from torchgrasp.geometry.frames import rotation_from_rpy
+from torchgrasp.hand.abilities import random_joints
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import Fingers, HandSpec, read_hand_toml
 from torchgrasp.hand.load import find_hand, load_hand
@@ -125,18 +126,6 @@ def find_faults(name_or_path: str | Path, fingers: Fingers = "default") -> Itera
     yield from _wrong_bodies(urdf)
     yield from _wrong_joints(urdf, spec, hand)
     yield from _wrong_pads(urdf, spec)
-
-
-def random_joints(hand: Hand, n: int, seed: int = 0) -> Float[Tensor, "n h"]:
-    """Return n random postures of the h actuated joints, uniform within the joint limits [rad]."""
-    share = torch.rand(
-        n,
-        hand.dof,
-        generator=torch.Generator().manual_seed(seed),
-        dtype=torch.float64,
-        device="cpu",
-    )
-    return hand.lower + (hand.upper - hand.lower) * share
 
 
 def most_met(hand: Hand, joints: Float[Tensor, "n h"]) -> tuple[str, str]:

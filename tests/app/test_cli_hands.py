@@ -2,6 +2,7 @@
 
 import importlib.util
 import io
+import json
 import re
 import shutil
 import sys
@@ -46,6 +47,11 @@ def test_new_writes_a_draft_that_check_takes_and_draws(barrett, capsys, monkeypa
         "none",
     ):
         assert words in said
+    known = json.loads((barrett / "abilities.json").read_text())["sets"]
+    assert [one["option"] for one in known] == ["default"] and known[0]["width_m"][1] > 0.1
+    free = known[0]["free_share"]
+    assert f"abilities of default: {free:.1%} of 5000 random postures are free" in said
+    assert re.search(r"\nf1 and f2 +0\.\d+ to 0\.\d+ ", said) and "force [N]" in said
     with Image.open(picture) as image:
         assert (
             image.width == 1350 and len(np.unique(np.asarray(image).reshape(-1, 3), axis=0)) > 100

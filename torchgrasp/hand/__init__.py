@@ -6,16 +6,26 @@ from torchgrasp.hand.hand import Actuator, HandSource
 from torchgrasp.hand.kinematics import KinematicTree
 from torchgrasp.hand.load import find_hand, hand_of, hands_folder, with_fingers
 from torchgrasp.hand.self_collision import SelfCollision
+from torchgrasp.hand.abilities import (
+    FingerAbility,
+    HandAbilities,
+    PairAbility,
+    hand_abilities,
+)
 
 __all__ = [
     "ActuatedJoints",
     "Actuator",
     "CollisionSpheres",
+    "FingerAbility",
     "Fingertips",
+    "HandAbilities",
     "HandSource",
     "KinematicTree",
+    "PairAbility",
     "SelfCollision",
     "find_hand",
+    "hand_abilities",
     "hand_of",
     "hands_folder",
     "with_fingers",

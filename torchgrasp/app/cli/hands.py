@@ -33,11 +33,12 @@ from torchgrasp.app.cli.inputs import (
 )
 from torchgrasp.app.report.stills import draw_hand, opposed_posture
 from torchgrasp.data.shipped import load_object
-from torchgrasp.files import format_columns, hold_file, render, write_file
+from torchgrasp.files import format_columns, format_json, hold_file, render, write_file
 from torchgrasp.foundation.base import count_status
 from torchgrasp.foundation.errors import BadArgument, GraspError, OutputError, Status
 from torchgrasp.foundation.rules import Range, Seed
 from torchgrasp.geometry.linalg import dot, norm
+from torchgrasp.hand.abilities import HandAbilities, hand_abilities, random_joints
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.hand_toml import read_hand_toml
 from torchgrasp.hand.load import find_hand
@@ -49,7 +50,7 @@ from torchgrasp.posture_model.mixture import mixture_path
 from torchgrasp.posture_model.sample import SampleSpec, Sampling, can_close, sample_configurations
 from torchgrasp.posture_model.score import evaluate_mixture, growing_bic
 from torchgrasp.posture_model.training import FitProgress, fit_mixture
-from torchgrasp.testing import check_hand, find_faults, most_met, random_joints
+from torchgrasp.testing import check_hand, find_faults, most_met
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,6 +82,7 @@ class TrainNumbers:
 
 TRIAL = HandTrial()
 TRAIN = TrainNumbers()
+ABILITIES = "abilities.json"  # file beside the picture of `hand check`
 
 
 @arguments()
@@ -158,6 +160,9 @@ class HandNew(Command):
 class HandCheck(Command):
     """List every fault of a hand; if there is none, describe and draw the hand, and plan on a
     shipped object.
+
+    Ends with a table of the hand's abilities, which abilities.json beside the picture holds, too:
+    spans of the fingertips, forces at the tips, widths that they can hold, and free postures.
     """
 
     hand: str = positional(HAND_HELP)
@@ -205,6 +210,12 @@ class HandCheck(Command):
                 bar.set_description(f"grasps of {one.source.option}")
                 able = _try_objects(one, bar) or able
                 bar.update()
+            abilities = [hand_abilities(one, TRIAL.postures) for one in hands]
+        for known in abilities:
+            print(describe_abilities(known))
+        file = self.out.with_name(ABILITIES)
+        write_file(file, format_json({"sets": [known.content() for known in abilities]}))
+        print(f"abilities: {file}")
         if able:
             print("the hand can grasp")
         return 0 if able else 1
@@ -245,6 +256,28 @@ def describe_sets(hand: Hand) -> str:
     """Return a text that lists the declared sets of fingers with which a hand can grasp."""
     rows = [(one.source.option, ", ".join(one.finger_names)) for one in finger_sets(hand, "auto")]
     return f"sets of fingers:\n{format_columns(rows, left={0, 1})}"
+
+
+def describe_abilities(abilities: HandAbilities) -> str:
+    """Return a table of the abilities of a hand with one set of fingers."""
+    widths = f"{abilities.least_width:.3f} to {abilities.greatest_width:.3f} m"
+    # a hand of which no two tips ever face each other
+    if not abilities.least_width <= abilities.greatest_width:
+        widths = "none"
+    rows = [("finger", "joints", "force [N]", "in 9 of 10 [N]")]
+    for finger in abilities.fingers:
+        forces = f"{finger.force:.1f}", f"{finger.sure_force:.1f}"
+        rows.append((finger.name, str(finger.joints), *forces))
+    between = [("tips", "span [m]", "holds [m]", "face each other")]
+    for pair in abilities.pairs:
+        span = f"{pair.least_span:.3f} to {pair.greatest_span:.3f}"
+        width = f"{pair.least_width:.3f} to {pair.greatest_width:.3f}" if pair.opposed else "-"
+        between.append((" and ".join(pair.fingers), span, width, f"{pair.opposed:.1%}"))
+    return (
+        f"abilities of {abilities.option}: {abilities.free:.1%} of {abilities.postures} random "
+        f"postures are free; two tips hold widths of {widths}\n"
+        f"{format_columns(rows, left={0})}\n{format_columns(between, left={0})}"
+    )
 
 
 def find_warnings(hand: Hand, joints: torch.Tensor) -> list[str]:

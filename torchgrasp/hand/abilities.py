@@ -1,0 +1,272 @@
+"""What a hand can do, as numbers: spans and forces of its fingertips, widths that it can hold, and
+its free postures.
+
+All numbers come from seeded random postures, which are uniform within the limits of the joints. A
+posture is free if no pair of links of `[self_collision]` overlaps.
+"""
+
+import dataclasses
+import itertools
+import math
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import Count, Fraction, Measured, Seed
+from torchgrasp.geometry.linalg import dot, norm
+from torchgrasp.hand.hand import Hand
+
+
+@dataclasses.dataclass(frozen=True)
+class AbilityNumbers:
+    """Numbers by which the abilities of a hand are told from its random postures."""
+
+    sure: float = (
+        0.1  # share of the free postures in which a fingertip is weaker than its sure force
+    )
+    least_apart: float = 1e-9  # least divisor [m] of a direction between tips that coincide
+    digits: int = 6  # significant digits in files: random postures tell no more
+
+
+ABILITY = AbilityNumbers()
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class FingerAbility:
+    """What the tip of one finger can do.
+
+    Args:
+        name: name of the finger.
+        tip_link: link of its tip.
+        joints: number of the actuated joints that move the tip.
+        force: normal force [N] with which the tip can press along its pad's normal, in the median
+            of the free postures. It acts at the pad's contact point. No other finger presses, and
+            each actuated joint exerts at most its effort.
+        sure_force: the same force [N] that nine of ten free postures reach.
+
+    A force is NaN where the finger has no lever along its normal: its structure carries the load.
+    """
+
+    name: str
+    tip_link: str
+    joints: Count
+    force: Measured
+    sure_force: Measured
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class PairAbility:
+    """What two fingertips can do together.
+
+    Args:
+        fingers: names of both fingers, in grasp order.
+        least_span: least distance [m] of the contact points of their pads, in the free postures.
+        greatest_span: greatest distance [m] of these points.
+        least_width: least thickness [m] of a plate that the tips can hold between them.
+        greatest_width: greatest thickness [m] of such a plate.
+        opposed: share of the free postures in which the tips can hold a plate.
+
+    Tips hold a plate where the line between the centres of their spheres leaves both within the
+    cones about their pads' normals, 60 degrees for round tips and 40 for flat ones. The plate is
+    as thick as the gap of the tips on this line. Widths are NaN if no free posture has a plate.
+    """
+
+    fingers: tuple[str, str]
+    least_span: Measured
+    greatest_span: Measured
+    least_width: Measured
+    greatest_width: Measured
+    opposed: Fraction
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class HandAbilities:
+    """The abilities of a hand with one set of grasping fingers.
+
+    Args:
+        hand: name of the hand.
+        option: option of hand.toml by which the fingers were chosen, or their names.
+        joints: number of actuated joints.
+        postures: number of random postures that were drawn.
+        seed: seed of these postures.
+        free: share of the postures that are free.
+        fingers: abilities of each fingertip, in grasp order.
+        pairs: abilities of each pair of fingertips.
+    """
+
+    hand: str
+    option: str
+    joints: Count
+    postures: Count
+    seed: Seed
+    free: Fraction
+    fingers: tuple[FingerAbility, ...]
+    pairs: tuple[PairAbility, ...]
+
+    @property
+    def least_width(self) -> float:
+        """Least thickness [m] of a plate that any two tips can hold; NaN if none can."""
+        return min(_known(pair.least_width for pair in self.pairs), default=math.nan)
+
+    @property
+    def greatest_width(self) -> float:
+        """Greatest thickness [m] of a plate that any two tips can hold; NaN if none can."""
+        return max(_known(pair.greatest_width for pair in self.pairs), default=math.nan)
+
+    @checked
+    def content(self) -> dict[str, Any]:
+        """Return the abilities as a dict for JSON, with units in the names; NaN becomes None."""
+        fingers = [
+            {
+                "name": finger.name,
+                "tip_link": finger.tip_link,
+                "joints": finger.joints,
+                "force_n": _rounded(finger.force),
+                "sure_force_n": _rounded(finger.sure_force),
+            }
+            for finger in self.fingers
+        ]
+        pairs = [
+            {
+                "fingers": list(pair.fingers),
+                "span_m": [_rounded(pair.least_span), _rounded(pair.greatest_span)],
+                "width_m": [_rounded(pair.least_width), _rounded(pair.greatest_width)],
+                "opposed_share": _rounded(pair.opposed),
+            }
+            for pair in self.pairs
+        ]
+        return {
+            "hand": self.hand,
+            "option": self.option,
+            "joints": self.joints,
+            "postures": self.postures,
+            "seed": self.seed,
+            "free_share": _rounded(self.free),
+            "width_m": [_rounded(self.least_width), _rounded(self.greatest_width)],
+            "fingers": fingers,
+            "pairs": pairs,
+        }
+
+
+@checked
+def hand_abilities(hand: Hand, postures: Count = 5000, seed: Seed = 0) -> HandAbilities:
+    """Return what a hand can do with its grasping fingers, from seeded random postures.
+
+    `HandAbilities`, `FingerAbility` and `PairAbility` define each number. Extremes are those of the
+    drawn postures: more `postures` come nearer to those of the hand. The hand keeps the result.
+    Raises `BadArgument` for a hand of whose postures none is free.
+
+    >>> from torchgrasp import load_hand
+    >>> able = hand_abilities(load_hand("barrett"), postures=500)
+    >>> [finger.name for finger in able.fingers], len(able.pairs), able.greatest_width > 0.1
+    (['f1', 'f2', 'f3'], 3, True)
+    """
+    key = "abilities", postures, seed
+    if key not in hand.derived:
+        hand.derived[key] = _measure(hand.to(device="cpu", dtype=torch.float64), postures, seed)
+    return hand.derived[key]
+
+
+def random_joints(hand: Hand, n: int, seed: int = 0) -> Float[Tensor, "n h"]:
+    """Return n random postures of the h actuated joints, uniform within the joint limits [rad]."""
+    share = torch.rand(
+        n,
+        hand.dof,
+        generator=torch.Generator().manual_seed(seed),
+        dtype=torch.float64,
+        device="cpu",
+    )
+    return hand.lower + (hand.upper - hand.lower) * share
+
+
+def _measure(hand: Hand, postures: int, seed: int) -> HandAbilities:
+    """Return the abilities of a hand on the CPU, from `postures` random postures."""
+    joints = random_joints(hand, postures, seed)
+    apart = hand.self_clearance(joints, below=0.0) > 0
+    free = joints[apart]
+    if not len(free):
+        found = f"{hand.name}, whose links meet in all of {postures} random postures"
+        raise BadArgument("hand", found, "a hand with a free posture, as check_hand demands")
+    points, normals = hand.fingertips(free)  # (n, f, 3)
+    centres = hand.tip_centres(free)  # (n, f, 3)
+    jacobian = hand.jacobian(free)  # (n, f, 3, h)
+    fingers = _fingers(hand, torch.einsum("nfih,nfi->nfh", jacobian, normals))
+    pairs = []
+    for one, two in itertools.combinations(range(len(hand.tips)), 2):
+        span = norm(points[:, two] - points[:, one])
+        width = _widths(hand, centres, normals, one, two)
+        names = hand.finger_names[one], hand.finger_names[two]
+        share = float(width.isfinite().double().mean())
+        pairs.append(PairAbility(names, *_ends(span), *_ends(width), share))
+    return HandAbilities(
+        hand.name,
+        hand.source.option,
+        hand.dof,
+        postures,
+        seed,
+        len(free) / postures,
+        fingers,
+        tuple(pairs),
+    )
+
+
+def _fingers(hand: Hand, levers: Float[Tensor, "n f h"]) -> tuple[FingerAbility, ...]:
+    """Return the abilities of the fingers.
+
+    `levers` [m, or no unit for a sliding joint] are the moves of each contact along its normal, for
+    each actuated joint.
+    """
+    effort = levers.new_tensor([hand.actuators[name].effort for name in hand.joint_names])
+    # the joint that reaches its effort first bounds the force
+    force = (effort / levers.abs()).amin(2)  # (n, f)
+    moved = (hand.tree.moves[hand.tips.index] @ hand.actuated.coupling.abs()) > 0  # (f, h)
+    found = []
+    for k, name in enumerate(hand.finger_names):
+        ranked = force[:, k].sort().values
+        median = float(ranked[len(ranked) // 2])
+        sure = float(ranked[int(ABILITY.sure * len(ranked))])
+        known = [x if math.isfinite(x) else math.nan for x in (median, sure)]
+        found.append(FingerAbility(name, hand.tips.links[k], int(moved[k].sum()), *known))
+    return tuple(found)
+
+
+def _widths(
+    hand: Hand,
+    centres: Float[Tensor, "n f 3"],
+    normals: Float[Tensor, "n f 3"],
+    one: int,
+    two: int,
+) -> Float[Tensor, "n"]:
+    """Return the thickness [m] of the plate between two tips in each posture; NaN without one."""
+    between = centres[:, two] - centres[:, one]
+    apart = norm(between)
+    way = between / apart.clamp_min(ABILITY.least_apart)[:, None]
+    width = apart - hand.tip_radius[one] - hand.tip_radius[two]
+    least = hand.tips.cone.cos()
+    held = dot(normals[:, one], way) >= least[one]
+    held &= dot(normals[:, two], -way) >= least[two]
+    return torch.where(held & (width > 0), width, torch.nan)
+
+
+def _ends(values: Float[Tensor, "n"]) -> tuple[float, float]:
+    """Return the least and the greatest of the values that are known; NaN if none is."""
+    known = values[values.isfinite()]
+    if not len(known):
+        return math.nan, math.nan
+    return float(known.min()), float(known.max())
+
+
+def _known(values: Any) -> list[float]:
+    return [x for x in values if math.isfinite(x)]
+
+
+def _rounded(value: float) -> float | None:
+    """Return a number with few digits; None for NaN."""
+    return float(f"{value:.{ABILITY.digits}g}") if math.isfinite(value) else None
