@@ -5,6 +5,7 @@ import re
 import pytest
 import torch
 
+from torchgrasp.app.author.draft import draft_hand
 from torchgrasp.foundation.errors import BadArgument, HandFileError
 from torchgrasp.hand.load import load_hand, with_fingers
 
@@ -131,3 +132,36 @@ def test_a_hand_of_two_or_six_fingers_says_what_is_supported(toy_hand, count):
     (toy_hand / "hand.toml").write_text(toml.replace('["f1", "f2", "f3"]', f"[{names}]"))
     with pytest.raises(HandFileError, match="three to five different fingers"):
         load_hand(toy_hand)
+
+
+def test_a_joint_may_follow_a_sum_of_joints(claw):
+    """A differential: the middle finger bends by the mean of its neighbours, as a bar pulls it."""
+    text = claw.read_text()
+    mimic = '<mimic joint="thumb_bend" multiplier="-0.7" offset="0.1"/>'
+    assert mimic in text
+    claw.write_text(text.replace(mimic, ""))
+    toml = claw.parent / "hand.toml"
+    row = '"thumb_follow" = { sources = { "left_bend" = 0.25, "right_bend" = -0.5 }, offset = 0.1 }'
+    drafted = draft_hand(claw)
+    toml.write_text(drafted.replace("[coupling]", f"[coupling]\n{row}"))
+    hand = load_hand(claw.parent)
+    joints = torch.rand(5, hand.dof, generator=torch.Generator().manual_seed(0)).double()
+    found = hand.expand(joints)
+    wanted = 0.1 + 0.25 * found["left_bend"] - 0.5 * found["right_bend"]
+    torch.testing.assert_close(found["thumb_follow"], wanted)
+    # the tip of the thumb moves with the joints of the other fingers
+    step = 1e-6 * torch.eye(hand.dof, dtype=torch.float64)
+    ahead = hand.fingertips(joints[:1] + step)[0]
+    behind = hand.fingertips(joints[:1] - step)[0]
+    slope = ((ahead - behind) / 2e-6).permute(1, 2, 0)
+    torch.testing.assert_close(hand.jacobian(joints[0]), slope, atol=1e-7, rtol=0)
+    for wrong, match in (
+        ("sources = { }", "at least one source"),
+        ('sources = { "left_follow" = 1.0 }', "not coupled itself"),
+        ('sources = { "none" = 1.0 }', "'none'"),
+        ('source = "left_bend", sources = { "left_bend" = 1.0 }', "source"),
+    ):
+        bad = row.replace('sources = { "left_bend" = 0.25, "right_bend" = -0.5 }', wrong)
+        toml.write_text(drafted.replace("[coupling]", f"[coupling]\n{bad}"))
+        with pytest.raises(HandFileError, match=match):
+            load_hand(claw.parent)

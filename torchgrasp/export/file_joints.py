@@ -199,7 +199,7 @@ def _reason(hand: Hand, joint: int) -> str:
     leaders = flatnonzero(hand.actuated.coupling[joint] != 0).tolist()
     if not leaders:
         return "where the hand parks it"
-    return f"by its coupling to {hand.joint_names[leaders[0]]}"
+    return f"by its coupling to {', '.join(hand.joint_names[k] for k in leaders)}"
 
 
 def _tips(hand: Hand, values: Float[Tensor, "g j"]) -> Float[Tensor, "g f 3"]:

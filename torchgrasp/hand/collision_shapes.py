@@ -303,7 +303,7 @@ def draw_postures(
     URDF lacks.
     """
     movable = {j.name: j for j in urdf.movable}
-    named = {*coupling} | {mimic.source for mimic in coupling.values()}
+    named = {*coupling} | {name for mimic in coupling.values() for name, _ in mimic.terms}
     unknown = sorted(named - set(movable))
     if unknown:
         raise BadArgument("coupling", unknown[0], f"joints of the URDF: {sorted(movable)}")
@@ -313,5 +313,5 @@ def draw_postures(
         for k, (name, j) in enumerate(movable.items())
     }
     for joint, mimic in coupling.items():
-        drawn[joint] = mimic.ratio * drawn[mimic.source] + mimic.offset
+        drawn[joint] = mimic.follow(drawn)
     return torch.from_numpy(np.stack([drawn[name] for name in movable]))

@@ -121,7 +121,7 @@ def joints_from_files(spec: HandSpec, urdf: Urdf) -> ActuatedJoints:
     """
     movable = {j.name: j for j in urdf.movable}
     own = [j for f in spec.fingers for j in f.joints]
-    leaders = [spec.coupling[j].source for j in own if j in spec.coupling]
+    leaders = [name for j in own if j in spec.coupling for name, _ in spec.coupling[j].terms]
     names = tuple(dict.fromkeys([*(j for j in own if j not in spec.coupling), *leaders]))
     margin = spec.limit_margin
     limits = real([[movable[n].lower, movable[n].upper] for n in names]) + real([margin, -margin])
@@ -135,16 +135,18 @@ def joints_from_files(spec: HandSpec, urdf: Urdf) -> ActuatedJoints:
     coupling = limits.new_zeros(len(movable), len(names))
     offset = limits.new_zeros(len(movable))
     for row, joint in enumerate(movable):
-        source, ratio, shift = spec.coupling.get(joint, Mimic(joint, 1.0, 0.0))
-        if source in names:
-            coupling[row, names.index(source)] = ratio
-            offset[row] = shift
-        elif source in spec.parked or spec.option not in spec.options:
-            offset[row] = ratio * spec.parked.get(source, movable[source].rest) + shift
-        else:
-            raise spec.wrong(
-                f"joint {joint}, which does neither", "every joint to grasp or to be parked"
-            )
+        mimic = spec.coupling.get(joint, Mimic(joint, 1.0, 0.0))
+        still = dict.fromkeys((source for source, _ in mimic.terms), 0.0)
+        for source, ratio in mimic.terms:
+            if source in names:
+                coupling[row, names.index(source)] = ratio
+            elif source in spec.parked or spec.option not in spec.options:
+                still[source] = spec.parked.get(source, movable[source].rest)
+            else:
+                raise spec.wrong(
+                    f"joint {joint}, which does neither", "every joint to grasp or to be parked"
+                )
+        offset[row] = mimic.follow(still)
     return ActuatedJoints(names, limits[:, 0].clone(), limits[:, 1].clone(), coupling, offset)
 
 

@@ -280,11 +280,7 @@ def _choose(
         raise BadArgument("fingers", repr(wanted), declared)
     fingers = tuple(known[name] for name in names)
     grasping = {joint for finger in fingers for joint in finger.joints}
-    moving = (
-        grasping
-        | {coupling[joint].source for joint in grasping if joint in coupling}
-        | set(coupling)
-    )
+    moving = grasping | leading(coupling, grasping) | set(coupling)
     parked = {
         joint: value
         for option in reversed(options.values())
@@ -299,14 +295,27 @@ def _coupling(field: Field) -> dict[str, Mimic]:
     coupling = dict[str, Mimic]()
     joints = field.entries()
     for joint, row in joints.items():
+        if "sources" in row.entries():
+            table = _entries(row, ("sources", "offset"), {})
+            ratios = table["sources"].entries()
+            terms = [(source, ratio.number()) for source, ratio in ratios.items()]
+            if not terms:
+                raise table["sources"].wrong("at least one source with its ratio")
+            coupling[joint] = Mimic(*terms[0], table["offset"].number(), tuple(terms[1:]))
+            continue
         table = _entries(row, ("source", "ratio", "offset"), {})
         coupling[joint] = Mimic(
             _word(table["source"]), table["ratio"].number(), table["offset"].number()
         )
-    for joint, mimic in coupling.items():
-        if mimic.source in coupling:
+    for joint in coupling:
+        if leading(coupling, [joint]) & set(coupling):
             raise joints[joint].wrong("a source that is not coupled itself")
     return coupling
+
+
+def leading(coupling: Mapping[str, Mimic], joints: Collection[str]) -> set[str]:
+    """Return the joints that some coupled ones of `joints` follow."""
+    return {name for joint in joints if joint in coupling for name, _ in coupling[joint].terms}
 
 
 def _pairs(field: Field) -> tuple[tuple[str, str], ...] | None:

@@ -9,7 +9,7 @@ from torchgrasp.geometry.frames import real
 from torchgrasp.hand.collision_shapes import self_collision_from_urdf, spheres_from_urdf
 from torchgrasp.hand.fingers import joints_from_files, tips_from_files
 from torchgrasp.hand.hand import Actuator, Hand, HandSource
-from torchgrasp.hand.hand_toml import Fingers, HandSpec, read_hand_toml
+from torchgrasp.hand.hand_toml import Fingers, HandSpec, leading, read_hand_toml
 from torchgrasp.hand.kinematics import chain_from_urdf, tree_from_urdf
 from torchgrasp.hand.urdf import Urdf, read_urdf
 from torchgrasp.values.planning import Grasps
@@ -144,11 +144,11 @@ def _check_names(spec: HandSpec, urdf: Urdf) -> None:
         raise spec.wrong(
             f"base_link {spec.base_link!r}", f"the URDF's root {urdf.root!r} as base_link"
         )
-    sources = {joint: mimic.source for joint, mimic in spec.coupling.items()}
+    leaders = leading(spec.coupling, spec.coupling)
     joints = {j for f in spec.all_fingers for j in f.joints} | {
         *spec.parked,
-        *sources,
-        *sources.values(),
+        *spec.coupling,
+        *leaders,
     }
     named = {f.tip_link for f in spec.all_fingers} | {x for pair in spec.pairs or () for x in pair}
     for kind, unknown, known in (
@@ -158,8 +158,8 @@ def _check_names(spec: HandSpec, urdf: Urdf) -> None:
         if unknown:
             raise spec.wrong(f"{kind} {min(unknown)!r}", f"one of {sorted(known)}")
     grasping = {j for f in spec.fingers for j in f.joints}
-    moved = grasping | {sources[joint] for joint in grasping if joint in sources}
-    both = set(spec.parked) & (moved | set(sources))
+    moved = grasping | leading(spec.coupling, grasping)
+    both = set(spec.parked) & (moved | set(spec.coupling))
     if both:
         raise spec.wrong(
             f"parked joint {min(both)!r}",

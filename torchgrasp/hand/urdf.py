@@ -10,6 +10,7 @@ import io
 import math
 import xml.etree.ElementTree as ET
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,11 +33,26 @@ Triple = tuple[float, float, float]
 class Mimic(NamedTuple):
     """A coupled joint: its position is `ratio` times that of the joint `source`, plus `offset`
     [rad or m].
+
+    A joint that follows a sum, as by a tendon, has `others`: further sources with their ratios.
     """
 
     source: str
     ratio: float
     offset: float
+    others: tuple[tuple[str, float], ...] = ()
+
+    @property
+    def terms(self) -> tuple[tuple[str, float], ...]:
+        """All joints that are followed, each with its ratio."""
+        return (self.source, self.ratio), *self.others
+
+    def follow(self, positions: Mapping[str, Any]) -> Any:
+        """Return the position [rad or m], given those of the joints that are followed by name."""
+        value = self.ratio * positions[self.source] + self.offset
+        for source, ratio in self.others:
+            value = value + ratio * positions[source]
+        return value
 
 
 @dataclasses.dataclass(frozen=True)

@@ -35,7 +35,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Seed
 from torchgrasp.hand.collision_shapes import collision_pairs, draw_postures, met_pairs
-from torchgrasp.hand.hand_toml import Pad
+from torchgrasp.hand.hand_toml import Pad, leading
 from torchgrasp.hand.kinematics import tree_from_urdf
 from torchgrasp.hand.safe_xml import seen_links
 from torchgrasp.hand.urdf import REPAIR, SIZES, Mimic, Triple, Urdf, read_published
@@ -435,7 +435,7 @@ def _parked(urdf: Urdf, grasping: set[str]) -> dict[str, float]:
     the nearest limit.
     """
     coupling = _coupling(urdf)
-    moved = grasping | {coupling[j].source for j in grasping if j in coupling}
+    moved = grasping | leading(coupling, grasping)
     return {j.name: j.rest for j in urdf.movable if j.name not in coupling and j.name not in moved}
 
 

@@ -72,8 +72,9 @@ def keep_below(urdf: Urdf, root: str) -> Step:
     joints = tuple(j for j in urdf.joints if j.parent in kept)
     inside = {j.name for j in joints}
     for j in joints:
-        if j.mimic and j.mimic.source not in inside:
-            found = f"joint {j.name} that follows {j.mimic.source!r} above {root!r}"
+        outside = [name for name, _ in j.mimic.terms if name not in inside] if j.mimic else []
+        if outside:
+            found = f"joint {j.name} that follows {outside[0]!r} above {root!r}"
             raise urdf.wrong(found, "a root above both")
     links = tuple(x for x in urdf.links if x.name in kept)
     done = f"{len(names) - len(kept)} links that are not below {root} are left out"
@@ -216,10 +217,20 @@ def fix_wrist(urdf: Urdf, tips: Sequence[str]) -> Step:
         return urdf, []
     at = {j.name: j.rest for j in common}
     # joints that follow a wrist joint are fixed where it puts them
+    kept = {}
     for j in urdf.movable:
-        if j.mimic and j.mimic.source in at:
-            at[j.name] = j.mimic.ratio * at[j.mimic.source] + j.mimic.offset
-    joints = tuple(_fixed(j, at[j.name]) if j.name in at else j for j in urdf.joints)
+        if j.mimic and any(name in at for name, _ in j.mimic.terms):
+            free = [term for term in j.mimic.terms if term[0] not in at]
+            still = {name: at.get(name, 0.0) for name, _ in j.mimic.terms}
+            rest = j.mimic.follow(still)
+            if free:
+                mimic = Mimic(*free[0], rest, tuple(free[1:]))
+                kept[j.name] = dataclasses.replace(j, mimic=mimic)
+            else:
+                at[j.name] = rest
+    joints = tuple(
+        _fixed(j, at[j.name]) if j.name in at else kept.get(j.name, j) for j in urdf.joints
+    )
     places = ", ".join(f"{name} at {value:.4g}" for name, value in at.items())
     done = f"joints that move all fingertips, a wrist, are fixed: {places}"
     return dataclasses.replace(urdf, joints=joints), [done]
@@ -285,9 +296,11 @@ def _follow_directly(joints: dict[str, Joint]) -> list[str]:
     done = []
     for name, j in joints.items():
         mimic = j.mimic
-        while mimic and (above := joints[mimic.source].mimic):
+        # a sum follows independent joints already
+        while mimic and not mimic.others and (above := joints[mimic.source].mimic):
             offset = mimic.ratio * above.offset + mimic.offset
-            mimic = Mimic(above.source, mimic.ratio * above.ratio, offset)
+            others = tuple((source, mimic.ratio * ratio) for source, ratio in above.others)
+            mimic = Mimic(above.source, mimic.ratio * above.ratio, offset, others)
         if mimic and mimic != j.mimic:
             source = mimic.source
             done.append(
@@ -306,9 +319,12 @@ def _limit_leaders(urdf: Urdf, joints: dict[str, Joint]) -> list[str]:
         mimic = j.mimic
         if mimic is None:
             continue
-        if not mimic.ratio:
+        if not all(ratio for _, ratio in mimic.terms):
             found = f"joint {name} that follows with a ratio of 0"
             raise urdf.wrong(found, "a fixed joint, or another ratio")
+        if mimic.others:
+            done += _limit_sum(urdf, joints, j, mimic)
+            continue
         leader = joints[mimic.source]
         ends = sorted((end - mimic.offset) / mimic.ratio for end in (j.lower, j.upper))
         low = max(leader.lower, ends[0])
@@ -325,6 +341,35 @@ def _limit_leaders(urdf: Urdf, joints: dict[str, Joint]) -> list[str]:
                 f"{name}, which follows it, would leave its own limits"
             )
     return done
+
+
+def _limit_sum(urdf: Urdf, joints: dict[str, Joint], joint: Joint, mimic: Mimic) -> list[str]:
+    """Narrow the ranges of all joints that one follows by a sum, so that it stays in its limits.
+
+    Where the sum would pass a limit, each range gives the same share of its width.
+    """
+    ends = []
+    for name, ratio in mimic.terms:
+        ends.append(sorted((ratio * joints[name].lower, ratio * joints[name].upper)))
+    widths = sum(high - low for low, high in ends)
+    over = max(0.0, mimic.offset + sum(high for _, high in ends) - joint.upper) / widths
+    under = max(0.0, joint.lower - mimic.offset - sum(low for low, _ in ends)) / widths
+    if not over + under:
+        return []
+    if over + under >= 1:
+        found = f"joint {joint.name} that follows a sum outside its own limits"
+        raise urdf.wrong(found, "limits that overlap")
+    told = []
+    for name, ratio in mimic.terms:
+        leader = joints[name]
+        width = leader.upper - leader.lower
+        below = under if ratio > 0 else over
+        above = over if ratio > 0 else under
+        low = leader.lower + below * width
+        high = leader.upper - above * width
+        joints[name] = dataclasses.replace(leader, lower=low, upper=high)
+        told.append(f"{name} [{low:.6g}, {high:.6g}]")
+    return [f"{joint.name} follows a sum, so the joints of it get narrower: {', '.join(told)}"]
 
 
 def repair_bodies(urdf: Urdf, surfaces: Mapping[str, np.ndarray]) -> Step:
