@@ -124,6 +124,16 @@ def test_a_posture_is_drawn_with_every_finger(barrett):
         assert (hue @ wanted > 0.99).sum() > 300
 
 
+def test_new_adds_sensor_tips_that_the_file_lacks(claw, run_command, refusal, tmp_path):
+    out = tmp_path / "felt"
+    words = "hand", "new", claw, "--out", out, "--tip-offset", "0.02", "--tip-radius", "0.009"
+    code, said, _ = run_command(*words)
+    assert code == 0 and "repaired: sensor tips are added: left_tip 20 mm along (0, 0, 1)" in said
+    assert load_hand(out).tip_radius.tolist() == [0.009] * 3
+    told = refusal("hand", "new", claw, "--out", tmp_path / "no", "--tip-offset", "0.5")
+    assert told.startswith("--tip-offset: ") and not (tmp_path / "no").exists()
+
+
 def test_new_mends_a_published_urdf_and_leaves_it_as_it_is(claw, capsys, tmp_path):
     """A mesh as a tip: the clean copy lies beside the URDF, under another name, or in a folder of
     its own.

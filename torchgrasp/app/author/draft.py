@@ -28,6 +28,7 @@ from torchgrasp.app.author.repair import (
     repair_bodies,
     repair_joints,
 )
+from torchgrasp.app.author.sensor_tips import add_sensors, extend_pads
 from torchgrasp.app.author.unusual import find_unusual
 from torchgrasp.files import render
 from torchgrasp.foundation.base import FINGERTIPS
@@ -94,6 +95,12 @@ class Wish(NamedTuple):
         root: first link of the hand, where the URDF has an arm, too.
         meshes: folder of all meshes, by default the URDF's.
         visual: links without <collision> take their <visual> as collision shapes.
+        tip_offset: lengths [m] by which sensor tips reach beyond the fingertips: one for all, or
+            one for each of `tips`. The direction is that from the axis of the finger's last joint
+            to its end, across this axis, and fixed in the frame of the fingertip's link. The pad's
+            contact point moves by exactly this length, its normal not. 0 adds no sensor.
+        tip_radius: radii [m] of the balls in which sensor tips end, likewise; by default those of
+            the fingertips' balls.
     """
 
     tips: tuple[str, ...] = ()
@@ -101,6 +108,8 @@ class Wish(NamedTuple):
     root: str = ""
     meshes: Path | None = None
     visual: bool = False
+    tip_offset: tuple[float, ...] = ()
+    tip_radius: tuple[float, ...] = ()
 
 
 NO_WISH = Wish()
@@ -173,21 +182,22 @@ def new_hand(
     tips = _checked_tips(urdf, tips, () if wish.visual else bare)
     frames = _frames(urdf, (*tips, palm_of(urdf, tips)), seed)
     guess = guess_pads(urdf, frames, tips, surfaces)
+    pads = extend_pads(tips, guess, wish.tip_offset, wish.tip_radius, bool(wish.tips))
     order = list(range(len(tips)))
     if not wish.tips:
-        order = order_by_facing(frames[:, :, :-1], guess.pads)
+        order = order_by_facing(frames[:, :, :-1], pads)
     possible = {name: n for name, n in OPTIONS.items() if n <= len(tips)}
     sets = {name: [tips[k] for k in sorted(order[:n])] for name, n in possible.items()}
     simple = {x.name for x in urdf.links if is_primitive(x)}
     clean, fitted = replace_meshes(urdf, points)
-    chosen = dict[str, Pad]()
     balls = list[str]()
     for tip, pad, outward in zip(tips, guess.pads, guess.outward, strict=True):
         if tip not in simple:
             balls.append(f"{tip} {1e3 * pad.radius:.1f} mm")
             clean = ball_tip(clean, tip, pad, outward, surfaces[tip])
-        chosen[tip] = pad
-    repairs = [*below, *merged, *fixed, *again, *marked, *joints, *bodies, *fitted]
+    clean, sensors = add_sensors(clean, tips, guess, pads)
+    chosen = dict(zip(tips, pads, strict=True))
+    repairs = [*below, *merged, *fixed, *again, *marked, *joints, *bodies, *fitted, *sensors]
     if balls:
         repairs.append(f"fingertips touch with a ball in their end, of radius: {', '.join(balls)}")
     if bare and wish.visual:

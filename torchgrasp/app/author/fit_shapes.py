@@ -248,7 +248,7 @@ def fit_shapes(points: Points) -> list[LinkShape]:
         radius = float(np.linalg.norm(across, axis=1).max())
         if math.pi * radius**2 * sides[axis] < FIT.round_share * volume:
             along = np.roll(np.eye(3), -axis - 1, 0).T  # its third column is the axis
-            return [_shape("cylinder", (radius, sides[axis]), turn @ along, turn @ middle)]
+            return [turned_shape("cylinder", (radius, sides[axis]), turn @ along, turn @ middle)]
     return _boxes(boxes, turn)
 
 
@@ -267,7 +267,8 @@ def _axes(points: Points) -> Float[np.ndarray, "3 3"]:
 def _boxes(corners: list[Corners], axes: np.ndarray) -> list[LinkShape]:
     """Return collision boxes, given their lower and upper corners along the columns of `axes`."""
     return [
-        _shape("box", tuple(high - low), axes, axes @ (low + high) / 2) for low, high in corners
+        turned_shape("box", tuple(high - low), axes, axes @ (low + high) / 2)
+        for low, high in corners
     ]
 
 
@@ -306,8 +307,14 @@ def _halves(low: np.ndarray, high: np.ndarray, points: Points) -> list[tuple[flo
     return found
 
 
-def _shape(kind: str, size: tuple[float, ...], turn: np.ndarray, center: np.ndarray) -> LinkShape:
-    """Return a collision shape of a kind, size, rotation and centre, with rounded numbers."""
+def turned_shape(
+    kind: str, size: tuple[float, ...], turn: np.ndarray, center: np.ndarray
+) -> LinkShape:
+    """Return a collision shape with rounded numbers.
+
+    `turn` (3, 3) holds its axes as columns, `center` (3,) [m] is its middle, both in the frame of
+    its link. `kind` and `size` are those of `LinkShape`.
+    """
     pose = np.eye(4)
     pose[:3, :3] = turn
     pose[:3, 3] = center

@@ -107,6 +107,14 @@ class HandNew(Command):
     visual: bool = option(
         False, "take the <visual> of links without <collision> as their collision shapes"
     )
+    tip_offset: tuple[float, ...] = option(
+        (),
+        "lengths [m] of sensor tips that the URDF lacks, from the maker's tip outward: one, or with "
+        "--tips one for each; docs/hands.md states the direction",
+    )
+    tip_radius: tuple[float, ...] = option(
+        (), "radii [m] of sensor tips, likewise; by default those of the fingertips' balls"
+    )
     out: Path | None = option(None, "folder to write; by default the URDF's")
     seed: Seed = option(0, "random seed of the postures from which pads and pairs are guessed")
 
@@ -121,7 +129,8 @@ class HandNew(Command):
         clean = (
             "hand.urdf" if (folder / "hand.urdf").resolve() != urdf.resolve() else "hand_clean.urdf"
         )
-        wish = Wish(self.tips, self.name or "", self.root, meshes, self.visual)
+        sensors = self.tip_offset, self.tip_radius
+        wish = Wish(self.tips, self.name or "", self.root, meshes, self.visual, *sensors)
         draft = new_hand(urdf, wish, self.seed, clean)
         texts = {"hand.toml": draft.toml}
         if draft.urdf or out is not None:
