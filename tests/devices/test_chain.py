@@ -36,6 +36,7 @@ from torchgrasp.evaluation.protocols import draw_object_poses
 from torchgrasp.export import (
     format_graspgen,
     format_grasps,
+    format_isaac,
     format_keyframes,
     format_moveit,
     format_trajectories,
@@ -86,6 +87,7 @@ TEXTS = {
     "grasps": lambda hand, grasps: format_grasps(hand, grasps),
     "keyframes": lambda hand, grasps: format_keyframes(hand, grasps),
     "moveit": lambda hand, grasps: format_moveit(hand, grasps),
+    "isaac": lambda hand, grasps: format_isaac(hand, grasps),
     "trajectories": lambda hand, grasps: format_trajectories(hand, grasps),
     "graspgen": lambda hand, grasps: format_graspgen(grasps, "object.obj"),
 }

@@ -15,7 +15,7 @@ from tests.pinch import pinch
 from torchgrasp import Plane, load_hand
 from torchgrasp.app import cli
 from torchgrasp.control.finger_forces import squeeze
-from torchgrasp.export import format_grasps, format_keyframes, format_moveit
+from torchgrasp.export import format_grasps, format_isaac, format_keyframes, format_moveit
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply
 
@@ -101,8 +101,9 @@ def test_a_hand_whose_opened_fingers_are_in_the_table_stays_above_its_pose():
     model = mujoco.MjModel.from_xml_string(format_keyframes(hand, grasp))
     opened, closed = (model.key(f"grasp_0_{name}").qpos[:3] for name in ("pregrasp", "grasp"))
     np.testing.assert_allclose(opened - closed, row["rise"], atol=1e-12)
-    with pytest.raises(BadArgument, match="goes down while it closes"):
-        format_moveit(hand, grasp)
+    for write in (format_moveit, format_isaac):  # a format of one pose
+        with pytest.raises(BadArgument, match="goes down while it closes"):
+            write(hand, grasp)
 
 
 def test_a_robot_of_half_the_stiffness_gets_twice_the_lead():

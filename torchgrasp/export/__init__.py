@@ -2,6 +2,7 @@
 
 from torchgrasp.export.arm_motion import ArmMotion, plan_motion
 from torchgrasp.export.foreign import ForeignGrasps, grasps_from_joints, read_foreign
+from torchgrasp.export.isaac import format_isaac
 from torchgrasp.export.other_formats import check_surface_path, format_graspgen, largest_std
 from torchgrasp.export.other_formats import save_dexgraspbench, save_surface
 from torchgrasp.export.postures import format_grasps, format_keyframes
@@ -14,6 +15,7 @@ __all__ = [
     "check_surface_path",
     "format_graspgen",
     "format_grasps",
+    "format_isaac",
     "format_keyframes",
     "format_motion",
     "format_moveit",

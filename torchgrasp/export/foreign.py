@@ -1,4 +1,4 @@
-"""Import of grasps from other planners and from our own JSON, as `Grasps`.
+"""Import of grasps from other planners, from Isaac, and from our own JSON, as `Grasps`.
 
 DexGraspBench's .npy is a pickle, which could run code when it is read, so it is rejected.
 docs/exchange.md converts it.
@@ -27,6 +27,7 @@ from torchgrasp.export.file_joints import (
     read_order,
     read_posture,
 )
+from torchgrasp.export.isaac import parse_isaac
 from torchgrasp.export.other_formats import bench_frame
 from torchgrasp.files import Field, is_file, read_bytes, read_json
 from torchgrasp.foundation.base import flatnonzero
@@ -88,6 +89,7 @@ def read_foreign(
     | `.json` of `format_grasps` | joints by name, pose, pre-grasp, table |
     | `.json` with `pose` and `dofs` (MultiGripperGrasp) | lists of 7 numbers, joints in `order` |
     | `.npz` with `grasp_qpos` (DexGraspBench) | lines of pose and joints; `pregrasp_qpos`, if any |
+    | `.yaml` of `isaac_grasp` 1.0 | pose, joints by name, pre-grasp if any |
 
     With `obj_pose` in the file, poses are in the world, and are moved to the object's frame. A
     wrist that moves from pre-grasp to grasp stays at the grasp here. The fingers of the pre-grasp
@@ -108,7 +110,8 @@ def read_foreign(
         unit_m: length [m] of one unit of the positions in the file.
         root: the frame of the hand whose poses the file has: a link of our URDF, or the pose [m] of
             its root link in the publisher's frame. By default it is the link that the file names
-            (`root_link`, `base_link`), the bench's frame of the Allegro hand, or our root link.
+            (`root_link`, `base_link`, or the end of Isaac's `gripper_frame_link`), the bench's
+            frame of the Allegro hand, or our root link.
 
     Raises `ModelFileError` for a missing or malformed file, for joints that fit with another sign
     only, for joints that do not follow as the hand's do, and for a root link that is none of ours.
@@ -129,7 +132,9 @@ def read_foreign(
     hand = hand.to("cpu", torch.float64)
     if path.suffix.lower() == ".npz":
         return _read_bench(path, hand, tuple(order), quaternion, unit_m, root)
-    file = read_json(path, _refuse, "a JSON file of grasps, or .npz")
+    if path.suffix.lower() in (".yaml", ".yml"):
+        return _read_isaac(path, hand, unit_m, root)
+    file = read_json(path, _refuse, "a JSON file of grasps, .npz, or .yaml of isaac_grasp")
     fields = file.entries()
     if "grasps" in fields:
         return _read_own(fields, hand, unit_m, root)
@@ -165,6 +170,19 @@ def _link_from_root(
         allowed = f"the pose of our root link in that one (--root), or one of {', '.join(links)}"
         raise _refuse(f"poses of the link {root}, which is none of ours", allowed)
     return inverse(hand.link_poses(joints)[:, links.index(root)])
+
+
+def _read_isaac(path: Path, hand: Hand, unit_m: float, root: str | Pose) -> ForeignGrasps:
+    """Return the grasps of an `isaac_grasp` file."""
+    content = parse_isaac(path, hand, MOST_GRASPS, FAR, _refuse)
+    joints = {
+        name: read_posture(hand, values, name, _refuse) for name, values in content.postures.items()
+    }
+    # a path in the stage ends with the link's name
+    named = content.gripper.rpartition("/")[2]
+    link_from_root = _link_from_root(hand, joints["grasp"], root if root != "" else named)
+    poses = read_poses(content.poses, "wxyz", unit_m) @ link_from_root
+    return ForeignGrasps(joints["grasp"], poses, joints.get("pregrasp"))
 
 
 def _read_own(

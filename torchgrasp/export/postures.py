@@ -155,6 +155,16 @@ def named_postures(
     return squeezed, {name: hand.expand(joints) for name, joints in postures.items()}
 
 
+def check_still(hand: Hand, grasps: Grasps) -> None:
+    """Refuse grasps whose hand goes down while it closes (`opened_pose`): a format of one pose for
+    each grasp cannot express it. Raises `BadArgument`.
+    """
+    opened = opened_pose(hand, grasps.pregrasp, grasps.obj_from_hand, grasps.table)
+    if not torch.equal(opened, grasps.obj_from_hand):
+        found = "a hand that goes down while it closes"
+        raise BadArgument("grasps", found, "hands that close at one pose")
+
+
 def rename_joints(hand: Hand, rename: Mapping[str, str] | None) -> dict[str, str]:
     """Return the robot's name of each joint of the URDF: those of `rename` first, in its order.
 

@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-import torch
 import yaml
 from jaxtyping import Float
 from torch import Tensor
@@ -14,17 +13,17 @@ from torch import Tensor
 from torchgrasp.control.protocol import POSE_TIME
 from torchgrasp.export.arm_motion import ArmMotion
 from torchgrasp.export.postures import (
+    check_still,
     follower_joints,
     named_postures,
     quaternion,
     rename_joints,
 )
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Force, Pose, Positive
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.urdf import read_urdf
-from torchgrasp.ik.motion import APPROACH_DISTANCE, UP, opened_pose
+from torchgrasp.ik.motion import APPROACH_DISTANCE, UP
 from torchgrasp.values.planning import Grasps
 
 NANOSECONDS = 1e9  # in a second
@@ -98,10 +97,7 @@ def format_moveit(
     poses = grasps.obj_from_hand.double()
     if flange is not None:
         poses = poses @ flange.double().cpu()
-    opened = opened_pose(hand, grasps.pregrasp, grasps.obj_from_hand, grasps.table)
-    if not torch.equal(opened, grasps.obj_from_hand):
-        found = "a hand that goes down while it closes"
-        raise BadArgument("grasps", found, "hands that close at one pose")
+    check_still(hand, grasps)
     # two motions, to the pre-grasp and from there
     times = POSE_TIME, POSE_TIME, 2 * POSE_TIME
     trajectories = _trajectories(hand, grasps, force, kp, rename, actuated, times, not actuated)
@@ -166,6 +162,7 @@ def format_motion(hand: Hand, motion: ArmMotion, actuated: bool = False) -> str:
     `motion` comes from `plan_motion`; `hand` is the hand on the arm. With `actuated`, joints of the
     hand that follow others are left out.
 
+    >>> import torch
     >>> from torchgrasp import load_hand
     >>> motion = ArmMotion(("a",), torch.tensor([0.0, 1.5]), torch.zeros(1, 2, 1), {"above": 0})
     >>> format_motion(load_hand("barrett"), motion).splitlines()[-1]

@@ -18,7 +18,7 @@ from torchgrasp.cloud.read import save_cloud
 from torchgrasp.cloud.safe_files import read_image_file
 from torchgrasp.data import list_views, read_entries, read_entry
 from torchgrasp.data.shipped import load_shipped_grasp
-from torchgrasp.export import format_grasps, grasps_from_joints, read_foreign
+from torchgrasp.export import format_grasps, format_isaac, grasps_from_joints, read_foreign
 from torchgrasp.foundation.errors import GraspFileWarning
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.hand.urdf import read_urdf
@@ -167,6 +167,7 @@ def foreign(folder: Path) -> list[Case]:
         json.dumps({"pose": [row[:7].tolist()] * 2, "dofs": [row[7:].tolist()] * 2})
     )
     np.savez(folder / "bench.npz", grasp_qpos=row[None], pregrasp_qpos=row[None])
+    (folder / "isaac.yaml").write_text(format_isaac(hand, grasp))
 
     def read(path: Path) -> None:
         with warnings.catch_warnings():

@@ -39,6 +39,7 @@ Unit = Literal["m", "cm", "mm"]
 UNITS: dict[Unit, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}  # [m]
 TEXTS: dict[str, Callable[..., str]] = {
     "json": formats.format_grasps,
+    "isaac": formats.format_isaac,
     "mujoco": formats.format_keyframes,
     "moveit": formats.format_moveit,
     "ros2": formats.format_trajectories,
@@ -66,6 +67,7 @@ class Export(Command):
     out: Path = required("file to write; for dexgraspbench, play-... and usd a folder")
     format: Literal[
         "json",
+        "isaac",
         "mujoco",
         "moveit",
         "ros2",
@@ -79,7 +81,8 @@ class Export(Command):
         "usd",
     ] = option(
         "json",
-        "json: frames, units, forces and torques. mujoco: the hand as a model with keyframes. "
+        "json: frames, units, forces and torques. isaac: an isaac_grasp file (YAML) of Isaac Sim "
+        "and Isaac ROS. mujoco: the hand as a model with keyframes. "
         "moveit: a list of "
         "moveit_msgs/Grasp in YAML. ros2: a JointTrajectory each. dexgraspbench, graspgen: files "
         "of these projects. "
@@ -100,26 +103,34 @@ class Export(Command):
     )
     object: str | None = option(
         None,
-        "dexgraspbench: its folder of the object; graspgen: the mesh in its data set; moveit: the "
-        "object's id; "
+        "dexgraspbench: its folder of the object; graspgen: the mesh in its data set; moveit, "
+        "isaac: the object's id, or frame; "
         "glb, play-..., usd: a mesh; by default the estimated surface.ply of GRASPS",
     )
     mass: float | None = option(None, "play-..., usd: mass of the object [kg]; by default 0.1")
     friction: float | None = option(None, "play-..., usd: coefficient of friction; by default 0.8")
     rename: tuple[str, ...] = option(
         (),
-        "json, moveit, ros2: the robot's joints, as URDF=ROBOT ..., in its order, or a .json file "
-        "of such an object",
+        "json, isaac, moveit, ros2: the robot's joints, as URDF=ROBOT ..., in its order, or a "
+        ".json file of such an object",
     )
     actuated: bool = option(
         False,
-        "moveit, ros2: leave out the joints that follow others, and moveit's efforts, which "
+        "isaac, moveit, ros2: leave out the joints that follow others, and moveit's efforts, which "
         "ros2_control refuses",
     )
     flange: tuple[float, float, float, float, float, float, float] | None = option(
         None,
-        "json, moveit: position [m] and quaternion wxyz of the robot's flange in the hand's "
+        "json, isaac, moveit: position [m] and quaternion wxyz of the robot's flange in the hand's "
         "frame, to write its pose",
+    )
+    gripper_link: str | None = option(
+        None,
+        "isaac: the gripper's frame, or its path in the stage; by default the hand's root link, or "
+        "'flange'",
+    )
+    isaac_ros: bool = option(
+        False, "isaac: write the names of Isaac ROS, object_frame and gripper_frame"
     )
 
     def run(self) -> int:
@@ -137,6 +148,8 @@ class Export(Command):
             "flange": flange,
             "object_id": None if named else self.object,
             "actuated": self.actuated or None,
+            "gripper_link": self.gripper_link,
+            "isaac_ros": self.isaac_ros or None,
         }
         robot = {name: x for name, x in robot.items() if x is not None}
         given = {"mass": self.mass, "friction": self.friction}
@@ -177,7 +190,7 @@ class Export(Command):
         followers = follower_joints(hand) if "actuated" in texts and not self.actuated else ()
         if followers:
             print(
-                f"note: joint_names hold joints that follow others: {', '.join(followers)}; "
+                f"note: joints that follow others are written: {', '.join(followers)}; "
                 "--actuated leaves them out, as ros2_control needs"
             )
         print(f"{len(best)} grasp{'s' * (len(best) != 1)} of the {hand.name} hand: {self.out}")
@@ -226,8 +239,8 @@ class Import(Command):
     grasps.safetensors.
 
     `torchgrasp export` and `torchgrasp evaluate --planned` accept the file. The input is JSON of
-    `torchgrasp export`, JSON with "pose" and "dofs" (MultiGripperGrasp), or .npz with
-    DexGraspBench's names.
+    `torchgrasp export`, JSON with "pose" and "dofs" (MultiGripperGrasp), .npz with DexGraspBench's
+    names, or .yaml of isaac_grasp 1.0.
     """
 
     file: Path = positional("the grasps, in the frame of the object")

@@ -1,0 +1,274 @@
+"""Grasps as an `isaac_grasp` file of version 1.0, which Isaac Sim and Isaac ROS read.
+
+Facts: https://docs.isaacsim.omniverse.nvidia.com/latest/robot_simulation/grasp_editor.html and
+https://nvidia-isaac-ros.github.io/concepts/manipulation/isaac_grasp.html.
+"""
+
+import math
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+import yaml
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.export.postures import (
+    check_still,
+    follower_joints,
+    named_postures,
+    quaternion,
+    rename_joints,
+)
+from torchgrasp.export.ros_messages import OBJECT_FRAME
+from torchgrasp.files import Field
+from torchgrasp.files.write import Malformed, Refuse, explain, read_bounded
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import GraspFileWarning
+from torchgrasp.foundation.limits import JSON_BYTES
+from torchgrasp.foundation.rules import Force, Pose, Positive
+from torchgrasp.foundation.told import warn_user
+from torchgrasp.hand.hand import Hand
+from torchgrasp.hand.urdf import read_urdf
+from torchgrasp.values.planning import Grasps
+
+FORMAT = "isaac_grasp"
+VERSION = 1.0
+FRAMES = "object_frame_link", "gripper_frame_link"
+ROS_FRAMES = "object_frame", "gripper_frame"  # names of Isaac ROS, and of what the editor writes
+GRASP = "cspace_position"
+PREGRASP = "pregrasp_cspace_position"
+SQUEEZE = "squeeze_cspace_position"  # a key of ours, which other readers skip
+FLANGE = "flange"
+POSE_KEYS = "confidence", "position", "orientation"
+ALLOWED = f"an {FORMAT} file of version {VERSION}"
+DEEPEST = 8  # most levels of a file; the format has five
+NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")  # YAML 1.1 takes 1e-05 for a text
+
+
+@checked
+def format_isaac(
+    hand: Hand,
+    grasps: Grasps,
+    force: Force = 4.0,
+    kp: Positive | None = None,
+    rename: Mapping[str, str] | None = None,
+    flange: Pose | None = None,
+    object_id: str = OBJECT_FRAME,
+    actuated: bool = False,
+    gripper_link: str | None = None,
+    isaac_ros: bool = False,
+) -> str:
+    """Return grasps as the YAML of an `isaac_grasp` file of version 1.0, in metres and radians.
+
+    `position` and `orientation` (w, xyz) are the pose of the gripper's frame in the object's: that
+    of the planned cloud. `cspace_position` has the joints at the contacts, by name, and
+    `pregrasp_cspace_position` those of the opened hand. `confidence` is the predicted success, 0
+    where it is unknown. `squeeze_cspace_position`, a key of ours, has the targets that press.
+
+    Args:
+        hand: the hand.
+        grasps: grasps planned for this hand, best first.
+        force: normal force of the strongest finger [N] in the squeeze.
+        kp: stiffness of the robot's position control [N m/rad]; None means the hand's.
+        rename: the robot's names of joints, by their names in the URDF; None keeps all names.
+        flange: pose [m] of the robot's flange in the frame of the root link; None means that poses
+            are those of `gripper_link`.
+        object_id: name of the object's frame, such as its path in the stage.
+        actuated: leave out joints that follow others. By default all joints of the hand are
+            written, followers and parked ones, too.
+        gripper_link: name of the gripper's frame, or its path in the stage. If its last part is a
+            link of the URDF, poses are of this link; any other name is one of the root link, or of
+            the flange. None means the root link, or "flange".
+        isaac_ros: write the names of Isaac ROS, `object_frame` and `gripper_frame`.
+
+    Raises `BadArgument` for joints of another hand, a force or stiffness that is not positive, or
+    unknown or equal names. A grasp whose hand goes down while it closes is refused, too: the file
+    has one pose.
+
+    >>> from torchgrasp import load_hand
+    >>> from torchgrasp.data.shipped import load_shipped_grasp
+    >>> text = format_isaac(load_hand("barrett"), load_shipped_grasp("jug", "barrett"))
+    >>> yaml.safe_load(text)["gripper_frame_link"]
+    'palm'
+    """
+    hand = hand.to("cpu")
+    grasps = grasps.to("cpu")
+    check_still(hand, grasps)
+    _, postures = named_postures(hand, grasps, force, kp)
+    followers = follower_joints(hand) if actuated else ()
+    names = {x: name for x, name in rename_joints(hand, rename).items() if x not in followers}
+    root = read_urdf(hand.urdf_path).root
+    poses = grasps.obj_from_hand.double()
+    if flange is not None:
+        frame = gripper_link or FLANGE
+        poses = poses @ flange.double().cpu()
+    else:
+        frame = gripper_link or root
+        poses = poses @ _root_from_link(hand, grasps, frame.rpartition("/")[2])
+    # an unknown success is NaN, which readers would sort anywhere
+    confidence = grasps.success.double().nan_to_num(0.0).clamp(0.0, 1.0)
+    keys = {"grasp": GRASP, "pregrasp": PREGRASP, "squeeze": SQUEEZE}
+    rows = dict[str, Any]()
+    for row, pose in enumerate(poses):
+        turn = quaternion(pose)
+        rows[f"grasp_{row}"] = {
+            "confidence": float(confidence[row]),
+            "position": pose[:3, 3].tolist(),
+            "orientation": {"w": turn[0], "xyz": turn[1:]},
+            **{
+                key: {names[x]: float(postures[what][x][row]) for x in names}
+                for what, key in keys.items()
+            },
+        }
+    frames = dict(zip(ROS_FRAMES if isaac_ros else FRAMES, (object_id, frame), strict=True))
+    content = {"format": FORMAT, "format_version": VERSION, **frames, "grasps": rows}
+    heading = (
+        f"# grasps of the {hand.name} hand, by torchgrasp: metres, radians; best first\n"
+        f"# object's frame: that of the planned cloud; the hand's root link is {root!r} of "
+        f"{hand.urdf_path.name}\n"
+        f"# confidence is the predicted success, 0 where it is unknown; {SQUEEZE} has the\n"
+        f"# targets that press, a key of torchgrasp\n"
+    )
+    return heading + yaml.safe_dump(
+        content, default_flow_style=None, width=math.inf, sort_keys=False, allow_unicode=True
+    )
+
+
+def _root_from_link(hand: Hand, grasps: Grasps, link: str) -> Float[Tensor, "*g 4 4"]:
+    """Return the pose [m] of a link in the root link's frame at each grasp; the identity for a name
+    that is none of the hand's links.
+    """
+    if link not in hand.tree.link_names:
+        return torch.eye(4, dtype=torch.float64)
+    return hand.link_poses(grasps.joints.double())[:, hand.tree.link_names.index(link)]
+
+
+class IsaacFile(NamedTuple):
+    """The content of an `isaac_grasp` file with g grasps, in its order.
+
+    `poses` (g, 7) are position and quaternion (w, x, y, z) of the frame `gripper`, "" if the file
+    names none. `postures` has "grasp" and, if the file has them, "pregrasp": values (g,) by the
+    names of the joints.
+    """
+
+    gripper: str
+    poses: np.ndarray
+    postures: dict[str, dict[str, np.ndarray]]
+
+
+def parse_isaac(path: Path, hand: Hand, most: int, far: float, refuse: Refuse) -> IsaacFile:
+    """Return the content of an `isaac_grasp` file of at most `most` grasps, with numbers up to
+    `far`.
+
+    A `GraspFileWarning` names keys that are not read. Raises the error of `refuse` for a malformed
+    file, another version, a joint that the hand does not have, and an actuated joint that is
+    missing.
+    """
+    content = _read_yaml(path, refuse).entries("format", "format_version", "grasps")
+    for key, wanted in (("format", FORMAT), ("format_version", VERSION)):
+        if content[key].value != wanted:
+            raise content[key].wrong(str(wanted))
+    for key in (FRAMES[0], ROS_FRAMES[0]):
+        if key in content:
+            content[key].text()
+    frames = [content[key].text() for key in (FRAMES[1], ROS_FRAMES[1]) if key in content]
+    rows = content["grasps"].entries()
+    if len(rows) > most:
+        raise refuse(f"{path}: {len(rows)} grasps", f"at most {most}")
+    skipped = {*content} - {"format", "format_version", "grasps", *FRAMES, *ROS_FRAMES}
+    poses = list[list[float]]()
+    opened = {PREGRASP in x.value for x in rows.values() if isinstance(x.value, dict)}
+    if len(opened) > 1:
+        raise refuse(f"{path}: {PREGRASP} in some grasps only", "each grasp, or none")
+    keys = {"grasp": GRASP, "pregrasp": PREGRASP} if True in opened else {"grasp": GRASP}
+    taken: dict[str, list[dict[str, Field]]] = {what: [] for what in keys}
+    for row in rows.values():
+        fields = row.entries("position", "orientation", *keys.values())
+        if "confidence" in fields:
+            fields["confidence"].number(0.0, 1.0)
+        turn = fields["orientation"].entries("w", "xyz")
+        position = fields["position"].numbers(3, -far, far)
+        xyz = turn["xyz"].numbers(3, -far, far)
+        poses.append([*position, turn["w"].number(-far, far), *xyz])
+        for what, key in keys.items():
+            taken[what].append(_check_joints(hand, fields[key]))
+        skipped |= {*fields} - {*POSE_KEYS, *keys.values(), SQUEEZE}
+    if skipped:
+        warn_user(GraspFileWarning, f"{path.name}: not read: {', '.join(sorted(skipped))}")
+    postures = {what: _fill(hand, fields, far) for what, fields in taken.items()}
+    numbers = np.array(poses, dtype=float).reshape(-1, 7)
+    return IsaacFile("".join(frames[:1]), numbers, postures)
+
+
+def _check_joints(hand: Hand, field: Field) -> dict[str, Field]:
+    """Return the joints of a posture in a file by name; refuse unknown and missing ones."""
+    names = hand.tree.joint_names
+    if unknown := [x for x in field.entries() if x not in names]:
+        allowed = f"joints of the {hand.name} hand: {', '.join(names)}"
+        raise field.refuse(f"{field.path}: {field.place} with {unknown[0]!r}", allowed)
+    return field.entries(*hand.joint_names)
+
+
+def _fill(hand: Hand, rows: list[dict[str, Field]], far: float) -> dict[str, np.ndarray]:
+    """Return the values (g,) of all joints by name; one that a grasp leaves out is our hand's."""
+    joints = torch.zeros(len(rows), len(hand.joint_names), dtype=torch.float64)
+    for column, name in enumerate(hand.joint_names):
+        joints[:, column] = torch.tensor([row[name].number(-far, far) for row in rows])
+    every = hand.expand_joints(joints)
+    values = dict(zip(hand.tree.joint_names, every.numpy().T.copy(), strict=True))
+    for place, row in enumerate(rows):
+        for name, field in row.items():
+            values[name][place] = field.number(-far, far)
+    return values
+
+
+def _read_yaml(path: Path, refuse: Refuse) -> Field:
+    """Return the content of a YAML file as a field: objects, lists, texts, and numbers.
+
+    Text that is a number is one, in quotes, too, as Isaac Sim reads it. Keys are texts. Raises the
+    error of `refuse` for malformed YAML, and for aliases, equal keys or a deep nesting.
+    """
+    data = read_bounded(path, JSON_BYTES, ALLOWED, refuse)
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    try:
+        # events alone: the loaders themselves recurse, and expand aliases
+        events = yaml.parse(data.decode("utf-8"), Loader=loader)
+        value = _build(events, next(_content(events), None), 0)
+        if isinstance(next(_content(events), None), yaml.Event):
+            raise Malformed("a second document")
+    except (yaml.YAMLError, ValueError) as error:
+        raise refuse(f"{path}: {explain(error)}", ALLOWED) from error
+    return Field(path, "", value, refuse)
+
+
+def _content(events: Iterator[yaml.Event]) -> Iterator[yaml.Event]:
+    """Yield the events that have content: no begin or end of a stream or document."""
+    frame = yaml.StreamStartEvent, yaml.StreamEndEvent, yaml.DocumentStartEvent
+    return (x for x in events if not isinstance(x, (*frame, yaml.DocumentEndEvent)))
+
+
+def _build(events: Iterator[yaml.Event], event: yaml.Event | None, depth: int) -> Any:
+    """Return the value that begins with `event`; raise `Malformed` for what is not allowed."""
+    if depth > DEEPEST:
+        raise Malformed(f"more than {DEEPEST} levels")
+    if isinstance(event, yaml.ScalarEvent):
+        return float(event.value) if NUMBER.fullmatch(event.value) else event.value
+    if isinstance(event, yaml.SequenceStartEvent):
+        items = list[Any]()
+        while not isinstance(item := next(events), yaml.SequenceEndEvent):
+            items.append(_build(events, item, depth + 1))
+        return items
+    if not isinstance(event, yaml.MappingStartEvent):
+        raise Malformed("an alias" if isinstance(event, yaml.AliasEvent) else "an empty file")
+    entries = dict[str, Any]()
+    while not isinstance(key := next(events), yaml.MappingEndEvent):
+        if not isinstance(key, yaml.ScalarEvent):
+            raise Malformed("a key that is no text")
+        if key.value in entries:
+            raise Malformed(f"{key.value} twice")
+        entries[key.value] = _build(events, next(events), depth + 1)
+    return entries
