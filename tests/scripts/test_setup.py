@@ -1,7 +1,8 @@
-"""What the set-up decides about torch, run against a stand-in for Python and pip: nothing is
-downloaded.
+"""What the set-up decides about torch and extras, run against a stand-in for Python and pip:
+nothing is downloaded.
 """
 
+import importlib.metadata
 import json
 import os
 import shutil
@@ -10,6 +11,8 @@ import sys
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parents[2]
 INDEX = "https://download.example.org/whl/cpu"
@@ -33,9 +36,24 @@ elif arguments[:2] == ["-m", "pip"]:
         if report is None:
             sys.exit(1)
         print(json.dumps(report))
-elif "import sapien" not in arguments[-1]:
+    elif "-e" in arguments:
+        print((here / "said.txt").read_text())
+        sys.exit(int(answers["breaks"]))
+elif not {{"import sapien", "import compileall"}} & {{x.split(",")[0] for x in arguments}}:
     os.execv({python!r}, [{python!r}, *arguments])
 """
+
+
+ALL = "sim,mujoco,cluster,data,dev,docs"
+SAID = """Collecting beartype>=0.19 (from torchgrasp==0.1.0)
+  Downloading beartype-0.23.1-py3-none-any.whl.metadata (37 kB)
+  Downloading beartype-0.23.1-py3-none-any.whl (1.6 MB)
+Processing /opt/numpy-2.4.6-cp311-cp311-manylinux_2_28_x86_64.whl (from torchgrasp==0.1.0)
+  Using cached svg_path-7.1-py2.py3-none-any.whl (18 kB)
+WARNING: something of no use
+Installing collected packages: beartype, numpy, svg.path
+"""
+"""Of pip, when it installs the project."""
 
 
 def report(wheel: Path, *needs: str) -> dict:
@@ -61,18 +79,21 @@ def set_up(tmp_path):
         shutil.copy(ROOT / name, project / name)
     (fake / "python").write_text(STAND_IN.format(python=sys.executable, folder=str(fake)))
     (fake / "python").chmod(0o755)
+    (fake / "said.txt").write_text(SAID)
     tools = fake / "tools"
     tools.mkdir()
     (tools / "nvidia-smi").touch(0o755)
 
-    def run(installed=False, configured=None, index=None, gpu=False, **environment):
+    def run(extras=ALL, installed=False, configured=None, index=None, gpu=False, **environment):
+        breaks = environment.pop("breaks", False)
         (tools / "nvidia-smi").write_text(f"#!/bin/sh\nexit {0 if gpu else 9}\n")
         answers = {"installed": installed, "configured": configured, "index": index}
+        answers["breaks"] = breaks
         (fake / "answers.json").write_text(json.dumps(answers))
         (fake / "calls.txt").unlink(missing_ok=True)
         clean = {k: v for k, v in os.environ.items() if not k.startswith(("TORCHGRASP_", "PIP_"))}
         done = subprocess.run(
-            ["bash", "-euo", "pipefail", "-c", "source scripts/_setup"],
+            ["bash", "-euo", "pipefail", "-c", f"source scripts/_setup {extras}"],
             cwd=project,
             env={
                 **clean,
@@ -87,7 +108,7 @@ def set_up(tmp_path):
         calls = (
             (fake / "calls.txt").read_text().splitlines() if (fake / "calls.txt").exists() else []
         )
-        return done, [c for c in calls if c.startswith("install") and "--report" not in c]
+        return done, [c for c in calls if " -c constraints.txt" in c and "--report" not in c]
 
     return run
 
@@ -126,7 +147,7 @@ def test_setup_chooses_a_build_of_torch(set_up, tmp_path, needs, around, own_ind
     ), done.stderr
     assert (f"--index-url {INDEX}" in installs[0]) is own_index and "torch==" in installs[0]
     assert (
-        "--index-url" not in installs[1] and "-e .[sim,mujoco,cluster,data,dev,docs]" in installs[1]
+        "--index-url" not in installs[1] and "-e .[cluster,data,dev,docs,mujoco,sim]" in installs[1]
     )
     done, installs = set_up()  # a second run does nothing
     assert done.returncode == 0 and installs == [] and done.stdout == ""
@@ -135,3 +156,70 @@ def test_setup_chooses_a_build_of_torch(set_up, tmp_path, needs, around, own_ind
 def test_setup_names_a_missing_torch(set_up):
     done, installs = set_up()
     assert done.returncode == 1 and installs == [] and "pip finds no torch==" in done.stderr
+
+
+@pytest.fixture
+def cpu(tmp_path):
+    """What pip would say of a CPU build."""
+    (tmp_path / "torch.whl").touch()
+    return report(tmp_path / "torch.whl")
+
+
+def test_setup_tells_each_package_and_keeps_the_words_of_a_failure(set_up, cpu):
+    done, _ = set_up("sim", configured=cpu)
+    told = done.stdout.splitlines()
+    assert told[-4:] == [
+        "set-up: 1: beartype 0.23.1 (1.6 MB)",
+        "set-up: 2: numpy 2.4.6",
+        "set-up: 3: svg_path 7.1 (18 kB)",
+        "set-up: unpacking 3 packages",
+    ]
+    assert any("about 75 packages" in line for line in told) and done.stderr == ""
+    done, _ = set_up("sim,dev", installed=True, breaks=True)
+    assert done.returncode == 1 and "something of no use" in done.stderr
+    assert done.stderr.splitlines()[-1] == "set-up: pip could not install torchgrasp."
+
+
+def test_extras_add_up_and_a_smaller_set_changes_nothing(set_up, cpu, tmp_path):
+    stamp = tmp_path / "project" / ".venv" / "torchgrasp-stamp"
+
+    def installed(extras):
+        done, installs = set_up(extras, configured=cpu)
+        assert done.returncode == 0, done.stderr
+        return [call.split("-e ")[1].split()[0] for call in installs if "-e " in call]
+
+    assert installed("sim") == [".[sim]"] and installed("sim") == []
+    assert installed("docs") == [".[docs,sim]"]  # none is forgotten when versions change
+    assert installed("sim") == [] and installed("docs") == []
+    assert installed(ALL) == [".[cluster,data,dev,docs,mujoco,sim]"]
+    assert installed("sim") == []
+    with (tmp_path / "project" / "constraints.txt").open("a") as constraints:
+        constraints.write("new==1\n")
+    assert installed("sim") == [".[cluster,data,dev,docs,mujoco,sim]"]
+    stamp.write_text(stamp.read_text().splitlines()[0])  # of a set-up that wrote no extras
+    assert installed("sim") == [".[sim]"]
+
+
+def test_the_demo_installs_about_75_packages_and_none_of_development():
+    """The installed packages say what they need."""
+    needed = set[str]()
+    waiting = [("torchgrasp", ("", "sim"))]
+    while waiting:
+        name, extras = waiting.pop()
+        needed.add(name)
+        try:
+            lines = importlib.metadata.requires(name) or []
+        except importlib.metadata.PackageNotFoundError:  # of another platform
+            continue
+        for need in map(Requirement, lines):
+            of_use = (
+                any(need.marker.evaluate({"extra": x}) for x in extras) if need.marker else True
+            )
+            known = canonicalize_name(need.name)
+            if of_use and known not in needed:
+                waiting.append((known, ("", *need.extras)))
+    cuda = {name for name in needed if name.startswith(("nvidia", "cuda", "triton"))}
+    assert 60 <= len(needed - cuda) <= 90
+    assert not needed & {"pytest", "ruff", "mkdocs", "dask", "pyarrow", "playwright", "ipykernel"}
+    demo = (ROOT / "scripts" / "demo").read_text()
+    assert '_setup" sim "$@"' in demo and demo.endswith('echo "demo: open out/demo/report.html"\n')
