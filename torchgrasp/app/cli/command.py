@@ -46,9 +46,12 @@ def required(help: str) -> Any:
     return dataclasses.field(metadata={"help": help})
 
 
-def positional(help: str) -> Any:
-    """Return a dataclass field that is a positional command-line argument with a `help` text."""
-    return dataclasses.field(metadata={"help": help, "positional": True})
+def positional(help: str, default: Any = dataclasses.MISSING) -> Any:
+    """Return a dataclass field that is a positional command-line argument with a `help` text.
+
+    With a `default` of None it may be left out.
+    """
+    return dataclasses.field(default=default, metadata={"help": help, "positional": True})
 
 
 def nested(default: Any) -> Any:
@@ -82,9 +85,9 @@ def _annotate(field: dataclasses.Field) -> Any:
         return Annotated[field.type, tyro.conf.arg(name="")]
     text = field.metadata["help"]
     if field.metadata.get("positional"):
-        return Annotated[
-            tyro.conf.Positional[field.type], tyro.conf.arg(help=text, metavar=field.name.upper())
-        ]
+        hint = "" if field.default is None else None
+        named = tyro.conf.arg(help=text, metavar=field.name.upper(), help_behavior_hint=hint)
+        return Annotated[tyro.conf.Positional[field.type], named]
     if not any(field.default is empty for empty in (None, False, ())):
         return Annotated[field.type, tyro.conf.arg(help=text)]
     kinds = [kind for kind in get_args(field.type) if kind is not type(None)]

@@ -15,6 +15,7 @@ from torchgrasp.app.cli.command import (
     option,
     positional,
 )
+from torchgrasp.app.cli.live import shoot_scene
 from torchgrasp.app.report.page import grasp_columns, grasp_rows, write_report
 from torchgrasp.app.report.recording import import_rerun, write_recording
 from torchgrasp.app.report.run_data import Run, verdict
@@ -70,11 +71,18 @@ class Grasp(Command):
     table or with another plane is refused, too. Other findings are printed as advice.
     """
 
-    cloud: Path = positional(
+    cloud: Path | None = positional(
         f"{inputs.CLOUD_HELP}, a scene (.npz with depth and intrinsics; see docs/real_camera.md), "
         "or the name of a "
-        "shipped object, as jug"
+        "shipped object, as jug",
+        default=None,
     )
+    realsense: bool = option(
+        False,
+        "instead of CLOUD, take the depth image of a connected RealSense, and write it as scene.npz "
+        'into the output folder (needs the extra "realsense")',
+    )
+    serial: str | None = option(None, "serial number of the RealSense, if several are connected")
     hand: str = option("allegro", inputs.HAND_HELP)
     out: Path | None = option(
         None, "folder of the results; by default out/ and the name of the object"
@@ -132,24 +140,42 @@ class Grasp(Command):
 
     def run(self) -> int:
         """Plan grasps, close the hand if asked, and write the results; return the exit code."""
-        path = inputs.find_cloud(self.cloud)
+        path = self._find_input()
         out = Path("out") / inputs.object_name(path) if self.out is None else self.out
         inputs.check_folder(out)
         if self.rerun:
             import_rerun()
-        scene = is_scene(path)
+        scene = self.realsense or is_scene(path)
         self._check_choice(scene)
         _ = self._task  # refused before any work
         hand, among = inputs.load_fingers(self.hand, self.fingers)
+        if self.realsense:
+            path = shoot_scene(out, self.serial, self.view)
         grasp = self._grasp_scene if scene else self._grasp_cloud
         return grasp(path, out, hand, among)
+
+    def _find_input(self) -> Path:
+        """Return the path of the cloud or the scene; of a live camera only its name.
+
+        Raises `BadArgument` for no input, or for two.
+        """
+        if self.serial is not None and not self.realsense:
+            raise BadArgument("--serial", "no --realsense beside it", "both, or neither")
+        if (self.cloud is None) != self.realsense:
+            found = "none" if self.cloud is None else f"{self.cloud} beside --realsense"
+            raise BadArgument("CLOUD", found, "one input: a file, a shipped object, or --realsense")
+        return Path("realsense") if self.cloud is None else inputs.find_cloud(self.cloud)
 
     def _check_choice(self, scene: bool) -> None:
         """Raise `BadArgument` for options of a scene with a cloud, or of a cloud with a scene."""
         if scene:
             if self.label is not None and self.point is not None:
                 raise BadArgument("--point", "--label beside it", "one of the two")
-            other = vars(self.view) | {"table": None, "up": None} != vars(inputs.CloudOptions())
+            free: dict[str, Any] = {"table": None, "up": None}
+            # the pose of a live camera is part of its scene
+            if self.realsense:
+                free["camera_pose"] = None
+            other = vars(self.view) | free != vars(inputs.CloudOptions())
             if self.mesh or other or self.mode != "joint" or self.time_budget:
                 options = (
                     "--label or --point, --table, --up, --hand, --fingers, --out, --seed, "
