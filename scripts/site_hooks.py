@@ -1,5 +1,8 @@
-"""Hooks of the documentation site: pages from outside `docs/`, and examples of docstrings as code."""
+"""Hooks of the documentation site: pages from outside `docs/`, the table of statuses, and how
+docstrings are shown.
+"""
 
+import ast
 import json
 import re
 from pathlib import Path
@@ -7,6 +10,8 @@ from typing import Any
 
 import griffe
 from mkdocs.structure.files import File, Files
+
+from torchgrasp.foundation.errors import Status
 
 ROOT = Path(__file__).resolve().parents[1]
 OUTSIDE = {
@@ -16,6 +21,8 @@ OUTSIDE = {
     "SECURITY.md": "SECURITY.md",
     "LICENSE": "LICENSE.md",
     "hands/README.md": "hands_README.md",
+    "scripts/README.md": "scripts_README.md",
+    "examples": "examples.md",
     "examples/ros2/README.md": "examples_ros2.md",
     **{
         f"examples/{path.name}": f"examples_{path.stem}.md"
@@ -28,6 +35,9 @@ OUTSIDE = {
 WORKER = "https://unpkg.com/iframe-worker/shim"
 """The script that the offline plugin names, and `docs/assets/worker.js` replaces."""
 
+STATUSES = "<!-- statuses -->"
+"""The place of the table of statuses in a page."""
+
 LINK = re.compile(r"\]\(([^)#:]+)(#[^)]*)?\)")
 """A link or a picture of this project; those with a colon lead elsewhere."""
 
@@ -35,19 +45,24 @@ LINK = re.compile(r"\]\(([^)#:]+)(#[^)]*)?\)")
 def on_files(files: Files, config: Any) -> Files:
     """Add the pages from outside."""
     for path, name in OUTSIDE.items():
-        text = (ROOT / path).read_text(encoding="utf-8")
+        if (ROOT / path).is_dir():
+            text = _list_examples()
+        else:
+            text = (ROOT / path).read_text(encoding="utf-8")
+        folder = Path(path) if (ROOT / path).is_dir() else Path(path).parent
         if path.endswith(".py"):
             text = f"# {path}\n\n```python\n{text}```\n"
         elif path.endswith(".ipynb"):
             text = _notebook(text)
-        files.append(File.generated(config, name, content=_relink(text, Path(path).parent)))
+        files.append(File.generated(config, name, content=_relink(text, folder)))
     return files
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Let links of the guides to files outside lead to their pages."""
+    """Let links of the guides to files outside lead to their pages; write the table of statuses."""
     if page.file.generated_by:
         return markdown
+    markdown = markdown.replace(STATUSES, list_statuses())
     folder = Path("docs", page.file.src_uri).parent
     return _relink(markdown, folder, "../" * (len(folder.parts) - 1))
 
@@ -61,6 +76,26 @@ def on_post_page(output: str, page: Any, **_: Any) -> str:
 def on_post_template(output_content: str, **_: Any) -> str:
     """Do the same for the page of a dead link."""
     return output_content.replace(WORKER, "/assets/worker.js")
+
+
+def list_statuses() -> str:
+    """Return a table of all statuses as Markdown."""
+    rows = [f"| {int(one)} | `{one.name}` | {one.sentence} |" for one in sorted(Status)]
+    return "\n".join(["| code | name | meaning |", "| --- | --- | --- |", *rows])
+
+
+def _list_examples() -> str:
+    """Return a page with the first sentence of each example, and links, as Markdown."""
+    lines = ["# Examples", "", "| file | what it shows |", "| --- | --- |"]
+    for path in sorted((ROOT / "examples").glob("*.py")):
+        text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+        first = " ".join(text.split("\n\n")[0].split())
+        lines.append(f"| [{path.name}]({path.name}) | {first} |")
+    lines += [
+        "| [tutorial.ipynb](tutorial.ipynb) | A notebook: from one noisy view to a held object. |",
+        "| [ros2](ros2/README.md) | A package of ROS 2 nodes. |",
+    ]
+    return "\n".join(lines)
 
 
 def _notebook(text: str) -> str:
@@ -96,6 +131,33 @@ class FenceExamples(griffe.Extension):
         """Rewrite the docstring of an object."""
         if obj.docstring is not None:
             obj.docstring.value = fence(obj.docstring.value)
+
+
+ARGUMENTS = re.compile(r"^( +)(\w+(?:, \w+)+): (.*(?:\n\1 +\S.*)*)", re.MULTILINE)
+"""An entry of a docstring's "Args:" that documents several arguments."""
+
+
+class OneRowEach(griffe.Extension):
+    """Give each argument its own row: rows of several show neither types nor defaults."""
+
+    def on_function(self, *, func: griffe.Function, **_: Any) -> None:
+        """Rewrite the docstring of a function."""
+        if func.docstring is not None:
+            func.docstring.value = split_arguments(func.docstring.value)
+
+
+def split_arguments(text: str) -> str:
+    """Return a docstring in which each entry of "Args:" documents one argument."""
+    start = text.find("Args:\n")
+    if start < 0:
+        return text
+    end = text.find("\n\n", start)
+    end = len(text) if end < 0 else end
+
+    def each(match: re.Match[str]) -> str:
+        return "\n".join(f"{match[1]}{name}: {match[3]}" for name in match[2].split(", "))
+
+    return text[:start] + ARGUMENTS.sub(each, text[start:end]) + text[end:]
 
 
 def fence(text: str) -> str:
