@@ -19,7 +19,17 @@ import tyro
 from tyro.extras import SubcommandApp
 
 from torchgrasp import __version__
-from torchgrasp.app.cli import clouds, depth_images, doctor, evaluate, export, grasp, hands, look
+from torchgrasp.app.cli import (
+    clouds,
+    depth_images,
+    doctor,
+    evaluate,
+    export,
+    filming,
+    grasp,
+    hands,
+    look,
+)
 from torchgrasp.app.cli.command import Command, execute
 from torchgrasp.foundation.errors import BadArgument, GraspError
 
@@ -29,7 +39,12 @@ TERMINATED = 143
 INTERRUPTED = 130
 """Exit codes of a command that a signal ended: 128 and the number of SIGTERM or SIGINT."""
 CHAPTERS: dict[str, dict[str, Callable[..., Command | int]]] = {
-    "Plan grasps": {"grasp": grasp.Grasp, "view": look.OpenPage, "objects": look.ListObjects},
+    "Plan grasps": {
+        "grasp": grasp.Grasp,
+        "view": look.OpenPage,
+        "film": filming.Film,
+        "objects": look.ListObjects,
+    },
     "Exchange grasps with other programs": {"export": export.Export, "import": export.Import},
     "Try many grasps in simulation": {
         "evaluate": evaluate.Evaluate,

@@ -2,6 +2,7 @@
 
 from torchgrasp.app.report.evaluation_page import write_evaluation
 from torchgrasp.app.report.glb import write_glb
+from torchgrasp.app.report.moving_picture import write_film
 from torchgrasp.app.report.page import write_report
 from torchgrasp.app.report.recording import write_recording
 from torchgrasp.app.report.run_data import Run
@@ -13,6 +14,7 @@ __all__ = [
     "draw_scene",
     "show_grasps",
     "write_evaluation",
+    "write_film",
     "write_glb",
     "write_recording",
     "write_report",

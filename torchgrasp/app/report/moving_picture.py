@@ -1,0 +1,228 @@
+"""A simulated closing as a moving picture: a GIF, or an MP4 with the extra `film`."""
+
+import dataclasses
+import importlib
+import io
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+
+from torchgrasp.app.report import canvas as paint
+from torchgrasp.app.report.canvas import Direction
+from torchgrasp.app.report.solids import link_poses, solids_of_links
+from torchgrasp.app.report.stills import add_solids, facing, to_array
+from torchgrasp.control.reference import check_single
+from torchgrasp.files import write_file
+from torchgrasp.foundation.base import flatnonzero
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import BadArgument, MissingExtra, OutputError
+from torchgrasp.foundation.lazy import Image, trimesh
+from torchgrasp.foundation.rules import Range
+from torchgrasp.geometry.frames import apply, inverse, real, rotate
+from torchgrasp.geometry.plane import move, upright_frame
+from torchgrasp.hand.hand import Hand
+from torchgrasp.values.closing import ClosureResult
+from torchgrasp.values.planning import Grasps
+
+KINDS = (".gif", ".mp4")
+Rate = Annotated[int, Range(1, 50)]  # pictures each second: a GIF counts hundredths of a second
+
+
+@dataclasses.dataclass(frozen=True)
+class MovieLayout:
+    """Sizes and limits of a moving picture."""
+
+    size: tuple[int, int] = (560, 448)  # width and height [pixels]; even, as H.264 needs
+    longest: float = 60.0  # longest closing that is filmed [s]
+    near: float = 0.25  # an object this far from its first place [m] is lost, and is not framed
+    colors: int = 256  # of a GIF
+    samples: int = 12  # pictures from which the colours of a GIF are taken
+    tick: float = 0.01  # unit of the times in a GIF [s]
+    quality: int = 20  # of H.264, "crf": lower is larger and sharper
+    most_error: int = 200  # of ffmpeg's own words in an error [characters]
+
+
+MOVIE = MovieLayout()
+
+
+@checked
+def write_film(
+    path: Path | str,
+    hand: Hand,
+    grasp: Grasps,
+    closure: ClosureResult,
+    mesh: "trimesh.Trimesh",
+    direction: Direction | None = None,
+    rate: Rate = 15,
+    observer: Callable[[int, int], Any] | None = None,
+) -> Path:
+    """Write the closing of a grasp, from the approach to the end, as a moving picture, atomically.
+
+    The name of the file ends in .gif, or in .mp4, which needs the extra `film` or `ffmpeg` on the
+    search path. It plays at the speed of the simulation, with `rate` pictures each second. One
+    camera sees all pictures, so the lift is seen. Returns the path.
+
+    Args:
+        path: the file to write.
+        hand: the hand of the grasp.
+        grasp: the single grasp.
+        closure: its closing in simulation.
+        mesh: the object [m] in the frame of the grasp.
+        direction: from the object to the camera, where z is up; None means across the fingers.
+        rate: pictures each second.
+        observer: is called with the number of pictures done and of all.
+
+    Raises `BadArgument` for another kind of file, not exactly one grasp, or a closing longer than a
+    minute; `MissingExtra` for an .mp4 without ffmpeg, `OutputError` if the file cannot be written.
+
+    >>> write_film("jug.gif", hand, grasp, closure, jug.mesh)  # doctest: +SKIP
+    """
+    place = Path(path)
+    kind = place.suffix.lower()
+    check_kind(place)
+    check_single(grasp)
+    seconds = float(closure.time[-1] - closure.time[0])
+    if not seconds <= MOVIE.longest:
+        raise BadArgument("closure", f"{seconds:.0f} s", f"at most {MOVIE.longest:g} s")
+    ticks = _ticks(closure, rate)
+    pictures = []
+    for picture in _draw(hand, grasp, closure, mesh, direction, ticks):
+        pictures.append(picture)
+        if observer is not None:
+            observer(len(pictures), len(ticks))
+    data = _encode_gif(pictures, rate) if kind == ".gif" else _encode_mp4(pictures, rate, place)
+    return write_file(place, data)
+
+
+def check_kind(path: Path) -> None:
+    """Raise `BadArgument` for a file that is no film, and `MissingExtra` if no encoder is there."""
+    if path.suffix.lower() not in KINDS:
+        raise BadArgument("path", path, f"a file that ends in {' or '.join(KINDS)}")
+    if path.suffix.lower() == ".mp4":
+        find_ffmpeg()
+
+
+def find_ffmpeg() -> str:
+    """Return the path of ffmpeg: that of the package imageio-ffmpeg, else of the search path.
+
+    Raises `MissingExtra` if there is none.
+    """
+    try:
+        return str(importlib.import_module("imageio_ffmpeg").get_ffmpeg_exe())
+    except (ImportError, RuntimeError):
+        found = shutil.which("ffmpeg")
+    if found is None:
+        raise MissingExtra("imageio-ffmpeg", "film")
+    return found
+
+
+def _ticks(closure: ClosureResult, rate: int) -> list[int]:
+    """Return the control ticks of the pictures; those of a diverged simulation are left out."""
+    known = closure.joints.isfinite().all(-1) & closure.object_pose.isfinite().all(-1).all(-1)
+    known &= closure.hand_pose.isfinite().all(-1).all(-1)
+    finite = flatnonzero(known)
+    times = closure.time[finite].double()
+    first = float(times[0])
+    wanted = first + torch.arange(int((float(times[-1]) - first) * rate) + 1) / rate
+    # the last picture shows the end
+    wanted = torch.cat([wanted.double(), times[-1:]])
+    nearest = torch.searchsorted(times, wanted).clamp_max(len(times) - 1)
+    ticks = finite[nearest].tolist()
+    return ticks[:-1] if len(ticks) > 1 and ticks[-1] == ticks[-2] else ticks
+
+
+def _draw(
+    hand: Hand,
+    grasp: Grasps,
+    closure: ClosureResult,
+    mesh: "trimesh.Trimesh",
+    direction: Direction | None,
+    ticks: list[int],
+) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+    """Yield the pictures at some ticks."""
+    # each corner of each face has its own normal, which is computed once
+    given = np.asarray(mesh.vertices)
+    corners_of = np.asarray(mesh.faces)
+    vertices = real(given[corners_of].reshape(-1, 3))
+    normals = real(paint.sharp_normals(given, corners_of).reshape(-1, 3))
+    faces = np.arange(len(vertices)).reshape(-1, 3)
+    level = torch.eye(4, dtype=torch.float64)
+    if grasp.table is not None:
+        level = inverse(upright_frame(vertices, None, grasp.table))
+    where = facing(move(grasp.to(torch.float64), level)) if direction is None else direction
+    object_pose = level @ closure.object_pose[ticks].double()
+    places = to_array(apply(object_pose, vertices))  # (n, v, 3)
+    bends = to_array(rotate(object_pose, normals))
+    hand_pose = level @ closure.hand_pose[ticks].double()
+    poses = link_poses(hand, closure.joints[ticks], closure.joint_names, hand_pose)
+    solids = solids_of_links(hand)
+    turned = to_array(poses)  # (n, l, 4, 4)
+    # one camera for all pictures sees the hand at both ends of its way, and the object near its place
+    corners = [x for x in places if np.abs(x - places[0]).mean(0).max() < MOVIE.near]
+    for k in (0, len(ticks) // 2, -1):
+        for solid in solids:
+            pose = turned[k, solid.link]
+            corners.append(solid.vertices @ pose[:3, :3].T + pose[:3, 3])
+    seen = np.concatenate(corners)
+    height = None if grasp.table is None else float(places[0][:, 2].min())
+    camera = paint.frame_camera(seen, where, size=MOVIE.size)
+    for place, bend, frames in zip(places, bends, turned, strict=True):
+        canvas = paint.Canvas()
+        moved = []
+        for solid in solids:
+            turn = frames[solid.link, :3, :3].T
+            corner = solid.vertices @ turn + frames[solid.link, :3, 3]
+            moved.append(solid._replace(vertices=corner, normals=solid.normals @ turn))
+        shadows = [(place, faces), *((s.vertices, s.faces) for s in moved)]
+        canvas.add_table(seen, height, shadows)
+        canvas.add_mesh(place, faces, paint.OBJECT, bend)
+        add_solids(canvas, moved)
+        yield canvas.render(camera, MOVIE.size)
+
+
+def _encode_gif(pictures: list[UInt8[np.ndarray, "h w 3"]], rate: int) -> bytes:
+    """Return the bytes of a GIF that repeats for ever, in which all pictures share their colours."""
+    sampled = pictures[:: max(1, len(pictures) // MOVIE.samples)]
+    palette = Image.fromarray(np.concatenate(sampled)).quantize(MOVIE.colors)
+    plain = Image.Dither.NONE  # dots that flicker would look worse than bands
+    frames = [Image.fromarray(p).quantize(palette=palette, dither=plain) for p in pictures]
+    # each time is rounded to hundredths of a second, so that no error grows
+    ends = np.round((np.arange(len(frames)) + 1) / rate / MOVIE.tick)
+    spans = np.diff(ends, prepend=0.0) * MOVIE.tick * 1000
+    buffer = io.BytesIO()
+    first, *others = frames
+    first.save(
+        buffer,
+        format="GIF",
+        save_all=True,
+        append_images=others,
+        duration=[round(span) for span in spans],
+        loop=0,
+    )
+    return buffer.getvalue()
+
+
+def _encode_mp4(pictures: list[UInt8[np.ndarray, "h w 3"]], rate: int, path: Path) -> bytes:
+    """Return the bytes of an MP4 with H.264, which every browser plays."""
+    height, width, _ = pictures[0].shape
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "film.mp4"
+        source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}"]
+        coded = ["-c:v", "libx264", "-crf", str(MOVIE.quality), "-pix_fmt", "yuv420p"]
+        words = [find_ffmpeg(), "-v", "error", *source, "-r", str(rate), "-i", "-", *coded]
+        # the same pictures give the same bytes, and a page can begin to play early
+        words += ["-fflags", "+bitexact", "-movflags", "+faststart", str(file)]
+        raw = b"".join(picture.tobytes() for picture in pictures)
+        done = subprocess.run(words, input=raw, capture_output=True, check=False)
+        if done.returncode != 0 or not file.is_file():
+            said = " ".join(done.stderr.decode(errors="replace").split())[: MOVIE.most_error]
+            wanted = "an ffmpeg with libx264, as of the extra film"
+            raise OutputError("path", f"{path}, which ffmpeg cannot encode ({said})", wanted)
+        return file.read_bytes()
