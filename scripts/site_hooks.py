@@ -24,6 +24,7 @@ OUTSIDE = {
     "scripts/README.md": "scripts_README.md",
     "examples": "examples.md",
     "examples/ros2/README.md": "examples_ros2.md",
+    "examples/lerobot_robot_torchgrasp/README.md": "examples_lerobot.md",
     **{
         f"examples/{path.name}": f"examples_{path.stem}.md"
         for path in sorted((ROOT / "examples").iterdir())
