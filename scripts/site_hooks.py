@@ -3,6 +3,7 @@ docstrings are shown.
 """
 
 import ast
+import base64
 import json
 import re
 from pathlib import Path
@@ -54,7 +55,9 @@ def on_files(files: Files, config: Any) -> Files:
         if path.endswith(".py"):
             text = f"# {path}\n\n```python\n{text}```\n"
         elif path.endswith(".ipynb"):
-            text = _notebook(text)
+            text, pictures = _notebook(text, Path(path).stem)
+            for picture, png in pictures.items():
+                files.append(File.generated(config, picture, content=png))
         files.append(File.generated(config, name, content=_relink(text, folder)))
     return files
 
@@ -99,12 +102,25 @@ def _list_examples() -> str:
     return "\n".join(lines)
 
 
-def _notebook(text: str) -> str:
-    """Return the cells of a notebook as Markdown, without their outputs."""
-    cells = [(cell["cell_type"], "".join(cell["source"])) for cell in json.loads(text)["cells"]]
-    return "\n\n".join(
-        source if kind == "markdown" else f"```python\n{source}\n```" for kind, source in cells
-    )
+def _notebook(text: str, stem: str) -> tuple[str, dict[str, bytes]]:
+    """Return a notebook with its outputs as Markdown, and its pictures by their names."""
+    parts = list[str]()
+    pictures = dict[str, bytes]()
+    for cell in json.loads(text)["cells"]:
+        source = "".join(cell["source"])
+        parts.append(source if cell["cell_type"] == "markdown" else f"```python\n{source}\n```")
+        for output in cell.get("outputs", []):
+            shown = {key: "".join(x) for key, x in output.get("data", {}).items()}
+            if "image/png" in shown:
+                name = f"examples_{stem}_{len(pictures) + 1}.png"
+                pictures[name] = base64.b64decode(shown["image/png"])
+                parts.append(f"![What the cell draws]({name})")
+            elif "text/html" in shown:
+                parts.append(shown["text/html"])
+            else:
+                said = shown.get("text/plain") or "".join(output.get("text", []))
+                parts.append(f"```text\n{said.rstrip()}\n```")
+    return "\n\n".join(parts), pictures
 
 
 def _relink(text: str, folder: Path, up: str = "") -> str:

@@ -1,5 +1,7 @@
 """What README, guides and examples show runs; commands exist and take their flags."""
 
+import base64
+import io
 import json
 import os
 import re
@@ -9,8 +11,10 @@ import sys
 from pathlib import Path
 
 import nbformat
+import numpy as np
 import pytest
 from nbclient import NotebookClient
+from PIL import Image
 
 from tests.pinch import QUICK
 from torchgrasp.app.cli.hands import HandTrial
@@ -156,15 +160,49 @@ def test_every_file_the_readme_names_exists():
     assert "docs/overview.png" in links
 
 
+NOTEBOOK = ROOT / "examples" / "tutorial.ipynb"
+
+
+def outputs_of(notebook):
+    """The kind of each output, and the sizes of its pictures [pixels], by cell."""
+    found = []
+    for cell in notebook.cells:
+        for output in cell.get("outputs", []):
+            data = output.get("data", {})
+            png = data.get("image/png")
+            if "text/html" in data:
+                png = re.search(r'src="data:image/png;base64,([^"]*)"', data["text/html"])[1]
+                assert "<script" not in data["text/html"]
+            size = None
+            if png is not None:
+                size = Image.open(io.BytesIO(base64.b64decode(png))).size
+            found.append((output["output_type"], sorted(data), size))
+    return found
+
+
 @pytest.mark.sim
 @pytest.mark.filterwarnings("ignore")  # of the kernel's own
-def test_the_notebook_runs_to_its_last_cell_and_is_stored_without_what_it_printed(monkeypatch):
+def test_the_notebook_runs_to_its_last_cell_and_is_stored_with_what_it_shows(monkeypatch):
     pytest.importorskip("sapien")
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    notebook = nbformat.read(ROOT / "examples" / "tutorial.ipynb", as_version=4)
-    assert not any(cell.get("outputs") for cell in notebook.cells)
+    notebook = nbformat.read(NOTEBOOK, as_version=4)
+    stored = outputs_of(notebook)
+    for cell in notebook.cells:
+        if cell.cell_type == "code":
+            cell.outputs = []
     NotebookClient(notebook, timeout=300, kernel_name="python3").execute()
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
     assert not any(output["output_type"] == "error" for output in outputs)
-    assert sum("image/png" in output.get("data", {}) for output in outputs) == 2
     assert outputs[-1]["text"].startswith("True")
+    shown = outputs_of(notebook)
+    assert [x[:2] for x in shown] == [x[:2] for x in stored]
+    assert sum(size is not None for *_, size in shown) == 3
+    for (*_, here), (*_, there) in zip(shown, stored, strict=True):
+        # fonts of other machines are a little wider
+        assert here == there or np.abs(np.subtract(here, there)).max() < 40
+
+
+def test_the_stored_notebook_is_small_and_ended_well():
+    assert NOTEBOOK.stat().st_size < 400_000
+    text = "".join(nbformat.read(NOTEBOOK, as_version=4).cells[-1].outputs[0].text)
+    assert text.startswith("True ") and str(ROOT) not in NOTEBOOK.read_text()

@@ -90,7 +90,7 @@ def test_another_hand_or_other_fingers_are_refused_by_name(grasps):
         closing_gains(nameless[0], load_hand("allegro"))
     with pytest.raises(BadArgument, match="without a hand"):
         hand_of(nameless)
-    with pytest.raises(BadArgument, match="fingers"):
+    with pytest.raises(BadArgument, match="hand: expected allegro"):
         hand_of(grasps, "barrett")
     for fingers, mode in ((4, "paper"), (4, "contact_first"), ("auto", "paper")):
         with pytest.raises(BadArgument, match="mode"):

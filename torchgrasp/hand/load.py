@@ -127,11 +127,15 @@ def hand_of(grasps: Grasps, hand: Hand | str | Path | None = None) -> Hand:
     if name is None:
         raise BadArgument("grasps", "grasps without a hand in `meta`", "grasps of plan_grasps")
     fingers = "default" if names is None else tuple(names.split(","))
-    known = name if hand is None else hand
-    found = with_fingers(known, fingers) if isinstance(known, Hand) else load_hand(known, fingers)
-    if found.name != name:
-        raise BadArgument("hand", found.name, f"{name}, for which the grasps were planned")
-    return found
+    known = hand
+    if hand is None:
+        known = load_hand(name, fingers)
+    elif not isinstance(hand, Hand):
+        known = load_hand(hand)  # its own fingers: another hand has not those of the grasps
+    assert isinstance(known, Hand)
+    if known.name != name:
+        raise BadArgument("hand", known.name, f"{name}, for which the grasps were planned")
+    return known if hand is None else with_fingers(known, fingers)
 
 
 def _check_names(spec: HandSpec, urdf: Urdf) -> None:

@@ -10,8 +10,9 @@ edges, h actuated joints, t time steps.
 """
 
 import dataclasses
+import importlib
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -340,6 +341,21 @@ class Grasps(Batch):
         """
         return None if (text := self.meta.get("table", "none")) == "none" else read_plane(text)
 
+    def show(self, cloud: Any = None, hand: Any = None) -> Any:
+        """Return a table and a picture of the best grasps: a notebook shows both, `print` the
+        table.
+
+        With `cloud`, in any form that `plan_grasps` takes, the picture has the surface estimated
+        from it. `hand` is needed for grasps of a hand that is not shipped. The result has the PNG
+        as `picture`. Raises `BadArgument` for another hand, or for a cloud that the grasps do not
+        touch.
+        """
+        return _pages().make_sheet(self, cloud, hand)
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows of the grasps."""
+        return _pages().show_in_notebook(self)
+
     @checked
     def save(self, path: Path | str) -> None:
         """Write the grasps as a safetensors file, atomically; `load_grasps` reads it.
@@ -347,6 +363,11 @@ class Grasps(Batch):
         Raises `OutputError` if the file cannot be written.
         """
         save_tensors(path, "grasps", named_tensors(self), self.meta)
+
+
+def _pages() -> Any:
+    """Return the module that draws grasps. It is of a later stage, so it is found when asked for."""
+    return importlib.import_module("torchgrasp.app.report.notebook")
 
 
 def format_success(success: "Grasps | float") -> str:

@@ -105,11 +105,16 @@ def draw_contacts(
 
 
 def draw_grasp(
-    surface: Surface, hand: Hand, grasp: Grasps, direction: Direction, table: float | None = None
+    surface: Surface | None,
+    hand: Hand,
+    grasp: Grasps,
+    direction: Direction,
+    table: float | None = None,
 ) -> bytes:
     """Return a PNG of the hand of the first grasp on the estimated surface, with its contacts.
 
-    `direction` points to the camera. `table` is the height z of the table [m]; None means no table.
+    Without a `surface` only hand and contacts are shown. `direction` points to the camera. `table`
+    is the height z of the table [m]; None means no table.
     """
     canvas, corners = _grasp(surface, hand, grasp)
     canvas.add_table(corners, table)
@@ -272,7 +277,7 @@ def mesh_arrays(surface: Surface) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _grasp(
-    surface: Surface, hand: Hand, grasp: Grasps
+    surface: Surface | None, hand: Hand, grasp: Grasps
 ) -> tuple[paint.Canvas, Float[np.ndarray, "n 3"]]:
     """Return a canvas with the surface and the first grasp's hand and contacts, and the points that
     must be in view.
@@ -280,7 +285,9 @@ def _grasp(
     joints = hand.expand_joints(grasp.joints[0].double())
     solids = solids_from_hand(hand, joints, hand.tree.joint_names, grasp.obj_from_hand[0])
     canvas = paint.Canvas()
-    vertices = _add_object(canvas, surface)
+    vertices = to_array(grasp.contacts.points[0])
+    if surface is not None:
+        vertices = _add_object(canvas, surface)
     _add_contacts(canvas, grasp.contacts)
     add_solids(canvas, solids)
     return canvas, np.concatenate([vertices, *(s.vertices for s in solids)])
