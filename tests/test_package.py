@@ -1,15 +1,19 @@
 """What importing torchgrasp does and leaves alone, and what its source never contains."""
 
 import ast
+import datetime
 import importlib
 import inspect
+import os
 import pkgutil
 import re
+import subprocess
 import sys
 import typing
 from pathlib import Path
 
 import pytest
+import yaml
 from packaging.requirements import Requirement
 from packaging.version import Version
 
@@ -227,3 +231,58 @@ def lowest_of(lines: list[str], operator: str) -> dict[str, tuple[Version, str]]
         assert len(versions) == 1, line
         found[requirement.name] = Version(versions[0]), str(requirement.marker)
     return found
+
+
+def test_the_citation_has_the_version_and_the_date_of_the_release():
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert cited["cff-version"] == "1.2.0" and cited["version"] == torchgrasp.__version__
+    released = datetime.date.fromisoformat(cited["date-released"])
+    changes = (ROOT / "CHANGELOG.md").read_text()
+    told = re.search(rf"^## \[{re.escape(cited['version'])}\] - (.*)$", changes, re.MULTILINE)
+    assert told is not None and told[1] in ("unreleased", released.isoformat())
+
+
+def test_the_wheel_installs_from_a_file_and_holds_models_hands_and_objects(tmp_path):
+    """Built and installed offline, beside the packages of this environment."""
+    builder = ROOT / ".beside" / "wheel" / "bin" / "python"
+    if not builder.exists():
+        pytest.skip("scripts/beside makes .beside/wheel")
+    build = [builder, "-m", "hatchling", "build", "-t", "wheel", "-d", tmp_path / "dist"]
+    done = subprocess.run(build, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    (wheel,) = (tmp_path / "dist").glob("*.whl")
+    assert wheel.name == f"torchgrasp-{torchgrasp.__version__}-py3-none-any.whl"
+    place = tmp_path / "place"
+    pip = [sys.executable, "-m", "pip", "install", "--no-deps", "--no-index", "--no-compile"]
+    subprocess.run([*pip, "--quiet", "--target", place, wheel], check=True, cwd=tmp_path)
+    ask = (
+        "import torchgrasp; print(torchgrasp.__file__, torchgrasp.__version__,"
+        " torchgrasp.load_hand('barrett').dof, len(torchgrasp.load_object('jug').view))"
+    )
+    around = os.environ | {"PYTHONPATH": str(place)}
+    done = subprocess.run(
+        [sys.executable, "-c", ask], cwd=tmp_path, env=around, capture_output=True, text=True
+    )
+    found = done.stdout.split()
+    assert found == [str(place / "torchgrasp" / "__init__.py"), torchgrasp.__version__, "4", "1000"]
+    command = place / "bin" / "torchgrasp"
+    assert command.is_file() and "torchgrasp.app.cli" in command.read_text()
+
+
+def test_reports_of_faults_ask_for_version_installation_and_cloud():
+    forms = ROOT / ".github" / "ISSUE_TEMPLATE"
+    asked = {}
+    for path in sorted(forms.glob("*.yml")):
+        form = yaml.safe_load(path.read_text())
+        fields = [x for x in form["body"] if x["type"] != "markdown"]
+        assert form["name"] and form["description"]
+        assert len({x["id"] for x in fields}) == len(fields)
+        asked[path.stem] = fields
+    assert {"bug", "feature"} == set(asked)
+    needed = {x["id"] for x in asked["bug"] if x.get("validations", {}).get("required")}
+    assert needed == {"what", "version", "doctor"}
+    said = str(asked["bug"])
+    commands = {"--version", *importlib.import_module("torchgrasp.app.cli").COMMANDS}
+    named = re.findall(r"`torchgrasp ([a-z-]+(?: check)?)", said)
+    assert {"--version", "doctor", "cloud check", "hand check"} == set(named) <= commands
+    assert (ROOT / ".github" / "pull_request_template.md").read_text().strip()
