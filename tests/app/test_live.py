@@ -29,7 +29,8 @@ def depth() -> torch.Tensor:
 @pytest.fixture(scope="module")
 def found(depth, tmp_path_factory):
     """What the commands did with the software devices, and the folder of their results."""
-    if not PYTHON.exists():
+    # there is no driver for macOS
+    if not [*PYTHON.parents[1].glob("lib/*/site-packages/pyrealsense2")]:
         pytest.skip("scripts/beside realsense makes the environment of the camera")
     folder = tmp_path_factory.mktemp("live")
     np.save(folder / "shown.npy", np.round(depth.numpy() / UNIT).astype(np.uint16))
