@@ -169,12 +169,12 @@ def test_setup_tells_each_package_and_keeps_the_words_of_a_failure(set_up, cpu):
     done, _ = set_up("sim", configured=cpu)
     told = done.stdout.splitlines()
     assert told[-4:] == [
-        "set-up: 1: beartype 0.23.1 (1.6 MB)",
-        "set-up: 2: numpy 2.4.6",
-        "set-up: 3: svg_path 7.1 (18 kB)",
+        "set-up: 1 of about 75: beartype 0.23.1 (1.6 MB)",
+        "set-up: 2 of about 75: numpy 2.4.6",
+        "set-up: 3 of about 75: svg_path 7.1 (18 kB)",
         "set-up: unpacking 3 packages",
     ]
-    assert any("about 75 packages" in line for line in told) and done.stderr == ""
+    assert any("0.5 GB to download" in line for line in told) and done.stderr == ""
     done, _ = set_up("sim,dev", installed=True, breaks=True)
     assert done.returncode == 1 and "something of no use" in done.stderr
     assert done.stderr.splitlines()[-1] == "set-up: pip could not install torchgrasp."
