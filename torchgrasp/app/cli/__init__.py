@@ -20,6 +20,7 @@ from tyro.extras import SubcommandApp
 
 from torchgrasp import __version__
 from torchgrasp.app.cli import (
+    agents,
     clouds,
     depth_images,
     doctor,
@@ -45,7 +46,11 @@ CHAPTERS: dict[str, dict[str, Callable[..., Command | int]]] = {
         "film": filming.Film,
         "objects": look.ListObjects,
     },
-    "Exchange grasps with other programs": {"export": export.Export, "import": export.Import},
+    "Exchange grasps with other programs": {
+        "export": export.Export,
+        "import": export.Import,
+        "mcp": agents.ServeAgents,
+    },
     "Try many grasps in simulation": {
         "evaluate": evaluate.Evaluate,
         "campaign": evaluate.RunCampaign,

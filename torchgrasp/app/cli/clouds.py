@@ -48,20 +48,30 @@ class CloudCheck(Command):
 
     def run(self) -> int:
         """Check the cloud and print the report; return the exit code."""
+        notes, report, unseen = self.judge()
+        print(clouds.format_report(report))
+        for note in notes:
+            print(f"{'note':12}{note}")
+        for advice in unseen:
+            print(f"{'refused':12}{advice}")
+        return int(any(advice.refused for advice in (*report.advice, *unseen)))
+
+    def judge(self) -> tuple[tuple[str, ...], clouds.CloudReport, tuple[clouds.Advice, ...]]:
+        """Return notes on the reading of the cloud, a report, and the refusal of a cloud that no
+        single camera sees.
+        """
         file = self.view.read("FILE", inputs.find_cloud(self.file, "FILE"), whole=True)
         view = self.view.with_table_of(file)
         plane = as_plane(view.plane(file.cloud))
         up = view.given_vertical(plane)
         known = plane if view.table is not None else None
         report = clouds.diagnose_cloud(file.cloud, up, known, stands=not view.no_table)
-        print(clouds.format_report(report))
-        for note in file.notes:
-            print(f"{'note':12}{note}")
         refused = any(advice.refused for advice in report.advice)
         error = None if refused else _no_view(file.cloud)
-        if error is not None:
-            print(f"{'refused':12}{error.found}: {error.allowed}")
-        return int(refused or error is not None)
+        if error is None:
+            return file.notes, report, ()
+        unseen = clouds.Advice(str(error.found), error.allowed, refused=True)
+        return file.notes, report, (unseen,)
 
 
 def _no_view(cloud: PointCloud) -> BadArgument | None:

@@ -242,10 +242,18 @@ def _checked(folder: Path) -> Hand | None:
 
 
 def print_faults(hand: str | Path, fingers: str = "default") -> bool:
-    """Print every fault of a hand; return whether there is any.
+    """Print every fault of a hand that `list_faults` finds; return whether there is any."""
+    faults = list_faults(hand, fingers)
+    for sentence in faults:
+        print(f"wrong: {sentence}")
+    return bool(faults)
+
+
+def list_faults(hand: str | Path, fingers: str = "default") -> tuple[str, ...]:
+    """Return a sentence for every fault of a hand, each once.
 
     `hand` is a name or folder. The given `fingers` and all sets that hand.toml declares are
-    checked.
+    checked. Raises `BadArgument` for fingers that the hand does not have.
     """
     try:
         options = read_hand_toml(find_hand(hand) / "hand.toml", fingers).options
@@ -256,9 +264,7 @@ def print_faults(hand: str | Path, fingers: str = "default") -> bool:
         if error.argument == "fingers":
             raise
         faults = [error]
-    for sentence in dict.fromkeys(" ".join(str(fault).split()) for fault in faults):
-        print(f"wrong: {sentence}")
-    return bool(faults)
+    return tuple(dict.fromkeys(" ".join(str(fault).split()) for fault in faults))
 
 
 def describe_sets(hand: Hand) -> str:
