@@ -1,7 +1,8 @@
 """Runs `torchgrasp grasp --realsense` on software devices of pyrealsense2; prints what it saw as
 JSON.
 
-The words are the folder for the results, and the depth image to show, in counts (.npy).
+The words are the folder for the results, and the depth image to show, in counts (.npy). The folder
+has pose.npy, the camera's pose.
 """
 
 import contextlib
@@ -119,6 +120,8 @@ def main(folder, file):
         found["unplugged"] = run("--realsense", "--out", f"{folder}/none")
     with connected(Camera(counts)):
         found["good"] = run("--realsense", "--out", f"{folder}/good", "--no-report")
+        posed = ("--camera-pose", f"{folder}/pose.npy", "--out", f"{folder}/posed", "--no-report")
+        found["posed"] = run("--realsense", *posed)
         found["again"] = shoot_depth("1").camera  # the camera was closed
     with connected(Camera(counts, "1"), Camera(counts, "2")):
         found["two"] = run("--realsense", "--out", f"{folder}/none")

@@ -34,6 +34,7 @@ def found(depth, tmp_path_factory):
         pytest.skip("scripts/beside realsense makes the environment of the camera")
     folder = tmp_path_factory.mktemp("live")
     np.save(folder / "shown.npy", np.round(depth.numpy() / UNIT).astype(np.uint16))
+    np.save(folder / "pose.npy", look_at(20.0, 45.0, 0.7).numpy())
     script = Path(__file__).with_name("software_camera.py")
     words = [str(PYTHON), "-W", "ignore", str(script), str(folder), str(folder / "shown.npy")]
     done = subprocess.run(
@@ -55,6 +56,16 @@ def test_a_grasp_is_planned_on_what_the_camera_shows(found, depth):
     np.testing.assert_allclose(scene["intrinsics"], INTRINSICS.numpy(), rtol=1e-6)
     assert (folder / "good" / "scene.png").is_file()
     assert len(load_grasps(folder / "good" / "grasps.safetensors"))
+
+
+def test_the_pose_of_the_camera_gives_the_frame_of_the_results(found):
+    cases, folder = found
+    code, out, err = cases["posed"]
+    assert code == 0, out + err
+    scene = np.load(folder / "posed" / "scene.npz")
+    np.testing.assert_allclose(scene["camera_pose"], np.load(folder / "pose.npy"), atol=1e-9)
+    # the table is at the height 0 there
+    np.testing.assert_allclose(scene["table"], [0.0, 0.0, 1.0, 0.0], atol=0.03)
 
 
 def test_a_camera_can_be_used_again_and_is_chosen_by_its_number(found):
