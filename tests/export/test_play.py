@@ -151,7 +151,10 @@ def test_a_script_is_short_and_needs_the_simulator_and_numpy(player, tmp_path):
         if isinstance(x, ast.Import)
         for name in x.names
     }
-    assert len(text.splitlines()) <= 40
+    assert len(text.splitlines()) <= 70 and max(map(len, text.splitlines())) <= 120
+    # one statement on a line
+    statements = [x.lineno for x in ast.walk(ast.parse(text)) if isinstance(x, ast.stmt)]
+    assert len(set(statements)) == len(statements)
     assert {x.split(".")[0] for x in modules} - sys.stdlib_module_names == LIBRARIES[player]
 
 
@@ -176,6 +179,56 @@ def test_a_script_refuses_a_grasp_that_it_has_not(player, word, tmp_path, monkey
         SystemExit, match=rf"^expected .* from 0 to 0, got {word}$"
     ):  # Python prints it; the code is 1
         runpy.run_path(str(folder / "play.py"), run_name="__main__")
+
+
+@pytest.mark.parametrize("player", LIBRARIES)
+def test_a_script_has_help_without_its_simulator(player, tmp_path):
+    folder = export(tmp_path, player, "jug", "barrett", 0.25)
+    # isolated: no package at all is found
+    words = [sys.executable, "-I", "-S", str(folder / "play.py"), "--help"]
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("usage: play.py [-h]") and "from 0, the best" in done.stdout
+    assert ("--view" in done.stdout) == (player in ("mujoco", "isaaclab"))
+
+
+def test_mujoco_shows_the_motion_in_its_passive_viewer(tmp_path, monkeypatch, capsys):
+    """A stand-in of the viewer sees the object rise by what is printed, in each grasp."""
+    pytest.importorskip("mujoco")
+    folder = export(tmp_path, "mujoco", "jug", "barrett", 0.25)
+    seen = []
+
+    class Viewer:
+        """Is open until the object was seen after the motion, as if the user then closed it."""
+
+        def __init__(self, model, data):
+            self.data = data
+            self.left = 3
+
+        def __enter__(self):
+            seen.append([])
+            return self
+
+        def __exit__(self, *error):
+            seen[-1].append(float(self.data.body("torchgrasp_object").xipos[2]))
+
+        def is_running(self):
+            self.left -= self.data.time >= play["times"]["hold"]
+            return self.left > 0
+
+        def sync(self):
+            seen[-1].append(float(self.data.body("torchgrasp_object").xipos[2]))
+
+    play = json.loads((folder / "play.json").read_text())
+    viewer = types.SimpleNamespace(launch_passive=Viewer)
+    monkeypatch.setitem(sys.modules, "mujoco.viewer", viewer)
+    monkeypatch.setattr("time.sleep", lambda seconds: None)
+    monkeypatch.setattr(sys, "argv", ["play.py", "0", "--view"])
+    runpy.run_path(str(folder / "play.py"), run_name="__main__")
+    told = json.loads(capsys.readouterr().out)
+    (heights,) = seen
+    # 60 pictures each second of the motion
+    assert len(heights) == pytest.approx(60 * play["times"]["hold"], rel=0.1)
+    assert told["held"] and heights[-1] - heights[0] == pytest.approx(told["rise"], abs=1e-4)
 
 
 def test_isaac_lab_gets_fields_that_its_documentation_lists(tmp_path):
