@@ -101,6 +101,8 @@ def said(folder):
             {"cloud": "cylinder", "hand": "barrett", "friction": 0.0, "starts": 4},
         ),
         "hand": ("check_hand", {"hand": "barrett"}),
+        "label": ("explain_empty", {"cloud": "seen/scene.npz", "label": 77}),
+        "cloud label": ("explain_empty", {"cloud": "tin.ply", "label": 1}),
         "cloud": ("check_cloud", {"cloud": "tin.ply"}),
         "rank": ("show", {**grasps, "rank": 9000}),
         "outside": ("check_cloud", {"cloud": "../tin.ply"}),
@@ -213,6 +215,8 @@ def test_a_depth_image_and_a_mesh_are_planned_on_and_an_empty_plan_is_explained(
         ("starts", r"^starts: expected a whole number in \[1, 2000\], got 1000000$"),
         ("both", r"^table: expected one of the two, got 0 and no_table$"),
         ("rank", r"^rank: expected a rank below \d+, .*, got 9000$"),
+        ("label", r"^target: expected .*77"),
+        ("cloud label", r"^label: expected a scene, which has labels, got a label beside a cloud$"),
         ("octopus", r"^hand: expected one of \['allegro', .*'.*octopus'$"),
         ("unknown", r"^tool: expected one of plan_grasps_from_point_cloud, .*, got 'juggle'$"),
     ],
@@ -265,6 +269,29 @@ def test_http_is_served_to_this_machine_alone_and_long_calls_are_ended(address):
             with wire.getresponse() as reply:
                 codes.append(reply.status)
     assert codes[:2] == [421, 403] and codes[2] not in (421, 403)
+
+
+def test_a_signal_ends_a_server_that_waits_for_its_client(folder):
+    """The client keeps its end of stdin open, as an agent does that is stopped."""
+    if not PYTHON.exists():
+        pytest.skip("scripts/beside mcp makes the environment of the SDK")
+    hello = {"protocolVersion": "2025-06-18", "capabilities": {}}
+    hello |= {"clientInfo": {"name": "a client", "version": "1"}}
+    call = {"jsonrpc": "2.0", "id": 1, "method": "initialize", "params": hello}
+    with subprocess.Popen(
+        [*COMMAND, str(folder)],
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as server:
+        assert server.stdin and server.stdout and server.stderr
+        server.stdin.write(json.dumps(call) + "\n")
+        server.stdin.flush()
+        assert json.loads(server.stdout.readline())["result"]["serverInfo"]["name"] == "torchgrasp"
+        server.send_signal(signal.SIGTERM)
+        assert server.wait(60) == 143 and server.stderr.read() == "torchgrasp: terminated\n"
 
 
 def test_paths_stay_below_the_folder(folder, tmp_path):

@@ -641,12 +641,19 @@ class ExplainEmpty(_HandTool, _SeenTool):
     Each change is tried by planning with it, which takes some seconds each.
     """
 
+    label: int | None = option(
+        None, "label of the object in a scene; by default the one that was planned for"
+    )
+
     def run(self, place: Workplace) -> ExplainAnswer:
         """Explain the loss of all grasps, and return the answer."""
         path = place.cloud("cloud", self.cloud)
         if is_scene(path):
             scene = read_scene(path)
+            scene = scene if self.label is None else scene.select(self.label)
             seen = _Seen(path, scene, scene.table, (*scene.notes, *scene.advice))
+        elif self.label is not None:
+            raise BadArgument("label", "a label beside a cloud", "a scene, which has labels")
         else:
             seen = self.see(place, path)
         hand, among = self.load(place)

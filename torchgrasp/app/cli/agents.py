@@ -233,7 +233,7 @@ class AgentServer:
             raise outcome
         if outcome is None:
             found = f"one that was ended after {self.seconds:g} s"
-            raise BadArgument("call", found, "a shorter one, as by fewer starts or `most`")
+            raise BadArgument("call", found, "a shorter one, as by fewer starts")
         return outcome
 
     async def _beat(self, context: Any) -> None:
