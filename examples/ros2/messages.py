@@ -30,10 +30,12 @@ PACKAGES = {
     "JointState": "sensor_msgs",
     "JointTrajectory": "trajectory_msgs",
     "JointTrajectoryPoint": "trajectory_msgs",
+    "MultiDOFJointState": "sensor_msgs",
     "Point": "geometry_msgs",
     "Pose": "geometry_msgs",
     "PoseStamped": "geometry_msgs",
     "Quaternion": "geometry_msgs",
+    "RobotState": "moveit_msgs",
     "Vector3": "geometry_msgs",
     "Vector3Stamped": "geometry_msgs",
 }
@@ -50,10 +52,12 @@ class Types(Protocol):
     JointState: "type[ros.sensor_msgs__msg__JointState]"
     JointTrajectory: "type[ros.trajectory_msgs__msg__JointTrajectory]"
     JointTrajectoryPoint: "type[ros.trajectory_msgs__msg__JointTrajectoryPoint]"
+    MultiDOFJointState: "type[ros.sensor_msgs__msg__MultiDOFJointState]"
     Point: "type[ros.geometry_msgs__msg__Point]"
     Pose: "type[ros.geometry_msgs__msg__Pose]"
     PoseStamped: "type[ros.geometry_msgs__msg__PoseStamped]"
     Quaternion: "type[ros.geometry_msgs__msg__Quaternion]"
+    RobotState: Callable[..., Any]
     Vector3: "type[ros.geometry_msgs__msg__Vector3]"
     Vector3Stamped: "type[ros.geometry_msgs__msg__Vector3Stamped]"
     floats: Callable[[Iterable[float]], Any]

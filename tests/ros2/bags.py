@@ -16,6 +16,31 @@ from rosbags.typesys.base import Nodetype
 
 ROOT = Path(__file__).parents[2]
 STORE = get_typestore(Stores.ROS2_HUMBLE)
+OTHERS = {
+    "object_recognition_msgs/ObjectType": "string key\nstring db",
+    "moveit_msgs/CollisionObject": """std_msgs/Header header
+        geometry_msgs/Pose pose
+        string id
+        object_recognition_msgs/ObjectType type
+        shape_msgs/SolidPrimitive[] primitives
+        geometry_msgs/Pose[] primitive_poses
+        shape_msgs/Mesh[] meshes
+        geometry_msgs/Pose[] mesh_poses
+        shape_msgs/Plane[] planes
+        geometry_msgs/Pose[] plane_poses
+        string[] subframe_names
+        geometry_msgs/Pose[] subframe_poses
+        byte operation""",
+    "moveit_msgs/AttachedCollisionObject": """string link_name
+        CollisionObject object
+        string[] touch_links
+        trajectory_msgs/JointTrajectory detach_posture
+        float64 weight""",
+    "moveit_msgs/RobotState": """sensor_msgs/JointState joint_state
+        sensor_msgs/MultiDOFJointState multi_dof_joint_state
+        AttachedCollisionObject[] attached_collision_objects
+        bool is_diff""",
+}
 MOVEIT = {
     "GripperTranslation": "geometry_msgs/Vector3Stamped direction\nfloat32 desired_distance\nfloat32 min_distance",
     "Grasp": """string id
@@ -29,11 +54,11 @@ MOVEIT = {
         float32 max_contact_force
         string[] allowed_touch_objects""",
 }
-"""The fields of two messages of MoveIt."""
+"""The fields of messages of MoveIt, and of what they hold."""
 ACTION = (ROOT / "examples/ros2/action/PlanGrasp.action").read_text().split("---\n")
-for name, text in MOVEIT.items():
+for name, text in (OTHERS | {f"moveit_msgs/{name}": text for name, text in MOVEIT.items()}).items():
     STORE.register(
-        get_types_from_msg("\n".join(map(str.strip, text.splitlines())), f"moveit_msgs/msg/{name}")
+        get_types_from_msg("\n".join(map(str.strip, text.splitlines())), name.replace("/", "/msg/"))
     )
 for name, text in zip(("Goal", "Result", "Feedback"), ACTION, strict=True):
     STORE.register(get_types_from_msg(text, f"torchgrasp_ros/msg/PlanGrasp_{name}"))
