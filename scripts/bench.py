@@ -5,6 +5,8 @@
 
 * gpu: clouds, launches: many clouds at once, also without a GPU
 
+* peers: rate: time for a grasp that passes the same checks, beside other planners
+
 * plan: pace, certificates: time to grasps, proofs
 
 * scene: real, rooms: supports and things in depth images
@@ -20,7 +22,7 @@ from collections.abc import Callable
 import tyro
 from benchmarks.common import Options, measure
 
-SUBJECTS = ("close", "gpu", "plan", "scene", "shape")
+SUBJECTS = ("close", "gpu", "peers", "plan", "scene", "shape")
 
 
 def command(subject: str) -> Callable[[Options], None]:

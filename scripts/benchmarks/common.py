@@ -56,6 +56,8 @@ class Options:
         planned: folder OBJECT/VIEW.safetensors with grasps for close/table-lift; by default they
             are planned and kept.
         simulator: of close/table-lift.
+        peers: other planners of peers/rate as NAME=PYTHON, with the Python of their environment, or
+            NAME=PYTHON:ADAPTER with a script of your own.
         workers: processes that share the trials.
         threads: of torch.
         seed: of every random number.
@@ -77,6 +79,7 @@ class Options:
     tries: int | None = None
     planned: Path | None = None
     simulator: Literal["sapien", "mujoco"] = "sapien"
+    peers: tuple[str, ...] = ()
     workers: int = 1
     threads: int = 1
     seed: int = 0
