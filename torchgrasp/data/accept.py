@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.cloud.read import make_cloud, read_cloud_file
-from torchgrasp.data.shipped import GraspObject
+from torchgrasp.data.shipped import GraspObject, find_view
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Taken, check_path, show
@@ -28,7 +28,7 @@ from torchgrasp.values.planning import PointCloud
 Read = TypeVar("Read")
 CLOUD = (
     "a PointCloud, an array (n, 3) in metres (cloud_from_array takes normals and the camera's position, too), "
-    "a cloud of Open3D or trimesh, a file or a GraspObject"
+    "a cloud of Open3D or trimesh, a file, the name of a shipped object, or a GraspObject"
 )
 SCENE = "a Scene, or a file of save_scene"
 HAND = "a Hand, the name of a shipped hand, or the folder of another hand"
@@ -68,14 +68,15 @@ def as_cloud(value: Any) -> PointCloud:
     """Return a `PointCloud` [m], in its own frame, given any value that `CloudLike` names.
 
     The value may be a cloud, a `GraspObject`, a file, an array or tensor (n, 3) [m], or a cloud of
-    Open3D or trimesh. An array has no viewpoint. Raises `BadArgument` for anything else.
+    Open3D or trimesh. The name of a shipped object means its view. An array has no viewpoint.
+    Raises `BadArgument` for anything else.
     """
     if isinstance(value, PointCloud):
         return value
     if isinstance(value, GraspObject):
         return value.view
     if isinstance(value, str | Path):
-        return read_cloud_file(value).cloud
+        return read_cloud_file(find_view(Path(value))).cloud
     if isinstance(value, Tensor):
         return PointCloud(value)
     if isinstance(value, np.ndarray):

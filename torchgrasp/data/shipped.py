@@ -56,6 +56,24 @@ def list_objects() -> tuple[str, ...]:
     return tuple(MASSES)
 
 
+def find_view(path: Path, name: str = "cloud") -> Path:
+    """Return the path of a cloud, which may be given as the name of a shipped object.
+
+    The name gives the path of the object's noisy view; any other path is returned itself. Raises
+    `BadArgument` for a word that is neither a file nor a shipped object; errors call the argument
+    `name`.
+
+    >>> find_view(Path("jug")).name, find_view(Path("mine.ply")).name
+    ('view.ply', 'mine.ply')
+    """
+    if path.exists() or path.suffix or len(path.parts) != 1:
+        return path
+    if str(path) not in MASSES:
+        allowed = f"a file, or one of the shipped objects {', '.join(MASSES)}"
+        raise BadArgument(name, f"{str(path)!r}, which is no file", allowed)
+    return DATA / path / "view.ply"
+
+
 @checked
 def load_object(name: str) -> GraspObject:
     """Return a shipped object by its name: mesh, mass and a noisy view.

@@ -9,6 +9,7 @@ itself are not checked again.
 import collections.abc
 import contextlib
 import dataclasses
+import difflib
 import functools
 import inspect
 import threading
@@ -148,7 +149,7 @@ def _guard(function: Any, owner: Any, gradients: bool, always: Callable[[], bool
             return run(args, kwargs, inside)
 
     def run(args: tuple[Any, ...], kwargs: dict[str, Any], inside: bool) -> Any:
-        _check_options(signature, kwargs)
+        _check_options(signature, kwargs, owner)
         bound = signature.bind(*args, **kwargs)
         shared = _Call(gradients, deep=not inside)
         hints = _hints(owner)
@@ -412,14 +413,34 @@ def _hints(thing: Any) -> dict[str, Any]:
     return typing.get_type_hints(thing, include_extras=True)
 
 
-def _check_options(signature: inspect.Signature, given: dict[str, Any]) -> None:
-    """Raise `TypeError` for a keyword argument that a function lacks, with those that it has."""
+def _check_options(signature: inspect.Signature, given: dict[str, Any], owner: Any) -> None:
+    """Raise `TypeError` for a keyword argument that a function lacks, with those that it has.
+
+    It names the nearest argument, or the argument whose value has a field of this name.
+    """
     kinds = {one.kind for one in signature.parameters.values()}
     if inspect.Parameter.VAR_KEYWORD in kinds:
         return
     for name in given.keys() - signature.parameters.keys():
-        options = ", ".join(signature.parameters)
-        raise TypeError(f"got an unexpected keyword argument {name!r}: expected one of {options}")
+        known = [option for option in signature.parameters if option != "self"]
+        sentence = f"expected one of {', '.join(known)}{_hint(name, signature, owner)}"
+        raise TypeError(f"got an unexpected keyword argument {name!r}: {sentence}")
+
+
+def _hint(name: str, signature: inspect.Signature, owner: Any) -> str:
+    """Return a text on where an unknown keyword argument belongs; empty if that is unknown.
+
+    It may be a field of the value that another, optional argument takes, or a misspelt name.
+    """
+    hints = _hints(owner)
+    for option, parameter in signature.parameters.items():
+        if parameter.default is not None or option not in hints:
+            continue
+        for kind in (hints[option], *typing.get_args(hints[option])):
+            if isinstance(kind, type) and name in _fields(kind):
+                return f"; {name} is a field: {option}={kind.__name__}({name}=...)"
+    near = difflib.get_close_matches(name, list(signature.parameters), 1)
+    return f"; did you mean {near[0]}?" if near else ""
 
 
 def _option(hint: Any, key: str) -> Any:

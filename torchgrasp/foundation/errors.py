@@ -5,7 +5,9 @@ row of a batch does not raise: it has a `Status`, which explains the failure in 
 """
 
 import copyreg
+import difflib
 import enum
+import re
 from typing import Any
 
 from torchgrasp.foundation.limits import MESSAGE_LETTERS
@@ -31,7 +33,7 @@ class BadArgument(GraspError, ValueError):
     """An argument has a wrong shape, type or range.
 
     `argument` is its name, `found` what was given, and `allowed` a text that says what is expected;
-    the message holds all three.
+    the message holds all three. For a misspelt word it names the nearest allowed one.
     """
 
     def __init__(self, argument: str, found: object, allowed: str):
@@ -39,10 +41,23 @@ class BadArgument(GraspError, ValueError):
         named, shown, wanted = (
             x if len(x) <= MESSAGE_LETTERS else f"{x[:MESSAGE_LETTERS]}..." for x in parts
         )
-        super().__init__(f"{named}: expected {wanted}, got {shown}")
+        super().__init__(f"{named}: expected {wanted}, got {shown}{_suggest(shown, allowed)}")
         self.argument = argument
         self.found = found
         self.allowed = allowed
+
+
+def _suggest(found: str, allowed: str) -> str:
+    """Return a text that names the word of `allowed` nearest to a quoted word that was found.
+
+    The text is empty for anything but a quoted word, and where no word is near.
+    """
+    quoted = re.match(r"'([A-Za-z_-]+)'(?:$|,)", found)
+    if quoted is None:
+        return ""
+    words = set(re.findall(r"[A-Za-z_-]+", allowed)) - {quoted[1]}
+    near = difflib.get_close_matches(quoted[1], sorted(words), 1)
+    return f"; did you mean {near[0]}?" if near else ""
 
 
 class TooFewPoints(BadArgument):

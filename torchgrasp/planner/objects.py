@@ -438,7 +438,7 @@ def join_objects(parts: Sequence[Objects], device: torch.device) -> Objects:
 
 def find_model(request: Request) -> Model:
     """Return the learned mixture of the request's hand, if its mode uses one, and the SHA-256 of
-    its file.
+    its file. Raises `BadArgument` for a mode that needs a model which the hand does not have.
     """
     if request.mode == "joint":
         return None, "none"
@@ -446,6 +446,10 @@ def find_model(request: Request) -> Model:
     # of postures of all sizes alike, so that Eq. (21) knows small objects
     own = folder / "paper.safetensors"
     path = own if request.mode == "paper" and own.is_file() else mixture_path(folder)
+    if not path.is_file():
+        found = f"'{request.mode}' with the {request.hand.name} hand, which has no learned model"
+        allowed = "'joint', or a hand whose model `torchgrasp hand train` has learned"
+        raise BadArgument("mode", found, allowed)
     return load_mixture(path), sha256(path)
 
 

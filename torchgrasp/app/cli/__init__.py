@@ -5,7 +5,6 @@ terminated.
 """
 
 import contextlib
-import difflib
 import os
 import re
 import signal
@@ -222,14 +221,8 @@ def format_help() -> str:
 
 
 def _sentence(error: GraspError) -> str:
-    """Return an error as one line of text, with a suggestion for a misspelt word."""
-    line = " ".join(str(error).split())
-    word = str(error.found).strip("'") if isinstance(error, BadArgument) else ""
-    if not re.fullmatch(r"[A-Za-z_-]+", word):
-        return line
-    allowed = set(re.findall(r"[A-Za-z_-]+", error.allowed)) - {word}  # pyright: ignore[reportAttributeAccessIssue]
-    near = difflib.get_close_matches(word, sorted(allowed), 1)
-    return f"{line}; did you mean {near[0]}?" if near else line
+    """Return an error as one line of text."""
+    return " ".join(str(error).split())
 
 
 @contextlib.contextmanager

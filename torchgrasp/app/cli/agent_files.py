@@ -3,8 +3,8 @@
 import dataclasses
 from pathlib import Path
 
-from torchgrasp.app.cli.inputs import find_cloud, object_name
-from torchgrasp.data.shipped import DATA, list_objects
+from torchgrasp.app.cli.inputs import object_name
+from torchgrasp.data.shipped import DATA, find_view, list_objects
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import check_path
 from torchgrasp.hand.load import hands_folder
@@ -53,7 +53,7 @@ class Workplace:
 
     def cloud(self, name: str, text: str) -> Path:
         """Return the path of a cloud below the folder, or of the view of a shipped object."""
-        return find_cloud(Path(text)) if text in list_objects() else self.file(name, text)
+        return find_view(Path(text)) if text in list_objects() else self.file(name, text)
 
     def mesh(self, name: str, text: str) -> Path:
         """Return the path of a mesh below the folder, or of the mesh of a shipped object."""

@@ -21,6 +21,7 @@ from torchgrasp.app.cli.command import (
 from torchgrasp.cloud.neighbours import draw_rows
 from torchgrasp.cloud.prepare import prepare_cloud
 from torchgrasp.data import write_objects
+from torchgrasp.data.shipped import find_view
 from torchgrasp.export import check_surface_path, largest_std, save_surface
 from torchgrasp.foundation.checks import check_tensor
 from torchgrasp.foundation.errors import BadArgument
@@ -60,7 +61,7 @@ class CloudCheck(Command):
         """Return notes on the reading of the cloud, a report, and the refusal of a cloud that no
         single camera sees.
         """
-        file = self.view.read("FILE", inputs.find_cloud(self.file, "FILE"), whole=True)
+        file = self.view.read("FILE", find_view(self.file, "FILE"), whole=True)
         view = self.view.with_table_of(file)
         plane = as_plane(view.plane(file.cloud))
         up = view.given_vertical(plane)
@@ -228,7 +229,7 @@ class ShapeSurface(Command):
     def run(self) -> int:
         """Fit the shape and write its surface as a mesh; return the exit code."""
         check_surface_path(self.out)
-        file = self.view.read("CLOUD", inputs.find_cloud(self.cloud))
+        file = self.view.read("CLOUD", find_view(self.cloud, "CLOUD"))
         table = self.view.with_table_of(file).plane(file.cloud)
         with naming(table="--table"):
             shape = fit_shape(file.cloud, support=self.support, seed=self.seed, table=table)

@@ -22,7 +22,7 @@ from torchgrasp.app.report.run_data import Run, verdict
 from torchgrasp.app.report.viewer import VIEW, write_viewer
 from torchgrasp.cloud.agreement import check_mesh, check_stand
 from torchgrasp.cloud.pose import find_plausible
-from torchgrasp.data.shipped import DATA, list_objects, load_object
+from torchgrasp.data.shipped import DATA, find_view, list_objects, load_object
 from torchgrasp.evaluation.lift import close_hand
 from torchgrasp.export import save_surface
 from torchgrasp.export.play import stand
@@ -57,6 +57,7 @@ STAGES = ("shape", "plan", "certify", "query", "refine")
 LEAST_BUDGET = 1e-3  # of --time-budget [s]
 ENOUGH = 0.9  # predicted success of an object that is easy enough: the others are not tried
 SHOWN = 5  # grasps that are printed
+OBJECT_WIDTHS = (-10, 7, -1)  # of the columns of a scene's objects
 
 
 @arguments(points="cloud", normals="cloud", path="out", target="label")
@@ -164,7 +165,7 @@ class Grasp(Command):
         if (self.cloud is None) != self.realsense:
             found = "none" if self.cloud is None else f"{self.cloud} beside --realsense"
             raise BadArgument("CLOUD", found, "one input: a file, a shipped object, or --realsense")
-        return Path("realsense") if self.cloud is None else inputs.find_cloud(self.cloud)
+        return Path("realsense") if self.cloud is None else find_view(self.cloud, "CLOUD")
 
     def _check_choice(self, scene: bool) -> None:
         """Raise `BadArgument` for options of a scene with a cloud, or of a cloud with a scene."""
@@ -426,11 +427,14 @@ class Grasp(Command):
         """
         options = {"fingers": among, "enough": ENOUGH, **self._task}
         plan = plan_scene(scene, hand, spec, self.starts, self.seed, **options)
+        print(format_line(("object", "success", "result"), OBJECT_WIDTHS))
         for thing in plan.things:
             count = 0 if thing.grasps is None else len(thing.grasps)
             text = thing.reason or f"{count} executable grasps"
-            cells = f"object {thing.label}", format_success(thing.success), text
-            print(format_line(cells, (-10, 7, -1)), flush=True)
+            # what was not planned has no prediction
+            likely = "-" if thing.grasps is None else format_success(thing.success)
+            cells = f"object {thing.label}", likely, text
+            print(format_line(cells, OBJECT_WIDTHS), flush=True)
         progress.end(
             "objects", f"{sum(thing.grasps is not None for thing in plan.things)} with a grasp"
         )

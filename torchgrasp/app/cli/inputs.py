@@ -22,7 +22,6 @@ from torchgrasp.cloud import Advice, CloudFile, check_cloud, diagnose_cloud, rea
 from torchgrasp.cloud.neighbours import draw_rows, find_inliers
 from torchgrasp.cloud.pose import read_pose
 from torchgrasp.contacts.region import Region
-from torchgrasp.data.shipped import DATA, list_objects
 from torchgrasp.files import hold_folder
 from torchgrasp.foundation.checks import check_tensor
 from torchgrasp.foundation.errors import BadArgument, MissingExtra, OutputError
@@ -243,23 +242,6 @@ def read_region(name: str, text: str | None) -> Region | None:
                 "mesh", repr(text), "six numbers of a box, or the file of a closed mesh"
             )
         return None if text is None else Region.box(numbers[:3], numbers[3:])
-
-
-def find_cloud(path: Path, name: str = "CLOUD") -> Path:
-    """Return the path of a cloud, which may be given as the name of a shipped object.
-
-    The name gives the path of the object's noisy view; any other path is returned itself. Raises
-    `BadArgument` for a word that is neither a file nor a shipped object; errors call the argument
-    `name`.
-    """
-    names = list_objects()
-    if path.exists() or path.suffix or len(path.parts) != 1:
-        return path
-    if str(path) not in names:
-        raise BadArgument(
-            name, f"{str(path)!r}", f"a file, or one of the shipped objects {', '.join(names)}"
-        )
-    return DATA / path / "view.ply"
 
 
 def print_notes(notes: tuple[str, ...], advice: tuple[Advice, ...] = ()) -> None:
