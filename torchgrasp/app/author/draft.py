@@ -19,6 +19,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.app.author.fit_shapes import ball_tip, replace_meshes, shape_points
+from torchgrasp.app.author.mjcf import FromMjcf, read_mjcf
+from torchgrasp.app.author.mjcf_text import is_mjcf
 from torchgrasp.app.author.pads import guess_pads, is_primitive, order_by_facing, palm_of
 from torchgrasp.app.author.repair import (
     fix_wrist,
@@ -30,10 +32,10 @@ from torchgrasp.app.author.repair import (
 )
 from torchgrasp.app.author.sensor_tips import add_sensors, extend_pads
 from torchgrasp.app.author.unusual import find_unusual
-from torchgrasp.files import render
+from torchgrasp.files import render, temporary_folder
 from torchgrasp.foundation.base import FINGERTIPS
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument, HandFileError
 from torchgrasp.foundation.rules import Seed
 from torchgrasp.hand.collision_shapes import collision_pairs, draw_postures, met_pairs
 from torchgrasp.hand.hand_toml import Pad, leading
@@ -138,7 +140,7 @@ def draft_hand(
     draft = new_hand(path, Wish(tuple(tips), name or ""), seed)
     if draft.urdf:
         repairs = "; ".join(draft.repairs)[:MOST_ERROR]
-        raise read_published(path).wrong(repairs, f"a clean URDF {REPAIR}")
+        raise HandFileError("urdf", f"{path}: {repairs}", f"a clean URDF {REPAIR}")
     return draft.toml
 
 
@@ -151,18 +153,32 @@ def new_hand(
 ) -> Draft:
     """Repair a published URDF, and draft a hand.toml for the clean copy.
 
+    An MJCF (.xml, .mjcf) is read by MuJoCo, and becomes a URDF.
+
     The user saves the clean copy as `file`, which the hand.toml names. `wish` holds the user's
     choices; `seed` is that of the random postures from which pads are guessed. Where links meet in
     nearly all postures, the pairs that cause it are left out of the self-collision, which a warning
     tells. Raises the errors of `draft_hand`, and `HandFileError` for a mesh that is refused, a URDF
-    without collision shapes, or one that cannot be repaired.
+    without collision shapes, or one that cannot be repaired; `MissingExtra` for an MJCF without
+    MuJoCo.
 
     >>> from torchgrasp import load_hand
     >>> draft = new_hand(load_hand("barrett").urdf_path, Wish(name="mine"))
     >>> 'name = "mine"' in draft.toml, draft.repairs
     (True, ())
     """
-    published = read_published(path, wish.visual)
+    if not is_mjcf(Path(path)):
+        return _draft(read_published(path, wish.visual), wish, seed, file)
+    with temporary_folder() as folder:
+        found = read_mjcf(Path(path), folder, wish.root, wish.tips, wish.visual, wish.meshes)
+        draft = _draft(found.urdf, wish._replace(meshes=folder), seed, file, found)
+    return draft
+
+
+def _draft(
+    published: Urdf, wish: Wish, seed: int, file: str, origin: FromMjcf | None = None
+) -> Draft:
+    """Return the draft of `new_hand` for a URDF that was read, from an MJCF if it has an `origin`."""
     bare = _bare_links(published, wish.visual)
     # frames are merged twice: a wrist that is fixed leaves new ones
     urdf, below = keep_below(published, wish.root or published.root)
@@ -172,13 +188,16 @@ def new_hand(
     points = shape_points(urdf, wish.meshes or published.path.parent)
     surfaces = {name: np.concatenate(parts) for name, parts in points.items() if parts}
     urdf, marked, taken_markers = merge_markers(urdf, surfaces)
-    warnings = find_unusual(urdf, points)
+    warnings = [*(origin.warnings if origin else ()), *find_unusual(urdf, points)]
     urdf, joints = repair_joints(urdf)
     urdf, bodies = repair_bodies(urdf, surfaces)
     # a tip that the user named may have been merged into another link
-    tips = wish.tips
+    tips = wish.tips or (origin.tips if origin else ())
     for merger in (taken, taken_again, taken_markers):
         tips = tuple(merger.get(tip, tip) for tip in tips)
+    if not wish.tips and not set(tips) <= {x.name for x in urdf.links if x.shapes}:
+        # sites of what was cut off
+        tips = ()
     tips = _checked_tips(urdf, tips, () if wish.visual else bare)
     frames = _frames(urdf, (*tips, palm_of(urdf, tips)), seed)
     guess = guess_pads(urdf, frames, tips, surfaces)
@@ -197,7 +216,9 @@ def new_hand(
             clean = ball_tip(clean, tip, pad, outward, surfaces[tip])
     clean, sensors = add_sensors(clean, tips, guess, pads)
     chosen = dict(zip(tips, pads, strict=True))
-    repairs = [*below, *merged, *fixed, *again, *marked, *joints, *bodies, *fitted, *sensors]
+    told = origin.told if origin else ()
+    repaired = [*below, *merged, *fixed, *again, *marked, *joints, *bodies, *fitted]
+    repairs = [*told, *repaired, *sensors]
     if balls:
         repairs.append(f"fingertips touch with a ball in their end, of radius: {', '.join(balls)}")
     if bare and wish.visual:

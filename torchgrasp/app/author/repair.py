@@ -279,14 +279,19 @@ def _add_limits(urdf: Urdf, joints: dict[str, Joint]) -> list[str]:
 def _add_drives(joints: dict[str, Joint]) -> list[str]:
     """Give joints without an effort or velocity limit the limits typical of small hands."""
     movable = [j for j in joints.values() if j.kind != "fixed"]
-    idle = [j for j in movable if not (j.effort > 0 and j.velocity > 0)]
-    for j in idle:
+    told = dict[str, list[str]]()
+    for j in movable:
         effort = j.effort if j.effort > 0 else REPAIRS.effort
         velocity = j.velocity if j.velocity > 0 else REPAIRS.velocity
         joints[j.name] = dataclasses.replace(j, effort=effort, velocity=velocity)
-    names = ", ".join(j.name for j in idle)
-    drive = f"{REPAIRS.effort:g} N m, {REPAIRS.velocity:g} rad/s"
-    return [f"{names} without effort or velocity get {drive}"] if idle else []
+        gets = [f"{effort:g} N m"] if effort != j.effort else []
+        gets += [f"{velocity:g} rad/s"] if velocity != j.velocity else []
+        if gets:
+            told.setdefault(", ".join(gets), []).append(j.name)
+    return [
+        f"{', '.join(names)} without effort or velocity get {drive}"
+        for drive, names in told.items()
+    ]
 
 
 def _follow_directly(joints: dict[str, Joint]) -> list[str]:
