@@ -54,9 +54,18 @@ class Robot(NamedTuple):
 
 
 def load_grasps(
-    types: messages.Types, path: Path | str, frame: str, stamp: Any, object_id: str, most: int = 20
+    types: messages.Types,
+    path: Path | str,
+    frame: str,
+    stamp: Any,
+    object_id: str,
+    most: int = 20,
+    **options: Any,
 ) -> list[Any]:
     """Return the best moveit_msgs/Grasp of a file of `torchgrasp grasp`, with poses in `frame`.
+
+    `options` are those of `torchgrasp.export.format_moveit`: the robot's names of joints as
+    `rename`, `force`, `kp`, and `flange`.
 
     Joints that follow others are left out, since MoveIt sets them itself. So are grasps whose hand
     goes down while it closes: a message has one pose.
@@ -66,7 +75,7 @@ def load_grasps(
     opened = opened_pose(hand, grasps.pregrasp, grasps.obj_from_hand, grasps.table)
     stays = (opened == grasps.obj_from_hand).all(2).all(1)
     best = grasps[(grasps.status == Status.OK) & stays][:most]
-    text = format_moveit(hand, best, object_id=object_id, actuated=True)
+    text = format_moveit(hand, best, object_id=object_id, actuated=True, **options)
     return messages.write_grasps(types, text, frame, stamp)
 
 
@@ -180,7 +189,7 @@ def _check_joints(robot_model: Any, states: Sequence[GraspStates], group: str) -
     for state in states:
         if unknown := [x for x in state.grasp.joint_state.name if x not in known]:
             words = f"Joint {unknown[0]!r} is not in group {group!r}"
-            raise ValueError(f"{words}: plan with the robot's names of joints.")
+            raise ValueError(f"{words}: give the robot's names of joints as rename.")
 
 
 def _opened(scene: Any, grasp: GraspStates) -> Any:

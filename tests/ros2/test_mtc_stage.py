@@ -209,7 +209,7 @@ def grasp():
 
 @pytest.fixture
 def file(grasp, tmp_path):
-    """Two grasps, the better one last in the planner's order of messages."""
+    """The grasp as the planner saves it."""
     grasp.save(tmp_path / "grasps.safetensors")
     return tmp_path / "grasps.safetensors"
 
@@ -253,9 +253,9 @@ def test_one_stage_offers_all_grasps_the_best_first(file, tmp_path, monkeypatch,
     """Where the bindings take a RobotState as a property, SimpleGrasp finds the postures, too."""
     monkeypatch.setattr(Properties, "registered", registered)
     (first,) = read(file, tmp_path / "a")
-    second = dataclasses.replace(first, id="better", grasp_quality=0.99)
+    second = dataclasses.replace(first, id="second", grasp_quality=0.99)
     states = mtc_stage.read_states(bags.types(), [first, second])
-    assert [state.name for state in states] == ["better", "grasp_0"]
+    assert [state.name for state in states] == ["second", "grasp_0"]
     stage = mtc_stage.make_stage(CORE, states, "hand")
     spawned = generate(stage, Scene({"jug": WORLD_FROM_OBJECT}))
     assert [cost for _, cost in spawned] == sorted(state.cost for state in states)
@@ -274,6 +274,16 @@ def test_joints_that_follow_are_left_to_moveit(tmp_path):
     states = mtc_stage.read_states(bags.types(), read(tmp_path / "g.safetensors", tmp_path / "a"))
     names = states[0].grasp.joint_state.name
     assert names == ["spread", "f1_flex", "f2_flex", "f3_flex"]
+    renamed = mtc_stage.load_grasps(
+        bags.types(),
+        tmp_path / "g.safetensors",
+        "jug",
+        bags.time(7),
+        "jug",
+        rename={"f1_flex": "right_f1"},
+    )
+    states = mtc_stage.read_states(bags.types(), renamed)
+    assert states[0].grasp.joint_state.name == ["right_f1", "spread", "f2_flex", "f3_flex"]
 
 
 def test_what_does_not_fit_is_refused_in_a_sentence(file, tmp_path):
@@ -283,7 +293,7 @@ def test_what_does_not_fit_is_refused_in_a_sentence(file, tmp_path):
     scene = Scene({"jug": WORLD_FROM_OBJECT})
     with pytest.raises(ValueError, match="no group 'hand': give the group"):
         generate(stage, scene, Model(group="gripper"))
-    with pytest.raises(ValueError, match="Joint 'joint_0' is not in group 'hand': plan with"):
+    with pytest.raises(ValueError, match=r"Joint 'joint_0' is not in group 'hand': give .* rename"):
         generate(stage, scene, Model([f"{name}.0" for name in JOINTS]))
     with pytest.raises(ValueError, match="Frame 'jug' of the grasps is not in the scene: add"):
         generate(stage, Scene({"world": np.eye(4)}))
