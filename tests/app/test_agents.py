@@ -294,6 +294,31 @@ def test_a_signal_ends_a_server_that_waits_for_its_client(folder):
         assert server.wait(60) == 143 and server.stderr.read() == "torchgrasp: terminated\n"
 
 
+def test_the_client_of_the_guide_plans(tmp_path):
+    """The Python of docs/agents.md, with few starts, and `torchgrasp` in the path."""
+    if not PYTHON.exists():
+        pytest.skip("scripts/beside mcp makes the environment of the SDK")
+    guide = (ROOT / "docs" / "agents.md").read_text()
+    code = re.findall(r"^```python\n(.*?)^```", guide, re.MULTILINE | re.DOTALL)[0]
+    code = code.replace('{"cloud": "jug"}', '{"cloud": "cylinder", "hand": "barrett", "starts": 8}')
+    assert "starts" in code
+    command = tmp_path / "bin" / "torchgrasp"
+    command.parent.mkdir()
+    words = f'PYTHONPATH={ROOT} exec {PYTHON} -m torchgrasp "$@"'
+    command.write_text(f"#!/bin/sh\n{words}\n")
+    command.chmod(0o755)
+    (tmp_path / "grasps").mkdir()
+    path = f"{command.parent}{os.pathsep}{os.environ['PATH']}"
+    done = subprocess.run(
+        [PYTHON, "-c", code],
+        cwd=tmp_path,
+        env=os.environ | {"PATH": path},
+        capture_output=True,
+        text=True,
+    )
+    assert re.search(r"The barrett hand has \d+ executable grasps", done.stdout), done.stderr
+
+
 def test_paths_stay_below_the_folder(folder, tmp_path):
     place = Workplace.at(folder)
     assert place.file("cloud", "tin.ply") == folder.resolve() / "tin.ply"
