@@ -252,7 +252,7 @@ def described(barrett, tmp_path, monkeypatch):
     here = f"REPOSITORY_PATH = {str(barrett)!r}\n"
     urdf = f"URDF_PATH = URDF_PATH_LEFT = {str(barrett / 'hand.urdf')!r}\n"
     (package / "claw_description.py").write_text(here + urdf)
-    (package / "scene_description.py").write_text(here + "MJCF_PATH = 'x.xml'\n")
+    (package / "scene_description.py").write_text(here + "XACRO_PATH = 'x.xacro'\n")
     (package / "far_description.py").write_text("raise OSError('no route to host')")
     monkeypatch.syspath_prepend(package.parent)
     monkeypatch.chdir(tmp_path)

@@ -14,11 +14,11 @@ MOST_ERROR = 300  # of the message of a failed download [characters]
 def locate_urdf(
     name: Path, meshes: Path | None, out: Path | None
 ) -> tuple[Path, Path | None, Path | None]:
-    """Return the URDF, the folder of its meshes, and the folder to write.
+    """Return the URDF or MJCF, the folder of its meshes, and the folder to write.
 
     If `name` is a name of robot_descriptions, its files are used, and a folder of this name is
     written, unless `meshes` or `out` is given. Otherwise the three arguments are returned as they
-    are. Raises `BadArgument` for a name without a URDF, or if the download fails; `MissingExtra`
+    are. Raises `BadArgument` for a name without either, or if the download fails; `MissingExtra`
     without the package.
     """
     if name.exists() or name.suffix or not str(name).isidentifier():
@@ -37,10 +37,9 @@ def locate_urdf(
         failed = f"{name}, which cannot be downloaded ({error})"[:MOST_ERROR]
         raise BadArgument("urdf", failed, wanted) from error
     others = {key: value for key, value in found.items() if key.startswith("URDF_PATH_")}
-    if "URDF_PATH" not in found:
-        raise BadArgument(
-            "urdf", f"{name} without a URDF", "a description with a URDF, not with MJCF or xacro"
-        )
+    file = found.get("URDF_PATH") or found.get("MJCF_PATH")
+    if file is None:
+        raise BadArgument("urdf", f"{name} without a URDF", "a description with URDF or MJCF")
     for key, path in others.items():
         print(f"note: {name} also has {key}: {path}")
-    return Path(found["URDF_PATH"]), meshes or Path(found["REPOSITORY_PATH"]), out or Path(name)
+    return Path(file), meshes or Path(found["REPOSITORY_PATH"]), out or Path(name)

@@ -92,7 +92,7 @@ class HandNew(Command):
     """
 
     urdf: Path = positional(
-        "file of the hand, with or without meshes, or its name in robot_descriptions"
+        "file of the hand, URDF or MJCF (.xml, extra `mujoco`), or its name in robot_descriptions"
     )
     tips: tuple[str, ...] = option(
         (),
