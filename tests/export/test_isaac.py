@@ -2,6 +2,7 @@
 of the URDF, a reader of another project, and the way back.
 """
 
+import dataclasses
 import json
 import math
 import subprocess
@@ -16,7 +17,7 @@ import yourdfpy
 from torchgrasp import load_grasps, load_hand
 from torchgrasp.app import cli
 from torchgrasp.data.shipped import load_shipped_grasp
-from torchgrasp.export import format_isaac, grasps_from_joints, read_foreign
+from torchgrasp.export import format_isaac, read_foreign
 from torchgrasp.foundation.errors import GraspFileWarning, ModelFileError
 
 READER = Path(__file__).parents[2] / ".beside" / "graspgenx" / "bin" / "python"
@@ -77,9 +78,11 @@ def test_each_field_is_what_the_published_pages_say(tmp_path, name, isaac_ros):
         )
 
 
-def test_an_unknown_success_is_confidence_0(tmp_path):
-    hand, _, path = written(tmp_path)
-    text = format_isaac(hand, grasps_from_joints(hand, *read_foreign(path, hand)))
+def test_an_unknown_success_is_confidence_0():
+    grasp = load_shipped_grasp("jug", "barrett")
+    grasp = dataclasses.replace(grasp, known=torch.zeros(1, dtype=torch.bool))
+    assert math.isnan(float(grasp.success[0]))
+    text = format_isaac(load_hand("barrett"), grasp)
     assert yaml.safe_load(text)["grasps"]["grasp_0"]["confidence"] == 0.0
 
 
