@@ -14,11 +14,12 @@ import torch
 import yaml
 import yourdfpy
 
-from torchgrasp import load_grasps, load_hand
+from torchgrasp import Plane, load_grasps, load_hand
 from torchgrasp.app import cli
 from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.export import format_isaac, read_foreign
 from torchgrasp.foundation.errors import GraspFileWarning, ModelFileError
+from torchgrasp.geometry.frames import apply
 
 READER = Path(__file__).parents[2] / ".beside" / "graspgenx" / "bin" / "python"
 HANDS = ("allegro", "barrett")
@@ -275,3 +276,26 @@ def test_the_command_line_writes_the_file_and_reads_it(tmp_path, capsys):
     wrong = [*command[:3], "moveit", "--out", str(out), "--isaac-ros"]
     assert cli.main(["export", str(tmp_path / "g.safetensors"), "--format", *wrong[3:]]) == 2
     assert "--isaac-ros" in capsys.readouterr().err
+
+
+def test_a_hand_that_goes_down_while_it_closes_is_left_out_and_told(tmp_path, capsys):
+    """Of two grasps, the one whose opened hand is 5 mm in the table."""
+    hand = load_hand("barrett")
+    grasp = load_shipped_grasp("jug", "barrett")
+    centres = apply(grasp.obj_from_hand, hand.sphere_centres(grasp.pregrasp))[0, :, 2]
+    lowest = (centres - hand.collision_spheres.radius).min()
+    table = Plane.horizontal(float(lowest) + 0.005)
+    higher = grasp.obj_from_hand.clone()
+    higher[:, 2, 3] += 0.02
+    both = grasp[[0, 0]]
+    poses = torch.cat([grasp.obj_from_hand, higher])
+    meta = grasp.meta | {"table": table.describe()}
+    both = dataclasses.replace(both, obj_from_hand=poses, meta=meta)
+    both.save(tmp_path / "g.safetensors")
+    for kind in ("isaac", "moveit"):
+        out = tmp_path / f"{kind}.yaml"
+        command = ["export", str(tmp_path / "g.safetensors"), "--format", kind, "--out", str(out)]
+        assert cli.main(command) == 0
+        assert "1 of 2 grasps are left out" in capsys.readouterr().out
+    grasps = yaml.safe_load((tmp_path / "isaac.yaml").read_text())["grasps"]
+    assert [x["position"][2] for x in grasps.values()] == [float(higher[0, 2, 3])]

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchgrasp.control.finger_forces import Squeeze, squeeze, stiff_drives
@@ -155,12 +155,17 @@ def named_postures(
     return squeezed, {name: hand.expand(joints) for name, joints in postures.items()}
 
 
-def check_still(hand: Hand, grasps: Grasps) -> None:
-    """Refuse grasps whose hand goes down while it closes (`opened_pose`): a format of one pose for
-    each grasp cannot express it. Raises `BadArgument`.
-    """
+def stands_still(hand: Hand, grasps: Grasps) -> Bool[Tensor, "g"]:
+    """Return which hands close at one pose; the others go down while they close (`opened_pose`)."""
     opened = opened_pose(hand, grasps.pregrasp, grasps.obj_from_hand, grasps.table)
-    if not torch.equal(opened, grasps.obj_from_hand):
+    return (opened == grasps.obj_from_hand).all(2).all(1)
+
+
+def check_still(hand: Hand, grasps: Grasps) -> None:
+    """Refuse grasps whose hand goes down while it closes: a format of one pose for each grasp
+    cannot express it. Raises `BadArgument`.
+    """
+    if not bool(stands_still(hand, grasps).all()):
         found = "a hand that goes down while it closes"
         raise BadArgument("grasps", found, "hands that close at one pose")
 

@@ -23,7 +23,7 @@ from torchgrasp.cloud.read import read_cloud
 from torchgrasp.data.shards import load_grasps
 from torchgrasp.evaluation.touch import TOUCH, Touch, measure_touch
 from torchgrasp.export.foreign import POSE_NUMBERS, Quaternion, read_poses
-from torchgrasp.export.postures import follower_joints
+from torchgrasp.export.postures import follower_joints, stands_still
 from torchgrasp.files import format_columns, format_json, read_bytes, read_json, write_file
 from torchgrasp.foundation.errors import BadArgument, ModelFileError, Status
 from torchgrasp.foundation.lazy import trimesh
@@ -164,7 +164,16 @@ class Export(Command):
         if planned.meta.get("hand_sha256") != hand.source.sha256:
             found = f"{hand.name}, whose files are not those that were planned with"
             raise BadArgument("--hand", found, "the same hand")
-        best = planned[planned.status == Status.OK][: 1 if self.format == "glb" else self.most]
+        best = planned[planned.status == Status.OK]
+        if self.format in ("isaac", "moveit"):
+            still = stands_still(hand, best)
+            if falling := int((~still).sum()):
+                print(
+                    f"note: {falling} of {len(best)} grasps are left out: their hand goes down "
+                    f"while it closes, and {self.format} has one pose"
+                )
+            best = best[still]
+        best = best[: 1 if self.format == "glb" else self.most]
         force = 4.0 if self.force is None else self.force
         body = Path(self.object or shown)
         if self.format in ("graspgen", "dexgraspbench"):
