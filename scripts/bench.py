@@ -3,6 +3,8 @@
 
 * close: table-lift, where, success, play: lifts, predicted success, exports
 
+* headline: lifts, low, pulls, region, rendered, real, pace: what README says; --publish writes it
+
 * gpu: clouds, launches: many clouds at once, also without a GPU
 
 * peers: rate: time for a grasp that passes the same checks, beside other planners
@@ -21,15 +23,18 @@ from collections.abc import Callable
 
 import tyro
 from benchmarks.common import Options, measure
+from benchmarks.headline.page import write_headline
 
-SUBJECTS = ("close", "gpu", "peers", "plan", "scene", "shape")
+SUBJECTS = ("close", "gpu", "headline", "peers", "plan", "scene", "shape")
 
 
 def command(subject: str) -> Callable[[Options], None]:
     """Return the command that runs the benches of a subject."""
 
     def run(options: tyro.conf.OmitArgPrefixes[Options]) -> None:
-        measure(subject, options)
+        rows = measure(subject, options)
+        if subject == "headline" and options.publish:
+            write_headline(rows, options)
 
     run.__doc__ = f"Run benches of {subject}; see scripts/bench.py --help."
     return run

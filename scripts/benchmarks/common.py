@@ -53,6 +53,7 @@ class Options:
         scale: factor of the numbers of random samples, scenes, frames, plans and trials.
         draws: trials of each grasp of close/table-lift, with other displacements and noise.
         tries: most grasps that a trial of close/table-lift tries; by default as the protocol says.
+        clouds: folder of real clouds NAME_CAMERA.ply for headline/shape, of one camera each.
         planned: folder OBJECT/VIEW.safetensors with grasps for close/table-lift; by default they
             are planned and kept.
         simulator: of close/table-lift.
@@ -77,6 +78,7 @@ class Options:
     scale: float = 1.0
     draws: int = 5
     tries: int | None = None
+    clouds: Path | None = None
     planned: Path | None = None
     simulator: Literal["sapien", "mujoco"] = "sapien"
     peers: tuple[str, ...] = ()
@@ -170,13 +172,22 @@ def measure(subject: str, options: Options) -> list[Row]:
 
 def write_table(folder: Path, name: str, rows: list[Row], options: Options) -> None:
     """Write rows as a Markdown table with commit, machine and command."""
-    command = " ".join(["scripts/bench.py", *sys.argv[1:]])
-    lines = [f"# {name}", "", f"`{command}`", "", describe_run(options.threads), ""]
-    lines += ["| what | target | measured | met |", "| --- | --- | --- | --- |"]
+    lines = [f"# {name}", "", f"`{command_line()}`", "", describe_run(options.threads), ""]
+    write_file(folder / f"{name}.md", "\n".join([*lines, *format_rows(rows)]) + "\n")
+
+
+def command_line() -> str:
+    """Return the command that runs this bench, as it was typed."""
+    return " ".join(["scripts/bench.py", *sys.argv[1:]])
+
+
+def format_rows(rows: Iterable[Row]) -> list[str]:
+    """Return the lines of a Markdown table of rows."""
+    lines = ["| what | target | measured | met |", "| --- | --- | --- | --- |"]
     for row in rows:
         cells = row.what, row.bar, row.measured, {True: "yes", False: "no", None: "-"}[row.met]
         lines.append(f"| {' | '.join(x.replace('|', '/') for x in cells)} |")
-    write_file(folder / f"{name}.md", "\n".join(lines) + "\n")
+    return lines
 
 
 def describe_run(threads: int) -> str:

@@ -67,7 +67,7 @@ def table_lift(o: Options) -> list[Row]:
     rows = list[Row]()
     for hand in map(load_hand, o.hands):
         lift = functools.cache(
-            functools.partial(_lift, o, hand)
+            functools.partial(lift_objects, o, hand)
         )  # one condition is a part of another
         for name in names:
             if name == SIMULATORS:
@@ -89,7 +89,7 @@ def table_lift(o: Options) -> list[Row]:
     return rows
 
 
-def _lift(
+def lift_objects(
     o: Options, hand: Hand, protocol: Protocol, simulator: str, grasps: int
 ) -> list[ViewScore]:
     """Return the scores of the objects under a protocol, with saved grasps, or with new ones that

@@ -1,0 +1,1 @@
+"""What README says, measured at one commit."""

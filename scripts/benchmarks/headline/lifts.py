@@ -1,0 +1,102 @@
+"""Lifts of the left-out objects: four hands in place, and the Allegro hand in other conditions and
+in a second simulator; and lifts of low bodies.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from train.household import household
+
+from benchmarks.close.table_lift import BASE, lift_objects
+from benchmarks.common import Options, Row, bench
+from benchmarks.headline.left_out import LEFT_OUT
+from torchgrasp.evaluation import PoseNoise, ViewScore
+from torchgrasp.evaluation.intervals import count_by, format_share, share_over
+from torchgrasp.hand.load import load_hand
+
+HANDS = {"allegro": 0.98, "barrett": 0.97, "leap": 0.97, "shadow": 0.97}
+"""Hands, and the project's bars for the share that rises in place with up to three grasps."""
+
+FIRST = 0.96
+"""Bar of the Allegro hand for the share that rises in place with the first grasp."""
+
+CONDITIONS: dict[str, tuple[dict[str, Any], float]] = {
+    "moved by up to 3 cm on each axis": ({"noise": PoseNoise(0.03)}, 0.96),
+    "moved by up to 5 cm on each axis": ({"noise": PoseNoise(0.05)}, 0.94),
+    "pushed by 2.5 N in any direction": ({"push": 2.5}, 0.96),
+}
+"""Other conditions: changes of the protocol, and bars of the Allegro hand."""
+
+LOW = {"allegro": 0.80, "barrett": 0.85}
+LOW_BODIES = 30
+HIGHEST = 0.016
+"""Hands that lift low bodies, with their bars; number of the bodies; height [m] of the highest."""
+
+
+@bench("headline/lifts", objects=True)
+def lifts(o: Options) -> list[Row]:
+    """Lift each object once in each condition, with up to three grasps of one view."""
+    o = dataclasses.replace(o, names=o.names or LEFT_OUT, draws=1)
+    rows = [_tried(o, hand, "in place", "sapien", {}, bar) for hand, bar in HANDS.items()]
+    rows.append(_tried(o, "allegro", "in place", "mujoco", {}, HANDS["allegro"]))
+    for name, (changes, bar) in CONDITIONS.items():
+        rows.append(_tried(o, "allegro", name, "sapien", changes, bar))
+    return rows
+
+
+@bench("headline/low")
+def low(o: Options) -> list[Row]:
+    """Lift authored bodies that are 8 to 16 mm high."""
+    count = o.times(LOW_BODIES)
+    folder = o.out / f"low_{count}"
+    if not (folder / "manifest.json").is_file():
+        household(folder, count, highest=HIGHEST)
+    o = dataclasses.replace(o, objects=(Path(folder),), names=(), draws=1)
+    return [_tried(o, hand, "low bodies", "sapien", {}, bar) for hand, bar in LOW.items()]
+
+
+def _tried(
+    o: Options, hand: str, condition: str, simulator: str, changes: dict[str, Any], bar: float
+) -> Row:
+    """Return the row of one hand in one condition."""
+    protocol = dataclasses.replace(BASE, **changes)
+    row = row_of(
+        hand, condition, simulator, lift_objects(o, load_hand(hand), protocol, simulator, 1), bar
+    )
+    print(row, flush=True)
+    return row
+
+
+def row_of(
+    hand: str, condition: str, simulator: str, scores: Sequence[ViewScore], bar: float
+) -> Row:
+    """Return the shares that rose with up to three grasps, and with the first one alone.
+
+    An object without a grasp counts as lost. Numbers name what was lost, and how.
+    """
+    tries = {x.object: [a.tries if a.passed else 0 for a in x.attempts] or [0] for x in scores}
+    unit = {x.object: x.unit for x in scores}
+    risen = share_over(count_by((unit[k], t > 0) for k, some in tries.items() for t in some))
+    first = share_over(count_by((unit[k], t == 1) for k, some in tries.items() for t in some))
+    refused = sum(not x.attempts for x in scores)
+    lost = {
+        x.object: [a.status.name for a in x.attempts] or [x.refusal.name]
+        for x in scores
+        if not all(tries[x.object])
+    }
+    least = FIRST if (hand, condition) == ("allegro", "in place") else 0.0
+    words = f"up to three grasps {format_share(risen)}; the first {format_share(first)}; "
+    words += f"no grasp for {refused} of {len(scores)}"
+    if lost:
+        words += f"; lost {', '.join(sorted(lost))}"
+    numbers = {"hand": hand, "condition": condition, "simulator": simulator, "risen": risen}
+    numbers |= {"first": first, "refused": refused, "objects": len(scores), "lost": lost}
+    return Row(
+        f"{hand}, {condition}, {simulator}",
+        f">= {bar:.0%}" + (f", first >= {least:.0%}" if least else ""),
+        words,
+        risen.value >= bar and first.value >= least,
+        numbers,
+    )

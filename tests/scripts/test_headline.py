@@ -1,0 +1,68 @@
+"""scripts/bench.py headline: counts of lifts by hand; the hidden side against a sphere."""
+
+import math
+
+import pytest
+import torch
+from benchmarks.common import Row
+from benchmarks.headline.lifts import row_of
+from benchmarks.headline.page import (
+    BEGIN,
+    END,
+    readme_table,
+    replace_table,
+)
+from benchmarks.headline.shapes import judge_hidden
+
+from torchgrasp.evaluation import ProtocolResult, ViewScore
+from torchgrasp.foundation.errors import Status
+from torchgrasp.geometry.linalg import unit
+
+
+def scores() -> list[ViewScore]:
+    def tried(name: str, family: str, passed: bool, tries: int) -> ViewScore:
+        status = Status.OK if passed else Status.DROPPED
+        attempt = ProtocolResult(0, 0, passed, status, tries=tries)
+        return ViewScore(name, "view0", 5, 1.0, (attempt,), family=family)
+
+    return [
+        tried("mug", "cup", True, 1),
+        tried("cup", "cup", True, 3),
+        tried("pan", "pan", False, 3),
+        ViewScore("pen", "view0", 0, 1.0, refusal=Status.OUT_OF_REACH, family="pen"),
+    ]
+
+
+def test_a_row_counts_first_grasps_further_ones_and_refusals():
+    row = row_of("allegro", "in place", "sapien", scores(), 0.5)
+    assert row.numbers["risen"].value == 0.5 and row.numbers["first"].value == 0.25
+    assert row.numbers["risen"].units == 3 and row.numbers["refused"] == 1
+    assert row.numbers["lost"] == {"pan": ["DROPPED"], "pen": ["OUT_OF_REACH"]}
+    assert not row.met  # the first grasps miss their own bar
+
+
+def test_the_table_of_readme_stands_between_its_marks():
+    rows = [row_of("leap", "in place", "mujoco", scores(), 0.5), Row("other", "-", "-")]
+    lines = readme_table(rows, "Commit 1234abcd; a processor")
+    assert "commit 1234abcd " in lines[0] and len(lines) == 5
+    assert lines[-1].startswith("| LEAP: in place, in MuJoCo | 50.0 %")
+    assert lines[-1].endswith("| 1 of 4 |")
+    text = replace_table(f"before\n{BEGIN}\nold\n{END}\nafter\n", lines)
+    assert text == "\n".join(["before", BEGIN, "", *lines, "", END, "after", ""])
+    assert replace_table(text, lines) == text
+
+    with pytest.raises(SystemExit, match=r"README\.md has no lines"):
+        replace_table("nothing", lines)
+
+
+def test_the_hidden_side_is_what_the_other_camera_saw_alone():
+    directions = unit(
+        torch.randn(4000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    )
+    ball = 0.035 * directions + torch.tensor([0.0, 0.0, 0.048])
+    front = ball[ball[:, 0] > 0.005]
+    found = judge_hidden(front[:800], ball)
+    wrong = judge_hidden(front[:800], ball + torch.tensor([-0.02, 0.0, 0.0]))
+    assert found["median"] < 3.0 < 6.0 < wrong["median"]
+    assert 0.0 <= found["within_1"] <= found["within_2"] <= found["within_3"] <= 1.0
+    assert math.isnan(judge_hidden(front[:3], ball)["median"])  # too few points: refused
