@@ -54,6 +54,7 @@ PEERS = {
     "torchgrasp": Peer("run_torchgrasp.py", "torchgrasp, one noisy view"),
     "torchgrasp-whole": Peer("run_torchgrasp_whole.py", "torchgrasp, whole surface"),
     "min-weight": Peer("run_min_weight.py", "min-weight baseline (ours, after FRoGGeR's paper)"),
+    "gpis": Peer("run_gpis.py", "GPIS baseline (ours, after SpringGrasp's paper)"),
     "frogger": Peer(
         "run_frogger.py",
         "FRoGGeR",
