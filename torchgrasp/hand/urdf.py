@@ -21,7 +21,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import HandFileError
 from torchgrasp.foundation.lazy import yourdfpy
 from torchgrasp.foundation.limits import HAND_LINKS, HAND_SHAPES, MAX_EXTENT, URDF_BYTES
-from torchgrasp.hand.safe_xml import DEGREES, FULL_TURN, SIZES, parse_urdf
+from torchgrasp.hand.safe_xml import DEGREES, FULL_TURN, SIZES, BoundedBuilder, parse_urdf
 
 AXIS_ERROR = 0.001  # largest error of the length of a joint's axis
 DEEPEST = 100  # most links in a line: pytorch-kinematics walks the tree by recursion
@@ -209,6 +209,23 @@ def read_published(path: Path | str, visual: bool = False) -> Urdf:
         read_bounded(path, URDF_BYTES, "a URDF file", functools.partial(HandFileError, "urdf")),
         visual,
     )
+
+
+def read_visuals(path: Path, data: bytes) -> dict[str, tuple[LinkShape, ...]]:
+    """Return the <visual> of each link by its name, given the bytes of a URDF that was read.
+
+    Pictures alone use them: the dict is empty if any of them is malformed.
+    """
+    robot = ET.fromstring(data, ET.XMLParser(target=BoundedBuilder()))
+    for link in robot.findall("link"):
+        for shape in link.findall("collision"):
+            link.remove(shape)
+        for shape in link.findall("visual"):
+            shape.tag = "collision"
+    try:
+        return {link.name: link.shapes for link in _parse(path, ET.tostring(robot), False).links}
+    except HandFileError:
+        return {}
 
 
 @functools.lru_cache(maxsize=16)

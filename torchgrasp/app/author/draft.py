@@ -10,6 +10,7 @@ import functools
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 from xml.sax.saxutils import quoteattr
 
@@ -30,8 +31,9 @@ from torchgrasp.app.author.repair import (
     repair_bodies,
     repair_joints,
 )
-from torchgrasp.app.author.sensor_tips import add_sensors, extend_pads
+from torchgrasp.app.author.sensor_tips import add_seen_sensors, add_sensors, extend_pads
 from torchgrasp.app.author.unusual import find_unusual
+from torchgrasp.app.author.visuals import keep_visuals, mesh_files
 from torchgrasp.files import render, temporary_folder
 from torchgrasp.foundation.base import FINGERTIPS
 from torchgrasp.foundation.checks import checked
@@ -80,12 +82,15 @@ class Draft(NamedTuple):
         repairs: a sentence for each repair of the URDF.
         warnings: a sentence for each number of the URDF that no hand has, and for each guess that
             is likely wrong; `toml` has them, too.
+        meshes: bytes of the files of visual meshes to which `urdf` refers, by their paths beside
+            it. Pictures alone use them.
     """
 
     toml: str
     urdf: str
     repairs: tuple[str, ...]
     warnings: tuple[str, ...] = ()
+    meshes: Mapping[str, bytes] = MappingProxyType({})
 
 
 class Wish(NamedTuple):
@@ -234,7 +239,14 @@ def _draft(
     pairs, without = _part_pairs(clean, options, seed)
     warnings += without
     toml = _toml_text(clean, chosen, options, guess.approach, names, pairs, warnings)
-    return Draft(toml, _urdf_text(clean) if repairs else "", tuple(repairs), tuple(warnings))
+    if not repairs:
+        return Draft(toml, "", (), tuple(warnings))
+    mergers = taken, taken_again, taken_markers
+    folder = wish.meshes or published.path.parent
+    seen = keep_visuals(published, clean, mergers, folder)
+    files = mesh_files(add_seen_sensors(seen, tips, guess, pads))
+    text = _urdf_text(clean, {link: (name,) for link, (name, _) in files.items()})
+    return Draft(toml, text, tuple(repairs), tuple(warnings), dict(files.values()))
 
 
 def _bare_links(urdf: Urdf, visual: bool) -> tuple[str, ...]:
@@ -441,9 +453,9 @@ def _toml_text(
     )
 
 
-def _urdf_text(urdf: Urdf) -> str:
-    """Return the text of a clean URDF."""
-    return _render("hand.urdf", urdf=urdf, sizes=SIZES)
+def _urdf_text(urdf: Urdf, visuals: Mapping[str, tuple[str, ...]] | None = None) -> str:
+    """Return the text of a clean URDF, with the files of visual meshes by link."""
+    return _render("hand.urdf", urdf=urdf, sizes=SIZES, visuals=visuals or {})
 
 
 def _render(template: str, **values: Any) -> str:

@@ -123,7 +123,7 @@ def shape_points(urdf: Urdf, folder: Path) -> dict[str, tuple[Points, ...]]:
         raise urdf.wrong(
             f"meshes of {size} bytes", f"meshes of at most {HAND_MESH_BYTES // MEBIBYTE} MiB in all"
         )
-    meshes = {name: _read_points(urdf, name, folder) for name in sorted(names)}
+    meshes = {name: _sample(read_mesh_file(urdf, name, folder)) for name in sorted(names)}
     found = {}
     for link in urdf.links:
         parts = []
@@ -189,8 +189,11 @@ def ball_tip(urdf: Urdf, tip: str, ball: Pad, outward: np.ndarray, points: Point
     return dataclasses.replace(urdf, links=tuple(ended if x is link else x for x in urdf.links))
 
 
-def _read_points(urdf: Urdf, name: str, folder: Path) -> Points:
-    """Read a mesh file, but no file that it refers to; return points on the mesh."""
+def read_mesh_file(urdf: Urdf, name: str, folder: Path) -> "trimesh.Trimesh":
+    """Return the mesh [m] of a file that a URDF names, read without any file that it refers to.
+
+    The file lies inside `folder`. Raises `HandFileError` for a file that is refused.
+    """
     path = mesh_file(urdf, name, folder)
     data = read_bounded(path, MESH_BYTES, "a mesh", functools.partial(HandFileError, "urdf"))
     allowed = f"a triangle mesh of at most {MESH_FACES} faces"
@@ -210,7 +213,9 @@ def _read_points(urdf: Urdf, name: str, folder: Path) -> Points:
     if not sound or not np.isfinite(mesh.vertices).all():
         found = f"mesh {name!r} without faces, or with vertices that are not finite"
         raise urdf.wrong(found, allowed)
-    return scale * _sample(mesh)
+    if scale != 1.0:
+        mesh.apply_scale(scale)
+    return mesh
 
 
 def _primitive_points(shape: LinkShape) -> Points:

@@ -5,13 +5,15 @@ the fingertip. The pad moves with it: its contact point by exactly the offset, i
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from torchgrasp.app.author.fit_shapes import turned_shape
 from torchgrasp.app.author.pads import Guess
+from torchgrasp.app.author.visuals import Triangles
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.lazy import trimesh
 from torchgrasp.hand.hand_toml import LEAST_RADIUS, MOST_RADIUS, Pad
 from torchgrasp.hand.urdf import LinkShape, Urdf
 
@@ -21,6 +23,7 @@ class SensorNumbers:
     """Bounds of a sensor tip."""
 
     most_offset: float = 0.1  # farthest that a sensor reaches beyond the maker's tip [m]
+    sides: int = 16  # sides of a sensor that is drawn
 
 
 SENSOR = SensorNumbers()
@@ -105,6 +108,29 @@ def add_sensors(
     )
     sentences = [f"sensor tips are added: {'; '.join(told)}"] if told else []
     return dataclasses.replace(urdf, links=links), sentences
+
+
+def add_seen_sensors(
+    seen: Mapping[str, Triangles], tips: Sequence[str], guess: Guess, pads: Sequence[Pad]
+) -> dict[str, Triangles]:
+    """Return the visual meshes by link, with a capsule for each pad that `extend_pads` moved."""
+    shown = dict(seen)
+    for tip, before, way, pad in zip(tips, guess.pads, guess.outward, pads, strict=True):
+        if pad is before or tip not in shown:
+            continue
+        end = np.array(pad.center)
+        offset = float((np.array(pad.contact) - before.contact) @ way)
+        capsule = trimesh.creation.capsule(offset, pad.radius, count=(SENSOR.sides, SENSOR.sides))
+        turn = np.eye(4)
+        turn[:3, :3] = np.stack([*_across(way), way], 1)
+        # its middle is halfway between the balls, wherever trimesh begins it
+        middle = capsule.bounds.mean(0)[2]
+        turn[:3, 3] = end - (offset / 2 + middle) * way
+        capsule.apply_transform(turn)
+        vertices, faces = shown[tip]
+        both = np.concatenate([faces, np.asarray(capsule.faces) + len(vertices)])
+        shown[tip] = np.concatenate([vertices, np.asarray(capsule.vertices)]), both
+    return shown
 
 
 def _round_pad(contact: np.ndarray, normal: np.ndarray, radius: float) -> Pad:

@@ -132,7 +132,7 @@ class HandNew(Command):
         sensors = self.tip_offset, self.tip_radius
         wish = Wish(self.tips, self.name or "", self.root, meshes, self.visual, *sensors)
         draft = new_hand(urdf, wish, self.seed, clean)
-        texts = {"hand.toml": draft.toml}
+        texts: dict[str, str | bytes] = {"hand.toml": draft.toml, **draft.meshes}
         if draft.urdf or out is not None:
             texts[clean if draft.urdf else urdf.name] = draft.urdf or urdf.read_text(
                 encoding="utf-8"
@@ -150,7 +150,10 @@ class HandNew(Command):
             print(f"warning: {sentence}")
         for file, text in texts.items():
             write_file(folder / file, text)
-            print(f"written: {folder / file}")
+            if file not in draft.meshes:
+                print(f"written: {folder / file}")
+        if draft.meshes:
+            print(f"written: {len(draft.meshes)} visual meshes for pictures")
         place = (
             folder if folder.is_absolute() else f"./{folder}"
         )  # a plain name may be that of a shipped hand

@@ -52,7 +52,7 @@ class GraspSheet:
     def _repr_html_(self) -> str:
         """Return table and picture as HTML without scripts, and without links to other files."""
         lines = [_row("th", self.columns), *(_row("td", row) for row in self.rows)]
-        table = f'<table>\n{"".join(lines)}</table>' if self.rows else ""
+        table = f"<table>\n{''.join(lines)}</table>" if self.rows else ""
         picture = ""
         if self.picture is not None:
             address = f"data:image/png;base64,{encode_base64(self.picture)}"

@@ -1,4 +1,6 @@
-"""A hand as meshes to draw: collision shapes with rounded edges, in the colours of the fingers."""
+"""A hand as meshes to draw, in the colours of the fingers: the visual meshes of its URDF, or
+collision shapes with rounded edges.
+"""
 
 import functools
 import itertools
@@ -8,7 +10,8 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.app.report.canvas import FINGERS, HAND
+from torchgrasp.app.author.visuals import link_meshes
+from torchgrasp.app.report.canvas import FINGERS, HAND, sharp_normals
 from torchgrasp.foundation.lazy import spatial, trimesh
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.urdf import LinkShape, read_urdf
@@ -21,7 +24,7 @@ TILTS = 7  # rings around its rounded edges
 
 
 class Solid(NamedTuple):
-    """The mesh of one collision shape of a hand, in the frame of its link.
+    """The mesh of one collision shape of a hand, or of all visuals of a link, in its link's frame.
 
     Attributes:
         vertices: corners [m].
@@ -44,18 +47,38 @@ class Solid(NamedTuple):
 
 
 def solids_of_links(hand: Hand) -> list[Solid]:
-    """Return the collision shapes of a hand as meshes, each in the frame of its link."""
-    shapes = {link.name: link.shapes for link in read_urdf(hand.urdf_path).links}
+    """Return the hand as meshes, each in the frame of its link.
+
+    A link whose URDF has a <visual> that can be read is drawn as that mesh, any other link by its
+    collision shapes.
+    """
+    if "solids" not in hand.derived:
+        hand.derived["solids"] = _read_solids(hand)
+    return hand.derived["solids"]
+
+
+def _read_solids(hand: Hand) -> list[Solid]:
+    """Return the meshes of a hand, read from its URDF and the files beside it."""
+    urdf = read_urdf(hand.urdf_path)
+    shapes = {link.name: link.shapes for link in urdf.links}
+    seen = link_meshes(urdf.path, urdf.data, urdf.path.parent)
     fingers = finger_of_links(hand)
-    return [
-        Solid(*round_shape(shape), link, fingers[name])
-        for link, name in enumerate(hand.tree.link_names)
-        for shape in shapes[name]
-    ]
+    found = []
+    for link, name in enumerate(hand.tree.link_names):
+        if name not in seen:
+            found += [Solid(*round_shape(shape), link, fingers[name]) for shape in shapes[name]]
+            continue
+        vertices, faces = seen[name]
+        # each corner of each face has its own normal
+        corners = vertices[faces].reshape(-1, 3)
+        normals = sharp_normals(vertices, faces).reshape(-1, 3)
+        one_each = np.arange(len(corners)).reshape(-1, 3)
+        found.append(Solid(corners, one_each, normals, link, fingers[name]))
+    return found
 
 
 def solids_by_link(hand: Hand) -> dict[str, Solid]:
-    """Return one mesh by link name for each link with collision shapes, in the link's frame."""
+    """Return one mesh by link name for each link that is drawn, in the link's frame."""
     found = {}
     solids = solids_of_links(hand)
     for link, name in enumerate(hand.tree.link_names):
@@ -96,7 +119,7 @@ def solids_from_hand(
     names: tuple[str, ...],
     obj_from_hand: Float[Tensor, "4 4"],
 ) -> list[Solid]:
-    """Return the collision shapes of a hand at a posture as meshes in the object's frame [m].
+    """Return a hand at a posture as meshes in the object's frame [m].
 
     `joints` [rad] are the positions of all joints of the URDF, whose names are `names`, in any
     order. `obj_from_hand` is the hand's pose [m].

@@ -1,0 +1,164 @@
+"""Visual meshes of a hand, for pictures: read from its URDF, and kept in the clean copy.
+
+Nothing but pictures depends on them, so a visual that is missing or malformed is left out.
+"""
+
+import dataclasses
+import functools
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from torchgrasp.app.author.fit_shapes import read_mesh_file
+from torchgrasp.app.author.repair import pose_of
+from torchgrasp.foundation.errors import BadArgument, GraspError
+from torchgrasp.foundation.lazy import trimesh
+from torchgrasp.foundation.limits import HAND_MESH_BYTES, MAX_EXTENT
+from torchgrasp.hand.urdf import LinkShape, Urdf, read_visuals
+
+
+@dataclasses.dataclass(frozen=True)
+class VisualNumbers:
+    """Bounds of the visual meshes of a hand."""
+
+    most_faces: int = 2000  # triangles of a link: more are not seen in a picture of a hand
+    first_cell: float = 5e-4  # edge of the cells [m] in which corners are joined, where too many
+    growth: float = 1.3  # by which cells grow until few triangles are left
+    letters: int = 60  # most of a link's name in the name of a file
+
+
+VISUAL = VisualNumbers()
+FOLDER = "visual"  # of the meshes beside a clean URDF
+Triangles = tuple[Float[np.ndarray, "_ 3"], np.ndarray]  # corners [m], and faces (t, 3)
+
+
+@functools.lru_cache(maxsize=16)
+def link_meshes(path: Path, data: bytes, folder: Path) -> dict[str, Triangles]:
+    """Return corners and faces by link, in its frame, for each link of which all visuals are read.
+
+    `path` and `data` are those of the URDF; mesh files lie inside `folder`.
+    """
+    found = {}
+    size = 0
+    for link, shapes in read_visuals(path, data).items():
+        if not shapes:
+            continue
+        parts = []
+        try:
+            for shape in shapes:
+                mesh = _mesh_of(path, data, shape, folder)
+                size += mesh.vertices.nbytes + mesh.faces.nbytes
+                parts.append(mesh)
+        except GraspError:
+            continue
+        whole: Any = trimesh.util.concatenate(parts)
+        reach = float(np.abs(whole.vertices).max())
+        if size > HAND_MESH_BYTES or not reach <= MAX_EXTENT:
+            continue
+        found[link] = _thinned(np.asarray(whole.vertices), np.asarray(whole.faces))
+    return found
+
+
+def keep_visuals(
+    published: Urdf, clean: Urdf, mergers: Sequence[Mapping[str, str]], folder: Path
+) -> dict[str, Triangles]:
+    """Return corners and faces of the visuals of each link of a clean URDF, in its frame.
+
+    `mergers` give for each link that was merged the link that took it over, in the order of the
+    merging. Frames of links that stay are those of the published URDF.
+    """
+    names = {link.name for link in clean.links}
+    poses = _poses(published)
+    meshes = link_meshes(published.path, published.data, folder)
+    parts: dict[str, list[Triangles]] = {}
+    partial = set[str]()
+    for link, shapes in read_visuals(published.path, published.data).items():
+        owner = link
+        for merger in mergers:
+            owner = merger.get(owner, owner)
+        if owner not in names or not shapes:
+            continue
+        # a link of which a part is missing would be drawn with a hole
+        if link not in meshes:
+            partial.add(owner)
+            continue
+        vertices, faces = meshes[link]
+        moved = np.linalg.inv(poses[owner]) @ poses[link]
+        corners = vertices @ moved[:3, :3].T + moved[:3, 3]
+        parts.setdefault(owner, []).append((corners, faces))
+    found = {}
+    for owner, some in parts.items():
+        if owner in partial:
+            continue
+        starts = np.cumsum([0, *(len(corners) for corners, _ in some)])
+        faces = [part + start for (_, part), start in zip(some, starts, strict=False)]
+        found[owner] = np.concatenate([corners for corners, _ in some]), np.concatenate(faces)
+    return found
+
+
+def mesh_files(meshes: Mapping[str, Triangles]) -> dict[str, tuple[str, bytes]]:
+    """Return by link the name and the bytes of a file, binary STL, of its corners and faces."""
+    files = {}
+    for number, (link, (vertices, faces)) in enumerate(meshes.items()):
+        word = re.sub(r"[^A-Za-z0-9_.-]", "_", link)[: VISUAL.letters]
+        data = trimesh.Trimesh(vertices, faces, process=False).export(file_type="stl")
+        assert isinstance(data, bytes)
+        files[link] = f"{FOLDER}/{number:02}_{word}.stl", data
+    return files
+
+
+def _mesh_of(path: Path, data: bytes, shape: LinkShape, folder: Path) -> "trimesh.Trimesh":
+    """Return a visual as a mesh in its link's frame; raise `HandFileError` for an unusable one."""
+    if shape.kind == "box":
+        mesh = trimesh.creation.box(shape.size)
+    elif shape.kind == "sphere":
+        mesh = trimesh.creation.icosphere(3, shape.size[0])
+    elif shape.kind == "cylinder":
+        radius, length = shape.size
+        mesh = trimesh.creation.cylinder(radius, length)
+    else:
+        urdf = Urdf(path, "", "", (), (), data, b"")
+        mesh = read_mesh_file(urdf, shape.file, folder)
+        mesh.merge_vertices()
+        mesh.apply_scale(shape.size)
+    mesh.apply_transform(pose_of(shape))
+    if not np.isfinite(mesh.vertices).all() or not len(mesh.faces):
+        raise BadArgument("urdf", f"{path}: a visual without faces", "a mesh")
+    return mesh
+
+
+def _thinned(vertices: np.ndarray, faces: np.ndarray) -> Triangles:
+    """Return a mesh with few triangles: corners in one cell of a grid become their mean."""
+    cell = VISUAL.first_cell
+    thin_vertices = vertices
+    thin_faces = faces
+    while len(thin_faces) > VISUAL.most_faces:
+        cells = np.floor(vertices / cell).astype(np.int64)
+        _, owner = np.unique(cells, axis=0, return_inverse=True)
+        owner = owner.reshape(-1)
+        counts = np.bincount(owner)[:, None]
+        sums = [np.bincount(owner, vertices[:, k]) for k in range(3)]
+        thin_vertices = np.stack(sums, 1) / counts
+        joined = owner[faces]
+        a, b, c = joined.T
+        joined = joined[(a != b) & (b != c) & (c != a)]
+        # two layers that were joined leave triangles that lie on each other
+        _, first = np.unique(np.sort(joined, 1), axis=0, return_index=True)
+        thin_faces = joined[np.sort(first)]
+        cell *= VISUAL.growth
+    return thin_vertices, thin_faces
+
+
+def _poses(urdf: Urdf) -> dict[str, np.ndarray]:
+    """Return the pose (4, 4) [m] of each link in the root's frame, with every joint at zero."""
+    found = {}
+    for link in urdf.links:
+        pose = np.eye(4)
+        for joint in urdf.joints_above(link.name):
+            pose = pose_of(joint) @ pose
+        found[link.name] = pose
+    return found
