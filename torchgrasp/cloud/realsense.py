@@ -17,7 +17,7 @@ CAMERA = "camera"
 
 
 @dataclasses.dataclass(frozen=True)
-class CameraNumbers:
+class LiveCameraNumbers:
     """Parameters of the shot of a live camera."""
 
     settle: int = 30
@@ -30,7 +30,7 @@ class CameraNumbers:
     """Longest wait for a frame [ms]; a camera that starts needs up to 2 s."""
 
 
-SHOT = CameraNumbers()
+SHOT = LiveCameraNumbers()
 
 
 class DepthShot(NamedTuple):
@@ -50,7 +50,7 @@ class DepthShot(NamedTuple):
     camera: str
 
 
-def shoot_depth(serial: str | None = None, numbers: CameraNumbers = SHOT) -> DepthShot:
+def shoot_depth(serial: str | None = None, numbers: LiveCameraNumbers = SHOT) -> DepthShot:
     """Return the median of some depth frames of a connected RealSense, which stands still.
 
     The mode is the camera's default. `serial` is the number of the camera; None means the only one.
@@ -133,7 +133,7 @@ def _find_mode(sdk: Any, sensor: Any, camera: str) -> Any:
     return next((mode for mode in modes if mode.is_default()), modes[0])
 
 
-def _take(sdk: Any, queue: Any, camera: str, numbers: CameraNumbers) -> np.ndarray:
+def _take(sdk: Any, queue: Any, camera: str, numbers: LiveCameraNumbers) -> np.ndarray:
     """Return the counts (h, w) of the next frame, as a copy: the camera uses its memory again."""
     wait = f"a frame within {numbers.patience / 1000:g} s; plug the camera in anew"
     with _refusing(camera, wait):
