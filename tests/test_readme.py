@@ -155,6 +155,44 @@ def test_commands_of_the_readme_exist_and_take_their_flags(line, capsys):
         assert words[0] in ("source", "pip")
 
 
+@pytest.mark.sim
+@pytest.mark.slow
+def test_commands_of_the_readme_run_in_a_clone_as_typed(
+    tmp_path, monkeypatch, capsys, few_postures
+):
+    """In the order of the page, with less work; what a clone holds is linked."""
+    from torchgrasp.app import cli
+
+    pytest.importorskip("sapien")
+    for name in ("torchgrasp", "hands", "examples"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    monkeypatch.chdir(tmp_path)
+    less = {
+        "grasp": ["--starts", "12", "--no-report"],
+        "evaluate": ["--starts", "12", "--grasps", "1", "--views", "1", "--only", "can"],
+    }
+    lines = [line for line in "".join(fenced("bash")).splitlines() if line[:11] == "torchgrasp "]
+    for line in lines:
+        words = shlex.split(line, comments=True)[1:]
+        assert cli.main([*words, *less.get(words[0], [])]) == 0, (line, capsys.readouterr())
+    made = {path.name for path in (tmp_path / "out").iterdir()}
+    assert len(lines) == 9 and made >= {"mine", "scene", "my_leap", "test", "grasps.json", "play"}
+
+
+def test_inputs_that_commands_of_the_readme_take_are_in_a_clone():
+    """What no earlier line of the page wrote must be a file, a folder or a shipped name."""
+    from torchgrasp import list_objects
+
+    for line in "".join(fenced("bash")).splitlines():
+        words = shlex.split(line, comments=True)
+        paths = [word for word in words if "/" in word and not word.startswith(("out", "scripts"))]
+        assert [
+            path for path in paths if words[0] == "torchgrasp" and not (ROOT / path).exists()
+        ] == []
+        if words[:2] == ["torchgrasp", "grasp"]:
+            assert "/" in words[2] or words[2] in list_objects()
+
+
 def test_every_file_the_readme_names_exists():
     links = re.findall(r"\]\(([^)#:]+)\)", README)
     assert [p for p in links if not (ROOT / p).exists()] == []
