@@ -21,7 +21,7 @@ import numpy as np
 from torchgrasp.app import cli
 from torchgrasp.cloud import realsense
 from torchgrasp.cloud.camera import INTRINSICS
-from torchgrasp.cloud.realsense import CameraNumbers, shoot_depth
+from torchgrasp.cloud.realsense import LiveCameraNumbers, shoot_depth
 from torchgrasp.foundation.errors import BadArgument
 
 # a machine without libusb loads the one of the package
@@ -136,7 +136,7 @@ def main(folder, file):
     realsense.list_cameras = lambda sdk: [still.device]
     began = time.monotonic()
     try:
-        shoot_depth(numbers=CameraNumbers(patience=100))
+        shoot_depth(numbers=LiveCameraNumbers(patience=100))
     except BadArgument as error:
         found["still"] = str(error), time.monotonic() - began
     print(json.dumps(found))
