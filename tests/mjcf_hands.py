@@ -18,10 +18,10 @@ class Hinge(NamedTuple):
     more: str = ""  # further attributes of the joint
 
 
-SWIVEL = Hinge("swivel", "0 0 1", -25, 25)
-BEND = Hinge("bend", "0 1 0", -25, 75)
-CURL = Hinge("curl", "0 1 0", 0, 75)
-TIP = Hinge("end", "0 1 0", 0, 70)
+SWIVEL = Hinge("swivel", "1 0 0", -45, 45)
+BEND = Hinge("bend", "0 1 0", -45, 90)
+CURL = Hinge("curl", "0 1 0", -20, 95)
+TIP = Hinge("end", "0 1 0", -10, 80)
 LENGTH = {"swivel": 0.018, "bend": 0.058, "curl": 0.044, "end": 0.03}
 
 
@@ -73,7 +73,11 @@ SOFT = (
     '<geom type="capsule" size="0.0095" fromto="0 0 0.006 0 0 {z:.6g}" solref="0.03 1" '
     'solimp="0.3 0.9 0.006"/>'
 )
-THREE = (("left", -0.045, -0.03, 0.0), ("right", -0.045, 0.03, 0.0), ("thumb", 0.045, 0.0, 180.0))
+THREE = (
+    ("left", -0.041, -0.0287, 35.0),
+    ("right", -0.041, 0.0287, -35.0),
+    ("thumb", 0.05, 0.0, 180.0),
+)
 
 
 def tendon_hand() -> str:
@@ -109,7 +113,7 @@ def tendon_hand() -> str:
 def soft_hand() -> str:
     """Five fingers with 21 joints and soft capsules as pads; the last joints of three follow."""
     row = [(n, -0.045, y, 0.0) for n, y in zip("abcd", (-0.06, -0.02, 0.02, 0.06), strict=True)]
-    flat = SWIVEL._replace(low=-12, high=12)
+    flat = SWIVEL._replace(low=-30, high=30)
     fingers = "".join(finger(*place, (flat, BEND, CURL, TIP), SOFT) for place in row)
     thumb = finger("thumb", 0.0, 0.0, 180.0, (SWIVEL, BEND, CURL, TIP), SOFT)
     fingers += (
@@ -148,8 +152,8 @@ def floating_hand() -> str:
         inner = inner.replace('pos="0.0 0.0 0.02" euler="0 0 0.0"', 'pos="0 0 0.05"')
         bodies += (
             f'<body name="{name}_base" pos="{x} {y} 0.026" euler="0 0 {yaw}">'
-            f'<joint name="{name}_swivel" axis="0 0 1" pos="0.001 0 0" range="-15 25" ref="5"/>'
-            f'<joint name="{name}_bend" axis="0 1 0" pos="0 0 0.004" range="-15 85" ref="10"/>'
+            f'<joint name="{name}_swivel" axis="1 0 0" pos="0.001 0 0" range="-35 45" ref="5"/>'
+            f'<joint name="{name}_bend" axis="0 1 0" pos="0 0 0.004" range="-35 100" ref="10"/>'
             f'<geom type="box" size="0.008 0.009 0.02" pos="0 0 0.026"/>{inner}</body>'
         )
         names += [f"{name}_{joint}" for joint in ("swivel", "bend", "curl", "end")]
