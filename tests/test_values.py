@@ -272,6 +272,20 @@ def test_the_best_grasp_is_the_first_executable_one_or_the_reasons():
         dataclasses.replace(three[:0], meta={"refused": "too small"}).best
 
 
+def test_the_success_of_one_grasp_formats_as_a_number_and_computes_as_a_tensor():
+    grasp = pinch("allegro")[1]
+    best = dataclasses.replace(grasp[[0]], status=torch.tensor([0]), score=torch.zeros(1).double())
+    assert f"{best.success:.2f}" == "0.50" and f"{best.best.success:.0%}" == "50%"
+    assert type(best.success + 0) is torch.Tensor and best.success.tolist() == [0.5]
+    assert torch.equal(copy.deepcopy(best.success), best.success)
+    sent = pickle.loads(pickle.dumps(best.success))  # noqa: S301
+    assert type(sent) is torch.Tensor and torch.equal(sent, best.success)
+    both = join([best, best])
+    assert f"{both.success}" == str(both.success) and both.success.shape == (2,)
+    with pytest.raises(TypeError):
+        f"{both.success:.2f}"
+
+
 def test_the_text_of_grasps_begins_with_what_a_user_asks_first():
     grasps = load_shipped_grasp("jug", "barrett")[[0, 0]]
     assert repr(grasps).startswith(

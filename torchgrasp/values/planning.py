@@ -9,6 +9,7 @@ Letters in shapes: n points, b batch rows, g grasps, f fingertips (three to five
 edges, h actuated joints, t time steps.
 """
 
+import copy
 import dataclasses
 import importlib
 from pathlib import Path
@@ -254,6 +255,27 @@ class IKSeeds(Batch):
     tip_error: Annotated[Float[Tensor, "g f"], ANY]
 
 
+class Probabilities(Tensor):
+    """A tensor of probabilities. If it holds a single one, format codes such as `.2f` apply to it.
+
+    All operations return plain tensors.
+    """
+
+    __torch_function__ = torch._C._disabled_torch_function_impl  # pyright: ignore[reportAssignmentType]
+
+    def __format__(self, code: str) -> str:
+        """Return the text of the tensor, or of its only number in the format `code`."""
+        return format(float(self), code) if code and self.numel() == 1 else super().__format__(code)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Tensor:
+        """Return a plain tensor, as all operations do."""
+        return copy.deepcopy(self.as_subclass(Tensor), memo)
+
+    def __reduce_ex__(self, proto: Any) -> Any:
+        """Return what is pickled: a plain tensor."""
+        return self.as_subclass(Tensor).__reduce_ex__(proto)
+
+
 @checked
 @dataclasses.dataclass(frozen=True)
 class Grasps(Batch):
@@ -310,15 +332,19 @@ class Grasps(Batch):
     def success(self) -> Float[Tensor, "g"]:
         """The predicted probability that each planned grasp holds; 0 if it cannot be executed, NaN
         if it is unknown.
+
+        That of a single grasp formats as a number: `f"{grasps.best.success:.0%}"`.
         """
         likely = torch.sigmoid(self.score)
         likely = likely if self.known is None else torch.where(self.known, likely, torch.nan)
-        return torch.where(self.status == Status.OK, likely, 0.0)
+        return torch.where(self.status == Status.OK, likely, 0.0).as_subclass(Probabilities)
 
     @property
     def best(self) -> "Grasps":
-        """The first executable grasp, as a batch of one. Raises `FailedRows` with the reasons if
-        there is none.
+        """The first executable grasp, as a batch of one, which all functions take.
+
+        `best.joints[0]` are its joints, without the axis of the batch, and `float(best.success)` is
+        a number. Raises `FailedRows` with the reasons if there is none.
         """
         good = self.status == Status.OK
         if not len(self):
