@@ -213,12 +213,13 @@ def _search_forces(
 
 
 def forces_near(points: Vectors, normals: Vectors, weights: Tensions) -> Vectors:
-    """Return balanced forces (b, f, 3) of little friction whose shares on the `internal_forces` are
-    near `weights`.
+    """Return balanced forces (b, f, 3) that need little friction, found by a short search from
+    `weights`.
 
-    `points` (b, f, 3) are the contacts, `normals` (b, f, 3) the outward unit normals. `weights` (b,
-    p) hold a share for each of p pairs; a short search begins with them. The forces are of any
-    scale; those of a set are NaN if none are found that push at all contacts.
+    `points` (b, f, 3) are the contacts, `normals` (b, f, 3) the outward unit normals. The forces
+    are a weighted sum of the `internal_forces` of p pairs. The search changes the `weights` (b, p),
+    which have no unit. Only the ratios of the forces count. They are NaN for a set if no found
+    forces push at all contacts.
     """
     pairs = internal_forces(points)
     push = -dot(pairs, normals[:, None])

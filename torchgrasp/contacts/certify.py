@@ -67,10 +67,10 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
 
     The margin is differentiable once in points and normals. Where several phi or v are optimal, its
     derivative is that of one of them. At its greatest possible value, where all phi are equal, it
-    is 0; where the margin is -inf, it is NaN. Rows that a loss masks spoil no other's. A second
-    derivative, and one of another field, raise `BadArgument`; in forward mode the latter is NaN.
-    Raises `BadArgument` for contacts of a wrong shape, normals that are not of length 1 (to 1e-3),
-    or no `ContactSpec`.
+    is 0; where the margin is -inf, it is NaN. A contact set that a loss masks does not affect the
+    derivatives of others. A second derivative, or the derivative of another field, raises
+    `BadArgument`; in forward mode the latter is NaN. Raises `BadArgument` for contacts of a wrong
+    shape, normals that are not of length 1 (to 1e-3), or a `spec` that is no `ContactSpec`.
 
     >>> corners = torch.tensor([[[1.0, 0, 0], [-0.6, 0.8, 0], [-0.6, -0.8, 0]]])
     >>> certify(Contacts(corners, corners)).closed

@@ -142,10 +142,11 @@ def settle_flatness(shape: ShapeLike, spec: ContactSpec, seed: int) -> FlatCandi
 def draw(
     shape: ShapeLike, spec: ContactSpec, size: tuple[int, int], generator: torch.Generator
 ) -> Float[Tensor, "_ f 3"]:
-    """Return random points on the sphere of `spec.start_radius`, in normalised units.
+    """Return random contact sets on the sphere around the origin with radius `spec.start_radius`,
+    in normalised units.
 
-    `size` is the number of contact sets, and that of contacts in each. `generator` draws the
-    points.
+    `size` holds the number of contact sets and the number of contacts in each. `generator` draws
+    the points.
     """
     points = unit(torch.randn(*size, 3, generator=generator, dtype=torch.float64, device="cpu"))
     return (spec.start_radius * points).to(device_of(shape))

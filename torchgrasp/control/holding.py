@@ -63,13 +63,14 @@ class GripNumbers:
     near: float = 0.95
     """Share of the limits of torque and force from which the forces count as near the limits."""
     normals: float = 1.0
-    """Cut-off [Hz] of the sensed normals."""
+    """Cut-off frequency [Hz] of the low-pass filter of the sensed normals."""
     forces: float = 8.0
-    """Cut-off [Hz] of the sensed forces."""
+    """Cut-off frequency [Hz] of the low-pass filter of the sensed forces."""
     load: float = 3.0
-    """Cut-off [Hz] of the sensed load."""
+    """Cut-off frequency [Hz] of the low-pass filter of the sensed load."""
     carried: float = 0.7
-    """Cut-off [Hz] of the load that counts as carried; a faster one rocks the object."""
+    """Cut-off frequency [Hz] of the low-pass filter of the load that counts as carried; a higher
+    one rocks the object."""
     carries: float = 0.8
     """Share of the carried load that is commanded; with 1, the hand would press a rigid table with
     ever growing forces.
@@ -77,7 +78,7 @@ class GripNumbers:
     settled: float = 0.4
     """Time [s] before which the hand may still reopen beside the object."""
     sure: float = 4.0
-    """Rate [1/s] at which the reserve for a push grows after that time."""
+    """Rate [1/s] at which the reserve for a push grows after the time `settled`."""
     lever: float = 0.1
     """Longest lever [m] at which weight and pushes may turn the object."""
     slow: float = 0.008
@@ -442,7 +443,7 @@ def push_reserve(
     side.
 
     With it, the force of the finger stays in its cone of the coefficient `friction`. The push acts
-    at `arm` (3,) [m] from the middle of the `contacts`, whose outward unit `normals` are (f, 3).
+    at `arm` (3,) [m] from the centroid of the `contacts`, whose outward unit `normals` are (f, 3).
     The fingers share the push like springs of equal stiffness.
     """
     sides = np.eye(3)

@@ -67,7 +67,7 @@ class LocalizationNumbers:
     a touch moves the object by twice the surface's deviation.
     """
     empty: float = 80.0
-    """Cost of a pose at which the hand closed on nothing."""
+    """Cost of a pose at which the hand would have touched the object, if it touched nothing."""
 
 
 PLANES = ContactPlaneNumbers()
@@ -207,9 +207,9 @@ class Localization:
     """Search for the object displacement that best explains the `touches`; each call tries one
     rotation angle.
 
-    Later touches weigh more, because each touch may move the object. The object is probably not
-    where the hand closed on nothing (`Touches.nothing`). The plan `reference` must have a surface
-    and a table.
+    Later touches weigh more, because each touch may move the object. If the hand touched nothing
+    (`Touches.nothing`), the object is probably not where the hand closed. The plan `reference` must
+    have a surface and a table.
     """
 
     def __init__(self, reference: ClosingReference, touches: Sequence[Touches]) -> None:

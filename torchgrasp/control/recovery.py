@@ -82,7 +82,7 @@ class LostNumbers:
     load: float = 0.2
     """Load [N] along the table's normal below which the object counts as not carried."""
     cutoff: float = 3.0
-    """Cut-off [Hz] of the low-pass filter of the load."""
+    """Cut-off frequency [Hz] of the low-pass filter of the load."""
     first: float = 0.01
     """Least height [m] of the lift at which missing touches count."""
     low: float = 0.02

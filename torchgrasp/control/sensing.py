@@ -120,11 +120,11 @@ def _forces_by_torques(
 
 
 class DriveFeel:
-    """Estimator of contact forces from the joint drives alone: a blocked joint does not reach its
-    target.
+    """Estimator of contact forces from the joint drives alone: a call returns the low-passed normal
+    force (f,) [N] of each fingertip.
 
-    A drive of stiffness k and damping d exerts the torque k (target - q) - d dq/dt at the joint
-    angle q.
+    A blocked joint does not reach its target. A drive of stiffness k and damping d exerts the
+    torque k (target - q) - d dq/dt at the joint angle q.
     """
 
     def __init__(self, reference: ClosingReference) -> None:

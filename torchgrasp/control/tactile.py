@@ -30,11 +30,12 @@ class TactileNumbers:
     """Parameters of simulated fingertip sensors; the noise of their normal force is `NOISE` [N]."""
 
     cutoff: float = 20.0
-    """Cut-off [Hz] of the lag of the sensor."""
+    """Cut-off frequency [Hz] of the low-pass filter that models the lag of the sensor."""
     tangential: float = 0.3
     """Standard deviation [N] of the force along the surface."""
     place: float = 1.5e-3
-    """Standard deviation [m] of the contact's place."""
+    """Standard deviation [m] of the sensed position of the contact, on each axis along the
+    surface."""
     slide: float = 2e-3
     """Standard deviation [m/s] of the sliding speed."""
     radius: float = 0.012

@@ -36,7 +36,8 @@ class TouchNumbers:
     limit: float = 0.003
     """Greatest gap [m] of a fingertip that touches: the usual deviation of an estimated surface."""
     reach: float = 1.5
-    """A cloud shows the surface at a fingertip within so many spacings of its points."""
+    """Greatest distance of a fingertip from the cloud's nearest point, along the surface, in
+    spacings of the points. Farther away, the cloud does not show the surface."""
 
 
 TOUCH = TouchNumbers()

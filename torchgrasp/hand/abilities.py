@@ -23,7 +23,7 @@ from torchgrasp.hand.hand import Hand
 
 @dataclasses.dataclass(frozen=True)
 class AbilityNumbers:
-    """Numbers by which the abilities of a hand are told from its random postures."""
+    """Parameters by which the abilities of a hand are computed from its random postures."""
 
     sure: float = (
         0.1  # share of the free postures in which a fingertip is weaker than its sure force

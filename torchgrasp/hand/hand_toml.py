@@ -314,7 +314,7 @@ def _coupling(field: Field) -> dict[str, Mimic]:
 
 
 def leading(coupling: Mapping[str, Mimic], joints: Collection[str]) -> set[str]:
-    """Return the joints that some coupled ones of `joints` follow."""
+    """Return the names of the joints that the coupled joints among `joints` follow."""
     return {name for joint in joints if joint in coupling for name, _ in coupling[joint].terms}
 
 

@@ -58,7 +58,7 @@ EXPLAIN = ExplainNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class Losses(Value):
-    """The number of things that a planning stage lost for each reason.
+    """How many of the things given to a planning stage were lost, and for which reasons.
 
     Args:
         stage: name of the stage.
@@ -268,8 +268,8 @@ def explain_empty(
 
     The changes are: no region, other fingers, another shipped hand, wider limits of contacts,
     higher friction, no table, no neighbours, an arm that reaches everything. The search ends at a
-    change that the user can choose and with which the best fifth of the guesses is likely to
-    succeed.
+    change that the user can choose and that gives grasps which are likely to succeed. For this, the
+    best grasps count, one for every five guesses.
 
     The work is bounded, not the time, so that a seed always gives the same explanation. A plan has
     at most 20 initial guesses and a small library of postures. Relaxed constraints are tried only

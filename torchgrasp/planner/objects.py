@@ -78,9 +78,9 @@ class ShapedObject:
     `cloud` and `scene` are what was seen. `cloud` and `table` (a plane, or a height [m] along z)
     are in the caller's frame, all else in the upright frame. `obj_from_upright` [m] is the
     transform from the upright frame to the caller's. `shape` is the estimated shape, `surface` its
-    mesh [m] and `body` what predictions of success need. `vague` says that the cloud hardly shows
-    the object: few points, one plane, or a part beyond the image border. `obstacles` surround a
-    scene's target; None without a scene.
+    mesh [m], and `body` the estimates from which success is predicted. `vague` says that the cloud
+    hardly shows the object: few points, one plane, or a part beyond the image border. `obstacles`
+    surround a scene's target; None without a scene.
     """
 
     cloud: PointCloud
@@ -147,7 +147,7 @@ class Objects:
         sizes: the sizes of the plan's batches.
         starts: the s initial guesses of each object (s, f, 3), normalised.
         shape: the estimated shapes.
-        constraints: the contact planning problems, in normalised units.
+        constraints: the contact planning problem (`ContactProblem`), in normalised units.
         body: the bodies for predictions of success.
         world: what the hand must not touch, in the upright frame.
         loads: w loads of the task for each object (force [N], torque [N m] about the origin of the
@@ -197,8 +197,8 @@ class Objects:
 
     @property
     def library(self) -> PostureLibrary:
-        """The library of random postures of the hand, on the device of the objects; the hand caches
-        it.
+        """The library of random hand postures for initial guesses, on the device of the objects;
+        the hand caches it.
         """
         hand = settle_hand(self.hand, self.each[0].shape.device)
         return settle(PostureLibrary.of(hand, self.postures, self.request.seed), self.device)
@@ -246,7 +246,7 @@ class Objects:
     def reach(
         self, contacts: Contacts, certificate: Certificate, cloud: CloudIndex
     ) -> GraspProblem:
-        """Return the problem of moving the hand onto b contact sets with their certificates.
+        """Return the inverse-kinematics problem of b contact sets with their certificates.
 
         `cloud` is the index of each contact set's object.
         """

@@ -2,7 +2,7 @@
 
 `step` reads like this. Find new contact sets. Choose the most promising. Move the hand onto their
 fixed contacts. Where no posture reaches them, move contacts and hand together ("sliding contacts").
-A contact set is named by its index in the `Candidates`, its row.
+A contact set is named by its row, which is its index in the `Candidates`.
 """
 
 import dataclasses

@@ -51,7 +51,7 @@ class EmRule:
     """The bounds that end a fit, and the variance that it adds."""
 
     iterations: int
-    """Most steps, including the steps before the start."""
+    """Most EM steps, including those that were made before the state from which the fit starts."""
     tolerance: float
     """Least rise [nats] of the mean log-likelihood in a step that goes on."""
     regularisation: float

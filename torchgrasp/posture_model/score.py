@@ -46,7 +46,7 @@ class MixtureScore(Value):
     paper_coverage: float  # share of codes of energy below `PAPER_ENERGY`
     default_coverage: float  # share of codes of energy below `DEFAULT_ENERGY`
     log_likelihood: float  # mean over the postures [nats]
-    postures: int  # their number
+    postures: int  # number of postures
 
     @property
     def mean_error(self) -> float:

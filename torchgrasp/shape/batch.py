@@ -43,8 +43,9 @@ class Walls(Value):
         x: observed points, normalised, those with normals first.
         a: weight of each observed distance (no unit).
         b: weight of each observed normal (no unit).
-        whitener: matrix that makes covariances white: lines of covariances with all `rows` observed
-            numbers (distances, then normals by component) are multiplied by it.
+        whitener: the inverse L^-T of the transposed Cholesky factor L of the observations'
+            covariance. The `rows` observed numbers are the distances, then the normals by
+            component.
         psi: length of each kernel, normalised.
     """
 
@@ -309,8 +310,8 @@ class ShapeBatch(Value):
         return SurfaceJet(*self._evaluate(evaluate, x))
 
     def estimate(self, x: Queries) -> Moments:
-        """Return mean and covariance of distance and gradient at q normalised points, Eqs. (7)-(8)
-        of the paper.
+        """Return mean (q, 4) and covariance (q, 4, 4) of distance and gradient at q normalised
+        points, Eqs. (7)-(8) of the paper.
         """
 
         def evaluate(part: Tensor, wall: Tensor) -> tuple[Tensor, Tensor]:

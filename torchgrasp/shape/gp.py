@@ -239,12 +239,12 @@ class ShapeGP(Posterior, Normalisation):
         noise: Positive = 0.001,
         normal_noise: Positive = 0.05,
     ) -> "ShapeGP":
-        """Return the shape given further surface points too, such as a finger's touch or a second
+        """Return the shape given additional surface points, such as a finger's touch or a second
         view.
 
         The result equals the posterior of all observations at once. Kernel, domain and `cloud` do
         not change. A view, which is 20 points or more, is compared with `cloud`. A distance that
-        noise does not explain is told by a `MendedInput`, and widens the deviations of both.
+        noise does not explain raises the warning `MendedInput`, and widens the deviations of both.
 
         Args:
             points: surface points [m] in the cloud's frame.
@@ -279,11 +279,11 @@ class ShapeGP(Posterior, Normalisation):
 
     @checked
     def widened(self, points: Points, error: Float[Tensor, "n"]) -> "ShapeGP":
-        """Return the shape with deviations that hold the standard deviations `error` (n,) [m] of
-        views' poses, too.
+        """Return the shape with standard deviations that include errors of a view's pose.
 
-        The points (n, 3) [m] of a view are off together: no number of them makes the shape more
-        certain than that.
+        `points` (n, 3) [m] are those of the view. `error` (n,) [m] is the standard deviation of
+        each point that the pose causes. An error of the pose moves all points of a view together,
+        so more points do not reduce it.
         """
         rows = draw_rows(len(points), DOMAIN.compared).to(points.device)
         std_m = self.predict(points[rows]).std_m

@@ -32,7 +32,7 @@ Found = TypeVar("Found")
 
 @dataclasses.dataclass(frozen=True)
 class TieNumbers:
-    """Numbers of the observations that give a vessel's wall its known thickness."""
+    """Parameters of the observations that give a vessel's wall its known thickness."""
 
     rounds: int = 3
     """Most rounds; each observes the points with the greatest error of the thickness."""
@@ -115,7 +115,9 @@ class HollowShape(ShapeGP):
 
     @checked(gradients=True)
     def estimate(self, x: Queries) -> Moments:
-        """Return mean and covariance of distance and gradient (d, w) at q normalised points."""
+        """Return mean (q, 4) and covariance (q, 4, 4) of distance and gradient (d, w) at q
+        normalised points.
+        """
         parts, merge = self._by_wall(x, lambda wall, own: wall.estimate(own))
         return tuple(map(merge, *parts))  # pyright: ignore[reportReturnType]
 

@@ -40,8 +40,8 @@ def evaluate_mean(
     x: Queries,
     gradient: bool,
 ) -> tuple[Tensor, ...]:
-    """Return the mean distance at q normalised points and, if asked for by `gradient`, its
-    gradient.
+    """Return the mean distance (q,) at q normalised points and, if `gradient` is True, its gradient
+    (q, 3).
 
     `of` holds the observations and weights.
     """

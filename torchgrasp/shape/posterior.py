@@ -131,8 +131,8 @@ class Posterior(Value):
 
     @checked(gradients=True)
     def estimate(self, x: Queries) -> Moments:
-        """Return mean and covariance of distance and gradient at q normalised points, Eqs. (7)-(8)
-        of the paper.
+        """Return mean (q, 4) and covariance (q, 4, 4) of distance and gradient at q normalised
+        points, Eqs. (7)-(8) of the paper.
         """
         prior = self.prior_block()
         rows = len(self.factor)

@@ -83,7 +83,7 @@ class Surface(Value):
     """
 
     vertices: Float[Tensor, "v 3"]  # corners of the triangles [m]
-    faces: Int[Tensor, "f 3"]  # indices of three vertices, turned outward
+    faces: Int[Tensor, "f 3"]  # indices of three vertices; normals point outward
     normals: Float[Tensor, "v 3"]  # outward unit gradients of the mean
     std_m: Float[Tensor, "v"]  # standard deviation of the surface along its normal [m]
 
@@ -122,7 +122,7 @@ class Mesh(Value):
     """A triangle mesh of the estimated surface, without normals and deviations."""
 
     vertices: Float[Tensor, "v 3"]  # corners of the triangles [m]
-    faces: Int[Tensor, "f 3"]  # indices of three vertices, turned outward
+    faces: Int[Tensor, "f 3"]  # indices of three vertices; normals point outward
 
 
 def extract_mesh(shape: ShapeGP) -> Mesh:

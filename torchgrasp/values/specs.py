@@ -118,8 +118,9 @@ class ContactSpec(Value):
         """The least height [m] of an object that fingertips on the table can grasp.
 
         They touch its wall or its upper rim. A rim of radius q and a fingertip of radius r touch at
-        the height (r + q)(1 - s), where s is the slope of the normal. Rims count unless
-        `flat_radius` is given; q is the least of `FLAT_RADII`.
+        the height (r + q)(1 - s). Here s is the largest vertical part of the contact's unit normal
+        that friction allows. Rims count unless `flat_radius` is given; q is the least of
+        `FLAT_RADII`.
         """
         if self.flat_radius is not None:
             return self.fingertip_radius + self.flat_radius

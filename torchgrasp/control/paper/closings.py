@@ -53,7 +53,7 @@ class UnstableNumbers:
     odds: float = 3.0
     """Odds of stability above which a grasp counts as stable."""
     cutoff: float = 2.0
-    """Cut-off [Hz] of the readings that are judged."""
+    """Cut-off frequency [Hz] of the low-pass filter of the readings that are judged."""
     wait: float = 0.3
     """Time [s] after the ramp in which the filtered readings follow the forces."""
     raised: float = 2.0
@@ -148,8 +148,8 @@ class PositionClosing:
 
 
 class OpenLoopClosing:
-    """Closing without sensors: the joints move from the pre-grasp to the grasp, then to targets
-    that press.
+    """Closing controller without sensors: the joints move from the pre-grasp to the grasp, then to
+    targets that press.
     """
 
     palm = STILL
@@ -169,7 +169,8 @@ class OpenLoopClosing:
     def advance(self, period: float) -> Float[Tensor, "*n j"]:
         """Return the targets [rad] of all joints for the next tick, `period` [s] later.
 
-        They are (j,) for one hand, or (n, j) if `poses` holds the postures of n hands.
+        They are (j,) for one hand, or (n, j) if the attribute `poses` holds the postures (3, n, j)
+        [rad] of n hands: pre-grasp, grasp and squeeze.
         """
         self.time += period
         progress = min(self.time / POSE_TIME, 2.0)

@@ -401,8 +401,8 @@ def merge_hidden(
     allowed: Callable[[SomeHidden], Bool[Tensor, "n"]],
     thin: Callable[[Points], Int[Tensor, "k"]],
 ) -> SomeHidden:
-    """Return `merged` with the points of each part added that are `allowed` and not beside earlier
-    points.
+    """Return `merged` with further points: those of the `parts` that are `allowed` and not near
+    earlier points.
 
     `allowed(part)` is a mask of the part's points. `thin(points)` returns the indices of the points
     to keep, given points (n, 3) [m].

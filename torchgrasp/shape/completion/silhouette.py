@@ -88,7 +88,9 @@ def pick_apart(
     points: Float[Tensor, "n d"],
     count: int,
 ) -> Int[Tensor, "picks"]:
-    """Return the indices of at most `count` points far apart, the same ones in every frame."""
+    """Return the indices of at most `count` points that lie far apart; a rigid motion of all points
+    does not change the choice.
+    """
     return farthest_points(points, count, tie=TIE)
 
 

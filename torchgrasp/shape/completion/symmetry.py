@@ -42,7 +42,7 @@ class SymmetryNumbers:
     probes: int = 150
     """Most points of the cloud that score a plane."""
     leaf: int = 32
-    """Points in a leaf of the tree of all points."""
+    """Most points in a leaf of the k-d tree of all points."""
 
 
 SYMMETRY = SymmetryNumbers()
