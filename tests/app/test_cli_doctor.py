@@ -2,12 +2,20 @@
 
 import importlib.metadata
 import importlib.util
+import re
+import sys
+from pathlib import Path
 
 import pytest
 
 from torchgrasp.app import cli
 from torchgrasp.data.shipped import load_object, load_shipped_grasp
 from torchgrasp.evaluation import golden
+
+if sys.version_info < (3, 11):
+    import tomli as tomllib
+else:
+    import tomllib
 
 
 def without(monkeypatch, *names):
@@ -34,17 +42,40 @@ def test_what_one_command_needs_is_told_and_is_no_fault(monkeypatch, capsys):
     version = importlib.metadata.version
     capsys.readouterr()
 
-    def without_distributed(name):
-        if name == "distributed":
+    def without_dask(name):
+        if name == "dask":
             raise importlib.metadata.PackageNotFoundError(name)
         return version(name)
 
-    monkeypatch.setattr(importlib.metadata, "version", without_distributed)
+    monkeypatch.setattr(importlib.metadata, "version", without_dask)
     assert cli.main(["doctor"]) == code
     assert (
         "`torchgrasp campaign --scheduler` needs it: pip install 'torchgrasp[cluster]'"
         in capsys.readouterr().out
     )
+
+
+def test_every_extra_of_the_package_is_listed(monkeypatch, capsys):
+    """The oracle is pyproject.toml; an extra without an entry in the library is listed, too."""
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())
+    extras = project["project"]["optional-dependencies"]
+    lines = [
+        f"{need.split(';')[0]}; extra == '{x}'" for x, needs in extras.items() for need in needs
+    ]
+    lines += ["no-such-package>=2; extra == 'novel'", "torch>=2.6"]
+    monkeypatch.setattr(importlib.metadata, "requires", lambda name: lines)
+    cli.main(["doctor"])
+    told = capsys.readouterr().out
+    assert re.search(r"extra novel +no no-such-package: pip install 'torchgrasp\[novel\]'", told)
+    for extra in {*extras} - {"sim", "mujoco"}:
+        assert f"\nextra {extra} " in told
+
+    def unknown(name):
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(importlib.metadata, "requires", unknown)
+    cli.main(["doctor"])
+    assert "torchgrasp is not installed, but imported" in capsys.readouterr().out
 
 
 def test_the_doctor_names_what_is_missing_and_what_installs_it(monkeypatch, capsys):
@@ -91,4 +122,8 @@ def test_the_selftest_fails_where_a_verdict_is_another(monkeypatch, capsys):
     wrong = [golden.GoldenResult(case, not case.held, 0.1) for case in golden.GOLDEN]
     monkeypatch.setattr(golden, "run_golden", lambda simulator: wrong)
     assert cli.main(["selftest"]) == 1
-    assert "(wrong)" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "(wrong)" in told
+    # no two rows are alike: what differs is said
+    rows = [" ".join(line.split()) for line in told.splitlines() if " kg " in line]
+    assert len(rows) == len(set(rows)) == len(golden.GOLDEN) and told.count("60 mm off") == 2

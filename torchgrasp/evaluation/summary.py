@@ -202,7 +202,8 @@ def _count_causes(scores: Sequence[ViewScore]) -> dict[str, dict[str, Any]]:
     found = {}
     for cause, count in Counter(name for name, _, _ in lost).most_common():
         groups = Counter(group for name, group, _ in lost if name == cause)
-        middle = statistics.median([size for name, _, size in lost if name == cause])
+        sizes = [size for name, _, size in lost if name == cause and not math.isnan(size)]
+        middle = statistics.median(sizes) if sizes else math.nan
         found[cause] = {"count": count, "by_group": dict(groups.most_common()), "median": middle}
     return found
 

@@ -6,6 +6,7 @@ from html.parser import HTMLParser
 import pytest
 
 from tests.scores import SCORES
+from torchgrasp import __version__
 from torchgrasp.app.report.evaluation_page import format_evaluation, write_evaluation
 from torchgrasp.app.report.page import TEMPLATES, format_page, grasp_rows, write_report
 from torchgrasp.app.report.run_data import closing_sentence, refusal, verdict
@@ -158,6 +159,26 @@ def test_the_page_of_an_evaluation_shows_shares_objects_and_reasons_and_no_text_
         ).read_text()
         == page
     )
+
+
+def test_a_report_says_version_command_and_date_of_its_run(run):
+    told = dataclasses.replace(run, command="torchgrasp grasp jug", date="2026-01-02 03:04 UTC")
+    page = format_page(told, {})
+    for text in (f"torchgrasp {__version__}", "torchgrasp grasp jug", "2026-01-02 03:04 UTC"):
+        assert text in page
+    assert format_page(told, {}) == page and " UTC" not in format_page(run, {})
+
+
+def test_the_page_of_an_evaluation_has_no_nan_and_no_success_of_what_was_not_tried():
+    """All predictions are right or none: skill and area are not measured, nor is a cause's size."""
+    tried = dataclasses.replace(SCORES[0].attempts[0], predicted=0.9)
+    lost = dataclasses.replace(tried, passed=False, status=Status.DROPPED, cause="turned")
+    for attempts in ((tried,), (lost,), (dataclasses.replace(lost, size=3.0), lost)):
+        scores = [dataclasses.replace(SCORES[0], attempts=attempts), *SCORES[1:2], SCORES[3]]
+        _, words = read(format_evaluation("Grasps", {}, scores))
+        assert not re.search(r"\bnan\b", words, re.IGNORECASE)
+        row = words[words.index("sieve") :].split("bad_object")[0]
+        assert "0%" not in row and row.split()[1] == "-"
 
 
 def test_a_bar_ends_where_the_interval_does():

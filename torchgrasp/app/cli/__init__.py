@@ -30,7 +30,7 @@ from torchgrasp.app.cli import (
     hands,
     look,
 )
-from torchgrasp.app.cli.command import Command, execute
+from torchgrasp.app.cli.command import WORDS, Command, execute
 from torchgrasp.foundation.errors import BadArgument, GraspError
 
 __all__ = ["main", "run_and_exit"]
@@ -106,8 +106,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # The batches are small: a second thread costs more than it gains, and one gives the same bits
     # on any machine.
     torch.set_num_threads(1)
-    with _open_streams():
-        return _guard(given)
+    before = WORDS.set(tuple(given))
+    try:
+        with _open_streams():
+            return _guard(given)
+    finally:
+        WORDS.reset(before)
 
 
 def run_and_exit() -> NoReturn:

@@ -11,6 +11,8 @@ from torchgrasp import cloud as clouds
 from torchgrasp.app.cli import inputs
 from torchgrasp.app.cli.command import (
     Command,
+    ForPrograms,
+    answer,
     arguments,
     naming,
     nested,
@@ -39,7 +41,7 @@ MOST_TRIED = 20_000  # points with which a camera is sought: more give no more c
 
 
 @arguments(points="file", normals="file")
-class CloudCheck(Command):
+class CloudCheck(ForPrograms):
     """Report on a point cloud, with advice for a better one. The exit code is 1 if `torchgrasp
     grasp` refuses it.
     """
@@ -55,7 +57,19 @@ class CloudCheck(Command):
             print(f"{'note':12}{note}")
         for advice in unseen:
             print(f"{'refused':12}{advice}")
-        return int(any(advice.refused for advice in (*report.advice, *unseen)))
+        found = (*report.advice, *unseen)
+        refused = any(advice.refused for advice in found)
+        measured = {
+            "points": report.points,
+            "size_m": report.size,
+            "spacing_m": report.spacing,
+            "noise_m": report.noise,
+            "outliers": report.outliers,
+            "viewpoint_given": report.viewpoint_given,
+        }
+        advice = [vars(one) for one in found]
+        answer({"refused": refused, "advice": advice, "notes": notes, **measured})
+        return int(refused)
 
     def judge(self) -> tuple[tuple[str, ...], clouds.CloudReport, tuple[clouds.Advice, ...]]:
         """Return notes on the reading of the cloud, a report, and the refusal of a cloud that no

@@ -3,20 +3,33 @@ does the work.
 """
 
 import contextlib
+import contextvars
 import dataclasses
+import os
+import shlex
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args, get_origin
+from typing import Annotated, Any, ClassVar, Literal, TextIO, TypeVar, get_args, get_origin
 
 import tyro
 from tqdm import tqdm
 
+from torchgrasp.files import format_json
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Range, check_path, describe
 
 T = TypeVar("T")
+BEAT = 15.0
+"""Seconds between the lines that tell how far a command is, where stderr is no terminal."""
+WORDS: contextvars.ContextVar[tuple[str, ...]] = contextvars.ContextVar("WORDS", default=())
+"""The words of the command line that runs."""
+ANSWER: contextvars.ContextVar[TextIO | None] = contextvars.ContextVar("ANSWER", default=None)
+"""Where --json writes; None without --json."""
+QUIET: contextvars.ContextVar[bool] = contextvars.ContextVar("QUIET", default=False)
+"""Whether only results, warnings and errors are told."""
 
 
 class Command:
@@ -129,8 +142,52 @@ def execute(command: Command) -> int:
                 raise BadArgument(options[name], value, describe(field.type))
         if isinstance(value, Path):
             check_path(options[name], value)
-    with naming(**options | {argument: options[name] for argument, name in command.names.items()}):
+    names = options | {argument: options[name] for argument, name in command.names.items()}
+    with naming(**names), _speaking(command):
         return command.run()
+
+
+@arguments()
+class ForPrograms(Command):
+    """Options of commands that programs call: what is printed, and where."""
+
+    json: bool = option(False, "print the result as JSON on stdout, and all words on stderr")
+    quiet: bool = option(False, "print no words: only warnings, errors and the JSON of --json")
+
+
+def answer(content: Any) -> None:
+    """Print the result of a command as JSON on stdout, if it runs with --json.
+
+    NaN and infinity become null.
+    """
+    stream = ANSWER.get()
+    if stream is not None:
+        print(format_json(content).rstrip("\n"), file=stream, flush=True)
+
+
+def command_line() -> str:
+    """Return the command line that runs, as it would be typed; "" outside a command."""
+    words = WORDS.get()
+    return shlex.join(["torchgrasp", *words]) if words else ""
+
+
+@contextlib.contextmanager
+def _speaking(command: Command) -> Iterator[None]:
+    """Within the context, words go where --json and --quiet send them."""
+    json: bool = getattr(command, "json", False)
+    quiet: bool = getattr(command, "quiet", False)
+    if not isinstance(command, ForPrograms) or not (json or quiet):
+        yield
+        return
+    with contextlib.ExitStack() as stack:
+        before = ANSWER.set(sys.stdout if json else None)
+        stack.callback(ANSWER.reset, before)
+        stack.callback(QUIET.reset, QUIET.set(quiet))
+        words = sys.stderr
+        if quiet:
+            words = stack.enter_context(open(os.devnull, "w"))
+        stack.enter_context(contextlib.redirect_stdout(words))
+        yield
 
 
 @contextlib.contextmanager
@@ -185,8 +242,53 @@ class StageProgress:
 
 
 def make_bar(total: int | None, unit: str, **options: Any) -> tqdm:
-    """Return a tqdm progress bar; it is silent if stderr is not a terminal.
+    """Return a tqdm progress bar; where stderr is no terminal, it prints lines instead.
 
-    `total` is the number of steps, None if it is unknown; `unit` is the name of a step.
+    `total` is the number of steps, None if it is unknown; `unit` is the name of a step. The lines
+    say how many steps are done, every `BEAT` seconds. With --quiet there are none.
     """
-    return tqdm(total=total, unit=unit, disable=None, leave=False, **options)
+    return _Beating(total=total, unit=unit, disable=None, leave=False, **options)
+
+
+class _Beating(tqdm):
+    """A progress bar that prints a line from time to time where there is no terminal."""
+
+    done = 0
+    ended: threading.Event | None = None
+
+    def update(self, n: int | float | None = 1) -> bool | None:
+        """Count `n` more steps as done."""
+        self.done += int(n or 0)
+        return super().update(n)
+
+    def describe(self) -> str:
+        """Return how many steps are done, and the seconds since the start."""
+        label = getattr(self, "desc", None)
+        name = f"{label.rstrip(': ')}: " if label else ""
+        of = f" of {self.total}" if self.total else ""
+        seconds = time.monotonic() - self.began
+        return f"{name}{self.done}{of} {getattr(self, 'named', 'step')}s, {seconds:.0f} s"
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self.named = options.get("unit", "step")
+        self.desc = getattr(self, "desc", None) or options.get("desc", "")
+        self.began = time.monotonic()
+        if self.disable and not QUIET.get():
+            self.ended = threading.Event()
+
+    def __enter__(self) -> "_Beating":
+        """Begin to print lines, if the bar is not drawn."""
+        if self.ended is not None:
+            threading.Thread(target=self._beat, args=(self.ended,), daemon=True).start()
+        return self
+
+    def close(self) -> None:
+        """End the bar and its lines."""
+        if self.ended is not None:
+            self.ended.set()
+        super().close()
+
+    def _beat(self, ended: threading.Event) -> None:
+        while not ended.wait(BEAT):
+            print(self.describe(), file=sys.stderr, flush=True)

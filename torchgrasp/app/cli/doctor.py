@@ -6,6 +6,7 @@ import importlib.metadata
 import importlib.util
 import os
 import platform
+import re
 import sys
 import time
 from typing import NamedTuple
@@ -13,7 +14,7 @@ from typing import NamedTuple
 import torch
 
 from torchgrasp import __version__
-from torchgrasp.app.cli.command import Command, arguments, make_bar
+from torchgrasp.app.cli.command import Command, ForPrograms, answer, arguments, make_bar
 from torchgrasp.app.cli.inputs import import_simulator
 from torchgrasp.files import format_columns
 from torchgrasp.foundation.errors import BadArgument, MissingExtra
@@ -24,6 +25,19 @@ CORE = ("torch", "numpy", "scipy", "trimesh", "pytorch-kinematics", "yourdfpy", 
 """Packages that every command needs."""
 SIMULATORS: dict[Simulator, str] = {"sapien": "sim", "mujoco": "mujoco"}
 """Simulators, and the extra that installs each."""
+NEEDED_BY = {
+    "cluster": "`torchgrasp campaign --scheduler`",
+    "data": "`torchgrasp campaign --parquet` and data sets for LeRobot",
+    "dev": "the tests of the library",
+    "docs": "the site of the library",
+    "film": "MP4 files of `torchgrasp film`",
+    "mcp": "`torchgrasp mcp`",
+    "meshes": "hands with .dae meshes",
+    "realsense": "`torchgrasp grasp --realsense`",
+    "rerun": "`torchgrasp grasp --rerun`",
+    "robots": "hands of robot_descriptions",
+}
+"""What needs an extra, where it is known; all other extras are listed without it."""
 
 
 class Finding(NamedTuple):
@@ -41,12 +55,11 @@ class Finding(NamedTuple):
 
 
 @arguments()
-class Doctor(Command):
+class Doctor(ForPrograms):
     """List installed and missing packages, with the command that installs each.
 
     The exit code is 1 if a simulator or a package is missing, even though planning needs no
-    simulator. A missing Dask, which only `campaign --scheduler` needs, does not change the exit
-    code.
+    simulator. Other extras, which single commands need, do not change the exit code.
     """
 
     def run(self) -> int:
@@ -54,6 +67,7 @@ class Doctor(Command):
         findings = find_parts()
         print(format_columns([(x.part, x.found) for x in findings], left={0, 1}))
         missing = [x for x in findings if x.fix]
+        answer({"complete": not missing, "parts": [x._asdict() for x in findings]})
         for x in missing:
             print(f"\n{x.part}: {x.fix}")
         print("\neverything is installed; `torchgrasp selftest` tries it" if not missing else "")
@@ -66,10 +80,6 @@ def find_parts() -> list[Finding]:
     gpu = "none visible to torch; everything runs on the processor"  # no fault
     if torch.cuda.is_available():
         gpu = f"{torch.cuda.get_device_name()}, CUDA {torch.version.cuda}"
-    dask = _package("distributed", "pip install 'torchgrasp[cluster]'")
-    if dask.fix:
-        found = f"none; `torchgrasp campaign --scheduler` needs it: {dask.fix}"
-        dask = Finding(dask.part, found)
     return [
         Finding("torchgrasp", f"{__version__}, hands: {hands}"),
         Finding(
@@ -82,8 +92,38 @@ def find_parts() -> list[Finding]:
         Finding("GPU", gpu),
         *(_simulator(name) for name in SIMULATORS),
         *(_package(name, "pip install 'torchgrasp[sim]'") for name in ("coacd", "pebble")),
-        dask,
+        *find_extras(),
     ]
+
+
+def find_extras() -> list[Finding]:
+    """Return the state of every extra but those of the simulators, as the package lists them.
+
+    What is not installed is no fault: only single commands need it.
+    """
+    try:
+        lines = importlib.metadata.requires("torchgrasp") or []
+    except importlib.metadata.PackageNotFoundError:  # imported from a clone
+        return [Finding("extras", "unknown: torchgrasp is not installed, but imported")]
+    packages = dict[str, list[str]]()
+    for line in lines:
+        extra = re.search(r"extra\s*==\s*['\"]([^'\"]+)['\"]", line)
+        name = re.match(r"[A-Za-z0-9._-]+", line)
+        if extra is not None and name is not None and extra[1] not in SIMULATORS.values():
+            packages.setdefault(extra[1], []).append(name[0])
+    return [_extra(extra, sorted(set(names))) for extra, names in sorted(packages.items())]
+
+
+def _extra(extra: str, names: list[str]) -> Finding:
+    """Return which of an extra's packages, `names`, are installed, and what installs the others."""
+    states = [_package(name) for name in names]
+    absent = [state.part for state in states if state.fix]
+    found = ", ".join(f"{state.part} {state.found}" for state in states if not state.fix)
+    if absent:
+        need = f"; {NEEDED_BY[extra]} needs it" if extra in NEEDED_BY else ""
+        fix = f"pip install 'torchgrasp[{extra}]'"
+        found = f"no {', '.join(absent)}{need}: {fix}"
+    return Finding(f"extra {extra}", found)
 
 
 @arguments()
@@ -117,14 +157,20 @@ class Selftest(Command):
                 right = sum(x.right for x in results)
                 seconds = time.perf_counter() - begin
                 bar.write(f"{name:8}{seconds:6.1f} s  {right} of {len(GOLDEN)} verdicts right")
-        rows = [("object", "hand", "expected", *found)]
+        rows = [("object", "hand", "hand is", "expected", *found)]
         words = {True: "held", False: "lost"}
         for k, case in enumerate(GOLDEN):
             verdicts = [
                 f"{words[x[k].held]}{'' if x[k].right else ' (wrong)'}" for x in found.values()
             ]
             rows.append(
-                (f"{case.object}, {case.mass:g} kg", case.hand, words[case.held], *verdicts)
+                (
+                    f"{case.object}, {case.mass:g} kg",
+                    case.hand,
+                    f"{1000 * case.shift:g} mm off" if case.shift else "as planned",
+                    words[case.held],
+                    *verdicts,
+                )
             )
         print(f"\n{format_columns(rows, left=range(len(rows[0])))}")
         return 0 if all(x.right for results in found.values() for x in results) else 1

@@ -10,6 +10,8 @@ from typing import Annotated, Any, Literal
 from torchgrasp import evaluation
 from torchgrasp.app.cli.command import (
     Command,
+    ForPrograms,
+    answer,
     arguments,
     make_bar,
     naming,
@@ -54,6 +56,7 @@ from torchgrasp.values.specs import ClosingMode, HoldingMode, Simulator
 
 NAME_WIDTHS = (12, 6)  # of the names of object and view, where their longest is not known yet
 COUNT_WIDTHS = (5, 7, -1)  # of executable grasps, of passed ones, and of reasons
+COUNT_HEADS = ("exec.", "passed", "why others did not pass")  # titles of these columns
 OBJECTS_HELP = (
     "folder with manifest.json, and for each object mesh.ply and noisy views; see docs/data.md"
 )
@@ -100,7 +103,7 @@ class _Trials(Command):
 
 
 @arguments()
-class Evaluate(_Trials):
+class Evaluate(_Trials, ForPrograms):
     """Plan on each noisy view of a folder's objects, and test the best grasps in simulation.
 
     Prints a line for each view, then success rates with 95 % intervals over families of objects.
@@ -188,6 +191,7 @@ class Evaluate(_Trials):
             found = evaluate(self.objects, hand, test, spec, folder=folder, workers=self.workers)
             names = list_names(self.objects, spec)
             widths = max(len(ascii(name)) for name, _ in names), max(len(view) for _, view in names)
+            _print_cells(("object", "view", *COUNT_HEADS), widths)
             with make_bar(sum(view != "" for _, view in names), "view") as bar:
                 for score in found:
                     with bar.external_write_mode(sys.stdout):
@@ -209,6 +213,7 @@ class Evaluate(_Trials):
                 "views": [dataclasses.asdict(score) for score in scores],
             }
             write_file(self.out / "evaluate.json", format_json(content))
+            answer(content)
             title = f"Grasps of the {self.hand} hand under {self.protocol}"
             write_evaluation(self.out / "evaluate.html", title, asked, scores)
         return 0
@@ -327,6 +332,7 @@ class RunCampaign(_Trials):
             else (self.scheduler, "--scheduler")
         )
         with naming(workers=name), make_bar(len(list_names(self.objects, trials)), "job") as bar:
+            _print_cells(("object", "view", *COUNT_HEADS), NAME_WIDTHS)
 
             def show(row: JobRow) -> None:
                 reason = "" if row.status is Status.OK else row.note or row.status.sentence

@@ -1,15 +1,18 @@
 """The command `torchgrasp grasp`, which plans grasps of an object in a cloud or a scene."""
 
 import dataclasses
+import datetime
 import functools
 from pathlib import Path
 from typing import Any, Literal
 
 from torchgrasp.app.cli import inputs
 from torchgrasp.app.cli.command import (
-    Command,
+    ForPrograms,
     StageProgress,
+    answer,
     arguments,
+    command_line,
     naming,
     nested,
     option,
@@ -61,7 +64,7 @@ OBJECT_WIDTHS = (-10, 7, -1)  # of the columns of a scene's objects
 
 
 @arguments(points="cloud", normals="cloud", path="out", target="label")
-class Grasp(Command):
+class Grasp(ForPrograms):
     """Plan grasps of an object in a partial cloud or a scene; with a mesh, also close the hand in
     simulation.
 
@@ -238,6 +241,7 @@ class Grasp(Command):
                 )
             progress.end("report", self._write(out, run))
         executable = print_grasps(run)
+        answer(describe_run(run, out))
         return (
             0 if (run.closure is not None and run.closure.held if self.close else executable) else 1
         )
@@ -294,6 +298,8 @@ class Grasp(Command):
             scene=scene,
             explanation=explanation,
             costs=tuple(costs),
+            command=command_line(),
+            date=datetime.datetime.now(datetime.timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
         )
 
     @functools.cached_property
@@ -354,6 +360,7 @@ class Grasp(Command):
             else:
                 best = self._find_easiest(scene, hand, spec, among, progress)
                 if best is None:
+                    answer({"executable": 0, "hand": hand.name, "best": None})
                     return 1
                 scene, grasps, shape = best
             spec = dataclasses.replace(spec, table=scene.table)
@@ -363,7 +370,9 @@ class Grasp(Command):
                 name, path, cloud, hand, spec, grasps, shape, progress, explanation, scene
             )
             progress.end("report", self._write(out, run))
-        return 0 if print_grasps(run) else 1
+        executable = print_grasps(run)
+        answer(describe_run(run, out) | {"label": scene.target})
+        return 0 if executable else 1
 
     def _with_table(self, scene: Scene, chosen: bool) -> Scene:
         """Return the scene with the table of --table or --up; raise `BadArgument` if the target is
@@ -456,6 +465,33 @@ def print_grasps(run: Run) -> bool:
         print(f"lowers success  {sentence}")
     print(verdict(run))
     return len(run.executable) > 0
+
+
+def describe_run(run: Run, out: Path) -> dict[str, Any]:
+    """Return the result of a run for JSON, with units in the names.
+
+    `best` is the best executable grasp, or None; `file`, in the folder `out`, holds all grasps.
+    """
+    best = None
+    for grasp in run.executable[:1]:
+        joints = run.hand.expand(grasp.joints[0])
+        best = {
+            "success": float(grasp.success[0]),
+            "joints_rad": {name: float(q) for name, q in joints.items()},
+            "obj_from_hand_m": grasp.obj_from_hand[0].tolist(),
+            "fingers": list(run.hand.finger_names),
+            "contacts_m": grasp.contacts.points[0].tolist(),
+        }
+    return {
+        "object": run.object_name,
+        "hand": run.hand.name,
+        "grasps": len(run.grasps),
+        "executable": len(run.executable),
+        "held": None if run.closure is None else run.closure.held,
+        "verdict": verdict(run),
+        "best": best,
+        "file": str(out / "grasps.safetensors"),
+    }
 
 
 def read_true_mesh(path: Path) -> "tuple[trimesh.Trimesh, list[trimesh.Trimesh] | None]":

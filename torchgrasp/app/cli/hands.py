@@ -15,6 +15,8 @@ from torchgrasp.app.author.fit_shapes import shape_points
 from torchgrasp.app.author.unusual import find_unusual
 from torchgrasp.app.cli.command import (
     Command,
+    ForPrograms,
+    answer,
     arguments,
     make_bar,
     naming,
@@ -169,7 +171,7 @@ class HandNew(Command):
 
 
 @arguments(path="out")
-class HandCheck(Command):
+class HandCheck(ForPrograms):
     """List every fault of a hand; if there is none, describe and draw the hand, and plan on a
     shipped object.
 
@@ -193,7 +195,10 @@ class HandCheck(Command):
             raise BadArgument("--out", self.out, "a file ending in .png")
         chosen = "default" if self.fingers == "auto" else self.fingers
         with make_bar(None, "step", desc="faults") as bar:
-            if print_faults(self.hand, chosen):
+            faults = list_faults(self.hand, chosen)
+            if faults:
+                print_faults(self.hand, chosen)
+                answer({"faults": faults, "able": False, "sets": []})
                 return 2
             sound = check_hand(self.hand, chosen)
             check_folder(self.out.parent)
@@ -228,6 +233,8 @@ class HandCheck(Command):
         file = self.out.with_name(ABILITIES)
         write_file(file, format_json({"sets": [known.content() for known in abilities]}))
         print(f"abilities: {file}")
+        sets = [known.content() for known in abilities]
+        answer({"faults": [], "able": able, "picture": str(self.out), "sets": sets})
         if able:
             print("the hand can grasp")
         return 0 if able else 1

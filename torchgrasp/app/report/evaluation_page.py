@@ -86,9 +86,15 @@ def _describe_prediction(success: Mapping[str, Any] | None) -> str | None:
         return None
     return (
         f"Predicted {success['predicted']:.0%}, passed {success['passed']:.0%}; "
-        f"expected calibration error {success['error']:.2f}, "
-        f"Brier skill {success['skill']:.2f}, area under the curve {success['auc']:.2f}."
+        f"expected calibration error {_number(success['error'], '.2f')}, "
+        f"Brier skill {_number(success['skill'], '.2f')}, "
+        f"area under the curve {_number(success['auc'], '.2f')}."
     )
+
+
+def _number(value: int | float | None, style: str) -> str:
+    """Return a number as text in a format `style`, and one that was not measured as "-"."""
+    return "-" if value is None or math.isnan(value) else format(value, style)
 
 
 def _bin_rows(success: Mapping[str, Any] | None) -> list[tuple[Any, ...]]:
@@ -119,7 +125,9 @@ def _object_rows(
         outcome[score.object, score.view] = passed if score.attempts else score.refusal.name.lower()
     rows = []
     for name, row in by_object.items():
-        best = "-" if math.isnan(row["top1"].value) else f"{row['top1'].value:.0%}"
+        # an object of which nothing was tried has no success
+        untried = math.isnan(row["gsr"].value) or math.isnan(row["top1"].value)
+        best = "-" if untried else f"{row['top1'].value:.0%}"
         cells = [outcome.get((name, view), "") for view in views]
         rows.append((name, *_share_cells(row["gsr"], 0), best, *cells))
     return rows
@@ -134,7 +142,7 @@ def list_causes(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     rows = []
     for name, found in summary["causes"].items():
         groups = ", ".join(f"{n} {group}" for group, n in found["by_group"].items() if group)
-        size = f"median {found['median']:.3g} {CAUSES[name][0]}"
+        size = f"median {_number(found['median'], '.3g')} {CAUSES[name][0]}"
         rows.append((name, f"{found['count']}{groups and f' ({groups})'}, {size}"))
     return rows
 
@@ -148,7 +156,7 @@ def list_figures(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     for key, (text, style) in NAMES["figures"].items():
         value = summary[key]
         found = value if isinstance(value, tuple | list) else [value]
-        texts = ["-" if x is None else format(x, style) for x in found]
+        texts = ["-" if x is None else _number(x, style) for x in found]
         rows.append((text, ", ".join(texts)))
     if summary["touch"]:
         texts = [f"{n} {name}" for name, n in summary["touch"].items()]

@@ -5,7 +5,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from torchgrasp import files
+from torchgrasp import __version__, files
 from torchgrasp.app.report import stills
 from torchgrasp.app.report.canvas import FINGERS
 from torchgrasp.app.report.film import describe_film, draw_film
@@ -110,10 +110,12 @@ def format_page(run: Run, pictures: Sections, view: str = "") -> str:
         outcomes.append(("Outcome of every initial guess", run.plan.status))
     if len(run.grasps):
         outcomes.append(("Outcome of every posture", run.grasps.status))
+    origin = (("command", run.command), ("date", run.date), ("torchgrasp", __version__))
     return render(
         "report.html",
         title=run.title,
         run=run,
+        version=__version__,
         verdict=verdict(run),
         good=run.good,
         view=view,
@@ -134,7 +136,10 @@ def format_page(run: Run, pictures: Sections, view: str = "") -> str:
             (name, [(str(n), s.name.lower(), s.sentence) for s, n in count_status(status).items()])
             for name, status in outcomes
         ],
-        facts=[(name.replace("_", " "), value) for name, value in sorted(run.grasps.meta.items())],
+        facts=[
+            *(pair for pair in origin if pair[1]),
+            *((name.replace("_", " "), value) for name, value in sorted(run.grasps.meta.items())),
+        ],
     )
 
 

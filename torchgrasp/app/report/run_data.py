@@ -56,6 +56,8 @@ class Run:
         scene: the scene that the cloud was cut from.
         explanation: why no grasp is executable, and what would help.
         costs: sentences on what lowers the predicted success of the best grasp most.
+        command: the command line of the run, or "".
+        date: date and time of the run as text, or "".
     """
 
     object_name: str
@@ -72,6 +74,8 @@ class Run:
     scene: Scene | None = None
     explanation: Explanation | None = None
     costs: tuple[str, ...] = ()
+    command: str = ""
+    date: str = ""
 
     @property
     def executable(self) -> Grasps:

@@ -1,0 +1,76 @@
+"""What programs get that call the command line: JSON on stdout, words on stderr, and how far a
+command is.
+"""
+
+import json
+import time
+
+import pytest
+
+from torchgrasp import load_grasps
+from torchgrasp.app.cli import command
+from torchgrasp.app.cli.command import make_bar
+from torchgrasp.data.shipped import DATA
+
+QUICK = ("--starts", "8", "--no-report", "--hand", "barrett")
+
+
+def test_grasp_tells_its_result_as_json_and_its_words_on_stderr(run_command, tmp_path):
+    code, out, err = run_command("grasp", "cylinder", *QUICK, "--out", tmp_path, "--json")
+    told = json.loads(out)
+    best = load_grasps(tmp_path / "grasps.safetensors").best
+    assert code == 0 and told["executable"] > 0 and told["verdict"] in err
+    assert told["file"] == str(tmp_path / "grasps.safetensors")
+    assert told["best"]["success"] == float(best.success)
+    assert told["best"]["obj_from_hand_m"] == best.obj_from_hand[0].tolist()
+    # all joints by name, the driven ones among them
+    assert {"f1_flex", "spread"} <= set(told["best"]["joints_rad"])
+
+
+def test_quiet_commands_print_json_alone_or_nothing(run_command, tmp_path):
+    view = DATA / "jug" / "view.ply"
+    assert run_command("cloud", "check", view, "--quiet") == (0, "", "")
+    code, out, err = run_command("cloud", "check", view, "--quiet", "--json")
+    told = json.loads(out)
+    assert (code, err) == (0, "") and told["points"] == 1000 and told["refused"] is False
+    code, out, err = run_command("doctor", "--json", "--quiet")
+    told = json.loads(out)
+    assert code == (0 if told["complete"] else 1) and err == ""
+    assert {"torch", "GPU"} <= {part["part"] for part in told["parts"]}
+    # an error is told all the same, and is no JSON
+    code, out, err = run_command("grasp", "jgu", "--json", "--quiet")
+    assert (code, out) == (2, "") and err.startswith("torchgrasp: CLOUD: ")
+
+
+def test_faults_of_a_hand_are_told_as_json(run_command, tmp_path, toy_hand):
+    text = (toy_hand / "hand.toml").read_text()
+    (toy_hand / "hand.toml").write_text(text.replace('"palm"', '"wrist"'))
+    code, out, err = run_command("hand", "check", toy_hand, "--json", "--out", tmp_path / "a.png")
+    told = json.loads(out)
+    assert code == 2 and told["able"] is False and "wrist" in told["faults"][0]
+    assert told["faults"][0] in err
+
+
+def test_a_bar_in_a_pipe_tells_n_of_all_and_goes_on_telling(capsys, monkeypatch):
+    with make_bar(4, "view", desc="trials") as bar:
+        bar.update()
+        assert bar.describe().startswith("trials: 1 of 4 views, ")
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(command, "BEAT", 0.001)
+    told = ""
+    with make_bar(3, "job") as bar:
+        bar.update(2)
+        while told.count("2 of 3 jobs") < 2:
+            time.sleep(0.001)
+            told += capsys.readouterr().err
+    assert bar.ended is not None and bar.ended.is_set()
+
+
+@pytest.mark.parametrize("words", [("evaluate",), ("hand", "check"), ("cloud", "check")])
+def test_commands_that_programs_call_have_both_options(words, capsys):
+    from torchgrasp.app import cli
+
+    with pytest.raises(SystemExit):
+        cli.main([*words, "--help"])
+    told = capsys.readouterr().out
+    assert "--json" in told and "--quiet" in told
