@@ -3,13 +3,17 @@ command is.
 """
 
 import json
+import re
 import time
 
 import pytest
+import torch
 
-from torchgrasp import load_grasps
+from torchgrasp import cloud_from_depth, load_grasps, load_object
 from torchgrasp.app.cli import command
 from torchgrasp.app.cli.command import make_bar
+from torchgrasp.cloud import save_cloud
+from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.data.shipped import DATA
 
 QUICK = ("--starts", "8", "--no-report", "--hand", "barrett")
@@ -74,3 +78,24 @@ def test_commands_that_programs_call_have_both_options(words, capsys):
         cli.main([*words, "--help"])
     told = capsys.readouterr().out
     assert "--json" in told and "--quiet" in told
+
+
+@pytest.mark.parametrize("noise", [False, True])
+def test_a_simulators_cloud_with_its_table_is_planned_on_and_a_cameras_is_refused(
+    noise, run_command, tmp_path
+):
+    """Oracle: the true labels of the image count the points of the table."""
+    pose = look_at(azimuth=30.0, elevation=35.0, target=load_object("cylinder").mesh)
+    depth, labels = render_depth([load_object("cylinder").mesh], pose, noise=noise)
+    body = (labels == 1).double()[None, None]
+    around = torch.nn.functional.max_pool2d(body, 41, 1, 20)[0, 0] > 0
+    cloud = cloud_from_depth(depth, INTRINSICS, mask=around, camera_pose=pose)
+    save_cloud(cloud, tmp_path / "cloud.npz")
+    assert run_command("cloud", "check", tmp_path / "cloud.npz")[0] == int(noise)
+    code, out, err = run_command("grasp", tmp_path / "cloud.npz", *QUICK, "--out", tmp_path / "out")
+    if noise:
+        assert code == 2 and "a table left in" in err
+        return
+    found = re.search(r"note +(\d+) points of a table without noise are left out: (.*)", out)
+    assert code == 0 and found and "0.000 m" in found[2]
+    assert abs(int(found[1]) - int((around & (labels == 0)).sum())) < 0.02 * len(cloud)

@@ -42,6 +42,12 @@ class PartNumbers:
     """A body stands on the ground if its foot is less than this [m] above the lowest point."""
     around: float = 0.5
     """Greatest distance [m] of an object's points from a place on or near it."""
+    exact: float = 2e-5
+    """Greatest median height [m] of a table's points above it in a cloud without noise."""
+    thin: float = 0.0005
+    """Half thickness [m] of the layer that is a table without noise."""
+    fewest: int = 50
+    """Fewest points of a table without noise."""
 
 
 PARTS = PartNumbers()
@@ -140,6 +146,26 @@ def cut_object(
         wanted = int((over if len(over) else label).mode().values)
     object_ = _select(cloud, label == wanted, "points of the object")
     return object_, None if support is None else support.plane
+
+
+def cut_exact_table(cloud: PointCloud, up: Vector) -> tuple[PointCloud, Plane | None]:
+    """Return a cloud without the points of a table that has no noise, and the plane of the table.
+
+    Only a simulator sees such a table, and only there no point of the object's foot is lost with
+    it. Without one, the cloud is returned itself, and None. `up` is the unit vector that points up.
+    """
+    points = cloud.points.double()
+    support = find_ground(points, cloud.viewpoint, up.to(points))
+    if support is None:
+        return cloud, None
+    height = support.plane.height(points)
+    near = height[height.abs() < PARTS.layer].abs()
+    if len(near) < PARTS.fewest or float(near.median()) > PARTS.exact:
+        return cloud, None
+    rest = height > PARTS.thin
+    if int(rest.sum()) < MIN_POINTS:
+        return cloud, None
+    return cloud.select(rest), support.plane
 
 
 def find_ground(

@@ -76,6 +76,7 @@ class CloudCheck(ForPrograms):
         single camera sees.
         """
         file = self.view.read("FILE", find_view(self.file, "FILE"), whole=True)
+        file = inputs.without_exact_table(file, self.view.vertical)
         view = self.view.with_table_of(file)
         plane = as_plane(view.plane(file.cloud))
         up = view.given_vertical(plane)

@@ -72,7 +72,8 @@ class Grasp(ForPrograms):
     folder. If no grasp is executable, one setting at a time is changed, and the change that helps
     most is named. The cloud is checked as by `cloud check`. It is refused if the camera is below
     the table or contradicts the points, or if the unit is wrong. A cloud with two bodies, with the
-    table or with another plane is refused, too. Other findings are printed as advice.
+    table or with another plane is refused, too. A simulator's table without noise is left out.
+    Other findings are printed as advice.
     """
 
     cloud: Path | None = positional(
@@ -196,6 +197,7 @@ class Grasp(ForPrograms):
         """Plan on a point cloud and write the results; return the exit code."""
         mesh = self._true_mesh(path)
         file = self.view.read("CLOUD", path)
+        file = inputs.without_exact_table(file, self.view.vertical)
         view = self.view.with_table_of(file)
         cloud = file.cloud
         table = view.plane(file.cloud)

@@ -20,6 +20,7 @@ from torch import Tensor
 from torchgrasp.app.cli.command import arguments, naming, option
 from torchgrasp.cloud import Advice, CloudFile, check_cloud, diagnose_cloud, read_cloud_file
 from torchgrasp.cloud.neighbours import draw_rows, find_inliers
+from torchgrasp.cloud.parts import cut_exact_table
 from torchgrasp.cloud.pose import read_pose
 from torchgrasp.contacts.region import Region
 from torchgrasp.files import hold_folder
@@ -242,6 +243,22 @@ def read_region(name: str, text: str | None) -> Region | None:
                 "mesh", repr(text), "six numbers of a box, or the file of a closed mesh"
             )
         return None if text is None else Region.box(numbers[:3], numbers[3:])
+
+
+def without_exact_table(file: CloudFile, up: Tensor | None) -> CloudFile:
+    """Return a simulator's cloud without the points of its table, which is then known.
+
+    `up` (3,) is the unit vector that points up; None means z. Other clouds are returned as they
+    are.
+    """
+    if file.table is not None:
+        return file
+    cloud, plane = cut_exact_table(file.cloud, real([0.0, 0.0, 1.0]) if up is None else up)
+    if plane is None:
+        return file
+    count = len(file.cloud) - len(cloud)
+    note = f"{count} points of a table without noise are left out: {describe_table(plane)}"
+    return CloudFile(cloud, (*file.notes, note), plane)
 
 
 def print_notes(notes: tuple[str, ...], advice: tuple[Advice, ...] = ()) -> None:
