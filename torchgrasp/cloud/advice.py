@@ -37,7 +37,8 @@ class AdviceNumbers:
     z_up: float = 0.9
     """The vertical is z above this cosine, as where none was given."""
     along: float = 0.8
-    """An outlier flies if it is off the others along the ray: above this cosine."""
+    """Cosine between the camera's ray and an outlier's offset from the others, above which it is a
+    flying pixel."""
     flying: float = 0.02
     """Share of flying pixels, over all points, that is worth advice."""
 

@@ -29,7 +29,7 @@ class AgreementNumbers:
     drawn_of_cloud: int = 500
     """Most points of a cloud to which these distances are measured."""
     slack: float = 0.01
-    """Greatest distance [m] of points from their mesh, beside the noise."""
+    """Greatest distance [m] of points from their mesh, in addition to the noise."""
     share: float = 0.2
     """Greatest share of points that may be farther from their mesh."""
     guessed: float = 0.4
@@ -39,7 +39,7 @@ class AgreementNumbers:
     astray: float = 0.7
     """Greatest share of contacts that may be farther in trials, where some grasps may miss."""
     levels: int = 8
-    """Depths behind each point of a cloud at which a region is sought."""
+    """Number of depths behind each point of a cloud at which a region is sought."""
     unseen: float = 0.03
     """Greatest distance [m] of contacts from a cloud, which is partial, and the space behind it."""
     unseen_share: float = 0.5
@@ -47,7 +47,7 @@ class AgreementNumbers:
     lowest: float = 0.02
     """Share of the points of an object that may be lower than its foot: outliers."""
     foot: float = 0.015
-    """Greatest height [m] of a foot above or below its table, beside the noise."""
+    """Greatest height [m] of a foot above or below its table, in addition to the noise."""
 
 
 AGREEMENT = AgreementNumbers()
@@ -131,10 +131,11 @@ def check_seen(grasps: Grasps, cloud: PointCloud, name: str) -> None:
 
 
 def check_where(name: str, distance: Callable[[Points], Tensor], cloud: PointCloud) -> None:
-    """Refuse a region "keep" that is off a cloud and the space hidden behind it; tell of another.
+    """Raise `BadArgument` for a region "keep" that lies off a cloud and the space hidden behind it.
 
     The function `distance` returns the signed distances [m] of points [m] in the frame of the
-    cloud. Raises `BadArgument` for the argument `name`.
+    cloud. Errors call the argument `name`. A region of another `name` raises the warning `NoEffect`
+    instead.
     """
     rows = draw_rows(len(cloud), AGREEMENT.drawn_of_cloud)
     seen = cloud.points[rows].double().cpu()
@@ -204,8 +205,9 @@ def noise_of(cloud: PointCloud) -> float:
 
 
 def distance_behind(points: Points, cloud: PointCloud) -> Float[Tensor, "n"]:
-    """Return each point's distance [m] from a cloud and the space hidden behind it, as deep as the
-    cloud is long.
+    """Return each point's distance [m] from a cloud and the space hidden behind it.
+
+    The hidden space reaches as far behind each point of the cloud as the cloud is long.
     """
     rows = draw_rows(len(cloud), AGREEMENT.drawn_of_cloud)
     seen = cloud.points[rows].double().cpu()

@@ -35,9 +35,10 @@ class CloudNumbers:
     line: float = 1e-6
     """Points are on a line if their second principal spread over the first is less than this."""
     scene: float = 10.0
-    """A too large extent below this number is that of a scene in metres, or of an object in cm."""
+    """Greatest extent, read as metres, that is taken for a scene in metres or an object in cm."""
     longest: float = 45.0
-    """A larger extent below this is in cm, of an object of 45 cm at most; above it is in mm."""
+    """Greatest extent, read as metres, that is taken for cm, of an object of at most 45 cm; a
+    larger one is taken for mm."""
 
 
 CLOUD = CloudNumbers()

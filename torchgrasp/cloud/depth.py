@@ -45,9 +45,11 @@ class DepthNumbers:
     is another.
     """
     millimetres: float = 200.0
-    """A median depth that is too large is in mm if it is above this [m], else in cm."""
+    """A median depth, read as metres, that is too large is in mm if it is above this, else in
+    cm."""
     background: float = 0.05
-    """Least share of the pixels at the greatest value by which it marks a background, if too far."""
+    """Least share of pixels with the greatest depth, from which this depth, if too far, marks a
+    background."""
     viewed: int = 5000
     """Number of points, about, by which a table in the view is compared with the pose."""
 
@@ -66,11 +68,11 @@ def cloud_from_depth(
 ) -> PointCloud:
     """Return the points of a pinhole camera's depth image.
 
-    A pixel (row v, column u) of depth z is the point z ((u - cx) / fx, (v - cy) / fy, 1). Of a raw
-    image with a polynomial distortion (plumb_bob, rational_polynomial), the ray is found that the
-    lens bends to the pixel, and a `MendedInput` warning tells so. The camera's frame has x right, y
-    down and z forward. Depths of 0, NaN, 65535 counts or more than 50 m are not measured. The
-    camera is the viewpoint, and the sides of the image give the frustum.
+    A pixel (row v, column u) of depth z is the point z ((u - cx) / fx, (v - cy) / fy, 1). A
+    polynomial distortion (plumb_bob, rational_polynomial) of a raw image is removed: the ray of a
+    pixel is the one that the lens bends to it. The warning `MendedInput` says so. The camera's
+    frame has x right, y down and z forward. Depths of 0, NaN, 65535 counts or more than 50 m are
+    not measured. The camera is the viewpoint, and the sides of the image give the frustum.
 
     Args:
         depth: (h, w) or (h, w, 1), distance along the optical axis: floats in metres, or integers

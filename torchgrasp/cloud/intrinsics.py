@@ -46,11 +46,12 @@ class IntrinsicsNumbers:
     most: int = 12
     """Longest list of numbers: that of a 3 x 4 projection."""
     nested: int = 4
-    """Most objects in each other that lead to a matrix; those of ROS and Zivid have two."""
+    """Greatest depth of nested objects at which a matrix is found; those of ROS and Zivid have
+    two."""
     greatest: float = 1e9
-    """A width, a height or a depth scale is less; more is no number of a camera."""
+    """Upper bound of a width, a height and a depth scale: no camera has greater ones."""
     widest: float = 1e6
-    """A side of a region of interest [px], and a binning, is less."""
+    """Upper bound of the side of a region of interest [px], and of a binning."""
     shown: int = 8
     """Most names of a wrong object that an error shows."""
     shown_name: int = 20
@@ -68,23 +69,27 @@ class IntrinsicsNumbers:
     beyond it, the point belongs to another image.
     """
     corner: float = 0.05
-    """A crop may reach so far out of the image of its camera, as a share of the side."""
+    """Greatest distance by which a crop may reach out of its camera's image, as a share of the
+    side."""
     moved: float = 0.04
-    """Least shift of a crop's corner, as a share of the side: a camera's point is off by less."""
+    """Least shift of a crop's corner, as a share of the side: a camera's principal point is off by
+    less."""
     centred: float = 0.05
     """Greatest shift of the principal point from the middle of a resolution that is guessed, over
     half the side.
     """
     scaled: float = 2.5
-    """A principal point so many times as far out as the middle, or as near, for both sides alike,
-    is that of an image of another scale: an object's crop is not so far from it.
+    """Ratio of the principal point's coordinates to those of the image's middle, or its inverse.
+    From this ratio on, the same for both sides, the point belongs to an image of another scale; the
+    point of a crop is nearer.
     """
     off: float = 0.16
     """Shift of the principal point from the middle, over half the side, beyond which another
     resolution is guessed: few cameras have more.
     """
     agree: float = 0.5
-    """Greatest difference [px] of ROS's K and P that say the same."""
+    """Greatest difference [px] between the numbers of ROS's matrices K and P that count as
+    equal."""
     swapped: float = 0.05
     """Greatest shift of a principal point from the middle whose numbers are swapped, as a share of
     the side.

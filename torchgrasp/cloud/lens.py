@@ -1,4 +1,6 @@
-"""The distortion of a camera's lens: read in the forms of many drivers, and taken from the rays."""
+"""The distortion of a camera's lens: read in the forms of many drivers, and removed from the rays
+of pixels.
+"""
 
 import dataclasses
 import math
@@ -35,7 +37,7 @@ class LensNumbers:
     straight: float = 1e-3
     """Greatest coefficient of a distortion that moves no pixel by more than a tenth."""
     most: float = 1e4
-    """Greatest coefficient: larger ones are no polynomial's."""
+    """Greatest absolute value of a coefficient: no real lens has a larger one."""
     steps: int = 20
     """Most Newton steps from a pixel to its ray."""
     still: float = 1e-6
@@ -48,14 +50,19 @@ LENS = LensNumbers()
 
 
 class Lens(NamedTuple):
-    """A polynomial distortion: `NAMES` (8,), without unit."""
+    """The polynomial distortion of a lens (OpenCV's rational model).
+
+    `coefficients` are the eight numbers, without unit, that `NAMES` lists.
+    """
 
     coefficients: tuple[float, ...]
 
     def distort(
         self, rays: Float[Tensor, "n 2"]
     ) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2 2"]]:
-        """Return where rays (x, y, 1) meet the image plane at depth 1, and the Jacobian of it."""
+        """Return where bent rays (x, y, 1) meet the image plane at depth 1, then the derivatives by
+        x and y.
+        """
         k1, k2, p1, p2, k3, k4, k5, k6 = self.coefficients
         x, y = rays.unbind(-1)
         r2 = x * x + y * y
@@ -105,7 +112,7 @@ def describe(coefficients: object) -> str:
 
 
 def numbers_of(value: object) -> list[float]:
-    """Return the numbers of a matrix or a list row by row; nothing for anything else."""
+    """Return the numbers of a matrix or a list row by row; an empty list for anything else."""
     if value is None:
         return []
     try:

@@ -21,8 +21,8 @@ class NeighbourNumbers:
     spacing: int = 9
     """Neighbours for the spacing: a raster's eight, more than fly off a rim together."""
     outlier: float = 2.5
-    """An outlier is farther from its neighbours than so many medians of this distance; depth and
-    slope vary the distance less.
+    """A point is an outlier if its mean distance from its neighbours is above this multiple of the
+    median. Depth and slope vary the distance less.
     """
     plane: int = 25
     """Neighbours for a plane: about eight for each of its three unknowns."""
@@ -31,8 +31,8 @@ class NeighbourNumbers:
     width: float = 0.7
     """Width of the weights of neighbours, over the distance of the farthest."""
     ridge: float = 1e-3
-    """Weight of the squared coefficients of a quadric beside the squared errors, of which it
-    penalises all but the constant: it matters only where points are few.
+    """Weight of the squared coefficients of a quadric, other than the constant one, relative to the
+    squared errors: it matters only where points are few.
     """
     block: int = 1 << 14
     """Points whose quadrics are fitted at once: bounds the memory for clouds of any size."""

@@ -239,9 +239,9 @@ def merge_clouds(
     `voxel_downsample` evens the density. The rigid `poses` obj_from_cloud (4, 4) [m] lead from the
     frames of the views.
 
-    Views are compared. A distance that noise does not explain is told by a `MendedInput`. It
+    Views are compared. A distance that noise does not explain raises the warning `MendedInput`. It
     becomes the result's `pose_error`, which widens the shape's standard deviations. With `align`,
-    views are moved onto the first by at most 50 mm and 20 degrees, which is told.
+    views are moved onto the first by at most 50 mm and 20 degrees, and a warning says so.
 
     Raises `BadArgument` for no cloud, another number of poses, a pose that is not rigid, or clouds
     of several dtypes or devices. It is raised, too, for views that contradict each other by more

@@ -39,11 +39,13 @@ class ViewNumbers:
     surface: int = 5000
     """Most points of the surface that they are compared with."""
     reach: float = 1.5
-    """A point meets a surface if the nearest point of it is so many spacings away, sideways."""
+    """Greatest distance, along the surface, of two points that are compared, in spacings of the
+    surface's points."""
     least: int = 20
     """Fewest compared points that count: fewer are a rim that flies."""
     seen: float = 0.9
-    """Quantile of the heights before a surface: flying pixels are above it."""
+    """Quantile of the heights of points in front of a surface that counts as their height; flying
+    pixels are higher."""
     same: float = 0.8
     """Least cosine of two normals of one surface."""
     refused: float = 2.5
@@ -52,8 +54,8 @@ class ViewNumbers:
     """Greatest shift of a view, or height before what another saw, over their noise."""
     likely: float = 1.0
     shown: float = 4.0
-    """Least chi squared of a motion that widens the band, and of one that is told, mended or
-    refused: below the second, noise and bias of the cameras explain it.
+    """Least chi squared of a motion that widens the standard deviations, and of one that is
+    reported, corrected or refused: below the second, noise and bias of the cameras explain it.
     """
     vague: float = 1.5
     """Factor of the limits for a view without a camera, whose noise is a guess."""
@@ -87,9 +89,9 @@ class RegistrationNumbers:
     gaussian: float = 1.4826
     """Ratio of a standard deviation to the median absolute value."""
     shift: float = 0.05
-    """Greatest shift [m] that is mended: matching points are to be found."""
+    """Greatest shift [m] that is corrected: matching points are to be found."""
     turn: float = 20.0
-    """Greatest turn [deg] that is mended: normals are to match."""
+    """Greatest rotation [deg] that is corrected: normals are to match."""
 
 
 VIEWS = ViewNumbers()
@@ -109,7 +111,9 @@ class Motion:
 
     @property
     def error(self) -> float:
-        """The distance [m], with what the overlap does not show; 0 if noise explains it."""
+        """The distance [m] of the views, including the part that the overlap does not show; 0 if
+        noise explains the motion.
+        """
         return math.hypot(self.distance, self.unsure) if self.chi_squared > VIEWS.likely else 0.0
 
     @property
@@ -124,8 +128,8 @@ def compare_views(views: Sequence[PointCloud]) -> list[float]:
     The views [m], with normals, are in one frame, each with at most one camera. Raises
     `BadArgument` if two contradict each other beyond their noise, and names those that are farthest
     apart, over their noise. Points of a view may not stand before a surface that the camera of
-    another saw. Views that nowhere meet are refused, too. A motion that noise does not explain is
-    told by a `MendedInput`.
+    another saw. Views that nowhere meet are refused, too. A motion that noise does not explain
+    raises the warning `MendedInput`.
     """
     surfaces = [_ViewSurface(view) for view in views]
     apart = list[tuple[float, float, float, tuple[int, int]]]()  # ratio, distance, limit, views
@@ -161,8 +165,8 @@ def compare_with(seen: PointCloud, view: PointCloud) -> float:
     """Return the standard deviation [m] of a view's pose that what was seen before shows; 0 for
     none.
 
-    Both have normals and are in one frame [m]. Raises `BadArgument` for a view that is too far off,
-    and tells a distance that noise does not explain by a `MendedInput`.
+    Both have normals and are in one frame [m]. Raises `BadArgument` for a view that is too far off.
+    A distance that noise does not explain raises the warning `MendedInput`.
     """
     one = _ViewSurface(seen)
     motion = _find_motion(one, _ViewSurface(view, one.noise))
@@ -193,8 +197,8 @@ def align_views(views: Sequence[PointCloud]) -> list[tuple[Float[Tensor, "4 4"],
     its standard deviation [m] along the surface's normals.
 
     The views [m] have normals and are in one frame. The first stays; each other one is moved onto
-    those that are placed. Motions that noise does not explain are told by a `MendedInput`; for
-    others the view stays. Raises `BadArgument` for a motion beyond 50 mm or 20 degrees.
+    those that are placed. A motion that noise does not explain raises the warning `MendedInput`;
+    for other motions the view stays. Raises `BadArgument` for a motion beyond 50 mm or 20 degrees.
     """
     placed = [views[0]]
     motions = [(torch.eye(4, dtype=torch.float64, device="cpu"), 0.0)] * len(views)

@@ -1,7 +1,7 @@
 """What public functions take in place of a cloud, a scene or a hand: arrays, clouds of other
 programs, files, names.
 
-The border (`checked`) turns it into a value, so that all other functions take values alone.
+The decorator `checked` converts it to a value, so that all other functions take values alone.
 """
 
 import functools

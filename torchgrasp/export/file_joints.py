@@ -1,7 +1,7 @@
 """Joints of other programs' files: their order, signs and couplings, held against our own hand.
 
-A file has values for all joints of its hand; we grasp with the actuated ones. What this would lose
-or turn is refused, or told in a `GraspFileWarning`.
+A file has values for all joints of its hand; we grasp with the actuated ones. Values that would be
+lost or change their sign are refused, or named in a `GraspFileWarning`.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ class PostureNumbers:
     same_tip: float = 1e-4  # greatest distance [m] of a fingertip from that of the file
     same_joint: float = 1e-3  # greatest difference [rad or m] of a joint that moves no fingertip
     backward: float = 0.05  # a joint [rad] that bends less is no sign of a reversed axis
-    short: float = 0.5  # share of the long side of a joint's range: a shorter one is its back
+    short: float = 0.5  # greatest backward part of a joint's range, as a share of the forward part
     reached: float = 1e-6  # sum of squared errors of the fingertips [mm^2] that ends a search
     rounding: float = 1e-6  # a joint [rad or m] may pass its limits by it
     steps: int = 60  # most steps in which fingers take up the motion of a wrist

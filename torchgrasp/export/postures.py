@@ -156,14 +156,17 @@ def named_postures(
 
 
 def stands_still(hand: Hand, grasps: Grasps) -> Bool[Tensor, "g"]:
-    """Return which hands close at one pose; the others go down while they close (`opened_pose`)."""
+    """Return a mask of the grasps whose hand closes at one pose; the other hands go down while they
+    close (`opened_pose`).
+    """
     opened = opened_pose(hand, grasps.pregrasp, grasps.obj_from_hand, grasps.table)
     return (opened == grasps.obj_from_hand).all(2).all(1)
 
 
 def check_still(hand: Hand, grasps: Grasps) -> None:
-    """Refuse grasps whose hand goes down while it closes: a format of one pose for each grasp
-    cannot express it. Raises `BadArgument`.
+    """Raise `BadArgument` for grasps whose hand goes down while it closes.
+
+    A format with one pose for each grasp cannot express them.
     """
     if not bool(stands_still(hand, grasps).all()):
         found = "a hand that goes down while it closes"

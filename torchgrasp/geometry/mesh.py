@@ -105,7 +105,8 @@ def check_solid(mesh: "trimesh.Trimesh", name: str) -> None:
 
 
 def with_true_normals(mesh: "trimesh.Trimesh") -> "trimesh.Trimesh":
-    """Return a mesh whose face normals are those of its corners: the same one, or a bare copy.
+    """Return a mesh whose face normals follow from its vertices: the mesh itself if its normals do,
+    else a bare copy.
 
     trimesh before 5.2 keeps normals that were read before an uneven scaling. It casts rays by them,
     too. A file may bring wrong normals as well.

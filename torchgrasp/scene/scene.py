@@ -41,8 +41,8 @@ class SceneNumbers:
     lowest: float = 0.02
     """Share of a target's points that may be lower than its foot: outliers."""
     afloat: float = 0.15
-    """Greatest distance [m] of a target's foot from its table that is not told: things in front of
-    it hide less.
+    """Greatest distance [m] of a target's foot from its table without a note: things in front of
+    the target hide less.
     """
 
 

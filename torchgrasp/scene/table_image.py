@@ -28,7 +28,8 @@ class HeightNumbers:
     normal: float = 1.4826
     """Standard deviation over the median of the absolute value, of a normal distribution."""
     jump: float = 0.006
-    """Least jump of depth between two surfaces [m], beside that of a slope."""
+    """Least jump of depth between two surfaces [m], in addition to the change that a slope
+    causes."""
     slope: float = 2.0
     """Largest change of depth of one surface from pixel to pixel, over a pixel's width."""
     least_share: float = 1e-9

@@ -162,10 +162,10 @@ def new_hand(
 
     The user saves the clean copy as `file`, which the hand.toml names. `wish` holds the user's
     choices; `seed` is that of the random postures from which pads are guessed. Where links meet in
-    nearly all postures, the pairs that cause it are left out of the self-collision, which a warning
-    tells. Raises the errors of `draft_hand`, and `HandFileError` for a mesh that is refused, a URDF
-    without collision shapes, or one that cannot be repaired; `MissingExtra` for an MJCF without
-    MuJoCo.
+    nearly all postures, the pairs that cause it are left out of the self-collision, and a warning
+    names them. Raises the errors of `draft_hand`, and `HandFileError` for a mesh that is refused, a
+    URDF without collision shapes, or one that cannot be repaired; `MissingExtra` for an MJCF
+    without MuJoCo.
 
     >>> from torchgrasp import load_hand
     >>> draft = new_hand(load_hand("barrett").urdf_path, Wish(name="mine"))

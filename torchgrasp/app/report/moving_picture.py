@@ -42,11 +42,11 @@ class MovieLayout:
     size: tuple[int, int] = (560, 448)  # width and height [pixels]; even, as H.264 needs
     longest: float = 60.0  # longest closing that is filmed [s]
     near: float = 0.25  # an object this far from its first place [m] is lost, and is not framed
-    colors: int = 256  # of a GIF
+    colors: int = 256  # most colours of a GIF
     samples: int = 12  # pictures from which the colours of a GIF are taken
     tick: float = 0.01  # unit of the times in a GIF [s]
-    quality: int = 20  # of H.264, "crf": lower is larger and sharper
-    most_error: int = 200  # of ffmpeg's own words in an error [characters]
+    quality: int = 20  # quality of H.264 ("crf"): a lower number gives a larger, sharper file
+    most_error: int = 200  # most characters of ffmpeg's own message in an error
 
 
 MOVIE = MovieLayout()
@@ -102,7 +102,9 @@ def write_film(
 
 
 def check_kind(path: Path) -> None:
-    """Raise `BadArgument` for a file that is no film, and `MissingExtra` if no encoder is there."""
+    """Raise `BadArgument` for a file that is neither .gif nor .mp4, and `MissingExtra` if no
+    encoder is installed.
+    """
     if path.suffix.lower() not in KINDS:
         raise BadArgument("path", path, f"a file that ends in {' or '.join(KINDS)}")
     if path.suffix.lower() == ".mp4":

@@ -64,7 +64,7 @@ class GraspSheet:
 def make_sheet(
     grasps: Grasps, cloud: CloudLike | None = None, hand: HandLike | None = None
 ) -> GraspSheet:
-    """Return the table and the picture that `Grasps.show` returns; see there.
+    """Return the table and the picture that `Grasps.show` returns, which has the same arguments.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> print(make_sheet(load_shipped_grasp("jug", "barrett")).title)
