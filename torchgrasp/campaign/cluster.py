@@ -88,13 +88,15 @@ def run_job(
     plans: object = None,
     place: int = 0,
 ) -> bytes:
-    """Plan and try the grasps of one job; return the bytes of a shard file with only this job.
+    """Plan and try the grasps of one job, a `view`; return the bytes of a shard file with only this
+    job.
 
-    `meta` holds the `versions` of the software with which the campaign began; every machine must
-    have them, and the same hand. `plans` is what `plan_jobs` returned, and the job's plan is
-    `plans[place]`. If it is no list (None, or the `Status` of a planning that took too long), the
-    job is planned here. A faulty object gives a `JobRow` with the reason. Errors that are not the
-    object's fault are raised.
+    `protocol` is the test of each grasp, and `spec` says which grasps are tried. `meta` holds the
+    `versions` of the software with which the campaign began; every machine must have them, and the
+    same hand. `plans` is what `plan_jobs` returned, and the job's plan is `plans[place]`. If it is
+    no list (None, or the `Status` of a planning that took too long), the job is planned here. A
+    faulty object gives a `JobRow` with the reason. Errors that are not the object's fault are
+    raised.
     """
     check_versions(meta)
     hand = view.load_hand()

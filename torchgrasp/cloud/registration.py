@@ -230,7 +230,7 @@ def _move(view: PointCloud, pose: Float[Tensor, "4 4"]) -> PointCloud:
 
 
 def _tell_motion(number: int, motion: Motion) -> None:
-    """Tell that a view was moved; raise `BadArgument` if that is too far."""
+    """Warn (`MendedInput`) that a view was moved; raise `BadArgument` if it was moved too far."""
     turn = math.degrees(float(rotation_angle(motion.pose[:3, :3])))
     found = f"view {number} moved by {1e3 * motion.shift:.1f} mm and turned by {turn:.1f} degrees"
     if motion.shift > MOTION.shift or turn > MOTION.turn:

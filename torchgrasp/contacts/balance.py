@@ -118,9 +118,9 @@ def internal_forces(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b p f 3"
     """Return for each of p pairs of contacts the opposite unit forces that pull the two contacts
     together.
 
-    `[..., k, i, :]` is the force on contact i by pair k, 0 at the other contacts. The order of the
-    pairs is that of `contact_pairs`. The forces of all pairs span all balanced forces, except for
-    four or five contacts in one plane.
+    `points` holds sets of f contacts. `[..., k, i, :]` is the force on contact i by pair k, 0 at
+    the other contacts. The order of the pairs is that of `contact_pairs`. The forces of all pairs
+    span all balanced forces, except for four or five contacts in one plane.
     """
     f = points.shape[-2]
     first, second = contact_pairs(f, points.device)
@@ -132,7 +132,7 @@ def internal_forces(points: Float[Tensor, "*b f 3"]) -> Float[Tensor, "*b p f 3"
 def tangential_ratio(
     forces: Float[Tensor, "*b f 3"], normals: Float[Tensor, "*b f 3"]
 ) -> Float[Tensor, "*b f"]:
-    """Return the ratio (no unit) of tangential to normal force at each contact.
+    """Return the ratio (no unit) of tangential to normal force at each of f contacts.
 
     `forces` act on the object, whose outward unit normals are `normals`. The ratio is infinite
     where a force does not push.

@@ -131,7 +131,8 @@ def cone_edges(
 def wrenches(
     points: Vectors, normals: Vectors, friction: float, edges: int = 8
 ) -> Float[Tensor, "b f e 6"]:
-    """Return the wrench (force, then torque) of each edge of all linearised friction cones.
+    """Return the wrench (force, then torque) of each of the e `edges` of all linearised friction
+    cones.
 
     They are w in Eq. (13) of the paper. `points` and outward unit `normals` have the shape (b, f,
     3), and `friction` is the coefficient of friction. The edges have normal component 1 and no

@@ -85,7 +85,7 @@ def device_of(shape: ShapeLike) -> torch.device:
 
 
 def rows_of(shape: AnyShape, rows: Int[Tensor, "k"]) -> AnyShape:
-    """Return the shapes of the entries with the indices `rows`, from a batch of shapes.
+    """Return the shapes of the k entries with the indices `rows`, from a batch of shapes.
 
     A single shape, which belongs to all entries, is returned as it is.
     """
@@ -292,7 +292,7 @@ class ContactProblem:
         )
 
     def rows(self, index: Int[Tensor, "k"]) -> "ContactProblem":
-        """Return the problem of the contact sets with the given indices."""
+        """Return the problem of the k contact sets with the indices `index`."""
         names = "domain_radius", "separation", "tip_radius", "ring", "floor"
         own = {name: x[index] for name in names if isinstance(x := getattr(self, name), Tensor)}
         return dataclasses.replace(self, **own) if own else self

@@ -216,7 +216,8 @@ def project(shape: ShapeLike, points: Float[Tensor, "b k 3"], steps: int) -> Flo
     """Return normalised points, moved onto the surface by Newton steps along the gradient of the
     signed distance.
 
-    `steps` is the number of Newton steps.
+    `points` (b, k, 3) holds k points for each of b contact sets, and `steps` is the number of
+    Newton steps.
     """
     x = points.flatten(0, 1)
     for _ in range(steps):

@@ -1,5 +1,7 @@
 """Initial guesses of the contact planner: on the paper's sphere, from candidate contacts, or given
 by the caller.
+
+f counts the contacts of a set.
 """
 
 import dataclasses

@@ -1,5 +1,7 @@
 """Desired forces of the fingers, and the joint targets that exert them with position-controlled
 drives.
+
+In shapes, g counts grasps, f fingertips, h actuated joints, and j all joints of the URDF.
 """
 
 import dataclasses

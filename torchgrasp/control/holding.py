@@ -2,7 +2,7 @@
 load.
 
 A load is a wrench of force [N] and torque [N m] about the centroid of the contacts. All vectors are
-in the hand's frame.
+in the hand's frame. f counts the fingertips, and j all joints of the URDF.
 """
 
 import dataclasses

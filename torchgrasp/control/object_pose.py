@@ -4,7 +4,7 @@ A displacement (6,) is a translation [m] of the contacts' centroid and a rotatio
 it, in the frame of the planned hand. While the fingers close, `ContactPlanes` uses the tangent
 plane at each planned contact. While the hand stands still, `Localization` compares touched points
 and normals with the estimated surface, so that it also finds displacements along the object's own
-surface.
+surface. f counts the fingertips.
 """
 
 import dataclasses

@@ -1,4 +1,7 @@
-"""The interface of all closing controllers, and the test by which a closing has settled."""
+"""The interface of all closing controllers, and the test by which a closing has settled.
+
+f counts fingertips, h actuated joints, and j all joints of the URDF.
+"""
 
 from collections.abc import Callable
 from typing import Protocol, runtime_checkable

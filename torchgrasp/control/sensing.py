@@ -2,7 +2,7 @@
 sensors with delay, noise and failures.
 
 A robot with such sensors makes its `TactileState` with `feel_flags` or `feel_torques` instead of
-`measure`.
+`measure`. f counts fingertips, and j all joints of the URDF.
 """
 
 import dataclasses

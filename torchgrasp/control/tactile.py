@@ -1,4 +1,7 @@
-"""Observations of a hand, and simulated tactile fingertips with noise, lag and sampling."""
+"""Observations of a hand, and simulated tactile fingertips with noise, lag and sampling.
+
+f counts fingertips, h actuated joints, and j all joints of the URDF.
+"""
 
 import dataclasses
 import math

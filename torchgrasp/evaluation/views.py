@@ -141,6 +141,8 @@ def plan_views(
 ) -> list[Grasps | None]:
     """Plan on several views at once on a torch `device`; return the executable grasps of each.
 
+    `protocol` gives the task of the grasps, and `spec` the options of planning.
+
     The result is None for a view whose cloud cannot be read or planned on; `plan_view` then plans
     it anew.
     """
@@ -176,7 +178,8 @@ def _plan(
 def plan_view(
     view: ObjectView, protocol: Protocol, spec: EvaluationSpec, planned: Path | Grasps | None = None
 ) -> PlannedView:
-    """Return the executable grasps of a view for a protocol, with its score.
+    """Return the executable grasps of a view for a protocol, with its score; `spec` has the options
+    of planning.
 
     The score says why there are none. `planned` are grasps that exist already: the path of their
     file, or what `plan_views` returned. None, or a plan without grasps, means to plan them here.

@@ -2,7 +2,8 @@
 reflections.
 
 Cholesky factors are checked, but a matrix is never repaired. The functions work in any unit of
-length.
+length. Vectors have d numbers along the last axis; leading axes are those of batches, which
+broadcast.
 """
 
 import math

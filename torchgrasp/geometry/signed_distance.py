@@ -203,9 +203,9 @@ def field_from_surface(
 ) -> SignedDistanceField:
     """Return the signed distance field of a triangle mesh with outward faces, which may be open.
 
-    `vertices` are in metres; `faces` holds the indices of three vertices each. The nodes are
-    `spacing` [m] apart and reach to `margin` [m] around the mesh. Raises `BadArgument` for more
-    than `FIELDS.most_nodes` nodes.
+    `vertices` (v, 3) are in metres; `faces` (f, 3) holds the indices of three vertices each. The
+    nodes are `spacing` [m] apart and reach to `margin` [m] around the mesh. Raises `BadArgument`
+    for more than `FIELDS.most_nodes` nodes.
     """
     check_tensor("vertices", vertices, (None, 3))
     surface = _Surface(vertices, faces)

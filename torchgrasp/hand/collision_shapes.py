@@ -296,7 +296,7 @@ def _limit_near(urdf: Urdf, shapes: SelfCollision, frames: Frames, ahead: int, m
 def draw_postures(
     urdf: Urdf, coupling: Mapping[str, Mimic], n: int, seed: int
 ) -> Float[Tensor, "j n"]:
-    """Return n random positions [rad or m] of all movable joints, uniform within the limits;
+    """Return n random positions [rad or m] of all j movable joints, uniform within the limits;
     coupled joints follow.
 
     `coupling` gives the coupled joints by name. Raises `BadArgument` if it names a joint that the

@@ -152,7 +152,7 @@ def joints_from_files(spec: HandSpec, urdf: Urdf) -> ActuatedJoints:
 
 @dataclasses.dataclass(frozen=True)
 class Fingertips(Value):
-    """The fingertips in grasp order: names, links, and the contact pad of each.
+    """The f fingertips in grasp order: names, links, and the contact pad of each.
 
     In the frame of the tip's link, `contact` [m] is the contact point of the pad, `normal` its
     outward unit normal, and `center` and `radius` [m] those of its sphere; `radius` is 0 for a pad

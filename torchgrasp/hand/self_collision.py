@@ -334,7 +334,7 @@ class BoxPairs(NamedTuple):
         contact point [m].
 
         The contact point is relative to the centre of box b. `best` is the index of an axis of
-        `along_axes`.
+        `along_axes` for each of c pairs.
         """
         a, b, gap, half_a, half_b = self
         best = best[None]

@@ -129,7 +129,8 @@ class Attempts(Generic[Result]):
                 self.add(refine(chosen), chosen.row)
 
     def best(self, keys: Callable[[Result], tuple[Tensor, ...]]) -> tuple[Result, Int[Tensor, "t"]]:
-        """Return the best result of each contact set with results, then the index of that set.
+        """Return the best result of each of t contact sets with results, then the index of that
+        set.
 
         `keys` returns tensors (k,) for k results. The best result has the least first key; in a tie
         the next key decides.
@@ -146,7 +147,7 @@ def executable(grasps: Grasps) -> Bool[Tensor, "g"]:
 
 
 def best_grasps(attempts: Attempts[Grasps]) -> tuple[Grasps, Int[Tensor, "t"]]:
-    """Return the best grasp of each contact set with results, then the index of that set.
+    """Return the best grasp of each of t contact sets with results, then the index of that set.
 
     An executable grasp comes first, then one that failed on valid contacts, then others; in a tie
     the higher score decides.
@@ -245,7 +246,8 @@ def refine_by_cobyla(
 ) -> Configuration:
     """Return hand configurations moved onto three contacts each by SciPy's COBYLA.
 
-    The joints in `start` are the initial ones; its poses are not used.
+    The joints in `start` are the initial ones; its poses are not used. `contacts` are one set for
+    each configuration, and the links keep clear of the `world`.
     """
     if not len(start):
         return start
@@ -259,8 +261,8 @@ def refine_by_cobyla(
 class CobylaRun:
     """One run of SciPy's COBYLA from initial `joints` [rad] onto three contact `points` [m].
 
-    The points are in the object's frame; `world` holds what the hand must not touch. The values at
-    the last evaluated point are cached.
+    The points are in the object's frame; `world` holds what the hand must not touch. l counts the
+    hand's links. The values at the last evaluated point are cached.
     """
 
     def __init__(

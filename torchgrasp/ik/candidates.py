@@ -1,5 +1,7 @@
 """The input of the grasp solvers, and the checks and scores that turn candidate configurations into
 grasps.
+
+b counts contact sets, g candidates or grasps, f fingertips.
 """
 
 import dataclasses
@@ -229,8 +231,10 @@ def measure_errors(
 
 
 def is_clear(hand: Hand, configuration: Configuration, world: CollisionWorld) -> Bool[Tensor, "g"]:
-    """Return a mask of the configurations in which no link, tips included, touches object, table or
-    another link.
+    """Return a mask of the g configurations in which no link, tips included, touches object, table
+    or another link.
+
+    `world` holds the object and the table.
     """
     links, _, table = link_clearance(
         SpatialJacobian.at(hand, configuration), world, tips_touch=False
@@ -326,7 +330,7 @@ def _keep_clear(
 
 
 def centred_friction(contacts: Contacts) -> Float[Tensor, "g"]:
-    """Return the friction coefficient that each contact set needs if all forces point to the
+    """Return the friction coefficient that each of g contact sets needs if all forces point to the
     contacts' centroid.
     """
     inward = unit(contacts.points.mean(1, keepdim=True) - contacts.points)

@@ -63,7 +63,8 @@ class Obstacles(Value):
     ) -> "Obstacles | None":
         """Return the obstacles of an occupancy grid, or None if all its voxels are probably free.
 
-        Voxels of probability `full`, in [0.01, 1], or more count as occupied.
+        Voxels of probability `full`, in [0.01, 1], or more count as occupied. `hard` says whether
+        links must not touch them (`Obstacles.hard`).
         """
         # SciPy's distances
         device = occupancy.origin.device
@@ -190,7 +191,8 @@ def collision_cost(
     """Return the cost [mm2] of each hand: the sum of squares of the clearances that its spheres
     lack.
 
-    Fingertips may touch the object. `centres` [m] are those of the hand's `spheres`.
+    Fingertips may touch the object. `centres` [m] are those of the hand's `spheres`, and `world`
+    holds what they must not touch.
     """
     radius = spheres.radius.to(centres)
     cost = centres.new_zeros(centres.shape[:-2])

@@ -127,6 +127,9 @@ class SpatialJacobian(Value):
 
 
 def differentiate(spatial: SpatialJacobian, parts: Sequence[ResidualRows]) -> Residuals:
-    """Return the residuals of all `parts`, then their Jacobian by hand pose (6) and joints."""
+    """Return the residuals of all `parts`, then their Jacobian by hand pose (6) and joints.
+
+    `spatial` holds the kinematics of the hands.
+    """
     residual, wrench, moves = (torch.cat(x, 1) for x in zip(*parts, strict=True))
     return residual, spatial.jacobian(wrench, moves)

@@ -87,7 +87,7 @@ class Request:
 
         These are an arm of another hand, no load to resist, a box or mesh to keep to that is not at
         the object, or a `promise` (the share of returned grasps that hold) for a displaced object.
-        A box or mesh to avoid that is not there is told in a `NoEffect` warning.
+        A box or mesh to avoid that is not at the object raises the warning `NoEffect`.
         """
         if self.arm is not None and self.arm.hand_sha256 != self.hand.source.sha256:
             raise BadArgument(

@@ -1,6 +1,7 @@
 """The contact sets of a plan that the hand tries, and the state of each in the search for grasps.
 
-A contact set is named by its row, which is its index in the `Candidates`.
+A contact set is named by its row, which is its index in the `Candidates`. b counts contact sets, c
+objects, and k such indices.
 """
 
 import dataclasses

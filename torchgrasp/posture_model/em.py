@@ -5,7 +5,7 @@ is linear in the f features [1, x_i, x_i x_j] of a data row x (one sample of d n
 step is one matrix product. Sums of the features, weighted by responsibilities, suffice for the
 maximisation and are small enough to add over processes. The data must have mean 0 and variance 1 in
 every column; otherwise differences of such sums would lose their digits. All numbers are therefore
-standardised, without unit.
+standardised, without unit. n counts samples, m the Gaussians (components) of the mixture.
 """
 
 import dataclasses

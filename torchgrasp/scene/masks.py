@@ -205,7 +205,7 @@ def _run_lengths(text: bytes) -> list[int]:
 def label_image(
     view: TableImage, labels: Int[Tensor, "h w"] | None, mask: Bool[Tensor, "h w"] | None
 ) -> tuple[Int[Tensor, "h w"], tuple[str, ...]]:
-    """Return the label of each pixel, and notes, given labels, a mask or neither.
+    """Return the label of each pixel of a `view`, and notes, given labels, a mask or neither.
 
     Given labels lose pixels on the table and flying pixels. Without labels the image is segmented.
     A mask becomes label 1, and loses strips of neighbouring objects, too. Pixels of the mask's

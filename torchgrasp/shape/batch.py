@@ -276,7 +276,9 @@ class ShapeBatch(Value):
         return x * spread(self.scale, x) + spread(self.centers[self.owner], x, 1)
 
     def wall_at(self, x: Queries) -> Bool[Tensor, "q walls"]:
-        """Return a mask of the surface among `walls` that applies at each normalised point."""
+        """Return a mask of the surface among `walls` that applies at each of q normalised
+        points.
+        """
         if not self.hollow:
             return torch.ones(len(x), 1, dtype=torch.bool, device=x.device)
         own = self._surface_at(x) == self._wall(x)[:, 0]

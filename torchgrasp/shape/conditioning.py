@@ -182,7 +182,7 @@ def _score(
     error: Float[Tensor, "n"],
 ) -> Float[Tensor, "n"]:
     """Return a score of each candidate point: the higher, the more an observation of the point
-    would tell.
+    reduces the uncertainty.
     """
     if criterion == "variance":
         return variance

@@ -127,7 +127,9 @@ class ShapeGP(Posterior, Normalisation):
 
     @checked(gradients=True)
     def wall_at(self, x: Queries) -> Bool[Tensor, "q walls"]:
-        """Return a mask of the surface among `walls` that applies at each normalised point."""
+        """Return a mask of the surface among `walls` that applies at each of q normalised
+        points.
+        """
         return torch.ones(len(x), 1, dtype=torch.bool, device=x.device)
 
     @checked(gradients=True)

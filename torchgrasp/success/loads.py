@@ -39,7 +39,8 @@ LOADS = LoadNumbers()
 
 
 def lever_arm(points: Float[Tensor, "b f 3"], center: Float[Tensor, "*b 3"]) -> Float[Tensor, "b"]:
-    """Return the lever arm (no unit) of a load at `center` [m] on each set of contact `points` [m].
+    """Return the lever arm (no unit) of a load at `center` [m] on each set of f contact `points`
+    [m].
 
     It is the distance of `center` from the longest side of the contacts' triangle, divided by the
     triangle's height over this side plus `LOADS.torsion`. About this side the object turns most
@@ -103,8 +104,8 @@ def carrying_force(
 def greatest_force(
     hand: Hand, grasps: Grasps, forces: Float[Tensor, "g f 3"]
 ) -> Float[Tensor, "g"]:
-    """Return the largest factor (no unit) on contact `forces` [N] at which no drive exceeds its
-    greatest torque.
+    """Return for each of g grasps the largest factor (no unit) on the contact `forces` [N] at which
+    no drive exceeds its greatest torque.
 
     The forces are in the frame of the grasps. Those that are NaN give NaN.
     """

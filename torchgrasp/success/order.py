@@ -23,9 +23,10 @@ unknown.
 
 
 def is_covered(features: Float[Tensor, "g k"]) -> Bool[Tensor, "g"]:
-    """Return a mask of the grasps for which trials support the prediction of success.
+    """Return a mask of the g grasps for which trials support the prediction of success.
 
-    Their features named in `DOMAIN` lie within the range of the trials.
+    `features` has a column for each name in `FEATURES`. Those named in `DOMAIN` must lie within the
+    range of the trials.
     """
     rows = [FEATURES.index(name) for name in DOMAIN]
     least, most = load_success_model(features.device).range[rows].T

@@ -185,7 +185,8 @@ class Canvas:
         """Add a mesh with one colour "#rrggbb", or with a colour in [0, 1] for each vertex.
 
         `vertices` [m] have the vertex `normals`; without them, edges with a strong bend look sharp.
-        `faces` (t, 3) are indices of three vertices. With `lit` False the mesh gets no shading.
+        `faces` (t, 3) are indices of three vertices. With `lit` False the mesh gets no shading. A
+        `transparent` mesh shows the opaque ones behind it.
         """
         corners = vertices[faces]
         bent = sharp_normals(vertices, faces) if normals is None else normals[faces]
@@ -345,8 +346,9 @@ def render(
 ) -> UInt8[np.ndarray, "h w 3"]:
     """Return the pixels of a picture of opaque and transparent triangles.
 
-    Of the transparent triangles, only the nearest layer is drawn over the opaque ones. `size` is
-    the width and height (w, h) [pixels]; `background` is red, green and blue in [0, 1].
+    They are shown as the `camera` sees them. Of the transparent triangles, only the nearest layer
+    is drawn over the opaque ones (`solid`). `size` is the width and height (w, h) [pixels];
+    `background` is red, green and blue in [0, 1].
     """
     samples = RASTER.samples
     width = size[0] * samples

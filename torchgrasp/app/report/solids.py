@@ -106,7 +106,7 @@ def link_poses(
 ) -> Float[Tensor, "n l 4 4"]:
     """Return the poses obj_from_link [m] of all l links, in the order of `hand.tree.link_names`.
 
-    `joints` holds n postures of all joints of the URDF [rad], whose names are `names`, in any
+    `joints` holds n postures of all j joints of the URDF [rad], whose names are `names`, in any
     order. `obj_from_hand` holds the n poses of the hand in the object's frame [m].
     """
     values = joints[:, [names.index(n) for n in hand.tree.joint_names]].double()

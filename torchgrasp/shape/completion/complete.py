@@ -157,7 +157,8 @@ def correlated_errors(
     shared: Float[Tensor, "m c"],
     local: Float[Tensor, "m"] | float,
 ) -> Float[Tensor, "m k"]:
-    """Return correlated errors [m] of m points [m], a column for each of k independent causes.
+    """Return correlated errors [m] of m points [m], a column for each of k independent causes; the
+    first c are those in `shared`.
 
     The `shared` errors [m] come first, then the modes of a smooth random field. The field's
     variance at a point is the sum of the squares of the `local` error [m] and of the `shared`
@@ -360,8 +361,8 @@ def _mirror_in(
 
 
 def _is_frame(scorer: SymmetryScorer) -> bool:
-    """Tell whether the middle of the cloud is empty: outside the outline or close to it, and wider
-    than a bar from the cloud.
+    """Return whether the middle of the cloud is empty: outside the outline or close to it, and
+    farther from the cloud than a bar is wide.
     """
     middle = scorer.center
     away = float(torch.cdist(middle[None], scorer.points).amin())
@@ -421,8 +422,8 @@ def _hidden(
     points: Points,
     apart: float = HIDDEN.new,
 ) -> Bool[Tensor, "n"]:
-    """Tell which points are hidden in every view, not below the table, and farther than `apart` [m]
-    from the cloud.
+    """Return a mask of the points that are hidden in every view, not below the table, and farther
+    than `apart` [m] from the cloud.
     """
     hidden = (scorer.nearest(points)[0] > apart) & scorer.outline.hides(points)
     if scorer.table is None:
