@@ -43,7 +43,8 @@ class ReachNumbers:
     speed: float = 0.1
     """Speed [m/s] of the tip on the way; a way on which a joint would be too fast is refused."""
     between: int = 8
-    """Number of poses from one comparison of links with each other to the next."""
+    """Links are tested for collisions with each other only at every pose of this number along the
+    way."""
     postures: int = 256
     """Number of postures that are compared at a time, which bounds the memory."""
     ways: int = 64

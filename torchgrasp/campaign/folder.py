@@ -67,9 +67,9 @@ def carry_out(
 ) -> GraspShards:
     """Run the jobs that a folder lacks, and write its data set, which is returned.
 
-    `work` runs jobs, given their indices. As each job ends, it yields the position of its index,
-    and the bytes of its shard or a failure. `observer` is called with the `JobRow` of each finished
-    job. Raises `OutputError` if the folder holds another campaign or other files.
+    `work` runs jobs, given their indices. As each job ends, it yields the job's place among these
+    indices, and the bytes of its shard or a failure. `observer` is called with the `JobRow` of each
+    finished job. Raises `OutputError` if the folder holds another campaign or other files.
     """
     with hold_folder(folder):
         begin_folder(folder / ASKED, campaign.text, "campaigns")

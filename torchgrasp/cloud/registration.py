@@ -105,7 +105,7 @@ class Motion:
     pose: Float[Tensor, "4 4"]  # new_from_old [m]
     shift: float  # length of the shift of the points' mean [m]
     distance: float  # rms distance [m] over the points, along their normals
-    unsure: float  # rms distance [m] that such a motion may have where the overlap shows none
+    unsure: float  # rms distance [m] that the overlap does not show, estimated from the shown one
     left: float  # deviation [m] of the points from the other view after the motion
     chi_squared: float  # of the motion: small if noise and bias explain it (no unit)
 

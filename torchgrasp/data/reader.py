@@ -149,9 +149,9 @@ def shard_path(folder: Path, k: int) -> Path:
 def read_shards(folder: Path | str, points: Count | None = None) -> GraspShards:
     """Open a data set that a campaign has written; shards are read on demand.
 
-    With `points`, so many points of each cloud are drawn, the same in every call; a smaller cloud
-    repeats points. None means all. Raises `ModelFileError` if the campaign is not finished, or its
-    card is damaged.
+    `points` is the number of points drawn from each cloud, the same ones in every call; a smaller
+    cloud repeats points. None means all. Raises `ModelFileError` if the campaign is not finished,
+    or its card is damaged.
 
     >>> import tempfile, trimesh
     >>> from torchgrasp import load_hand

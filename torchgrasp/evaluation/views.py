@@ -94,7 +94,7 @@ def choose_rows(executable: int, most: int, ranks: Ranks) -> list[int]:
     """Return the indices of the grasps to try.
 
     There are at most `most` out of `executable` grasps, which are in ranked order. `ranks` says
-    which: the "best", or as many "spread" over all ranks.
+    which: the "best", or grasps "spread" evenly over all ranks.
     """
     most = min(most, executable)
     if ranks == "best" or most < 2:

@@ -44,7 +44,7 @@ POSTURE = PostureNumbers()
 class Column(NamedTuple):
     """One joint of a file. Its value in our hand is `factor` times the file's, plus `offset`.
 
-    `offset` is in rad, or in m for a sliding joint. `turned` tells whether the user gave a factor.
+    `offset` is in rad, or in m for a sliding joint. `turned` says whether the user gave a factor.
     """
 
     joint: str

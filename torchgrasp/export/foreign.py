@@ -96,8 +96,7 @@ def read_foreign(
     take up its motion, so that their tips are where the file has them.
 
     Coupled and parked joints of the file may differ from the hand's, unless a fingertip moves by
-    over 0.1 mm. A `GraspFileWarning` tells of values that are not kept, and of joints that bend
-    backward.
+    over 0.1 mm. A `GraspFileWarning` names values that are not kept, and joints that bend backward.
 
     Args:
         path: the file. Its angles are in radians.

@@ -29,7 +29,7 @@ class AbilityNumbers:
         0.1  # share of the free postures in which a fingertip is weaker than its sure force
     )
     least_apart: float = 1e-9  # least divisor [m] of a direction between tips that coincide
-    digits: int = 6  # significant digits in files: random postures tell no more
+    digits: int = 6  # significant digits in files: random postures give no more
 
 
 ABILITY = AbilityNumbers()

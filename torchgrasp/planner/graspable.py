@@ -26,7 +26,7 @@ from torchgrasp.values.specs import FLAT_RADII, TIP_RADIUS, ContactSpec
 
 @dataclasses.dataclass(frozen=True)
 class JudgeNumbers:
-    """The bounds by which an object's image shows that a hand cannot grasp it."""
+    """Bounds on the points and pixels of an object beyond which a hand cannot grasp it."""
 
     on_support: float = 0.5
     """Least share of an object's points over its support."""

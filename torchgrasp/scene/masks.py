@@ -39,7 +39,7 @@ class MaskNumbers:
     low: float = 0.01
     """Height [m] above the support below which a pixel counts as lying on it."""
     rim: int = 4
-    """Number of pixels by which the border of a given mask may be off."""
+    """Greatest error [pixels] of the border of a given mask."""
     told: float = 0.05
     """Share of a mask's pixels whose removal is mentioned in a note; a smaller share is not."""
 

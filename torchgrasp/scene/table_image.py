@@ -92,7 +92,8 @@ class TableImage(Value):
 
     @kept
     def median_noise(self) -> float:
-        """The standard deviation of mean heights over the squared depth [1/m], from a median.
+        """The standard deviation of mean heights divided by the squared depth [1/m], estimated by a
+        median.
 
         A few outliers do not move it. It is 0 if no pixel shows the table.
         """

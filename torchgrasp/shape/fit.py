@@ -92,7 +92,7 @@ def fit_shape(
 
     Args:
         cloud: points [m] of one object from one view or several (`merge_clouds`), as in
-            `plan_grasps`. Normals, if they are given, tell whether the points cover the whole
+            `plan_grasps`. Normals, if they are given, show whether the points cover the whole
             surface. Walls thinner than the cloud's spacing merge, but an open vessel seen from
             above on a `table` becomes a `HollowShape` with two surfaces.
         noise: standard deviation of an observed signed distance, in radii of the object. If

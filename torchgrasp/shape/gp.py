@@ -217,7 +217,7 @@ class ShapeGP(Posterior, Normalisation):
         most 1000.
 
         Samples of one seed are differentiable in the points twice. Where points coincide, the
-        derivatives are those of points that move together.
+        derivatives assume that these points move together.
 
         Raises the errors of `joint`.
         """

@@ -46,8 +46,8 @@ class SimulatedScene(abc.ABC):
     (3,) [m] is the object's centre of mass in its own frame, `timestep` is in seconds. A
     simulator's subclass sets `joint_names` and the handles of bodies: `body` of the object, `root`
     of the hand's root link, `tips` of the links of the f fingertips in the order of the contacts,
-    and `neighbours` of the other bodies. Then it calls `_map_contacts`, which tells their contacts
-    apart.
+    and `neighbours` of the other bodies. Then it calls `_map_contacts`, which distinguishes their
+    contacts.
     """
 
     joint_names: tuple[str, ...]

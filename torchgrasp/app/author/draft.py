@@ -94,7 +94,7 @@ class Draft(NamedTuple):
 
 
 class Wish(NamedTuple):
-    """The user's choices for a new hand; an empty choice is made by the draft.
+    """The user's choices for a new hand; `draft_hand` decides what is left empty.
 
     Attributes:
         tips: links of the fingertips in grasp order.

@@ -50,7 +50,7 @@ class FitNumbers:
     thinnest: float = 0.008  # least thickness of a part [m]
     fewest: int = 20  # each part of a cut has more points: the size of fewer is chance
     round_share: float = 0.9  # a cylinder replaces boxes with less than this share of their volume
-    turned_share: float = 0.85  # likewise a box that is turned out of the link's axes
+    turned_share: float = 0.85  # the same for a box that is turned out of the link's axes
     flat: float = 1e-7  # root mean square thickness [m] of a flat body, which has no hull
     least_size: float = 1e-4  # least side of a shape [m], so that none is empty
     digits: int = 6  # decimals to which all numbers are rounded

@@ -36,7 +36,7 @@ class PadNumbers:
     # angle [rad] by which the contact of a round tip is turned from its motion to the finger's end
     tilt: float = math.radians(30)
     short_arm: float = 1e-3  # least distance of a tip from the axis of a joint that moves it [m]
-    beside: float = 0.003  # points of a surface count so near a ray or a plane [m]
+    beside: float = 0.003  # greatest distance [m] of surface points from a ray or a plane
     end: float = 0.015  # length of a finger's end, half of whose thickness is the ball's radius [m]
     radii: tuple[float, float] = (0.003, 0.013)  # least and greatest radius of a ball [m]
     radius_digits: int = 4  # decimals of the radius of a ball [m]

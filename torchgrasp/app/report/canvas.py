@@ -116,9 +116,9 @@ class Lamps:
 class BarLayout:
     """Layout of a colour bar at the bottom of a picture [pixels]."""
 
-    side: int = 5  # one part in so many of the width stays free on each side of the bar
+    side: int = 5  # width of the picture over the free width on each side of the bar
     top: int = 24  # upper end of the strip, from the bottom of the picture
-    bottom: int = 10  # lower end of the strip, likewise
+    bottom: int = 10  # lower end of the strip, from the bottom of the picture
     font: int = 20  # size of numbers and title
     labels: int = 4  # count of the numbers above the strip
     label_rise: int = 4  # height of these numbers above the strip

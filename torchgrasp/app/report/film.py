@@ -40,8 +40,8 @@ class FilmLayout:
     plots_top: int = 62  # gap between stills and plots, for the letters of the moments
     plots_bottom: int = 60  # gap below the plots, for the axis of time
     bottom: int = 76  # height beside stills, plots and their gaps
-    left: float = 0.05  # ends of the plots, as shares of the width
-    right: float = 0.985  # likewise
+    left: float = 0.05  # left end of the plots, as a share of the width
+    right: float = 0.985  # right end of the plots, as a share of the width
     letter_rise: int = 30  # height of a letter above the first plot [points]
     touch: int = 12  # size of the mark at a finger's first touch [points]
     far: float = 0.25  # an object this far from its first place [m] is lost, and is not framed

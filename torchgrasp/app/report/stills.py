@@ -44,14 +44,14 @@ class HandSheet:
     """Layout of the picture of a hand: four stills, and below them the ranges of the joints."""
 
     eye: Direction = (1.0, -0.9, 0.5)  # direction to the camera, in the hand's frame
-    aside: float = 110.0  # the other side from which the posture is seen [degrees]
+    aside: float = 110.0  # rotation of the direction to the camera in the second view [degrees]
     width: float = 13.5  # width of the picture [inches]
     height: float = 10.8  # height of the stills [inches]
     row: float = 0.3  # height for each joint [inches]
     dpi: int = 100  # resolution [pixels per inch]
     font: int = 14  # size of the titles [points]
     bar: float = 0.4  # height of the bar of a joint, in rows
-    margin: float = 0.02  # beside the widest range, as a share of it
+    margin: float = 0.02  # margin beside the widest range, as a share of it
     mark: int = 16  # length of the mark of the posture [points]
     mark_width: int = 3  # width of this mark [points]
 

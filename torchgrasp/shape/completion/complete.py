@@ -91,7 +91,8 @@ class BarNumbers:
     the centre from the cloud.
     """
     neighbours: int = 30
-    """Number of points that give width and direction; normals are fitted to as many."""
+    """Number of neighbouring points that give width and direction, the same as for fitted
+    normals."""
     middle: float = 0.8
     """Least width at a point in the middle of a bar, as a share of the bar's width."""
     deviation: float = 0.5

@@ -39,7 +39,8 @@ class VesselNumbers:
     miss: float = 0.006
     """Distance [m] of a point from its wall at which it has half the weight in the last rounds."""
     wider: float = 4.0
-    """Excess of this distance in the first round, over `miss`: the axis is not yet known."""
+    """Excess of this distance over `miss` in the first round, in multiples of `miss`: the axis is
+    not yet known."""
     narrowing: float = 0.8
     """Factor by which this excess shrinks from round to round."""
     on_body: float = 0.002
@@ -54,7 +55,7 @@ class VesselNumbers:
     walls.
     """
     body_share: float = 0.65
-    """Least share of the walls on the body."""
+    """Least share of the points on walls that lie on the fitted body."""
     inner_share: float = 0.09
     outer_share: float = 0.07
     """Least shares of the cloud on either wall."""
