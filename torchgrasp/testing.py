@@ -34,7 +34,9 @@ class LawNumbers:
     jacobian: float = 1e-6
     """Largest difference [m/rad] of central differences from the Jacobian."""
     rounding: float = 1e-6
-    """Largest error of a joint [rad or m], and of the sum of two principal inertias, relative."""
+    """Largest error of a joint [rad or m], and largest relative error of the sum of two principal
+    inertias.
+    """
     outward: float = 1e-4
     """Distance [m] outside a contact at which no shape may be."""
 

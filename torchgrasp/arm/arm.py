@@ -43,7 +43,7 @@ class ArmNumbers:
     cell: float = 0.065
     """Edge [m] of a sphere's cell: one sphere fills a section of a thin link."""
     bulge: float = 0.01
-    """Distance [m] that a sphere may stand out of a shape."""
+    """Distance [m] by which a sphere may protrude from a shape."""
 
 
 ARM = ArmNumbers()

@@ -44,7 +44,8 @@ class ReachNumbers:
     """Speed [m/s] of the tip on the way; a way on which a joint would be too fast is refused."""
     between: int = 8
     """Links are tested for collisions with each other only at every pose of this number along the
-    way."""
+    way.
+    """
     postures: int = 256
     """Number of postures that are compared at a time, which bounds the memory."""
     ways: int = 64

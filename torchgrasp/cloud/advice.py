@@ -38,7 +38,8 @@ class AdviceNumbers:
     """The vertical is z above this cosine, as where none was given."""
     along: float = 0.8
     """Cosine between the camera's ray and an outlier's offset from the others, above which it is a
-    flying pixel."""
+    flying pixel.
+    """
     flying: float = 0.02
     """Share of flying pixels, over all points, that is worth advice."""
 

@@ -38,7 +38,8 @@ class CloudNumbers:
     """Greatest extent, read as metres, that is taken for a scene in metres or an object in cm."""
     longest: float = 45.0
     """Greatest extent, read as metres, that is taken for cm, of an object of at most 45 cm; a
-    larger one is taken for mm."""
+    larger one is taken for mm.
+    """
 
 
 CLOUD = CloudNumbers()

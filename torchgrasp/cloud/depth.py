@@ -46,10 +46,12 @@ class DepthNumbers:
     """
     millimetres: float = 200.0
     """A median depth, read as metres, that is too large is in mm if it is above this, else in
-    cm."""
+    cm.
+    """
     background: float = 0.05
     """Least share of pixels with the greatest depth, from which this depth, if too far, marks a
-    background."""
+    background.
+    """
     viewed: int = 5000
     """Number of points, about, by which a table in the view is compared with the pose."""
 

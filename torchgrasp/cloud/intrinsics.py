@@ -47,7 +47,8 @@ class IntrinsicsNumbers:
     """Longest list of numbers: that of a 3 x 4 projection."""
     nested: int = 4
     """Greatest depth of nested objects at which a matrix is found; those of ROS and Zivid have
-    two."""
+    two.
+    """
     greatest: float = 1e9
     """Upper bound of a width, a height and a depth scale: no camera has greater ones."""
     widest: float = 1e6
@@ -70,10 +71,12 @@ class IntrinsicsNumbers:
     """
     corner: float = 0.05
     """Greatest distance by which a crop may reach out of its camera's image, as a share of the
-    side."""
+    side.
+    """
     moved: float = 0.04
     """Least shift of a crop's corner, as a share of the side: a camera's principal point is off by
-    less."""
+    less.
+    """
     centred: float = 0.05
     """Greatest shift of the principal point from the middle of a resolution that is guessed, over
     half the side.
@@ -89,7 +92,8 @@ class IntrinsicsNumbers:
     """
     agree: float = 0.5
     """Greatest difference [px] between the numbers of ROS's matrices K and P that count as
-    equal."""
+    equal.
+    """
     swapped: float = 0.05
     """Greatest shift of a principal point from the middle whose numbers are swapped, as a share of
     the side.

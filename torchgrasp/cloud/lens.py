@@ -35,7 +35,7 @@ class LensNumbers:
     """Bounds of a distortion, and parameters of the search for rays."""
 
     straight: float = 1e-3
-    """Greatest coefficient of a distortion that moves no pixel by more than a tenth."""
+    """Greatest coefficient of a distortion that moves no point by more than a tenth of a pixel."""
     most: float = 1e4
     """Greatest absolute value of a coefficient: no real lens has a larger one."""
     steps: int = 20
@@ -62,6 +62,8 @@ class Lens(NamedTuple):
     ) -> tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2 2"]]:
         """Return where bent rays (x, y, 1) meet the image plane at depth 1, then the derivatives by
         x and y.
+
+        `rays` holds x and y of n rays before the lens bends them (no unit).
         """
         k1, k2, p1, p2, k3, k4, k5, k6 = self.coefficients
         x, y = rays.unbind(-1)

@@ -151,8 +151,9 @@ def cut_object(
 def cut_exact_table(cloud: PointCloud, up: Vector) -> tuple[PointCloud, Plane | None]:
     """Return a cloud without the points of a table that has no noise, and the plane of the table.
 
-    Only a simulator sees such a table, and only there no point of the object's foot is lost with
-    it. Without one, the cloud is returned itself, and None. `up` is the unit vector that points up.
+    Only simulated clouds have such a table; without noise, no point of the object's foot is cut off
+    with it. Without one, the cloud is returned itself, and None. `up` is the unit vector that
+    points up.
     """
     points = cloud.points.double()
     support = find_ground(points, cloud.viewpoint, up.to(points))

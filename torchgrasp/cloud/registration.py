@@ -40,12 +40,14 @@ class ViewNumbers:
     """Most points of the surface that they are compared with."""
     reach: float = 1.5
     """Greatest distance, along the surface, of two points that are compared, in spacings of the
-    surface's points."""
+    surface's points.
+    """
     least: int = 20
     """Fewest compared points that count: fewer are a rim that flies."""
     seen: float = 0.9
     """Quantile of the heights of points in front of a surface that counts as their height; flying
-    pixels are higher."""
+    pixels are higher.
+    """
     same: float = 0.8
     """Least cosine of two normals of one surface."""
     refused: float = 2.5

@@ -159,7 +159,8 @@ def survey(
 ) -> Float[Tensor, "_ f 3"]:
     """Return points (normalised) all over the surface, from which candidates are chosen.
 
-    They come in sets of three. For a vessel, half of them are on each wall. `generator` draws them.
+    They come in sets of f = 3 points. For a vessel, half of them are on each wall. `generator`
+    draws them.
     """
     walls = walls_of(shape)
     triples = CANDIDATE_TRIPLES * (1 if spec.region is None else 4)  # few of them lie in a region

@@ -70,7 +70,8 @@ class GripNumbers:
     """Cut-off frequency [Hz] of the low-pass filter of the sensed load."""
     carried: float = 0.7
     """Cut-off frequency [Hz] of the low-pass filter of the load that counts as carried; a higher
-    one rocks the object."""
+    one rocks the object.
+    """
     carries: float = 0.8
     """Share of the carried load that is commanded; with 1, the hand would press a rigid table with
     ever growing forces.

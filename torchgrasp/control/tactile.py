@@ -38,7 +38,8 @@ class TactileNumbers:
     """Standard deviation [N] of the force along the surface."""
     place: float = 1.5e-3
     """Standard deviation [m] of the sensed position of the contact, on each axis along the
-    surface."""
+    surface.
+    """
     slide: float = 2e-3
     """Standard deviation [m/s] of the sliding speed."""
     radius: float = 0.012

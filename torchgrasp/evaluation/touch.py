@@ -37,7 +37,8 @@ class TouchNumbers:
     """Greatest gap [m] of a fingertip that touches: the usual deviation of an estimated surface."""
     reach: float = 1.5
     """Greatest distance of a fingertip from the cloud's nearest point, along the surface, in
-    spacings of the points. Farther away, the cloud does not show the surface."""
+    spacings of the points. Farther away, the cloud does not show the surface.
+    """
 
 
 TOUCH = TouchNumbers()

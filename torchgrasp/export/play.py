@@ -70,7 +70,7 @@ class PlayNumbers:
     friction: float = 0.1
     """Least coefficient of friction for which the force is chosen."""
     force: float = 100.0
-    """Largest force [N], far beyond what hands exert."""
+    """Largest normal force [N] of the strongest finger, far beyond what hands exert."""
     mass: float = 0.1
     """Mass [kg] of each link of the mount."""
     inertia: float = 1e-4

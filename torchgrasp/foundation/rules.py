@@ -256,8 +256,8 @@ def is_rigid(a_from_b: Float[Tensor, "*b 4 4"]) -> Bool[Tensor, "*b"]:
 def nearest_rotation(turn: Float[Tensor, "3 3"]) -> tuple[Float[Tensor, "3 3"], float]:
     """Return the rotation nearest to a matrix, and the error of the matrix as an angle [deg].
 
-    The angle is that of the axis which is farthest from the rotation's; its length counts, too.
-    Numbers that are not finite have an angle of infinity.
+    The error is the largest distance between a column of the matrix and the same column of the
+    rotation, in degrees, as for small angles. It is infinite for numbers that are not finite.
     """
     turn = turn.double()
     if not bool(torch.isfinite(turn).all()):

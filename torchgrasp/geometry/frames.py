@@ -19,7 +19,8 @@ from torchgrasp.geometry.linalg import eye_like, norm, unit
 
 FLAT = 1e-3
 """Least height of a contact triangle over its longest side: in a flatter one, noise decides the
-direction of the virtual frame."""
+direction of the virtual frame.
+"""
 
 
 def rigid(

@@ -41,17 +41,18 @@ class CoverNumbers:
     """Parameters of the spheres that cover a hand for collision checks."""
 
     finger_cell: float = 0.015
-    """Edge [m] of a finger's cells; larger: the corners of a shape stand farther out of its
+    """Edge [m] of a finger's cells; larger: the corners of a shape protrude farther from its
     spheres.
     """
     palm_cell: float = 0.022
     """Edge [m] of the palm's cells."""
     bulge: float = 0.004
-    """Distance [m] that a sphere may stand out of a shape's faces, other than a fingertip's."""
+    """Distance [m] by which a sphere may protrude from a shape's faces, other than a
+    fingertip's."""
     single_layer: float = 0.025
     """A shape thinner than this [m] has one layer of cells across."""
     sunk: float = 0.001
-    """Distance [m] by which a cell's corners may stand out of its sphere."""
+    """Distance [m] by which a cell's corners may protrude from its sphere."""
 
 
 COVER = CoverNumbers()

@@ -26,7 +26,7 @@ ROUNDING = 1e-6  # greatest error of the weights' sum, and relative asymmetry of
 
 
 class of_parameters(kept[Kept]):
-    """A property of a mixture whose value is kept unless a parameter requires a gradient.
+    """A property of a mixture whose value is cached unless a parameter requires a gradient.
 
     An optimiser may change such a parameter, so the value is then computed each time.
     """

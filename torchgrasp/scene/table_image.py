@@ -29,7 +29,8 @@ class HeightNumbers:
     """Standard deviation over the median of the absolute value, of a normal distribution."""
     jump: float = 0.006
     """Least jump of depth between two surfaces [m], in addition to the change that a slope
-    causes."""
+    causes.
+    """
     slope: float = 2.0
     """Largest change of depth of one surface from pixel to pixel, over a pixel's width."""
     least_share: float = 1e-9

@@ -158,7 +158,7 @@ class ExtraObservations(Value):
     std_factor: float = 1.0
     parts: tuple[Part, ...] = ()  # observed points of the outline and of the hidden side
     free: FreeSpace | None = None  # points in free space, or None if they are not used
-    rows: Bool[Tensor, "rows"] | None = None  # mask of the cloud's points on it; None means all
+    rows: Bool[Tensor, "rows"] | None = None  # mask of cloud points on this surface; None: all
     kind: Kind = "guess"  # how the hidden side was completed, as in `ShapeGP`
 
 

@@ -246,7 +246,8 @@ class ShapeGP(Posterior, Normalisation):
 
         The result equals the posterior of all observations at once. Kernel, domain and `cloud` do
         not change. A view, which is 20 points or more, is compared with `cloud`. A distance that
-        noise does not explain raises the warning `MendedInput`, and widens the deviations of both.
+        noise does not explain raises the warning `MendedInput`, and increases the standard
+        deviations of both.
 
         Args:
             points: surface points [m] in the cloud's frame.

@@ -55,7 +55,7 @@ class UnstableNumbers:
     cutoff: float = 2.0
     """Cut-off frequency [Hz] of the low-pass filter of the readings that are judged."""
     wait: float = 0.3
-    """Time [s] after the ramp in which the filtered readings follow the forces."""
+    """Time [s] after the forces have risen, in which the filtered readings follow them."""
     raised: float = 2.0
     """Factor to which the forces are raised."""
     rate: float = 8.0

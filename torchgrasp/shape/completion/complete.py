@@ -92,7 +92,8 @@ class BarNumbers:
     """
     neighbours: int = 30
     """Number of neighbouring points that give width and direction, the same as for fitted
-    normals."""
+    normals.
+    """
     middle: float = 0.8
     """Least width at a point in the middle of a bar, as a share of the bar's width."""
     deviation: float = 0.5

@@ -40,7 +40,8 @@ class VesselNumbers:
     """Distance [m] of a point from its wall at which it has half the weight in the last rounds."""
     wider: float = 4.0
     """Excess of this distance over `miss` in the first round, in multiples of `miss`: the axis is
-    not yet known."""
+    not yet known.
+    """
     narrowing: float = 0.8
     """Factor by which this excess shrinks from round to round."""
     on_body: float = 0.002
