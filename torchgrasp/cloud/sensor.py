@@ -28,7 +28,7 @@ SensorName = Literal["realsense", "kinect_v1", "azure", "zivid"]
 
 @dataclasses.dataclass(frozen=True)
 class FaultNumbers:
-    """Parameters of a depth camera's errors beside random noise: at rims and in corners."""
+    """Parameters of a depth camera's errors other than random noise: at rims and in corners."""
 
     background: float = 100.0
     """Depth [m] that is assumed for a pixel in which nothing is measured."""

@@ -60,7 +60,7 @@ class LawClosing(Closing, Protocol):
         ...
 
     def press(self) -> Step:
-        """Return the `Step` with which the same law presses."""
+        """Return the function (`Step`) by which the same law presses, for each tick."""
         ...
 
 

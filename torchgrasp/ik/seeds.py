@@ -316,10 +316,10 @@ def query_mixture(
     """Return initial guesses (seeds) for sets of three contacts from the learned model `mixture`.
 
     They follow Eqs. (21)-(24) of the paper. An assignment of contacts to fingers is reachable if
-    its energy (Eq. 21) is below `max_energy`. Each reachable assignment gives `n_seeds` seeds: the
-    mean joints given the contacts (Eq. 23), and the mean joints of the most responsible components.
-    The seeds of a contact set are sorted: seeds that touch the surface from outside come first,
-    then by tip error. A contact set without a reachable assignment has no seeds. Raises
+    its energy (Eq. 21, no unit) is below `max_energy`. Each reachable assignment gives `n_seeds`
+    seeds: the mean joints given the contacts (Eq. 23), and the mean joints of the most responsible
+    components. The seeds of a contact set are sorted: seeds that touch the surface from outside
+    come first, then by tip error. A contact set without a reachable assignment has no seeds. Raises
     `BadArgument` for a model of another hand, joint limits or fingertips.
     """
     check_compatible(mixture.meta, mixture.joint_names, hand)

@@ -56,7 +56,7 @@ class ChoiceNumbers:
     refines.
     """
     lever: float = 0.3
-    """Weight of the load's lever arm beside the fingertips' errors, both as logarithms."""
+    """Weight of the load's lever arm relative to the fingertips' errors, both as logarithms."""
     short: float = 0.1
     """Lever arm (no unit, see `lever_arm`) below which a shorter one hardly counts."""
     touching: float = 1e-3

@@ -1,4 +1,5 @@
-"""Observations besides the seen points: inside and outside, on the hidden side, in free space.
+"""Observations in addition to the seen points: inside and outside, on the hidden side, in free
+space.
 
 A normalised length is in units of the `scale` [m] of a surface's frame.
 """
@@ -148,7 +149,9 @@ FreeSpace = tuple[Points, Float[Tensor, "n"]]
 
 @dataclasses.dataclass(frozen=True)
 class ExtraObservations(Value):
-    """The normalised frame of a surface, and the observations besides the cloud."""
+    """The normalised frame of a surface, and the observations in addition to the points of the
+    cloud.
+    """
 
     frame: Normalisation
     # observed distances at points inside and outside the object, without normals
@@ -167,8 +170,8 @@ def paper_support(
     noise: float,
     generator: torch.Generator,
 ) -> ExtraObservations:
-    """Return the paper's observations besides the cloud: its centre, and random points outside
-    (Sec. 3.1).
+    """Return the paper's observations in addition to the cloud: its centre, and random points
+    outside (Sec. 3.1).
 
     `seen` is the cloud [m], and `noise` the standard deviation of distances (normalised) and
     normals. `generator` draws the points.
@@ -198,7 +201,8 @@ def camera_support(
     noise: float,
     table: float | None,
 ) -> ExtraObservations:
-    """Return the observations besides the cloud's points, with distances that are true to scale.
+    """Return the observations in addition to the cloud's points, with distances that are true to
+    scale.
 
     If the cloud `seen` [m] is a view with a `completion`, they include its hidden side and free
     space. `noise` is the standard deviation of the distance observed inside, normalised; `table` is

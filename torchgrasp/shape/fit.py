@@ -103,7 +103,7 @@ def fit_shape(
             point's variance exceeds `noise`, at most 1000.
         psi_scale: ratio of the kernel's length psi to the longest distance between observed points;
             below 1.34 the covariance may be indefinite.
-        support: observations besides the cloud's points, "camera" or "paper"; see above.
+        support: observations in addition to the cloud's points, "camera" or "paper"; see above.
         seed: random seed.
         table: the table's plane, or its height [m] along z; only "camera" uses it.
         kernel: "thin_plate", "matern52" or "rbf", whose length psi sets (`kernel_by_name`); or your

@@ -434,7 +434,7 @@ def _hidden(
 
 
 def _thin(points: Points) -> Int[Tensor, "k"]:
-    """Return the indices of points that do not lie beside earlier ones."""
+    """Return the indices of the points that are not near earlier ones."""
     # NumPy's calls cost a quarter of torch's
     apart = (torch.cdist(points, points) >= HIDDEN.spacing).numpy()
     keep = np.ones(len(points), dtype=bool)
