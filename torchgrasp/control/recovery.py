@@ -390,10 +390,10 @@ class LiftCheck:
     """Check of a closed hand that rises and holds: `lost` becomes true, and stays so, when it loses
     the object.
 
-    The object is lost if fewer than two fingertips touch, and these carry hardly any load along the
-    table's normal. The hand will lose the object if two fingertips slide along it in the first 20
-    mm of the lift. The load does not count for binary sensors, or without a table. Broken sensors
-    count as touching.
+    The object is lost if fewer than two fingertips touch, and the fingertips carry hardly any load
+    along the table's normal. The hand will lose the object if two fingertips slide along it in the
+    first 20 mm of the lift. The load does not count for binary sensors, or without a table. Broken
+    sensors count as touching.
     """
 
     @checked

@@ -19,11 +19,11 @@ from torchgrasp.values.specs import Simulator, TrialSpec
 
 
 class GoldenCase(NamedTuple):
-    """A test case of the simulation: a shipped grasp, and whether it rightly holds its object."""
+    """A test case of the simulation: a shipped grasp, and whether it should hold its object."""
 
     object: str  # name of a shipped object
     hand: str  # name of a shipped hand
-    held: bool  # whether the object is rightly held
+    held: bool  # whether the object should be held
     shift: float = 0.0  # distance [m] by which the hand is moved back from the object
     mass: float = 0.1  # mass of the object [kg]
 

@@ -133,7 +133,7 @@ class Hand(Value):
 
     @functools.cached_property
     def derived(self) -> dict[Any, Any]:
-        """A cache of values that other modules derive from the hand, by keys of their choice."""
+        """A cache of values that other modules compute from the hand, by keys of their choice."""
         return {}
 
     @property

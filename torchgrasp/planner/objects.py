@@ -152,7 +152,8 @@ class Objects:
         world: what the hand must not touch, in the upright frame.
         loads: w loads of the task for each object (force [N], torque [N m] about the origin of the
             upright frame); None if grasps need not resist loads.
-        model: the learned mixture of the mode, and its SHA-256.
+        model: the learned posture mixture of the mode, None for a mode without one, and the SHA-256
+            of its file.
         buried: whether obstacles prevent that the object is lifted.
         descends: whether the hand may move down while it closes.
         postures: size of the posture library; None means the default.
@@ -353,7 +354,8 @@ def pose(
         object_: the object, with its shape.
         request: the arguments of the plan.
         hand: the hand of the plan.
-        model: the learned mixture of the mode, and its SHA-256.
+        model: the learned posture mixture of the mode, None for a mode without one, and the SHA-256
+            of its file.
         spec: constraints in the caller's frame; by default the request's, on the object's table.
         postures: size of the posture library; None means the default.
         descends: whether the hand may move down while it closes.

@@ -37,7 +37,7 @@ from torchgrasp.shape.kernel import (
 
 @dataclasses.dataclass(frozen=True)
 class ChunkNumbers:
-    """Numbers of points that are worked on at once.
+    """Numbers of points that are processed at once, in chunks.
 
     On a CPU the temporaries of a chunk stay in the cache.
     """
