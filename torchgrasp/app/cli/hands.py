@@ -485,7 +485,8 @@ class HandTrain(Command):
 
 
 def choose_components(hand: Hand, seed: int, workers: int) -> int:
-    """Return the number of Gaussians with the least BIC on separate random postures.
+    """Return the number of Gaussians with the least Bayesian information criterion (BIC), on
+    separate random postures.
 
     The BIC curve is printed. `workers` is the number of threads that sample the postures.
     """

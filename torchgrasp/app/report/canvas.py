@@ -109,7 +109,7 @@ class Lamps:
     key: Direction = (-0.45, 0.65, 0.62)  # direction to the main lamp
     fill: Direction = (0.70, 0.10, 0.60)  # direction to the second lamp
     shininess: int = 40  # exponent: larger makes the highlight smaller
-    least_normal: float = 1e-12  # a face without area has a normal of length 0
+    least_normal: float = 1e-12  # least length of a normal as a divisor: a face without area has 0
 
 
 @dataclasses.dataclass(frozen=True)

@@ -39,7 +39,7 @@ class FilmLayout:
     plot_gap: int = 50  # gap above each plot, for its title
     plots_top: int = 62  # gap between stills and plots, for the letters of the moments
     plots_bottom: int = 60  # gap below the plots, for the axis of time
-    bottom: int = 76  # height beside stills, plots and their gaps
+    bottom: int = 76  # height in addition to stills, plots and their gaps
     left: float = 0.05  # left end of the plots, as a share of the width
     right: float = 0.985  # right end of the plots, as a share of the width
     letter_rise: int = 30  # height of a letter above the first plot [points]

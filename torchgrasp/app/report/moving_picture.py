@@ -67,7 +67,7 @@ def write_film(
 
     The name of the file ends in .gif, or in .mp4, which needs the extra `film` or `ffmpeg` on the
     search path. It plays at the speed of the simulation, with `rate` pictures each second. One
-    camera sees all pictures, so the lift is seen. Returns the path.
+    fixed camera takes all pictures, so the lift is visible. Returns the path.
 
     Args:
         path: the file to write.
