@@ -33,8 +33,9 @@ from torchgrasp.app.cli.agent_tools import (
     make_tool,
     plain_answer,
 )
-from torchgrasp.data.shipped import DATA
+from torchgrasp.data.shipped import DATA, load_shipped_grasp
 from torchgrasp.foundation.errors import BadArgument, GraspError
+from torchgrasp.hand.load import hands_folder
 
 ROOT = Path(__file__).parents[2]
 PYTHON = ROOT / ".beside" / "mcp" / "bin" / "python"
@@ -339,6 +340,17 @@ def test_paths_stay_below_the_folder(folder, tmp_path):
     shutil.rmtree(hand)
     with pytest.raises(BadArgument, match=r"^--folder: expected a folder that exists"):
         Workplace.at(tmp_path / "none")
+
+
+def test_a_file_of_grasps_names_no_folder_of_a_hand(folder, tmp_path):
+    """The hand of a file is read only if it is shipped, or below the folder and given."""
+    shutil.copytree(hands_folder() / "barrett", tmp_path / "hand")
+    grasp = load_shipped_grasp("jug", "barrett")
+    for name in (str(tmp_path / "hand"), "mine"):
+        dataclasses.replace(grasp, meta=grasp.meta | {"hand": name}).save(folder / "x.safetensors")
+        tool = make_tool("show", {"grasps": "x.safetensors", "mesh": "jug"})
+        with pytest.raises(BadArgument, match=r"^hand: expected the folder of the .* hand below"):
+            tool.run(Workplace.at(folder))
 
 
 @pytest.mark.parametrize(

@@ -773,6 +773,11 @@ class _GraspTool(Tool):
         if not self.rank < len(good):
             wanted = f"a rank below {len(good)}, the number of executable grasps in the file"
             raise BadArgument("rank", self.rank, wanted)
+        named = grasps.meta.get("hand", "")
+        if self.hand is None and named and named not in list_hands():
+            # a name in the file could be that of any folder
+            wanted = f"the folder of the {named} hand below {place.root}, as it is not shipped"
+            raise BadArgument("hand", "none", wanted)
         hand = None if self.hand is None else place.hand("hand", self.hand)
         surface = place.place("grasps", place.tell(path.with_name(SURFACE)))
         return good[self.rank : self.rank + 1], hand_of(grasps, hand), surface
