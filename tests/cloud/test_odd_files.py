@@ -86,6 +86,8 @@ READ = {
     ),
     "turned.csv": ("t,z,y,x\n" + rows(COLOURED[:, [3, 2, 1, 0]], ","), False, "columns t were"),
     "comment.txt": ("# z y x\n" + rows(POINTS[:, ::-1]), False, ""),
+    "sentence.txt": ("# x y z in mm\n" + rows(POINTS), False, ""),
+    "columns.txt": ("# columns: z y x r\n" + rows(COLOURED[:, [2, 1, 0, 3]]), False, "columns r"),
     "excel.csv": ("\ufeffx,y,z\n" + rows(POINTS, ","), False, ""),
     "quoted.csv": (
         "".join('"' + '","'.join(f"{x:.4f}" for x in p) + '"\n' for p in POINTS),
@@ -125,6 +127,8 @@ TOLD = {
     "double.pcd": (pcd("x y z", POINTS.tobytes(), "binary"), "1440 bytes"),
     "cut.ply": (ply(XYZ, bytes(620), "binary_little_endian"), "620 bytes"),
     "cut.pcd": (pcd("x y z", bytes(620), "binary"), "620 bytes"),
+    # as many words as columns: x was read from the second column
+    "sentence.txt": ("# points x y z in mm\n" + rows(BOTH), "names alone, one for each column"),
     "flat.ply": (ply(XYZ[:2], rows(POINTS[:, :2])), "columns 'x y' without z"),
     "half.ply": (ply([*XYZ, "float nx", "float ny"], rows(BOTH[:, :5])), "without nz"),
     "twice.ply": (ply([*XYZ, "float X"], rows(COLOURED[:, :4])), "two columns X"),

@@ -17,6 +17,8 @@ from torchgrasp.foundation.limits import CLOUD_POINTS, LINE_LETTERS, TEXT_COLUMN
 # letters of wrong names, and of a wrong line, that an error shows
 SHOWN_NAMES = 200
 SHOWN_LINE = 60
+# words that are no names of columns, in comments that may name them
+PROSE = {"and", "are", "as", "cm", "in", "mm", "of", "points", "the"}
 SIXES = {
     ".xyzn": ["x", "y", "z", "nx", "ny", "nz"],
     ".xyzrgb": ["x", "y", "z", "red", "green", "blue"],
@@ -216,9 +218,30 @@ def _read_text(data: bytes) -> tuple[list[str], Float[np.ndarray, "rows columns"
     if not table.size:
         raise Malformed("no numbers")
     # Also a comment may name the columns, above a count of the rows or without one.
-    words = [*comment.replace(",", " ").split()]
     unnamed = not names or names == [str(len(table))]
-    return words if unnamed and {"x", "y", "z"} <= {*map(str.lower, words)} else names, table
+    return (unnamed and _names_in(comment, width)) or names, table
+
+
+def _names_in(comment: str, width: int) -> list[str]:
+    """Return the names of `width` columns in a comment; [] if it names none.
+
+    Three columns are x, y and z, whatever else is said, as in "x y z in mm". Raises `Malformed` for
+    a sentence above more columns, whose words would be taken for names.
+    """
+    words = comment.replace(",", " ").split()
+    if words and words[0].endswith(":"):  # as in "columns: x y z"
+        del words[0]
+    lower = [*map(str.lower, words)]
+    if not {"x", "y", "z"} <= {*lower}:
+        return []
+    if width == 3 and len(words) > 3 and "x y z" in " ".join(lower):
+        return []
+    if said := [word for word in words if word.lower() in PROSE]:
+        wanted = "names alone, one for each column"
+        raise Malformed(
+            f"a comment {comment.strip()[:SHOWN_NAMES]!r} with {said[0]!r}, not {wanted}"
+        )
+    return words
 
 
 def _check_line(line: str) -> None:
