@@ -121,6 +121,15 @@ def test_jaws_that_overlap_are_not_free(gripper, tmp_path):
     assert 0.0 < able.pairs[0].least_width < 0.002
 
 
+def test_a_joint_of_unknown_effort_leaves_the_forces_of_other_fingers(gripper, tmp_path):
+    """A URDF without an effort has the effort 0."""
+    text = (gripper / "hand.urdf").read_text().replace(f'effort="{TORQUE}"', 'effort="0"')
+    (tmp_path / "hand.urdf").write_text(text)
+    (tmp_path / "hand.toml").write_text((gripper / "hand.toml").read_text())
+    forces = [finger.force for finger in hand_abilities(read_hand(tmp_path)).fingers]
+    assert forces == pytest.approx([EFFORT, EFFORT, 0.0])
+
+
 def test_forces_are_those_of_the_principle_of_virtual_work():
     """Each joint of the Allegro at its own effort moves the contact: the weakest one bounds it."""
     hand = load_hand("allegro")

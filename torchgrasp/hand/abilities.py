@@ -224,8 +224,10 @@ def _fingers(hand: Hand, levers: Float[Tensor, "n f h"]) -> tuple[FingerAbility,
     each actuated joint.
     """
     effort = levers.new_tensor([hand.actuators[name].effort for name in hand.joint_names])
-    # the joint that reaches its effort first bounds the force
-    force = (effort / levers.abs()).amin(2)  # (n, f)
+    # the joint that reaches its effort first bounds the force; one without a lever does not, even
+    # if its effort is unknown, which is 0
+    bounds = torch.where(levers == 0, math.inf, effort / levers.abs())
+    force = bounds.amin(2)  # (n, f)
     moved = (hand.tree.moves[hand.tips.index] @ hand.actuated.coupling.abs()) > 0  # (f, h)
     found = []
     for k, name in enumerate(hand.finger_names):
