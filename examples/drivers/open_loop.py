@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchgrasp.control import squeeze
-from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values.planning import Grasps
 
@@ -77,10 +77,15 @@ def prepare(
 ) -> LimitedClosing:
     """Return the closing of a grasp, whose strongest finger presses with `force` [N].
 
-    Raises `BadArgument` for more than one grasp, and for a force that needs more than the limits.
+    Raises `BadArgument` for more than one grasp, for one that failed a check or is of another hand,
+    and for a force that needs more than the limits.
     """
     if len(grasp) != 1:
         raise BadArgument("grasp", f"{len(grasp)} grasps", "one grasp, as grasps[:1]")
+    status = Status(int(grasp.status[0]))
+    if status != Status.OK:
+        found = f"one that failed: {status.sentence}"
+        raise BadArgument("grasp", found, "a grasp that passed all checks, as grasps.best")
     names = hand.tree.joint_names
     drives = [hand.actuators[name] for name in names]
     kp = torch.tensor([drive.kp for drive in drives], dtype=torch.float64)
@@ -113,6 +118,9 @@ def close_open_loop(
     ended = "stopped by an error"
     try:
         now, before = driver.read()
+        if not bool(torch.isfinite(before).all()):
+            ended = "stopped at the start: a reading that is no number"
+            return ended
         for name, posture in closing.postures.items():
             way = posture - before
             seconds = float(way.abs().max()) / numbers.speed

@@ -21,7 +21,7 @@ from open_loop import OPEN_LOOP, LimitedClosing, OpenLoopNumbers, close_open_loo
 
 from tests.make import load_hand
 from torchgrasp.data import load_shipped_grasp
-from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument, Status
 
 EXAMPLE = Path(open_loop.__file__).parents[1] / "11_open_loop_driver.py"
 
@@ -161,6 +161,15 @@ def test_a_reading_that_is_no_number_stops_the_hand(mock):
     assert (len(driver.torques), driver.stops) == (1, 1)
 
 
+def test_a_first_reading_that_is_no_number_moves_nothing(mock):
+    closing = closing_of()
+    driver = mock(closing)
+    driver.joints = driver.joints * torch.nan
+    ended = close_open_loop(driver, closing, threading.Event())
+    assert ended == "stopped at the start: a reading that is no number"
+    assert (len(driver.torques), driver.stops) == (0, 1)
+
+
 def test_a_finger_that_meets_something_before_the_grasp_stops_the_hand(mock):
     closing = closing_of()
     driver = mock(closing)
@@ -193,3 +202,9 @@ def test_what_the_hand_cannot_do_is_refused_before_it_moves():
     grasp = load_shipped_grasp("jug", "allegro")
     with pytest.raises(BadArgument, match="one grasp"):
         prepare(load_hand("allegro"), grasp[[0, 0]], 3.0)
+    failed = dataclasses.replace(grasp, status=torch.tensor([int(Status.TIP_ERROR)]))
+    with pytest.raises(BadArgument, match=r"grasp: expected a grasp that passed .* got one that"):
+        prepare(load_hand("allegro"), failed, 3.0)
+    # its fingers and joints have the same names
+    with pytest.raises(BadArgument, match=r"hand: expected allegro, .* got allegro_left"):
+        prepare(load_hand("allegro_left"), grasp, 3.0)

@@ -125,10 +125,13 @@ def squeeze(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None 
 
 
 def check_same_hand(hand: Hand, grasps: Grasps) -> None:
-    """Raise `BadArgument` if the fingers or joints of grasps are not the hand's.
+    """Raise `BadArgument` if grasps are not the hand's: by its name, their fingers or joints.
 
-    Grasps whose metadata name no fingers need only their number.
+    Grasps whose metadata name no hand or no fingers need only the number of fingers.
     """
+    planned = grasps.meta.get("hand", hand.name)
+    if planned != hand.name:
+        raise BadArgument("hand", hand.name, f"{planned}, for which the grasps were planned")
     names = grasps.meta.get("finger_names", ",".join(hand.finger_names)).split(",")
     count = grasps.contacts.fingertips
     if tuple(names) != hand.finger_names or count != len(names):
