@@ -149,6 +149,7 @@ def main(folder):
     refused = {
         "hand": (plan, "--hand", "allegro"),
         "row": (*barrett, "--row", 7),
+        "failed": (str(folder / "failed.safetensors"), "--hand", "barrett"),
         "object": (*barrett, "--body", "mujoco"),
         "body": (*barrett, "--body", "none"),
         "fps": (*barrett, "--fps", 0),

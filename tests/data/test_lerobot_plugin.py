@@ -2,6 +2,7 @@
 environment.
 """
 
+import dataclasses
 import json
 import os
 import shutil
@@ -12,12 +13,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from scipy.spatial.transform import Rotation
 
 from tests.data.others import PYTHON, ROOT
 from torchgrasp import load_hand
 from torchgrasp.control import squeeze
 from torchgrasp.data import load_shipped_grasp
+from torchgrasp.foundation.errors import Status
 
 PLUGIN = ROOT / "examples" / "lerobot_robot_torchgrasp"
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
@@ -39,6 +42,11 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     assert done.returncode == 0, done.stderr[-2000:]
     load_shipped_grasp("jug", "barrett").save(folder / "plan.safetensors")
     load_shipped_grasp("jug", "allegro").save(folder / "allegro.safetensors")
+    failed = load_shipped_grasp("jug", "barrett")
+    failed = dataclasses.replace(
+        failed, status=torch.full_like(failed.status, int(Status.TABLE_COLLISION))
+    )
+    failed.save(folder / "failed.safetensors")
     environment = os.environ | {
         "PYTHONPATH": f"{installed}:{ROOT}",
         "HF_HOME": str(folder / "cache"),
@@ -137,6 +145,7 @@ def test_actions_of_another_hand_are_not_sent(found):
     [
         ("hand", "hand: expected barrett, for which the grasps were planned, got allegro"),
         ("row", "row: expected the number of one of 1 grasps"),
+        ("failed", "row: expected a grasp that passed all checks, got 0, which failed: "),
         ("object", "object: expected a shipped object or a mesh, for MuJoCo, got none"),
         ("body", 'body: expected "dry", "mujoco", or "module:Class"'),
         ("fps", "fps: expected at least one target a second, got 0"),

@@ -8,7 +8,7 @@ import numpy as np
 
 from torchgrasp import load_grasps
 from torchgrasp.export import format_grasps
-from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.hand.load import hand_of, load_hand
 from torchgrasp.values.planning import Grasps
 
@@ -52,8 +52,8 @@ class GraspSkill:
         grasps: the grasp, as a batch of one.
         ends: time [s] at which each phase ends, by its name.
 
-    Raises `BadArgument` for a grasp of another hand or another row, and a rate that is not
-    positive.
+    Raises `BadArgument` for a grasp of another hand or another row, one that failed a check, and a
+    rate that is not positive.
     """
 
     def __init__(
@@ -71,6 +71,10 @@ class GraspSkill:
         if not 0 <= row < len(every):
             raise BadArgument("row", row, f"the number of one of {len(every)} grasps in {plan}")
         self.grasps: Grasps = every[row : row + 1]
+        status = Status(int(self.grasps.status[0]))
+        if status != Status.OK:
+            found = f"{row}, which failed: {status.sentence}"
+            raise BadArgument("row", found, "a grasp that passed all checks")
         given = load_hand(hand)
         planned = every.meta.get("hand", given.name)
         if planned != given.name:
