@@ -26,8 +26,11 @@ sys.dont_write_bytecode = False
 annotations.install()
 
 collect_ignore = [
-    "export/play_usd.py"
-]  # its packages are in an environment beside; test_play.py runs it there
+    "app/agent_client.py",
+    "app/software_camera.py",
+    "data/lerobot_plugin.py",
+    "export/play_usd.py",
+]  # their packages are in environments beside, where tests run them
 
 SLOW = [HealthCheck.too_slow, HealthCheck.function_scoped_fixture]
 settings.register_profile(
