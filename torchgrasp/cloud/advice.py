@@ -188,8 +188,12 @@ def _judge_height(
     table: Plane | None,
     ground: Plane | None,
 ) -> Advice | None:
-    """Return advice if the camera is below the table, or below the lowest point if the table is
-    unknown.
+    """Return advice if the camera is below the table, or None if it is not.
+
+    Without a `table`, the camera is compared with the lowest of the `points` (n, 3) [m]. `eye` [m]
+    is the camera's position, one for all points or one for each. `given` is whether the user gave
+    it; otherwise it is estimated. `up` is the unit vertical. `ground` is a plane found in the
+    cloud, or None. Its normal is suggested as the vertical of a cloud in its camera's frame.
     """
     lowest = float((points @ up).min()) if table is None else table.offset
     normal = up if table is None else table.normal.double()

@@ -31,13 +31,16 @@ from torchgrasp.values.specs import ContactSpec
 
 
 class Resisted(NamedTuple):
-    """The multiple of the worst load that each contact set resists, with a proof.
+    """The greatest multiple of the worst load that each of b contact sets resists, with a proof.
+
+    It proves that no greater multiple is possible.
 
     Args:
         margin: the greatest multiple s (no unit) of the load that the contacts resist; 0 if it is
             not proven.
         load: the worst load t, a force [N] and a torque [N m] about the contacts' centroid.
-        twist: the proof y [1/N, 1/(N m)] about the centroid, with y . t = -1.
+        twist: the proof, a motion y [1/N, 1/(N m)] about the centroid with y . t = -1. Along it,
+            admissible contact forces do at most the work s. To resist m t, they must do the work m.
         forces: contact forces [N] (b, f, 3) that balance s t.
     """
 

@@ -421,8 +421,12 @@ class GripHold:
             self.status = Status.TOO_HEAVY
 
     def _command(self, contacts: Balance, wanted: np.ndarray, period: float) -> np.ndarray:
-        """Return the fingertip forces (f, 3) [N] to command: `wanted`, corrected by feedback; new
-        load is taken up slowly.
+        """Return the fingertip forces (f, 3) [N] to command in this tick of `period` seconds.
+
+        They are the `wanted` forces (f, 3) [N] plus a correction. It is the integrated difference
+        between wanted and sensed normal forces, without the part that would move the object. Of the
+        load, they carry only the share `GRIP.carries` of `carried`, so new load is taken up slowly.
+        `contacts` is the grasp map of the fingertips.
         """
         if self.time > RAMP:
             lacking = ((self.felt - wanted) * self.normals).sum(-1)

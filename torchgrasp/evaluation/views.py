@@ -241,10 +241,11 @@ def _read_planned(path: Path, score: ViewScore, cloud: PointCloud, hand: Hand) -
 def try_grasp(
     view: ObjectView, grasps: Grasps, protocol: Protocol, spec: EvaluationSpec, at: tuple[int, int]
 ) -> ProtocolResult:
-    """Try one of the grasps of a view in simulation, and return the result.
+    """Try grasp `at[0]` of a view in simulation with random pose error number `at[1]`, and return
+    the result.
 
-    `at` holds the grasp's index and the number of the pose error's draw. The other `grasps` are
-    tried where a lift fails, if the protocol allows further tries.
+    If a lift fails and the protocol allows more tries, the other `grasps` follow. Raises
+    `BadArgument` if the protocol looks again from a view without the camera's position.
     """
     others = [k for k in range(len(grasps)) if k != at[0] and protocol.tries > 1]
     grasp = grasps[[at[0], *others]]

@@ -260,8 +260,11 @@ def _choose(
     coupling: dict[str, Mimic],
     wanted: Fingers,
 ) -> tuple[str, Option]:
-    """Return name and content of the option for the `wanted` fingers. If none is declared, the name
-    lists the fingers.
+    """Return name and content of the option of hand.toml that has the `wanted` fingers.
+
+    `options` are the file's options, `known` its fingers, and `coupling` its coupled joints, each
+    by name. If no option has these fingers, a new one is made; its name lists them. Raises
+    `BadArgument` for an unknown option or finger, or an impossible number of fingers.
     """
     declared = (
         f"one of the options {sorted(options)}, their number of fingers, or {SUPPORTED} "

@@ -198,12 +198,13 @@ def motion_clearance(
 def collision_probability(
     hand: Hand, grasps: Grasps, obstacles: Obstacles, table: Plane | None
 ) -> Float[Tensor, "g"]:
-    """Return the probability that the hand of each grasp hits one of the `obstacles` in approach,
-    closing or lift along z.
+    """Return the probability in [0, 1], for each of g grasps, that its hand hits one of the
+    `obstacles`.
 
-    The hand comes to its opened pose above the `table`. The probability is the largest occupancy
-    probability of the voxels that the hand sweeps, because hidden voxels behind one object are
-    occupied or free together.
+    The hand approaches opened, closes, and is lifted along z. The probability is the largest
+    occupancy probability of the voxels that it sweeps. Hidden voxels behind one object are occupied
+    or free together. The approach ends in the pose of `opened_pose`, which is raised where the hand
+    would be in the `table`. None means no table.
     """
     closed = Configuration(grasps.joints, grasps.obj_from_hand)
     raised = opened_pose(hand, grasps.pregrasp, grasps.obj_from_hand, table)

@@ -132,8 +132,9 @@ class HandSamples(Batch):
 class SampleSpec(Value):
     """The settings by which `n` postures without self-collision are drawn.
 
-    `Sampling` lists the ways to draw. Chunk i depends only on (seed, i), so a smaller set of
-    samples is the beginning of a larger set. Raises `BadArgument` for values out of range.
+    Postures are drawn in chunks of `CHUNK_POSTURES`. Chunk i depends only on `seed` and i.
+    So a smaller set of samples is the beginning of a larger one. `Sampling` lists the ways to draw.
+    Raises `BadArgument` for values out of range.
 
     >>> from torchgrasp import load_hand
     >>> SampleSpec(1000, seed=7).meta(load_hand("barrett"))["seed"]

@@ -159,8 +159,12 @@ def _trace_wall(
     number: int,
     resolution: int,
 ) -> tuple[Float[Tensor, "v 3"], Int[Tensor, "f 3"]]:
-    """Return vertices (normalised) and faces of one wall, cut off where the wall leaves the
-    material.
+    """Return vertices (v, 3), normalised, and triangles (f, 3) of the surface
+    `whole.walls[number]`.
+
+    A hollow shape has two such surfaces, an outer and an inner one. Parts of one that lie outside
+    the material between them are cut off. `resolution` is the number of cells along the domain's
+    diameter. Raises `BadArgument` if the mean distance is nowhere zero.
     """
     from skimage.measure import marching_cubes
 

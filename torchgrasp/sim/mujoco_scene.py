@@ -129,8 +129,9 @@ class MujocoScene(SimulatedScene):
         self.data.ctrl[self.motors] = targets
 
     def pull(self, force: np.ndarray, torque: np.ndarray = STILL) -> None:
-        """Apply a force (3,) [N] and a torque (3,) [N m] to the object, in this and all later
-        steps.
+        """Apply a force (3,) [N] at the object's centre of mass and a torque (3,) [N m].
+
+        They are in the world's axes, and act in this and all later steps.
         """
         self.data.xfrc_applied[self.body] = [*force, *torque]
 

@@ -19,7 +19,9 @@ from torchgrasp.sim.simulated_scene import STILL, SimulatedScene, StepContacts
 
 
 def _noted(method: Callable[..., Any]) -> Any:
-    """Let a method note its calls, which `SapienScene.keep` repeats."""
+    """Decorate a method of `SapienScene`: record each of its calls, which `SapienScene.keep`
+    repeats in a new scene.
+    """
 
     @functools.wraps(method)
     def call(self: "SapienScene", *args: Any) -> Any:
@@ -117,7 +119,11 @@ class SapienScene(SimulatedScene):
             yield *contact.bodies, contact
 
     def _read(self, contact: Any, sign: float) -> Iterator[tuple[float, list[float]]]:
-        """Yield size and numbers of each point that presses; SAPIEN reports the impulse on the
+        """Yield the size [N s] of the impulse at each point of a contact, and seven numbers.
+
+        The first three are the impulse [N s] on the body that the hand touches. The others are size
+        times position (3,) [N s m], and size. Points without an impulse are left out. `sign` is 1
+        if the hand's link is the contact's first body, else -1: SAPIEN reports the impulse on the
         first body.
         """
         for point in contact.points:

@@ -256,12 +256,13 @@ def euler_from_rotation(rotation: np.ndarray) -> tuple[float, float, float]:
 
 
 def pair_masks(pairs: Iterable[tuple[str, str]], first: int) -> dict[str, tuple[int, int]]:
-    """Return for each link in `pairs` two bit masks: its collision group, and the groups that it
-    collides with.
+    """Return for each link in `pairs` two bit masks: its own collision group, and the groups that
+    it collides with.
 
-    Two links collide if the group of one shares a bit with the mask of the other, as in PhysX and
-    MuJoCo. Only one link of each pair needs its own bit; bits from number `first` are free.
-    `HandFileError` is raised if they do not suffice.
+    `pairs` are the names of links that are to collide; no other two of these links do. Two links
+    collide if the group of one shares a bit with the mask of the other. PhysX and MuJoCo work so.
+    Only one link of each pair needs its own bit. Bits from number `first` (from 0) are used; those
+    below are taken. Raises `HandFileError` if they do not suffice.
     """
     left = [tuple(pair) for pair in pairs]
     kinds = dict.fromkeys((name for pair in left for name in pair), 0)

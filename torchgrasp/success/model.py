@@ -23,9 +23,12 @@ KIND = "success-model"
 
 @dataclasses.dataclass(frozen=True)
 class SuccessModel(Value):
-    """Boosted trees that predict success: t trees of m nodes, of which the first is the root.
+    """Boosted decision trees that predict whether a grasp holds: t trees of m nodes; node 0 is the
+    root.
 
-    Shares and log-odds have no unit. The k features have the units of `CAUSES`.
+    The input is k features of a grasp, in the order of `success.features.FEATURES`. Their units are
+    in `success.features.CAUSES`. The output is the log-odds of success. Log-odds and shares, which
+    are fractions in [0, 1], have no unit.
     """
 
     feature: Int[Tensor, "t m"]  # the feature that a node reads

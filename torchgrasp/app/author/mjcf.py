@@ -239,7 +239,12 @@ class _Reader:
         return row
 
     def couple(self) -> Mechanism:
-        """Return how the joints of the hand move together, and set their limits and efforts."""
+        """Return which joints of the hand lead, follow or stand still.
+
+        Each joint's limits and its greatest force or torque are stored in `drives`. Raises
+        `HandFileError` for actuators, tendons or equalities of another kind. It is also raised for
+        equalities that contradict each other.
+        """
         model = self.model
         own = self.joints
         names = tuple(self.joint_names[j] for j in own)

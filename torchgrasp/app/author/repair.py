@@ -188,8 +188,9 @@ def _under(joint: Joint, above: Joint) -> Joint:
 
 
 def _moved(link: Link, pose: np.ndarray) -> Link:
-    """Return a link with its mass centre, inertia and shapes in another frame; `pose` maps the
-    link's frame to it.
+    """Return a copy of a link whose mass centre, inertia and shapes are given in a new frame.
+
+    `pose` (4, 4) [m] is the rigid transform from the link's present frame to the new one.
     """
     turn = pose[:3, :3]
     shapes = []

@@ -123,10 +123,12 @@ def import_mcp() -> Any:
 
 
 class AgentServer:
-    """The tools as an MCP server.
+    """A server of the Model Context Protocol (MCP) that offers torchgrasp's tools to AI agents.
+
+    Raises `MissingExtra` without the package `mcp`.
 
     Args:
-        place: the folder of all files.
+        place: the folder in which tools read and write all files.
         seconds: longest time of a call [s].
     """
 

@@ -342,7 +342,11 @@ def find_warnings(hand: Hand, joints: torch.Tensor) -> list[str]:
 
 
 def _try_objects(hand: Hand, bar: tqdm) -> bool:
-    """Plan on shipped objects until one has an executable grasp; return whether any has one."""
+    """Plan grasps of shipped objects in turn until an object has an executable grasp; return
+    whether one has.
+
+    A line on each object is written above the progress `bar`.
+    """
     for name in TRIAL.objects:
         grasps = plan_grasps(load_object(name).view, hand, starts=TRIAL.starts)
         count = count_status(grasps.status)

@@ -82,10 +82,11 @@ MOTION_COLORS = {
 def draw_film(
     mesh: "trimesh.Trimesh", hand: Hand, closure: ClosureResult, direction: Direction
 ) -> bytes:
-    """Return a PNG of the film strip of a closing.
+    """Return a PNG of a simulated closing: pictures of its main moments in a row, over plots
+    against time.
 
-    `mesh` is the true object [m] in the frame of the grasp, where z is up. `direction` points from
-    the object to the camera.
+    `closure` holds the record that is plotted. `mesh` is the true object [m] in the frame of the
+    grasp, where z is up. The unit vector `direction` points from the object to the camera.
     """
     from matplotlib.figure import Figure
 

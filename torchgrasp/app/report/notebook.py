@@ -124,6 +124,9 @@ def _shrink(png: bytes) -> bytes:
 
 
 def _row(cell: str, texts: tuple[str, ...]) -> str:
-    """Return one row of a table as HTML."""
+    """Return a row of an HTML table, with one cell for each of the `texts`, which are escaped.
+
+    `cell` is the tag of a cell: "td", or "th" in a header.
+    """
     cells = "".join(f"<{cell}>{html.escape(text)}</{cell}>" for text in texts)
     return f"<tr>{cells}</tr>\n"

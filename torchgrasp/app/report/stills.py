@@ -312,7 +312,10 @@ def _add_contacts(canvas: paint.Canvas, contacts: Contacts) -> None:
 
 
 def add_solids(canvas: paint.Canvas, solids: list[Solid]) -> None:
-    """Add the links of a hand to a canvas, each in its colour."""
+    """Add the links of a hand to a canvas, each in its colour.
+
+    The `solids` [m] must be in the frame of the canvas, not in those of their links.
+    """
     for solid in solids:
         canvas.add_mesh(solid.vertices, solid.faces, solid.color, solid.normals)
 

@@ -50,8 +50,9 @@ SYMMETRY = SymmetryNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class PlaneSearchNumbers:
-    """Parameters of the search for a cloud's mirror planes; cosines are those
-    of angles between normals.
+    """Parameters of the search for a cloud's mirror planes.
+
+    Unless a field says otherwise, a cosine is that of the angle between the normals of two planes.
     """
 
     sphere: int = 160
