@@ -125,8 +125,12 @@ def test_bad_arguments_are_named():
         )
     with pytest.raises(BadArgument, match=r"error: expected .*got"):
         Truth(cylinder(), error=torch.full((4, 4), math.nan))
+    barrett = pinch("barrett")[0]
+    with pytest.raises(BadArgument, match=r"hand: expected allegro.*got barrett"):
+        squeeze(barrett, grasp)
+    nameless = dataclasses.replace(grasp, meta={})
     with pytest.raises(BadArgument, match=r"grasps: expected .*got 12 joints"):
-        squeeze(pinch("barrett")[0], grasp)
+        squeeze(barrett, nameless)
 
 
 def test_a_pull_in_open_loop_is_the_same_whether_the_hand_observes_or_not(monkeypatch):
