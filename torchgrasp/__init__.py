@@ -6,6 +6,7 @@ public names.
 
 from torchgrasp.foundation.errors import GraspError, Status
 from torchgrasp.geometry.plane import Plane
+from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.specs import ContactSpec, TrialSpec
 from torchgrasp.values.planning import (
     Certificate,
@@ -52,6 +53,7 @@ __all__ = [
     "GraspError",
     "Status",
     "Plane",
+    "Distribution",
     "ContactSpec",
     "SensorModel",
     "TrialSpec",

@@ -114,6 +114,7 @@ def special(kind: type) -> Any:
         ),
         SimulatedHand: simulated_hand,
         torchgrasp.Plane: lambda: torchgrasp.Plane.horizontal(0.0),
+        torchgrasp.Distribution: lambda: torchgrasp.Distribution.between(0.1, 1.0),
         torchgrasp.ShapeGP: lambda: fit_shape(special(PointCloud), budget=30),
         ShapeLike: lambda: special(torchgrasp.ShapeGP),
         Kernel: lambda: thin_plate_kernel(2.0),

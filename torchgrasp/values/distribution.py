@@ -1,0 +1,226 @@
+"""The distribution of an uncertain number, such as a friction coefficient or a mass."""
+
+import dataclasses
+import functools
+import math
+from typing import Annotated
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.foundation.base import Value, kept
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import ANY, LEAST, Positive, Range, Seed, show
+from torchgrasp.geometry.frames import real
+
+MOST_PARTS = 10_000
+"""Largest number of parts, and of samples that are drawn at once."""
+FORM = "a number, an interval such as 0.3:0.8, or several of them with | between"
+"""What a text of a distribution may be."""
+Few = Annotated[int, Range(1, MOST_PARTS)]
+"""A number of nodes or samples."""
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class Distribution(Value):
+    """A mixture of intervals, in each of which all numbers are equally likely.
+
+    An interval (x, x) is the single number x. Further ways to make a distribution are `parse`,
+    `of`, `between` and `of_samples`.
+
+    Args:
+        parts: intervals (least, greatest).
+        weights: weight of each part, of which only the ratios count; None means equal weights.
+
+    Raises `BadArgument` for no part, too many parts, an interval whose first number is the greater
+    one, or another number of weights than of parts.
+
+    >>> friction = Distribution.parse("0.3:0.8|1.0")
+    >>> friction.mean, friction.cdf(torch.tensor([0.55, 1.0])).tolist()
+    (0.775, [0.25, 1.0])
+    """
+
+    parts: tuple[tuple[float, float], ...]
+    weights: tuple[Positive, ...] | None = None
+
+    def __post_init__(self) -> None:
+        count = len(self.parts)
+        if not 1 <= count <= MOST_PARTS:
+            raise BadArgument("parts", f"{count} parts", f"1 to {MOST_PARTS} parts")
+        for low, high in self.parts:
+            if low > high:
+                raise BadArgument("parts", f"{low:g} to {high:g}", "the lesser number first")
+        if self.weights is not None and len(self.weights) != count:
+            raise BadArgument("weights", f"{len(self.weights)} weights", f"{count}, one a part")
+
+    @classmethod
+    @checked
+    def of(cls, value: "float | Distribution") -> "Distribution":
+        """Return the distribution of a number that is certain; a distribution is returned as it
+        is.
+        """
+        return value if isinstance(value, Distribution) else cls(((value, value),))
+
+    @classmethod
+    @checked
+    def between(cls, low: float, high: float) -> "Distribution":
+        """Return the distribution in which all numbers in [low, high] are equally likely."""
+        return cls(((low, high),))
+
+    @classmethod
+    @checked
+    def of_samples(cls, samples: Float[Tensor, "n"]) -> "Distribution":
+        """Return the distribution in which each of n samples is equally likely."""
+        return cls(tuple((x, x) for x in samples.tolist()))
+
+    @classmethod
+    @checked
+    def parse(cls, text: str) -> "Distribution":
+        """Return the distribution that a text names.
+
+        The text is a number "0.5", an interval "0.3:0.8", or several of them with "|" between. A
+        part may have a weight behind "@", by default 1. `str` writes such a text. Raises
+        `BadArgument` for another text.
+
+        >>> str(Distribution.parse(".3:.8@2|1"))
+        '0.3:0.8@2.0|1.0@1.0'
+        """
+        parts = list[tuple[float, float]]()
+        weights = list[float]()
+        for part in text.split("|"):
+            interval, at, weight = part.partition("@")
+            low, colon, high = interval.partition(":")
+            try:
+                parts.append((float(low), float(high if colon else low)))
+                weights.append(float(weight if at else 1))
+            except ValueError as error:
+                raise BadArgument("text", show(text), FORM) from error
+        return cls(tuple(parts), tuple(weights) if "@" in text else None)
+
+    def __str__(self) -> str:
+        """Return the distribution as a text that `parse` reads."""
+        texts = [str(low) if low == high else f"{low}:{high}" for low, high in self.parts]
+        if self.weights is not None:
+            texts = [f"{text}@{x}" for text, x in zip(texts, self.weights, strict=True)]
+        return "|".join(texts)
+
+    @functools.cached_property
+    def shares(self) -> tuple[float, ...]:
+        """The probability of each part."""
+        weights = self.weights or (1.0,) * len(self.parts)
+        total = math.fsum(weights)
+        return tuple(x / total for x in weights)
+
+    @property
+    def mean(self) -> float:
+        """The mean."""
+        middles = [(low + high) / 2 for low, high in self.parts]
+        return math.fsum(p * x for p, x in zip(self.shares, middles, strict=True))
+
+    @property
+    def least(self) -> float:
+        """The least number that is possible."""
+        return min(low for low, _ in self.parts)
+
+    @property
+    def most(self) -> float:
+        """The greatest number that is possible."""
+        return max(high for _, high in self.parts)
+
+    @kept
+    def _intervals(self) -> Float[Tensor, "k 3"]:
+        """Least number, length and share of each interval that is longer than 0."""
+        pairs = zip(self.parts, self.shares, strict=True)
+        found = [(low, high - low, share) for (low, high), share in pairs if high > low]
+        return real(found).reshape(-1, 3)
+
+    @kept
+    def _points(self) -> Float[Tensor, "k 2"]:
+        """The single numbers in ascending order, each with its share."""
+        pairs = zip(self.parts, self.shares, strict=True)
+        found = [(low, share) for (low, high), share in pairs if high == low]
+        return real(sorted(found)).reshape(-1, 2)
+
+    @kept
+    def _steps(self) -> Float[Tensor, "2 k"]:
+        """The cumulative distribution function as a polygon: numbers, and its values there.
+
+        Every number stands twice, with the values below and at a jump.
+        """
+        low, length, _ = self._intervals.unbind(1)
+        ends = torch.cat([low, low + length, self._points[:, 0]]).unique()
+        below = self._below(ends, reached=False)
+        upto = self._below(ends, reached=True)
+        values = torch.stack([below, upto], 1).flatten().cummax(0).values
+        return torch.stack([ends.repeat_interleave(2), values / values[-1]])
+
+    @checked(gradients=True)
+    def cdf(self, x: Annotated[Float[Tensor, "*b"], ANY]) -> Float[Tensor, "*b"]:
+        """Return the probability of numbers up to `x`: F(x) = P(X <= x); NaN for NaN.
+
+        Its derivative is the density between the single numbers.
+        """
+        return torch.where(x.isnan(), x, self._below(x, reached=True).clamp(0, 1))
+
+    def _below(self, x: Float[Tensor, "*b"], reached: bool) -> Float[Tensor, "*b"]:
+        """Return P(X < x), or P(X <= x) if `reached`."""
+        low, length, share = self._intervals.to(x).unbind(1)
+        points, jump = self._points.to(x).unbind(1)
+        passed = ((x[..., None] - low) / length).clamp(0, 1)  # (*b, k)
+        index = torch.searchsorted(points.contiguous(), x.detach().contiguous(), right=reached)
+        jumps = torch.cat([jump.new_zeros(1), jump.cumsum(0)])
+        return (share * passed).sum(-1) + jumps[index]
+
+    @checked(gradients=True)
+    def quantile(self, q: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+        """Return the least number x with P(X <= x) >= q; `q` is in [0, 1].
+
+        Raises `BadArgument` for another probability.
+        """
+        if not bool(((q >= 0) & (q <= 1)).all()):
+            raise BadArgument("q", "a number outside [0, 1]", "probabilities in [0, 1]")
+        numbers, values = self._steps.to(q)
+        values = values.contiguous()
+        end = torch.searchsorted(values, q.detach().contiguous()).clamp(1, len(values) - 1)
+        rise = (values[end] - values[end - 1]).clamp_min(LEAST)
+        share = ((q - values[end - 1]) / rise).clamp(0, 1)
+        return torch.lerp(numbers[end - 1], numbers[end], share)
+
+    @checked
+    def sample(self, count: Few, seed: Seed) -> Float[Tensor, "n"]:
+        """Return `count` independent random numbers, as float64 on the CPU."""
+        generator = torch.Generator().manual_seed(seed)
+        drawn = torch.rand(count, generator=generator, dtype=torch.float64, device="cpu")
+        return self.quantile(drawn)
+
+    @checked
+    def share(self, low: float, high: float) -> float:
+        """Return the probability of the interval [low, high]."""
+        upto = self._below(real([high]), reached=True)
+        below = self._below(real([low]), reached=False)
+        return min(max(float(upto - below), 0.0), 1.0)
+
+    @checked
+    def nodes(self, count: Few) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+        """Return at most `count` numbers with probabilities, whose weighted mean approximates a
+        mean.
+
+        A single number is itself a node, and an interval has the middles of equal parts as nodes,
+        about as many as its share. If there are more parts than `count`, the nodes are the
+        quantiles (i + 1/2) / `count`.
+        """
+        if len(self.parts) > count:
+            middles = (torch.arange(count, dtype=torch.float64, device="cpu") + 0.5) / count
+            return self.quantile(middles), torch.full_like(middles, 1 / count)
+        numbers = list[float]()
+        weights = list[float]()
+        spare = count - len(self.parts)
+        wide = math.fsum(self._intervals[:, 2].tolist())
+        for (low, high), share in zip(self.parts, self.shares, strict=True):
+            n = 1 if low == high else 1 + int(spare * share / wide)
+            numbers += [low + (high - low) * (i + 0.5) / n for i in range(n)]
+            weights += [share / n] * n
+        return real(numbers), real(weights)
