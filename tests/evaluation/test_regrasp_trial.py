@@ -11,6 +11,7 @@ import torch
 from tests.make import real
 from tests.pinch import QUICK, cylinder, digest, pinch, quick_trial
 from torchgrasp import Plane
+from torchgrasp.control.regrasp import list_others, next_grasp
 from torchgrasp.evaluation import (
     GraspTrial,
     Protocol,
@@ -24,7 +25,7 @@ from torchgrasp.evaluation.causes import tick_of
 from torchgrasp.evaluation.lift import lift_grasp
 from torchgrasp.evaluation.protocols import apply_error
 from torchgrasp.evaluation.pull import run_protocol
-from torchgrasp.evaluation.regrasp import _left_behind, lift_grasps, list_others, next_grasp
+from torchgrasp.evaluation.regrasp import _left_behind, lift_grasps
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate, rotation_from_vector
 from torchgrasp.geometry.signed_distance import SignedDistanceField

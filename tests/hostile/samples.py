@@ -31,7 +31,7 @@ from torchgrasp import (
 from torchgrasp.arm import Arm
 from torchgrasp.cloud import estimate_normals
 from torchgrasp.contacts import ShapeLike
-from torchgrasp.control import no_contact, observe
+from torchgrasp.control import GraspTry, no_contact, observe
 from torchgrasp.control.paper.closings import Impedance
 from torchgrasp.control.paper.stability import NAMES, StabilityModel
 from torchgrasp.data.shipped import load_shipped_grasp
@@ -92,6 +92,7 @@ def special(kind: type) -> Any:
         ),
         Arm: lambda: ur5e(special(torchgrasp.Hand)),
         GraspController: lambda: GraspController(special(ClosingReference)),
+        GraspTry: lambda: GraspTry(special(Grasps), lambda _: special(GraspController)),
         GraspProblem: grasp_problem,
         PostureLibrary: lambda: PostureLibrary.of(special(torchgrasp.Hand), 100),
         Impedance: impedance,

@@ -5,6 +5,7 @@ the joints and the palm.
 from torchgrasp.values.closing import ClosingGains, ClosingOptions
 from torchgrasp.control.finger_forces import squeeze
 from torchgrasp.control.recovery import LiftCheck
+from torchgrasp.control.regrasp import GraspTry
 from torchgrasp.control.sensing import FingertipSensor, feel_flags, feel_torques
 from torchgrasp.control.tactile import (
     Observation,
@@ -20,6 +21,7 @@ __all__ = [
     "ClosingGains",
     "ClosingOptions",
     "FingertipSensor",
+    "GraspTry",
     "LiftCheck",
     "Observation",
     "TactileState",

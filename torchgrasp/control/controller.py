@@ -31,7 +31,7 @@ from torchgrasp.foundation.base import check_device, settle
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.rules import Range
-from torchgrasp.geometry.frames import apply, inverse, rigid
+from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_from_vector
 from torchgrasp.values.closing import ClosingOptions, choose_options
 from torchgrasp.values.planning import PointCloud
 from torchgrasp.values.specs import ClosingMode, HoldingMode, check_modes, default_holding
@@ -155,6 +155,28 @@ class GraspController:
         if acts and isinstance(self.closing, LawClosing):
             return self.closing.share
         return torch.full_like(self.reference.normals[:, 0], torch.nan)
+
+    @property
+    def displacement(self) -> Float[Tensor, "4 4"]:
+        """Displacement [m] of the object that the touches show, a rigid transform in the frame of
+        the planned hand.
+        """
+        closing = self.closing
+        if not isinstance(closing, UncertaintyClosing):
+            return torch.eye(4, dtype=torch.float64)
+        centre = self.reference.gains.target.mean(0)
+        shift = closing.displacement[:3]
+        rotation = rotation_from_vector(closing.displacement[3:])
+        return rigid(rotation, centre + shift - rotation @ centre)
+
+    @property
+    def object_motion(self) -> Float[Tensor, "4 4"]:
+        """Motion [m] of the object since the plan, as a view (`relook`) and the touches show it: a
+        rigid transform in the frame of the grasp.
+        """
+        straight = torch.eye(3, dtype=torch.float64)
+        placed = self.planned.obj_from_hand @ rigid(straight, self.path)
+        return placed @ self.displacement @ inverse(self.reference.obj_from_hand)
 
     @checked
     def relook(self, cloud: PointCloud) -> None:

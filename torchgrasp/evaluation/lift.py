@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchgrasp.cloud.agreement import check_contacts, check_stand
 from torchgrasp.control.reference import check_single
+from torchgrasp.control.regrasp import smooth_step
 from torchgrasp.data.shipped import GraspObject
 from torchgrasp.evaluation.criterion import Tick, judge_lift, motion_between
 from torchgrasp.evaluation.trial import (
@@ -21,7 +22,6 @@ from torchgrasp.evaluation.trial import (
     TrialDriver,
     TrialRun,
     Truth,
-    smooth_step,
 )
 from torchgrasp.foundation.base import map_tensors
 from torchgrasp.foundation.checks import checked

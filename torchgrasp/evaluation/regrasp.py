@@ -3,109 +3,30 @@ another grasp.
 """
 
 import dataclasses
-import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.control.controller import GraspController
-from torchgrasp.control.recovery import LiftCheck, Reopening
-from torchgrasp.control.tactile import Targets
-from torchgrasp.control.uncertainty_closing import UncertaintyClosing
-from torchgrasp.evaluation.lift import _Lift, run_lift
+from torchgrasp.control.regrasp import GraspTry
+from torchgrasp.evaluation.lift import _Lift
 from torchgrasp.evaluation.protocols import apply_error, seed_of
-from torchgrasp.evaluation.trial import (
-    GraspTrial,
-    TrialDriver,
-    TrialRun,
-    Truth,
-    check_truth,
-    smooth_step,
-)
-from torchgrasp.foundation.base import flatnonzero
+from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, TrialRun, Truth, check_truth
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import Status
 from torchgrasp.foundation.rules import Count
 from torchgrasp.foundation.threads import single_threaded
-from torchgrasp.geometry.frames import inverse, rigid, rotation_from_vector
-from torchgrasp.geometry.linalg import norm
+from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.mesh import read_mesh
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.sim.convex_parts import read_solid
 from torchgrasp.sim.scene_spec import Neighbour
-from torchgrasp.success.loads import log_odds_about
 from torchgrasp.values.closing import ClosureResult
 from torchgrasp.values.planning import Grasps
 from torchgrasp.values.specs import TrialSpec
-
-
-@dataclasses.dataclass(frozen=True)
-class RegraspNumbers:
-    """Parameters by which another grasp is chosen after a failed one."""
-
-    gap: float = 0.015  # mean distance [m] of the contacts above which a grasp differs
-    turn: float = math.radians(30)  # angle [rad] of the approaches above which a grasp differs
-    share: float = 0.35  # share of the object's mass that may be concentrated at one surface point
-    withdrawal: float = 0.6  # time [s] in which the opened hand withdraws, and the object rests
-    # number of surface points, at least, that are tried as the place of this mass (fewer if the
-    # surface has fewer)
-    places: int = 64
-
-
-REGRASP = RegraspNumbers()
-
-
-@checked
-def next_grasp(
-    grasps: Grasps, tried: Sequence[int], surface: SignedDistanceField | None = None
-) -> int:
-    """Return the index of the grasp of `list_others` that most likely holds, after those `tried`
-    failed.
-
-    `surface` is the estimated surface of the object, in the frame of the grasps. Without it or a
-    table, or if the grasps are not ranked by success, it is the best-ranked one.
-    """
-    others = list_others(grasps, tried)
-    if surface is None or grasps.table is None or grasps.meta.get("ranking") != "success":
-        return int(others[0])
-    return int(others[_chances(grasps, grasps.table, surface, tried)[others].argmax()])
-
-
-@checked
-def list_others(grasps: Grasps, tried: Sequence[int]) -> Int[Tensor, "k"]:
-    """Return the indices of the grasps that differ from all `tried` (indices).
-
-    They differ by more than `REGRASP.turn` in approach, or `REGRASP.gap` in contacts.
-    """
-    approach = grasps.approach
-    points = grasps.contacts.points.double()
-    gaps = norm(points[:, None] - points[list(tried)]).mean(-1)  # (g, t)
-    differs = (gaps > REGRASP.gap) | (approach @ approach[list(tried)].T < math.cos(REGRASP.turn))
-    return flatnonzero(differs.all(-1))
-
-
-def _chances(
-    grasps: Grasps, table: Plane, surface: SignedDistanceField, tried: Sequence[int]
-) -> Float[Tensor, "g"]:
-    """Return each grasp's probability of success given that the tried ones failed; 0 if it is
-    unknown.
-
-    A share of the mass may be at any point of the surface, which may explain the failures.
-    """
-    shell = (surface.values.abs() < surface.spacing).nonzero().double()
-    some = shell[:: max(1, len(shell) // REGRASP.places)]
-    places = surface.origin.double() + surface.spacing * some  # (p, 3)
-    middle = places.mean(0)
-    centers = torch.cat([middle[None], middle + REGRASP.share * (places - middle)])
-    friction = float(grasps.meta["friction"])
-    log_odds = log_odds_about(grasps, centers, friction, (-table.normal).tolist())  # (g, p + 1)
-    weight = torch.sigmoid(-log_odds[list(tried)]).prod(0)
-    return (torch.sigmoid(log_odds) @ weight / weight.sum()).where(grasps.success > 0, 0.0)
 
 
 class LiftTry(NamedTuple):
@@ -146,41 +67,46 @@ def lift_grasps(
 def run_lifts(driver: TrialDriver, grasps: Grasps, tries: int) -> tuple[LiftTry, ...]:
     """Run the trial of the first of several grasps, and trials of others where a lift fails.
 
-    Return all tries, at most `tries`.
+    Return all tries, at most `tries`. The robot's part is `GraspTry`; the simulation opens a scene
+    for each try.
     """
-    tried = [0]
     done = list[LiftTry]()
-    while len(tried) < tries and len(list_others(grasps, tried)):
-        lift = _CheckedLift(driver.open())
+    run: TrialRun | None = None
+
+    def start(grasp: Grasps) -> GraspController:
+        nonlocal driver, run
+        if run is not None:
+            driver = _again(driver, grasp, done[-1].result, run.controller.displacement)
+        run = driver.open()
+        return run.controller
+
+    attempt: GraspTry | None = GraspTry(grasps, start, driver.trial.surface)
+    while attempt is not None:
+        assert run is not None
+        # the last try goes on whatever the hand feels
+        last = len(done) + 1 >= tries or not len(attempt.others)
+        lift = _Lift(run) if last else _CheckedLift(run, attempt)
         result = lift.complete()
-        done.append(LiftTry(tried[-1], result))
-        if not (lift.check.lost or result.status is Status.TOO_HEAVY):
-            return tuple(done)
-        trial = driver.trial
-        controller = lift.run.controller
-        row = next_grasp(grasps, tried, trial.surface)
-        following = grasps.obj_from_hand[row].to("cpu", torch.float64)
-        truth = _left_behind(trial, result, _felt(controller), following)
-        seed = seed_of(trial.seed, "again")
-        trial = dataclasses.replace(trial, grasp=grasps[row], truth=truth, seed=seed)
-        tried = [*tried, row]
-        driver = TrialDriver(trial, driver.spec)
-    last = run_lift(driver)  # it goes on whatever the hand feels
-    return *done, LiftTry(tried[-1], last)
+        done.append(LiftTry(attempt.row, result))
+        if last or not (attempt.lost or result.status is Status.TOO_HEAVY):
+            break
+        attempt = attempt.next()
+    return tuple(done)
 
 
 class _CheckedLift(_Lift):
-    """A lift that ends where the hand feels that it has lost the object."""
+    """A lift that ends where the robot feels that it has failed."""
 
-    def __init__(self, run: TrialRun) -> None:
+    def __init__(self, run: TrialRun, attempt: GraspTry) -> None:
         super().__init__(run)
-        self.check = LiftCheck(run.robot.reference)
+        self.attempt = attempt
 
     def _gives_up(self, height: float) -> bool:
         """Return whether the object is too heavy or, before it is pushed, lost."""
         alone = height < self.spec.lift_height or not any(self.spec.push)
-        lost = alone and self.check(self.run.observation, height, self.run.robot.period)
-        return super()._gives_up(height) or lost
+        period = self.run.robot.period
+        failed = alone and self.attempt.fails(self.run.observation, height, period)
+        return failed or super()._gives_up(height)
 
     def _put_down(self, time: float, rising: float) -> Status:
         """Lower the hand, open it, withdraw it and let the object come to rest; return why the lift
@@ -188,22 +114,27 @@ class _CheckedLift(_Lift):
         """
         status = super()._put_down(time, rising)
         run = self.run
-        length = self.spec.approach
-        joints = run.observation.joints
-        palm = run.controller.targets.palm
-        here = torch.zeros(6, dtype=torch.float64)
-        reference = run.robot.reference
-        opening = Reopening(reference, here, joints, palm, palm + reference.rise, reach=0.0)
-        while not opening.done:
-            run.robot.tick(Targets(opening(run.robot.period), opening.palm))
+        withdrawal = self.attempt.withdraw(run.observation, run.robot.period, self.spec.approach)
+        for targets in withdrawal:
+            run.scene.approach(targets.left, -withdrawal.speed)
+            run.robot.tick(targets)
             self._record()
-        ticks = run.robot.ticks(REGRASP.withdrawal)
-        for k in range(2 * ticks):
-            share, rate = smooth_step(min((k + 1) / ticks, 1.0))
-            run.scene.approach(length * share, -length * rate / (ticks * run.robot.period))
-            run.robot.tick(Targets(opening.opened, opening.palm))
-            self._record()
-        return self._verdict() if self.check.lost else status
+        return self._verdict() if self.attempt.lost else status
+
+
+def _again(
+    driver: TrialDriver, grasp: Grasps, result: ClosureResult, felt: Float[Tensor, "4 4"]
+) -> TrialDriver:
+    """Return the driver of the next try, of another `grasp`, where the last try left the bodies.
+
+    `felt` is the displacement of the object that the last try felt, in its planned hand's frame.
+    """
+    trial = driver.trial
+    following = grasp.obj_from_hand[0].to("cpu", torch.float64)
+    truth = _left_behind(trial, result, felt, following)
+    seed = seed_of(trial.seed, "again")
+    following_trial = dataclasses.replace(trial, grasp=grasp, truth=truth, seed=seed)
+    return TrialDriver(following_trial, driver.spec)
 
 
 def _left_behind(
@@ -229,19 +160,6 @@ def _left_behind(
     target, *others = (_moved(body, pose.numpy()) for body, pose in zip(bodies, poses, strict=True))
     changes = {"error": error, "table": table, "neighbours": others, "slide": None}
     return dataclasses.replace(truth, mesh=target.mesh, parts=target.parts, **changes)
-
-
-def _felt(controller: GraspController) -> Float[Tensor, "4 4"]:
-    """Return the displacement of the object that a controller has felt, in the planned hand's
-    frame.
-    """
-    closing = controller.closing
-    centre = controller.reference.gains.target.mean(0)
-    if not isinstance(closing, UncertaintyClosing):
-        return torch.eye(4, dtype=torch.float64)
-    shift = closing.displacement[:3]
-    rotation = rotation_from_vector(closing.displacement[3:])
-    return rigid(rotation, centre + shift - rotation @ centre)
 
 
 def _moved(body: Neighbour, pose: np.ndarray) -> Neighbour:

@@ -19,6 +19,7 @@ from torchgrasp.control.holding import GripHold
 from torchgrasp.control.modes import choose_preference
 from torchgrasp.control.recovery import can_guard
 from torchgrasp.control.reference import ClosingReference, check_single
+from torchgrasp.control.regrasp import smooth_step
 from torchgrasp.control.relook import REACH
 from torchgrasp.evaluation.frame import moved_mesh, rounded, to_frame, world_frame
 from torchgrasp.evaluation.protocols import apply_error, seed_of
@@ -396,14 +397,6 @@ class TrialRun:
         effort = reference.kp.new_tensor([hand.actuators[x].effort for x in hand.tree.joint_names])
         off = (self.controller.targets.joints - self.observation.joints).abs()
         return bool((reference.kp * off >= effort).any())
-
-
-def smooth_step(time: float) -> tuple[float, float]:
-    """Return (position, speed) of a motion from 0 to 1 that starts and ends at rest.
-
-    The `time` is in [0, 1]; all are without unit.
-    """
-    return time * time * (3 - 2 * time), 6 * time * (1 - time)
 
 
 def _by_name(hand: Hand, joints: Float[Tensor, " h"]) -> dict[str, float]:

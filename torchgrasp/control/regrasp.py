@@ -1,0 +1,233 @@
+"""The tries of a robot at one object: where a lift fails, the hand opens and withdraws, and another
+grasp comes next.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import Annotated
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchgrasp.control.controller import GraspController, Period
+from torchgrasp.control.recovery import LiftCheck, Reopening
+from torchgrasp.control.tactile import Observation, Targets
+from torchgrasp.foundation.base import flatnonzero
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import BadArgument, Status
+from torchgrasp.foundation.rules import Pose, Range
+from torchgrasp.geometry.linalg import norm
+from torchgrasp.geometry.plane import Plane
+from torchgrasp.geometry.signed_distance import SignedDistanceField
+from torchgrasp.success.loads import log_odds_about
+from torchgrasp.values.planning import Grasps
+
+
+@dataclasses.dataclass(frozen=True)
+class RegraspNumbers:
+    """Parameters by which another grasp is chosen after a failed one."""
+
+    gap: float = 0.015  # mean distance [m] of the contacts above which a grasp differs
+    turn: float = math.radians(30)  # angle [rad] of the approaches above which a grasp differs
+    share: float = 0.35  # share of the object's mass that may be concentrated at one surface point
+    withdrawal: float = 0.6  # time [s] in which the opened hand withdraws, and the object rests
+    # number of surface points, at least, that are tried as the place of this mass (fewer if the
+    # surface has fewer)
+    places: int = 64
+
+
+REGRASP = RegraspNumbers()
+
+
+@checked
+def next_grasp(
+    grasps: Grasps, tried: Sequence[int], surface: SignedDistanceField | None = None
+) -> int:
+    """Return the index of the grasp of `list_others` that most likely holds, after those `tried`
+    failed.
+
+    `surface` is the estimated surface of the object, in the frame of the grasps. Without it or a
+    table, or if the grasps are not ranked by success, it is the best-ranked one. Raises
+    `BadArgument` if no other grasp is left.
+    """
+    others = list_others(grasps, tried)
+    if not len(others):
+        raise BadArgument("tried", list(tried), "rows that leave another grasp to try")
+    if surface is None or grasps.table is None or grasps.meta.get("ranking") != "success":
+        return int(others[0])
+    return int(others[_chances(grasps, grasps.table, surface, tried)[others].argmax()])
+
+
+@checked
+def list_others(grasps: Grasps, tried: Sequence[int]) -> Int[Tensor, "k"]:
+    """Return the indices of the grasps that differ from all `tried` (indices).
+
+    They differ by more than `REGRASP.turn` in approach, or `REGRASP.gap` in contacts.
+    """
+    approach = grasps.approach
+    points = grasps.contacts.points.double()
+    gaps = norm(points[:, None] - points[list(tried)]).mean(-1)  # (g, t)
+    differs = (gaps > REGRASP.gap) | (approach @ approach[list(tried)].T < math.cos(REGRASP.turn))
+    return flatnonzero(differs.all(-1))
+
+
+def _chances(
+    grasps: Grasps, table: Plane, surface: SignedDistanceField, tried: Sequence[int]
+) -> Float[Tensor, "g"]:
+    """Return each grasp's probability of success given that the tried ones failed; 0 if it is
+    unknown.
+
+    A share of the mass may be at any point of the surface, which may explain the failures.
+    """
+    shell = (surface.values.abs() < surface.spacing).nonzero().double()
+    some = shell[:: max(1, len(shell) // REGRASP.places)]
+    places = surface.origin.double() + surface.spacing * some  # (p, 3)
+    middle = places.mean(0)
+    centers = torch.cat([middle[None], middle + REGRASP.share * (places - middle)])
+    friction = float(grasps.meta["friction"])
+    log_odds = log_odds_about(grasps, centers, friction, (-table.normal).tolist())  # (g, p + 1)
+    weight = torch.sigmoid(-log_odds[list(tried)]).prod(0)
+    return (torch.sigmoid(log_odds) @ weight / weight.sum()).where(grasps.success > 0, 0.0)
+
+
+class GraspTry:
+    """One try to lift an object with one of several grasps; `next` is the robot's next try.
+
+    The robot moves its hand to `obj_from_hand`, and steps the `controller` until the hand has
+    closed. In each tick of the lift it asks `fails`. If so, it lowers the hand, sends the targets
+    of `withdraw`, and goes on with `next`.
+
+    Attributes:
+        row: index of the grasp of this try.
+        controller: the controller of this grasp.
+        moved: motion [m] of the object since the grasps were planned, as far as it is known: a
+            rigid transform (4, 4) in the frame of the grasps. Views and surfaces of later tries are
+            in the frame that has moved with the object.
+
+    Args:
+        grasps: the grasps in the order of preference.
+        start: function that returns the controller of a single grasp.
+        surface: estimated surface of the object in the frame of the grasps, by which `next_grasp`
+            chooses; None if it is unknown.
+        tried: rows that were tried, with the one of this try at the end.
+        moved: the attribute; None means no motion.
+
+    Raises `BadArgument` if a row of `tried` is none of the grasps.
+    """
+
+    @checked
+    def __init__(
+        self,
+        grasps: Grasps,
+        start: Callable[[Grasps], GraspController],
+        surface: SignedDistanceField | None = None,
+        tried: Sequence[int] = (0,),
+        moved: Pose | None = None,
+    ) -> None:
+        if not tried or not all(0 <= row < len(grasps) for row in tried):
+            raise BadArgument("tried", list(tried), f"rows of the {len(grasps)} grasps")
+        self.grasps = grasps
+        self.start = start
+        self.surface = surface
+        self.tried = tuple(tried)
+        self.row = self.tried[-1]
+        self.moved = torch.eye(4, dtype=torch.float64) if moved is None else moved.cpu().double()
+        self.controller = start(grasps[self.row])
+        self.check = LiftCheck(self.controller.reference)
+
+    @property
+    def obj_from_hand(self) -> Float[Tensor, "4 4"]:
+        """Where the hand shall close: its pose [m] in the frame of the grasps, at the moved
+        object.
+        """
+        return self.moved @ self.grasps.obj_from_hand[self.row].to(self.moved)
+
+    @property
+    def others(self) -> Int[Tensor, "k"]:
+        """Indices of the grasps that are left to try (`list_others`)."""
+        return list_others(self.grasps, self.tried)
+
+    @property
+    def lost(self) -> bool:
+        """Whether the hand felt in the lift that it loses the object (`LiftCheck`)."""
+        return self.check.lost
+
+    @property
+    def failed(self) -> bool:
+        """Whether the lift has failed: the object is lost, or too heavy for the hand."""
+        return self.lost or self.controller.status is Status.TOO_HEAVY
+
+    @checked
+    def fails(
+        self, observation: Observation, height: Annotated[float, Range(-1.0, 10.0)], period: Period
+    ) -> bool:
+        """Return whether the lift has `failed`, and shall end.
+
+        It is called at the end of each tick of `period` [s], in which the hand has risen to
+        `height` [m].
+        """
+        self.check(observation, height, period)
+        return self.failed
+
+    @checked
+    def withdraw(
+        self, observation: Observation, period: Period, length: Annotated[float, Range(0.0, 1.0)]
+    ) -> "Withdrawal":
+        """Return the targets of the lowered hand's ticks, in which it opens and withdraws by
+        `length` [m].
+
+        The last `observation` shows where the fingers begin; the ticks come every `period` [s].
+        """
+        return Withdrawal(self.controller, observation, period, length)
+
+    def next(self) -> "GraspTry | None":
+        """Return the try of `next_grasp` at the object where it is now expected; None if no other
+        grasp is left.
+        """
+        if not len(self.others):
+            return None
+        row = next_grasp(self.grasps, self.tried, self.surface)
+        moved = self.moved @ self.controller.object_motion
+        return GraspTry(self.grasps, self.start, self.surface, (*self.tried, row), moved)
+
+
+class Withdrawal:
+    """The targets of each tick in which a hand opens, withdraws against its approach, and waits
+    until the object rests.
+
+    `speed` [m/s] is that at which `Targets.left` grows at the last target.
+    """
+
+    def __init__(
+        self, controller: GraspController, observation: Observation, period: float, length: float
+    ) -> None:
+        reference = controller.reference
+        palm = controller.targets.palm
+        here = torch.zeros(6, dtype=torch.float64)
+        joints = observation.joints
+        self.opening = Reopening(reference, here, joints, palm, palm + reference.rise, reach=0.0)
+        self.period = period
+        self.length = length
+        self.speed = 0.0
+
+    def __iter__(self) -> Iterator[Targets]:
+        """Yield the targets of the ticks in turn."""
+        opening = self.opening
+        while not opening.done:
+            joints = opening(self.period)
+            yield Targets(joints, opening.palm)
+        ticks = max(1, round(REGRASP.withdrawal / self.period))
+        for k in range(2 * ticks):
+            share, rate = smooth_step(min((k + 1) / ticks, 1.0))
+            self.speed = self.length * rate / (ticks * self.period)
+            yield Targets(opening.opened, opening.palm, self.length * share)
+
+
+def smooth_step(time: float) -> tuple[float, float]:
+    """Return (position, speed) of a motion from 0 to 1 that starts and ends at rest.
+
+    The `time` is in [0, 1]; all are without unit.
+    """
+    return time * time * (3 - 2 * time), 6 * time * (1 - time)
