@@ -66,3 +66,7 @@ def test_the_hidden_side_is_what_the_other_camera_saw_alone():
     assert found["median"] < 3.0 < 6.0 < wrong["median"]
     assert 0.0 <= found["within_1"] <= found["within_2"] <= found["within_3"] <= 1.0
     assert math.isnan(judge_hidden(front[:3], ball)["median"])  # too few points: refused
+    far = torch.tensor([[0.5, 0.0, 0.048]], dtype=torch.float64)
+    away = judge_hidden(front[:800], torch.cat([front[:800], far]))
+    assert away["median"] == pytest.approx(465.0, abs=10.0)
+    assert away["within_3"] == 0.0

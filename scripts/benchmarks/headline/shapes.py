@@ -31,6 +31,9 @@ UNSEEN = 0.006
 QUERIES = 1500
 """Most points of the hidden side that are compared."""
 
+EDGE = 1 - 1e-9
+"""Share of the largest distance from the centre at which a shape is asked."""
+
 LIMIT = 600.0
 """Wall time [s] of one view."""
 
@@ -98,9 +101,14 @@ def judge_hidden(
         shape = fit_shape(PointCloud(seen), table=table)
     except GraspError:
         return dict.fromkeys(names, float("nan"))
-    guess = shape.predict(hidden)
-    off = (guess.distance * shape.scale).abs()
-    score = off / guess.std_m
+    # the estimate ends at twice the domain's radius: points beyond are within no deviation of it
+    outward = hidden - shape.center
+    away = outward.norm(dim=1, keepdim=True)
+    most = EDGE * 2 * shape.domain_radius * shape.scale
+    beyond = (away - most).clamp_min(0.0)
+    guess = shape.predict(shape.center + outward * (most / away).clamp_max(1.0))
+    off = (guess.distance * shape.scale).abs() + beyond[:, 0]
+    score = torch.where(beyond[:, 0] > 0, torch.inf, off / guess.std_m)
     shares = [float((score <= k).double().mean()) for k in (1, 2, 3)]
     values = [1e3 * float(off.median()), 1e3 * float(off.quantile(0.9)), *shares]
     return dict(zip(names, values, strict=True))
