@@ -37,6 +37,7 @@ from torchgrasp.control.least_forces import LeastForces, balance, friction_ratio
 from torchgrasp.control.tactile import Observation
 from torchgrasp.geometry.linalg import GOLDEN_ANGLE, fibonacci_sphere
 from torchgrasp.geometry.signed_distance import SignedDistanceField
+from torchgrasp.values.distribution import Distribution
 
 POINTS = TARGET.numpy()
 OUTWARD = NORMALS.numpy()
@@ -195,7 +196,7 @@ def test_least_forces_keep_the_floors():
 
 
 def test_friction_estimate_is_a_gaussian_posterior():
-    estimate = FrictionEstimate()
+    estimate = FrictionEstimate(0.8)
     estimate.update(0.5, 4.0)
     noise = 0.4 * math.hypot(1.0, 0.5) / 4.0
     precision = FRICTION.std**-2 + noise**-2
@@ -206,7 +207,7 @@ def test_friction_estimate_is_a_gaussian_posterior():
 
 
 def test_friction_is_at_least_the_ratio_of_a_finger_that_sticks():
-    estimate = FrictionEstimate()
+    estimate = FrictionEstimate(0.8)
     estimate.update(0.6, 20.0, slides=False)
     least = 0.6 - 0.4 * math.hypot(1.0, 0.6) / 20
     assert estimate.mean == 0.8 and estimate.least == pytest.approx(least)
@@ -217,6 +218,43 @@ def test_friction_is_at_least_the_ratio_of_a_finger_that_sticks():
     assert estimate.mean == pytest.approx(0.58, abs=0.01)
     estimate.update(0.9, 20.0, slides=False)
     assert estimate.mean == estimate.least > 0.8
+
+
+def test_the_prior_of_friction_is_that_of_the_plan_if_it_is_a_distribution():
+    """The moments are those of the pieces: (0.35, 0.3^2 / 12) for a third, (1, 0) for the rest."""
+    prior = Distribution(((0.2, 0.5), (1.0, 1.0)), (1.0, 2.0))
+    estimate = FrictionEstimate(prior)
+    mean = (0.35 + 2 * 1.0) / 3
+    variance = (0.3**2 / 12 + (0.35 - mean) ** 2 + 2 * (1.0 - mean) ** 2) / 3
+    assert estimate.mean == pytest.approx(mean) and estimate.std == pytest.approx(variance**0.5)
+    assert FrictionEstimate(Distribution.of(0.3)).mean == FrictionEstimate(0.3).mean == 0.8
+
+
+@pytest.mark.parametrize("prior", [Distribution.between(0.2, 1.0), 0.8, 0.25])
+@pytest.mark.parametrize("friction", [0.3, 0.5, 0.9])
+def test_what_the_touches_leave_of_the_friction_contains_the_true_one(prior, friction):
+    """Fingertips stick at any ratio below the coefficient, and slide at it; readings are noisy."""
+    generator = np.random.default_rng(0)
+    estimate = FrictionEstimate(prior)
+    assert estimate.posterior == Distribution.of(prior)
+    force = 10.0
+    for _ in range(40):
+        noise = 0.2 * 0.4 / force * generator.normal()
+        estimate.update(friction * generator.uniform() + noise, force, slides=False)
+    low = estimate.held
+    assert 0.8 * friction < low < friction
+    kept = Distribution.of(prior)
+    if kept.share(low, math.inf):
+        assert estimate.posterior == kept.given(low, math.inf)
+    else:
+        assert estimate.posterior == Distribution.of(low)
+    for _ in range(40):
+        noise = 0.2 * 0.4 / force * generator.normal()
+        estimate.update(friction + noise, force)
+    found = estimate.posterior
+    # a number near the truth stays; all else is a short interval about the truth
+    assert found.least - 0.05 <= friction <= found.most + 0.05
+    assert found.most - found.least < 0.2
 
 
 @functools.cache
@@ -292,7 +330,7 @@ def test_grip_reports_a_load_as_too_heavy_only_if_a_finger_slides():
     weight = 5.0
     most = 2.0
     believed = (
-        FrictionEstimate().mean * 2 * most
+        FrictionEstimate(0.8).mean * 2 * most
     )  # the thumb presses with 2 N, the others with the half
     assert believed < weight
     assert carried(weight, 3.0, max_force=most)[0].status is Status.OK
@@ -318,3 +356,17 @@ def test_grip_floors_stay_finite_for_a_planned_force_along_the_surface(sideways,
     floor = hold._bounded(np.maximum(hold.grip, GRIP.least_push))
     assert np.isfinite(floor).all() and (floor > 0).all()
     assert max_force is not None or (floor >= GRIP.least_push).all()
+
+
+@pytest.mark.parametrize("weight", [1.5, 4.0])
+def test_the_felt_load_shows_the_mass(weight):
+    hold = carried(weight, 0.8)[0]
+    assert hold.mass is not None and hold.mass.share(weight / 9.81, weight / 9.81) == 0.0
+    assert hold.mass.least < weight / 9.81 < hold.mass.most < 1.3 * weight / 9.81
+    assert carried(0.2, 0.8)[0].mass is None  # it may still stand on the table
+
+
+def test_a_load_that_is_too_heavy_bounds_the_mass_below():
+    hold = carried(9.0, 0.4, 4.0)[0]
+    assert hold.status is Status.TOO_HEAVY and hold.mass.least < 9.0 / 9.81 < hold.mass.most
+    assert hold.mass.least > 0.1

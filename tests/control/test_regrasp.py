@@ -33,6 +33,7 @@ from torchgrasp.control.uncertainty_closing import PALM_SPEED
 from torchgrasp.data.shipped import load_shipped_grasp
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.values.closing import NO_OPTIONS, ClosingOptions, SensorModel
+from torchgrasp.values.distribution import Distribution
 
 STILL = torch.zeros(3).double()
 PLACE = torch.zeros(6).double()
@@ -67,6 +68,10 @@ def test_grasp_check_rejects_forces_beyond_the_planned_friction(degrees, frictio
     leaning = torch.stack([NORMALS[:, 0] * angle.cos(), angle.sin().expand(3), NORMALS[:, 2]], -1)
     check = judge(pressing(normals=leaning), reference=on_table(friction=friction))
     assert check.secure is (math.tan(math.radians(degrees)) < friction)
+    likely = Distribution.between(friction - 0.1, friction + 0.1)  # its mean decides
+    assert (
+        judge(pressing(normals=leaning), reference=on_table(friction=likely)).secure is check.secure
+    )
 
 
 def test_the_closing_plan_knows_the_friction_that_the_grasp_was_planned_for():
@@ -82,7 +87,8 @@ def test_the_closing_plan_knows_the_friction_that_the_grasp_was_planned_for():
         return ClosingReference.from_grasp(hand, dataclasses.replace(grasp, meta=meta)).friction
 
     assert list(map(planned, ("0.5", "1", None))) == [0.5, 1.0, ContactSpec().friction]
-    for text in ("wet", "-1", "nan"):
+    assert planned("0.2:0.6") == Distribution.between(0.2, 0.6)
+    for text in ("wet", "-1", "nan", "-0.1:0.5"):
         with pytest.raises(BadArgument, match=r"friction.*a positive number"):
             planned(text)
 

@@ -43,6 +43,22 @@ def test_mixtures_of_intervals_are_those_of_scipy(found, parts, weights):
     )
 
 
+@pytest.mark.parametrize(("low", "high"), [(0.35, 0.65), (0.65, np.inf), (-np.inf, 1.0)])
+@pytest.mark.parametrize(("found", "parts", "weights"), MIXED)
+def test_what_is_left_of_a_distribution_is_that_of_its_draws(found, parts, weights, low, high):
+    drawn = found.sample(10_000, 1).numpy()
+    pairs = zip(parts, weights, strict=True)
+    square = sum(w * (part.var() + part.mean() ** 2) for part, w in pairs)
+    assert found.std == pytest.approx((square - found.mean**2) ** 0.5)
+    kept = drawn[(drawn >= low) & (drawn <= high)]
+    if not len(kept):
+        with pytest.raises(BadArgument, match="low"):
+            found.given(low, high)
+        return
+    wanted = (kept <= LATTICE.numpy()[:, None]).mean(-1)
+    np.testing.assert_allclose(found.given(low, high).cdf(LATTICE), wanted, atol=0.03)
+
+
 def test_samples_have_the_quantiles_of_numpy():
     samples = np.random.default_rng(0).lognormal(-1.0, 0.4, 307)
     found = Distribution.of_samples(torch.from_numpy(samples))

@@ -33,6 +33,7 @@ from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.rules import Range
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_from_vector
 from torchgrasp.values.closing import ClosingOptions, choose_options
+from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import PointCloud
 from torchgrasp.values.specs import ClosingMode, HoldingMode, check_modes, default_holding
 
@@ -142,6 +143,20 @@ class GraspController:
         The hand should then set the object down.
         """
         return self.hold.status if isinstance(self.hold, GripHold) else Status.OK
+
+    @property
+    def friction(self) -> Distribution | None:
+        """What the touches leave of the plan's friction (`FrictionEstimate`); None unless the hand
+        holds in the mode "grip".
+        """
+        return self.hold.friction.posterior if isinstance(self.hold, GripHold) else None
+
+    @property
+    def mass(self) -> Distribution | None:
+        """The mass [kg] that the felt load shows; None unless the mode "grip" carries a steady
+        load.
+        """
+        return self.hold.mass if isinstance(self.hold, GripHold) else None
 
     @property
     def blend(self) -> Float[Tensor, " f"]:

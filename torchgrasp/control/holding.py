@@ -21,6 +21,7 @@ from torchgrasp.control.reference import ClosingReference
 from torchgrasp.control.tactile import Observation, smooth
 from torchgrasp.foundation.errors import Status
 from torchgrasp.geometry.frames import apply, inverse
+from torchgrasp.values.distribution import Distribution
 
 MAX_FACTOR = 1.5  # largest factor on the forces; it bounds the force if a sensor reads too little
 RAMP = 0.4  # time [s] in which the forces rise to the desired forces
@@ -33,9 +34,9 @@ class FrictionNumbers:
     """Parameters of `FrictionEstimate`, the running estimate of the friction coefficient."""
 
     mean: float = 0.8
-    """Estimate at the start."""
+    """Estimate at the start, if the grasp was planned for a single coefficient."""
     std: float = 0.2
-    """Standard deviation of the estimate at the start."""
+    """Standard deviation of this estimate."""
     least_std: float = 0.03
     """Least standard deviation of the estimate; larger: it follows later readings more."""
     least: float = 0.15
@@ -44,6 +45,8 @@ class FrictionNumbers:
     """Largest coefficient that is estimated."""
     noise: float = 0.4
     """Standard deviation [N] of a fingertip's force; over the normal force, that of the ratio."""
+    sure: float = 2.0
+    """Standard deviations within which a coefficient is likely."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -112,6 +115,16 @@ class WeightNumbers:
     """Density [kg/m^3]: that of water."""
     mass: float = 0.4
     """Least mass [kg]: a small thing may be of metal."""
+    noise: float = 0.5
+    """Standard deviation [N] of the load that the fingertips feel in one tick."""
+    share: float = 0.05
+    """Standard deviation of the mean load by motion and oblique contacts, as a share of it."""
+    sure: float = 2.0
+    """Standard deviations within which a mass is likely."""
+    gravity: float = 9.81
+    """Acceleration [m/s^2] of a weight."""
+    most: float = 10.0
+    """Largest mass [kg] of an object."""
 
 
 FRICTION = FrictionNumbers()
@@ -210,12 +223,25 @@ class FrictionEstimate:
 
     `mean` is the estimate, `std` its standard deviation, and `least` a lower bound of the
     coefficient.
+
+    Args:
+        prior: the coefficient that the grasp was planned for. A distribution gives mean and
+            deviation at the start; with a number they are those of `FRICTION`.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, prior: float | Distribution) -> None:
+        self.prior = Distribution.of(prior)
         self.mean = FRICTION.mean
         self.std = FRICTION.std
         self.least = FRICTION.least
+        self.most = FRICTION.most
+        if self.prior.least < self.prior.most:
+            self.mean = self.prior.mean
+            self.std = max(self.prior.std, FRICTION.least_std)
+            self.least = min(self.prior.least, FRICTION.least)
+            self.most = max(self.prior.most, FRICTION.most)
+        self.held = 0.0  # largest coefficient that sticking fingertips have shown
+        self.slid = False
 
     def update(self, ratio: float, force: float, slides: bool = True) -> None:
         """Update the estimate by the sensed force of one fingertip.
@@ -226,13 +252,30 @@ class FrictionEstimate:
         """
         noise = FRICTION.noise * math.hypot(1.0, ratio) / force
         if not slides:
-            self.least = max(self.least, ratio - noise)
+            self.held = max(self.held, ratio - noise)
+            self.least = max(self.least, self.held)
             self.mean = max(self.mean, self.least)
         elif ratio + noise > self.least:
             weight = self.std**2 / (self.std**2 + noise**2)
             mean = self.mean + weight * (ratio - self.mean)
-            self.mean = min(max(mean, self.least), FRICTION.most)
+            self.mean = min(max(mean, self.least), self.most)
             self.std = max(self.std * math.sqrt(1 - weight), FRICTION.least_std)
+            self.slid = True
+
+    @property
+    def posterior(self) -> Distribution:
+        """The prior, cut where fingertips have stuck or slid.
+
+        A fingertip that sticks bounds the coefficient below; one that slides bounds it above. Where
+        the prior excludes what is left, the touches alone decide.
+        """
+        around = FRICTION.sure * self.std
+        high = self.mean + around if self.slid else math.inf
+        if self.prior.share(self.held, high) > 0.0:
+            return self.prior.given(self.held, high)
+        if self.slid:
+            return Distribution.between(max(self.mean - around, self.held), high)
+        return Distribution.of(self.held)
 
     @property
     def high(self) -> float:
@@ -279,7 +322,7 @@ class GripHold:
         self.carried = np.zeros(6)
         self.up = None if reference.table is None else reference.table.normal.numpy()
         self.centre, self.unfelt = likely_body(reference)
-        self.friction = FrictionEstimate()
+        self.friction = FrictionEstimate(reference.friction)
         self.cover = 0.0
         self.aim = self.friction.mean
         self.sent = np.zeros((len(push), 3))
@@ -289,6 +332,8 @@ class GripHold:
         self.steady = 0.0
         self.over = 0.0
         self.released = False  # whether the load is steady
+        self.weighed = np.zeros(3)  # mean force [N] of the steady load
+        self.weighings = 0  # ticks in this mean
         self.strained = False  # whether forces are near their limits
         self.status = Status.OK
         self.slid = np.zeros(len(push))
@@ -297,6 +342,23 @@ class GripHold:
     def weight(self) -> float:
         """Size [N] of the filtered force with which the object loads the fingertips."""
         return float(np.linalg.norm(self.load[:3]))
+
+    @property
+    def mass(self) -> Distribution | None:
+        """The mass [kg] that the steady load shows, while nothing else pushes at the object.
+
+        None if no load is steady. A load that is too heavy bounds the mass below.
+        """
+        if self.status is Status.TOO_HEAVY:
+            carried = (1 - WEIGHT.sure * WEIGHT.share) * self.most / WEIGHT.gravity
+            return Distribution.between(min(carried, WEIGHT.most), WEIGHT.most)
+        load = float(np.linalg.norm(self.weighed))
+        if min(load, self.weight) < GRIP.lifted:
+            return None
+        std = math.hypot(WEIGHT.noise / math.sqrt(self.weighings), WEIGHT.share * load)
+        around = WEIGHT.sure * std
+        low = max(load - around, 0.0) / WEIGHT.gravity
+        return Distribution.between(low, (load + around) / WEIGHT.gravity)
 
     @property
     def sliding(self) -> np.ndarray:
@@ -352,6 +414,9 @@ class GripHold:
         load = self._weight(contacts.wrench @ forces.ravel())
         self.load = smooth(self.load, load, GRIP.load, period)
         self.carried = smooth(self.carried, load, GRIP.carried, period)
+        if self.released:
+            self.weighings += 1
+            self.weighed = self.weighed + (load[:3] - self.weighed) / self.weighings
         sure = min(max(GRIP.sure * (self.time - GRIP.settled), 0.0), 1.0)
         push = self.cover * sure * (PUSH + self.unfelt)
         arm = self.centre - points.mean(0)
@@ -484,7 +549,7 @@ def likely_body(
         middle = field.origin + field.spacing * inside.double().mean(0)
         centre = apply(inverse(reference.obj_from_hand), middle[None])[0]
         mass = numbers.density * len(inside) * field.spacing**3
-    return centre.numpy(), 9.81 * max(mass, numbers.mass)
+    return centre.numpy(), numbers.gravity * max(mass, numbers.mass)
 
 
 def _limited(vector: np.ndarray, most: float) -> np.ndarray:

@@ -25,6 +25,7 @@ from torchgrasp.foundation.rules import Range
 from torchgrasp.geometry.linalg import limit_norm, unit
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.values.closing import ClosingOptions
+from torchgrasp.values.distribution import Distribution
 
 # time [s] from the end of closing until the hand counts as closed, and is judged
 PRESSING_TIME = 0.5
@@ -258,9 +259,9 @@ class GraspCheck:
 
     `secure` then says whether to lift: all fingers touch, the palm has followed the object
     (`CHECK.misplaced`) and, if all contact points are known, forces balance with the planned
-    friction. `displacement` (6,) holds the object's translation [m] and rotation vector [rad] in
-    the planned hand's frame: that of the closing, or one estimated anew from all touches if the
-    plan has a table and a surface.
+    friction, of a distribution its mean. `displacement` (6,) holds the object's translation [m] and
+    rotation vector [rad] in the planned hand's frame: that of the closing, or one estimated anew
+    from all touches if the plan has a table and a surface.
 
     Args:
         reference: the closing plan.
@@ -324,7 +325,7 @@ class GraspCheck:
         points, normals = touches.means()
         ratio = tangential_ratio(least_friction_forces(points, normals), normals)
         # false for NaN, where no forces balance
-        return bool((ratio <= self.reference.friction).all())
+        return bool((ratio <= Distribution.of(self.reference.friction).mean).all())
 
 
 class Reopening:

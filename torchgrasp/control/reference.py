@@ -25,6 +25,7 @@ from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.hand.hand import Hand
 from torchgrasp.ik.motion import opened_pose
 from torchgrasp.values.closing import ClosingGains, SensorModel
+from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import Grasps
 from torchgrasp.values.specs import ContactSpec
 
@@ -57,7 +58,7 @@ class ClosingReference(Value):
         max_force: largest normal force [N] of a fingertip; None means no limit.
         distance_variance: variance [m^2] of the signed distance at each contact (f_cov in Eq. 12 of
             the paper); None if it is unknown. The closing "paper" needs it.
-        friction: coefficient of friction that the grasp was planned for.
+        friction: coefficient of friction that the grasp was planned for, or its `Distribution`.
     """
 
     hand: Hand
@@ -74,7 +75,7 @@ class ClosingReference(Value):
     sensor: SensorModel = dataclasses.field(default_factory=SensorModel)
     max_force: Annotated[float, Range(0.1, 1000.0)] | None = None
     distance_variance: Float[Tensor, "f"] | None = None
-    friction: Annotated[float, Range(0.0, 10.0)] = ContactSpec.friction
+    friction: Annotated[float, Range(0.0, 10.0)] | Distribution = ContactSpec.friction
 
     @classmethod
     @checked
@@ -154,7 +155,7 @@ class ClosingReference(Value):
             gains=gains,
             approach=unit(direction) if bool((direction != 0.0).any()) else None,
             distance_variance=_distance_variance(grasp),
-            friction=_number(grasp, "friction") or ContactSpec.friction,
+            friction=_friction(grasp),
         )
 
     @checked
@@ -277,6 +278,21 @@ def _distance_variance(grasp: Grasps) -> Float[Tensor, "f"] | None:
     if contacts.variance is None:
         return contacts.require_std()[0] ** 2
     return None if unit_m is None else contacts.variance[0] * unit_m**2
+
+
+def _friction(grasp: Grasps) -> float | Distribution:
+    """Return the friction in the metadata of a grasp, by default that of `ContactSpec`."""
+    text = grasp.meta.get("friction")
+    if text is None:
+        return ContactSpec.friction
+    try:
+        friction = Distribution.parse(text)
+    except BadArgument:
+        friction = None
+    if friction is None or friction.least <= 0.0:
+        allowed = "a positive number, or a distribution"
+        raise BadArgument("grasp.meta['friction']", repr(text), allowed)
+    return friction.least if friction.least == friction.most else friction
 
 
 def _number(grasp: Grasps, name: str) -> float | None:

@@ -22,6 +22,7 @@ from torchgrasp.geometry.linalg import norm
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.signed_distance import SignedDistanceField
 from torchgrasp.success.loads import log_odds_about
+from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import Grasps
 
 
@@ -86,7 +87,7 @@ def _chances(
     places = surface.origin.double() + surface.spacing * some  # (p, 3)
     middle = places.mean(0)
     centers = torch.cat([middle[None], middle + REGRASP.share * (places - middle)])
-    friction = float(grasps.meta["friction"])
+    friction = Distribution.parse(grasps.meta["friction"]).mean
     log_odds = log_odds_about(grasps, centers, friction, (-table.normal).tolist())  # (g, p + 1)
     weight = torch.sigmoid(-log_odds[list(tried)]).prod(0)
     return (torch.sigmoid(log_odds) @ weight / weight.sum()).where(grasps.success > 0, 0.0)

@@ -347,4 +347,6 @@ class _Lift:
             stops=self.run.controller.stops,
             attempts=self.run.controller.attempts,
             seconds=seconds,
+            friction=self.run.controller.friction,
+            mass=self.run.controller.mass,
         )

@@ -12,6 +12,7 @@ from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.rules import ANY, Measured, Range
+from torchgrasp.values.distribution import Distribution
 
 
 @checked
@@ -141,6 +142,10 @@ class ClosureResult(Value):
         stops: number of stops of the approaching hand at a contact.
         attempts: number of closings of the hand.
         seconds: wall time [s] of the trial.
+        friction: what the touches leave of the friction that the grasp was planned for; None if the
+            hand did not hold in the mode "grip".
+        mass: the object's mass [kg] by the load that the hand felt, while nothing pushed at it;
+            None if the mode "grip" felt no steady load.
     """
 
     held: bool
@@ -166,6 +171,8 @@ class ClosureResult(Value):
     stops: int
     attempts: int
     seconds: float
+    friction: Distribution | None = None
+    mass: Distribution | None = None
 
 
 SensorKind = Literal["tactile", "torque", "binary"]

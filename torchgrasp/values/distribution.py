@@ -12,7 +12,7 @@ from torch import Tensor
 from torchgrasp.foundation.base import Value, kept
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
-from torchgrasp.foundation.rules import ANY, LEAST, Positive, Range, Seed, show
+from torchgrasp.foundation.rules import ANY, LEAST, Measured, Positive, Range, Seed, show
 from torchgrasp.geometry.frames import real
 
 MOST_PARTS = 10_000
@@ -121,6 +121,13 @@ class Distribution(Value):
         return math.fsum(p * x for p, x in zip(self.shares, middles, strict=True))
 
     @property
+    def std(self) -> float:
+        """The standard deviation."""
+        squares = [(low * low + low * high + high * high) / 3 for low, high in self.parts]
+        square = math.fsum(p * x for p, x in zip(self.shares, squares, strict=True))
+        return math.sqrt(max(square - self.mean**2, 0.0))
+
+    @property
     def least(self) -> float:
         """The least number that is possible."""
         return min(low for low, _ in self.parts)
@@ -197,11 +204,34 @@ class Distribution(Value):
         return self.quantile(drawn)
 
     @checked
-    def share(self, low: float, high: float) -> float:
-        """Return the probability of the interval [low, high]."""
+    def share(self, low: Measured, high: Measured) -> float:
+        """Return the probability of the interval [low, high], whose ends may be infinite."""
         upto = self._below(real([high]), reached=True)
         below = self._below(real([low]), reached=False)
         return min(max(float(upto - below), 0.0), 1.0)
+
+    @checked
+    def given(self, low: Measured, high: Measured) -> "Distribution":
+        """Return the distribution of the number once it is known to be in [low, high].
+
+        Raises `BadArgument` if that is impossible.
+
+        >>> str(Distribution.between(0.2, 1.0).given(0.3, 0.5))
+        '0.3:0.5'
+        """
+        found = list[tuple[tuple[float, float], float]]()
+        for (least, most), share in zip(self.parts, self.shares, strict=True):
+            kept = max(least, low), min(most, high)
+            if least == most:
+                weight = share * (low <= least <= high)
+            else:
+                weight = share * (kept[1] - kept[0]) / (most - least)
+            if weight > 0.0:
+                found.append((kept, weight))
+        if not found:
+            raise BadArgument("low", f"{low:g} to {high:g}", f"an interval in which {self} may be")
+        parts = tuple(kept for kept, _ in found)
+        return Distribution(parts, tuple(x for _, x in found) if len(found) > 1 else None)
 
     @checked
     def nodes(self, count: Few) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
