@@ -21,8 +21,9 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from tests.make import run_python
 from torchgrasp import load_grasps, load_scene
-from torchgrasp.app.cli import agents
+from torchgrasp.app.cli import agent_server
 from torchgrasp.app.cli.agent_files import Workplace
 from torchgrasp.app.cli.agent_tools import (
     TOOLS,
@@ -387,12 +388,12 @@ class Noisy(Tool):
 
 def test_what_libraries_print_misses_the_protocol_and_warnings_are_told(folder, capfd):
     place = Workplace.at(folder)
-    answer = agents.do_work(Noisy(), place)
+    answer = agent_server.do_work(Noisy(), place)
     assert plain_answer(answer) == {"notes": ["give viewpoint X Y Z", "the cloud has unit mm"]}
     with pytest.raises(
         GraspError, match=r"ended the work \(ZeroDivisionError\); the standard error"
     ):
-        agents.do_work(Noisy(ZeroDivisionError("secret")), place)
+        agent_server.do_work(Noisy(ZeroDivisionError("secret")), place)
     out, err = capfd.readouterr()
     assert out == "" and err.count("a library prints") == 2
 
@@ -406,12 +407,12 @@ def test_the_command_names_what_is_missing(run_command, folder, monkeypatch):
         with pytest.raises(
             BadArgument, match=r"^--http: expected a port up to 65535, or 0 for any"
         ):
-            agents.bind_port(port)
-    with agents.bind_port(0) as bound:
+            agent_server.bind_port(port)
+    with agent_server.bind_port(0) as bound:
         host, port = bound.getsockname()
         assert host == "127.0.0.1"
         with pytest.raises(BadArgument, match=r"^--http: expected a free port.*in use"):
-            agents.bind_port(port)
+            agent_server.bind_port(port)
 
 
 def test_numbers_of_answers_are_finite_and_short():
@@ -422,3 +423,9 @@ def test_numbers_of_answers_are_finite_and_short():
     close = dataclasses.replace(row, expected=1 / 3)
     plain = plain_answer(dataclasses.replace(answer, changes=(close,)))
     assert plain["changes"][0]["expected"] == 0.333333
+
+
+def test_other_commands_do_not_import_the_tools_of_agents():
+    code = "import sys, torchgrasp.app.cli; print([x for x in sys.modules if 'agent_' in x])"
+    done = run_python("-c", code)
+    assert (done.returncode, done.stdout.strip()) == (0, "[]"), done.stderr

@@ -4,6 +4,7 @@ LeRobot's writer records one episode, without waiting for the clock. The last li
 """
 
 import argparse
+import contextlib
 import json
 import sys
 from pathlib import Path
@@ -30,19 +31,23 @@ def features(robot: TorchgraspHand) -> dict[str, dict[str, Any]]:
 def record(robot: TorchgraspHand, plan: TorchgraspPlan, root: Path, task: str) -> dict[str, Any]:
     """Run the plan on the robot and record it as a data set of one episode; return what happened.
 
-    Raises `BadArgument` if the folder exists.
+    The hand is stopped and disconnected in the end, also after an error. Raises `BadArgument` if the
+    folder exists.
     """
     import numpy as np
 
     if root.exists():
         raise BadArgument("root", root, "a folder that is not there yet")
     fps = robot.config.fps
-    robot.connect()
-    plan.connect()
-    dataset = LeRobotDataset.create(
-        "torchgrasp", fps, features(robot), root=root, robot_type=robot.name, use_videos=False
-    )
-    try:
+    with contextlib.ExitStack() as ends:
+        robot.connect()
+        ends.callback(robot.disconnect)
+        plan.connect()
+        ends.callback(plan.disconnect)
+        dataset = LeRobotDataset.create(
+            "torchgrasp", fps, features(robot), root=root, robot_type=robot.name, use_videos=False
+        )
+        ends.callback(dataset.finalize)
         for _ in range(len(plan.skill)):
             state = robot.get_observation()
             sent = robot.send_action(plan.get_action())
@@ -53,10 +58,6 @@ def record(robot: TorchgraspHand, plan: TorchgraspPlan, root: Path, task: str) -
             dataset.add_frame(frame | {"task": task})
         dataset.save_episode()
         risen = getattr(robot.body, "risen", None)
-    finally:
-        plan.disconnect()
-        robot.disconnect()
-        dataset.finalize()
     return {"frames": len(plan.skill), "fps": fps, "root": str(root), "risen": risen}
 
 
