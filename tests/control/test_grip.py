@@ -242,7 +242,7 @@ def test_what_the_touches_leave_of_the_friction_contains_the_true_one(prior, fri
         noise = 0.2 * 0.4 / force * generator.normal()
         estimate.update(friction * generator.uniform() + noise, force, slides=False)
     low = estimate.held
-    assert 0.8 * friction < low < friction
+    assert 0.7 * friction < low < friction
     kept = Distribution.of(prior)
     if kept.share(low, math.inf):
         assert estimate.posterior == kept.given(low, math.inf)

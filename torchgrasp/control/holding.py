@@ -240,7 +240,7 @@ class FrictionEstimate:
             self.std = max(self.prior.std, FRICTION.least_std)
             self.least = min(self.prior.least, FRICTION.least)
             self.most = max(self.prior.most, FRICTION.most)
-        self.held = 0.0  # largest coefficient that sticking fingertips have shown
+        self.held = 0.0  # lower bound that sticking fingertips have surely shown
         self.slid = False
 
     def update(self, ratio: float, force: float, slides: bool = True) -> None:
@@ -252,8 +252,8 @@ class FrictionEstimate:
         """
         noise = FRICTION.noise * math.hypot(1.0, ratio) / force
         if not slides:
-            self.held = max(self.held, ratio - noise)
-            self.least = max(self.least, self.held)
+            self.held = max(self.held, ratio - FRICTION.sure * noise)
+            self.least = max(self.least, ratio - noise)
             self.mean = max(self.mean, self.least)
         elif ratio + noise > self.least:
             weight = self.std**2 / (self.std**2 + noise**2)
