@@ -21,9 +21,10 @@ from torchgrasp.foundation.errors import BadArgument, MendedInput, NoSupport
 from torchgrasp.foundation.limits import SHOWN_LETTERS
 from torchgrasp.foundation.rules import RIGID, is_rigid, nearest_rotation
 from torchgrasp.foundation.told import warn_user
-from torchgrasp.geometry.linalg import Points, unit
+from torchgrasp.geometry.linalg import Points, Vector, unit
 from torchgrasp.geometry.plane import Plane
-from torchgrasp.geometry.support_planes import SupportPlane, find_table
+from torchgrasp.geometry.plane_fit import PLANES
+from torchgrasp.geometry.support_planes import SupportPlane, Target, find_table
 
 Transform = Float[Tensor, "4 4"]
 UNIT = "depth in metres: depth_unit (--depth-unit) says how many metres a count is"
@@ -66,6 +67,8 @@ class PoseNumbers:
     """Greatest height [m] of a camera above the table if the unit of the depth is assumed."""
     highest: float = 10.0
     """Greatest height [m] of a camera above the table if the unit of the depth is given."""
+    wall: float = 0.5
+    """Cosine between a normal and z below which a plane beside a level support is a wall."""
     tilt: float = 3.0
     """Greatest tilt of a table [deg] that needs no explanation."""
     level: float = 5.0
@@ -215,18 +218,22 @@ def find_plausible(
     table: Plane | float | None,
     up: object,
     known_unit: bool,
+    target: Target | None = None,
 ) -> tuple[SupportPlane, ...]:
     """Return the planes on which objects may stand, the most plausible first.
 
     `points` (n, 3) [m] and the `table`, a plane or a height z [m], are in the frame to which the
     `pose` leads. `up` is the direction against gravity there; with None, planes may face any way,
-    and are compared with z. `known_unit` is whether the user gave the unit of the depth. Raises
+    but level ones, as z of a given pose says, come before walls. `known_unit` is whether the user
+    gave the unit of the depth. Supports that carry the `target` come first. Raises
     `BadArgument` for a pose or a unit that the view contradicts, and `NoSupport` if there is no
     plane.
     """
     eye = pose[:3, 3]
     try:
-        supports = find_table(points, eye, table, up)
+        supports = find_table(points, eye, table, up, target)
+        if table is None and up is None and not _is_own(pose):
+            supports = _level(supports, points, eye, target)
     except NoSupport:
         if table is not None:
             raise
@@ -244,6 +251,23 @@ def find_plausible(
     else:
         _check_given_table(points, supports[0].plane)
     return supports
+
+
+def _level(
+    supports: tuple[SupportPlane, ...], points: Points, eye: Vector, target: Target | None
+) -> tuple[SupportPlane, ...]:
+    """Return the supports without walls, as z of a given pose says; all of them if none is level.
+
+    If the first one is a wall, level ones are sought alone. The arguments are those of
+    `find_table`.
+    """
+    least = math.cos(math.radians(PLANES.most_tilt))
+    if float(supports[0].plane.normal[2]) < least:
+        with contextlib.suppress(NoSupport):
+            supports = find_table(points, eye, None, [0.0, 0.0, 1.0], target)
+    if float(supports[0].plane.normal[2]) < least:
+        return supports
+    return tuple(support for support in supports if float(support.plane.normal[2]) > POSE.wall)
 
 
 def check_view(points: Points, pose: Transform, up: object, known_unit: bool) -> None:

@@ -150,8 +150,11 @@ def fit_planes(view: SeenPoints, generator: torch.Generator) -> Iterator[PlaneFi
         i = int(counts.argmax())
         if int(counts[i]) < 0.5 * PLANES.least_share * len(points):
             break
-        fit = _refine(view, normals[i], float(offsets[i]))
-        yield fit
+        fit = refine_plane(view, normals[i], float(offsets[i]))
+        rough = fit.scale >= PLANES.rough
+        yield (
+            dataclasses.replace(fit, normal=normals[i], offset=float(offsets[i])) if rough else fit
+        )
         beside = (points @ fit.normal - fit.offset).abs() > PLANES.core * noise
         left = left * beside * (1 - held[i])
 
@@ -201,7 +204,7 @@ def _held(
     return held
 
 
-def _refine(view: SeenPoints, normal: Float[Tensor, "3"], offset: float) -> PlaneFit:
+def refine_plane(view: SeenPoints, normal: Float[Tensor, "3"], offset: float) -> PlaneFit:
     """Refine a plane by iterated least squares with Tukey's weights, which change smoothly with the
     points.
     """

@@ -3,6 +3,7 @@
 All points are in one frame, which may be any.
 """
 
+import contextlib
 import dataclasses
 import math
 from collections.abc import Iterator
@@ -17,7 +18,14 @@ from torchgrasp.foundation.errors import BadArgument, NoSupport
 from torchgrasp.foundation.lazy import ndimage, spatial
 from torchgrasp.geometry.linalg import Points, Vector, unit
 from torchgrasp.geometry.plane import Plane, as_plane
-from torchgrasp.geometry.plane_fit import PLANES, PlaneFit, SeenPoints, assume_noise, fit_planes
+from torchgrasp.geometry.plane_fit import (
+    PLANES,
+    PlaneFit,
+    SeenPoints,
+    assume_noise,
+    fit_planes,
+    refine_plane,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,10 +46,34 @@ class SupportNumbers:
     """Most points that the camera sees through a support's region, over the points on it."""
     edge: float = 0.05
     """Border of the region, over its width, through which the camera may see points."""
+    bowed: float = 0.5
+    """Factor on the score of a support that is flat in a small part only."""
+    plausible: float = 0.2
+    """Least score of a support at an angle to the best one, over the best score: a wall has less."""
+    near: float = 0.3
+    """Distance [m] from a target within which its own support is sought if no other carries it."""
+    outliers: float = 0.02
+    """Share of a target's points that may be lower than its foot."""
+    foot: float = 0.03
+    """Greatest depth [m] of a target's foot below its support: masks are a little too large."""
+    overhang: float = 0.05
+    """Greatest distance [m] of a target's points beside the region of its support."""
+    over: float = 0.5
+    """Least share of a target's points over the region of its support."""
+    plain: float = 0.75
+    """Share of a low point's score that is lost if it lies on another plane, perhaps a wall."""
+    bow: float = 0.010
+    """Greatest height [m] of a bowed support above or below the plane under the things on it."""
     low: float = 0.06
     """Height [m] below which points of an object stand close to its support."""
     pierced_cell: float = 0.02
     """Width [m] of the columns in which points above and below a support are counted."""
+    crossed: float = 0.5
+    """Least ratio of points below to points on a plane, in a column in which a surface crosses it."""
+    askew: float = 0.7
+    """Greatest cosine between the normals of a support and a wall beside it."""
+    sag: float = 2.0
+    """Depth of a point below a support, over the tolerance of points on it: dark feet sag less."""
     below: float = 0.2
     """Least ratio of points below to points above a support, in a column that goes through it."""
     most_pierced: float = 0.05
@@ -68,6 +100,10 @@ class SupportNumbers:
     """Width [m] of the cells in which points on a plane are connected."""
     closing: int = 2
     """Cells by which the groups of points grow and shrink again, to close gaps."""
+    gap: float = 0.25
+    """Points below the plane that the camera sees in a cell of a gap, over the usual points of a cell
+    on it.
+    """
     least_part: float = 0.02
     """Least size of a group of points, over the largest group."""
     most_open: float = 0.05
@@ -115,8 +151,30 @@ class SupportPlane:
         return SupportPlane(plane, sides, self.width)
 
 
+@dataclasses.dataclass(frozen=True)
+class Target:
+    """Points (n, 3) [m] of a thing that is to be grasped.
+
+    They begin at most `reach` [m] above its support.
+    """
+
+    points: Points
+    reach: float
+
+    def stands_on(self, support: SupportPlane) -> bool:
+        """Return whether the thing is over the region of a support, and begins at its plane."""
+        height = support.plane.height(self.points)
+        foot = float(height.quantile(SUPPORTS.outliers))
+        over = support.covers(self.points, SUPPORTS.overhang).double().mean()
+        return -SUPPORTS.foot < foot < self.reach and float(over) > SUPPORTS.over
+
+
 def find_table(
-    points: Points, viewpoint: Vector, table: Plane | float | None, up: object
+    points: Points,
+    viewpoint: Vector,
+    table: Plane | float | None,
+    up: object,
+    target: Target | None = None,
 ) -> tuple[SupportPlane, ...]:
     """Return the support on a given table, or all supports found in the points, the most plausible
     first.
@@ -126,6 +184,7 @@ def find_table(
         viewpoint: position (3,) [m] of the camera.
         table: the table as a plane, or its height [m] along z; None to search for supports.
         up: upward direction, three numbers of any length; None if unknown.
+        target: a thing on the support; None if unknown. Supports that carry it come first.
 
     Raises `BadArgument` for a camera below the table, or `up` far from the table's normal;
     `NoSupport` if none is found.
@@ -133,7 +192,7 @@ def find_table(
     plane = as_plane(table)
     direction = None if up is None else torch.as_tensor(up, dtype=torch.float64).cpu()
     if plane is None:
-        return find_supports(points, viewpoint, direction)
+        return _find_under(target, points, viewpoint, direction)
     if direction is not None and float(unit(direction) @ plane.normal.double()) < 0.5:
         allowed = "a direction within 60 degrees of the table's normal"
         raise BadArgument("up", direction.tolist(), allowed)
@@ -145,6 +204,35 @@ def find_table(
     points = points[:: 1 + len(points) // SUPPORTS.points]
     on = plane.height(points).abs() < PLANES.core * assume_noise(points, eye)
     return (bound(plane, points, on, eye) or SupportPlane(plane),)
+
+
+def _find_under(
+    target: Target | None, points: Points, viewpoint: Vector, up: Vector | None
+) -> tuple[SupportPlane, ...]:
+    """Return the supports in a view; those that carry the target first.
+
+    If none does, supports are sought in the surroundings of the target, too. The arguments are those
+    of `find_table`.
+    """
+    if target is None:
+        return find_supports(points, viewpoint, up)
+    missing = None
+    found: tuple[SupportPlane, ...] = ()
+    try:
+        found = find_supports(points, viewpoint, up)
+    except NoSupport as error:
+        missing = error
+    carrying = [support for support in found if target.stands_on(support)]
+    if not carrying:
+        middle = target.points.mean(0)
+        radius = float((target.points - middle).norm(dim=-1).quantile(1 - SUPPORTS.outliers))
+        near = (points - middle).norm(dim=-1) < radius + SUPPORTS.near
+        with contextlib.suppress(NoSupport):
+            local = find_supports(points[near], viewpoint, up)
+            carrying = [support for support in local if target.stands_on(support)]
+    if not found and not carrying and missing is not None:
+        raise missing
+    return (*carrying, *(support for support in found if support not in carrying))
 
 
 def find_supports(
@@ -165,7 +253,9 @@ def find_supports(
     Triples of points propose planes. An iterated fit with Tukey's weights refines each plane.
     Objects stand on a support, over its region, and the camera sees nothing through the region. The
     support with the most points low above it comes first; the points count twice if the camera
-    looks at the support. Of parallel supports, a higher one as wide as furniture comes first. A
+    looks at the support, half if it is bowed, and a quarter if they lie on a wall beside it. Walls
+    beside the first support, on which far fewer points stand, are left out. Of parallel supports, a
+    higher one as wide as furniture comes first. A
     rigid motion of all arguments moves the supports alike. Raises `NoSupport` if there is none.
     """
     points = check_tensor("points", points, (None, 3)).detach().cpu().double()
@@ -182,17 +272,22 @@ def find_supports(
     # The points are centred so that distant origins cost no digits.
     centre = points.mean(0)
     view = SeenPoints(points - centre, None if eye is None else eye - centre, sky)
+    surfaces = [_Surface.of(view, fit) for fit in fit_planes(view, generator)]
     found: list[_Candidate] = []
     reasons: list[str] = []
-    for fit in fit_planes(view, generator):
-        judged = _judge(view, fit.turned_up(view), least_width)
+    for surface in surfaces:
+        judged = _judge(view, surface, surfaces, least_width)
         if isinstance(judged, str):
             reasons.append(judged)
         elif not any(judged.repeats(other) for other in found):
             found.append(judged)
     if not found:
         raise NoSupport("table", reasons[0] if reasons else "no plane with enough points", SUPPORT)
-    return tuple(candidate.support.moved(centre) for candidate in _ordered(found))
+    ordered = _ordered(found)
+    best = ordered[0]
+    least = SUPPORTS.plausible * best.score
+    likely = [one for one in ordered if one.score >= least or one.parallel(best)]
+    return tuple(candidate.support.moved(centre) for candidate in likely)
 
 
 def bound(
@@ -216,9 +311,10 @@ def bound(
     crossing, behind = cross(plane, points, eye)
     # (n, 2), in the plane
     flat = (points[on] - middle) @ axes
+    flat = flat[~_crossed((points - middle) @ axes, on, plane.height(points))[on]]
     lower = (crossing[behind & ~on] - middle) @ axes
     region = None
-    for part in _parts(flat):
+    for part in _parts(flat, lower):
         if region is None:
             region = Hull.of(part)
             continue
@@ -231,6 +327,20 @@ def bound(
     outward = region.sides[:, :2] @ axes.T
     offset = region.sides[:, 2] - outward @ middle
     return SupportPlane(plane, torch.cat([outward, offset[:, None]], -1), region.width)
+
+
+def _crossed(
+    flat: Float[Tensor, "n 2"], on: Bool[Tensor, "n"], height: Float[Tensor, "n"]
+) -> Bool[Tensor, "n"]:
+    """Return a mask of the points in narrow columns in which a surface goes on below a plane.
+
+    There the plane cuts a wall or a bed, or ends. `flat` holds the place of each point in the plane
+    [m], `height` is that above it [m], and the points `on` lie on it.
+    """
+    cells = torch.floor(flat / SUPPORTS.pierced_cell).long().unique(dim=0, return_inverse=True)[1]
+    below = ~on & (height < 0) & (height > -SUPPORTS.low)
+    lower = torch.bincount(cells, below.double())
+    return (lower > SUPPORTS.crossed * torch.bincount(cells, on.double()))[cells]
 
 
 def _axes(normal: Vector, points: Points) -> Float[Tensor, "3 2"]:
@@ -273,19 +383,30 @@ class Hull:
         return -float((self.corners @ self.sides[:, :2].T + self.sides[:, 2]).amin(0).amax())
 
 
-def _parts(flat: Float[Tensor, "n 2"]) -> Iterator[Float[Tensor, "m 2"]]:
+def _parts(
+    flat: Float[Tensor, "n 2"], lower: Float[Tensor, "k 2"]
+) -> Iterator[Float[Tensor, "m 2"]]:
     """Yield the connected groups of points in a plane, the largest first, without narrow strips and
     specks.
+
+    `lower` are the places at which rays to points below the plane cross it: groups do not connect
+    where they fill the cells of a gap.
     """
     cells = torch.floor(flat / SUPPORTS.cell).long()
     # Groups grow into the empty cells at the border.
     border = SUPPORTS.closing + 1
-    cells = cells - cells.amin(0) + border
+    first = cells.amin(0) - border
+    cells = cells - first
     place = tuple(cells.T.numpy())
     grid = np.zeros((cells.amax(0) + border + 1).tolist(), dtype=bool)
     grid[place] = True
     box = np.ones((3, 3))
     closed = ndimage.binary_closing(grid, box, iterations=SUPPORTS.closing)
+    gaps = torch.floor(lower / SUPPORTS.cell).long() - first
+    gaps = gaps[((gaps >= 0) & (gaps < torch.tensor(grid.shape))).all(-1)]
+    seen = np.zeros(grid.shape)
+    np.add.at(seen, tuple(gaps.T.numpy()), 1)
+    closed &= grid | (seen <= SUPPORTS.gap * len(flat) / grid.sum())
     labels = np.empty(grid.shape, dtype=np.int32)
     ndimage.label(ndimage.binary_opening(closed, box), output=labels)
     own = torch.from_numpy(labels[place]).long()
@@ -343,13 +464,78 @@ def _ordered(found: list[_Candidate]) -> list[_Candidate]:
     return found
 
 
-def _judge(view: SeenPoints, fit: PlaneFit, least_width: float) -> _Candidate | str:
-    """Return the candidate support on a fitted plane, or as text the reason why the plane supports
-    nothing.
+def _refit(view: SeenPoints, fit: PlaneFit) -> PlaneFit:
+    """Return a rough plane fitted again, to the largest group of points on it: without this, walls
+    that a small or bowed support cuts turn its plane away.
+    """
+    height = view.points @ fit.normal - fit.offset
+    on = height.abs() < PLANES.core * view.noise
+    plane = Plane(fit.normal, fit.offset)
+    support = bound(plane, view.points, on, view.eye)
+    if support is None:
+        return fit
+    own = support.covers(view.points) & (height.abs() < SUPPORTS.bow)
+    part = SeenPoints(view.points[own], view.eye, view.sky)
+    return refine_plane(part, fit.normal, fit.offset)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Surface:
+    """A plane that was fitted to a view, the points on it, and its region.
+
+    `height` [m] is that of each point of the view, `tolerance` [m] the greatest height of a point on
+    the plane, above or below. `support` is None without a flat region; `bowed` tells that the plane
+    was fitted to a part of the points alone.
+    """
+
+    fit: PlaneFit
+    height: Float[Tensor, "n"]
+    tolerance: Float[Tensor, "n"]
+    support: SupportPlane | None
+    bowed: bool
+
+    @classmethod
+    def of(cls, view: SeenPoints, fit: PlaneFit) -> "_Surface":
+        """Return the surface of a fit, its normal turned to the upper side."""
+        bowed = fit.scale >= PLANES.rough
+        fit = (_refit(view, fit) if bowed else fit).turned_up(view)
+        height = view.points @ fit.normal - fit.offset
+        tolerance = SUPPORTS.thickness * fit.scale * view.noise + SUPPORTS.least_thickness
+        if bowed:
+            tolerance = tolerance.clamp_max(SUPPORTS.bow)
+        flat = fit.scale < PLANES.rough and fit.count >= PLANES.least_share * len(height)
+        plane = Plane(fit.normal, fit.offset)
+        support = bound(plane, view.points, height.abs() < tolerance, view.eye) if flat else None
+        return cls(fit, height, tolerance, support, bowed)
+
+    @property
+    def on(self) -> Bool[Tensor, "n"]:
+        """Mask of the points on the plane."""
+        return self.height.abs() < self.tolerance
+
+    def beside(self, other: "_Surface") -> bool:
+        """Return whether this surface is at an angle to another one, as a wall to a table."""
+        return abs(float(self.fit.normal @ other.fit.normal)) < SUPPORTS.askew
+
+    @property
+    def width(self) -> float:
+        """The least width [m] of the region."""
+        return 0.0 if self.support is None else self.support.width
+
+
+def _judge(
+    view: SeenPoints, surface: _Surface, surfaces: list[_Surface], least_width: float
+) -> _Candidate | str:
+    """Return the candidate support on a surface, or as text the reason why it supports nothing.
+
+    Of the other `surfaces`, those of furniture do not stand on it.
     """
     points = view.points
-    height = points @ fit.normal - fit.offset
-    tolerance = SUPPORTS.thickness * fit.scale * view.noise + SUPPORTS.least_thickness
+    fit = surface.fit
+    height = surface.height
+    tolerance = surface.tolerance
+    on = surface.on
+    plane = Plane(fit.normal, fit.offset)
     share = fit.count / len(points)
     if share < PLANES.least_share:
         return f"no plane with more than {share:.1%} of the points"
@@ -358,10 +544,8 @@ def _judge(view: SeenPoints, fit: PlaneFit, least_width: float) -> _Candidate | 
     level = math.cos(math.radians(PLANES.most_tilt))
     if view.sky is not None and float(fit.normal @ view.sky) < level:
         return f"no plane within {PLANES.most_tilt:g} degrees of level"
-    on = height.abs() < tolerance
-    plane = Plane(fit.normal, fit.offset)
-    support = bound(plane, points, on, view.eye)
-    width = 0.0 if support is None else support.width
+    support = surface.support
+    width = surface.width
     if support is None or width < least_width:
         return f"a flat face about {width:.2f} m wide"
     middle = points[on & support.covers(points)].mean(0)
@@ -382,8 +566,14 @@ def _judge(view: SeenPoints, fit: PlaneFit, least_width: float) -> _Candidate | 
     above = height > tolerance
     over = above & (height < PLANES.reach) & support.covers(points, -inner)
     low = above & (height < SUPPORTS.low)
+    plain = torch.zeros_like(low)
+    for other in surfaces:
+        if other.beside(surface) and other.width > SUPPORTS.furniture:
+            low &= ~other.on
+        if other.beside(surface) and other.width > least_width:
+            plain |= other.on
     standing = low & over
-    below = (-height > tolerance) & (-height < SUPPORTS.low)
+    below = (-height > SUPPORTS.sag * tolerance) & (-height < SUPPORTS.low)
     columns = torch.floor(points @ _axes(fit.normal, points) / SUPPORTS.pierced_cell).long()
     cells = columns.unique(dim=0, return_inverse=True)[1]
     pierced = torch.bincount(cells, below.double()) > SUPPORTS.below * torch.bincount(
@@ -398,7 +588,9 @@ def _judge(view: SeenPoints, fit: PlaneFit, least_width: float) -> _Candidate | 
     if feet < max(least, SUPPORTS.least_low * int(low.sum())):
         return f"{told} and nothing that stands on it"
     favour = SUPPORTS.favour if _looked_at(view, fit, support) else 1.0
-    return _Candidate(support, count * favour, middle)
+    favour *= SUPPORTS.bowed if surface.bowed else 1.0
+    score = count - SUPPORTS.plain * int((standing & plain).sum())
+    return _Candidate(support, score * favour, middle)
 
 
 def _looked_at(view: SeenPoints, fit: PlaneFit, support: SupportPlane) -> bool:

@@ -15,7 +15,7 @@ from torchgrasp.foundation.lazy import ndimage
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.support_planes import SupportPlane
 from torchgrasp.scene.image import IMAGE, DepthImage
-from torchgrasp.scene.segment import count_labels, rests_on, segment
+from torchgrasp.scene.segment import count_labels, may_be_own, rests_on, segment
 from torchgrasp.scene.table_image import TableImage
 
 
@@ -217,7 +217,7 @@ def label_image(
     objects = segment(view)
     if mask is None:
         return objects, ()
-    inside = mask & rests_on(view)
+    inside = mask & may_be_own(view)
     # objects that the mask shows, or that fill much of it, belong to the target
     length = int(objects.max()) + 1
     whole = count_labels(objects, length)
@@ -234,10 +234,12 @@ def label_image(
         raise BadArgument("mask", found, least)
     rest = _dense(_beside(objects, target, mask, belongs))
     low = mask & ~inside & _on_support(view)
+    flying = mask & ~inside & view.measured & ~low
     strips = inside & ~target
     notes = [
         *_removed("mask", int(low.sum()), seen),
         *_removed("mask", int(strips.sum()), seen, "another object"),
+        *_removed("mask", int(flying.sum()), seen, "no surface, between near and far ones,"),
     ]
     return torch.where(target, 1, torch.where(rest > 0, rest + 1, 0)), tuple(notes)
 
@@ -248,7 +250,7 @@ def _trim_labels(
     """Return given labels without pixels on the table and flying pixels, and a note on each label
     that loses many.
     """
-    kept = torch.where(rests_on(view), labels, 0)
+    kept = torch.where(may_be_own(view), labels, 0)
     if not bool((kept > 0).any()):
         raise BadArgument(
             "labels", "none that rises above the table", "labels of objects on the table"
@@ -281,7 +283,7 @@ def label_again(
     view = TableImage.of(image, support)
     before = TableImage(image, view.points, SupportPlane(former))
     own = torch.isin(labels, torch.tensor(given, dtype=torch.long))
-    kept = torch.where(own & rests_on(view), labels, 0)
+    kept = torch.where(own & may_be_own(view), labels, 0)
     found = segment(view)
     seen = rests_on(before)
     width = int(found.max()) + 1

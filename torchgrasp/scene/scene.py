@@ -16,8 +16,9 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Pose, Positive
 from torchgrasp.geometry.frames import inverse
+from torchgrasp.geometry.linalg import Points
 from torchgrasp.geometry.plane import Plane, to_upright
-from torchgrasp.geometry.support_planes import find_table
+from torchgrasp.geometry.support_planes import Target, find_table
 from torchgrasp.scene.creases import cut_creases
 from torchgrasp.scene.image import DepthImage, image_of_cloud, read_image
 from torchgrasp.scene.masks import label_image, read_labels, read_mask
@@ -40,6 +41,8 @@ class SceneNumbers:
     """Share of an object's pixels beyond a crease that may be another object."""
     lowest: float = 0.02
     """Share of a target's points that may be lower than its foot: outliers."""
+    drawn: int = 2000
+    """Most points of a target whose place on a support is judged."""
     afloat: float = 0.15
     """Greatest distance [m] of a target's foot from its table without a note: things in front of
     the target hide less.
@@ -133,7 +136,12 @@ class Scene(Value):
         points = image.points()
         measured = image.depth > 0
         supports = find_plausible(
-            points[measured], image.obj_from_camera, table, up, depth_unit is not None
+            points[measured],
+            image.obj_from_camera,
+            table,
+            up,
+            depth_unit is not None,
+            _target(points[measured], None if inside is None else inside[measured]),
         )
         found, notes = label_image(TableImage(image, points, supports[0]), given, inside)
         if table is None and depth_unit is None:
@@ -202,7 +210,7 @@ class Scene(Value):
             raise BadArgument(
                 "mask" if box is None else "box", "no point inside", "one that holds the target"
             )
-        supports = find_table(points, viewpoint, table, up)
+        supports = find_table(points, viewpoint, table, up, _target(points, inside))
         planes = tuple(support.plane for support in supports)
         image, pixels = image_of_cloud(points, viewpoint, planes[0].normal.double())
         row, column = pixels.unbind(-1)
@@ -393,3 +401,11 @@ class Scene(Value):
             table=None if self.table is None else Plane.horizontal(0.0),
             others=(),
         )
+
+
+def _target(points: Points, inside: Tensor | None) -> Target | None:
+    """Return the target that a mask shows, `inside` (n,) of the `points` (n, 3) [m], or None."""
+    if inside is None or not bool(inside.any()):
+        return None
+    own = points[inside]
+    return Target(own[:: 1 + len(own) // SCENE.drawn], SCENE.afloat)

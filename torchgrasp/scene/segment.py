@@ -140,15 +140,33 @@ def _risen(view: TableImage) -> Bool[Tensor, "h w"]:
     return smooth.measured & (view.mean_height > least) & (smooth.height > SEGMENT.own * least)
 
 
+def may_be_own(view: TableImage) -> Bool[Tensor, "h w"]:
+    """Return a mask of the pixels above the table that a user may give as those of an object.
+
+    They are the pixels of `rests_on`, and those of bars too thin for it. Flying pixels, between a
+    nearer and a farther surface, are left out.
+    """
+    before_jump, behind_jump = _jumps(view.smooth)
+    return rests_on(view) | (_risen(view) & ~(before_jump & behind_jump))
+
+
 def _core(smooth: TableImage, risen: Tensor) -> Bool[Tensor, "h w"]:
     """Return a mask of pixels above the table and away from depth jumps."""
+    before_jump, behind_jump = _jumps(smooth)
+    return risen & ~(before_jump | behind_jump)
+
+
+def _jumps(smooth: TableImage) -> tuple[Bool[Tensor, "h w"], Bool[Tensor, "h w"]]:
+    """Return masks of the pixels beside which depth jumps back, and of those beside which it jumps
+    forward.
+    """
     depth = smooth.image.depth
     behind = torch.where(smooth.measured, depth, 0.0).numpy()
     # where nothing was measured, all is far away
     before = torch.where(smooth.measured, depth, 100.0).numpy()
     farthest = torch.from_numpy(ndimage.maximum_filter(behind, 3))
     nearest = torch.from_numpy(ndimage.minimum_filter(before, 3))
-    return risen & ~((farthest - depth > smooth.jump) | (depth - nearest > smooth.jump))
+    return farthest - depth > smooth.jump, depth - nearest > smooth.jump
 
 
 def _components(smooth: TableImage, core: Tensor) -> Int[Tensor, "h w"]:
