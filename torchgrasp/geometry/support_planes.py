@@ -3,7 +3,6 @@
 All points are in one frame, which may be any.
 """
 
-import contextlib
 import dataclasses
 import math
 from collections.abc import Iterator
@@ -42,7 +41,7 @@ class SupportNumbers:
     """Greatest distance of a point on a support, over its noise."""
     least_thickness: float = 0.001
     """Distance [m] that is added to the noise: a table is not quite flat."""
-    most_through: float = 0.1
+    most_through: float = 0.15
     """Most points that the camera sees through a support's region, over the points on it."""
     edge: float = 0.05
     """Border of the region, over its width, through which the camera may see points."""
@@ -50,8 +49,14 @@ class SupportNumbers:
     """Factor on the score of a support that is flat in a small part only."""
     plausible: float = 0.2
     """Least score of a support at an angle to the best one, over the best score: a wall has less."""
-    near: float = 0.3
+    margin: float = 0.1
+    """Distance [m] beside a bowed support at which its surface may not go on at another height."""
+    most_away: float = 0.5
+    """Most points there near the plane but not on it, over those on the support."""
+    near: float = 0.08
     """Distance [m] from a target within which its own support is sought if no other carries it."""
+    shallow: float = 0.01
+    """Greatest depth [m] of the target's foot below that support: its own top is no support."""
     outliers: float = 0.02
     """Share of a target's points that may be lower than its foot."""
     foot: float = 0.03
@@ -128,6 +133,9 @@ class SupportPlane:
     # with u . p + o < 0 for points p within; None: the region is unbounded
     sides: Float[Tensor, "s 4"] | None = None
     width: float = math.inf  # least width of the region [m]
+    local: bool = (
+        False  # whether it is bowed or small, so that the plane holds near its region only
+    )
 
     def covers(self, points: Float[Tensor, "*b 3"], margin: float = 0.0) -> Bool[Tensor, "*b"]:
         """Return a mask of the points [m] over the region, or at most `margin` [m] beside it.
@@ -148,7 +156,7 @@ class SupportPlane:
         sides = self.sides
         if sides is not None:
             sides = torch.cat([sides[:, :3], sides[:, 3:] - sides[:, :3] @ shift[:, None]], -1)
-        return SupportPlane(plane, sides, self.width)
+        return dataclasses.replace(self, plane=plane, sides=sides)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -211,8 +219,8 @@ def _find_under(
 ) -> tuple[SupportPlane, ...]:
     """Return the supports in a view; those that carry the target first.
 
-    If none does, supports are sought in the surroundings of the target, too. The arguments are those
-    of `find_table`.
+    If none does, a plane under the target is sought close to it, too. The arguments are those of
+    `find_table`.
     """
     if target is None:
         return find_supports(points, viewpoint, up)
@@ -224,15 +232,40 @@ def _find_under(
         missing = error
     carrying = [support for support in found if target.stands_on(support)]
     if not carrying:
-        middle = target.points.mean(0)
-        radius = float((target.points - middle).norm(dim=-1).quantile(1 - SUPPORTS.outliers))
-        near = (points - middle).norm(dim=-1) < radius + SUPPORTS.near
-        with contextlib.suppress(NoSupport):
-            local = find_supports(points[near], viewpoint, up)
-            carrying = [support for support in local if target.stands_on(support)]
+        carrying = _support_near(target, points.double().cpu(), viewpoint.double().cpu(), up)
     if not found and not carrying and missing is not None:
         raise missing
     return (*carrying, *(support for support in found if support not in carrying))
+
+
+def _support_near(
+    target: Target, points: Points, eye: Vector, up: Vector | None
+) -> list[SupportPlane]:
+    """Return the plane on which a target stands among the `points` [m] close to it, in a list; an
+    empty list without one.
+
+    A bowed or soft support has such a plane, although no plane holds its whole surface.
+    """
+    middle = target.points.mean(0)
+    radius = float((target.points - middle).norm(dim=-1).quantile(1 - SUPPORTS.outliers))
+    points = points[(points - middle).norm(dim=-1) < radius + SUPPORTS.near]
+    generator = torch.Generator().manual_seed(0)
+    drawn = torch.randperm(len(points), generator=generator, device="cpu")[: SUPPORTS.points]
+    if len(drawn) < SUPPORTS.least_points:
+        return []
+    view = SeenPoints(
+        points[drawn] - middle, eye - middle, None if up is None else unit(up.double().cpu())
+    )
+    near = dataclasses.replace(target, points=target.points - middle)
+    for fit in fit_planes(view, generator):
+        surface = _Surface.of(view, fit)
+        support = surface.support
+        if support is None or not near.stands_on(support):
+            continue
+        deep = surface.height < -SUPPORTS.shallow - surface.tolerance
+        if float((deep & support.covers(view.points)).double().mean()) < SUPPORTS.outliers:
+            return [dataclasses.replace(support, local=True).moved(middle)]
+    return []
 
 
 def find_supports(
@@ -506,6 +539,8 @@ class _Surface:
         flat = fit.scale < PLANES.rough and fit.count >= PLANES.least_share * len(height)
         plane = Plane(fit.normal, fit.offset)
         support = bound(plane, view.points, height.abs() < tolerance, view.eye) if flat else None
+        if support is not None:
+            support = dataclasses.replace(support, local=bowed)
         return cls(fit, height, tolerance, support, bowed)
 
     @property
@@ -548,7 +583,13 @@ def _judge(
     width = surface.width
     if support is None or width < least_width:
         return f"a flat face about {width:.2f} m wide"
-    middle = points[on & support.covers(points)].mean(0)
+    own = on & support.covers(points)
+    middle = points[own].mean(0)
+    if surface.bowed:
+        beside = support.covers(points, SUPPORTS.margin) & ~support.covers(points)
+        away = beside & ~on & (height.abs() < SUPPORTS.low)
+        if int(away.sum()) > SUPPORTS.most_away * int(own.sum()):
+            return "a part of a surface that bends away"
     # Without a camera, no object hides its feet.
     steep = False
     if view.eye is not None:
@@ -564,14 +605,14 @@ def _judge(
         return f"{told}, but {through / len(points):.0%} of them below it"
     # Low points of an object are over the plane's own region. A pan's rim is not over its floor.
     above = height > tolerance
-    over = above & (height < PLANES.reach) & support.covers(points, -inner)
-    low = above & (height < SUPPORTS.low)
-    plain = torch.zeros_like(low)
+    plain = torch.zeros_like(above)
     for other in surfaces:
         if other.beside(surface) and other.width > SUPPORTS.furniture:
-            low &= ~other.on
+            above &= ~other.on
         if other.beside(surface) and other.width > least_width:
             plain |= other.on
+    over = above & (height < PLANES.reach) & support.covers(points, -inner)
+    low = above & (height < SUPPORTS.low)
     standing = low & over
     below = (-height > SUPPORTS.sag * tolerance) & (-height < SUPPORTS.low)
     columns = torch.floor(points @ _axes(fit.normal, points) / SUPPORTS.pierced_cell).long()

@@ -50,6 +50,9 @@ class SceneNumbers:
 
 
 SCENE = SceneNumbers()
+LOCAL = (
+    "the support is bowed or small: its plane was fitted to a part of it, and holds near that part"
+)
 
 
 @checked
@@ -150,6 +153,8 @@ class Scene(Value):
             )
         if table is None:
             notes += tell_furniture(points[measured], found[measured])
+        if supports[0].local:
+            notes += (LOCAL,)
         if table is None and up is None:
             notes += tell_tilt(image.obj_from_camera, supports[0].plane)
         pixels = torch.nonzero(measured)
