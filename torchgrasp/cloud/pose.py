@@ -413,7 +413,7 @@ def tell_furniture(points: Points, labels: Tensor) -> tuple[str, ...]:
             longest = max(longest, float((high - low).norm()))
     if longest < SIZES.furniture:
         return ()
-    fix = "is the table a wall or the floor? Give the table, or up"
+    fix = "if the table is wrong, too, give it, or up"
     return (f"an object is {longest:.1f} m long, as furniture or a wall: {fix}",)
 
 

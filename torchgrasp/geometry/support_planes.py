@@ -41,7 +41,7 @@ class SupportNumbers:
     """Greatest distance of a point on a support, over its noise."""
     least_thickness: float = 0.001
     """Distance [m] that is added to the noise: a table is not quite flat."""
-    most_through: float = 0.15
+    most_through: float = 0.2
     """Most points that the camera sees through a support's region, over the points on it."""
     edge: float = 0.05
     """Border of the region, over its width, through which the camera may see points."""
@@ -263,7 +263,10 @@ def _support_near(
         if support is None or not near.stands_on(support):
             continue
         deep = surface.height < -SUPPORTS.shallow - surface.tolerance
-        if float((deep & support.covers(view.points)).double().mean()) < SUPPORTS.outliers:
+        below = float((deep & support.covers(view.points)).double().mean())
+        # its own face holds most of the target
+        face = support.plane.height(near.points).abs() < surface.tolerance.median()
+        if below < SUPPORTS.outliers and 2 * int(face.sum()) < len(face):
             return [dataclasses.replace(support, local=True).moved(middle)]
     return []
 

@@ -6,6 +6,8 @@ import dataclasses
 from collections.abc import Iterator
 from typing import Any
 
+import torch
+
 from torchgrasp.foundation.errors import Status
 from torchgrasp.hand.load import hands_folder, load_hand
 from torchgrasp.planner.objects import take_target
@@ -29,6 +31,10 @@ class ChangeNumbers:
     """Largest angles [rad] between the normals at a contact and on a ring around it."""
     margins: tuple[float, ...] = (0.5, 1.0)
     """Values of `friction_margin`: shares of the friction that are planned with."""
+    compared: int = 1000
+    """Most points of an object whose distances to the target are computed."""
+    beside: float = 0.15
+    """Distance [m] from the target within which an object is its neighbour: the reach of a finger."""
 
 
 CHANGES = ChangeNumbers()
@@ -176,6 +182,20 @@ def _friction(request: Request) -> Iterator[Change]:
         yield Change(words, False, OPEN, _with(request, friction=friction))
 
 
+def _surrounding(scene: Scene) -> str:
+    """Return what stands around a target: objects near it, or else what is no object."""
+    own = scene.points[scene.rows_of()]
+    near = []
+    for label in scene.things:
+        other = scene.points[scene.labels == label]
+        some = [part[:: 1 + len(part) // CHANGES.compared] for part in (own, other)]
+        if label != scene.target and float(torch.cdist(*some).min()) < CHANGES.beside:
+            near.append(str(label))
+    if not near:
+        return "what is no object (a wall, or furniture beside it)"
+    return f"its neighbours ({'object' if len(near) == 1 else 'objects'} {', '.join(near)})"
+
+
 def _surroundings(request: Request) -> Iterator[Change]:
     """Yield changes of the surroundings: another table, no neighbours, an arm that reaches every
     pose.
@@ -193,7 +213,8 @@ def _surroundings(request: Request) -> Iterator[Change]:
         alone = dataclasses.replace(
             _with(request, table=table), cloud=take_target(cloud, request.seed)
         )
-        yield Change("if its neighbours were taken away first", False, crowded, alone, refit=True)
+        words = f"if {_surrounding(cloud)} were taken away first"
+        yield Change(words, False, crowded, alone, refit=True)
     elif spec.table is not None:
         words = "if no table were in the way, as on a narrow stand"
         yield Change(
