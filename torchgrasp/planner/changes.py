@@ -184,13 +184,16 @@ def _friction(request: Request) -> Iterator[Change]:
 
 def _surrounding(scene: Scene) -> str:
     """Return what stands around a target: objects near it, or else what is no object."""
-    own = scene.points[scene.rows_of()]
-    near = []
+    some = {}
     for label in scene.things:
-        other = scene.points[scene.labels == label]
-        some = [part[:: 1 + len(part) // CHANGES.compared] for part in (own, other)]
-        if label != scene.target and float(torch.cdist(*some).min()) < CHANGES.beside:
-            near.append(str(label))
+        part = scene.points[scene.labels == label]
+        some[label] = part[:: 1 + len(part) // CHANGES.compared]
+    own = some.pop(scene.target or 0)
+    near = [
+        str(label)
+        for label, other in some.items()
+        if float(torch.cdist(own, other).min()) < CHANGES.beside
+    ]
     if not near:
         return "what is no object (a wall, or furniture beside it)"
     return f"its neighbours ({'object' if len(near) == 1 else 'objects'} {', '.join(near)})"

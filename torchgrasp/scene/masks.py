@@ -217,7 +217,7 @@ def label_image(
     objects = segment(view)
     if mask is None:
         return objects, ()
-    inside = mask & may_be_own(view)
+    inside = mask & _on_objects(view, mask.long())
     # objects that the mask shows, or that fill much of it, belong to the target
     length = int(objects.max()) + 1
     whole = count_labels(objects, length)
@@ -250,7 +250,7 @@ def _trim_labels(
     """Return given labels without pixels on the table and flying pixels, and a note on each label
     that loses many.
     """
-    kept = torch.where(may_be_own(view), labels, 0)
+    kept = torch.where(_on_objects(view, labels), labels, 0)
     if not bool((kept > 0).any()):
         raise BadArgument(
             "labels", "none that rises above the table", "labels of objects on the table"
@@ -283,7 +283,7 @@ def label_again(
     view = TableImage.of(image, support)
     before = TableImage(image, view.points, SupportPlane(former))
     own = torch.isin(labels, torch.tensor(given, dtype=torch.long))
-    kept = torch.where(own & may_be_own(view), labels, 0)
+    kept = torch.where(own & _on_objects(view, labels), labels, 0)
     found = segment(view)
     seen = rests_on(before)
     width = int(found.max()) + 1
@@ -316,6 +316,19 @@ def _beside(objects: Tensor, target: Tensor, mask: Tensor, belongs: Tensor) -> I
     rest = torch.where(target | (about & belongs[objects]), 0, objects)
     few = count_labels(rest, len(belongs)) < IMAGE.least_pixels
     return torch.where(few[rest], 0, rest)
+
+
+def _on_objects(view: TableImage, labels: Int[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
+    """Return a mask of the pixels on the surface of an object.
+
+    Labels that lose many pixels at jumps of depth are those of thin bars, and keep more.
+    """
+    sure = rests_on(view)
+    names, own = labels.unique(return_inverse=True)
+    at_jumps = view.measured & ~sure & ~_on_support(view)
+    lost = count_labels(own[at_jumps], len(names))
+    thin = lost > MASKS.told * count_labels(own[view.measured], len(names))
+    return sure | (thin[own] & may_be_own(view))
 
 
 def _on_support(view: TableImage) -> Bool[Tensor, "h w"]:
