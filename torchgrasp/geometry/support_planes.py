@@ -41,8 +41,10 @@ class SupportNumbers:
     """Greatest distance of a point on a support, over its noise."""
     least_thickness: float = 0.001
     """Distance [m] that is added to the noise: a table is not quite flat."""
-    most_through: float = 0.2
+    most_through: float = 0.1
     """Most points that the camera sees through a support's region, over the points on it."""
+    slats: float = 0.5
+    """Least points on a support, over those seen through it, in a cell that is no hole."""
     edge: float = 0.05
     """Border of the region, over its width, through which the camera may see points."""
     bowed: float = 0.5
@@ -584,7 +586,8 @@ def _judge(
         return f"no plane within {PLANES.most_tilt:g} degrees of level"
     support = surface.support
     width = surface.width
-    if support is None or width < least_width:
+    # a narrower round face belongs to an object
+    if support is None or width < (SUPPORTS.furniture if surface.bowed else least_width):
         return f"a flat face about {width:.2f} m wide"
     own = on & support.covers(points)
     middle = points[own].mean(0)
@@ -602,7 +605,14 @@ def _judge(
         steep = sine > SUPPORTS.steep
     inner = SUPPORTS.edge * width
     crossing, behind = cross(plane, points, view.eye)
-    through = int((behind & (height < -tolerance) & support.covers(crossing, -inner)).sum())
+    seen = behind & (height < -tolerance) & support.covers(crossing, -inner)
+    # slats show what is behind them beside points of their own
+    cells = torch.floor(crossing @ _axes(fit.normal, points) / SUPPORTS.cell).long()
+    cells = cells.unique(dim=0, return_inverse=True)[1]
+    beside = torch.bincount(cells, on.double()) > SUPPORTS.slats * torch.bincount(
+        cells, seen.double()
+    )
+    through = int((seen & ~beside[cells]).sum())
     told = f"a plane with {share:.0%} of the points"
     if through > SUPPORTS.most_through * fit.count:
         return f"{told}, but {through / len(points):.0%} of them below it"
