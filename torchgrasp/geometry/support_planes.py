@@ -350,6 +350,8 @@ def bound(
     # (n, 2), in the plane
     flat = (points[on] - middle) @ axes
     flat = flat[~_crossed((points - middle) @ axes, on, plane.height(points))[on]]
+    if len(flat) < 3:
+        return None
     lower = (crossing[behind & ~on] - middle) @ axes
     region = None
     for part in _parts(flat, lower):
@@ -513,6 +515,8 @@ def _refit(view: SeenPoints, fit: PlaneFit) -> PlaneFit:
     if support is None:
         return fit
     own = support.covers(view.points) & (height.abs() < SUPPORTS.bow)
+    if int(own.sum()) < SUPPORTS.least_points:
+        return fit
     part = SeenPoints(view.points[own], view.eye, view.sky)
     return refine_plane(part, fit.normal, fit.offset)
 
