@@ -20,6 +20,7 @@ from torchgrasp.shape.fit import fit_shape
 from torchgrasp.success.body import EstimatedBody
 from torchgrasp.success.features import FEATURES, measure_grasps
 from torchgrasp.success.model import SuccessModel
+from torchgrasp.success.task import Conditions
 from torchgrasp.values.planning import Grasps, PointCloud
 from train.trials import BEST, SPREAD, Trial, read_rows
 
@@ -106,9 +107,9 @@ def measure_job(hand: Hand, cloud: PointCloud, grasps: Grasps, trials: list[Tria
     beside = np.full((n, BEST + SPREAD, len(FEATURES)), np.nan)
     for k, trial in enumerate(trials):
         task = trial.task.known
-        friction = trial.task.friction
+        conditions = Conditions.of(trial.task.friction, task.mass)
         lifted = trial.task.lift
-        beside[k, :n] = measure_grasps(hand, body, grasps, friction, task, lifted).numpy()
+        beside[k, :n] = measure_grasps(hand, body, grasps, conditions, task, lifted)[0].numpy()
     place = np.arange(n)
     return Trials(
         features=beside[place, place],

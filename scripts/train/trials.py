@@ -43,6 +43,7 @@ from torchgrasp.success.body import EstimatedBody
 from torchgrasp.success.features import measure_grasps
 from torchgrasp.success.model import MODEL, load_success_model
 from torchgrasp.success.order import is_covered
+from torchgrasp.success.task import Conditions
 from torchgrasp.values.planning import Grasps, PointCloud
 from torchgrasp.values.specs import ContactSpec
 from train.household import CALIBRATING, FAMILIES, HouseholdBody, author_household, family_of
@@ -251,7 +252,8 @@ def best_for(tasks: Sequence[Task], hand: Hand, shape: ShapeGP, grasps: Grasps) 
     body = EstimatedBody.of(shape)
     best = list[int]()
     for task in tasks:
-        features = measure_grasps(hand, body, grasps, task.friction, task.known, task.lift)
+        conditions = Conditions.of(task.friction, task.known.mass)
+        features = measure_grasps(hand, body, grasps, conditions, task.known, task.lift)[0]
         best.append(
             int(
                 load_success_model()

@@ -73,7 +73,7 @@ def test_the_likelier_success_ranks_first_and_failures_stay_last(run):
     assert bool((scores[:-1] >= scores[1:]).all())
     good = int((grasps.status == Status.OK).sum())
     odds = torch.randn(good, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    ranked = by_success(grade(grasps, odds, torch.ones(good, dtype=torch.bool)))
+    ranked = by_success(grade(grasps, odds, torch.ones(good, dtype=torch.float64)))
     assert torch.equal(ranked.score[:good], odds.sort(descending=True).values.to(grasps.score))
     assert bool((ranked.status[:good] == Status.OK).all()) and not bool(
         (ranked.status[good:] == Status.OK).any()
@@ -85,7 +85,7 @@ def test_the_likelier_success_ranks_first_and_failures_stay_last(run):
 def test_success_is_what_the_model_says_of_the_features_that_an_explanation_measures_again(run):
     hand, grasps, stages = run
     best = grasps[grasps.status == Status.OK][:5]
-    odds = load_success_model().log_odds(measure_again(best, hand, stages["shape"], GraspTask()))
+    odds = load_success_model().log_odds(measure_again(best, hand, stages["shape"], GraspTask())[0])
     torch.testing.assert_close(best.success, torch.sigmoid(odds), rtol=1e-6, atol=1e-6)
     near(best.interval, load_success_model().interval(odds), 1e-6)
 
@@ -97,7 +97,7 @@ def test_a_task_changes_the_predictions_and_not_the_grasps(task):
     note = lambda stage, text, value: shapes.append(value) if stage == "shape" else None  # noqa: E731
     grasps = plan_grasps(VIEW, hand, SPEC, starts=12, task=task, observer=note)
     best = grasps[grasps.status == Status.OK]
-    odds = load_success_model().log_odds(measure_again(best, hand, shapes[0], task))
+    odds = load_success_model().log_odds(measure_again(best, hand, shapes[0], task)[0])
     near(best.score, odds, 1e-6)
     assert grasps.meta["task"] == task.describe() != usual().meta["task"]
     first, second = (

@@ -19,7 +19,7 @@ from torchgrasp.geometry.plane import move
 from torchgrasp.success.features import CAUSES, FEATURES, measure_grasps
 from torchgrasp.success.loads import carrying_force, greatest_force
 from torchgrasp.success.moved import touch_moved
-from torchgrasp.success.task import GraspTask
+from torchgrasp.success.task import Conditions, GraspTask
 from torchgrasp.values.planning import Contacts
 
 VERTICES = RADIUS * directions(3000, seed=1) * real([1.0, 0.8, 0.6]) + real([0.0, 0.004, -0.01])
@@ -28,9 +28,10 @@ EVEN = (0.0, 2 * math.pi / 3, 4 * math.pi / 3)
 
 def measure(hand, grasps, shape=None, vertices=VERTICES, friction=0.6, lifted=True, **task):
     """The features of grasps of the ball by name."""
-    found = measure_grasps(
-        hand, ball_body(vertices, shape), grasps, friction, GraspTask(**task), lifted
-    )
+    asked = GraspTask(**task)
+    conditions = Conditions.of(friction, asked.mass)
+    body = ball_body(vertices, shape)
+    [found] = measure_grasps(hand, body, grasps, conditions, asked, lifted)
     assert found.shape == (len(grasps), len(FEATURES)) and found.dtype == torch.float64
     return dict(zip(FEATURES, found.T, strict=True))
 

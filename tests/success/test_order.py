@@ -74,8 +74,8 @@ def test_the_order_is_known_then_unknown_then_failed_each_by_falling_score(gener
 def test_scores_intervals_and_knowledge_are_those_of_the_executable_grasps(model):
     rows = grasps_of([9.0, 8.0, 7.0, 6.0], [OK, FAILED, OK, OK])
     odds = real([-1.0, 3.0, 2.0])
-    known = torch.tensor([True, False, True])
-    ranked = order.by_success(order.grade(rows, odds, known))
+    covered = real([1.0, 0.0, 1.0])
+    ranked = order.by_success(order.grade(rows, odds, covered))
     assert ranked.score.tolist() == [2.0, -1.0, 3.0, 8.0] and ranked.status.tolist() == [
         OK,
         OK,
@@ -91,12 +91,12 @@ def test_scores_intervals_and_knowledge_are_those_of_the_executable_grasps(model
 
 def test_float32_and_no_grasps_keep_their_dtype_and_shape(model):
     rows = grasps_of([1.0, 2.0]).to(torch.float32)
-    ranked = order.by_success(order.grade(rows, real([0.5, 1.5]), torch.tensor([True, True])))
+    ranked = order.by_success(order.grade(rows, real([0.5, 1.5]), real([1.0, 1.0])))
     assert (
         ranked.score.dtype == ranked.interval.dtype == torch.float32
         and ranked.score.tolist() == [1.5, 0.5]
     )
-    none = order.by_success(order.grade(rows[:0], real([]), torch.zeros(0, dtype=torch.bool)))
+    none = order.by_success(order.grade(rows[:0], real([]), real([])))
     assert none.interval.shape == (0, 2) and len(order.by_success(none)) == 0
     assert len(order.keep_promise(none, 0.9)) == 0
 

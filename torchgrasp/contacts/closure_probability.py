@@ -25,6 +25,7 @@ from torchgrasp.geometry.linalg import dot, norm, unit
 from torchgrasp.shape.estimate import surface_deviation
 from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.posterior import combined_covariance, symmetric_root
+from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import Contacts
 from torchgrasp.values.specs import ContactSpec
 
@@ -36,6 +37,7 @@ NODES = (4.0, 1.5, 0.0, -1.5, -4.0)
 LINES = 32  # contact sets whose covariances are computed at a time: they stay in the cache
 DRAWS = 8192  # drawn rows that are judged at a time: their tensors take about 20 MB
 DRAWS_ON_GPU = 2**18  # the same on a GPU, which fewer leave idle: about 700 MB
+FRICTIONS = 9  # frictions that stand for a distribution
 OUTER_GRID = (12.0, 9.0, 6.5, 4.0, 3.375, 2.75, 2.125, 1.5, 1.125, 0.75, 0.375, 0.0)
 """Outer half of the grid on a line, in standard deviations of the surface; all nodes are grid
 points.
@@ -274,7 +276,7 @@ def closure_probability(
             shape. A random surface that a finger does not meet within 12 standard deviations counts
             as one without force closure.
         spec: its `friction` is used, the friction coefficient at execution; `planned_friction` is
-            not used.
+            not used. Of a distribution the mean over 9 frictions counts.
         n: number of random surfaces. The standard error is at most 1 / (2 sqrt(n)): 0.01 for 2500.
             It is computed for the fraction (k + 1) / (n + 2) if k surfaces give force closure, and
             so is never 0.
@@ -287,7 +289,10 @@ def closure_probability(
     tensor([True])
     """
     spec = ContactSpec() if spec is None else spec
-    share = closed_share(line_posterior(shape, contacts), spec.friction, n, seed)
+    lines = line_posterior(shape, contacts)
+    frictions, weights = Distribution.of(spec.friction).nodes(FRICTIONS)
+    shares = torch.stack([closed_share(lines, x, n, seed) for x in frictions.tolist()])
+    share = weights.to(shares) @ shares
     middle = (n * share + 1) / (n + 2)
     return ClosureProbability(share, torch.sqrt(middle * (1 - middle) / n))
 

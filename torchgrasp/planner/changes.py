@@ -163,7 +163,10 @@ def _limits(request: Request) -> Iterator[Change]:
         )
         cures = frozenset({Status.BELOW_TABLE, Status.TOO_CLOSE})
         yield Change(words, True, cures, _with(request, tip_radius=tips))
-    if spec.friction > 0 and (wider := _next(CHANGES.margins, spec.friction_margin)) is not None:
+    if (
+        spec.mean_friction > 0
+        and (wider := _next(CHANGES.margins, spec.friction_margin)) is not None
+    ):
         words = f"with friction_margin={wider:g} instead of {spec.friction_margin:g} (less room for errors)"
         yield Change(words, True, OPEN, _with(request, friction_margin=wider))
 
@@ -175,7 +178,7 @@ def _next(limits: tuple[float, ...], present: float) -> float | None:
 
 def _friction(request: Request) -> Iterator[Change]:
     """Yield changes to the next two frictions that are clearly above the present one."""
-    present = request.contact_spec.friction
+    present = request.contact_spec.mean_friction
     higher = [f for f in CHANGES.frictions if f >= CHANGES.clearly * present]
     for friction in higher[: CHANGES.tried]:
         words = f"if the friction were {friction:g} instead of {present:g}"

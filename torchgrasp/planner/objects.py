@@ -56,6 +56,7 @@ from torchgrasp.success.body import EstimatedBody
 from torchgrasp.success.features import GRIP
 from torchgrasp.success.promise import describe_promise
 from torchgrasp.success.task import loads_of
+from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import Certificate, Contacts, Grasps, PointCloud
 from torchgrasp.values.specs import ContactSpec
 
@@ -309,7 +310,7 @@ class Objects:
             ),
             "units": "metre, radian",
             "unit_m": repr(float(object_.shape.scale)),
-            "friction": f"{spec.friction:g}",
+            "friction": str(Distribution.of(spec.friction)),
             "planned_friction": f"{spec.planned_friction:g}",
             "table": "none" if spec.plane is None else spec.plane.describe(),
             "mode": request.mode,
@@ -320,7 +321,9 @@ class Objects:
             "seed": str(request.seed),
         }
         if request.resist is not None:
-            meta["resist"] = f"{request.resist} with {request.grasp_task.mass:g} kg"
+            meta["resist"] = (
+                f"{request.resist} with {Distribution.of(request.grasp_task.mass).most:g} kg"
+            )
         moved = self._moved(grasps.to(object_.shape.device))
         return dataclasses.replace(moved, meta=grasps.meta | meta)
 
@@ -386,7 +389,7 @@ def pose(
     loads = None
     if request.resist is not None:
         frame = inverse(object_.obj_from_upright).to(object_.body.center)
-        mass = request.grasp_task.mass
+        mass = Distribution.of(request.grasp_task.mass).most
         on_table = flat.spec.plane is not None
         loads = loads_of(request.resist, mass, object_.body.center, frame, on_table)[None]
     mixture = None if model[0] is None else model[0].to(shape.device)

@@ -18,11 +18,12 @@ from torchgrasp.success.loads import strength_of
 from torchgrasp.success.model import load_success_model
 from torchgrasp.success.order import (
     by_success,
+    covered_share,
     grade,
-    is_covered,
     keep_promise,
     rank_by_variance,
 )
+from torchgrasp.success.task import Conditions
 from torchgrasp.values.planning import Grasps
 from torchgrasp.values.specs import Ranking
 
@@ -48,13 +49,13 @@ def rank(objects: Objects, grasps: Grasps, cloud: CloudIndex) -> list[Grasps]:
     grasps = objects.on_arm(grasps)
     grasps = prove_resistance(objects, grasps, cloud)
     rows = torch.nonzero(grasps.status == Status.OK)[:, 0]
-    log_odds, known = predict(objects, grasps[rows], cloud[rows])
+    log_odds, covered = predict(objects, grasps[rows], cloud[rows])
     # the host sorts
     cpu = torch.device("cpu")
     cloud = cloud.cpu()
     vague = torch.tensor([one.vague for one in objects.each])
-    known = known.cpu() & ~vague[cloud[rows.cpu()]]
-    graded = grade(grasps.to(cpu), log_odds.cpu(), known)
+    covered = covered.cpu().masked_fill(vague[cloud[rows.cpu()]], 0.0)
+    graded = grade(grasps.to(cpu), log_odds.cpu(), covered)
     if request.promise is not None:
         graded = keep_promise(graded, request.promise)
     ranked = by_success(graded, cloud)
@@ -67,30 +68,31 @@ def rank(objects: Objects, grasps: Grasps, cloud: CloudIndex) -> list[Grasps]:
 
 def predict(
     objects: Objects, grasps: Grasps, cloud: CloudIndex
-) -> tuple[Float[Tensor, "g"], Tensor]:
-    """Return the log-odds of success of g grasps, then a mask (g,) of those that trials support.
+) -> tuple[Float[Tensor, "g"], Float[Tensor, "g"]]:
+    """Return the log-odds of success of g grasps, then the probability that trials support them.
 
-    The mask marks grasps whose features are in the range of our trials. With obstacles, the
-    probability of success includes that the hand hits none. `cloud` is the index of each grasp's
-    object.
+    The success is the mean over the distributions of friction and mass. With obstacles, it includes
+    that the hand hits none. `cloud` is the index of each grasp's object.
     """
     task = objects.request.grasp_task
     spec = objects.spec
+    conditions = Conditions.of(spec.friction, task.mass)
     features = measure_grasps(
         objects.hand,
         objects.body.rows(cloud),
         grasps,
-        spec.friction,
+        conditions,
         task,
         task.lifts(spec.plane),
     )
-    log_odds = load_success_model(features.device).log_odds(features)
+    model = load_success_model(features.device)
+    log_odds = model.mean_log_odds(features, conditions.weights)
     obstacles = objects.world.obstacles
     if obstacles is not None:
         hit = collision_probability(objects.hand, grasps, obstacles, spec.plane)
         free = 1 - hit.to(log_odds)
         log_odds = torch.logit(torch.sigmoid(log_odds) * free, eps=SURE)
-    return log_odds, is_covered(features)
+    return log_odds, covered_share(features, conditions)
 
 
 def prove_resistance(objects: Objects, grasps: Grasps, cloud: CloudIndex) -> Grasps:

@@ -75,7 +75,7 @@ def _close_triples(
     points: Float[Tensor, "n 3 3"], normals: Float[Tensor, "n 3 3"]
 ) -> Bool[Tensor, "n"]:
     """Return a mask of the contact triples that can balance forces inside their friction cones."""
-    spread = 1 + ContactSpec().friction ** 2
+    spread = 1 + ContactSpec().mean_friction ** 2
     t12, t13, t23 = fibonacci_sphere(BALANCES).to(points).T
     e12, e13, e23 = (unit(points[:, j] - points[:, i]) for i, j in ((0, 1), (0, 2), (1, 2)))
     closed = torch.ones(len(points), BALANCES, dtype=torch.bool, device=points.device)

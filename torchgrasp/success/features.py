@@ -18,7 +18,7 @@ from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.success.body import EstimatedBody
 from torchgrasp.success.loads import carrying_force, greatest_force
 from torchgrasp.success.moved import touch_moved
-from torchgrasp.success.task import GraspTask
+from torchgrasp.success.task import Conditions, GraspTask
 from torchgrasp.values.planning import Contacts, Grasps
 
 CAUSES: dict[str, dict[str, str]] = {
@@ -78,15 +78,23 @@ MEASURES = FeatureNumbers()
 
 
 def measure_grasps(
-    hand: Hand, body: EstimatedBody, grasps: Grasps, friction: float, task: GraspTask, lifted: bool
-) -> Float[Tensor, "g k"]:
-    """Return the k features of each of g grasps for a task, a column for each name in `FEATURES`.
+    hand: Hand,
+    body: EstimatedBody,
+    grasps: Grasps,
+    conditions: Conditions,
+    task: GraspTask,
+    lifted: bool,
+) -> Float[Tensor, "c g k"]:
+    """Return the k features of each of g grasps for a task, for each of c conditions.
+
+    There is a column for each name in `FEATURES`.
 
     `CAUSES` gives their units; shares and logarithms have none. Body and grasps are in an upright
-    frame; `body` is one object for all grasps, or one for each. `friction` is the coefficient of
-    friction, and `lifted` says whether the task is a lift; otherwise the object is pulled. A force
-    to spare is the logarithm of the fingers' strength over the force needed. "force needed", "force
-    to spare" and the features named "slippery" are at half the friction.
+    frame; `body` is one object for all grasps, or one for each. `conditions` are the
+    frictions and masses, in place of the mass of the `task`. `lifted` says whether the task is a
+    lift; otherwise the object is pulled. A force to spare is the logarithm of the fingers' strength
+    over the force needed. "force needed", "force to spare" and the features named "slippery" are at
+    half the friction.
     """
     contacts = grasps.contacts
     g = len(grasps)
@@ -98,40 +106,44 @@ def measure_grasps(
     greatest = greatest_force(hand, grasps, forces).to(points).nan_to_num(0.0)
     strength = torch.minimum(greatest, greatest.new_tensor(pressing or GRIP))
     numbers = MEASURES
-    slipping = numbers.slippery * friction
-    needed = _force_for(contacts, forces, center, (slipping,), task.mass, lifted)[0]
+    frictions = conditions.frictions[0].tolist()
+    masses = conditions.masses[0].tolist()
+    slipping = [numbers.slippery * friction for friction in frictions]
+    needed = _force_for(contacts, forces, center, slipping, masses, lifted)
     moved = touch_moved(hand, body.field, grasps, forces)
     everywhere = center if center.ndim == 1 else center.repeat(len(moved.touched), 1)
-    there = _force_for(
-        moved.contacts, moved.forces, everywhere, (friction, slipping), task.mass, lifted
-    )
-    there = there.unflatten(1, moved.touched.shape).where(moved.touched, numbers.most_force)
+    both = [*frictions, *slipping]
+    there = _force_for(moved.contacts, moved.forces, everywhere, both, masses, lifted)
+    there = there.unflatten(2, moved.touched.shape).where(moved.touched, numbers.most_force)
     strength = strength.clamp_min(numbers.least_force)
-    spare, slippery = torch.log(strength / there).clamp(-numbers.most_spare, numbers.most_spare)
+    logs = torch.log(strength / there).clamp(-numbers.most_spare, numbers.most_spare)
+    spare, slippery = logs.split(len(frictions))  # (n, m, d, g)
     found: dict[str, Tensor | float] = {
         "force needed": needed,
         "force to spare": torch.log(strength / needed),
         "offset": norm(points.mean(1) - center),
-        "force to spare if moved": spare.mean(0),
-        "force to spare if moved and slippery": slippery.mean(0),
-        "carried if moved": (spare > 0).to(points).mean(0),
+        "force to spare if moved": spare.mean(2),
+        "force to spare if moved and slippery": slippery.mean(2),
+        "carried if moved": (spare > 0).to(points).mean(2),
         "deviation": contacts.require_std().to(points).amax(1),
         "tilt": _normal_deviation(body.shape, points).amax(1),
         "size": body.size,
         "height": body.height,
         "breadth": body.breadth,
-        "friction": friction,
-        "mass": task.mass,
+        "friction": points.new_tensor(frictions)[:, None, None],
+        "mass": points.new_tensor(masses)[:, None],
         "force": pressing,
         "lifted": float(lifted),
         "displaced": float(task.displaced),
         "open loop": float(task.closing == "open_loop"),
     }
     assert tuple(found) == FEATURES
+    size = len(frictions), len(masses), g
     columns = [
-        x.to(points) if isinstance(x, Tensor) else points.new_full((g,), x) for x in found.values()
+        x.to(points).expand(size) if isinstance(x, Tensor) else points.new_full(size, x)
+        for x in found.values()
     ]
-    return torch.stack(columns, -1)
+    return torch.stack(columns, -1).flatten(0, 1)
 
 
 def _force_for(
@@ -139,20 +151,23 @@ def _force_for(
     forces: Float[Tensor, "g f 3"],
     center: Float[Tensor, "*b 3"],
     frictions: Sequence[float],
-    mass: float,
+    masses: Sequence[float],
     lifted: bool,
-) -> Float[Tensor, "m g"]:
-    """Return the force [N] of the strongest finger at which no contact slides under the load, for m
-    friction coefficients.
+) -> Float[Tensor, "n m g"]:
+    """Return the force [N] of the strongest finger at which no contact slides under the load, for n
+    friction coefficients and m masses [kg].
 
-    The load is the weight of a `mass` [kg] if the object is `lifted`, and otherwise a pull in any
+    The load is the weight of the mass if the object is `lifted`, and otherwise a pull in any
     direction.
     """
     numbers = MEASURES
-    weight = numbers.gravity * mass if lifted else 0.0
-    pull = 0.0 if lifted else numbers.pull * mass
+    weight = numbers.gravity * masses[0] if lifted else 0.0
+    pull = 0.0 if lifted else numbers.pull * masses[0]
     load = center.new_tensor([0.0, 0.0, -weight])
     force = carrying_force(contacts, forces, center, frictions, load, pull)
+    # the force is proportional to the mass
+    ratios = force.new_tensor(masses)[:, None] / masses[0]
+    force = torch.where(ratios == 1, force[:, None], ratios * force[:, None])
     return force.clamp(numbers.least_force, numbers.most_force)  # infinite: no force does
 
 

@@ -56,6 +56,18 @@ class SuccessModel(Value):
             node = self.children[trees, node, above.long()]
         return self.start + self.value[trees, node].sum(1)
 
+    def mean_log_odds(
+        self, features: Float[Tensor, "c g k"], weights: Float[Tensor, "c"]
+    ) -> Float[Tensor, "g"]:
+        """Return the log-odds of the mean success of g grasps under c conditions.
+
+        `weights` are the probabilities of the conditions.
+        """
+        log_odds = self.log_odds(features.flatten(0, 1)).view(features.shape[:2])
+        if len(log_odds) == 1:
+            return log_odds[0]
+        return torch.logit(weights.to(log_odds) @ torch.sigmoid(log_odds))
+
     @functools.cached_property
     def depth(self) -> int:
         """The number of steps from the root to the deepest leaf of all trees."""

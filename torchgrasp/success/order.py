@@ -4,6 +4,7 @@ the paper.
 
 import dataclasses
 import math
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -14,24 +15,43 @@ from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.success.features import FEATURES
 from torchgrasp.success.model import load_success_model
 from torchgrasp.success.promise import find_promise
+from torchgrasp.success.task import Conditions
 from torchgrasp.values.planning import Grasps
 
 DOMAIN = ("deviation", "size", "height", "friction", "mass", "force")
 """Features that must lie within the range of the trials; otherwise the success of a grasp is
 unknown.
 """
+UNKNOWN = 0.1
+"""Largest probability of a friction or mass outside of the trials at which success counts as known:
+more would break the promise that 0.9 of the grasps hold.
+"""
 
 
-def is_covered(features: Float[Tensor, "g k"]) -> Bool[Tensor, "g"]:
+def is_covered(features: Float[Tensor, "g k"], names: Sequence[str] = DOMAIN) -> Bool[Tensor, "g"]:
     """Return a mask of the g grasps for which trials support the prediction of success.
 
-    `features` has a column for each name in `FEATURES`. Those named in `DOMAIN` must lie within the
-    range of the trials.
+    `features` has a column for each name in `FEATURES`. Those in `names` must lie within the range
+    of the trials.
     """
-    rows = [FEATURES.index(name) for name in DOMAIN]
+    rows = [FEATURES.index(name) for name in names]
     least, most = load_success_model(features.device).range[rows].T
     found = features[:, rows]
     return ((found >= least) & (found <= most)).all(1)
+
+
+def covered_share(features: Float[Tensor, "c g k"], conditions: Conditions) -> Float[Tensor, "g"]:
+    """Return for each of g grasps the probability of a friction and a mass that trials support.
+
+    It is 0 if another of the `features` in `DOMAIN` lies outside of the range of the trials.
+    """
+    share = 1.0
+    of = {"friction": conditions.friction, "mass": conditions.mass}
+    for name, distribution in of.items():
+        least, most = load_success_model().range[FEATURES.index(name)].tolist()
+        share *= distribution.share(least, most)
+    others = [name for name in DOMAIN if name not in of]
+    return share * is_covered(features[0], others).to(features)
 
 
 def largest_known() -> float:
@@ -42,18 +62,24 @@ def largest_known() -> float:
     return float(load_success_model().range[FEATURES.index("size"), 1])
 
 
-def grade(grasps: Grasps, log_odds: Float[Tensor, "k"], known: Bool[Tensor, "k"]) -> Grasps:
+def grade(grasps: Grasps, log_odds: Float[Tensor, "k"], covered: Float[Tensor, "k"]) -> Grasps:
     """Return grasps whose k executable ones have a new score, interval and `known`.
 
-    The score is `log_odds`. The interval is that of the success model, or [0, 1] where not `known`.
-    Failed grasps keep their score; their interval is [0, 0], and they count as known.
+    The score is `log_odds`. `covered` is the probability of conditions that trials support. Of the
+    rest nothing is known: the interval is that of the success model times `covered`, and its upper
+    end is greater by the rest. A grasp is known if the rest is at most `UNKNOWN`; otherwise its
+    interval is [0, 1]. Failed grasps keep their score; their interval is [0, 0], and they count as
+    known.
     """
+    known = covered >= 1 - UNKNOWN
     good = flatnonzero(grasps.status == Status.OK)
     score = grasps.score.clone()
     score[good] = log_odds.to(score)
     interval = torch.zeros_like(score)[:, None].repeat(1, 2)
     supported = torch.ones_like(score, dtype=torch.bool)
     bounds = load_success_model(log_odds.device).interval(log_odds)
+    bounds = covered[:, None] * bounds
+    bounds[:, 1] += 1 - covered
     bounds = bounds.where(known[:, None], log_odds.new_tensor([0.0, 1.0]))
     interval[good] = bounds.to(score)
     supported[good] = known

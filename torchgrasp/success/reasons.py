@@ -3,7 +3,8 @@
 import math
 from typing import NamedTuple
 
-import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
@@ -14,7 +15,8 @@ from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.success.body import EstimatedBody
 from torchgrasp.success.features import CAUSES, measure_grasps
 from torchgrasp.success.model import load_success_model
-from torchgrasp.success.task import GraspTask
+from torchgrasp.success.task import Conditions, GraspTask
+from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import Grasps
 
 SENTENCES = {
@@ -70,19 +72,22 @@ def explain_success(
         raise BadArgument(
             "grasps", f"{len(grasps)} grasps, planned for no friction", "grasps of plan_grasps"
         )
-    features = measure_again(grasps[0], hand, shape, GraspTask() if task is None else task)
+    task = GraspTask() if task is None else task
+    features = measure_again(grasps[0], hand, shape, task)
+    weights = conditions_of(grasps, task).weights.to(features)
     model = load_success_model(features.device)
+    known = model.mean_log_odds(features, weights)
     first = 0
     told = list[Cost]()
     units = [pair for names in CAUSES.values() for pair in names.items()]
     values = {
         name: _say(float(x), unit)
-        for (name, unit), x in zip(units, features[0].tolist(), strict=True)
+        for (name, unit), x in zip(units, (weights @ features[:, 0]).tolist(), strict=True)
     }
     for cause, names in CAUSES.items():
         usual = features.clone()
-        usual[:, first : first + len(names)] = model.usual[first : first + len(names)]
-        gain = float(model.log_odds(usual) - model.log_odds(features))
+        usual[..., first : first + len(names)] = model.usual[first : first + len(names)]
+        gain = float(model.mean_log_odds(usual, weights) - known)
         told.append(Cost(cause, gain, SENTENCES[cause].format_map(values)))
         first += len(names)
     return tuple(
@@ -90,8 +95,15 @@ def explain_success(
     )
 
 
-def measure_again(grasps: Grasps, hand: Hand, shape: ShapeGP, task: GraspTask) -> torch.Tensor:
-    """Return the `FEATURES` (g, k) of planned grasps for any task.
+def conditions_of(grasps: Grasps, task: GraspTask) -> Conditions:
+    """Return the frictions and masses of a task; the metadata of the grasps name the friction."""
+    return Conditions.of(Distribution.parse(grasps.meta["friction"]), task.mass)
+
+
+def measure_again(
+    grasps: Grasps, hand: Hand, shape: ShapeGP, task: GraspTask
+) -> Float[Tensor, "c g k"]:
+    """Return the `FEATURES` of g planned grasps for any task, under its c conditions.
 
     The metadata of the grasps name the table and the friction. The `shape` is in the frame of the
     grasps.
@@ -100,9 +112,9 @@ def measure_again(grasps: Grasps, hand: Hand, shape: ShapeGP, task: GraspTask) -
     upright = move(grasps, frame)
     shape = shape.moved(frame)
     hand = hand.to(grasps.joints.device, grasps.joints.dtype)
-    friction = float(grasps.meta["friction"])
+    conditions = conditions_of(grasps, task)
     return measure_grasps(
-        hand, EstimatedBody.of(shape), upright, friction, task, task.lifts(grasps.table)
+        hand, EstimatedBody.of(shape), upright, conditions, task, task.lifts(grasps.table)
     )
 
 

@@ -1,6 +1,7 @@
 """The task of a grasp: the loads that it must hold."""
 
 import dataclasses
+import functools
 import itertools
 import math
 from typing import Annotated, Literal
@@ -15,6 +16,10 @@ from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Force, Range
 from torchgrasp.geometry.frames import apply, real, rotate
 from torchgrasp.geometry.plane import Plane
+from torchgrasp.values.distribution import Distribution, check_within
+
+MASSES = Range(0.001, 10.0)
+"""The masses [kg] that are possible."""
 
 
 @checked
@@ -23,7 +28,7 @@ class GraspTask(Value):
     """What a grasp must do. The predicted success is that of this task.
 
     Args:
-        mass: mass of the object [kg].
+        mass: mass of the object [kg], or its `Distribution`.
         force: normal force [N] of the strongest finger. None: in a lift the hand presses as much as
             the felt load needs; in pulls it presses with 4 N.
         lift: whether the object is lifted off its table. Otherwise it floats, and is pulled along
@@ -40,13 +45,14 @@ class GraspTask(Value):
     ('lift of 0.5 kg', 'pulls of 0.25 kg with 7 N')
     """
 
-    mass: Annotated[float, Range(0.001, 10.0)] = 0.25
+    mass: Annotated[float, MASSES] | Distribution = 0.25
     force: Force | None = None
     lift: bool | None = None
     closing: Literal["uncertainty", "open_loop"] = "uncertainty"
     displaced: bool = False
 
     def __post_init__(self) -> None:
+        check_within("mass", self.mass, MASSES)
         if self.lift and self.closing == "open_loop":  # no trial has tested it
             raise BadArgument("closing", "'open_loop' for a lift", "'uncertainty'")
 
@@ -54,7 +60,9 @@ class GraspTask(Value):
         """Return the task as a short text."""
         what = "task" if self.lift is None else "lift" if self.lift else "pulls"
         force = "" if self.force is None else f" with {self.force:g} N"
-        return f"{what} of {self.mass:g} kg{force}" + (", displaced" if self.displaced else "")
+        return f"{what} of {Distribution.of(self.mass)} kg{force}" + (
+            ", displaced" if self.displaced else ""
+        )
 
     @checked
     def pressing(self, lifted: bool) -> float:
@@ -73,6 +81,53 @@ class GraspTask(Value):
         "open_loop".
         """
         return table is not None and self.closing != "open_loop" if self.lift is None else self.lift
+
+
+@dataclasses.dataclass(frozen=True)
+class ConditionNumbers:
+    """Numbers of frictions and masses that stand for their distributions."""
+
+    one: int = 9
+    """Number of frictions, or of masses if the friction is certain: success falls by steps, of
+    which a mean over 9 misses at most 1/18.
+    """
+    both: int = 3
+    """Number of masses if the friction is uncertain, too: the load matters less."""
+
+
+CONDITIONS = ConditionNumbers()
+
+
+@dataclasses.dataclass(frozen=True)
+class Conditions:
+    """The c pairs of a friction and a mass [kg] for which success is predicted.
+
+    The two are independent. Each of n frictions stands beside all m masses.
+    """
+
+    friction: Distribution
+    mass: Distribution
+
+    @classmethod
+    def of(cls, friction: float | Distribution, mass: float | Distribution) -> "Conditions":
+        """Return the conditions of a coefficient of friction and a mass [kg]."""
+        return cls(Distribution.of(friction), Distribution.of(mass))
+
+    @functools.cached_property
+    def frictions(self) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+        """The frictions, and their probabilities."""
+        return self.friction.nodes(CONDITIONS.one)
+
+    @functools.cached_property
+    def masses(self) -> tuple[Float[Tensor, "m"], Float[Tensor, "m"]]:
+        """The masses [kg], and their probabilities."""
+        certain = len(self.frictions[0]) == 1
+        return self.mass.nodes(CONDITIONS.one if certain else CONDITIONS.both)
+
+    @property
+    def weights(self) -> Float[Tensor, "c"]:
+        """The probability of each pair."""
+        return torch.outer(self.frictions[1], self.masses[1]).flatten()
 
 
 @checked
@@ -138,7 +193,7 @@ def loads_of(
 
     Args:
         resist: the loads: "lift", "pour" or "push", several of these names, or `TaskWrenches`.
-        mass: mass of the object [kg].
+        mass: mass of the object [kg], of a distribution the greatest one.
         center: estimated centre of the object [m] in the upright frame.
         upright_from_obj: transform from the cloud's frame, in which `TaskWrenches` are, to the
             upright frame.

@@ -29,7 +29,7 @@ class Distribution(Value):
     """A mixture of intervals, in each of which all numbers are equally likely.
 
     An interval (x, x) is the single number x. Further ways to make a distribution are `parse`,
-    `of`, `between` and `of_samples`.
+    `read`, `of`, `between` and `of_samples`.
 
     Args:
         parts: intervals (least, greatest).
@@ -78,6 +78,17 @@ class Distribution(Value):
 
     @classmethod
     @checked
+    def read(cls, text: str) -> "float | Distribution":
+        """Return what `parse` reads, a number if the text names just one.
+
+        >>> Distribution.read("0.5")
+        0.5
+        """
+        found = cls.parse(text)
+        return found.least if found.least == found.most else found
+
+    @classmethod
+    @checked
     def parse(cls, text: str) -> "Distribution":
         """Return the distribution that a text names.
 
@@ -86,7 +97,7 @@ class Distribution(Value):
         `BadArgument` for another text.
 
         >>> str(Distribution.parse(".3:.8@2|1"))
-        '0.3:0.8@2.0|1.0@1.0'
+        '0.3:0.8@2|1@1'
         """
         parts = list[tuple[float, float]]()
         weights = list[float]()
@@ -102,9 +113,11 @@ class Distribution(Value):
 
     def __str__(self) -> str:
         """Return the distribution as a text that `parse` reads."""
-        texts = [str(low) if low == high else f"{low}:{high}" for low, high in self.parts]
+        texts = [
+            _text(low) if low == high else f"{_text(low)}:{_text(high)}" for low, high in self.parts
+        ]
         if self.weights is not None:
-            texts = [f"{text}@{x}" for text, x in zip(texts, self.weights, strict=True)]
+            texts = [f"{text}@{_text(x)}" for text, x in zip(texts, self.weights, strict=True)]
         return "|".join(texts)
 
     @functools.cached_property
@@ -254,3 +267,21 @@ class Distribution(Value):
             numbers += [low + (high - low) * (i + 0.5) / n for i in range(n)]
             weights += [share / n] * n
         return real(numbers), real(weights)
+
+
+def check_within(name: str, value: float | Distribution, allowed: Range) -> None:
+    """Raise `BadArgument` for a distribution of numbers outside the range `allowed`.
+
+    Errors call the distribution by `name`.
+    """
+    if (
+        isinstance(value, Distribution)
+        and not allowed.low <= value.least <= value.most <= allowed.high
+    ):
+        within = f"a distribution in [{allowed.low:g}, {allowed.high:g}]"
+        raise BadArgument(name, f"{value.least:g} to {value.most:g}", within)
+
+
+def _text(x: float) -> str:
+    """Return a number as text, in full if it has more than six digits."""
+    return f"{x:g}" if float(f"{x:g}") == x else repr(x)

@@ -11,12 +11,15 @@ from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Force, Length, Range
 from torchgrasp.geometry.plane import Plane, as_plane
 from torchgrasp.values.closing import ClosingOptions, SensorModel, choose_options
+from torchgrasp.values.distribution import Distribution, check_within
 
 Simulator = Literal["sapien", "mujoco"]
 """The simulators."""
 RIM = 0.001  # radius [m] that is flat on a rim
 PAPER_RADIUS = 0.1  # the paper's radius of starts, normalised
 ROUNDING = 1e-9  # relative error of a period
+FRICTIONS = Range(0.0, 10.0)
+"""The coefficients of friction that are possible."""
 TIP_RADIUS = 0.012
 SEPARATION = 0.026
 """Default radius [m] of a fingertip, and least distance [m] between two. Wider links lie behind
@@ -38,12 +41,13 @@ class ContactSpec(Value):
     paper: a lower friction, a flat surface, and a distance between fingertips.
 
     Args:
-        friction: coefficient of friction between fingertip and object at execution.
+        friction: coefficient of friction between fingertip and object at execution, or its
+            `Distribution`.
         edges: number of edges of the linearised friction cone, at least 3.
         max_variance: largest variance of the surface at a contact, S_thresh of Eq. (12), in
             normalised units.
-        friction_margin: share of the friction that is planned with: contacts are planned and
-            certified with `friction * friction_margin`.
+        friction_margin: share of the friction, of a distribution its mean, that is planned with:
+            contacts are planned and certified with `friction * friction_margin`.
         separation: least distance between the centres of two fingertips [m]; by default their
             diameter plus 2 mm. Contacts on opposite sides of a thin object may be closer.
         flatness: largest angle [rad] between the normals at a contact and on a ring around it; None
@@ -68,7 +72,7 @@ class ContactSpec(Value):
     0.4
     """
 
-    friction: Annotated[float, Range(0.0, 10.0)] = 0.8
+    friction: Annotated[float, FRICTIONS] | Distribution = 0.8
     edges: Annotated[int, Range(3, 1024)] = 8
     max_variance: Annotated[float, Range(1e-12, 1000000.0)] = 0.03
     friction_margin: Annotated[float, Range(0.001, 1.0)] = 0.5
@@ -82,6 +86,14 @@ class ContactSpec(Value):
     contact_allowed: bool = False
     region: Callable[..., Any] | None = None
 
+    def __post_init__(self) -> None:
+        check_within("friction", self.friction, FRICTIONS)
+
+    @property
+    def mean_friction(self) -> float:
+        """The coefficient of friction at execution, of a distribution its mean."""
+        return Distribution.of(self.friction).mean
+
     @property
     def plane(self) -> Plane | None:
         """The table as a plane in the cloud's frame, or None if there is no table."""
@@ -90,7 +102,7 @@ class ContactSpec(Value):
     @property
     def planned_friction(self) -> float:
         """The coefficient of friction with which contacts are planned and certified."""
-        return self.friction * self.friction_margin
+        return self.mean_friction * self.friction_margin
 
     @property
     def fingertip_radius(self) -> float:
@@ -124,7 +136,7 @@ class ContactSpec(Value):
         """
         if self.flat_radius is not None:
             return self.fingertip_radius + self.flat_radius
-        slope = math.sin(math.atan(self.friction * math.cos(math.pi / self.edges)))
+        slope = math.sin(math.atan(self.mean_friction * math.cos(math.pi / self.edges)))
         return (self.fingertip_radius + FLAT_RADII[-1]) * (1 - slope)
 
     @checked
@@ -182,7 +194,7 @@ class ContactSpec(Value):
     @checked
     def paper(
         cls,
-        friction: float = 0.8,
+        friction: float | Distribution = 0.8,
         edges: int = 8,
         max_variance: float = 0.03,
         table: Plane | float | None = None,
