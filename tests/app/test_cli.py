@@ -78,6 +78,8 @@ def bad_inputs(folder):
         "two tables": ([VIEW, *hand, "--table", "0", "--no-table"], ["--table", "--no-table"]),
         "no friction": ([VIEW, *hand, "--friction", "-1"], ["--friction", "-1"]),
         "nan friction": ([VIEW, *hand, "--friction", "nan"], ["--friction", "nan"]),
+        "no interval": ([VIEW, *hand, "--mass", "0.1-0.4"], ["--mass", "'0.1-0.4'", "0.3:0.8"]),
+        "wide interval": ([VIEW, *hand, "--friction", "0.3:11"], ["--friction", "0.3 to 11"]),
         "no starts": ([VIEW, *hand, "--starts", "0"], ["--starts", "0"]),
         "negative seed": ([VIEW, *hand, "--seed", "-1"], ["--seed", "-1"]),
         "nan viewpoint": ([VIEW, *hand, "--viewpoint", "nan", "0", "0"], ["--viewpoint", "nan"]),

@@ -20,6 +20,7 @@ from torchgrasp.foundation.errors import BadArgument, MeshError, Status
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.signed_distance import field_from_surface
 from torchgrasp.values.closing import ClosingOptions
+from torchgrasp.values.distribution import Distribution
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore")]
 
@@ -298,6 +299,14 @@ def test_mass_density_and_friction_reach_the_simulators_parameters():
         found = TrialDriver(GraspTrial(hand, grasp, Truth(mesh, [mesh])), spec).scene_spec
         mass = spec.mass if spec.density is None else 300.0 * mesh.volume
         assert (found.mass, found.friction, found.gravity) == (mass, spec.friction, spec.gravity)
+    mesh = cylinder()
+    spec = TrialSpec(mass=Distribution.between(0.1, 0.4), friction=Distribution.between(0.3, 0.8))
+    trials = [GraspTrial(hand, grasp, Truth(mesh, [mesh]), seed) for seed in (5, 5, 6)]
+    drivers = [TrialDriver(trial, spec) for trial in trials]
+    drawn = [(driver.scene_spec.mass, driver.scene_spec.friction) for driver in drivers]
+    # each seed has its own draw, and the controller does not know it
+    assert drawn[0] == drawn[1] == (drivers[0].spec.mass, drivers[0].spec.friction) != drawn[2]
+    assert drivers[0].reference.friction == drivers[2].reference.friction
 
 
 def test_a_mesh_and_a_table_that_contradict_the_grasp_are_told_before_any_work(monkeypatch):

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from scipy import stats
 
 from tests.make import near, real
 from tests.pinch import cylinder, pinch
@@ -21,12 +22,15 @@ from torchgrasp.evaluation.protocols import (
     draw_object_poses,
     draw_push,
     draw_slide,
+    draw_trial,
     error_from_object_pose,
     find_protocol,
     seed_of,
 )
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotation_angle, rotation_from_vector
+from torchgrasp.values.distribution import Distribution
+from torchgrasp.values.specs import TrialSpec
 
 
 def test_errors_of_the_pose_stay_within_the_protocol_s():
@@ -142,3 +146,26 @@ def test_the_command_line_changes_only_what_was_asked_for_and_displaces_no_objec
     assert (moved.noise, moved.displaced, moved.push) == (PoseNoise(0.03, 0.0, 5), "approach", 2.5)
     with pytest.raises(BadArgument, match="--displaced"):
         disturbed("dexgraspbench", displaced=0.03)
+
+
+def test_each_trial_draws_friction_and_mass_from_their_distributions():
+    friction = Distribution.between(0.3, 0.8)
+    mass = Distribution.parse("0.1|0.4@3")
+    spec = TrialSpec(friction=friction, mass=mass)
+    drawn = [draw_trial(spec, seed) for seed in range(400)]
+    assert drawn == [draw_trial(spec, seed) for seed in range(400)]
+    # the oracle: scipy's test of the law, and the share of a fair draw
+    assert stats.kstest([x.friction for x in drawn], stats.uniform(0.3, 0.5).cdf).pvalue > 1e-3
+    assert {x.mass for x in drawn} == {0.1, 0.4}
+    heavy = sum(x.mass == 0.4 for x in drawn)
+    assert stats.binomtest(heavy, 400, 0.75).pvalue > 1e-3
+    assert stats.spearmanr([x.friction for x in drawn], [x.mass for x in drawn]).pvalue > 1e-3
+    assert draw_trial(TrialSpec(friction=0.5, mass=0.2), 3) == TrialSpec(friction=0.5, mass=0.2)
+
+
+def test_a_protocol_plans_for_the_distributions_that_its_trials_draw_from():
+    test = find_protocol("dexgraspbench").with_trial(mass=Distribution.between(0.1, 0.4))
+    assert test.task.mass == Distribution.between(0.1, 0.4)
+    assert find_protocol("multidex").task.mass == 0.1 * 0.5 / 10.0
+    with pytest.raises(BadArgument, match="at most friction"):
+        TrialSpec(friction=Distribution.between(0.3, 0.8), table_friction=0.4)

@@ -15,6 +15,8 @@ from torchgrasp.success import order
 from torchgrasp.success.features import FEATURES
 from torchgrasp.success.model import load_success_model
 from torchgrasp.success.promise import Promise
+from torchgrasp.success.task import Conditions
+from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import format_success
 
 OK = int(Status.OK)
@@ -87,6 +89,33 @@ def test_scores_intervals_and_knowledge_are_those_of_the_executable_grasps(model
     assert ranked.interval[2].tolist() == [0.0, 1.0]  # nothing is known of it
     assert [format_success(grasp) for grasp in ranked] == ["88%", "27%", "unknown", "0%"]
     assert ranked.interval[3].tolist() == [0.0, 0.0]  # it is not executed
+
+
+def test_what_no_trial_supports_widens_the_interval_and_beyond_a_share_nothing_is_known(model):
+    odds = real([0.4, 0.4, 0.4])
+    graded = order.grade(grasps_of([0.0, 0.0, 0.0]), odds, real([1.0, 0.93, 0.89]))
+    low, high = MODEL.interval(odds)[0].tolist()
+    assert graded.interval[0].tolist() == pytest.approx([low, high])
+    # in 7 % of the cases it may hold or not
+    assert graded.interval[1].tolist() == pytest.approx([0.93 * low, 0.93 * high + 0.07])
+    assert graded.interval[2].tolist() == [0.0, 1.0]
+    assert graded.known.tolist() == [True, True, False]
+
+
+def test_the_share_that_trials_support_is_that_of_friction_and_mass_in_their_range():
+    row = load_success_model().range.mean(1).repeat(1, 2, 1)
+    row[0, 1, FEATURES.index("deviation")] = 1.0  # a metre
+    friction = Distribution.parse("0.101:0.301")  # from 0.201 on
+    mass = Distribution.parse("0.2|2.0@3")
+    least, _ = load_success_model().range[FEATURES.index("friction")].tolist()
+    wanted = (0.301 - least) / 0.2
+    assert order.covered_share(row, Conditions.of(friction, 0.2)).tolist() == pytest.approx(
+        [wanted, 0.0]
+    )
+    assert order.covered_share(row, Conditions.of(friction, mass))[0] == pytest.approx(wanted / 4)
+    for certain in (0.1, 0.5):
+        share = order.covered_share(row, Conditions.of(certain, 0.2))[0]
+        assert share == float(certain > least)
 
 
 def test_float32_and_no_grasps_keep_their_dtype_and_shape(model):

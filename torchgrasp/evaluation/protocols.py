@@ -21,6 +21,7 @@ from torchgrasp.foundation.rules import Count, Length, Pose, Range, Seed
 from torchgrasp.geometry.frames import inverse, real, rigid, rotation_from_vector
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.success.task import GraspTask
+from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import Grasps
 from torchgrasp.values.specs import TrialSpec
 
@@ -102,10 +103,14 @@ class Protocol(Value):
         """
         trial = self.trial
         lift = self.pull is None
-        mass = trial.mass if self.pull is None else trial.mass * self.pull.acceleration / 10.0
+        mass = trial.mass
+        if self.pull is not None:
+            pull = self.pull.acceleration
+            mass = mass.times(pull / 10.0) if isinstance(mass, Distribution) else mass * pull / 10.0
+        mass = Distribution.of(mass).clamped(LEAST_MASS, math.inf)
         closing = "open_loop" if trial.closing == "open_loop" and not lift else "uncertainty"
         displaced = self.noise.translation + self.noise.rotation > 0
-        return GraspTask(max(mass, LEAST_MASS), trial.force, lift, closing, displaced)
+        return GraspTask(mass.simplest, trial.force, lift, closing, displaced)
 
     @checked
     def with_trial(self, **changes: Any) -> "Protocol":
@@ -215,6 +220,17 @@ def seed_of(seed: Seed, *names: str | int) -> int:
     """
     digest = hashlib.sha256(json.dumps([seed, *names]).encode()).digest()
     return int.from_bytes(digest[:8], "big") >> 1
+
+
+@checked
+def draw_trial(trial: TrialSpec, seed: Seed) -> TrialSpec:
+    """Return the parameters of a trial, with friction and mass drawn if they are distributions.
+
+    The draws are independent. `seed` is that of the trial.
+    """
+    friction = Distribution.of(trial.friction).sample(1, seed_of(seed, "friction"))
+    mass = Distribution.of(trial.mass).sample(1, seed_of(seed, "mass"))
+    return dataclasses.replace(trial, friction=float(friction), mass=float(mass))
 
 
 @checked

@@ -22,7 +22,7 @@ from torchgrasp.control.reference import ClosingReference, check_single
 from torchgrasp.control.regrasp import smooth_step
 from torchgrasp.control.relook import REACH
 from torchgrasp.evaluation.frame import moved_mesh, rounded, to_frame, world_frame
-from torchgrasp.evaluation.protocols import apply_error, seed_of
+from torchgrasp.evaluation.protocols import apply_error, draw_trial, seed_of
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import trimesh
@@ -38,6 +38,7 @@ from torchgrasp.sim.scene_spec import Body, Neighbour, SceneSpec
 from torchgrasp.sim.simulated_hand import SimulatedHand, open_scene
 from torchgrasp.sim.simulated_scene import SimulatedScene
 from torchgrasp.values.closing import SensorModel
+from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import Grasps
 from torchgrasp.values.specs import ClosingMode, TrialSpec
 
@@ -110,6 +111,7 @@ class TrialDriver:
     A bad trial raises the errors of `close_hand`.
 
     Attributes:
+        spec: the parameters of the trial, with friction and mass drawn by the trial's seed.
         reference: the closing plan; by default derived from what the robot knows of the trial.
         obj_from_world: pose [m] of the simulator's frame in the grasp's frame. If there is a true
             table, the frame is upright on it. Numbers are then rounded, so that results are bitwise
@@ -121,6 +123,7 @@ class TrialDriver:
     ) -> None:
         check_single(trial.grasp)
         self.trial = trial
+        spec = draw_trial(spec, trial.seed)
         self.spec = spec
         hand = trial.hand.to("cpu", torch.float64)
         planned = trial.grasp.to("cpu", torch.float64)
@@ -178,7 +181,7 @@ class TrialDriver:
             mesh=body.mesh,
             parts=list(body.parts),
             mass=body.mass,
-            friction=spec.friction,
+            friction=Distribution.of(spec.friction).mean,
             table_friction=spec.table_friction,
             gravity=spec.gravity,
             timestep=spec.timestep,
@@ -199,7 +202,11 @@ class TrialDriver:
         mesh, parts = read_solid(given.mesh, given.parts)
         if mass is None:
             density = self.spec.density
-            mass = self.spec.mass if density is None else density * float(mesh.volume)
+            mass = (
+                Distribution.of(self.spec.mass).mean
+                if density is None
+                else density * float(mesh.volume)
+            )
         if self.trial.truth.table is not None:
             mesh, *parts = (moved_mesh(x, self.obj_from_world) for x in (mesh, *parts))
         return Body(mesh, parts, mass)

@@ -40,6 +40,7 @@ from torchgrasp.planner.objects import digest
 from torchgrasp.shape.fit import fit_shape
 from torchgrasp.shape.surface import surface_field
 from torchgrasp.sim.convex_parts import convex_parts
+from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import Grasps, PointCloud
 from torchgrasp.values.specs import ContactSpec
 
@@ -169,8 +170,8 @@ def _plan(
     cloud: Any, view: ObjectView, protocol: Protocol, spec: EvaluationSpec, **more: Any
 ) -> Any:
     """Plan grasps on the cloud of a view, or on several clouds."""
-    friction = min(protocol.trial.friction, MOST_FRICTION)
-    contacts = ContactSpec(friction=friction, table=Plane.horizontal(0.0))
+    friction = Distribution.of(protocol.trial.friction).clamped(0.0, MOST_FRICTION)
+    contacts = ContactSpec(friction=friction.simplest, table=Plane.horizontal(0.0))
     more |= {"fingers": spec.fingers, "task": protocol.task}
     return plan_grasps(cloud, view.load_hand(), contacts, spec.starts, spec.seed, **more)
 

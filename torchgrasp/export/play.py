@@ -42,6 +42,7 @@ from torchgrasp.sim.scene_spec import (
     mounted_urdf,
     pair_masks,
 )
+from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import Grasps
 from torchgrasp.values.specs import TrialSpec
 
@@ -198,7 +199,11 @@ def _scene(
     axes = zip("xyz", AXES, strict=True)
     slides = [Slide(f"{OWN}mount_{x}", axis, -reach, reach, 0.0) for x, axis in axes]
     drives = stiff_drives(hand, spec.kp)
-    mass = spec.mass if spec.density is None else spec.density * float(mesh.volume)
+    mass = (
+        Distribution.of(spec.mass).mean
+        if spec.density is None
+        else spec.density * float(mesh.volume)
+    )
     return SceneSpec(
         hand.urdf_path,
         np.eye(4),
@@ -208,7 +213,7 @@ def _scene(
         mesh,
         list(parts),
         mass,
-        spec.friction,
+        Distribution.of(spec.friction).mean,
         spec.gravity,
         spec.timestep,
         patch=spec.patch,
@@ -231,7 +236,7 @@ def pressing_force(spec: TrialSpec, mass: Positive) -> float:
     """
     if spec.force is not None:
         return spec.force
-    needed = (mass * spec.gravity + PUSH) / max(spec.friction, PLAY.friction)
+    needed = (mass * spec.gravity + PUSH) / max(Distribution.of(spec.friction).mean, PLAY.friction)
     return min(needed, spec.max_force or PLAY.force, PLAY.force)
 
 

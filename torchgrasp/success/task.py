@@ -13,13 +13,11 @@ from torch import Tensor
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
-from torchgrasp.foundation.rules import Force, Range
+from torchgrasp.foundation.rules import Force
 from torchgrasp.geometry.frames import apply, real, rotate
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.values.distribution import Distribution, check_within
-
-MASSES = Range(0.001, 10.0)
-"""The masses [kg] that are possible."""
+from torchgrasp.values.specs import MASSES
 
 
 @checked

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import math
+from collections.abc import Callable
 from typing import Annotated
 
 import torch
@@ -84,8 +85,7 @@ class Distribution(Value):
         >>> Distribution.read("0.5")
         0.5
         """
-        found = cls.parse(text)
-        return found.least if found.least == found.most else found
+        return cls.parse(text).simplest
 
     @classmethod
     @checked
@@ -126,6 +126,11 @@ class Distribution(Value):
         weights = self.weights or (1.0,) * len(self.parts)
         total = math.fsum(weights)
         return tuple(x / total for x in weights)
+
+    @property
+    def simplest(self) -> "float | Distribution":
+        """The number if it is certain, else the distribution."""
+        return self.least if self.least == self.most else self
 
     @property
     def mean(self) -> float:
@@ -176,6 +181,24 @@ class Distribution(Value):
         upto = self._below(ends, reached=True)
         values = torch.stack([below, upto], 1).flatten().cummax(0).values
         return torch.stack([ends.repeat_interleave(2), values / values[-1]])
+
+    @checked
+    def times(self, factor: Positive) -> "Distribution":
+        """Return the distribution of `factor` times the number."""
+        return self._mapped(lambda x: factor * x)
+
+    @checked
+    def clamped(self, low: Measured, high: Measured) -> "Distribution":
+        """Return the distribution with intervals that end at `low` and `high`; weights are kept.
+
+        An interval beyond them becomes the nearest of the two, which may be infinite.
+        """
+        return self._mapped(lambda x: min(max(x, low), high))
+
+    def _mapped(self, function: Callable[[float], float]) -> "Distribution":
+        """Return the distribution whose intervals have their ends mapped by a function."""
+        parts = tuple((function(low), function(high)) for low, high in self.parts)
+        return dataclasses.replace(self, parts=parts)
 
     @checked(gradients=True)
     def cdf(self, x: Annotated[Float[Tensor, "*b"], ANY]) -> Float[Tensor, "*b"]:

@@ -20,6 +20,8 @@ PAPER_RADIUS = 0.1  # the paper's radius of starts, normalised
 ROUNDING = 1e-9  # relative error of a period
 FRICTIONS = Range(0.0, 10.0)
 """The coefficients of friction that are possible."""
+MASSES = Range(0.001, 10.0)
+"""The masses [kg] of objects that are possible."""
 TIP_RADIUS = 0.012
 SEPARATION = 0.026
 """Default radius [m] of a fingertip, and least distance [m] between two. Wider links lie behind
@@ -264,8 +266,8 @@ class TrialSpec(Value):
         options: components of the closing "uncertainty" or "fixed"; by default all components.
         sensor: sensors of the fingertips; the controller knows their kind.
         max_force: largest normal force [N] of a fingertip; None means no limit.
-        mass: mass of the object [kg].
-        friction: coefficient of friction of every contact.
+        mass: mass of the object [kg]; each trial draws it from a `Distribution` by its seed.
+        friction: coefficient of friction of every contact; each trial draws it as the mass.
         table_friction: coefficient of friction between object and table; by default `friction`.
         gravity: acceleration by gravity [m/s^2].
         approach: length [m] of the straight path to the pre-grasp; 0 means that the hand starts
@@ -298,8 +300,8 @@ class TrialSpec(Value):
 
     closing: ClosingMode = "uncertainty"
     holding: HoldingMode | None = None
-    mass: Annotated[float, Range(0.001, 10.0)] = 0.1
-    friction: Annotated[float, Range(0.0, 10.0)] = 0.8
+    mass: Annotated[float, MASSES] | Distribution = 0.1
+    friction: Annotated[float, FRICTIONS] | Distribution = 0.8
     gravity: Annotated[float, Range(0.0, 100.0)] = 9.81
     approach: Annotated[float, Range(0.0, 1.0)] = 0.1
     lift_height: Annotated[float, Range(0.0, 1.0)] = 0.1
@@ -327,10 +329,11 @@ class TrialSpec(Value):
         check_modes(self.sensor, self.closing, self.pressing)
         if self.max_force is not None and self.force is not None and self.force > self.max_force:
             raise BadArgument("force", self.force, f"at most max_force, {self.max_force:g}")
-        if self.table_friction is not None and self.table_friction > self.friction:
-            raise BadArgument(
-                "table_friction", self.table_friction, f"at most friction, {self.friction:g}"
-            )
+        check_within("mass", self.mass, MASSES)
+        check_within("friction", self.friction, FRICTIONS)
+        least = Distribution.of(self.friction).least
+        if self.table_friction is not None and self.table_friction > least:
+            raise BadArgument("table_friction", self.table_friction, f"at most friction, {least:g}")
         if not all(abs(x) <= 1000.0 for x in self.push):
             raise BadArgument("push", self.push, "at most 1000 N along each axis")
         if not self.control_rate * self.timestep < 1 + ROUNDING:

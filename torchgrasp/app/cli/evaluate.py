@@ -26,6 +26,7 @@ from torchgrasp.app.cli.inputs import (
     STARTS_HELP,
     import_simulator,
     load_fingers,
+    read_distribution,
 )
 from torchgrasp.app.report.evaluation_page import (
     SHARE_NAMES,
@@ -123,6 +124,14 @@ class Evaluate(_Trials, ForPrograms):
     force: float | None = option(
         None, "normal force of the strongest finger [N]; by default as the protocol says"
     )
+    friction: str | None = option(
+        None,
+        "coefficient of friction, or its distribution, such as 0.3:0.8, from which each trial "
+        "draws; by default as the protocol says",
+    )
+    mass: str | None = option(
+        None, "mass of the objects [kg], or its distribution; by default as the protocol says"
+    )
     displaced: float | None = option(
         None,
         "lifts: most that the object is displaced on each axis of the table [m]; by default as "
@@ -171,9 +180,13 @@ class Evaluate(_Trials, ForPrograms):
         import_simulator(self.simulator)
         hand, among = load_fingers(self.hand, self.fingers)
         test = self.disturbed(find_protocol(self.protocol))
-        test = test.with_trial(
-            **self.trial(force=self.force, holding=self.holding or (self.force and "force"))
-        )
+        truth = {
+            name: read_distribution(f"--{name}", text)
+            for name in ("friction", "mass")
+            if (text := getattr(self, name)) is not None
+        }
+        holding = self.holding or (self.force and "force")
+        test = test.with_trial(**self.trial(force=self.force, holding=holding, **truth))
         spec = EvaluationSpec(
             self.grasps,
             self.ranks,

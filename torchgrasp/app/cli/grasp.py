@@ -51,6 +51,7 @@ from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.success.reasons import explain_success
 from torchgrasp.success.task import GraspTask, TaskName
+from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import Grasps, PointCloud, format_success
 from torchgrasp.values.specs import ContactSpec, Mode, TrialSpec
 
@@ -106,9 +107,15 @@ class Grasp(ForPrograms):
         None, "seconds after which no batch of planning begins; by default no limit"
     )
     view: inputs.CloudOptions = nested(inputs.CloudOptions())
-    friction: float = option(0.8, "coefficient of friction between fingertips and object")
-    mass: float = option(
-        0.25, "mass [kg] for which success is predicted, and with which the simulator lifts"
+    friction: str = option(
+        "0.8",
+        "coefficient of friction between fingertips and object, or its distribution: an interval "
+        "0.3:0.8, or several with | between",
+    )
+    mass: str = option(
+        "0.25",
+        "mass [kg] for which success is predicted, and with which the simulator lifts, or its "
+        "distribution",
     )
     promise: float | None = option(
         None, "share of the grasps that must hold, such as 0.9; others are not returned"
@@ -152,7 +159,7 @@ class Grasp(ForPrograms):
             import_rerun()
         scene = self.realsense or is_scene(path)
         self._check_choice(scene)
-        _ = self._task  # refused before any work
+        _ = self._task, self._friction  # refused before any work
         hand, among = inputs.load_fingers(self.hand, self.fingers)
         if self.realsense:
             path = shoot_scene(out, self.serial, self.view)
@@ -203,7 +210,7 @@ class Grasp(ForPrograms):
         table = view.plane(file.cloud)
         plane = as_plane(table)
         spec = (ContactSpec.paper if self.mode == "paper" else ContactSpec)(
-            friction=self.friction, table=table
+            friction=self._friction, table=table
         )
         true_mesh, parts = (None, None) if mesh is None else read_true_mesh(mesh)
         inputs.print_notes(file.notes, view.judge(cloud, table))
@@ -230,7 +237,7 @@ class Grasp(ForPrograms):
             surface = run.surface
             if self.close and true_mesh is not None and len(run.executable):
                 felt = field_from_surface(surface.vertices, surface.faces, FIELD_SPACING)
-                trial = TrialSpec(friction=self.friction, mass=self.mass)
+                trial = TrialSpec(friction=self._friction, mass=self._mass)
                 options = {"parts": parts, "table": plane, "surface": felt}
                 closure = close_hand(
                     run.executable[0], run.hand, true_mesh, trial, seed=self.seed, **options
@@ -305,10 +312,20 @@ class Grasp(ForPrograms):
         )
 
     @functools.cached_property
+    def _friction(self) -> float | Distribution:
+        """The friction of --friction."""
+        return inputs.read_distribution("--friction", self.friction)
+
+    @functools.cached_property
+    def _mass(self) -> float | Distribution:
+        """The mass [kg] of --mass."""
+        return inputs.read_distribution("--mass", self.mass)
+
+    @functools.cached_property
     def _task(self) -> dict[str, Any]:
         """The options of the planner that say what the grasps must do, and where."""
         return {
-            "task": GraspTask(self.mass),
+            "task": GraspTask(self._mass),
             "promise": self.promise,
             "resist": self.resist or None,
             "keep": inputs.read_region("--keep", self.keep),
@@ -333,7 +350,7 @@ class Grasp(ForPrograms):
         """Plan for the chosen object of a scene, or the easiest object, and write the results;
         return the exit code.
         """
-        spec = ContactSpec(friction=self.friction)
+        spec = ContactSpec(friction=self._friction)
         choice = self.point if self.label is None else self.label
         names = {
             name: f"CLOUD: {name}"

@@ -31,6 +31,7 @@ from torchgrasp.geometry.linalg import unit
 from torchgrasp.geometry.plane import Plane, as_plane
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
+from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import PointCloud
 from torchgrasp.values.specs import Simulator
 
@@ -243,6 +244,12 @@ def read_region(name: str, text: str | None) -> Region | None:
                 "mesh", repr(text), "six numbers of a box, or the file of a closed mesh"
             )
         return None if text is None else Region.box(numbers[:3], numbers[3:])
+
+
+def read_distribution(name: str, text: str) -> float | Distribution:
+    """Return the number or the distribution that the text of the option `name` holds."""
+    with naming(text=name, parts=name, weights=name):
+        return Distribution.read(text)
 
 
 def without_exact_table(file: CloudFile, up: Tensor | None) -> CloudFile:
