@@ -292,7 +292,7 @@ def _friction(grasp: Grasps) -> float | Distribution:
     if friction is None or friction.least <= 0.0:
         allowed = "a positive number, or a distribution"
         raise BadArgument("grasp.meta['friction']", repr(text), allowed)
-    return friction.least if friction.least == friction.most else friction
+    return friction.simplest
 
 
 def _number(grasp: Grasps, name: str) -> float | None:

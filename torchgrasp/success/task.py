@@ -12,10 +12,11 @@ from torch import Tensor
 
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.foundation.rules import Force
 from torchgrasp.geometry.frames import apply, real, rotate
 from torchgrasp.geometry.plane import Plane
+from torchgrasp.values.closing import ClosureResult
 from torchgrasp.values.distribution import Distribution, check_within
 from torchgrasp.values.specs import MASSES
 
@@ -61,6 +62,24 @@ class GraspTask(Value):
         return f"{what} of {Distribution.of(self.mass)} kg{force}" + (
             ", displaced" if self.displaced else ""
         )
+
+    @checked
+    def updated(self, result: ClosureResult) -> "GraspTask":
+        """Return the task of the next grasp, with what a lift has shown of the mass
+        (`ClosureResult.mass`).
+
+        The mass stays if the lift neither held nor was too heavy. Where it excludes what the lift
+        has shown, the lift alone decides.
+        """
+        felt = result.mass
+        if felt is None or result.status not in (Status.OK, Status.TOO_HEAVY):
+            return self
+        mass = Distribution.of(self.mass)
+        if mass.share(felt.least, felt.most) > 0.0:
+            mass = mass.given(felt.least, felt.most)
+        else:
+            mass = felt.clamped(MASSES.low, MASSES.high)
+        return dataclasses.replace(self, mass=mass.simplest)
 
     @checked
     def pressing(self, lifted: bool) -> float:

@@ -10,7 +10,7 @@ from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Force, Length, Range
 from torchgrasp.geometry.plane import Plane, as_plane
-from torchgrasp.values.closing import ClosingOptions, SensorModel, choose_options
+from torchgrasp.values.closing import ClosingOptions, ClosureResult, SensorModel, choose_options
 from torchgrasp.values.distribution import Distribution, check_within
 
 Simulator = Literal["sapien", "mujoco"]
@@ -100,6 +100,15 @@ class ContactSpec(Value):
     def plane(self) -> Plane | None:
         """The table as a plane in the cloud's frame, or None if there is no table."""
         return as_plane(self.table)
+
+    @checked
+    def updated(self, result: ClosureResult) -> "ContactSpec":
+        """Return the constraints of the next grasp, with what a closing has shown of the friction
+        (`ClosureResult.friction`).
+        """
+        if result.friction is None:
+            return self
+        return dataclasses.replace(self, friction=result.friction.simplest)
 
     @property
     def planned_friction(self) -> float:
