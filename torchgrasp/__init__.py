@@ -30,6 +30,7 @@ from torchgrasp.shape.fit import fit_shape
 from torchgrasp.contacts.region import Region
 from torchgrasp.contacts.certify import certify
 from torchgrasp.contacts.closure_probability import closure_probability
+from torchgrasp.contacts.critical import critical_friction
 from torchgrasp.contacts.plan import plan_contacts
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
@@ -81,6 +82,7 @@ __all__ = [
     "Region",
     "certify",
     "closure_probability",
+    "critical_friction",
     "plan_contacts",
     "Hand",
     "load_hand",

@@ -1,0 +1,391 @@
+"""The least friction at which contacts can balance, and the forces that need it.
+
+Forces f_i on the object with the outward normals n_i have the normal parts a_i = -n_i . f_i, and
+the tangential parts t_i. G maps them to their total force and torque. The critical friction is the
+least mu for which
+
+    G f = 0,    sum a_i = number of contacts,    x_i = (mu a_i, t_i) in the cone |t_i| <= mu a_i
+
+has a solution. With the multipliers s_i of the cones, y of the balance and l of the sum, the best
+forces satisfy, for x_i = M_i f_i with the linear map M_i,
+
+    M_i^T s_i = G_i^T y + l n_i,    sum a_i s_i0 = 1,    x_i o s_i = nu e,    nu -> 0.
+
+The twist y is a motion of the object, along which friction of the coefficient mu just stops all
+contacts. Newton's method with the scaling of Nesterov and Todd [1] solves the equations for falling
+nu. The three numbers of a contact scale as the cone itself does: with the scaling point w of x and
+s, D = (2 J w w^T J - J) / beta maps x to s, and has the inverse beta (2 w w^T - J).
+
+[1] Andersen, Roos and Terlaky, Mathematical Programming 95, 2003.
+"""
+
+import dataclasses
+from typing import Annotated, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchgrasp.contacts.balance import grasp_map
+from torchgrasp.contacts.form_closure import Vectors, scaled_arms
+from torchgrasp.foundation.base import FINGERTIPS, flatnonzero
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.rules import ANY
+from torchgrasp.foundation.threads import single_threaded
+from torchgrasp.geometry.frames import degenerate
+from torchgrasp.geometry.linalg import dot, eye_like, matvec, norm
+from torchgrasp.shape.kernel import is_plain
+
+
+@dataclasses.dataclass(frozen=True)
+class CriticalNumbers:
+    """Parameters of Newton's method for the critical friction."""
+
+    most: float = 10.0
+    """Greatest friction coefficient; contacts that need more count as unable to balance."""
+    exact: float = 1e-6
+    """The last nu: the result is larger than the critical friction by about 2 nu a contact."""
+    steps: int = 60
+    """Most steps; most contact sets need fewer than 15."""
+    first: float = 1.5
+    """The first friction coefficient, as a multiple of what the first forces need."""
+    above: float = 0.2
+    """Added to the first friction coefficient."""
+    pushing: float = 0.05
+    """Least normal force of first forces that balance; otherwise the first forces are normal."""
+    within: float = 0.9
+    """Share of the way to the edge of the cones that a step goes at most."""
+    shorter: tuple[float, ...] = (1.0, 0.8, 0.5, 0.2, 0.05)
+    """Shares of a step that are tried, since the product mu a_i is not linear."""
+    power: float = 1.5
+    """Exponent of the part of nu that the next step keeps; the base is what a step to nu = 0 leaves
+    undone.
+    """
+    short: float = 0.3
+    """A step with a lesser share is short: the next one keeps mu, and `kept` of nu."""
+    kept: float = 0.5
+    """Share of nu that is kept after a short step."""
+    polishing: int = 2
+    """Number of whole steps at the end, which leave nothing but rounding."""
+    rounding: float = 1e-6
+    """Largest resultant of forces that balance, for normal forces of about 1."""
+
+
+CRITICAL = CriticalNumbers()
+
+
+class LeastBalance(NamedTuple):
+    """Balanced forces that need the least friction, with the multipliers that prove it.
+
+    Args:
+        forces: forces f on the object (b, f, 3), with a mean normal force of 1.
+        friction: the friction coefficient mu (b,).
+        press: multipliers s_0 of the cones (b, f).
+        slide: tangential multipliers of the cones (b, f, 3).
+        twist: motion y of the object (b, 6), in the units of `scaled_arms`.
+        scale: multiplier l of the sum of the normal forces (b,).
+    """
+
+    forces: Vectors
+    friction: Float[Tensor, "b"]
+    press: Float[Tensor, "b f"]
+    slide: Vectors
+    twist: Float[Tensor, "b 6"]
+    scale: Float[Tensor, "b"]
+
+    def plus(self, other: "LeastBalance", share: Float[Tensor, "b"]) -> "LeastBalance":
+        """Return the sum of this one and a share of the other one."""
+        shares = [share.reshape(-1, *[1] * (x.ndim - 1)) for x in self]
+        return LeastBalance(*(x + s * d for x, s, d in zip(self, shares, other, strict=True)))
+
+    def rows(self, rows: Tensor) -> "LeastBalance":
+        """Return some of the rows."""
+        return LeastBalance(*(x[rows] for x in self))
+
+
+@checked
+@single_threaded
+def critical_friction(
+    points: Annotated[Float[Tensor, "*b f 3"], ANY],
+    normals: Annotated[Float[Tensor, "*b f 3"], ANY],
+) -> Float[Tensor, "*b"]:
+    """Return the least common friction coefficient at which contacts have force closure.
+
+    At any greater friction there are balanced forces inside all friction cones, and at any lesser
+    one there are none. The result is infinite for contacts that cannot balance at a friction up to
+    10, contacts on a line, and contacts that are not finite. It is infinite, too, for the few contacts
+    for which the method does not converge.
+
+    Raises `BadArgument` for a number of contacts other than 3 to 5.
+
+    Args:
+        points: positions [m] of f contacts.
+        normals: outward unit normals of the object.
+
+    >>> points = torch.tensor([[0.0, 1, 0], [0, 0, 0], [1, 0.5, 0]])
+    >>> normals = torch.tensor([[-1.0, 0, 0], [-1, 0, 0], [0.8, 0, 0.6]])
+    >>> f"{float(critical_friction(points, normals)):.3f}"
+    '0.750'
+    """
+    f = points.shape[-2]
+    if not FINGERTIPS[0] <= f <= FINGERTIPS[1]:
+        raise BadArgument("points", f"{f} contacts a set", "3 to 5 contacts")
+    flat = points.reshape(-1, f, 3).double()
+    rows, found = least_balance(flat, normals.reshape(-1, f, 3).double())
+    friction = flat.new_full((len(flat),), torch.inf).index_put((rows,), found.friction)
+    return friction.to(points).reshape(points.shape[:-2])
+
+
+def least_balance(
+    points: Vectors, normals: Vectors, nu: float = CRITICAL.exact
+) -> tuple[Int[Tensor, "k"], LeastBalance]:
+    """Return the indices of the k contact sets that can balance, and their balances.
+
+    A `nu` that is not small gives forces inside the friction cones, which are more even. The
+    balances are differentiable in `points` and `normals`. Where several motions of the object prove
+    the friction, its derivative is that of one of them.
+    """
+    with torch.no_grad():
+        rows, found = _search(points.detach(), normals.detach(), nu)
+        for _ in range(CRITICAL.polishing):
+            found = _Cones.of(points.detach()[rows], normals.detach()[rows]).nearer(found, nu)
+    if is_plain(points, normals):
+        return rows, found
+    # Newton's steps at the solution change the derivatives alone: the first step those of first
+    # order, the second step those of second order.
+    cones = _Cones.of(points[rows], normals[rows])
+    for _ in range(2):
+        found = cones.nearer(found, nu)
+    return rows, found
+
+
+def _search(points: Vectors, normals: Vectors, nu: float) -> tuple[Int[Tensor, "k"], LeastBalance]:
+    """Return the result of `least_balance`, without derivatives."""
+    numbers = CRITICAL
+    finite = torch.isfinite(points) & torch.isfinite(normals)
+    left = flatnonzero(finite.flatten(1).all(1) & ~degenerate(points))
+    cones = _Cones.of(points[left], normals[left])
+    at = cones.first()
+    whole = points.new_ones(len(left))
+    shorter = whole.new_tensor(numbers.shorter)
+    last = whole
+    aimed = whole
+    found_rows = list[Tensor]()
+    found = list[LeastBalance]()
+    for _ in range(numbers.steps):
+        held = last < numbers.short
+        still, centring = cones.directions(at, held)
+        mean = cones.products(at).mean(1)
+        undone = (1 - cones.longest(at, still)).clamp(0, 1)
+        kept = torch.where(held, numbers.kept, undone**numbers.power)
+        target = (kept * mean).clamp_min(nu)
+        change = still.plus(centring, target)
+        share = (numbers.within * cones.longest(at, change)).clamp_max(1)
+        tried = share[:, None] * shorter
+        inside = cones.inside(at, change, tried)
+        share = tried.gather(1, inside.double().argmax(1, keepdim=True))[:, 0]
+        at = at.plus(change, share)
+        settled = (share == 1) & (last == 1) & (target == nu) & (aimed == nu)
+        last = share
+        aimed = target
+        lost = ~(at.friction < 2 * numbers.most)
+        going = flatnonzero(~(settled | lost))
+        if len(going) == len(last):
+            continue
+        ended = flatnonzero(settled & (cones.resultant(at) <= numbers.rounding))
+        found_rows.append(left[ended])
+        found.append(at.rows(ended))
+        left = left[going]
+        at = at.rows(going)
+        cones = _Cones(*(x[going] for x in cones))
+        last = last[going]
+        aimed = aimed[going]
+        if len(left) == 0:
+            break
+    found_rows.append(left[:0])
+    found.append(at.rows(left[:0]))
+    rows = torch.cat(found_rows)
+    joined = LeastBalance(*(torch.cat(x) for x in zip(*found, strict=True)))
+    order = torch.argsort(rows)
+    order = order[joined.friction[order] <= numbers.most]
+    return rows[order], joined.rows(order)
+
+
+class _Cones(NamedTuple):
+    """The friction cones of b contact sets: the normals, and the rows of G and of the sum of normal
+    forces (b, 7, f, 3).
+    """
+
+    normals: Vectors
+    rows: Float[Tensor, "b 7 f 3"]
+
+    @classmethod
+    def of(cls, points: Vectors, normals: Vectors) -> "_Cones":
+        """Return the cones of contacts."""
+        balance = grasp_map(scaled_arms(points)).unflatten(2, (-1, 3))
+        return cls(normals, torch.cat([balance, normals[:, None]], 1))
+
+    def first(self) -> LeastBalance:
+        """Return the start: equal pushes, made to balance where they then push everywhere."""
+        numbers = CRITICAL
+        n = self.normals
+        b, f, _ = n.shape
+        grasp = self.rows[:, :6].flatten(2)
+        total = -(grasp @ n.flatten(1)[..., None])
+        needed, _ = torch.linalg.solve_ex(grasp @ grasp.mT, total)
+        balanced = -n - (grasp.mT @ needed)[..., 0].view(b, f, 3)
+        pushes = (-dot(balanced, n) > numbers.pushing).all(1)[:, None, None]
+        forces = torch.where(pushes, balanced, -n)
+        forces = forces * (f / -dot(forces, n).sum(1))[:, None, None]
+        push, tangential = self.split(forces)
+        friction = numbers.first * (norm(tangential) / push).amax(1) + numbers.above
+        ahead = friction[:, None] * push
+        press = ahead / _form(ahead, tangential)
+        slide = -tangential / _form(ahead, tangential)[..., None]
+        nu = 1 / (press * push).sum(1)
+        slide = nu[:, None, None] * slide
+        twist = n.new_zeros(b, 6)
+        return LeastBalance(forces, friction, nu[:, None] * press, slide, twist, -2 * nu)
+
+    def split(self, forces: Float[Tensor, "*b f 3"]) -> tuple[Tensor, Tensor]:
+        """Return normal and tangential parts of forces."""
+        push = -dot(forces, self.normals)
+        return push, forces + push[..., None] * self.normals
+
+    def products(self, at: LeastBalance) -> Float[Tensor, "b f"]:
+        """Return half of x_i . s_i, the nu of each contact."""
+        push, tangential = self.split(at.forces)
+        return (at.friction[:, None] * push * at.press + dot(tangential, at.slide)) / 2
+
+    def resultant(self, at: LeastBalance) -> Float[Tensor, "b"]:
+        """Return the length of the total wrench of the forces."""
+        return norm(matvec(self.rows[:, :6].flatten(2), at.forces.flatten(1)))
+
+    def longest(self, at: LeastBalance, change: LeastBalance) -> Float[Tensor, "b"]:
+        """Return the largest share of a change for which all x_i and s_i stay in their cones, to
+        first order.
+        """
+        push, tangential = self.split(at.forces)
+        more, across = self.split(change.forces)
+        friction = at.friction[:, None]
+        ahead = friction * more + change.friction[:, None] * push
+        first = _way(friction * push, tangential, ahead, across)
+        second = _way(at.press, at.slide, change.press, change.slide)
+        return torch.minimum(first, second).amin(1)
+
+    def inside(
+        self, at: LeastBalance, change: LeastBalance, shares: Float[Tensor, "b s"]
+    ) -> Bool[Tensor, "b s"]:
+        """Return for each of s shares of a change whether the forces stay in the cones."""
+        push, tangential = self.split(at.forces)
+        more, across = self.split(change.forces)
+        share = shares[..., None]
+        normal = push[:, None] + share * more[:, None]
+        sideways = norm(tangential[:, None] + share[..., None] * across[:, None])
+        friction = at.friction[:, None] + shares * change.friction[:, None]
+        good = (normal > 0) & (friction[..., None] * normal > sideways)
+        return good.all(-1) & (friction > 0)
+
+    def nearer(self, at: LeastBalance, nu: float) -> LeastBalance:
+        """Return the balance after a whole step to `nu`."""
+        still, centring = self.directions(at)
+        whole = torch.ones_like(at.friction)
+        return at.plus(still, whole).plus(centring, nu * whole)
+
+    def directions(
+        self, at: LeastBalance, held: Bool[Tensor, "b"] | None = None
+    ) -> tuple[LeastBalance, LeastBalance]:
+        """Return Newton's step to nu = 0, and its change for each unit of nu.
+
+        The friction does not change where `held`.
+        """
+        n = self.normals
+        mu = at.friction[:, None]
+        push, tangential = self.split(at.forces)
+        x = mu * push
+        # the scaling point w = (ahead, across) and the factor beta
+        size_x = _form(x, tangential).sqrt()
+        size_s = _form(at.press, at.slide).sqrt()
+        both = x / size_x * (at.press / size_s)
+        both = both + dot(tangential, at.slide) / (size_x * size_s)
+        half = 2 * ((1 + both) / 2).sqrt()
+        ahead = (x / size_x + at.press / size_s) / half
+        across = (tangential / size_x[..., None] - at.slide / size_s[..., None]) / half[..., None]
+        beta = size_x / size_s
+        # in the space of forces: D^-1 becomes beta (2 w w^T + 1 - (1 + 1/mu^2) n n^T)
+        point = across - (ahead / mu)[..., None] * n
+        flat = (1 + 1 / mu**2)[:, None, :, None]
+
+        def soften(z: Float[Tensor, "b c f 3"]) -> Float[Tensor, "b c f 3"]:
+            along = 2 * dot(point[:, None], z, keepdim=True) * point[:, None]
+            normal = flat * dot(n[:, None], z, keepdim=True) * n[:, None]
+            return beta[:, None, :, None] * (along + z - normal)
+
+        # how the stationarity of the forces changes with mu: the eighth row
+        stiff = (2 * ahead**2 - 1) / beta
+        by_mu = (at.press - mu * push * stiff)[..., None] * n
+        by_mu = by_mu - (2 * push * ahead / beta)[..., None] * across
+        rows = torch.cat([self.rows, by_mu[:, None]], 1)  # (b, 8, f, 3)
+        softened = soften(rows)
+        matrix = softened.flatten(2) @ rows.flatten(2).mT
+        last = (push**2 * stiff).sum(1)
+        corner = eye_like(8, n)[7]
+        matrix = matrix - last[:, None, None] * (corner[:, None] * corner)
+        multipliers = torch.cat([at.twist, at.scale[:, None]], 1)
+        pull = at.slide - (mu * at.press)[..., None] * n
+        lacking = pull - torch.einsum("br,brfi->bfi", multipliers, self.rows)
+        inverse_s = 1 / _form(at.press, at.slide)
+        inverse_x = 1 / _form(x, tangential)
+        still = soften(lacking[:, None])[:, 0] - at.forces
+        centring = -inverse_s[..., None] * (at.slide + (at.press / mu)[..., None] * n)
+        free = torch.stack([still, centring], 1)  # (b, 2, f, 3)
+        right = free.flatten(2) @ rows.flatten(2).mT  # (b, 2, 8)
+        total = torch.einsum("brfi,bfi->br", self.rows, at.forces)
+        total = total + torch.cat([total.new_zeros(6), total.new_full((1,), n.shape[1])])
+        weighed = (push * x * inverse_x).sum(1)
+        residual = torch.cat([total, torch.ones_like(weighed)[:, None]], 1)
+        other = -weighed[:, None] * corner
+        right = right + torch.stack([residual, other], 1)
+        if held is not None:
+            matrix[held, 7] = corner
+            right[held, :, 7] = 0
+        solved, _ = torch.linalg.solve_ex(matrix, right.mT)
+        solved = solved.mT  # (b, 2, 8)
+        forces = free - (solved @ softened.flatten(2)).unflatten(2, n.shape[1:])
+        twist, scale, friction = solved.split([6, 1, 1], 2)
+        more = -dot(forces, n[:, None])
+        sideways = forces + more[..., None] * n[:, None]
+        more = mu[:, None] * more + push[:, None] * friction
+        inner = ahead[:, None] * more - dot(across[:, None], sideways)
+        press = torch.stack([-at.press, x * inverse_x], 1)
+        press = press - (2 * ahead[:, None] * inner - more) / beta[:, None]
+        slide = torch.stack([-at.slide, -tangential * inverse_x[..., None]], 1)
+        bent = 2 * inner[..., None] * across[:, None] - sideways
+        slide = slide + bent / beta[:, None, :, None]
+        parts = (forces, friction[..., 0], press, slide, twist, scale[..., 0])
+        first, second = (LeastBalance(*(x[:, i] for x in parts)) for i in range(2))
+        return first, second
+
+
+def _form(ahead: Float[Tensor, "*b"], across: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
+    """Return ahead^2 - |across|^2, which is positive inside the cone."""
+    return ahead**2 - dot(across, across)
+
+
+def _way(
+    ahead: Float[Tensor, "*b"],
+    across: Float[Tensor, "*b 3"],
+    more: Float[Tensor, "*b"],
+    sideways: Float[Tensor, "*b 3"],
+) -> Float[Tensor, "*b"]:
+    """Return the way from a point in the cone along a direction to the cone's edge; infinite if it
+    never ends.
+    """
+    a = _form(more, sideways)
+    b = ahead * more - dot(across, sideways)
+    c = _form(ahead, across)
+    root = (b**2 - a * c).clamp_min(0).sqrt()
+    q = -(b + torch.where(b >= 0, root, -root))
+    ends = torch.stack([q / a, c / q], -1)
+    return torch.where(ends > 0, ends, torch.inf).amin(-1)
