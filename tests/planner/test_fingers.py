@@ -84,7 +84,7 @@ def test_files_keep_the_fingers_and_forces_of_four_balance(grasps, tmp_path):
 def test_another_hand_or_other_fingers_are_refused_by_name(grasps):
     with pytest.raises(BadArgument, match=r"hand_of.*index, middle, ring, thumb"):
         closing_gains(grasps[0], load_hand("allegro"))
-    with pytest.raises(BadArgument, match="hand: expected allegro.*got barrett"):
+    with pytest.raises(BadArgument, match=r"hand: expected allegro.*got barrett"):
         closing_gains(grasps[0], load_hand("barrett"))
     nameless = dataclasses.replace(grasps, meta={})
     with pytest.raises(BadArgument, match="4 contacts"):
