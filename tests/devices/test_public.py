@@ -13,6 +13,7 @@ from tests.devices.elsewhere import DEVICE
 from torchgrasp import (
     ClosingReference,
     ContactSpec,
+    Distribution,
     GraspController,
     PointCloud,
     Region,
@@ -23,6 +24,7 @@ from torchgrasp import (
     encode,
     fit_mixture,
     fit_shape,
+    hold_probability,
     load_mixture,
     load_object,
     load_scene,
@@ -47,6 +49,7 @@ from torchgrasp.testing import random_joints
 from torchgrasp.values.planning import ContactPlan
 
 SPEC = ContactSpec(table=0.0)
+FRICTION = Distribution.between(0.3, 0.8)
 CPU = torch.device("cpu")
 VIEW = load_object("cylinder").view
 
@@ -103,6 +106,7 @@ CONTACTS = {
     "certify": lambda contacts, shape: certify(contacts, SPEC),
     "closure_probability": lambda contacts, shape: closure_probability(shape, contacts, SPEC, 200),
     "encode": lambda contacts, shape: encode(contacts),
+    "hold_probability": lambda contacts, shape: hold_probability(contacts, FRICTION, 0.002, 0.05),
     "least_friction_forces": lambda contacts, shape: least_friction_forces(
         contacts.points, contacts.normals
     ),

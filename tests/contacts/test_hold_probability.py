@@ -1,0 +1,158 @@
+"""The probability of closure under uncertain friction, placement and normals, against random draws
+with an exact test of closure, scipy's distributions, quadrature and finite differences.
+"""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy import integrate, stats
+
+from tests.contacts.test_forces import tripods
+from tests.make import real
+from torchgrasp import Contacts, Distribution, critical_friction, hold_probability
+from torchgrasp.contacts.critical import least_balance
+from torchgrasp.contacts.form_closure import closed_exact
+from torchgrasp.contacts.hold_probability import exceeding, sensitivities
+from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.geometry.linalg import dot, unit
+
+WIDE = Distribution.between(0.2, 0.9)
+MIXED = Distribution.parse("0.2:0.4@1|0.5@1|0.6:1.0@2")
+PLACEMENT = 0.002
+TILT = math.radians(3)
+STEP = 1e-5
+
+
+def tangential(noise, normals):
+    return noise - dot(noise, normals, keepdim=True) * normals
+
+
+def drawn_share(contacts, law, generator, frictions=20, draws=100):
+    """The share of random frictions, placements and normals for which each contact set closes; each
+    of equally likely ranges of the friction has one of the frictions.
+    """
+    size = (draws, *contacts.points.shape)
+    normals = contacts.normals.expand(size)
+    closed = 0.0
+    for k in range(frictions):
+        q = (k + torch.rand(1, generator=generator, dtype=torch.float64)) / frictions
+        noise = torch.randn(2, *size, generator=generator, dtype=torch.float64)
+        moved = contacts.points + PLACEMENT * tangential(noise[0], normals)
+        turned = unit(normals + TILT * tangential(noise[1], normals))
+        found = closed_exact(moved.flatten(0, 1), turned.flatten(0, 1), float(law.quantile(q)))
+        closed = closed + found.view(draws, -1).double().mean(0)
+    return closed / frictions
+
+
+@pytest.mark.parametrize("law", [WIDE, MIXED, Distribution.parse("0.5")], ids=str)
+def test_it_is_the_share_of_random_draws_that_close(law, generator):
+    contacts = Contacts(*tripods(20, 3))
+    found = hold_probability(contacts, law, PLACEMENT, TILT)
+    share = drawn_share(contacts, law, generator)
+    assert float((found - share).abs().mean()) <= 0.02
+    assert int(((share > 0.05) & (share < 0.95)).sum()) >= 8
+    # the errors make a difference, and an order of magnitude more than the error of the draws
+    without = hold_probability(contacts, law)
+    assert float((without - share).abs().mean()) > float((found - share).abs().mean())
+
+
+def test_friction_alone_is_scipys_survival_of_the_critical_friction():
+    points, normals = tripods(20, 3)
+    normals[0] = normals[0, :1]
+    contacts = Contacts(points, normals)
+    critical = critical_friction(points, normals).numpy()
+    assert critical[0] == math.inf
+    low, point, high = stats.uniform(0.2, 0.2), stats.uniform(0.5, 1e-12), stats.uniform(0.6, 0.4)
+    wanted = (low.sf(critical) + point.sf(critical) + 2 * high.sf(critical)) / 4
+    np.testing.assert_allclose(hold_probability(contacts, MIXED), wanted, atol=1e-12)
+    wanted = stats.uniform(0.2, 0.7).sf(critical)
+    np.testing.assert_allclose(hold_probability(contacts, WIDE), wanted, atol=1e-12)
+    assert hold_probability(contacts, 0.4).tolist() == (critical < 0.4).astype(float).tolist()
+
+
+@pytest.mark.parametrize("deviation", [1e-9, 1e-3, 0.05, 3.0])
+def test_a_gaussian_threshold_is_exceeded_as_often_as_quadrature_says(deviation):
+    parts = ((0.2, 0.9), (0.5, 0.5), (0.4, 0.4 + 1e-14), (0.3, 0.31))
+    mean = torch.linspace(0.1, 1.0, 11, dtype=torch.float64)
+    found = exceeding(Distribution(parts), mean, torch.full_like(mean, deviation))
+
+    def exceeded(low, high, at):
+        gaussian = stats.norm(at, deviation)
+        if high - low < 1e-9:
+            return gaussian.cdf(low)
+        return integrate.quad(gaussian.cdf, low, high, points=[at])[0] / (high - low)
+
+    wanted = [sum(exceeded(*part, at) for part in parts) / len(parts) for at in mean.tolist()]
+    np.testing.assert_allclose(found, wanted, atol=1e-7)
+
+
+@pytest.mark.parametrize("fingertips", [3, 4, 5])
+def test_the_sensitivities_are_finite_differences_of_the_critical_friction(fingertips, generator):
+    points, normals = tripods(10, 3, fingertips)
+    rows, balance = least_balance(points, normals)
+    points = points[rows]
+    normals = normals[rows]
+    moved, turned = sensitivities(points, normals, balance)
+    noise = torch.randn(2, *points.shape, generator=generator, dtype=torch.float64)
+    move, turn = tangential(noise, normals)
+    move = 0.04 * move  # the size of the grasp [m]
+
+    def friction(step, other):
+        return critical_friction(points + step * move, unit(normals + other * turn))
+
+    for found, change in (
+        ((moved * move).sum((1, 2)), friction(STEP, 0) - friction(-STEP, 0)),
+        ((turned * turn).sum((1, 2)), friction(0, STEP) - friction(0, -STEP)),
+    ):
+        torch.testing.assert_close(found, change / (2 * STEP), rtol=1e-2, atol=1e-3)
+        assert float(found.abs().amin()) > 0
+    for x in (moved, turned):
+        assert float(dot(x, normals).abs().amax()) < 1e-9
+
+
+@pytest.mark.parametrize(("placement", "tilt"), [(0.0, 0.0), (PLACEMENT, TILT)])
+def test_more_friction_never_lowers_it(placement, tilt):
+    contacts = Contacts(*tripods(20, 3, 4))
+    last = torch.zeros(20, dtype=torch.float64)
+    for low in torch.linspace(0.0, 1.2, 13).tolist():
+        law = Distribution.between(low, low + 0.3)
+        found = hold_probability(contacts, law, placement, tilt)
+        assert bool((found >= last - 1e-12).all())
+        last = found
+    assert bool((last > 0.9).any())
+
+
+def test_each_normal_may_have_its_own_tilt_and_sets_are_independent():
+    contacts = Contacts(*tripods(6, 3))
+    tilt = torch.full((6, 3), TILT, dtype=torch.float64)
+    both = hold_probability(contacts, WIDE, PLACEMENT, TILT)
+    assert torch.equal(hold_probability(contacts, WIDE, PLACEMENT, tilt), both)
+    tilt[2] = 0.0
+    other = hold_probability(contacts, WIDE, PLACEMENT, tilt)
+    assert (other != both).tolist() == [False, False, True, False, False, False]
+    torch.testing.assert_close(hold_probability(contacts[[4]], WIDE, PLACEMENT, TILT), both[[4]])
+    single = Contacts(contacts.points.float(), contacts.normals.float())
+    assert hold_probability(single, WIDE, PLACEMENT, TILT).dtype == torch.float32
+    assert hold_probability(contacts[:0], WIDE, PLACEMENT, TILT).shape == (0,)
+
+
+def test_wrong_arguments_are_refused():
+    points, normals = tripods(4, 3)
+    contacts = Contacts(points, normals)
+    wrong = [
+        ("contacts.points", (Contacts(points[:, :2], normals[:, :2]), 0.5)),
+        ("contacts.normals", (Contacts(points, 2 * normals), 0.5)),
+        ("contacts.points", (Contacts(points.clone().requires_grad_(), normals), 0.5)),
+        ("friction", (contacts, Distribution.between(0.5, 11.0))),
+        ("friction", (contacts, -0.1)),
+        ("placement", (contacts, 0.5, -0.001)),
+        ("tilt", (contacts, 0.5, 0.0, -0.1)),
+        ("tilt", (contacts, 0.5, 0.0, torch.full((4, 3), 4.0))),
+        ("tilt", (contacts, 0.5, 0.0, torch.zeros(4, 2))),
+        ("tilt", (contacts, 0.5, 0.0, real([[math.nan] * 3] * 4))),
+    ]
+    for argument, arguments in wrong:
+        with pytest.raises(BadArgument, match=argument):
+            hold_probability(*arguments)
