@@ -57,10 +57,10 @@ def hold_probability(
     finger placement and normals.
 
     Without `placement` and `tilt` it is exact: the probability that the friction exceeds the
-    `critical_friction`. Their errors count to first order, as the module's equations say. That is
-    good while they hardly change which contacts slip first. It is too certain where the critical
-    friction has a kink, as for contacts that are exactly symmetric. The probability is 0 where the
-    critical friction is infinite.
+    `critical_friction`, and 0 where that is infinite. Their errors count to first order, by the
+    equations of this module. So it is mostly a little too high, since errors also raise the mean of
+    the critical friction. Errors count too little where the critical friction has a kink, as for
+    contacts that are exactly symmetric.
 
     Raises `BadArgument` for sets of other than 3 to 5 contacts, normals that are not of length 1
     (to 1e-3), and numbers outside their range.
