@@ -177,8 +177,9 @@ def write_table(folder: Path, name: str, rows: list[Row], options: Options) -> N
 
 
 def command_line() -> str:
-    """Return the command that runs this bench, as it was typed."""
-    return " ".join(["scripts/bench.py", *sys.argv[1:]])
+    """Return the command that runs this bench, as it was typed, with DIR for folders of data."""
+    words = ["DIR" if Path(word).is_absolute() else word for word in sys.argv[1:]]
+    return " ".join(["scripts/bench.py", *words])
 
 
 def format_rows(rows: Iterable[Row]) -> list[str]:
