@@ -1,4 +1,6 @@
-"""scripts/bench.py headline: counts of lifts by hand; the hidden side against a sphere."""
+"""scripts/bench.py headline: README's table is of plans that the present code makes; counts of lifts
+by hand; the hidden side against a sphere.
+"""
 
 import math
 
@@ -9,6 +11,9 @@ from benchmarks.headline.lifts import row_of
 from benchmarks.headline.page import (
     BEGIN,
     END,
+    README,
+    golden_plans,
+    read_plans,
     readme_table,
     replace_table,
 )
@@ -17,6 +22,20 @@ from benchmarks.headline.shapes import judge_hidden
 from torchgrasp.evaluation import ProtocolResult, ViewScore
 from torchgrasp.foundation.errors import Status
 from torchgrasp.geometry.linalg import unit
+
+CLOSE = 1e-6  # of joints [rad], contacts [m] and log-odds: processors round otherwise
+
+
+def test_the_plans_of_the_table_in_readme_are_those_of_the_present_code():
+    """Otherwise the table is of another planner: run scripts/bench.py headline --publish again."""
+    told = read_plans()
+    found = golden_plans()
+    assert found.keys() == told.keys()
+    for name, plan in found.items():
+        assert plan["statuses"] == told[name]["statuses"], name
+        for what in ("joints", "contacts", "log_odds"):
+            one, other = (torch.tensor(x[name][what]).double() for x in (found, told))
+            assert torch.allclose(one, other, rtol=0.0, atol=CLOSE), (name, what)
 
 
 def scores() -> list[ViewScore]:
@@ -50,7 +69,7 @@ def test_the_table_of_readme_stands_between_its_marks():
     text = replace_table(f"before\n{BEGIN}\nold\n{END}\nafter\n", lines)
     assert text == "\n".join(["before", BEGIN, "", *lines, "", END, "after", ""])
     assert replace_table(text, lines) == text
-
+    assert README.read_text("utf-8").count(BEGIN) == 1
     with pytest.raises(SystemExit, match=r"README\.md has no lines"):
         replace_table("nothing", lines)
 
