@@ -137,30 +137,27 @@ def critical_friction(
     return friction.to(points).reshape(points.shape[:-2])
 
 
-def least_balance(
-    points: Vectors, normals: Vectors, nu: float = CRITICAL.exact
-) -> tuple[Int[Tensor, "k"], LeastBalance]:
+def least_balance(points: Vectors, normals: Vectors) -> tuple[Int[Tensor, "k"], LeastBalance]:
     """Return the indices of the k contact sets that can balance, and their balances.
 
-    A `nu` that is not small gives forces inside the friction cones, which are more even. The
-    balances are differentiable in `points` and `normals`. Where several motions of the object prove
-    the friction, its derivative is that of one of them.
+    The balances are differentiable in `points` and `normals`. Where several motions of the object
+    prove the friction, its derivative is that of one of them.
     """
     with torch.no_grad():
-        rows, found = _search(points.detach(), normals.detach(), nu)
+        rows, found = _search(points.detach(), normals.detach())
         for _ in range(CRITICAL.polishing):
-            found = _Cones.of(points.detach()[rows], normals.detach()[rows]).nearer(found, nu)
+            found = _Cones.of(points.detach()[rows], normals.detach()[rows]).nearer(found)
     if is_plain(points, normals):
         return rows, found
     # Newton's steps at the solution change the derivatives alone: the first step those of first
     # order, the second step those of second order.
     cones = _Cones.of(points[rows], normals[rows])
     for _ in range(2):
-        found = cones.nearer(found, nu)
+        found = cones.nearer(found)
     return rows, found
 
 
-def _search(points: Vectors, normals: Vectors, nu: float) -> tuple[Int[Tensor, "k"], LeastBalance]:
+def _search(points: Vectors, normals: Vectors) -> tuple[Int[Tensor, "k"], LeastBalance]:
     """Return the result of `least_balance`, without derivatives."""
     numbers = CRITICAL
     finite = torch.isfinite(points) & torch.isfinite(normals)
@@ -179,14 +176,14 @@ def _search(points: Vectors, normals: Vectors, nu: float) -> tuple[Int[Tensor, "
         mean = cones.products(at).mean(1)
         undone = (1 - cones.longest(at, still)).clamp(0, 1)
         kept = torch.where(held, numbers.kept, undone**numbers.power)
-        target = (kept * mean).clamp_min(nu)
+        target = (kept * mean).clamp_min(numbers.exact)
         change = still.plus(centring, target)
         share = (numbers.within * cones.longest(at, change)).clamp_max(1)
         tried = share[:, None] * shorter
         inside = cones.inside(at, change, tried)
         share = tried.gather(1, inside.double().argmax(1, keepdim=True))[:, 0]
         at = at.plus(change, share)
-        settled = (share == 1) & (last == 1) & (target == nu) & (aimed == nu)
+        settled = (share == 1) & (last == 1) & (target == numbers.exact) & (aimed == numbers.exact)
         last = share
         aimed = target
         lost = ~(at.friction < 2 * numbers.most)
@@ -287,11 +284,11 @@ class _Cones(NamedTuple):
         good = (normal > 0) & (friction[..., None] * normal > sideways)
         return good.all(-1) & (friction > 0)
 
-    def nearer(self, at: LeastBalance, nu: float) -> LeastBalance:
-        """Return the balance after a whole step to `nu`."""
+    def nearer(self, at: LeastBalance) -> LeastBalance:
+        """Return the balance after a whole step to the last nu."""
         still, centring = self.directions(at)
         whole = torch.ones_like(at.friction)
-        return at.plus(still, whole).plus(centring, nu * whole)
+        return at.plus(still, whole).plus(centring, CRITICAL.exact * whole)
 
     def directions(
         self, at: LeastBalance, held: Bool[Tensor, "b"] | None = None

@@ -135,9 +135,8 @@ class SupportPlane:
     # with u . p + o < 0 for points p within; None: the region is unbounded
     sides: Float[Tensor, "s 4"] | None = None
     width: float = math.inf  # least width of the region [m]
-    local: bool = (
-        False  # whether it is bowed or small, so that the plane holds near its region only
-    )
+    # whether it is bowed or small, so that the plane holds near its region only
+    local: bool = False
 
     def covers(self, points: Float[Tensor, "*b 3"], margin: float = 0.0) -> Bool[Tensor, "*b"]:
         """Return a mask of the points [m] over the region, or at most `margin` [m] beside it.

@@ -15,7 +15,7 @@ from torchgrasp.foundation.lazy import ndimage
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.geometry.support_planes import SupportPlane
 from torchgrasp.scene.image import IMAGE, DepthImage
-from torchgrasp.scene.segment import count_labels, may_be_own, rests_on, segment
+from torchgrasp.scene.segment import at_one_jump, count_labels, rests_on, segment
 from torchgrasp.scene.table_image import TableImage
 
 
@@ -283,7 +283,9 @@ def label_again(
     view = TableImage.of(image, support)
     before = TableImage(image, view.points, SupportPlane(former))
     own = torch.isin(labels, torch.tensor(given, dtype=torch.long))
-    kept = torch.where(own & _on_objects(view, labels), labels, 0)
+    # a support takes no pixel from which it has moved away
+    away = view.height >= before.height
+    kept = torch.where(own & (_on_objects(view, labels) | away), labels, 0)
     found = segment(view)
     seen = rests_on(before)
     width = int(found.max()) + 1
@@ -321,14 +323,15 @@ def _beside(objects: Tensor, target: Tensor, mask: Tensor, belongs: Tensor) -> I
 def _on_objects(view: TableImage, labels: Int[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
     """Return a mask of the pixels on the surface of an object.
 
-    Labels that lose many pixels at jumps of depth are those of thin bars, and keep more.
+    Labels with many pixels at jumps of depth are those of thin bars, and keep these pixels. Labels
+    that lose the other pixels lose none when they are read again.
     """
     sure = rests_on(view)
+    beside = at_one_jump(view) & ~sure
     names, own = labels.unique(return_inverse=True)
-    at_jumps = view.measured & ~sure & ~_on_support(view)
-    lost = count_labels(own[at_jumps], len(names))
-    thin = lost > MASKS.told * count_labels(own[view.measured], len(names))
-    return sure | (thin[own] & may_be_own(view))
+    more = count_labels(own[beside], len(names))
+    thin = more > MASKS.told * (more + count_labels(own[sure], len(names)))
+    return sure | (thin[own] & beside)
 
 
 def _on_support(view: TableImage) -> Bool[Tensor, "h w"]:

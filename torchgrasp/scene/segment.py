@@ -140,14 +140,13 @@ def _risen(view: TableImage) -> Bool[Tensor, "h w"]:
     return smooth.measured & (view.mean_height > least) & (smooth.height > SEGMENT.own * least)
 
 
-def may_be_own(view: TableImage) -> Bool[Tensor, "h w"]:
-    """Return a mask of the pixels above the table that a user may give as those of an object.
+def at_one_jump(view: TableImage) -> Bool[Tensor, "h w"]:
+    """Return a mask of the pixels above the table that may lie on bars too thin for `rests_on`.
 
-    They are the pixels of `rests_on`, and those of bars too thin for it. Flying pixels, between a
-    nearer and a farther surface, are left out.
+    Flying pixels, between a nearer and a farther surface, are left out.
     """
     before_jump, behind_jump = _jumps(view.smooth)
-    return rests_on(view) | (_risen(view) & ~(before_jump & behind_jump))
+    return _risen(view) & ~(before_jump & behind_jump)
 
 
 def _core(smooth: TableImage, risen: Tensor) -> Bool[Tensor, "h w"]:
