@@ -16,6 +16,7 @@ from torch.nn.functional import normalize
 
 from torchgrasp import (
     Contacts,
+    Distribution,
     ContactSpec,
     GraspMixture,
     Hand,
@@ -265,6 +266,20 @@ def of_distances(dtype: torch.dtype) -> tuple[Function, tuple[Tensor, ...]]:
     return (lambda distance: shape_of(distance=distance).predict(x).distance), (TOLD,)
 
 
+UNCERTAIN = Distribution(((0.2, 0.5), (0.6, 0.6), (0.7, 1.2)), (0.5, 0.2, 0.3))
+"""A distribution with two intervals and a single number."""
+
+
+def of_probabilities(dtype: torch.dtype) -> tuple[Function, tuple[Tensor, ...]]:
+    q = torch.tensor([[0.1, 0.3, 0.45], [0.75, 0.8, 0.9]], dtype=torch.float64, device="cpu")
+    return UNCERTAIN.quantile, (q.to(dtype),)
+
+
+def of_numbers(dtype: torch.dtype) -> tuple[Function, tuple[Tensor, ...]]:
+    x = torch.tensor([[0.25, 0.3, 0.45], [0.75, 0.9, 1.1]], dtype=torch.float64, device="cpu")
+    return UNCERTAIN.cdf, (x.to(dtype),)
+
+
 CODE = ("j", *CODE_NAMES)
 PLAIN = ("a", "b")
 GAUSSIAN = "torchgrasp.posture_model.gaussian.GaussianMixture"
@@ -299,6 +314,12 @@ ROWS: dict[str, Row] = {
         ONCE,
         of_contacts(margin),
         note="by the dual; a subgradient where it is not unique",
+    ),
+    "torchgrasp.values.distribution.Distribution.cdf": Row(
+        "numbers", TWICE, of_numbers, note="the density; zero between intervals"
+    ),
+    "torchgrasp.values.distribution.Distribution.quantile": Row(
+        "probabilities", TWICE, of_probabilities, note="zero at a single number"
     ),
     "torchgrasp.posture_model.mixture.encode": Row("points, normals", TWICE, of_contacts(code)),
     **densities(GAUSSIAN, GaussianMixture, PLAIN),

@@ -13,7 +13,16 @@ from torch import Tensor
 from torchgrasp.foundation.base import Value, kept
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
-from torchgrasp.foundation.rules import ANY, LEAST, Measured, Positive, Range, Seed, show
+from torchgrasp.foundation.rules import (
+    ANY,
+    LEAST,
+    Measured,
+    Positive,
+    Range,
+    Seed,
+    is_known,
+    show,
+)
 from torchgrasp.geometry.frames import real
 
 MOST_PARTS = 10_000
@@ -221,9 +230,10 @@ class Distribution(Value):
     def quantile(self, q: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
         """Return the least number x with P(X <= x) >= q; `q` is in [0, 1].
 
-        Raises `BadArgument` for another probability.
+        Its derivative is one over the density, and 0 at a single number. Raises `BadArgument` for
+        another probability; torch.vmap and torch.compile leave this check out.
         """
-        if not bool(((q >= 0) & (q <= 1)).all()):
+        if is_known(q) and not bool(((q >= 0) & (q <= 1)).all()):
             raise BadArgument("q", "a number outside [0, 1]", "probabilities in [0, 1]")
         numbers, values = self._steps.to(q)
         values = values.contiguous()
