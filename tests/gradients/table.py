@@ -16,8 +16,8 @@ from torch.nn.functional import normalize
 
 from torchgrasp import (
     Contacts,
-    Distribution,
     ContactSpec,
+    Distribution,
     GraspMixture,
     Hand,
     Plane,
