@@ -16,7 +16,8 @@
 * shape: objects: the estimated shape against true meshes
 
 Each bench prints rows, and writes them as JSON and as a Markdown table with commit, machine and
-command. Times are for a quiet machine; beside other work set OMP_WAIT_POLICY=PASSIVE.
+command. A run that was stopped goes on: rows of the same commit and options are kept in --out.
+Times are for a quiet machine; beside other work set OMP_WAIT_POLICY=PASSIVE.
 """
 
 import dataclasses

@@ -20,6 +20,8 @@ from torchgrasp.evaluation.intervals import Share, contrast_over
 from torchgrasp.files import write_file
 
 ROOT = Path(__file__).resolve().parents[2]
+CHANGED = " with changes"
+"""What stands behind a commit if the working tree differs from it."""
 Result = TypeVar("Result")
 
 
@@ -150,7 +152,7 @@ def measure(subject: str, options: Options) -> list[Row]:
         if known[name].objects and not options.objects:
             print(f"{subject}/{name} needs --objects")
             continue
-        rows = known[name].run(options)
+        rows = keep_rows(options, f"{subject}-{name}", lambda run=known[name].run: run(options))
         print(*rows, sep="\n", flush=True)
         write_table(
             ROOT / "docs" / "results" if options.publish else options.out,
@@ -168,6 +170,29 @@ def measure(subject: str, options: Options) -> list[Row]:
     }
     write_file(options.out / f"bench_{subject}.json", json.dumps(content, indent=1, default=str))
     return found
+
+
+CHOICES = ("only", "out", "publish", "workers")
+"""Options that change no row."""
+
+
+def keep_rows(options: Options, name: str, measure_rows: Callable[[], list[Row]]) -> list[Row]:
+    """Return the rows of a stopped run of the same commit and options, or measure and keep them.
+
+    Rows are kept in the folder `out`, but not while the working tree has changes.
+    """
+    run = describe_run(options.threads)
+    settings = {k: v for k, v in dataclasses.asdict(options).items() if k not in CHOICES}
+    head = {"run": run, "settings": json.loads(json.dumps(settings, default=str))}
+    path = options.out / "rows" / f"{name}.json"
+    if path.is_file():
+        content = json.loads(path.read_text("utf-8"))
+        if content["head"] == head and CHANGED not in run:
+            return [Row(**row) for row in content["rows"]]
+    rows = measure_rows()
+    content = {"head": head, "rows": list(map(dataclasses.asdict, rows))}
+    write_file(path, json.dumps(content, indent=1, default=str))
+    return rows
 
 
 def write_table(folder: Path, name: str, rows: list[Row], options: Options) -> None:
@@ -199,9 +224,9 @@ def describe_run(threads: int) -> str:
             ["git", *words], cwd=ROOT, capture_output=True, text=True, check=False
         ).stdout.strip()
 
-    commit = (git("rev-parse", "--short", "HEAD") or "unknown") + (
-        " with changes" if git("status", "--short") else ""
-    )
+    commit = git("rev-parse", "--short", "HEAD") or "unknown"
+    if git("status", "--short"):
+        commit += CHANGED
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.is_file() else []
     names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]

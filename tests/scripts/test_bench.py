@@ -13,7 +13,8 @@ import pytest
 import torch
 import trimesh
 from bench import SUBJECTS
-from benchmarks.common import Options, benches_of, measure
+from benchmarks import common
+from benchmarks.common import Options, Row, benches_of, keep_rows, measure
 from benchmarks.ground_truth import nearest_on_mesh, sample_mesh
 from benchmarks.plan.exact_lp import (
     exact_margin,
@@ -70,6 +71,26 @@ def test_benches_in_the_documentation_exist_or_have_a_commit():
 def test_measure_refuses_an_unknown_bench():
     with pytest.raises(SystemExit, match="unknown; the benches of scene are"):
         measure("scene", Options(only=("nothing",)))
+
+
+def test_rows_of_a_stopped_run_are_kept_for_the_same_commit_and_options(tmp_path, monkeypatch):
+    runs = ["Commit 1", "Commit 1", "Commit 2", "Commit 1 with changes", "Commit 1 with changes"]
+    measured = list[str]()
+
+    def measure_rows() -> list[Row]:
+        measured.append(run)
+        return [Row("a share", ">= 1", "0.5", False, {"of": {"tin": 2}})]
+
+    for run in runs:
+        monkeypatch.setattr(common, "describe_run", lambda threads, run=run: run)
+        rows = keep_rows(Options(out=tmp_path), "bench", measure_rows)
+        assert rows == [Row("a share", ">= 1", "0.5", False, {"of": {"tin": 2}})]
+    assert measured == [runs[0], *runs[2:]]
+    monkeypatch.setattr(common, "describe_run", lambda threads: "Commit 1")
+    for options in (Options(out=tmp_path), Options(out=tmp_path, workers=2)):
+        keep_rows(options, "bench", measure_rows)
+    keep_rows(Options(out=tmp_path, starts=8), "bench", measure_rows)
+    assert len(measured) == len(runs) + 1
 
 
 def ball(radius: float, n: int) -> torch.Tensor:

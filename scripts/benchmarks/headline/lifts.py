@@ -10,7 +10,7 @@ from typing import Any
 from train.household import household
 
 from benchmarks.close.table_lift import BASE, lift_objects
-from benchmarks.common import Options, Row, bench
+from benchmarks.common import Options, Row, bench, keep_rows
 from benchmarks.headline.left_out import LEFT_OUT
 from torchgrasp.evaluation import PoseNoise, ViewScore
 from torchgrasp.evaluation.intervals import count_by, format_share, share_over
@@ -62,9 +62,13 @@ def _tried(
 ) -> Row:
     """Return the row of one hand in one condition."""
     protocol = dataclasses.replace(BASE, **changes)
-    row = row_of(
-        hand, condition, simulator, lift_objects(o, load_hand(hand), protocol, simulator, 1), bar
-    )
+
+    def try_objects() -> list[Row]:
+        scores = lift_objects(o, load_hand(hand), protocol, simulator, 1)
+        return [row_of(hand, condition, simulator, scores, bar)]
+
+    words = f"headline {hand} {condition} {simulator}"
+    (row,) = keep_rows(o, words.replace(" ", "-"), try_objects)
     print(row, flush=True)
     return row
 
