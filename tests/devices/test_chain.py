@@ -61,6 +61,7 @@ from torchgrasp.ik.motion import collision_probability, lift_clearance
 from torchgrasp.planner.objects import take_target
 from torchgrasp.planner.rows import spread_rows
 from torchgrasp.scene import estimate_occupancy
+from torchgrasp.scene.removal import take_away
 from torchgrasp.shape import extract_surface
 from torchgrasp.shape.completion.complete import complete_cloud
 from torchgrasp.shape.completion.silhouette import silhouettes
@@ -136,6 +137,11 @@ def test_things_of_a_scene_are_planned_where_it_is(device, hand):
     there = plan_scene(sent(scene), hand, starts=1, enough=0.01)
     grasps = [thing.grasps for thing in there.things if thing.grasps is not None]
     assert grasps and all(found.joints.device == DEVICE for found in grasps)
+
+
+def test_an_object_is_taken_away_where_the_scene_is(device):
+    scene = see((0.0, 0.0, 0.06, 0.1), (0.0, 0.1, 0.06, 0.1)).select(1)
+    same(take_away(sent(scene), 2), take_away(scene, 2))
 
 
 def test_completion_is_on_the_cpu(device):

@@ -31,7 +31,7 @@ def test_a_signature_is_plain_and_has_every_option_with_the_default_of_the_reque
     shown = inspect.signature(function).parameters
     named = {name: one for name, one in shown.items() if one.kind is one.KEYWORD_ONLY}
     wanted = OPTIONS.keys() - (OF_PLANS if function is plan_scene else set())
-    assert wanted == named.keys() - {"workers", "enough"}
+    assert wanted == named.keys() - {"workers", "enough", "target"}
     assert all(named[name].default == OPTIONS[name] for name in wanted)
     assert not any(one.kind is one.VAR_KEYWORD for one in shown.values())
 

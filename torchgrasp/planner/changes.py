@@ -185,21 +185,26 @@ def _friction(request: Request) -> Iterator[Change]:
         yield Change(words, False, OPEN, _with(request, friction=friction))
 
 
-def _surrounding(scene: Scene) -> str:
-    """Return what stands around a target: objects near it, or else what is no object."""
-    some = {}
+def near_target(scene: Scene) -> list[int]:
+    """Return the labels of the objects within a finger's reach of the target, the nearest first."""
+    some = dict[int, torch.Tensor]()
     for label in scene.things:
         part = scene.points[scene.labels == label]
         some[label] = part[:: 1 + len(part) // CHANGES.compared]
     own = some.pop(scene.target or 0)
-    near = [
-        str(label)
-        for label, other in some.items()
-        if float(torch.cdist(own, other).min()) < CHANGES.beside
-    ]
+    gaps = {label: float(torch.cdist(own, other).min()) for label, other in some.items()}
+    near = [label for label, gap in gaps.items() if gap < CHANGES.beside]
+    return sorted(near, key=lambda label: gaps[label])
+
+
+def _surrounding(scene: Scene) -> str:
+    """Return what stands around a target: objects near it, or else what is no object."""
+    near = sorted(near_target(scene))
     if not near:
         return "what is no object (a wall, or furniture beside it)"
-    return f"its neighbours ({'object' if len(near) == 1 else 'objects'} {', '.join(near)})"
+    return (
+        f"its neighbours ({'object' if len(near) == 1 else 'objects'} {', '.join(map(str, near))})"
+    )
 
 
 def _surroundings(request: Request) -> Iterator[Change]:

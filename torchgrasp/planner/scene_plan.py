@@ -15,6 +15,7 @@ from torchgrasp.foundation.rules import Count, Fraction, Measured, Seed
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.hand.hand_toml import Fingers
 from torchgrasp.ik.candidates import Reachable
+from torchgrasp.planner.clearing import order_to_clear
 from torchgrasp.planner.explain import Funnel
 from torchgrasp.planner.graspable import is_vague, judge_things, order_by_ease
 from torchgrasp.planner.grasps import plan_grasps
@@ -60,7 +61,10 @@ class ThingPlan(Value):
 class ScenePlan(Value):
     """The plans of all objects in a scene, those of most probable success first.
 
-    `things` holds one plan for each object; objects without a grasp come last.
+    Args:
+        things: one plan for each object; objects without a grasp come last.
+        clear: labels of objects to take away, in this order, so that the given target has a grasp.
+            It is empty if the target has one, or if no few objects are in the way.
 
     >>> empty = ThingPlan(1, success=0.0, reason="too flat")
     >>> ScenePlan((empty,)).best is None
@@ -68,6 +72,7 @@ class ScenePlan(Value):
     """
 
     things: tuple[ThingPlan, ...]
+    clear: tuple[int, ...] = ()
 
     @property
     def best(self) -> ThingPlan | None:
@@ -84,6 +89,7 @@ def plan_scene(
     starts: Count = 1000,
     seed: Seed = 0,
     *,
+    target: int | None = None,
     enough: Fraction = 1.0,
     fingers: Fingers | None = None,
     task: GraspTask | None = None,
@@ -99,8 +105,11 @@ def plan_scene(
     Nothing is planned for an object if its image shows that it cannot be grasped
     (`Status.FEW_PIXELS` to `TOO_VAGUE`). Of the other objects, near and tall ones with free space
     around them are planned first. Objects that are larger than all objects in our trials, or cut
-    off by the image border, are planned last. Raises `BadArgument` for a scene without objects, or
-    an argument of the wrong type or range.
+    off by the image border, are planned last.
+
+    With a `target`, this object alone is planned. If it has no grasp, the search goes on without
+    the nearest objects, until `ScenePlan.clear` says which of them to take away first. Raises
+    `BadArgument` for a scene without objects, or an argument of the wrong type or range.
 
     Args:
         scene: objects on a table, or a file of `save_scene`.
@@ -108,6 +117,7 @@ def plan_scene(
         spec: the constraints on contacts; `ContactSpec()` by default.
         starts: number of random initial guesses of the contact planner for each object.
         seed: random seed.
+        target: label of the object to grasp; None means any object.
         enough: predicted success of a grasp, in [0, 1], at which the remaining objects are not
             planned.
         fingers: the fingers that grasp; "auto" chooses for each object, and `hand_of` loads the
@@ -139,11 +149,13 @@ def plan_scene(
         avoid=avoid,
         resist=resist,
     )
-    plans: list[ThingPlan] = []
     judged = judge_things(scene, hand, spec)
+    if target is not None:
+        return _plan_target(scene.select(target), judged[target], plan, starts)
+    plans: list[ThingPlan] = []
     for label in order_by_ease(scene):
         if judged[label] is not Status.OK:
-            plans.append(ThingPlan(label, 0.0, reason=judged[label].sentence, status=judged[label]))
+            plans.append(_judged_thing(label, judged[label]))
         elif any(thing.success >= enough for thing in plans):
             plans.append(ThingPlan(label, 0.0, reason="not tried: another object is easy enough"))
         else:
@@ -157,6 +169,28 @@ def plan_scene(
         )
     )
     return ScenePlan(tuple(plans))
+
+
+def _plan_target(
+    scene: Scene, judged: Status, plan: Callable[..., Grasps], starts: int
+) -> ScenePlan:
+    """Return the plan of a scene's target alone by the function `plan`, with what to take away.
+
+    `judged` is what the image shows of the target; `starts` is the number of initial guesses.
+    """
+    assert scene.target is not None
+    if judged is not Status.OK:
+        return ScenePlan((_judged_thing(scene.target, judged),))
+    thing = _plan_thing(scene, plan)
+    # a shape that is too vague stays so
+    if thing.grasps is not None or thing.status is not Status.OK:
+        return ScenePlan((thing,))
+    return ScenePlan((thing,), order_to_clear(scene, plan, starts))
+
+
+def _judged_thing(label: int, judged: Status) -> ThingPlan:
+    """Return the plan of an object that cannot be grasped, as its image shows."""
+    return ThingPlan(label, 0.0, reason=judged.sentence, status=judged)
 
 
 def _plan_thing(scene: Scene, plan: Callable[..., Grasps]) -> ThingPlan:

@@ -38,6 +38,7 @@ from torchgrasp.geometry.plane import as_plane
 from torchgrasp.geometry.signed_distance import FIELD_SPACING, field_from_surface
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import hand_of
+from torchgrasp.planner.clearing import order_to_clear
 from torchgrasp.planner.explain import Explanation, explain_empty
 from torchgrasp.planner.graspable import judge_things
 from torchgrasp.planner.grasps import plan_grasps
@@ -390,7 +391,16 @@ class Grasp(ForPrograms):
             )
             progress.end("report", self._write(out, run))
         executable = print_grasps(run)
-        answer(describe_run(run, out) | {"label": scene.target})
+        clear = ()
+        if not executable:
+            plan = functools.partial(
+                plan_grasps, hand=hand, spec=spec, seed=self.seed, fingers=among, **self._task
+            )
+            clear = order_to_clear(scene, plan, self.starts)
+        if clear:
+            words = ", then ".join(f"object {label}" for label in clear)
+            print(f"take away first  {words}; object {scene.target} then has a grasp")
+        answer(describe_run(run, out) | {"label": scene.target, "clear": list(clear)})
         return 0 if executable else 1
 
     def _with_table(self, scene: Scene, chosen: bool) -> Scene:

@@ -1,0 +1,64 @@
+"""Which objects of a scene to take away first, so that its target can be grasped."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+
+from torchgrasp.foundation.errors import GraspError, Status
+from torchgrasp.planner.changes import near_target
+from torchgrasp.scene.removal import take_away
+from torchgrasp.scene.scene import Scene
+from torchgrasp.values.planning import Grasps
+
+
+@dataclasses.dataclass(frozen=True)
+class ClearingNumbers:
+    """Bounds on the search for objects to take away."""
+
+    compared: int = 4
+    """Most objects that are compared at once, the nearest: others are seldom in the way."""
+    starts: int = 60
+    """Most initial guesses of each plan: counts are compared, no grasp is used."""
+    removed: int = 3
+    """Most objects that are taken away: after more, a new image is due."""
+
+
+CLEARING = ClearingNumbers()
+
+
+def order_to_clear(scene: Scene, plan: Callable[..., Grasps], starts: int) -> tuple[int, ...]:
+    """Return labels of the objects to take away, in order, until the target has a grasp.
+
+    Each time, the object goes without which the target has the most executable grasps. If it has
+    none, the nearest goes. The result is empty if no object is near, or if too many would have to
+    go.
+
+    Args:
+        scene: the scene, with its target.
+        plan: function that plans the target of a scene, with the number of initial guesses as
+            `starts`.
+        starts: number of initial guesses; `CLEARING.starts` if it is greater.
+    """
+    plan = functools.partial(plan, starts=min(starts, CLEARING.starts))
+    order = list[int]()
+    while len(order) < CLEARING.removed:
+        near = near_target(scene)[: CLEARING.compared]
+        if not near:
+            break
+        without = {label: take_away(scene, label) for label in near}
+        counts = {label: count_grasps(plan, one) for label, one in without.items()}
+        # of equal ones the first is taken, which is the nearest
+        best = max(near, key=lambda label: counts[label])
+        order.append(best)
+        scene = without[best]
+        if counts[best]:
+            return tuple(order)
+    return ()
+
+
+def count_grasps(plan: Callable[..., Grasps], scene: Scene) -> int:
+    """Return the number of executable grasps of a scene's target; 0 if it cannot be planned."""
+    try:
+        return int((plan(scene).status == Status.OK).sum())
+    except GraspError:
+        return 0
