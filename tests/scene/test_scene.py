@@ -155,6 +155,26 @@ def test_a_target_cut_off_at_the_border_is_told(picture):
     assert "border" in sentence
 
 
+def cylinder(x, height):
+    return trimesh.creation.cylinder(0.03, height).apply_translation([x, 0.0, height / 2])
+
+
+@pytest.mark.parametrize(
+    ("x", "height", "covers"), [(0.1, 0.12, True), (0.1, 0.03, False), (-0.1, 0.12, False)]
+)
+def test_an_object_that_hides_much_of_the_target_is_told(x, height, covers):
+    camera = look_at(0.0, 35.0, 0.7)
+    bodies = [cylinder(0.0, 0.09), cylinder(x, height)]
+    depth, labels = render_depth(bodies, camera)
+    alone = render_depth(bodies[:1], camera)[1]
+    hidden = 1 - float((labels == 1).sum() / (alone == 1).sum())
+    assert (hidden > 0.2) == covers  # what the pixels of a picture without the other say
+    seen = Scene.from_depth(depth, K, camera, labels=labels)
+    told = [x for x in seen.select(1).advice if x.startswith("object 2 stands before")]
+    assert len(told) == covers
+    assert not any("stands before" in x for x in seen.advice)  # no target
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [

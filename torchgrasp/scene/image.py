@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.cloud.depth import Array, frustum_of_image, read_depth
@@ -20,6 +20,7 @@ from torchgrasp.files import explain, read_bounded
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument, CloudFileError
+from torchgrasp.foundation.lazy import ndimage
 from torchgrasp.foundation.limits import CLOUD_BYTES
 from torchgrasp.foundation.rules import Pose
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate
@@ -283,3 +284,14 @@ def is_scene(path: Path) -> bool:
         return False
     with zipfile.ZipFile(path) as archive:
         return "depth.npy" in archive.namelist()
+
+
+def find_nearest(pixels: Bool[Tensor, "h w"]) -> tuple[Float[Tensor, "h w"], Int[Tensor, "h w"]]:
+    """Return each pixel's distance [px] to the nearest pixel of a mask, and the index of that
+    pixel.
+
+    The index is row * w + column, that in the flattened image. `pixels` is the mask.
+    """
+    found: Any = ndimage.distance_transform_edt(~pixels.numpy(), return_indices=True)
+    row, column = torch.from_numpy(found[1]).long()
+    return torch.from_numpy(found[0]), row * pixels.shape[1] + column

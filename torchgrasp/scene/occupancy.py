@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchgrasp.foundation.base import Value, settle
@@ -23,7 +23,7 @@ from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.lazy import ndimage
 from torchgrasp.geometry.frames import apply, inverse
 from torchgrasp.geometry.linalg import unit
-from torchgrasp.scene.image import DepthImage
+from torchgrasp.scene.image import DepthImage, find_nearest
 from torchgrasp.scene.scene import Scene
 
 
@@ -166,17 +166,6 @@ def cast_shadows(scene: Scene, target: int) -> Shadows:
     depth = torch.where(near, depth.reshape(-1)[nearest], depth)
     owner = torch.where(near, owner.reshape(-1)[nearest], owner)
     return Shadows(image, depth, owner, points)
-
-
-def find_nearest(pixels: Bool[Tensor, "h w"]) -> tuple[Float[Tensor, "h w"], Int[Tensor, "h w"]]:
-    """Return each pixel's distance [px] to the nearest pixel of a mask, and the index of that
-    pixel.
-
-    The index is row * w + column, that in the flattened image. `pixels` is the mask.
-    """
-    found: Any = ndimage.distance_transform_edt(~pixels.numpy(), return_indices=True)
-    row, column = torch.from_numpy(found[1]).long()
-    return torch.from_numpy(found[0]), row * pixels.shape[1] + column
 
 
 def shadow_features(

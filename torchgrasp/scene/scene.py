@@ -14,13 +14,14 @@ from torchgrasp.cloud.sensor import SensorNoise, estimate_noise
 from torchgrasp.foundation.base import Value
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.lazy import ndimage
 from torchgrasp.foundation.rules import Pose, Positive
 from torchgrasp.geometry.frames import inverse
 from torchgrasp.geometry.linalg import Points
 from torchgrasp.geometry.plane import Plane, to_upright
 from torchgrasp.geometry.support_planes import Target, find_table
 from torchgrasp.scene.creases import cut_creases
-from torchgrasp.scene.image import DepthImage, image_of_cloud, read_image
+from torchgrasp.scene.image import DepthImage, find_nearest, image_of_cloud, read_image
 from torchgrasp.scene.masks import label_image, read_labels, read_mask
 from torchgrasp.scene.merge import find_touching
 from torchgrasp.scene.table_image import TableImage
@@ -43,6 +44,15 @@ class SceneNumbers:
     """Share of a target's points that may be lower than its foot: outliers."""
     drawn: int = 2000
     """Most points of a target whose place on a support is judged."""
+    beside: float = 6.0
+    """Largest distance [px] of an object from the outline that it covers: rims have no label."""
+    before: float = 0.01
+    """Least distance [m] of such an object in front of the target: objects beside it cover nothing.
+    """
+    covered: float = 0.2
+    """Share of the target's outline that one object covers, above which it is told: then a fifth of
+    the target is usually hidden.
+    """
     afloat: float = 0.15
     """Greatest distance [m] of a target's foot from its table without a note: things in front of
     the target hide less.
@@ -296,7 +306,7 @@ class Scene(Value):
         """Problems of the scene, a sentence each.
 
         They are several supports, objects that touch, creases in an object, and a target that is
-        cut off at the border of the image.
+        cut off at the border of the image or much hidden by another object.
         """
         found = [
             f"objects could also stand on another plane ({plane.describe()}); give it as the table to choose it"
@@ -320,7 +330,28 @@ class Scene(Value):
         if self.image.at_border(self.pixels[self.rows_of()]):
             fix = "its other part is unknown; turn the camera to it"
             found.append(f"the target is cut off at the border of the image: {fix}")
+        for k, share in self._covers().items():
+            fix = f"turn the camera, or take object {k} away first"
+            found.append(f"object {k} stands before {share:.0%} of the target's outline: {fix}")
         return tuple(found)
+
+    def _covers(self) -> dict[int, float]:
+        """Return the objects that hide much of the target: labels, and shares of its outline."""
+        labels = self.pixel_labels.cpu()
+        depth = self.image.depth.cpu().double()
+        own = labels == (self.target or 0)
+        others = (labels > 0) & ~own
+        if self.target is None or not bool(others.any()):
+            return {}
+        inner: Any = ndimage.binary_erosion(own.numpy())
+        outline = own & ~torch.from_numpy(inner)
+        gap, nearest = find_nearest(others)
+        before = depth - depth.reshape(-1)[nearest] > SCENE.before
+        whose = labels.reshape(-1)[nearest][outline & before & (gap <= SCENE.beside)]
+        covering, pixels = whose.unique(return_counts=True)
+        shares = (pixels / outline.sum()).tolist()
+        pairs = zip(covering.tolist(), shares, strict=True)
+        return {k: share for k, share in pairs if share > SCENE.covered}
 
     @property
     def pixel_labels(self) -> Int[Tensor, "h w"]:
