@@ -14,6 +14,7 @@ from hypothesis import HealthCheck, settings
 from torch import Tensor
 
 from tests import annotations
+from tests.kept import kept as kept
 
 if TYPE_CHECKING:
     from torchgrasp.values.planning import PointCloud

@@ -351,6 +351,7 @@ def run_python(*arguments: str, given: str = "") -> subprocess.CompletedProcess[
     )
 
 
+@functools.cache
 def see(*boxes: tuple[float, ...], pose: Tensor | None = None) -> Scene:
     """Return the scene of boxes (x, y, width, height) on the table, or (x, y, width, height, foot)."""
     meshes = []

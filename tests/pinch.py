@@ -123,13 +123,15 @@ def digest(result):
     ).hexdigest()
 
 
-def digest_elsewhere(name, simulator, seed):
-    """The digest of a quick trial in a process of its own."""
+@functools.cache
+def digests_elsewhere(name, simulators, seed):
+    """The digests of quick trials in each of the simulators, in one process of its own."""
     code = (
-        "import dataclasses, warnings; warnings.simplefilter('ignore'); from tests.pinch import QUICK, close, digest; "
-        f"spec = dataclasses.replace(QUICK, simulator={simulator!r}); "
-        f"print(digest(close({name!r}, spec=spec, seed={seed})))"
+        "import dataclasses, warnings; warnings.simplefilter('ignore'); from tests.pinch import QUICK, close, digest\n"
+        f"for simulator in {simulators!r}:\n"
+        "    spec = dataclasses.replace(QUICK, simulator=simulator)\n"
+        f"    print(digest(close({name!r}, spec=spec, seed={seed})))"
     )
     done = run_python("-c", code)
     assert done.returncode == 0, done.stderr
-    return done.stdout.strip()
+    return dict(zip(simulators, done.stdout.split(), strict=True))

@@ -19,6 +19,7 @@ from PIL import Image
 from tests.pinch import QUICK
 from torchgrasp.app.cli.hands import HandTrial
 
+pytestmark = pytest.mark.usefixtures("kept")
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 APART = "agents.md"  # its client is in an environment beside; app/test_agents.py runs it there
@@ -169,7 +170,10 @@ def test_commands_of_the_readme_run_in_a_clone_as_typed(
     monkeypatch.chdir(tmp_path)
     less = {
         "grasp": ["--starts", "12", "--no-report"],
-        "evaluate": ["--starts", "12", "--grasps", "1", "--views", "1", "--only", "can"],
+        "evaluate": [
+            *("--starts", "12", "--grasps", "1", "--views", "1", "--only", "can"),
+            *("--workers", "0"),
+        ],
     }
     lines = [line for line in "".join(fenced("bash")).splitlines() if line[:11] == "torchgrasp "]
     for line in lines:

@@ -7,6 +7,11 @@ import pytest
 from torchgrasp.app import cli
 
 
+@pytest.fixture(scope="module", autouse=True)
+def shapes_once(kept: None) -> None:
+    """Estimate the shape of each object once for all commands."""
+
+
 @pytest.fixture
 def run_command(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
     """Return a function that runs a command, and returns its exit code and what it printed on

@@ -1,4 +1,6 @@
-"""Each hand is read once for all tests of the planner; observed runs are planned once."""
+"""Each hand is read once for all tests of the planner; shapes are estimated, and observed runs
+planned, once.
+"""
 
 import pytest
 
@@ -9,7 +11,7 @@ RUNS = [("allegro", "joint"), ("barrett", "joint"), ("barrett", "contact_first")
 
 
 @pytest.fixture(scope="module", autouse=True)
-def hands_once():
+def hands_once(kept):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("torchgrasp.hand.load.load_hand", load_hand)
         patch.setattr("torchgrasp.planner.changes.load_hand", load_hand)

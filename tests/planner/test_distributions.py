@@ -15,6 +15,7 @@ from torchgrasp import (
     plan_grasps,
 )
 from torchgrasp.foundation.errors import BadArgument, Status
+from torchgrasp.success.body import EstimatedBody
 from torchgrasp.success.model import load_success_model
 from torchgrasp.success.reasons import explain_success, measure_again
 
@@ -37,6 +38,20 @@ def planned():
     return grasps, stages["shape"]
 
 
+@pytest.fixture
+def one_body(monkeypatch):
+    """Estimate the body of the shape once: it depends on neither friction nor mass."""
+    estimate = EstimatedBody.of
+    bodies = []
+
+    def once(shape):
+        if not bodies:
+            bodies.append(estimate(shape))
+        return bodies[0]
+
+    monkeypatch.setattr(EstimatedBody, "of", once)
+
+
 def success_at(grasps, shape, friction, mass):
     """The success of grasps if friction and mass were known."""
     known = dataclasses.replace(grasps, meta=grasps.meta | {"friction": str(friction)})
@@ -44,7 +59,7 @@ def success_at(grasps, shape, friction, mass):
     return torch.sigmoid(load_success_model().log_odds(features))
 
 
-def test_the_score_is_that_of_the_mean_success_over_single_frictions_and_masses(planned):
+def test_the_score_is_that_of_the_mean_success_over_single_frictions_and_masses(planned, one_body):
     grasps, shape = planned
     good = grasps[grasps.status == Status.OK]
     assert len(good) >= 3

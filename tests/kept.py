@@ -1,0 +1,83 @@
+"""Estimated shapes and posture libraries that tests with another subject compute once.
+
+Tests ask for them by the fixture `kept`. Those of shapes, libraries, costs, and of the same numbers
+in every call, do not.
+"""
+
+import dataclasses
+import functools
+import warnings
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+KEPT: dict[Any, Any] = {}
+"""What a function returned, by its name and the content of its arguments."""
+
+
+def content(value: Any) -> Any:
+    """Return all numbers of a value as a key; raise `TypeError` if it holds what is none."""
+    if isinstance(value, Tensor):
+        plain = type(value) is Tensor and value.device.type == "cpu" and not value.requires_grad
+        if not plain or torch._C._functorch.is_functorch_wrapped_tensor(value):
+            raise TypeError
+        return value.dtype, tuple(value.shape), value.contiguous().numpy().tobytes()
+    if dataclasses.is_dataclass(value):
+        fields = (getattr(value, field.name) for field in dataclasses.fields(value) if field.init)
+        return type(value), *map(content, fields)
+    if isinstance(value, dict):
+        return tuple((key, content(one)) for key, one in value.items())
+    if isinstance(value, tuple | list):
+        return tuple(map(content, value))
+    hash(value)
+    return value
+
+
+def once(key: Any, compute: Callable[[], Any]) -> Any:
+    """Return what was computed for a key, or compute it; a warning is told at each call."""
+    if key in KEPT:
+        return KEPT[key]
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        found = compute()
+    if told:
+        return compute()
+    KEPT[key] = found
+    return found
+
+
+@pytest.fixture(scope="module")
+def kept() -> Iterator[None]:
+    """Estimate the shape of each object, and draw the library of each hand, once for all tests."""
+    from torchgrasp.ik import seeds
+    from torchgrasp.planner.objects import ShapedObject
+
+    shaped = ShapedObject.of
+    draw = seeds.PostureLibrary._drawn
+
+    def shape(request: Any) -> Any:
+        compute = functools.partial(shaped, request)
+        if request.shape is not None:
+            return compute()
+        try:
+            cloud = content(request.cloud)
+            table = content(request.contact_spec.table)
+        except TypeError:
+            return compute()
+        return once(("shape", cloud, table, request.seed, request.mode == "paper"), compute)
+
+    def library(hand: Any, count: int, seed: int) -> Any:
+        compute = functools.partial(draw, hand, count, seed)
+        try:
+            key = "library", content(hand), count, seed
+        except TypeError:
+            return compute()
+        return dataclasses.replace(once(key, compute), hand=hand)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ShapedObject, "of", shape)
+        patch.setattr(seeds.PostureLibrary, "_drawn", library)
+        yield
