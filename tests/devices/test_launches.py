@@ -22,7 +22,7 @@ KNOWN = {
     "cloud/neighbours.py": "_fit_block _principal_axes is_flat nearest",
     "cloud/prepare.py": "_fit_normals prepare_cloud share_facing",
     "geometry/frames.py": "virtual_frame",
-    "geometry/linalg.py": "cholesky farthest_points",
+    "geometry/linalg.py": "cholesky farthest_points number_rows",
     "geometry/optim.py": "levenberg_marquardt",
     "geometry/plane.py": "__post_init__ move round_upright upright_frame",
     "geometry/signed_distance.py": "__init__ field_from_surface",

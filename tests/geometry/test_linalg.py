@@ -10,6 +10,7 @@ from torchgrasp.geometry.linalg import (
     farthest_points,
     limit_norm,
     number_components,
+    number_rows,
     solve_least_squares,
     squared_mahalanobis,
     unit,
@@ -138,6 +139,14 @@ def test_tests_check_annotations_and_let_right_arguments_pass():
     assert solve_least_squares(torch.rand(4, 2).double(), VALUES).shape == (2,)
     with pytest.raises(TypeError):
         limit_norm(ROWS, "1")  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("dtype", [torch.int64, torch.float64])
+def test_rows_are_numbered_as_torch_does_however_large_their_numbers_are(dtype, generator):
+    rows = torch.randint(-3, 3, (200, 3), generator=generator).to(dtype)
+    far = torch.tensor([[10**15, -(10**15), 0], [10**15, -(10**15), 1]]).to(dtype)
+    rows = torch.cat([rows, far, rows[:5], far])
+    assert torch.equal(number_rows(rows), torch.unique(rows, dim=0, return_inverse=True)[1])
 
 
 def test_components_are_those_of_the_pairs_and_keep_the_order_of_nodes():

@@ -15,7 +15,7 @@ from torchgrasp.foundation.errors import BadArgument, SuspiciousScale, TooFewPoi
 from torchgrasp.foundation.lazy import spatial
 from torchgrasp.foundation.limits import MAX_EXTENT, MIN_EXTENT
 from torchgrasp.foundation.rules import Range
-from torchgrasp.geometry.linalg import Points
+from torchgrasp.geometry.linalg import Points, number_rows
 from torchgrasp.values.planning import PointCloud
 
 MIN_POINTS = 4  # fewest distinct points from which a surface can be estimated
@@ -89,7 +89,7 @@ def voxel_downsample(cloud: PointCloud, voxel: Annotated[float, Range(1e-5, 1.0)
     points = cloud.points.double()
     place = (points - points.amin(0)) / voxel
     cell = torch.floor(place)
-    _, group = torch.unique(cell, dim=0, return_inverse=True)
+    group = number_rows(cell)
     order = torch.argsort(torch.linalg.vector_norm(place - cell - 0.5, dim=-1), stable=True)
     rows = order[first_of_each(group[order])].sort().values
     if len(rows) < MIN_POINTS:
@@ -168,7 +168,7 @@ def _distinct_rows(points: Points) -> Int[Tensor, "m"]:
     # Points that share a cell of half the tolerance coincide: one point a cell leaves few pairs
     # among many copies.
     cells = torch.floor((points - low) / (tolerance / 2))
-    _, group = torch.unique(cells, dim=0, return_inverse=True)
+    group = number_rows(cells)
     rows = first_of_each(group).sort().values
     pairs = spatial.KDTree(points[rows].cpu().numpy()).query_pairs(tolerance, output_type="ndarray")
     # The first index of a pair is the smaller one, which is kept.

@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from torchgrasp.foundation.errors import IndefiniteCovariance
@@ -87,6 +87,19 @@ def number_components(pairs: np.ndarray, count: int) -> np.ndarray:
     linked = np.ones(len(pairs), dtype=bool)
     links = sparse.coo_array((linked, (pairs[:, 0], pairs[:, 1])), shape=(count, count))
     return sparse.csgraph.connected_components(links, directed=False)[1]
+
+
+def number_rows(rows: Shaped[Tensor, "n d"]) -> Int[Tensor, "n"]:
+    """Return the number of each of n rows among the distinct rows in ascending order, from 0.
+
+    `torch.unique` of whole rows takes much longer than that of one column after the other.
+    """
+    number = torch.zeros(len(rows), dtype=torch.int64, device=rows.device)
+    for column in rows.T:
+        place = column.unique(return_inverse=True)[1]
+        pair = number * (place.amax() + 1) + place
+        number = pair.unique(return_inverse=True)[1]
+    return number
 
 
 def fibonacci_sphere(

@@ -15,7 +15,7 @@ from torch import Tensor
 from torchgrasp.foundation.checks import check_tensor
 from torchgrasp.foundation.errors import BadArgument, NoSupport
 from torchgrasp.foundation.lazy import ndimage, spatial
-from torchgrasp.geometry.linalg import Points, Vector, unit
+from torchgrasp.geometry.linalg import Points, Vector, number_rows, unit
 from torchgrasp.geometry.plane import Plane, as_plane
 from torchgrasp.geometry.plane_fit import (
     PLANES,
@@ -376,7 +376,7 @@ def _crossed(
     There the plane cuts a wall or a bed, or ends. `flat` holds the place of each point in the plane
     [m], `height` is that above it [m], and the points `on` lie on it.
     """
-    cells = torch.floor(flat / SUPPORTS.pierced_cell).long().unique(dim=0, return_inverse=True)[1]
+    cells = number_rows(torch.floor(flat / SUPPORTS.pierced_cell).long())
     below = ~on & (height < 0) & (height > -SUPPORTS.low)
     lower = torch.bincount(cells, below.double())
     return (lower > SUPPORTS.crossed * torch.bincount(cells, on.double()))[cells]
@@ -611,7 +611,7 @@ def _judge(
     seen = behind & (height < -tolerance) & support.covers(crossing, -inner)
     # slats show what is behind them beside points of their own
     cells = torch.floor(crossing @ _axes(fit.normal, points) / SUPPORTS.cell).long()
-    cells = cells.unique(dim=0, return_inverse=True)[1]
+    cells = number_rows(cells)
     beside = torch.bincount(cells, on.double()) > SUPPORTS.slats * torch.bincount(
         cells, seen.double()
     )
@@ -632,7 +632,7 @@ def _judge(
     standing = low & over
     below = (-height > SUPPORTS.sag * tolerance) & (-height < SUPPORTS.low)
     columns = torch.floor(points @ _axes(fit.normal, points) / SUPPORTS.pierced_cell).long()
-    cells = columns.unique(dim=0, return_inverse=True)[1]
+    cells = number_rows(columns)
     pierced = torch.bincount(cells, below.double()) > SUPPORTS.below * torch.bincount(
         cells, standing.double()
     )
