@@ -1,7 +1,7 @@
 #!/usr/bin/env python
 """Measure torchgrasp: python scripts/bench.py SUBJECT [--only BENCH ...] [--objects DIR] [options].
 
-* close: table-lift, where, success, play: lifts, predicted success, exports
+* close: table-lift, where, success, sensors, play: lifts, predicted success, exports
 
 * headline: lifts, low, pulls, region, rendered, real, pace: what README says; --publish writes it
 
