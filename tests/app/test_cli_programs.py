@@ -11,7 +11,7 @@ import torch
 
 from torchgrasp import cloud_from_depth, load_grasps, load_object
 from torchgrasp.app.cli import command
-from torchgrasp.app.cli.command import make_bar
+from torchgrasp.app.cli.command import StageProgress, make_bar
 from torchgrasp.cloud import save_cloud
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.data.shipped import DATA
@@ -99,3 +99,13 @@ def test_a_simulators_cloud_with_its_table_is_planned_on_and_a_cameras_is_refuse
     found = re.search(r"note +(\d+) points of a table without noise are left out: (.*)", out)
     assert code == 0 and found and "0.000 m" in found[2]
     assert abs(int(found[1]) - int((around & (labels == 0)).sum())) < 0.02 * len(cloud)
+
+
+def test_a_stage_that_runs_again_counts_once(capsys):
+    progress = StageProgress("shape", "plan", "report")
+    counts = []
+    for name in ("shape", "plan", "other", "shape", "plan", "report"):
+        progress.end(name, "done")
+        counts.append(progress.bar.done)
+    assert counts == [1, 2, 2, 2, 2, 3]
+    assert capsys.readouterr().out.count("\n") == 6  # each has its line

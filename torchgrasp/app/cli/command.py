@@ -220,6 +220,7 @@ class StageProgress:
 
     def __init__(self, *names: str) -> None:
         self.next = dict(zip(names, (*names[1:], "done"), strict=True))
+        self.place = {name: k + 1 for k, name in enumerate(names)}
         self.stages: list[tuple[str, str, float]] = []
         self.values: dict[str, Any] = {}
         self.began = time.perf_counter()
@@ -237,11 +238,12 @@ class StageProgress:
             print(f"{name:8}{now - self.began:6.1f} s  {message}", flush=True)
         self.began = now
         if name in self.next:
-            self.bar.update()
+            # a stage that runs again, as in a later batch, is no step forward
+            self.bar.update(max(self.place[name] - self.bar.done, 0))
             self.bar.set_description(self.next[name])
 
 
-def make_bar(total: int | None, unit: str, **options: Any) -> tqdm:
+def make_bar(total: int | None, unit: str, **options: Any) -> "_Beating":
     """Return a tqdm progress bar; where stderr is no terminal, it prints lines instead.
 
     `total` is the number of steps, None if it is unknown; `unit` is the name of a step. The lines
