@@ -17,6 +17,7 @@ sys.path.append(str(ROOT))
 from tests.devices.elsewhere import DEVICE, pretend
 from tests.devices.launches import Launches, Place
 
+SPEC = ContactSpec(friction=0.8, table=0.0)
 KINDS = ("launch", "read", "upload")
 STAGES = {
     "shape": "upright_frame remove_duplicates fit_upright extract_mesh collision_field vague",
@@ -37,7 +38,8 @@ def count_launches(o: Options) -> list[Row]:
     """Count what plans of batches of clouds ask of a GPU for each cloud."""
     hand = load_hand(o.hands[0])
     found = dict[int, Launches]()
-    count_plans(hand, [see(OBJECTS[0], 0)], 20)  # what a process keeps is made before
+    with pretend():  # what a process keeps is made before
+        plan_grasps([see(OBJECTS[0], 0).to(DEVICE)], hand, SPEC, 20)
     for size in o.batches:
         found[size] = count_plans(hand, views(size), o.starts)
     rows = [batch_row(size, counted, hand, o.starts) for size, counted in found.items()]
@@ -68,7 +70,7 @@ def count_plans(hand: Hand, clouds: list[PointCloud], starts: int) -> Launches:
     with pretend():
         there = [cloud.to(DEVICE) for cloud in clouds]
         with Launches(stages) as counted:
-            plan_grasps(there, hand, ContactSpec(friction=0.8, table=0.0), starts)
+            plan_grasps(there, hand, SPEC, starts)
     return counted
 
 
