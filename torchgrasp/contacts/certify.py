@@ -28,7 +28,7 @@ from torchgrasp.contacts.form_closure import (
     wrenches,
 )
 from torchgrasp.foundation.base import FINGERTIPS, flatnonzero
-from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import is_known
 from torchgrasp.foundation.threads import single_threaded
@@ -51,14 +51,17 @@ UNIT_TOLERANCE = 1e-3
 
 @checked(gradients=True)
 @single_threaded
-def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
+def certify(
+    contacts: Contacts, spec: ContactSpec | None = None, friction: Float[Tensor, "b"] | None = None
+) -> Certificate:
     """Prove in float64 whether contact sets have frictional form closure, Eq. (13) of the paper.
 
     The `contacts` are sets of three to five points [m] with outward unit normals, from any planner.
     The margin is the largest s for which coefficients phi >= s with sum phi = 1 balance the
     wrenches W of all cone edges, W phi = 0; it is -inf if no phi balances them. The friction cones
-    have `spec.edges` edges at friction `spec.planned_friction`. A set is `closed` if its margin is
-    at least 1e-6 and its wrenches have full rank.
+    have `spec.edges` edges at `friction`, a coefficient for each set, such as `ContactPlan.friction`;
+    None means `spec.planned_friction` for all. A set is `closed` if its margin is at least 1e-6 and
+    its wrenches have full rank.
 
     If a set is not closed, its `witness` v is a wrench that no contact force opposes: v.w >= 0 for
     every edge wrench w, up to rounding. For a margin between 0 and 1e-6, v.w >= -margin. If only
@@ -70,7 +73,8 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
     is 0; where the margin is -inf, it is NaN. A contact set that a loss masks does not affect the
     derivatives of others. A second derivative, or the derivative of another field, raises
     `BadArgument`; in forward mode the latter is NaN. Raises `BadArgument` for contacts of a wrong
-    shape, normals that are not of length 1 (to 1e-3), or a `spec` that is no `ContactSpec`.
+    shape, normals that are not of length 1 (to 1e-3), a `spec` that is no `ContactSpec`, or a
+    `friction` that is not one number for each set.
 
     >>> corners = torch.tensor([[[1.0, 0, 0], [-0.6, 0.8, 0], [-0.6, -0.8, 0]]])
     >>> certify(Contacts(corners, corners)).closed
@@ -79,8 +83,13 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
     spec = ContactSpec() if spec is None else spec
     points = check_contacts(contacts).points.double()
     normals = check_unit(contacts.normals.double())
-    wrench = wrenches(points, normals, spec.planned_friction, spec.edges)
-    return Certificate(*_Proof.apply(wrench.flatten(1, 2), degenerate(points))[:5])
+    coefficient = spec.planned_friction
+    if friction is not None:
+        check_tensor("friction", friction, (len(points),))
+        coefficient = friction.to(points)
+    wrench = wrenches(points, normals, coefficient, spec.edges)
+    proof = _Proof.apply(wrench.flatten(1, 2), degenerate(points))
+    return Certificate(*proof[:5], friction=friction)
 
 
 class _Proof(torch.autograd.Function):

@@ -5,12 +5,13 @@ once.
 import time
 from collections.abc import Iterator
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.contacts.feasibility import check_feasibility
 from torchgrasp.contacts.form_closure import Vectors
-from torchgrasp.contacts.problem import ContactProblem, ShapeLike, rows_of
+from torchgrasp.contacts.problem import ContactProblem, ShapeLike, frictions_in_turn, rows_of
 from torchgrasp.contacts.solver import FINISH, Stage, descend, project, start_state
 from torchgrasp.contacts.starts import (
     check_starts,
@@ -54,7 +55,8 @@ def plan_contacts(
     order of the guesses.
 
     A set has `spec.fingertips` contacts. A failed set carries the `Status` of the first constraint
-    that it violates. If the solver fails from a feasible initial guess, the guess itself is the
+    that it violates. For a distribution of friction, guess i is planned at the friction of number i
+    of `spec.planned_frictions`, in turn. If the solver fails from a feasible initial guess, the guess itself is the
     result. Without `time_budget` the result is deterministic, and the sets from 500 or 1000 initial
     guesses are the first sets of a plan from more. Raises `BadArgument` for `starts` that are not
     positive, of a wrong shape, or outside the shape's domain, or another wrong argument.
@@ -85,7 +87,14 @@ def plan_contacts(
     if time_budget is not None:
         firsts = _within(time_budget, firsts)
     problem = ContactProblem.of(shape, settled.spec)
-    return join([plan_chunk(shape, problem, first, stages) for first in firsts])
+    begun = 0
+    plans = list[ContactPlan]()
+    for first in firsts:
+        number = torch.arange(begun, begun + len(first), device=first.device)
+        own = problem.at(frictions_in_turn(settled.spec, number))
+        plans.append(plan_chunk(shape, own, first, stages))
+        begun += len(first)
+    return join(plans)
 
 
 def stages_for(spec: ContactSpec) -> tuple[Stage, ...]:

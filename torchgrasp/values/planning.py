@@ -174,13 +174,15 @@ class ContactPlan(Batch):
     `coefficients` (no unit, with sum 1) are phi of Eq. (13) of the paper: weights of the edges of
     the friction cones at which the forces balance. `quality` is Eq. (14), the distance [m] of the
     contacts' centroid from the cloud's centre; less is better. `status` holds a `Status` code for
-    each contact set.
+    each contact set. `friction` is the friction coefficient of the cones of each set; None if it is
+    `ContactSpec.planned_friction` for all.
     """
 
     contacts: Annotated[Contacts, Rows("b")]
     coefficients: Annotated[Float[Tensor, "b f e"], ANY]
     quality: Annotated[Float[Tensor, "b"], ANY]
     status: Int[Tensor, "b"]
+    friction: Float[Tensor, "b"] | None = None
 
 
 @checked
@@ -202,6 +204,9 @@ class Certificate(Batch):
     times t. `task_forces` [N], with normal forces up to `task_strength` [N], balance this multiple
     of t. `task_twist` y [1/N, 1/(N m)] with y . t = -1 proves that no such forces balance more:
     none have a greater power along y. Without `resist` these fields are None.
+
+    `friction` is the friction coefficient of the cones of each set; None if it is that of the spec,
+    `ContactSpec.planned_friction`, for all.
     """
 
     margin: Annotated[Float[Tensor, "b"], ANY]
@@ -214,6 +219,7 @@ class Certificate(Batch):
     task_twist: Annotated[Float[Tensor, "b 6"], ANY] | None = None
     task_forces: Annotated[Float[Tensor, "b f 3"], ANY] | None = None
     task_strength: Annotated[Float[Tensor, "b f"], ANY] | None = None
+    friction: Float[Tensor, "b"] | None = None
 
 
 @checked

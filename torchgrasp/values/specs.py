@@ -9,6 +9,7 @@ from torchgrasp.foundation.base import FINGERTIPS, Value
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Force, Length, Range
+from torchgrasp.geometry.frames import real
 from torchgrasp.geometry.plane import Plane, as_plane
 from torchgrasp.values.closing import ClosingOptions, ClosureResult, SensorModel, choose_options
 from torchgrasp.values.distribution import Distribution, check_within
@@ -27,6 +28,8 @@ SEPARATION = 0.026
 """Default radius [m] of a fingertip, and least distance [m] between two. Wider links lie behind
 smaller fingertips.
 """
+LOW_QUANTILE = 0.05
+"""Probability of frictions below the least one at which contacts are planned."""
 FLAT_RADII = (0.008, 0.006, 0.004, 0.003)
 """Radii [m] within which the surface at a contact must be flat; the largest that the object allows
 is used.
@@ -49,7 +52,8 @@ class ContactSpec(Value):
         max_variance: largest variance of the surface at a contact, S_thresh of Eq. (12), in
             normalised units.
         friction_margin: share of the friction, of a distribution its mean, that is planned with:
-            contacts are planned and certified with `friction * friction_margin`.
+            contacts are planned and certified with `friction * friction_margin`. For a distribution
+            they are planned at further frictions, too (`planned_frictions`).
         separation: least distance between the centres of two fingertips [m]; by default their
             diameter plus 2 mm. Contacts on opposite sides of a thin object may be closer.
         flatness: largest angle [rad] between the normals at a contact and on a ring around it; None
@@ -114,6 +118,23 @@ class ContactSpec(Value):
     def planned_friction(self) -> float:
         """The coefficient of friction with which contacts are planned and certified."""
         return self.mean_friction * self.friction_margin
+
+    @property
+    def planned_frictions(self) -> tuple[float, ...]:
+        """The coefficients of friction with which contact sets are planned in turn.
+
+        They are `planned_friction`, and of a distribution also its mean and its 5 % quantile. Equal
+        ones count once.
+
+        >>> ContactSpec(Distribution.between(0.2, 1.0)).planned_frictions
+        (0.3, 0.6, 0.24)
+        """
+        first = self.planned_friction
+        law = Distribution.of(self.friction)
+        if not isinstance(law.simplest, Distribution):
+            return (first,)
+        low = float(law.quantile(real([LOW_QUANTILE])))
+        return tuple(dict.fromkeys([first, law.mean, low]))
 
     @property
     def fingertip_radius(self) -> float:
