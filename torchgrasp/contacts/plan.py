@@ -55,11 +55,12 @@ def plan_contacts(
     order of the guesses.
 
     A set has `spec.fingertips` contacts. A failed set carries the `Status` of the first constraint
-    that it violates. For a distribution of friction, guess i is planned at the friction of number i
-    of `spec.planned_frictions`, in turn. If the solver fails from a feasible initial guess, the guess itself is the
-    result. Without `time_budget` the result is deterministic, and the sets from 500 or 1000 initial
-    guesses are the first sets of a plan from more. Raises `BadArgument` for `starts` that are not
-    positive, of a wrong shape, or outside the shape's domain, or another wrong argument.
+    that it violates. For a distribution of friction, guesses are planned at the frictions of
+    `spec.planned_frictions` in turn. If the solver fails from a feasible initial guess, the guess
+    itself is the result. Without `time_budget` the result is deterministic, and the sets from 500
+    or 1000 initial guesses are the first sets of a plan from more. Raises `BadArgument` for
+    `starts` that are not positive, of a wrong shape, or outside the shape's domain, or another
+    wrong argument.
 
     Args:
         shape: a `ShapeGP`, or another implicit surface with the same methods.
