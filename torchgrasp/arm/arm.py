@@ -106,7 +106,10 @@ class Arm(Value):
 
     @checked
     def hand_poses(self, joints: Float[Tensor, "k n"]) -> Float[Tensor, "k 4 4"]:
-        """Return the pose `obj_from_hand` [m] of the hand in each of k postures of the arm."""
+        """Return the pose `obj_from_hand` [m] of the hand in each of k postures of the arm.
+
+        `joints` are the positions of its n joints [rad, or m for sliding joints].
+        """
         return self.obj_from_base @ self.tree.poses(joints)[:, -1] @ self.tip_from_hand
 
     @checked

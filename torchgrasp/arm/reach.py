@@ -102,8 +102,9 @@ def follow_grasps(
 
     The results are the w postures of the way [rad or m], a mask of the grasps that have a way, and
     the ease of the way: the least columns of `measure_ease`. The way goes through the easiest
-    posture that reaches the grasp, and from which the arm can follow the whole way: without a jump,
-    a joint beyond its limits, or a collision of its links with the `world`, each other or the palm.
+    posture that reaches the grasp, and from which the arm can follow the whole way. The arm follows
+    without a jump and within its joint limits. Its links collide neither with the `world`, nor with
+    each other or the palm.
     If the `world` has no table, the hand is lifted along the unit vector `up`.
     """
     poses = way_of(hand, grasps, world, up).to(arm.lower)

@@ -275,7 +275,7 @@ def median_depth(frames: Sequence[Tensor | np.ndarray]) -> Tensor:
     is that of the frames.
 
     The `frames` are images (h, w) of one size and one dtype. Raises `BadArgument` for no frame, for
-    frames of several sizes or dtypes, or if camera or scene have moved in one: then more than 5 % of
+    frames of several sizes or dtypes, or if camera or scene have moved in one. Then more than 5 % of
     its pixels, or 1 % of patches of 8 x 8 pixels, differ from the median.
 
     >>> median_depth([torch.tensor([[0.0, 0.7]]), torch.tensor([[0.0, 0.701]]), torch.tensor([[0.5, 0.702]])])

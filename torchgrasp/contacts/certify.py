@@ -57,11 +57,11 @@ def certify(
     """Prove in float64 whether contact sets have frictional form closure, Eq. (13) of the paper.
 
     The `contacts` are sets of three to five points [m] with outward unit normals, from any planner.
-    The margin is the largest s for which coefficients phi >= s with sum phi = 1 balance the
-    wrenches W of all cone edges, W phi = 0; it is -inf if no phi balances them. The friction cones
-    have `spec.edges` edges at `friction`, a coefficient for each set, such as `ContactPlan.friction`;
-    None means `spec.planned_friction` for all. A set is `closed` if its margin is at least 1e-6 and
-    its wrenches have full rank.
+    The friction cones have `spec.edges` edges at `friction`, a coefficient for each set, such as
+    `ContactPlan.friction`; None means `spec.planned_friction` for all. The columns of W are the
+    wrenches of all edges. Coefficients phi with W phi = 0 and sum phi = 1 balance them. The margin
+    is the largest s with phi >= s for such a phi, or -inf without one. A set is `closed` if its
+    margin is at least 1e-6 and its wrenches have full rank.
 
     If a set is not closed, its `witness` v is a wrench that no contact force opposes: v.w >= 0 for
     every edge wrench w, up to rounding. For a margin between 0 and 1e-6, v.w >= -margin. If only

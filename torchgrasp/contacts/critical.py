@@ -13,8 +13,8 @@ forces satisfy, for x_i = M_i f_i with the linear map M_i,
 
 The twist y is a motion of the object, along which friction of the coefficient mu just stops all
 contacts. Newton's method with the scaling of Nesterov and Todd [1] solves the equations for falling
-nu. The three numbers of a contact scale as the cone itself does: with the scaling point w of x and
-s, D = (2 J w w^T J - J) / beta maps x to s, and has the inverse beta (2 w w^T - J).
+nu. The three numbers of a contact scale as the cone itself does. With the scaling point w of x and
+s, D = (2 J w w^T J - J) / beta maps x to s. Its inverse is beta (2 w w^T - J).
 
 [1] Andersen, Roos and Terlaky, Mathematical Programming 95, 2003.
 """

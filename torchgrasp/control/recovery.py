@@ -260,8 +260,8 @@ class GraspCheck:
     `secure` then says whether to lift: all fingers touch, the palm has followed the object
     (`CHECK.misplaced`) and, if all contact points are known, forces balance with the planned
     friction, of a distribution its mean. `displacement` (6,) holds the object's translation [m] and
-    rotation vector [rad] in the planned hand's frame: that of the closing, or one estimated anew
-    from all touches if the plan has a table and a surface.
+    rotation vector [rad] in the planned hand's frame. It is that of the closing. If the plan has a
+    table and a surface, it is estimated anew from all touches.
 
     Args:
         reference: the closing plan.

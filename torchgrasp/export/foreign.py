@@ -112,10 +112,9 @@ def read_foreign(
             (`root_link`, `base_link`, or the end of Isaac's `gripper_frame_link`), the bench's
             frame of the Allegro hand, or our root link.
 
-    Raises `ModelFileError` for a missing or malformed file, for joints that fit with another sign
-    only, for joints that do not follow as the hand's do, and for a root link that is none of ours.
-    Raises `BadArgument` for an order that
-    misses a joint.
+    Raises `ModelFileError` for a missing or malformed file, and for a root link that is none of
+    ours. It is also raised for joints that fit with another sign only, or that do not follow as the
+    hand's do. Raises `BadArgument` for an order that misses a joint.
 
     >>> import tempfile
     >>> from torchgrasp import load_hand

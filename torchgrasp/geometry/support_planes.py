@@ -289,11 +289,13 @@ def find_supports(
 
     Triples of points propose planes. An iterated fit with Tukey's weights refines each plane.
     Objects stand on a support, over its region, and the camera sees nothing through the region. The
-    support with the most points low above it comes first; the points count twice if the camera
-    looks at the support, half if it is bowed, and a quarter if they lie on a wall beside it. Walls
+    support with the most points low above it comes first. The points count twice if the camera
+    looks at the support, and half if it is bowed. Those on a wall beside it count a quarter. Walls
     beside the first support, on which far fewer points stand, are left out. Of parallel supports, a
     higher one as wide as furniture comes first. A
-    rigid motion of all arguments moves the supports alike. Raises `NoSupport` if there is none.
+    rigid motion of all arguments moves the supports alike.
+
+    Raises `NoSupport` if there is none.
     """
     points = check_tensor("points", points, (None, 3)).detach().cpu().double()
     eye = sky = None

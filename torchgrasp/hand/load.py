@@ -64,9 +64,9 @@ def load_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
     Args:
         name_or_path: a shipped hand, such as "allegro", "barrett", "leap" or "shadow", or the
             folder of another hand.
-        fingers: the grasping fingers, as an option of hand.toml: "default", or for the Allegro
-            "four" (all) or "paper_literal" (index, middle and ring); or as a number of fingers, for
-            the first option with this number; or as the names of three to five fingers in grasp
+        fingers: the grasping fingers. A text is an option of hand.toml: "default", or for the
+            Allegro "four" (all) or "paper_literal" (index, middle and ring). A number of fingers
+            means the first option with this number. A tuple names three to five fingers in grasp
             order. Joints of other fingers are parked where an option parks them, else at zero or
             the limit nearest to zero.
 

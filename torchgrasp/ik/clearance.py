@@ -210,10 +210,11 @@ def collision_cost(
 def clearance_rows(
     spatial: SpatialJacobian, world: CollisionWorld, tips_touch: bool
 ) -> list[ResidualRows]:
-    """Return residuals [mm]: by how much the smallest clearances are below the least wanted ones.
+    """Return residuals (g, k) [mm]: by how much the k smallest clearances of each of g hands are
+    below the least wanted ones.
 
     The wanted ones are `SELF_CLEARANCE` between links, which come first, and `CLEARANCE` from
-    object, obstacles and table. A larger clearance gives 0. `spatial` are the kinematics of g
+    object, obstacles and table. A larger clearance gives 0. `spatial` are the kinematics of the
     hands. With `tips_touch` the fingertips may touch the object and the table.
     """
     pairs = spatial.hand.self_collision

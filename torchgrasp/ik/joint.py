@@ -105,11 +105,11 @@ class JointState(Batch):
     variance_gradient: Float[Tensor, "g f 3"]
 
     def integrate(self, hand: Hand, step: Float[Tensor, "g d"]) -> "JointState":
-        """Return the state after a `step`: changes of hand pose (6), joints, contact points and
-        tensions, in this order.
+        """Return the states of g grasps after a `step` (g, d) of all unknowns.
 
-        The step of the pose is a translation [m] and a rotation vector [rad] in the hand's axes.
-        The points are normalised.
+        The d columns are changes of the hand pose (6), the joints [rad], the contact points (3 f)
+        and the tensions, in this order. That of the pose is a translation [m] and a rotation vector
+        [rad] in the hand's axes. Points are normalised, and tensions have no unit.
         """
         by_hand, by_points, by_tension = step.split(
             [6 + hand.dof, self.points[0].numel(), self.tension.shape[1]], 1

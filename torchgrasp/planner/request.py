@@ -85,8 +85,9 @@ class Request:
     def __post_init__(self) -> None:
         """Raise `BadArgument` for arguments that contradict each other.
 
-        These are an arm of another hand, no load to resist, a box or mesh to keep to that is not at
-        the object, or a `promise` (the share of returned grasps that hold) for a displaced object.
+        These are an arm of another hand, no load to resist, and a box or mesh to keep to that is
+        not at the object. A `promise` (the share of returned grasps that hold) contradicts a
+        displaced object.
         A box or mesh to avoid that is not at the object raises the warning `NoEffect`.
         """
         if self.arm is not None and self.arm.hand_sha256 != self.hand.source.sha256:

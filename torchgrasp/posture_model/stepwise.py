@@ -94,7 +94,8 @@ def fit_subsets(
 def fit_smallest(subsets: Subsets, start: FitProgress, rule: EmRule) -> Fit:
     """Fit a mixture to the smaller subsets; the fit to all rows can go on from the result.
 
-    `start` is the state before the first step, and `rule` ends the steps.
+    The smaller ones have at most `ENOUGH` times the rows of the smallest of `subsets`. `start` is
+    the state before the first step, and `rule` ends the steps of each fit.
     """
     most = ENOUGH * subsets.sizes[0]
     sizes = [size for size in subsets.sizes[:-1] if size <= most] or subsets.sizes

@@ -1,10 +1,10 @@
 """Merging of pieces, which are connected smooth surfaces in a depth image, that belong to one
 object.
 
-Two pieces belong to one object if they meet at two ends, as a handle and its cup do; if one is over
-the footprint of the other; if they form the rim of a hollow body; or if one floats beside the
-other. Touching pieces also belong to one object, unless both stand on the table or one lies upon
-the other.
+Two pieces belong to one object if they meet at two ends, as a handle and its cup do. So do pieces
+of which one is over the footprint of the other, pieces that form the rim of a hollow body, and a
+piece that floats beside another. Touching pieces also belong to one object, unless both stand on
+the table or one lies upon the other.
 """
 
 import dataclasses

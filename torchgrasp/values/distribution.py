@@ -83,7 +83,11 @@ class Distribution(Value):
     @classmethod
     @checked
     def of_samples(cls, samples: Float[Tensor, "n"]) -> "Distribution":
-        """Return the distribution in which each of n samples is equally likely."""
+        """Return the distribution in which each of n samples is equally likely.
+
+        The samples may have any unit. Raises `BadArgument` for none, more than 10,000, or one
+        that is not finite.
+        """
         return cls(tuple((x, x) for x in samples.tolist()))
 
     @classmethod

@@ -113,7 +113,11 @@ def add_sensors(
 def add_seen_sensors(
     seen: Mapping[str, Triangles], tips: Sequence[str], guess: Guess, pads: Sequence[Pad]
 ) -> dict[str, Triangles]:
-    """Return the visual meshes by link, with a capsule for each pad that `extend_pads` moved."""
+    """Return the visual meshes by link [m], with a capsule for each pad that `extend_pads` moved.
+
+    `seen` are the meshes without sensors, and `guess` holds the pads before they were moved. `pads`
+    are those afterwards, in the order of the links `tips`.
+    """
     shown = dict(seen)
     for tip, before, way, pad in zip(tips, guess.pads, guess.outward, pads, strict=True):
         if pad is before or tip not in shown:

@@ -38,7 +38,8 @@ Triangles = tuple[Float[np.ndarray, "_ 3"], np.ndarray]  # corners [m], and face
 
 @functools.lru_cache(maxsize=16)
 def link_meshes(path: Path, data: bytes, folder: Path) -> dict[str, Triangles]:
-    """Return corners and faces by link, in its frame, for each link of which all visuals are read.
+    """Return corners [m] and faces by link, in its frame, for each link of which all visuals are
+    read.
 
     `path` and `data` are those of the URDF; mesh files lie inside `folder`.
     """
@@ -66,7 +67,7 @@ def link_meshes(path: Path, data: bytes, folder: Path) -> dict[str, Triangles]:
 def keep_visuals(
     published: Urdf, clean: Urdf, mergers: Sequence[Mapping[str, str]], folder: Path
 ) -> dict[str, Triangles]:
-    """Return corners and faces of the visuals of each link of a clean URDF, in its frame.
+    """Return corners [m] and faces of the visuals of each link of a clean URDF, in its frame.
 
     `mergers` give for each link that was merged the link that took it over, in the order of the
     merging. Frames of links that stay are those of the published URDF.
