@@ -22,7 +22,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from tests.make import run_python
-from torchgrasp import load_grasps, load_scene
+from torchgrasp import Distribution, GraspTask, load_grasps, load_scene
 from torchgrasp.app.cli import agent_server
 from torchgrasp.app.cli.agent_files import Workplace
 from torchgrasp.app.cli.agent_tools import (
@@ -361,6 +361,7 @@ def test_a_file_of_grasps_names_no_folder_of_a_hand(folder, tmp_path):
         ({"cloud": 3}, "^cloud: expected a text, got 3$"),
         ({"cloud": "jug", "seed": -1}, "^seed: "),
         ({"cloud": "jug", "friction": float("nan")}, "^friction: expected a number in"),
+        ({"cloud": "jug", "mass": [1]}, "^mass: expected "),
         ({"cloud": "jug", "up": [0, 1]}, "^up: "),
         ({"cloud": "jug", "unit": "inch"}, "^unit: expected one of 'm', 'cm', 'mm', got 'inch'$"),
         ({"cloud": "jug", "strats": 3}, "^strats: expected one of cloud, .* that .* lacks$"),
@@ -370,6 +371,16 @@ def test_a_file_of_grasps_names_no_folder_of_a_hand(folder, tmp_path):
 def test_arguments_are_checked_before_any_work(given, words):
     with pytest.raises(BadArgument, match=words):
         make_tool("plan_grasps_from_point_cloud", given)
+
+
+def test_an_uncertain_friction_and_mass_are_texts():
+    given = {"cloud": "jug", "friction": "0.2:0.8", "mass": "0.1|0.4"}
+    tool = make_tool("plan_grasps_from_point_cloud", given)
+    assert tool.law == Distribution.between(0.2, 0.8)
+    assert tool.grasp_task == GraspTask(Distribution.parse("0.1|0.4"))
+    assert make_tool("plan_grasps_from_point_cloud", {"cloud": "jug"}).law == 0.8
+    with pytest.raises(BadArgument, match=r"^friction: expected a number, an interval"):
+        make_tool("plan_grasps_from_point_cloud", {"cloud": "jug", "friction": "slippery"}).law
 
 
 class Noisy(Tool):

@@ -26,6 +26,7 @@ from torchgrasp.control import GraspTry
 from torchgrasp.control.regrasp import next_grasp
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.geometry.frames import apply, rigid, rotation_from_vector
+from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import Grasps
 
 AWAY = 0.008  # displacement [m] of the block along x of the hand
@@ -132,3 +133,25 @@ def test_rows_that_are_no_grasps_are_refused(tried):
 def test_no_grasp_is_next_where_none_is_left():
     with pytest.raises(BadArgument, match="another grasp"):
         next_grasp(around(0.0, 10.0), [0])
+
+
+def test_the_next_try_begins_with_what_the_touches_have_left_of_an_uncertain_friction():
+    def begin(grasp: Grasps) -> GraspController:
+        friction = Distribution.read(grasp.meta["friction"])
+        return GraspController(
+            on_table(obj_from_hand=grasp.obj_from_hand[0], friction=friction), holding="grip"
+        )
+
+    def after(friction: str) -> Grasps:
+        planned = around(0.0, 90.0)
+        planned = dataclasses.replace(planned, meta=planned.meta | {"friction": friction})
+        attempt = GraspTry(planned, begin)
+        list(close_on_block(attempt.controller, 3.0))
+        attempt.controller.hold.friction.update(0.6, 100.0, slides=False)  # it sticks
+        return attempt.next()
+
+    left = after("0.2:1")
+    known = Distribution.parse(left.grasps.meta["friction"])
+    assert 0.5 < known.least < 0.6 and known.most == 1.0
+    assert left.controller.reference.friction == known
+    assert after("0.8").grasps.meta["friction"] == "0.8"

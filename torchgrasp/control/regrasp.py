@@ -186,12 +186,26 @@ class GraspTry:
     def next(self) -> "GraspTry | None":
         """Return the try of `next_grasp` at the object where it is now expected; None if no other
         grasp is left.
+
+        If the grasps were planned for a distribution of friction, those of the next try have in
+        `meta["friction"]` what the touches have left of it.
         """
         if not len(self.others):
             return None
-        row = next_grasp(self.grasps, self.tried, self.surface)
+        grasps = self._informed()
+        row = next_grasp(grasps, self.tried, self.surface)
         moved = self.moved @ self.controller.object_motion
-        return GraspTry(self.grasps, self.start, self.surface, (*self.tried, row), moved)
+        return GraspTry(grasps, self.start, self.surface, (*self.tried, row), moved)
+
+    def _informed(self) -> Grasps:
+        """Return the grasps, with what the touches have left of an uncertain friction."""
+        prior = self.controller.reference.friction
+        left = self.controller.friction
+        # a controller accepts no friction of 0
+        if left is None or left.least <= 0.0 or not isinstance(prior, Distribution):
+            return self.grasps
+        meta = self.grasps.meta | {"friction": str(left)}
+        return dataclasses.replace(self.grasps, meta=meta)
 
 
 class Withdrawal:

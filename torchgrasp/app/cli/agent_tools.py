@@ -35,6 +35,7 @@ from torchgrasp.app.cli.inputs import (
     import_simulator,
     load_fingers,
     object_name,
+    read_distribution,
     read_table,
 )
 from torchgrasp.app.report.page import write_report
@@ -73,8 +74,9 @@ from torchgrasp.shape.surface import Surface, extract_surface
 from torchgrasp.success.reasons import explain_success
 from torchgrasp.success.task import GraspTask
 from torchgrasp.testing import check_hand
+from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import Grasps, PointCloud, format_success
-from torchgrasp.values.specs import ContactSpec, Simulator, TrialSpec
+from torchgrasp.values.specs import FRICTIONS, MASSES, ContactSpec, Simulator, TrialSpec
 
 GRASPS = "grasps.safetensors"
 JSON = "grasps.json"
@@ -111,11 +113,17 @@ Box = tuple[float, float, float, float, float, float]
 Starts = Annotated[int, Range(1, BOUNDS.starts)]
 Shown = Annotated[int, Range(1, BOUNDS.listed)]
 Rank = Annotated[int, Range(0, 10_000)]
-Friction = Annotated[float, Range(0.0, 10.0)]
-Mass = Annotated[float, Range(0.001, 10.0)]
+Friction = Annotated[float, FRICTIONS] | str
+Mass = Annotated[float, MASSES] | str
+OR_TEXT = 'a number, or a text as "0.3:0.8" for an interval, "0.2|0.8" for one or the other'
 GRASPS_HELP = f"file {GRASPS} that a plan wrote, as its answer names it"
 RANK_HELP = "rank of the executable grasp in the plan's answer; 0 is the best"
 MESH_HELP = "closed mesh [m] (.ply, .obj, .stl, .off), or the name of a shipped object, as jug"
+
+
+def law_of(name: str, given: float | str) -> float | Distribution:
+    """Return the number or the distribution that the argument `name` gives."""
+    return read_distribution(name, given) if isinstance(given, str) else given
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -348,8 +356,10 @@ class _HandTool(Tool):
     fingers: str = option("default", PLAN_HELP["fingers"])
     starts: Starts = option(BOUNDS.few, STARTS_HELP)
     seed: Seed = option(0, SEED_HELP)
-    friction: Friction = option(0.8, PLAN_HELP["friction"])
-    mass: Mass = option(0.25, "mass of the object [kg], for which success is predicted")
+    friction: Friction = option(
+        0.8, f"coefficient of friction between fingertips and object: {OR_TEXT}"
+    )
+    mass: Mass = option(0.25, f"mass of the object [kg], for which success is predicted: {OR_TEXT}")
     promise: Fraction | None = option(None, PLAN_HELP["promise"])
     keep: Box | None = option(
         None, "box x0 y0 z0 x1 y1 z1 [m] in the frame of the cloud, where contacts may be"
@@ -367,7 +377,17 @@ class _HandTool(Tool):
             with naming(low=name):
                 low, high = real(box or [0.0] * 6).split(3)
                 regions[name] = None if box is None else Region.box(low, high)
-        return {"task": GraspTask(self.mass), "promise": self.promise, **regions}
+        return {"task": self.grasp_task, "promise": self.promise, **regions}
+
+    @property
+    def law(self) -> float | Distribution:
+        """The friction, or its distribution."""
+        return law_of("friction", self.friction)
+
+    @property
+    def grasp_task(self) -> GraspTask:
+        """The task for which success is predicted."""
+        return GraspTask(law_of("mass", self.mass))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -383,7 +403,7 @@ class _PlanTool(_HandTool):
     def plan(self, place: Workplace, seen: _Seen, out: Path, name: str) -> PlanAnswer:
         """Plan grasps of what is seen, write them into a folder, and return the answer."""
         hand, among = self.load(place)
-        spec = ContactSpec(friction=self.friction, table=seen.table)
+        spec = ContactSpec(friction=self.law, table=seen.table)
         told = dict[str, Any]()
         grasps = plan_grasps(
             seen.source,
@@ -415,9 +435,9 @@ class _PlanTool(_HandTool):
         costs = [
             cost.sentence
             for best in good[:1]
-            for cost in explain_success(best, hand, told["shape"], GraspTask(self.mass))
+            for cost in explain_success(best, hand, told["shape"], self.grasp_task)
         ]
-        spec = ContactSpec(friction=self.friction, table=seen.table)
+        spec = ContactSpec(friction=self.law, table=seen.table)
         surface = extract_surface(told["shape"])
         run = Run(name, seen.path, cloud, hand, spec, surface, grasps, plan=told.get("plan"))
         run = dataclasses.replace(run, scene=scene, costs=tuple(costs))
@@ -565,7 +585,7 @@ class PlanFromDepth(_PlanTool):
     ) -> PlanAnswer:
         """Plan on all objects until one is easy, and return the answer with the best of them."""
         hand, among = self.load(place)
-        spec = ContactSpec(friction=self.friction)
+        spec = ContactSpec(friction=self.law)
         options = {"fingers": among, "enough": ENOUGH, **self.task()}
         plan = plan_scene(scene, hand, spec, self.starts, self.seed, **options)
         rows = tuple(
@@ -657,7 +677,7 @@ class ExplainEmpty(_HandTool, _SeenTool):
         else:
             seen = self.see(place, path)
         hand, among = self.load(place)
-        spec = ContactSpec(friction=self.friction, table=seen.table)
+        spec = ContactSpec(friction=self.law, table=seen.table)
         given = (seen.source, hand, spec, self.starts, self.seed)
         found = explain_empty(*given, fingers=among, **self.task())
         return _explained(found, seen.notes)
@@ -792,8 +812,10 @@ class CloseInSimulation(_GraspTool):
     """
 
     mesh: str = required(MESH_HELP)
-    mass: Mass = option(0.25, "mass of the object [kg]")
-    friction: Friction = option(0.8, "coefficient of friction between fingertips and object")
+    mass: Mass = option(0.25, f"mass of the object [kg]: {OR_TEXT}")
+    friction: Friction = option(
+        0.8, f"coefficient of friction between fingertips and object: {OR_TEXT}"
+    )
     hold_time: Annotated[float, Range(0.0, BOUNDS.hold)] = option(
         2.0, "time for which the raised object is held [s]"
     )
@@ -807,8 +829,8 @@ class CloseInSimulation(_GraspTool):
         import_simulator(self.simulator)
         mesh, parts = read_true_mesh(file)
         spec = TrialSpec(
-            friction=self.friction,
-            mass=self.mass,
+            friction=law_of("friction", self.friction),
+            mass=law_of("mass", self.mass),
             hold_time=self.hold_time,
             simulator=self.simulator,
         )
