@@ -58,6 +58,30 @@ def test_it_is_the_share_of_random_draws_that_close(law, generator):
     assert float((without - share).abs().mean()) > float((found - share).abs().mean())
 
 
+@pytest.mark.parametrize(("shift", "turn"), [(0.003, 0.0), (0.0, 0.05), (0.002, 0.05)])
+def test_errors_of_the_pose_move_all_contacts_together(shift, turn, generator):
+    contacts = Contacts(*tripods(20, 3))
+    found = hold_probability(contacts, WIDE, shift=shift, turn=turn)
+    share = torch.zeros(20, dtype=torch.float64)
+    frictions = 20
+    draws = 500  # 10,000 of each contact set
+    arms = contacts.points - contacts.points.mean(1, keepdim=True)
+    size = (draws, *contacts.points.shape)
+    normals = contacts.normals.expand(size)
+    for k in range(frictions):
+        q = (k + torch.rand(1, generator=generator, dtype=torch.float64)) / frictions
+        noise = torch.randn(2, draws, 20, 1, 3, generator=generator, dtype=torch.float64)
+        motion = shift * noise[0] + torch.linalg.cross(
+            turn * noise[1].expand(size), arms.expand(size)
+        )
+        moved = contacts.points + tangential(motion, normals)
+        closed = closed_exact(moved.flatten(0, 1), normals.flatten(0, 1), float(WIDE.quantile(q)))
+        share += closed.view(draws, -1).double().mean(0) / frictions
+    assert float((found - share).abs().mean()) <= 0.02
+    without = hold_probability(contacts, WIDE)
+    assert float((without - share).abs().mean()) > float((found - share).abs().mean())
+
+
 def test_friction_alone_is_scipys_survival_of_the_critical_friction():
     points, normals = tripods(20, 3)
     normals[0] = normals[0, :1]
@@ -148,6 +172,8 @@ def test_wrong_arguments_are_refused():
         ("friction", (contacts, Distribution.between(0.5, 11.0))),
         ("friction", (contacts, -0.1)),
         ("placement", (contacts, 0.5, -0.001)),
+        ("shift", (contacts, 0.5, 0.0, 0.0, -0.001)),
+        ("turn", (contacts, 0.5, 0.0, 0.0, 0.0, 4.0)),
         ("tilt", (contacts, 0.5, 0.0, -0.1)),
         ("tilt", (contacts, 0.5, 0.0, torch.full((4, 3), 4.0))),
         ("tilt", (contacts, 0.5, 0.0, torch.zeros(4, 2))),

@@ -7,7 +7,9 @@ contacts that move by u_i and normals that turn by w_i, both along the surface, 
     sum_i (f_i x y / r) . u_i + (mu_c s_i0 f_i - a_i s_i) . w_i
 
 with the symbols of `torchgrasp.contacts.critical`, of the twist y only the rotation, and the
-root-mean-square radius r of the contacts. So Gaussian errors make mu_c Gaussian, with a standard
+root-mean-square radius r of the contacts. An object that is displaced by v, and turned by z about
+the centroid of its contacts p_i, moves all contacts together: u_i is the part of v + z x (p_i - p)
+along the surface, with the centroid p. So Gaussian errors make mu_c Gaussian, with a standard
 deviation s. Then the friction m suffices with the probability Phi((m - mu_c) / s), whose mean for m
 in an interval [a, b] is
 
@@ -52,12 +54,14 @@ def hold_probability(
     friction: Annotated[float, FRICTIONS] | Distribution,
     placement: Length = 0.0,
     tilt: Annotated[float, TILTS] | Float[Tensor, "b f"] = 0.0,
+    shift: Length = 0.0,
+    turn: Annotated[float, TILTS] = 0.0,
 ) -> Float[Tensor, "b"]:
     """Return the probability that each contact set has force closure, for uncertain friction,
-    finger placement and normals.
+    finger placement, normals and pose of the object.
 
-    Without `placement` and `tilt` it is exact: the probability that the friction exceeds the
-    `critical_friction`, and 0 where that is infinite. Their errors count to first order, by the
+    Without further errors than the friction's it is exact: the probability that the friction exceeds the
+    `critical_friction`, and 0 where that is infinite. The other errors count to first order, by the
     equations of this module. So it is mostly a little too high, since errors also raise the mean of
     the critical friction. Errors count too little where the critical friction has a kink, as for
     contacts that are exactly symmetric.
@@ -72,6 +76,10 @@ def hold_probability(
             perpendicular tangents. The normal stays as it is, as on a surface that is flat nearby.
         tilt: standard deviation [rad] of the angle of a normal about each of two perpendicular
             tangents, one for all contacts or one for each.
+        shift: standard deviation [m] of the object's position along each of three axes. It moves
+            all contacts together along the surface.
+        turn: standard deviation [rad] of the object's rotation about each of three axes through the
+            contacts' centroid.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> contacts = load_shipped_grasp("jug", "allegro").contacts
@@ -86,7 +94,12 @@ def hold_probability(
     rows, balance = least_balance(points, normals)
     moved, turned = sensitivities(points[rows], normals[rows], balance)
     errors = torch.stack([placement * moved, tilts[rows, :, None] * turned], 1)  # (k, 2, f, 3)
-    deviation = torch.linalg.vector_norm(errors, dim=(1, 2, 3))
+    arms = points[rows] - points[rows].mean(1, keepdim=True)
+    together = torch.stack(
+        [shift * moved.sum(1), turn * torch.linalg.cross(arms, moved).sum(1)], 1
+    )  # (k, 2, 3)
+    errors = torch.cat([errors.flatten(1), together.flatten(1)], 1)
+    deviation = torch.linalg.vector_norm(errors, dim=1)
     found = exceeding(Distribution.of(friction), balance.friction, deviation)
     return points.new_zeros(len(points)).index_put((rows,), found).to(contacts.points)
 
