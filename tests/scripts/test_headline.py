@@ -17,7 +17,7 @@ from benchmarks.headline.page import (
     readme_table,
     replace_table,
 )
-from benchmarks.headline.shapes import judge_hidden
+from benchmarks.headline.shapes import judge_hidden, measure_floor
 
 from torchgrasp.evaluation import ProtocolResult, ViewScore
 from torchgrasp.foundation.errors import Status
@@ -89,3 +89,13 @@ def test_the_hidden_side_is_what_the_other_camera_saw_alone():
     away = judge_hidden(front[:800], torch.cat([front[:800], far]))
     assert away["median"] == pytest.approx(465.0, abs=10.0)
     assert away["within_3"] == 0.0
+
+
+def test_the_floor_of_real_views_is_the_distance_of_the_cameras_where_both_see() -> None:
+    generator = torch.Generator().manual_seed(0)
+    flat = 0.05 * torch.rand(600, 3, generator=generator, dtype=torch.float64)
+    flat[:, 2] = 0.0
+    above = flat[:300] + torch.tensor([0.0, 0.0, 0.002])
+    far = flat[:300] + torch.tensor([0.0, 0.0, 0.1])  # the view did not see it
+    assert measure_floor(flat, torch.cat([above, far])) == pytest.approx(2.0, abs=0.01)
+    assert math.isnan(measure_floor(flat, far))
