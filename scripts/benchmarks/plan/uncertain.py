@@ -56,9 +56,9 @@ RULES: dict[str, Callable[[Distribution], ContactSpec]] = {
 @bench("plan/uncertain")
 def uncertain(o: Options) -> list[Row]:
     """Lift the best grasp of each rule at quantiles of the friction; predictions know all of it."""
-    families = list(FAMILIES)
-    left_out = [k for k in range(FIRST, FIRST + 10 * len(families)) if family_of(k) in CALIBRATING]
-    step = len(left_out) // o.times(BODIES)
+    # one body of each family
+    left_out = [k for k in range(FIRST, FIRST + len(FAMILIES)) if family_of(k) in CALIBRATING]
+    step = max(1, len(left_out) // o.times(BODIES))
     hand = load_hand(o.hands[0])
     rows = list[Row]()
     for regime in REGIMES:
