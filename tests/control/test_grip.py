@@ -33,7 +33,7 @@ from torchgrasp.control.holding import (
     likely_body,
     push_reserve,
 )
-from torchgrasp.control.least_forces import LeastForces, balance, friction_ratios
+from torchgrasp.control.least_forces import LeastForces, _Barrier, balance, friction_ratios
 from torchgrasp.control.tactile import Observation
 from torchgrasp.geometry.linalg import GOLDEN_ANGLE, fibonacci_sphere
 from torchgrasp.geometry.signed_distance import SignedDistanceField
@@ -187,6 +187,21 @@ def test_a_finger_in_the_air_bears_no_load_and_presses_as_little_as_allowed():
     assert push[:2] == pytest.approx([least] * 2, rel=0.05) and push[2] == pytest.approx(
         0.7, rel=0.1
     )
+
+
+@pytest.mark.parametrize("digits", [4, 8, 16, 64])
+def test_fingers_in_the_air_with_forces_on_the_border_of_their_cones_end_in_finite_forces(digits):
+    """A hold that has lost its object comes there; the Hessian may then be singular."""
+    normals = -np.eye(3)
+    contacts = balance(0.03 * normals, np.zeros(3, dtype=bool))
+    barrier = _Barrier(contacts, normals, np.zeros((6, 9)), np.zeros(6), 0.01, 0.0)
+    barrier.squared = 1.0
+    barrier.floor = np.full(3, 0.4)
+    slide = 1 - digits * 2.0**-53  # of a normal force of 1, with friction 1
+    step, decrement = barrier.newton(
+        barrier.place(np.array([[1.0, slide, 0], [0, 1, slide], [slide, 0, 1]]))
+    )
+    assert np.isfinite(step).all() and math.isfinite(decrement)
 
 
 def test_least_forces_keep_the_floors():

@@ -290,6 +290,8 @@ class _Barrier:
     def newton(self, z: Float[Array, " k"]) -> tuple[Float[Array, " k"], float]:
         """Return Newton's step (k,) at coordinates z, and the Newton decrement, which measures the
         distance from the optimum.
+
+        Both are 0 where the Hessian is singular.
         """
         gap = self.gap
         push = self.push
@@ -313,5 +315,9 @@ class _Barrier:
         bent = 2 * (1 + self.squared) * (push.T / cone) @ push
         hessian += gap * ((half.T * (4 / cone**2)) @ half - bent)
         hessian += gap * np.einsum("n,nkl->kl", 2 / cone, self.spread)
-        step = -np.linalg.solve(hessian + BARRIER.ridge * np.eye(len(z)), gradient)
+        try:
+            step = -np.linalg.solve(hessian + BARRIER.ridge * np.eye(len(z)), gradient)
+        except np.linalg.LinAlgError:
+            # on the border of a cone one term outweighs all others by more than the digits
+            return np.zeros_like(z), 0.0
         return step, math.sqrt(max(-float(gradient @ step), 0.0) / gap)
