@@ -95,11 +95,14 @@ class DistanceField(Value, abc.ABC):
         For a point outside the grid it is a node at the border.
         """
         grid = self._grid(points)
-        node = torch.round((points - grid.origin) / grid.spacing).clamp_min_(0)
-        node = torch.minimum(node, grid.last.to(points)).long()
+        spacing = grid.spacing if isinstance(grid.spacing, float) else grid.spacing[..., 0]
+        # operations on many points are faster where x, y and z are apart
+        node = points.movedim(-1, 0).contiguous() - grid.origin.movedim(-1, 0)
+        node = node.div_(spacing).round_().clamp_min_(0)
+        x, y, z = torch.minimum(node, grid.last.movedim(-1, 0).to(points)).int()
         dx, dy = grid.stride
-        x, y, z = node.unbind(-1)
-        return self.nodes[x * dx + y * dy + z + grid.first].to(points)
+        flat = x * dx + y * dy + z + grid.first
+        return self.nodes.index_select(0, flat.flatten()).view(flat.shape).to(points)
 
     @abc.abstractmethod
     def _grid(self, points: Float[Tensor, "*b 3"]) -> Grid:
@@ -180,8 +183,11 @@ class SignedDistanceField(DistanceField):
     def _grid(self, points: Float[Tensor, "*b 3"]) -> Grid:
         last, corners = self._cells
         _, ny, nz = self.values.shape
-        corners = corners.view(-1, *[1] * (points.ndim - 1))
-        return Grid(self.origin.to(points), self.spacing, last, (ny * nz, nz), 0, corners)
+        ones = [1] * (points.ndim - 1)
+        origin = self.origin.to(points).view(*ones, 3)
+        last = last.view(*ones, 3)
+        corners = corners.view(-1, *ones)
+        return Grid(origin, self.spacing, last, (ny * nz, nz), 0, corners)
 
 
 def corner_steps(dx: Int[Tensor, "*b"], dy: Int[Tensor, "*b"]) -> Int[Tensor, "8 *b"]:

@@ -198,12 +198,13 @@ def collision_cost(
     cost = centres.new_zeros(centres.shape[:-2])
     for field in world.fields:
         deficit = CLEARANCE + radius - field.nearest_node(centres)
-        deficit = deficit * ~spheres.touching if field is world.field else deficit
-        cost = cost + deficit.clamp_min(0).square().sum(-1)
+        if field is world.field:
+            deficit *= ~spheres.touching
+        cost = cost + deficit.clamp_min_(0).square_().sum(-1)
     if world.plane is not None:
         wanted = world.plane.offset + CLEARANCE * ~spheres.touching + radius
         deficit = wanted - along(centres, world.plane)
-        cost = cost + deficit.clamp_min(0).square().sum(-1)
+        cost = cost + deficit.clamp_min_(0).square_().sum(-1)
     return cost / MILLIMETRE**2
 
 

@@ -145,7 +145,8 @@ class PostureLibrary(Value):
             vf_from_hand,
             centres,
             feature(centres, pads),
-            hand.sphere_centres(joints).float(),
+            # the coordinates of a posture's spheres lie side by side by axis, as they are used
+            hand.sphere_centres(joints).float().mT.contiguous().mT,
         )
 
 
@@ -239,7 +240,10 @@ def nearest_postures(
         order = index // len(given)
         sample = index % len(given)
         obj_from_hand = obj_from_vf[at, order] @ library.vf_from_hand[sample]
-        spheres = apply(obj_from_hand.float(), library.spheres[sample])
+        placed = obj_from_hand.flatten(0, 1).float()
+        spheres = library.spheres.mT[sample.flatten()]
+        spheres = torch.baddbmm(placed[:, :3, 3:], placed[:, :3, :3], spheres)
+        spheres = spheres.mT.unflatten(0, sample.shape)  # (r, c, k, 3)
         # Squared millimetres, weighed as in `refine`.
         tips = 2 * energy * (TIP_WEIGHT * SEEDS.length_scale / MILLIMETRE) ** 2
         cost = tips + collision_cost(spheres, library.hand.collision_spheres, world.rows(row))
@@ -288,9 +292,12 @@ def _energies(
     """Return half the squared distance between the features of contacts and postures; infinite
     where not `framed`.
     """
-    squares = wanted.square().sum(-1)[..., None] / 2 + given.square().sum(-1) / 2
-    energy = squares - wanted @ given.T
-    return torch.where(framed[..., None], energy, torch.inf)
+    # one product, as each pass over so many numbers costs as much: w w / 2 + g g / 2 - w g
+    half = torch.where(framed, wanted.square().sum(-1) / 2, torch.inf)
+    one = torch.ones_like(half)
+    rows = torch.cat([wanted, half[..., None], one[..., None]], -1)
+    columns = torch.cat([-given, torch.ones_like(given[:, :1]), given.square().sum(-1, True) / 2], 1)
+    return rows @ columns.T
 
 
 def _likely_assignments(
