@@ -296,7 +296,9 @@ def _energies(
     half = torch.where(framed, wanted.square().sum(-1) / 2, torch.inf)
     one = torch.ones_like(half)
     rows = torch.cat([wanted, half[..., None], one[..., None]], -1)
-    columns = torch.cat([-given, torch.ones_like(given[:, :1]), given.square().sum(-1, True) / 2], 1)
+    columns = torch.cat(
+        [-given, torch.ones_like(given[:, :1]), given.square().sum(-1, True) / 2], 1
+    )
     return rows @ columns.T
 
 
