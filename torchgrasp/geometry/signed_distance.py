@@ -95,7 +95,7 @@ class DistanceField(Value, abc.ABC):
         For a point outside the grid it is a node at the border.
         """
         grid = self._grid(points)
-        spacing = grid.spacing if isinstance(grid.spacing, float) else grid.spacing[..., 0]
+        spacing = grid.spacing[..., 0] if isinstance(grid.spacing, Tensor) else grid.spacing
         # operations on many points are faster where x, y and z are apart
         node = points.movedim(-1, 0).contiguous() - grid.origin.movedim(-1, 0)
         node = node.div_(spacing).round_().clamp_min_(0)
