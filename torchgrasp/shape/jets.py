@@ -51,9 +51,8 @@ def evaluate_mean(
     else:
         distances = separations(x, of.x)[1]
     k, first, *second = of.kernel.derivatives(distances, 3 if gradient else 2)
-    offset = (of.x[..., :near, :] * of.b).sum(-1)
-    along = _times(x, of.b.mT) - offset
-    distance = _dot(k, of.a) - (first[:, :near] * along).sum(1)
+    along = _along_normals(of, x)
+    distance = _dot(k, of.a) - torch.linalg.vecdot(first[:, :near], along)
     if not gradient:
         return (distance,)
     c = first * of.a
@@ -75,16 +74,12 @@ def evaluate_mean_jet(
     k, first, second, third = kernel.derivatives(r, 4)
     near_first = first[:, :near]
     near_second = second[:, :near]
-    offset = (known[..., :near, :] * b).sum(-1)
-    if b.ndim == 2:
-        along = torch.addmm(offset, x, b.T, beta=-1.0)
-    else:
-        along = _times(x, b.mT) - offset
+    along = _along_normals(of, x)
     c = torch.mul(first, a)
     c[:, :near].addcmul_(near_second, along, value=-1.0)
     outer = second * a
     outer[:, :near].addcmul_(third[:, :near], along, value=-1.0)
-    distance = _dot(k, a) - (near_first * along).sum(1)
+    distance = _dot(k, a) - torch.linalg.vecdot(near_first, along)
     gradient = _sum_differences(c, x, known) - _times(near_first, b)
     rows = []
     for part in d:
@@ -140,6 +135,19 @@ def distance_rows(
     """
     slope = first[:, :near]
     return torch.cat([k, *(-(part[:, :near] * slope) for part in d)], 1)
+
+
+def _along_normals(
+    of: Weighted,
+    x: Queries,
+) -> Float[Tensor, "q near"]:
+    """Return the products of the differences from the observed points with their weighted
+    normals.
+    """
+    offset = (of.x[..., : of.b.shape[-2], :] * of.b).sum(-1)
+    if of.b.ndim == 2:
+        return torch.addmm(offset, x, of.b.T, beta=-1.0)
+    return _times(x, of.b.mT) - offset
 
 
 def _sum_differences(

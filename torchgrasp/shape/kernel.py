@@ -197,13 +197,13 @@ def differentiate_thin_plate(
 
     The kernel is `thin_plate`; its length `psi` and the distances `r` are normalised.
     """
-    k = (2.0 * r).sub_(3.0 * psi).mul_(r).mul_(r).add_(psi**3)
-    values = [k, (6 * r).sub_(6 * psi)]
+    # each pass over the distances counts: k is r^2 (k' / 3 - psi) + psi^3
+    first = (r - psi).mul_(6)
+    values = [(first / 3).sub_(psi).mul_(r).mul_(r).add_(psi**3), first]
     if count > 2:
-        inverse = torch.reciprocal(r).masked_fill_(r == 0, 0.0)
-        values.append(6 * inverse)
+        values.append((6 / r).nan_to_num_(nan=math.nan, posinf=0.0))
         if count > 3:
-            values.append((inverse * inverse).mul_(inverse).mul_(-6))
+            values.append((values[2] * values[2]).mul_(values[2]).mul_(-1 / 36))
     return tuple(values[:count])
 
 
