@@ -74,7 +74,7 @@ def certify(
     derivatives of others. A second derivative, or the derivative of another field, raises
     `BadArgument`; in forward mode the latter is NaN. Raises `BadArgument` for contacts of a wrong
     shape, normals that are not of length 1 (to 1e-3), a `spec` that is no `ContactSpec`, or a
-    `friction` that is not one number for each set.
+    `friction` that is not one number from 0 for each set.
 
     >>> corners = torch.tensor([[[1.0, 0, 0], [-0.6, 0.8, 0], [-0.6, -0.8, 0]]])
     >>> certify(Contacts(corners, corners)).closed
@@ -86,6 +86,8 @@ def certify(
     coefficient = spec.planned_friction
     if friction is not None:
         check_tensor("friction", friction, (len(points),))
+        if is_known(friction) and bool((friction < 0).any()):
+            raise BadArgument("friction", f"{float(friction.min()):g}", "coefficients from 0")
         coefficient = friction.to(points)
     wrench = wrenches(points, normals, coefficient, spec.edges)
     proof = _Proof.apply(wrench.flatten(1, 2), degenerate(points))
