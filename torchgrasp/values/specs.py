@@ -126,8 +126,8 @@ class ContactSpec(Value):
         They are `planned_friction`, and of a distribution also its mean and its 5 % quantile. Equal
         ones count once.
 
-        >>> ContactSpec(Distribution.between(0.2, 1.0)).planned_frictions
-        (0.3, 0.6, 0.24)
+        >>> ContactSpec(Distribution.between(0.0, 1.0)).planned_frictions
+        (0.25, 0.5, 0.05)
         """
         first = self.planned_friction
         law = Distribution.of(self.friction)
