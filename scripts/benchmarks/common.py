@@ -21,7 +21,10 @@ from torchgrasp.files import write_file
 
 ROOT = Path(__file__).resolve().parents[2]
 CHANGED = " with changes"
-"""What stands behind a commit if the working tree differs from it."""
+UNKNOWN = "unknown"
+"""What stands behind a commit if the working tree differs from it, and what stands for a commit
+that git does not tell.
+"""
 Result = TypeVar("Result")
 
 
@@ -179,7 +182,8 @@ CHOICES = ("only", "out", "publish", "workers")
 def keep_rows(options: Options, name: str, measure_rows: Callable[[], list[Row]]) -> list[Row]:
     """Return the rows of a stopped run of the same commit and options, or measure and keep them.
 
-    Rows are kept in the folder `out`, but not while the working tree has changes.
+    Rows are kept in the folder `out`. They are measured again while the working tree has changes,
+    or without git.
     """
     run = describe_run(options.threads)
     settings = {k: v for k, v in dataclasses.asdict(options).items() if k not in CHOICES}
@@ -187,7 +191,8 @@ def keep_rows(options: Options, name: str, measure_rows: Callable[[], list[Row]]
     path = options.out / "rows" / f"{name}.json"
     if path.is_file():
         content = json.loads(path.read_text("utf-8"))
-        if content["head"] == head and CHANGED not in run:
+        fixed = CHANGED not in run and UNKNOWN not in run
+        if content["head"] == head and fixed:
             return [Row(**row) for row in content["rows"]]
     rows = measure_rows()
     content = {"head": head, "rows": list(map(dataclasses.asdict, rows))}
@@ -224,7 +229,7 @@ def describe_run(threads: int) -> str:
             ["git", *words], cwd=ROOT, capture_output=True, text=True, check=False
         ).stdout.strip()
 
-    commit = git("rev-parse", "--short", "HEAD") or "unknown"
+    commit = git("rev-parse", "--short", "HEAD") or UNKNOWN
     if git("status", "--short"):
         commit += CHANGED
     info = Path("/proc/cpuinfo")

@@ -147,6 +147,7 @@ def test_rows_are_numbered_as_torch_does_however_large_their_numbers_are(dtype, 
     far = torch.tensor([[10**15, -(10**15), 0], [10**15, -(10**15), 1]]).to(dtype)
     rows = torch.cat([rows, far, rows[:5], far])
     assert torch.equal(number_rows(rows), torch.unique(rows, dim=0, return_inverse=True)[1])
+    assert number_rows(rows[:0]).tolist() == []
 
 
 def test_components_are_those_of_the_pairs_and_keep_the_order_of_nodes():

@@ -74,7 +74,8 @@ def test_measure_refuses_an_unknown_bench():
 
 
 def test_rows_of_a_stopped_run_are_kept_for_the_same_commit_and_options(tmp_path, monkeypatch):
-    runs = ["Commit 1", "Commit 1", "Commit 2", "Commit 1 with changes", "Commit 1 with changes"]
+    untold = ["Commit 1 with changes"] * 2 + ["Commit unknown"] * 2
+    runs = ["Commit 1", "Commit 1", "Commit 2", *untold]
     measured = list[str]()
 
     def measure_rows() -> list[Row]:

@@ -27,7 +27,6 @@ from torchgrasp.foundation.base import FINGERTIPS, Batch, map_tensors, spread
 from torchgrasp.geometry.linalg import dot, eye_like, norm
 from torchgrasp.shape.batch import ShapeBatch
 from torchgrasp.shape.estimate import MeanJet, SurfaceJet
-from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.specs import ContactSpec
 
 # inequalities are solved to this share of their bound: the last steps onto the surface stay inside
@@ -82,13 +81,14 @@ AnyShape = TypeVar("AnyShape", bound=ShapeLike)
 
 def frictions_in_turn(spec: ContactSpec, number: Int[Tensor, "b"]) -> Float[Tensor, "b"] | None:
     """Return the friction coefficients at which initial guesses are planned, the frictions of
-    `spec` in turn; None if the friction is certain.
+    `spec` in turn; None if there is only one, as for a friction that is certain.
 
     `number` holds the number of each guess, from 0.
     """
-    if not isinstance(Distribution.of(spec.friction).simplest, Distribution):
+    frictions = spec.planned_frictions
+    if len(frictions) == 1:
         return None
-    found = torch.tensor(spec.planned_frictions, dtype=torch.float64, device=number.device)
+    found = torch.tensor(frictions, dtype=torch.float64, device=number.device)
     return found[number % len(found)]
 
 

@@ -96,8 +96,8 @@ def number_rows(rows: Shaped[Tensor, "n d"]) -> Int[Tensor, "n"]:
     """
     number = torch.zeros(len(rows), dtype=torch.int64, device=rows.device)
     for column in rows.T:
-        place = column.unique(return_inverse=True)[1]
-        pair = number * (place.amax() + 1) + place
+        values, place = column.unique(return_inverse=True)
+        pair = number * len(values) + place
         number = pair.unique(return_inverse=True)[1]
     return number
 

@@ -9,16 +9,15 @@ from pathlib import Path
 
 import torch
 import trimesh
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 from train.household import CALIBRATING, author_household, family_of, write_bodies
 
 from benchmarks.close.table_lift import BASE, lift_objects
-from benchmarks.common import Options, Row, bench
+from benchmarks.common import Options, Row, bench, mean_over
 from torchgrasp.cloud.camera import partial_view
 from torchgrasp.cloud.sensor import SensorName
 from torchgrasp.evaluation import ViewScore
-from torchgrasp.evaluation.intervals import contrast_over, count_by, share_over
 from torchgrasp.hand.load import load_hand
 from torchgrasp.values.planning import PointCloud
 
@@ -58,7 +57,7 @@ CAMERAS = {
 def wear(cloud: PointCloud) -> PointCloud:
     """Return a cloud whose points are means of their neighbours, without the lowest ones."""
     points = cloud.points.double()
-    near = cKDTree(points.numpy()).query_ball_point(points.numpy(), SMOOTHED)
+    near = KDTree(points.numpy()).query_ball_point(points.numpy(), SMOOTHED)
     smooth = torch.stack([points[some].mean(0) for some in near])
     return dataclasses.replace(cloud, points=smooth[smooth[:, 2] > CROPPED])
 
@@ -84,15 +83,11 @@ def sensors(o: Options) -> list[Row]:
 def _row(what: str, scores: Sequence[ViewScore]) -> Row:
     """Return the mean predicted success beside the share that rose, over families."""
     tried = [(x.unit, a) for x in scores for a in x.attempts]
-    held = count_by((unit, a.passed) for unit, a in tried)
-    sums = dict[str, tuple[float, int]]()
-    for unit, a in tried:
-        total, n = sums.get(unit, (0.0, 0))
-        sums[unit] = total + a.predicted, n + 1
-    apart = contrast_over([sums, held], [1.0, -1.0])
-    predicted = sum(a.predicted for _, a in tried) / max(len(tried), 1)
-    words = f"predicted {predicted:.2f}, rose {share_over(held).value:.2f} of {len(tried)}; "
+    predicted = mean_over((unit, a.predicted) for unit, a in tried)
+    risen = mean_over((unit, float(a.passed)) for unit, a in tried)
+    apart = mean_over((unit, a.predicted - a.passed) for unit, a in tried)
+    words = f"predicted {predicted.value:.2f}, rose {risen.value:.2f} of {len(tried)}; "
     words += f"predicted minus rose {apart.value:+.2f} [{apart.low:+.2f}, {apart.high:+.2f}]; "
     words += f"no grasp for {sum(not x.attempts for x in scores)}"
-    numbers = {"apart": apart, "predicted": predicted}
+    numbers = {"apart": apart, "predicted": predicted, "risen": risen}
     return Row(what, f"within {APART}", words, abs(apart.value) <= APART, numbers)

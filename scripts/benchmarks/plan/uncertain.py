@@ -5,7 +5,13 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-from train.household import CALIBRATING, FAMILIES, author_household, family_of
+from train.household import (
+    CALIBRATING,
+    FAMILIES,
+    GOLDEN_ANGLE,
+    author_household,
+    family_of,
+)
 
 from benchmarks.common import Options, Row, bench, mean_over
 from torchgrasp import ContactSpec, Distribution, GraspTask, load_hand, plan_grasps
@@ -76,7 +82,7 @@ def uncertain(o: Options) -> list[Row]:
 def try_rule(k: int, hand: Hand, law: Distribution, spec: ContactSpec, seed: int) -> Outcome:
     """Plan on a view of body `k`, and lift the best grasp at quantiles of the friction."""
     body = author_household(k)
-    eye = look_at(137.5 * k % 360, 35.0, target=body.mesh)
+    eye = look_at(GOLDEN_ANGLE * k % 360, 35.0, target=body.mesh)
     cloud = partial_view(body.mesh, eye, noise=True, seed=k)
     none = Outcome(body.name, 0, math.nan, 0.0, math.nan)
     try:

@@ -390,15 +390,18 @@ class Grasp(ForPrograms):
                 name, path, cloud, hand, spec, grasps, shape, progress, explanation, scene
             )
             progress.end("report", self._write(out, run))
+            clear = ()
+            words = ""
+            if explanation is not None:
+                options = {"fingers": among, "mode": self.mode, **self._task}
+                plan = functools.partial(
+                    plan_grasps, hand=hand, spec=spec, seed=self.seed, **options
+                )
+                clear = order_to_clear(scene, plan, self.starts)
+                words = ", then ".join(f"object {label}" for label in clear)
+                progress.end("clear", words or "no object that is in the way")
         executable = print_grasps(run)
-        clear = ()
-        if not executable:
-            plan = functools.partial(
-                plan_grasps, hand=hand, spec=spec, seed=self.seed, fingers=among, **self._task
-            )
-            clear = order_to_clear(scene, plan, self.starts)
         if clear:
-            words = ", then ".join(f"object {label}" for label in clear)
             print(f"take away first  {words}; object {scene.target} then has a grasp")
         answer(describe_run(run, out) | {"label": scene.target, "clear": list(clear)})
         return 0 if executable else 1
