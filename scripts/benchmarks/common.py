@@ -7,6 +7,7 @@ import math
 import os
 import pkgutil
 import platform
+import re
 import subprocess
 import sys
 import time
@@ -20,6 +21,8 @@ from torchgrasp.evaluation.intervals import Share, contrast_over
 from torchgrasp.files import write_file
 
 ROOT = Path(__file__).resolve().parents[2]
+RESULTS = ROOT / "docs" / "results"
+SPEED = RESULTS / "speed.md"
 CHANGED = " with changes"
 UNKNOWN = "unknown"
 """What stands behind a commit if the working tree differs from it, and what stands for a commit
@@ -66,6 +69,8 @@ class Options:
             NAME=PYTHON:ADAPTER with a script of your own.
         workers: processes that share the trials.
         threads: of torch.
+        beside: commit whose times plan/pace takes in the same run, for ratios; with publish they
+            become a section of docs/results/speed.md.
         seed: of every random number.
         out: folder of the results as JSON, of kept plans and trials, and of the tables.
         publish: write the tables to docs/results instead.
@@ -89,6 +94,7 @@ class Options:
     peers: tuple[str, ...] = ()
     workers: int = 1
     threads: int = 1
+    beside: str | None = None
     seed: int = 0
     out: Path = Path("out")
     publish: bool = False
@@ -157,12 +163,11 @@ def measure(subject: str, options: Options) -> list[Row]:
             continue
         rows = keep_rows(options, f"{subject}-{name}", lambda run=known[name].run: run(options))
         print(*rows, sep="\n", flush=True)
-        write_table(
-            ROOT / "docs" / "results" if options.publish else options.out,
-            f"{subject}-{name}",
-            rows,
-            options,
-        )
+        if options.publish and options.beside is not None:
+            write_section(SPEED, f"Beside commit {options.beside}", rows, options)
+        else:
+            folder = RESULTS if options.publish else options.out
+            write_table(folder, f"{subject}-{name}", rows, options)
         found += rows
     met, missed = (sum(row.met is verdict for row in found) for verdict in (True, False))
     print(f"{met} targets met, {missed} missed, {len(found) - met - missed} rows without a target")
@@ -202,8 +207,21 @@ def keep_rows(options: Options, name: str, measure_rows: Callable[[], list[Row]]
 
 def write_table(folder: Path, name: str, rows: list[Row], options: Options) -> None:
     """Write rows as a Markdown table with commit, machine and command."""
-    lines = [f"# {name}", "", f"`{command_line()}`", "", describe_run(options.threads), ""]
-    write_file(folder / f"{name}.md", "\n".join([*lines, *format_rows(rows)]) + "\n")
+    lines = [f"# {name}", "", *describe_rows(rows, options)]
+    write_file(folder / f"{name}.md", "\n".join(lines) + "\n")
+
+
+def write_section(page: Path, heading: str, rows: list[Row], options: Options) -> None:
+    """Write the same as the last section of a page, in place of one with this heading."""
+    text = page.read_text("utf-8")
+    section = re.compile(rf"\n## {re.escape(heading)}\n.*?(?=\n## |\Z)", re.DOTALL)
+    lines = ["", f"## {heading}", "", *describe_rows(rows, options)]
+    write_file(page, section.sub("", text).rstrip("\n") + "\n" + "\n".join(lines) + "\n")
+
+
+def describe_rows(rows: list[Row], options: Options) -> list[str]:
+    """Return the lines of command, commit and machine, and of a table of rows."""
+    return [f"`{command_line()}`", "", describe_run(options.threads), "", *format_rows(rows)]
 
 
 def command_line() -> str:

@@ -14,8 +14,9 @@ import torch
 import trimesh
 from bench import SUBJECTS
 from benchmarks import common
-from benchmarks.common import Options, Row, benches_of, keep_rows, measure
-from benchmarks.ground_truth import nearest_on_mesh, sample_mesh
+from benchmarks.common import Options, Row, benches_of, keep_rows, measure, write_section
+from benchmarks.ground_truth import nearest_on_mesh, read_views, sample_mesh
+from benchmarks.plan import beside, timed
 from benchmarks.plan.exact_lp import (
     exact_margin,
     proves_margin_above,
@@ -92,6 +93,56 @@ def test_rows_of_a_stopped_run_are_kept_for_the_same_commit_and_options(tmp_path
         keep_rows(options, "bench", measure_rows)
     keep_rows(Options(out=tmp_path, starts=8), "bench", measure_rows)
     assert len(measured) == len(runs) + 1
+
+
+class Slower:
+    """Stands for a process that times a tree: its work takes so many times as long."""
+
+    def __init__(self, factor: float, log: list[float]) -> None:
+        self.factor = factor
+        self.log = log
+
+    def run(self, job: str, **arguments: object) -> dict[str, float]:
+        self.log.append(self.factor)
+        names = {"plan": ("first", "fifty", "all"), "cold": ("import", "command")}
+        times = dict.fromkeys(names.get(job, ("shape", "predict")), self.factor)
+        return times | ({"grasps": 30.0, "fifty": math.nan} if job == "plan" else {})
+
+
+def test_times_beside_a_commit_are_taken_by_turns_and_become_ratios():
+    log = list[float]()
+    jobs = beside.list_jobs(["a", "b"], "allegro", Options(starts=8))
+    found = beside.take_turns((Slower(1.0, log), Slower(4.0, log)), jobs)  # pyright: ignore
+    assert log[:6] == [4.0, 1.0, 1.0, 4.0, 4.0, 1.0]
+    rows = {row.what: row for row in beside.ratio_rows("two", *found, "abc")}
+    first = rows["two: first executable grasp, median"]
+    assert first.met and first.measured == "0.25x: 1 s beside 4 s at abc"
+    rate = rows["two: executable grasps for each CPU second"]
+    assert rate.met and rate.numbers == {"ratio": 4.0, "here": 30.0, "there": 7.5}
+    # none of the plans had fifty
+    assert rows["two: fifty executable grasps, median"].met is None
+
+
+def test_a_view_that_is_timed_is_the_same_in_the_other_process(tin, tmp_path):
+    _, _, cloud, _ = next(read_views(tin))
+    path = beside.write_view(tmp_path / "view.npz", cloud)
+    again = timed.read_view(str(path))
+    assert torch.equal(again.points, cloud.points)
+    assert torch.equal(again.viewpoint, cloud.viewpoint) and again.normals is None
+    job = ["shape", {"view": str(path), "seed": 0}]
+    times = json.loads(timed.answer(json.dumps(job)))
+    assert set(times) == {"shape", "predict", "surface", "field"} and min(times.values()) > 0
+
+
+def test_a_section_of_a_page_is_replaced(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text("# Page\n\n## Beside a\n\nold\n\n## Other\n\ntext\n")
+    for measured in ("2", "3"):
+        write_section(page, "Beside a", [Row("what", "-", measured)], Options())
+    text = page.read_text()
+    assert text.startswith("# Page\n\n## Other\n\ntext\n\n## Beside a\n")
+    assert text.count("## Beside a") == 1 and text.endswith("| what | - | 3 | - |\n")
+    assert "Commit " in text and "old" not in text
 
 
 def ball(radius: float, n: int) -> torch.Tensor:

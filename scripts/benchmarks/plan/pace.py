@@ -9,6 +9,7 @@ from tqdm import tqdm
 
 from benchmarks.common import Options, Row, bench
 from benchmarks.ground_truth import read_views
+from benchmarks.plan.beside import compare_with_commit
 from torchgrasp import ContactSpec, Hand, PointCloud, load_hand, load_object, stream_grasps
 
 FRICTIONS = (0.6, 0.8)
@@ -32,8 +33,10 @@ class Pace(NamedTuple):
 @bench("plan/pace", objects=True)
 def keep_pace(o: Options) -> list[Row]:
     """Plan on one view of each object at each friction, and time the batches; the first plan is not
-    counted.
+    counted. With `beside`, all is done at another commit, too.
     """
+    if o.beside is not None:
+        return compare_with_commit(o, o.beside)
     rows = list[Row]()
     for name in o.hands:
         hand = load_hand(name)
