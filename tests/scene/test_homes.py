@@ -10,6 +10,7 @@ import pytest
 import torch
 import trimesh
 from jaxtyping import Bool, Float
+from scipy import ndimage
 from torch import Tensor
 
 from tests.make import box, load_hand
@@ -143,6 +144,25 @@ def test_a_good_mask_is_kept(kind):
     told = [note for note in scene.notes if note.startswith("mask")]
     assert kept > 0.9
     assert kept > 0.95 or told
+
+
+def test_a_mask_beside_its_object_is_told_with_the_shift_that_fits():
+    seen = home("lone")
+    for right, down in ((-6, 0), (5, -4)):
+        moved = seen.ball.roll((down, right), (0, 1))
+        notes = Scene.from_depth(seen.depth, seen.intrinsics, mask=moved).notes
+        (note,) = [note for note in notes if "fits its object" in note]
+        words = [f"{abs(right)} pixels {'right' if right < 0 else 'left'}"]
+        words += [f"{abs(down)} pixels {'down' if down < 0 else 'up'}"] if down else []
+        assert note.startswith(f"mask: it fits its object {' and '.join(words)}: align it")
+
+
+def test_a_mask_that_is_too_wide_is_not_told_to_lie_beside_its_object():
+    seen = home("lone")
+    wide = torch.from_numpy(ndimage.binary_dilation(seen.ball.numpy(), iterations=6))
+    notes = Scene.from_depth(seen.depth, seen.intrinsics, mask=wide).notes
+    assert any("lie on the support" in note for note in notes)
+    assert not any("fits its object" in note for note in notes)
 
 
 def test_thin_bars_under_a_mask_are_kept():

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -42,6 +43,14 @@ class MaskNumbers:
     """Greatest error [pixels] of the border of a given mask."""
     told: float = 0.05
     """Share of a mask's pixels whose removal is mentioned in a note; a smaller share is not."""
+    reach: float = 0.04
+    """Greatest shift of a mask that is looked for, as a share of the image's width: colour and
+    depth that are not aligned differ by 2 % or so.
+    """
+    gained: float = 0.1
+    """Least share of a mask's pixels that a shift must bring back onto the object to be told."""
+    fitting: float = 0.85
+    """Least share of the shifted mask's pixels on the object; else its shape is another one."""
 
 
 MASKS = MaskNumbers()
@@ -241,6 +250,8 @@ def label_image(
         *_removed("mask", int(strips.sum()), seen, "another object"),
         *_removed("mask", int(flying.sum()), seen, "no surface, between near and far ones,"),
     ]
+    if notes:
+        notes += _shifted(mask & view.measured, target | (belongs & shown)[objects] & (objects > 0))
     return torch.where(target, 1, torch.where(rest > 0, rest + 1, 0)), tuple(notes)
 
 
@@ -337,6 +348,35 @@ def _on_objects(view: TableImage, labels: Int[Tensor, "h w"]) -> Bool[Tensor, "h
 def _on_support(view: TableImage) -> Bool[Tensor, "h w"]:
     """Return a mask of the measured pixels that lie on the plane of the support or below it."""
     return view.measured & (view.height < MASKS.low)
+
+
+def _shifted(mask: Bool[Tensor, "h w"], target: Bool[Tensor, "h w"]) -> list[str]:
+    """Return a list with one sentence if the mask fits its object better elsewhere; else an empty
+    one.
+
+    A mask from a colour image that is not aligned with the depth lies beside its object.
+    """
+    reach = math.ceil(MASKS.reach * mask.shape[1])
+    rows, columns = torch.nonzero(mask).unbind(1)
+    padded = torch.from_numpy(np.pad(target.numpy(), reach))
+    shares = torch.stack(
+        [
+            padded[rows + down, columns + right].double().mean()
+            for down in range(2 * reach + 1)
+            for right in range(2 * reach + 1)
+        ]
+    ).reshape(2 * reach + 1, -1)
+    best = int(shares.argmax())
+    gained = float(shares.max() - shares[reach, reach])
+    if gained < MASKS.gained or float(shares.max()) < MASKS.fitting:
+        return []
+    down, right = (k - reach for k in divmod(best, 2 * reach + 1))
+    place = [
+        f"{abs(count)} {'pixel' if abs(count) == 1 else 'pixels'} {after if count > 0 else before}"
+        for count, before, after in ((right, "left", "right"), (down, "up", "down"))
+        if count
+    ]
+    return [f"mask: it fits its object {' and '.join(place)}: align it with the depth image"]
 
 
 def _removed(mask: str, count: int, seen: int, where: str = "the support") -> list[str]:
