@@ -30,7 +30,7 @@ collect_ignore = [
     "app/agent_client.py",
     "app/software_camera.py",
     "data/lerobot_plugin.py",
-    "export/play_usd.py",
+    "export/play_newton.py",
 ]  # their packages are in environments beside, where tests run them
 
 SLOW = [HealthCheck.too_slow, HealthCheck.function_scoped_fixture]

@@ -1,5 +1,5 @@
-"""Run by test_play.py with Newton and OpenUSD: checks the scene.usda of a folder, plays it, and
-prints results.
+"""Run by test_play.py with Newton and OpenUSD: plays folders for Newton, checks the scene.usda of
+another one, plays it, and prints results.
 """
 
 import json
@@ -14,7 +14,11 @@ import warp
 from pxr import Usd, UsdPhysics
 
 warp.config.quiet = True
-folder = Path(sys.argv[1])
+folder, *scenes = map(Path, sys.argv[1:])
+sys.argv[1:] = ["0"]
+for scene in scenes:
+    names = runpy.run_path(str(scene / "play.py"), run_name="__main__")
+iterations = names["solver"].mj_model.opt.noslip_iterations
 play = json.loads((folder / "play.json").read_text())
 stage = Usd.Stage.Open(str(folder / "scene.usda"))
 parsed = UsdPhysics.LoadUsdPhysicsFromRange(stage, ["/"])
@@ -28,7 +32,6 @@ for name in play["drives"]:
     stiffness = drive.GetStiffnessAttr().Get() * unit
     damping = drive.GetDampingAttr().Get() * unit
     joints[name] = {"kp": stiffness, "kd": damping, "effort": drive.GetMaxForceAttr().Get()}
-sys.argv[1:] = ["0"]
 runpy.run_path(str(folder / "play.py"), run_name="__main__")
 
 builder = newton.ModelBuilder()
@@ -64,6 +67,7 @@ print(
             "mass": builder.body_mass[body],
             "joints": joints,
             "rise": end[2] - centre[2],
+            "iterations": iterations,
         }
     )
 )
