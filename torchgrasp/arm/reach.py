@@ -170,7 +170,7 @@ def track(
     """Return arm postures along each way, tracked from the grasp both ways, then a mask of the ways
     without jumps.
 
-    `start` are the postures at the grasps, one in each column, and `tips` the poses (3 x 4) [m] of
+    `start` are the postures at the grasps, one in each column. `tips` are the poses (3 x 4) [m] of
     the tip in the base's frame at all w places. On a way without a jump every pose is reached, and
     no joint moves faster than it can at the hand's speed.
     """

@@ -101,8 +101,8 @@ def partial_view(
 
     By default the noise is that of an active stereo camera: noise and steps of the disparity, a
     smooth bias, flying and missing pixels at rims, and surfaces that fade out at grazing angles.
-    Raises `BadArgument` for fewer than 4 points or a pose that is not rigid, `MeshError` for a mesh
-    without faces, and `TooFewPoints` if the camera sees nothing of the mesh.
+    Raises `BadArgument` for fewer than 4 points or a pose that is not rigid. Raises `MeshError` for
+    a mesh without faces, and `TooFewPoints` if the camera sees nothing of the mesh.
 
     Args:
         mesh: surface of the object, in the object frame [m].

@@ -49,9 +49,9 @@ CLOUD = CloudNumbers()
 def check_cloud(cloud: PointCloud) -> PointCloud:
     """Return the cloud itself if it is fit for grasp planning, else raise an error.
 
-    A flat cloud is fit, too. Raises `TooFewPoints` for fewer than 4 distinct points,
-    `SuspiciousScale` for an extent outside [5 mm, 2 m], and `BadArgument` for points on one line or
-    a normal of length zero.
+    A flat cloud is fit, too. Raises `TooFewPoints` for fewer than 4 distinct points, and
+    `SuspiciousScale` for an extent outside [5 mm, 2 m]. Raises `BadArgument` for points on one line
+    or a normal of length zero.
 
     >>> check_cloud(PointCloud(torch.rand(50, 3))).viewpoint is None
     True

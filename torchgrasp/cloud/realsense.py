@@ -54,8 +54,9 @@ def shoot_depth(serial: str | None = None, numbers: LiveCameraNumbers = SHOT) ->
     """Return the median of some depth frames of a connected RealSense, which stands still.
 
     The mode is the camera's default. `serial` is the number of the camera; None means the only one.
-    Raises `MissingExtra` without pyrealsense2, and `BadArgument` if it cannot be loaded, if no
-    camera is connected, if none or several fit, if a frame does not come, or if the view moves.
+    Raises `MissingExtra` without pyrealsense2, and `BadArgument` if it cannot be loaded. The same
+    is raised if no camera is connected, if none or several fit, if a frame does not come, or if the
+    view moves.
     """
     sdk = import_sdk()
     device = _choose(sdk, list_cameras(sdk), serial)

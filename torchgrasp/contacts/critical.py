@@ -6,8 +6,8 @@ least mu for which
 
     G f = 0,    sum a_i = number of contacts,    x_i = (mu a_i, t_i) in the cone |t_i| <= mu a_i
 
-has a solution. With the multipliers s_i of the cones, y of the balance and l of the sum, the best
-forces satisfy, for x_i = M_i f_i with the linear map M_i,
+has a solution. The multipliers are s_i of the cones, y of the balance and l of the sum. With the
+linear map M_i, for which x_i = M_i f_i, the best forces satisfy
 
     M_i^T s_i = G_i^T y + l n_i,    sum a_i s_i0 = 1,    x_i o s_i = nu e,    nu -> 0.
 

@@ -48,9 +48,9 @@ class GraspController:
 
     A closing controller brings the fingers to the object, then a hold controller presses. After
     `PRESSING_TIME` of pressing, `closed` becomes true: the hand may be lifted, but `step` must
-    still be called. If the plan includes the table and the grasp seems too weak to lift the object,
-    the hand opens, locates the object from its touches and closes again; `attempts` counts the
-    closings.
+    still be called. A plan that includes the table allows another closing, if the grasp seems too
+    weak to lift the object. Then the hand opens, locates the object from its touches and closes
+    again; `attempts` counts the closings.
 
     With `approach` > 0 the opened hand starts away from its pre-grasp, the pose from which the
     fingers close. While `approaching`, a robot arm must keep the hand at the distance

@@ -98,9 +98,9 @@ class ClosingReference(Value):
                 the covariance of the forces (`load_stability`). With None, the standard deviation
                 of a force is a tenth of it.
 
-        Raises `BadArgument` for not exactly one grasp, joints or fingers of another hand, a force
-        or stiffness that is not positive, joints beyond their limits, or numbers in the grasp that
-        are not finite.
+        Raises `BadArgument` for not exactly one grasp, or for joints or fingers of another hand.
+        The same is raised for a force or stiffness that is not positive, joints beyond their
+        limits, or numbers in the grasp that are not finite.
         """
         check_single(grasp)
         finger_forces.check_same_hand(hand, grasp)

@@ -53,8 +53,9 @@ def judge_lift(ticks: Sequence[Tick], pressed: int, judged: int, lift_height: fl
         judged: number of last ticks in which the fingers must touch the object.
         lift_height: height of the lift [m].
 
-    The object is held if its centre rose by half of the lift, two fingers touch it in most of the
-    judged ticks, and it slipped less than `SLIP_DISTANCE` and `SLIP_ANGLE` since it was pressed.
+    The object is held if three conditions are met. Its centre rose by half of the lift. Two fingers
+    touch it in most of the judged ticks. Since it was pressed it slipped less than `SLIP_DISTANCE`
+    and `SLIP_ANGLE`.
     """
     half = 0.5 * lift_height
     rise = [float(tick.centre[2] - ticks[0].centre[2]) for tick in ticks]

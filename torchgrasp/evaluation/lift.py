@@ -82,9 +82,9 @@ def close_hand(
 
     The result is the record of all control ticks, with a status that says whether the object was
     held, else why not. The opened hand moves straight to its pre-grasp, closes and presses
-    (`GraspController`), rises and holds. The object is **held** if its centre rose by half the
-    lift, two fingers touch it at the end, and it slipped by less than 20 mm and 30 degrees in the
-    closed hand. Equal arguments give bitwise equal results.
+    (`GraspController`), rises and holds. The object is **held** if its centre rose by half the lift
+    and two fingers touch it at the end. It must also have slipped by less than 20 mm and 30 degrees
+    in the closed hand. Equal arguments give bitwise equal results.
 
     Args:
         grasp: a single grasp.

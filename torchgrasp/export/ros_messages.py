@@ -133,9 +133,9 @@ def format_trajectories(
     squeeze.
 
     The hand must already be at its pose, which `format_moveit` and `format_grasps` give. `force`
-    [N] is the normal force of the strongest finger, `kp` [N m/rad] the stiffness of the robot's
-    position control, and `rename` holds the robot's names of joints, by their names in the URDF.
-    The points have no efforts, which controllers of positions refuse; `format_grasps` has the
+    [N] is the normal force of the strongest finger. `kp` [N m/rad] is the stiffness of the robot's
+    position control. `rename` holds the robot's names of joints, by their names in the URDF. The
+    points have no efforts, which controllers of positions refuse; `format_grasps` has the
     torques.
     With `actuated`, joints that follow others are left out: controllers of ros2_control refuse
     their names. Raises `BadArgument` for joints of another hand, a force or stiffness that is not positive, and

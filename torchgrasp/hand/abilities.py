@@ -72,9 +72,10 @@ class PairAbility:
         greatest_width: greatest thickness [m] of such a plate.
         opposed: share of the free postures in which the tips can hold a plate.
 
-    Tips hold a plate where the line between the centres of their spheres leaves both within the
-    cones about their pads' normals, 60 degrees for round tips and 40 for flat ones. The plate is
-    as thick as the gap of the tips on this line. Widths are NaN if no free posture has a plate.
+    Each pad has a cone about its normal, of 60 degrees for a round tip and of 40 for a flat one.
+    Tips hold a plate where the line between the centres of their spheres leaves both within these
+    cones. The plate is as thick as the gap of the tips on this line. Widths are NaN if no free
+    posture has a plate.
     """
 
     fingers: tuple[str, str]

@@ -154,12 +154,12 @@ def joints_from_files(spec: HandSpec, urdf: Urdf) -> ActuatedJoints:
 class Fingertips(Value):
     """The f fingertips in grasp order: names, links, and the contact pad of each.
 
-    In the frame of the tip's link, `contact` [m] is the contact point of the pad, `normal` its
-    outward unit normal, and `center` and `radius` [m] those of its sphere; `radius` is 0 for a pad
-    without a sphere. `index` is the index of each tip's link in the whole kinematic tree. Each tip
-    is rigidly attached to a carrier, the last link that a joint moves. `chains` is the part of the
-    tree that leads to the carriers, and `carrier` is the index of each carrier in this part.
-    `carrier_from_tip` holds the poses (3 x 4) [m] of the tips' links in their carriers.
+    In the frame of the tip's link, `contact` [m] is the contact point of the pad and `normal` its
+    outward unit normal. `center` and `radius` [m] are those of the pad's sphere; `radius` is 0 for
+    a pad without a sphere. `index` is the index of each tip's link in the whole kinematic tree.
+    Each tip is rigidly attached to a carrier, the last link that a joint moves. `chains` is the
+    part of the tree that leads to the carriers, and `carrier` is the index of each carrier in this
+    part. `carrier_from_tip` holds the poses (3 x 4) [m] of the tips' links in their carriers.
 
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("allegro")

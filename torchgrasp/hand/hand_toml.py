@@ -38,9 +38,9 @@ _DOTTED = re.compile(rf"""(?<![\w"'-]){_PART}(?:[ \t]*\.[ \t]*{_PART}){{16}}""")
 class Pad(NamedTuple):
     """The surface of a fingertip that may touch: a sphere, or a point (radius 0).
 
-    In the frame of the tip's link, `contact` [m] is its contact point, `normal` the outward unit
-    normal there, `center` [m] the centre of the sphere (or the contact point), and `radius` [m] its
-    radius.
+    All is in the frame of the tip's link. `contact` [m] is its contact point, and `normal` the
+    outward unit normal there. `center` [m] is the centre of the sphere, or the contact point, and
+    `radius` [m] its radius.
     """
 
     contact: Triple

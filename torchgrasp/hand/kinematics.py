@@ -1,8 +1,8 @@
 """Forward kinematics of a pytorch-kinematics chain, compiled from its tensors.
 
 All postures are computed at once, level by level of the tree. The pose of a child link in its
-parent is `constant + sine sin q + cosine cos q + slide q`, where q [rad or m] is the position of
-the joint between them. The four tables are computed once. Poses (3 x 4) are the upper rows of 4 x 4
+parent is `constant + sine sin q + cosine cos q + slide q`. Here q [rad or m] is the position of the
+joint between them. The four tables are computed once. Poses (3 x 4) are the upper rows of 4 x 4
 transforms [m]. n counts postures, l links, j joints, p points.
 """
 

@@ -346,8 +346,8 @@ def score(
     better.
 
     It is -(d / `CHECKS.offset` + mu + a / `CHECKS.pad_angle`). Here d is the distance of the
-    contacts' centroid from `center` [m], mu the friction coefficient that forces towards the
-    centroid need (`centred_friction`), and a the largest `normal_angle` [rad] of a fingertip.
+    contacts' centroid from `center` [m], and a the largest `normal_angle` [rad] of a fingertip. mu
+    is the friction coefficient that forces towards the centroid need (`centred_friction`).
     """
     offset = norm(contacts.points.mean(1) - center)
     away = offset / CHECKS.offset

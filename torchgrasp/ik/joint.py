@@ -56,7 +56,7 @@ CONTACT_WEIGHT = 2.0  # weight of a millimetre of the contact problem: contacts 
 class SlidingStage(NamedTuple):
     """A stage of the solver.
 
-    `steps` is the number of its steps, `flat` says whether contacts must be on flat surface, and
+    `steps` is the number of its steps, and `flat` says whether contacts must be on flat surface.
     `hopeless` [mm2] is the cost from which a grasp is given up after the stage.
     """
 

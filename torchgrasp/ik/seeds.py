@@ -199,8 +199,8 @@ def nearest_postures(
     means that it reaches all.
 
     Raises `BadArgument` for `n_seeds` that are not in [1, 64], or above six times the number of
-    postures, and for contacts on another device than the library, or of another number than
-    fingertips.
+    postures. The same is raised for contacts on another device than the library, or of another
+    number than fingertips.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp

@@ -61,8 +61,8 @@ class IKSolution(Batch):
 
     `joints` [rad] are the actuated joints, `obj_from_hand` [m] the hand's pose in the frame of the
     contacts. Finger i touches contact `permutation[:, i]`. `tip_error` [m] is each tip's distance
-    from its contact, `normal_angle` [rad] the angle of the contact direction (the inward normal)
-    from the pad's axis, and `clearance` [m] the least clearance of the links. `attempts` counts the
+    from its contact. `normal_angle` [rad] is the angle of the contact's inward normal from the
+    pad's axis. `clearance` [m] is the least clearance of the links. `attempts` counts the
     initial guesses that were refined. `status` is the `Status` of the first error out of tolerance.
     A contact set without initial guesses has NaN.
 

@@ -152,8 +152,8 @@ def write_samples(
             postures in each new chunk.
 
     Raises `BadArgument` for workers outside [1, 1024], or a hand of which almost all postures
-    collide, and `OutputError` if the folder holds other samples, another run is writing it, or the
-    disk is full.
+    collide. Raises `OutputError` if the folder holds other samples, another run is writing it, or
+    the disk is full.
 
     >>> import tempfile
     >>> from torchgrasp import load_hand

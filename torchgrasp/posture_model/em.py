@@ -1,8 +1,8 @@
 """Expectation-maximisation of Gaussian mixtures (Eqs. 19-20), in one process or in several.
 
-torchrun starts several processes, which each hold a part of the data. The log-density of a Gaussian
-is linear in the f features [1, x_i, x_i x_j] of a data row x (one sample of d numbers), so each
-step is one matrix product. Sums of the features, weighted by responsibilities, suffice for the
+torchrun starts several processes, which each hold a part of the data. A data row x is one sample of
+d numbers. The log-density of a Gaussian is linear in its f features [1, x_i, x_i x_j], so each step
+is one matrix product. Sums of the features, weighted by responsibilities, suffice for the
 maximisation and are small enough to add over processes. The data must have mean 0 and variance 1 in
 every column; otherwise differences of such sums would lose their digits. All numbers are therefore
 standardised, without unit. n counts samples, m the Gaussians (components) of the mixture.

@@ -18,10 +18,11 @@ from torchgrasp.scene.scene import Scene
 def read_scene(path: Path | str) -> Scene:
     """Read a scene from the arrays in a .npz file, with the checks of `Scene.from_depth`.
 
-    The file has `depth` (h, w) [m, or whole mm] and `intrinsics` (3, 3) or (4,). Optional are
-    `camera_pose` (4, 4), the objects' `labels` or the target's `mask` (h, w), the label `target`,
-    the `table` (4,) as normal and offset, and `given`, the labels that the user made. If `given` is
-    missing, the user made all labels, unless there is a table, as in scenes that the library saved.
+    The file has `depth` (h, w) [m, or whole mm] and `intrinsics` (3, 3) or (4,). The other arrays
+    are optional: `camera_pose` (4, 4), and the objects' `labels` or the target's `mask` (h, w). The
+    label `target` and the `table` (4,), as normal and offset, are optional, too. `given` holds the
+    labels that the user made. If `given` is missing, the user made all labels, unless there is a
+    table, as in scenes that the library saved.
     Raises the errors of `Scene.from_depth`, and `CloudFileError` for no such file, or malformed
     content.
 

@@ -305,8 +305,8 @@ class Scene(Value):
     def advice(self) -> tuple[str, ...]:
         """Problems of the scene, a sentence each.
 
-        They are several supports, objects that touch, creases in an object, and a target that is
-        cut off at the border of the image or much hidden by another object.
+        They are several supports, objects that touch, and creases in an object. A target may also
+        be cut off at the border of the image, or much hidden by another object.
         """
         found = [
             f"objects could also stand on another plane ({plane.describe()}); give it as the table to choose it"

@@ -1,9 +1,9 @@
 """The shapes of many clouds in one value: each entry of a batch of points belongs to the shape of
 its own cloud.
 
-Stages that work on batches of contacts or hands ask a shape for values at the points of each entry,
-and continue with those of its `rows` that are left. A `ShapeGP` is the one shape of all entries. A
-`ShapeBatch` stacks the observations of c clouds, and knows the cloud of each entry.
+Some stages work on batches of contacts or hands. They ask a shape for values at the points of each
+entry, and continue with those of its `rows` that are left. A `ShapeGP` is the one shape of all
+entries. A `ShapeBatch` stacks the observations of c clouds, and knows the cloud of each entry.
 """
 
 import dataclasses

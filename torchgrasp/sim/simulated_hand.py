@@ -22,8 +22,9 @@ from torchgrasp.values.specs import Simulator
 def open_scene(spec: SceneSpec, simulator: Simulator = "sapien") -> SimulatedScene:
     """Return a fresh scene of a simulator, at its initial state.
 
-    Raises `BadArgument` for an unknown simulator, or a joint of the hand without a position or
-    drive, `HandFileError` for a bad URDF, and `MissingExtra` for a simulator that is not installed.
+    Raises `BadArgument` for an unknown simulator, or for a joint of the hand without a position or
+    drive. Raises `HandFileError` for a bad URDF, and `MissingExtra` for a simulator that is not
+    installed.
 
     >>> from torchgrasp import load_hand, load_object
     >>> jug, hand = load_object("jug"), load_hand("barrett")

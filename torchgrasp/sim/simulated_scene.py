@@ -44,10 +44,10 @@ class SimulatedScene(abc.ABC):
 
     Arrays are in the world's axes. The j driven joints are in the order of `joint_names`. `centre`
     (3,) [m] is the object's centre of mass in its own frame, `timestep` is in seconds. A
-    simulator's subclass sets `joint_names` and the handles of bodies: `body` of the object, `root`
-    of the hand's root link, `tips` of the links of the f fingertips in the order of the contacts,
-    and `neighbours` of the other bodies. Then it calls `_map_contacts`, which distinguishes their
-    contacts.
+    simulator's subclass sets `joint_names` and the handles of bodies. `body` is the object, `root`
+    the hand's root link, and `neighbours` are the other bodies. `tips` are the links of the f
+    fingertips in the order of the contacts. Then it calls `_map_contacts`, which distinguishes
+    their contacts.
     """
 
     joint_names: tuple[str, ...]

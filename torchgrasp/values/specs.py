@@ -288,10 +288,10 @@ class TrialSpec(Value):
             gains for all contacts. "paper_position": PI position control to the contacts until 0.5
             N, the paper's baseline. "position": PI control to goals behind the contacts.
             "open_loop": joint motion from pre-grasp to grasp to squeeze.
-        holding: how the closed hand presses: "force" (balanced forces), "grip" (the forces that the
-            felt load and a push of 2.5 N need), "impedance" (virtual springs keep the fingertips
-            together and in place), "position" (joint targets are kept) or "law" (Eq. 25 continues).
-            In open loop the squeeze is kept. None means "grip", or "force" if `force` is given, the
+        holding: how the closed hand presses. "force": balanced forces. "grip": the forces that the
+            felt load and a push of 2.5 N need. "impedance": virtual springs keep the fingertips
+            together and in place. "position": joint targets are kept. "law": Eq. 25 continues. In
+            open loop the squeeze is kept. None means "grip", or "force" if `force` is given, the
             closing is not "uncertainty" or "fixed", or a fingertip is not tactile.
         options: components of the closing "uncertainty" or "fixed"; by default all components.
         sensor: sensors of the fingertips; the controller knows their kind.

@@ -40,9 +40,9 @@ def write_recording(path: Path | str, run: Run) -> Path:
     `cloud`, `surface` in the colours of its standard deviation, and `contacts` with outward
     normals. On the timeline `posture`, `plan/hand` goes through approach, pre-grasp, grasp and
     squeeze of the best grasp. On the timeline `time` [s], `closing/hand` and `closing/object` move
-    as in the simulation, `closing/forces` are the forces on the object, 1 cm for each newton, and
-    `force/FINGER` [N] are curves. Needs the extra `rerun`. Returns the path. Raises `MissingExtra`
-    without Rerun, `OutputError` if the file cannot be written.
+    as in the simulation. There `closing/forces` are the forces on the object, 1 cm for each newton,
+    and `force/FINGER` [N] are curves. Needs the extra `rerun`. Returns the path. Raises
+    `MissingExtra` without Rerun, `OutputError` if the file cannot be written.
 
     >>> write_recording("run.rrd", run)  # doctest: +SKIP
     """

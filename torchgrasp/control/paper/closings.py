@@ -70,8 +70,8 @@ class PaperClosing:
     """The paper's control law, Eqs. (25)-(28): position control far from the contacts, force
     control near them.
 
-    It is d theta = J^-1 [(1 - lambda) K_P (x_d - x_c) + lambda C_F (f_d - f_c)], where theta are
-    the joints and J is the fingertips' Jacobian. x and f are positions and forces of the
+    It is d theta = J^-1 [(1 - lambda) K_P (x_d - x_c) + lambda C_F (f_d - f_c)]. Here theta are the
+    joints, and J is the fingertips' Jacobian. x and f are positions and forces of the
     fingertips, desired (d) and sensed (c). The gains K_P and C_F are those of
     `ClosingReference.as_printed`. A damped inverse replaces J^-1; speed is bounded. No joint target
     is so far ahead of its joint that the drive would exceed its torque limit. The closing ends when

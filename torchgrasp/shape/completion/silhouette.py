@@ -255,9 +255,9 @@ def silhouettes(cloud: PointCloud) -> Outlines:
 def silhouette(view: PointCloud) -> Silhouette:
     """Return the silhouette of one view [m], whose points must all lie in front of the camera.
 
-    A gap within the outline, where nothing was measured, counts as a hole (free space) only if it
-    is far wider than the surface around it, as in a frame of bars. Other gaps do not count as free
-    space: a mirror-like patch is not measured, and leaves a gap, too.
+    Within the outline there may be gaps, where nothing was measured. A gap counts as a hole (free
+    space) only if it is far wider than the surface around it, as in a frame of bars. Other gaps do
+    not count as free space: a mirror-like patch is not measured, and leaves a gap, too.
     """
     assert view.viewpoint is not None
     axes, pixels, depths = (t.numpy() for t in _project(view.points, view.viewpoint))
