@@ -19,7 +19,8 @@ from torchgrasp.data.shipped import DATA
 QUICK = ("--starts", "8", "--no-report", "--hand", "barrett")
 
 
-def test_grasp_tells_its_result_as_json_and_its_words_on_stderr(run_command, tmp_path):
+def test_grasp_tells_its_result_as_json_and_its_words_on_stderr(run_command, tmp_path, monkeypatch):
+    monkeypatch.setattr("torchgrasp.app.cli.grasp.ENOUGH", 1.0)  # no grasp is likely enough
     code, out, err = run_command("grasp", "cylinder", *QUICK, "--out", tmp_path, "--json")
     told = json.loads(out)
     best = load_grasps(tmp_path / "grasps.safetensors").best
@@ -29,6 +30,11 @@ def test_grasp_tells_its_result_as_json_and_its_words_on_stderr(run_command, tmp
     assert told["best"]["obj_from_hand_m"] == best.obj_from_hand[0].tolist()
     # all joints by name, the driven ones among them
     assert {"f1_flex", "spread"} <= set(told["best"]["joints_rad"])
+    # a second view is asked for, from another side than that of the first
+    look = told["look_next"]
+    assert look["turn_deg"] > 45 and look["std_after_m"] < look["std_before_m"]
+    x, y, z = (row[3] for row in look["obj_from_camera_m"][:3])
+    assert f"look next  from ({x:.2f}, {y:.2f}, {z:.2f}) m" in err
 
 
 def test_quiet_commands_print_json_alone_or_nothing(run_command, tmp_path):

@@ -5,12 +5,14 @@ from torchgrasp.shape.fit import condition
 from torchgrasp.shape.hollow import HollowShape
 from torchgrasp.shape.kernel import Kernel, matern52_kernel, rbf_kernel, thin_plate_kernel
 from torchgrasp.shape.surface import Surface, extract_surface, surface_field
+from torchgrasp.shape.second_view import NextView, next_view
 from torchgrasp.shape.estimate import JointEstimate, Normalisation, Observations, ShapeDerivatives
 
 __all__ = [
     "HollowShape",
     "JointEstimate",
     "Kernel",
+    "NextView",
     "Normalisation",
     "Observations",
     "ShapeDerivatives",
@@ -19,6 +21,7 @@ __all__ = [
     "condition",
     "extract_surface",
     "matern52_kernel",
+    "next_view",
     "rbf_kernel",
     "surface_field",
     "thin_plate_kernel",

@@ -49,6 +49,7 @@ from torchgrasp.scene.image import is_scene
 from torchgrasp.scene.masks import label_again
 from torchgrasp.scene.scene import Scene
 from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.second_view import NextView, next_view
 from torchgrasp.shape.surface import extract_surface
 from torchgrasp.success.reasons import explain_success
 from torchgrasp.success.task import GraspTask, TaskName
@@ -61,6 +62,7 @@ STAGES = ("shape", "plan", "certify", "query", "refine")
 """Stages of planning, as the planner reports them."""
 LEAST_BUDGET = 1e-3  # of --time-budget [s]
 ENOUGH = 0.9  # predicted success of an object that is easy enough: the others are not tried
+HELPS = 0.8  # share of the deviation that may remain after a second view that is worth telling
 SHOWN = 5  # grasps that are printed
 OBJECT_WIDTHS = (-10, 7, -1)  # of the columns of a scene's objects
 
@@ -308,6 +310,7 @@ class Grasp(ForPrograms):
             scene=scene,
             explanation=explanation,
             costs=tuple(costs),
+            look=find_look(shape, grasps, spec),
             command=command_line(),
             date=datetime.datetime.now(datetime.timezone.utc).strftime("%Y-%m-%d %H:%M UTC"),
         )
@@ -495,8 +498,22 @@ def print_grasps(run: Run) -> bool:
         )
     for sentence in run.costs:
         print(f"lowers success  {sentence}")
+    if run.look is not None:
+        print(f"look next  from {run.look.sentence}")
     print(verdict(run))
     return len(run.executable) > 0
+
+
+def find_look(shape: ShapeGP, grasps: Grasps, spec: ContactSpec) -> NextView | None:
+    """Return from where a second view would help.
+
+    It is None if the best grasp is likely enough, or if no view would tell much.
+    """
+    best = grasps[grasps.status == Status.OK][:1]
+    if len(best) and float(best.success[0]) >= ENOUGH:
+        return None
+    view = next_view(shape, grasps, table=spec.plane)
+    return view if view.after < HELPS * view.before else None
 
 
 def describe_run(run: Run, out: Path) -> dict[str, Any]:
@@ -522,7 +539,18 @@ def describe_run(run: Run, out: Path) -> dict[str, Any]:
         "held": None if run.closure is None else run.closure.held,
         "verdict": verdict(run),
         "best": best,
+        "look_next": None if run.look is None else describe_look(run.look),
         "file": str(out / "grasps.safetensors"),
+    }
+
+
+def describe_look(view: NextView) -> dict[str, Any]:
+    """Return a camera for a second view for JSON, with units in the names."""
+    return {
+        "obj_from_camera_m": view.camera_pose.tolist(),
+        "turn_deg": view.turn if view.turn == view.turn else None,
+        "std_before_m": view.before,
+        "std_after_m": view.after,
     }
 
 

@@ -25,6 +25,7 @@ from torchgrasp.geometry.plane import move, upright_frame
 from torchgrasp.hand.hand import Hand
 from torchgrasp.planner.explain import Explanation
 from torchgrasp.scene.scene import Scene
+from torchgrasp.shape.second_view import NextView
 from torchgrasp.shape.surface import Surface
 from torchgrasp.values.closing import ClosureResult
 from torchgrasp.values.planning import ContactPlan, Grasps, PointCloud
@@ -56,6 +57,7 @@ class Run:
         scene: the scene that the cloud was cut from.
         explanation: why no grasp is executable, and what would help.
         costs: sentences on what lowers the predicted success of the best grasp most.
+        look: from where a second view would help; None if none is needed.
         command: the command line of the run, or "".
         date: date and time of the run as text, or "".
     """
@@ -74,6 +76,7 @@ class Run:
     scene: Scene | None = None
     explanation: Explanation | None = None
     costs: tuple[str, ...] = ()
+    look: NextView | None = None
     command: str = ""
     date: str = ""
 

@@ -1,0 +1,265 @@
+"""From where to look next: the camera from which a second view tells most about the surface."""
+
+import dataclasses
+import math
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchgrasp.cloud.camera import look_at
+from torchgrasp.foundation.base import Value
+from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import BadArgument, Status
+from torchgrasp.foundation.rules import Length, Measured, Pose
+from torchgrasp.foundation.threads import single_threaded
+from torchgrasp.geometry.linalg import Points, Vector, unit
+from torchgrasp.geometry.plane import Plane, as_plane, upright_frame
+from torchgrasp.geometry.signed_distance import SignedDistanceField, field_from_surface
+from torchgrasp.shape.completion.silhouette import find_middle, pick_apart
+from torchgrasp.shape.gp import ShapeGP
+from torchgrasp.shape.surface import extract_surface
+from torchgrasp.values.planning import Grasps
+
+
+@dataclasses.dataclass(frozen=True)
+class ViewNumbers:
+    """The cameras that are compared, and what each of them sees."""
+
+    azimuths: int = 24
+    """Directions around the object."""
+    elevations: tuple[float, ...] = (15.0, 30.0, 45.0, 60.0, 75.0)
+    """Angles [deg] above the horizontal; without a table, also below."""
+    far: float = 0.5
+    """Distance [m] of a camera, if that of the first view is unknown."""
+    near: float = 1.5
+    """Least distance of a camera, in radii of the shape's domain."""
+    resolution: int = 32
+    """Cells along the domain's diameter when the surface is extracted."""
+    points: int = 250
+    """Points of the surface that a camera may see."""
+    grasps: int = 20
+    """Best grasps whose contacts count: as many as judge a set of fingers."""
+    least_cosine: float = 0.3
+    """Least cosine between ray and normal: real cameras lose surface at grazing angles."""
+    spacing: float = 0.004
+    """Spacing [m] of the distance field that hides surface from a camera."""
+    margin: float = 0.01
+    """Distance [m] to which the field reaches around the surface."""
+    blocked: float = 0.25
+    """A ray is blocked nearer to the surface than this share of the spacing."""
+    steps: int = 24
+    """Most steps along a ray, each as long as the distance from the surface."""
+    noise: float = 0.01
+    """Deviation of a seen point, normalised: the noise that `fit_shape` assumes."""
+    unseen: float = 1e3
+    """Deviation, normalised, that stands for a point that was not seen."""
+
+
+VIEW = ViewNumbers()
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class NextView(Value):
+    """A camera for a second view, and what it is expected to tell.
+
+    `turn` [deg] is the angle at the object from the nearest earlier camera, NaN if none is known.
+    `before` [m] is the standard deviation of the surface now, and `after` [m] the one expected with
+    the second view. Both are means over the contacts of the best grasps, or over the surface.
+    """
+
+    camera_pose: Pose  # obj_from_camera [m]: x right, y down, z forward, as `look_at` returns it
+    turn: Measured
+    before: float
+    after: float
+
+    @property
+    def sentence(self) -> str:
+        """Where to look from, in the frame of the cloud, and what it is expected to tell."""
+        x, y, z = self.camera_pose[:3, 3].tolist()
+        known = self.turn == self.turn
+        turn = f", {self.turn:.0f} degrees from the first camera" if known else ""
+        place = f"({x:.2f}, {y:.2f}, {z:.2f}) m{turn}"
+        return f"{place}: std_m falls from {1e3 * self.before:.1f} to {1e3 * self.after:.1f} mm"
+
+
+@checked
+@single_threaded
+def next_view(
+    shape: ShapeGP,
+    grasps: Grasps | None = None,
+    *,
+    table: Plane | float | None = None,
+    distance: Length | None = None,
+) -> NextView:
+    """Return the camera on a sphere around the object that would reduce the deviation most.
+
+    A Gaussian process knows its deviation before it is measured. So each camera is given the points
+    of the estimated surface that it would see. They face it, and no other surface is in the way.
+    The surface keeps out of the space that the first view saw as free. The deviation after a view
+    is that of the posterior given these points.
+
+    A new fit may do better: it also takes the second outline, and completes the rest anew.
+    Neighbours of the object do not hide it here, and whether an arm reaches the camera is not
+    asked.
+
+    Args:
+        shape: posterior [m] of `fit_shape`.
+        grasps: grasps of this shape, in its frame. The deviation counts at the contacts of the best
+            executable ones, weighted by their predicted success. Without an executable grasp it
+            counts on all of the surface.
+        table: the table's plane, or its height [m] along z; by default that of the grasps. Cameras
+            are above it.
+        distance: distance [m] of the camera from the middle of the surface; by default that of the
+            first camera.
+
+    Raises `BadArgument` for a wrong argument, a distance that is too near to the object, or grasps
+    whose contacts lie outside the shape's domain.
+
+    >>> from torchgrasp import fit_shape, load_object
+    >>> from torchgrasp.shape import next_view
+    >>> shape = fit_shape(load_object("jug").view, table=0.0)
+    >>> view = next_view(shape, table=0.0)
+    >>> view.turn > 90, view.after < view.before
+    (True, True)
+    """
+    plane = as_plane(table)
+    if plane is None and grasps is not None:
+        plane = grasps.table
+    targets, weights = _contacts(shape, grasps)
+    surface = extract_surface(shape, VIEW.resolution)
+    rows = pick_apart(surface.vertices, VIEW.points)
+    points = surface.vertices[rows]
+    if len(targets) == 0:
+        targets = points
+        weights = torch.ones_like(points[:, 0])
+    middle = find_middle(surface.vertices)
+    away = _distance(shape, middle, distance)
+    poses = _poses(shape, plane, middle, away)
+    field = field_from_surface(surface.vertices, surface.faces, VIEW.spacing, VIEW.margin)
+    eyes = poses[:, :3, 3].to(points)
+    seen = find_seen(points, surface.normals[rows], eyes, field)
+    before, after = expect_deviation(shape, targets, points, seen)
+    share = weights / weights.sum()
+    expected = after @ share
+    best = int(expected.argmin())
+    turn = _turn(shape, middle, eyes[best])
+    return NextView(poses[best], turn, float(before @ share), float(expected[best]))
+
+
+def find_seen(
+    points: Points, normals: Points, eyes: Float[Tensor, "v 3"], field: SignedDistanceField
+) -> Bool[Tensor, "v n"]:
+    """Return which of n surface points each of v cameras sees.
+
+    `points`, `normals` and the cameras' positions `eyes` [m] are in the frame of the `field`, the
+    distances from the surface. A ray from a point to a camera must not meet the surface again.
+    """
+    offset = eyes[:, None] - points
+    towards = unit(offset)
+    length = torch.linalg.vector_norm(offset, dim=-1)
+    seen = (towards * normals).sum(-1) > VIEW.least_cosine
+    # only rays of surface that faces the camera are followed: (r,)
+    ray = torch.nonzero(seen, as_tuple=True)
+    way = towards[ray]
+    # a ray begins off the surface, which it would meet at once
+    start = (points + VIEW.spacing * normals)[ray[1]]
+    along = torch.zeros_like(way[:, 0])
+    free = torch.ones_like(along, dtype=torch.bool)
+    least = VIEW.blocked * VIEW.spacing
+    for _ in range(VIEW.steps):
+        height = field.query(start + along[:, None] * way)[0]
+        free &= (height > least) | (along >= length[ray])
+        along = along + height.clamp_min(least)
+    seen[ray] = free
+    return seen
+
+
+def expect_deviation(
+    shape: ShapeGP, targets: Float[Tensor, "t 3"], points: Points, seen: Bool[Tensor, "v n"]
+) -> tuple[Float[Tensor, "t"], Float[Tensor, "v t"]]:
+    """Return (before, after): the surface's deviation [m] at t targets now, and after each view.
+
+    View k of v measures those of the n `points` [m] that the mask `seen[k]` names. The posterior's
+    covariance does not depend on what is measured, so it is known before.
+    """
+    count = len(points)
+    joint = shape.joint(torch.cat([points, targets]).double())
+    total = len(joint.mean)
+    covariance = joint.covariance.reshape(total, 4, total, 4)[:, 0, :, 0]
+    slope = torch.linalg.vector_norm(joint.mean[count:, 1:], dim=-1)
+    variance = torch.where(seen, VIEW.noise**2, VIEW.unseen**2).to(covariance)
+    measured = covariance[:count, :count] + torch.diag_embed(variance)  # (v, n, n)
+    across = covariance[:count, count:]
+    root = torch.linalg.cholesky(measured)
+    told = torch.linalg.solve_triangular(root, across.expand(len(seen), -1, -1), upper=False)
+    prior = covariance.diagonal()[count:]
+    left = (prior - told.square().sum(1)).clamp_min(0.0)
+    metres = shape.std_factor * shape.scale / slope
+    return metres * prior.sqrt(), metres * left.sqrt()
+
+
+def _contacts(
+    shape: ShapeGP, grasps: Grasps | None
+) -> tuple[Float[Tensor, "t 3"], Float[Tensor, "t"]]:
+    """Return the contacts [m] of the best executable grasps, and the weight of each."""
+    if grasps is None:
+        return shape.x.new_zeros(0, 3), shape.x.new_zeros(0)
+    good = grasps[grasps.status == Status.OK][: VIEW.grasps]
+    contacts = good.contacts.points.to(shape.x)
+    outside = int((~shape.contains(contacts)).sum())
+    if outside:
+        allowed = "grasps of this shape, in its frame"
+        raise BadArgument("grasps", f"{outside} contacts outside the shape's domain", allowed)
+    # where the success is unknown, the score is still the best guess
+    weights = torch.sigmoid(good.score).to(shape.x)
+    return contacts.flatten(0, 1), weights.repeat_interleave(contacts.shape[1])
+
+
+def _poses(
+    shape: ShapeGP, table: Plane | None, middle: Vector, distance: float
+) -> Float[Tensor, "v 4 4"]:
+    """Return the poses obj_from_camera [m] of the cameras that are compared, on the CPU."""
+    frame = upright_frame(shape.cloud.points, shape.cloud.viewpoint, table)
+    heights = VIEW.elevations
+    if table is None:
+        heights = (*heights, 0.0, *(-height for height in heights))
+    step = 360 / VIEW.azimuths
+    around = [step * k for k in range(VIEW.azimuths)]
+    local = [look_at(azimuth, height, distance) for height in heights for azimuth in around]
+    poses = frame @ torch.stack(local)
+    # the cameras look at the middle, not at the origin of the frame
+    poses[:, :3, 3] += middle.cpu() - frame[:3, 3]
+    return poses
+
+
+def _eyes(shape: ShapeGP) -> Float[Tensor, "c 3"]:
+    """Return the positions [m] of the cameras that have seen the object, none if unknown."""
+    eyes = shape.cloud.viewpoint
+    if eyes is None:
+        return shape.x.new_zeros(0, 3)
+    return eyes.reshape(-1, 3).unique(dim=0).to(shape.x)
+
+
+def _turn(shape: ShapeGP, middle: Vector, eye: Vector) -> float:
+    """Return the angle [deg] at the middle between a camera and the nearest earlier one."""
+    before = _eyes(shape)
+    if not len(before):
+        return math.nan
+    cosine = (unit(before - middle) @ unit(eye - middle)).max()
+    return math.degrees(math.acos(min(1.0, float(cosine))))
+
+
+def _distance(shape: ShapeGP, middle: Vector, distance: float | None) -> float:
+    """Return the distance [m] of the cameras; raise `BadArgument` for one that is too near."""
+    least = VIEW.near * shape.domain_radius * shape.scale
+    if distance is not None:
+        if not distance >= least:
+            allowed = f"at least {least:.3g} m, off the object"
+            raise BadArgument("distance", f"{distance:g} m", allowed)
+        return distance
+    before = _eyes(shape)
+    if not len(before):
+        return max(least, VIEW.far)
+    return max(least, float(torch.linalg.vector_norm(before - middle, dim=-1).mean()))
