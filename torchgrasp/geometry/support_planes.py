@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchgrasp.foundation.checks import check_tensor
@@ -575,13 +575,52 @@ def _judge(
 
     Of the other `surfaces`, those of furniture do not stand on it.
     """
-    points = view.points
+    support = surface.support
+    wide = SUPPORTS.furniture if surface.bowed else least_width
+    reason = _refuse_plane(view, surface)
+    if reason:
+        return reason
+    # a narrower round face belongs to an object
+    if support is None or support.width < wide:
+        return f"a flat face about {surface.width:.2f} m wide"
+    own = surface.on & support.covers(view.points)
+    middle = view.points[own].mean(0)
+    if surface.bowed and _bends_away(view, surface, support, int(own.sum())):
+        return "a part of a surface that bends away"
+    # Without a camera, no object hides its feet.
+    steep = False
+    if view.eye is not None:
+        sine = float(unit(view.eye - middle) @ surface.fit.normal)
+        if sine < math.sin(math.radians(SUPPORTS.grazing)):
+            return "a plane that the camera does not see from above"
+        steep = sine > SUPPORTS.steep
+
+    total = len(view.points)
+    told = f"a plane with {surface.fit.count / total:.0%} of the points"
+    through = _count_through(view, surface, support)
+    if through > SUPPORTS.most_through * surface.fit.count:
+        return f"{told}, but {through / total:.0%} of them below it"
+    risen = _Risen.on(view, surface, support, _furniture(surface, surfaces, SUPPORTS.furniture))
+    least = SUPPORTS.least_standing * total
+    count = int(risen.standing.sum())
+    if _count_pierced(view, surface, risen) > max(least, SUPPORTS.most_pierced * count):
+        return f"{told}, but objects go through it"
+    # From a steep view, objects hide their feet.
+    feet = int(risen.over.sum()) if steep else count
+    if feet < max(least, SUPPORTS.least_low * int(risen.low.sum())):
+        return f"{told} and nothing that stands on it"
+
+    plain = _furniture(surface, surfaces, least_width)
+    favour = SUPPORTS.favour if _looked_at(view, surface.fit, support) else 1.0
+    favour *= SUPPORTS.bowed if surface.bowed else 1.0
+    score = count - SUPPORTS.plain * int((risen.standing & plain).sum())
+    return _Candidate(support, score * favour, middle)
+
+
+def _refuse_plane(view: SeenPoints, surface: _Surface) -> str:
+    """Return the reason why a fit is no plane that may be level; an empty text if it may be."""
     fit = surface.fit
-    height = surface.height
-    tolerance = surface.tolerance
-    on = surface.on
-    plane = Plane(fit.normal, fit.offset)
-    share = fit.count / len(points)
+    share = fit.count / len(view.points)
     if share < PLANES.least_share:
         return f"no plane with more than {share:.1%} of the points"
     if fit.scale >= PLANES.rough:
@@ -589,67 +628,90 @@ def _judge(
     level = math.cos(math.radians(PLANES.most_tilt))
     if view.sky is not None and float(fit.normal @ view.sky) < level:
         return f"no plane within {PLANES.most_tilt:g} degrees of level"
-    support = surface.support
-    width = surface.width
-    # a narrower round face belongs to an object
-    if support is None or width < (SUPPORTS.furniture if surface.bowed else least_width):
-        return f"a flat face about {width:.2f} m wide"
-    own = on & support.covers(points)
-    middle = points[own].mean(0)
-    if surface.bowed:
-        beside = support.covers(points, SUPPORTS.margin) & ~support.covers(points)
-        away = beside & ~on & (height.abs() < SUPPORTS.low)
-        if int(away.sum()) > SUPPORTS.most_away * int(own.sum()):
-            return "a part of a surface that bends away"
-    # Without a camera, no object hides its feet.
-    steep = False
-    if view.eye is not None:
-        sine = float(unit(view.eye - middle) @ fit.normal)
-        if sine < math.sin(math.radians(SUPPORTS.grazing)):
-            return "a plane that the camera does not see from above"
-        steep = sine > SUPPORTS.steep
-    inner = SUPPORTS.edge * width
-    crossing, behind = cross(plane, points, view.eye)
-    seen = behind & (height < -tolerance) & support.covers(crossing, -inner)
+    return ""
+
+
+def _bends_away(view: SeenPoints, surface: _Surface, support: SupportPlane, own: int) -> bool:
+    """Return whether many points around the region of a support are near its plane, but off it.
+
+    `own` is the number of points on the support.
+    """
+    around = support.covers(view.points, SUPPORTS.margin) & ~support.covers(view.points)
+    away = around & ~surface.on & (surface.height.abs() < SUPPORTS.low)
+    return int(away.sum()) > SUPPORTS.most_away * own
+
+
+def _count_through(view: SeenPoints, surface: _Surface, support: SupportPlane) -> int:
+    """Return the number of points that the camera sees through the region of a support."""
+    inner = SUPPORTS.edge * support.width
+    crossing, behind = cross(support.plane, view.points, view.eye)
+    seen = behind & (surface.height < -surface.tolerance) & support.covers(crossing, -inner)
+    axes = _axes(surface.fit.normal, view.points)
     # slats show what is behind them beside points of their own
-    cells = torch.floor(crossing @ _axes(fit.normal, points) / SUPPORTS.cell).long()
-    cells = number_rows(cells)
-    beside = torch.bincount(cells, on.double()) > SUPPORTS.slats * torch.bincount(
-        cells, seen.double()
-    )
-    through = int((seen & ~beside[cells]).sum())
-    told = f"a plane with {share:.0%} of the points"
-    if through > SUPPORTS.most_through * fit.count:
-        return f"{told}, but {through / len(points):.0%} of them below it"
-    # Low points of an object are over the plane's own region. A pan's rim is not over its floor.
-    above = height > tolerance
-    plain = torch.zeros_like(above)
+    cell = _number_cells(crossing, axes, SUPPORTS.cell)
+    slats = torch.bincount(cell, surface.on.double())
+    gaps = torch.bincount(cell, seen.double())
+    slatted = slats > SUPPORTS.slats * gaps
+    return int((seen & ~slatted[cell]).sum())
+
+
+def _number_cells(points: Points, axes: Float[Tensor, "3 2"], side: float) -> Int[Tensor, "n"]:
+    """Return the number of the square of a grid, `side` [m] wide along two `axes`, of each point."""
+    return number_rows(torch.floor(points @ axes / side).long())
+
+
+def _furniture(surface: _Surface, surfaces: list[_Surface], width: float) -> Bool[Tensor, "n"]:
+    """Return a mask of the points on surfaces at an angle to one that are wider than `width` [m]."""
+    found = torch.zeros_like(surface.on)
     for other in surfaces:
-        if other.beside(surface) and other.width > SUPPORTS.furniture:
-            above &= ~other.on
-        if other.beside(surface) and other.width > least_width:
-            plain |= other.on
-    over = above & (height < PLANES.reach) & support.covers(points, -inner)
-    low = above & (height < SUPPORTS.low)
-    standing = low & over
-    below = (-height > SUPPORTS.sag * tolerance) & (-height < SUPPORTS.low)
-    columns = torch.floor(points @ _axes(fit.normal, points) / SUPPORTS.pierced_cell).long()
-    cells = number_rows(columns)
-    pierced = torch.bincount(cells, below.double()) > SUPPORTS.below * torch.bincount(
-        cells, standing.double()
-    )
-    count = int(standing.sum())
-    least = SUPPORTS.least_standing * len(points)
-    if int((pierced[cells] & standing).sum()) > max(least, SUPPORTS.most_pierced * count):
-        return f"{told}, but objects go through it"
-    # From a steep view, objects hide their feet.
-    feet = int(over.sum()) if steep else count
-    if feet < max(least, SUPPORTS.least_low * int(low.sum())):
-        return f"{told} and nothing that stands on it"
-    favour = SUPPORTS.favour if _looked_at(view, fit, support) else 1.0
-    favour *= SUPPORTS.bowed if surface.bowed else 1.0
-    score = count - SUPPORTS.plain * int((standing & plain).sum())
-    return _Candidate(support, score * favour, middle)
+        if other.beside(surface) and other.width > width:
+            found |= other.on
+    return found
+
+
+@dataclasses.dataclass(frozen=True)
+class _Risen:
+    """Masks of the points above a support that are not those of furniture.
+
+    Points `over` the support are above its own region and within reach. Points that are `low` are
+    near its plane. Those of both kinds are of objects that are `standing` on it.
+    """
+
+    over: Bool[Tensor, "n"]
+    low: Bool[Tensor, "n"]
+
+    @classmethod
+    def on(
+        cls,
+        view: SeenPoints,
+        surface: _Surface,
+        support: SupportPlane,
+        furniture: Bool[Tensor, "n"],
+    ) -> "_Risen":
+        """Return the masks of the points of a view, given a mask of those of furniture."""
+        above = (surface.height > surface.tolerance) & ~furniture
+        # Low points of an object are over the plane's own region. A pan's rim is not over its floor.
+        inner = SUPPORTS.edge * support.width
+        near = surface.height < PLANES.reach
+        over = above & near & support.covers(view.points, -inner)
+        return cls(over, above & (surface.height < SUPPORTS.low))
+
+    @property
+    def standing(self) -> Bool[Tensor, "n"]:
+        """Mask of the points of objects that stand on the support."""
+        return self.over & self.low
+
+
+def _count_pierced(view: SeenPoints, surface: _Surface, risen: _Risen) -> int:
+    """Return the number of standing points with many points below the plane under them."""
+    depth = -surface.height
+    below = (depth > SUPPORTS.sag * surface.tolerance) & (depth < SUPPORTS.low)
+    axes = _axes(surface.fit.normal, view.points)
+    cell = _number_cells(view.points, axes, SUPPORTS.pierced_cell)
+    under = torch.bincount(cell, below.double())
+    standing = torch.bincount(cell, risen.standing.double())
+    pierced = under > SUPPORTS.below * standing
+    return int((pierced[cell] & risen.standing).sum())
 
 
 def _looked_at(view: SeenPoints, fit: PlaneFit, support: SupportPlane) -> bool:
