@@ -247,7 +247,7 @@ def of_shape(
 UNCOMPILED = "not inside torch.compile"
 FITS = UNCOMPILED, ("single", "compile")
 METRES = "predict", "differentiate", "joint", "sample", "normalise", "metres"
-NORMALISED = "cross distance_rows estimate jet joint_at mean mean_and_gradient mean_jet whiten ordered".split()
+NORMALISED = "cross distance_rows estimate jet joint_at mean mean_and_gradient mean_jet variance whiten ordered".split()
 """Methods of a shape that take points in any frame and dtype, and those that take normalised points
 of its own.
 """

@@ -34,6 +34,7 @@ METHODS = {
     "mean jet": lambda shape, x: vars(shape.mean_jet(x)).values(),
     "jet": lambda shape, x: vars(shape.jet(x)).values(),
     "estimate": lambda shape, x: shape.estimate(x),
+    "variance": lambda shape, x: [shape.variance(x)],
     "wall": lambda shape, x: [shape.wall_at(x)[:, 0]],
 }
 

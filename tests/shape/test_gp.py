@@ -82,6 +82,19 @@ def test_std_m_is_the_calibrated_deviation_in_metres_over_the_slope(
         torch.testing.assert_close(std_m, found.variance.sqrt() / slope, rtol=1e-4, atol=0)
 
 
+def test_variances_equal_those_of_a_dense_solve(shape: ShapeGP):
+    x = shape.normalise(queries(shape, 300))
+    cross = shape.cross(x).transpose(0, 1)
+    lines = shape.ordered(cross.flatten(0, 1).T)
+    solved = torch.linalg.solve(shape.factor @ shape.factor.T, lines)
+    explained = lines.T.view(-1, 4, len(lines)) @ solved.T.view(-1, 4, len(lines)).mT
+    covariance = shape.estimate(x)[1]
+    prior = float(shape.prior_block()[0, 0])
+    near(covariance, shape.prior_block() - explained, 1e-9 * prior)
+    near(shape.variance(x), covariance[:, 0, 0], 1e-12 * prior)
+    assert shape.variance(x[:0]).shape == (0,)
+
+
 def test_jet_equals_predict_and_its_gradients_equal_finite_differences(shape: ShapeGP):
     points = queries(shape, 300)
     step = 1e-5

@@ -89,6 +89,7 @@ def test_the_greater_distance_counts_with_its_own_normal_and_covariance(
     jet = vessel.jet(x)
     torch.testing.assert_close(jet.gradient, mean[:, 1:])
     torch.testing.assert_close(jet.variance, covariance[:, 0, 0])
+    torch.testing.assert_close(vessel.variance(x), covariance[:, 0, 0])
     torch.testing.assert_close(vessel.mean_jet(x).hessian, jet.hessian)
     assert vessel.jet(x[:0]).hessian.shape == (0, 3, 3)
 

@@ -149,8 +149,9 @@ def _along_lines(
     """Return, on lines along the normals: standard deviations, mean distances, mean gradients and
     covariances.
     """
-    jet = shape.jet(points.flatten(0, 1))
-    deviation = surface_deviation(jet.variance, jet.gradient)
+    x = points.flatten(0, 1)
+    _, gradient = shape.mean_and_gradient(x)
+    deviation = surface_deviation(shape.variance(x), gradient)
     deviation = factor * deviation.reshape(points.shape[:2])
     nodes = deviation[..., None] * torch.tensor(NODES, dtype=torch.float32, device="cpu").to(
         deviation

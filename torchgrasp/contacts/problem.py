@@ -135,6 +135,14 @@ def triple_jet(shape: ShapeLike, points: Vectors) -> SurfaceJet:
     return map_tensors(lambda x: x.unflatten(0, points.shape[:2]), jet)
 
 
+def variance_at(shape: ShapeLike, x: Float[Tensor, "q 3"]) -> Float[Tensor, "q"]:
+    """Return the variance of the signed distance at normalised points, without its derivatives if
+    possible.
+    """
+    variance = getattr(shape, "variance", None)
+    return shape.jet(x).variance if variance is None else variance(x)
+
+
 def triple_mean_jet(shape: ShapeLike, points: Vectors) -> MeanJet:
     """Return the mean signed distance, its gradient and Hessian at contacts; the variance is not
     computed if possible.

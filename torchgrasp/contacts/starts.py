@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchgrasp.contacts.feasibility import normal_variation, within
 from torchgrasp.contacts.form_closure import Vectors, closed_exact
-from torchgrasp.contacts.problem import ContactProblem, ShapeLike, device_of, walls_of
+from torchgrasp.contacts.problem import ContactProblem, ShapeLike, device_of, variance_at, walls_of
 from torchgrasp.contacts.solver import project
 from torchgrasp.foundation.base import flatnonzero
 from torchgrasp.foundation.errors import BadArgument
@@ -215,7 +215,7 @@ def qualify(
     radius = norm(points)
     good = (distance.abs() < NEAR_SURFACE) & (radius < problem.domain_radius)
     good &= (problem.room(points, normals) > 0) & within(problem, points)
-    variance = shape.jet(points[good]).variance  # it costs more than all else
+    variance = variance_at(shape, points[good])  # it costs more than all else
     good[good.clone()] = (variance >= 0) & (variance < spec.max_variance)
     return good, normals
 

@@ -58,8 +58,10 @@ class Report:
         shape = self.objects.each[0].shape
         vertices = self.objects.each[0].surface.vertices
         some = vertices[:: len(vertices) // REPORT.vertices + 1]
-        jet = shape.jet(shape.normalise(some))
-        std_m = shape.std_factor * shape.scale * surface_deviation(jet.variance, jet.gradient)
+        x = shape.normalise(some)
+        _, gradient = shape.mean_and_gradient(x)
+        deviation = surface_deviation(shape.variance(x), gradient)
+        std_m = shape.std_factor * shape.scale * deviation
         certain = float((std_m < REPORT.certain).double().mean())
         told = f"{certain:.0%} of the surface certain to {1000.0 * REPORT.certain:g} mm"
         self.objects.tell("shape", f"{len(shape.x)} points, {told}", shape)

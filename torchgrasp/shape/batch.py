@@ -18,13 +18,20 @@ from torchgrasp.foundation.base import Value, at_once, rank_in_group, spread
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.shape.estimate import MeanAndGradient, MeanJet, Moments, SurfaceJet
 from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.shape.jets import Weighted, evaluate_jet, evaluate_mean, evaluate_mean_jet
+from torchgrasp.shape.jets import (
+    Weighted,
+    distance_rows,
+    evaluate_jet,
+    evaluate_mean,
+    evaluate_mean_jet,
+)
 from torchgrasp.shape.kernel import (
     CovarianceRows,
     Kernel,
     Queries,
     cross_covariance,
     differentiate_thin_plate,
+    separations,
     thin_plate,
 )
 from torchgrasp.shape.posterior import CHUNK
@@ -301,6 +308,20 @@ class ShapeBatch(Value):
             return evaluate_mean_jet(self.surfaces.weighted(wall), part)[0]
 
         return MeanJet(*self._evaluate(evaluate, x))
+
+    def variance(self, x: Queries) -> Float[Tensor, "q"]:
+        """Return the variance of the distance at q normalised points."""
+
+        def evaluate(part: Tensor, wall: Tensor) -> tuple[Tensor]:
+            of = self.surfaces.weighted(wall)
+            d, r = separations(part, of.x)
+            k, first = of.kernel.derivatives(r, 2)
+            rows = distance_rows(d, k, first, of.b.shape[1])
+            whitened = self.surfaces.whiten(wall, rows)
+            prior = of.kernel.profile(part.new_zeros(len(part), 1))[:, 0]
+            return (prior - torch.linalg.vecdot(whitened, whitened),)
+
+        return self._evaluate(evaluate, x)[0]
 
     def jet(self, x: Queries) -> SurfaceJet:
         """Return mean and variance of the distance, with derivatives, at q normalised points."""

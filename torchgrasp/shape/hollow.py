@@ -122,6 +122,12 @@ class HollowShape(ShapeGP):
         return tuple(map(merge, *parts))  # pyright: ignore[reportReturnType]
 
     @checked(gradients=True)
+    def variance(self, x: Queries) -> Float[Tensor, "q"]:
+        """Return the variance of the signed distance, normalised, at q normalised points."""
+        parts, merge = self._by_wall(x, lambda wall, own: wall.variance(own))
+        return merge(*parts)
+
+    @checked(gradients=True)
     def jet(self, x: Queries) -> SurfaceJet:
         """Return mean and variance of the signed distance with their derivatives, at normalised
         points.
@@ -208,7 +214,7 @@ def tie_walls(shape: HollowShape, middle: Middle) -> HollowShape:
             break
         rows = rows[torch.argsort(off[rows], descending=True, stable=True)]
         rows = rows[pick_apart(x[rows], TIE_WALLS.points)]
-        variance = torch.stack([wall.estimate(x[rows])[1][:, 0, 0] for wall in shape.walls])
+        variance = torch.stack([wall.variance(x[rows]) for wall in shape.walls])
         walls = []
         for wall, own, other, beyond in zip(
             shape.walls, variance, variance.flip(0), distance.flip(0), strict=True

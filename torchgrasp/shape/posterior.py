@@ -141,21 +141,27 @@ class Posterior(Value):
             cross = self.cross(x)
             mean = (cross @ self.weights).T
             whitened = self.whiten(cross.reshape(-1, rows)).reshape(4, len(x), rows)
-            if not self._is_plain(cross):
-                return mean, prior - torch.einsum("mqr,pqr->qmp", whitened, whitened)
-            spread = prior.repeat(len(x), 1, 1)
-            for m in range(4):
-                for p in range(m, 4):
-                    explained = torch.linalg.vecdot(whitened[m], whitened[p])
-                    spread[:, m, p] -= explained
-                    if p > m:
-                        spread[:, p, m] -= explained
-            return mean, spread
+            whitened = whitened.transpose(0, 1)
+            return mean, prior - whitened @ whitened.mT
 
         size = CHUNK.jet
         if x.device.type != "cpu":
             size = max(CHUNK.memory // (CHUNK.entry * rows), CHUNK.least)
         return in_chunks(evaluate, x, size)  # pyright: ignore[reportReturnType]
+
+    @checked(gradients=True)
+    def variance(self, x: Queries) -> Float[Tensor, "q"]:
+        """Return the variance of the signed distance, normalised, at q normalised points.
+
+        It costs a quarter of `estimate`.
+        """
+        prior = self.kernel.profile(self.x.new_zeros(()))
+
+        def evaluate(x: Tensor) -> tuple[Tensor]:
+            whitened = self.whiten(self.distance_rows(x))
+            return (prior - torch.linalg.vecdot(whitened, whitened),)
+
+        return in_chunks(evaluate, x, at_once(x, CHUNK.jet))[0]
 
     @checked(gradients=True)
     def jet(self, x: Queries) -> SurfaceJet:
@@ -230,7 +236,13 @@ class Posterior(Value):
         rows = rows if self.order is None else rows[:, self.order]
         if not self._is_plain(rows):
             return torch.linalg.solve_triangular(self.factor, rows.T, upper=False).T
-        return torch.cat([rows[:, : len(block)] @ block for block in self.whiteners], 1)
+        whitened = torch.empty_like(rows)
+        first = 0
+        for block in self.whiteners:
+            end = first + block.shape[1]
+            torch.mm(rows[:, : len(block)], block, out=whitened[:, first:end])
+            first = end
+        return whitened
 
     @checked
     def explain(

@@ -111,9 +111,10 @@ def extract_surface(
     """
     walls = list[Surface]()
     for wall, (x, faces) in zip(shape.walls, _trace_walls(shape, resolution), strict=True):
-        jet = wall.jet(x)
-        std_m = shape.std_factor * shape.scale * surface_deviation(jet.variance, jet.gradient)
-        walls.append(Surface(shape.metres(x), faces, unit(jet.gradient), std_m))
+        _, gradient = wall.mean_and_gradient(x)
+        deviation = surface_deviation(wall.variance(x), gradient)
+        std_m = shape.std_factor * shape.scale * deviation
+        walls.append(Surface(shape.metres(x), faces, unit(gradient), std_m))
     return map_tensors(lambda *parts: torch.cat(parts), *walls)
 
 

@@ -168,8 +168,9 @@ def ratio_rows(what: str, here: list[Numbers], there: list[Numbers], commit: str
         values = [summarise(numbers, name, statistic) for numbers in (here, there)]
         ratio = values[0] / values[1]
         least = statistic == "rate"
-        known = bar is not None and not math.isnan(ratio)
-        met = bool(ratio >= bar if least else ratio <= bar) if known else None
+        met = None
+        if bar is not None and not math.isnan(ratio):
+            met = ratio >= bar if least else ratio <= bar
         limit = "-" if bar is None else f"{'>=' if least else '<='} {bar:.2f}x"
         now, before = (f"{x:.3g}" if x < 1000 else f"{x:.0f}" for x in values)
         rows.append(
