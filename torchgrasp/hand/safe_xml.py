@@ -152,54 +152,72 @@ def _seen_only(robot: ET.Element) -> list[ET.Element]:
     return [x for x in links if x.find("visual") is not None and x.find("collision") is None]
 
 
-def _clean(path: Path, where: str, element: ET.Element) -> ET.Element:
+def _clean(path: Path, parent: str, element: ET.Element) -> ET.Element:
     """Return a copy of an element with its known parts; raise `HandFileError` for missing parts or
     bad numbers.
     """
     tag = str(element.tag)
+    name = (element.get("name") or "")[:XML_LETTERS]
+    where = "" if tag == "robot" else f"{parent} {tag} {name}".strip()
+    place = f"{path}: {where}"
+    _refuse_xacro(place, element)
     clean = ET.Element(tag)
-    where = (
-        ""
-        if tag == "robot"
-        else f"{where} {tag} {(element.get('name') or '')[:XML_LETTERS]}".strip()
-    )
-    read = [element.get(key, "") for key in (*WORDS.get(tag, ()), *NUMBERS.get(tag, {}))]
-    left = [x for x in read if "${" in x or "$(" in x] + [
-        f"xacro:{str(part.tag).rpartition('}')[2]}" for part in element if "xacro}" in str(part.tag)
-    ]
-    if left:
-        raise HandFileError("urdf", f"{path}: {where} {left[0][:SHOWN]!r}", NO_XACRO)
     for key in WORDS.get(tag, ()):
-        word = element.get(key, "")
-        if not 0 < len(word) <= XML_LETTERS or not word.isprintable():
-            found = "without one" if not word else f"of {len(word)} letters: {word[:SHOWN_WORD]!r}"
-            allowed = f"a {key} of 1 to {XML_LETTERS} printable letters"
-            raise HandFileError("urdf", f"{path}: {where}: a {key} {found}", allowed)
-        clean.set(key, word)
+        clean.set(key, _read_word(place, key, element.get(key, "")))
     for key, (count, default) in NUMBERS.get(tag, {}).items():
         text = element.get(key, default)
-        words = (text or "").split()
-        words *= 3 if tag == "mesh" and len(words) == 1 else 1  # one scale for all axes
-        right = len(words) == count and all(
-            NUMBER.fullmatch(w) and math.isfinite(float(w)) for w in words
-        )
-        if right and key == "rpy" and any(abs(float(w)) > FULL_TURN for w in words):
-            raise HandFileError("urdf", f"{path}: {where} rpy {text!r}", f"radians {DEGREES}")
-        if right:
-            clean.set(key, " ".join("0" if float(w) == 0 else w for w in words))  # no negative zero
+        numbers = _read_numbers(place, key, text, count, tag == "mesh")
+        if numbers:
+            clean.set(key, numbers)
         elif text != "" or key in element.attrib:
             allowed = f"{count} finite numbers" if count > 1 else "a finite number"
-            raise HandFileError(
-                "urdf", f"{path}: {where} {key} {(text or 'nothing')[:SHOWN]!r}", allowed
-            )
+            found = f"{place} {key} {(text or 'nothing')[:SHOWN]!r}"
+            raise HandFileError("urdf", found, allowed)
     if tag == "geometry" and (len(element) != 1 or element[0].tag not in SIZES):
-        found = f"{where} <{element[0].tag}>" if len(element) == 1 else f"{where} without one shape"
-        raise HandFileError("urdf", f"{path}: {found}", "box, cylinder or sphere")
-    kept = PARTS.get(tag, ())
+        shape = f"<{element[0].tag}>" if len(element) == 1 else "without one shape"
+        raise HandFileError("urdf", f"{place} {shape}", "box, cylinder or sphere")
     for need in REQUIRED.get(tag, ()):
         if element.find(need) is None:
-            raise HandFileError(
-                "urdf", f"{path}: {where} without <{need}>", f"a <{need}> in every <{tag}>"
-            )
+            allowed = f"a <{need}> in every <{tag}>"
+            raise HandFileError("urdf", f"{place} without <{need}>", allowed)
+    kept = PARTS.get(tag, ())
     clean.extend([_clean(path, where, part) for part in element if part.tag in kept])
     return clean
+
+
+def _refuse_xacro(place: str, element: ET.Element) -> None:
+    """Raise `HandFileError` if an element holds what only xacro reads."""
+    tag = str(element.tag)
+    texts = [element.get(key, "") for key in (*WORDS.get(tag, ()), *NUMBERS.get(tag, {}))]
+    unread = [text for text in texts if "${" in text or "$(" in text]
+    parts = [str(part.tag) for part in element if "xacro}" in str(part.tag)]
+    unread += [f"xacro:{part.rpartition('}')[2]}" for part in parts]
+    if unread:
+        raise HandFileError("urdf", f"{place} {unread[0][:SHOWN]!r}", NO_XACRO)
+
+
+def _read_word(place: str, key: str, word: str) -> str:
+    """Return a word, such as a name; raise `HandFileError` if it is missing, too long or not
+    printable.
+    """
+    if 0 < len(word) <= XML_LETTERS and word.isprintable():
+        return word
+    found = f"of {len(word)} letters: {word[:SHOWN_WORD]!r}" if word else "without one"
+    allowed = f"a {key} of 1 to {XML_LETTERS} printable letters"
+    raise HandFileError("urdf", f"{place}: a {key} {found}", allowed)
+
+
+def _read_numbers(place: str, key: str, text: str | None, count: int, mesh: bool) -> str:
+    """Return `count` finite numbers in one text, without a negative zero; empty for another text.
+
+    Raises `HandFileError` for angles in degrees.
+    """
+    words = (text or "").split()
+    if mesh and len(words) == 1:
+        words = 3 * words  # one scale for all axes
+    finite = all(NUMBER.fullmatch(word) and math.isfinite(float(word)) for word in words)
+    if len(words) != count or not finite:
+        return ""
+    if key == "rpy" and any(abs(float(word)) > FULL_TURN for word in words):
+        raise HandFileError("urdf", f"{place} rpy {text!r}", f"radians {DEGREES}")
+    return " ".join("0" if float(word) == 0 else word for word in words)

@@ -135,35 +135,63 @@ class Export(Command):
 
     def run(self) -> int:
         """Load the grasps and write them in the chosen format; return the exit code."""
-        plays = self.format == "usd" or self.format.startswith("play-")
-        shown = self.grasps.with_name("surface.ply")
-        named = plays or self.format in ("dexgraspbench", "graspgen", "glb")
-        found = (plays or self.format == "glb") and shown.is_file()
-        if named and self.object is None and not found:
+        surface = self.grasps.with_name("surface.ply")
+        replaced = (self._plays or self.format == "glb") and surface.is_file()
+        if self._needs_object and self.object is None and not replaced:
             raise BadArgument("--object", None, f"a path with --format {self.format}")
-        with naming(path="--flange"):
-            flange = None if self.flange is None else read_poses(np.array([self.flange]), "wxyz")[0]
-        robot = {
-            "rename": read_names(self.rename),
-            "flange": flange,
-            "object_id": None if named else self.object,
-            "actuated": self.actuated or None,
-            "gripper_link": self.gripper_link,
-            "isaac_ros": self.isaac_ros or None,
-        }
-        robot = {name: x for name, x in robot.items() if x is not None}
-        given = {"mass": self.mass, "friction": self.friction}
-        trial: dict[str, Any] = {name: x for name, x in given.items() if x is not None}
+        robot = self._robot_options()
+        trial = _given(mass=self.mass, friction=self.friction)
         texts = inspect.signature(TEXTS[self.format]).parameters if self.format in TEXTS else ()
-        taken = trial if plays else texts
+        taken = trial if self._plays else texts
         if unused := [name for name in (*robot, *trial) if name not in taken]:
             raise BadArgument(unused[0], f"--format {self.format}", "a format that it is for")
         with naming(path="GRASPS"):
             planned = load_grasps(self.grasps)
         hand = hand_of(planned, self.hand)
         if planned.meta.get("hand_sha256") != hand.source.sha256:
-            found = f"{hand.name}, whose files are not those that were planned with"
-            raise BadArgument("--hand", found, "the same hand")
+            other = f"{hand.name}, whose files are not those that were planned with"
+            raise BadArgument("--hand", other, "the same hand")
+        best = self._choose(hand, planned)
+        body = Path(self.object or surface)
+        if self.format in ("graspgen", "dexgraspbench"):
+            bench = body / "mesh" / "simplified.obj"
+            _check_reached(best, bench if self.format == "dexgraspbench" else body)
+        with naming(hand="--format"):
+            self._write(hand, best, body, robot, trial)
+        followers = follower_joints(hand) if "actuated" in texts and not self.actuated else ()
+        if followers:
+            print(
+                f"note: joints that follow others are written: {', '.join(followers)}; "
+                "--actuated leaves them out, as ros2_control needs"
+            )
+        print(f"{len(best)} grasp{'s' * (len(best) != 1)} of the {hand.name} hand: {self.out}")
+        return 0 if len(best) else 1
+
+    @property
+    def _plays(self) -> bool:
+        """Whether the format plays a closing in a simulator."""
+        return self.format == "usd" or self.format.startswith("play-")
+
+    @property
+    def _needs_object(self) -> bool:
+        """Whether the format needs the object itself, or names its file."""
+        return self._plays or self.format in ("dexgraspbench", "graspgen", "glb")
+
+    def _robot_options(self) -> dict[str, Any]:
+        """Return the options of the robot that were given, by their names in the writers."""
+        with naming(path="--flange"):
+            flange = None if self.flange is None else read_poses(np.array([self.flange]), "wxyz")[0]
+        return _given(
+            rename=read_names(self.rename),
+            flange=flange,
+            object_id=None if self._needs_object else self.object,
+            actuated=self.actuated or None,
+            gripper_link=self.gripper_link,
+            isaac_ros=self.isaac_ros or None,
+        )
+
+    def _choose(self, hand: Hand, planned: Grasps) -> Grasps:
+        """Return the best executable grasps that the format can hold, at most `most`."""
         best = planned[planned.status == Status.OK]
         if self.format in ("isaac", "moveit"):
             still = stands_still(hand, best)
@@ -173,37 +201,32 @@ class Export(Command):
                     f"while it closes, and {self.format} has one pose"
                 )
             best = best[still]
-        best = best[: 1 if self.format == "glb" else self.most]
+        return best[: 1 if self.format == "glb" else self.most]
+
+    def _write(
+        self, hand: Hand, best: Grasps, body: Path, robot: dict[str, Any], trial: dict[str, Any]
+    ) -> None:
+        """Write the chosen grasps; `body` is the mesh of the object, or of its surface."""
         force = 4.0 if self.force is None else self.force
-        body = Path(self.object or shown)
-        if self.format in ("graspgen", "dexgraspbench"):
-            bench = body / "mesh" / "simplified.obj"
-            _check_reached(best, bench if self.format == "dexgraspbench" else body)
-        with naming(hand="--format"):
-            if plays and len(best):
-                player: Any = self.format.removeprefix("play-")
-                spec = TrialSpec(force=self.force, kp=self.kp, **trial)
-                formats.save_play(hand, best, self.out, player, body, spec)
-            elif self.format == "dexgraspbench":
-                stiffness = {} if self.kp is None else {"kp": self.kp}
-                formats.save_dexgraspbench(
-                    hand, best, self.out, str(self.object), force, **stiffness
-                )
-            elif self.format == "glb":
-                if len(best):
-                    write_glb(self.out, hand, best[0], read_mesh(body))
-            elif self.format == "graspgen":
-                write_file(self.out, formats.format_graspgen(best, str(self.object)))
-            elif self.format in TEXTS:
-                write_file(self.out, TEXTS[self.format](hand, best, force, self.kp, **robot))
-        followers = follower_joints(hand) if "actuated" in texts and not self.actuated else ()
-        if followers:
-            print(
-                f"note: joints that follow others are written: {', '.join(followers)}; "
-                "--actuated leaves them out, as ros2_control needs"
-            )
-        print(f"{len(best)} grasp{'s' * (len(best) != 1)} of the {hand.name} hand: {self.out}")
-        return 0 if len(best) else 1
+        if self._plays and len(best):
+            player: Any = self.format.removeprefix("play-")
+            spec = TrialSpec(force=self.force, kp=self.kp, **trial)
+            formats.save_play(hand, best, self.out, player, body, spec)
+        elif self.format == "dexgraspbench":
+            stiffness = _given(kp=self.kp)
+            formats.save_dexgraspbench(hand, best, self.out, str(self.object), force, **stiffness)
+        elif self.format == "glb":
+            if len(best):
+                write_glb(self.out, hand, best[0], read_mesh(body))
+        elif self.format == "graspgen":
+            write_file(self.out, formats.format_graspgen(best, str(self.object)))
+        elif self.format in TEXTS:
+            write_file(self.out, TEXTS[self.format](hand, best, force, self.kp, **robot))
+
+
+def _given(**options: Any) -> dict[str, Any]:
+    """Return the options that are not None."""
+    return {name: value for name, value in options.items() if value is not None}
 
 
 def _check_reached(grasps: Grasps, path: Path) -> None:
