@@ -13,7 +13,7 @@
 
 * scene: real, rooms: supports and things in depth images
 
-* shape: objects: the estimated shape against true meshes
+* shape: objects, views: the estimated shape against true meshes; what more views bring
 
 Each bench prints rows, and writes them as JSON and as a Markdown table with commit, machine and
 command. A run that was stopped goes on: rows of the same commit and options are kept in --out.

@@ -17,7 +17,12 @@ from benchmarks.headline.page import (
     readme_table,
     replace_table,
 )
-from benchmarks.headline.shapes import judge_hidden, measure_floor
+from benchmarks.headline.shapes import (
+    distance_from,
+    judge_contacts,
+    judge_hidden,
+    measure_floor,
+)
 
 from torchgrasp.evaluation import ProtocolResult, ViewScore
 from torchgrasp.foundation.errors import Status
@@ -99,3 +104,20 @@ def test_the_floor_of_real_views_is_the_distance_of_the_cameras_where_both_see()
     far = flat[:300] + torch.tensor([0.0, 0.0, 0.1])  # the view did not see it
     assert measure_floor(flat, torch.cat([above, far])) == pytest.approx(2.0, abs=0.01)
     assert math.isnan(measure_floor(flat, far))
+
+
+def test_contacts_on_real_views_are_near_what_was_measured_or_told() -> None:
+    flat = torch.zeros(4, 3, dtype=torch.float64)
+    flat[:, 0] = torch.tensor([0.0, 0.1, 0.2, 0.3])
+    height = torch.tensor([0.004, 0.006, 0.02])
+    above = flat[:3].clone()
+    above[:, 2] = height
+    away = distance_from(flat, above)
+    torch.testing.assert_close(away, height.double())
+    # the first is near, the second is told by its deviation, the third is not
+    row = judge_contacts("", [away], [torch.tensor([0.0, 0.003, 0.009]).double()], 0.9, 1)
+    assert row.measured.startswith("33% of 3; 1 of the other 2 are told") and not row.met
+    wide = judge_contacts("", [away[:1]] * 9 + [away[2:]], [away[:1]] * 10, 0.9, 0)
+    assert not wide.met
+    told = judge_contacts("", [away[:1]] * 9 + [away[2:]], [away[2:]] * 10, 0.9, 0)
+    assert told.met and told.measured.startswith("90% of 10; 1 of the other 1 ")
