@@ -71,48 +71,45 @@ def format_grasps(
     actuated = [names[joint] for joint in hand.joint_names]
     forces = rotate(grasps.obj_from_hand.double(), squeezed.forces)
     std = grasps.contacts.std_m
-    rows = [
-        {
+
+    def describe_contact(row: int, i: int) -> dict[str, Any]:
+        return {
+            "finger": hand.tips.names[i],
+            "link": hand.tips.links[i],
+            "point": grasps.contacts.points[row, i].tolist(),
+            "normal": grasps.contacts.normals[row, i].tolist(),
+            "force": forces[row, i].tolist(),
+            "std_m": None if std is None else float(std[row, i]),
+            "tip_error": float(grasps.tip_error[row, i]),
+        }
+
+    def describe_grasp(row: int) -> dict[str, Any]:
+        pose = grasps.obj_from_hand[row]
+        entry: dict[str, Any] = {
             "rank": row,
             "status": Status(int(grasps.status[row])).name,
             "success": float(grasps.success[row]),
             "pose": describe_pose(pose),
-            **(
-                {}
-                if flange is None
-                else {"flange": describe_pose(pose.double() @ flange.double().cpu())}
-            ),
-            "approach": {"direction": grasps.approach[row].tolist(), "distance": APPROACH_DISTANCE},
-            "rise": (opened[row] - pose)[:3, 3].tolist(),
-            "joints": {
-                name: {names[joint]: float(q[joint][row]) for joint in names}
-                for name, q in postures.items()
-            },
-            "torque": dict(zip(actuated, squeezed.torques[row].tolist(), strict=True)),
-            "contacts": [
-                {
-                    "finger": finger,
-                    "link": link,
-                    "point": grasps.contacts.points[row, i].tolist(),
-                    "normal": grasps.contacts.normals[row, i].tolist(),
-                    "force": forces[row, i].tolist(),
-                    "std_m": None if std is None else float(std[row, i]),
-                    "tip_error": float(grasps.tip_error[row, i]),
-                }
-                for i, (finger, link) in enumerate(
-                    zip(hand.tips.names, hand.tips.links, strict=True)
-                )
-            ],
-            "clearance": float(grasps.clearance[row]),
-            "closure_margin": float(grasps.certificate.margin[row]),
-            **{
-                name: x[row].tolist()
-                for name, x in vars(grasps.certificate).items()
-                if x is not None and name in TASK
-            },
         }
-        for row, pose in enumerate(grasps.obj_from_hand)
-    ]
+        if flange is not None:
+            entry["flange"] = describe_pose(pose.double() @ flange.double().cpu())
+        direction = grasps.approach[row].tolist()
+        entry["approach"] = {"direction": direction, "distance": APPROACH_DISTANCE}
+        entry["rise"] = (opened[row] - pose)[:3, 3].tolist()
+        entry["joints"] = {
+            posture: {names[joint]: float(q[joint][row]) for joint in names}
+            for posture, q in postures.items()
+        }
+        entry["torque"] = dict(zip(actuated, squeezed.torques[row].tolist(), strict=True))
+        entry["contacts"] = [describe_contact(row, i) for i in range(len(hand.tips.names))]
+        entry["clearance"] = float(grasps.clearance[row])
+        entry["closure_margin"] = float(grasps.certificate.margin[row])
+        # what a task adds to the certificate
+        for name, x in vars(grasps.certificate).items():
+            if x is not None and name in TASK:
+                entry[name] = x[row].tolist()
+        return entry
+
     content = {
         "format": "torchgrasp grasps",
         "version": 3,  # version 1 had no approach, version 2 no rise
@@ -129,7 +126,7 @@ def format_grasps(
         "strongest_normal_force": force,
         "time": {"pregrasp": 0.0, "grasp": POSE_TIME, "squeeze": 2 * POSE_TIME},
         "provenance": grasps.meta,
-        "grasps": rows,
+        "grasps": [describe_grasp(row) for row in range(len(grasps))],
     }
     return format_json(content)
 

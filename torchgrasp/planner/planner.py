@@ -101,8 +101,8 @@ def step(
     if turn == 1 and not last:
         rows, ended = try_first(objects, rows, fresh)
     else:
-        now = torch.cat([rows.find(Row.BEGUN), fresh])
-        rows, ended = try_fully(objects, rows, now, now[:0], last)
+        begun = torch.cat([rows.find(Row.BEGUN), fresh])
+        rows, ended = try_fully(objects, rows, begun, begun[:0], last)
     return rows, rows.best(ended), rows.cloud[ended]
 
 
@@ -125,26 +125,27 @@ def try_first(
 def try_fully(
     objects: Objects,
     rows: Candidates,
-    now: Int[Tensor, "k"],
-    before: Int[Tensor, "d"],
+    tried: Int[Tensor, "k"],
+    ended: Int[Tensor, "d"],
     last: bool,
 ) -> tuple[Candidates, Int[Tensor, "e"]]:
-    """Solve for the hand on the contact sets `now` with all steps, then with sliding contacts.
+    """Solve for the hand on the contact sets `tried` with all steps, then with sliding contacts.
 
     Return all contact sets `rows` with the results, then the indices of those that ended in this
-    batch: those in `before`, which ended earlier, and the new ones. A solved set ends
-    (`Row.ENDED`); a failed one gets `Row.STUCK`. In the `last` batch `solve_with_sliding` then
-    tries all stuck sets, and ends them; in other batches only those of objects without a grasp in
-    this batch, because it takes long.
+    batch: those in `ended`, which ended earlier in it, and the new ones. A solved set ends
+    (`Row.ENDED`); a failed one gets `Row.STUCK`. `solve_with_sliding` then tries stuck sets, and
+    ends them. It takes long. So in the `last` batch it tries all stuck sets, and in others only
+    those of objects without a grasp in this batch.
     """
     clouds = len(objects)
-    rows, solved = solve_fixed(objects, rows, now, ITERATIONS, Row.STUCK)
-    ended = torch.cat([before, solved])
-    slides = torch.ones(clouds, dtype=torch.bool, device=now.device)
-    if not last:
-        slides = without(rows, ended, clouds)
-    if bool(slides.any()):
-        rows, slid = solve_with_sliding(objects, rows, rows.find(Row.STUCK, slides))
+    rows, solved = solve_fixed(objects, rows, tried, ITERATIONS, Row.STUCK)
+    ended = torch.cat([ended, solved])
+    wanting = without(rows, ended, clouds)
+    if last:
+        wanting = torch.ones_like(wanting)
+    if bool(wanting.any()):
+        stuck = rows.find(Row.STUCK, wanting)
+        rows, slid = solve_with_sliding(objects, rows, stuck)
         ended = torch.cat([ended, slid])
     return rows, ended
 
