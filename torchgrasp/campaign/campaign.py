@@ -38,19 +38,23 @@ LONGEST_LICENCE = 100  # letters of a licence's name; those of the SPDX list hav
 @checked
 @dataclasses.dataclass(frozen=True)
 class CampaignSpec(Value):
-    """Options of a campaign: protocol, trials, licence and size of the files.
-
-    Raises `BadArgument` for an unknown protocol, or trials of whole clouds, of grasps that were
-    planned before, or of other fingers than the hand's.
+    """Options of a campaign (`run_campaign`): protocol, trials, licence and size of the files.
 
     Args:
         protocol: test protocol of each grasp, or its name in `torchgrasp.evaluation.PROTOCOLS`.
         trials: which views are planned on, and how many of their grasps are tried, with the hand's
             own fingers.
         licence: licence of the data set, preferably an SPDX identifier such as "CC-BY-4.0".
-        jobs_in_shard: number of jobs (an object and a view) in one file.
-        device: "cuda" plans on all views of a file at once, on the workers of a Dask cluster that
-            have a GPU and the resource "GPU". A GPU's rounding may change grasps.
+        jobs_in_shard: number of jobs in one file. A job is one view of one object.
+        device: "cpu" or "cuda". "cuda" plans on all views of a file at once, on the workers of a
+            Dask cluster with the resource "GPU". A GPU's rounding may change grasps.
+
+    Raises `BadArgument` for:
+
+    * `trials` of whole clouds (`complete`), of grasps that were planned before (`planned`), or with
+      other `fingers` than the hand's;
+    * a `licence` that is empty, too long, or not one printable line;
+    * a number outside its range.
 
     >>> CampaignSpec("dexgraspbench").test.trial.friction
     0.6
@@ -78,7 +82,10 @@ class CampaignSpec(Value):
 
     @property
     def test(self) -> Protocol:
-        """The settings of the trials that test each grasp."""
+        """The `Protocol` of the field `protocol`, also where the field holds its name.
+
+        Raises `BadArgument` for an unknown name.
+        """
         return find_protocol(self.protocol)
 
 
@@ -91,23 +98,24 @@ def run_campaign(
     workers: Annotated[int, Range(0, 1024)] | str = 0,
     observer: Callable[[JobRow], object] = lambda row: None,
 ) -> GraspShards:
-    """Plan on every view of a folder of objects, and try the grasps in simulation.
+    """Plan grasps on every view of a folder of objects, try them in simulation, and return the data
+    set.
 
-    The results are written as a data set, which is returned. Each job, one object and view, gives a
-    `JobRow` and its grasps, or the reason why there are none. A finished job is on disk at once.
-    The same call continues an interrupted run, and retries failed jobs (`WORKER_DIED`, `TIMED_OUT`,
-    `BROKEN`). Equal results give equal bytes, whatever the workers, their order and the
-    interruptions (docs/promises.md, N10, on equal results).
+    The data set is written to `folder` (`read_shards` reads it). A job is one view of one object.
+    It gives a `JobRow` and its grasps, or the reason why there are none. A finished job is on disk
+    at once. The same call continues an interrupted run, and retries failed jobs (`WORKER_DIED`,
+    `TIMED_OUT`, `BROKEN`). Equal results give equal bytes, whatever the workers, their order and
+    the interruptions (docs/promises.md, N10).
 
     Args:
         objects: a folder of objects with its manifest, as `write_objects` makes it. On a cluster it
             has the same path on every machine.
         hand: from `load_hand`, with the fingers that grasp.
         folder: folder of the data set; no other run may write to it at the same time.
-        spec: options of the campaign; `CampaignSpec()` by default.
-        workers: number of processes on this machine, where 0 means this process. Or the address of
-            a Dask scheduler, such as "tcp://10.0.0.1:8786", whose workers have one thread each.
-        observer: called with the `JobRow` of each finished job.
+        spec: options of the campaign; None means `CampaignSpec()`.
+        workers: number of processes on this machine; 0 means this process. Or the address of a Dask
+            scheduler, such as "tcp://10.0.0.1:8786", whose workers have one thread each.
+        observer: function that is called with the `JobRow` of each finished job.
 
     Raises:
         BadArgument: no objects, no scheduler at the address or for "cuda", or a machine with other

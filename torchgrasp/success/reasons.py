@@ -38,8 +38,13 @@ SENTENCES = {
 class Cost(NamedTuple):
     """A cause that lowers the predicted success of a grasp.
 
-    `cause` is a name in `CAUSES`. `log_odds` is by how much the cause lowers the log-odds of
-    success, compared to grasps that held. `sentence` explains it.
+    `explain_success` makes it.
+
+    Attributes:
+        cause: name of the cause: "load", "moved", "surface", "object" or "task".
+        log_odds: by how much (no unit) the cause lowers the log-odds of success, compared to grasps
+            that held.
+        sentence: explanation of the cause, with its numbers.
     """
 
     cause: str
@@ -54,11 +59,17 @@ def explain_success(
     """Return at most three causes that lower the predicted success of the first grasp most, the
     greatest first.
 
-    Each cause stands for several features of the success model (`CAUSES`). Its cost is by how much
-    the log-odds rise if these features take their median over grasps that held.
+    Each cause stands for several features of the success model (`CAUSES`). Its `log_odds` is by how
+    much the log-odds rise if these features take their median over grasps that held. Causes that do
+    not lower the success are left out.
 
-    The `shape` is in the frame of the grasps. The `task` is by default `GraspTask()`. Raises
-    `BadArgument` for no grasps, or grasps of another planner.
+    Args:
+        grasps: grasps of `plan_grasps`, of which the first counts.
+        hand: the hand of the grasps.
+        shape: the estimated shape of the object (`fit_shape`), in the frame of the grasps.
+        task: what the grasp must do; None means `GraspTask()`.
+
+    Raises `BadArgument` for no grasps, or grasps of another planner.
 
     >>> from torchgrasp import fit_shape, load_hand, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp

@@ -24,17 +24,18 @@ from torchgrasp.values.specs import MASSES
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspTask(Value):
-    """What a grasp must do. The predicted success is that of this task.
+    """What a grasp must do. The predicted success is the success in this task.
 
     Args:
-        mass: mass of the object [kg], or its `Distribution`.
-        force: normal force [N] of the strongest finger. None: in a lift the hand presses as much as
-            the felt load needs; in pulls it presses with 4 N.
+        mass: mass [kg] of the object, or its `Distribution`.
+        force: normal force [N] of the strongest finger. None means 4 N in pulls. In a lift it means
+            as much as the felt load needs.
         lift: whether the object is lifted off its table. Otherwise it floats, and is pulled along
             six directions with a force of 10 m/s^2 times its mass. None means a lift if the planner
-            knows the table, but not in open loop.
-        closing: how the hand closes: by touch ("uncertainty"), or without sensors, from pre-grasp
-            to grasp to squeeze ("open_loop").
+            knows the table and the closing is not "open_loop".
+        closing: how the hand closes.
+            "uncertainty": by touch.
+            "open_loop": without sensors, from pre-grasp to grasp to squeeze.
         displaced: whether the object may be elsewhere: up to 30 mm along the table, or 5 mm and 5
             degrees if it floats.
 
@@ -56,7 +57,10 @@ class GraspTask(Value):
             raise BadArgument("closing", "'open_loop' for a lift", "'uncertainty'")
 
     def describe(self) -> str:
-        """Return the task as a short text."""
+        """Return the task as a short text, such as "lift of 0.5 kg".
+
+        It begins with "lift" or "pulls", or with "task" if the field `lift` is None.
+        """
         what = "task" if self.lift is None else "lift" if self.lift else "pulls"
         force = "" if self.force is None else f" with {self.force:g} N"
         return f"{what} of {Distribution.of(self.mass)} kg{force}" + (
@@ -65,11 +69,12 @@ class GraspTask(Value):
 
     @checked
     def updated(self, result: ClosureResult) -> "GraspTask":
-        """Return the task of the next grasp, with what a lift has shown of the mass
+        """Return the task of the next grasp, with the mass narrowed to what a lift has shown
         (`ClosureResult.mass`).
 
-        The mass stays if the lift neither held nor was too heavy. Where it excludes what the lift
-        has shown, the lift alone decides.
+        `result` is what `close_hand` returned. If no mass of the task is among the shown masses,
+        the shown masses replace the task's. The task is returned as it is in two cases: the lift
+        showed no mass, or its status is neither `OK` nor `TOO_HEAVY`.
         """
         felt = result.mass
         if felt is None or result.status not in (Status.OK, Status.TOO_HEAVY):
@@ -83,19 +88,21 @@ class GraspTask(Value):
 
     @checked
     def pressing(self, lifted: bool) -> float:
-        """Return the normal force [N] of the strongest finger; 0 if the hand presses as much as the
-        felt load needs.
+        """Return the normal force [N] of the strongest finger.
 
-        `lifted` says whether the task is a lift.
+        It is the field `force`. If that is None, it is 4 N in pulls and 0 in a lift. There 0 means
+        that the hand presses as much as the felt load needs. `lifted` says whether the task is a
+        lift (`lifts`).
         """
         return self.force or (0.0 if lifted else 4.0)
 
     @checked
     def lifts(self, table: Plane | None) -> bool:
-        """Return whether the task is a lift.
+        """Return whether the task is a lift, for a planner that knows this `table` (None: no
+        table).
 
-        If the field `lift` is None, it is one if there is a `table` and the closing is not
-        "open_loop".
+        It is the field `lift`. If that is None, the task is a lift with a `table`, unless the
+        closing is "open_loop".
         """
         return table is not None and self.closing != "open_loop" if self.lift is None else self.lift
 
@@ -150,10 +157,14 @@ class Conditions:
 @checked
 @dataclasses.dataclass(frozen=True)
 class TaskWrenches(Value):
-    """The w loads of an object in a task, in the cloud's frame.
+    """The w loads of an object in a task, for the argument `resist` of `plan_grasps`.
 
-    Each of the `wrenches` is a force [N], weight included, and a torque [N m] about `point` [m], by
-    default the estimated centre. Raises `BadArgument` for no load, or one of zeros.
+    Args:
+        wrenches: loads (w, 6) in the cloud's frame: force [N] with the weight included, then torque
+            [N m] about `point`.
+        point: point (3,) [m] in the cloud's frame; None means the estimated centre of the object.
+
+    Raises `BadArgument` for no load, or a load that is all zeros.
 
     >>> turn = [0.0, 0.0, -2.5, 0.0, 0.0, 0.1]
     >>> back = [0.0, 0.0, -2.5, 0.0, 0.0, -0.1]

@@ -18,13 +18,19 @@ from torchgrasp.values.distribution import Distribution
 @checked
 @dataclasses.dataclass(frozen=True)
 class ClosingGains(Value):
-    """Targets and gains of the closing controller for f fingers, in the hand's frame (Eqs. 26-28 of
-    the paper).
+    """Targets and gains of the closing controller for f fingers (Eqs. 26-28 of the paper), in the
+    hand's frame.
 
-    `target` [m] is the planned position of each contact, `covariance` [m^2] its uncertainty.
-    `position_gain` [1/s] and `force_gain` [m/(s N)] are diagonals of gain matrices. `desired_force`
-    [N] is the contact force on the object to reach. `force_source` is "analytic", or "stability" if
-    the stability model chose among the balanced forces.
+    `closing_gains` makes them. The hand's frame is the frame of its root link at the planned pose.
+
+    Attributes:
+        target: planned position (f, 3) [m] of each contact.
+        covariance: uncertainty (f, 3, 3) [m^2] of each position.
+        position_gain: diagonal (f, 3) [1/s] of each finger's position gain matrix.
+        force_gain: diagonal (f, 3) [m/(s N)] of each finger's force gain matrix.
+        desired_force: contact force (f, 3) [N] on the object to reach.
+        force_source: "analytic", or "stability" if the stability model chose among the balanced
+            forces.
 
     >>> from torchgrasp import closing_gains, load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -44,7 +50,9 @@ class ClosingGains(Value):
 class ObjectMotion(NamedTuple):
     """Motion of an object between two times, relative to the hand or to the world.
 
-    `distance` [m] is that by which its centre moved, and `angle` [rad] that of its rotation.
+    Attributes:
+        distance: how far [m] the object's centre moved; NaN if it was not measured.
+        angle: how far [rad] the object turned; NaN if it was not measured.
 
     >>> slip = ObjectMotion(distance=0.004, angle=0.1)
     >>> f"{1000 * slip.distance:g} mm, {57.3 * slip.angle:.0f} degrees"
@@ -60,16 +68,17 @@ class ObjectMotion(NamedTuple):
 class Disturbance(Value):
     """Unintended contacts of the hand in a simulated trial, of three kinds.
 
-    Entry 0 is for contacts with neighbours, and entry 1 for contacts with the table. Entry 2 is for
-    contacts of other links than fingertips with the object.
+    It is the field `disturbance` of a `ClosureResult`. Entry 0 of each (3,) is for contacts with
+    neighbours, and entry 1 for contacts with the table. Entry 2 is for contacts of other links than
+    fingertips with the object.
 
-    Args:
-        first_touch: time [s] of the first contact; infinite if there is none.
-        impulse: sum of the normal impulses [N s].
-        force: largest mean normal force [N] in a control tick.
-        early: whether the first of these contacts was before a fingertip touched the object.
-        neighbour_pose: rigid transforms [m] in the frame of the grasp, for t ticks and m
-            neighbours. Each moves a neighbour from its start to its place at the tick.
+    Attributes:
+        first_touch: time (3,) [s] of the first contact; infinite if there is none.
+        impulse: sum (3,) of the normal impulses [N s].
+        force: largest normal force (3,) [N], averaged over a control tick.
+        early: whether (3,) the first of these contacts was before a fingertip touched the object.
+        neighbour_pose: rigid transforms (t, m, 4, 4) [m] in the frame of the grasp, for t ticks and
+            m neighbours. Each moves a neighbour from its start to its place at the tick.
     """
 
     first_touch: Annotated[Float[Tensor, "3"], ANY]
@@ -82,19 +91,20 @@ class Disturbance(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class ClosingTrace(Value):
-    """True contacts of f fingertips, and estimates of the controller, at t control ticks, in the
-    hand's frame.
+    """True contacts of f fingertips, and estimates of the controller, at t control ticks.
 
-    Args:
-        forces: contact forces [N] on the object, with friction.
-        points: contact points [m]; NaN without contact.
-        normals: outward unit normals of the object; NaN without contact.
-        sliding: speed [m/s] of each fingertip along the surface.
-        blend: weight lambda of Eq. (26), 0 for position and 1 for force control; NaN if the control
-            law was not active.
-        friction: coefficient of friction that the holding mode "grip" estimates; NaN before the
-            hand holds.
-        load: load [N] on the grasp that the holding mode "grip" estimates; NaN before the hand
+    It is the field `trace` of a `ClosureResult`. Vectors are in the hand's frame.
+
+    Attributes:
+        forces: contact forces (t, f, 3) [N] on the object, with friction; 0 without contact.
+        points: contact points (t, f, 3) [m]; NaN without contact.
+        normals: outward unit normals (t, f, 3) of the object; NaN without contact.
+        sliding: speed (t, f) [m/s] of each fingertip along the surface.
+        blend: weight lambda (t, f) of Eq. (26), 0 for position and 1 for force control. NaN if the
+            control law was not active.
+        friction: coefficient of friction (t,) that the holding mode "grip" estimates; NaN before
+            the hand holds.
+        load: load (t,) [N] on the grasp that the holding mode "grip" estimates; NaN before the hand
             holds.
     """
 
@@ -112,40 +122,44 @@ class ClosingTrace(Value):
 class ClosureResult(Value):
     """The result of closing a hand on the true object in simulation, recorded at t control ticks.
 
-    Numbers that were not measured before the trial ended are NaN. Poses are rigid transforms [m].
+    `close_hand` returns it. f counts fingertips, and j all joints of the URDF. Numbers that were
+    not measured before the trial ended are NaN. Poses are rigid transforms [m]. Joints that slide
+    have [m] in place of [rad].
 
-    Args:
-        held: whether the object was lifted with the hand and slipped little.
-        status: `OK`, or the reason why it was not held.
-        time: times [s] at which the control ticks ended.
-        forces: normal force [N] of each of f fingertips.
-        object_pose: pose of the object in the frame of the grasp.
-        hand_pose: pose of the hand in the frame of the grasp.
-        joints: positions [rad] of all j joints of the URDF, in the order of `joint_names`.
-        targets: positions [rad] that were the targets of the drives of these joints in the tick.
-        joint_names: names of the joints.
+    Attributes:
+        held: whether the object was lifted with the hand and slipped little (`close_hand` gives the
+            bounds).
+        status: `OK`, or the reason why the object was not held.
+        time: times (t,) [s] at which the control ticks ended.
+        forces: normal force (t, f) [N] of each fingertip; 0 without contact.
+        object_pose: pose (t, 4, 4) of the object in the frame of the grasp.
+        hand_pose: pose (t, 4, 4) of the hand in the frame of the grasp.
+        joints: positions (t, j) [rad or m] of all joints, in the order of `joint_names`.
+        targets: positions (t, j) [rad or m] that were the targets of the drives in the tick.
+        joint_names: names of all joints of the URDF.
         contact_order: indices of the fingers that touched, in the order of their first contacts.
         object_motion: motion of the object in the hand from the pre-grasp to the end.
-        pushed: motion of the object in the world from the pre-grasp until all fingers touched, or
+        pushed: motion of the object in the world, from the pre-grasp until all fingers touched or
             the closing ended.
         before_lift: motion of the object in the world from the start to the end of the pressing.
         rise: height [m] by which the object's centre has risen at the end.
-        unbalanced: norm of the sum of the fingertip forces before the lift, relative to the sum of
-            their norms.
+        unbalanced: norm of the sum of the fingertip forces before the lift, over the sum of their
+            norms (no unit).
         slip: motion of the object in the hand from the end of pressing to the end.
         start_overlap: depth [m] by which the opened hand penetrates the object or the table at the
             start.
         disturbance: unintended contacts of the hand.
         trace: contacts and estimates at every tick.
-        phases: times [s] at which the hand arrived, all fingers touched, and the hand pressed; NaN
-            if never.
+        phases: times (3,) [s] at which the hand arrived, all fingers touched, and the hand pressed;
+            NaN if never.
         stops: number of stops of the approaching hand at a contact.
         attempts: number of closings of the hand.
         seconds: wall time [s] of the trial.
-        friction: what the touches leave of the friction that the grasp was planned for; None if the
-            hand did not hold in the mode "grip".
-        mass: the object's mass [kg] by the load that the hand felt, while nothing pushed at it;
-            None if the mode "grip" felt no steady load.
+        friction: what the touches leave of the friction that the grasp was planned for. If they
+            leave nothing of it, what the touches alone show. None if the hand did not hold in the
+            mode "grip".
+        mass: the object's mass [kg] by the load that the hand felt while nothing pushed at the
+            object. None if the mode "grip" felt no steady load.
     """
 
     held: bool
@@ -188,15 +202,15 @@ class ClosingOptions(Value):
         wait: whether a finger that touches waits for the others, so that all press together.
         pose_estimate: whether early and late touches update the estimated object pose, which moves
             all contact targets.
-        palm_reach: largest displacement [m] of the palm, which follows the estimated object pose; 0
+        palm_reach: largest displacement [m] of the palm, which follows the estimated object pose. 0
             means that the palm does not move.
         stops: largest number of stops at an unexpected contact, after which the approaching hand
             moves sideways; 0 means none.
-        attempts: largest number of closings: on a known table the hand closes again if the grasp
+        attempts: largest number of closings. On a known table the hand closes again if the grasp
             seems too weak to lift.
 
-    Raises `BadArgument` for a number outside its range, for `palm_reach` or a second attempt
-    without `pose_estimate`, or for `stops` with a `palm_reach` of 0.
+    Raises `BadArgument` for a number outside its range, and for two contradictions. These are a
+    `palm_reach` or a second attempt without `pose_estimate`, and `stops` with a `palm_reach` of 0.
 
     >>> ClosingOptions(palm_reach=0.0, stops=0).attempts  # an arm that cannot yield
     5
@@ -238,13 +252,15 @@ def choose_options(closing: str, options: ClosingOptions | None) -> ClosingOptio
 @checked
 @dataclasses.dataclass(frozen=True)
 class SensorModel(Value):
-    """The sensors of a hand's fingertips: kind, delay, noise and dead sensors. `FingertipSensor`
-    simulates them.
+    """The sensors of a hand's fingertips: kind, delay, noise and dead sensors.
+
+    `FingertipSensor` simulates them.
 
     Args:
-        kind: what the sensors measure. "tactile": force, position and sliding of each contact, like
-            a BioTac. "torque": only the force, from the torques of the finger's joints. "binary":
-            only whether the tip touches.
+        kind: what the sensors measure.
+            "tactile": force, position and sliding of each contact, like a BioTac.
+            "torque": only the force, from the torques of the finger's joints.
+            "binary": only whether the tip touches.
         delay: age [s] of the readings, rounded to whole samples of the sensor.
         noise: factor (no unit) that multiplies the usual noise of the sensor.
         dead: names of the fingers whose sensor is known to be broken.
@@ -262,5 +278,8 @@ class SensorModel(Value):
 
     @property
     def full(self) -> bool:
-        """Whether the sensors of all fingers measure force, position and sliding."""
+        """Whether the sensors of all fingers measure force, position and sliding.
+
+        This is so if `kind` is "tactile" and no finger is in `dead`.
+        """
         return self.kind == "tactile" and not self.dead

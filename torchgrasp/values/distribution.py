@@ -36,17 +36,21 @@ Few = Annotated[int, Range(1, MOST_PARTS)]
 @checked
 @dataclasses.dataclass(frozen=True)
 class Distribution(Value):
-    """A mixture of intervals, in each of which all numbers are equally likely.
+    """The distribution of an uncertain number: a mixture of intervals, in each of which all numbers
+    are equally likely.
 
-    An interval (x, x) is the single number x. Further ways to make a distribution are `parse`,
-    `read`, `of`, `between` and `of_samples`.
+    The number may have any unit, such as a mass [kg]. An interval (x, x) is the single number x.
+    Further ways to make a distribution are `parse`, `read`, `of`, `between` and `of_samples`.
 
     Args:
-        parts: intervals (least, greatest).
+        parts: intervals (least, greatest), 1 to 10,000 of them.
         weights: weight of each part, of which only the ratios count; None means equal weights.
 
-    Raises `BadArgument` for no part, too many parts, an interval whose first number is the greater
-    one, or another number of weights than of parts.
+    Raises `BadArgument` for:
+
+    * no part, or more than 10,000;
+    * an interval whose first number is the greater one;
+    * weights that are not positive, or not one for each part.
 
     >>> friction = Distribution.parse("0.3:0.8|1.0")
     >>> friction.mean, friction.cdf(torch.tensor([0.55, 1.0])).tolist()
@@ -69,7 +73,7 @@ class Distribution(Value):
     @classmethod
     @checked
     def of(cls, value: "float | Distribution") -> "Distribution":
-        """Return the distribution of a number that is certain; a distribution is returned as it
+        """Return the distribution of a number that is certain. A `Distribution` is returned as it
         is.
         """
         return value if isinstance(value, Distribution) else cls(((value, value),))
@@ -77,15 +81,19 @@ class Distribution(Value):
     @classmethod
     @checked
     def between(cls, low: float, high: float) -> "Distribution":
-        """Return the distribution in which all numbers in [low, high] are equally likely."""
+        """Return the distribution in which all numbers in [low, high] are equally likely.
+
+        `low` and `high` have the unit of the number. Raises `BadArgument` if `low` is the greater
+        one.
+        """
         return cls(((low, high),))
 
     @classmethod
     @checked
     def of_samples(cls, samples: Float[Tensor, "n"]) -> "Distribution":
-        """Return the distribution in which each of n samples is equally likely.
+        """Return the distribution in which each of n samples (n,) is equally likely.
 
-        The samples may have any unit. Raises `BadArgument` for none, more than 10,000, or one
+        The samples may have any unit. Raises `BadArgument` for no sample, more than 10,000, or one
         that is not finite.
         """
         return cls(tuple((x, x) for x in samples.tolist()))
@@ -93,7 +101,10 @@ class Distribution(Value):
     @classmethod
     @checked
     def read(cls, text: str) -> "float | Distribution":
-        """Return what `parse` reads, a number if the text names just one.
+        """Return the number or the `Distribution` that a text names, in the form that `parse`
+        explains.
+
+        A text of one number gives a float. Raises `BadArgument` for another text.
 
         >>> Distribution.read("0.5")
         0.5
@@ -103,7 +114,7 @@ class Distribution(Value):
     @classmethod
     @checked
     def parse(cls, text: str) -> "Distribution":
-        """Return the distribution that a text names.
+        """Return the `Distribution` that a text names, also for a text of one number.
 
         The text is a number "0.5", an interval "0.3:0.8", or several of them with "|" between. A
         part may have a weight behind "@", by default 1. `str` writes such a text. Raises
@@ -135,25 +146,25 @@ class Distribution(Value):
 
     @functools.cached_property
     def shares(self) -> tuple[float, ...]:
-        """The probability of each part."""
+        """The probability of each part, in the order of `parts`; their sum is 1."""
         weights = self.weights or (1.0,) * len(self.parts)
         total = math.fsum(weights)
         return tuple(x / total for x in weights)
 
     @property
     def simplest(self) -> "float | Distribution":
-        """The number if it is certain, else the distribution."""
+        """The number as a float if it is certain, else the `Distribution`."""
         return self.least if self.least == self.most else self
 
     @property
     def mean(self) -> float:
-        """The mean."""
+        """The mean, in the unit of the number."""
         middles = [(low + high) / 2 for low, high in self.parts]
         return math.fsum(p * x for p, x in zip(self.shares, middles, strict=True))
 
     @property
     def std(self) -> float:
-        """The standard deviation."""
+        """The standard deviation, in the unit of the number."""
         squares = [(low * low + low * high + high * high) / 3 for low, high in self.parts]
         square = math.fsum(p * x for p, x in zip(self.shares, squares, strict=True))
         return math.sqrt(max(square - self.mean**2, 0.0))
@@ -197,14 +208,15 @@ class Distribution(Value):
 
     @checked
     def times(self, factor: Positive) -> "Distribution":
-        """Return the distribution of `factor` times the number."""
+        """Return the distribution of `factor` times the number. `factor` is positive."""
         return self._mapped(lambda x: factor * x)
 
     @checked
     def clamped(self, low: Measured, high: Measured) -> "Distribution":
-        """Return the distribution with intervals that end at `low` and `high`; weights are kept.
+        """Return the distribution with the ends of each interval clamped to [low, high]; weights
+        are kept.
 
-        An interval beyond them becomes the nearest of the two, which may be infinite.
+        An interval outside becomes the nearer of the two numbers. `low` and `high` may be infinite.
         """
         return self._mapped(lambda x: min(max(x, low), high))
 
@@ -215,7 +227,7 @@ class Distribution(Value):
 
     @checked(gradients=True)
     def cdf(self, x: Annotated[Float[Tensor, "*b"], ANY]) -> Float[Tensor, "*b"]:
-        """Return the probability of numbers up to `x`: F(x) = P(X <= x); NaN for NaN.
+        """Return the probability P(X <= x) of numbers up to each `x` (*b,); NaN for NaN.
 
         Its derivative is the density between the single numbers.
         """
@@ -232,10 +244,10 @@ class Distribution(Value):
 
     @checked(gradients=True)
     def quantile(self, q: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-        """Return the least number x with P(X <= x) >= q; `q` is in [0, 1].
+        """Return for each probability `q` (*b,) in [0, 1] the least number x with P(X <= x) >= q.
 
-        Its derivative is one over the density, and 0 at a single number. Raises `BadArgument` for
-        another probability; torch.vmap and torch.compile leave this check out.
+        Its derivative is one over the density, and 0 at a single number. Raises `BadArgument` for a
+        `q` outside [0, 1]; torch.vmap and torch.compile leave this check out.
         """
         if is_known(q) and not bool(((q >= 0) & (q <= 1)).all()):
             raise BadArgument("q", "a number outside [0, 1]", "probabilities in [0, 1]")
@@ -248,14 +260,20 @@ class Distribution(Value):
 
     @checked
     def sample(self, count: Few, seed: Seed) -> Float[Tensor, "n"]:
-        """Return `count` independent random numbers, as float64 on the CPU."""
+        """Return `count` independent random numbers (count,), as float64 on the CPU.
+
+        `count` is 1 to 10,000, and `seed` the random seed.
+        """
         generator = torch.Generator().manual_seed(seed)
         drawn = torch.rand(count, generator=generator, dtype=torch.float64, device="cpu")
         return self.quantile(drawn)
 
     @checked
     def share(self, low: Measured, high: Measured) -> float:
-        """Return the probability of the interval [low, high], whose ends may be infinite."""
+        """Return the probability that the number is in [low, high], both ends included.
+
+        The ends may be infinite. The result is 0 if `low` is greater than `high`.
+        """
         upto = self._below(real([high]), reached=True)
         below = self._below(real([low]), reached=False)
         return min(max(float(upto - below), 0.0), 1.0)
@@ -264,7 +282,7 @@ class Distribution(Value):
     def given(self, low: Measured, high: Measured) -> "Distribution":
         """Return the distribution of the number once it is known to be in [low, high].
 
-        Raises `BadArgument` if that is impossible.
+        The ends may be infinite. Raises `BadArgument` if the number cannot be in this interval.
 
         >>> str(Distribution.between(0.2, 1.0).given(0.3, 0.5))
         '0.3:0.5'
@@ -285,12 +303,12 @@ class Distribution(Value):
 
     @checked
     def nodes(self, count: Few) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
-        """Return at most `count` numbers with probabilities, whose weighted mean approximates a
-        mean.
+        """Return n numbers (n,) and their probabilities (n,), with n at most `count` (1 to 10,000).
 
-        A single number is itself a node, and an interval has the middles of equal parts as nodes,
-        about as many as its share. If there are more parts than `count`, the nodes are the
-        quantiles (i + 1/2) / `count`.
+        They stand for the distribution: the mean of a function is about the weighted mean of its
+        values at the numbers. A single number is itself a node. An interval has the middles of
+        equal parts as nodes, about as many as its share. If there are more parts than `count`, the
+        nodes are the quantiles (i + 1/2) / `count`.
         """
         if len(self.parts) > count:
             middles = (torch.arange(count, dtype=torch.float64, device="cpu") + 0.5) / count

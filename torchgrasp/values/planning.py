@@ -32,17 +32,22 @@ from torchgrasp.geometry.plane import Plane, read_plane
 class PointCloud(Value):
     """The measured surface points of one object, with optional normals and camera positions.
 
-    Args:
-        points: n surface points [m], at least 4.
-        normals: outward normals of any length, or None.
-        viewpoint: position of the camera [m], or of each point's camera; None if it is unknown.
-        frustum: inward unit normals of the four sides of the camera's view, or of each point's
-            camera; None if unknown. An object that reaches a side is cut off there.
-        pose_error: standard deviation [m] of the position of each point's view, which moves its
-            points together; None if the poses are exact.
+    All fields are in one frame, the frame of the cloud ("obj"). n counts points.
 
-    Raises `BadArgument` for a wrong shape or dtype or numbers that are not finite, `TooFewPoints`
-    for fewer than 4 points.
+    Args:
+        points: surface points (n, 3) [m], at least 4.
+        normals: outward normals (n, 3) of any length; None if they are unknown.
+        viewpoint: position of the camera (3,) [m], or of each point's camera (n, 3) [m]; None if it
+            is unknown.
+        frustum: inward unit normals (4, 3) of the four sides of the camera's view. Or the normals
+            (n, 4, 3) of each point's camera. An object that reaches a side is cut off there. None
+            if they are unknown.
+        pose_error: standard deviation (n,) [m] of the position of each point's view, which moves
+            its points together. None if the poses are exact.
+
+    Raises:
+        BadArgument: a wrong shape or dtype, or numbers that are not finite.
+        TooFewPoints: fewer than 4 points.
 
     >>> import torch
     >>> cloud = PointCloud(torch.rand(100, 3), viewpoint=torch.eye(3)[:2].repeat_interleave(50, 0))
@@ -67,7 +72,8 @@ class PointCloud(Value):
     def select(self, rows: Int[Tensor, "m"] | Bool[Tensor, "n"]) -> "PointCloud":
         """Return a cloud of some of the points, with all that belongs to them.
 
-        `rows` is a mask of the points, or holds m indices in the wanted order.
+        `rows` is a mask (n,) of the points, or holds m indices of points in the wanted order.
+        Raises `BadArgument` for another shape or dtype, or fewer than 4 points (`TooFewPoints`).
         """
         normals = self.normals
         eye = self.viewpoint
@@ -82,14 +88,22 @@ class PointCloud(Value):
         )
 
     def view_rows(self) -> list[Int[Tensor, "m"]]:
-        """Return the indices of the points of each camera, in the order of their first points."""
+        """Return the indices of the points of each camera, one tensor for each camera.
+
+        The cameras are in the order of their first points. Without `viewpoint`, or with a single
+        one, all points are of one camera.
+        """
         if self.viewpoint is None or self.viewpoint.ndim == 1:
             return [torch.arange(len(self), device=self.points.device)]
         _, view = self.viewpoint.unique(dim=0, return_inverse=True)
         return [torch.nonzero(view == k)[:, 0] for k in dict.fromkeys(view.tolist())]
 
     def split_views(self) -> "list[PointCloud]":
-        """Return one cloud for each camera, in the order of their first points."""
+        """Return one cloud for each camera, in the order of their first points.
+
+        Each cloud has a single `viewpoint` (3,) [m]. Without `viewpoint`, or with a single one, the
+        list holds this cloud alone.
+        """
         if self.viewpoint is None or self.viewpoint.ndim == 1:
             return [self]
         views = []
@@ -107,10 +121,17 @@ class ShapeEstimate(Value):
     """The estimated shape at query points: signed distance and normal with their uncertainty (Eqs.
     7-8 of the paper).
 
-    `distance`, its `variance`, and the `covariance` of distance (index 0) and gradient (1 to 3) are
-    in the normalised units of the paper: one unit is `shape.scale` metres. `normal` is the unit
-    gradient of the mean distance. `std_m` [m] is the calibrated standard deviation of the surface:
-    that of the distance, divided by the slope of the mean.
+    A `ShapeGP` makes it when it is called with points. All fields share the leading axes `*b` of
+    these points. Normalised units are the paper's: one unit is `shape.scale` metres.
+
+    Attributes:
+        distance: mean signed distance (*b,), normalised; negative inside the object.
+        normal: outward unit normal (*b, 3) in the frame of the cloud, the unit gradient of the mean
+            distance.
+        variance: variance (*b,) of the distance, in squared normalised units.
+        covariance: covariance (*b, 4, 4) of distance (index 0) and gradient (1 to 3), normalised.
+        std_m: calibrated standard deviation (*b,) [m] of the surface along its normal. It is the
+            standard deviation of the distance, divided by the slope of the mean.
     """
 
     distance: Float[Tensor, "*b"]
@@ -125,10 +146,18 @@ class ShapeEstimate(Value):
 class Contacts(Batch):
     """Sets of three to five contacts, one contact for each fingertip.
 
-    `points` [m] are the contact points on the object, and `normals` its outward unit normals there.
-    `variance` (Eq. 12, normalised units) and `std_m` [m] are the uncertainty of the surface at the
-    contacts, or None if it is unknown, as for contacts of another planner. All tensors have one
-    dtype.
+    b counts contact sets, and f the fingertips of a set. All is in the frame of the cloud, and all
+    tensors have one dtype. `plan_contacts` makes contacts; contacts of another planner are made
+    from `points` and `normals`.
+
+    Args:
+        points: contact points (b, f, 3) [m] on the object.
+        normals: outward unit normals (b, f, 3) of the object at these points.
+        variance: variance (b, f) of the signed distance at each contact (Eq. 12), in squared
+            normalised units. None if it is unknown.
+        std_m: standard deviation (b, f) [m] of the surface at each contact; None if it is unknown.
+
+    Raises `BadArgument` for tensors of different dtypes, or of shapes that do not fit together.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> contacts = load_shipped_grasp("jug", "allegro").contacts
@@ -156,7 +185,11 @@ class Contacts(Batch):
         return self.points.shape[-2]
 
     def require_std(self) -> Float[Tensor, "b f"]:
-        """Return `std_m` [m]; raise `BadArgument` if it is None."""
+        """Return the field `std_m` (b, f) [m], the standard deviation of the surface at each
+        contact.
+
+        Raises `BadArgument` if it is None.
+        """
         if self.std_m is None:
             raise BadArgument(
                 "contacts.std_m",
@@ -171,11 +204,18 @@ class Contacts(Batch):
 class ContactPlan(Batch):
     """Planned contact sets, one for each initial guess, in the order of the guesses.
 
-    `coefficients` (no unit, with sum 1) are phi of Eq. (13) of the paper: weights of the edges of
-    the friction cones at which the forces balance. `quality` is Eq. (14), the distance [m] of the
-    contacts' centroid from the cloud's centre; less is better. `status` holds a `Status` code for
-    each contact set. `friction` is the friction coefficient of the cones of each set; None if it is
-    `ContactSpec.planned_friction` for all.
+    `plan_contacts` makes it. b counts contact sets, f the fingertips of a set, and e the edges of a
+    friction cone (`ContactSpec.edges`).
+
+    Attributes:
+        contacts: the contact sets, also those that violate a constraint.
+        coefficients: weights phi (b, f, e) of the edges of the friction cones, without unit and
+            with sum 1 (Eq. 13). At these weights the forces of a closed set balance.
+        quality: distance (b,) [m] of the contacts' centroid from the cloud's centre (Eq. 14); less
+            is better.
+        status: `Status` code (b,) of each set: `OK`, or the first constraint that the set violates.
+        friction: coefficient of friction (b,) of the cones of each set. None if it is
+            `ContactSpec.planned_friction` for all.
     """
 
     contacts: Annotated[Contacts, Rows("b")]
@@ -188,25 +228,39 @@ class ContactPlan(Batch):
 @checked
 @dataclasses.dataclass(frozen=True)
 class Certificate(Batch):
-    """The proof that contact sets have frictional form closure (Eq. 13), or that they have not;
-    `certify` makes it.
+    """The verdict whether each of b contact sets has frictional form closure (Eq. 13), with its
+    proof.
 
-    The columns of W are the wrenches along the edges of the friction cones, with torques divided by
-    the radius of the contacts; phi are their coefficients. W, phi and the first five fields have no
-    unit. `margin` is the largest s with W phi = 0, sum phi = 1, phi >= s. `rank_ratio` is the
-    smallest over the largest singular value of W. `residual` is the largest |W phi|. `closed`,
-    which means force closure, needs a margin clearly above 0 and full rank, because coincident or
-    collinear contacts satisfy Eq. (13) too. `witness` is a unit wrench w with w . v >= -margin for
-    every column v of W. Without force closure no contact force opposes w.
+    `certify` makes it, and `closed` is the answer. f counts the fingertips of a set. The wrenches w
+    of a set are the columns of W: forces along the edges of its friction cones, then their torques.
+    Torques are about the contacts' centroid, and are divided by the radius of the contacts. So
+    wrenches have no unit.
 
-    With `resist`, a task has several loads; `task_load` t (3 forces [N], 3 torques [N m]) is the
-    one that the contacts resist least, about their centroid. They resist `task_margin` (no unit)
-    times t. `task_forces` [N], with normal forces up to `task_strength` [N], balance this multiple
-    of t. `task_twist` y [1/N, 1/(N m)] with y . t = -1 proves that no such forces balance more:
-    none have a greater power along y. Without `resist` these fields are None.
+    Attributes:
+        closed: whether the set has force closure (b,). It needs a margin clearly above 0 and full
+            rank, because coincident or collinear contacts satisfy Eq. (13), too.
+        margin: the largest s (b,) for which coefficients phi >= s have W phi = 0 and sum phi = 1.
+            -inf if no coefficients balance; NaN for contacts that are not finite.
+        rank_ratio: the smallest singular value of W over its largest one (b,).
+        residual: the largest component |W phi| (b,) of the balance found; infinite if there is
+            none.
+        witness: a unit wrench v (b, 6). If the margin is at most 0 or -inf, v . w >= 0 for every
+            edge wrench w, up to rounding: no contact force opposes v. Above 0, v proves that no
+            greater margin is possible: the margin is -min(v . w) / sum(v . w - min(v . w)) over the
+            edge wrenches.
+        task_load: the load t (b, 6) that the contacts resist least, of those of `resist`: force
+            [N], then torque [N m] about the contacts' centroid.
+        task_margin: the greatest multiple (b,) of t that the contacts resist, without unit; all
+            loads are resisted if it is at least 1.
+        task_forces: contact forces (b, f, 3) [N] that balance this multiple of t, in the frame of
+            the cloud.
+        task_strength: normal force (b, f) [N] up to which each finger presses in this proof.
+        task_twist: proof (b, 6) [1/N, 1/(N m)] that no greater multiple is resisted. It is a twist
+            y with y . t = -1: no admissible forces have a greater power along y.
+        friction: coefficient of friction (b,) of the cones of each set. None if it is
+            `ContactSpec.planned_friction` for all.
 
-    `friction` is the friction coefficient of the cones of each set; None if it is that of the spec,
-    `ContactSpec.planned_friction`, for all.
+    The `task_` fields are None unless `plan_grasps` was called with `resist`.
     """
 
     margin: Annotated[Float[Tensor, "b"], ANY]
@@ -225,13 +279,19 @@ class Certificate(Batch):
 @checked
 @dataclasses.dataclass(frozen=True)
 class ContactCode(Value):
-    """The code q of sets of three contacts, which is the same in every frame (Eq. 18).
+    """The code q of sets of three contacts (Eq. 18), which is the same in every frame.
 
-    Axis 1 counts the six assignments of contacts to fingers. In assignment k finger i touches
-    contact `permutation[k, i]`. `q` holds 3 distances [m] of the contacts from their centroid, then
-    3 cosines between their normals. `obj_from_vf` [m] is the pose of the virtual frame that the
-    contacts define. Contact sets on a line or in a point have NaN, and a `status` code other than
-    OK.
+    `encode` makes it. b counts contact sets. The axis of length 6 counts the assignments of the
+    three contacts to three fingers.
+
+    Attributes:
+        q: code (b, 6, 6) of each set in each assignment: first 3 distances [m] of the contacts from
+            their centroid, then 3 cosines between their normals.
+        obj_from_vf: pose (b, 6, 4, 4) [m] of the virtual frame that the contacts define, in the
+            frame of the contacts.
+        status: `Status` code (b,) of each set. Sets on a line or in a point have another one than
+            `OK`, and NaN in `q` and `obj_from_vf`.
+        permutation: indices (6, 3): in assignment k finger i touches contact `permutation[k, i]`.
     """
 
     q: Annotated[Float[Tensor, "b 6 6"], ANY]
@@ -246,11 +306,17 @@ class IKSeeds(Batch):
     """Initial guesses for inverse kinematics: g postures whose fingertips are placed on contacts
     (Eq. 24 of the paper).
 
-    `joints` [rad] are in the order of `hand.joint_names`, and `obj_from_hand` [m] is the hand's
-    pose. `row` is the index of the contact set. Finger i is placed on contact `permutation[k, i]`
-    of the set of guess k. `energy` (no unit; less is better) is the misfit of the posture, the
-    least f_i of Eq. (21) or half the squared feature distance of a library posture. `tip_error` [m]
-    is the distance of each fingertip from its contact.
+    `nearest_postures` makes it. f counts fingertips, and h actuated joints.
+
+    Attributes:
+        joints: actuated joints (g, h) [rad or m], in the order of `hand.joint_names`.
+        obj_from_hand: pose (g, 4, 4) [m] of the hand in the frame of the contacts.
+        row: index (g,) of the contact set of each guess.
+        permutation: indices (g, f): in guess k finger i is placed on contact `permutation[k, i]` of
+            its set.
+        energy: misfit (g,) of the posture, without unit; less is better. It is the least f_i of Eq.
+            (21), or half the squared feature distance of a library posture.
+        tip_error: distance (g, f) [m] of each fingertip from its contact.
     """
 
     joints: Float[Tensor, "g h"]
@@ -285,26 +351,39 @@ class Probabilities(Tensor):
 @checked
 @dataclasses.dataclass(frozen=True)
 class Grasps(Batch):
-    """Grasps: hand configurations with their contacts, certificates and checks, best first.
+    """Grasps: hand configurations with their contacts, certificates and checks, the best grasp
+    first.
 
-    `joints` [rad] are in the order of `hand.joint_names`, and `obj_from_hand` [m] is the hand's
-    pose. Finger i touches contact i of `contacts`, which was contact `permutation[k, i]` of the
-    contact set that the planner found for grasp k. `pregrasp` [rad] are the joints of the opened
-    hand, which is at the same pose or, where its links would be in the table, above it
-    (`ik.opened_pose`). `approach` is the unit direction, in the frame of the cloud, in which the
-    opened hand moves straight there.
+    `plan_grasps` makes them, and `load_grasps` reads them. g counts grasps, f fingertips, h
+    actuated joints of the hand, and n joints of the arm. Positions are in the frame of the cloud.
+    Joints that slide have [m] in place of [rad].
 
-    `tip_error` [m] is the distance of each fingertip from its contact. `clearance` [m] is the least
-    distance of the links from the estimated surface, from each other and from the table; fingertips
-    may touch the surface. `normal_angle` [rad] is the angle between pad axis and contact direction.
-    `certificate` proves force closure, and `status` holds a `Status` code. `score` is the log-odds
-    of the predicted success, which ranks the grasps. `interval` bounds the share of such grasps
-    that held in trials (95 % over families). `known` tells for which grasps trials support the
-    prediction; None means for all. `meta` holds names, units, hashes and the seed as text.
-
-    With an arm, `arm` are its joints [rad]. `ease` holds the least joint margin (share of half a
-    joint's range) and the least manipulability, sqrt(det(J J^T)) [m^3], on the way
-    (`torchgrasp.arm`).
+    Attributes:
+        joints: actuated joints (g, h) [rad or m], in the order of `hand.joint_names`.
+        pregrasp: joints (g, h) [rad or m] of the opened hand. It is at the same pose, or above it
+            where its links would be in the table (`ik.opened_pose`).
+        approach: unit direction (g, 3) in which the opened hand moves straight to its pre-grasp.
+        obj_from_hand: pose (g, 4, 4) [m] of the hand's root link.
+        contacts: contact sets (g rows); finger i touches contact i.
+        permutation: indices (g, f): contact i was contact `permutation[k, i]` of the planned
+            contact set of grasp k.
+        tip_error: distance (g, f) [m] of each fingertip from its contact.
+        clearance: least distance (g,) [m] of the links from the estimated surface, from each other
+            and from the table; negative where they overlap. Fingertips may touch the surface.
+        normal_angle: angle (g, f) [rad] between pad axis and contact direction.
+        certificate: proof of force closure (g rows).
+        score: log-odds (g,) of the predicted success, which rank the executable grasps. Failed
+            grasps have a geometric score in its place.
+        status: `Status` code (g,): `OK` for an executable grasp, else the reason why it failed.
+        meta: names, units, hashes and the seed of the plan, as text.
+        known: mask (g,) of the grasps whose predicted success trials support; None means all.
+        interval: bounds (g, 2) of the share of such grasps that held in trials (95 % over
+            families). [0, 1] if the success is unknown, [0, 0] for failed grasps. None if there are
+            no bounds.
+        arm: joints (g, n) [rad or m] of the arm at the grasp; None without an arm.
+        ease: two numbers (g, 2) of the arm's way (`torchgrasp.arm`): the least joint margin, as a
+            share of half a joint's range, and the least manipulability, sqrt(det(J J^T)) [m^3]. 0
+            for failed grasps; None without an arm.
 
     Each index keeps the batch axis: `grasps[0]` is a batch of one, and `grasps[0].joints[0]` are
     its joints. For all joints of the hand see `Hand.expand`, for a 3D page
@@ -336,10 +415,10 @@ class Grasps(Batch):
 
     @property
     def success(self) -> Float[Tensor, "g"]:
-        """The predicted probability that each planned grasp holds; 0 if it cannot be executed, NaN
-        if it is unknown.
+        """The predicted probability (g,) that each planned grasp holds.
 
-        That of a single grasp formats as a number: `f"{grasps.best.success:.0%}"`.
+        It is 0 for a grasp that cannot be executed, and NaN if it is unknown. The success of a
+        single grasp formats as a number: `f"{grasps.best.success:.0%}"`.
         """
         likely = torch.sigmoid(self.score)
         likely = likely if self.known is None else torch.where(self.known, likely, torch.nan)
@@ -349,8 +428,9 @@ class Grasps(Batch):
     def best(self) -> "Grasps":
         """The first executable grasp, as a batch of one, which all functions take.
 
-        `best.joints[0]` are its joints, without the axis of the batch, and `float(best.success)` is
-        a number. Raises `FailedRows` with the reasons if there is none.
+        `best.joints[0]` are its joints [rad or m], without the axis of the batch.
+        `float(best.success)` is a number. Raises `FailedRows` with the reasons if there is no
+        executable grasp.
         """
         good = self.status == Status.OK
         if not len(self):
@@ -368,19 +448,24 @@ class Grasps(Batch):
 
     @property
     def table(self) -> Plane | None:
-        """The table that the planner was given, in the frame of the grasps; None without a table,
-        or if it is unknown.
+        """The table that the planner was given, in the frame of the grasps.
+
+        None if there was no table, or if it is unknown.
         """
         return None if (text := self.meta.get("table", "none")) == "none" else read_plane(text)
 
     def show(self, cloud: Any = None, hand: Any = None) -> Any:
-        """Return a table and a picture of the best grasps: a notebook shows both, `print` the
-        table.
+        """Return a sheet of the best grasps: a table as text and a picture.
 
-        With `cloud`, in any form that `plan_grasps` takes, the picture has the surface estimated
-        from it. `hand` is needed for grasps of a hand that is not shipped. The result has the PNG
-        as `picture`. Raises `BadArgument` for another hand, or for a cloud that the grasps do not
-        touch.
+        A notebook shows both, and `print` shows the table. The attribute `picture` of the sheet
+        holds the picture as PNG.
+
+        Args:
+            cloud: the cloud of the object, in any form that `plan_grasps` takes. With it the
+                picture has the surface estimated from it; None leaves the surface out.
+            hand: the hand of the grasps. It is needed only for a hand that is not shipped.
+
+        Raises `BadArgument` for another hand, or for a cloud that the grasps do not touch.
         """
         return _pages().make_sheet(self, cloud, hand)
 

@@ -42,37 +42,38 @@ class ContactSpec(Value):
     """The constraints on sets of three to five contacts (Eqs. 10-14). `ContactSpec.paper()` returns
     those of the paper.
 
-    The estimated surface differs from the true one, so the defaults keep larger margins than the
-    paper: a lower friction, a flat surface, and a distance between fingertips.
+    The estimated surface differs from the true one. So the defaults keep larger margins than the
+    paper: a lower friction, a flat surface, and a distance between fingertips. Normalised lengths
+    are the paper's: one unit is `ShapeGP.scale` metres.
 
     Args:
         friction: coefficient of friction between fingertip and object at execution, or its
             `Distribution`.
         edges: number of edges of the linearised friction cone, at least 3.
-        max_variance: largest variance of the surface at a contact, S_thresh of Eq. (12), in
-            normalised units.
-        friction_margin: share of the friction, of a distribution its mean, that is planned with:
-            contacts are planned and certified with `friction * friction_margin`. For a distribution
-            they are planned at further frictions, too (`planned_frictions`).
-        separation: least distance between the centres of two fingertips [m]; by default their
-            diameter plus 2 mm. Contacts on opposite sides of a thin object may be closer.
-        flatness: largest angle [rad] between the normals at a contact and on a ring around it; None
-            checks nothing.
-        flat_radius: radius [m] of the ring; by default the largest of `FLAT_RADII` that the object
+        max_variance: largest variance of the signed distance at a contact, S_thresh of Eq. (12), in
+            squared normalised units.
+        friction_margin: share of the mean friction that is planned with. Contacts are planned and
+            certified with `planned_friction`, which is mean friction times `friction_margin`. For a
+            distribution they are planned at further frictions, too (`planned_frictions`).
+        separation: least distance [m] between the centres of two fingertips. None means
+            `SEPARATION`, or more for wide fingertips (`least_separation`). Contacts on opposite
+            sides of a thin object may be closer.
+        flatness: largest angle [rad] between the normals at a contact and on a ring around it. None
+            means that flatness is not checked.
+        flat_radius: radius [m] of the ring. None means the largest of `FLAT_RADII` that the object
             allows.
         table: the table's `Plane` in the cloud's frame, or its height [m] along z; None means no
             table.
-        tip_radius: radius [m] of the fingertips, which may rest on the table; 0 means points. By
-            default the hand's.
-        start_radius: normalised radius of the sphere on which initial guesses are drawn (Sec. 6.2;
-            the paper: 0.1).
+        tip_radius: radius [m] of the fingertips, which may rest on the table; 0 means points. None
+            means the radius of the hand's fingertips.
+        start_radius: normalised radius of the sphere on which initial guesses are drawn (Sec. 6.2).
         fingertips: number of contacts, one for each fingertip: 3, 4 or 5.
-        contact_allowed: whether links may touch and push the target's neighbours; collisions then
+        contact_allowed: whether links may touch and push the target's neighbours. Collisions then
             only lower the predicted success.
-        region: function of points (n, 3) [m], such as a `Region`, that is negative where contacts
-            may be.
+        region: where contacts may be: a `Region`, or a function of points (n, 3) [m] that returns
+            their signed distances (n,) [m], negative there. None means anywhere.
 
-    Raises `BadArgument` for a number outside its range.
+    Raises `BadArgument` for a number outside its range, or an argument of another type.
 
     >>> ContactSpec(friction=0.8).planned_friction
     0.4
@@ -97,18 +98,24 @@ class ContactSpec(Value):
 
     @property
     def mean_friction(self) -> float:
-        """The coefficient of friction at execution, of a distribution its mean."""
+        """The coefficient of friction at execution; for a distribution its mean."""
         return Distribution.of(self.friction).mean
 
     @property
     def plane(self) -> Plane | None:
-        """The table as a plane in the cloud's frame, or None if there is no table."""
+        """The table as a `Plane` in the cloud's frame; None without a table.
+
+        A `table` that is a height [m] is the level plane z = height.
+        """
         return as_plane(self.table)
 
     @checked
     def updated(self, result: ClosureResult) -> "ContactSpec":
-        """Return the constraints of the next grasp, with what a closing has shown of the friction
+        """Return this spec with its `friction` replaced by what a closing has shown
         (`ClosureResult.friction`).
+
+        `result` is what `close_hand` returned. If it has shown nothing of the friction (None), the
+        spec is returned as it is.
         """
         if result.friction is None:
             return self
@@ -116,15 +123,19 @@ class ContactSpec(Value):
 
     @property
     def planned_friction(self) -> float:
-        """The coefficient of friction with which contacts are planned and certified."""
+        """The mean friction times `friction_margin`, a coefficient without unit.
+
+        Contacts are planned and certified with it. For a `Distribution` of friction, contacts are
+        planned at several frictions (`planned_frictions`), of which this is the first.
+        """
         return self.mean_friction * self.friction_margin
 
     @property
     def planned_frictions(self) -> tuple[float, ...]:
         """The coefficients of friction with which contact sets are planned in turn.
 
-        They are `planned_friction`, and of a distribution also its mean and its 5 % quantile. Equal
-        ones count once.
+        The first one is `planned_friction`. For a `Distribution` of friction, its mean and its 5 %
+        quantile follow. Equal coefficients count once.
 
         >>> ContactSpec(Distribution.between(0.0, 1.0)).planned_frictions
         (0.25, 0.5, 0.05)
@@ -138,21 +149,23 @@ class ContactSpec(Value):
 
     @property
     def fingertip_radius(self) -> float:
-        """The radius [m] of the fingertips; `TIP_RADIUS` if the field `tip_radius` is None."""
+        """The radius [m] of the fingertips: the field `tip_radius`, or `TIP_RADIUS` if it is None."""
         return TIP_RADIUS if self.tip_radius is None else self.tip_radius
 
     @property
     def ring_radius(self) -> float:
         """The radius [m] around a contact within which the surface must be flat.
 
-        It is the largest of `FLAT_RADII` if the field `flat_radius` is None.
+        It is the field `flat_radius`, or the largest of `FLAT_RADII` if it is None.
         """
         return FLAT_RADII[0] if self.flat_radius is None else self.flat_radius
 
     @property
     def least_separation(self) -> float:
-        """The least distance [m] between the centres of two fingertips, also where the field
-        `separation` is None.
+        """The least distance [m] between the centres of two fingertips.
+
+        It is the field `separation`. If that is None, it is `SEPARATION`, plus twice what
+        `fingertip_radius` exceeds `TIP_RADIUS` by.
         """
         wider = 2 * max(self.fingertip_radius - TIP_RADIUS, 0.0)
         return SEPARATION + wider if self.separation is None else self.separation
@@ -161,10 +174,10 @@ class ContactSpec(Value):
     def least_height(self) -> float:
         """The least height [m] of an object that fingertips on the table can grasp.
 
-        They touch its wall or its upper rim. A rim of radius q and a fingertip of radius r touch at
-        the height (r + q)(1 - s). Here s is the largest vertical part of the contact's unit normal
-        that friction allows. Rims count unless `flat_radius` is given; q is the least of
-        `FLAT_RADII`.
+        With a `flat_radius` they must touch the wall, so it is `fingertip_radius` plus
+        `flat_radius`. Otherwise they may touch the upper rim. A rim of radius q and a fingertip of
+        radius r touch at the height (r + q)(1 - s). Here q is the least of `FLAT_RADII`. s is the
+        largest vertical part of the contact's unit normal that friction allows.
         """
         if self.flat_radius is not None:
             return self.fingertip_radius + self.flat_radius
@@ -177,7 +190,7 @@ class ContactSpec(Value):
         [m].
 
         The new `tip_radius` is at least `TIP_RADIUS`. A spec whose `tip_radius` is not None is
-        returned as it is.
+        returned as it is. Raises `BadArgument` for a radius outside the range of `tip_radius`.
 
         >>> wide = ContactSpec().for_fingertips(0.015)
         >>> points = ContactSpec(tip_radius=0.0).for_fingertips(0.015)
@@ -194,12 +207,16 @@ class ContactSpec(Value):
     def relaxed(self, below: Length, radius: Length) -> "Iterator[ContactSpec]":
         """Yield weaker constraints for an object without grasps, the strictest first.
 
-        The first specs need flat areas of radii smaller than `below` [m]. If there is a table, the
-        last specs allow contacts on the object's upper rim: a fingertip on the table touches the
-        rim of a low object with an inclined normal. The estimated rim is rounder than the true one,
-        so its normals are steeper. Therefore the margins of friction and of the fingertips'
-        `radius` [m] are given up step by step. If `flatness` is None, or `flat_radius` is not None,
-        there are no such specs.
+        The first specs have a smaller `flat_radius`: each of `FLAT_RADII` that is smaller than
+        `below`. With a table, the last specs also allow contacts on the object's upper rim. There a
+        fingertip on the table touches a low object with an inclined normal. The estimated rim is
+        rounder than the true one, so its normals are steeper. Therefore the margins of friction and
+        of `tip_radius` are given up step by step. If `flatness` is None, or `flat_radius` is not
+        None, there are no such specs.
+
+        Args:
+            below: radius [m] of the flat areas that were tried before.
+            radius: radius [m] of the hand's fingertips.
 
         >>> relaxed = ContactSpec(table=0.0).relaxed(0.003, 0.0096)
         >>> [round(spec.planned_friction, 1) for spec in relaxed]
@@ -231,10 +248,21 @@ class ContactSpec(Value):
         max_variance: float = 0.03,
         table: Plane | float | None = None,
     ) -> "ContactSpec":
-        """Return the paper's constraints: full friction, contacts above the table, no least
-        separation or flatness.
+        """Return the constraints of the paper.
 
-        The arguments `friction`, `edges`, `max_variance` and `table` are those of `ContactSpec`.
+        Contacts are planned with the whole friction (`friction_margin` 1). Fingertips are points
+        (`tip_radius` 0). No least separation and no flat surface is asked for. Initial guesses are
+        drawn on the paper's sphere (`start_radius` 0.1).
+
+        Args:
+            friction: coefficient of friction between fingertip and object, or its `Distribution`.
+            edges: number of edges of the linearised friction cone, at least 3.
+            max_variance: largest variance of the signed distance at a contact, in squared
+                normalised units.
+            table: the table's `Plane` in the cloud's frame, or its height [m] along z; None means
+                no table.
+
+        Raises `BadArgument` for a number outside its range, or an argument of another type.
 
         >>> ContactSpec.paper(friction=0.8).planned_friction, ContactSpec.paper().flatness
         (0.8, None)
@@ -276,53 +304,65 @@ class TrialSpec(Value):
     """Parameters of a simulated trial: close the hand on the true object, lift it off the table,
     hold it.
 
-    The controller does not know `mass`, `density`, `friction`, `gravity`, `patch` and the numbers
-    of the simulator. Raises `BadArgument` for a number outside its range, an unknown closing,
-    holding or simulator, or options of a closing that has none. It is raised, too, for a sensor or
-    force that the closing cannot use, and for a control period below one timestep.
+    `close_hand` runs such a trial. The controller does not know `mass`, `density`, `friction`,
+    `gravity`, `patch` and the numbers of the simulator.
 
     Args:
-        closing: how the hand closes. "paper": Eqs. 25-28 as written, with forces of the hand's
-            stability model. "uncertainty": this law with the surface's calibrated standard
-            deviations, and further components (`ClosingOptions`). "fixed": the same with equal
-            gains for all contacts. "paper_position": PI position control to the contacts until 0.5
-            N, the paper's baseline. "position": PI control to goals behind the contacts.
+        closing: how the hand closes.
+            "uncertainty": Eqs. 25-28 with the surface's calibrated standard deviations, and further
+              components (`ClosingOptions`).
+            "fixed": the same with equal gains for all contacts.
+            "paper": Eqs. 25-28 as written, with forces of the hand's stability model.
+            "paper_position": PI position control to the contacts until 0.5 N, the paper's baseline.
+            "position": PI control to goals behind the contacts.
             "open_loop": joint motion from pre-grasp to grasp to squeeze.
-        holding: how the closed hand presses. "force": balanced forces. "grip": the forces that the
-            felt load and a push of 2.5 N need. "impedance": virtual springs keep the fingertips
-            together and in place. "position": joint targets are kept. "law": Eq. 25 continues. In
-            open loop the squeeze is kept. None means "grip", or "force" if `force` is given, the
-            closing is not "uncertainty" or "fixed", or a fingertip is not tactile.
-        options: components of the closing "uncertainty" or "fixed"; by default all components.
-        sensor: sensors of the fingertips; the controller knows their kind.
-        max_force: largest normal force [N] of a fingertip; None means no limit.
-        mass: mass of the object [kg]; each trial draws it from a `Distribution` by its seed.
-        friction: coefficient of friction of every contact; each trial draws it as the mass.
-        table_friction: coefficient of friction between object and table; by default `friction`.
+        holding: how the closed hand presses; after "open_loop" the squeeze is kept.
+            "grip": the forces that the felt load and a push of 2.5 N need.
+            "force": balanced forces.
+            "impedance": virtual springs keep the fingertips together and in place.
+            "position": joint targets are kept.
+            "law": Eq. 25 continues.
+            None means "grip", or "force" in three cases: `force` is given, the closing is not
+              "uncertainty" or "fixed", or a fingertip is not tactile.
+        mass: mass [kg] of the object. From a `Distribution` each trial draws it by its seed.
+        friction: coefficient of friction of every contact. From a `Distribution` each trial draws
+            it by its seed.
         gravity: acceleration by gravity [m/s^2].
         approach: length [m] of the straight path to the pre-grasp; 0 means that the hand starts
             there.
-        lift_height: height of the lift [m].
+        lift_height: height [m] of the lift.
         hold_time: time [s] after the lift.
         shake: amplitude [m] of a vertical sinusoid of 5 Hz during the hold.
-        push: force [N] at the object's centre of mass during the hold, in the world's axes, whose z
-            axis points up.
-        force: normal force of the strongest finger [N] in the closing and in the holding "force";
+        force: normal force [N] of the strongest finger in the closing and in the holding "force".
             None means 4 N, or `max_force` if it is less.
-        noise: whether the sensor is noisy; for a tactile sensor 0.1 N normal, 0.3 N tangential and
-            1.5 mm of position.
-        timestep: timestep of the simulator [s].
-        control_rate: rate of the controller [Hz].
+        noise: whether the sensors are noisy (`SensorModel.noise` scales the noise).
+        timestep: timestep [s] of the simulator.
+        control_rate: rate [Hz] of the controller.
         simulator: "sapien" or "mujoco".
-        density: density of the object [kg/m^3]; it replaces `mass` unless None.
-        patch: radius [m] of the contact patch of a fingertip; torsional friction is friction x
+        density: density [kg/m^3] of the object, in place of `mass`; None means that `mass` counts.
+        patch: radius [m] of the contact patch of a fingertip. Torsional friction is friction x
             force x patch. With 0 the contacts are hard points, as in the paper.
-        kp: stiffness of all joint drives [N m/rad]; by default the hand's own.
-        overlap: largest overlap [m] of hand and object at the start; the object's convex parts
+        kp: stiffness [N m/rad] of all joint drives; None means the hand's own.
+        overlap: largest overlap [m] of hand and object at the start. The object's convex parts
             bulge a little.
         table: whether the object stands on a table.
         self_collision: whether links of the hand collide with each other, in the pairs that the
             hand names.
+        options: components of the closing "uncertainty" or "fixed"; None means `ClosingOptions()`.
+        sensor: sensors of the fingertips; the controller knows their kind.
+        max_force: largest normal force [N] of a fingertip; None means no limit.
+        table_friction: coefficient of friction between object and table; None means `friction`.
+        push: force [N] (x, y, z) at the object's centre of mass during the hold. It is along the
+            world's axes, whose z axis points up.
+
+    Raises `BadArgument` for:
+
+    * a number outside its range, or an unknown closing, holding or simulator;
+    * `options` of a closing that has none;
+    * a closing or holding that needs more than the `sensor` measures;
+    * the holding "law" after a closing that does not follow Eq. 25;
+    * a `force` above `max_force`, or a `table_friction` above the least `friction`;
+    * a control period below one timestep.
 
     >>> TrialSpec(mass=0.3).pressing, TrialSpec(force=6.0).pressing
     ('grip', 'force')
@@ -372,7 +412,10 @@ class TrialSpec(Value):
 
     @property
     def pressing(self) -> HoldingMode:
-        """The holding mode: the field `holding`, or the default mode if it is None."""
+        """The holding mode of the trial, such as "grip" or "force".
+
+        It is the field `holding`. If that is None, it is the default that `TrialSpec` states.
+        """
         default = default_holding(self.sensor, self.closing) if self.force is None else "force"
         return self.holding or default
 
@@ -380,12 +423,18 @@ class TrialSpec(Value):
     def strongest(self) -> float:
         """The normal force [N] of the strongest finger in the closing, and in the holding mode
         "force".
+
+        It is the field `force`. If that is None, it is 4 N, or `max_force` if it is less.
         """
         return min(4.0, self.max_force or 4.0) if self.force is None else self.force
 
     @property
     def components(self) -> ClosingOptions:
-        """The options of the closing mode; all are off in a mode that takes no options."""
+        """The `ClosingOptions` with which the hand closes.
+
+        They are the field `options`, or `ClosingOptions()` if it is None. In a closing mode that
+        takes no options, all are off.
+        """
         return choose_options(self.closing, self.options)
 
 
