@@ -11,6 +11,7 @@ from torch import Tensor
 from torchgrasp.cloud.advice import Advice, judge_view
 from torchgrasp.cloud.check import FEW_POINTS, remove_duplicates
 from torchgrasp.cloud.neighbours import draw_rows, find_inliers, fit_local_planes, is_flat, nearest
+from torchgrasp.cloud.pixels import PIXELS, find_pixel_camera
 from torchgrasp.cloud.prepare import (
     FACING,
     MAX_POINTS,
@@ -119,7 +120,7 @@ def diagnose_cloud(
         check = compare_normals(view.points.double(), view.normals.double())
         if not check.oriented:
             view = PointCloud(view.points, None, view.viewpoint)
-    guessed, angle = _guess_camera(view, vertical, assumed=up is None)
+    guessed, angle = _guess_camera(whole, view, vertical, assumed=up is None)
     clean = clean_cloud(guessed)
     # Clean normals face the viewpoint by construction; given normals may be those of a whole
     # surface.
@@ -149,16 +150,23 @@ def diagnose_cloud(
     return dataclasses.replace(report, advice=(*advice, *_advise(report, is_flat(points), angle)))
 
 
-def _guess_camera(view: PointCloud, up: Vector, assumed: bool) -> tuple[PointCloud, float]:
-    """Return a view with its viewpoint, guessed if it is unknown, and the angle [deg] of the guess.
+def _guess_camera(
+    whole: PointCloud, view: PointCloud, up: Vector, assumed: bool
+) -> tuple[PointCloud, float]:
+    """Return a view with its viewpoint, estimated if it is unknown, and the angle [deg] of its
+    uncertainty.
 
-    A guess that too few of the given normals face is dropped.
+    The pixels of the `whole` cloud show it, of which `view` has only some, or it is guessed. One
+    that too few of the given normals face is dropped.
     """
     if view.viewpoint is not None:
         return view, 0.0
-    points = view.points.double()
-    seen = points[find_inliers(points)]
-    eye, angle = guess_viewpoint(seen, fit_local_planes(seen)[0], up, assumed)
+    eye = find_pixel_camera(whole.points, up)
+    angle = PIXELS.error
+    if eye is None:
+        points = view.points.double()
+        seen = points[find_inliers(points)]
+        eye, angle = guess_viewpoint(seen, fit_local_planes(seen)[0], up, assumed)
     eye = eye.to(view.points)
     if view.normals is not None and share_facing(view.points, view.normals, eye) < FACING:
         return view, 0.0
@@ -199,6 +207,7 @@ def _advise(report: CloudReport, flat: bool, angle: float) -> list[Advice]:
     sure = f"to {angle:.0f} degrees" if angle < 180.0 else "on weak evidence"
     guess = f"a camera whose position is a guess, {sure}"
     guessed = report.viewpoint is not None and not report.viewpoint_given
+    guessed &= angle > PIXELS.error
     rules = [
         (longest > DIAGNOSIS.long, scene, f"one object: {cut}"),
         (report.points > 2 * MAX_POINTS, many, f"as many: {thin}"),

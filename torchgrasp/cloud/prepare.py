@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchgrasp.cloud.check import check_cloud, remove_duplicates
 from torchgrasp.cloud.neighbours import find_inliers, fit_local_planes, fit_quadrics, nearest
+from torchgrasp.cloud.pixels import find_pixel_camera
 from torchgrasp.cloud.pose import Transform, check_rigid
 from torchgrasp.cloud.registration import align_views, compare_views
 from torchgrasp.cloud.viewpoint import guess_viewpoint
@@ -104,8 +105,9 @@ def prepare_cloud(
     random signs, with which a single view would look like a whole surface. With `clean`, outliers
     are removed, the other points are moved onto quadrics fitted around them, and all normals are
     fitted anew. Also with `clean`, a viewpoint that too few given normals face counts as missing.
-    Where normals are fitted, a missing viewpoint is estimated by `guess_viewpoint`; `up` is the
-    upward direction, or None. Raises the errors of `check_cloud`, `BadArgument` for more than 16
+    With `clean`, a missing viewpoint is that of `find_pixel_camera`, if its pixels show it; `up` is
+    the upward direction, or None. Else, and where normals are fitted, it is estimated by
+    `guess_viewpoint`. Raises the errors of `check_cloud`, `BadArgument` for more than 16
     cameras, and `TooFewPoints` for a view of fewer than 10 points.
     """
     cloud = remove_duplicates(cloud)
@@ -125,6 +127,9 @@ def prepare_cloud(
         elif clean and viewpoint is not None:
             facing = share_facing(cloud.points, normals, viewpoint)
             viewpoint = viewpoint if facing >= FACING else None
+    if clean and viewpoint is None:
+        # before points are moved: the fit of normals smooths the lattice away
+        viewpoint = _seen_by_pixels(cloud.points, normals, up)
     cloud = dataclasses.replace(cloud, normals=normals, viewpoint=viewpoint)
     if clean or normals is None:
         cloud = _fit_normals(cloud, clean, up)
@@ -141,6 +146,14 @@ def prepare_cloud(
     normals = unit(precise.normals)
     fields = precise.viewpoint, precise.frustum, precise.pose_error
     return PreparedCloud(cloud, precise.points, normals, *fields)
+
+
+def _seen_by_pixels(points: Points, normals: Points | None, up: Vector | None) -> Vector | None:
+    """Return the camera [m] that the pixels of a view show, if given normals face it."""
+    eye = find_pixel_camera(points, up)
+    if eye is None or (normals is not None and share_facing(points, normals, eye) < FACING):
+        return None
+    return eye.to(points)
 
 
 @checked

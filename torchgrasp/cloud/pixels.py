@@ -1,0 +1,147 @@
+"""The camera of a view whose pixels were kept: seen from there, the points form a regular lattice.
+
+Noise and steps of depth move a point along its ray, so the lattice stays regular however noisy the
+view is. Clouds that were resampled, averaged or thinned at random show none.
+"""
+
+import dataclasses
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchgrasp.cloud.neighbours import draw_rows, fit_local_planes, nearest
+from torchgrasp.geometry.linalg import Points, Vector, across, fibonacci_sphere, unit
+
+
+@dataclasses.dataclass(frozen=True)
+class PixelNumbers:
+    """Parameters of the search for the camera from which a cloud is regular.
+
+    The irregularity of a camera is the mean deviation of the angles between neighbouring pixels
+    from their median, over the median: about 0 for a lattice, and a third for random points.
+    """
+
+    probes: int = 500
+    """Most points at which the irregularity is taken."""
+    neighbours: int = 12
+    """Nearest points of each probe; the noise of depth moves true neighbours apart."""
+    directions: int = 800
+    """Directions over a whole sphere that are tried first; they are about 7 degrees apart."""
+    above: float = 0.1
+    """Least cosine between a direction and the one of the side: a camera is above the support."""
+    usual: float = 0.6
+    """Usual distance [m] of a camera, at which the search begins."""
+    rare: float = 0.5
+    """Share by which the irregularity counts as greater at e times this distance, or 1 / e: small
+    things hardly show how far the camera is.
+    """
+    starts: int = 2
+    """Best directions that are refined together."""
+    steps: int = 12
+    """Number of refinements; each tries a grid of 27 cameras about each of the best."""
+    narrow: float = 0.5
+    """Width of the grids, over the first, below which only the best start is refined further."""
+    narrowing: float = 0.65
+    """Ratio of the widths of one grid and the last."""
+    turn: float = 0.1
+    """Half width of the first grid [rad] across the direction."""
+    stretch: float = 0.5
+    """Half width of the first grid in the logarithm of the distance."""
+    promising: float = 0.2
+    """Irregularity of the best direction above which no search is worth while."""
+    regular: float = 0.12
+    """Greatest irregularity of a lattice: of which half the pixels may be missing."""
+    error: float = 3.0
+    """Angle [deg] within which the camera of a lattice is likely."""
+    block: int = 64
+    """Number of cameras that are compared at once, which bounds the memory."""
+
+
+PIXELS = PixelNumbers()
+
+
+def find_pixel_camera(points: Points, up: Vector | None = None) -> Vector | None:
+    """Return the camera position [m] from which points (n, 3) [m] form a regular lattice of pixels.
+
+    It is None if there is no such place. A camera on the opposite side sees nearly the same
+    lattice. So only cameras above are tried, in the direction `up`; if it is None, those on the
+    side to which the surface bulges. The origin, the camera of a cloud in its camera's frame, is
+    tried first.
+    """
+    points = points.double()
+    rows = draw_rows(len(points), PIXELS.probes).to(points.device)
+    count = min(PIXELS.neighbours + 1, len(points))
+    index = nearest(points, count, rows)[1]
+    probes = points[rows]
+    near = points[index[:, 1:]]  # (m, k, 3)
+    centre = (points.amax(0) + points.amin(0)) / 2
+    origin = torch.zeros_like(centre)
+    if float(irregularity(probes, near, origin[None])) < PIXELS.regular:
+        return origin
+    if up is None:
+        normals = fit_local_planes(points, rows)[0]
+        # either sign of a normal gives the same
+        up = unit((((probes - centre) * normals).sum(1, keepdim=True) * normals).sum(0))
+    directions = fibonacci_sphere(PIXELS.directions).to(points)
+    directions = directions[directions @ up.to(points) > PIXELS.above]
+    eyes = centre + PIXELS.usual * directions
+    score = irregularity(probes, near, eyes)
+    if not float(score.min()) < PIXELS.promising:
+        return None
+    best = torch.topk(score, min(PIXELS.starts, len(score)), largest=False).indices
+    eye, least = _refine(probes, near, centre, eyes[best])
+    return eye if least < PIXELS.regular else None
+
+
+def irregularity(
+    probes: Float[Tensor, "m 3"], near: Float[Tensor, "m k 3"], eyes: Float[Tensor, "c 3"]
+) -> Float[Tensor, "c"]:
+    """Return how irregular the pixels of c cameras are, as in `PixelNumbers`.
+
+    `probes` are m points [m], and `near` the k nearest points of each.
+    """
+    found = list[Tensor]()
+    for some in eyes.split(PIXELS.block):
+        ray = unit(probes - some[:, None])  # (b, m, 3)
+        other = unit(near - some[:, None, None])  # (b, m, k, 3)
+        # the square of the chord, which is an angle where it is small
+        apart = 2 - 2 * (other @ ray[..., None])[..., 0]
+        angle = apart.clamp_min(0.0).amin(-1).sqrt()
+        usual = angle.median(1, keepdim=True).values
+        found.append(((angle - usual).abs() / usual).mean(1))
+    return torch.cat(found).nan_to_num(torch.inf)
+
+
+def _refine(
+    probes: Float[Tensor, "m 3"],
+    near: Float[Tensor, "m k 3"],
+    centre: Vector,
+    eyes: Float[Tensor, "s 3"],
+) -> tuple[Vector, float]:
+    """Return the camera near one of the `eyes` [m] with the most regular pixels, and its
+    irregularity.
+    """
+    side = torch.linspace(-1.0, 1.0, 3).to(eyes)
+    grid = torch.cartesian_prod(side, side, side)  # (27, 3)
+    width = 1.0
+    score = eyes.new_zeros(len(eyes))
+    for _ in range(PIXELS.steps):
+        away = eyes - centre
+        distance = torch.linalg.vector_norm(away, dim=-1)
+        forward = away / distance[:, None]
+        aside = torch.stack(across(forward), 1)  # (s, 2, 3)
+        turned = forward[:, None] + PIXELS.turn * width * (grid[:, :2] @ aside)  # (s, 27, 3)
+        far = distance[:, None] * torch.exp(PIXELS.stretch * width * grid[:, 2])  # (s, 27)
+        tried = centre + far[..., None] * unit(turned)
+        score = irregularity(probes, near, tried.flatten(0, 1)).reshape(far.shape)
+        counted = score * (1 + PIXELS.rare * torch.log(far / PIXELS.usual) ** 2)
+        best = counted.argmin(1, keepdim=True)
+        eyes = torch.take_along_dim(tried, best[..., None], 1)[:, 0]
+        score = torch.take_along_dim(score, best, 1)[:, 0]
+        if width < PIXELS.narrow:
+            first = torch.take_along_dim(counted, best, 1)[:, 0].argmin()
+            eyes = eyes[first][None]
+            score = score[first][None]
+        width *= PIXELS.narrowing
+    return eyes[0], float(score[0])
