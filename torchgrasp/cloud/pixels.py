@@ -22,6 +22,8 @@ class PixelNumbers:
     from their median, over the median: about 0 for a lattice, and a third for random points.
     """
 
+    least: int = 100
+    """Fewest points that show a lattice: a few may be regular by chance."""
     probes: int = 500
     """Most points at which the irregularity is taken."""
     neighbours: int = 12
@@ -69,10 +71,11 @@ def find_pixel_camera(points: Points, up: Vector | None = None) -> Vector | None
     side to which the surface bulges. The origin, the camera of a cloud in its camera's frame, is
     tried first.
     """
+    if len(points) < PIXELS.least:
+        return None
     points = points.double()
     rows = draw_rows(len(points), PIXELS.probes).to(points.device)
-    count = min(PIXELS.neighbours + 1, len(points))
-    index = nearest(points, count, rows)[1]
+    index = nearest(points, PIXELS.neighbours + 1, rows)[1]
     probes = points[rows]
     near = points[index[:, 1:]]  # (m, k, 3)
     centre = (points.amax(0) + points.amin(0)) / 2
@@ -87,7 +90,7 @@ def find_pixel_camera(points: Points, up: Vector | None = None) -> Vector | None
     directions = directions[directions @ up.to(points) > PIXELS.above]
     eyes = centre + PIXELS.usual * directions
     score = irregularity(probes, near, eyes)
-    if not float(score.min()) < PIXELS.promising:
+    if not bool((score < PIXELS.promising).any()):
         return None
     best = torch.topk(score, min(PIXELS.starts, len(score)), largest=False).indices
     eye, least = _refine(probes, near, centre, eyes[best])
