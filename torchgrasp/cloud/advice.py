@@ -49,12 +49,12 @@ ADVICE = AdviceNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class Advice(Value):
-    """A fault of a point cloud, and how to fix it.
+    """A fault of a point cloud, and how to fix it, from `diagnose_cloud`. `str(advice)` joins both.
 
     Attributes:
         found: the fault in words.
         fix: what to do, such as the option of a command.
-        refused: whether no grasp is planned on such a cloud.
+        refused: True if no grasp is planned on such a cloud; False if planning goes on.
 
     >>> print(Advice("the cloud is empty", "look again", refused=True))
     the cloud is empty: look again

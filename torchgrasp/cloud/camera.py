@@ -53,16 +53,16 @@ def look_at(
     distance: Annotated[float, Range(0.01, 10.0)] = 0.5,
     target: "Float[Tensor, '3'] | trimesh.Trimesh | None" = None,
 ) -> Transform:
-    """Return the pose obj_from_camera (4, 4) [m] of an upright camera that looks at a target.
+    """Return the pose `obj_from_camera` (4, 4) [m] of an upright camera that looks at a target.
 
     The camera's frame has x right, y down and z forward. The vertical is the z axis of the target's
-    frame.
+    frame, in which the pose is.
 
     Args:
-        azimuth: direction of the camera, from x towards y [deg].
-        elevation: angle of the camera above the horizontal [deg], in [-89.9, 89.9].
-        distance: distance of the camera from the target [m], in [0.01, 10].
-        target: point (3,) [m] in the middle of the image; or a mesh for the centre of its box, or
+        azimuth: direction [deg] in which the camera stands, seen from the target, from x towards y.
+        elevation: angle [deg] of the camera above the horizontal, in [-89.9, 89.9].
+        distance: distance [m] of the camera from the target, in [0.01, 10].
+        target: point (3,) [m] in the middle of the image; or a mesh, for the centre of its box; or
             None for the origin.
 
     Raises `BadArgument` for an angle or a distance outside its range, and `MeshError` for a mesh
@@ -96,21 +96,28 @@ def partial_view(
     noise: bool | SensorName | SensorNoise = True,
     seed: Seed = 0,
 ) -> PointCloud:
-    """Return n points [m] of a mesh that the default camera sees, with a viewpoint and without
-    normals.
+    """Return the points of a mesh that a simulated depth camera sees, as a `PointCloud` of n
+    points.
 
-    By default the noise is that of an active stereo camera: noise and steps of the disparity, a
-    smooth bias, flying and missing pixels at rims, and surfaces that fade out at grazing angles.
-    Raises `BadArgument` for fewer than 4 points or a pose that is not rigid. Raises `MeshError` for
-    a mesh without faces, and `TooFewPoints` if the camera sees nothing of the mesh.
+    Points and `viewpoint` [m] are in the frame of the mesh. There are no normals. The camera has
+    640 x 480 pixels.
+
+    By default the noise is that of an active stereo camera. It has noise and steps of the
+    disparity, a smooth bias, and flying and missing pixels at rims. Surfaces fade out at grazing
+    angles.
 
     Args:
         mesh: surface of the object, in the object frame [m].
-        camera_pose: pose obj_from_camera (4, 4) [m] of the camera, as `look_at` returns it.
-        n: number of pixels drawn at random; if there are fewer pixels, all are returned.
-        noise: True for the default noise, False for exact depths, the name of a camera, or a
-            `SensorNoise`.
-        seed: random seed of the noise and of the choice of points.
+        camera_pose: pose `obj_from_camera` (4, 4) [m] of the camera, as `look_at` returns it.
+        n: number of pixels drawn at random, at least 4; if the camera sees fewer, all are returned.
+        noise: True for the default noise; False for exact depths; the camera "realsense",
+            "kinect_v1", "azure" or "zivid"; or a `SensorNoise`.
+        seed: seed of the noise and of the choice of points.
+
+    Raises:
+        BadArgument: fewer than 4 points; a pose that is not rigid.
+        MeshError: a mesh without faces.
+        TooFewPoints: the camera sees fewer than 4 points of the mesh.
 
     >>> import trimesh
     >>> box = trimesh.creation.box([0.06, 0.06, 0.1])

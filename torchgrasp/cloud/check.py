@@ -49,9 +49,12 @@ CLOUD = CloudNumbers()
 def check_cloud(cloud: PointCloud) -> PointCloud:
     """Return the cloud itself if it is fit for grasp planning, else raise an error.
 
-    A flat cloud is fit, too. Raises `TooFewPoints` for fewer than 4 distinct points, and
-    `SuspiciousScale` for an extent outside [5 mm, 2 m]. Raises `BadArgument` for points on one line
-    or a normal of length zero.
+    A flat cloud is fit, too.
+
+    Raises:
+        TooFewPoints: fewer than 4 distinct points.
+        SuspiciousScale: an extent outside [5 mm, 2 m], as of points in mm.
+        BadArgument: points that all coincide or lie on one line; a normal of length zero.
 
     >>> check_cloud(PointCloud(torch.rand(50, 3))).viewpoint is None
     True
@@ -76,11 +79,16 @@ def remove_duplicates(cloud: PointCloud) -> PointCloud:
 
 @checked
 def voxel_downsample(cloud: PointCloud, voxel: Annotated[float, Range(1e-5, 1.0)]) -> PointCloud:
-    """Return a thinned cloud with one point of each voxel, in the given order.
+    """Return a thinned cloud: of each voxel the one point nearest to the voxel's centre.
 
-    It is the point nearest to the voxel's centre. The grid of voxels of side `voxel` [m] starts at
-    the lowest corner of the cloud. Points are not averaged, since a mean may lie inside a thin
-    wall. Raises the errors of `check_cloud`, and `TooFewPoints` if fewer than 4 voxels hold points.
+    The points keep their order. Points are not averaged, since a mean may lie inside a thin wall.
+
+    Args:
+        cloud: the points [m].
+        voxel: side [m] of the voxels, 0.00001 to 1. Their grid starts at the lowest corner of the
+            cloud.
+
+    Raises the errors of `check_cloud`, and `TooFewPoints` if fewer than 4 voxels hold points.
 
     >>> len(voxel_downsample(PointCloud(0.1 * torch.rand(5000, 3)), 0.05)) <= 27
     True
@@ -100,10 +108,12 @@ def voxel_downsample(cloud: PointCloud, voxel: Annotated[float, Range(1e-5, 1.0)
 
 @checked
 def remove_outliers(cloud: PointCloud) -> PointCloud:
-    """Return a cloud without duplicate points and without outliers, such as flying pixels.
+    """Return the cloud without duplicate points and without outliers, such as flying pixels.
 
-    The mean distance of an outlier to its 8 nearest neighbours is above 2.5 times the median of
-    this distance. Raises the errors of `check_cloud`.
+    An outlier's mean distance to its 8 nearest neighbours is above 2.5 times (`NEAR.outlier`) the
+    median of all points.
+
+    Raises the errors of `check_cloud`.
 
     >>> points = torch.cat([0.1 * torch.rand(500, 3), torch.ones(1, 3)])
     >>> bool(remove_outliers(PointCloud(points)).points.max() < 0.2)

@@ -68,35 +68,44 @@ def cloud_from_depth(
     depth_unit: Positive | None = None,
     up: Sequence[float | int] | Tensor | np.ndarray | None = None,
 ) -> PointCloud:
-    """Return the points of a pinhole camera's depth image.
+    """Return the points [m] that a pinhole camera's depth image shows, in the object frame.
 
-    A pixel (row v, column u) of depth z is the point z ((u - cx) / fx, (v - cy) / fy, 1). A
-    polynomial distortion (plumb_bob, rational_polynomial) of a raw image is removed: the ray of a
-    pixel is the one that the lens bends to it. The warning `MendedInput` says so. The camera's
-    frame has x right, y down and z forward. Depths of 0, NaN, 65535 counts or more than 50 m are
-    not measured. The camera is the viewpoint, and the sides of the image give the frustum.
+    `camera_pose` leads to the object frame; without it, points are in the camera's frame (x right,
+    y down, z forward). The result's `viewpoint` is the camera, and its `frustum` the sides of the
+    image. It has the dtype of a depth tensor of floats, else float64.
+
+    A pixel with depth z in column u and row v shows the camera's point z ((u - cx) / fx, (v - cy) /
+    fy, 1). Columns and rows count from 0. Pixels with depth 0, NaN, 65535 counts or more than 50 m
+    were not measured, and are left out.
 
     Args:
-        depth: (h, w) or (h, w, 1), distance along the optical axis: floats in metres, or integers
-            (such as uint16) in millimetres.
-        intrinsics: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels, its 9 numbers, or a 3 x 4
-            projection matrix. Or (fx, fy, cx, cy) [pixels], or (fx, fy, cx, cy, width, height) with
-            the size of the image, which may be a crop. Or the dict or object of ROS (CameraInfo), Open3D,
-            RealSense, Zivid, Azure Kinect or BOP, with its depth_scale and distortion.
-        mask: (h, w), pixels of the object, bool or uint8 (0 is outside); None for all measured
+        depth: image (h, w) or (h, w, 1) of distances along the optical axis: floats in metres, or
+            integers (such as uint16) in millimetres.
+        intrinsics: the camera, in one of these forms:
+            - a matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels, or its 9 numbers;
+            - a 3 x 4 projection matrix;
+            - (fx, fy, cx, cy) [pixels];
+            - (fx, fy, cx, cy, width, height) with the size of the image, which may be a crop;
+            - the dict or object of ROS (CameraInfo), Open3D, RealSense, Zivid, Azure Kinect or BOP,
+              with its depth_scale and distortion.
+        mask: image (h, w) of bool or uint8, not 0 at the object's pixels; None for all measured
             pixels.
-        camera_pose: obj_from_camera (4, 4), rigid; None if the result shall be in the camera's
+        camera_pose: rigid pose `obj_from_camera` (4, 4) [m]; None for results in the camera's
             frame.
-        depth_unit: metres for one count of the depth, such as 0.00025; None for the depth_scale of
-            the intrinsics, else for the units under `depth`.
-        up: direction (3,) against gravity, in the object frame, with which the normal of a table in
-            the image is compared; None for z.
+        depth_unit: metres of one count of the depth, such as 0.00025. None means the depth_scale of
+            the intrinsics, else the units named under `depth`.
+        up: direction (3,) against gravity, in the object frame. The normal of a table in the image
+            is compared with it. None means z.
+
+    A polynomial distortion of a raw image (plumb_bob, rational_polynomial) is removed: each pixel's
+    ray is undistorted. `MendedInput` then warns that the distortion was removed.
 
     Raises:
-        BadArgument: depth that is negative or of another unit; intrinsics of another resolution, or
-            with a distortion of another model, such as a fisheye's; a mask of another size or
-            without pixels; a pose that is not rigid, is more than 100 m off, or turns a table
-            upside down.
+        BadArgument: depth that is negative or of another unit.
+        BadArgument: intrinsics of another resolution, or with a distortion of another model, such
+            as a fisheye's.
+        BadArgument: a mask of another size or without pixels.
+        BadArgument: a pose that is not rigid, is more than 100 m off, or turns a table upside down.
         TooFewPoints: fewer than 4 measured pixels.
         SuspiciousScale: an extent outside [5 mm, 2 m], as of a scene without a mask.
 

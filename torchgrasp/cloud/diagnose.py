@@ -60,7 +60,24 @@ DIAGNOSIS = DiagnosisNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class CloudReport(Value):
-    """The measured properties of a point cloud, with advice on how to improve it.
+    """The measured properties of a point cloud, with advice on how to improve it, from
+    `diagnose_cloud`.
+
+    Attributes:
+        points: number of all points.
+        measured: number of the points at which spacing, density, noise and outliers are measured.
+        size: sides (x, y, z) [m] of the cloud's box along the axes.
+        spacing: median distance [m] of a point to the nearest other point.
+        density: median density of the points [1/m2].
+        noise: median rms distance [m] of the points from planes fitted around them.
+        copies: number of coincident points beyond the first.
+        outliers: estimated number of points far from their neighbours.
+        normals: agreement of the given normals among neighbours; None without normals.
+        viewpoint: position (3,) [m] of the camera, or (points, 3) of each point's camera; None for
+            a whole surface.
+        viewpoint_given: True if the viewpoint was given; False if it is estimated.
+        facing: share [0 to 1] of the normals that face the viewpoint; 0 without one.
+        advice: faults and their fixes; refusals come first.
 
     >>> from torchgrasp import load_object
     >>> report = diagnose_cloud(load_object("jug").view)
@@ -68,19 +85,19 @@ class CloudReport(Value):
     (1000, '0.7 mm', ())
     """
 
-    points: int  # number of all points
-    measured: int  # number of the points that are measured
-    size: tuple[float, float, float]  # sides of the box along the axes [m]
-    spacing: float  # median distance to the nearest point [m]
-    density: float  # median number of points per square metre
-    noise: float  # median rms about local planes [m]
-    copies: int  # number of coincident points
-    outliers: int  # estimated number of points far from their neighbours
-    normals: NormalCheck | None  # agreement of the given normals; None without them
-    viewpoint: Float[Tensor, "*points 3"] | None  # [m]; None: a whole surface
-    viewpoint_given: bool  # whether the viewpoint was given; else it is estimated
-    facing: float  # share of normals that face the viewpoint
-    advice: tuple[Advice, ...]  # refusals come first
+    points: int
+    measured: int
+    size: tuple[float, float, float]
+    spacing: float
+    density: float
+    noise: float
+    copies: int
+    outliers: int
+    normals: NormalCheck | None
+    viewpoint: Float[Tensor, "*points 3"] | None
+    viewpoint_given: bool
+    facing: float
+    advice: tuple[Advice, ...]
 
 
 @checked
@@ -90,15 +107,19 @@ def diagnose_cloud(
     table: Plane | None = None,
     stands: bool = True,
 ) -> CloudReport:
-    """Return a report on the measured properties of a cloud, with advice on what would improve it.
+    """Return the measured properties of a cloud, with advice on what would improve it.
 
-    In a large cloud, 50 000 points are measured; 5000 of them serve the advice on camera, vertical,
-    table and bodies.
+    Args:
+        cloud: the points [m].
+        up: vector (3,) of any length that points up; None means z, unless the cloud seems to be in
+            its camera's frame.
+        table: the plane under the object; None means a level plane at the lowest point.
+        stands: True if the object stands on a table; False allows a camera below it.
 
-    `up` is a vector of any length that points up; None means z, unless the cloud seems to be in its
-    camera's frame. A `table` of None is assumed at the lowest point. With `stands` False the object
-    stands on no table, and the camera may be below it. Raises the errors of `check_cloud`, and
-    `BadArgument` for a vertical of length zero.
+    Of a larger cloud, 50,000 points (`DIAGNOSIS.measured`) are measured. 5000 of them
+    (`DIAGNOSIS.viewed`) serve the advice on camera, vertical, table and bodies.
+
+    Raises the errors of `check_cloud`, and `BadArgument` for a vertical of length zero.
 
     >>> diagnose_cloud(PointCloud(0.1 * torch.rand(500, 3), viewpoint=torch.tensor([0.0, 0.0, 1.0]))).copies
     0
@@ -175,7 +196,7 @@ def _guess_camera(
 
 @checked
 def format_report(report: CloudReport) -> str:
-    """Return a report on a cloud as text of several lines for a terminal.
+    """Return a report of `diagnose_cloud` as text of several lines for a terminal.
 
     >>> print(format_report(diagnose_cloud(PointCloud(0.1 * torch.rand(500, 3)))).splitlines()[0])
     points      500

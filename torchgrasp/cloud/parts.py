@@ -102,19 +102,21 @@ def cut_object(
     box: Float[Tensor, "2 3"] | None = None,
     gap: Annotated[float, Range(0.001, 1.0)] = PARTS.gap,
 ) -> tuple[PointCloud, Plane | None]:
-    """Return the points of one object on a support, and the plane of the support.
+    """Return (object, support): the points of one object of a scene, and the plane it stands on.
 
-    The plane is None if none was found.
+    The plane is None if no support was found. Points of the support are left out.
 
     Args:
         cloud: points [m] of a scene.
-        up: unit vector that points up.
-        point: place on or near the object [m]; points over 0.5 m away are left out. None for the
-            largest object.
-        box: two opposite corners [m] of a box along the axes; points outside are left out first.
-        gap: least distance [m] between objects.
+        up: unit vector (3,) that points up.
+        point: place (3,) [m] on or near the object. Points more than 0.5 m away (`PARTS.around`)
+            are left out. None means the object with the most points.
+        box: two opposite corners (2, 3) [m] of a box along the axes; points outside are left out
+            first. None means no box.
+        gap: least distance [m] between two objects, 0.001 to 1.
 
-    Raises `TooFewPoints` for fewer than 4 points in the box, near the point or of the object.
+    Raises `TooFewPoints` for fewer than 4 points in the box, near the point, above the plane, or of
+    the object.
 
     >>> from torchgrasp import load_scene
     >>> seen = PointCloud(load_scene().points.double())

@@ -67,12 +67,21 @@ NORMALS = NormalNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class NormalCheck(Value):
-    """The agreement of a cloud's given normals with those of neighbouring points."""
+    """How well the given normals of n points agree with the normals of neighbouring points.
 
-    flipped: Bool[Tensor, "n"]  # whether a normal opposes most of its neighbours' normals
-    opposed: float  # share of opposite normals among pairs of neighbours
-    oriented: bool  # whether the signs can be trusted
-    scaled: int  # number of normals that are not of unit length
+    `diagnose_cloud` makes it (`CloudReport.normals`).
+
+    Attributes:
+        flipped: mask (n,) of the normals that oppose most of their neighbours' normals.
+        opposed: share [0 to 1] of opposite normals among pairs of neighbours.
+        oriented: False if the signs look random: the normals are then ignored.
+        scaled: number of normals that are not of unit length.
+    """
+
+    flipped: Bool[Tensor, "n"]
+    opposed: float
+    oriented: bool
+    scaled: int
 
 
 @dataclasses.dataclass(frozen=True)
@@ -158,11 +167,13 @@ def _seen_by_pixels(points: Points, normals: Points | None, up: Vector | None) -
 
 @checked
 def estimate_normals(cloud: PointCloud) -> PointCloud:
-    """Return a cloud without duplicate points, with outward unit normals.
+    """Return the cloud without duplicate points, with outward unit normals of a fitted surface.
 
-    They are those of quadrics fitted around the points. Outward is towards the viewpoint. If the
-    viewpoint is unknown, outward is the side of the given normals. If normals are missing, too, the
-    viewpoint is estimated. Raises the errors of `check_cloud`.
+    The surface is a quadric fitted around each point. Given normals are replaced. Outward is the
+    side of the viewpoint. Without a viewpoint, outward is the side of the given normals. Without
+    both, the viewpoint is estimated, and the result has it.
+
+    Raises the errors of `check_cloud`.
 
     >>> estimate_normals(PointCloud(torch.rand(90, 3), viewpoint=torch.tensor([0.5, 0.5, 9.0]))).normals.shape
     torch.Size([90, 3])
@@ -247,19 +258,26 @@ def merge_clouds(
 ) -> PointCloud:
     """Return one cloud of several views in a common frame, with each point's normal and camera.
 
-    `estimate_normals` gives normals to a view without normals. If a view has normals but no
-    viewpoint, the result has no viewpoint. Points are denser where views overlap;
-    `voxel_downsample` evens the density. The rigid `poses` obj_from_cloud (4, 4) [m] lead from the
-    frames of the views.
+    Points are denser where views overlap; `voxel_downsample` evens the density. A view without
+    normals gets normals by `estimate_normals`. If a view has normals but no viewpoint, the result
+    has no viewpoint.
 
-    Views are compared. A distance that noise does not explain raises the warning `MendedInput`. It
-    becomes the result's `pose_error`, which widens the shape's standard deviations. With `align`,
-    views are moved onto the first by at most 50 mm and 20 degrees, and a warning says so.
+    Args:
+        clouds: k views of one object [m], each in a frame of its own.
+        poses: rigid pose `obj_from_cloud` (4, 4) [m] of each view's frame in the common frame.
+        align: whether views are moved onto the first, by at most 50 mm and 20 degrees.
+            `MendedInput` then warns.
 
-    Raises `BadArgument` for no cloud, another number of poses, a pose that is not rigid, or clouds
-    of several dtypes or devices. It is raised, too, for views that contradict each other by more
-    than about three times their noise: a pose is wrong, or the object moved. The views and the result
-    may raise the errors of `check_cloud`.
+    Views are compared. If noise does not explain their distance, `MendedInput` warns. The distance
+    becomes the result's `pose_error` [m], which widens the standard deviations of a shape.
+
+    Raises:
+        BadArgument: no cloud, another number of poses, or a pose that is not rigid.
+        BadArgument: clouds of several dtypes or devices.
+        BadArgument: views that contradict each other by more than about three times their noise. A
+            pose is wrong, or the object moved.
+
+    The views and the result may raise the errors of `check_cloud`.
 
     >>> view = PointCloud(0.1 * torch.rand(90, 3), viewpoint=torch.tensor([0.0, 0.0, 1.0]))
     >>> len(merge_clouds([view, view], [torch.eye(4), torch.eye(4)]))

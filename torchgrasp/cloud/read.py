@@ -63,7 +63,7 @@ READ = ReadNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class CloudFile(Value):
-    """A cloud read from a file, with notes on what was left out.
+    """A cloud with what else was found in its file, from `read_cloud_file`.
 
     Attributes:
         cloud: the points [m], in float64.
@@ -88,35 +88,38 @@ def read_cloud(
     viewpoint: Sequence[float | int] | Tensor | None = None,
     unit: Literal["m", "cm", "mm"] = "m",
 ) -> PointCloud:
-    """Read the point cloud of one object, in float64; `read_cloud_file` also reports what was left
-    out.
+    """Read the point cloud [m] of one object, in float64.
 
-    * `.ply`, ascii or binary: x y z, optionally nx ny nz; header lines `comment viewpoint x y z`
-      and `comment frustum` with 12 numbers give the camera, `comment table` with 4 the table. A
-      mesh gives 2000 surface points, with normals if it is closed.
-    * `.pcd`, ascii, binary or compressed: x y z, optionally normal_x normal_y normal_z; VIEWPOINT
-      gives the camera. Its default `0 0 0 1 0 0 0` counts only if the points look like those of a
-      camera in the origin.
+    `read_cloud_file` also reports what was left out, and the table in the file. The suffix tells
+    the format:
+
+    * `.ply`, ascii or binary: x y z, optionally nx ny nz. Header lines `comment viewpoint x y z`
+      and `comment frustum` with 12 numbers give the camera. `comment table` with 4 numbers gives
+      the table. A mesh gives 2000 surface points, with normals if it is closed.
+    * `.pcd`, ascii, binary or compressed: x y z, optionally normal_x normal_y normal_z. VIEWPOINT
+      gives the camera. Its default `0 0 0 1 0 0 0` counts only if a camera in the origin can have
+      seen the points.
     * `.npz`: arrays `points` (n, 3), optionally `normals` (n, 3), `viewpoint` (3,), `frustum` (4,
-      3), `table` (4,); for several views, `viewpoint` (n, 3) and `frustum` (n, 4, 3).
+      3), `table` (4,). For several views: `viewpoint` (n, 3) and `frustum` (n, 4, 3).
     * `.npy`: an (n, 3) array, or (n, 6) with normals; colours are left out. Columns 4 to 6 without
-      names are normals if they have length 1 and are across planes fitted to the points.
+      names are normals if they have length 1 and fit the surface of the points.
     * `.xyz`, `.txt`, `.csv`, `.asc`, `.pts`, `.xyzi`, `.xyzn`, `.xyzrgb`: the same as text. A first
-      line may name the columns, as in x y z nx ny nz, or hold the number of points.
+      line may name the columns (x y z nx ny nz), or hold the number of points.
 
-    Images (h, w, 3) of points are accepted. Points with NaN or infinity are left out; so are points
-    at (0, 0, 0), if there are several.
+    Images (h, w, 3) of points are accepted. Points with NaN or infinity are left out. Points at (0,
+    0, 0) are left out if there are several.
 
     Args:
         path: the file.
         viewpoint: the camera's position (3,) [m] in the cloud's frame; None for the viewpoint in
             the file.
-        unit: unit of length of the file's points and viewpoint.
+        unit: unit of length of the file's points and viewpoint, "m", "cm" or "mm".
 
     Raises:
         CloudFileError: no such file; an unknown suffix; malformed content; more than 512 MB or 5
             million points.
-        BadArgument: a viewpoint other than three numbers; points on one line.
+        BadArgument: a viewpoint other than three numbers; points on one line; a normal of length
+            zero.
         TooFewPoints: fewer than 4 distinct points.
         SuspiciousScale: an extent outside [5 mm, 2 m].
 
@@ -133,10 +136,16 @@ def read_cloud_file(
     viewpoint: Sequence[float | int] | Tensor | None = None,
     unit: Literal["m", "cm", "mm"] = "m",
 ) -> CloudFile:
-    """Read a cloud of any size, such as a whole scene, with notes on what was left out.
+    """Read a cloud of any size, such as a whole scene. Also return the file's table, and what was
+    left out.
 
-    Formats and arguments are those of `read_cloud`. Raises `CloudFileError`, `BadArgument` and
-    `TooFewPoints` as `read_cloud`.
+    Formats and arguments are those of `read_cloud`.
+
+    Raises:
+        CloudFileError: no such file; an unknown suffix; malformed content; more than 512 MB or 5
+            million points.
+        BadArgument: a viewpoint other than three finite numbers.
+        TooFewPoints: fewer than 4 measured points.
 
     >>> read_cloud_file("none.ply")
     Traceback (most recent call last):
@@ -180,12 +189,19 @@ def cloud_from_array(
     normals: np.ndarray | None = None,
     viewpoint: np.ndarray | Sequence[float | int] | None = None,
 ) -> PointCloud:
-    """Return a cloud made of NumPy arrays [m]; points that were not measured are left out.
+    """Return a cloud made of NumPy arrays [m], in float64. Points that were not measured are left
+    out.
 
-    `points` are (n, 3), or (h, w, 3) for an image; or have six columns, of which the last three are
-    normals. `normals` have the shape of the points. Colours are left out. `viewpoint` (3,) is the
-    camera's position [m], or (n, 3) that of each point; None if it is unknown. Raises the errors of
-    `check_cloud`.
+    Not measured are points with NaN or infinity, and points at (0, 0, 0) if there are several.
+
+    Args:
+        points: (n, 3), or (h, w, 3) for an image of points. Without `normals` they may have six
+            columns; the last three are then normals, or colours, which are left out.
+        normals: outward normals in the shape of `points`; None without normals.
+        viewpoint: position (3,) [m] of the camera, or (n, 3) of each point's camera; None if it is
+            unknown.
+
+    Raises the errors of `check_cloud`, and `CloudFileError` for arrays of another shape or type.
 
     >>> len(cloud_from_array(np.random.default_rng(0).random((6, 8, 3))))
     48
@@ -202,8 +218,13 @@ def cloud_from_array(
 def save_cloud(cloud: PointCloud, path: Path | str, table: Plane | None = None) -> Path:
     """Write a cloud as `.npz` (exact) or binary `.ply` (float32), atomically; return the path.
 
-    The file also holds the `table`, if given. Raises `OutputError`, and `BadArgument` for another
-    suffix, or several views for `.ply`, which has one viewpoint.
+    Args:
+        cloud: the points [m], with all that belongs to them.
+        path: a file ending in `.npz` or `.ply`.
+        table: plane that is written, too; None without one.
+
+    Raises `OutputError` if the file cannot be written, and `BadArgument` for another suffix. A
+    `.ply` file has one viewpoint, so several views for `.ply` raise `BadArgument`, too.
 
     >>> save_cloud(PointCloud(torch.rand(9, 3)), "cloud.txt")
     Traceback (most recent call last):

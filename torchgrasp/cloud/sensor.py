@@ -88,37 +88,56 @@ STILL = StillNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class SensorNoise(Value):
-    """A model of a depth camera's noise: random noise, depth steps, smooth bias, and faults.
+    """A model of a depth camera's noise: random noise, depth steps, a smooth bias, and faults.
 
-    Faults are flying and missing pixels at rims, at grazing angles and in corners.
+    `partial_view` draws such noise. Faults are flying and missing pixels at rims, at grazing angles
+    and in corners.
+
+    Args:
+        base: focal length times baseline [px m] of a stereo camera; 0 means time of flight.
+        disparity: standard deviation of the disparity [px]; only with a `base`.
+        step: difference [px] of two neighbouring values of the disparity; 0 means no steps. Only
+            with a `base`.
+        floor: standard deviation [m] at any distance; `partial_view` draws it only without a
+            `base`.
+        growth: standard deviation over the squared distance [1/m]; only without a `base`.
+        grain: width [px] of patches of similar noise; 0 means that each pixel has its own.
+        bias: standard deviation [m] of the smooth bias.
+        bias_width: width [px] of the patches of the bias.
+        shadow: whether a second eye misses surfaces beside nearer ones.
+        flying: share [0 to 1] of flying pixels at rims.
+        flight: mean distance [m] of flying pixels behind the rim.
+        lost_rim: share [0 to 1] of rim pixels without depth.
+        lost: share [0 to 1] of all pixels without depth.
+        grazing: angles [deg] between ray and normal at which pixels begin to fade, and at which all
+            are gone.
+        multipath: excess of the depth in a corner, over the corner's depth behind its surroundings.
 
     >>> float(SENSORS["kinect_v1"].sigma(torch.tensor(2.0))) < 0.007
     True
     """
 
-    base: float = 0.0  # focal length times baseline [px m]; 0: time of flight
-    disparity: float = 0.0  # standard deviation of the disparity [px]
-    step: float = 0.0  # between two values of the disparity [px]; 0: none
-    floor: float = 0.0  # standard deviation [m] at any distance
-    growth: float = 0.0  # without a base: standard deviation over the squared distance [1/m]
-    grain: float = 0.0  # width of patches of similar noise [px]; 0: each pixel has its own
-    bias: float = 0.0008  # standard deviation of the smooth bias [m]
-    bias_width: float = 12.0  # width of the patches of the bias [px]
-    shadow: bool = False  # whether a second eye misses surfaces beside nearer ones
-    flying: float = 0.25  # share of flying pixels at rims
-    flight: float = 0.008  # mean distance of flying pixels behind the rim [m]
-    lost_rim: float = 0.35  # share of rim pixels without depth
-    lost: float = 0.01  # share of all pixels without depth
-    # angle of ray and normal [deg] at which pixels fade, and are gone
+    base: float = 0.0
+    disparity: float = 0.0
+    step: float = 0.0
+    floor: float = 0.0
+    growth: float = 0.0
+    grain: float = 0.0
+    bias: float = 0.0008
+    bias_width: float = 12.0
+    shadow: bool = False
+    flying: float = 0.25
+    flight: float = 0.008
+    lost_rim: float = 0.35
+    lost: float = 0.01
     grazing: tuple[float, float] = (72.5, 87.0)
-    # excess of depth in a corner, over the corner's depth behind its surroundings
     multipath: float = 0.0
 
     @checked
     def sigma(self, depth: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-        """Return the standard deviation [m] of the random noise at a depth [m].
+        """Return the standard deviation (*b,) [m] of the random noise at each depth (*b,) [m].
 
-        Bias and steps do not count.
+        Bias and steps do not count. b stands for any batch axes.
         """
         growth = self.disparity / self.base if self.base else self.growth
         return torch.sqrt(self.floor**2 + (growth * depth * depth) ** 2)
@@ -184,8 +203,9 @@ def add_noise(
     noisy = torch.where(measured, depth, 1.0)
     if sensor.base:
         disparity = sensor.base / noisy + sensor.disparity * own
-        steps = torch.round(disparity / sensor.step) * sensor.step
-        noisy = sensor.base / steps.clamp_min(sensor.step)
+        if sensor.step:
+            disparity = torch.round(disparity / sensor.step) * sensor.step
+        noisy = sensor.base / disparity.clamp_min(sensor.step)
     else:
         noisy = noisy + sensor.sigma(noisy) * own
     noisy = noisy + patches(sensor.bias, sensor.bias_width)
@@ -269,14 +289,19 @@ def _deviation(error: Float[Tensor, "n"]) -> Float[Tensor, ""]:
 
 @checked
 def median_depth(frames: Sequence[Tensor | np.ndarray]) -> Tensor:
-    """Return the median depth of each pixel over several depth images.
+    """Return one depth image (h, w): the median of each pixel over several depth images.
 
-    Camera and scene stand still. Pixels that most frames miss (0, NaN or infinity) are 0. The unit
-    is that of the frames.
+    It has the unit and dtype of the frames. Pixels that were not measured (0, NaN or infinity) in
+    half of the frames or more are 0.
 
-    The `frames` are images (h, w) of one size and one dtype. Raises `BadArgument` for no frame, for
-    frames of several sizes or dtypes, or if camera or scene have moved in one. Then more than 5 % of
-    its pixels, or 1 % of patches of 8 x 8 pixels, differ from the median.
+    Args:
+        frames: images (h, w) of one size, one unit and one dtype, while camera and scene stand
+            still.
+
+    Raises:
+        BadArgument: no frame; frames of several sizes or dtypes.
+        BadArgument: camera or scene have moved in a frame. More than 5 % of its pixels, or 1 % of
+            patches of 8 x 8 pixels, then differ from the median (`STILL`).
 
     >>> median_depth([torch.tensor([[0.0, 0.7]]), torch.tensor([[0.0, 0.701]]), torch.tensor([[0.5, 0.702]])])
     tensor([[0.0000, 0.7010]])

@@ -16,15 +16,24 @@ from torchgrasp.scene.scene import Scene
 
 @checked
 def read_scene(path: Path | str) -> Scene:
-    """Read a scene from the arrays in a .npz file, with the checks of `Scene.from_depth`.
+    """Read a scene from a .npz file, as `save_scene` writes it, with the checks of
+    `Scene.from_depth`.
 
-    The file has `depth` (h, w) [m, or whole mm] and `intrinsics` (3, 3) or (4,). The other arrays
-    are optional: `camera_pose` (4, 4), and the objects' `labels` or the target's `mask` (h, w). The
-    label `target` and the `table` (4,), as normal and offset, are optional, too. `given` holds the
-    labels that the user made. If `given` is missing, the user made all labels, unless there is a
-    table, as in scenes that the library saved.
-    Raises the errors of `Scene.from_depth`, and `CloudFileError` for no such file, or malformed
-    content.
+    The file holds these arrays, of which only the first two are needed:
+
+    * `depth` (h, w): floats in m, or whole numbers in mm.
+    * `intrinsics`: (3, 3) or (4,) [pixels].
+    * `camera_pose` (4, 4): the pose `obj_from_camera` [m].
+    * `labels` (h, w) of the objects, or `mask` (h, w) of the target.
+    * `target`: the target's label.
+    * `table` (4,): unit normal, and offset [m]. `others` (k, 4) are other planes on which objects
+      could stand.
+    * `given`: the labels that the user made. If it is missing, the user made all labels. With a
+      table, as in scenes that the library saved, the user then made none.
+    * `bounded`: whether the border of the image is the camera's.
+
+    Raises the errors of `Scene.from_depth`. Raises `CloudFileError` for no such file, or for
+    malformed content.
 
     >>> import tempfile
     >>> from torchgrasp import load_scene
@@ -49,10 +58,12 @@ def read_scene(path: Path | str) -> Scene:
 
 @checked
 def save_scene(scene: Scene, path: Path | str) -> Path:
-    """Write a scene as .npz, atomically; `read_scene` reads it. Return the path.
+    """Write a scene as .npz, atomically, for `read_scene`. Return the path.
 
-    The file holds depth [m] in float32, labels, camera, table and target. Raises `OutputError`, and
-    `BadArgument` for another suffix.
+    The file holds depth [m] in float32, labels, camera, table and target.
+
+    Raises `BadArgument` for a path that does not end in .npz, and `OutputError` if the file cannot
+    be written.
 
     >>> import tempfile
     >>> from torchgrasp import load_scene

@@ -68,14 +68,16 @@ fitted.
 @checked
 @dataclasses.dataclass(frozen=True)
 class Occupancy(Value):
-    """The probability that each voxel is full of something that is neither the target nor the
-    table.
+    """The probability that each voxel around a target is full of something else, from
+    `estimate_occupancy`.
+
+    Something else is neither the target nor the table. The grid has x by y by z voxels.
 
     Attributes:
-        origin: centre [m] of voxel (0, 0, 0), in the scene's upright frame, where z is up.
-        spacing: distance [m] of neighbouring centres; that of voxel (i, j, k) is `origin` + (i, j,
-            k) * `spacing`.
-        probability: probability of each of the x by y by z voxels, in [0, 1].
+        origin: centre (3,) [m] of voxel (0, 0, 0), in the scene's upright frame, where z is up.
+        spacing: distance [m] of neighbouring centres. Voxel (i, j, k) has its centre at `origin` +
+            (i, j, k) * `spacing`.
+        probability: probability (x, y, z) of each voxel, in [0, 1].
 
     >>> free = Occupancy(torch.zeros(3), 0.01, torch.zeros(2, 3, 4))
     >>> free.centres[-1, -1, -1]
@@ -88,7 +90,7 @@ class Occupancy(Value):
 
     @property
     def centres(self) -> Float[Tensor, "x y z 3"]:
-        """The centres [m] of the x by y by z voxels, in the frame of `origin`."""
+        """The centres (x, y, z, 3) [m] of the x by y by z voxels, in the frame of `origin`."""
         steps = [
             torch.arange(n, dtype=torch.float64, device=self.origin.device) * self.spacing
             for n in self.probability.shape
@@ -255,10 +257,15 @@ def probability(kind: str, features: Float[Tensor, "n f"]) -> Float[Tensor, "n"]
 def estimate_occupancy(scene: Scene, target: int) -> Occupancy:
     """Return the probability that each voxel around the target is full of something else.
 
-    The table does not count. The scene must be in its upright frame, with z up. Space in front of a
-    measured depth is free. Behind an object, a model estimates the probability. Behind the target
-    and outside the image, it is a rough guess from depth and height. All work is on the CPU. Raises
-    `BadArgument` for a target without points.
+    The table does not count. Space in front of a measured depth is free. Behind an object, a model
+    estimates the probability. Behind the target and outside the image, it is a rough guess from
+    depth and height. All work is on the CPU.
+
+    Args:
+        scene: the scene in its upright frame, with z up (`Scene.to_upright`).
+        target: label of the target.
+
+    Raises `BadArgument` for a target without points.
 
     >>> from torchgrasp import load_scene
     >>> found = estimate_occupancy(load_scene(), target=1)

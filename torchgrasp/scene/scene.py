@@ -68,19 +68,23 @@ LOCAL = (
 @checked
 @dataclasses.dataclass(frozen=True)
 class Scene(Value):
-    """Objects on a table, as one camera saw them, in the given frame ("obj").
+    """Objects on a table, as one camera saw them. `plan_scene` plans grasps of its target.
 
-    Args:
-        points: every measured point [m].
-        labels: label of each point: 1, 2, ... for the objects, 0 for the table and everything else.
+    `Scene.from_depth`, `Scene.from_cloud`, `read_scene` and `load_scene` make it. All places are in
+    the frame "obj" to which the camera's pose leads.
+
+    Attributes:
+        points: the n measured points (n, 3) [m].
+        labels: label (n,) of each point: 1, 2, ... for the objects, 0 for the table and everything
+            else.
         image: the camera's depth image, which shows free space and hidden space.
-        pixels: row and column of each point in the image.
+        pixels: row and column (n, 2) of each point in the image.
         table: the plane that the objects stand on, or None if it is unknown.
         target: label of the object to be grasped, or None if none is chosen.
         others: other planes that objects could stand on, the more plausible first.
-        notes: a sentence for each given mask or label from which pixels were removed, and for a table
-            or a camera in an unlikely place.
-        given: labels whose pixels the user gave, as labels or as a mask; the library found the
+        notes: what was changed or is doubtful, a sentence each: pixels removed from a given mask or
+            label, or a table or a camera in an unlikely place.
+        given: labels whose pixels the user gave, as labels or as a mask. The library found the
             other objects.
 
     >>> from torchgrasp import load_scene
@@ -114,31 +118,37 @@ class Scene(Value):
         up: Sequence[float | int] | Tensor | np.ndarray | None = None,
         depth_unit: Positive | None = None,
     ) -> "Scene":
-        """Return the scene in a pinhole camera's depth image.
+        """Return the scene that a pinhole camera's depth image shows.
 
-        Pixels on the table and flying pixels at rims get the label 0. Without labels the objects
-        are the connected components above the table.
+        The objects are those of `labels`. Without labels they are the connected components above
+        the table. Pixels on the table and flying pixels at rims get the label 0. A `mask` or a
+        `point` chooses the target; without both there is none.
 
         Args:
-            depth: (h, w), as `cloud_from_depth` takes it: floats in metres, or integers in
-                millimetres.
-            intrinsics: (3, 3), (fx, fy, cx, cy) [pixels], or another form that `cloud_from_depth`
-                takes.
-            camera_pose: obj_from_camera (4, 4), rigid; without it results are in the camera's
+            depth: image (h, w) of depths, as `cloud_from_depth` takes it: floats in metres, or
+                integers in millimetres.
+            intrinsics: matrix (3, 3) or (fx, fy, cx, cy) [pixels], or another form that
+                `cloud_from_depth` takes, without distortion.
+            camera_pose: rigid pose `obj_from_camera` (4, 4) [m]; None for results in the camera's
                 frame.
-            mask: (h, w), not 0 at the target, accurate to a few pixels; or in another form that
-                `labels` allows.
-            labels: (h, w) of whole numbers, where 0 means no object; a picture with a colour for
-                each object; a list of masks; or COCO's run lengths.
-            point: a place on the target, as a pixel (u, v) or a point (x, y, z) [m].
-            table: a plane, or its height z [m]; by default it is fitted.
-            up: (3,), against gravity, for the fit; None allows any direction.
+            mask: image (h, w), not 0 at the target, accurate to a few pixels; or another form of
+                `labels` with one object.
+            labels: the objects' pixels, in one of these forms:
+                - an image (h, w) of whole numbers, where 0 means no object;
+                - a picture (h, w, 3 or 4) with a colour for each object, where black and
+                  transparent mean no object;
+                - a list of masks, where a smaller mask lies above a larger one;
+                - COCO's run lengths, or a dict with "annotations".
+            point: a place on the target, as a pixel (u, v), column first, or a point (x, y, z) [m].
+            table: a plane, or its height [m] along z; None means that it is fitted.
+            up: direction (3,) against gravity, for the fit; None allows any direction.
             depth_unit: metres of one count of the depth, as `cloud_from_depth` takes it.
 
         Raises:
-            BadArgument: what `cloud_from_depth` refuses; mask or labels of another size; a target
-                that is the table; a point where nothing was measured; a camera below the table; a
-                pose or a unit that the view contradicts.
+            BadArgument: what `cloud_from_depth` refuses, and an image with distortion.
+            BadArgument: mask or labels of another size; a mask beside labels or a point.
+            BadArgument: a target that is the table; a point where nothing was measured.
+            BadArgument: a camera below the table; a pose or a unit that the view contradicts.
             NoSupport: no plane is found on which objects stand.
         """
         if sum(given is not None for given in (mask, labels, point)) > 1 and mask is not None:
@@ -187,18 +197,26 @@ class Scene(Value):
         table: Plane | float | None = None,
         up: Sequence[float | int] | Tensor | np.ndarray | None = None,
     ) -> "Scene":
-        """Return the scene in a cloud of one view, projected to a pinhole image at its viewpoint.
+        """Return the scene that a cloud of one view shows, projected to a pinhole image at its
+        viewpoint.
 
-        Raises `BadArgument` for no viewpoint, or several, and labels or a mask of another size, and
-        the errors of `from_depth`.
+        Objects and target are found as in `from_depth`. A `mask`, a `box` or a `point` chooses the
+        target.
 
         Args:
-            cloud: everything that the camera saw [m], with its viewpoint.
-            labels: (n,) of whole numbers; 0 means no object.
-            mask: (n,) of bool, points of the target.
-            box: two corners (2, 3) [m] of a box along the axes, which holds the target.
-            point: a point (x, y, z) [m] of the target.
-            table, up: as in `from_depth`.
+            cloud: everything that the camera saw, n points [m], with the camera's viewpoint.
+            labels: whole numbers (n,); 0 means no object.
+            mask: mask (n,) of bool: the points of the target.
+            box: two opposite corners (2, 3) [m] of a box along the axes, which holds the target.
+            point: a place on the target, as a point (x, y, z) [m].
+            table: a plane, or its height [m] along z; None means that it is fitted.
+            up: direction (3,) against gravity, for the fit; None allows any direction.
+
+        Raises:
+            BadArgument: no viewpoint or several; labels or a mask of another size.
+            BadArgument: more than one of labels, mask and box; a mask or box without points.
+            BadArgument: the target or the camera as in `from_depth`.
+            NoSupport: no plane is found on which objects stand.
 
         >>> from torchgrasp import PointCloud, load_scene
         >>> seen = load_scene()
@@ -271,9 +289,13 @@ class Scene(Value):
     def select(self, target: int | Sequence[float | int] | Tensor | np.ndarray) -> "Scene":
         """Return the scene with another target.
 
-        The target is a label, a pixel (u, v) of the image, or a point (x, y, z) [m]. Raises
-        `BadArgument` for no such label, for a place where nothing was measured, or for a place on
-        the table.
+        Args:
+            target: a label of `things`; or a pixel (u, v) of the image, column first; or a point
+                (x, y, z) [m].
+
+        Raises `BadArgument` for no such label, for a place on the table, or for a place where
+        nothing was measured. A place counts as measured within 3 pixels (`SCENE.click`) or 10 mm
+        (`SCENE.touch`).
         """
         if isinstance(target, int) and not isinstance(target, bool):
             if target not in self.things:
@@ -303,7 +325,7 @@ class Scene(Value):
 
     @property
     def advice(self) -> tuple[str, ...]:
-        """Problems of the scene, a sentence each.
+        """Problems of the scene with their fixes, a sentence each; empty if there are none.
 
         They are several supports, objects that touch, and creases in an object. A target may also
         be cut off at the border of the image, or much hidden by another object.
@@ -355,14 +377,18 @@ class Scene(Value):
 
     @property
     def pixel_labels(self) -> Int[Tensor, "h w"]:
-        """The label of each pixel of the image; 0 where nothing was measured, too."""
+        """Label (h, w) of each pixel of the image, as in `labels`; also 0 where nothing was
+        measured.
+        """
         labels = self.labels.new_zeros(self.image.depth.shape)
         labels[self.pixels[:, 0], self.pixels[:, 1]] = self.labels
         return labels
 
     @property
     def supports(self) -> tuple[Plane, ...]:
-        """The planes that objects could stand on, the table first."""
+        """The planes that objects could stand on: `table`, then `others`. It is empty if no table
+        is known.
+        """
         return () if self.table is None else (self.table, *self.others)
 
     @property
@@ -386,19 +412,20 @@ class Scene(Value):
 
     @property
     def viewpoint(self) -> Float[Tensor, "3"]:
-        """The camera's position [m] in the frame "obj"."""
+        """The camera's position (3,) [m] in the frame "obj"."""
         return self.image.obj_from_camera[:3, 3]
 
     @property
     def things(self) -> tuple[int, ...]:
-        """The labels of the objects, ascending."""
+        """The labels of the objects, ascending, without 0."""
         return tuple(k for k in self.labels.unique().tolist() if k > 0)
 
     @checked
     def rows_of(self, label: int | None = None) -> Bool[Tensor, "n"]:
-        """Return a mask of the points of the object with a label, by default the target.
+        """Return a mask (n,) of the points of the object with the given label.
 
-        It is all False if there is no target.
+        None means the target. Without a target, and for a label without points, the mask is all
+        False.
         """
         label = self.target if label is None else label
         return (
@@ -409,10 +436,12 @@ class Scene(Value):
 
     @checked
     def cloud(self, label: int | None = None) -> PointCloud:
-        """Return the points [m] of an object, by default the target, with the camera as viewpoint.
+        """Return the points [m] of the object with the given label, with the camera as viewpoint.
 
-        `label` is that of the object. Raises `BadArgument` for a label without points or no target,
-        and `TooFewPoints` for fewer than 4 points.
+        None means the target. The cloud is in the frame "obj".
+
+        Raises `BadArgument` for a label without points, or for None without a target. Raises
+        `TooFewPoints` for fewer than 4 points.
         """
         rows = self.rows_of(label)
         frustum = self.image.frustum
@@ -424,10 +453,13 @@ class Scene(Value):
 
     @checked
     def to_upright(self, obj_from_upright: Pose) -> "Scene":
-        """Return the scene in an upright frame, where the table is the plane z = 0.
+        """Return the scene in an upright frame, in which the table is the plane z = 0.
 
-        Coordinates are rounded. `obj_from_upright` (4, 4) [m] is the pose of the upright frame in
-        the scene's frame "obj".
+        Coordinates are rounded, and `others` is empty.
+
+        Args:
+            obj_from_upright: pose (4, 4) [m] of the upright frame in the frame "obj". Its z axis
+                must be the table's normal, and its origin on the table.
         """
         obj_from_upright = obj_from_upright.double()
         return dataclasses.replace(

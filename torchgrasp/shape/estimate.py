@@ -25,7 +25,13 @@ normalised.
 
 @dataclasses.dataclass(frozen=True)
 class Normalisation(Value):
-    """A normalised frame without units: points [m] minus `center` (3,) [m], divided by `scale` [m].
+    """A frame for normalised points, which have no unit: x = (point - `center`) / `scale`.
+
+    `ShapeGP` is such a frame. One normalised unit of length is `scale` [m].
+
+    Args:
+        center: origin (3,) [m] of the normalised frame, in the cloud's frame.
+        scale: length [m] of one normalised unit.
 
     >>> frame = Normalisation(torch.tensor([0.0, 0.0, 0.1]), scale=0.05)
     >>> frame.normalise(torch.tensor([0.0, 0.0, 0.15])), frame.metres(torch.tensor([0.0, 0.0, 1.0]))
@@ -40,7 +46,10 @@ class Normalisation(Value):
         self,
         points: Float[Tensor, "*b 3"],
     ) -> Float[Tensor, "*b 3"]:
-        """Return points [m] of the cloud's frame in the normalised frame."""
+        """Return points (*b, 3) [m] of the cloud's frame as normalised points (*b, 3).
+
+        b stands for any batch axes.
+        """
         return (points - self.center.to(points)) / self.scale
 
     @checked(gradients=True)
@@ -48,31 +57,46 @@ class Normalisation(Value):
         self,
         x: Float[Tensor, "*b 3"],
     ) -> Float[Tensor, "*b 3"]:
-        """Return normalised points in the cloud's frame [m]."""
+        """Return normalised points `x` (*b, 3) as points (*b, 3) [m] in the cloud's frame.
+
+        b stands for any batch axes. It is the inverse of `normalise`.
+        """
         return x * self.scale + self.center.to(x)
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class Observations(Batch):
-    """Observed signed distances at n points, and observed normals at some of them.
+    """Observed signed distances at n points, and observed normals at some of them, for `condition`.
+
+    All lengths are normalised: one unit is `Normalisation.scale` [m].
+
+    Args:
+        x: observed points (n, 3), normalised.
+        distance: signed distance (n,) of each point from the surface, normalised, positive outside.
+        normal: outward unit normals (n, 3); rows without a normal are not used.
+        has_normal: mask (n,) of the points whose normals are observed.
+        distance_noise: standard deviation (n,) of each distance, normalised.
+        normal_noise: standard deviation (n,) of each component of a unit normal (no unit).
 
     >>> x, some = torch.eye(3), torch.ones(3)
     >>> len(Observations(x, 0 * some, x, some > 0, 0.01 * some, 0.05 * some).rows()[0])
     12
     """
 
-    x: Points  # (n, 3), normalised
-    distance: Float[Tensor, "n"]  # signed distances, normalised, positive outside
-    normal: Points  # (n, 3), outward unit normals
-    has_normal: Bool[Tensor, "n"]  # mask of the points whose normals are observed
-    distance_noise: Float[Tensor, "n"]  # standard deviation of each distance, normalised
-    normal_noise: Float[Tensor, "n"]  # standard deviation of each component of a unit normal
+    x: Points
+    distance: Float[Tensor, "n"]
+    normal: Points
+    has_normal: Bool[Tensor, "n"]
+    distance_noise: Float[Tensor, "n"]
+    normal_noise: Float[Tensor, "n"]
 
     def rows(self) -> tuple[Float[Tensor, "rows"], Float[Tensor, "rows"]]:
-        """Return (values, variances): all observed numbers, and the variances of their noise.
+        """Return (values, variances): all r observed numbers (r,), and the variances (r,) of their
+        noise.
 
-        The distances come first, then the normals by component: all x, all y, all z.
+        Here r is n plus three for each observed normal. The distances (normalised) come first. Then
+        come the normals by component: all x, all y, all z.
         """
         y = torch.cat([self.distance, self.normal[self.has_normal].T.reshape(-1)])
         noise = torch.cat([self.distance_noise, self.normal_noise[self.has_normal].repeat(3)])
@@ -80,12 +104,17 @@ class Observations(Batch):
 
     @property
     def least_noise(self) -> float:
-        """The least standard deviation of the noise of all observed numbers, normalised."""
+        """The least standard deviation of all observed numbers: of distances (normalised) and of
+        components of normals.
+        """
         every = torch.cat([self.distance_noise, self.normal_noise[self.has_normal]])
         return float(every.detach().min())
 
     def with_normals_first(self) -> "Observations":
-        """Return the observations in another order: those with normals come first."""
+        """Return the same observations in another order: those with normals come first.
+
+        Apart from that the order is kept.
+        """
         return self[torch.argsort(~self.has_normal, stable=True)]
 
 
@@ -161,24 +190,39 @@ class SurfaceJet(MeanJet):
 
 @dataclasses.dataclass(frozen=True)
 class JointEstimate(Value):
-    """The joint posterior of distance and gradient (d, w) at k points, normalised.
+    """The joint posterior of signed distance d and gradient w at k points, from `ShapeGP.joint`.
 
-    The gradient w need not have unit length. Points i and j have the block `covariance.reshape(k,
-    4, k, 4)[i, :, j]`.
+    Distances are normalised: one unit is `ShapeGP.scale` [m]. The gradient w is by normalised
+    coordinates (no unit), and need not have unit length.
+
+    Attributes:
+        mean: means (k, 4) of (d, w) at each point.
+        covariance: covariance (4 k, 4 k); its rows are (d, w) of point 0, of point 1, and so on.
+            Points i and j have the block `covariance.reshape(k, 4, k, 4)[i, :, j]`.
     """
 
     mean: Float[Tensor, "k 4"]
-    covariance: Float[Tensor, "rows rows"]  # rows = 4 k: (d, w) of point 0, of point 1, ...
+    covariance: Float[Tensor, "rows rows"]
 
 
 @dataclasses.dataclass(frozen=True)
 class ShapeDerivatives(Value):
-    """Derivatives of a `ShapeEstimate` by the query point [m]."""
+    """Derivatives of a `ShapeEstimate` by the query points [m], from `ShapeGP.differentiate`.
 
-    distance: Float[Tensor, "*b 3"]  # [normalised units / m]
-    normal: Float[Tensor, "*b 3 3"]  # `normal[i, j]` is d normal_i / d point_j [1/m]
-    variance: Float[Tensor, "*b 3"]  # [squared normalised units / m]
-    std_m: Float[Tensor, "*b 3"]  # [m / m]
+    b stands for the batch axes of the query points. One normalised unit is `ShapeGP.scale` [m].
+
+    Attributes:
+        distance: derivatives (*b, 3) of the signed distance [normalised units / m].
+        normal: derivatives (*b, 3, 3) of the unit normal [1/m]; `normal[..., i, j]` is d normal_i /
+            d point_j.
+        variance: derivatives (*b, 3) of the distance's variance [squared normalised units / m].
+        std_m: derivatives (*b, 3) of the surface's standard deviation [m / m].
+    """
+
+    distance: Float[Tensor, "*b 3"]
+    normal: Float[Tensor, "*b 3 3"]
+    variance: Float[Tensor, "*b 3"]
+    std_m: Float[Tensor, "*b 3"]
 
 
 def surface_deviation(

@@ -80,41 +80,44 @@ def fit_shape(
     kernel: KernelName | Kernel = "thin_plate",
     criterion: Criterion = "variance",
 ) -> ShapeGP:
-    """Return the Gaussian process posterior of an object's shape given a partial cloud, Eqs.
-    (2)-(9) of the paper.
+    """Return the shape of an object as a Gaussian process, given a partial cloud, Eqs. (2)-(9) of
+    the paper.
 
-    With `support` "camera" the cloud is cleaned and signed distances are true to scale. The
-    object's outline and the mirrored cloud are added as noisier observations. The shape is kept out
-    of free space and of the table.
+    The result is in the frame of the cloud. With `support` "camera" the cloud is cleaned, and
+    signed distances are true to scale. The object's outline and its estimated hidden side are added
+    as noisier observations. The shape is kept out of free space and of the table.
 
-    With "paper", as in Sec. 3.1, the cloud's centre is observed at distance -1, and 20 random
-    points around it at +1.
+    With "paper", as in Sec. 3.1, the cloud's centre is observed at distance -1. 20 random points
+    around it are observed at distance +1.
 
     Args:
         cloud: points [m] of one object from one view or several (`merge_clouds`), as in
-            `plan_grasps`. Normals, if they are given, show whether the points cover the whole
-            surface. Walls thinner than the cloud's spacing merge, but an open vessel seen from
-            above on a `table` becomes a `HollowShape` with two surfaces.
+            `plan_grasps`.
+            Normals, if they are given, show whether the points cover the whole surface.
+            Walls thinner than the cloud's spacing merge. An open vessel seen from above on a
+            `table` becomes a `HollowShape` with two surfaces.
         noise: standard deviation of an observed signed distance, in radii of the object. If
-            `support` is "paper", also of a normal.
-        budget: number of observed points: 1 inside, 20 outside, the rest the most informative of
-            the cloud. The default is 85 for "camera", which does not count points of the outline
-            and mirrored points, and 70 for "paper". "sure", the paper's rule, adds points until no
-            point's variance exceeds `noise`, at most 1000.
+            `support` is "paper", also of a component of a normal.
+        budget: number of observed points. It counts at most 1 inside, 20 outside, and the most
+            informative of the cloud. Points of the outline and of the hidden side do not count.
+            None means 85 for "camera" (`SHAPE.camera`) and 70 for "paper" (`SHAPE.paper`).
+            "sure", the paper's rule, adds points until no point's variance (squared normalised
+            units) exceeds `noise`, but at most 1000 (`SHAPE.budget`).
         psi_scale: ratio of the kernel's length psi to the longest distance between observed points;
             below 1.34 the covariance may be indefinite.
         support: observations in addition to the cloud's points, "camera" or "paper"; see above.
-        seed: random seed.
-        table: the table's plane, or its height [m] along z; only "camera" uses it.
-        kernel: "thin_plate", "matern52" or "rbf", whose length psi sets (`kernel_by_name`); or your
-            own `Kernel` of normalised distances.
+        seed: seed of the random draws.
+        table: the table's plane, or its height [m] along z; None means no table. Only "camera"
+            keeps the shape out of it.
+        kernel: "thin_plate", "matern52" or "rbf", whose length follows from psi; or your own
+            `Kernel` of normalised distances.
         criterion: what is greatest at the most informative point: the "variance" of its distance,
             the "error" |mean distance|, or "both", |error| + 2 sqrt(variance).
 
     Raises:
-        BadArgument: an argument out of range; a table above the object's foot; a cloud that
-            `prepare_cloud` refuses; a view that is not wholly in front of its camera; for "camera"
-            a whole surface without normals.
+        BadArgument: an argument out of range; a table above the object's foot; a cloud that cannot
+            be prepared; a view that is not wholly in front of its camera; for "camera" a whole
+            surface without normals; a kernel whose profile requires a gradient (use `condition`).
         TooFewPoints: fewer than 4 distinct points, or fewer than 10 of one of several views.
         IndefiniteCovariance: `psi_scale` is too small, or the kernel too long for the noise.
 
@@ -254,21 +257,25 @@ def condition(
 ) -> ShapeGP:
     """Return the posterior of a shape given normalised observations, Eqs. (7)-(9) of the paper.
 
-    The posterior is differentiable, to any order, in all tensors of the observations, in the
-    frame's centre and in tensors that the kernel's profile uses. The length psi of a kernel by name
-    and the domain's radius are constants. Raises `BadArgument` for an unknown kernel or points
-    inside torch.vmap, and `IndefiniteCovariance` if psi is too small for these observations.
+    It is differentiable, to any order, in the observations, in the frame's centre, and in tensors
+    of the kernel's profile. The length psi of a kernel by name and the domain's radius are
+    constants.
 
     Args:
-        observations: signed distances and normals at points, with their noise, all normalised.
-            torch.vmap may map over distances, normals and noise. Then `IndefiniteCovariance` is not
-            raised, and the estimate is NaN.
-        normalisation: centre and scale of the normalised frame.
-        cloud: the points that the camera saw [m].
-        psi_scale: ratio of the kernel's length psi to the longest distance between observed points;
-            the paper's value 1 makes the covariance indefinite.
+        observations: signed distances and normals at n points, with their noise, all normalised.
+            torch.vmap may map over distances, normals and noise.
+        normalisation: centre and scale [m] of the normalised frame.
+        cloud: the points [m] that the camera saw, in the frame of `normalisation.center`.
+        psi_scale: ratio of the kernel's length psi to the longest distance between observed points.
+            The paper's value 1 makes the covariance indefinite.
         std_factor: ratio of the surface's true deviations to the posterior's standard deviations.
-        kernel: a name that `kernel_by_name` takes, or any `Kernel` of normalised distances.
+        kernel: "thin_plate", "matern52" or "rbf", whose length follows from psi; or your own
+            `Kernel` of normalised distances.
+
+    Raises:
+        BadArgument: an unknown kernel; points or `has_normal` inside torch.vmap.
+        IndefiniteCovariance: `psi_scale` is too small for these observations. Inside torch.vmap it
+            is not raised, and the estimate is NaN.
 
     >>> x = torch.cat([torch.eye(3), -torch.eye(3)]).double() / 2
     >>> noise = torch.full((6,), 0.01).double()

@@ -51,21 +51,38 @@ DOMAIN = DomainNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class ShapeGP(Posterior, Normalisation):
-    """The posterior of an object's signed distance function, Eq. (1) of the paper, as `fit_shape`
-    returns it.
+    """An object's shape as a Gaussian process over its signed distance, Eq. (1) of the paper.
 
-    All methods but `update` are differentiable in the points to any order, and twice at observed
-    points, where the thin plate's normals have one derivative only. `update` refuses points that
-    require a gradient.
+    `fit_shape` makes it. `predict` returns distance, normal and uncertainty at points [m] in the
+    cloud's frame. Methods that take "normalised points" take results of `normalise`. One normalised
+    unit of length is `scale` [m].
 
-    Args:
+    n counts observed points, and r observed numbers: n distances, and three for each observed
+    normal.
+
+    Attributes:
+        x: observed points (n, 3), normalised, those with normals first.
+        has_normal: mask (n,) of the points with observed normals.
+        weights: (K + noise)^-1 y (r,) of the observed numbers y: distances, then normals by
+            component.
+        factor: lower Cholesky factor (r, r) of K + noise, the covariance of the observed numbers.
+        order: index (r,) in `weights` of each row of `factor`; None if both have the same order.
+        kernel: covariance function of the signed distance, by normalised distance.
+        center: origin (3,) [m] of the normalised frame, in the cloud's frame.
+        scale: length [m] of one normalised unit.
         psi: the kernel's length psi, normalised.
-        domain_radius: radius, normalised, of the ball in which the posterior is valid.
+        domain_radius: radius, normalised, of the domain: the ball around `center` in which the
+            posterior is valid.
         std_factor: ratio of the surface's true deviations to the posterior's standard deviations,
             calibrated on known objects.
-        cloud: the points that the camera saw, after cleaning.
+        cloud: the points [m] that the camera saw, after cleaning.
         kind: how the hidden side was completed: "ball", "revolution", "mirrored", "vessel", "guess"
-            (from the outline alone), "cut off" (by the image border), or "whole" (no hidden side).
+            (from the outline alone, or not at all), "cut off" (by the image border), or "whole" (no
+            hidden side).
+
+    Evaluating methods are differentiable in the points to any order. At observed points they are
+    twice differentiable, and normals of a thin plate once. `update` refuses points that require a
+    gradient.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> view = load_object("jug").view
@@ -92,11 +109,20 @@ class ShapeGP(Posterior, Normalisation):
         psi: Positive,
         std_factor: Positive = 1.0,
     ) -> "ShapeGP":
-        """Return the shape of a posterior in the normalised frame `frame`, with the seen points
-        `cloud` [m].
+        """Return the shape of a given posterior in the given normalised frame; `condition` calls
+        it.
 
-        `psi` is the kernel's length, normalised, and `std_factor` the ratio of the surface's true
-        deviations to the posterior's. The domain follows from kernel and observations.
+        The domain's radius is the smaller of two lengths. One is half the kernel's `diameter`. The
+        other is `DOMAIN.reach` times the greatest distance of an observed point from the centre.
+
+        Args:
+            posterior: observed points, weights and Cholesky factor, all normalised, as another
+                shape has them.
+            frame: the normalised frame.
+            cloud: the seen points [m].
+            psi: the kernel's length, normalised.
+            std_factor: ratio of the surface's true deviations to the posterior's standard
+                deviations.
         """
         away = torch.linalg.vector_norm(posterior.x.detach(), dim=-1)
         reach = DOMAIN.reach * float(away.max())
@@ -105,8 +131,9 @@ class ShapeGP(Posterior, Normalisation):
         return cls(**fields, psi=psi, domain_radius=radius, std_factor=std_factor, cloud=cloud)
 
     def to(self, *args: Any, **kwargs: Any) -> "ShapeGP":
-        """Return the shape on another device, always in float64, which its condition number
-        requires.
+        """Return the shape on another device, given as in `torch.Tensor.to`.
+
+        The dtype stays float64, which the covariance requires; another given dtype is ignored.
         """
         check_moved(*args, **kwargs)
         device = torch.empty(0, device=self.x.device).to(*args, **kwargs).device
@@ -114,21 +141,24 @@ class ShapeGP(Posterior, Normalisation):
 
     @property
     def device(self) -> torch.device:
-        """The device of the shape; planners put their points there."""
+        """The device of the shape's tensors. Planners put their points there."""
         return self.x.device
 
     @property
     def walls(self) -> "tuple[ShapeGP, ...]":
         """The surfaces that enclose the material, each as a shape of its own.
 
-        An object that is not hollow has only one.
+        It is (shape,) for an object that is not hollow. A `HollowShape` has an outer and an inner
+        one.
         """
         return (self,)
 
     @checked(gradients=True)
     def wall_at(self, x: Queries) -> Bool[Tensor, "q walls"]:
-        """Return a mask of the surface among `walls` that applies at each of q normalised
+        """Return a mask (q, walls): which surface of `walls` applies at each of q normalised
         points.
+
+        Each row has one True. This shape has one surface, so all are True.
         """
         return torch.ones(len(x), 1, dtype=torch.bool, device=x.device)
 
@@ -137,22 +167,28 @@ class ShapeGP(Posterior, Normalisation):
         self,
         points: Float[Tensor, "*b 3"],
     ) -> Bool[Tensor, "*b"]:
-        """Return a mask of the points [m] in the domain, where the posterior is valid."""
+        """Return a mask (*b,) of the points (*b, 3) [m] that lie in the domain.
+
+        The domain is the ball in which the posterior is valid: `domain_radius` around `center`. b
+        stands for any batch axes.
+        """
         return torch.linalg.vector_norm(self.normalise(points), dim=-1) <= self.domain_radius
 
     @checked(gradients=True)
     def predict(self, points: Float[Tensor, "*b 3"]) -> ShapeEstimate:
-        """Return signed distance, normal and covariance at points [m] in the cloud's frame, Eqs.
-        (7)-(8) of the paper.
+        """Return signed distance, normal and covariance at points (*b, 3) [m] in the cloud's frame,
+        Eqs. (7)-(8) of the paper.
 
-        Distance, variance and covariance are normalised by `scale` [m]. The estimate has the dtype
-        of `points`, and is differentiable in the points to any order. Inside torch.vmap the domain
-        is not checked.
+        Distance, variance and covariance are normalised: one unit is `scale` [m]. `std_m` is in
+        metres. The estimate has the dtype of `points`, and is differentiable in the points to any
+        order. b stands for any batch axes.
 
-        Outside the domain, within its diameter of the centre, the distance grows outward from that
-        at the nearest point of the domain, with slope 1. Covariance and `std_m` are there the
-        prior's. Raises `BadArgument` for numbers that are not finite, or a point farther outside,
-        where a thin plate's variance is negative.
+        Points outside the domain, up to twice `domain_radius` from the centre, get a guess. There
+        the distance grows outward with slope 1, from the distance at the nearest point of the
+        domain. Covariance and `std_m` are the prior's.
+
+        Raises `BadArgument` for numbers that are not finite, and for points farther away. Inside
+        torch.vmap neither is checked.
 
         >>> from torchgrasp import fit_shape, load_object
         >>> shape = fit_shape(load_object("jug").view)
@@ -168,10 +204,13 @@ class ShapeGP(Posterior, Normalisation):
 
     @checked(gradients=True)
     def differentiate(self, points: Float[Tensor, "*b 3"]) -> ShapeDerivatives:
-        """Return the derivatives of the results of `predict` by the query points, per metre.
+        """Return the derivatives of the results of `predict` by points (*b, 3) [m] in the cloud's
+        frame.
 
-        Raises `BadArgument` for numbers that are not finite, or a point outside the domain: at its
-        edge the deviation jumps.
+        They are per metre, with the dtype of `points`. b stands for any batch axes.
+
+        Raises `BadArgument` for numbers that are not finite, and for points outside the domain. At
+        its edge the deviation jumps.
 
         >>> from torchgrasp import fit_shape, load_object
         >>> view = load_object("jug").view
@@ -195,10 +234,13 @@ class ShapeGP(Posterior, Normalisation):
 
     @checked(gradients=True)
     def joint(self, points: Float[Tensor, "k 3"]) -> JointEstimate:
-        """Return the joint posterior of distance and gradient, normalised, at k points [m], at most
-        1000.
+        """Return the joint posterior of distance and gradient at k points (k, 3) [m] in the cloud's
+        frame.
 
-        Raises the errors of `differentiate`, and `BadArgument` for more points.
+        The result is normalised: one unit is `scale` [m]. It has the dtype of `points`.
+
+        Raises `BadArgument` for numbers that are not finite, points outside the domain, or more
+        than 1000 points (`DOMAIN.joint`).
         """
         x = self._queries(points)
         if len(x) > DOMAIN.joint:
@@ -213,13 +255,17 @@ class ShapeGP(Posterior, Normalisation):
         n: Annotated[int, Range(0, 1_000_000)],
         seed: Seed = 0,
     ) -> Float[Tensor, "n k 4"]:
-        """Draw n joint samples of distance and gradient (d, w), normalised, at k points [m], at
-        most 1000.
+        """Return n random samples (n, k, 4) of distance and gradient (d, w) at k points (k, 3) [m].
 
-        Samples of one seed are differentiable in the points twice. Where points coincide, the
+        The points are in the cloud's frame. Each sample is drawn for all k points together, from
+        the posterior of `joint`. Distances are normalised: one unit is `scale` [m]. The same `seed`
+        gives the same samples.
+
+        Samples of one seed are twice differentiable in the points. Where points coincide, the
         derivatives assume that these points move together.
 
-        Raises the errors of `joint`.
+        Raises `BadArgument` for the causes of `joint`, and for n outside 0 to 1,000,000. Raises
+        `IndefiniteCovariance` if the covariance of the points is not positive semidefinite.
         """
         joint = self.joint(points.double())
         prior = float(self.prior_block()[0, 0].detach())
@@ -241,22 +287,23 @@ class ShapeGP(Posterior, Normalisation):
         noise: Positive = 0.001,
         normal_noise: Positive = 0.05,
     ) -> "ShapeGP":
-        """Return the shape given additional surface points, such as a finger's touch or a second
-        view.
+        """Return the shape given m more surface points, such as a finger's touch or a second view.
 
         The result equals the posterior of all observations at once. Kernel, domain and `cloud` do
-        not change. A view, which is 20 points or more, is compared with `cloud`. A distance that
-        noise does not explain raises the warning `MendedInput`, and increases the standard
-        deviations of both.
+        not change.
+
+        At least 20 points (`VIEWS.least`) count as a view, which is compared with `cloud` if that
+        has normals. If noise does not explain the distance of both, `MendedInput` warns, and all
+        standard deviations grow.
 
         Args:
-            points: surface points [m] in the cloud's frame.
-            normals: outward normals of any length, or None if they are unknown.
-            noise: standard deviation of a point [m] along the normal.
-            normal_noise: standard deviation of the components of a unit normal.
+            points: surface points (m, 3) [m] in the cloud's frame.
+            normals: outward normals (m, 3) of any length, or None if they are unknown.
+            noise: standard deviation [m] of a point along the normal.
+            normal_noise: standard deviation of the components of a unit normal (no unit).
 
-        Raises `BadArgument` for a wrong argument, a point outside the domain, or a view that is
-        farther off than `merge_clouds` allows.
+        Raises `BadArgument` for a wrong argument, a normal of length 0, or a point outside the
+        domain. A view that is too far from `cloud` raises it, too (limits: `merge_clouds`).
 
         >>> ball = unit(torch.randn(400, 3, generator=torch.Generator().manual_seed(0)))
         >>> from torchgrasp import fit_shape
@@ -282,11 +329,18 @@ class ShapeGP(Posterior, Normalisation):
 
     @checked
     def widened(self, points: Points, error: Float[Tensor, "n"]) -> "ShapeGP":
-        """Return the shape with standard deviations that include errors of a view's pose.
+        """Return the shape with greater standard deviations, which include the error of a view's
+        pose.
 
-        `points` (n, 3) [m] are those of the view. `error` (n,) [m] is the standard deviation of
-        each point that the pose causes. An error of the pose moves all points of a view together,
-        so more points do not reduce it.
+        An error of the pose moves all points of a view together, so more points do not reduce it.
+        At most 300 of the points (`DOMAIN.compared`) are used. All standard deviations grow by one
+        factor: `std_factor` changes.
+
+        Args:
+            points: the view's points (n, 3) [m] in the cloud's frame.
+            error: standard deviation (n,) [m] of each point that the pose causes.
+
+        Raises `BadArgument` for a used point farther than twice `domain_radius` from the centre.
         """
         rows = draw_rows(len(points), DOMAIN.compared).to(points.device)
         std_m = self.predict(points[rows]).std_m
@@ -299,16 +353,16 @@ class ShapeGP(Posterior, Normalisation):
 
     @checked
     def append(self, new: Observations) -> "ShapeGP":
-        """Return the shape given further observations in the normalised frame.
+        """Return the shape given further normalised observations, which count as those of the fit.
 
-        Kernel and domain do not change.
+        Kernel, domain and `cloud` do not change. `update` does the same for points [m].
         """
         return dataclasses.replace(self, **common_fields(append_observations(self, new), Posterior))
 
     @checked
     def moved(self, b_from_a: Pose) -> "ShapeGP":
-        """Return the shape in frame b, given the rigid transform `b_from_a` [m] from its own frame
-        a.
+        """Return the shape in frame b, given the rigid transform `b_from_a` (4, 4) [m] from its own
+        frame a.
         """
         rotation = b_from_a[:3, :3].to(self.x)
         n = len(self.x)

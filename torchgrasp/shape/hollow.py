@@ -49,13 +49,20 @@ TIE_WALLS = TieNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class HollowShape(ShapeGP):
-    """The shape of an open vessel: the material between an outer and an inner surface, each a
-    Gaussian process.
+    """The shape of an open vessel: the material between an outer and an inner surface.
 
-    A single smooth field cannot change its sign twice within a thin wall. At every point the
-    surface with the greater mean distance gives distance, normal and covariance. Errors of the two
-    surfaces are independent. The signed distance of the `inner` surface is positive in the vessel's
-    cavity and negative around the cavity.
+    `fit_shape` returns it for an upright open vessel seen from above on a `table`. It has all
+    methods of `ShapeGP`. Each surface is a Gaussian process, and both share one normalised frame.
+    One smooth field cannot change its sign twice within a thin wall.
+
+    At each point one surface applies: the surface with the greater mean signed distance. Distance,
+    normal and covariance are those of this surface. The errors of the two surfaces are independent.
+
+    The attributes of `ShapeGP` describe the outer surface, but `cloud` holds the points of both.
+
+    Attributes:
+        inner: the inner surface; its signed distance is positive in the cavity and negative around
+            the cavity.
 
     >>> import trimesh
     >>> from torchgrasp import fit_shape
@@ -71,9 +78,10 @@ class HollowShape(ShapeGP):
     @classmethod
     @checked(gradients=True)
     def join(cls, outer: ShapeGP, inner: ShapeGP, cloud: PointCloud) -> "HollowShape":
-        """Return the vessel with two surfaces that share a normalised frame.
+        """Return the vessel with an `outer` and an `inner` surface in the same normalised frame.
 
-        `cloud` holds the seen points [m] of both.
+        `cloud` holds the seen points [m] of both surfaces. The domain is the smaller of both
+        domains.
         """
         fields = common_fields(outer, ShapeGP)
         fields["cloud"] = cloud
@@ -87,26 +95,30 @@ class HollowShape(ShapeGP):
 
     @property
     def walls(self) -> tuple[ShapeGP, ...]:
-        """The outer and the inner surface of the hollow object."""
+        """The two surfaces of the vessel: (outer, inner)."""
         return self.outer, self.inner
 
     @checked(gradients=True)
     def wall_at(self, x: Queries) -> Bool[Tensor, "q walls"]:
-        """Return a mask (q, 2) of the surface, outer or inner, that applies at each of q normalised
+        """Return a mask (q, 2): which surface, outer or inner, applies at each of q normalised
         points.
+
+        Each row has one True. The points `x` are (q, 3).
         """
         inner = self.inner.mean(x) > self.outer.mean(x)
         return torch.stack([~inner, inner], 1)
 
     @checked(gradients=True)
     def mean(self, x: Queries) -> Float[Tensor, "q"]:
-        """Return the mean signed distance, normalised, at q normalised points."""
+        """Return the mean signed distance (q,), normalised, at q normalised points `x` (q, 3)."""
         return torch.maximum(self.outer.mean(x), self.inner.mean(x))
 
     @checked(gradients=True)
     def mean_and_gradient(self, x: Queries) -> MeanAndGradient:
-        """Return (distance, gradient): the mean signed distance and its gradient at q normalised
-        points.
+        """Return (distance, gradient): the mean signed distance (q,) and its gradient (q, 3).
+
+        They are at q normalised points `x` (q, 3). The distance is normalised, and the gradient is
+        by normalised coordinates (no unit).
         """
         a, slope_a = self.outer.mean_and_gradient(x)
         b, slope_b = self.inner.mean_and_gradient(x)
@@ -115,8 +127,11 @@ class HollowShape(ShapeGP):
 
     @checked(gradients=True)
     def estimate(self, x: Queries) -> Moments:
-        """Return mean (q, 4) and covariance (q, 4, 4) of distance and gradient (d, w) at q
-        normalised points.
+        """Return mean (q, 4) and covariance (q, 4, 4) of signed distance and gradient (d, w) at
+        each point.
+
+        The q points `x` (q, 3) are normalised, and so is the result. Each point has the result of
+        the surface that applies there.
         """
         parts, merge = self._by_wall(x, lambda wall, own: wall.estimate(own))
         return tuple(map(merge, *parts))  # pyright: ignore[reportReturnType]
@@ -129,21 +144,34 @@ class HollowShape(ShapeGP):
 
     @checked(gradients=True)
     def jet(self, x: Queries) -> SurfaceJet:
-        """Return mean and variance of the signed distance with their derivatives, at normalised
-        points.
+        """Return mean and variance of the signed distance with derivatives, at q normalised points
+        `x` (q, 3).
+
+        The mean has first and second derivatives, the variance the first. All are by normalised
+        coordinates, as in `ShapeGP.jet`.
         """
         parts, merge = self._by_wall(x, lambda wall, own: wall.jet(own))
         return map_tensors(merge, *parts)
 
     @checked(gradients=True)
     def mean_jet(self, x: Queries) -> MeanJet:
-        """Return the mean signed distance with its derivatives, at normalised points."""
+        """Return the mean signed distance with first and second derivatives, at q normalised points
+        `x` (q, 3).
+
+        All are by normalised coordinates: `distance` (q,), `gradient` (q, 3) and `hessian` (q, 3,
+        3).
+        """
         parts, merge = self._by_wall(x, lambda wall, own: wall.mean_jet(own))
         return map_tensors(merge, *parts)
 
     @checked(gradients=True)
     def joint_at(self, x: Float[Tensor, "k 3"]) -> JointEstimate:
-        """Return the joint posterior of distance and gradient (d, w) at k normalised points."""
+        """Return the joint posterior of distance and gradient (d, w) at k normalised points `x` (k,
+        3).
+
+        It is normalised. Points at which different surfaces apply have covariance 0. It is `joint`
+        without a limit of the number of points and without a check of the domain.
+        """
         outer = self.outer.joint_at(x)
         inner = self.inner.joint_at(x)
         owner = self.wall_at(x)
@@ -159,7 +187,7 @@ class HollowShape(ShapeGP):
 
     @checked
     def append(self, new: Observations) -> "HollowShape":
-        """Return the shape given further normalised observations.
+        """Return the vessel given further normalised observations.
 
         Each observation changes the surface, outer or inner, that applies at its point.
         """
@@ -170,8 +198,8 @@ class HollowShape(ShapeGP):
 
     @checked
     def moved(self, b_from_a: Pose) -> "HollowShape":
-        """Return the shape in frame b, given the rigid transform `b_from_a` [m] from its own frame
-        a.
+        """Return the vessel in frame b, given the rigid transform `b_from_a` (4, 4) [m] from its
+        own frame a.
         """
         outer = self.outer.moved(b_from_a)
         return self.join(outer, self.inner.moved(b_from_a), outer.cloud)

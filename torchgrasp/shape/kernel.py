@@ -51,20 +51,21 @@ PROFILE = ProfileNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class Kernel:
-    """A radial kernel k(r) of normalised distances r, with its derivatives by r^2 / 2.
+    """A radial kernel: the covariance k(r) of the signed distances at two points a normalised
+    distance r apart.
 
-    Each derivative is (1/r) d/dr of the one before: k, k'/r, (k'/r)'/r, and so on; they are not k',
-    k'', k'''. Autograd of the profile defines them. Gradients also reach tensors that the profile
-    itself uses, such as a length.
+    Use `thin_plate_kernel`, `matern52_kernel` or `rbf_kernel`, or your own profile. `fit_shape` and
+    `condition` take it. Gradients also reach tensors that the profile itself uses, such as a
+    length.
 
     Args:
-        profile: the function k(r).
-        diameter: diameter of the ball, normalised, within which k is a covariance; infinite if it
-            is a covariance everywhere.
+        profile: the function k(r), elementwise on a tensor of distances r >= 0.
+        diameter: diameter, normalised, of the ball within which k is a covariance; infinite if it
+            is one everywhere.
         remedy: fix that the error suggests if the covariance is not positive definite.
-        closed_form: function of `r` and `count` that returns these derivatives faster, or False. It
-            serves plain tensors; where a gradient is needed, the profile's derivatives are taken by
-            autograd.
+        closed_form: function of `r` and `count` that returns the results of `derivatives` faster;
+            False means autograd of the profile. Where a gradient is needed, autograd is used in any
+            case.
 
     >>> kernel = Kernel(lambda r: (1 + r) * torch.exp(-r))
     >>> [round(float(s), 4) for s in kernel.derivatives(torch.ones(1, dtype=torch.float64), 4)]
@@ -82,10 +83,13 @@ class Kernel:
         r: Float[Tensor, "*s"],
         count: Orders,
     ) -> tuple[Float[Tensor, "*s"], ...]:
-        """Return the first `count` (1 to 4) of k and its derivatives by r^2 / 2 at distances r,
-        elementwise.
+        """Return `count` tensors (1 to 4): k(r), then its first derivatives by r^2 / 2.
 
-        `differentiate` says more about them.
+        Each derivative is (1/r) d/dr of the one before: k, k'/r, (k'/r)'/r, and so on. They are not
+        k', k'', k'''. `r` holds normalised distances of any shape, and each tensor has this shape.
+
+        The results are differentiable. At r = 0 infinite derivatives count as 0, and the third is
+        not reliable.
         """
         if self.closed_form and is_plain(r):
             return self.closed_form(r, count)
@@ -172,9 +176,11 @@ def thin_plate(
 
 @checked
 def thin_plate_kernel(psi: Positive, closed_form: bool = True) -> Kernel:
-    """Return the thin plate kernel 2 r^3 - 3 psi r^2 + psi^3, with the normalised length `psi`.
+    """Return the thin plate kernel k(r) = 2 r^3 - 3 psi r^2 + psi^3, Eq. (6) of the paper.
 
-    Its derivatives are in closed form, or by autograd of the profile if `closed_form` is False.
+    Args:
+        psi: the kernel's length, normalised. k is a covariance in a ball of diameter 3/4 `psi`.
+        closed_form: whether derivatives are in closed form; False means autograd of the profile.
 
     >>> kernel = thin_plate_kernel(psi=2.0)
     >>> kernel.diameter
@@ -209,9 +215,11 @@ def differentiate_thin_plate(
 
 @checked
 def matern52_kernel(length: Positive, variance: Positive = 1.0) -> Kernel:
-    """Return the Matern 5/2 kernel variance (1 + s + s^2 / 3) exp(-s), with s = sqrt(5) r / length.
+    """Return the Matern 5/2 kernel k(r) = variance (1 + s + s^2 / 3) exp(-s), with s = sqrt(5) r /
+    length.
 
-    The length is normalised, the variance in squared normalised units.
+    `length` is normalised. `variance` is the prior variance of the signed distance, in squared
+    normalised units.
 
     >>> float(matern52_kernel(1.0).profile(torch.zeros(())))
     1.0
@@ -237,9 +245,10 @@ def matern52_kernel(length: Positive, variance: Positive = 1.0) -> Kernel:
 
 @checked
 def rbf_kernel(length: Positive, variance: Positive = 1.0) -> Kernel:
-    """Return the squared exponential kernel: variance exp(-r^2 / (2 length^2)).
+    """Return the squared exponential kernel k(r) = variance exp(-r^2 / (2 length^2)).
 
-    The length is normalised, the variance in squared normalised units.
+    `length` is normalised. `variance` is the prior variance of the signed distance, in squared
+    normalised units.
 
     >>> float(rbf_kernel(1.0).profile(torch.zeros(())))
     1.0

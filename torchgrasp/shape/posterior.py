@@ -68,9 +68,10 @@ SINGULAR = 1e-12
 class Posterior(Value):
     """A Gaussian process given observed distances and normals, in normalised units and float64.
 
-    The observed numbers are `rows`: n distances, and three for each normal. (d, w) are the signed
-    distance and its gradient. All methods are differentiable, to any order, in the points and in
-    the tensors of the posterior. Plain tensors take faster formulas, which reuse buffers.
+    n counts observed points, and r observed numbers: n distances, and three for each observed
+    normal. (d, w) are the signed distance and its gradient. All methods but `explain` are
+    differentiable, to any order, in the points and in the posterior's tensors. Plain tensors take
+    faster formulas, which reuse buffers.
     """
 
     x: Points  # observed points (n, 3), those with normals first
@@ -84,8 +85,9 @@ class Posterior(Value):
 
     @kept
     def whiteners(self) -> list[Float[Tensor, "columns width"]]:
-        """The inverse L^-T of the transposed Cholesky factor, in blocks of columns without the
-        zeros below them.
+        """The inverse L^-T of the transposed Cholesky factor L, as a list of blocks of its columns.
+
+        A block (rows, width) leaves out the zeros below the diagonal. `whiten` uses it.
         """
         rows = len(self.factor)
         one = torch.eye(rows, dtype=self.x.dtype, device=self.x.device)
@@ -95,7 +97,7 @@ class Posterior(Value):
 
     @cached_property
     def n_oriented(self) -> int:
-        """Number of observed points with normals."""
+        """Number of observed points with normals. They are the first points of `x`."""
         return int(self.has_normal.sum())
 
     @checked(gradients=True)
@@ -103,14 +105,14 @@ class Posterior(Value):
         self,
         rows: Shaped[Tensor, "rows *c"],
     ) -> Shaped[Tensor, "rows *c"]:
-        """Return `rows`, one for each observed number in the order of `weights`, in the order of
-        `factor`.
+        """Return `rows` (r, ...) of all r observed numbers, sorted from the order of `weights` into
+        the order of `factor`.
         """
         return rows if self.order is None else rows[self.order]
 
     @checked(gradients=True)
     def mean(self, x: Queries) -> Float[Tensor, "q"]:
-        """Return the mean signed distance, normalised, at q normalised points."""
+        """Return the mean signed distance (q,), normalised, at q normalised points `x` (q, 3)."""
         if not self._is_plain(x):
             return self.distance_rows(x) @ self.weights
         mean = partial(evaluate_mean, self.weighted, gradient=False)
@@ -118,10 +120,10 @@ class Posterior(Value):
 
     @checked(gradients=True)
     def mean_and_gradient(self, x: Queries) -> MeanAndGradient:
-        """Return (distance, gradient): the mean signed distance and its gradient at q normalised
-        points.
+        """Return (distance, gradient): the mean signed distance (q,) and its gradient (q, 3).
 
-        `jet` gives the formula.
+        They are at q normalised points `x` (q, 3). The distance is normalised, and the gradient is
+        by normalised coordinates (no unit).
         """
         if not self._is_plain(x):
             distance, *slope = (self.cross(x) @ self.weights).unbind(0)
@@ -131,8 +133,11 @@ class Posterior(Value):
 
     @checked(gradients=True)
     def estimate(self, x: Queries) -> Moments:
-        """Return mean (q, 4) and covariance (q, 4, 4) of distance and gradient at q normalised
-        points, Eqs. (7)-(8) of the paper.
+        """Return mean (q, 4) and covariance (q, 4, 4) of signed distance and gradient (d, w) at
+        each point.
+
+        The q points `x` (q, 3) are normalised, and so is the result, Eqs. (7)-(8) of the paper.
+        Other than in `joint_at`, points have no covariance with each other.
         """
         prior = self.prior_block()
         rows = len(self.factor)
@@ -165,15 +170,18 @@ class Posterior(Value):
 
     @checked(gradients=True)
     def jet(self, x: Queries) -> SurfaceJet:
-        """Return mean and variance of the distance with their derivatives at q normalised points,
-        in closed form.
+        """Return mean and variance of the signed distance with derivatives, at q normalised points
+        `x` (q, 3).
 
-        The mean is sum_j (a_j k - k' d.b_j), with d = x - x_j and k' = dk / d(|d|^2 / 2). Here a_j
-        is the weight of the distance at the observed point x_j, and b_j that of its normal. The
-        variance is k0 - k*^T A k*: k0 is the prior variance, k* the covariance of the point with
-        the data, and A the inverse covariance of the data. Its gradient is -2 times the gradient of
-        a mean with the weights A k*.
+        The mean has first and second derivatives, the variance the first. All are by normalised
+        coordinates: `distance` (q,), `gradient` (q, 3), `hessian` (q, 3, 3), `variance` (q,),
+        `variance_gradient` (q, 3).
         """
+        # The mean is sum_j (a_j k - k' d.b_j), with d = x - x_j and k' = dk / d(|d|^2 / 2). Here a_j
+        # is the weight of the distance at the observed point x_j, and b_j the weight of its normal.
+        # The variance is k0 - k*^T A k*: k0 is the prior variance, k* the covariance of the point
+        # with the data, and A the inverse covariance of the data. Its gradient is -2 times the
+        # gradient of a mean with the weights A k*.
         evaluate = partial(_differentiable_jet, self)
         if self._is_plain(x):
             evaluate = partial(evaluate_jet, self.weighted, explain=self.explain)
@@ -181,9 +189,11 @@ class Posterior(Value):
 
     @checked(gradients=True)
     def mean_jet(self, x: Queries) -> MeanJet:
-        """Return the mean distance with first and second derivatives at q normalised points.
+        """Return the mean signed distance with first and second derivatives, at q normalised points
+        `x` (q, 3).
 
-        It costs less than `jet`.
+        All are by normalised coordinates: `distance` (q,), `gradient` (q, 3) and `hessian` (q, 3,
+        3). It costs less than `jet`.
         """
         size = at_once(x, CHUNK.jet)
         if not self._is_plain(x):
@@ -192,8 +202,10 @@ class Posterior(Value):
 
     @checked(gradients=True)
     def joint_at(self, x: Float[Tensor, "k 3"]) -> JointEstimate:
-        """Return the joint posterior of distance and gradient at k normalised points, Eqs. (7)-(8)
-        of the paper.
+        """Return the joint posterior of distance and gradient at k normalised points `x` (k, 3).
+
+        It is normalised, Eqs. (7)-(8) of the paper. It is `joint` without a limit of the number of
+        points and without a check of the domain.
         """
         k = len(x)
         cross = self.cross(x)
@@ -205,7 +217,7 @@ class Posterior(Value):
         return JointEstimate(mean, prior - whitened.T @ whitened)
 
     def prior_block(self) -> Float[Tensor, "4 4"]:
-        """Return the prior covariance (4, 4) of signed distance and gradient, normalised.
+        """Return the prior covariance (4, 4) of signed distance and gradient (d, w), normalised.
 
         It is the same at every point.
         """
@@ -214,8 +226,10 @@ class Posterior(Value):
 
     @checked(gradients=True)
     def distance_rows(self, x: Queries) -> CovarianceRows:
-        """Return the covariance of the distance at each of q normalised points with all
-        observations.
+        """Return the prior covariance (q, r) of the distance at q normalised points with all r
+        observed numbers.
+
+        The points `x` are (q, 3). The columns are in the order of `weights`.
         """
         if not self._is_plain(x):
             d = x[:, None] - self.x
@@ -228,10 +242,11 @@ class Posterior(Value):
 
     @checked(gradients=True)
     def whiten(self, rows: CovarianceRows) -> CovarianceRows:
-        """Return `rows` times L^-T, with the Cholesky factor L of the observations' covariance.
+        """Return `rows` (q, r) times L^-T, where L is the Cholesky factor `factor`.
 
-        Each line of `rows` holds the covariances of one number with all observations. The dot
-        product of two lines of the result is the covariance that the observations explain.
+        Each of the q rows holds the covariances of one number with all r observed numbers, in the
+        order of `weights`. The dot product of two rows of the result (q, r) is the covariance that
+        the observations explain.
         """
         rows = rows if self.order is None else rows[:, self.order]
         if not self._is_plain(rows):
@@ -249,11 +264,12 @@ class Posterior(Value):
         self,
         rows: CovarianceRows,
     ) -> tuple[Float[Tensor, "q"], CovarianceRows]:
-        """Return the variance k A k that the observations explain, and k A, for each line k of
-        `rows`.
+        """Return (k A k, k A) for each row k of `rows` (q, r): the explained variance (q,), and k A
+        (q, r).
 
-        A line holds the covariances of one number with all observations, and A is their inverse
-        covariance. With the whitened line, the variance is a sum of squares.
+        A row holds the covariances of one number with all r observed numbers. A is the inverse
+        covariance of the observed numbers. Prior variance minus explained variance is the posterior
+        variance.
         """
         whitened = self.whiten(rows)
         solved = torch.zeros_like(rows)
@@ -268,8 +284,11 @@ class Posterior(Value):
 
     @checked(gradients=True)
     def cross(self, x: Queries) -> Float[Tensor, "4 q rows"]:
-        """Return the covariance of distance (first) and gradient at q normalised points with all
-        observations.
+        """Return the prior covariance (4, q, r) of distance and gradient at q normalised points
+        with all r observed numbers.
+
+        The points `x` are (q, 3). On the first axis, index 0 is the distance, and 1 to 3 are the
+        gradient. The last axis is in the order of `weights`.
         """
         return cross_covariance(self.kernel, x, self.x, self.n_oriented)
 
@@ -279,7 +298,9 @@ class Posterior(Value):
 
     @property
     def weighted(self) -> Weighted:
-        """The observed points with the posterior weights of their distances and normals."""
+        """The observed points, the kernel, and the posterior weights of each point's distance and
+        normal.
+        """
         n = len(self.x)
         normals = self.weights[n:].reshape(3, self.n_oriented).T
         return Weighted(self.x, self.weights[:n], normals, self.kernel)

@@ -74,7 +74,17 @@ NODES = NodeNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class Surface(Value):
-    """A triangle mesh of the estimated surface [m]; it is open where it leaves the domain.
+    """A triangle mesh of the estimated surface, from `extract_surface`.
+
+    It has v vertices and f triangles, in the cloud's frame. It is open where the surface leaves the
+    shape's domain.
+
+    Attributes:
+        vertices: corners (v, 3) [m] of the triangles.
+        faces: indices (f, 3) of the three vertices of each triangle; the triangles' normals point
+            outward.
+        normals: outward unit normals (v, 3) of the estimated surface at the vertices.
+        std_m: standard deviation (v,) [m] of the surface along its normal at the vertices.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> surface = extract_surface(fit_shape(load_object("jug").view), resolution=24)
@@ -82,13 +92,13 @@ class Surface(Value):
     (True, True)
     """
 
-    vertices: Float[Tensor, "v 3"]  # corners of the triangles [m]
-    faces: Int[Tensor, "f 3"]  # indices of three vertices; normals point outward
-    normals: Float[Tensor, "v 3"]  # outward unit gradients of the mean
-    std_m: Float[Tensor, "v"]  # standard deviation of the surface along its normal [m]
+    vertices: Float[Tensor, "v 3"]
+    faces: Int[Tensor, "f 3"]
+    normals: Float[Tensor, "v 3"]
+    std_m: Float[Tensor, "v"]
 
     def mesh(self) -> "trimesh.Trimesh":
-        """Return vertices [m] and faces as a trimesh mesh."""
+        """Return the surface as a `trimesh.Trimesh` with the same vertices [m] and faces."""
         return trimesh.Trimesh(self.vertices.cpu().numpy(), self.faces.cpu().numpy(), process=False)
 
 
@@ -98,11 +108,16 @@ def extract_surface(
     shape: ShapeGP,
     resolution: Annotated[int, Range(8, 256)] = SURFACE.resolution,
 ) -> Surface:
-    """Return the estimated surface, by marching cubes and Newton steps, Eq. (9) of the paper.
+    """Return the estimated surface as a triangle mesh, Eq. (9) of the paper.
 
-    There the mean distance is zero. `resolution` is the number of cells along the domain's
-    diameter. Separate pieces are left out if they are nearest to less than 2 % of the cloud. Raises
-    `BadArgument` for a resolution outside [8, 256], or a mean distance that is nowhere zero.
+    The mean signed distance is zero there. Marching cubes find it, and Newton steps refine it.
+    Pieces to which less than 2 % of the cloud is nearest (`SURFACE.share`) are left out.
+
+    Args:
+        shape: the shape, from `fit_shape`.
+        resolution: number of cells along the domain's diameter, 8 to 256.
+
+    Raises `BadArgument` for another resolution, or if the mean signed distance is nowhere zero.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> surface = extract_surface(fit_shape(load_object("jug").view, table=0.0), resolution=24)
@@ -299,9 +314,15 @@ def surface_field(
     shape: ShapeGP,
     spacing: Annotated[float, Range(0.001, 0.02)] = FIELD_SPACING,
 ) -> SignedDistanceField:
-    """Return the signed distance field of a shape's estimated surface.
+    """Return the signed distance field [m] of a shape's estimated surface, negative inside.
 
-    It serves to locate the object by touch. The nodes are `spacing` [m] apart.
+    It serves to locate the object by touch. Its nodes are in the cloud's frame.
+
+    Args:
+        shape: the shape, from `fit_shape`.
+        spacing: distance [m] of neighbouring nodes, 0.001 to 0.02.
+
+    Raises `BadArgument` for another spacing, or if the mean signed distance is nowhere zero.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> jug = load_object("jug")
