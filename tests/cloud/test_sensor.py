@@ -43,6 +43,11 @@ def test_a_wall_has_the_random_noise_of_the_sensor_and_its_steps(name, z):
     assert float(wall(z, noise).std()) == pytest.approx(expected, rel=0.25)
 
 
+def test_a_stereo_camera_without_steps_has_the_random_noise_alone():
+    noise = dataclasses.replace(ACTIVE_STEREO, bias=0.0, step=0.0)
+    assert float(wall(0.5, noise).std()) == pytest.approx(0.12 / 33.88 * 0.5**2, rel=0.05)
+
+
 def test_the_noise_of_a_kinect_is_that_of_its_paper():
     noise = dataclasses.replace(SENSORS["kinect_v1"], bias=0.0)
     assert float(wall(2.0, noise).std()) == pytest.approx(1.425e-3 * 2.0**2, rel=0.1)

@@ -52,29 +52,30 @@ TipPoses = Float[Tensor, "3 4 k"]  # poses [m] of the tip in k postures, in the 
 
 @dataclasses.dataclass(frozen=True)
 class Arm(Value):
-    """A robot arm that carries a hand, from `load_arm`; n counts its joints, from the base to the
-    tip.
+    """A robot arm that carries a hand, from `load_arm`. `plan_grasps` keeps grasps that it reaches.
 
-    Postures (k, n) hold k positions of all joints [rad, or m for sliding ones]. The tip is the link
-    that carries the hand.
+    n counts the arm's joints, from the base to the tip. The tip is the link that carries the hand.
+    A posture holds one position of each joint [rad, or m for sliding joints].
 
-    Args:
+    Attributes:
         urdf: the chain of links from base to tip.
         tree: its kinematic tree.
-        lower: lower limits of the joints [rad or m].
-        upper: upper limits of the joints [rad or m].
-        speed: greatest speed of each joint [rad/s or m/s].
-        obj_from_base: pose of the arm's root link in the object's frame, that of the cloud [m].
-        tip_from_hand: pose of the hand's root link in the frame of the tip [m].
-        link: index in `urdf.links` of the link of each of the s collision spheres: those of the
-            links, then those of the hand's palm, which count as the tip's.
-        center: centre of each sphere in the frame of its link [m].
-        radius: radius of each sphere [m].
-        moving: indices of the spheres of links that joints move, without the palm. They keep clear
-            of objects and, unless their links only slide, of the table.
-        pairs: indices of the two spheres of each pair that must not overlap.
-        library: m random postures [rad or m].
-        features: `features` of the tip's pose in each posture of the library [mm].
+        lower: lower limits (n,) of the joints [rad or m].
+        upper: upper limits (n,) of the joints [rad or m].
+        speed: greatest speed (n,) of each joint [rad/s or m/s].
+        obj_from_base: pose (4, 4) [m] of the arm's root link in the frame of the object and its
+            cloud.
+        tip_from_hand: pose (4, 4) [m] of the hand's root link in the frame of the tip.
+        link: index (s,) in `urdf.links` of the link of each of s collision spheres. First come the
+            spheres of the links, then the spheres of the hand's palm, which count as the tip's.
+        center: centre (s, 3) [m] of each sphere in the frame of its link.
+        radius: radius (s,) [m] of each sphere.
+        moving: indices (w,) of the spheres of links that joints move, without the palm. They keep
+            clear of objects and, unless their links only slide, of the table.
+        pairs: indices (p, 2) of the two spheres of each pair that must not overlap.
+        library: m random postures (m, n) [rad or m], from which inverse kinematics starts.
+        features: twelve numbers (m, 12) [mm] of the tip's pose in each posture of the library, by
+            which poses are compared.
         hand_sha256: hash of the files of the hand.
     """
 
@@ -101,21 +102,32 @@ class Arm(Value):
 
     @checked
     def moved(self, b_from_a: Pose) -> "Arm":
-        """Return the arm transformed by `b_from_a` [m], from frame a to frame b."""
+        """Return the arm for a cloud in frame b, where `b_from_a` (4, 4) [m] is a rigid transform.
+
+        Frame a is the present frame of the object. The arm stays in its place: only `obj_from_base`
+        changes.
+        """
         return dataclasses.replace(self, obj_from_base=b_from_a.to(self.lower) @ self.obj_from_base)
 
     @checked
     def hand_poses(self, joints: Float[Tensor, "k n"]) -> Float[Tensor, "k 4 4"]:
-        """Return the pose `obj_from_hand` [m] of the hand in each of k postures of the arm.
+        """Return the pose `obj_from_hand` (k, 4, 4) [m] of the hand in each of k postures of the
+        arm.
 
-        `joints` are the positions of its n joints [rad, or m for sliding joints].
+        Args:
+            joints: positions (k, n) of the n joints [rad, or m for sliding joints], a row for each
+                posture.
         """
         return self.obj_from_base @ self.tree.poses(joints)[:, -1] @ self.tip_from_hand
 
     @checked
     def tip_poses(self, obj_from_hand: Float[Tensor, "k 4 4"]) -> TipPoses:
-        """Return the poses (3, 4, k) [m] of the tip, in the base's frame, for which the hand is at
-        `obj_from_hand` [m].
+        """Return the poses (3, 4, k) [m] of the tip that put the hand at k given poses.
+
+        The result is in the frame of the base.
+
+        Args:
+            obj_from_hand: poses (k, 4, 4) [m] of the hand in the object's frame.
         """
         base_from_hand = inverse(self.obj_from_base) @ obj_from_hand.to(self.lower)
         base_from_tip = base_from_hand @ inverse(self.tip_from_hand)
@@ -123,10 +135,16 @@ class Arm(Value):
 
     @checked
     def tip_motion(self, joints: Float[Tensor, "n k"]) -> tuple[TipPoses, Float[Tensor, "6 n k"]]:
-        """Return the tip's poses (3, 4, k) [m] in the base's frame, then its motion by each joint.
+        """Return (poses, motion) of the tip in k postures, in the base's frame.
 
-        `joints` are k postures, one in each column. The motion is the derivative of the translation
-        [mm], then of the rotation vector times `LEVER` [mm], by the joint.
+        `poses` (3, 4, k) [m] are those of the tip. `motion` (6, n, k) is the derivative of the
+        tip's pose by each of the n joints. Its first three rows are the derivative of the
+        translation [mm per rad or m]. The other three are that of the rotation vector, times
+        `LEVER` [mm per rad].
+
+        Args:
+            joints: positions (n, k) of the joints [rad, or m for sliding joints], a column for each
+                posture.
         """
         frames = self.tree.frames(joints)
         tip = frames[:, :, -1]
@@ -140,8 +158,12 @@ class Arm(Value):
 
     @checked
     def sphere_centres(self, joints: Float[Tensor, "n k"]) -> Float[Tensor, "3 s k"]:
-        """Return the centres [m] of all collision spheres in the object's frame, for k postures in
-        the columns of `joints`.
+        """Return the centres (3, s, k) [m] of all s collision spheres in k postures, in the
+        object's frame.
+
+        Args:
+            joints: positions (n, k) of the joints [rad, or m for sliding joints], a column for each
+                posture.
         """
         frames = self.tree.frames(joints.contiguous()).index_select(2, self.link)
         pose = self.obj_from_base
@@ -151,8 +173,10 @@ class Arm(Value):
 
     @checked
     def overlaps(self, centres: Float[Tensor, "3 s k"]) -> Bool[Tensor, "p k"]:
-        """Return a mask of the `pairs` of spheres that overlap in each of k postures, given the
-        `centres` [m].
+        """Return a mask (p, k): which of the p `pairs` of spheres overlap in each of k postures.
+
+        Args:
+            centres: centres (3, s, k) [m] of the spheres, from `sphere_centres`.
         """
         one, two = self.pairs.unbind(1)
         gap = centres.index_select(1, one) - centres.index_select(1, two)
@@ -180,22 +204,25 @@ def load_arm(
     tip_from_hand: Pose | None = None,
     seed: Seed = 0,
 ) -> Arm:
-    """Load a robot arm that carries a hand from the arm's URDF, for `plan_grasps`.
+    """Return the robot arm that carries a hand, read from the arm's URDF, for `plan_grasps`.
 
     Args:
         urdf: path of the file; a joint without limits gets [-2 pi, 2 pi] rad.
         hand: the hand on the arm, or its name or folder.
-        tip: the link that carries the hand; None means the one that most joints move, the last of
-            equals.
-        obj_from_base: pose of the arm's root link in the frame of the cloud [m]; None means the
-            identity.
-        tip_from_hand: pose of the hand's root link in the frame of the tip [m]; None means the
-            identity.
-        seed: random seed of the postures from which inverse kinematics starts.
+        tip: name of the link that carries the hand; None means the link that most joints move, the
+            last of equals.
+        obj_from_base: pose (4, 4) [m] of the arm's root link in the frame of the cloud; None means
+            the identity.
+        tip_from_hand: pose (4, 4) [m] of the hand's root link in the frame of the tip; None means
+            the identity.
+        seed: seed of the random postures from which inverse kinematics starts.
 
-    Raises `HandFileError` for a URDF that is missing or malformed. On the way to the tip it may
-    have no mesh, which `clean_arm` replaces, and no joint without a drive. Raises `BadArgument` for
-    a tip that fewer than six joints move.
+    Raises:
+        HandFileError: a URDF that is missing or malformed.
+        HandFileError: a mesh on a link up to the tip (`torchgrasp.app.author.clean_arm` replaces
+            it).
+        HandFileError: a joint up to the tip that follows another joint.
+        BadArgument: no link named `tip`, or fewer than six joints that move it.
 
     >>> from torchgrasp import load_hand
     >>> load_arm(load_hand("allegro").urdf_path, "allegro", "thumb_tip")

@@ -97,8 +97,8 @@ def read_cloud(
       and `comment frustum` with 12 numbers give the camera. `comment table` with 4 numbers gives
       the table. A mesh gives 2000 surface points, with normals if it is closed.
     * `.pcd`, ascii, binary or compressed: x y z, optionally normal_x normal_y normal_z. VIEWPOINT
-      gives the camera. Its default `0 0 0 1 0 0 0` counts only if a camera in the origin can have
-      seen the points.
+      gives the camera. Its default `0 0 0 1 0 0 0` counts only if a camera there can have seen the
+      points.
     * `.npz`: arrays `points` (n, 3), optionally `normals` (n, 3), `viewpoint` (3,), `frustum` (4,
       3), `table` (4,). For several views: `viewpoint` (n, 3) and `frustum` (n, 4, 3).
     * `.npy`: an (n, 3) array, or (n, 6) with normals; colours are left out. Columns 4 to 6 without
@@ -107,7 +107,8 @@ def read_cloud(
       line may name the columns (x y z nx ny nz), or hold the number of points.
 
     Images (h, w, 3) of points are accepted. Points with NaN or infinity are left out. Points at (0,
-    0, 0) are left out if there are several.
+    0, 0) are left out if there are several. Points whose normal is NaN or zero are left out; if
+    most are so, all normals are left out instead.
 
     Args:
         path: the file.
@@ -118,8 +119,7 @@ def read_cloud(
     Raises:
         CloudFileError: no such file; an unknown suffix; malformed content; more than 512 MB or 5
             million points.
-        BadArgument: a viewpoint other than three numbers; points on one line; a normal of length
-            zero.
+        BadArgument: a viewpoint other than three numbers; points on one line.
         TooFewPoints: fewer than 4 distinct points.
         SuspiciousScale: an extent outside [5 mm, 2 m].
 
@@ -193,6 +193,8 @@ def cloud_from_array(
     out.
 
     Not measured are points with NaN or infinity, and points at (0, 0, 0) if there are several.
+    Points whose normal is NaN or zero are left out, too; if most are so, all normals are left out
+    instead.
 
     Args:
         points: (n, 3), or (h, w, 3) for an image of points. Without `normals` they may have six

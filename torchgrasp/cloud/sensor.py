@@ -300,8 +300,8 @@ def median_depth(frames: Sequence[Tensor | np.ndarray]) -> Tensor:
 
     Raises:
         BadArgument: no frame; frames of several sizes or dtypes.
-        BadArgument: camera or scene have moved in a frame. More than 5 % of its pixels, or 1 % of
-            patches of 8 x 8 pixels, then differ from the median (`STILL`).
+        BadArgument: camera or scene have moved in a frame. Then more than 5 % of its pixels, or 1 %
+            of its patches, differ from the median (`STILL`).
 
     >>> median_depth([torch.tensor([[0.0, 0.7]]), torch.tensor([[0.0, 0.701]]), torch.tensor([[0.5, 0.702]])])
     tensor([[0.0000, 0.7010]])

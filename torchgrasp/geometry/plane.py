@@ -37,11 +37,15 @@ MOST_ABOVE = 0.01
 @checked
 @dataclasses.dataclass(frozen=True)
 class Plane(Value):
-    """A table plane: the points p [m] with normal . p = offset. Objects are on the side of the
+    """A table plane: the points p [m] with normal . p = offset. Objects stand on the side of the
     normal.
 
-    The unit `normal` points up; `offset` is the distance [m] of the plane from the origin along it.
-    Raises `BadArgument` if the normal is not of unit length, or a number is not finite.
+    Args:
+        normal: unit normal (3,), which points up.
+        offset: distance [m] of the plane from the origin along the normal; negative if the plane is
+            below the origin.
+
+    Raises `BadArgument` if the normal is not of unit length, or if a number is not finite.
 
     >>> plane = Plane.horizontal(0.1)
     >>> plane.describe(), plane.height(torch.tensor([0.0, 0.0, 0.3]))
@@ -59,18 +63,21 @@ class Plane(Value):
     @classmethod
     @checked
     def horizontal(cls, height: float) -> "Plane":
-        """Return the plane z = height [m]."""
+        """Return the plane z = `height` [m]."""
         return cls(real([0.0, 0.0, 1.0]), float(height))
 
     @checked(gradients=True)
     def height(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return the signed heights [m] of points [m] above the plane."""
+        """Return the heights (*b,) [m] of points (*b, 3) [m] above the plane, negative below it.
+
+        b stands for any batch axes.
+        """
         return points @ self.normal.to(points) - self.offset
 
     @checked
     def moved(self, b_from_a: Pose) -> "Plane":
-        """Return the plane in frame b, given the rigid transform `b_from_a` [m] from its own frame
-        a.
+        """Return the plane in frame b, given the rigid transform `b_from_a` (4, 4) [m] from its own
+        frame a.
         """
         normal = b_from_a[:3, :3].double() @ self.normal.double()
         return Plane(unit(normal), self.offset + float(normal @ b_from_a[:3, 3].double()))

@@ -76,7 +76,7 @@ class Grid(NamedTuple):
 class DistanceField(Value, abc.ABC):
     """Signed distances [m] at the `nodes` of a grid, negative inside.
 
-    It holds the grid of one object for all points, or that of an own object for each of r entries.
+    It holds the grid of one object for all points, or an own grid for each of r entries.
     """
 
     nodes: Any  # Float[Tensor, "n"] [m], the values of all nodes, those of the z axis contiguous
@@ -84,15 +84,17 @@ class DistanceField(Value, abc.ABC):
 
     @abc.abstractmethod
     def rows(self, index: Int[Tensor, "k"]) -> "DistanceField":
-        """Return the field whose entry k is that of entry `index[k]`; one object's field is
-        unchanged.
+        """Return the field of the k entries with the indices `index` (k,), in this order.
+
+        The field of one object is the same for every entry, and is returned unchanged.
         """
 
     @checked
     def nearest_node(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return the signed distance [m] at the grid node nearest to each point [m].
+        """Return the signed distance (*b,) [m] at the grid node nearest to each point (*b, 3) [m].
 
-        For a point outside the grid it is a node at the border.
+        For a point outside the grid it is a node at the border. b stands for any batch axes.
+        `query` is slower and interpolates.
         """
         grid = self._grid(points)
         spacing = grid.spacing[..., 0] if isinstance(grid.spacing, Tensor) else grid.spacing
@@ -112,10 +114,11 @@ class DistanceField(Value, abc.ABC):
     def query(
         self, points: Float[Tensor, "*b 3"]
     ) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
-        """Return (distance, gradient): the interpolated signed distance [m] at each point [m], and
-        its gradient (no unit).
+        """Return (distance, gradient) at points (*b, 3) [m], interpolated between the nodes.
 
-        Outside the grid, the distance [m] from the grid is added to the value at the border.
+        `distance` (*b,) is the signed distance [m], and `gradient` (*b, 3) its derivative by the
+        point (no unit). b stands for any batch axes. Outside the grid, the distance [m] from the
+        grid is added to the value at the border.
         """
         origin, spacing, last, (dx, dy), first, corners = self._grid(points)
         position = (points - origin) / spacing
@@ -149,8 +152,13 @@ class DistanceField(Value, abc.ABC):
 class SignedDistanceField(DistanceField):
     """Signed distances [m] of one object on a grid, negative inside.
 
-    `values` [m] has an axis for each of x, y and z; `values[i]` is at the point origin + i *
-    spacing. `origin` [m] is node (0, 0, 0), `spacing` [m] the distance of neighbouring nodes.
+    `surface_field` makes it of a shape.
+
+    Args:
+        origin: position (3,) [m] of node (0, 0, 0).
+        spacing: distance [m] of neighbouring nodes.
+        values: signed distances (x, y, z) [m]; `values[i, j, k]` is at the point `origin` + (i, j,
+            k) * `spacing`.
 
     >>> ball = torch.cartesian_prod(*[torch.linspace(-0.1, 0.1, 41)] * 3).norm(dim=1).reshape(41, 41, 41) - 0.05
     >>> distance, gradient = SignedDistanceField(torch.full((3,), -0.1), 0.005, ball).query(torch.tensor([0, 0, 0.08]))
@@ -164,12 +172,16 @@ class SignedDistanceField(DistanceField):
 
     @property
     def nodes(self) -> Float[Tensor, "n"]:
-        """The signed distances [m] at all n nodes, those along the z axis contiguous."""
+        """The signed distances (n,) [m] at all n nodes: `values`, flattened. Neighbours along z are
+        adjacent.
+        """
         return self.values.reshape(-1)
 
     @checked
     def rows(self, index: Int[Tensor, "k"]) -> "SignedDistanceField":
-        """Return this field: one object's field is the same for every entry."""
+        """Return this field unchanged: the field of one object is the same for every entry of
+        `index` (k,).
+        """
         return self
 
     @kept

@@ -63,23 +63,23 @@ CHECKS = CheckNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspProblem(Value):
-    """The input of a grasp solver: hand, b contact sets with certificates of force closure,
-    collision world.
-
-    Raises `BadArgument` if the contacts lack `std_m`.
+    """The input of a grasp solver such as `solve_joint`: a hand, b contact sets and their
+    surroundings.
 
     Args:
         hand: the hand.
-        contacts: the contact sets, in the object's frame [m]; the pre-grasp opens by their `std_m`.
-        certificate: the certificate of each contact set.
-        world: the surroundings of the hand; it may hold one object for all contact sets, or one for
-            each.
-        center: the object's centre [m], (3,), or one for each contact set (b, 3). Grasps near it
+        contacts: the b contact sets, in the object's frame [m], with `std_m`; the pre-grasp opens
+            by their `std_m`.
+        certificate: the certificate of force closure of each contact set, from `certify`.
+        world: the surroundings of the hand, with one object for all contact sets, or one for each.
+        center: the object's centre (3,) [m], or one for each contact set (b, 3). Grasps near it
             score higher.
-        reachable: function that returns a mask of the hand poses that an arm can reach; None means
-            that every pose is reachable.
+        reachable: function of hand poses (k, 4, 4) [m] that returns a mask (k,) of the poses that
+            an arm reaches; None means that every pose is reachable.
         descends: whether the opened hand may start above its pose where its opened links would be
             in the table (`opened_pose`).
+
+    Raises `BadArgument` if the contacts lack `std_m`.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -103,7 +103,7 @@ class GraspProblem(Value):
 
     @checked
     def rows(self, index: Int[Tensor, "k"]) -> "GraspProblem":
-        """Return the problem of the k contact sets with the indices `index`."""
+        """Return the problem of the k contact sets with the indices `index` (k,), in this order."""
         center = self.center if self.center.ndim == 1 else self.center[index]
         contacts = self.contacts[index]
         certificate = self.certificate[index]
@@ -114,8 +114,11 @@ class GraspProblem(Value):
 
     @checked
     def drop_unreachable(self, seeds: IKSeeds) -> IKSeeds:
-        """Return those of the initial guesses `seeds` whose hand poses the function `reachable`
+        """Return those initial guesses of `seeds` whose hand poses the function `reachable`
         accepts.
+
+        All are returned if `reachable` is None. Raises `BadArgument` for a malformed answer of the
+        function.
         """
         return (
             seeds

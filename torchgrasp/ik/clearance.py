@@ -34,14 +34,15 @@ LEVELS = (0.1, 0.5, 0.8)  # probabilities of occupancy whose regions are told ap
 @checked
 @dataclasses.dataclass(frozen=True)
 class Obstacles(Value):
-    """Regions of a scene that are probably occupied, given as grids of the distance [m] from these
-    regions.
+    """Regions of a scene that are probably occupied, as grids of distances [m]; `Obstacles.of`
+    makes them.
 
-    Args:
+    Attributes:
         field: signed distances [m] from the region that counts as occupied, negative inside.
-        distances: for each of the k `levels`, the distances [m] from the region that is occupied
-            with at least this probability; 0 inside, on the same grid of x y z nodes.
-        levels: k probabilities, ascending.
+        distances: distances (k, x, y, z) [m], one grid for each of the k `levels`. They are from
+            the region occupied with at least this probability, and 0 inside it. The nodes are those
+            of `field`.
+        levels: k probabilities (k,), ascending.
         hard: whether links must not touch the occupied region; otherwise a collision only lowers
             the predicted success.
 
@@ -63,8 +64,11 @@ class Obstacles(Value):
     ) -> "Obstacles | None":
         """Return the obstacles of an occupancy grid, or None if all its voxels are probably free.
 
-        Voxels of probability `full`, in [0.01, 1], or more count as occupied. `hard` says whether
-        links must not touch them (`Obstacles.hard`).
+        Args:
+            occupancy: the grid, from `estimate_occupancy`.
+            full: probability from which a voxel counts as occupied, in [0.01, 1].
+            hard: whether links must not touch occupied voxels; otherwise a collision only lowers
+                the predicted success.
         """
         # SciPy's distances
         device = occupancy.origin.device
@@ -85,10 +89,15 @@ class Obstacles(Value):
     def likelihood(
         self, centres: Float[Tensor, "*b s 3"], radius: Float[Tensor, "s"]
     ) -> Float[Tensor, "*b"]:
-        """Return the largest occupancy probability of the regions that each set of s spheres
+        """Return the largest occupancy probability (*b,) of the regions that each set of s spheres
         touches.
 
-        `centres` [m] and `radius` [m] are those of the spheres.
+        It is the middle between the region's level and the next level, and 0 if none is touched. b
+        stands for any batch axes.
+
+        Args:
+            centres: centres (*b, s, 3) [m] of the spheres, in the frame of `field`.
+            radius: radius (s,) [m] of each sphere.
         """
         met = centres.new_zeros(centres.shape[:-2])
         levels = [*self.levels.tolist(), 1.0]
@@ -115,12 +124,16 @@ def distance_to(region: Bool[Tensor, "x y z"], spacing: float) -> Float[Tensor, 
 @checked
 @dataclasses.dataclass(frozen=True)
 class CollisionWorld(Value):
-    """The surroundings that a hand must not touch, in the frame of the object.
+    """The surroundings that a hand must not touch, in the frame of the object. None means that a
+    part does not exist.
 
-    A part of the surroundings that does not exist is None. The `field` holds signed distances [m]
-    from one object, the same for all hands of a batch, or from one object for each hand. The
-    `table` is a plane, or a height [m] along z. The `obstacles` are other bodies of a scene. Raises
-    `BadArgument` for a table that is neither a plane nor a height.
+    Args:
+        field: signed distances [m] from the object, negative inside. They are of one object for all
+            hands of a batch, or of one object for each hand. `surface_field` makes one of a shape.
+        table: the table's plane, or its height [m] along z.
+        obstacles: other bodies of a scene.
+
+    Raises `BadArgument` for a table that is neither a plane nor a height.
 
     >>> CollisionWorld(table=0.02).plane.offset
     0.02
@@ -143,7 +156,9 @@ class CollisionWorld(Value):
 
     @property
     def fields(self) -> tuple[DistanceField, ...]:
-        """The distance fields of object and obstacles: none, one or both."""
+        """The distance fields of object and obstacles, in this order, without those that do not
+        exist.
+        """
         return tuple(
             x for x in (self.field, self.obstacles and self.obstacles.field) if x is not None
         )
@@ -155,9 +170,9 @@ class CollisionWorld(Value):
 
     @checked
     def rows(self, index: Int[Tensor, "k"]) -> "CollisionWorld":
-        """Return the world of some hands: entry i of the result is that of hand `index[i]`.
+        """Return the world of k hands: entry i of the result is the world of hand `index[i]`.
 
-        A world of one object is the same for all hands, and is returned unchanged.
+        A world of one object is the same for all hands, and is returned unchanged. `index` is (k,).
         """
         if self.field is None or isinstance(self.field, SignedDistanceField):
             return self
@@ -165,7 +180,7 @@ class CollisionWorld(Value):
 
     @property
     def guarded(self) -> bool:
-        """Whether there are obstacles that links must not touch."""
+        """Whether there are obstacles that links must not touch (`Obstacles.hard`)."""
         return self.obstacles is not None and self.obstacles.hard
 
 

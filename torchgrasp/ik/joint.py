@@ -286,11 +286,17 @@ def solve_sliding(
 def solve_joint(
     problem: GraspProblem, seeds: IKSeeds, shape: ShapeLike, spec: ContactSpec
 ) -> Grasps:
-    """Return checked grasps of the contact sets that have initial guesses, best first.
+    """Return checked grasps, the best of each contact set that has initial guesses, best first.
 
-    The guesses, `seeds`, are tried in their order. If the hand cannot reach the contacts, they
-    slide along the surface of the `shape` and are certified anew under `spec`. If they fail, the
-    grasp has the `Status` of the contact planner.
+    The guesses are tried in their order. If the hand cannot reach the contacts, they slide along
+    the surface of the `shape`, and are certified anew. If the moved contacts fail, the grasp has
+    the `Status` of the contact planner.
+
+    Args:
+        problem: hand, b contact sets and surroundings.
+        seeds: initial guesses, from `nearest_postures`.
+        shape: the object's shape, from `fit_shape`, in the frame of the contacts.
+        spec: constraints under which sliding contacts are certified.
 
     >>> from torchgrasp import fit_shape, load_hand, load_object
     >>> from torchgrasp.ik import CollisionWorld, PostureLibrary, nearest_postures

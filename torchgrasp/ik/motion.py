@@ -90,12 +90,17 @@ def opened_pose(
     obj_from_hand: Float[Tensor, "g 4 4"],
     table: Plane | None,
 ) -> Float[Tensor, "g 4 4"]:
-    """Return the pose [m] of the opened hand at the end of its approach, in the object's frame.
+    """Return the poses (g, 4, 4) [m] of g opened hands at the end of their approach.
 
-    It is the pose of the grasp, raised along the normal of the `table` where links of the opened
-    hand would be in the table: coupled fingers can move towards the table as they open. A hand that
-    would have to rise by more than 30 mm is not raised. `joints` [rad] are those of the opened
-    hand, `obj_from_hand` [m] is the pose of the grasp.
+    They are in the object's frame. Each is the pose of its grasp, raised along the table's normal
+    where an opened link would be in the table. Coupled fingers can move towards the table as they
+    open. A hand that would have to rise by more than 30 mm (`MOTION.most`) is not raised.
+
+    Args:
+        hand: the hand.
+        joints: joints (g, h) [rad or m] of the opened hands.
+        obj_from_hand: poses (g, 4, 4) [m] of the grasps.
+        table: the table in the object's frame; None means that no hand is raised.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp

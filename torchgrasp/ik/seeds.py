@@ -76,14 +76,23 @@ SEEDS = SeedNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class PostureLibrary(Value):
-    """Random postures of a hand, s in number, prepared for quick comparison of their fingertips
-    with contact sets.
+    """Random postures of a hand, prepared for quick comparison of their fingertips with contact
+    sets.
 
-    `joints` [rad] are the actuated joints. The fingertips of each posture define a frame
-    (`tips_frame`): `vf_from_hand` [m] is the hand's pose in it, and `centres` [m] are the centres
-    of the fingertips in it. `feature` (s, 6 f) holds the `feature` vectors, without unit. `spheres`
-    [m] are the centres of the k collision spheres in the hand's frame. Raises `BadArgument` for
-    numbers of joints, tips or spheres that are not the hand's.
+    `PostureLibrary.of` makes it, and `nearest_postures` uses it. s counts postures, h actuated
+    joints, f fingertips, and k collision spheres. The fingertips of each posture define a frame
+    ("vf") with the origin at their centroid.
+
+    Attributes:
+        hand: the hand.
+        joints: actuated joints (s, h) [rad or m].
+        vf_from_hand: pose (s, 4, 4) [m] of the hand's root in the frame of its fingertips.
+        centres: centres (s, f, 3) [m] of the fingertips, in the frame of the fingertips.
+        feature: vectors (s, 6 f) without unit that are compared: the fingertips' centres and the
+            axes of their pads, each over its scale.
+        spheres: centres (s, k, 3) [m] of the collision spheres, in the hand's frame.
+
+    Raises `BadArgument` for numbers of joints, tips or spheres that are not the hand's.
 
     >>> from torchgrasp import load_hand
     >>> library = PostureLibrary.of(load_hand("barrett"), count=200)
@@ -114,11 +123,16 @@ class PostureLibrary(Value):
     @classmethod
     @checked
     def of(cls, hand: Hand, count: Count | None = None, seed: Seed = 0) -> "PostureLibrary":
-        """Return random postures within the joint limits and without self-collision.
+        """Return random postures of a hand within the joint limits and without self-collision.
 
-        Of `count` drawn postures, those whose fingertips are on a line are left out. As `count`,
-        None means `SEEDS.postures`, or `SEEDS.many_postures` for more than three fingers. The hand
-        caches the last library of each count.
+        Postures whose fingertips are on a line are left out, so there may be fewer than `count`.
+        The hand caches the last library of each count.
+
+        Args:
+            hand: the hand.
+            count: number of drawn postures. None means `SEEDS.postures`, or `SEEDS.many_postures`
+                for more than three fingers.
+            seed: seed of the draws.
         """
         if count is None:
             count = SEEDS.postures if len(hand.tips) == 3 else SEEDS.many_postures
@@ -189,18 +203,28 @@ def nearest_postures(
     n_seeds: Count = 8,
     reachable: Reachable | None = None,
 ) -> IKSeeds:
-    """Return the postures of the `library` that fit contact sets best, as initial guesses (seeds)
-    placed on the contacts.
+    """Return initial guesses for inverse kinematics: postures of a library, placed on contact sets
+    (Eq. 24).
 
-    Each contact set has at most `n_seeds` seeds, best first, or none if its contacts lie on a line.
-    The seeds are in the order of the contact sets; Eq. (24) gives their poses. `energy` is half the
-    squared distance between the features of posture and contacts. The `world` ranks them by
-    clearance. If the arm cannot reach a pose by `reachable`, the next posture takes its place; None
-    means that it reaches all.
+    The guesses (seeds) are in the order of the contact sets. Each set has at most `n_seeds`, best
+    first, and none if its contacts lie on a line. Their `energy` is half the squared distance
+    between the features of posture and contacts.
 
-    Raises `BadArgument` for `n_seeds` that are not in [1, 64], or above six times the number of
-    postures. The same is raised for contacts on another device than the library, or of another
-    number than fingertips.
+    Args:
+        library: random postures of the hand.
+        contacts: b contact sets [m], with one contact for each fingertip.
+        world: surroundings in the frame of the contacts. The clearance from them and the distance
+            of features rank the guesses.
+        n_seeds: most guesses of a contact set, 1 to 64.
+        reachable: function of hand poses (k, 4, 4) [m] that returns a mask (k,) of the poses that
+            an arm reaches. The next posture takes the place of an unreachable one. None means that
+            every pose is reachable.
+
+    Raises:
+        BadArgument: `n_seeds` outside [1, 64], or above six times the number of postures in the
+            library.
+        BadArgument: contacts on another device than the library, or of another number than
+            fingertips.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp

@@ -57,14 +57,21 @@ SOLVING = SolveNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class IKSolution(Batch):
-    """The hand configurations that were found for b contact sets, one for each.
+    """The hand configurations that `solve_ik` found for b contact sets, one for each.
 
-    `joints` [rad] are the actuated joints, `obj_from_hand` [m] the hand's pose in the frame of the
-    contacts. Finger i touches contact `permutation[:, i]`. `tip_error` [m] is each tip's distance
-    from its contact. `normal_angle` [rad] is the angle of the contact's inward normal from the
-    pad's axis. `clearance` [m] is the least clearance of the links. `attempts` counts the
-    initial guesses that were refined. `status` is the `Status` of the first error out of tolerance.
-    A contact set without initial guesses has NaN.
+    h counts actuated joints, and f fingertips. A contact set without initial guesses has NaN.
+
+    Attributes:
+        joints: actuated joints (b, h) [rad or m].
+        obj_from_hand: pose (b, 4, 4) [m] of the hand's root in the frame of the contacts.
+        permutation: index (b, f) of the contact that each finger touches: finger i touches contact
+            `permutation[:, i]`.
+        tip_error: distance (b, f) [m] of each fingertip from its contact.
+        normal_angle: angle (b, f) [rad] between the contact's inward normal and the axis of the
+            finger's pad.
+        clearance: least clearance (b,) [m] of the links, negative in a collision.
+        attempts: number (b,) of initial guesses that were refined.
+        status: `Status` (b,) of the first error out of tolerance, or `Status.OK`.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -93,26 +100,28 @@ def solve_ik(
     method: Method = "levenberg_marquardt",
     library: PostureLibrary | None = None,
 ) -> IKSolution:
-    """Return hand configurations that touch given contacts, in any assignment to fingers, without
-    self-collision.
+    """Return for each contact set the best hand configuration whose fingertips touch its contacts.
 
-    All arguments are moved to the contacts' device. Raises `BadArgument` for contacts that are not
-    finite, or not one for each fingertip, a mixture of another hand, or an unknown method. For more
-    than three fingertips it refuses a mixture and COBYLA.
+    Any finger may touch any contact. With `Status.OK` every tip is within 1 mm of its contact.
+    Every contact direction is then inside its pad's cone, and every link is clear.
 
     Args:
         hand: the hand.
-        contacts: b contact sets, each of one contact [m] for each fingertip; `std_m` and `variance`
+        contacts: b contact sets [m], with one contact for each fingertip; `std_m` and `variance`
             are not used.
         mixture: the hand's learned model; None means that all initial guesses come from `library`.
         world: object, table and obstacles that the links must not touch; None means that only
             self-collision counts.
-        method: "cobyla" is the paper's method (Sec. 6.3), which brings each tip's contact point to
-            its contact and ignores the contact directions.
+        method: "levenberg_marquardt", or "cobyla", the paper's method (Sec. 6.3). "cobyla" brings
+            each tip's contact point to its contact and ignores the contact directions.
         library: the hand's random postures; None means that they are drawn when they are needed.
 
-    The result has the best configuration for each contact set. With `Status.OK` every tip is within
-    1 mm of its contact, every contact direction is inside its pad's cone, and every link is clear.
+    Hand, mixture, world and library are moved to the contacts' device.
+
+    Raises:
+        BadArgument: contacts that are not finite, or not one for each fingertip.
+        BadArgument: a mixture of another hand, or an unknown method.
+        BadArgument: a mixture or "cobyla" for a hand with more than three fingertips.
 
     >>> from torchgrasp.hand.load import load_hand
     >>> points = 0.05 * torch.eye(3)[None].double()

@@ -50,9 +50,18 @@ Chunk = Annotated[int, Range(0, 1_000_000)]
 class SampleFolder:
     """A complete folder of `n` sampled postures in chunk files, which are read on demand.
 
+    `write_samples` makes it, and `load_samples` opens it. h counts the hand's joints.
+
     Iteration yields the chunks as `HandSamples`. By index the folder is a map-style dataset for
-    `torch.utils.data.DataLoader`: item i holds the joints (h,) [rad] and the contact code (6,) of
-    posture i. Recent chunks stay in memory.
+    `torch.utils.data.DataLoader`: item i holds the joints (h,) [rad or m] and the contact code (6,)
+    of posture i. Recent chunks stay in memory.
+
+    Attributes:
+        folder: path of the folder.
+        n: number of postures.
+        joint_names: names of the h joints, in the order of the hand.
+        meta: hand, seed and sampling, as in `HandSamples`.
+        recent: chunks that were read lately.
 
     >>> import tempfile
     >>> from torchgrasp import load_hand
@@ -63,10 +72,9 @@ class SampleFolder:
     """
 
     folder: Path
-    n: int  # number of postures
-    joint_names: tuple[str, ...]  # names of the h joints, in the order of the hand
-    meta: dict[str, str]  # hand, seed and sampling, as in `HandSamples`
-    # chunks that were read lately
+    n: int
+    joint_names: tuple[str, ...]
+    meta: dict[str, str]
     recent: Recent[HandSamples] = dataclasses.field(
         default_factory=lambda: Recent(KEPT), repr=False, compare=False
     )
@@ -89,9 +97,10 @@ class SampleFolder:
 
     @checked
     def chunk(self, i: Chunk) -> HandSamples:
-        """Read the postures of chunk i.
+        """Read the postures of chunk i, counted from 0. A chunk has 10,000 postures
+        (`CHUNK_POSTURES`); the last has the rest.
 
-        Raises `ModelFileError` if its file is missing, damaged, or belongs to other samples, and
+        Raises `ModelFileError` if its file is missing, damaged, or belongs to other samples. Raises
         `BadArgument` for an index beyond the last chunk.
         """
         sizes = chunk_sizes(self.n)
@@ -112,7 +121,8 @@ class SampleFolder:
     def read(self, n: Count | None = None) -> HandSamples:
         """Read the first `n` postures into memory; None means all.
 
-        Raises `BadArgument` for n outside [1, len].
+        Raises `BadArgument` for n outside [1, len], and `ModelFileError` for a missing or damaged
+        chunk.
         """
         n = self.n if n is None else n
         check_whole("n", n, 1, self.n)
@@ -120,12 +130,16 @@ class SampleFolder:
 
     @checked
     def path(self, i: Chunk) -> Path:
-        """Return the path of the file of chunk i."""
+        """Return the path of the file of chunk i, counted from 0. The file need not exist."""
         return self.folder / f"chunk-{i:06d}.safetensors"
 
     @checked
     def holds(self, i: Chunk) -> bool:
-        """Return whether chunk i is on disk and undamaged."""
+        """Return whether the file of chunk i, counted from 0, exists and is undamaged.
+
+        It is also False for a chunk of other samples. Raises `BadArgument` for an index beyond the
+        last chunk.
+        """
         try:
             self.chunk(i)
         except ModelFileError:
@@ -141,19 +155,21 @@ def write_samples(
     workers: Annotated[int, Range(1, 1024)] = 1,
     observer: Callable[[int], object] = lambda count: None,
 ) -> SampleFolder:
-    """Draw random postures of a hand, as `sample_configurations` does, and write them to a folder
-    in chunks.
+    """Draw random postures of a hand, write them to a folder in chunks, and return the folder.
+
+    The postures are those of `sample_configurations`.
 
     Args:
+        hand: the hand.
         spec: number of postures, seed and sampling.
         folder: folder that is made, or continued after an interrupted run with the same arguments.
-        workers: number of threads that draw at the same time.
-        observer: called with the number of postures on disk at the start, then with the number of
-            postures in each new chunk.
+        workers: number of threads that draw at the same time, 1 to 1024.
+        observer: called at the start with the number of postures on disk, then with the number in
+            each new chunk.
 
-    Raises `BadArgument` for workers outside [1, 1024], or a hand of which almost all postures
-    collide. Raises `OutputError` if the folder holds other samples, another run is writing it, or
-    the disk is full.
+    Raises:
+        BadArgument: workers outside [1, 1024]; a hand of which almost all postures collide.
+        OutputError: the folder holds other samples, another run is writing it, or the disk is full.
 
     >>> import tempfile
     >>> from torchgrasp import load_hand
@@ -195,9 +211,9 @@ def write_samples(
 
 @checked
 def load_samples(folder: Path | str) -> SampleFolder:
-    """Open a complete folder of posture samples.
+    """Open a complete folder of sampled postures, as `write_samples` made it.
 
-    Raises `ModelFileError` for an unfinished folder or a damaged manifest.
+    No posture is read yet. Raises `ModelFileError` for an unfinished folder or a damaged manifest.
 
     >>> import tempfile
     >>> from torchgrasp.hand.load import load_hand

@@ -107,24 +107,31 @@ class DataRows:
 class Components(Value):
     """Weights, means and covariances of m Gaussians in d dimensions (Eqs. 19-20).
 
+    A fit reports them in `FitProgress`, in standardised dimensions.
+
+    Attributes:
+        weights: shares (m,) of the Gaussians, of sum 1.
+        means: means (m, d).
+        covariances: covariances (m, d, d).
+
     >>> Components(torch.ones(1), torch.zeros(1, 2), torch.eye(2)[None]).means.shape
     torch.Size([1, 2])
     """
 
-    weights: Float[Tensor, "m"]  # shares, of sum 1
+    weights: Float[Tensor, "m"]
     means: Float[Tensor, "m d"]
     covariances: Float[Tensor, "m d d"]
 
 
 @dataclasses.dataclass(frozen=True)
 class FitProgress(Value):
-    """The state of a fit of m Gaussians after t steps; with the data it determines the next step.
+    """The state of a fit of m Gaussians after t steps, which `fit_mixture` gives to its `observer`.
 
     Attributes:
         components: the Gaussians.
-        reseeded: how often each of them collapsed and was placed anew; the likelihood may fall
+        reseeded: how often (m,) each of them collapsed and was placed anew; the likelihood may fall
             after that.
-        log_likelihood: mean over the data [nats] before each step.
+        log_likelihood: mean log-likelihood (t,) [nats] of the standardised data before each step.
         jumped: whether the last step placed a component anew, or the next step uses other rows.
         rows: number of rows that the last step used, 0 before the first step.
 

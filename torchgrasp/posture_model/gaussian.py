@@ -51,8 +51,16 @@ class GaussianMixture(Value):
     """A mixture of m Gaussians over d named dimensions (Eqs. 19-20), evaluated in float64.
 
     Densities are differentiable, to any order, in the points and in `weights`, `means` and
-    `covariances`. Raises `BadArgument` for inconsistent shapes, weights that are negative or do not
-    sum to 1, an indefinite or asymmetric covariance, or a repeated name.
+    `covariances`.
+
+    Args:
+        weights: probabilities (m,) of the components, of sum 1.
+        means: means (m, d) of the components, in the units of the d dimensions.
+        covariances: covariances (m, d, d) of the components, in products of these units.
+        names: names of the d dimensions.
+
+    Raises `BadArgument` for inconsistent shapes, a repeated name, or an indefinite or asymmetric
+    covariance. Weights that are negative or do not sum to 1 raise it, too.
 
     >>> mixture = GaussianMixture(torch.ones(1), torch.zeros(1, 2), torch.eye(2)[None], ("a", "b"))
     >>> mixture.condition({"b": 3.0}).means
@@ -61,10 +69,10 @@ class GaussianMixture(Value):
     (tensor(-1.8379), ('b',), torch.Size([5, 2]))
     """
 
-    weights: Float[Tensor, "m"]  # probabilities of the m components, of sum 1
-    means: Float[Tensor, "m d"]  # means of the components, in the units of the d dimensions
-    covariances: Float[Tensor, "m d d"]  # their covariances, in products of these units
-    names: tuple[str, ...]  # names of the d dimensions
+    weights: Float[Tensor, "m"]
+    means: Float[Tensor, "m d"]
+    covariances: Float[Tensor, "m d d"]
+    names: tuple[str, ...]
 
     def __post_init__(self) -> None:
         d = len(self.names)
@@ -96,9 +104,9 @@ class GaussianMixture(Value):
 
     @checked(gradients=True)
     def log_prob(self, x: Float[Tensor, "*b d"]) -> Float[Tensor, "*b"]:
-        """Return the log-density [nats] of each point x (..., d), Eq. (19).
+        """Return the log-density (*b,) [nats] of each point `x` (*b, d), Eq. (19).
 
-        Raises `BadArgument` for points that do not have d numbers.
+        b stands for any batch axes. Raises `BadArgument` for points that do not have d numbers.
         """
         if x.ndim < 1 or x.shape[-1] != len(self.names):
             raise BadArgument("x", f"shape {tuple(x.shape)}", f"rows of {len(self.names)} numbers")
@@ -106,9 +114,10 @@ class GaussianMixture(Value):
 
     @checked(gradients=True)
     def log_joint(self, x: Float[Tensor, "n d"]) -> Float[Tensor, "n m"]:
-        """Return the log joint density [nats] of each of n points x with each component.
+        """Return the log joint density (n, m) [nats] of each of n points `x` (n, d) with each
+        component.
 
-        It is log(weight) + log N(x | mean, covariance).
+        It is log(weight) + log N(x | mean, covariance). It is -inf for a component of weight 0.
         """
         density = self.whitening.log_scale - 0.5 * self.whitening.squared(x.double())
         weights = self.weights.double()
@@ -119,10 +128,10 @@ class GaussianMixture(Value):
 
     @checked
     def sample(self, n: Annotated[int, Range(0, 10**8)], seed: Seed = 0) -> Float[Tensor, "n d"]:
-        """Draw n random points of the mixture, in the units of its dimensions.
+        """Draw n random points (n, d) of the mixture, in the units of its dimensions.
 
-        Raises `BadArgument` for n or seed out of range, or a parameter that requires a gradient:
-        samples are not differentiable.
+        The same `seed` gives the same points. Raises `BadArgument` for n or seed out of range, or a
+        parameter that requires a gradient: samples are not differentiable.
         """
         for name in PARAMETERS:
             check_dense(name, getattr(self, name), gradients=False)
@@ -158,9 +167,13 @@ class GaussianMixture(Value):
         """Return the mixture of the other dimensions, given the values of some of them, Eq. (23) of
         the paper.
 
-        `given` maps the names of dimensions to values, in their units. Components of weight 0 are
-        left out, except inside torch.vmap. Raises `BadArgument` for unknown names, non-finite
-        values, or if all dimensions are given.
+        Components whose weight becomes 0 are left out, except inside torch.vmap.
+
+        Args:
+            given: values of some dimensions, by name, in their units.
+
+        Raises `BadArgument` for unknown names, values that are not finite, or if all dimensions are
+        given.
         """
         observed = self._index(tuple(given))
         rest = [i for i in range(len(self.names)) if i not in observed]
@@ -185,18 +198,24 @@ class GaussianMixture(Value):
         return GaussianMixture(weights, means, covariances, names)
 
     def mean(self) -> Float[Tensor, "d"]:
-        """Return the expected value of each of the d dimensions, in its unit."""
+        """Return the expected value (d,) of each of the d dimensions, in its unit."""
         return self.weights.double() @ self.means.double()
 
     def covariance(self) -> Float[Tensor, "d d"]:
-        """Return the covariance matrix of the whole mixture, in products of the units."""
+        """Return the covariance matrix (d, d) of the whole mixture, in products of the dimensions'
+        units.
+        """
         offset = self.means.double() - self.mean()
         within = torch.einsum("m,mij->ij", self.weights.double(), self.covariances.double())
         return within + torch.einsum("m,mi,mj->ij", self.weights.double(), offset, offset)
 
     @of_parameters
     def whitening(self) -> "Whitening":
-        """The components in whitened form, which makes densities quick to evaluate."""
+        """The components in whitened form, which makes densities quick to evaluate.
+
+        It holds `matrix` (m, d, d), the lower-triangular W with W^T W = covariance^-1, and `means`
+        (m, d), W mean. `log_scale` (m,) [nats] is the log-density of each Gaussian at its mean.
+        """
         means = self.means.double()
         d = len(self.names)
         matrix = whitening_matrices(self.covariances.double())

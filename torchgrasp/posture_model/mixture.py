@@ -62,12 +62,18 @@ def encode_fingertips(
 
 @checked(gradients=True)
 def encode(contacts: Contacts | tuple[Tensor, Tensor]) -> ContactCode:
-    """Return the contact codes of b contact triples for all six assignments of contacts to fingers,
-    Eqs. (15)-(18).
+    """Return six contact codes for each of b contact triples, one for each assignment of contacts
+    to fingers, Eqs. (15)-(18).
 
-    A code is three lengths [m] and three cosines, which no rigid motion changes. Contacts are given
-    as `Contacts`, or as points [m] and unit normals, both (b, 3, 3). Contacts on a line give NaN
-    and `Status.DEGENERATE`. Codes and frames are differentiable in both. Raises `BadArgument` for
+    A code is three distances [m] of the contacts from their centroid, and three cosines between
+    their normals. No rigid motion changes it. Codes and frames are differentiable in points and
+    normals.
+
+    Args:
+        contacts: `Contacts` with three contacts in each set, or a pair of points [m] and unit
+            normals, both (b, 3, 3).
+
+    A triple whose contacts lie on a line has NaN and `Status.DEGENERATE`. Raises `BadArgument` for
     wrong shapes, numbers that are not finite, or normals whose length is not 1 within 1e-3.
 
     >>> encode((torch.eye(3)[None], torch.eye(3)[None])).q.shape
@@ -160,11 +166,22 @@ def _probe_codes(hand: Hand) -> Float[Tensor, "3 q"]:
 class GraspMixture(GaussianMixture):
     """The learned mixture over the joints and contact codes of one hand (Eqs. 19-20).
 
-    The dimensions are the joints [rad], in the hand's order, then the contact code of
-    `ContactCode`: distances L1 L2 L3 [m] of the contacts from their centroid, cosines N1 N2 N3
-    between their normals. A contact set has 6 codes, one for each assignment to fingers. The names
-    must end with `CODE_NAMES`. `regularisation`, relative to the samples' variance, was added to
-    every variance. `meta` describes hand, samples and fit.
+    `load_mixture` reads it, and `fit_mixture` fits it. `energy` tells whether the hand reaches a
+    contact code, and `joints` returns its expected joints.
+
+    Its d dimensions are the h joints [rad or m], in the hand's order, then a contact code. A code
+    has the distances L1 L2 L3 [m] of three contacts from their centroid. Then come the cosines N1
+    N2 N3 between their normals. A contact set has six codes, one for each assignment to fingers
+    (`encode`).
+
+    Args:
+        weights: probabilities (m,) of the m components, of sum 1.
+        means: means (m, d) of the components, in the units of the dimensions.
+        covariances: covariances (m, d, d) of the components, in products of these units.
+        names: names of the d dimensions; the last six are `CODE_NAMES`.
+        regularisation: variance that was added to every dimension, relative to the samples'
+            variance.
+        meta: texts that describe hand, samples and fit.
 
     >>> from torchgrasp import encode
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -173,7 +190,7 @@ class GraspMixture(GaussianMixture):
     (torch.Size([1, 6]), torch.Size([1, 6, 4]), torch.Size([1, 6, 2, 4]))
     """
 
-    regularisation: float = 0.0  # added to each variance, relative to the samples' variance
+    regularisation: float = 0.0
     meta: dict[str, str] = dataclasses.field(default_factory=dict[str, str])
 
     def __post_init__(self) -> None:
@@ -213,12 +230,17 @@ class GraspMixture(GaussianMixture):
     def energy(
         self, code: ContactCode | Annotated[Float[Tensor, "*b 6"], ANY]
     ) -> Float[Tensor, "*b"]:
-        """Return the energy min f_i (no unit) of each contact code, Eq. (21).
+        """Return the energy min f_i (*b,) (no unit) of each contact code, Eq. (21). Less is easier
+        to reach.
 
         It is half the squared Mahalanobis distance of the code from the nearest component. The hand
         probably reaches a code whose energy is below `DEFAULT_ENERGY`, or the paper's
-        `PAPER_ENERGY`. A code that is not finite gives NaN. Where two components are equally near,
-        the derivative is the mean of theirs.
+        `PAPER_ENERGY`. Where two components are equally near, the derivative is the mean of both
+        derivatives.
+
+        Args:
+            code: a `ContactCode`, or codes (*b, 6): three lengths [m], then three cosines. b stands
+                for any batch axes. A code that is not finite gives NaN.
         """
         whitening = self._code.whitening
         return _map_codes(lambda q: 0.5 * whitening.squared(q).amin(-1), code)
@@ -227,10 +249,14 @@ class GraspMixture(GaussianMixture):
     def joints(
         self, code: ContactCode | Annotated[Float[Tensor, "*b 6"], ANY]
     ) -> Float[Tensor, "*b h"]:
-        """Return the expected joint positions [rad] given each contact code, Eq. (23) of the paper.
+        """Return the expected positions (*b, h) [rad or m] of the joints given each contact code,
+        Eq. (23) of the paper.
 
-        The code describes a contact set by three lengths [m] and three cosines. The joints may
-        exceed their limits. A code that is not finite gives NaN.
+        They may exceed the joint limits.
+
+        Args:
+            code: a `ContactCode`, or codes (*b, 6): three lengths [m], then three cosines. b stands
+                for any batch axes. A code that is not finite gives NaN.
         """
         codes = self._code
         regression = self._stacked_regression
@@ -248,12 +274,18 @@ class GraspMixture(GaussianMixture):
         self, q: Annotated[Float[Tensor, "*b 6"], ANY], k: Count
     ) -> tuple[Float[Tensor, "*b k h"], Float[Tensor, "*b k"]]:
         """Return (joints, responsibilities) of the k components most responsible for each contact
-        code q.
+        code.
 
-        The joints [rad] are each component's mean given the code. The responsibilities (shares) are
-        h_i in Eq. (23) of the paper, the largest first. Use them where several postures have the
-        same code: the expected joints may then be none of these postures. A code that is not finite
-        gives NaN. Raises `BadArgument` for k outside [1, m].
+        `joints` (*b, k, h) [rad or m] are each component's mean given the code. `responsibilities`
+        (*b, k) are the shares h_i in Eq. (23) of the paper, the largest first. Use them where
+        several postures have the same code: the expected joints may then be none of these postures.
+
+        Args:
+            q: codes (*b, 6): three lengths [m], then three cosines. b stands for any batch axes. A
+                code that is not finite gives NaN.
+            k: number of components, 1 to m.
+
+        Raises `BadArgument` for k outside [1, m].
         """
         check_whole("k", k, 1, len(self.weights))
         codes = self._code
@@ -273,8 +305,7 @@ class GraspMixture(GaussianMixture):
 
     @checked
     def save(self, path: Path | str) -> Path:
-        """Write the mixture atomically as a safetensors file, which `load_mixture` reads; return
-        its path.
+        """Write the mixture to a safetensors file, atomically, for `load_mixture`. Return its path.
 
         Raises `OutputError` if the file cannot be written.
 
@@ -306,10 +337,14 @@ def _map_codes(
 
 @checked
 def load_mixture(name_or_path: Path | str) -> GraspMixture:
-    """Read the learned mixture of a hand.
+    """Return the learned mixture of a hand, read from a file.
 
-    It is given by the hand's name or folder, or by the path of a .safetensors file. Raises
-    `HandFileError` for an unknown hand, `ModelFileError` for a missing or malformed file.
+    Args:
+        name_or_path: the hand's name, the hand's folder, or the path of a .safetensors file that
+            `GraspMixture.save` wrote.
+
+    Raises `HandFileError` for an unknown hand, and `ModelFileError` for a missing or malformed
+    file.
 
     >>> load_mixture("allegro").means.shape
     torch.Size([40, 18])

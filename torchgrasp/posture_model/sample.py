@@ -108,7 +108,14 @@ Sampling = Literal["uniform", "grasping"]
 @checked
 @dataclasses.dataclass(frozen=True)
 class HandSamples(Batch):
-    """Sampled postures of one hand.
+    """n sampled postures of one hand, from `sample_configurations` or `SampleFolder.read`.
+
+    Attributes:
+        joints: positions (n, h) [rad or m] of the h actuated joints.
+        q: contact codes (n, q) of the fingertips: lengths [m], then cosines. A hand of three
+            fingers has q = 6.
+        joint_names: names of the h joints, in the order of the columns of `joints`.
+        meta: texts that describe hand, seed and sampling.
 
     >>> from torchgrasp import load_hand
     >>> samples = sample_configurations(load_hand("barrett"), 50)
@@ -116,24 +123,30 @@ class HandSamples(Batch):
     (torch.Size([50, 4]), torch.Size([50, 10]), 'barrett')
     """
 
-    joints: Float[Tensor, "n h"]  # actuated joints [rad], in the order of `joint_names`
-    q: Float[Tensor, "n q"]  # contact codes of the fingertips: lengths [m], then cosines
+    joints: Float[Tensor, "n h"]
+    q: Float[Tensor, "n q"]
     joint_names: tuple[str, ...]
-    # hand, seed and sampling
     meta: dict[str, str] = dataclasses.field(default_factory=dict[str, str])
 
     def rows(self) -> Float[Tensor, "n d"]:
-        """Return d numbers for each posture: its joints [rad], then its contact code."""
+        """Return d numbers (n, d) for each posture: joints [rad or m], then the contact code."""
         return torch.cat([self.joints, self.q], dim=-1)
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class SampleSpec(Value):
-    """The settings by which `n` postures without self-collision are drawn.
+    """The settings by which `write_samples` draws `n` postures without self-collision.
 
-    Postures are drawn in chunks of `CHUNK_POSTURES`. Chunk i depends only on `seed` and i.
-    So a smaller set of samples is the beginning of a larger one. `Sampling` lists the ways to draw.
+    A smaller set of samples is the beginning of a larger one. Chunk i of `CHUNK_POSTURES` postures
+    depends only on `seed`, `sampling` and i.
+
+    Args:
+        n: number of postures, 1 to 100,000,000.
+        seed: seed of the draws.
+        sampling: which postures are taken. "uniform" means all, as in the paper. "grasping" means
+            those whose random contacts can have force closure.
+
     Raises `BadArgument` for values out of range.
 
     >>> from torchgrasp import load_hand
@@ -141,15 +154,13 @@ class SampleSpec(Value):
     '7'
     """
 
-    n: Annotated[int, Range(1, MAX_SAMPLES)]  # number of postures
+    n: Annotated[int, Range(1, MAX_SAMPLES)]
     seed: Seed = 0
-    sampling: Sampling = "uniform"  # which postures are taken
+    sampling: Sampling = "uniform"
 
     @checked
     def meta(self, hand: Hand) -> dict[str, str]:
-        """Return metadata that identifies the samples: hand, seed and sampling, but not their
-        number.
-        """
+        """Return texts that identify the samples: hand, seed and sampling, but not their number."""
         return {**describe_compatibility(hand), "seed": str(self.seed), "sampling": self.sampling}
 
 
@@ -162,15 +173,23 @@ def sample_configurations(
     sampling: Sampling = "uniform",
     observer: Callable[[int], object] = lambda count: None,
 ) -> HandSamples:
-    """Draw random postures within the joint limits, and return `n` of them without self-collision
-    (Sec. 6.3).
+    """Return `n` random postures within the joint limits and without self-collision (Sec. 6.3).
 
-    `sampling` "uniform" keeps all postures without self-collision. "grasping" keeps only those
-    whose random contacts can have force closure (`Sampling`); it needs a hand with three fingers. A
-    smaller set with the same `seed` is the beginning of a larger one. `workers` threads draw at the
-    same time. The `observer` is called after each chunk with the number of its postures. Raises
-    `BadArgument` for an argument out of range or "grasping" with another number of fingers. It is
-    also raised for a hand of which almost no random posture is kept.
+    A smaller set with the same `seed` is the beginning of a larger one.
+
+    Args:
+        hand: the hand.
+        n: number of postures, 1 to 100,000,000.
+        seed: seed of the draws.
+        workers: number of threads that draw at the same time, 1 to 1024.
+        sampling: which postures are taken. "uniform" means all without self-collision. "grasping"
+            means those whose random contacts can have force closure; it needs a hand with three
+            fingers.
+        observer: called after each chunk with the number of its postures.
+
+    Raises:
+        BadArgument: an argument out of range; "grasping" with another number of fingers.
+        BadArgument: a hand of which almost no random posture is kept.
 
     >>> from torchgrasp.hand.load import load_hand
     >>> sample_configurations(load_hand("barrett"), 100).q.shape

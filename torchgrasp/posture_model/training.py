@@ -146,33 +146,38 @@ def fit_mixture(
     distributed: bool = False,
     observer: Callable[[FitProgress], None] = lambda progress: None,
 ) -> GraspMixture:
-    """Fit the mixture of Eqs. (19)-(20) to sampled postures by expectation-maximisation,
-    initialised by k-means.
+    """Return the mixture of Eqs. (19)-(20), fitted to sampled postures by expectation-maximisation.
 
-    The mixture's `meta` reports iterations, convergence, collapsed components, mean log-likelihood
-    and the Bayesian information criterion (BIC). Codes are exact functions of the joints, so the
-    BIC keeps falling with more components: use its elbow, not its minimum. Raises `BadArgument` for
-    too few samples, a joint that does not vary, a number out of range, or another fit's checkpoint.
-    Raises `ModelFileError` for a damaged checkpoint, and `OutputError` for one that cannot be
-    written. Raises `IndefiniteCovariance` if a component collapses more than three times.
+    It starts from k-means. The mixture's `meta` reports iterations, convergence, collapsed
+    components, mean log-likelihood [nats] and the Bayesian information criterion (BIC). Codes are
+    exact functions of the joints, so the BIC keeps falling with more components: use its elbow, not
+    its minimum.
 
     Args:
-        samples: joints [rad] and fingertip codes of postures of one hand.
+        samples: n postures of one hand: joints [rad or m] and fingertip codes.
         components: number m of Gaussians.
+        seed: seed of k-means, and of the random subsets.
         iterations: largest number of steps.
-        tolerance: stop when a step raises the mean log-likelihood by less [nats].
-        regularisation: variance added to every dimension of a component, relative to its variance
-            over all samples.
+        tolerance: the fit stops when a step raises the mean log-likelihood by less [nats].
+        regularisation: variance added to every dimension of a component, relative to the
+            dimension's variance over all samples.
         starts: number of k-means initialisations, with consecutive seeds. After a few steps of
             each, the fit of the greatest likelihood continues.
         subset: least number of rows of nested random subsets, each half of the next. EM fits one
-            after the other, and all rows at last. Every start is fitted to the smaller subsets. By
-            default, EM sees all rows in each step.
-        checkpoint: file that stores the fit after every step. A fit that continues from it gives
-            the same bits.
+            after the other, and all rows at last. Every start is fitted to the smaller subsets.
+            None means that EM sees all rows in each step.
+        checkpoint: file that stores the fit after every step; None means none. A fit that continues
+            from it gives the same bits.
         distributed: whether `samples` are only the part of this process under torchrun. All
             processes must see the same checkpoint.
         observer: called with the state of the fit after each step.
+
+    Raises:
+        BadArgument: too few samples; a joint that does not vary; a number out of range; another
+            fit's checkpoint.
+        ModelFileError: a damaged checkpoint.
+        OutputError: a checkpoint that cannot be written.
+        IndefiniteCovariance: a component collapses more than three times.
 
     >>> import torch
     >>> numbers = torch.rand(500, 7, generator=torch.Generator().manual_seed(0))
