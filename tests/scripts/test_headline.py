@@ -17,12 +17,8 @@ from benchmarks.headline.page import (
     readme_table,
     replace_table,
 )
-from benchmarks.headline.shapes import (
-    distance_from,
-    judge_contacts,
-    judge_hidden,
-    measure_floor,
-)
+from benchmarks.headline.shapes import judge_hidden, measure_floor
+from benchmarks.headline.touched import Touch, distance_from, judge_contacts, prefer_measured
 
 from torchgrasp.evaluation import ProtocolResult, ViewScore
 from torchgrasp.foundation.errors import Status
@@ -115,9 +111,15 @@ def test_contacts_on_real_views_are_near_what_was_measured_or_told() -> None:
     away = distance_from(flat, above)
     torch.testing.assert_close(away, height.double())
     # the first is near, the second is told by its deviation, the third is not
-    row = judge_contacts("", [away], [torch.tensor([0.0, 0.003, 0.009]).double()], 0.9, 1)
+    row = judge_contacts("", [Touch(away, torch.tensor([0.0, 0.003, 0.009]).double(), 0.9)], 1)
     assert row.measured.startswith("33% of 3; 1 of the other 2 are told") and not row.met
-    wide = judge_contacts("", [away[:1]] * 9 + [away[2:]], [away[:1]] * 10, 0.9, 0)
-    assert not wide.met
-    told = judge_contacts("", [away[:1]] * 9 + [away[2:]], [away[2:]] * 10, 0.9, 0)
+    near = [Touch(away[:1], away[:1], 0.9)] * 9
+    assert not judge_contacts("", [*near, Touch(away[2:], away[:1], 0.9)], 0).met
+    told = judge_contacts("", [*near, Touch(away[2:], away[2:], 0.9)], 0)
     assert told.met and told.measured.startswith("90% of 10; 1 of the other 1 ")
+
+
+def test_a_grasp_on_measured_surface_is_preferred_within_the_slack() -> None:
+    own = torch.tensor([[0.02, 0.02], [0.001, 0.02], [0.02, 0.002], [0.001, 0.001]])
+    success = torch.tensor([0.9, 0.88, 0.87, 0.6])
+    assert [prefer_measured(own, success, slack) for slack in (0.0, 0.05, 1.0)] == [0, 1, 3]

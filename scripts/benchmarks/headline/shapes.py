@@ -13,9 +13,9 @@ from scipy.spatial import cKDTree
 
 from benchmarks.common import Options, Row, bench
 from benchmarks.headline.left_out import LEFT_OUT, PACED
+from benchmarks.headline.touched import contact_rows
 from benchmarks.plan.pace import keep_pace
 from benchmarks.shape.accuracy import measure_shape
-from torchgrasp import ContactSpec, load_hand, plan_grasps
 from torchgrasp.cloud import read_cloud_file
 from torchgrasp.cloud.prepare import estimate_normals
 from torchgrasp.data import read_object_mesh, read_view
@@ -32,15 +32,6 @@ UNSEEN = 0.006
 
 QUERIES = 1500
 """Most points of the hidden side that are compared."""
-
-NEAR = 0.005
-"""Distance [m] from a measured point within which a contact is on measured surface."""
-
-TOLD = 0.5
-"""Share of a contact's distance from measured points that its std_m must have to tell it."""
-
-FRICTION = 0.8
-"""Friction of the plans on real clouds."""
 
 EDGE = 1 - 1e-9
 """Share of the largest distance from the centre at which a shape is asked."""
@@ -94,7 +85,8 @@ def real(o: Options) -> list[Row]:
     )
     floor_row = Row("floor: distance of the cameras where both see", "-", words)
     hidden = _hidden(f"{len(found)} real views", found, "<= 3.0 mm")
-    return [hidden, floor_row, *(_contacts_row(name, clouds, o) for name in o.hands)]
+    contacts = [row for name in o.hands for row in contact_rows(name, clouds, TABLE, o)]
+    return [hidden, floor_row, *contacts]
 
 
 @bench("headline/pace", objects=True)
@@ -157,70 +149,6 @@ def measure_floor(seen: torch.Tensor, measured: torch.Tensor) -> float:
     offset = measured[both] - view.points[rows]
     height = (offset * view.normals[rows]).sum(1).abs()
     return 1e3 * float(height.median()) if len(height) else float("nan")
-
-
-def _contacts_row(name: str, clouds: dict[str, dict[str, torch.Tensor]], o: Options) -> Row:
-    """Return how many contacts of the best grasps are on measured surface, and how many are told.
-
-    Each view is planned alone. All cameras tell what was measured.
-    """
-    hand = load_hand(name)
-    away = list[torch.Tensor]()
-    std_m = list[torch.Tensor]()
-    success = list[float]()
-    refused = 0
-    for thing, views in clouds.items():
-        measured = torch.cat(list(views.values()))
-        for camera, points in views.items():
-            try:
-                shape = fit_shape(PointCloud(points), table=TABLE)
-                spec = ContactSpec(friction=FRICTION, table=TABLE)
-                plan = plan_grasps(PointCloud(points), hand, spec, o.starts, o.seed)
-                best = plan.best
-            except GraspError:
-                refused += 1
-                continue
-            contacts = best.contacts.points[0].double()
-            away.append(distance_from(measured, contacts))
-            std_m.append(shape.predict(contacts).std_m)
-            success.append(float(torch.sigmoid(best.score[0])))
-            pairs = zip(away[-1].tolist(), std_m[-1].tolist(), strict=True)
-            text = ", ".join(f"{1e3 * d:.1f} mm (std_m {1e3 * s:.1f})" for d, s in pairs)
-            print(f"{thing}_{camera}, {name}: {text} from a measured point")
-    what = f"contacts of the best grasp of {len(away)} real views, {name}"
-    if not away:
-        return Row(what, "-", f"{refused} views without a grasp")
-    return judge_contacts(what, away, std_m, statistics.mean(success), refused)
-
-
-def distance_from(measured: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
-    """Return the distance (n,) of each of the points (n, 3) from the nearest measured one [m]."""
-    return torch.from_numpy(cKDTree(measured.numpy()).query(points.numpy())[0])
-
-
-def judge_contacts(
-    what: str,
-    away: list[torch.Tensor],
-    std_m: list[torch.Tensor],
-    success: float,
-    refused: int,
-) -> Row:
-    """Return the row of contacts whose distances `away` from measured points are near, or told.
-
-    A distance [m] is told if the `std_m` [m] of the surface there is half of it or more. There is
-    one tensor for each view, and `success` is the mean of the best grasps.
-    """
-    distance = torch.cat(away)
-    deviation = torch.cat(std_m)
-    near = distance <= NEAR
-    told = (deviation >= TOLD * distance) & ~near
-    share = float(near.double().mean())
-    rest = int((~near).sum())
-    words = f"{share:.0%} of {len(near)}; {int(told.sum())} of the other {rest} are told"
-    words += f"; predicted success {success:.2f}; {refused} views without a grasp"
-    met = share >= 0.85 and int(told.sum()) == rest
-    bar = ">= 85 % within 5 mm of a measured point, all others with std_m of half their distance"
-    return Row(what, bar, words, met, {"away": away, "std_m": std_m})
 
 
 def _hidden(what: str, found: list[dict[str, float]], bar: str) -> Row:

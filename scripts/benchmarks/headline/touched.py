@@ -1,0 +1,131 @@
+"""Where the contacts of grasps lie that were planned on one real view: on measured surface, or on
+guessed surface that says so.
+"""
+
+import dataclasses
+import statistics
+
+import torch
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from benchmarks.common import Options, Row
+from torchgrasp import ContactSpec, load_hand, plan_grasps
+from torchgrasp.foundation.errors import GraspError, Status
+from torchgrasp.shape.fit import fit_shape
+from torchgrasp.values.planning import PointCloud
+
+NEAR = 0.005
+"""Distance [m] from a measured point within which a contact is on measured surface."""
+
+TOLD = 0.5
+"""Share of a contact's distance from measured points that its std_m must have to tell it."""
+
+LEAST = 0.85
+"""Least share of contacts on measured surface."""
+
+FRICTION = 0.8
+"""Friction of the plans."""
+
+CHOICES = {
+    "the best grasp": 0.0,
+    "the grasp of most measured contacts within 0.05 of the best's success": 0.05,
+    "the grasp of most measured contacts": 1.0,
+}
+"""Grasps whose contacts are judged: by how much less likely they may be than the best one."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Touch:
+    """The contacts of one grasp: their distances `away` from what any camera measured, and the
+    deviation `std_m` of the surface there [m]; and the grasp's predicted success.
+    """
+
+    away: Tensor
+    std_m: Tensor
+    success: float
+
+
+def contact_rows(
+    name: str, clouds: dict[str, dict[str, Tensor]], table: float, o: Options
+) -> list[Row]:
+    """Return a row for each of `CHOICES` of the grasps of a hand, planned on each view alone.
+
+    `clouds` holds the points (n, 3) [m] of each thing by camera, on a `table` [m].
+    """
+    hand = load_hand(name)
+    found: dict[str, list[Touch]] = {choice: [] for choice in CHOICES}
+    refused = 0
+    for thing, views in clouds.items():
+        measured = torch.cat(list(views.values()))
+        for camera, points in views.items():
+            cloud = PointCloud(points)
+            try:
+                shape = fit_shape(cloud, table=table)
+                spec = ContactSpec(friction=FRICTION, table=table)
+                plan = plan_grasps(cloud, hand, spec, o.starts, o.seed)
+            except GraspError:
+                refused += 1
+                continue
+            good = plan[plan.status == Status.OK]
+            if not len(good):
+                refused += 1
+                continue
+            contacts = good.contacts.points.double()
+            success = torch.sigmoid(good.score)
+            own = distance_from(points, contacts)
+            for choice, slack in CHOICES.items():
+                k = prefer_measured(own, success, slack)
+                away = distance_from(measured, contacts[k])
+                touch = Touch(away, shape.predict(contacts[k]).std_m, float(success[k]))
+                found[choice].append(touch)
+            print(f"{thing}_{camera}, {name}: {tell(found['the best grasp'][-1])}", flush=True)
+    if not found["the best grasp"]:
+        return [Row(f"contacts on real views, {name}", "-", f"{refused} views without a grasp")]
+    return [
+        judge_contacts(f"contacts of {choice}, {len(some)} real views, {name}", some, refused)
+        for choice, some in found.items()
+    ]
+
+
+def distance_from(measured: Tensor, points: Tensor) -> Tensor:
+    """Return the distance (..) of each of the points (.., 3) from the nearest measured one [m]."""
+    away = KDTree(measured.numpy()).query(points.reshape(-1, 3).numpy())[0]
+    return torch.from_numpy(away).reshape(points.shape[:-1])
+
+
+def prefer_measured(own: Tensor, success: Tensor, slack: float) -> int:
+    """Return the index of the grasp with most contacts near what its own view measured.
+
+    `own` (g, f) [m] are the distances of the contacts from it. Only grasps count whose `success`
+    (g,), which falls, is at most `slack` below that of the first. Of equal ones the first is taken.
+    """
+    near = (own <= NEAR).sum(1)
+    near[success < success[0] - slack] = -1
+    return 0 if slack == 0 else int(torch.nonzero(near == near.max())[0, 0])
+
+
+def tell(touch: Touch) -> str:
+    """Return the contacts of a grasp as text."""
+    pairs = zip(touch.away.tolist(), touch.std_m.tolist(), strict=True)
+    text = ", ".join(f"{1e3 * d:.1f} mm (std_m {1e3 * s:.1f})" for d, s in pairs)
+    return f"{text} from a measured point"
+
+
+def judge_contacts(what: str, found: list[Touch], refused: int) -> Row:
+    """Return the row of contacts that are near what was measured, or told.
+
+    A distance is told if `std_m` is half of it or more. `refused` views had no grasp.
+    """
+    distance = torch.cat([touch.away for touch in found])
+    deviation = torch.cat([touch.std_m for touch in found])
+    near = distance <= NEAR
+    told = (deviation >= TOLD * distance) & ~near
+    share = float(near.double().mean())
+    rest = int((~near).sum())
+    success = statistics.mean(touch.success for touch in found)
+    words = f"{share:.0%} of {len(near)}; {int(told.sum())} of the other {rest} are told"
+    words += f"; predicted success {success:.3f}; {refused} views without a grasp"
+    met = share >= LEAST and int(told.sum()) == rest
+    bar = ">= 85 % within 5 mm of a measured point, all others with std_m of half their distance"
+    return Row(what, bar, words, met, {"away": distance, "std_m": deviation})
