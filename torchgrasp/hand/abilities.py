@@ -38,18 +38,19 @@ ABILITY = AbilityNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class FingerAbility:
-    """What the tip of one finger can do.
+    """What the tip of one finger can do; `hand_abilities` makes it.
 
-    Args:
+    Attributes:
         name: name of the finger.
-        tip_link: link of its tip.
+        tip_link: name of the link of its tip.
         joints: number of the actuated joints that move the tip.
-        force: normal force [N] with which the tip can press along its pad's normal, in the median
-            of the free postures. It acts at the pad's contact point. No other finger presses, and
-            each actuated joint exerts at most its effort.
-        sure_force: the same force [N] that nine of ten free postures reach.
+        force: normal force [N] with which the tip presses in the median free posture. NaN if no
+            joint moves the contact point along its normal: the structure then carries the load.
+        sure_force: normal force [N] that nine of ten free postures reach. NaN as for `force`.
 
-    A force is NaN where the finger has no lever along its normal: its structure carries the load.
+    Both forces act at the contact point of the pad, along the pad's normal. No other finger
+    presses, and each actuated joint exerts at most its effort. A posture is free if no links of the
+    hand overlap.
     """
 
     name: str
@@ -62,20 +63,22 @@ class FingerAbility:
 @checked
 @dataclasses.dataclass(frozen=True)
 class PairAbility:
-    """What two fingertips can do together.
+    """What two fingertips can do together; `hand_abilities` makes it.
 
-    Args:
+    Attributes:
         fingers: names of both fingers, in grasp order.
-        least_span: least distance [m] of the contact points of their pads, in the free postures.
-        greatest_span: greatest distance [m] of these points.
-        least_width: least thickness [m] of a plate that the tips can hold between them.
-        greatest_width: greatest thickness [m] of such a plate.
-        opposed: share of the free postures in which the tips can hold a plate.
+        least_span: least distance [m] between the contact points of the two pads, over the free
+            postures.
+        greatest_span: greatest distance [m] between these contact points.
+        least_width: least thickness [m] of a plate that the tips hold between them. NaN if no free
+            posture holds a plate.
+        greatest_width: greatest thickness [m] of a plate that the tips hold. NaN as for
+            `least_width`.
+        opposed: share [0 to 1] of the free postures in which the tips hold a plate.
 
-    Each pad has a cone about its normal, of 60 degrees for a round tip and of 40 for a flat one.
-    Tips hold a plate where the line between the centres of their spheres leaves both within these
-    cones. The plate is as thick as the gap of the tips on this line. Widths are NaN if no free
-    posture has a plate.
+    A posture is free if no links of the hand overlap. Tips hold a plate if the line between the
+    centres of their spheres lies in the cones of both pads. `Fingertips.cone` is the half angle of
+    these cones. The plate is as thick as the gap of the tips on this line.
     """
 
     fingers: tuple[str, str]
@@ -89,17 +92,17 @@ class PairAbility:
 @checked
 @dataclasses.dataclass(frozen=True)
 class HandAbilities:
-    """The abilities of a hand with one set of grasping fingers.
+    """What a hand can do with one choice of grasping fingers; `hand_abilities` makes it.
 
-    Args:
+    Attributes:
         hand: name of the hand.
         option: option of hand.toml by which the fingers were chosen, or their names.
         joints: number of actuated joints.
         postures: number of random postures that were drawn.
         seed: seed of these postures.
-        free: share of the postures that are free.
-        fingers: abilities of each fingertip, in grasp order.
-        pairs: abilities of each pair of fingertips.
+        free: share [0 to 1] of the postures in which no links of the hand overlap.
+        fingers: a `FingerAbility` for each grasping finger, in grasp order.
+        pairs: a `PairAbility` for each pair of grasping fingers.
     """
 
     hand: str
@@ -113,17 +116,20 @@ class HandAbilities:
 
     @property
     def least_width(self) -> float:
-        """Least thickness [m] of a plate that any two tips can hold; NaN if none can."""
+        """Least thickness [m] of a plate that any two tips hold; NaN if no two tips hold one."""
         return min(_known(pair.least_width for pair in self.pairs), default=math.nan)
 
     @property
     def greatest_width(self) -> float:
-        """Greatest thickness [m] of a plate that any two tips can hold; NaN if none can."""
+        """Greatest thickness [m] of a plate that any two tips hold; NaN if no two tips hold one."""
         return max(_known(pair.greatest_width for pair in self.pairs), default=math.nan)
 
     @checked
     def content(self) -> dict[str, Any]:
-        """Return the abilities as a dict for JSON, with units in the names; NaN becomes None."""
+        """Return the abilities as a dict for JSON.
+
+        Keys end with the unit, as `force_n`. Numbers have six significant digits. NaN becomes None.
+        """
         fingers = [
             {
                 "name": finger.name,
@@ -158,11 +164,15 @@ class HandAbilities:
 
 @checked
 def hand_abilities(hand: Hand, postures: Count = 5000, seed: Seed = 0) -> HandAbilities:
-    """Return what a hand can do with its grasping fingers, from seeded random postures.
+    """Return what a hand can do with its grasping fingers, measured in random postures.
 
-    `HandAbilities`, `FingerAbility` and `PairAbility` define each number. Extremes are those of the
-    drawn postures: more `postures` come nearer to those of the hand. The hand keeps the result.
-    Raises `BadArgument` for a hand of whose postures none is free.
+    Args:
+        hand: the hand, with its grasping fingers. It caches the result.
+        postures: number of random postures, uniform within the joint limits. Extremes are over
+            these postures: more postures approach the hand's own extremes.
+        seed: seed of the random postures.
+
+    Raises `BadArgument` if links of the hand overlap in every drawn posture.
 
     >>> from torchgrasp import load_hand
     >>> able = hand_abilities(load_hand("barrett"), postures=500)

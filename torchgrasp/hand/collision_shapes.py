@@ -60,11 +60,15 @@ COVER = CoverNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class CollisionSpheres(Value):
-    """Spheres that cover the links of a hand.
+    """The s spheres that cover the links of a hand; a `Hand` holds them as `collision_spheres`.
 
-    `center` [m] is in the frame of the link with the index `link_index`, in the order of the URDF;
-    `radius` is in metres. `finger` is the index of the sphere's finger in grasp order, -1 for the
-    palm, -2 for a finger that does not grasp. `touching` marks the spheres of fingertips.
+    Attributes:
+        link_index: index (s,) of the link of each sphere, in `Hand.tree.link_names`.
+        center: centre (s, 3) [m] of each sphere, in the frame of its link.
+        radius: radius (s,) [m] of each sphere.
+        finger: index (s,) of the grasping finger of each sphere, in grasp order. It is -1 for the
+            palm, and -2 for a finger that does not grasp.
+        touching: mask (s,) of the spheres of the grasping fingers' tip links.
 
     >>> from torchgrasp import load_hand
     >>> load_hand("barrett").collision_spheres.center.shape

@@ -36,11 +36,17 @@ touch.
 
 @dataclasses.dataclass(frozen=True)
 class ActuatedJoints(Value):
-    """The joints that move the grasping fingers, and the coupling of all joints to them.
+    """The h actuated joints of the grasping fingers; a `Hand` holds them as `actuated`.
 
-    The positions of all j movable joints of the URDF are `coupling @ joints + offset`, with the h
-    actuated `joints` [rad or m] in the order of `names`. `lower` and `upper` [rad or m] are the
-    limits of the actuated joints. `offset` [rad or m] has the unit of its joint.
+    All j movable joints of the URDF follow the actuated joints. Their positions are `coupling @
+    joints + offset`.
+
+    Attributes:
+        names: names of the h actuated joints, in the order of every tensor of joints.
+        lower: lower limits (h,) [rad, or m for a sliding joint].
+        upper: upper limits (h,) [rad or m].
+        coupling: motion of each movable joint for each actuated joint (j, h).
+        offset: positions (j,) [rad or m] of the movable joints with all actuated joints at 0.
 
     >>> from torchgrasp import load_hand
     >>> actuated = load_hand("barrett").actuated
@@ -56,29 +62,32 @@ class ActuatedJoints(Value):
 
     @checked(gradients=True)
     def expand(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b j"]:
-        """Check the actuated `joints` [rad or m], and return the positions of all movable joints of
-        the URDF.
+        """Return the positions (*b, j) [rad or m] of all j movable joints of the URDF.
 
-        Raises `BadArgument` for what `check` refuses.
+        `joints` (*b, h) are positions [rad or m] of the h actuated joints. Raises `BadArgument` for
+        joints of a wrong count, dtype or device, and for NaN or infinity. Limits are not checked.
         """
         self.check(joints)
         return self.couple(joints)
 
     @checked(gradients=True)
     def couple(self, joints: Annotated[Float[Tensor, "*b h"], ANY]) -> Float[Tensor, "*b j"]:
-        """Return the positions [rad or m] of all movable joints of the URDF, given the actuated
-        `joints`.
+        """Return the positions (*b, j) [rad or m] of all movable joints of the URDF; NaN and
+        infinity pass.
 
-        The input is not checked, because a check would wait for the GPU.
+        `joints` (*b, h) are positions [rad or m] of the h actuated joints. Unlike in `expand`,
+        their numbers are not checked, because a check would wait for the GPU. Raises `BadArgument`
+        for a wrong count of joints.
         """
         return joints @ self.coupling.to(joints).T + self.offset.to(joints)
 
     @checked(gradients=True)
     def check(self, joints: Tensor, name: str = "joints") -> None:
-        """Raise `BadArgument` for joints of a wrong count, dtype or device, for NaN and for
-        infinity.
+        """Raise `BadArgument` unless `joints` (*b, h) are finite positions [rad or m] of the h
+        actuated joints.
 
-        Errors call the argument `name`.
+        The error is raised for joints of a wrong count, dtype or device, for NaN and for infinity.
+        Its text calls the argument `name`. Limits are not checked.
         """
         if joints.ndim < 1 or joints.shape[-1] != len(self.names):
             allowed = f"{len(self.names)} joints in the last axis: {self.names}"
@@ -90,10 +99,11 @@ class ActuatedJoints(Value):
 
     @checked(gradients=True)
     def check_limits(self, joints: Tensor, name: str = "joints") -> None:
-        """Raise `BadArgument` if `check` does, or if a joint [rad or m] is outside its limits by
-        more than rounding.
+        """Raise `BadArgument` unless `joints` (*b, h) [rad or m] pass `check` and are within their
+        limits.
 
-        The rounding is that of float32. Errors call the argument `name`.
+        A joint may exceed a limit by the rounding of float32. The error's text calls the argument
+        `name`.
         """
         self.check(joints, name)
         low = self.lower.to(joints) - ROUNDING
@@ -152,14 +162,22 @@ def joints_from_files(spec: HandSpec, urdf: Urdf) -> ActuatedJoints:
 
 @dataclasses.dataclass(frozen=True)
 class Fingertips(Value):
-    """The f fingertips in grasp order: names, links, and the contact pad of each.
+    """The f grasping fingertips of a hand, in grasp order; a `Hand` holds them as `tips`.
 
-    In the frame of the tip's link, `contact` [m] is the contact point of the pad and `normal` its
-    outward unit normal. `center` and `radius` [m] are those of the pad's sphere; `radius` is 0 for
-    a pad without a sphere. `index` is the index of each tip's link in the whole kinematic tree.
-    Each tip is rigidly attached to a carrier, the last link that a joint moves. `chains` is the
-    part of the tree that leads to the carriers, and `carrier` is the index of each carrier in this
-    part. `carrier_from_tip` holds the poses (3 x 4) [m] of the tips' links in their carriers.
+    A tip touches with its pad. Each tip is rigidly attached to a carrier: the last link that a
+    joint moves.
+
+    Attributes:
+        names: names of the fingers.
+        links: names of the tips' links.
+        index: index (f,) of each tip's link in `Hand.tree.link_names`.
+        contact: contact point (f, 3) [m] of each pad, in the frame of the tip's link.
+        normal: outward unit normal (f, 3) of each pad, in the frame of the tip's link.
+        center: centre (f, 3) [m] of each pad's sphere, in the frame of the tip's link.
+        radius: radius (f,) [m] of each pad's sphere; 0 for a pad without a sphere.
+        chains: the part of the kinematic tree that leads to the carriers.
+        carrier: index (f,) of each carrier in `chains.link_names`.
+        carrier_from_tip: pose (3, 4, f, 1) [m] of each tip's link in its carrier.
 
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("allegro")
@@ -183,7 +201,7 @@ class Fingertips(Value):
 
     @kept
     def cone(self) -> Float[Tensor, "f"]:
-        """Half angle [rad] of the cone about each pad's axis within which the tip may touch."""
+        """Half angle (f,) [rad] of the cone about each pad's normal in which the tip may touch."""
         # float32, as when results were published
         angles = self.radius.new_tensor([ROUND_PAD, FLAT_PAD], dtype=torch.float32)
         return torch.where(self.radius > 0, *angles).to(self.radius)
@@ -192,8 +210,9 @@ class Fingertips(Value):
     def in_carriers(
         self,
     ) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"], Float[Tensor, "f 3"]]:
-        """Contact points [m], unit normals and centres [m] of the pads, each in the frame of the
-        tip's carrier.
+        """Contact points [m], unit normals and sphere centres [m] of the pads, each (f, 3).
+
+        They are in the frames of the tips' carriers.
         """
         pose = self.carrier_from_tip
         contact = map_points(pose, self.contact)[..., 0].T
@@ -203,10 +222,12 @@ class Fingertips(Value):
 
     @checked(gradients=True)
     def frames(self, values: Float[Tensor, "j n"]) -> tuple[Frames, Float[Tensor, "3 4 f n"]]:
-        """Return the poses (3 x 4) [m] of all links of `chains`, then those of the f carriers.
+        """Return the poses [m] of the m links of `chains` (3, 4, m, n), then of the f carriers (3,
+        4, f, n).
 
-        `values` [rad or m] holds the positions of all joints of the URDF in n postures. The poses
-        are in the root's frame. Raises `BadArgument` for a wrong number of joints.
+        `values` (j, n) [rad or m] are the positions of all j movable joints of the URDF, in n
+        postures. The poses are in the palm's frame. Raises `BadArgument` for a wrong number of
+        joints.
         """
         if len(values) != (every := len(self.chains.joint_names)):
             raise BadArgument("values", f"{len(values)} joints", f"all {every} joints of the URDF")

@@ -29,10 +29,15 @@ from torchgrasp.hand.self_collision import SelfCollision
 
 
 class Actuator(NamedTuple):
-    """Drive of one joint: greatest effort and velocity, stiffness and damping.
+    """The drive of one joint: greatest effort and velocity, stiffness and damping.
 
-    `effort` is in [N m], `velocity` in [rad/s], `kp` in [N m/rad] and `kd` in [N m s/rad]; for a
-    sliding joint with [N] and [m] in place of [N m] and [rad].
+    A sliding joint has [N] and [m] in place of [N m] and [rad].
+
+    Attributes:
+        effort: greatest torque [N m].
+        velocity: greatest speed [rad/s].
+        kp: stiffness [N m/rad].
+        kd: damping [N m s/rad].
 
     >>> from torchgrasp import load_hand
     >>> load_hand("barrett").actuators["f1_flex"].effort
@@ -46,10 +51,13 @@ class Actuator(NamedTuple):
 
 
 class HandSource(NamedTuple):
-    """The origin of a hand: its files, and the option by which its fingers were chosen.
+    """The files of a hand, and the option by which its fingers were chosen.
 
-    `option` is an option of hand.toml, or the names of the fingers. `sha256` is one hash of the
-    URDF (`urdf_path`) and of the description, `hand.toml`. `options` are all options of hand.toml.
+    Attributes:
+        option: option of hand.toml, or the names of the fingers.
+        urdf_path: path of the URDF.
+        sha256: one hash of both files, hand.toml and the URDF.
+        options: all options of hand.toml.
 
     >>> from torchgrasp import load_hand
     >>> load_hand("allegro").source.options
@@ -64,20 +72,29 @@ class HandSource(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Hand(Value):
-    """A robot hand with three to five grasping fingers, in grasp order.
+    """A robot hand with three to five grasping fingers; `load_hand` loads it.
 
-    Positions [m] are in the frame of the palm, the URDF's root link. `approach` is the unit vector
-    out of the palm. `actuators` holds the drive of every movable joint of the URDF, by name.
-    `collision_spheres` cover the links; `self_collision` holds their exact shapes. `source` says
-    from which files the hand was loaded.
+    Positions [m] are in the palm's frame, the frame of the URDF's root link. Fingers are in grasp
+    order.
 
-    `chain` is the hand's model, a chain of pytorch-kinematics in which every movable joint is
-    independent. `tree` and `tips` are compiled from its tensors, so do not change it in place.
+    In the methods, `joints` (*b, h) are positions of the h actuated joints, in the order of
+    `joint_names`. Their unit is [rad], or [m] for sliding joints. f counts the fingertips, j all
+    movable joints of the URDF, l its links, s the collision spheres. Methods raise `BadArgument`
+    for joints of a wrong count or dtype, and for NaN or infinity.
 
-    `joints` (*b, h) are the actuated joints [rad, or m for sliding ones] of the grasping fingers,
-    in the order of `joint_names`. f counts the fingertips, j all movable joints, l the links and s
-    the collision spheres. Every method raises `BadArgument` for joints of a wrong count or dtype,
-    and for NaN or infinity.
+    Attributes:
+        name: name of the hand.
+        source: the files of the hand, and the chosen option.
+        actuated: names, limits and coupling of the actuated joints.
+        chain: the model as a chain of pytorch-kinematics, in which every movable joint is
+            independent. `tree` and `tips` are compiled from its tensors, so do not change it in
+            place.
+        tree: the kinematic tree: names of links and joints, and forward kinematics.
+        tips: the fingertips and their pads.
+        approach: unit vector (3,) out of the palm.
+        actuators: the drive of every movable joint of the URDF, by the joint's name.
+        collision_spheres: spheres that cover the links.
+        self_collision: shapes of the links, and the pairs of them that must not collide.
 
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("barrett")
@@ -107,10 +124,11 @@ class Hand(Value):
         return self.source.urdf_path
 
     def to(self, *args: Any, **kwargs: Any) -> "Hand":
-        """Return the hand, with its chain, on another device or in another floating dtype, with the
-        arguments of `torch.Tensor.to`.
+        """Return the hand on another device or in another floating dtype.
 
-        A hand that is there already is returned itself, without a copy of its chain.
+        It takes the arguments of `torch.Tensor.to`. A hand that is already there is returned
+        itself. Raises `BadArgument` if the device does not exist, or the dtype is neither float32
+        nor float64.
         """
         check_moved(*args, **kwargs)
         if self.lower.to(*args, **kwargs) is self.lower:
@@ -121,8 +139,10 @@ class Hand(Value):
 
     @kept
     def motion(self) -> FreeMotion:
-        """Tables of how links, collision spheres, tip centres and pads move with the hand's pose
-        and its joints.
+        """Tables (`FreeMotion`) of how the links move with the hand's pose and its joints.
+
+        Its markers are the centres of collision spheres, the centres of tips, and the normals of
+        pads. `solve_ik` uses them.
         """
         spheres = self.collision_spheres
         tips = self.tips
@@ -133,7 +153,7 @@ class Hand(Value):
 
     @functools.cached_property
     def derived(self) -> dict[Any, Any]:
-        """A cache of values that other modules compute from the hand, by keys of their choice."""
+        """A cache of values that torchgrasp computes from the hand, such as `hand_abilities`."""
         return {}
 
     @property
@@ -143,7 +163,7 @@ class Hand(Value):
 
     @property
     def finger_names(self) -> tuple[str, ...]:
-        """Names of the grasping fingers, in grasp order."""
+        """Names of the f grasping fingers, in grasp order."""
         return self.tips.names
 
     @property
@@ -153,24 +173,25 @@ class Hand(Value):
 
     @property
     def dof(self) -> int:
-        """Number of actuated joints, h."""
+        """Number h of actuated joints."""
         return len(self.actuated.names)
 
     @property
     def lower(self) -> Float[Tensor, " h"]:
-        """Lower limits [rad, or m for a sliding joint] of the actuated joints."""
+        """Lower limits (h,) [rad, or m for a sliding joint] of the actuated joints."""
         return self.actuated.lower
 
     @property
     def upper(self) -> Float[Tensor, " h"]:
-        """Upper limits [rad, or m for a sliding joint] of the actuated joints."""
+        """Upper limits (h,) [rad, or m for a sliding joint] of the actuated joints."""
         return self.actuated.upper
 
     @checked
     def require_three(self, argument: str, what: str) -> None:
         """Raise `BadArgument` unless the hand has three fingertips, as in the paper.
 
-        The error names the `argument`, and `what`, its value that needs three fingertips.
+        `argument` is the name of the argument that the error's text names. `what` is its value,
+        which needs three fingertips.
         """
         if len(self.tips) != 3:
             raise BadArgument(
@@ -181,8 +202,9 @@ class Hand(Value):
 
     @checked(gradients=True)
     def check_joints(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b h"]:
-        """Return `joints` if all are within their limits; otherwise raise `BadArgument` for the
-        first that is not.
+        """Return `joints` (*b, h) [rad or m] if all are within their limits.
+
+        Otherwise it raises `BadArgument`, whose text names the first joint beyond its limits.
 
         >>> from torchgrasp import load_hand
         >>> hand = load_hand("barrett")
@@ -197,11 +219,12 @@ class Hand(Value):
 
     @checked(gradients=True)
     def expand(self, joints: Float[Tensor, "*b h"]) -> dict[str, Float[Tensor, "*b"]]:
-        """Return the positions [rad or m] of all movable joints of the URDF by name, given the
-        actuated joints.
+        """Return the positions (*b) [rad or m] of all movable joints of the URDF, as a dict by
+        name.
 
-        A grasp of three fingers of the Allegro has twelve joints; the result also has those of the
-        finger that does not grasp.
+        `joints` (*b, h) [rad or m] are positions of the actuated joints. The dict also has the
+        joints of fingers that do not grasp. Raises `BadArgument` for joints of a wrong count, dtype
+        or device, and for NaN or infinity.
 
         >>> from torchgrasp import load_hand
         >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -212,15 +235,19 @@ class Hand(Value):
 
     @checked(gradients=True)
     def expand_joints(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b j"]:
-        """Return the positions [rad or m] of all movable joints, in the order of
-        `tree.joint_names`.
+        """Return the positions (*b, j) [rad or m] of all j movable joints of the URDF.
+
+        They are in the order of `tree.joint_names`. `joints` (*b, h) [rad or m] are positions of
+        the actuated joints. Errors are the same as in `expand`.
         """
         return self.actuated.expand(joints)
 
     @checked(gradients=True)
     def link_poses(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b l 4 4"]:
-        """Return the pose `hand_from_link` (4 x 4) [m] of every link, in the order of
-        `tree.link_names`.
+        """Return the poses `hand_from_link` (*b, l, 4, 4) [m] of the l links in the palm's frame.
+
+        Links are in the order of `tree.link_names`. `joints` (*b, h) [rad or m] are positions of
+        the actuated joints.
         """
         values = self.expand_joints(joints)
         poses = self.tree.poses(values.reshape(-1, values.shape[-1]))
@@ -232,11 +259,15 @@ class Hand(Value):
         joints: Float[Tensor, "*b h"],
         backend: Literal["torchgrasp", "pytorch_kinematics"] = "torchgrasp",
     ) -> tuple[Float[Tensor, "*b f 3"], Float[Tensor, "*b f 3"]]:
-        """Return the contact points [m], then the outward unit normals, of the fingertip pads in
-        the palm's frame.
+        """Return the contact points (*b, f, 3) [m] of the f pads, then their outward unit normals
+        (*b, f, 3).
 
-        With `backend="pytorch_kinematics"` the hand's chain itself computes the poses of the
-        fingertips.
+        Both are in the palm's frame.
+
+        Args:
+            joints: positions (*b, h) [rad or m] of the actuated joints.
+            backend: what computes the poses of the fingertips. "torchgrasp" means the compiled
+                tables of `tips`. "pytorch_kinematics" means the hand's `chain`.
         """
         if backend == "torchgrasp":
             _, frames = self.tips.frames(self._columns(joints))
@@ -253,8 +284,10 @@ class Hand(Value):
 
     @checked(gradients=True)
     def tip_centres(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b f 3"]:
-        """Return the centres [m] of the fingertip spheres in the palm's frame; for tips of radius 0
-        the contact points.
+        """Return the centres (*b, f, 3) [m] of the f fingertip spheres in the palm's frame.
+
+        A tip of radius 0 has its contact point there. `joints` (*b, h) [rad or m] are positions of
+        the actuated joints.
         """
         _, carriers = self.tips.frames(self._columns(joints))
         return _rows(map_points(carriers, self.tips.in_carriers[2]), joints)
@@ -263,11 +296,15 @@ class Hand(Value):
     def jacobian(
         self, joints: Float[Tensor, "*b h"], at: Float[Tensor, "*b f 3"] | None = None
     ) -> Float[Tensor, "*b f 3 h"]:
-        """Return the Jacobian [m/rad] of the fingertips' contact points by the actuated joints, in
-        the palm's frame.
+        """Return the Jacobian (*b, f, 3, h) [m/rad] of a point on each fingertip by the actuated
+        joints.
 
-        `at` holds points [m] in the palm's frame that are fixed to the fingertips, such as where
-        round tips touch; None means the contact points of the pads.
+        It is in the palm's frame. Columns of sliding joints have no unit.
+
+        Args:
+            joints: positions (*b, h) [rad or m] of the actuated joints.
+            at: points (*b, f, 3) [m] in the palm's frame, each fixed to its fingertip. None means
+                the contact points of the pads.
         """
         chains = self.tips.chains
         frames, carriers = self.tips.frames(self._columns(joints))
@@ -296,7 +333,10 @@ class Hand(Value):
 
     @checked(gradients=True)
     def sphere_centres(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b s 3"]:
-        """Return the centres [m] of the `collision_spheres` in the palm's frame."""
+        """Return the centres (*b, s, 3) [m] of the s `collision_spheres` in the palm's frame.
+
+        `joints` (*b, h) [rad or m] are positions of the actuated joints.
+        """
         spheres = self.collision_spheres
         frames = self.tree.frames(self._columns(joints)).index_select(2, spheres.link_index)
         return _rows(map_points(frames, spheres.center), joints)
@@ -308,13 +348,18 @@ class Hand(Value):
         below: Annotated[float, Range(-math.inf, math.inf)] = math.inf,
         chunk: Count = 1000,
     ) -> Float[Tensor, "*b"]:
-        """Return the least signed separation [m] of the pairs of links in hand.toml; negative if
-        links overlap.
+        """Return the least signed separation (*b) [m] of the pairs of links in `self_pairs`;
+        negative if links overlap.
 
         A negative value is minus the shortest translation that separates two links. A positive
-        value is a lower bound of the distance, exact where a face is nearest. Separations above
-        `below` [m] may be inexact lower bounds, which is faster. `chunk` postures are computed at a
-        time, which bounds the memory.
+        value is a lower bound of the distance, exact where a face is nearest. It is infinite if no
+        pair is tested.
+
+        Args:
+            joints: positions (*b, h) [rad or m] of the actuated joints.
+            below: separation [m] above which results may be inexact lower bounds. A small value
+                makes the function faster.
+            chunk: number of postures that are computed at a time, which bounds the memory.
         """
         self.actuated.check(joints)
         rows = joints.reshape(-1, joints.shape[-1])
@@ -324,7 +369,7 @@ class Hand(Value):
 
     @property
     def self_pairs(self) -> tuple[tuple[str, str], ...]:
-        """The names of each pair of links that `self_clearance` tests for collision."""
+        """Names of the two links of each pair that `self_clearance` tests for collision."""
         names = self.tree.link_names
         return tuple((names[one], names[two]) for one, two in self.self_collision.link_pairs())
 

@@ -29,20 +29,28 @@ Frames = Float[Tensor, "3 4 l n"]  # poses (3 x 4) of l links in n postures
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class KinematicTree(Value):
-    """The kinematic tree of a URDF, or a part of it, as tables.
+    """The kinematic tree of a URDF as tables of l links and j movable joints; a `Hand` holds it as
+    `tree`.
 
-    Links (`link_names`) and movable joints (`joint_names`) are in the order of the file.
+    The root link is the palm. `Fingertips.chains` holds only the part of the tree that leads to the
+    fingertips. In `tables`, `joint` and `parent`, links are sorted by level, the number of joints
+    from the root.
 
-    `child[j]` is the index of the link that joint j moves, or 0 if it is outside this part; `axis`
-    is the unit axis of each joint in that link's frame. `prismatic` is 1 for a sliding joint, and
-    `moves[l, j]` is 1 if joint j moves link l. `slides` says whether any joint is prismatic.
-
-    `tables` hold each link's pose (3 x 4) in its parent: `tables[0]` is the constant part,
-    `tables[1]`, `tables[2]` and `tables[3]` the factors of sin q, cos q and q. In them, links are
-    sorted by level, the number of joints from the root; `level_sizes` counts the links of each
-    level. `joint` is the index of the joint that moves a link, 0 for a fixed link. `parent` is the
-    index of a link's parent in the level above. `places` are the indices of `link_names` among the
-    sorted links.
+    Attributes:
+        link_names: names of the l links, in the order of the URDF.
+        joint_names: names of the j movable joints, in the order of the URDF.
+        child: index (j,) of the link that each joint moves; 0 if that link is outside this part.
+        axis: unit axis (j, 3) of each joint, in the frame of the link that it moves.
+        prismatic: 1 for a sliding joint, 0 for others (j,).
+        moves: 1 if joint j moves link l, else 0 (l, j).
+        tables: pose [m] of each link in its parent as four 3 x 4 tables (4, 3, 4, l, 1). The first
+            is the constant part. The others are the factors of sin q, cos q and q, with the joint's
+            position q.
+        joint: index (l,) of the joint that moves each link; 0 for a fixed link.
+        parent: index (l,) of each link's parent in the level above.
+        level_sizes: number of links in each level.
+        places: index (l,) of each of `link_names` among the sorted links.
+        slides: whether any joint is prismatic.
 
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("barrett")
@@ -69,10 +77,12 @@ class KinematicTree(Value):
     def frames(
         self, values: Float[Tensor, "j n"], root: Float[Tensor, "3 4 n"] | None = None
     ) -> Frames:
-        """Return every link's pose (3 x 4) [m] in the root's frame, given joint positions `values`
-        [rad or m].
+        """Return the poses (3, 4, l, n) [m] of the l links in n postures, in the root's frame.
 
-        If `root` gives the n poses of the root in another frame, the link poses are in that frame.
+        Args:
+            values: positions (j, n) [rad or m] of all movable joints of the URDF.
+            root: poses (3, 4, n) [m] of the root link in another frame, in which the result then
+                is. None means the root's own frame.
         """
         constant, sine, cosine, slide = self.tables.to(values).unbind()
         local = torch.addcmul(constant, sine, values.sin().index_select(0, self.joint))
@@ -97,8 +107,9 @@ class KinematicTree(Value):
 
     @checked(gradients=True)
     def poses(self, values: Float[Tensor, "n j"]) -> Float[Tensor, "n l 4 4"]:
-        """Return the pose `root_from_link` [m] of every link; `values` [rad or m] are n positions
-        of all movable joints.
+        """Return the poses `root_from_link` (n, l, 4, 4) [m] of the l links in n postures.
+
+        `values` (n, j) [rad or m] are positions of all movable joints of the URDF.
         """
         frames = self.frames(values.T.contiguous())
         last = eye_like(4, frames)[3, :, None, None].expand(1, 4, *frames.shape[2:])
@@ -108,8 +119,11 @@ class KinematicTree(Value):
     def joint_axes(
         self, poses: Float[Tensor, "*b l 4 4"]
     ) -> tuple[Float[Tensor, "*b j 3"], Float[Tensor, "*b j 3"]]:
-        """Return the unit axis, then a point [m], of every joint in the root's frame, given the
-        link `poses` [m].
+        """Return the unit axis of each joint, then the origin [m] of the link that it moves, each
+        (*b, j, 3).
+
+        `poses` (*b, l, 4, 4) [m] are poses of the l links in any one frame, as `poses` returns
+        them. Axes and origins are in the same frame. Each origin lies on the axis of its joint.
         """
         frames = poses.reshape(-1, *poses.shape[-3:])[..., :3, :].permute(2, 3, 1, 0)
         child = frames.index_select(2, self.child)  # (3, 4, j, n)

@@ -16,8 +16,9 @@ from torchgrasp.values.planning import Grasps
 
 
 def hands_folder() -> Path:
-    """Return the folder of the shipped hands: inside the package, or beside it in a source
-    checkout.
+    """Return the folder of the shipped hands.
+
+    It is inside the package, or beside the package in a source checkout.
 
     >>> (hands_folder() / "allegro" / "hand.toml").is_file()
     True
@@ -29,11 +30,12 @@ def hands_folder() -> Path:
 
 @checked
 def find_hand(name_or_path: str | Path) -> Path:
-    """Return the folder of a hand, given a shipped hand's name, a folder, or the path of a
-    hand.toml.
+    """Return the folder of a hand.
 
-    Raises `HandFileError` if there is no such hand, or if a shipped hand's name is also a folder in
-    the working directory.
+    `name_or_path` is the name of a shipped hand, a folder, or the path of a hand.toml.
+
+    Raises `HandFileError` if there is no such hand. The name of a shipped hand raises it, too, if
+    the working directory has another hand of this name.
 
     >>> find_hand("allegro").name
     'allegro'
@@ -62,16 +64,19 @@ def load_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
     """Load a hand from its hand.toml and URDF, with the chosen grasping fingers.
 
     Args:
-        name_or_path: a shipped hand, such as "allegro", "barrett", "leap" or "shadow", or the
-            folder of another hand.
+        name_or_path: name of a shipped hand, such as "allegro", "barrett", "leap" or "shadow". Or
+            the folder or hand.toml of another hand.
         fingers: the grasping fingers. A text is an option of hand.toml: "default", or for the
             Allegro "four" (all) or "paper_literal" (index, middle and ring). A number of fingers
             means the first option with this number. A tuple names three to five fingers in grasp
-            order. Joints of other fingers are parked where an option parks them, else at zero or
-            the limit nearest to zero.
+            order, and a text may list them: "index,middle,thumb".
 
-    Raises `HandFileError` if a file is missing or malformed, or the two do not fit, and
-    `BadArgument` for unknown fingers.
+    An option may park joints of the other fingers at a position. Other joints that do not grasp
+    stay at zero, or at the limit nearest to zero.
+
+    Raises:
+        HandFileError: a file is missing or malformed, or the two files contradict each other.
+        BadArgument: the hand has no such fingers.
 
     >>> load_hand("allegro", ("index", "ring", "thumb")).finger_names
     ('index', 'ring', 'thumb')
@@ -98,10 +103,10 @@ def load_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
 
 @checked
 def with_fingers(hand: Hand, fingers: Fingers) -> Hand:
-    """Return the same hand, on the same device, with other grasping `fingers`, given as in
-    `load_hand`.
+    """Return the same hand, on the same device, with other grasping `fingers`.
 
-    Raises the errors of `load_hand`.
+    `fingers` are chosen as in `load_hand`, and the hand's files are read again. Raises the errors
+    of `load_hand`.
 
     >>> with_fingers(load_hand("allegro"), 4).finger_names
     ('index', 'middle', 'ring', 'thumb')
@@ -112,11 +117,15 @@ def with_fingers(hand: Hand, fingers: Fingers) -> Hand:
 
 @checked
 def hand_of(grasps: Grasps, hand: Hand | str | Path | None = None) -> Hand:
-    """Return the hand with the fingers for which grasps were planned.
+    """Return the hand, with the fingers for which `grasps` were planned.
 
-    `grasps` may be loaded from a file. `hand` is the same hand with any fingers, its name or its
-    folder; None means the shipped hand that the grasps name. Raises the errors of `load_hand`, and
-    `BadArgument` for grasps that name no hand, another hand, or unknown fingers.
+    Args:
+        grasps: grasps of `plan_grasps`, or loaded from a file. Their `meta` names hand and fingers.
+        hand: the same hand with any fingers, its name or its folder. None means the shipped hand
+            that the grasps name.
+
+    Raises the errors of `load_hand`. Raises `BadArgument` if the grasps name no hand, another hand,
+    or unknown fingers.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> hand_of(load_shipped_grasp("jug", "barrett")).name

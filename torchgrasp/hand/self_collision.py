@@ -47,12 +47,26 @@ class Chosen(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class SelfCollision(Value):
-    """Boxes and spheres fixed to the links of a hand, and the pairs of them to test for collision.
+    """Boxes and spheres on the links of a hand, and the p pairs of them that are tested for
+    collision.
 
-    `link` is the index of the link of each shape. In its frame are the axes of a box, the columns
-    of `rotation[:, :, s]`, and the `center` [m]. `half` [m] holds the half sizes of a box, 0 for a
-    sphere; `radius` [m] is that of a sphere, 0 for a box. `pairs` holds the indices of two shapes:
-    first box-box pairs, then sphere-box, then sphere-sphere; `kinds` counts each kind.
+    A `Hand` holds it as `self_collision`. s counts the shapes.
+
+    Attributes:
+        link: index (s,) of the link of each shape, in `Hand.tree.link_names`.
+        rotation: axes of each box in its link's frame, the columns of `rotation[:, :, s]` (3, 3,
+            s).
+        center: centre (s, 3) [m] of each shape, in its link's frame.
+        half: half sizes (s, 3) [m] of each box; 0 for a sphere.
+        radius: radius (s,) [m] of each sphere; 0 for a box.
+        pairs: indices of the two shapes of each pair (p, 2). Box-box pairs come first, then
+            sphere-box pairs, then sphere-sphere pairs.
+        kinds: number of pairs of each of the three kinds.
+
+    `frames` (3, 4, l, n) in the methods are poses [m] of the l links in n postures.
+    `Hand.tree.frames` makes them. A negative separation is minus the shortest translation that
+    separates two shapes. A positive separation is a lower bound of their distance, exact where a
+    face is nearest.
 
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("barrett")
@@ -72,10 +86,11 @@ class SelfCollision(Value):
 
     @checked(gradients=True)
     def clearance(self, frames: Frames, below: Bound = torch.inf) -> Float[Tensor, " n"]:
-        """Return the least signed separation [m] of each posture: infinite if there are no pairs to
-        test.
+        """Return the least signed separation (n,) [m] of all pairs in each posture; infinite if
+        there are no pairs.
 
-        Separations above `below` [m] may be inexact lower bounds.
+        `frames` (3, 4, l, n) are poses [m] of the links. Results above `below` [m] may be inexact
+        lower bounds. Raises `BadArgument` for too few links.
         """
         least = frames.new_full(frames.shape[3:], torch.inf)
         if not len(self.pairs):
@@ -97,9 +112,11 @@ class SelfCollision(Value):
 
     @checked
     def separations(self, frames: Frames, below: Bound) -> Float[Tensor, "p n"]:
-        """Return the signed separation [m] of each pair in each posture.
+        """Return the signed separation (p, n) [m] of each pair in each posture.
 
-        Above `below` [m] it is that of bounding spheres.
+        `frames` (3, 4, l, n) are poses [m] of the links. Pairs whose bounding spheres are at least
+        `below` [m] apart get the separation of these spheres. Raises `BadArgument` for too few
+        links, and inside `torch.vmap`.
         """
         shapes, apart, chosen = self._near(frames, below)
         return apart.index_put(chosen[:2], self._separations(shapes, chosen))
@@ -108,12 +125,16 @@ class SelfCollision(Value):
     def pushes(
         self, frames: Frames, below: Bound
     ) -> tuple[Float[Tensor, "p n"], Int[Tensor, "p n"], Float[Tensor, "6 k"]]:
-        """Return the separations [m] of the pairs, the index of each pair's wrench, and the
-        wrenches as columns.
+        """Return the signed separations (p, n) [m] of the pairs, and by which wrenches the pairs
+        move apart.
 
-        A wrench is the derivative of a separation by a twist of the second shape: translation, then
-        rotation about the origin [m/rad]. The last wrench is zero, and belongs to separations above
-        `below` [m].
+        `frames` (3, 4, l, n) are poses [m] of the links. The second tensor (p, n) is the index of
+        each pair's wrench. The third tensor (6, k) holds the wrenches as columns. A wrench is the
+        derivative of a separation by a twist of the second shape. Its first three numbers belong to
+        translation, the last three [m/rad] to rotation about the origin.
+
+        The last wrench is zero. Pairs whose bounding spheres are at least `below` [m] apart refer
+        to it. Raises `BadArgument` for too few links, and inside `torch.vmap`.
         """
         shapes, apart, (pair, row, parts) = self._near(frames, below)
         separation = apart.new_zeros(len(pair))
@@ -136,21 +157,22 @@ class SelfCollision(Value):
 
     @checked(gradients=True)
     def count_near(self, frames: Frames, below: Bound) -> int:
-        """Return the number of pairs, over all postures, whose bounding spheres are nearer than
+        """Return how many pairs, summed over all postures, have bounding spheres nearer than
         `below` [m].
+
+        `frames` (3, 4, l, n) are poses [m] of the links. Raises `BadArgument` for too few links,
+        and inside `torch.vmap`.
         """
         return len(self._near(frames, below)[2].pair)
 
     @checked
     def only(self, kept: Bool[Tensor, " p"]) -> "SelfCollision":
-        """Return the shapes with only the pairs in the mask `kept`; other pairs are no longer
-        tested for collision.
-        """
+        """Return the same shapes with only the pairs that the mask `kept` (p,) selects."""
         one, two, three = (int(kind.sum()) for kind in kept.split(self.kinds))
         return dataclasses.replace(self, pairs=self.pairs[kept], kinds=(one, two, three))
 
     def link_pairs(self) -> list[tuple[int, int]]:
-        """Return the two link indices of each pair of links that is tested."""
+        """Return the two link indices, ascending, of each pair of links that is tested."""
         links = self.link[self.pairs].sort(1).values
         return [(one, two) for one, two in torch.unique(links, dim=0).tolist()]
 
