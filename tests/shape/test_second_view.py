@@ -130,6 +130,13 @@ def test_contacts_on_a_flank_are_looked_at_from_there(shape, chosen):
     torch.testing.assert_close(whole.camera_pose, chosen.camera_pose)
 
 
+def test_surface_that_ends_at_the_edge_of_the_domain_is_taken_as_far_as_it_is_known(shape):
+    cut = dataclasses.replace(shape, domain_radius=0.7)
+    assert not cut.contains(extract_surface(cut, VIEW.resolution).vertices).all()
+    view = next_view(cut, table=0.0, distance=0.4)
+    assert 0 < view.after < view.before
+
+
 def test_a_camera_in_the_object_and_grasps_of_another_object_are_refused(shape):
     with pytest.raises(BadArgument, match=r"distance.*off the object"):
         next_view(shape, table=0.0, distance=0.05)

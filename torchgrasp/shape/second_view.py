@@ -79,7 +79,7 @@ class NextView(Value):
         """Where to look from, in the frame of the cloud, and what it is expected to tell."""
         x, y, z = self.camera_pose[:3, 3].tolist()
         known = self.turn == self.turn
-        turn = f", {self.turn:.0f} degrees from the first camera" if known else ""
+        turn = f", {self.turn:.0f} degrees from where the camera was" if known else ""
         place = f"({x:.2f}, {y:.2f}, {z:.2f}) m{turn}"
         return f"{place}: std_m falls from {1e3 * self.before:.1f} to {1e3 * self.after:.1f} mm"
 
@@ -115,7 +115,7 @@ def next_view(
             first camera.
 
     Raises `BadArgument` for a wrong argument, a distance that is too near to the object, or grasps
-    whose contacts lie outside the shape's domain.
+    whose contacts all lie outside the shape's domain.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> from torchgrasp.shape import next_view
@@ -129,7 +129,9 @@ def next_view(
         plane = grasps.table
     targets, weights = _contacts(shape, grasps)
     surface = extract_surface(shape, VIEW.resolution)
-    rows = pick_apart(surface.vertices, VIEW.points)
+    # the surface may end a little outside the domain, where the posterior is unknown
+    inside = torch.nonzero(shape.contains(surface.vertices))[:, 0]
+    rows = inside[pick_apart(surface.vertices[inside], VIEW.points)]
     points = surface.vertices[rows]
     if len(targets) == 0:
         targets = points
@@ -207,14 +209,15 @@ def _contacts(
     if grasps is None:
         return shape.x.new_zeros(0, 3), shape.x.new_zeros(0)
     good = grasps[grasps.status == Status.OK][: VIEW.grasps]
-    contacts = good.contacts.points.to(shape.x)
-    outside = int((~shape.contains(contacts)).sum())
-    if outside:
-        allowed = "grasps of this shape, in its frame"
-        raise BadArgument("grasps", f"{outside} contacts outside the shape's domain", allowed)
+    contacts = good.contacts.points.to(shape.x).flatten(0, 1)
+    inside = shape.contains(contacts)
+    if len(inside) and not bool(inside.any()):
+        found = f"{len(inside)} contacts outside the shape's domain"
+        raise BadArgument("grasps", found, "grasps of this shape, in its frame")
     # where the success is unknown, the score is still the best guess
     weights = torch.sigmoid(good.score).to(shape.x)
-    return contacts.flatten(0, 1), weights.repeat_interleave(contacts.shape[1])
+    fingers = good.contacts.points.shape[1]
+    return contacts[inside], weights.repeat_interleave(fingers)[inside]
 
 
 def _poses(
