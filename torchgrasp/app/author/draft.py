@@ -19,10 +19,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.app.author.fit_shapes import ball_tip, replace_meshes, shape_points
+from torchgrasp.app.author.fit_shapes import Points, ball_tip, replace_meshes, shape_points
 from torchgrasp.app.author.mjcf import FromMjcf, read_mjcf
 from torchgrasp.app.author.mjcf_text import is_mjcf
-from torchgrasp.app.author.pads import guess_pads, is_primitive, order_by_facing, palm_of
+from torchgrasp.app.author.pads import Guess, guess_pads, is_primitive, order_by_facing, palm_of
 from torchgrasp.app.author.repair import (
     fix_wrist,
     keep_below,
@@ -185,25 +185,11 @@ def _draft(
 ) -> Draft:
     """Return the draft of `new_hand` for a URDF that was read, from an MJCF if it has an `origin`."""
     bare = _bare_links(published, wish.visual)
-    # frames are merged twice: a wrist that is fixed leaves new ones
-    urdf, below = keep_below(published, wish.root or published.root)
-    urdf, merged, taken = merge_frames(urdf)
-    urdf, fixed = fix_wrist(urdf, fingertip_links(urdf) or [urdf.root])
-    urdf, again, taken_again = merge_frames(urdf)
-    points = shape_points(urdf, wish.meshes or published.path.parent)
-    surfaces = {name: np.concatenate(parts) for name, parts in points.items() if parts}
-    urdf, marked, taken_markers = merge_markers(urdf, surfaces)
-    warnings = [*(origin.warnings if origin else ()), *find_unusual(urdf, points)]
-    urdf, joints = repair_joints(urdf)
-    urdf, bodies = repair_bodies(urdf, surfaces)
-    # a tip that the user named may have been merged into another link
-    tips = wish.tips or (origin.tips if origin else ())
-    for merger in (taken, taken_again, taken_markers):
-        tips = tuple(merger.get(tip, tip) for tip in tips)
-    if not wish.tips and not set(tips) <= {x.name for x in urdf.links if x.shapes}:
-        # sites of what was cut off
-        tips = ()
-    tips = _checked_tips(urdf, tips, () if wish.visual else bare)
+    folder = wish.meshes or published.path.parent
+    reduced = _reduce(published, wish, folder)
+    urdf = reduced.urdf
+    surfaces = reduced.surfaces
+    tips = _checked_tips(urdf, _tips(reduced, wish, origin), () if wish.visual else bare)
     frames = _frames(urdf, (*tips, palm_of(urdf, tips)), seed)
     guess = guess_pads(urdf, frames, tips, surfaces)
     pads = extend_pads(tips, guess, wish.tip_offset, wish.tip_radius, bool(wish.tips))
@@ -212,20 +198,13 @@ def _draft(
         order = order_by_facing(frames[:, :, :-1], pads)
     possible = {name: n for name, n in OPTIONS.items() if n <= len(tips)}
     sets = {name: [tips[k] for k in sorted(order[:n])] for name, n in possible.items()}
-    simple = {x.name for x in urdf.links if is_primitive(x)}
-    clean, fitted = replace_meshes(urdf, points)
-    balls = list[str]()
-    for tip, pad, outward in zip(tips, guess.pads, guess.outward, strict=True):
-        if tip not in simple:
-            balls.append(f"{tip} {1e3 * pad.radius:.1f} mm")
-            clean = ball_tip(clean, tip, pad, outward, surfaces[tip])
+
+    clean, fitted = replace_meshes(urdf, reduced.points)
+    clean, balls = _round_tips(urdf, clean, tips, guess, surfaces)
     clean, sensors = add_sensors(clean, tips, guess, pads)
-    chosen = dict(zip(tips, pads, strict=True))
     told = origin.told if origin else ()
-    repaired = [*below, *merged, *fixed, *again, *marked, *joints, *bodies, *fitted]
-    repairs = [*told, *repaired, *sensors]
-    if balls:
-        repairs.append(f"fingertips touch with a ball in their end, of radius: {', '.join(balls)}")
+    repairs = [*told, *reduced.repairs, *fitted, *sensors, *balls]
+    warnings = [*(origin.warnings if origin else ()), *reduced.unusual]
     if bare and wish.visual:
         repairs.append(f"links without <collision> take their <visual>: {', '.join(bare)}")
     elif bare:
@@ -234,19 +213,86 @@ def _draft(
             "(--visual takes their <visual>)"
         )
     warnings += _thin_tips(tips, surfaces)
+
     names = wish.name or urdf.name, file if repairs else published.path.name
     options = _options(clean, sets)
     pairs, without = _part_pairs(clean, options, seed)
     warnings += without
+    chosen = dict(zip(tips, pads, strict=True))
     toml = _toml_text(clean, chosen, options, guess.approach, names, pairs, warnings)
     if not repairs:
         return Draft(toml, "", (), tuple(warnings))
-    mergers = taken, taken_again, taken_markers
-    folder = wish.meshes or published.path.parent
-    seen = keep_visuals(published, clean, mergers, folder)
+    seen = keep_visuals(published, clean, reduced.mergers, folder)
     files = mesh_files(add_seen_sensors(seen, tips, guess, pads))
     text = _urdf_text(clean, {link: (name,) for link, (name, _) in files.items()})
     return Draft(toml, text, tuple(repairs), tuple(warnings), dict(files.values()))
+
+
+class _Reduced(NamedTuple):
+    """A hand's URDF without frames, markers, and what is cut off.
+
+    Args:
+        urdf: the repaired URDF.
+        repairs: what was done to it, a sentence each.
+        mergers: the links that took others up, by the names of the others; one dict for each pass.
+        points: points [m] on the collision shapes of each link, one array for each shape.
+        surfaces: the same points, one array for each link.
+        unusual: warnings of what is unusual in it.
+    """
+
+    urdf: Urdf
+    repairs: list[str]
+    mergers: tuple[dict[str, str], ...]
+    points: dict[str, tuple[Points, ...]]
+    surfaces: dict[str, np.ndarray]
+    unusual: list[str]
+
+
+def _reduce(published: Urdf, wish: Wish, folder: Path) -> _Reduced:
+    """Return a URDF reduced to the hand below the root that was asked for; `folder` has meshes."""
+    # frames are merged twice: a wrist that is fixed leaves new ones
+    urdf, below = keep_below(published, wish.root or published.root)
+    urdf, merged, taken = merge_frames(urdf)
+    urdf, fixed = fix_wrist(urdf, fingertip_links(urdf) or [urdf.root])
+    urdf, merged_again, taken_again = merge_frames(urdf)
+    points = shape_points(urdf, folder)
+    surfaces = {name: np.concatenate(parts) for name, parts in points.items() if parts}
+    urdf, marked, taken_markers = merge_markers(urdf, surfaces)
+    unusual = list(find_unusual(urdf, points))
+    urdf, joints = repair_joints(urdf)
+    urdf, bodies = repair_bodies(urdf, surfaces)
+    repairs = [*below, *merged, *fixed, *merged_again, *marked, *joints, *bodies]
+    mergers = taken, taken_again, taken_markers
+    return _Reduced(urdf, repairs, mergers, points, surfaces, unusual)
+
+
+def _tips(reduced: _Reduced, wish: Wish, origin: FromMjcf | None) -> tuple[str, ...]:
+    """Return the links of the fingertips that the user or the MJCF names; empty if none."""
+    tips = tuple(wish.tips or (origin.tips if origin else ()))
+    # a tip that the user named may have been merged into another link
+    for merger in reduced.mergers:
+        tips = tuple(merger.get(tip, tip) for tip in tips)
+    if not wish.tips and not set(tips) <= {x.name for x in reduced.urdf.links if x.shapes}:
+        # sites of what was cut off
+        return ()
+    return tips
+
+
+def _round_tips(
+    urdf: Urdf, clean: Urdf, tips: Sequence[str], guess: Guess, surfaces: dict[str, np.ndarray]
+) -> tuple[Urdf, list[str]]:
+    """Return the `clean` URDF with a ball in each tip of no simple shape in `urdf`, and a sentence
+    on them, if any.
+    """
+    simple = {x.name for x in urdf.links if is_primitive(x)}
+    balls = list[str]()
+    for tip, pad, outward in zip(tips, guess.pads, guess.outward, strict=True):
+        if tip not in simple:
+            balls.append(f"{tip} {1e3 * pad.radius:.1f} mm")
+            clean = ball_tip(clean, tip, pad, outward, surfaces[tip])
+    if not balls:
+        return clean, []
+    return clean, [f"fingertips touch with a ball in their end, of radius: {', '.join(balls)}"]
 
 
 def _bare_links(urdf: Urdf, visual: bool) -> tuple[str, ...]:
