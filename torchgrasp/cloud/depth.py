@@ -109,7 +109,8 @@ def cloud_from_depth(
         TooFewPoints: fewer than 4 measured pixels.
         SuspiciousScale: an extent outside [5 mm, 2 m], as of a scene without a mask.
 
-    >>> cloud_from_depth(np.full((48, 64), 500, dtype=np.uint16), (600.0, 600.0, 32.0, 24.0)).viewpoint
+    >>> depth = np.full((48, 64), 500, dtype=np.uint16)  # [mm]
+    >>> cloud_from_depth(depth, (600.0, 600.0, 32.0, 24.0)).viewpoint
     tensor([0., 0., 0.], dtype=torch.float64)
     """
     z_image, k, inside, lens = read_depth(depth, intrinsics, mask, depth_unit)

@@ -121,7 +121,8 @@ def diagnose_cloud(
 
     Raises the errors of `check_cloud`, and `BadArgument` for a vertical of length zero.
 
-    >>> diagnose_cloud(PointCloud(0.1 * torch.rand(500, 3), viewpoint=torch.tensor([0.0, 0.0, 1.0]))).copies
+    >>> cloud = PointCloud(0.1 * torch.rand(500, 3), viewpoint=torch.tensor([0.0, 0.0, 1.0]))
+    >>> diagnose_cloud(cloud).copies
     0
     """
     vertical = torch.tensor([0.0, 0.0, 1.0]) if up is None else check_tensor("up", up, (3,)).cpu()

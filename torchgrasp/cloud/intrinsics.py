@@ -1,4 +1,4 @@
-"""The intrinsics of a depth camera in the forms of many drivers, and checks that they fit an image."""
+"""The intrinsics of a depth camera in the forms of many drivers, and checks that they fit."""
 
 import dataclasses
 import math

@@ -113,7 +113,7 @@ class SizeNumbers:
     large: float = 0.2
     """Objects larger than this [m] are too large under a camera higher than `higher`."""
     furniture: float = 0.6
-    """An object whose box has a longer diagonal [m] is furniture: the plane under it is no table."""
+    """An object whose box has a longer diagonal [m] is furniture: its support is no table."""
     ends: float = 0.02
     """Share of an object's points at each end along an axis that may fly, and do not count."""
     huge: float = 0.5
@@ -346,7 +346,7 @@ def _check_normals(supports: tuple[SupportPlane, ...], pose: Transform, up: obje
 
 
 def tell_tilt(pose: Transform, plane: Plane) -> tuple[str, ...]:
-    """Return one note if a table is tilted from z of the frame to which the `pose` leads, else none.
+    """Return one note if a table is tilted from z of the frame to which `pose` leads, else none.
 
     A camera's own frame has no such z. `plane` is the table in that frame.
     """

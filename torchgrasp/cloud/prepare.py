@@ -175,7 +175,8 @@ def estimate_normals(cloud: PointCloud) -> PointCloud:
 
     Raises the errors of `check_cloud`.
 
-    >>> estimate_normals(PointCloud(torch.rand(90, 3), viewpoint=torch.tensor([0.5, 0.5, 9.0]))).normals.shape
+    >>> cloud = PointCloud(torch.rand(90, 3), viewpoint=torch.tensor([0.5, 0.5, 9.0]))
+    >>> estimate_normals(cloud).normals.shape
     torch.Size([90, 3])
     """
     return _fit_normals(remove_duplicates(cloud), clean=False)

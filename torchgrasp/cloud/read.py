@@ -72,7 +72,8 @@ class CloudFile(Value):
 
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp(), "cloud.npy")
-    >>> np.save(file, np.vstack([np.random.default_rng(0).random((50, 3)) * 0.1, np.full((3, 3), np.nan)]))
+    >>> points = np.random.default_rng(0).random((50, 3)) * 0.1
+    >>> np.save(file, np.vstack([points, np.full((3, 3), np.nan)]))
     >>> read_cloud_file(file).notes
     ('3 of 53 rows with NaN or infinity were left out',)
     """
@@ -125,7 +126,8 @@ def read_cloud(
 
     >>> read_cloud("scan.docx")
     Traceback (most recent call last):
-    torchgrasp.foundation.errors.CloudFileError: path: expected a file ending in .ply, ..., got scan.docx
+    torchgrasp.foundation.errors.CloudFileError: path: expected a file ending in
+    .ply, ..., got scan.docx
     """
     return check_cloud(read_cloud_file(path, viewpoint, unit).cloud)
 
@@ -149,7 +151,8 @@ def read_cloud_file(
 
     >>> read_cloud_file("none.ply")
     Traceback (most recent call last):
-    torchgrasp.foundation.errors.CloudFileError: path: expected a .ply file, got none.ply, which is no file
+    torchgrasp.foundation.errors.CloudFileError: path: expected a .ply file, got
+    none.ply, which is no file
     """
     try:
         position = None if viewpoint is None else torch.as_tensor(viewpoint, dtype=torch.float64)
@@ -230,7 +233,8 @@ def save_cloud(cloud: PointCloud, path: Path | str, table: Plane | None = None) 
 
     >>> save_cloud(PointCloud(torch.rand(9, 3)), "cloud.txt")
     Traceback (most recent call last):
-    torchgrasp.foundation.errors.BadArgument: path: expected a file ending in .npz or .ply, got cloud.txt
+    torchgrasp.foundation.errors.BadArgument: path: expected a file ending in .npz or
+    .ply, got cloud.txt
     """
     path = Path(path)
     arrays = {name: tensor.detach().cpu().numpy() for name, tensor in named_tensors(cloud).items()}
@@ -364,7 +368,7 @@ def _split_columns(source: str, arrays: dict[str, Any], notes: list[str]) -> dic
 
 
 def _fit_surface(arrays: dict[str, Any]) -> bool:
-    """Return whether unnamed unit vectors are normals: colours such as pure red have length 1, too."""
+    """Return whether unnamed unit vectors are normals: colours such as red have length 1, too."""
     rows = np.concatenate([arrays[name].reshape(-1, 3) for name in ("points", "normals")], -1)
     rows = torch.from_numpy(rows.astype(np.float64))
     rows = rows[torch.isfinite(rows).all(1) & rows[:, 3:].any(1)].unique(dim=0)

@@ -21,7 +21,7 @@ class LiveCameraNumbers:
     """Parameters of the shot of a live camera."""
 
     settle: int = 30
-    """Frames that are dropped first; the exposure settles within a second, at 30 frames a second."""
+    """Frames that are dropped first: the exposure settles within a second, of 30 frames."""
     frames: int = 9
     """Frames whose median is taken: the noise of single pixels falls to about a third."""
     queue: int = 2

@@ -303,7 +303,8 @@ def median_depth(frames: Sequence[Tensor | np.ndarray]) -> Tensor:
         BadArgument: camera or scene have moved in a frame. Then more than 5 % of its pixels, or 1 %
             of its patches, differ from the median (`STILL`).
 
-    >>> median_depth([torch.tensor([[0.0, 0.7]]), torch.tensor([[0.0, 0.701]]), torch.tensor([[0.5, 0.702]])])
+    >>> frames = [[[0.0, 0.7]], [[0.0, 0.701]], [[0.5, 0.702]]]
+    >>> median_depth([torch.tensor(frame) for frame in frames])
     tensor([[0.0000, 0.7010]])
     """
     images = [as_tensor("frames", frame) for frame in frames]

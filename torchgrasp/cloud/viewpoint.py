@@ -1,4 +1,4 @@
-"""A guess of where the camera of a view was, and a test whether a camera can have been at a place."""
+"""A guess of where a view's camera was, and a test whether a camera can have been at a place."""
 
 import contextlib
 import dataclasses

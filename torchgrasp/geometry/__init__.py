@@ -1,1 +1,1 @@
-"""Geometry: frames, planes, meshes, distance fields, linear algebra and least squares. Not public."""
+"""Geometry: frames, planes, meshes, distance fields, linear algebra, least squares. Not public."""

@@ -160,8 +160,10 @@ class SignedDistanceField(DistanceField):
         values: signed distances (x, y, z) [m]; `values[i, j, k]` is at the point `origin` + (i, j,
             k) * `spacing`.
 
-    >>> ball = torch.cartesian_prod(*[torch.linspace(-0.1, 0.1, 41)] * 3).norm(dim=1).reshape(41, 41, 41) - 0.05
-    >>> distance, gradient = SignedDistanceField(torch.full((3,), -0.1), 0.005, ball).query(torch.tensor([0, 0, 0.08]))
+    >>> nodes = torch.cartesian_prod(*[torch.linspace(-0.1, 0.1, 41)] * 3)
+    >>> ball = nodes.norm(dim=1).reshape(41, 41, 41) - 0.05
+    >>> field = SignedDistanceField(torch.full((3,), -0.1), 0.005, ball)
+    >>> distance, gradient = field.query(torch.tensor([0, 0, 0.08]))
     >>> f"{distance:.3f}", gradient.round()
     ('0.030', tensor([0., 0., 1.]))
     """

@@ -50,7 +50,7 @@ class SupportNumbers:
     bowed: float = 0.5
     """Factor on the score of a support that is flat in a small part only."""
     plausible: float = 0.2
-    """Least score of a support at an angle to the best one, over the best score: a wall has less."""
+    """Least score of a support at an angle to the best one, over the best: a wall has less."""
     margin: float = 0.1
     """Distance [m] beside a bowed support at which its surface may not go on at another height."""
     most_away: float = 0.5
@@ -76,7 +76,7 @@ class SupportNumbers:
     pierced_cell: float = 0.02
     """Width [m] of the columns in which points above and below a support are counted."""
     crossed: float = 0.5
-    """Least ratio of points below to points on a plane, in a column in which a surface crosses it."""
+    """Least ratio of points below to points on a plane, in a column where a surface crosses it."""
     askew: float = 0.7
     """Greatest cosine between the normals of a support and a wall beside it."""
     sag: float = 2.0
@@ -108,8 +108,8 @@ class SupportNumbers:
     closing: int = 2
     """Cells by which the groups of points grow and shrink again, to close gaps."""
     gap: float = 0.25
-    """Points below the plane that the camera sees in a cell of a gap, over the usual points of a cell
-    on it.
+    """Points below the plane that the camera sees in a cell of a gap, over the usual points of a
+    cell on it.
     """
     least_part: float = 0.02
     """Least size of a group of points, over the largest group."""
@@ -526,8 +526,8 @@ def _refit(view: SeenPoints, fit: PlaneFit) -> PlaneFit:
 class _Surface:
     """A plane that was fitted to a view, the points on it, and its region.
 
-    `height` [m] is that of each point of the view, `tolerance` [m] the greatest height of a point on
-    the plane, above or below. `support` is None without a flat region; `bowed` tells that the plane
+    `height` [m] is that of each point of the view, `tolerance` [m] the greatest height of a point
+    on the plane, above or below. `support` is None without a flat region; `bowed` tells that the plane
     was fitted to a part of the points alone.
     """
 
@@ -656,12 +656,12 @@ def _count_through(view: SeenPoints, surface: _Surface, support: SupportPlane) -
 
 
 def _number_cells(points: Points, axes: Float[Tensor, "3 2"], side: float) -> Int[Tensor, "n"]:
-    """Return the number of the square of a grid, `side` [m] wide along two `axes`, of each point."""
+    """Return the number of each point's square in a grid, `side` [m] wide along two `axes`."""
     return number_rows(torch.floor(points @ axes / side).long())
 
 
 def _furniture(surface: _Surface, surfaces: list[_Surface], width: float) -> Bool[Tensor, "n"]:
-    """Return a mask of the points on surfaces at an angle to one that are wider than `width` [m]."""
+    """Return a mask of the points on surfaces wider than `width` [m] at an angle to `surface`."""
     found = torch.zeros_like(surface.on)
     for other in surfaces:
         if other.beside(surface) and other.width > width:
@@ -690,7 +690,7 @@ class _Risen:
     ) -> "_Risen":
         """Return the masks of the points of a view, given a mask of those of furniture."""
         above = (surface.height > surface.tolerance) & ~furniture
-        # Low points of an object are over the plane's own region. A pan's rim is not over its floor.
+        # Low points of an object are over the plane's own region. A pan's rim is not over the floor.
         inner = SUPPORTS.edge * support.width
         near = surface.height < PLANES.reach
         over = above & near & support.covers(view.points, -inner)

@@ -181,7 +181,8 @@ def fit_mixture(
 
     >>> import torch
     >>> numbers = torch.rand(500, 7, generator=torch.Generator().manual_seed(0))
-    >>> fit_mixture(HandSamples(numbers[:, :1], numbers[:, 1:], ("knuckle",)), components=2).joint_names
+    >>> samples = HandSamples(numbers[:, :1], numbers[:, 1:], ("knuckle",))
+    >>> fit_mixture(samples, components=2).joint_names
     ('knuckle',)
     """
     shard, centre, scale = standardised_rows(samples, components, distributed)

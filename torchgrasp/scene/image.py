@@ -69,12 +69,19 @@ PROJECTION = ProjectionNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class DepthImage(Value):
-    """A pinhole camera's depth image."""
+    """A pinhole camera's depth image, as in `Scene.image`.
 
-    depth: Float[Tensor, "h w"]  # along the optical axis [m], 0 where nothing was measured
-    intrinsics: Float[Tensor, "3 3"]  # [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels
-    obj_from_camera: Pose  # pose (4, 4) [m] of the camera (x right, y down, z forward)
-    bounded: bool = True  # whether its border is the camera's; an image made of a cloud has none
+    Attributes:
+        depth: depth (h, w) [m] along the optical axis, 0 where nothing was measured.
+        intrinsics: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels.
+        obj_from_camera: pose (4, 4) [m] of the camera (x right, y down, z forward).
+        bounded: whether its border is the camera's; an image made of a cloud has none.
+    """
+
+    depth: Float[Tensor, "h w"]
+    intrinsics: Float[Tensor, "3 3"]
+    obj_from_camera: Pose
+    bounded: bool = True
 
     @property
     def focal(self) -> float:

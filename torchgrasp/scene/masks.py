@@ -110,7 +110,7 @@ def _masks(labels: Any, shape: tuple[int, ...]) -> Any:
 
 
 def _read_one(labels: Any, shape: tuple[int, ...], name: str) -> Int[Tensor, "..."]:
-    """Return the labels that an array of numbers, a picture of colours, or COCO's run lengths hold."""
+    """Return the labels in an array of numbers, a picture of colours, or COCO's run lengths."""
     while isinstance(labels, Mapping) and "segmentation" in labels:
         labels = labels["segmentation"]
     if isinstance(labels, Mapping):

@@ -1,4 +1,4 @@
-"""A scene: objects on a table, as one camera saw them; from images and clouds, from and to files."""
+"""A scene: objects on a table, as one camera saw them, from images and clouds."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -331,7 +331,8 @@ class Scene(Value):
         be cut off at the border of the image, or much hidden by another object.
         """
         found = [
-            f"objects could also stand on another plane ({plane.describe()}); give it as the table to choose it"
+            f"objects could also stand on another plane ({plane.describe()}); "
+            "give it as the table to choose it"
             for plane in self.others
         ]
         labels = self.pixel_labels
@@ -340,14 +341,16 @@ class Scene(Value):
             if a in self.given and b in self.given:
                 continue
             found.append(
-                f"objects {a} and {b} touch, and their border is a guess: give a mask of the one to grasp"
+                f"objects {a} and {b} touch, and their border is a guess: "
+                "give a mask of the one to grasp"
             )
         parts = cut_creases(self.image, points, labels)
         for k in (k for k in self.things if k not in self.given):
             sizes = parts[labels == k].unique(return_counts=True)[1]
             if int((sizes > SCENE.part * sizes.sum()).sum()) > 1:
                 found.append(
-                    f"object {k} has a crease: if it is several objects, give a mask of the one to grasp"
+                    f"object {k} has a crease: if it is several objects, "
+                    "give a mask of the one to grasp"
                 )
         if self.image.at_border(self.pixels[self.rows_of()]):
             fix = "its other part is unknown; turn the camera to it"

@@ -152,15 +152,20 @@ def off_surface(
 
 @dataclasses.dataclass(frozen=True)
 class MeanJet(Batch):
-    """The posterior mean of the signed distance at points, with its gradient and Hessian.
+    """The mean signed distance at points with its gradient and Hessian, from `ShapeGP.mean_jet`.
 
-    The derivatives are by normalised coordinates (centred and scaled). Gradients need not have unit
-    length.
+    Derivatives are by normalised coordinates. Gradients need not have unit length. b stands for the
+    batch axes of the points.
+
+    Attributes:
+        distance: mean signed distance (*b,), normalised.
+        gradient: gradient (*b, 3) of the mean (no unit).
+        hessian: second derivatives (*b, 3, 3) of the mean, per normalised unit.
     """
 
-    distance: Float[Tensor, "*b"]  # normalised
-    gradient: Float[Tensor, "*b 3"]  # without unit
-    hessian: Float[Tensor, "*b 3 3"]  # per normalised unit
+    distance: Float[Tensor, "*b"]
+    gradient: Float[Tensor, "*b 3"]
+    hessian: Float[Tensor, "*b 3 3"]
 
     @property
     def normals(self) -> Float[Tensor, "*b 3"]:
@@ -182,10 +187,18 @@ class MeanJet(Batch):
 
 @dataclasses.dataclass(frozen=True)
 class SurfaceJet(MeanJet):
-    """The mean signed distance with two derivatives, and its variance with one."""
+    """The mean signed distance with two derivatives, and its variance with one, from `ShapeGP.jet`.
 
-    variance: Float[Tensor, "*b"]  # squared normalised units
-    variance_gradient: Float[Tensor, "*b 3"]  # normalised units
+    Attributes:
+        distance: mean signed distance (*b,), normalised.
+        gradient: gradient (*b, 3) of the mean (no unit).
+        hessian: second derivatives (*b, 3, 3) of the mean, per normalised unit.
+        variance: variance (*b,) of the signed distance, in squared normalised units.
+        variance_gradient: gradient (*b, 3) of the variance, in normalised units.
+    """
+
+    variance: Float[Tensor, "*b"]
+    variance_gradient: Float[Tensor, "*b 3"]
 
 
 @dataclasses.dataclass(frozen=True)
