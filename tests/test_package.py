@@ -45,8 +45,8 @@ SLOW = {
     "sklearn",
     "embreex",
 }
-OF_URDF = SLOW - {"skimage", "sklearn"} | {"matplotlib", "PIL", "mujoco"}
-"""What yourdfpy and pytorch-kinematics import."""
+OF_URDF = SLOW - {"skimage", "sklearn"} | {"PIL"}
+"""What yourdfpy and the used modules of pytorch-kinematics import."""
 
 
 @pytest.mark.promise("F9")
@@ -71,6 +71,19 @@ def test_a_start_brings_in_nothing_that_simulates_draws_or_is_slow_to_import(cod
     loaded = set(run_python("-c", f"{code}\n{end}").stdout.splitlines()[-1].split())
     assert "torchgrasp" in loaded
     assert not loaded & (SIMULATORS | DRAWERS | SLOW) - needed
+
+
+@pytest.mark.parametrize("words", ["import *", "import build_chain_from_mjcf"])
+def test_a_caller_finds_the_whole_pytorch_kinematics_after_a_hand_is_loaded(words):
+    code = f"""
+import torchgrasp
+hand = torchgrasp.load_hand("barrett")
+from pytorch_kinematics {words}
+import pytorch_kinematics as kinematics
+assert isinstance(hand.chain, kinematics.Chain) and kinematics.PseudoInverseIK
+print(build_chain_from_mjcf.__module__, type(kinematics).__name__)
+"""
+    assert run_python("-c", code).stdout == "pytorch_kinematics.mjcf module\n"
 
 
 def test_import_changes_no_global_state_and_writes_no_file(tmp_path, monkeypatch):

@@ -3,6 +3,8 @@ is first used. `lazy_loader` would import the parents of submodules, such as Sci
 """
 
 import importlib
+import importlib.util
+import sys
 import types
 from typing import TYPE_CHECKING, Any
 
@@ -22,10 +24,38 @@ class _Late(types.ModuleType):
         )
 
 
+class _Package(types.ModuleType):
+    """A package of which single modules are used: its own start runs when another name is used."""
+
+    def __getattr__(self, name: str) -> Any:
+        """Run the start of the package, and return what it calls `name`."""
+        self.__class__ = types.ModuleType  # pyright: ignore[reportAttributeAccessIssue]
+        spec: Any = self.__spec__
+        spec.loader.exec_module(self)
+        return getattr(self, name)
+
+
+class _Parts(_Late):
+    """A stand-in for a package whose start imports what its modules do not need."""
+
+    def __getattr__(self, name: str) -> Any:
+        """Return the module `name` of the package, without the start of the package."""
+        if name.startswith("__"):
+            raise AttributeError(name)
+        if self.__name__ not in sys.modules:
+            spec: Any = importlib.util.find_spec(self.__name__)
+            package = importlib.util.module_from_spec(spec)
+            package.__class__ = _Package
+            sys.modules[self.__name__] = package
+        return importlib.import_module(f"{self.__name__}.{name}")
+
+
 if TYPE_CHECKING:
     import jinja2 as jinja2
     import matplotlib as matplotlib
-    import pytorch_kinematics as pytorch_kinematics
+    import pytorch_kinematics.chain
+    import pytorch_kinematics.frame
+    import pytorch_kinematics.transforms
     import trimesh as trimesh
     import yourdfpy as yourdfpy
     from PIL import Image as Image
@@ -38,7 +68,8 @@ if TYPE_CHECKING:
 else:
     jinja2 = _Late("jinja2")
     matplotlib = _Late("matplotlib")
-    pytorch_kinematics = _Late("pytorch_kinematics")
+    # its start imports MuJoCo and matplotlib
+    pytorch_kinematics = _Parts("pytorch_kinematics")
     trimesh = _Late("trimesh")
     yourdfpy = _Late("yourdfpy")
     Image = _Late("PIL.Image")

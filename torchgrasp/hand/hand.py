@@ -110,7 +110,7 @@ class Hand(Value):
     name: str
     source: HandSource
     actuated: ActuatedJoints
-    chain: "pytorch_kinematics.Chain" = dataclasses.field(repr=False, compare=False)
+    chain: "pytorch_kinematics.chain.Chain" = dataclasses.field(repr=False, compare=False)
     tree: KinematicTree = dataclasses.field(repr=False)
     tips: Fingertips = dataclasses.field(repr=False)
     approach: Float[Tensor, "3"]

@@ -229,7 +229,7 @@ def map_directions(
     return torch.addcmul(mapped, frames[:, 2], z)
 
 
-def chain_from_urdf(urdf: Urdf) -> "pytorch_kinematics.Chain":
+def chain_from_urdf(urdf: Urdf) -> "pytorch_kinematics.chain.Chain":
     """Return a URDF as a pytorch-kinematics chain of independent joints, in float64.
 
     The library's own reader has float32.
@@ -242,12 +242,12 @@ def chain_from_urdf(urdf: Urdf) -> "pytorch_kinematics.Chain":
             place = rigid(rotation_from_rpy(j.rpy), real(j.xyz))
             ranges = (j.lower, j.upper), (-j.velocity, j.velocity), (-j.effort, j.effort)
             kind = "revolute" if j.kind == "continuous" else j.kind
-            offset = pytorch_kinematics.Transform3d(matrix=place)
+            offset = pytorch_kinematics.transforms.Transform3d(matrix=place)
             joint = frame.Joint(j.name, offset, kind, j.axis, torch.float64, "cpu", *ranges)
             frames[j.child] = frame.Frame(j.child, frame.Link(j.child), joint)
         for j in urdf.joints:
             frames[j.parent].add_child(frames[j.child])
-        return pytorch_kinematics.Chain(frames[urdf.root], torch.float64)
+        return pytorch_kinematics.chain.Chain(frames[urdf.root], torch.float64)
 
 
 def tree_from_urdf(
@@ -296,7 +296,7 @@ def tree_from_urdf(
 
 
 def chain_poses(
-    chain: "pytorch_kinematics.Chain", names: Sequence[str], values: Float[Tensor, "j n"]
+    chain: "pytorch_kinematics.chain.Chain", names: Sequence[str], values: Float[Tensor, "j n"]
 ) -> Float[Tensor, "c n 4 4"]:
     """Return the poses [m] of a chain's c frames in n postures, computed by pytorch-kinematics.
 
@@ -315,7 +315,7 @@ def chain_poses(
 
 
 def pose_in_carrier(
-    chain: "pytorch_kinematics.Chain", link: str
+    chain: "pytorch_kinematics.chain.Chain", link: str
 ) -> tuple[str, Float[Tensor, "3 4"]]:
     """Return the name of a link's carrier, then the pose (3 x 4) [m] of the link in it.
 
@@ -332,7 +332,7 @@ def pose_in_carrier(
     return chain.idx_to_frame[carrier], pose
 
 
-def _tables(chain: "pytorch_kinematics.Chain", frame: int) -> Float[Tensor, "4 3 4"]:
+def _tables(chain: "pytorch_kinematics.chain.Chain", frame: int) -> Float[Tensor, "4 3 4"]:
     """Return four 3 x 4 tables: a frame's pose in its parent is their sum, weighted by 1, sin q,
     cos q and q.
     """
