@@ -6,6 +6,7 @@ import torch
 from tests.contacts.test_forces import judged, tripods
 from tests.make import ball_contacts
 from torchgrasp import critical_friction
+from torchgrasp.contacts.balance import least_friction_forces
 from torchgrasp.contacts.critical import least_balance
 from torchgrasp.contacts.form_closure import closed_exact
 from torchgrasp.foundation.errors import BadArgument
@@ -64,3 +65,7 @@ def test_contacts_without_a_balance_are_infinite_and_other_numbers_are_refused()
     assert alone.item() == pytest.approx(found[3].item(), abs=1e-4)
     with pytest.raises(BadArgument, match="3 to 5 contacts"):
         critical_friction(points[:, :2], normals[:, :2])
+    for count in (2, 6):
+        same = points[3, :1].expand(count, 3)
+        with pytest.raises(BadArgument, match="3 to 5 contacts"):
+            least_friction_forces(same, same)

@@ -27,8 +27,9 @@ from torch import Tensor
 
 from torchgrasp.contacts.form_closure import Vectors, centre_and_radius, solve_closure_lp, wrenches
 from torchgrasp.contacts.problem import Tensions, contact_pairs, pull_signs
-from torchgrasp.foundation.base import row_numbers
+from torchgrasp.foundation.base import FINGERTIPS, row_numbers
 from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import ANY, Positive
 from torchgrasp.geometry.frames import skew
 from torchgrasp.geometry.linalg import (
@@ -150,21 +151,22 @@ def least_friction_forces(
     strongest: Positive = 4.0,
     preferred: Annotated[Float[Tensor, "*#b f"], ANY] | None = None,
 ) -> Float[Tensor, "*b f 3"]:
-    """Return balanced fingertip forces [N] on the object that need the least friction.
+    """Return balanced fingertip forces (*b, f, 3) [N] on the object that need the least friction.
 
     Forces of three contacts lie in the friction cones whenever any balanced forces do, except for a
     small error: the search also slightly favours even forces. Forces of four or five contacts may
-    need slightly more friction than the least.
+    need slightly more friction than the least. All forces of a set are NaN where no balanced forces
+    push at each of its contacts.
 
     Args:
-        points: positions [m] of f contacts.
-        normals: outward unit normals of the object.
+        points: positions (*b, f, 3) [m] of the f contacts of each set, 3 to 5.
+        normals: outward unit normals (*b, f, 3) of the object, in the same frame; the forces are in
+            it, too.
         strongest: normal force [N] of the strongest finger.
-        preferred: ratios (no unit) of the f normal forces to prefer among forces of similar
-            friction; by default they are equal.
+        preferred: ratios (*b, f) or (f,) of the normal forces to prefer among forces of similar
+            friction, without unit. None means equal ones.
 
-    Returns:
-        Forces; NaN at all contacts of a set where no balanced forces push at each of them.
+    Raises `BadArgument` for another number of contacts, or a `strongest` that is not positive.
 
     >>> points = torch.tensor([[[0.0, 1, 0], [0, 0, 0], [1, 0.5, 0]]])
     >>> normals = torch.tensor([[[-1.0, 0, 0], [-1, 0, 0], [1, 0, 0]]])
@@ -172,6 +174,8 @@ def least_friction_forces(
     tensor([ 1.,  1., -2.])
     """
     f = points.shape[-2]
+    if not FINGERTIPS[0] <= f <= FINGERTIPS[1]:
+        raise BadArgument("points", f"{f} contacts a set", "3 to 5 contacts")
     p = points.double().reshape(-1, f, 3)
     n = normals.double().reshape(-1, f, 3)
     if preferred is not None:

@@ -54,27 +54,39 @@ UNIT_TOLERANCE = 1e-3
 def certify(
     contacts: Contacts, spec: ContactSpec | None = None, friction: Float[Tensor, "b"] | None = None
 ) -> Certificate:
-    """Prove in float64 whether contact sets have frictional form closure, Eq. (13) of the paper.
+    """Return whether each of b contact sets has frictional form closure (Eq. 13 of the paper), with
+    a proof in float64.
 
-    The `contacts` are sets of three to five points [m] with outward unit normals, from any planner.
-    The friction cones have `spec.edges` edges at `friction`, a coefficient for each set, such as
-    `ContactPlan.friction`; None means `spec.planned_friction` for all. The columns of W are the
-    wrenches of all edges. Coefficients phi with W phi = 0 and sum phi = 1 balance them. The margin
-    is the largest s with phi >= s for such a phi, or -inf without one. A set is `closed` if its
-    margin is at least 1e-6 and its wrenches have full rank.
+    The answer is `Certificate.closed`. The wrenches w of a set are forces along the edges of its
+    friction cones, with their torques; they are the columns of W. Coefficients phi with W phi = 0
+    and sum phi = 1 balance them. The margin is the largest s with phi >= s for such a phi, or -inf
+    without one. A set is `closed` if its margin is at least 1e-6 and its wrenches have full rank.
 
-    If a set is not closed, its `witness` v is a wrench that no contact force opposes: v.w >= 0 for
-    every edge wrench w, up to rounding. For a margin between 0 and 1e-6, v.w >= -margin. If only
-    the rank is too low, the wrenches are smallest along v. Sets with contacts that are not finite
-    are not closed, and their margin and witness are NaN.
+    If a set is not closed, its `witness` is a unit wrench v that no contact force opposes: v . w >=
+    0 for every edge wrench w, up to rounding. If only the rank is too low, the wrenches are
+    smallest along v. A set with a contact that is not finite is not closed. Its margin and witness
+    are NaN.
 
-    The margin is differentiable once in points and normals. Where several phi or v are optimal, its
-    derivative is that of one of them. At its greatest possible value, where all phi are equal, it
-    is 0; where the margin is -inf, it is NaN. A contact set that a loss masks does not affect the
-    derivatives of others. A second derivative, or the derivative of another field, raises
-    `BadArgument`; in forward mode the latter is NaN. Raises `BadArgument` for contacts of a wrong
-    shape, normals that are not of length 1 (to 1e-3), a `spec` that is no `ContactSpec`, or a
-    `friction` that is not one number from 0 for each set.
+    The margin has a first derivative by points and normals. Where several phi or v are optimal, the
+    derivative is the one of a single phi and v. Where the margin is greatest, all phi are equal,
+    and the derivative is 0. Where the margin is -inf, the derivative is NaN. A set whose margin a
+    loss masks adds nothing to the loss's derivatives. In forward mode the derivatives of other
+    fields are NaN.
+
+    Args:
+        contacts: sets of three to five contacts (b, f, 3) [m] with outward unit normals, from any
+            planner.
+        spec: its `edges` and `planned_friction` define the friction cones; None means
+            `ContactSpec()`.
+        friction: coefficient of friction (b,) of each set, such as `ContactPlan.friction`; None
+            means `spec.planned_friction` for all.
+
+    Raises `BadArgument` for:
+
+    * contacts of a wrong shape, or sets that do not have three to five contacts;
+    * normals that are not of length 1 (to 1e-3);
+    * a `friction` that is not one number from 0 for each set;
+    * a second derivative, or a backward derivative of another field than the margin.
 
     >>> corners = torch.tensor([[[1.0, 0, 0], [-0.6, 0.8, 0], [-0.6, -0.8, 0]]])
     >>> certify(Contacts(corners, corners)).closed

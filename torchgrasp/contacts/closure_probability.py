@@ -243,9 +243,14 @@ def first_contact(
 @checked
 @dataclasses.dataclass(frozen=True)
 class ClosureProbability(Batch):
-    """The probability that each contact set has force closure on the true surface.
+    """The probability that each of b contact sets has force closure on the true surface.
 
-    `standard_error` is that of the `probability`, which is estimated from random surfaces.
+    `closure_probability` makes it.
+
+    Attributes:
+        probability: share (b,) of random surfaces on which the set has force closure, in [0, 1].
+        standard_error: standard error (b,) of the probability, which is estimated from random
+            surfaces.
 
     >>> ClosureProbability(torch.tensor([0.97]), torch.tensor([0.01])).probability
     tensor([0.9700])
@@ -267,21 +272,22 @@ def closure_probability(
     """Return the probability that each contact set has force closure on the uncertain surface, by
     Monte Carlo.
 
-    All contact sets share the random surfaces, and no result depends on another set. Raises
-    `BadArgument` for a wrong argument, or a contact that is not finite or outside the shape's
-    domain.
+    All contact sets share the random surfaces, and no result depends on another set.
 
     Args:
-        shape: the uncertain shape.
-        contacts: sets of 3 to 5 contacts [m] with outward unit normals, inside the domain of the
-            shape. A random surface that a finger does not meet within 12 standard deviations counts
-            as one without force closure.
-        spec: its `friction` is used, the friction coefficient at execution; `planned_friction` is
-            not used. Of a distribution the mean over 9 frictions counts.
-        n: number of random surfaces. The standard error is at most 1 / (2 sqrt(n)): 0.01 for 2500.
-            It is computed for the fraction (k + 1) / (n + 2) if k surfaces give force closure, and
-            so is never 0.
+        shape: the uncertain shape, from `fit_shape`.
+        contacts: sets of 3 to 5 contacts (b, f, 3) [m] with outward unit normals, inside the domain
+            of the shape. A random surface that a finger does not meet within 12 standard deviations
+            counts as one without force closure.
+        spec: its `friction` is used, the coefficient of friction at execution; `planned_friction`
+            is not used. For a distribution the result is the mean over 9 frictions. None means
+            `ContactSpec()`.
+        n: number of random surfaces. The standard error is at most 1 / (2 sqrt(n)). If k surfaces
+            give force closure, it is computed for the fraction (k + 1) / (n + 2). So it is never 0.
         seed: random seed.
+
+    Raises `BadArgument` for a contact that is not finite or outside the shape's domain, or another
+    wrong argument.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp

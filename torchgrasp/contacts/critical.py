@@ -110,18 +110,21 @@ def critical_friction(
     points: Annotated[Float[Tensor, "*b f 3"], ANY],
     normals: Annotated[Float[Tensor, "*b f 3"], ANY],
 ) -> Float[Tensor, "*b"]:
-    """Return the least common friction coefficient at which contacts have force closure.
+    """Return the least common friction coefficient (*b,) at which contacts have force closure.
 
     At any greater friction there are balanced forces inside all friction cones, and at any lesser
-    one there are none. The result is infinite for contacts that cannot balance at a friction up to
-    10, contacts on a line, and contacts that are not finite. It is infinite, too, for the few contacts
-    for which the method does not converge.
+    one there are none. The result is infinite for:
 
-    Raises `BadArgument` for a number of contacts other than 3 to 5.
+    * contacts that cannot balance at a friction up to 10;
+    * contacts on a line;
+    * contacts that are not finite;
+    * the few contacts for which the method does not converge.
 
     Args:
-        points: positions [m] of f contacts.
-        normals: outward unit normals of the object.
+        points: positions (*b, f, 3) [m] of the f contacts of each set, 3 to 5.
+        normals: outward unit normals (*b, f, 3) of the object, in the same frame.
+
+    Raises `BadArgument` for another number of contacts, or tensors of different shapes.
 
     >>> points = torch.tensor([[0.0, 1, 0], [0, 0, 0], [1, 0.5, 0]])
     >>> normals = torch.tensor([[-1.0, 0, 0], [-1, 0, 0], [0.8, 0, 0.6]])

@@ -57,29 +57,29 @@ def hold_probability(
     shift: Length = 0.0,
     turn: Annotated[float, TILTS] = 0.0,
 ) -> Float[Tensor, "b"]:
-    """Return the probability that each contact set has force closure, for uncertain friction,
-    finger placement, normals and pose of the object.
+    """Return the probability (b,) that each contact set has force closure, for uncertain friction,
+    finger placement, normals and object pose.
 
-    Without further errors than the friction's it is exact: the probability that the friction exceeds the
-    `critical_friction`, and 0 where that is infinite. The other errors count to first order, by the
-    equations of this module. So it is mostly a little too high, since errors also raise the mean of
+    If only the friction is uncertain, the result is exact. It then is the probability that the
+    friction exceeds the `critical_friction`, and 0 where that is infinite. The other errors count
+    to first order. So the result is mostly a little too high, since errors also raise the mean of
     the critical friction. Errors count too little where the critical friction has a kink, as for
     contacts that are exactly symmetric.
 
-    Raises `BadArgument` for sets of other than 3 to 5 contacts, normals that are not of length 1
-    (to 1e-3), and numbers outside their range.
-
     Args:
-        contacts: sets of 3 to 5 contacts [m] with outward unit normals.
-        friction: coefficient of friction of all contacts, or its distribution, in [0, 10].
+        contacts: sets of 3 to 5 contacts (b, f, 3) [m] with outward unit normals.
+        friction: coefficient of friction of all contacts, or its `Distribution`, in [0, 10].
         placement: standard deviation [m] of each fingertip's position along each of two
             perpendicular tangents. The normal stays as it is, as on a surface that is flat nearby.
         tilt: standard deviation [rad] of the angle of a normal about each of two perpendicular
-            tangents, one for all contacts or one for each.
+            tangents. It is one number for all contacts, or one for each (b, f).
         shift: standard deviation [m] of the object's position along each of three axes. It moves
             all contacts together along the surface.
         turn: standard deviation [rad] of the object's rotation about each of three axes through the
             contacts' centroid.
+
+    Raises `BadArgument` for sets of other than 3 to 5 contacts, normals that are not of length 1
+    (to 1e-3), and numbers outside their range.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> contacts = load_shipped_grasp("jug", "allegro").contacts

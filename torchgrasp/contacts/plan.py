@@ -51,25 +51,26 @@ def plan_contacts(
     *,
     time_budget: Positive | None = None,
 ) -> ContactPlan:
-    """Return planned contact sets, Eqs. (10)-(14) of the paper, one for each initial guess, in the
+    """Return planned contact sets (Eqs. 10-14 of the paper), one for each initial guess, in the
     order of the guesses.
 
     A set has `spec.fingertips` contacts. A failed set carries the `Status` of the first constraint
-    that it violates. For a distribution of friction, guesses are planned at the frictions of
-    `spec.planned_frictions` in turn. If the solver fails from a feasible initial guess, the guess
-    itself is the result. Without `time_budget` the result is deterministic, and the sets from 500
-    or 1000 initial guesses are the first sets of a plan from more. Raises `BadArgument` for
-    `starts` that are not positive, of a wrong shape, or outside the shape's domain, or another
-    wrong argument.
+    that it violates. If the solver fails from a feasible initial guess, the guess itself is the
+    result. For a distribution of friction, guesses are planned at the frictions of
+    `spec.planned_frictions` in turn. Without `time_budget` the result is deterministic. The sets
+    from 500 or 1000 initial guesses then are the first sets of a plan from more.
 
     Args:
-        shape: a `ShapeGP`, or another implicit surface with the same methods.
-        spec: the constraints on contacts; `ContactSpec()` by default.
-        starts: number of random initial guesses (Sec. 6.2), or b sets of f initial contact points
-            [m].
+        shape: a `ShapeGP`, or another implicit surface with the same methods (`ShapeLike`).
+        spec: the constraints on contacts; None means `ContactSpec()`.
+        starts: number of random initial guesses (Sec. 6.2), or b sets of initial contact points (b,
+            f, 3) [m].
         seed: random seed.
-        time_budget: wall time [s] of the call, in which at least 25 guesses are planned; by default
-            all are planned.
+        time_budget: wall time [s] of the call, in which at least 25 guesses are planned. None means
+            that all are planned.
+
+    Raises `BadArgument` for `starts` that are not positive, of a wrong shape, or outside the
+    shape's domain. It is raised, too, for another argument out of its range.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> plan = plan_contacts(fit_shape(load_object("jug").view), ContactSpec.paper(), starts=8)

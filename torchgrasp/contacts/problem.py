@@ -49,12 +49,8 @@ PerRow = float | Float[Tensor, "b"]
 class ShapeLike(Protocol):
     """The interface of a shape with uncertainty: a `ShapeGP`, or another implicit surface.
 
-    `scale` [m] is the length of one normalised unit, `domain_radius` (normalised) the radius in
-    which the shape is known, and `std_factor` (no unit) multiplies standard deviations. A
-    `ShapeBatch` has one of these numbers for each entry. At q normalised points x, `jet` gives the
-    signed distance, its variance and their derivatives; `mean_and_gradient` gives the mean signed
-    distance and its gradient only. `normalise` converts points [m] to normalised ones, and `metres`
-    does the reverse.
+    `plan_contacts` takes any object with these methods. Normalised points are points of the cloud's
+    frame, shifted and divided by `scale` [m].
 
     >>> from torchgrasp import fit_shape, load_object
     >>> shape = fit_shape(load_object("jug").view)
@@ -63,17 +59,43 @@ class ShapeLike(Protocol):
     """
 
     @property
-    def scale(self) -> PerRow: ...  # noqa: D102
+    def scale(self) -> PerRow:
+        """The length [m] of one normalised unit; a `ShapeBatch` has one for each entry."""
+        ...
+
     @property
-    def domain_radius(self) -> PerRow: ...  # noqa: D102
+    def domain_radius(self) -> PerRow:
+        """The normalised radius about the origin in which the shape is known."""
+        ...
+
     @property
-    def std_factor(self) -> PerRow: ...  # noqa: D102
-    def jet(self, x: Float[Tensor, "q 3"]) -> SurfaceJet: ...  # noqa: D102
-    def mean_and_gradient(  # noqa: D102
+    def std_factor(self) -> PerRow:
+        """The factor (no unit) that calibrates standard deviations: they are multiplied by it."""
+        ...
+
+    def jet(self, x: Float[Tensor, "q 3"]) -> SurfaceJet:
+        """Return the signed distance and its variance at q normalised points `x`, normalised.
+
+        The distance is the mean, with its gradient and Hessian; the variance has its gradient.
+        """
+        ...
+
+    def mean_and_gradient(
         self, x: Float[Tensor, "q 3"]
-    ) -> tuple[Float[Tensor, "q"], Float[Tensor, "q 3"]]: ...
-    def normalise(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]: ...  # noqa: D102
-    def metres(self, x: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]: ...  # noqa: D102
+    ) -> tuple[Float[Tensor, "q"], Float[Tensor, "q 3"]]:
+        """Return the mean signed distance (q,) at q normalised points `x`, and its gradient (q, 3).
+
+        The distance is normalised, and the gradient has no unit.
+        """
+        ...
+
+    def normalise(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
+        """Return points (*b, 3) [m] of the cloud's frame as normalised points (*b, 3)."""
+        ...
+
+    def metres(self, x: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
+        """Return normalised points `x` (*b, 3) as points (*b, 3) [m] of the cloud's frame."""
+        ...
 
 
 AnyShape = TypeVar("AnyShape", bound=ShapeLike)

@@ -35,9 +35,15 @@ Distance = Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n"]]
 class Region(Value):
     """A region of space in the frame of the cloud, as a signed distance.
 
-    `distance` is a function of points (n, 3) [m] in float64; it returns their signed distances (n,)
-    [m], negative inside. Errors call the function by the `name`. A `placed` region, a box or a
-    mesh, must be at the object: planning compares it with the cloud.
+    `plan_grasps` takes it as `keep` or `avoid`, and a `ContactSpec` as `region`. `box`, `mesh`,
+    `mask` and `rim` make usual regions.
+
+    Args:
+        distance: function of points (n, 3) [m] in float64 that returns their signed distances (n,)
+            [m], negative inside.
+        name: name of the function in errors.
+        placed: whether the region must be at the object, as a box or a mesh. Planning then compares
+            it with the cloud.
 
     >>> from torchgrasp import load_object
     >>> ball = Region(lambda points: points.norm(dim=-1) - 0.05)
@@ -53,7 +59,7 @@ class Region(Value):
 
     @checked
     def __call__(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Return the signed distance [m] of points [m], negative inside the region.
+        """Return the signed distance (*b,) [m] of points (*b, 3) [m], negative inside the region.
 
         Raises `BadArgument` if the function does not return one finite number for each point.
         """
@@ -76,11 +82,15 @@ class Region(Value):
     def box(
         cls, low: Float[Tensor, "3"], high: Float[Tensor, "3"], obj_from_box: Pose | None = None
     ) -> "Region":
-        """Return the box between two corners [m], along the axes of the cloud, or of the frame
-        `obj_from_box`.
+        """Return the inside of a box.
 
-        `low` holds the least, and `high` the greatest coordinates in this frame. Raises
-        `BadArgument` unless `low` is less than `high` on each axis.
+        Args:
+            low: least coordinates (3,) [m] of the box, in the box's frame.
+            high: greatest coordinates (3,) [m] of the box, in the box's frame.
+            obj_from_box: pose (4, 4) [m] of the box's frame in the cloud's frame. None means that
+                the two are the same.
+
+        Raises `BadArgument` unless `low` is less than `high` on each axis.
         """
         if not bool((low < high).all()):
             raise BadArgument(
@@ -102,10 +112,10 @@ class Region(Value):
     @classmethod
     @checked
     def mesh(cls, mesh: "trimesh.Trimesh | Path | str") -> "Region":
-        """Return the inside of a closed mesh [m] in the frame of the cloud.
+        """Return the inside of a closed mesh.
 
-        `mesh` is a mesh or a file. Raises `MeshError` for a mesh that is missing, open, or has no
-        volume.
+        `mesh` is a trimesh, or an .obj, .off, .ply or .stl file. It is in metres, in the frame of
+        the cloud. Raises `MeshError` for a mesh that is missing, open, or has no volume.
         """
         solid = read_mesh(mesh)
         surface = surface_distance(
@@ -120,11 +130,16 @@ class Region(Value):
     @classmethod
     @checked
     def mask(cls, scene: Scene, mask: Bool[Tensor, "h w"]) -> "Region":
-        """Return the part of space that the pixels of a mask cover in a scene's image.
+        """Return the space that the pixels of a mask (h, w) cover, as the scene's camera sees it.
 
-        It is the cone of the view rays of these pixels, on the seen and the unseen side of the
-        object. So a contact behind a marked part of the object is inside, too. Points outside the
-        image are outside. Raises `BadArgument` for a mask of a wrong shape or without pixels.
+        The region is in the frame of the scene. It reaches through the object, so contacts on the
+        hidden side count, too. Points outside the image are outside.
+
+        Args:
+            scene: the scene, whose image has h rows and w columns.
+            mask: mask (h, w) of the covered pixels.
+
+        Raises `BadArgument` for a mask of a wrong shape or without pixels.
         """
         image = scene.image
         if mask.shape != image.depth.shape or not bool(mask.any()):
@@ -152,9 +167,17 @@ class Region(Value):
     @classmethod
     @checked
     def rim(cls, cloud: PointCloud, table: Plane | float, share: Fraction = 0.2) -> "Region":
-        """Return the space of the upper `share`, in [0, 1], of an object's height over its table.
+        """Return the space above a level near the top of an object.
 
-        `table` is a plane, or a height [m] along z, in the frame of the `cloud`.
+        The level is lower than the cloud's highest point by `share` of that point's height over the
+        table. The space has no upper end.
+
+        Args:
+            cloud: the cloud of the object.
+            table: the table's `Plane` in the frame of the cloud, or its height [m] along z.
+            share: share of the height, in [0, 1].
+
+        Raises `BadArgument` for a `share` outside [0, 1].
         """
         plane = as_plane(table)
         assert plane is not None
