@@ -155,10 +155,11 @@ class ShapeGP(Posterior, Normalisation):
 
     @checked(gradients=True)
     def wall_at(self, x: Queries) -> Bool[Tensor, "q walls"]:
-        """Return a mask (q, walls): which surface of `walls` applies at each of q normalised
-        points.
+        """Return a mask (q, walls): which surface of `walls` applies at each of q points `x` (q,
+        3).
 
-        Each row has one True. This shape has one surface, so all are True.
+        The points are those that `normalise` returned. Each row has one True. This shape has one
+        surface, so all are True.
         """
         return torch.ones(len(x), 1, dtype=torch.bool, device=x.device)
 
@@ -353,7 +354,8 @@ class ShapeGP(Posterior, Normalisation):
 
     @checked
     def append(self, new: Observations) -> "ShapeGP":
-        """Return the shape given further normalised observations, which count as those of the fit.
+        """Return the shape given further observations in the normalised frame, in addition to all
+        earlier ones.
 
         Kernel, domain and `cloud` do not change. `update` does the same for points [m].
         """

@@ -100,25 +100,28 @@ class HollowShape(ShapeGP):
 
     @checked(gradients=True)
     def wall_at(self, x: Queries) -> Bool[Tensor, "q walls"]:
-        """Return a mask (q, 2): which surface, outer or inner, applies at each of q normalised
-        points.
+        """Return a mask (q, 2): which surface, outer or inner, applies at each of q points `x` (q,
+        3).
 
-        Each row has one True. The points `x` are (q, 3).
+        The points are those that `normalise` returned. Each row has one True.
         """
         inner = self.inner.mean(x) > self.outer.mean(x)
         return torch.stack([~inner, inner], 1)
 
     @checked(gradients=True)
     def mean(self, x: Queries) -> Float[Tensor, "q"]:
-        """Return the mean signed distance (q,), normalised, at q normalised points `x` (q, 3)."""
+        """Return the mean signed distance (q,) at q points `x` (q, 3) that `normalise` returned.
+
+        It is normalised: one unit is `scale` [m].
+        """
         return torch.maximum(self.outer.mean(x), self.inner.mean(x))
 
     @checked(gradients=True)
     def mean_and_gradient(self, x: Queries) -> MeanAndGradient:
         """Return (distance, gradient): the mean signed distance (q,) and its gradient (q, 3).
 
-        They are at q normalised points `x` (q, 3). The distance is normalised, and the gradient is
-        by normalised coordinates (no unit).
+        They are at q points `x` (q, 3) that `normalise` returned. The distance is normalised: one
+        unit is `scale` [m]. The gradient is by normalised coordinates (no unit).
         """
         a, slope_a = self.outer.mean_and_gradient(x)
         b, slope_b = self.inner.mean_and_gradient(x)
@@ -130,47 +133,50 @@ class HollowShape(ShapeGP):
         """Return mean (q, 4) and covariance (q, 4, 4) of signed distance and gradient (d, w) at
         each point.
 
-        The q points `x` (q, 3) are normalised, and so is the result. Each point has the result of
-        the surface that applies there.
+        The q points `x` (q, 3) are those that `normalise` returned. The result is normalised: one
+        unit is `scale` [m]. Each point has the result of the surface that applies there.
         """
         parts, merge = self._by_wall(x, lambda wall, own: wall.estimate(own))
         return tuple(map(merge, *parts))  # pyright: ignore[reportReturnType]
 
     @checked(gradients=True)
     def variance(self, x: Queries) -> Float[Tensor, "q"]:
-        """Return the variance of the signed distance, normalised, at q normalised points."""
+        """Return the variance (q,) of the signed distance at q points `x` (q, 3) that `normalise`
+        returned.
+
+        It is in squared normalised units: one unit is `scale` [m].
+        """
         parts, merge = self._by_wall(x, lambda wall, own: wall.variance(own))
         return merge(*parts)
 
     @checked(gradients=True)
     def jet(self, x: Queries) -> SurfaceJet:
-        """Return mean and variance of the signed distance with derivatives, at q normalised points
-        `x` (q, 3).
+        """Return mean and variance of the signed distance with derivatives, at q points `x` (q, 3).
 
-        The mean has first and second derivatives, the variance the first. All are by normalised
-        coordinates, as in `ShapeGP.jet`.
+        The points are those that `normalise` returned. The mean has first and second derivatives,
+        the variance the first. All are by normalised coordinates, as in `ShapeGP.jet`.
         """
         parts, merge = self._by_wall(x, lambda wall, own: wall.jet(own))
         return map_tensors(merge, *parts)
 
     @checked(gradients=True)
     def mean_jet(self, x: Queries) -> MeanJet:
-        """Return the mean signed distance with first and second derivatives, at q normalised points
-        `x` (q, 3).
-
-        All are by normalised coordinates: `distance` (q,), `gradient` (q, 3) and `hessian` (q, 3,
+        """Return the mean signed distance with first and second derivatives, at q points `x` (q,
         3).
+
+        The points are those that `normalise` returned. All are by normalised coordinates:
+        `distance` (q,), `gradient` (q, 3) and `hessian` (q, 3, 3).
         """
         parts, merge = self._by_wall(x, lambda wall, own: wall.mean_jet(own))
         return map_tensors(merge, *parts)
 
     @checked(gradients=True)
     def joint_at(self, x: Float[Tensor, "k 3"]) -> JointEstimate:
-        """Return the joint posterior of distance and gradient (d, w) at k normalised points `x` (k,
-        3).
+        """Return the joint posterior of distance and gradient (d, w) at k points `x` (k, 3).
 
-        It is normalised. Points at which different surfaces apply have covariance 0. It is `joint`
-        without a limit of the number of points and without a check of the domain.
+        The points are those that `normalise` returned, and the result is normalised. Points at
+        which different surfaces apply have covariance 0. It is `joint` without a limit of the
+        number of points and without a check of the domain.
         """
         outer = self.outer.joint_at(x)
         inner = self.inner.joint_at(x)

@@ -112,7 +112,10 @@ class Posterior(Value):
 
     @checked(gradients=True)
     def mean(self, x: Queries) -> Float[Tensor, "q"]:
-        """Return the mean signed distance (q,), normalised, at q normalised points `x` (q, 3)."""
+        """Return the mean signed distance (q,) at q points `x` (q, 3) that `normalise` returned.
+
+        It is normalised: one unit is `scale` [m].
+        """
         if not self._is_plain(x):
             return self.distance_rows(x) @ self.weights
         mean = partial(evaluate_mean, self.weighted, gradient=False)
@@ -122,8 +125,8 @@ class Posterior(Value):
     def mean_and_gradient(self, x: Queries) -> MeanAndGradient:
         """Return (distance, gradient): the mean signed distance (q,) and its gradient (q, 3).
 
-        They are at q normalised points `x` (q, 3). The distance is normalised, and the gradient is
-        by normalised coordinates (no unit).
+        They are at q points `x` (q, 3) that `normalise` returned. The distance is normalised: one
+        unit is `scale` [m]. The gradient is by normalised coordinates (no unit).
         """
         if not self._is_plain(x):
             distance, *slope = (self.cross(x) @ self.weights).unbind(0)
@@ -136,8 +139,9 @@ class Posterior(Value):
         """Return mean (q, 4) and covariance (q, 4, 4) of signed distance and gradient (d, w) at
         each point.
 
-        The q points `x` (q, 3) are normalised, and so is the result, Eqs. (7)-(8) of the paper.
-        Other than in `joint_at`, points have no covariance with each other.
+        The q points `x` (q, 3) are those that `normalise` returned. The result is normalised: one
+        unit is `scale` [m]. Eqs. (7)-(8) of the paper. The covariance between different points is
+        left out; `joint_at` has it.
         """
         prior = self.prior_block()
         rows = len(self.factor)
@@ -156,9 +160,11 @@ class Posterior(Value):
 
     @checked(gradients=True)
     def variance(self, x: Queries) -> Float[Tensor, "q"]:
-        """Return the variance of the signed distance, normalised, at q normalised points.
+        """Return the variance (q,) of the signed distance at q points `x` (q, 3) that `normalise`
+        returned.
 
-        It costs a quarter of `estimate`.
+        It is in squared normalised units: one unit is `scale` [m]. It costs a quarter of
+        `estimate`.
         """
         prior = self.kernel.profile(self.x.new_zeros(()))
 
@@ -170,12 +176,11 @@ class Posterior(Value):
 
     @checked(gradients=True)
     def jet(self, x: Queries) -> SurfaceJet:
-        """Return mean and variance of the signed distance with derivatives, at q normalised points
-        `x` (q, 3).
+        """Return mean and variance of the signed distance with derivatives, at q points `x` (q, 3).
 
-        The mean has first and second derivatives, the variance the first. All are by normalised
-        coordinates: `distance` (q,), `gradient` (q, 3), `hessian` (q, 3, 3), `variance` (q,),
-        `variance_gradient` (q, 3).
+        The points are those that `normalise` returned. The mean has first and second derivatives,
+        the variance the first. All are by normalised coordinates: `distance` (q,), `gradient` (q,
+        3), `hessian` (q, 3, 3), `variance` (q,), `variance_gradient` (q, 3).
         """
         # The mean is sum_j (a_j k - k' d.b_j), with d = x - x_j and k' = dk / d(|d|^2 / 2).
         # Here a_j is the weight of the distance at the observed point x_j, b_j that of its normal.
@@ -189,11 +194,11 @@ class Posterior(Value):
 
     @checked(gradients=True)
     def mean_jet(self, x: Queries) -> MeanJet:
-        """Return the mean signed distance with first and second derivatives, at q normalised points
-        `x` (q, 3).
+        """Return the mean signed distance with first and second derivatives, at q points `x` (q,
+        3).
 
-        All are by normalised coordinates: `distance` (q,), `gradient` (q, 3) and `hessian` (q, 3,
-        3). It costs less than `jet`.
+        The points are those that `normalise` returned. All are by normalised coordinates:
+        `distance` (q,), `gradient` (q, 3) and `hessian` (q, 3, 3). It costs less than `jet`.
         """
         size = at_once(x, CHUNK.jet)
         if not self._is_plain(x):
@@ -202,7 +207,8 @@ class Posterior(Value):
 
     @checked(gradients=True)
     def joint_at(self, x: Float[Tensor, "k 3"]) -> JointEstimate:
-        """Return the joint posterior of distance and gradient at k normalised points `x` (k, 3).
+        """Return the joint posterior of distance and gradient at k points `x` (k, 3) that
+        `normalise` returned.
 
         It is normalised, Eqs. (7)-(8) of the paper. It is `joint` without a limit of the number of
         points and without a check of the domain.
@@ -226,10 +232,11 @@ class Posterior(Value):
 
     @checked(gradients=True)
     def distance_rows(self, x: Queries) -> CovarianceRows:
-        """Return the prior covariance (q, r) of the distance at q normalised points with all r
-        observed numbers.
+        """Return the prior covariance (q, r) of the distance at q points with all r observed
+        numbers.
 
-        The points `x` are (q, 3). The columns are in the order of `weights`.
+        The points `x` (q, 3) are those that `normalise` returned. The columns are in the order of
+        `weights`.
         """
         if not self._is_plain(x):
             d = x[:, None] - self.x
@@ -244,9 +251,9 @@ class Posterior(Value):
     def whiten(self, rows: CovarianceRows) -> CovarianceRows:
         """Return `rows` (q, r) times L^-T, where L is the Cholesky factor `factor`.
 
-        Each of the q rows holds the covariances of one number with all r observed numbers, in the
-        order of `weights`. The dot product of two rows of the result (q, r) is the covariance that
-        the observations explain.
+        Each of the q rows holds the covariances of one number with all r observed numbers. They are
+        in the order of `weights`. The dot product of two rows of the result (q, r) is the
+        covariance that the observations explain.
         """
         rows = rows if self.order is None else rows[:, self.order]
         if not self._is_plain(rows):
@@ -284,11 +291,11 @@ class Posterior(Value):
 
     @checked(gradients=True)
     def cross(self, x: Queries) -> Float[Tensor, "4 q rows"]:
-        """Return the prior covariance (4, q, r) of distance and gradient at q normalised points
-        with all r observed numbers.
+        """Return the prior covariance (4, q, r) of distance and gradient at q points with all r
+        observed numbers.
 
-        The points `x` are (q, 3). On the first axis, index 0 is the distance, and 1 to 3 are the
-        gradient. The last axis is in the order of `weights`.
+        The points `x` (q, 3) are those that `normalise` returned. On the first axis, index 0 is the
+        distance, and 1 to 3 are the gradient. The last axis is in the order of `weights`.
         """
         return cross_covariance(self.kernel, x, self.x, self.n_oriented)
 

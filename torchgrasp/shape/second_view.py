@@ -62,21 +62,29 @@ VIEW = ViewNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class NextView(Value):
-    """A camera for a second view, and what it is expected to tell.
+    """A camera for a second view, and what it is expected to tell, from `next_view`.
 
-    `turn` [deg] is the angle at the object from the nearest earlier camera, NaN if none is known.
-    `before` [m] is the standard deviation of the surface now, and `after` [m] the one expected with
-    the second view. Both are means over the contacts of the best grasps, or over the surface.
+    `before` and `after` are means over the contacts of the best grasps, or over the surface without
+    grasps.
+
+    Attributes:
+        camera_pose: pose `obj_from_camera` (4, 4) [m] in the cloud's frame, as `look_at` returns it
+            (x right, y down, z forward).
+        turn: angle [deg] at the object from the nearest earlier camera; NaN if none is known.
+        before: standard deviation [m] of the surface now.
+        after: standard deviation [m] of the surface that is expected with the second view.
     """
 
-    camera_pose: Pose  # obj_from_camera [m]: x right, y down, z forward, as `look_at` returns it
+    camera_pose: Pose
     turn: Measured
     before: float
     after: float
 
     @property
     def sentence(self) -> str:
-        """Where to look from, in the frame of the cloud, and what it is expected to tell."""
+        """A sentence in words: where to look from, in the frame of the cloud, and what it is
+        expected to tell.
+        """
         x, y, z = self.camera_pose[:3, 3].tolist()
         known = self.turn == self.turn
         turn = f", {self.turn:.0f} degrees from where the camera was" if known else ""
@@ -93,29 +101,27 @@ def next_view(
     table: Plane | float | None = None,
     distance: Length | None = None,
 ) -> NextView:
-    """Return the camera on a sphere around the object that would reduce the deviation most.
+    """Return the camera for a second view that would reduce the shape's standard deviation most.
 
-    A Gaussian process knows its deviation before it is measured. So each camera is given the points
-    of the estimated surface that it would see. They face it, and no other surface is in the way.
-    The surface keeps out of the space that the first view saw as free. The deviation after a view
-    is that of the posterior given these points.
+    Candidates are cameras on a sphere around the object. Each is given the points of the estimated
+    surface that it would see. They face it, and no other surface is in the way. The deviation after
+    a view is the deviation of the posterior given these points.
 
     A new fit may do better: it also takes the second outline, and completes the rest anew.
-    Neighbours of the object do not hide it here, and whether an arm reaches the camera is not
-    asked.
+    Neighbours of the object do not hide it here. Whether an arm reaches the camera is not asked.
 
     Args:
-        shape: posterior [m] of `fit_shape`.
+        shape: the shape, from `fit_shape`.
         grasps: grasps of this shape, in its frame. The deviation counts at the contacts of the best
-            executable ones, weighted by their predicted success. Without an executable grasp it
-            counts on all of the surface.
-        table: the table's plane, or its height [m] along z; by default that of the grasps. Cameras
-            are above it.
-        distance: distance [m] of the camera from the middle of the surface; by default that of the
-            first camera.
+            executable ones, weighted by their predicted success. None, or no executable grasp,
+            means that it counts on all of the surface.
+        table: the table's plane, or its height [m] along z; cameras are above it. None means the
+            table of the grasps, if they have one.
+        distance: distance [m] of the camera from the middle of the surface; None means the mean
+            distance of earlier cameras, or `VIEW.far` if none is known.
 
-    Raises `BadArgument` for a wrong argument, a distance that is too near to the object, or grasps
-    whose contacts all lie outside the shape's domain.
+    Raises `BadArgument` for a wrong argument, or a distance that is too near to the object. Grasps
+    whose contacts all lie outside the shape's domain raise it, too.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> from torchgrasp.shape import next_view
