@@ -15,6 +15,7 @@ from torch import Tensor
 
 from tests import annotations
 from tests.kept import kept as kept
+from tests.kept import kept_plans as kept_plans
 
 if TYPE_CHECKING:
     from torchgrasp.values.planning import PointCloud

@@ -1,7 +1,7 @@
-"""Estimated shapes and posture libraries that tests with another subject compute once.
+"""Estimated shapes, posture libraries and plans that tests with another subject compute once.
 
-Tests ask for them by the fixture `kept`. Those of shapes, libraries, costs, and of the same numbers
-in every call, do not.
+Tests ask for shapes and libraries by the fixture `kept`, and for plans, too, by `kept_plans`. Those
+of shapes, libraries, plans, costs, and of the same numbers in every call, do not.
 """
 
 import dataclasses
@@ -37,15 +37,15 @@ def content(value: Any) -> Any:
 
 
 def once(key: Any, compute: Callable[[], Any]) -> Any:
-    """Return what was computed for a key, or compute it; a warning is told at each call."""
-    if key in KEPT:
-        return KEPT[key]
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always")
-        found = compute()
-    if told:
-        return compute()
-    KEPT[key] = found
+    """Return what was computed for a key, or compute it; its warnings are told at each call."""
+    if key not in KEPT:
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            found = compute()
+        KEPT[key] = found, told
+    found, told = KEPT[key]
+    for one in told:
+        warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
     return found
 
 
@@ -80,4 +80,36 @@ def kept() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ShapedObject, "of", shape)
         patch.setattr(seeds.PostureLibrary, "_drawn", library)
+        yield
+
+
+@pytest.fixture(scope="module")
+def kept_plans(kept: None) -> Iterator[None]:
+    """Plan for each request once; an observer hears the stages of the first plan."""
+    from torchgrasp.planner import grasps
+    from torchgrasp.planner.request import Request
+
+    plan = grasps.plan_request
+
+    def planned(request: Request) -> Any:
+        stages = list[tuple[Any, ...]]()
+
+        def note(*stage: Any) -> None:
+            stages.append(stage)
+            request.tell(*stage)
+
+        if request.time_budget is not None:
+            return plan(request)
+        try:
+            key = "plan", content(dataclasses.replace(request, observer=None))
+        except TypeError:
+            return plan(request)
+        first = key not in KEPT
+        found, told = once(key, lambda: (plan(dataclasses.replace(request, observer=note)), stages))
+        for stage in () if first else told:
+            request.tell(*stage)
+        return found
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(grasps, "plan_request", planned)
         yield

@@ -1,6 +1,8 @@
 """What README, guides and examples show runs; commands exist and take their flags."""
 
 import base64
+import contextlib
+import functools
 import io
 import json
 import os
@@ -17,9 +19,11 @@ from nbclient import NotebookClient
 from PIL import Image
 
 from tests.pinch import QUICK
+from torchgrasp import TrialSpec
 from torchgrasp.app.cli.hands import HandTrial
+from torchgrasp.evaluation import PROTOCOLS
 
-pytestmark = pytest.mark.usefixtures("kept")
+pytestmark = pytest.mark.usefixtures("kept_plans")
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 APART = "agents.md"  # its client is in an environment beside; app/test_agents.py runs it there
@@ -33,13 +37,23 @@ def fenced(language, text=README):
 def with_little_work(code, most=8):
     """Return code whose plans have few starts, with few steps of descent and one trial of a view."""
     code = re.sub(r"starts=(\d+)", lambda found: f"starts={min(int(found[1]), most)}", code)
-    return code.replace("range(300)", "range(10)").replace("grasps=2,", "grasps=1,")
+    code = code.replace("range(300)", "range(10)").replace("grasps=2,", "grasps=1,")
+    code = code.replace("task=GraspTask(mass=mass))", f"task=GraspTask(mass=mass), starts={most})")
+    return code
 
 
 @pytest.fixture
 def short_trials(monkeypatch):
-    """Trials without parameters have few ticks, and hold the object for a short time."""
-    monkeypatch.setattr("torchgrasp.evaluation.lift.TrialSpec", lambda: QUICK)
+    """Trials have few ticks, and hold the object for a short time: those without parameters, of
+    `torchgrasp grasp --close`, and of the protocols by name.
+    """
+    quick = functools.partial(TrialSpec, hold_time=QUICK.hold_time, control_rate=QUICK.control_rate)
+    for place in ("evaluation.lift", "app.cli.grasp"):
+        monkeypatch.setattr(f"torchgrasp.{place}.TrialSpec", quick)
+    for name, protocol in PROTOCOLS.items():
+        rate = min(protocol.trial.control_rate, QUICK.control_rate)
+        less = protocol.with_trial(hold_time=QUICK.hold_time, control_rate=rate)
+        monkeypatch.setitem(PROTOCOLS, name, less)
 
 
 @pytest.mark.parametrize(
@@ -52,11 +66,21 @@ def test_python_of_the_readme_and_the_guides_runs(code, tmp_path, monkeypatch, s
 
 @pytest.mark.slow
 @pytest.mark.sim
-def test_the_guide_to_hands_runs_as_it_stands(tmp_path, monkeypatch, capsys, few_postures):
+def test_the_guide_to_hands_runs_as_it_stands(
+    tmp_path, monkeypatch, capsys, few_postures, short_trials
+):
     """A draft, its check, a mend by hand, a held object, a file for the robot; with fewer starts."""
     from torchgrasp.app import cli
 
+    def of_python(found):
+        """Return what Python prints for the code of a command in a line of the shell."""
+        out = io.StringIO()
+        with contextlib.redirect_stdout(out):
+            exec(found[1], {})
+        return out.getvalue().strip()
+
     def in_shell(line):
+        line = re.sub(r"\$\(python -c '(.*?)'\)", of_python, line)
         done = subprocess.run(
             ["bash", "-euo", "pipefail", "-c", line], capture_output=True, text=True
         )
@@ -67,7 +91,8 @@ def test_the_guide_to_hands_runs_as_it_stands(tmp_path, monkeypatch, capsys, few
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}:{os.environ['PATH']}")
-    monkeypatch.setattr("torchgrasp.app.cli.hands.TRIAL", HandTrial(starts=4))
+    monkeypatch.setattr("torchgrasp.app.cli.hands.TRIAL", HandTrial(starts=4, postures=1000))
+    monkeypatch.setattr("torchgrasp.app.cli.hands.draw_hand", lambda *hand: b"")
     monkeypatch.setattr("torchgrasp.app.report.page.draw_pictures", lambda run: {})
     guide = "".join(fenced("bash", (ROOT / "docs" / "hands.md").read_text())).replace(
         "--starts 200", "--starts 8"
@@ -160,7 +185,7 @@ def test_commands_of_the_readme_exist_and_take_their_flags(line, capsys):
 @pytest.mark.sim
 @pytest.mark.slow
 def test_commands_of_the_readme_run_in_a_clone_as_typed(
-    tmp_path, monkeypatch, capsys, few_postures
+    tmp_path, monkeypatch, capsys, few_postures, short_trials
 ):
     """In the order of the page, with less work; what a clone holds is linked."""
     from torchgrasp.app import cli
@@ -234,6 +259,7 @@ def test_the_notebook_runs_to_its_last_cell_and_is_stored_with_what_it_shows(mon
     for cell in notebook.cells:
         if cell.cell_type == "code":
             cell.outputs = []
+            cell.source = cell.source.replace("starts=150", "starts=24")
     NotebookClient(notebook, timeout=300, kernel_name="python3").execute()
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
     assert not any(output["output_type"] == "error" for output in outputs)

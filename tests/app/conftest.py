@@ -8,8 +8,8 @@ from torchgrasp.app import cli
 
 
 @pytest.fixture(scope="module", autouse=True)
-def shapes_once(kept: None) -> None:
-    """Estimate the shape of each object once for all commands."""
+def plans_once(kept_plans: None) -> None:
+    """Estimate the shape of each object, and plan for each request, once for all commands."""
 
 
 @pytest.fixture

@@ -28,7 +28,7 @@ def barrett(tmp_path):
 @pytest.fixture(autouse=True)
 def few_starts(monkeypatch, few_postures):
     """Try a hand with little work."""
-    monkeypatch.setattr("torchgrasp.app.cli.hands.TRIAL", HandTrial(starts=4))
+    monkeypatch.setattr("torchgrasp.app.cli.hands.TRIAL", HandTrial(starts=4, postures=1000))
 
 
 def test_new_writes_a_draft_that_check_takes_and_draws(barrett, capsys, monkeypatch):
@@ -50,7 +50,7 @@ def test_new_writes_a_draft_that_check_takes_and_draws(barrett, capsys, monkeypa
     known = json.loads((barrett / "abilities.json").read_text())["sets"]
     assert [one["option"] for one in known] == ["default"] and known[0]["width_m"][1] > 0.1
     free = known[0]["free_share"]
-    assert f"abilities of default: {free:.1%} of 5000 random postures are free" in said
+    assert f"abilities of default: {free:.1%} of 1000 random postures are free" in said
     assert re.search(r"\nf1 and f2 +0\.\d+ to 0\.\d+ ", said) and "force [N]" in said
     with Image.open(picture) as image:
         assert (
