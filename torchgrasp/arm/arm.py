@@ -2,7 +2,7 @@
 to start from.
 
 A posture is one position [rad, or m for sliding joints] of each of the n joints, from the base to
-the tip, the link that carries the hand.
+the tip. The tip is the link that carries the hand.
 """
 
 import dataclasses
@@ -102,10 +102,13 @@ class Arm(Value):
 
     @checked
     def moved(self, b_from_a: Pose) -> "Arm":
-        """Return the arm for a cloud in frame b, where `b_from_a` (4, 4) [m] is a rigid transform.
+        """Return the arm with its base given in frame b, a new frame of the object and its cloud.
 
-        Frame a is the present frame of the object. The arm stays in its place: only `obj_from_base`
-        changes.
+        The arm itself stays in its place: only `obj_from_base` changes.
+
+        Args:
+            b_from_a: rigid transform (4, 4) [m] from the present frame of the object, a, to frame
+                b.
         """
         return dataclasses.replace(self, obj_from_base=b_from_a.to(self.lower) @ self.obj_from_base)
 
@@ -137,10 +140,9 @@ class Arm(Value):
     def tip_motion(self, joints: Float[Tensor, "n k"]) -> tuple[TipPoses, Float[Tensor, "6 n k"]]:
         """Return (poses, motion) of the tip in k postures, in the base's frame.
 
-        `poses` (3, 4, k) [m] are those of the tip. `motion` (6, n, k) is the derivative of the
-        tip's pose by each of the n joints. Its first three rows are the derivative of the
-        translation [mm per rad or m]. The other three are that of the rotation vector, times
-        `LEVER` [mm per rad].
+        `poses` (3, 4, k) [m] are the tip's poses. `motion` (6, n, k) is the derivative of each pose
+        by each of the n joints. Rows 0 to 2 are the derivative of the translation [mm per rad or
+        m]. Rows 3 to 5 are the derivative of the rotation vector, times `LEVER` [mm per rad].
 
         Args:
             joints: positions (n, k) of the joints [rad, or m for sliding joints], a column for each

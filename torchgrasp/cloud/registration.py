@@ -2,8 +2,8 @@
 
 Three decisions matter. First, the distance of two views is that of a motion: the rigid one after
 which they agree best. It is the root mean square, over the points, of how far the motion moves them
-along their normals. So shifts to and from a camera count alike, turns and scales count, cameras
-need not be known, and slides along a surface that do not change it count nothing. Second, this motion is a most
+along their normals. So shifts to and from a camera count alike, and turns and scales count. Slides
+along a surface that do not change it count nothing. Cameras need not be known. Second, this motion is a most
 likely one: what the overlap does not show stays as given, since the poses are known to some mm.
 Registration with `align` is the same motion, so a package for it would do less: those that we know
 let a bottle spin about its axis. Third, what a camera saw through is empty: points that another

@@ -44,8 +44,9 @@ def read_mesh(mesh: "trimesh.Trimesh | Path | str") -> "trimesh.Trimesh":
 
     Raises:
         MeshError: the file is no .obj, .off, .ply or .stl file, has no faces, or has too many faces
-            or bytes; or the mesh has non-finite vertices, an open surface, faces that are not all
-            turned outward, or no volume.
+            or bytes.
+        MeshError: the mesh has vertices that are not finite, an open surface, or no volume.
+        MeshError: the faces are not all turned outward.
         SuspiciousScale: the longest side of the bounding box is outside [5 mm, 2 m]; most often the
             unit is mm.
     """

@@ -106,7 +106,8 @@ class GaussianMixture(Value):
     def log_prob(self, x: Float[Tensor, "*b d"]) -> Float[Tensor, "*b"]:
         """Return the log-density (*b,) [nats] of each point `x` (*b, d), Eq. (19).
 
-        b stands for any batch axes. Raises `BadArgument` for points that do not have d numbers.
+        A point has d numbers, in the units of the dimensions. b stands for any batch axes. Raises
+        `BadArgument` for points of another length.
         """
         if x.ndim < 1 or x.shape[-1] != len(self.names):
             raise BadArgument("x", f"shape {tuple(x.shape)}", f"rows of {len(self.names)} numbers")
@@ -117,7 +118,8 @@ class GaussianMixture(Value):
         """Return the log joint density (n, m) [nats] of each of n points `x` (n, d) with each
         component.
 
-        It is log(weight) + log N(x | mean, covariance). It is -inf for a component of weight 0.
+        It is log(weight) + log N(x | mean, covariance). It is -inf for a component of weight 0. m
+        counts the components. The points have d numbers, in the units of the dimensions.
         """
         density = self.whitening.log_scale - 0.5 * self.whitening.squared(x.double())
         weights = self.weights.double()

@@ -230,8 +230,8 @@ class GraspMixture(GaussianMixture):
     def energy(
         self, code: ContactCode | Annotated[Float[Tensor, "*b 6"], ANY]
     ) -> Float[Tensor, "*b"]:
-        """Return the energy min f_i (*b,) (no unit) of each contact code, Eq. (21). Less is easier
-        to reach.
+        """Return the energy (*b,) (no unit) of each contact code, Eq. (21): the less, the more
+        surely the hand reaches it.
 
         It is half the squared Mahalanobis distance of the code from the nearest component. The hand
         probably reaches a code whose energy is below `DEFAULT_ENERGY`, or the paper's
@@ -241,6 +241,8 @@ class GraspMixture(GaussianMixture):
         Args:
             code: a `ContactCode`, or codes (*b, 6): three lengths [m], then three cosines. b stands
                 for any batch axes. A code that is not finite gives NaN.
+
+        Raises `BadArgument` for codes that do not have six numbers.
         """
         whitening = self._code.whitening
         return _map_codes(lambda q: 0.5 * whitening.squared(q).amin(-1), code)
@@ -257,6 +259,8 @@ class GraspMixture(GaussianMixture):
         Args:
             code: a `ContactCode`, or codes (*b, 6): three lengths [m], then three cosines. b stands
                 for any batch axes. A code that is not finite gives NaN.
+
+        Raises `BadArgument` for codes that do not have six numbers.
         """
         codes = self._code
         regression = self._stacked_regression
@@ -285,7 +289,7 @@ class GraspMixture(GaussianMixture):
                 code that is not finite gives NaN.
             k: number of components, 1 to m.
 
-        Raises `BadArgument` for k outside [1, m].
+        Raises `BadArgument` for k outside [1, m], or for codes that do not have six numbers.
         """
         check_whole("k", k, 1, len(self.weights))
         codes = self._code

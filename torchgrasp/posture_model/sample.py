@@ -160,7 +160,9 @@ class SampleSpec(Value):
 
     @checked
     def meta(self, hand: Hand) -> dict[str, str]:
-        """Return texts that identify the samples: hand, seed and sampling, but not their number."""
+        """Return texts by name that identify the samples: hand, seed and sampling, but not their
+        number.
+        """
         return {**describe_compatibility(hand), "seed": str(self.seed), "sampling": self.sampling}
 
 

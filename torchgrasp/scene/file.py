@@ -26,10 +26,10 @@ def read_scene(path: Path | str) -> Scene:
     * `camera_pose` (4, 4): the pose `obj_from_camera` [m].
     * `labels` (h, w) of the objects, or `mask` (h, w) of the target.
     * `target`: the target's label.
-    * `table` (4,): unit normal, and offset [m]. `others` (k, 4) are other planes on which objects
-      could stand.
-    * `given`: the labels that the user made. If it is missing, the user made all labels. With a
-      table, as in scenes that the library saved, the user then made none.
+    * `table` (4,): unit normal, and offset [m].
+    * `others` (k, 4): other planes on which objects could stand.
+    * `given`: the labels that the user made. If it is missing, the user made all labels, or none in
+      a file with a table.
     * `bounded`: whether the border of the image is the camera's.
 
     Raises the errors of `Scene.from_depth`. Raises `CloudFileError` for no such file, or for

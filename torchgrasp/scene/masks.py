@@ -65,11 +65,18 @@ MOST_BITS = 35
 def read_labels(labels: Any, shape: tuple[int, ...], name: str = "labels") -> Int[Tensor, "..."]:
     """Return checked labels in the given shape: whole numbers >= 0, where 0 means no object.
 
-    `shape` is that of the depth (h, w) or of the cloud (n,); errors call the argument `name`. The
-    labels are numbers of any type in this shape, or with one more axis of length 1; a picture (h,
-    w, 3 or 4) with a colour for each object, where black and transparent mean no object; a list of
-    masks, where a smaller mask lies above a larger one; a mask as COCO's run lengths {"size": [h,
-    w], "counts": ...}, or in a dict as its "segmentation"; or a dict with a list of "annotations".
+    Args:
+        labels: the objects' pixels or points, in one of these forms:
+            - numbers of any type in the given shape, or with one more axis of length 1;
+            - a picture (h, w, 3 or 4) with a colour for each object, where black and transparent
+              mean no object;
+            - a list of masks, where a smaller mask lies above a larger one;
+            - a mask as COCO's run lengths {"size": [h, w], "counts": ...}, or in a dict as its
+              "segmentation";
+            - a dict with a list of "annotations".
+        shape: shape of the depth (h, w) or of the cloud (n,).
+        name: name of the argument in errors.
+
     Raises `BadArgument` for anything else.
     """
     if isinstance(labels, Mapping) and "annotations" in labels:

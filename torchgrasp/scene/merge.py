@@ -2,8 +2,8 @@
 object.
 
 Two pieces belong to one object if they meet at two ends, as a handle and its cup do. So do pieces
-of which one is over the footprint of the other, pieces that form the rim of a hollow body, and a
-piece that floats beside another. Touching pieces also belong to one object, unless both stand on
+of which one is over the footprint of the other. So do pieces that form the rim of a hollow body,
+and a piece that floats beside another. Touching pieces also belong to one object, unless both stand on
 the table or one lies upon the other.
 """
 

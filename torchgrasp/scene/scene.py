@@ -425,10 +425,12 @@ class Scene(Value):
 
     @checked
     def rows_of(self, label: int | None = None) -> Bool[Tensor, "n"]:
-        """Return a mask (n,) of the points of the object with the given label.
+        """Return a mask (n,) of the points of one object.
 
-        None means the target. Without a target, and for a label without points, the mask is all
-        False.
+        Args:
+            label: the object's label; None means the target.
+
+        The mask is all False for a label without points, and for None without a target.
         """
         label = self.target if label is None else label
         return (
@@ -439,9 +441,10 @@ class Scene(Value):
 
     @checked
     def cloud(self, label: int | None = None) -> PointCloud:
-        """Return the points [m] of the object with the given label, with the camera as viewpoint.
+        """Return the points [m] of one object in the frame "obj", with the camera as viewpoint.
 
-        None means the target. The cloud is in the frame "obj".
+        Args:
+            label: the object's label; None means the target.
 
         Raises `BadArgument` for a label without points, or for None without a target. Raises
         `TooFewPoints` for fewer than 4 points.
