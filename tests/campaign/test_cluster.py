@@ -4,12 +4,14 @@ nobody answers.
 
 import dataclasses
 import json
+import multiprocessing
 import os
 import shutil
 import signal
 import threading
 import time
 from collections import Counter
+from multiprocessing import forkserver
 from pathlib import Path
 
 import pytest
@@ -43,10 +45,16 @@ JOBS = 17
 
 @pytest.fixture(scope="module")
 def address():
-    """The address of a scheduler with two worker processes, which come back when they die."""
+    """The address of a scheduler with two worker processes, which come back when they die: each is
+    forked from one that has imported what its jobs need.
+    """
     import dask
 
+    forking = multiprocessing.get_context("forkserver")
+    forking.set_forkserver_preload(["distributed", "tests.campaign.cheap", "torchgrasp.campaign"])
+    forkserver.ensure_running()
     quiet = {
+        "distributed.worker.multiprocessing-method": "forkserver",
         "distributed.logging.distributed": "critical",
         "distributed.scheduler.allowed-failures": 1,
     }
@@ -141,6 +149,13 @@ def forty():
         yield cluster
 
 
+@pytest.fixture
+def few():
+    """Three workers in this process."""
+    with swarm(3) as cluster:
+        yield cluster
+
+
 @pytest.mark.promise("F4")
 @pytest.mark.filterwarnings("ignore")
 def test_four_of_forty_workers_die_and_every_job_is_written_once(
@@ -201,7 +216,7 @@ def test_a_worker_with_a_gpu_plans_for_a_shard_and_another_one_if_it_dies(forty,
 @pytest.mark.sim
 @pytest.mark.filterwarnings("ignore")
 def test_plans_of_a_batch_are_tried_and_say_their_device(
-    forty, carton: Path, data: Path, tmp_path: Path, monkeypatch
+    few, carton: Path, data: Path, tmp_path: Path, monkeypatch
 ):
     """The processor stands for the GPU: the records of the only sound view are those of its plan
     alone.
@@ -214,9 +229,9 @@ def test_plans_of_a_batch_are_tried_and_say_their_device(
     (objects / "manifest.json").write_text(
         json.dumps({"objects": entries | {"a gone one": entries["carton"]}})
     )
-    forty.sync(next(iter(forty.workers.values())).set_resources, GPU=1)
+    few.sync(next(iter(few.workers.values())).set_resources, GPU=1)
     monkeypatch.setattr(run_module, "plan_jobs", lambda *task: plan_jobs(*task[:-1], "cpu"))
-    run_campaign(objects, load_hand("barrett"), out, spec, forty.scheduler_address)
+    run_campaign(objects, load_hand("barrett"), out, spec, few.scheduler_address)
     gone, there = (read_shards(out).job(j) for j in (0, 1))
     alone = read_shards(data).job(0)
     assert gone.row.status is Status.BAD_OBJECT and "no file" in gone.row.note
