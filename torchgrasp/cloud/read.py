@@ -100,15 +100,15 @@ def read_cloud(
     * `.pcd`, ascii, binary or compressed: x y z, optionally normal_x normal_y normal_z. VIEWPOINT
       gives the camera. Its default `0 0 0 1 0 0 0` counts only if a camera there can have seen the
       points.
-    * `.npz`: arrays `points` (n, 3), optionally `normals` (n, 3), `viewpoint` (3,), `frustum` (4,
-      3), `table` (4,). For several views: `viewpoint` (n, 3) and `frustum` (n, 4, 3).
+    * `.npz`: arrays `points` (n, 3), optionally `normals` (n, 3), `viewpoint` (3,), `frustum`
+      (4, 3), `table` (4,). For several views: `viewpoint` (n, 3) and `frustum` (n, 4, 3).
     * `.npy`: an (n, 3) array, or (n, 6) with normals; colours are left out. Columns 4 to 6 without
       names are normals if they have length 1 and fit the surface of the points.
     * `.xyz`, `.txt`, `.csv`, `.asc`, `.pts`, `.xyzi`, `.xyzn`, `.xyzrgb`: the same as text. A first
       line may name the columns (x y z nx ny nz), or hold the number of points.
 
-    Images (h, w, 3) of points are accepted. Points with NaN or infinity are left out. Points at (0,
-    0, 0) are left out if there are several. Points whose normal is NaN or zero are left out; if
+    Images (h, w, 3) of points are accepted. Points with NaN or infinity are left out. Points at
+    (0, 0, 0) are left out if there are several. Points whose normal is NaN or zero are left out; if
     most are so, all normals are left out instead.
 
     Args:

@@ -157,8 +157,8 @@ class SignedDistanceField(DistanceField):
     Args:
         origin: position (3,) [m] of node (0, 0, 0).
         spacing: distance [m] of neighbouring nodes.
-        values: signed distances (x, y, z) [m]; `values[i, j, k]` is at the point `origin` + (i, j,
-            k) * `spacing`.
+        values: signed distances (x, y, z) [m]; `values[i, j, k]` is at the point `origin` +
+            (i, j, k) * `spacing`.
 
     >>> nodes = torch.cartesian_prod(*[torch.linspace(-0.1, 0.1, 41)] * 3)
     >>> ball = nodes.norm(dim=1).reshape(41, 41, 41) - 0.05

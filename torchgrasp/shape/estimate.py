@@ -113,7 +113,7 @@ class Observations(Batch):
     def with_normals_first(self) -> "Observations":
         """Return the same observations in another order: those with normals come first.
 
-        Apart from that the order is kept.
+        Among points with normals, and among the others, the order is kept.
         """
         return self[torch.argsort(~self.has_normal, stable=True)]
 

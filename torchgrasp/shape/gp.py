@@ -155,8 +155,8 @@ class ShapeGP(Posterior, Normalisation):
 
     @checked(gradients=True)
     def wall_at(self, x: Queries) -> Bool[Tensor, "q walls"]:
-        """Return a mask (q, walls): which surface of `walls` applies at each of q points `x` (q,
-        3).
+        """Return a mask (q, walls): which surface of `walls` applies at each of q points `x`
+        (q, 3).
 
         The points are those that `normalise` returned. Each row has one True. This shape has one
         surface, so all are True.
@@ -293,9 +293,9 @@ class ShapeGP(Posterior, Normalisation):
         The result equals the posterior of all observations at once. Kernel, domain and `cloud` do
         not change.
 
-        At least 20 points (`VIEWS.least`) count as a view, which is compared with `cloud` if that
-        has normals. If noise does not explain the distance of both, `MendedInput` warns, and all
-        standard deviations grow.
+        At least 20 points (`VIEWS.least`) count as a view, which is compared with `cloud` if
+        `cloud` has normals. If noise does not explain the distance between view and cloud,
+        `MendedInput` warns, and all standard deviations grow.
 
         Args:
             points: surface points (m, 3) [m] in the cloud's frame.
@@ -339,7 +339,7 @@ class ShapeGP(Posterior, Normalisation):
 
         Args:
             points: the view's points (n, 3) [m] in the cloud's frame.
-            error: standard deviation (n,) [m] of each point that the pose causes.
+            error: standard deviation (n,) [m] of each point because of the uncertain pose.
 
         Raises `BadArgument` for a used point farther than twice `domain_radius` from the centre.
         """

@@ -100,8 +100,8 @@ class HollowShape(ShapeGP):
 
     @checked(gradients=True)
     def wall_at(self, x: Queries) -> Bool[Tensor, "q walls"]:
-        """Return a mask (q, 2): which surface, outer or inner, applies at each of q points `x` (q,
-        3).
+        """Return a mask (q, 2): which surface, outer or inner, applies at each of q points `x`
+        (q, 3).
 
         The points are those that `normalise` returned. Each row has one True.
         """
@@ -161,8 +161,8 @@ class HollowShape(ShapeGP):
 
     @checked(gradients=True)
     def mean_jet(self, x: Queries) -> MeanJet:
-        """Return the mean signed distance with first and second derivatives, at q points `x` (q,
-        3).
+        """Return the mean signed distance with first and second derivatives, at q points `x`
+        (q, 3).
 
         The points are those that `normalise` returned. All are by normalised coordinates:
         `distance` (q,), `gradient` (q, 3) and `hessian` (q, 3, 3).

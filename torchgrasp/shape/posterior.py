@@ -179,8 +179,8 @@ class Posterior(Value):
         """Return mean and variance of the signed distance with derivatives, at q points `x` (q, 3).
 
         The points are those that `normalise` returned. The mean has first and second derivatives,
-        the variance the first. All are by normalised coordinates: `distance` (q,), `gradient` (q,
-        3), `hessian` (q, 3, 3), `variance` (q,), `variance_gradient` (q, 3).
+        the variance the first. All are by normalised coordinates: `distance` (q,), `gradient`
+        (q, 3), `hessian` (q, 3, 3), `variance` (q,), `variance_gradient` (q, 3).
         """
         # The mean is sum_j (a_j k - k' d.b_j), with d = x - x_j and k' = dk / d(|d|^2 / 2).
         # Here a_j is the weight of the distance at the observed point x_j, b_j that of its normal.
@@ -194,8 +194,8 @@ class Posterior(Value):
 
     @checked(gradients=True)
     def mean_jet(self, x: Queries) -> MeanJet:
-        """Return the mean signed distance with first and second derivatives, at q points `x` (q,
-        3).
+        """Return the mean signed distance with first and second derivatives, at q points `x`
+        (q, 3).
 
         The points are those that `normalise` returned. All are by normalised coordinates:
         `distance` (q,), `gradient` (q, 3) and `hessian` (q, 3, 3). It costs less than `jet`.
@@ -271,12 +271,12 @@ class Posterior(Value):
         self,
         rows: CovarianceRows,
     ) -> tuple[Float[Tensor, "q"], CovarianceRows]:
-        """Return (k A k, k A) for each row k of `rows` (q, r): the explained variance (q,), and k A
-        (q, r).
+        """Return (explained, k A) for each row k of `rows` (q, r): the variance k A k (q,) that the
+        observations explain, and k A (q, r).
 
         A row holds the covariances of one number with all r observed numbers. A is the inverse
-        covariance of the observed numbers. Prior variance minus explained variance is the posterior
-        variance.
+        covariance of the observed numbers. The prior variance minus the explained variance is the
+        posterior variance.
         """
         whitened = self.whiten(rows)
         solved = torch.zeros_like(rows)
