@@ -49,17 +49,24 @@ FK_TOLERANCE = 1e-8  # largest difference [m, and entries of rotations] from the
 
 @checked
 def check_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
-    """Check a hand, shipped or in a folder, with a choice of grasping fingers, and return it.
+    """Check the files and kinematics of a hand with a choice of grasping fingers, and return the
+    hand.
 
     The rules for the files concern coupling, limits, drives, masses, pads, parked joints and
-    self-collision. The kinematics of the loaded hand must obey these laws, which errors name:
+    self-collision. The kinematics of the loaded hand must obey three laws:
 
-    * `kinematics`: the poses of all links are those of yourdfpy.
+    * `kinematics`: the poses of all links are the poses of yourdfpy.
     * `jacobian`: the Jacobian of the fingertips equals central differences.
     * `batch`: each posture of a batch gives what it gives alone, and an empty batch is empty.
 
-    Raises `BrokenLaw` for the first law that the kinematics break, `HandFileError` for a file that
-    breaks a rule, and `BadArgument` if the hand has no such fingers.
+    Args:
+        name_or_path: name of a shipped hand, or the folder or hand.toml of another hand.
+        fingers: the grasping fingers, as in `load_hand`.
+
+    Raises:
+        HandFileError: a file breaks a rule, is missing or malformed.
+        BrokenLaw: the kinematics break a law; `law` is the name of the first.
+        BadArgument: the hand has no such fingers.
 
     >>> check_hand("barrett").name
     'barrett'

@@ -95,13 +95,20 @@ def test_a_hand_inside_the_object_is_refused_and_one_beside_it_misses_it():
     )
     assert (
         result.status is Status.START_OVERLAP
-        and result.directions == 1
+        and result.directions == 0
         and math.isnan(result.force)
     )
     aside = torch.eye(4, dtype=torch.float64)
     aside[2, 3] = 0.2
     hand, grasp = pinch("allegro")
     assert not pull_grasp(GraspTrial(hand, grasp, Truth(cylinder(), error=aside)), QUICK).passed
+
+
+def test_an_object_that_moves_while_the_hand_closes_is_not_pulled():
+    """Every closing moves the object by more than nothing, so it fails at a distance of 0."""
+    result = pull("allegro", dataclasses.replace(PULL, distance=0.0))
+    assert result.status is Status.EJECTED and not result.passed
+    assert result.directions == 0 and result.moved > 0.0
 
 
 def test_bad_arguments_are_named():

@@ -33,22 +33,30 @@ RATE_DECIMALS = 6  # to which rates [Hz] are rounded before they are compared
 
 @checked
 def write_lerobot(folder: Path | str, episodes: Episodes, hand: Hand) -> Path:
-    """Write closings, each with its task in words, as a LeRobot data set (v3.0); return the folder.
+    """Write closings as a LeRobot data set (v3.0), to train policies on; return the folder.
 
-    `LeRobotDataset(name, root=folder)` reads it. A frame is a control tick; poses [m] are in the
-    frame of the grasp:
+    `LeRobotDataset(name, root=folder)` reads it. A frame is a control tick. Positions [m] and
+    quaternions (x, y, z, w) are in the frame of the grasp. There are no images and no rewards.
 
     | feature | contents |
     | --- | --- |
-    | `observation.state` | joints [rad] of the URDF by name, then position and quaternion (x, y, z, w) of the hand |
-    | `observation.forces` | force of each fingertip on the object [N], in the hand's frame |
+    | `observation.state` | joints [rad or m] by name, then position and quaternion of the hand |
+    | `observation.forces` | force [N] of each fingertip on the object, in the hand's frame |
     | `observation.environment_state` | position and quaternion of the object |
-    | `action` | the joints' targets in the next tick [rad], then position and quaternion of the hand at its end |
-    | `next.done`, `next.success` | whether the next tick is the last one, and whether the object is then held |
+    | `action` | the joints' targets in the next tick, then the hand's pose as above at its end |
+    | `next.done` | whether the next tick is the last one |
+    | `next.success` | whether the next tick is the last one, and the object is held |
 
-    Raises `BadArgument` for no closing, a closing of a single tick, or one of another hand or rate
-    than the first; `OutputError` if the folder holds other files or cannot be written;
-    `MissingExtra` without pyarrow.
+    Args:
+        folder: the folder to write.
+        episodes: pairs of a task in words and the `ClosureResult` of `close_hand`.
+        hand: the hand of all closings.
+
+    Raises:
+        BadArgument: there is no closing, or a closing has a single tick. A closing is of another
+            hand, or at another control rate than the first.
+        OutputError: the folder holds other files, or cannot be written.
+        MissingExtra: pyarrow is not installed.
 
     >>> import tempfile
     >>> from torchgrasp import TrialSpec, close_hand, load_hand, load_object

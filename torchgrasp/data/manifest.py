@@ -135,13 +135,24 @@ def write_objects(
 ) -> list[str]:
     """Make a folder of objects from a folder of mesh files; return the objects' names.
 
-    The names are those of the files without suffix. Each mesh is moved so that its lowest point is
-    at z = 0 and the middle of its box above the origin. Each view is rendered by the depth camera
+    The names are the names of the files without suffix. Each mesh is moved: its lowest point is then
+    at z = 0, and the middle of its box above the origin. Each view is rendered by the depth camera
     of `partial_view` from a random side. The manifest is written last, so that a folder with a
-    manifest is complete. The `meshes` are closed, in metres, with z up (.ply, .stl, .obj, .off).
-    Raises `DatasetError` for no meshes or two meshes of one name, the errors of `read_mesh`, and
-    `OutputError` if the folder cannot be written. Warns of meshes in a normalised unit
-    (`CloudWarning`) and of bodies that lie apart (`TwoBodies`).
+    manifest is complete.
+
+    Args:
+        meshes: folder of closed meshes (.ply, .stl, .obj, .off), in metres, with z up.
+        out: the folder to write.
+        views: number of views of each object.
+        seed: random seed of the camera positions and of the noise.
+
+    Warns of a mesh that is too large for a hand (`CloudWarning`), and of bodies that lie apart
+    (`TwoBodies`).
+
+    Raises:
+        DatasetError: there are no meshes, or two meshes of one name.
+        MeshError: a mesh is malformed, open or without volume.
+        OutputError: the folder cannot be written.
 
     >>> import tempfile, trimesh
     >>> folder = Path(tempfile.mkdtemp())
@@ -219,10 +230,15 @@ def _check_name(field: Field, name: str) -> None:
 def list_views(
     objects: Path | str, whole: bool = False, only: Sequence[str] = (), most: Count | None = None
 ) -> list[tuple[str, str]]:
-    """Return sorted pairs of object and view, at most `most` views of each object, by default all.
+    """Return the pairs (object, view) of names in a folder of objects, sorted.
 
-    `only` selects objects by name; with `whole` each object has the single view `WHOLE`, which
-    shows all sides. Raises `DatasetError` for no manifest, none of the objects in it, or a bad
+    Args:
+        objects: the folder of objects, as `write_objects` makes it.
+        whole: give each object the single view "whole", which shows all sides.
+        only: names of the objects; empty means all.
+        most: largest number of views of each object; None means all.
+
+    Raises `DatasetError` if there is no manifest, if none of the objects is in it, or for a bad
     entry.
 
     >>> import tempfile, trimesh
@@ -241,11 +257,18 @@ def list_views(
 
 @checked
 def read_view(objects: Path | str, name: str, view: str, camera: bool = True) -> PointCloud:
-    """Return the point cloud [m] of a noisy view without normals, with the camera's position.
+    """Return the noisy point cloud [m] of a view, with the camera's position as `viewpoint`.
 
-    It is in the frame of the object, which rests at z = 0. With `camera` False the camera is left
-    out. The view `WHOLE` has normals and no camera. Raises `DatasetError` for a bad or missing
-    entry, or an unknown view, and `CloudFileError` for a bad file.
+    The cloud is in the frame of the object, which rests at z = 0. It has no normals.
+
+    Args:
+        objects: the folder of objects, as `write_objects` makes it.
+        name: name of the object.
+        view: name of the view. "whole" is the view of all sides, with normals and no `viewpoint`.
+        camera: whether the cloud has a `viewpoint`.
+
+    Raises `DatasetError` for a bad or missing entry, or an unknown view, and `CloudFileError` for a
+    bad file.
 
     >>> import tempfile, trimesh
     >>> folder = Path(tempfile.mkdtemp())
@@ -270,7 +293,8 @@ def read_view(objects: Path | str, name: str, view: str, camera: bool = True) ->
 def read_object_mesh(objects: Path | str, name: str) -> "trimesh.Trimesh":
     """Return the true, closed mesh [m] of an object in a folder of objects.
 
-    It is in the frame of the object's views. Raises the errors of `read_entry` and `read_mesh`.
+    It is in the frame of the object's views. `objects` is the folder, and `name` the object's name.
+    Raises `DatasetError` for a bad or missing entry, and `MeshError` for a bad mesh.
 
     >>> import tempfile, trimesh
     >>> folder = Path(tempfile.mkdtemp())

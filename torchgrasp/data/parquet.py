@@ -30,15 +30,22 @@ OBJECT = ("object", "view", "family", "group")
 
 @checked
 def write_parquet(data: GraspShards, folder: Path | str) -> Path:
-    """Write a data set as Parquet with cards in Markdown and Croissant; return the folder.
+    """Write a data set as Parquet files with cards in Markdown and Croissant; return the folder.
 
-    In `datasets`, `load_dataset(folder)` reads a line for each grasp: the numbers of an item of
-    `GraspShards`, with object, view, hand, friction, seed and the status of each try.
-    `load_dataset(folder, "views")` reads a line for each job: its cloud and counts. The joints'
-    names are in the cards, and in the metadata of each file's schema.
+    With the package `datasets`, `load_dataset(folder)` reads a line for each grasp. A line has the
+    numbers of an item of `GraspShards`, with object, view, hand, friction, seed and the status of
+    each try. `load_dataset(folder, "views")` reads a line for each job: its cloud and counts. The
+    joints' names are in the cards, and in the metadata of each file's schema.
 
-    Raises `BadArgument` for no grasps, `ModelFileError` for a damaged shard or card, `OutputError`
-    if the folder holds other files or cannot be written, `MissingExtra` without pyarrow.
+    Args:
+        data: the data set, as `read_shards` opens it.
+        folder: the folder to write.
+
+    Raises:
+        BadArgument: the data set has no grasps.
+        ModelFileError: a shard or the card is damaged.
+        OutputError: the folder holds other files, or cannot be written.
+        MissingExtra: pyarrow is not installed.
 
     >>> write_parquet(read_shards("campaign"), "parquet")  # doctest: +SKIP
     """

@@ -28,12 +28,14 @@ CARD_BYTES = 256 * 1024**2  # largest card
 class ShardJob(NamedTuple):
     """One job of a data set: a view of an object, and the g grasps that were tried on it.
 
+    `GraspShards.job` makes it. d counts the simulated trials of each grasp.
+
     Attributes:
         row: the outcome of the job.
         cloud: the cloud [m] of the view; None if no view was read.
         grasps: the grasps, in the frame of the cloud.
-        passed: whether each of d simulated trials of each grasp passed.
-        outcome: the `Status` of each of these trials.
+        passed: whether each trial of each grasp passed (g, d).
+        outcome: the `Status` of each of these trials (g, d), as integers.
     """
 
     row: JobRow
@@ -45,22 +47,28 @@ class ShardJob(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class GraspShards:
-    """A data set of grasps on disk; a map-style dataset for `torch.utils.data.DataLoader`.
+    """A data set of grasps on disk, for `torch.utils.data.DataLoader`; `read_shards` opens it.
 
-    `len` counts the grasps. Item i is a dict of float32 tensors in the object's frame, for n
-    points, h actuated joints and f fingertips: `points` (n, 3) and `viewpoint` (3,) of the cloud
-    [m]; `joints` and `pregrasp` (h,) [rad], the unit vector `approach` (3,), the pose
-    `obj_from_hand` (4, 4) [m]; `contacts` (f, 3) [m], their outward unit `normals` (f, 3), `std_m`
-    (f,) [m]; `margin` and `witness` (6,) as in `Certificate`; `clearance` [m]; `predicted` success
-    in [0, 1]; `simulated`, the fraction of simulated trials that passed. `closed` (a bool) is
-    whether the grasp has force closure, `job` is the index in `jobs`.
+    `len` counts the grasps. Item i is a dict of tensors for grasp i. They are float32 and in the
+    object's frame, for n points, h actuated joints and f fingertips:
 
-    Args:
+    * `points` (n, 3) [m] and `viewpoint` (3,) [m] of the cloud; the viewpoint is 0 if unknown.
+    * `joints` (h,) and `pregrasp` (h,) [rad or m].
+    * `approach` (3,), a unit vector, and the pose `obj_from_hand` (4, 4) [m].
+    * `contacts` (f, 3) [m], their outward unit `normals` (f, 3), and their `std_m` (f,) [m].
+    * `margin` and `witness` (6,) of the `Certificate`.
+    * `clearance` [m].
+    * `predicted`, the predicted success in [0, 1].
+    * `simulated`, the share of simulated trials that passed.
+    * `closed`, a bool: whether the contacts have frictional form closure.
+    * `job`, an integer: the index in `jobs`.
+
+    Attributes:
         folder: folder of the data set.
         card: content of `card.json`.
         jobs: the outcome for each object and view, with or without grasps.
         size: number of jobs in a shard.
-        points: number of points of each item's cloud; None means all points, so that clouds may
+        points: number of points of each item's cloud. None means all points, so that clouds may
             differ in size.
         recent: the shards that were read last, kept in memory.
     """
@@ -116,9 +124,9 @@ class GraspShards:
 
     @checked
     def job(self, j: Annotated[int, Range(0, MOST)]) -> ShardJob:
-        """Return the cloud, the grasps and the results of trials of the job with the index `j`.
+        """Return cloud, grasps and trials of the job with the index `j` in `jobs`.
 
-        Numbers have the precision of the file. Raises `IndexError` for no such job, and
+        Numbers have the precision of the file. Raises `IndexError` for no such job. Raises
         `ModelFileError` if its file is missing, damaged, or of another campaign.
         """
         j = range(len(self.jobs))[j]
@@ -147,11 +155,14 @@ def shard_path(folder: Path, k: int) -> Path:
 
 @checked
 def read_shards(folder: Path | str, points: Count | None = None) -> GraspShards:
-    """Open a data set that a campaign has written; shards are read on demand.
+    """Open a data set that a campaign has written, for learning; its shards are read on demand.
 
-    `points` is the number of points drawn from each cloud, the same ones in every call; a smaller
-    cloud repeats points. None means all. Raises `ModelFileError` if the campaign is not finished,
-    or its card is damaged.
+    Args:
+        folder: the folder that `run_campaign` wrote.
+        points: number of points that are drawn from each cloud, the same ones in every call. A
+            smaller cloud repeats points. None means all points.
+
+    Raises `ModelFileError` if the campaign is not finished, or its card is damaged.
 
     >>> import tempfile, trimesh
     >>> from torchgrasp import load_hand

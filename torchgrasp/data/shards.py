@@ -28,21 +28,21 @@ META_LETTERS = 10_000  # letters of an entry of the metadata, which may name all
 
 
 class JobRow(NamedTuple):
-    """The outcome of one job, which is one view of one object.
+    """The outcome of one job of a campaign: one view of one object.
 
     Attributes:
         object: name of the object.
         view: name of the view; "" if the object could not be read, or has no view.
-        status: OK, or the reason why there is no grasp: the most frequent failure, a bad object, or
-            how the process ended.
-        note: details of the status.
-        family: family of similar objects.
-        group: group of objects, such as "solid".
+        status: `OK`, or the reason why there is no grasp: the most frequent failure, a bad object,
+            or how the process ended.
+        note: details of the status, or "".
+        family: family of similar objects, or "".
+        group: group of objects, such as "solid", or "".
         executable: number of executable grasps that were planned.
         points: number of points of the cloud.
         grasps: number of grasps that were kept and tried.
         passed: number of simulated trials that passed.
-        meta: metadata of the `Grasps`.
+        meta: `Grasps.meta` of the plan. It is empty without a plan, and in `GraspShards.jobs`.
 
     >>> JobRow("mug", "view0", Status.NOT_CLOSED, points=1000).as_json()["status"]
     'NOT_CLOSED'
@@ -61,7 +61,7 @@ class JobRow(NamedTuple):
     meta: dict[str, str] = {}  # noqa: RUF012
 
     def as_json(self) -> dict[str, Any]:
-        """Return the fields by name as a dictionary for JSON."""
+        """Return the fields by name as a dict for JSON; the status is its name."""
         return {**self._asdict(), "status": self.status.name}
 
 
@@ -177,10 +177,10 @@ def short(text: str) -> str:
 
 @checked
 def load_grasps(path: Path | str) -> Grasps:
-    """Read grasps that `Grasps.save` wrote.
+    """Return the grasps in a file that `Grasps.save` wrote.
 
-    Raises `ModelFileError` if the file is missing, or a pose, a status or the number of contacts is
-    not valid.
+    Raises `ModelFileError` if the file is missing or malformed. It is also raised if a pose, a
+    status or the number of contacts is not valid.
 
     >>> import tempfile
     >>> from torchgrasp.data.shipped import load_shipped_grasp

@@ -26,7 +26,7 @@ GRASPED = {(name, hand) for name in ("cylinder", "jug") for hand in ("allegro", 
 @checked
 @dataclasses.dataclass(frozen=True, eq=False)
 class GraspObject:
-    """An object to grasp, which rests at z = 0 with z up.
+    """An object to grasp, which rests at z = 0 with z up; `load_object` makes it.
 
     Attributes:
         name: name of the object.
@@ -76,9 +76,9 @@ def find_view(path: Path, name: str = "cloud") -> Path:
 
 @checked
 def load_object(name: str) -> GraspObject:
-    """Return a shipped object by its name: mesh, mass and a noisy view.
+    """Return a shipped object by its name: mesh, convex parts, mass and a noisy view.
 
-    Raises `BadArgument` for an unknown name.
+    `list_objects` has the names. Raises `BadArgument` for an unknown name.
 
     >>> jug = load_object("jug")
     >>> jug.mesh.is_watertight, len(jug.view)
@@ -97,8 +97,11 @@ def load_object(name: str) -> GraspObject:
 def load_shipped_grasp(name: str, hand: str) -> Grasps:
     """Return a shipped grasp of a shipped object, to close or draw at once.
 
-    The objects are "cylinder" and "jug", the hands "allegro" and "barrett". Raises `BadArgument`
-    for others.
+    Args:
+        name: name of the object: "cylinder" or "jug".
+        hand: name of the hand: "allegro" or "barrett".
+
+    Raises `BadArgument` for another name.
 
     >>> grasp = load_shipped_grasp("jug", "barrett")
     >>> grasp.joints.shape, grasp.certificate.closed
@@ -114,7 +117,7 @@ def load_scene() -> Scene:
     """Return a scene of the shipped objects on a table: a rendered, noisy depth image with true
     labels.
 
-    Its frame has z up; lengths are in metres.
+    Its frame has z up, and lengths are in metres.
 
     >>> load_scene().things
     (1, 2, 3, 4)

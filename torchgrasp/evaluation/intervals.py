@@ -34,17 +34,24 @@ object). For a mean: (sum, number) of the values.
 
 
 class Share(NamedTuple):
-    """A success rate, mean or difference, with its 95 % interval.
+    """A success rate, mean or difference, with its 95 % interval; `summarise` makes it.
 
-    The interval is found by resampling units, such as families of objects. With a single unit it is
-    NaN. Without trials all values are NaN.
+    The interval is found by resampling units, such as families of objects. With a single unit, the
+    ends of the interval are NaN. Without trials, value and interval are NaN.
+
+    Attributes:
+        value: a share in [0, 1], or a mean or difference in its own unit.
+        low: lower end of the interval.
+        high: upper end of the interval.
+        total: number of trials.
+        units: number of resampled units.
     """
 
-    value: float  # a share in [0, 1], or a mean or difference in its own unit
-    low: float  # lower end of the interval
-    high: float  # upper end of the interval
-    total: int  # number of trials
-    units: int  # number of resampled units
+    value: float
+    low: float
+    high: float
+    total: int
+    units: int
 
 
 @checked

@@ -78,38 +78,43 @@ def close_hand(
     surface: SignedDistanceField | None = None,
     slide: Float[Tensor, "3"] | None = None,
 ) -> ClosureResult:
-    """Close a hand on the true object, lift it and hold it, in simulation.
+    """Close a hand on the true object, lift it and hold it, in simulation; return the record.
 
-    The result is the record of all control ticks, with a status that says whether the object was
-    held, else why not. The opened hand moves straight to its pre-grasp, closes and presses
-    (`GraspController`), rises and holds. The object is **held** if its centre rose by half the lift
-    and two fingers touch it at the end. It must also have slipped by less than 20 mm and 30 degrees
-    in the closed hand. Equal arguments give bitwise equal results.
+    The opened hand moves straight to its pre-grasp, closes and presses (`GraspController`), rises
+    and holds. The object is **held** if three conditions are met. Its centre rose by half the lift.
+    Two fingers touch it at the end. It slipped by less than 20 mm and 30 degrees in the closed
+    hand.
+
+    `status` says why an object was not held. Equal arguments give bitwise equal results.
 
     Args:
         grasp: a single grasp.
         hand: the hand of the grasp, or its name or folder.
         mesh: the true object [m], closed, in the frame of the grasp: a trimesh, a file, or a
-            `GraspObject` with parts.
-        spec: parameters of the trial; `TrialSpec()` by default.
-        seed: random seed of the tactile sensors' noise.
-        error: true pose of the hand in its planned frame, unknown to the controller; by default the
-            planned pose.
-        parts: convex parts of the mesh; by default they are computed (`convex_parts`).
-        table: the true table below the object, in the grasp's frame; by default level, at the
-            mesh's lowest point.
+            `GraspObject`.
+        spec: parameters of the trial; None means `TrialSpec()`.
+        seed: random seed of the tactile sensors' noise. Friction and mass are drawn by it if the
+            `spec` has distributions.
+        error: rigid transform [m] from the hand's planned pose to its true pose, in the frame of
+            the planned hand. The controller does not know it. None means no error.
+        parts: convex parts [m] of the mesh. None means the parts of a `GraspObject`, or those that
+            `convex_parts` computes.
+        table: the true table below the object, in the frame of the grasp. None means a level table
+            at the mesh's lowest point.
         neighbours: other bodies on the table, which the hand may push.
-        told: the table that the controller knows, in the grasp's frame; by default that of the plan
-            (`Grasps.table`).
-        surface: estimated surface of the object (`surface_field`), to estimate the object's pose
-            from touches. Without it, only the tangent planes of the planned contacts are used.
-        slide: displacement [m] of the object along the table, in the frame of the grasp, halfway
-            through the approach, unknown to the controller.
+        told: the table that the controller knows, in the frame of the grasp. None means the table
+            of the plan (`Grasps.table`).
+        surface: estimated surface of the object (`surface_field`), by which touches show the
+            object's pose. None means the tangent planes of the planned contacts.
+        slide: displacement (3,) [m] of the object along the table, in the frame of the grasp. It
+            happens halfway through the approach, and the controller does not know it. None means no
+            displacement.
 
     Raises:
-        BadArgument: not exactly one grasp, joints of another hand, or a pre-grasp outside the joint
-            limits; an approach that is no unit vector; contacts off the mesh; a table that the mesh
-            does not stand on; the holding "law" for a closing that does not follow it (Eq. 25).
+        BadArgument: there is not exactly one grasp. Joints are of another hand, or a pre-grasp is
+            outside the joint limits. The approach is no unit vector. Contacts are off the mesh. The
+            mesh does not stand on the `table`. The holding "law" is asked for with a closing that
+            does not follow it (Eq. 25).
         MeshError: the mesh is missing, open or without volume.
         MissingExtra: the simulator is not installed.
 

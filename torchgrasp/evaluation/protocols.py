@@ -31,47 +31,65 @@ LEAST_MASS = 1e-3  # least mass [kg] of a task, so that no load is zero
 @checked
 @dataclasses.dataclass(frozen=True)
 class PoseNoise(Value):
-    """The bounds of random pose errors."""
+    """The bounds of random pose errors in the trials of a `Protocol`.
 
-    translation: Length = 0.0  # greatest error [m] along each axis
-    rotation: Annotated[float, Range(0.0, math.pi)] = 0.0  # greatest error [rad] about each axis
-    draws: Count = 1  # number of random errors for each grasp
+    In pulls, the hand's pose errs, in the frame of the planned hand. In lifts, the object is
+    displaced along the table.
+
+    Args:
+        translation: greatest error [m] along each axis.
+        rotation: greatest error [rad] about each axis; in lifts about the vertical.
+        draws: number of random errors that `evaluate` tries for each grasp.
+    """
+
+    translation: Length = 0.0
+    rotation: Annotated[float, Range(0.0, math.pi)] = 0.0
+    draws: Count = 1
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class PullSpec(Value):
-    """The settings of pulls at a grasped object, and the motion that passes."""
+    """The settings of pulls at a grasped object, and the motion that passes.
 
-    acceleration: Annotated[float, Range(0.0, 1000.0)]  # force of a pull over the mass [m/s^2]
-    seconds: Annotated[float, Range(0.0, 60.0)]  # time of each pull [s]
-    distance: Length  # greatest motion of the object [m] that passes
-    angle: Annotated[float, Range(0.0, math.inf)]  # greatest rotation [rad] that passes
+    Args:
+        acceleration: force of each pull over the object's mass [m/s^2].
+        seconds: duration [s] of each pull.
+        distance: motion [m] of the object's centre of mass at which a pull fails. It is measured
+            from the start of the trial, so it includes the closing.
+        angle: rotation [rad] of the object, since the start of the trial, at which a pull fails.
+    """
+
+    acceleration: Annotated[float, Range(0.0, 1000.0)]
+    seconds: Annotated[float, Range(0.0, 60.0)]
+    distance: Length
+    angle: Annotated[float, Range(0.0, math.inf)]
 
 
 @checked
 @dataclasses.dataclass(frozen=True)
 class Protocol(Value):
-    """The settings of the simulated trials that test a grasp: pulls at the object, or lifts.
+    """The settings of the simulated trials that test a grasp: pulls at the object, or a lift.
 
-    Raises `BadArgument` for a rotation during the approach, or a push or a displacement in a
-    protocol of pulls.
+    `PROTOCOLS` holds published ones by name.
 
     Args:
         name: the protocol's name.
         trial: parameters of the simulated trials.
         pull: the pulls; None means a lift.
-        noise: random errors of the hand's pose in pulls, and displacements of the object along the
-            table in lifts.
-        criterion: a lift passes if the object is "held" (`close_hand`), or has "risen" by half of
-            the lift at the end.
-        displaced: when the object of a lift is displaced: "before" the approach, or halfway through
-            the "approach".
-        push: size of a force [N] in a random direction at the lifted object.
+        noise: bounds of random errors: of the hand's pose in pulls, of the object's place in lifts.
+        criterion: when a lift passes: the object is "held" (`close_hand`), or has "risen" by half
+            of the lift at the end.
+        displaced: when `noise` displaces the object of a lift: "before" the approach, or halfway
+            through the "approach".
+        push: size [N] of a force in a random direction at the lifted object; 0 means no push.
         relook: whether the camera looks at the object of a lift once more, from the same place,
             before the approach.
-        tries: largest number of grasps to try in a lift: another grasp where the object stays
-            behind (`lift_grasps`).
+        tries: largest number of grasps to try in a lift (`lift_grasps`).
+
+    Raises `BadArgument` for two contradictions. The first is a `noise.rotation` with an object
+    displaced during the approach. The second is `pull` with one of the five settings of lifts,
+    `criterion` to `tries`.
     """
 
     name: str
@@ -96,7 +114,7 @@ class Protocol(Value):
 
     @property
     def task(self) -> GraspTask:
-        """The task of the protocol's grasps, for which the planner predicts their success.
+        """The task that `plan_grasps` takes, so that it predicts success under this protocol.
 
         >>> find_protocol("dexgraspbench").task.describe()
         'pulls of 0.1 kg with 7 N'
@@ -114,7 +132,10 @@ class Protocol(Value):
 
     @checked
     def with_trial(self, **changes: Any) -> "Protocol":
-        """Return the protocol with the given settings of its simulated trial replaced.
+        """Return the protocol with some fields of its `trial` replaced.
+
+        `changes` are fields of `TrialSpec` by name. Raises `BadArgument` for an unknown field or a
+        wrong value.
 
         >>> find_protocol("tabletop").with_trial(closing="fixed").trial.closing
         'fixed'
@@ -184,7 +205,7 @@ PROTOCOLS = {
 
 @checked
 def find_protocol(protocol: Protocol | str) -> Protocol:
-    """Return a protocol, given its name or the protocol itself.
+    """Return a protocol, given its name in `PROTOCOLS` or the protocol itself.
 
     Raises `BadArgument` for an unknown name.
 

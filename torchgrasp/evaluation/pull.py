@@ -29,29 +29,45 @@ INTERVAL = 0.2  # interval [s] at which the pulled object's motion is checked
 @checked
 @dataclasses.dataclass(frozen=True)
 class PullResult(Value):
-    """The result of a pull trial: whether the object stayed in the hand when pulled in each
-    direction.
+    """The result of a pull trial: whether the object stayed in the hand; `pull_grasp` makes it.
+
+    Attributes:
+        passed: whether the object stayed in the hand in all six pulls.
+        status: how the last pull ended, or the closing if no pull was tried.
+        directions: number of pulls that were tried, up to 6; 0 if the closing failed.
+        moved: largest motion [m] of the object's centre of mass in the world. It is infinite if the
+            simulation did not stay finite, and 0 if the closing did not start.
+        turned: largest rotation [rad] of the object in the world; infinite or 0 as `moved`.
+        force: mean normal force [N] of the fingers before the first pull; NaN if the closing did
+            not start.
+        seconds: CPU time [s] of the trial.
     """
 
     passed: bool
-    status: Status  # how the last pull ended
-    directions: int  # number of pulls that were tried
-    moved: Measured  # largest motion of the object's centre of mass in the world [m]
-    turned: Measured  # largest rotation of the object in the world [rad]
-    force: Measured  # mean normal force of the fingers before the first pull [N], or NaN
-    seconds: Measured  # CPU time [s]
+    status: Status
+    directions: int
+    moved: Measured
+    turned: Measured
+    force: Measured
+    seconds: Measured
 
 
 @checked
 @single_threaded
 def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") -> PullResult:
-    """Close a hand on the true object, and pull at the object along the world's axes until a pull
-    fails.
+    """Close a hand on the true object, pull at the object, and return whether it stayed in the
+    hand.
 
-    The result says whether the object stayed in the hand. Every pull begins from the same grasp.
-    The object's motion includes its motion during the closing. `protocol` may be a name in
-    `PROTOCOLS`. Raises the errors of `close_hand`, and `BadArgument` for an unknown protocol, or a
-    protocol that lifts.
+    The pulls are along -x, +x, -y, +y, -z and +z of the world, until one fails. Every pull begins
+    from the same grasp. The object's motion is measured from the start of the trial, so it includes
+    the closing.
+
+    Args:
+        trial: the hand, a single grasp and the true object.
+        protocol: a protocol with pulls, or its name in `PROTOCOLS`.
+
+    Raises the errors of `close_hand`. Raises `BadArgument` for an unknown protocol, or a protocol
+    that lifts.
 
     >>> from torchgrasp import load_hand, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -79,7 +95,7 @@ def run_pulls(driver: TrialDriver, spec: PullSpec) -> PullResult:
     run = driver.open()
     start = run.scene.object_pose()
     force = math.nan
-    tried = 1
+    tried = 0
     status = Status.START_OVERLAP
     largest = np.zeros(2)
     if run.starts:

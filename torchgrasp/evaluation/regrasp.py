@@ -30,10 +30,15 @@ from torchgrasp.values.specs import TrialSpec
 
 
 class LiftTry(NamedTuple):
-    """One try of a trial over several grasps."""
+    """One try of `lift_grasps`.
 
-    row: int  # index of the grasp that was tried
-    result: ClosureResult  # record of its lift
+    Attributes:
+        row: index of the grasp that was tried, in the trial's grasps.
+        result: record of its lift.
+    """
+
+    row: int
+    result: ClosureResult
 
 
 @checked
@@ -41,15 +46,21 @@ class LiftTry(NamedTuple):
 def lift_grasps(
     trial: GraspTrial, spec: TrialSpec | None = None, tries: Count = 3
 ) -> tuple[LiftTry, ...]:
-    """Lift an object with the first grasp of a trial, and with others where a lift fails.
+    """Lift an object with the first of several grasps, and with others where a lift fails; return
+    all tries.
 
-    The result lists all tries, at most `tries`. Where the hand feels that the object slides or
-    stays behind (`LiftCheck`), or is too heavy, it goes down, opens and withdraws. The object stays
-    where it then is. The robot expects it at the pose that the touches of the last try show, or
-    looks once more, and tries the grasp of `next_grasp`.
+    The hand may feel that the object slides or stays behind (`LiftCheck`), or that it is too heavy.
+    Then it goes down, opens and withdraws. The object stays where it then is. The robot expects it
+    at the pose that the touches of the last try show, or looks once more. It tries the grasp of
+    `next_grasp`.
 
-    The trial's grasps are in the order of preference; the truth's `error` is that of the first
-    grasp. With `tries` 1 the trial is that of `close_hand`. Raises the errors of `close_hand`.
+    Args:
+        trial: the hand, grasps in the order of preference, and the true object. `trial.truth.error`
+            is the pose error of the first grasp.
+        spec: parameters of the trial; None means `TrialSpec()`.
+        tries: largest number of tries. With 1 the trial is the same as in `close_hand`.
+
+    Raises the errors of `close_hand`.
 
     >>> from torchgrasp import load_hand, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp

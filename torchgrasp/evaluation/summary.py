@@ -35,29 +35,32 @@ QUANTILES = (0.5, 0.95)  # the median and a large value, which few exceed
 @checked
 @dataclasses.dataclass(frozen=True)
 class ProtocolResult(Value):
-    """The outcome of one trial of a grasp; numbers that were not measured are NaN.
+    """The outcome of one trial of a grasp under a protocol; numbers that were not measured are NaN.
 
-    Args:
-        rank: rank of the grasp among those of its view.
-        draw: number of the random pose error.
+    `evaluate` makes it.
+
+    Attributes:
+        rank: rank of the grasp among the executable grasps of its view; 0 is the best.
+        draw: number of the random pose error, from 0.
         passed: whether the trial passed under its protocol.
         status: how the trial ended.
-        moved: motion of the object [m]; in a lift relative to the hand.
-        turned: rotation of the object [rad]; in a lift relative to the hand.
-        force: mean normal force of the fingers [N].
-        overlap: overlap of hand and object at the grasp [m].
-        seconds: CPU time [s].
-        slip: motion of the object in the closed hand [m], in a lift.
-        slip_angle: rotation of the object in the closed hand [rad], in a lift.
+        moved: motion [m] of the object's centre: in pulls in the world, in a lift relative to the
+            hand.
+        turned: rotation [rad] of the object: in pulls in the world, in a lift relative to the hand.
+        force: mean normal force [N] of the fingers: before the first pull, or at the end of a lift.
+        overlap: depth [m] by which the hand at the planned grasp penetrates the object.
+        seconds: CPU time [s] of the trial.
+        slip: motion [m] of the object's centre in the closed hand, in a lift.
+        slip_angle: rotation [rad] of the object in the closed hand, in a lift.
         predicted: predicted probability of success of the grasp.
-        tries: number of grasps that were tried; all but `predicted`, `rank` and `overlap` is of the
-            last grasp.
-        cause: why the object of a lift was not held, a name in `CAUSES`, or "".
-        size: size of the cause, in the cause's unit.
-        gap_mm: largest gap between a fingertip and the object at the planned posture, before any
-            force and without an error of the pose [mm].
-        deepest_mm: smallest such gap, negative if the fingertip penetrates the object [mm].
-        touch: whether the fingertips then touch, a `Verdict`, or "" if unknown.
+        tries: number of grasps that were tried. `rank`, `predicted`, `overlap`, `gap_mm`,
+            `deepest_mm` and `touch` belong to the first one. All else belongs to the last one.
+        cause: why the object of a lift was not held, such as "slid"; "" if there is none.
+        size: size of the cause, in the cause's own unit.
+        gap_mm: largest gap [mm] between a fingertip and the object at the planned posture. It is
+            measured before any force and without a pose error.
+        deepest_mm: smallest such gap [mm]; negative if the fingertip penetrates the object.
+        touch: whether the fingertips then touch (`Touch.verdicts`); "" if unknown.
     """
 
     rank: int
@@ -81,8 +84,8 @@ class ProtocolResult(Value):
 
     @property
     def held(self) -> bool:
-        """Whether the status is `OK`. In a lift, the object is then held without slip
-        (`close_hand`).
+        """Whether the status is `OK`; in a lift, the object is then held as `close_hand` defines
+        it.
         """
         return self.status is Status.OK
 
@@ -90,19 +93,20 @@ class ProtocolResult(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class ViewScore(Value):
-    """The outcome of one view: planning, and the trials of its grasps.
+    """The outcome of one view of an object: planning, and the trials of its grasps; `evaluate`
+    makes it.
 
-    Args:
+    Attributes:
         object: name of the object.
-        view: name of the view.
+        view: name of the view; "" if the object could not be read.
         executable: number of executable grasps.
-        seconds: CPU time of planning [s].
-        attempts: results of the grasps that were tried.
-        refusal: the most frequent failure if no grasp is executable.
-        note: details of the refusal.
-        family: family of the object (`torchgrasp.data`), or "".
-        group: group of the object, or "".
-        fingers: names of the grasping fingers.
+        seconds: CPU time [s] of planning; NaN if it was not measured.
+        attempts: results of the trials, one for each tried grasp and pose error.
+        refusal: most frequent failure if no grasp is executable; else `OK`.
+        note: details of the refusal, or "".
+        family: family of similar objects, or "".
+        group: group of the object, such as "solid", or "".
+        fingers: names of the grasping fingers, joined by commas.
     """
 
     object: str
@@ -118,31 +122,39 @@ class ViewScore(Value):
 
     @property
     def unit(self) -> str:
-        """The name of the unit that confidence intervals resample: the object's family.
+        """The name of the unit that confidence intervals resample.
 
-        If the object has no family, it is the object.
+        It is the family of the object, or the object if it has no family.
         """
         return self.family or self.object
 
 
 @checked
 def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
-    """Return the figures of an evaluation by name; their 95 % intervals resample families of
-    objects.
+    """Return the figures of an evaluation by name, given the `scores` that `evaluate` yields.
 
-    * "gsr": grasp success rate, the fraction of trials that passed.
-    * "top1": fraction of best-ranked grasps that passed; a view without grasps counts as failed.
-    * "objects": fraction of objects with a success. "refused": number of views without a grasp.
-    * "by_object", "by_group": the same numbers for each object or group.
+    Success rates are `Share` values. Their 95 % intervals resample families of objects.
+
+    * "gsr": grasp success rate, the share of trials that passed.
+    * "top1": share of best-ranked grasps that passed; a view without grasps counts as failed.
+    * "objects": share of objects with a success. "refused": number of views without a trial.
+    * "executable": number of executable grasps.
+    * "by_object", "by_group": these five figures for each object and each group.
     * "tries": numbers of trials that passed with the first grasp, with the second grasp, and so on.
-    * "failures": counts of statuses by stage. "causes": why objects were not held, with counts and
-      median sizes.
-    * "fingers": counts of views by the grasping fingers.
-    * "force_n", "overlap_mm", "plan_cpu_s", "trial_cpu_s": means. "cpu_s": total.
-    * "slip_mm", "slip_deg": median and 95 % quantile over the held grasps.
-    * "gap_mm": median and 95 % quantile of the largest gaps before any force. "touch": counts of
-      the verdicts on them (`measure_touch`).
-    * "success": calibration of the predictions (`judge`), or None.
+    * "failures": numbers of each status by stage: planning, start, closing, pulling or lifting,
+      simulation.
+    * "causes": why objects were not held, each with "count", "by_group" and the "median" size.
+    * "fingers": numbers of views by the grasping fingers.
+    * "force_n" [N], "overlap_mm" [mm], "plan_cpu_s" [s], "trial_cpu_s" [s]: means, or None.
+    * "overlap_mm_max": largest overlap [mm], or None. "cpu_s": total CPU time [s].
+    * "slip_mm" [mm], "slip_deg" [deg]: (median, 95 % quantile) over the trials that passed, or
+      None.
+    * "gap_mm" [mm]: (median, 95 % quantile) of the largest gaps before any force, or None.
+    * "touch": numbers of the verdicts on these gaps (`measure_touch`).
+    * "success": how well predicted success fits the outcomes, or None without predictions. "brier"
+      is the mean squared error. "skill" is 1 for perfect predictions and 0 for the mean alone.
+      "auc" is the area under the ROC curve. "error" is the expected calibration error over the
+      "bins".
 
     >>> held = ProtocolResult(0, 0, True, Status.OK, predicted=0.9)
     >>> lost = ViewScore("pen", "view0", 0, 3.0, refusal=Status.OUT_OF_REACH)

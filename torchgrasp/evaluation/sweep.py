@@ -44,22 +44,28 @@ def evaluate(
     folder: Path | None = None,
     workers: Annotated[int, Range(0, 1024)] = 0,
 ) -> Generator[ViewScore, None, None]:
-    """Yield the score of every view of a folder of objects: grasps are planned, and tried in
+    """Yield the score of every view of a folder of objects: grasps are planned, then tried in
     simulation.
 
     Only the simulator uses the true mesh. An object with bad files or a bad entry gets a score with
-    a refusal. Raises `BadArgument` for an unknown protocol or no objects, and `OutputError` if
-    another run holds the folder or it cannot be written. Without the simulator, or pebble for
-    workers, `MissingExtra` is raised.
+    a refusal.
 
     Args:
         objects: a folder of objects with its manifest, as `write_objects` makes it.
         hand: the hand that grasps.
-        protocol: a protocol or its name in `PROTOCOLS`.
-        spec: which views and grasps are tried; `EvaluationSpec()` by default.
-        folder: folder for the executable grasps of each view, OBJECT/VIEW.safetensors; by default a
-            temporary folder. No other run may write to it at the same time.
-        workers: number of worker processes; the scores do not depend on it.
+        protocol: a protocol, or its name in `PROTOCOLS`.
+        spec: which views and grasps are tried; None means `EvaluationSpec()`.
+        folder: folder for the executable grasps of each view, in OBJECT/VIEW.safetensors. None
+            means a temporary folder. No other run may write to it at the same time.
+        workers: number of worker processes; 0 means this process, without limits of time. The
+            scores do not depend on it.
+
+    Raises:
+        BadArgument: the protocol is unknown.
+        DatasetError: the manifest is missing or malformed, or has none of the objects.
+        OutputError: another run holds the folder, or it cannot be written.
+        MissingExtra: the simulator is not installed, or pebble for workers.
+        NoWorkers: no worker process can start.
 
     >>> import tempfile
     >>> from torchgrasp import load_hand, load_object

@@ -47,11 +47,12 @@ TOUCH = TouchNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class Touch(Value):
-    """The gaps between the f fingertips of g grasps and the object, before any force.
+    """The gaps between the f fingertips of g grasps and the object; `measure_touch` makes it.
 
     Attributes:
-        gaps: distances [m] of the pads from the surface; negative where a pad penetrates it, NaN
-            where a cloud does not show the surface.
+        gaps: signed distances (g, f) [m] of the pads from the surface, at the planned postures.
+            They are negative where a pad penetrates the object, and NaN where a cloud does not show
+            the surface.
         limit: greatest distance [m] of a fingertip that touches.
     """
 
@@ -60,17 +61,25 @@ class Touch(Value):
 
     @property
     def largest(self) -> Float[Tensor, "g"]:
-        """The largest gap of each grasp [m]; NaN if none is known."""
+        """Largest gap (g,) [m] of each grasp; NaN if none is known."""
         return _known(self.gaps.nan_to_num(-torch.inf).amax(-1))
 
     @property
     def deepest(self) -> Float[Tensor, "g"]:
-        """The smallest gap of each grasp [m], negative if a pad penetrates; NaN if unknown."""
+        """Smallest gap (g,) [m] of each grasp, negative if a pad penetrates the object; NaN if none
+        is known.
+        """
         return _known(self.gaps.nan_to_num(torch.inf).amin(-1))
 
     @property
     def verdicts(self) -> list[Verdict]:
-        """The verdict on each grasp."""
+        """The verdict on each of the g grasps.
+
+        * "apart": a fingertip is farther than `limit` from the surface.
+        * "penetrates": none is apart, but one is deeper in the object than `limit`.
+        * "unseen": the cloud does not show the surface at a fingertip; all others touch.
+        * "touches": each fingertip is within `limit` of the surface.
+        """
         verdicts = list[Verdict]()
         for gaps in self.gaps:
             verdict: Verdict = "touches"
@@ -96,11 +105,11 @@ def measure_touch(
     surface: "trimesh.Trimesh | PointCloud",
     limit: Length = TOUCH.limit,
 ) -> Touch:
-    """Return the gaps between fingertips and an object at the posture of each grasp.
+    """Return the gaps between fingertips and an object at the planned posture of each grasp.
 
-    A gap is the signed distance of the sphere of a pad, or of the contact point of a pad without a
-    sphere, from the surface. Forces, and errors of the pose, are not considered. In a cloud with a
-    viewpoint, what lies behind the seen surface is unknown.
+    A gap is the signed distance from the surface to the sphere of a pad. For a pad without a sphere
+    it is the distance to its contact point. Forces, and errors of the pose, are not considered. In
+    a cloud with a viewpoint, the surface behind the seen one is unknown.
 
     Args:
         hand: the hand of the grasps.
@@ -109,8 +118,8 @@ def measure_touch(
             the grasps.
         limit: greatest gap [m] of a fingertip that touches.
 
-    Raises `BadArgument` for joints of another hand, and a cloud without normals on which none can
-    be estimated.
+    Raises `BadArgument` for joints of another hand. It is also raised for a cloud without normals
+    for which none can be estimated.
 
     >>> from torchgrasp import load_hand, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp

@@ -65,21 +65,29 @@ TRIALS = TrialNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class Truth:
-    """The true world of a trial, which only the simulator gets; the fields are arguments of
-    `close_hand`.
+    """The true world of a trial, which only the simulator knows.
 
-    Lengths are in metres, and all is in the frame of the grasp. A `camera` looks at the object once
-    more before the hand comes to its approach.
+    All is in the frame of the grasp, and lengths are in metres.
+
+    Args:
+        mesh: closed mesh of the object [m], or its file.
+        parts: convex parts of the mesh [m]; None means those that `convex_parts` computes.
+        error: rigid transform (4, 4) [m] from the hand's planned pose to its true pose. It is in
+            the frame of the planned hand. None means no error.
+        table: the true table below the object. None means a level table at the mesh's lowest point.
+        neighbours: other bodies on the table.
+        slide: displacement (3,) [m] of the object halfway through the approach; None means none.
+        camera: pose (4, 4) [m] of a depth camera that looks at the object once more before the
+            approach. None means no second look.
     """
 
-    mesh: "trimesh.Trimesh | Path | str"  # mesh of the object [m]
-    parts: "Sequence[trimesh.Trimesh] | None" = None  # convex parts of the object [m]
-    error: Pose | None = None  # error of the hand's pose [m], in the frame of the planned hand
-    table: Plane | None = None  # the true table below the object
-    neighbours: Sequence[Neighbour] = ()  # other bodies on the table
-    # displacement [m] of the object halfway through the approach
+    mesh: "trimesh.Trimesh | Path | str"
+    parts: "Sequence[trimesh.Trimesh] | None" = None
+    error: Pose | None = None
+    table: Plane | None = None
+    neighbours: Sequence[Neighbour] = ()
     slide: Float[Tensor, "3"] | None = None
-    camera: Pose | None = None  # pose of a depth camera for a second look [m]
+    camera: Pose | None = None
 
 
 @checked
@@ -87,16 +95,26 @@ class Truth:
 class GraspTrial:
     """The input of a trial: the truth, and what the robot knows.
 
-    The fields are arguments of `close_hand`. `grasp` holds one grasp of the `hand`, or several in
-    the order of preference for `lift_grasps`. `seed` is that of the random noise.
+    `pull_grasp` and `lift_grasps` take it.
+
+    Args:
+        hand: the hand.
+        grasp: one grasp of the hand, or for `lift_grasps` several in the order of preference.
+        truth: the true world, which only the simulator knows.
+        seed: random seed of the noise. Friction and mass are drawn by it if they are distributions.
+        told: the table that the controller knows, in the frame of the grasp. None means the table
+            of the plan (`Grasps.table`).
+        surface: estimated surface of the object (`surface_field`), in the frame of the grasp, by
+            which touches show the object's pose. None means the tangent planes of the planned
+            contacts.
     """
 
     hand: Hand
     grasp: Grasps
     truth: Truth
     seed: Seed = 0
-    told: Plane | None = None  # the table that the controller knows, in the frame of the grasp
-    surface: SignedDistanceField | None = None  # the estimated surface of the object
+    told: Plane | None = None
+    surface: SignedDistanceField | None = None
 
 
 def check_truth(trial: GraspTrial) -> None:

@@ -54,21 +54,21 @@ Ranks = Literal["best", "spread"]
 @checked
 @dataclasses.dataclass(frozen=True)
 class EvaluationSpec(Value):
-    """Options of an evaluation: which views are planned on, and which of their grasps are tried.
-
-    Raises `BadArgument` for no grasps, or unknown ranks.
+    """Options of `evaluate`: which views are planned on, and which of their grasps are tried.
 
     Args:
         grasps: largest number of grasps to try for each view.
         ranks: "best" tries the best grasps, "spread" tries grasps spread evenly over all ranks.
         starts: number of initial guesses of the contact planner.
         complete: plan on whole clouds with normals, as if the shape were known.
-        only: names of objects; by default all objects.
-        planned: use the grasps that an earlier call saved, instead of planning.
+        only: names of the objects to evaluate; empty means all.
+        planned: read the grasps that an earlier call saved in `folder`, instead of planning.
         seed: random seed.
         views: largest number of views of each object; None means all views.
-        fingers: the fingers that grasp (`load_hand`), by default the hand's own. "auto" takes for
-            each view those most likely to succeed.
+        fingers: the fingers that grasp (`load_hand`); None means the hand's own. "auto" takes for
+            each view the fingers most likely to succeed.
+
+    Raises `BadArgument` for no grasps, or unknown ranks.
     """
 
     grasps: Count = 20

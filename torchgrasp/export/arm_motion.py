@@ -25,12 +25,16 @@ HELD = 1e-3  # largest difference [m, 1] between the poses of the grasps and of 
 @checked
 @dataclasses.dataclass(frozen=True)
 class ArmMotion(Value):
-    """The motions of an arm and its hand through g grasps, at t common times.
+    """The motions of an arm and its hand through g grasps, at t common times; `plan_motion` makes
+    it.
 
-    `positions` [rad, or m for sliding joints] are those of the j joints of `joint_names`: the
-    arm's, then the hand's. `times` [s] start at 0. `phases` holds the index of a time for each
-    name: "above" (the hand is above its pre-grasp), "pregrasp", "grasp", "squeeze" (it presses; its
-    joints are then targets), and "lift" (it has lifted the object).
+    Attributes:
+        joint_names: names of the j joints: first the arm's, then all movable joints of the hand.
+        times: times (t,) [s] from the start, beginning at 0.
+        positions: positions (g, t, j) [rad, or m for sliding joints] of these joints.
+        phases: index into `times` by name. "above": the hand is above its pre-grasp. "pregrasp" and
+            "grasp": it is there. "squeeze": it presses, and its joints are targets. "lift": it has
+            lifted the object.
     """
 
     joint_names: tuple[str, ...]
@@ -45,11 +49,19 @@ def plan_motion(
 ) -> ArmMotion:
     """Return the motions of arm and hand through executable grasps that were planned with the arm.
 
-    The hand comes straight at 0.1 m/s from 0.1 m, and is lifted by 0.1 m as fast. `force` [N] is
-    the normal force of the strongest finger, `kp` [N m/rad] the stiffness of the robot's position
-    control; None means the hand's. The way to the first posture is not planned. Without a table z
-    points up. Raises `BadArgument` for grasps without postures of this arm at its place, and the
-    errors of `format_grasps`.
+    The hand comes straight at 0.1 m/s from 0.1 m, closes and presses. It is lifted by 0.1 m as
+    fast, along the normal of the plan's table. Without a table it is lifted along z. The way to the
+    first posture is not planned.
+
+    Args:
+        arm: the arm, at the place for which the grasps were planned.
+        hand: the hand on the arm.
+        grasps: executable grasps of `plan_grasps(..., arm=arm)`.
+        force: normal force [N] of the strongest finger in the squeeze.
+        kp: stiffness [N m/rad] of the robot's position control; None means the hand's own.
+
+    Raises `BadArgument` for grasps without postures of this arm at its place, and for joints of
+    another hand.
 
     >>> grasps = plan_grasps(cloud, hand, spec, arm=arm)  # doctest: +SKIP
     >>> motion = plan_motion(arm, hand, grasps[:1])  # doctest: +SKIP

@@ -59,12 +59,16 @@ Quaternion = Literal["wxyz", "xyzw"]
 
 
 class ForeignGrasps(NamedTuple):
-    """Imported grasps of a hand, g in number.
+    """The g grasps of a file of another program, for a hand with h actuated joints; `read_foreign`
+    makes it.
 
-    `joints` [rad] are the actuated joints, in the order of `hand.joint_names`. `obj_from_hand` [m]
-    are the poses of the hand's root link in the object's frame. `pregrasp` [rad] are the joints of
-    the opened hand, or None if the file has none. `table` is the table under the object, or None
-    if the file has none.
+    Attributes:
+        joints: positions (g, h) [rad or m] of the actuated joints, in the order of
+            `hand.joint_names`.
+        obj_from_hand: poses (g, 4, 4) [m] of the hand's root link in the object's frame.
+        pregrasp: positions (g, h) [rad or m] of the opened hand's joints; None if the file has
+            none.
+        table: the table under the object, in the object's frame; None if the file has none.
     """
 
     joints: Float[Tensor, "g h"]
@@ -83,6 +87,8 @@ def read_foreign(
     root: str | Pose = "",
 ) -> ForeignGrasps:
     """Return joints and poses of grasps from the file of another program, or from our own JSON.
+
+    `grasps_from_joints` makes `Grasps` of them.
 
     | file | what is read |
     | --- | --- |
@@ -103,18 +109,19 @@ def read_foreign(
         hand: the grasping hand. For the Allegro hand DexGraspBench's frame and joint order are
             known.
         order: names (as in the hand's URDF) of the joints in the file. `JOINT:FACTOR` or
-            `JOINT:FACTOR:OFFSET` convert a number of another sign, unit or zero [rad]. Values
-            under other names are not read.
+            `JOINT:FACTOR:OFFSET` convert a number of another sign, unit or zero [rad]. Values under
+            other names are not read.
         quaternion: order of the four numbers after the position in a pose.
         unit_m: length [m] of one unit of the positions in the file.
-        root: the frame of the hand whose poses the file has: a link of our URDF, or the pose [m] of
-            its root link in the publisher's frame. By default it is the link that the file names
-            (`root_link`, `base_link`, or the end of Isaac's `gripper_frame_link`), the bench's
-            frame of the Allegro hand, or our root link.
+        root: the frame of the hand whose poses the file has. It is a link of our URDF, or the pose
+            (4, 4) [m] of our root link in the publisher's frame. "" means the link that the file
+            names (`root_link`, `base_link`, or the end of Isaac's `gripper_frame_link`). If it
+            names none, "" means the bench's frame of the Allegro hand, or our root link.
 
-    Raises `ModelFileError` for a missing or malformed file, and for a root link that is none of
-    ours. It is also raised for joints that fit with another sign only, or that do not follow as the
-    hand's do. Raises `BadArgument` for an order that misses a joint.
+    Raises:
+        ModelFileError: the file is missing or malformed, or its root link is none of ours. Joints
+            fit with another sign only, or do not follow as the hand's joints do.
+        BadArgument: the `order` misses a joint.
 
     >>> import tempfile
     >>> from torchgrasp import load_hand
@@ -373,27 +380,29 @@ def grasps_from_joints(
     spec: ContactSpec | None = None,
     std_m: Length | None = None,
 ) -> Grasps:
-    """Return imported joints and poses as `Grasps`, for `certify`, `close_hand`, `evaluate` and the
-    exporters.
+    """Return imported joints and poses as `Grasps`, for `certify`, `close_hand` and the exporters.
 
-    Contacts are at the middle of each pad, with normals opposite to the pads'. Certificates are for
-    these contacts; a grasp without force closure gets `Status.NOT_CLOSED`. Replace contacts and
-    certificate if you know the surface. `clearance` is that of self-collision, and success is
-    unknown, because no object is known. The approach is the hand's own approach axis.
+    Each contact is at the middle of a pad, with a normal opposite to the pad's normal. Certificates
+    are for these contacts. A grasp without frictional form closure gets `Status.NOT_CLOSED`.
+    Replace contacts and certificate if you know the surface.
+
+    `clearance` is only the clearance between links, and success is unknown, because no object is
+    known. `approach` is the approach axis of the hand.
 
     Args:
         hand: the hand.
-        joints: actuated joints [rad], in the order of `hand.joint_names`.
-        obj_from_hand: poses [m] of the root link of the hand's URDF, in the object's frame.
-        pregrasp: actuated joints [rad] of the opened hand; None means that each tip moves 20 mm off
-            its contact, or as far as limits allow.
-        table: the table under the object, in its frame, above which an opened hand stays; None
-            means no table, or an unknown one.
+        joints: positions (g, h) [rad or m] of the actuated joints, in the order of
+            `hand.joint_names`.
+        obj_from_hand: poses (g, 4, 4) [m] of the hand's root link in the object's frame.
+        pregrasp: positions (g, h) [rad or m] of the opened hand's joints. None means that each tip
+            moves 20 mm off its contact, or as far as limits allow.
+        table: the table under the object, in the object's frame, above which an opened hand stays.
+            None means no table, or an unknown one.
         spec: friction and number of cone edges of the certificate; None means `ContactSpec()`.
-        std_m: standard deviation [m] of the surface at each contact, for closing controllers that
-            use it; None if it is unknown.
+        std_m: standard deviation [m] of the surface at each contact, for closing modes that use it.
+            None means unknown.
 
-    Raises `BadArgument` for wrong shapes, joints outside the limits, or poses that are not rigid.
+    Raises `BadArgument` for wrong shapes, joints outside their limits, or poses that are not rigid.
 
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("barrett")

@@ -62,32 +62,35 @@ def format_isaac(
     gripper_link: str | None = None,
     isaac_ros: bool = False,
 ) -> str:
-    """Return grasps as the YAML of an `isaac_grasp` file of version 1.0, in metres and radians.
+    """Return grasps as the YAML text of an `isaac_grasp` file of version 1.0, in metres, radians.
 
-    `position` and `orientation` (w, xyz) are the pose of the gripper's frame in the object's: that
-    of the planned cloud. `cspace_position` has the joints at the contacts, by name, and
-    `pregrasp_cspace_position` those of the opened hand. `confidence` is the predicted success, 0
-    where it is unknown. `squeeze_cspace_position`, a key of ours, has the targets that press.
+    * `position` and `orientation` (w, x, y, z) are the pose of the gripper's frame. It is in the
+      object's frame, in which the cloud was planned.
+    * `cspace_position` has the joints at the contacts, by name.
+    * `pregrasp_cspace_position` has the joints of the opened hand.
+    * `squeeze_cspace_position`, a key of ours, has the targets that press.
+    * `confidence` is the predicted success, 0 where it is unknown.
 
     Args:
         hand: the hand.
         grasps: grasps planned for this hand, best first.
-        force: normal force of the strongest finger [N] in the squeeze.
-        kp: stiffness of the robot's position control [N m/rad]; None means the hand's.
+        force: normal force [N] of the strongest finger in the squeeze.
+        kp: stiffness [N m/rad] of the robot's position control; None means the hand's own.
         rename: the robot's names of joints, by their names in the URDF; None keeps all names.
-        flange: pose [m] of the robot's flange in the frame of the root link; None means that poses
-            are those of `gripper_link`.
+        flange: pose (4, 4) [m] of the robot's flange in the frame of the root link. With it, poses
+            are the flange's. None means poses of `gripper_link`.
         object_id: name of the object's frame, such as its path in the stage.
         actuated: leave out joints that follow others. By default all joints of the hand are
-            written, followers and parked ones, too.
+            written.
         gripper_link: name of the gripper's frame, or its path in the stage. If its last part is a
-            link of the URDF, poses are of this link; any other name is one of the root link, or of
-            the flange. None means the root link, or "flange".
+            link of the URDF, poses are of this link. Another name is a name for the root link, or
+            for the flange. None means the root link, or "flange".
         isaac_ros: write the names of Isaac ROS, `object_frame` and `gripper_frame`.
 
-    Raises `BadArgument` for joints of another hand, a force or stiffness that is not positive, or
-    unknown or equal names. A grasp whose hand goes down while it closes is refused, too: the file
-    has one pose.
+    Raises:
+        BadArgument: joints are of another hand. The `force` is outside 0.01 to 100 N, or `kp` is
+            not positive. Names are unknown, empty or equal. A hand goes down while it closes,
+            which a file with one pose cannot express.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp

@@ -47,25 +47,26 @@ def save_dexgraspbench(
     force: Force = 4.0,
     kp: Positive = 5.0,
 ) -> list[Path]:
-    """Write each grasp as a file `folder/0.npy`, `folder/1.npy` and so on, for DexGraspBench's
-    evaluator; return their paths.
+    """Write each grasp as a file of DexGraspBench's evaluator; return the paths of the files.
 
-    A file is a dictionary: `obj_path`, `obj_scale` (1), `obj_pose` (identity), and `pregrasp_qpos`,
-    `grasp_qpos`, `squeeze_qpos` (23): position [m] and quaternion (w, x, y, z) of the hand, then 16
-    joints [rad]. The evaluator only accepts a pickled dictionary; ours holds only arrays, numbers
-    and a text.
+    The files are `folder/0.npy`, `folder/1.npy` and so on. A file is a pickled dictionary, because
+    the evaluator accepts nothing else. It holds only arrays, numbers and a text: `obj_path`,
+    `obj_scale` (1), `obj_pose` (identity), `pregrasp_qpos`, `grasp_qpos` and `squeeze_qpos`. Each
+    `qpos` has 23 numbers: position [m] and quaternion (w, x, y, z) of the hand, then 16 joints
+    [rad].
 
     Args:
-        hand: the Allegro hand, whose model the bench has.
+        hand: the Allegro hand, whose model DexGraspBench has.
         grasps: grasps planned for this hand.
-        folder: folder to write, in the bench `output/NAME_allegro/graspdata/OBJECT`.
-        object_path: the object's folder in the bench (`assets/...`); its frame must be that of the
-            planned cloud.
-        force: normal force of the strongest finger [N].
-        kp: stiffness of the bench's drives [N m/rad].
+        folder: folder to write: in DexGraspBench `output/NAME_allegro/graspdata/OBJECT`.
+        object_path: the object's folder in DexGraspBench (`assets/...`). Its frame must be the
+            frame of the planned cloud.
+        force: normal force [N] of the strongest finger in the squeeze.
+        kp: stiffness [N m/rad] of DexGraspBench's drives.
 
-    Raises `OutputError`, and `BadArgument` for a hand that is not in the bench, or joints of
-    another hand.
+    Raises:
+        BadArgument: DexGraspBench does not have the hand, or joints are of another hand.
+        OutputError: a file cannot be written.
 
     >>> import tempfile
     >>> from torchgrasp import load_hand
@@ -99,13 +100,16 @@ def save_dexgraspbench(
 
 @checked
 def format_graspgen(grasps: Grasps, object_path: str) -> str:
-    """Return grasps as the JSON of a GraspGen data set: poses of the hand's root link in the
-    object's frame.
+    """Return grasps as the JSON text of a GraspGen data set.
 
-    Lengths are in metres. `object_in_gripper` says which grasps are executable. The fields
-    `success` (predicted probability), `joints` [rad] and `joint_names` are our additions.
-    `object_path` is the path of the mesh in the data set; its frame is that of the planned cloud,
-    its scale 1.
+    `transforms` [m] are poses of the hand's root link in the object's frame. `object_in_gripper`
+    says which grasps are executable. The fields `success` (predicted probability), `joints` [rad or
+    m] and `joint_names` are our additions.
+
+    Args:
+        grasps: grasps, executable or not.
+        object_path: path of the mesh in the data set. Its frame is the frame of the planned cloud,
+            its scale 1.
 
     >>> import json
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -140,9 +144,14 @@ def bench_frame(hand: Hand) -> tuple[Float[Tensor, "4 4"], tuple[str, ...]]:
 def save_surface(surface: Surface, path: Path | str) -> Path:
     """Write a surface, with its uncertainty as colours, to a .ply or .glb file; return the path.
 
-    The suffix of the `path` selects the format; .ply also has `std_m` [m] of each vertex. Yellow
-    marks a standard deviation of `largest_std`, violet 0. Raises `OutputError`, and `BadArgument`
-    for another suffix.
+    Violet marks a standard deviation of 0, yellow one of `largest_std` or more. A .ply file also
+    has `std_m` [m] of each vertex.
+
+    Args:
+        surface: the surface, as `extract_surface` returns it.
+        path: the file to write; its suffix selects the format.
+
+    Raises `BadArgument` for another suffix, and `OutputError` if the file cannot be written.
 
     >>> import tempfile
     >>> from torchgrasp import fit_shape, load_object
@@ -172,8 +181,9 @@ def save_surface(surface: Surface, path: Path | str) -> Path:
 
 @checked
 def largest_std(surface: Surface) -> float:
-    """Return the largest standard deviation [m] of the colour scale: the 99 % quantile over the
-    surface's vertices.
+    """Return the upper end [m] of the colour scale of `save_surface`.
+
+    It is the 99 % quantile of the vertices' standard deviations, at least 1e-6 m.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> from torchgrasp.shape import extract_surface

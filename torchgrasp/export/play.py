@@ -92,28 +92,30 @@ def save_play(
     *,
     parts: "Sequence[trimesh.Trimesh] | None" = None,
 ) -> Path:
-    """Write a folder in which `python play.py 0` plays the first grasp; return the folder.
+    """Write a folder in which `python play.py 0` plays the first grasp in a simulator; return the
+    folder.
 
-    The script needs only the simulator and NumPy.
-
-    The hand comes along its approach, closes in open loop, presses, lifts and holds. The script
-    prints one line of JSON: how far the object rose [m], and whether that is at least half of the
-    lift. `play.json` has the motion, drives, contacts and the object; its text "frames" explains
-    the numbers.
+    The script needs only the simulator and NumPy. The hand comes along its approach, closes in open
+    loop, presses, lifts and holds. The script prints one line of JSON: how far the object rose [m],
+    and whether this is at least half of the lift. `play.json` has the motion, drives, contacts and
+    the object; its text "frames" explains the numbers.
 
     Args:
         hand: the hand.
         grasps: one or more grasps of the hand.
         folder: the folder to write.
-        player: the simulator.
-        mesh: closed mesh of the object [m] in the frame of the grasps; or the estimated `Surface`,
-            whose points below the table are moved up to it.
+        player: the simulator, or "usd" for a scene.
+        mesh: closed mesh of the object [m] in the frame of the grasps. It may be the estimated
+            `Surface`, whose points below the table are moved up to it.
         spec: mass, friction, force, stiffness, heights, times and timestep; None means
             `TrialSpec()`.
-        parts: convex parts of the mesh; None means that they are computed (`convex_parts`).
+        parts: convex parts [m] of the mesh; None means that `convex_parts` computes them.
 
-    Raises `BadArgument` for no grasps, joints of another hand, or a mesh that the grasps do not
-    touch; `MeshError` for an open mesh, and `OutputError`.
+    Raises:
+        BadArgument: there are no grasps, joints are of another hand, or the grasps do not touch the
+            mesh.
+        MeshError: the mesh is open or malformed.
+        OutputError: a file cannot be written.
 
     >>> import tempfile
     >>> from torchgrasp import load_hand, load_object

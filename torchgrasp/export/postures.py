@@ -45,16 +45,23 @@ def format_grasps(
     rename: Mapping[str, str] | None = None,
     flange: Pose | None = None,
 ) -> str:
-    """Return grasps as JSON, together with `CONVENTIONS`, which explain the numbers.
+    """Return grasps as JSON text, with postures by joint name and an explanation of all numbers.
 
     In its "pregrasp" posture, the hand moves along "approach" to its "pose", raised by "rise". It
-    closes to "grasp" in the given time, and in the same time again it presses towards "squeeze".
-    All joints move at constant speeds. The strongest finger presses with a normal force of `force`
-    [N]. `kp` is the stiffness of the robot's position control [N m/rad], None means the hand's.
-    `rename` holds the robot's names of joints, by their names in the URDF. `flange` is the pose [m]
-    of the robot's flange in the frame of the root link; its pose is then added as "flange". Raises
-    `BadArgument` for joints of another hand, unknown or equal names, or a force or stiffness that
-    is not positive.
+    closes to "grasp" in the given time. In the same time again it presses towards "squeeze". All
+    joints move at constant speeds. Poses are in the object's frame.
+
+    Args:
+        hand: the hand.
+        grasps: grasps planned for this hand, best first.
+        force: normal force [N] of the strongest finger in the squeeze.
+        kp: stiffness [N m/rad] of the robot's position control; None means the hand's own.
+        rename: the robot's names of joints, by their names in the URDF; None keeps all names.
+        flange: pose (4, 4) [m] of the robot's flange in the frame of the root link. With it, the
+            flange's pose is added as "flange".
+
+    Raises `BadArgument` for joints of another hand, and for names that are unknown, empty or equal.
+    It is also raised for a `force` outside 0.01 to 100 N, or a `kp` that is not positive.
 
     >>> import json
     >>> from torchgrasp import load_hand
@@ -208,15 +215,24 @@ def quaternion(a_from_b: Tensor | np.ndarray) -> list[float]:
 def format_keyframes(
     hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None = None
 ) -> str:
-    """Return the hand as MJCF with four keyframes for each grasp: grasp_0_approach, _pregrasp,
-    _grasp, _squeeze.
+    """Return the hand as MJCF text with four keyframes for each grasp.
 
-    The world is the object's frame. `qpos` is the free joint, then the joints of the model [m,
-    rad]; `ctrl` holds the targets [rad] of the actuators. The text elements "qpos" and "ctrl" name
-    their order. The approach has the joints of the pre-grasp. The squeeze has the joints of the
-    grasp and targets that press. `force` [N] is the normal force of the strongest finger. `kp` is
-    the stiffness of every drive [N m/rad]; None means the hand's own. Raises `BadArgument` for
-    joints of another hand, or a force or stiffness that is not positive.
+    They are `grasp_0_approach`, `grasp_0_pregrasp`, `grasp_0_grasp` and `grasp_0_squeeze`. The
+    approach has the joints of the pre-grasp. The squeeze has the joints of the grasp and targets
+    that press.
+
+    The world is the object's frame. `qpos` is the free joint, then the joints of the model [rad or
+    m]. `ctrl` holds the targets [rad or m] of the actuators. The text elements "qpos" and "ctrl"
+    name their order.
+
+    Args:
+        hand: the hand.
+        grasps: grasps planned for this hand, best first.
+        force: normal force [N] of the strongest finger in the squeeze.
+        kp: stiffness [N m/rad] of every drive; None means the hand's own.
+
+    Raises `BadArgument` for joints of another hand. It is also raised for a `force` outside 0.01 to
+    100 N, or a `kp` that is not positive.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp

@@ -65,25 +65,30 @@ def format_moveit(
 ) -> str:
     """Return grasps as a YAML list of moveit_msgs/Grasp, in metres and radians.
 
-    `grasp_pose` is the pose in `OBJECT_FRAME` of the root link of the hand's URDF, or of a robot's
-    flange. The pre-grasp posture has joint positions. The grasp posture has the positions at the
-    contacts, then targets that press, with the torques [N m] as effort. `grasp_quality` is the
-    predicted success. The retreat is up: the normal of the plan's table, or z.
+    `grasp_pose` is the pose of the hand's root link, or of the robot's flange, in the frame
+    "object". Publish a transform of this name: it is the frame of the planned cloud.
+    `pre_grasp_posture` has the joints of the opened hand. `grasp_posture` has the joints at the
+    contacts, then targets that press, with torques [N m] as effort. `time_from_start` is in
+    seconds. `grasp_quality` is the predicted success. The retreat is along the normal of the plan's
+    table, or along z without a table.
 
     Args:
-        force: normal force of the strongest finger [N].
-        kp: stiffness of the robot's own position control [N m/rad]; None means the hand's.
-        rename: the robot's names of joints, by their names in the URDF; these joints come first, in
+        hand: the hand.
+        grasps: grasps planned for this hand, best first.
+        force: normal force [N] of the strongest finger in the squeeze.
+        kp: stiffness [N m/rad] of the robot's position control; None means the hand's own.
+        rename: the robot's names of joints, by their names in the URDF. These joints come first, in
             this order. None keeps all names.
-        flange: pose [m] of the robot's flange in the frame of the root link; None means that poses
-            are those of the root link.
+        flange: pose (4, 4) [m] of the robot's flange in the frame of the root link. With it, poses
+            are the flange's. None means poses of the root link.
         object_id: id of the object in the planning scene, which the hand may touch.
-        actuated: leave out efforts and the joints that follow others, which controllers of
-            ros2_control refuse.
+        actuated: leave out efforts, and joints that follow others. Controllers of ros2_control
+            refuse both.
 
-    Raises `BadArgument` for joints of another hand, a force or stiffness that is not positive, or
-    unknown or equal names. A grasp whose hand goes down while it closes (`opened_pose`) is refused,
-    too: a message with one pose cannot express it.
+    Raises:
+        BadArgument: joints are of another hand. The `force` is outside 0.01 to 100 N, or `kp` is
+            not positive. Names are unknown, empty or equal. A hand goes down while it closes,
+            which a message with one pose cannot express.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -129,17 +134,25 @@ def format_trajectories(
     rename: Mapping[str, str] | None = None,
     actuated: bool = False,
 ) -> str:
-    """Return a YAML document of trajectory_msgs/JointTrajectory for each grasp: pre-grasp, grasp,
-    squeeze.
+    """Return a YAML document of trajectory_msgs/JointTrajectory for each grasp.
 
-    The hand must already be at its pose, which `format_moveit` and `format_grasps` give. `force`
-    [N] is the normal force of the strongest finger. `kp` [N m/rad] is the stiffness of the robot's
-    position control. `rename` holds the robot's names of joints, by their names in the URDF. The
-    points have no efforts, which controllers of positions refuse; `format_grasps` has the
+    Each trajectory has three points: pre-grasp, grasp and squeeze, with `time_from_start` in
+    seconds. The hand must already be at its pose, which `format_moveit` and `format_grasps` give.
+    The points have no efforts, which controllers of positions refuse. `format_grasps` has the
     torques.
-    With `actuated`, joints that follow others are left out: controllers of ros2_control refuse
-    their names. Raises `BadArgument` for joints of another hand, a force or stiffness that is not positive, and
-    unknown or equal names.
+
+    Args:
+        hand: the hand.
+        grasps: grasps planned for this hand, best first.
+        force: normal force [N] of the strongest finger in the squeeze.
+        kp: stiffness [N m/rad] of the robot's position control; None means the hand's own.
+        rename: the robot's names of joints, by their names in the URDF. These joints come first, in
+            this order. None keeps all names.
+        actuated: leave out joints that follow others. Controllers of ros2_control refuse their
+            names.
+
+    Raises `BadArgument` for joints of another hand, and for names that are unknown, empty or equal.
+    It is also raised for a `force` outside 0.01 to 100 N, or a `kp` that is not positive.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -156,11 +169,14 @@ def format_trajectories(
 
 @checked
 def format_motion(hand: Hand, motion: ArmMotion, actuated: bool = False) -> str:
-    """Return a YAML document of trajectory_msgs/JointTrajectory for each grasp, with the joints of
-    arm and hand.
+    """Return a YAML document of trajectory_msgs/JointTrajectory for each grasp, of arm and hand.
 
-    `motion` comes from `plan_motion`; `hand` is the hand on the arm. With `actuated`, joints of the
-    hand that follow others are left out.
+    Positions are in [rad], or [m] for sliding joints; `time_from_start` is in seconds.
+
+    Args:
+        hand: the hand on the arm.
+        motion: the motions, from `plan_motion`.
+        actuated: leave out joints of the hand that follow others.
 
     >>> import torch
     >>> from torchgrasp import load_hand

@@ -232,7 +232,7 @@ class Batch(Value):
     def raise_for_status(self: SomeBatch) -> SomeBatch:
         """Return this batch if every row has `Status.OK`; else raise `FailedRows`.
 
-        The error states how many rows have each other status.
+        The error's text says how many rows have each other status, and explains each status.
         """
         counts = count_status(getattr(self, "status"))  # noqa: B009
         failed = {s: k for s, k in counts.items() if s is not Status.OK}

@@ -16,6 +16,8 @@ from torchgrasp.foundation.limits import MESSAGE_LETTERS
 class GraspError(Exception):
     """Base class of all errors of torchgrasp.
 
+    Its text says what was expected, what was given, and in which argument or file.
+
     >>> from torchgrasp import load_hand
     >>> try:
     ...     load_hand("octopus")
@@ -145,7 +147,7 @@ class DegenerateContacts(GraspError, ValueError):
 
 
 class BrokenLaw(GraspError, AssertionError):
-    """The kinematics of a hand break a law that `torchgrasp.testing` checks; `law` is its name.
+    """The kinematics of a hand break a law that `check_hand` checks; `law` is the law's name.
 
     >>> error = BrokenLaw("order", "2 nan", "finite numbers")
     >>> error.law, str(error)
@@ -202,7 +204,10 @@ class GraspFileWarning(UserWarning):
 
 
 class Status(enum.IntEnum):
-    """The outcome of one row of a batch, such as one grasp; `sentence` explains the outcome.
+    """The outcome of one row of a batch, such as one grasp.
+
+    It is an integer: 0 (`OK`) means success, and other values are failures. `name` is its name, and
+    `sentence` explains it. `Status(code)` makes one from an entry of a `status` tensor.
 
     >>> Status.NOT_CLOSED.sentence
     'the contacts do not resist every wrench at the planned friction (no frictional form closure)'

@@ -34,13 +34,19 @@ _log = logging.getLogger(__name__)
 def convex_parts(
     mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None = None
 ) -> "list[trimesh.Trimesh]":
-    """Return convex parts [m] that together fill a closed mesh [m]; a single part if the mesh is
+    """Return convex parts [m] that together fill a closed mesh; a single part if the mesh is
     convex.
 
-    The parts are cached in the folder `cache`, by default `$XDG_CACHE_HOME/torchgrasp` or
-    `~/.cache/torchgrasp`. If the folder cannot be written, a warning is logged. Raises the errors
-    of `read_mesh`, and `MeshError` for a mesh that takes too much time or memory to cut. Without
-    CoACD a mesh that is not convex raises `MissingExtra`.
+    Args:
+        mesh: the closed mesh [m], or its file.
+        cache: folder in which the parts are kept for later calls. None means
+            `$XDG_CACHE_HOME/torchgrasp` or `~/.cache/torchgrasp`. If it cannot be written, a
+            warning is logged.
+
+    Raises:
+        MeshError: the mesh is missing, open or without volume, or takes too much time or memory to
+            cut.
+        MissingExtra: the mesh is not convex, and CoACD is not installed.
 
     >>> import trimesh
     >>> len(convex_parts(trimesh.creation.box((0.1, 0.1, 0.1))))

@@ -50,11 +50,13 @@ SIMULATION = SimulationNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class Neighbour:
-    """Another body on the simulated table, beside the object to grasp.
+    """Another body on the simulated table, beside the object to grasp; `close_hand` takes it.
 
-    The closed `mesh` [m] is in the frame of the grasp. `parts` are its convex parts [m], by default
-    those of `convex_parts`. By default, the `mass` [kg] follows from `TrialSpec.mass` or
-    `TrialSpec.density`, as for the object.
+    Args:
+        mesh: closed mesh [m], in the frame of the grasp.
+        parts: convex parts of the mesh [m]; None means those that `convex_parts` computes.
+        mass: mass [kg]. None means the mass by `TrialSpec.mass` or `TrialSpec.density`, as for the
+            object.
     """
 
     mesh: "trimesh.Trimesh"
@@ -81,31 +83,33 @@ class Body:
 class SceneSpec:
     """Parameters of a simulated scene: a hand on its mount, the object, the table and neighbours.
 
+    `open_scene` takes it. All is in the world's frame, with z up.
+
     Args:
         urdf_path: URDF of the hand.
         world_from_hand: pose (4, 4) [m] of the hand's root link at the end of the approach.
-        joints: start position of every joint of the URDF by name [rad].
-        drives: motor of every joint of the URDF by name.
+        joints: start position [rad or m] of every joint of the URDF, by name.
+        drives: drive of every joint of the URDF, by name.
         tip_links: names of the links of the f fingertips, in the order of the grasp's contacts.
         mesh: closed mesh [m] of the object, which gives table height, centre of mass and inertia.
         parts: convex bodies [m] that make up the object.
-        mass: mass of the object [kg].
-        friction: friction coefficient of every contact.
-        table_friction: friction coefficient of objects with the table and with each other; by
-            default `friction`.
-        gravity: gravity [m/s^2].
-        timestep: timestep of the simulator [s].
+        mass: mass [kg] of the object.
+        friction: friction coefficient of every contact; `table_friction` may replace it.
+        gravity: gravity [m/s^2], downward.
+        timestep: timestep [s] of the simulator.
         travel: largest height [m] of a lift.
-        approach: displacement [m] from the hand's start to the pose `world_from_hand`.
+        approach: displacement (x, y, z) [m] from the hand's start to the pose `world_from_hand`.
         table: whether there is a table.
-        patch: radius [m] of a fingertip's contact patch; torsional friction is friction x force x
+        patch: radius [m] of a fingertip's contact patch. Torsional friction is friction x force x
             patch.
-        height: height of the table [m]; by default the lowest point of the mesh.
+        height: height [m] of the table; None means the lowest point of the mesh.
         neighbours: other bodies on the table.
         self_pairs: pairs of the hand's links that collide with each other.
         yields: largest displacement [m] of the mount along each axis of the world; 0 if the mount
             is stiff.
-        start: initial displacement [m] of the mount along each axis of the world, if it yields.
+        start: initial displacement (x, y, z) [m] of the mount, if it yields.
+        table_friction: friction coefficient of objects with the table and with each other; None
+            means `friction`.
         mount: all prismatic joints of the mount; None means those that `travel`, `approach` and
             `yields` need.
     """
@@ -140,7 +144,7 @@ class SceneSpec:
 
     @functools.cached_property
     def slides(self) -> list["Slide"]:
-        """The prismatic joints of the mount, which carries the hand, in order from the world to the
+        """The prismatic joints of the mount that carries the hand, in order from the world to the
         hand.
         """
         if self.mount is not None:
@@ -177,9 +181,10 @@ class SceneSpec:
 
     @property
     def hulls(self) -> list[list[np.ndarray]]:
-        """The vertices (v, 3) [m] of each convex part, first of the object, then of each neighbour.
+        """The vertices (v, 3) [m] of each convex part: a list for the object, then one for each
+        neighbour.
 
-        Vertices nearly on the table are moved onto it: a scanned round body would otherwise roll
+        Vertices nearly on the table are moved onto it. A scanned round body would otherwise roll
         away on its facets before it is touched.
         """
         lowest = self.table_height + SIMULATION.near if self.table else -math.inf
@@ -193,7 +198,7 @@ class SceneSpec:
 
     @checked
     def check_drives(self, names: list[str]) -> None:
-        """Raise `BadArgument` if a joint in `names` has no initial position or no drive."""
+        """Raise `BadArgument` if a joint in `names` has no start position or no drive."""
         missing = [name for name in names if name not in self.joints or name not in self.drives]
         if missing:
             found = f"no position or drive for {missing}"

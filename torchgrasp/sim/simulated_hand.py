@@ -22,9 +22,15 @@ from torchgrasp.values.specs import Simulator
 def open_scene(spec: SceneSpec, simulator: Simulator = "sapien") -> SimulatedScene:
     """Return a fresh scene of a simulator, at its initial state.
 
-    Raises `BadArgument` for an unknown simulator, or for a joint of the hand without a position or
-    drive. Raises `HandFileError` for a bad URDF, and `MissingExtra` for a simulator that is not
-    installed.
+    Args:
+        spec: parameters of the scene.
+        simulator: "sapien" or "mujoco".
+
+    Raises:
+        BadArgument: the simulator is unknown, or a joint of the hand has no start position or
+            drive.
+        HandFileError: the hand's URDF is missing or malformed.
+        MissingExtra: the simulator is not installed.
 
     >>> from torchgrasp import load_hand, load_object
     >>> jug, hand = load_object("jug"), load_hand("barrett")
@@ -43,29 +49,29 @@ def open_scene(spec: SceneSpec, simulator: Simulator = "sapien") -> SimulatedSce
 
 
 class SimulatedHand:
-    """The simulated hand of f fingers for a controller.
-
-    It takes targets, and returns observations of the joints and of the fingertips' sensors.
+    """A simulated hand of f fingers, as a controller uses it: `tick` takes targets, and observes.
 
     Args:
-        scene: scene at its initial state.
+        scene: scene at its initial state, from `open_scene`.
         reference: the closing plan.
-        control_rate: rate of the control ticks [Hz].
+        control_rate: rate [Hz] of the control ticks.
         generator: source of the noise of the fingertips' sensors; None means no noise.
 
     Attributes:
-        truth: the contacts of the last tick.
+        truth: the true contacts of the last tick, in the hand's frame.
         force: true normal forces (f,) [N], averaged over the tick.
         pushes: full forces (f, 3) [N] of the fingertips on the object, in the world's frame,
             averaged over the tick.
         finger: mask (f,) of the fingers that touched the object in the last step.
         steps: number of steps of the simulator so far.
-        sent: targets (j,) [rad] of the last tick, in the scene's order of joints.
+        sent: targets (j,) [rad or m] of the last tick, in the order of `scene.joint_names`.
         first_touch: number of the step of each fingertip's first contact (f,); infinite before it.
-        first_stray: number of the step of the hand's first other contact (3,): with a neighbour,
-            with the table, and of its links with the object, in this order.
+        first_stray: number of the step of the hand's first other contact (3,); infinite before it.
+            The three are with a neighbour, with the table, and of links that are no fingertip with
+            the object.
         stray: sums of the impulses (3,) [N s] of these contacts.
         most_stray: largest force (3,) [N] of these contacts, averaged over a tick.
+        period: time [s] of a control tick.
     """
 
     def __init__(
@@ -104,10 +110,11 @@ class SimulatedHand:
 
     @checked
     def tick(self, targets: Targets) -> Observation:
-        """Drive joints and palm towards their targets for one control period; return the
-        observation at its end.
+        """Drive joints and palm towards their targets for one control tick; return the observation
+        at its end.
 
-        Raises `BadArgument` unless `targets` are those of all joints of the URDF.
+        `targets` are the controller's. Raises `BadArgument` unless they hold all joints of the
+        URDF.
         """
         if len(targets.joints) != len(self._to_scene):
             allowed = f"all {len(self._to_scene)} of the URDF"
@@ -145,22 +152,22 @@ class SimulatedHand:
 
     @checked
     def rest(self, ticks: Annotated[int, Range(0, 1000000)]) -> None:
-        """Keep the targets for a number of control ticks, without observations."""
+        """Keep the last targets for a number of control ticks, without observations."""
         self.scene.skip(ticks * self.substeps)
         self.steps += ticks * self.substeps
 
     def unbalanced(self) -> float:
-        """Return the size of the sum of all fingertip forces over the sum of their sizes, in [0,
+        """Return the norm of the sum of all fingertip forces over the sum of their norms, in [0,
         1].
 
-        It is NaN if there are no forces.
+        It is for the last tick, and NaN if there are no forces.
         """
         sizes = float(np.linalg.norm(self.pushes, axis=-1).sum())
         return float(np.linalg.norm(self.pushes.sum(0))) / sizes if sizes > 0.0 else math.nan
 
     @checked
     def ticks(self, seconds: Annotated[float, Range(0.0, 1e6)]) -> int:
-        """Return the number of control ticks in a time `seconds` [s], at least one."""
+        """Return the whole number of control ticks nearest to `seconds` [s], at least one."""
         return max(1, round(seconds / self.period))
 
     def _observe(self, impulse: np.ndarray, moment: np.ndarray, weight: np.ndarray) -> Observation:

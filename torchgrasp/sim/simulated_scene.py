@@ -40,14 +40,23 @@ class StepContacts:
 
 
 class SimulatedScene(abc.ABC):
-    """The interface of a simulated scene: table, object, neighbours and hand.
+    """A simulated scene of one trial: table, object, neighbours and a hand on a mount; `open_scene`
+    makes it.
 
-    Arrays are in the world's axes. The j driven joints are in the order of `joint_names`. `centre`
-    (3,) [m] is the object's centre of mass in its own frame, `timestep` is in seconds. A
-    simulator's subclass sets `joint_names` and the handles of bodies. `body` is the object, `root`
-    the hand's root link, and `neighbours` are the other bodies. `tips` are the links of the f
-    fingertips in the order of the contacts. Then it calls `_map_contacts`, which distinguishes
-    their contacts.
+    Arrays are in the world's frame. The j driven joints are all movable joints of the hand's URDF.
+    f counts the fingertips, in the order of the grasp's contacts.
+
+    Attributes:
+        joint_names: names of the j driven joints, in the order of every array of joints.
+        spec: the parameters of the scene.
+        timestep: time [s] of a step.
+        centre: centre of mass (3,) [m] of the object, in the object's frame.
+        body: the simulator's handle of the object.
+        root: the simulator's handle of the hand's root link.
+        tips: the simulator's handles of the links of the f fingertips.
+        neighbours: the simulator's handles of the other bodies.
+
+    A simulator's subclass sets `joint_names` and the handles, then calls `_map_contacts`.
     """
 
     joint_names: tuple[str, ...]
@@ -137,43 +146,45 @@ class SimulatedScene(abc.ABC):
     def keep(self) -> "Callable[[], SimulatedScene]":
         """Return a function that opens scenes in the present state of this one.
 
-        They continue bitwise as this one does.
+        Each of them continues bitwise as this one does.
         """
 
     @abc.abstractmethod
     def drive(self, targets: np.ndarray) -> None:
-        """Set the `targets` (j,) [rad] of the j driven joints."""
+        """Set the `targets` (j,) [rad or m] of the j driven joints, until the next call."""
 
     @abc.abstractmethod
     def pull(self, force: np.ndarray, torque: np.ndarray = STILL) -> None:
-        """Apply a force (3,) [N] at the object's centre of mass and a torque (3,) [N m].
+        """Apply a `force` (3,) [N] at the object's centre of mass, and a `torque` (3,) [N m].
 
-        They act in this and all later steps.
+        Both are in the world's frame, and act in all later steps until the next call.
         """
 
     @abc.abstractmethod
     def displace(self, shift: np.ndarray) -> None:
-        """Move the object by a displacement `shift` (3,) [m].
+        """Move the object at once by a displacement `shift` (3,) [m] in the world's frame.
 
         This is as if a person pushed the object while the hand approaches.
         """
 
     @abc.abstractmethod
     def joints(self) -> np.ndarray:
-        """Return the positions (j,) [rad] of the driven joints."""
+        """Return the positions (j,) [rad or m] of the j driven joints."""
 
     @abc.abstractmethod
     def jacobian(self, points: np.ndarray) -> np.ndarray:
         """Return the Jacobian (f, 3, j) [m/rad] of one point on each fingertip by the driven
         joints.
 
-        The `points` (f, 3) [m] are in the world's frame.
+        The `points` (f, 3) [m] and the result are in the world's frame. Columns of sliding joints
+        have no unit.
         """
 
     @abc.abstractmethod
     def penetration(self) -> float:
-        """Return the largest depth [m] by which the hand at its start penetrates another body or
-        itself.
+        """Return the largest depth [m] by which the hand penetrates another body or itself.
+
+        It is at most 0 if the hand penetrates nothing. Call it before the first step.
         """
 
     @abc.abstractmethod
@@ -188,14 +199,14 @@ class SimulatedScene(abc.ABC):
 
     @checked
     def lift(self, height: float, speed: float = 0.0) -> None:
-        """Set the mount's target height [m] above its start, and its target speed [m/s]."""
+        """Set the target `height` [m] of the mount above its start, with a `speed` [m/s]."""
         self._move_mount(LIFT_JOINT, height, speed)
 
     @checked
     def approach(self, left: float, speed: float = 0.0) -> None:
         """Set the target of the hand's motion along its approach.
 
-        The target is the distance `left` [m] before the end of the approach; its `speed` is in m/s.
+        The target is the distance `left` [m] before the end of the approach, with a `speed` [m/s].
         """
         self._move_mount(APPROACH_JOINT, -left, speed)
 
@@ -203,7 +214,8 @@ class SimulatedScene(abc.ABC):
     def shift(self, displacement: np.ndarray, velocity: np.ndarray = STILL) -> None:
         """Set the target of the hand's displacement from its path, if the mount yields.
 
-        The target has a `displacement` (3,) [m] and a `velocity` (3,) [m/s].
+        The target has a `displacement` (3,) [m] and a `velocity` (3,) [m/s], both in the world's
+        frame. Raises `BadArgument` for arrays of another shape, or without numbers.
         """
         for name, vector in (("displacement", displacement), ("velocity", velocity)):
             if vector.shape != (3,) or vector.dtype.kind not in "iuf":
@@ -222,9 +234,8 @@ class SimulatedScene(abc.ABC):
         return self._pose(self.body)
 
     def hand_pose(self) -> np.ndarray:
-        """Return the pose (4, 4) [m] of the hand's root link in the world's frame.
-
-        It is valid after the first step.
+        """Return the pose (4, 4) [m] of the hand's root link in the world's frame; valid after the
+        first step.
         """
         return self._pose(self.root)
 

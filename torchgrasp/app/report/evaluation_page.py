@@ -28,7 +28,12 @@ def write_evaluation(
 ) -> Path:
     """Write the HTML page of an evaluation, atomically; return the path.
 
-    `asked` are the settings of the evaluation by name, and `scores` the results of `evaluate`.
+    Args:
+        path: the file to write.
+        title: title of the page.
+        asked: the settings of the evaluation by name, which the page lists.
+        scores: the scores that `evaluate` yielded.
+
     Raises `OutputError` if the file cannot be written.
 
     >>> import tempfile

@@ -40,12 +40,20 @@ ROUGHNESS = 0.6  # of all parts, from 0, a mirror, to 1: that of matt plastic
 def write_glb(
     path: Path | str, hand: Hand, grasp: Grasps, body: "Surface | trimesh.Trimesh"
 ) -> Path:
-    """Write a hand at a single grasp with the object as one GLB file, atomically.
+    """Write a hand at a single grasp, with the object, as one GLB file, atomically; return the
+    path.
 
-    The file is binary glTF 2.0, in metres, with y up. Its nodes have the names of the hand's links,
-    in the colours of their fingers, and "object". The `body` is a mesh [m] in the frame of the
-    grasp, or the estimated surface, which is coloured by its standard deviation. Returns the path.
-    Raises `BadArgument` if there is not exactly one grasp or if it does not touch the mesh,
+    The file is binary glTF 2.0, in metres, with y up. Its nodes are the hand's links by name, in
+    the colours of their fingers, and "object".
+
+    Args:
+        path: the file to write.
+        hand: the hand of the grasp.
+        grasp: a single grasp.
+        body: the object's mesh [m] in the frame of the grasp, or its estimated surface. The surface
+            is coloured by its standard deviation.
+
+    Raises `BadArgument` if there is not exactly one grasp, or if it does not touch the mesh. Raises
     `OutputError` if the file cannot be written.
 
     >>> import tempfile

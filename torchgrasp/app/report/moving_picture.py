@@ -63,24 +63,29 @@ def write_film(
     rate: Rate = 15,
     observer: Callable[[int, int], Any] | None = None,
 ) -> Path:
-    """Write the closing of a grasp, from the approach to the end, as a moving picture, atomically.
+    """Write the closing of a grasp as a moving picture, atomically; return the path.
 
-    The name of the file ends in .gif, or in .mp4, which needs the extra `film` or `ffmpeg` on the
-    search path. It plays at the speed of the simulation, with `rate` pictures each second. One
-    fixed camera takes all pictures, so the lift is visible. Returns the path.
+    It shows the approach, the closing and the lift at the speed of the simulation. One fixed camera
+    takes all pictures, so the lift is visible.
 
     Args:
-        path: the file to write.
+        path: the file to write: .gif or .mp4. An .mp4 needs the extra `film`, or `ffmpeg` on the
+            search path.
         hand: the hand of the grasp.
-        grasp: the single grasp.
-        closure: its closing in simulation.
+        grasp: a single grasp.
+        closure: its closing in simulation, from `close_hand`.
         mesh: the object [m] in the frame of the grasp.
-        direction: from the object to the camera, where z is up; None means across the fingers.
+        direction: direction (x, y, z) from the object to the camera, where z is up. None means
+            across the fingers.
         rate: pictures each second.
-        observer: is called with the number of pictures done and of all.
+        observer: function that is called with the number of pictures done and the number of all
+            pictures.
 
-    Raises `BadArgument` for another kind of file, not exactly one grasp, or a closing longer than a
-    minute; `MissingExtra` for an .mp4 without ffmpeg, `OutputError` if the file cannot be written.
+    Raises:
+        BadArgument: the file is of another kind, there is not exactly one grasp, or the closing is
+            longer than a minute.
+        MissingExtra: ffmpeg is missing for an .mp4.
+        OutputError: the file cannot be written.
 
     >>> write_film("jug.gif", hand, grasp, closure, jug.mesh)  # doctest: +SKIP
     """

@@ -35,10 +35,15 @@ the worst finger.
 
 @checked
 def write_report(path: Path | str, run: Run, view: str = "") -> Path:
-    """Write the report of a run, with its pictures, as one HTML file, atomically.
+    """Write the report of a run, with its pictures, as one HTML file, atomically; return the path.
 
-    `view` is the file name of the 3D page that `write_viewer` wrote beside the report, for a link.
-    Returns the path. Raises `OutputError` if the file cannot be written.
+    Args:
+        path: the file to write.
+        run: the inputs and results that the report shows.
+        view: file name of the 3D page that `write_viewer` wrote beside the report, for a link; ""
+            means no link.
+
+    Raises `OutputError` if the file cannot be written.
 
     >>> import tempfile
     >>> from torchgrasp import ContactSpec, fit_shape, load_hand, load_object

@@ -34,15 +34,20 @@ Index = tuple[str, str, np.ndarray]
 
 @checked
 def write_recording(path: Path | str, run: Run) -> Path:
-    """Write a run as a recording of the viewer Rerun, atomically.
+    """Write a run as a recording of the viewer Rerun, atomically; return the path.
 
-    `rerun FILE.rrd` opens it. Below the entity `world/obj`, the frame of the cloud [m], are
-    `cloud`, `surface` in the colours of its standard deviation, and `contacts` with outward
-    normals. On the timeline `posture`, `plan/hand` goes through approach, pre-grasp, grasp and
-    squeeze of the best grasp. On the timeline `time` [s], `closing/hand` and `closing/object` move
-    as in the simulation. There `closing/forces` are the forces on the object, 1 cm for each newton,
-    and `force/FINGER` [N] are curves. Needs the extra `rerun`. Returns the path. Raises
-    `MissingExtra` without Rerun, `OutputError` if the file cannot be written.
+    `rerun FILE.rrd` opens it. Lengths are in metres. Entities are in the frame of the cloud:
+
+    * `cloud`, `surface` in the colours of its standard deviation, and `contacts` with outward
+      normals.
+    * `plan/hand`, on the timeline `posture`: approach, pre-grasp, grasp and squeeze of the best
+      grasp.
+    * `closing/hand` and `closing/object`, on the timeline `time` [s]: the simulated closing.
+    * `closing/forces`: the forces on the object, 1 cm for each newton; `force/FINGER` [N] are
+      curves.
+
+    Raises `MissingExtra` if Rerun (extra `rerun`) is not installed, and `OutputError` if the file
+    cannot be written.
 
     >>> write_recording("run.rrd", run)  # doctest: +SKIP
     """

@@ -38,24 +38,24 @@ CREEP = 0.01  # fingertips that stick slide more slowly than this [m/s]
 @checked
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """The inputs and results of one planning run, which a report shows.
+    """The inputs and results of one planning run, which reports show; a user makes it.
 
-    Clouds, surface, grasps, mesh and scene are in one frame [m].
+    Cloud, surface, grasps, mesh and scene are in one frame, in metres.
 
     Args:
         object_name: name of the object in titles and sentences.
         source: file of the cloud or the scene.
         cloud: the cloud that was planned on.
         hand: the hand of the grasps.
-        spec: the numbers of the contacts, such as the table and the friction.
+        spec: the constraints on contacts, such as the table and the friction.
         surface: the estimated surface of the object.
         grasps: all grasps of the plan, failed ones included, best first.
         stages: name, result in words and wall time [s] of each stage.
         plan: the contacts that were planned; None if they are unknown.
-        mesh: the true object.
-        closure: result of closing on the true object; only with `mesh`.
-        scene: the scene that the cloud was cut from.
-        explanation: why no grasp is executable, and what would help.
+        mesh: the true object [m]; None if it is unknown.
+        closure: result of closing on the true object, only with `mesh`; None without a closing.
+        scene: the scene that the cloud was cut from; None without a scene.
+        explanation: why no grasp is executable, and what would help; None if it is not asked for.
         costs: sentences on what lowers the predicted success of the best grasp most.
         look: from where a second view would help; None if none is needed.
         command: the command line of the run, or "".
@@ -87,19 +87,21 @@ class Run:
 
     @property
     def title(self) -> str:
-        """The title of the run's pages."""
+        """The title of the run's pages, which names object and hand."""
         return f"Grasps of the {self.object_name} with the {self.hand.name} hand"
 
     @property
     def good(self) -> bool:
-        """Whether the object was held or, without a closing, whether a grasp is executable."""
+        """Whether the object was held in the closing; without a closing, whether a grasp is
+        executable.
+        """
         return bool(self.closure.held) if self.closure is not None else len(self.executable) > 0
 
     def upright(self) -> "Run":
         """Return the run in the upright frame of its cloud and table, where z is up.
 
         A table has the height z = 0 there. `spec` stays as it is. Raises `BadArgument` for a mesh
-        that the grasps do not touch.
+        that the executable grasps do not touch.
         """
         obj_from_upright = upright_frame(self.cloud.points, self.cloud.viewpoint, self.spec.plane)
         upright_from_obj = inverse(obj_from_upright)

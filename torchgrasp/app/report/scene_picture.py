@@ -90,10 +90,15 @@ TEXT = SceneText()
 
 @checked
 def draw_scene(scene: Scene, path: Path | str) -> Path:
-    """Write a picture of a scene as PNG to `path`, and return the path.
+    """Write a picture of a scene as a PNG file; return the path.
 
-    It shows the support, numbered objects, obstacles, unmeasured pixels and a legend. Raises
-    `OutputError` if the file cannot be written.
+    It shows the support, numbered objects, obstacles, unmeasured pixels and a legend.
+
+    Args:
+        scene: the scene.
+        path: the file to write.
+
+    Raises `OutputError` if the file cannot be written.
 
     >>> import tempfile
     >>> from torchgrasp import load_scene

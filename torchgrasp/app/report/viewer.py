@@ -77,13 +77,19 @@ POSTURES = ("approach", "pre-grasp", "grasp", "squeeze")
 
 @checked
 def write_viewer(path: Path | str, run: Run) -> Path:
-    """Write a run as a 3D page in one HTML file, atomically. The page needs WebGL, but no network.
+    """Write a run as a 3D page in one HTML file, atomically; return the path.
 
-    The page shows the cloud, the surface by its standard deviation, a shell at k standard
-    deviations, and the contacts. Each of the best 20 grasps has four postures of the hand, and the
-    motion with the lift. The closing of the first grasp is replayed with its forces. The address may name
-    a state, as in `view.html#grasp=3&posture=squeeze&sigma=2` or `view.html#tick=50`. Returns the
-    path. Raises `OutputError` if the file cannot be written.
+    The page needs WebGL, but no network. It shows the cloud, the surface by its standard deviation,
+    a shell at k standard deviations, and the contacts. Each of the best 20 grasps has four postures
+    of the hand, and the motion with the lift. The closing of the first grasp is replayed with its
+    forces. The address may name a state, as in `view.html#grasp=3&posture=squeeze&sigma=2` or
+    `view.html#tick=50`.
+
+    Args:
+        path: the file to write.
+        run: the inputs and results that the page shows.
+
+    Raises `OutputError` if the file cannot be written.
 
     >>> import tempfile
     >>> from torchgrasp import ContactSpec, fit_shape, load_hand, load_object
@@ -105,10 +111,14 @@ def show_grasps(
 ) -> Path:
     """Write the 3D page of grasps to a temporary file, and open it in the browser; return its path.
 
-    `cloud` is the cloud that was planned on, in any form that `plan_grasps` takes. The surface on
-    the page is estimated anew from it. `hand` is needed for grasps of a hand that is not shipped.
-    With `browser` False the page is only written. Raises `BadArgument` for a cloud that the grasps
-    do not touch.
+    Args:
+        cloud: the cloud that was planned on, in any form that `plan_grasps` takes. The surface on
+            the page is estimated anew from it.
+        grasps: grasps that were planned on the cloud.
+        hand: the hand; None means the shipped hand that the grasps name.
+        browser: whether the page is opened; if False it is only written.
+
+    Raises `BadArgument` for a cloud that the grasps do not touch.
 
     >>> from torchgrasp import load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp
