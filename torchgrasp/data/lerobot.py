@@ -61,7 +61,8 @@ def write_lerobot(folder: Path | str, episodes: Episodes, hand: Hand) -> Path:
     >>> import tempfile
     >>> from torchgrasp import TrialSpec, close_hand, load_hand, load_object
     >>> from torchgrasp.data import load_shipped_grasp
-    >>> jug, grasp, hand = load_object("jug"), load_shipped_grasp("jug", "barrett"), load_hand("barrett")
+    >>> jug, hand = load_object("jug"), load_hand("barrett")
+    >>> grasp = load_shipped_grasp("jug", "barrett")
     >>> closing = close_hand(grasp, hand, jug.mesh, TrialSpec(hold_time=0.1), parts=jug.parts)
     >>> folder = write_lerobot(Path(tempfile.mkdtemp(), "jug"), [("lift the jug", closing)], hand)
     >>> json.loads((folder / "meta" / "info.json").read_text())["features"]["action"]["names"][:3]
@@ -176,7 +177,7 @@ def _numbers(poses: Float[Tensor, "t 4 4"]) -> Float[Tensor, "t 7"]:
 
 
 def _stats(column: Tensor) -> dict[str, list[Any]]:
-    """Return statistics of each number of a feature over all frames, named as LeRobot names them."""
+    """Return statistics of each number of a feature over all frames, named as in LeRobot."""
     x = column.double().reshape(len(column), -1).numpy()
     found = {"min": x.min(0), "max": x.max(0), "mean": x.mean(0), "std": x.std(0)}
     found |= {f"q{q:02d}": np.quantile(x, q / 100.0, axis=0) for q in PERCENTILES}

@@ -135,10 +135,10 @@ def write_objects(
 ) -> list[str]:
     """Make a folder of objects from a folder of mesh files; return the objects' names.
 
-    The names are the names of the files without suffix. Each mesh is moved: its lowest point is then
-    at z = 0, and the middle of its box above the origin. Each view is rendered by the depth camera
-    of `partial_view` from a random side. The manifest is written last, so that a folder with a
-    manifest is complete.
+    The names are the names of the files without suffix. Each mesh is moved: its lowest point is
+    then at z = 0, and the middle of its box above the origin. Each view is rendered by the depth
+    camera of `partial_view` from a random side. The manifest is written last, so that a folder with
+    a manifest is complete.
 
     Args:
         meshes: folder of closed meshes (.ply, .stl, .obj, .off), in metres, with z up.

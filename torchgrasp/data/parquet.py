@@ -33,9 +33,9 @@ def write_parquet(data: GraspShards, folder: Path | str) -> Path:
     """Write a data set as Parquet files with cards in Markdown and Croissant; return the folder.
 
     With the package `datasets`, `load_dataset(folder)` reads a line for each grasp. A line has the
-    numbers of an item of `GraspShards`, with object, view, hand, friction, seed and the status of
-    each try. `load_dataset(folder, "views")` reads a line for each job: its cloud and counts. The
-    joints' names are in the cards, and in the metadata of each file's schema.
+    numbers of an item of `GraspShards`. It also names object, view, hand, friction and seed, and
+    the status of each try. `load_dataset(folder, "views")` reads a line for each job: its cloud and
+    counts. The joints' names are in the cards, and in the metadata of each file's schema.
 
     Args:
         data: the data set, as `read_shards` opens it.

@@ -184,7 +184,8 @@ def load_grasps(path: Path | str) -> Grasps:
 
     >>> import tempfile
     >>> from torchgrasp.data.shipped import load_shipped_grasp
-    >>> load_shipped_grasp("jug", "barrett").save(file := Path(tempfile.mkdtemp(), "grasps.safetensors"))
+    >>> file = Path(tempfile.mkdtemp(), "grasps.safetensors")
+    >>> load_shipped_grasp("jug", "barrett").save(file)
     >>> load_grasps(file).meta["hand"]
     'barrett'
     """

@@ -95,8 +95,8 @@ def close_hand(
         spec: parameters of the trial; None means `TrialSpec()`.
         seed: random seed of the tactile sensors' noise. Friction and mass are drawn by it if the
             `spec` has distributions.
-        error: rigid transform [m] from the hand's planned pose to its true pose, in the frame of
-            the planned hand. The controller does not know it. None means no error.
+        error: rigid transform (4, 4) [m] from the hand's planned pose to its true pose. It is in
+            the frame of the planned hand. The controller does not know it. None means no error.
         parts: convex parts [m] of the mesh. None means the parts of a `GraspObject`, or those that
             `convex_parts` computes.
         table: the true table below the object, in the frame of the grasp. None means a level table
@@ -104,8 +104,9 @@ def close_hand(
         neighbours: other bodies on the table, which the hand may push.
         told: the table that the controller knows, in the frame of the grasp. None means the table
             of the plan (`Grasps.table`).
-        surface: estimated surface of the object (`surface_field`), by which touches show the
-            object's pose. None means the tangent planes of the planned contacts.
+        surface: estimated surface of the object (`surface_field`), in the frame of the grasp. By
+            it, touches show the object's pose. None means the tangent planes of the planned
+            contacts.
         slide: displacement (3,) [m] of the object along the table, in the frame of the grasp. It
             happens halfway through the approach, and the controller does not know it. None means no
             displacement.
@@ -122,8 +123,10 @@ def close_hand(
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> grasp = load_shipped_grasp("jug", "allegro")
     >>> result = close_hand(grasp, "allegro", load_object("jug"), TrialSpec(hold_time=0.2))
-    >>> result.held, result.slip.distance < 0.01, result.disturbance.early, result.trace.forces.shape[1:]
-    (True, True, tensor([False, False, False]), torch.Size([3, 3]))
+    >>> result.held, result.slip.distance < 0.01, result.disturbance.early
+    (True, True, tensor([False, False, False]))
+    >>> result.trace.forces.shape[1:]
+    torch.Size([3, 3])
     """
     check_single(grasp)
     if isinstance(mesh, GraspObject):

@@ -134,8 +134,8 @@ class Protocol(Value):
     def with_trial(self, **changes: Any) -> "Protocol":
         """Return the protocol with some fields of its `trial` replaced.
 
-        `changes` are fields of `TrialSpec` by name. Raises `BadArgument` for an unknown field or a
-        wrong value.
+        `changes` are fields of `TrialSpec` by name. Raises `BadArgument` for a wrong value, and
+        `TypeError` for an unknown field.
 
         >>> find_protocol("tabletop").with_trial(closing="fixed").trial.closing
         'fixed'
@@ -193,8 +193,8 @@ PROTOCOLS = {
 * dexgraspbench: force closure for floating objects (as of BODex, arXiv 2412.16490).
 * dexgraspbench-hard: the same with halved friction, as in Dexonomy (arXiv 2504.18829).
 * pose-noise: the same with errors of the hand's pose.
-* paper: the paper's lift (Sec. 6.5) at friction 0.8; errors of the object's pose stand for a real
-  robot's chance.
+* paper: the paper's lift (Sec. 6.5) at friction 0.8; the object's pose errs at random, as on a real
+  robot.
 * tabletop: a lift by 0.1 m at friction 0.6, held for 2 s while the hand shakes.
 * household: the same at friction 0.8.
 * table-lift: a lift by 0.2 m of 0.249 kg with friction 0.8 at the fingertips and 0.2 at the table,

@@ -73,8 +73,10 @@ def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") ->
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> jug, grasp = load_object("jug"), load_shipped_grasp("jug", "allegro")
     >>> from torchgrasp.evaluation import Truth
-    >>> protocol = dataclasses.replace(find_protocol("dexgraspbench"), pull=PullSpec(10.0, 0.1, 0.05, 0.26))
-    >>> found = pull_grasp(GraspTrial(load_hand("allegro"), grasp, Truth(jug.mesh, jug.parts)), protocol)
+    >>> pull = PullSpec(10.0, 0.1, 0.05, 0.26)
+    >>> protocol = dataclasses.replace(find_protocol("dexgraspbench"), pull=pull)
+    >>> trial = GraspTrial(load_hand("allegro"), grasp, Truth(jug.mesh, jug.parts))
+    >>> found = pull_grasp(trial, protocol)
     >>> found.passed, found.directions
     (True, 6)
     """

@@ -152,9 +152,9 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
     * "gap_mm" [mm]: (median, 95 % quantile) of the largest gaps before any force, or None.
     * "touch": numbers of the verdicts on these gaps (`measure_touch`).
     * "success": how well predicted success fits the outcomes, or None without predictions. "brier"
-      is the mean squared error. "skill" is 1 for perfect predictions and 0 for the mean alone.
-      "auc" is the area under the ROC curve. "error" is the expected calibration error over the
-      "bins".
+      is the mean squared error. "skill" is 1 for perfect predictions, and 0 for always the
+      mean. "auc" is the area under the ROC curve. "error" is the expected calibration error over
+      the "bins".
 
     >>> held = ProtocolResult(0, 0, True, Status.OK, predicted=0.9)
     >>> lost = ViewScore("pen", "view0", 0, 3.0, refusal=Status.OUT_OF_REACH)

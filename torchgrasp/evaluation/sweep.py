@@ -73,7 +73,8 @@ def evaluate(
     >>> folder = Path(tempfile.mkdtemp())
     >>> _ = load_object("cylinder").mesh.export(folder / "tin.ply")
     >>> _ = write_objects(folder, folder / "objects", views=1)
-    >>> scores = evaluate(folder / "objects", load_hand("barrett"), "tabletop", EvaluationSpec(1, starts=10))
+    >>> spec = EvaluationSpec(1, starts=10)
+    >>> scores = evaluate(folder / "objects", load_hand("barrett"), "tabletop", spec)
     >>> [score.executable > 0 for score in scores]
     [True]
     """

@@ -26,7 +26,7 @@ from torchgrasp.hand.kinematics import map_points
 
 @dataclasses.dataclass(frozen=True)
 class PostureNumbers:
-    """Bounds by which a file's posture counts as our hand's, and parameters of the fit of fingers."""
+    """Bounds by which a file's posture counts as our hand's, and parameters of the fingers' fit."""
 
     same_tip: float = 1e-4  # greatest distance [m] of a fingertip from that of the file
     same_joint: float = 1e-3  # greatest difference [rad or m] of a joint that moves no fingertip

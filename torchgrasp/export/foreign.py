@@ -93,7 +93,7 @@ def read_foreign(
     | file | what is read |
     | --- | --- |
     | `.json` of `format_grasps` | joints by name, pose, pre-grasp, table |
-    | `.json` with `pose` and `dofs` (MultiGripperGrasp) | lists of 7 numbers, joints in `order` |
+    | `.json` with `pose`, `dofs` (MultiGripperGrasp) | position, quaternion, joints in `order` |
     | `.npz` with `grasp_qpos` (DexGraspBench) | lines of pose and joints; `pregrasp_qpos`, if any |
     | `.yaml` of `isaac_grasp` 1.0 | pose, joints by name, pre-grasp if any |
 
@@ -114,9 +114,9 @@ def read_foreign(
         quaternion: order of the four numbers after the position in a pose.
         unit_m: length [m] of one unit of the positions in the file.
         root: the frame of the hand whose poses the file has. It is a link of our URDF, or the pose
-            (4, 4) [m] of our root link in the publisher's frame. "" means the link that the file
-            names (`root_link`, `base_link`, or the end of Isaac's `gripper_frame_link`). If it
-            names none, "" means the bench's frame of the Allegro hand, or our root link.
+            (4, 4) [m] of our root link in that frame. "" means the link that the file names
+            (`root_link`, `base_link`, or the end of Isaac's `gripper_frame_link`). If none is
+            named, "" means DexGraspBench's frame of the Allegro hand, or our root link.
 
     Raises:
         ModelFileError: the file is missing or malformed, or its root link is none of ours. Joints

@@ -72,7 +72,7 @@ def read_fields(
         order: byte order of binary data, "<" or ">"; "" means that the data are text.
         last: whether the table ends the data; otherwise anything may follow it.
 
-    Raises `Malformed` for too little data. With `last`, data of a further line raise it, too, and so
+    Raises `Malformed` for too little data. With `last`, data of a further line raise it, too. So
     does a first line of text with a wrong number of values.
     """
     if not 0 <= count <= CLOUD_POINTS:

@@ -1,1 +1,1 @@
-"""What all other folders build on, without robotics: errors, checks, processes, limits. Not public."""
+"""What all other folders build on, without robotics: errors, checks, jobs, limits. Not public."""

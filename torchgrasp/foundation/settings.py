@@ -113,7 +113,7 @@ def _backends() -> tuple[Any, ...]:
 
 
 def _restore_products() -> None:
-    """Set back the precision of products, and that of each backend, unset where it follows another."""
+    """Set back the precision of products and of each backend, unset where it follows another."""
     if _state["products"] is not None:
         torch.set_float32_matmul_precision(_state["products"])
     for part, value in zip(_backends(), _state["backends"], strict=True):

@@ -222,12 +222,11 @@ class Fingertips(Value):
 
     @checked(gradients=True)
     def frames(self, values: Float[Tensor, "j n"]) -> tuple[Frames, Float[Tensor, "3 4 f n"]]:
-        """Return the poses [m] of the m links of `chains` (3, 4, m, n), then of the f carriers (3,
-        4, f, n).
+        """Return the poses [m] of the m links of `chains`, then the poses [m] of the f carriers.
 
-        `values` (j, n) [rad or m] are the positions of all j movable joints of the URDF, in n
-        postures. The poses are in the palm's frame. Raises `BadArgument` for a wrong number of
-        joints.
+        The shapes are (3, 4, m, n) and (3, 4, f, n), in n postures. `values` (j, n) [rad or m] are
+        the positions of all j movable joints of the URDF. The poses are in the palm's frame. Raises
+        `BadArgument` for a wrong number of joints.
         """
         if len(values) != (every := len(self.chains.joint_names)):
             raise BadArgument("values", f"{len(values)} joints", f"all {every} joints of the URDF")

@@ -119,11 +119,11 @@ class KinematicTree(Value):
     def joint_axes(
         self, poses: Float[Tensor, "*b l 4 4"]
     ) -> tuple[Float[Tensor, "*b j 3"], Float[Tensor, "*b j 3"]]:
-        """Return the unit axis of each joint, then the origin [m] of the link that it moves, each
-        (*b, j, 3).
+        """Return the unit axis of each joint, then the origin [m] of the link that it moves.
 
-        `poses` (*b, l, 4, 4) [m] are poses of the l links in any one frame, as `poses` returns
-        them. Axes and origins are in the same frame. Each origin lies on the axis of its joint.
+        Both are (*b, j, 3). `poses` (*b, l, 4, 4) [m] are poses of the l links in any one frame, as
+        `poses` returns them. Axes and origins are in the same frame. Each origin lies on the axis
+        of its joint.
         """
         frames = poses.reshape(-1, *poses.shape[-3:])[..., :3, :].permute(2, 3, 1, 0)
         child = frames.index_select(2, self.child)  # (3, 4, j, n)

@@ -125,7 +125,7 @@ class MujocoScene(SimulatedScene):
         return reopen
 
     def drive(self, targets: np.ndarray) -> None:
-        """Set the `targets` (j,) [rad] of the j driven joints."""
+        """Set the `targets` (j,) [rad or m] of the j driven joints."""
         self.data.ctrl[self.motors] = targets
 
     def pull(self, force: np.ndarray, torque: np.ndarray = STILL) -> None:
@@ -142,7 +142,7 @@ class MujocoScene(SimulatedScene):
         self._mujoco.mj_step1(self.model, self.data)
 
     def joints(self) -> np.ndarray:
-        """Return the positions (j,) [rad] of the driven joints."""
+        """Return the positions (j,) [rad or m] of the driven joints."""
         return self.data.qpos[self._positions]
 
     def jacobian(self, points: np.ndarray) -> np.ndarray:

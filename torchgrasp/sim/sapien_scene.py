@@ -150,7 +150,7 @@ class SapienScene(SimulatedScene):
 
     @_noted
     def drive(self, targets: np.ndarray) -> None:
-        """Set the `targets` (j,) [rad] of the j driven joints."""
+        """Set the `targets` (j,) [rad or m] of the j driven joints."""
         for joint, target in zip(self._driven, targets.tolist(), strict=True):
             joint.set_drive_target(target)
 
@@ -171,7 +171,7 @@ class SapienScene(SimulatedScene):
         self.body.entity.set_pose(sapien.Pose(pose.p + shift, pose.q))
 
     def joints(self) -> np.ndarray:
-        """Return the positions (j,) [rad] of the driven joints."""
+        """Return the positions (j,) [rad or m] of the driven joints."""
         return np.asarray(self.hand.get_qpos(), float)[self._places]
 
     def jacobian(self, points: np.ndarray) -> np.ndarray:

@@ -35,7 +35,8 @@ def open_scene(spec: SceneSpec, simulator: Simulator = "sapien") -> SimulatedSce
     >>> from torchgrasp import load_hand, load_object
     >>> jug, hand = load_object("jug"), load_hand("barrett")
     >>> start, tips = dict.fromkeys(hand.tree.joint_names, 0.1), hand.tips.links
-    >>> spec = SceneSpec(hand.urdf_path, np.eye(4), start, hand.actuators, tips, jug.mesh, jug.parts, mass=0.2)
+    >>> body = jug.mesh, jug.parts, 0.2
+    >>> spec = SceneSpec(hand.urdf_path, np.eye(4), start, hand.actuators, tips, *body)
     >>> open_scene(spec).object_pose().shape
     (4, 4)
     """

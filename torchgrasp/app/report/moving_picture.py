@@ -171,7 +171,7 @@ def _draw(
     poses = link_poses(hand, closure.joints[ticks], closure.joint_names, hand_pose)
     solids = solids_of_links(hand)
     turned = to_array(poses)  # (n, l, 4, 4)
-    # one camera for all pictures sees the hand at both ends of its way, and the object near its place
+    # one camera for all pictures sees the hand at both ends of its way, and the object's place
     corners = [x for x in places if np.abs(x - places[0]).mean(0).max() < MOVIE.near]
     for k in (0, len(ticks) // 2, -1):
         for solid in solids:
@@ -195,7 +195,7 @@ def _draw(
 
 
 def _encode_gif(pictures: list[UInt8[np.ndarray, "h w 3"]], rate: int) -> bytes:
-    """Return the bytes of a GIF that repeats for ever, in which all pictures share their colours."""
+    """Return the bytes of a GIF that repeats for ever; all pictures share their colours."""
     sampled = pictures[:: max(1, len(pictures) // MOVIE.samples)]
     palette = Image.fromarray(np.concatenate(sampled)).quantize(MOVIE.colors)
     plain = Image.Dither.NONE  # dots that flicker would look worse than bands
