@@ -49,44 +49,51 @@ OF_URDF = SLOW - {"skimage", "sklearn"} | {"PIL"}
 """What yourdfpy and the used modules of pytorch-kinematics import."""
 
 
-@pytest.mark.promise("F9")
-@pytest.mark.parametrize(
-    ("code", "needed"),
-    [
-        ("import torchgrasp", set()),
-        (
-            "import torchgrasp; [torchgrasp.load_hand(name) for name in ('allegro', 'shadow')]",
-            OF_URDF,
-        ),
-        (
-            "import torchgrasp.app.cli as cli\ntry: cli.main(['--help'])\nexcept SystemExit: pass",
-            set(),
-        ),
-    ],
-    ids=["import", "load_hand", "help"],
-)
-def test_a_start_brings_in_nothing_that_simulates_draws_or_is_slow_to_import(code, needed):
+MODULES = "import sys; print(*sys.modules)"
+"""Code that prints what is imported."""
+
+
+def assert_light(modules: str, needed: frozenset[str] = frozenset()) -> None:
     """What is heavy is imported by the function that needs it."""
-    end = "import sys; print(*(m.split('.')[0] for m in sys.modules))"
-    loaded = set(run_python("-c", f"{code}\n{end}").stdout.splitlines()[-1].split())
+    loaded = {name.split(".")[0] for name in modules.split()}
     assert "torchgrasp" in loaded
     assert not loaded & (SIMULATORS | DRAWERS | SLOW) - needed
 
 
-@pytest.mark.parametrize("words", ["import *", "import build_chain_from_mjcf"])
-def test_a_caller_finds_the_whole_pytorch_kinematics_after_a_hand_is_loaded(words):
+@pytest.mark.promise("F9")
+def test_help_brings_in_nothing_that_simulates_draws_or_is_slow_to_import():
+    """Nor does it bring in the tools of agents."""
+    code = "import torchgrasp.app.cli as cli\ntry: cli.main(['--help'])\nexcept SystemExit: pass\n"
+    modules = run_python("-c", code + MODULES).stdout.splitlines()[-1]
+    assert_light(modules)
+    assert "torchgrasp.app.cli" in modules.split() and ".agent_" not in modules
+
+
+@pytest.mark.promise("F9")
+def test_a_hand_brings_in_little_and_leaves_the_whole_pytorch_kinematics_to_its_caller():
+    """Each way of importing is tried in a copy of the process, after the hands are loaded."""
     code = f"""
-import torchgrasp
-hand = torchgrasp.load_hand("barrett")
-from pytorch_kinematics {words}
-import pytorch_kinematics as kinematics
-assert isinstance(hand.chain, kinematics.Chain) and kinematics.PseudoInverseIK
-print(build_chain_from_mjcf.__module__, type(kinematics).__name__)
+import os, torchgrasp
+hand = [torchgrasp.load_hand(name) for name in ("allegro", "shadow", "barrett")][-1]
+{MODULES}
+for words in ("*", "build_chain_from_mjcf"):
+    if child := os.fork():
+        assert os.waitpid(child, 0)[1] == 0
+        continue
+    exec(f"from pytorch_kinematics import {{words}}")
+    import pytorch_kinematics as kinematics
+    assert isinstance(hand.chain, kinematics.Chain) and kinematics.PseudoInverseIK
+    print(build_chain_from_mjcf.__module__, type(kinematics).__name__, flush=True)
+    os._exit(0)
 """
-    assert run_python("-c", code).stdout == "pytorch_kinematics.mjcf module\n"
+    found = run_python("-u", "-c", code)
+    modules, *told = found.stdout.splitlines()
+    assert_light(modules, frozenset(OF_URDF))
+    assert told == ["pytorch_kinematics.mjcf module"] * 2, found.stderr
 
 
-def test_import_changes_no_global_state_and_writes_no_file(tmp_path, monkeypatch):
+@pytest.mark.promise("F9")
+def test_import_is_light_changes_no_global_state_and_writes_no_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     code = """
 import logging, os, random, warnings
@@ -103,8 +110,10 @@ for a, b in zip(before, state(), strict=True):
     assert same if isinstance(same, bool) else bool(same.all()), (a, b)
 print("same")
 """
-    found = run_python("-c", code)
-    assert found.stdout == "same\n" and list(tmp_path.iterdir()) == [], found.stderr
+    found = run_python("-c", code + MODULES)
+    same, modules = found.stdout.splitlines()
+    assert same == "same" and list(tmp_path.iterdir()) == [], found.stderr
+    assert_light(modules)
 
 
 @pytest.mark.promise("H4")
