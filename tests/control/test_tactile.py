@@ -16,6 +16,7 @@ from torchgrasp.control.tactile import (
     measure,
     no_contact,
 )
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.linalg import unit
 
 NORMALS = torch.tensor([[1.0, 0, 0], [0, 0.6, 0.8], [0, 0, -1]], dtype=torch.float64)
@@ -122,3 +123,8 @@ def test_contact_flag_has_hysteresis_and_measure_repeats_itself_by_seed():
     assert torch.equal(first.reading, second.reading) and torch.equal(first.points, second.points)
     assert not torch.equal(first.reading, other.reading)
     assert torch.equal(before, torch.random.get_rng_state())
+
+
+def test_measure_refuses_contacts_of_another_number_of_fingertips():
+    with pytest.raises(BadArgument, match="expected 4, as the tactile state, got 3 fingertips"):
+        measure(no_contact(fingers=4), press(1.0), NORMALS, RADIUS, period=0.01)

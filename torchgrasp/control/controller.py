@@ -43,33 +43,43 @@ CLOSING_TIME = 4.0
 
 
 class GraspController:
-    """Controller that closes a hand and holds the object: each `step` maps an observation to
+    """Controller that closes a hand on an object and holds it. Each `step` maps an `Observation` to
     `Targets`, on the CPU.
 
-    A closing controller brings the fingers to the object, then a hold controller presses. After
-    `PRESSING_TIME` of pressing, `closed` becomes true: the hand may be lifted, but `step` must
-    still be called. A plan that includes the table allows another closing, if the grasp seems too
-    weak to lift the object. Then the hand opens, locates the object from its touches and closes
-    again; `attempts` counts the closings.
+    A closing controller brings the fingers to the object, then a hold controller presses. After the
+    time `PRESSING_TIME` [s] of pressing, `closed` becomes true. The hand may then be lifted, but
+    `step` must still be called.
+
+    A plan that includes the table allows another closing, if the grasp seems too weak to lift the
+    object. Then the hand opens, locates the object from its touches and closes again.
 
     With `approach` > 0 the opened hand starts away from its pre-grasp, the pose from which the
     fingers close. While `approaching`, a robot arm must keep the hand at the distance
-    `Targets.left` from the pre-grasp; `stops` counts the stops at an unexpected touch. A new view
-    of the object (`relook`) moves this path.
+    `Targets.left` from the pre-grasp. A new view of the object (`relook`) moves this path.
 
     Args:
-        reference: the closing plan.
+        reference: the closing plan (`ClosingReference.from_grasp`).
         closing: the closing mode, such as "uncertainty" or "paper"; `TrialSpec` explains all.
         holding: the holding mode, such as "grip" or "force"; `TrialSpec` explains all. None means
             "grip", or "force" where the closing mode or the sensor does not allow "grip".
-        options: options of the closing; None means all on, or all off for a mode without options.
-        approach: remaining length [m] of the approach; it is 0 if the hand is at its pre-grasp.
+        options: options of the closing. None means `ClosingOptions()`, or all off for a mode
+            without options.
+        approach: remaining length [m] of the approach; 0 means that the hand is at its pre-grasp.
 
-    Raises:
-        BadArgument: unknown modes; options or the holding "law" for a closing mode that does not
-            allow them; "impedance" for more than three fingertips; modes that need more than the
-            sensor measures; an approach whose options allow no stops, or whose plan lacks a table,
-            a surface or tactile fingertips.
+    Attributes:
+        reference: the closing plan, at the object as the last view showed it.
+        targets: the present `Targets`.
+        attempts: number of closings so far.
+        stops: number of stops of the approach at an unexpected touch.
+
+    Raises `BadArgument` for:
+
+    * unknown modes;
+    * options or the holding "law" for a closing mode that does not allow them;
+    * "impedance" for more than three fingertips;
+    * modes that need more than the sensor measures;
+    * an approach whose options allow no stops;
+    * an approach whose plan lacks a direction, a table, a surface or tactile fingertips.
     """
 
     @checked
@@ -130,41 +140,49 @@ class GraspController:
 
     @property
     def closed(self) -> bool:
-        """Whether the hand has closed and pressed long enough, so that it may be lifted."""
+        """Whether the hand has closed and pressed long enough, so that it may be lifted.
+
+        With another closing allowed, it also must not seem too weak to lift the object.
+        """
         if not self.closing.feels:
             return self.closing.done
         return self.pressed >= PRESSING_TIME - EARLY and (self.check is None or self.check.secure)
 
     @property
     def status(self) -> Status:
-        """The hold's status: `OK`, or `TOO_HEAVY` if the mode "grip" senses more load than the hand
-        can hold.
+        """Whether the hand can hold the object: `OK`, or `TOO_HEAVY`.
 
-        The hand should then set the object down.
+        `TOO_HEAVY` means that the mode "grip" senses more load than the hand can hold. The hand
+        should then set the object down. In other modes the status is always `OK`.
         """
         return self.hold.status if isinstance(self.hold, GripHold) else Status.OK
 
     @property
     def friction(self) -> Distribution | None:
-        """What the touches leave of the plan's friction (`FrictionEstimate`); None unless the hand
-        holds in the mode "grip".
+        """The coefficients of friction that the touches still allow, of those of the plan.
+
+        Fingertips that stick and slide bound the friction. If they leave nothing of the plan's
+        friction, the result is what the touches alone show. None unless the hand holds in the mode
+        "grip".
         """
         return self.hold.friction.posterior if isinstance(self.hold, GripHold) else None
 
     @property
     def mass(self) -> Distribution | None:
-        """The mass [kg] that the felt load shows; None unless the mode "grip" carries a steady
-        load.
+        """The mass [kg] of the object that the felt load shows.
+
+        None unless the hand holds in the mode "grip" and its load is steady. A load that is too
+        heavy bounds the mass below only.
         """
         return self.hold.mass if isinstance(self.hold, GripHold) else None
 
     @property
     def blend(self) -> Float[Tensor, " f"]:
-        """Share of force control (f,) of each finger at the last tick, from 0 to 1: lambda in Eq.
-        (26) of the paper.
+        """The share of force control (f,) of each finger at the last tick, from 0 to 1: lambda in
+        Eq. (26) of the paper.
 
-        The shares are NaN before the first tick, and at ticks at which the control law does not
-        command the fingers.
+        It is NaN before the first tick, and at ticks at which the control law does not command the
+        fingers.
         """
         acts = self.hold is None and self.reopening is None and self.time > 0.0
         if acts and isinstance(self.closing, LawClosing):
@@ -173,8 +191,10 @@ class GraspController:
 
     @property
     def displacement(self) -> Float[Tensor, "4 4"]:
-        """Displacement [m] of the object that the touches show, a rigid transform in the frame of
-        the planned hand.
+        """The displacement (4, 4) [m] of the object that the touches show.
+
+        It is a rigid transform in the frame of the planned hand, from the planned to the present
+        object. It is the identity for closing modes without pose estimate.
         """
         closing = self.closing
         if not isinstance(closing, UncertaintyClosing):
@@ -186,8 +206,10 @@ class GraspController:
 
     @property
     def object_motion(self) -> Float[Tensor, "4 4"]:
-        """Motion [m] of the object since the plan, as a view (`relook`) and the touches show it: a
-        rigid transform in the frame of the grasp.
+        """The motion (4, 4) [m] of the object since the plan, as a view (`relook`) and the touches
+        show it.
+
+        It is a rigid transform in the frame of the grasp, from the planned to the present object.
         """
         straight = torch.eye(3, dtype=torch.float64)
         placed = self.planned.obj_from_hand @ rigid(straight, self.path)
@@ -200,7 +222,7 @@ class GraspController:
         `targets.palm` [m] then is the displacement at which the new path begins. The palm does not
         rotate, so the contacts of a turned object are found by touch.
 
-        The `cloud` has points [m] of the object alone, in the frame of the grasp. Raises
+        `cloud` holds points [m] of the object alone, in the frame of the grasp. Raises
         `BadArgument` if the hand has no approach, or has begun it.
         """
         reference = self.planned
@@ -219,12 +241,17 @@ class GraspController:
 
     @checked
     def step(self, observation: Observation, period: Period) -> Targets:
-        """Return the targets of joints [rad] and palm [m] for the next tick, which comes `period`
-        [s] later.
+        """Return the targets of joints and palm for the next tick.
 
         In the tick in which the closing ends, the targets do not change: this tick only prepares
-        the hold. Raises `BadArgument` for an observation of another hand or on a device other than
-        the CPU, or a period out of range.
+        the hold.
+
+        Args:
+            observation: what the hand measures now (`observe`), on the CPU.
+            period: time [s] until the next tick.
+
+        Raises `BadArgument` for an observation of another hand or on another device, or a period
+        out of range.
         """
         shape = len(self.reference.normals), 3, len(self.targets.joints)
         found = tuple(observation.jacobian.shape)

@@ -99,14 +99,27 @@ class Squeeze(NamedTuple):
 def squeeze(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None = None) -> Squeeze:
     """Return joint targets with which position-controlled fingers press at their planned contacts.
 
-    The targets solve J^T f = kp (target - q) for the `desired_forces` f. They may exceed a joint's
-    limits. They are differentiable in the joints of the grasps; the forces, found by a search, are
-    not differentiable in the contacts.
+    The result has three fields, for g grasps, h actuated joints and f fingertips:
 
-    `force` [N] is the normal force of the strongest finger, `kp` [N m/rad] the stiffness of every
-    joint's drive, None means the hand's own. The hand follows the grasps to their device. Raises
-    `BadArgument` for joints or fingers of another hand, a force or stiffness that is not positive,
-    or contacts or poses that require gradients.
+    * `joints` (g, h) [rad or m]: targets of the actuated joints, which may exceed their limits.
+    * `forces` (g, f, 3) [N]: balanced forces of the fingertips on the object, in the hand's frame.
+    * `torques` (g, h) [N m or N]: efforts of the actuated joints that exert these forces.
+
+    The targets solve J^T f = kp (target - q). Here q are the joints of the grasp, f the forces, and
+    J the Jacobian of the contacts. The targets are differentiable in the joints of the grasps. The
+    forces, found by a search, are not differentiable in the contacts.
+
+    Args:
+        hand: the hand of the grasps; it follows the grasps to their device.
+        grasps: the grasps.
+        force: normal force [N] of the strongest finger.
+        kp: stiffness [N m/rad] of every joint's drive; None means the hand's own.
+
+    Raises `BadArgument` for:
+
+    * joints or fingers of another hand;
+    * a `force` outside [0.01, 100] N, or a stiffness that is not positive;
+    * contacts or poses that require gradients.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp

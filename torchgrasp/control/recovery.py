@@ -388,13 +388,25 @@ class Reopening:
 
 
 class LiftCheck:
-    """Check of a closed hand that rises and holds: `lost` becomes true, and stays so, when it loses
-    the object.
+    """Check of a closed hand that rises and holds. `lost` becomes true, and stays so, when the hand
+    loses the object, or surely will.
 
-    The object is lost if fewer than two fingertips touch, and the fingertips carry hardly any load
-    along the table's normal. The hand will lose the object if two fingertips slide along it in the
-    first 20 mm of the lift. The load does not count for binary sensors, or without a table. Broken
-    sensors count as touching.
+    That is at the first of two events; the bounds are fields of `LOST` (module `recovery`):
+
+    * At a height of at least `first` [m], fewer than two fingertips touch. Their load along the
+      table's normal is below `load` [N].
+    * Two fingertips have each slid by more than `slip` [m], up to the height `low` [m].
+
+    The load does not count for binary sensors, or without a table. Broken sensors count as
+    touching.
+
+    Args:
+        reference: the closing plan of the grasp (`ClosingReference.from_grasp`).
+
+    Attributes:
+        lost: whether the object is lost, or surely will be.
+
+    Raises `BadArgument` if the plan's sensor names an unknown finger as dead.
     """
 
     @checked
@@ -409,8 +421,12 @@ class LiftCheck:
     def __call__(
         self, observation: Observation, height: float, period: Annotated[float, Range(1e-5, 1.0)]
     ) -> bool:
-        """Return `lost` at the end of a tick of `period` [s], in which the hand has risen to
-        `height` [m].
+        """Return whether the object is lost (`lost`) at the end of a tick of the lift.
+
+        Args:
+            observation: what the hand measures at the end of the tick (`observe`).
+            height: height [m] to which the hand has risen.
+            period: length [s] of the tick.
         """
         tactile = observation.tactile
         if height <= LOST.low:

@@ -33,31 +33,34 @@ from torchgrasp.values.specs import ContactSpec
 @checked
 @dataclasses.dataclass(frozen=True)
 class ClosingReference(Value):
-    """The plan for closing a hand on one grasp, in the frame of the planned hand (its root link).
+    """The plan for closing a hand on one grasp.
 
-    Joints are the actuated joints [rad], unless said otherwise.
+    `from_grasp` makes it. f counts fingertips, h actuated joints, and j all joints of the URDF. All
+    is in the frame of the planned hand, its root link, except for `obj_from_hand` and `surface`.
+    Joints that slide have [m] in place of [rad], and their drives [N/m].
 
     Args:
         hand: the hand, in float64.
-        kp: stiffness of every joint's drive [N m/rad], in the order of `hand.tree.joint_names`.
-        obj_from_hand: planned pose of the hand in the frame of the grasp [m].
-        pregrasp: joints of the opened hand.
-        joints: joints of the grasp.
-        squeeze: joint targets that press on the object without feedback, from
-            `torchgrasp.control.squeeze`.
-        normals: outward unit normals of the planned contacts.
-        gains: targets, controller gains and desired forces (`ClosingGains`) of the closing
-            "uncertainty"; the method `as_printed` returns a plan with those of Eqs. (26) and (27).
-        approach: unit vector along which the opened hand moves to its pre-grasp; None means no
+        kp: stiffness (j,) [N m/rad] of every joint's drive, in the order of
+            `hand.tree.joint_names`.
+        obj_from_hand: planned pose (4, 4) [m] of the hand in the frame of the grasp.
+        pregrasp: actuated joints (h,) [rad or m] of the opened hand.
+        joints: actuated joints (h,) [rad or m] of the grasp.
+        squeeze: targets (h,) [rad or m] of the actuated joints that press on the object without
+            feedback, from `torchgrasp.control.squeeze`.
+        normals: outward unit normals (f, 3) of the planned contacts.
+        gains: targets, controller gains and desired forces of the closing "uncertainty"
+            (`ClosingGains`). `as_printed` returns a plan with the gains of Eqs. (26) and (27).
+        approach: unit vector (3,) along which the opened hand moves to its pre-grasp; None means no
             approach.
         table: the table, which no fingertip enters while it searches; None if it is unknown.
-        surface: estimated surface of the object in the frame of the grasp (`surface_field`), with
-            which touches are compared to locate the object. None means that the tangent planes of
+        surface: estimated surface of the object (`surface_field`) in the frame of the grasp.
+            Touches are compared with it to locate the object. None means that the tangent planes of
             the contacts are used.
         sensor: sensors of the fingertips.
         max_force: largest normal force [N] of a fingertip; None means no limit.
-        distance_variance: variance [m^2] of the signed distance at each contact (f_cov in Eq. 12 of
-            the paper); None if it is unknown. The closing "paper" needs it.
+        distance_variance: variance (f,) [m^2] of the signed distance at each contact (f_cov in Eq.
+            12 of the paper). The closing "paper" needs it. None if it is unknown.
         friction: coefficient of friction that the grasp was planned for, or its `Distribution`.
     """
 
@@ -89,18 +92,26 @@ class ClosingReference(Value):
     ) -> "ClosingReference":
         """Return the closing plan of one grasp, in float64 on the CPU.
 
+        Its `table` and `surface` are None, and its `sensor` is the default. Set them with
+        `dataclasses.replace`.
+
         Args:
-            hand: the hand.
-            grasp: a single grasp, planned for the hand.
-            force: normal force of the strongest finger [N].
-            kp: stiffness of every joint's drive [N m/rad]; None means the hand's own.
+            hand: the hand of the grasp.
+            grasp: a single grasp, such as `grasps[0]`.
+            force: normal force [N] of the strongest finger.
+            kp: stiffness [N m/rad] of every joint's drive; None means the hand's own.
             stability: model that chooses among balanced forces of nearly equal friction, and gives
                 the covariance of the forces (`load_stability`). With None, the standard deviation
                 of a force is a tenth of it.
 
-        Raises `BadArgument` for not exactly one grasp, or for joints or fingers of another hand.
-        The same is raised for a force or stiffness that is not positive, joints beyond their
-        limits, or numbers in the grasp that are not finite.
+        Raises `BadArgument` for:
+
+        * not exactly one grasp, or a grasp of another hand or other fingers;
+        * joints beyond their limits, or numbers in the grasp that are not finite;
+        * contacts without `std_m`;
+        * a `force` outside [0.01, 100] N, or a stiffness that is not positive;
+        * a friction in its metadata that may be 0;
+        * a `stability` for other than three fingers.
         """
         check_single(grasp)
         finger_forces.check_same_hand(hand, grasp)
@@ -162,8 +173,8 @@ class ClosingReference(Value):
     def as_printed(self) -> "ClosingReference":
         """Return the same plan with the gains of the closing "paper".
 
-        Sigma_cov and K_P are those of Eqs. (26) and (27) as the paper prints them. Raises
-        `BadArgument` if the plan lacks `distance_variance`.
+        The covariance and the position gains are those of Eqs. (26) and (27) as the paper prints
+        them. Raises `BadArgument` if `distance_variance` is None.
         """
         if self.distance_variance is None:
             found = "'paper' without f_cov, the variance of the signed distance [m^2]"
@@ -177,25 +188,31 @@ class ClosingReference(Value):
 
     @checked
     def expand(self, actuated: Annotated[Float[Tensor, " h"], ANY]) -> Float[Tensor, " j"]:
-        """Return the positions [rad] of all joints of the URDF, in their order, given the actuated
-        joints [rad].
+        """Return the positions (j,) [rad or m] of all joints of the URDF.
 
-        NaN is allowed.
+        `actuated` (h,) [rad or m] are the actuated joints. The result is in the order of
+        `hand.tree.joint_names`. NaN is passed on, unlike in `ActuatedJoints.expand`. Raises
+        `BadArgument` for another number of joints.
         """
         return self.hand.actuated.coupling @ actuated + self.hand.actuated.offset
 
     @checked
     def pick(self, joints: Annotated[Float[Tensor, " j"], ANY]) -> Float[Tensor, " h"]:
-        """Return the actuated joints [rad], given the positions [rad] of all joints of the URDF.
+        """Return the actuated joints (h,) [rad or m].
 
-        NaN is allowed.
+        `joints` (j,) [rad or m] are the positions of all joints of the URDF. NaN is passed on.
+        Raises `BadArgument` for another number of joints.
         """
         return joints[self._actuated]
 
     @kept
     def rise(self) -> Float[Tensor, "3"]:
-        """Displacement [m] of the opened hand from its planned pose before it closes, so that no
-        link is in the table.
+        """The displacement (3,) [m] of the opened hand before it closes, which lifts all links out
+        of the table.
+
+        It is in the frame of the planned hand. It is 0 without a table, and if no link is in the
+        table. It is also 0 for a hand that would have to rise by more than `MOTION.most` [m]
+        (`ik.opened_pose`).
         """
         planned = torch.eye(4, dtype=torch.float64)[None]
         return opened_pose(self.hand, self.pregrasp[None], planned, self.table)[0, :3, 3]
@@ -207,9 +224,9 @@ class ClosingReference(Value):
 
     @property
     def alive(self) -> Bool[Tensor, "f"]:
-        """Mask of the fingertips whose sensor works.
+        """The mask (f,) of the fingertips whose sensor works: those not in `sensor.dead`.
 
-        Raises `BadArgument` if the plan names an unknown finger.
+        Raises `BadArgument` if `sensor.dead` names an unknown finger.
         """
         names = self.hand.finger_names
         dead = self.sensor.dead
@@ -219,13 +236,18 @@ class ClosingReference(Value):
 
     @checked
     def clamp(self, actuated: Float[Tensor, " h"]) -> Float[Tensor, " h"]:
-        """Return the `actuated` joints [rad] clamped to their limits."""
+        """Return the `actuated` joints (h,) [rad or m] clamped to their limits.
+
+        Raises `BadArgument` for another number of joints, or numbers that are not finite.
+        """
         return torch.minimum(torch.maximum(actuated, self.hand.lower), self.hand.upper)
 
     @checked
     def contact_points(self, tips: Float[Tensor, "f 3"]) -> Float[Tensor, "f 3"]:
-        """Return the points [m] where fingertips would touch: one tip radius from their centres
-        `tips` [m], against the normals.
+        """Return the points (f, 3) [m] where fingertips would touch the object.
+
+        Each is one tip radius from the centre of its fingertip, against the planned normal. `tips`
+        (f, 3) [m] are the centres, in the frame of the planned hand.
         """
         return tips - self.hand.tips.radius[:, None] * self.normals
 
@@ -319,9 +341,16 @@ def closing_gains(
     """Return the target, gains and desired force of each finger for one grasp, in the hand's frame.
 
     The gains are those of the closing "uncertainty"; `ClosingReference.as_printed` has those that
-    the paper prints. `force` [N] is the normal force of the strongest finger. `stability` is a
-    model that chooses among balanced forces, or None. Errors are those of
-    `ClosingReference.from_grasp`.
+    the paper prints.
+
+    Args:
+        grasp: a single grasp, such as `grasps[0]`.
+        hand: the hand of the grasp.
+        force: normal force [N] of the strongest finger.
+        stability: model that chooses among balanced forces of nearly equal friction
+            (`load_stability`); None means no model.
+
+    Raises the errors of `ClosingReference.from_grasp`.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp

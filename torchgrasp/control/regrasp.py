@@ -100,22 +100,22 @@ class GraspTry:
     closed. In each tick of the lift it asks `fails`. If so, it lowers the hand, sends the targets
     of `withdraw`, and goes on with `next`.
 
+    Args:
+        grasps: the grasps in the order of preference.
+        start: function that returns the `GraspController` of a single grasp.
+        surface: estimated surface of the object (`surface_field`) in the frame of the grasps, by
+            which the next grasp is chosen; None if it is unknown.
+        tried: indices of the grasps that were tried, with the grasp of this try at the end.
+        moved: motion (4, 4) [m] of the object, as in the attribute; None means no motion.
+
     Attributes:
         row: index of the grasp of this try.
         controller: the controller of this grasp.
-        moved: motion [m] of the object since the grasps were planned, as far as it is known: a
-            rigid transform (4, 4) in the frame of the grasps. Views and surfaces of later tries are
-            in the frame that has moved with the object.
+        moved: motion (4, 4) [m] of the object since the grasps were planned, as far as it is known.
+            It is a rigid transform in the frame of the grasps. Views and surfaces of later tries
+            are in the frame that has moved with the object.
 
-    Args:
-        grasps: the grasps in the order of preference.
-        start: function that returns the controller of a single grasp.
-        surface: estimated surface of the object in the frame of the grasps, by which `next_grasp`
-            chooses; None if it is unknown.
-        tried: rows that were tried, with the one of this try at the end.
-        moved: the attribute; None means no motion.
-
-    Raises `BadArgument` if a row of `tried` is none of the grasps.
+    Raises `BadArgument` if `tried` is empty, or an index in it is none of the grasps.
     """
 
     @checked
@@ -140,14 +140,18 @@ class GraspTry:
 
     @property
     def obj_from_hand(self) -> Float[Tensor, "4 4"]:
-        """Where the hand shall close: its pose [m] in the frame of the grasps, at the moved
+        """The pose (4, 4) [m] at which the hand closes, in the frame of the grasps, at the moved
         object.
         """
         return self.moved @ self.grasps.obj_from_hand[self.row].to(self.moved)
 
     @property
     def others(self) -> Int[Tensor, "k"]:
-        """Indices of the grasps that are left to try (`list_others`)."""
+        """The indices (k,) of the grasps that are left to try.
+
+        A grasp is left if it differs from each tried grasp. Its approach then differs by more than
+        `REGRASP.turn` [rad], or its contacts by more than `REGRASP.gap` [m].
+        """
         return list_others(self.grasps, self.tried)
 
     @property
@@ -164,10 +168,14 @@ class GraspTry:
     def fails(
         self, observation: Observation, height: Annotated[float, Range(-1.0, 10.0)], period: Period
     ) -> bool:
-        """Return whether the lift has `failed`, and shall end.
+        """Return whether the lift has `failed`, and must end.
 
-        It is called at the end of each tick of `period` [s], in which the hand has risen to
-        `height` [m].
+        It is called at the end of each tick of the lift.
+
+        Args:
+            observation: what the hand measures at the end of the tick (`observe`).
+            height: height [m] to which the hand has risen.
+            period: length [s] of the tick.
         """
         self.check(observation, height, period)
         return self.failed
@@ -176,19 +184,27 @@ class GraspTry:
     def withdraw(
         self, observation: Observation, period: Period, length: Annotated[float, Range(0.0, 1.0)]
     ) -> "Withdrawal":
-        """Return the targets of the lowered hand's ticks, in which it opens and withdraws by
-        `length` [m].
+        """Return the `Targets` of the ticks in which the lowered hand opens and withdraws, to
+        iterate over.
 
-        The last `observation` shows where the fingers begin; the ticks come every `period` [s].
+        Its attribute `speed` [m/s] is how fast `Targets.left` grows at the last target.
+
+        Args:
+            observation: the last observation, which shows where the fingers begin.
+            period: length [s] of a tick.
+            length: distance [m] by which the hand withdraws against its approach.
         """
         return Withdrawal(self.controller, observation, period, length)
 
     def next(self) -> "GraspTry | None":
-        """Return the try of `next_grasp` at the object where it is now expected; None if no other
-        grasp is left.
+        """Return the next try, at the object where it is now expected; None if no grasp is left.
 
-        If the grasps were planned for a distribution of friction, those of the next try have in
-        `meta["friction"]` what the touches have left of it.
+        Its grasp is the one of `others` that most likely holds, given that the tried grasps failed.
+        Without `surface`, or for grasps that are not ranked by success on a known table, it is the
+        best-ranked one.
+
+        If the grasps were planned for a distribution of friction, the touches narrow it. The grasps
+        of the next try have what is left in `meta["friction"]`.
         """
         if not len(self.others):
             return None

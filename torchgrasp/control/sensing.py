@@ -43,9 +43,13 @@ ALONG_STD = 3.0
 
 @checked
 def feel_flags(tactile: TactileState, touching: Bool[Tensor, "f"]) -> TactileState:
-    """Return the tactile state of fingertips that sense only whether they touch.
+    """Return the tactile state of f fingertips that sense only whether they touch.
 
-    `tactile` is the state at the last tick, and `touching` marks the fingertips that touch.
+    A fingertip that touches reads `WAITING_FORCE` [N], another one 0.
+
+    Args:
+        tactile: the state at the last tick; `no_contact` makes the first one.
+        touching: mask (f,) of the fingertips that touch.
 
     >>> feel_flags(no_contact(), torch.tensor([True, False, False])).reading
     tensor([0.3000, 0.0000, 0.0000], dtype=torch.float64)
@@ -65,15 +69,18 @@ def feel_torques(
     torques: Float[Tensor, " j"],
     period: Positive,
 ) -> TactileState:
-    """Return the tactile state of fingertips whose forces are estimated from joint torques.
+    """Return the tactile state of f fingertips whose forces are estimated from joint torques.
+
+    j counts all joints of the URDF. Contact points and normals of the state are NaN.
 
     Args:
-        tactile: the state at the last tick.
+        tactile: the state at the last tick; `no_contact` makes the first one.
         reference: the closing plan; its normals give the direction in which a finger presses.
-        jacobian: Jacobian [m/rad] of the centres of the fingertips by all joints of the URDF.
-        torques: torques of all joints [N m] that contacts cause, without those of weight, friction
-            and acceleration.
-        period: time since the last readings [s].
+        jacobian: Jacobian (f, 3, j) [m/rad] of the centres of the fingertips
+            (`Observation.jacobian`).
+        torques: torques (j,) [N m] of all joints that contacts cause, without those of weight,
+            friction and acceleration.
+        period: time [s] since the last readings.
 
     Raises `BadArgument` for a Jacobian with the shape of another hand.
 
@@ -156,8 +163,11 @@ class FingertipSensor:
     """Simulator of the fingertip sensors that a `SensorModel` describes: a call maps true contacts
     to readings.
 
-    The closing plan `reference` has the sensor model. The `generator` draws the noise; None means
-    no noise.
+    Args:
+        reference: the closing plan; its `sensor` is the sensor model.
+        generator: draws the noise; None means no noise.
+
+    Raises `BadArgument` if the sensor model names an unknown finger as dead.
     """
 
     def __init__(
@@ -176,11 +186,13 @@ class FingertipSensor:
     def __call__(
         self, truth: TipContact, jacobian: Float[Tensor, "f 3 j"], period: float
     ) -> TactileState:
-        """Return what the sensors report at the end of a control tick of `period` [s], with the
-        sensor's delay.
+        """Return what the sensors report at the end of a control tick, with the sensor's delay.
 
-        `truth` holds the true contacts during the tick, `jacobian` [m/rad] is that of the
-        fingertips by all joints of the URDF.
+        Args:
+            truth: true contacts of the f fingertips, averaged over the tick.
+            jacobian: Jacobian (f, 3, j) [m/rad] of the fingertips by all j joints of the URDF
+                (`Observation.jacobian`).
+            period: length [s] of the tick.
         """
         reference = self.reference
         before = self.sensed

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchgrasp.foundation.base import FINGERTIPS, Value, check_device
 from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import ANY, Count, Range
 from torchgrasp.geometry.linalg import unit
 from torchgrasp.hand.hand import Hand
@@ -54,10 +55,16 @@ TACTILE = TactileNumbers()
 class TipContact(Value):
     """True contacts of f fingertips, averaged over a tick, in the hand's frame.
 
-    `normal_force` [N] is that on the object, along the inward normal. `forces` [N] act on the
-    object, friction included. `points` [m] and outward unit `normals` are NaN for tips without
-    contact. `sliding` [m/s] is the speed of each tip along the surface; None means that no tip
-    slides.
+    A simulator makes it for `measure` or a `FingertipSensor`. All tensors may have the same leading
+    axes `*b`.
+
+    Args:
+        normal_force: normal force (*b, f) [N] on the object, along the inward normal; 0 without
+            contact.
+        forces: full force (*b, f, 3) [N] on the object, friction included; 0 without contact.
+        points: contact points (*b, f, 3) [m]; NaN without contact.
+        normals: outward unit normals (*b, f, 3) of the object; NaN without contact.
+        sliding: speed (*b, f) [m/s] of each tip along the surface; None means that no tip slides.
     """
 
     normal_force: Float[Tensor, "*b f"]
@@ -72,16 +79,19 @@ class TipContact(Value):
 class TactileState(Value):
     """Readings of f fingertips in the hand's frame, and the state of their filters.
 
+    `no_contact` makes the first one. `measure`, `feel_flags` or `feel_torques` then make one at
+    each tick. All tensors may have the same leading axes `*b`.
+
     Args:
-        reading: normal force [N].
-        forces: full force on the object [N].
-        contact: whether the fingertip touches.
-        points: position of the contact [m]; NaN without contact.
-        normals: outward unit normal of the contact; NaN without contact.
-        lagged: low-passed normal force [N] (entry 0), full force [N] (1 to 3), sliding speed [m/s]
-            (4).
-        average: low-passed normal force [N] that sets the contact flag.
-        sliding: sliding speed [m/s].
+        reading: normal force (*b, f) [N].
+        forces: full force (*b, f, 3) [N] on the object.
+        contact: whether each fingertip touches (*b, f).
+        points: contact points (*b, f, 3) [m]; NaN without contact.
+        normals: outward unit normals (*b, f, 3) of the object; NaN without contact.
+        lagged: low-passed values (*b, f, 5): normal force [N] (entry 0), full force [N] (1 to 3),
+            sliding speed [m/s] (4).
+        average: low-passed normal force (*b, f) [N] that sets the contact flag.
+        sliding: sliding speed (*b, f) [m/s].
         age: time [s] since the last sample.
     """
 
@@ -98,10 +108,13 @@ class TactileState(Value):
 
 @checked
 def no_contact(*batch: Count, fingers: Annotated[int, Range(*FINGERTIPS)] = 3) -> TactileState:
-    """Return the tactile state of fingertips that touch nothing, which are sampled at the next
-    tick.
+    """Return the tactile state of fingertips that touch nothing, the first state of a closing.
 
-    `batch` gives the leading axes of its tensors, and `fingers` the number of fingertips.
+    The fingertips are sampled at the next tick.
+
+    Args:
+        batch: sizes of the leading axes of its tensors; by default none.
+        fingers: number of fingertips, 3 to 5.
 
     >>> no_contact().contact
     tensor([False, False, False])
@@ -128,17 +141,21 @@ def measure(
     """Return the simulated tactile state one tick later, with lag, noise and sampling of the
     sensors.
 
-    Args:
-        tactile: the state at the last tick.
-        truth: true contacts in this tick.
-        pads: outward unit normals of the surface at the planned contacts, which direct the noise of
-            tips that touch nothing.
-        radius: radius of the tips [m]; 0 means that they are not round, and 12 mm is assumed.
-        period: period of the tick [s].
-        generator: draws the noise; None means no noise.
-        noise: factor on the standard deviation of the noise.
+    All is in the hand's frame, for f fingertips with the same leading axes `*b`.
 
-    Raises `BadArgument` for true contacts on another device than the state.
+    Args:
+        tactile: the state at the last tick; `no_contact` makes the first one.
+        truth: true contacts in this tick.
+        pads: outward unit normals (*b, f, 3) of the surface at the planned contacts. They direct
+            the noise of tips that touch nothing.
+        radius: radius (f,) [m] of the tips. 0 means that a tip is not round; then `TACTILE.radius`
+            [m] is assumed.
+        period: length [s] of the tick.
+        generator: draws the noise; None means no noise.
+        noise: factor (no unit) on the standard deviations of the noise.
+
+    Raises `BadArgument` for true contacts on another device than the state, or of another number of
+    fingertips.
 
     >>> normals, pressed = torch.eye(3).double(), torch.tensor([2.0, 0.0, 1.0]).double()  # [N]
     >>> truth = TipContact(pressed, -pressed[:, None] * normals, 0.03 * normals, normals)
@@ -147,6 +164,10 @@ def measure(
     (tensor([ True, False, False]), tensor([1.4308, 0.0000, 0.7154], dtype=torch.float64))
     """
     check_device("truth", truth.forces.device, "the tactile state", tactile.lagged.device)
+    fingers = tactile.reading.shape[-1]
+    if truth.normal_force.shape[-1] != fingers:
+        found = f"{truth.normal_force.shape[-1]} fingertips"
+        raise BadArgument("truth", found, f"{fingers}, as the tactile state")
     sliding = torch.zeros_like(truth.normal_force) if truth.sliding is None else truth.sliding
     parts = [truth.normal_force[..., None], truth.forces, sliding[..., None]]
     force = torch.cat(parts, dim=-1)  # (*b, f, 5)
@@ -211,11 +232,14 @@ def smooth(old: Filtered, new: Filtered, cutoff: float, period: float) -> Filter
 class Targets(NamedTuple):
     """Commands to hand and arm until the next tick.
 
-    Args:
-        joints: targets of all joints of the URDF, in the order of `hand.tree.joint_names` [rad].
-        palm: displacement of the palm [m] from its planned path, in the hand's frame; the palm does
-            not rotate.
-        left: remaining length [m] of the approach; it is 0 if the hand is at its pre-grasp.
+    `GraspController.step` returns them.
+
+    Attributes:
+        joints: targets (j,) [rad or m] of all joints of the URDF, in the order of
+            `hand.tree.joint_names`.
+        palm: displacement (3,) [m] of the palm from its planned path, in the hand's frame. The palm
+            does not rotate.
+        left: remaining length [m] of the approach; 0 if the hand is at its pre-grasp.
     """
 
     joints: Float[Tensor, " j"]
@@ -228,10 +252,14 @@ class Targets(NamedTuple):
 class Observation(Value):
     """What a hand measures at a tick, in the hand's frame (its root link).
 
+    `observe` makes it. f counts fingertips, and j all joints of the URDF. Joints that slide have
+    [m] in place of [rad].
+
     Args:
-        joints: positions [rad] of all joints of the URDF, in the order of `hand.tree.joint_names`.
-        tips: centres of the fingertips [m].
-        jacobian: Jacobian of these centres with respect to all joints [m/rad].
+        joints: positions (j,) [rad or m] of all joints, in the order of `hand.tree.joint_names`.
+        tips: centres (f, 3) [m] of the fingertips.
+        jacobian: Jacobian (f, 3, j) [m/rad] of these centres by all joints, as if none were
+            coupled.
         tactile: readings of the fingertips.
     """
 
@@ -243,10 +271,15 @@ class Observation(Value):
 
 @checked
 def observe(hand: Hand, joints: Float[Tensor, " h"], tactile: TactileState) -> Observation:
-    """Return the observation of a robot, from its measured actuated `joints` [rad] and fingertip
-    readings.
+    """Return the observation of a robot, from its measured joints and fingertip readings.
 
-    Raises `BadArgument` for joints or fingertips on another device than the hand.
+    Args:
+        hand: the hand.
+        joints: measured actuated joints (h,) [rad or m], in the order of `hand.joint_names`.
+        tactile: readings of the f fingertips (`feel_flags`, `feel_torques` or `measure`).
+
+    Raises `BadArgument` for joints or fingertips on another device than the hand, or another number
+    of joints.
 
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("barrett")
