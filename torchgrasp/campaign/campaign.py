@@ -46,7 +46,7 @@ class CampaignSpec(Value):
             own fingers.
         licence: licence of the data set, preferably an SPDX identifier such as "CC-BY-4.0".
         jobs_in_shard: number of jobs in one file. A job is one view of one object.
-        device: "cpu" or "cuda". "cuda" plans on all views of a file at once, on the workers of a
+        device: "cpu", or "cuda" to plan on all views of a file at once. "cuda" needs workers of a
             Dask cluster with the resource "GPU". A GPU's rounding may change grasps.
 
     Raises `BadArgument` for:

@@ -78,8 +78,11 @@ def hold_probability(
         turn: standard deviation [rad] of the object's rotation about each of three axes through the
             contacts' centroid.
 
-    Raises `BadArgument` for sets of other than 3 to 5 contacts, normals that are not of length 1
-    (to 1e-3), and numbers outside their range.
+    Raises `BadArgument` for:
+
+    * sets of other than 3 to 5 contacts;
+    * normals that are not of length 1 (to 1e-3);
+    * numbers outside their range.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> contacts = load_shipped_grasp("jug", "allegro").contacts

@@ -34,7 +34,7 @@ class ChangeNumbers:
     compared: int = 1000
     """Most points of an object whose distances to the target are computed."""
     beside: float = 0.15
-    """Distance [m] from the target within which an object is its neighbour: the reach of a finger."""
+    """Distance [m] from the target within which an object is its neighbour: a finger's reach."""
 
 
 CHANGES = ChangeNumbers()
@@ -69,7 +69,7 @@ class Change:
 
 
 def _with(request: Request, **fields: Any) -> Request:
-    """Return the request with the given fields of its contact constraints (`ContactSpec`) replaced."""
+    """Return the request with given fields of its contact constraints (`ContactSpec`) replaced."""
     return dataclasses.replace(request, spec=dataclasses.replace(request.contact_spec, **fields))
 
 

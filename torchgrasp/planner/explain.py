@@ -126,7 +126,7 @@ class Funnel(Value):
 
     @property
     def worst(self) -> Losses:
-        """The first stage that lost everything, or else the stage that lost the largest fraction."""
+        """The first stage that lost everything, or else the stage that lost the largest share."""
         empty = next((stage for stage in self.stages if stage.given and not stage.kept), None)
         return empty or max(self.stages, key=lambda stage: 1 - stage.kept / max(stage.given, 1))
 
@@ -188,16 +188,17 @@ class Trial(Value):
 class Explanation(Value):
     """Why there is no grasp: where grasps were lost, and the results of single changes.
 
-    Args:
+    `explain_empty` makes it. `str` gives one line for each planning stage, and the `advice`.
+
+    Attributes:
         starts: number of initial guesses from which grasps were planned with each change.
         funnel: losses of the planning stages without a change.
         trials: the results of the changes, the most helpful first.
         left: number of changes that were not tried, because the work is bounded.
 
-    `str` gives one line for each stage, and a sentence about the best change.
-
     >>> funnel = Funnel((Losses("grasps", "postures", 40, {Status.TABLE_COLLISION: 40}),))
-    >>> lower = Trial("if the table were 20 mm lower", choice=True, executable=9, expected=0.75, funnel=funnel)
+    >>> words = "if the table were 20 mm lower"
+    >>> lower = Trial(words, choice=True, executable=9, expected=0.75, funnel=funnel)
     >>> print(Explanation(50, funnel, (lower,)))
     grasps: 0 of 40 postures (40 table_collision)
     What would help most (1 change tried): if the table were 20 mm lower: 9 executable grasps, from 50 starts.
@@ -210,16 +211,21 @@ class Explanation(Value):
 
     @property
     def best(self) -> Trial | None:
-        """The most helpful change; None if no change gives a grasp."""
+        """The most helpful change; None if no change gives a grasp.
+
+        Its `words` describe the change, and `executable` is the number of grasps with it.
+        `expected` is their mean predicted success, in [0, 1].
+        """
         return next((trial for trial in self.trials if trial.executable), None)
 
     @property
     def advice(self) -> str:
         """A sentence for the user on what would help most.
 
-        If there is a grasp, it says so. Else it names the best change and, if that is a change of
-        the world, such as more friction, also the best one that the user can make. If no change
-        helps, it names the stage that loses the most.
+        If there is a grasp, the sentence says so. Otherwise it names the best change. If the user
+        cannot make this change, it also names the best change that the user can make. A higher
+        friction is such a change. If no change helps, the sentence names the stage that loses the
+        most.
         """
         if self.funnel.executable:
             return f"There is a grasp: {self.funnel.executable} of {self.starts} starts ended in an executable one."
@@ -263,31 +269,38 @@ def explain_empty(
     shape: ShapeGP | None = None,
     observer: Observer | None = None,
 ) -> Explanation:
-    """Explain why `plan_grasps` found no executable grasp, and find a single change that gives
-    grasps.
+    """Return why `plan_grasps` found no executable grasp, and which single change gives grasps.
 
     The changes are: no region, other fingers, another shipped hand, wider limits of contacts,
-    higher friction, no table, no neighbours, an arm that reaches everything. The search ends at a
-    change that the user can choose and that gives grasps which are likely to succeed. For this, the
-    best grasps count, one for every five guesses.
+    higher friction. Further changes are: no table, no neighbours, an arm that reaches everything.
+    Each is tried by planning with it. The search ends at a change that the user can make and that
+    gives grasps which are likely to succeed.
 
-    The work is bounded, not the time, so that a seed always gives the same explanation. A plan has
-    at most 20 initial guesses and a small library of postures. Relaxed constraints are tried only
-    where no contact set is found. At most eight changes are tried, in the order of the losses that
-    they could prevent; fewer with "auto" fingers. If no change helps, a request of at most 80
-    guesses is tried with four times as many. Raises the errors of `plan_grasps`.
+    The work is bounded by the fields of `EXPLAIN`, not by time, so a seed always gives the same
+    explanation. A plan has at most `starts` initial guesses and a library of `postures` postures.
+    Relaxed constraints are tried only where no contact set is found. At most `trials` changes are
+    tried, in the order of the losses that they could prevent; fewer with "auto" fingers. If no
+    change helps, a request of few guesses is tried with `more` times as many.
 
     Args:
-        cloud, hand, spec, starts, seed: as in `plan_grasps`.
+        cloud: the cloud or scene, as in `plan_grasps`.
+        hand: the hand, as in `plan_grasps`.
+        spec: the constraints on contacts, as in `plan_grasps`.
+        starts: number of random initial guesses, as in `plan_grasps`.
+        seed: random seed.
         fingers, task, promise, reachable, arm, keep, avoid, resist, mode, ranking, shape: as in
             `plan_grasps`.
-        observer: function that is called with "funnel" and the `Funnel` of the first plan, then
-            with "change" and the `Trial` of each change.
-        time_budget: wall time [s] after which no change is begun.
+        time_budget: wall time [s] after which no change is begun; None means no limit.
+        observer: function that is called with a name, a line of text and a value. The name is
+            "funnel", with the losses of the first plan, then "change", with the result of each
+            change.
+
+    Raises the errors of `plan_grasps`.
 
     >>> from torchgrasp import load_hand, load_object
     >>> spec = ContactSpec(friction=0.0, table=0.0)
-    >>> explanation = explain_empty(load_object("cylinder").view, load_hand("barrett"), spec, starts=20)
+    >>> cloud, hand = load_object("cylinder").view, load_hand("barrett")
+    >>> explanation = explain_empty(cloud, hand, spec, starts=20)
     >>> explanation.best.words
     'if the friction were 0.4 instead of 0'
     """

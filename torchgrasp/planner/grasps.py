@@ -89,8 +89,8 @@ def plan_grasps(
     shape: ShapeGP | None = None,
     observer: Observer | None = None,
 ) -> Grasps | list[Grasps]:
-    """Plan grasps of a hand on the object of a partial point cloud, or on the target of a scene,
-    the best grasp first.
+    """Return planned grasps of a hand on the object of a partial point cloud or scene, the best
+    grasp first.
 
     >>> from torchgrasp import load_object
     >>> grasps = plan_grasps(load_object("cylinder"), "barrett", ContactSpec(table=0.0), starts=20)
@@ -98,45 +98,52 @@ def plan_grasps(
     4
 
     Args:
-        cloud: points that a camera saw [m], in any frame; the grasps are in this frame. A
-            `PointCloud`, a `Scene` with a target, an array or tensor (n, 3), a cloud of Open3D or
-            trimesh, a file for `read_cloud` or `read_scene`, or a `GraspObject`. Missing normals
-            and viewpoint are estimated; `cloud_from_array` takes them. A sequence gives a list of
-            results; a bad cloud has no grasps, and `meta["refused"]` holds the reason.
+        cloud: points that a camera saw [m], in any frame; the grasps are in this frame.
+            One of: a `PointCloud`, a `Scene` with a target, an array or tensor (n, 3), a cloud of
+              Open3D or trimesh, a file for `read_cloud` or `read_scene`, a `GraspObject`.
+            Missing normals and viewpoint are estimated; `cloud_from_array` takes them.
+            A sequence of clouds gives a list of results. A bad cloud then has no grasps, and
+              `meta["refused"]` holds the reason.
         hand: from `load_hand`, or its name or folder; it is moved to the device of the cloud.
-        spec: the constraints on contacts; by default `ContactSpec()`, in mode "paper"
+        spec: the constraints on contacts. None means `ContactSpec()`, in mode "paper"
             `ContactSpec.paper()`.
         starts: number of random initial guesses of the contact planner.
         seed: random seed; on the CPU the same seed gives bitwise the same grasps.
         workers: number of processes for a sequence of clouds; 0 means this process. On a GPU, which
             plans all clouds at once, they estimate the shapes.
-        fingers: the fingers that grasp, as in `load_hand`; by default those of `hand`. "auto"
+        fingers: the fingers that grasp, as in `load_hand`; None means the fingers of `hand`. "auto"
             chooses, of the sets that the hand declares, the one with the greatest expected success.
             `hand_of` loads the hand of the result.
-        task: what the grasps must do, for which their success is predicted; by default
+        task: what the grasps must do, for which their success is predicted; None means
             `GraspTask()`.
-        promise: share of the returned grasps that must hold, or None; less sure grasps get the
-            status `NO_PROMISE`. `meta["promise"]` says which trials chose the bound
-            (`torchgrasp.success.promise`).
-        reachable: function that returns as booleans (k,) which hand poses `obj_from_hand` (k, 4, 4)
-            an arm reaches, in the frame of the cloud; by default all poses are reachable.
+        promise: share of the returned grasps that must hold, in [0.5, 0.99]. Less sure grasps get
+            the status `NO_PROMISE`. `meta["promise"]` says which trials chose the bound
+            (`torchgrasp.success.promise`). None means no promise.
+        reachable: function of hand poses `obj_from_hand` (k, 4, 4) [m] in the frame of the cloud.
+            It returns a mask (k,) of the poses that an arm reaches. None means that all poses are
+            reachable.
         arm: the arm that carries the hand, from `load_arm`; it must reach each grasp by a straight
-            approach, and lift. Without a table z points up.
-        keep, avoid: a `Region` in which all contacts lie, and one in which none lies; or a function
-            of points (n, 3) [m] that returns their signed distance [m], negative inside. Contacts
-            lie on the estimated surface.
-        resist: what contacts must resist: "lift", "pour", "push", several of them (`Resist`), or
+            approach, and lift. Without a table z points up. None means no arm.
+        keep: where all contacts lie: a `Region`, or a function of points (n, 3) [m] that returns
+            their signed distances (n,) [m], negative inside. Contacts lie on the estimated surface.
+            None means anywhere.
+        avoid: where no contact lies, given as `keep`.
+        resist: what contacts must resist: "lift", "pour", "push", a tuple of several of them, or
             `TaskWrenches`. Forces are in the planned friction cones, and of the hand's strength.
-            `Grasps.certificate` has the proof; grasps that resist less than all have the status
-            `NOT_RESISTED`.
-        mode: how contacts become grasps: "joint", "contact_first" or "paper" (`Mode`). All but
-            "joint" need the hand's learned model, and three fingers.
+            `Grasps.certificate` has the proof; grasps that resist less have the status
+            `NOT_RESISTED`. None means that nothing is asked for.
+        mode: how contacts become grasps. All but "joint" need the hand's learned model, and three
+            fingers.
+            "joint": the hand starts from random postures near each contact set. If none succeeds,
+              the contacts move along the surface with the hand.
+            "contact_first": initial postures of the learned model are refined onto fixed contacts.
+            "paper": the paper's method (docs/paper.md).
         ranking: what puts a grasp first: the greatest predicted "success", or the least "variance"
-            of the surface at its contacts. The default is "success", in mode "paper" "variance".
-        time_budget: wall time [s] after which no batch begins; `meta["starts"]` is the number of
-            planned guesses.
+            of the surface at its contacts. None means "success", in mode "paper" "variance".
+        time_budget: wall time [s] after which no batch begins; None means no limit.
+            `meta["starts"]` is the number of planned guesses.
         shape: the object's shape if it is known better than the cloud shows, as after a touch
-            (`ShapeGP.update`).
+            (`ShapeGP.update`). None means that it is estimated.
         observer: function that is called after each stage with the stage's name, a line of text and
             its result.
 
@@ -145,9 +152,9 @@ def plan_grasps(
             result.
 
     Raises:
-        BadArgument: an argument of the wrong type or range; a cloud of an object that is not of
-            graspable size; a scene without a target; `shape`, `observer`, `reachable`, `arm` or a
-            region beside several clouds.
+        BadArgument: an argument of the wrong type or range; an object that is not of graspable
+            size; a scene without a target; `shape`, `observer`, `reachable`, `arm` or a region
+            beside several clouds.
         MissingExtra, NoWorkers: pebble is not installed, or no worker process can start.
 
     The result does not depend on the frame of cloud, camera and table. In a scene the hand keeps
@@ -207,12 +214,21 @@ def stream_grasps(
     """Yield the executable grasps of each batch of `plan_grasps` as soon as the batch ends, best
     first.
 
-    The arguments are those of `plan_grasps` for one cloud or scene. Each grasp has force closure,
-    has passed all checks, and is scored. All batches together, ranked, are the executable grasps of
-    `plan_grasps` with the same arguments. The work stops when the caller stops iterating. In modes
-    other than "joint", and with "auto" fingers, there is one batch. Each batch has at least one
-    grasp; a later one may have a better best grasp. Raises the errors of `plan_grasps`; for a wrong
-    cloud at the first iteration.
+    Each yielded batch has at least one grasp; a later batch may have a better best grasp. Each
+    grasp has force closure, has passed all checks, and is scored. All batches together, ranked, are
+    the executable grasps of `plan_grasps` with the same arguments. The work stops when the caller
+    stops iterating. In modes other than "joint", and with "auto" fingers, there is one batch.
+
+    Args:
+        cloud: one cloud or scene, as in `plan_grasps`.
+        hand: the hand, as in `plan_grasps`.
+        spec: the constraints on contacts, as in `plan_grasps`.
+        starts: number of random initial guesses, as in `plan_grasps`.
+        seed: random seed.
+        fingers, task, promise, reachable, arm, keep, avoid, resist: as in `plan_grasps`.
+        mode, ranking, time_budget, shape, observer: as in `plan_grasps`.
+
+    Raises the errors of `plan_grasps`, for a wrong cloud at the first iteration.
 
     >>> from torchgrasp import load_hand, load_object
     >>> first = next(stream_grasps(load_object("cylinder").view, load_hand("barrett"), starts=40))

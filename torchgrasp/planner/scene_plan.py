@@ -32,15 +32,17 @@ from torchgrasp.values.specs import ContactSpec
 class ThingPlan(Value):
     """The plan of one object in a scene: its executable grasps, or the reason why there are none.
 
-    Args:
+    `plan_scene` makes it.
+
+    Attributes:
         label: label of the object in the scene.
-        success: predicted probability that the best grasp succeeds: 0 without grasps, NaN if it is
+        success: predicted probability that the best grasp holds: 0 without grasps, NaN if it is
             unknown.
         grasps: executable grasps, best first; None if there are none.
         reason: sentence that says why there are no grasps.
-        shape: the estimated shape; None without grasps.
-        status: the reason why the image shows that the object cannot be grasped, or `TOO_VAGUE` for
-            a shape that is too uncertain; otherwise `OK`.
+        shape: the estimated shape of the object; None without grasps.
+        status: `OK`, or the reason why the image shows that the object cannot be grasped.
+            `TOO_VAGUE` means that its shape is too uncertain.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> grasp = load_shipped_grasp("jug", "allegro")
@@ -59,9 +61,11 @@ class ThingPlan(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class ScenePlan(Value):
-    """The plans of all objects in a scene, those of most probable success first.
+    """The plans of all objects in a scene, the object with the greatest predicted success first.
 
-    Args:
+    `plan_scene` makes it.
+
+    Attributes:
         things: one plan for each object; objects without a grasp come last.
         clear: labels of objects to take away, in this order, so that the given target has a grasp.
             It is empty if the target has one, or if no few objects are in the way.
@@ -100,7 +104,8 @@ def plan_scene(
     avoid: Where | None = None,
     resist: Resist | None = None,
 ) -> ScenePlan:
-    """Plan grasps of the objects of a scene, and rank the objects by predicted success.
+    """Return grasps of the objects of a scene, the object with the greatest predicted success
+    first.
 
     Nothing is planned for an object if its image shows that it cannot be grasped
     (`Status.FEW_PIXELS` to `TOO_VAGUE`). Of the other objects, near and tall ones with free space
@@ -108,21 +113,23 @@ def plan_scene(
     off by the image border, are planned last.
 
     With a `target`, this object alone is planned. If it has no grasp, the search goes on without
-    the nearest objects, until `ScenePlan.clear` says which of them to take away first. Raises
-    `BadArgument` for a scene without objects, or an argument of the wrong type or range.
+    the nearest objects. `ScenePlan.clear` then says which of them to take away first.
 
     Args:
         scene: objects on a table, or a file of `save_scene`.
         hand: from `load_hand`, or its name or folder.
-        spec: the constraints on contacts; `ContactSpec()` by default.
+        spec: the constraints on contacts; None means `ContactSpec()`.
         starts: number of random initial guesses of the contact planner for each object.
         seed: random seed.
         target: label of the object to grasp; None means any object.
         enough: predicted success of a grasp, in [0, 1], at which the remaining objects are not
             planned.
-        fingers: the fingers that grasp; "auto" chooses for each object, and `hand_of` loads the
-            hand of its grasps.
+        fingers: the fingers that grasp, as in `plan_grasps`. "auto" chooses for each object, and
+            `hand_of` loads the hand of its grasps.
         task, promise, reachable, arm, keep, avoid, resist: as in `plan_grasps`.
+
+    Raises `BadArgument` for a scene without objects, an unknown `target`, or an argument of the
+    wrong type or range.
 
     >>> from torchgrasp import load_hand, load_scene
     >>> plan = plan_scene(load_scene(), load_hand("barrett"), starts=30, enough=0.5)

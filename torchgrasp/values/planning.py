@@ -483,7 +483,10 @@ class Grasps(Batch):
 
 
 def _pages() -> Any:
-    """Return the module that draws grasps. It is of a later stage, so it is found when asked for."""
+    """Return the module that draws grasps.
+
+    It is of a later stage, so it is found when asked for.
+    """
     return importlib.import_module("torchgrasp.app.report.notebook")
 
 

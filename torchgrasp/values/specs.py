@@ -149,7 +149,7 @@ class ContactSpec(Value):
 
     @property
     def fingertip_radius(self) -> float:
-        """The radius [m] of the fingertips: the field `tip_radius`, or `TIP_RADIUS` if it is None."""
+        """The radius [m] of the fingertips; `TIP_RADIUS` if the field `tip_radius` is None."""
         return TIP_RADIUS if self.tip_radius is None else self.tip_radius
 
     @property
