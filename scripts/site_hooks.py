@@ -177,9 +177,22 @@ def split_arguments(text: str) -> str:
     return text[:start] + ARGUMENTS.sub(each, text[start:end]) + text[end:]
 
 
+STAR = re.compile(r"`[^`]*`|\(\*(?=\w)")
+"""Code, or the first star of a shape such as (*b, 3)."""
+
+
 def fence(text: str) -> str:
-    """Return a docstring whose examples are fenced."""
+    """Return a docstring whose examples are fenced, and whose shapes keep their stars.
+
+    Markdown takes the text between the stars of two shapes for emphasis.
+    """
     blocks = re.split(r"\n{2,}", text)
     return "\n\n".join(
-        f"```pycon\n{b}\n```" if b.lstrip().startswith(">>> ") else b for b in blocks
+        f"```pycon\n{b}\n```" if b.lstrip().startswith(">>> ") else STAR.sub(_escape, b)
+        for b in blocks
     )
+
+
+def _escape(match: re.Match[str]) -> str:
+    """Return code as it is, and the beginning of a shape with its star escaped."""
+    return match[0] if match[0].startswith("`") else r"(\*"

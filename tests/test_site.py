@@ -85,6 +85,14 @@ def test_each_argument_of_a_docstring_gets_a_row_of_its_own():
     assert site_hooks.split_arguments("No, arguments: here.") == "No, arguments: here."
 
 
+def test_shapes_of_a_docstring_keep_their_stars():
+    text = "Return points (*b, f, 3) for joints (*b, h).\n\n`f(*x)` does.\n\n>>> f(*x)\n1"
+    markdown = pytest.importorskip("markdown")  # of mkdocs
+    page = markdown.markdown(site_hooks.fence(text), extensions=["pymdownx.superfences"])
+    assert "points (*b, f, 3) for joints (*b, h)." in page and "<em>" not in page
+    assert "<code>f(*x)</code>" in page and "\\*" not in page
+
+
 def test_a_link_to_the_folder_of_examples_leads_to_their_list():
     assert site_hooks._relink("[e](examples)", Path()) == "[e](examples.md)"
     assert site_hooks._relink("[h](../hands)", Path("docs")) == "[h](hands_README.md)"
