@@ -64,8 +64,8 @@ def format_isaac(
 ) -> str:
     """Return grasps as the YAML text of an `isaac_grasp` file of version 1.0, in metres, radians.
 
-    * `position` and `orientation` (w, x, y, z) are the pose of the gripper's frame in the
-      object's frame, which is the frame of the planned cloud.
+    * `position` and `orientation` (w, x, y, z) are the pose of the gripper's frame in
+      the object's frame. The object's frame is the frame of the planned cloud.
     * `cspace_position` has the joints at the contacts, by name.
     * `pregrasp_cspace_position` has the joints of the opened hand.
     * `squeeze_cspace_position`, a key of ours, has the targets that press.
