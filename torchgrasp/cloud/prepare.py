@@ -96,6 +96,7 @@ class PreparedCloud(Value):
     # inward unit normals of the four sides of the camera's view, or of each point's, if known
     frustum: Float[Tensor, "*views 4 3"] | None
     pose_error: Float[Tensor, "n"] | None  # as in `PointCloud` [m], of `points`
+    estimated: bool = False  # whether the viewpoint was estimated, not given
 
     @property
     def one_sided(self) -> bool:
@@ -136,7 +137,8 @@ def prepare_cloud(
         elif clean and viewpoint is not None:
             facing = share_facing(cloud.points, normals, viewpoint)
             viewpoint = viewpoint if facing >= FACING else None
-    if clean and viewpoint is None:
+    estimated = viewpoint is None
+    if clean and estimated:
         # before points are moved: the fit of normals smooths the lattice away
         viewpoint = _seen_by_pixels(cloud.points, normals, up)
     cloud = dataclasses.replace(cloud, normals=normals, viewpoint=viewpoint)
@@ -154,7 +156,7 @@ def prepare_cloud(
     assert precise.normals is not None
     normals = unit(precise.normals)
     fields = precise.viewpoint, precise.frustum, precise.pose_error
-    return PreparedCloud(cloud, precise.points, normals, *fields)
+    return PreparedCloud(cloud, precise.points, normals, *fields, estimated)
 
 
 def _seen_by_pixels(points: Points, normals: Points | None, up: Vector | None) -> Vector | None:

@@ -81,7 +81,10 @@ class FreeNumbers:
     """Parameters of the points in free space at which the object's distance is bounded."""
 
     outline_error: float = 0.005
-    """Distance [m] by which the object may reach beyond its outline: a camera loses rims."""
+    estimated_error: float = 0.010
+    """Distances [m] by which the object may reach beyond its outline, as a camera loses rims: if
+    the camera is given, and if it was estimated.
+    """
     radius: float = 1.15
     """Ratio of the radius within which free space is probed to that of all points."""
     ground: int = 9
@@ -140,6 +143,10 @@ STD_FACTORS: dict[tuple[Kind, bool], float] = {
 the table is known.
 
 `scripts/train.py bands DIR` fits them.
+"""
+ESTIMATED = 1.15
+"""Ratio by which errors are greater where the camera was estimated: outline and free space are less
+exact then.
 """
 # observations of n points, and the correlated errors (n, c) of their distances, normalised
 Part = tuple[Observations, Tensor | None]
@@ -228,7 +235,8 @@ def camera_support(
         reach = 1.0
         if completion.frame:
             reach = float(torch.linalg.vector_norm(frame.normalise(surface), dim=-1).max())
-        free = free_space(completion.outline, frame, table, reach)
+        error = FREE.estimated_error if seen.estimated else FREE.outline_error
+        free = free_space(completion.outline, frame, table, reach, error)
         # the centre of an arch or of a bowl is not inside
         inside = not completion.frame and float(completion.outline.violation(center.cpu())) == 0.0
     sphere = OUTSIDE.radius * fibonacci_sphere(OUTSIDE.points).to(center)
@@ -238,6 +246,8 @@ def camera_support(
     inner = off_surface(x[:count], -distance[:count], noise)
     outer = off_surface(sphere, distance[count:], OUTSIDE.noise)
     factor = STD_FACTORS[kind, table is not None]
+    if completion is not None and seen.estimated:
+        factor = ESTIMATED * factor
     anchors = join([inner, outer])
     return ExtraObservations(frame, anchors, NOISE.normal, factor, parts, free, kind=kind)
 
@@ -399,6 +409,7 @@ def free_space(
     frame: Normalisation,
     table: float | None = None,
     reach: float = 1.0,
+    outline_error: float = FREE.outline_error,
 ) -> FreeSpace:
     """Return points in free space, and lower bounds of their signed distances, both normalised.
 
@@ -407,6 +418,7 @@ def free_space(
         frame: the normalised frame.
         table: the table's height [m]; None means no table.
         reach: normalised radius within which the points lie.
+        outline_error: distance [m] by which the object may reach beyond its outline.
 
     The points lie beside the object's outline, and below the table. A bound becomes an observation
     only where the shape violates it: otherwise the shape would inflate to its visual hull.
@@ -414,7 +426,7 @@ def free_space(
     origin = frame.center.double().cpu()
     scale = frame.scale * reach
     points = torch.cat([_points_beside(view, origin, scale) for view in outline.views])
-    least = outline.hull_distance(points) - FREE.outline_error
+    least = outline.hull_distance(points) - outline_error
     if table is not None:
         half = FREE.ground_side
         steps = torch.linspace(-half, half, FREE.ground, dtype=torch.float64, device="cpu")
