@@ -142,6 +142,7 @@ def test_text_is_read_back(text):
         (lambda: Distribution.between(0.8, 0.3), "the lesser number first"),
         (lambda: Distribution(()), "1 to 10000 parts"),
         (lambda: Distribution(((0.0, 1.0),), (1.0, 2.0)), "1, one a part"),
+        (lambda: Distribution.of(1.0).clamped(3.0, 2.0), "at most high, got 3 beside high 2"),
         (lambda: Distribution.of(1.0).quantile(torch.tensor(1.1)), r"in \[0, 1\]"),
     ],
 )

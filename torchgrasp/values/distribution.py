@@ -217,7 +217,10 @@ class Distribution(Value):
         are kept.
 
         An interval outside becomes the nearer of the two numbers. `low` and `high` may be infinite.
+        Raises `BadArgument` if `low` is the greater one.
         """
+        if low > high:
+            raise BadArgument("low", f"{low:g} beside high {high:g}", "at most high")
         return self._mapped(lambda x: min(max(x, low), high))
 
     def _mapped(self, function: Callable[[float], float]) -> "Distribution":

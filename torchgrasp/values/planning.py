@@ -72,8 +72,9 @@ class PointCloud(Value):
     def select(self, rows: Int[Tensor, "m"] | Bool[Tensor, "n"]) -> "PointCloud":
         """Return a cloud of some of the points, with all that belongs to them.
 
-        `rows` is a mask (n,) of the points, or holds m indices of points in the wanted order.
-        Raises `BadArgument` for another shape or dtype, or fewer than 4 points (`TooFewPoints`).
+        `rows` is a mask (n,) of the points, or holds m indices of points in the wanted order. Raises
+        `BadArgument` for another shape or dtype, and `TooFewPoints` if fewer than 4 points are left.
+        Raises `IndexError` for an index beyond the last point.
         """
         normals = self.normals
         eye = self.viewpoint
