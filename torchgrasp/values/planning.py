@@ -234,8 +234,8 @@ class Certificate(Batch):
 
     `certify` makes it, and `closed` is the answer. f counts the fingertips of a set. The wrenches w
     of a set are the columns of W: forces along the edges of its friction cones, then their torques.
-    Torques are about the contacts' centroid, and are divided by the radius of the contacts. So
-    wrenches have no unit.
+    Torques are about the contacts' centroid. They are divided by the contacts' root-mean-square
+    distance from it, so wrenches have no unit.
 
     Attributes:
         closed: whether the set has force closure (b,). It needs a margin clearly above 0 and full
@@ -246,9 +246,9 @@ class Certificate(Batch):
         residual: the largest component |W phi| (b,) of the balance found; infinite if there is
             none.
         witness: a unit wrench v (b, 6). If the margin is at most 0 or -inf, v . w >= 0 for every
-            edge wrench w, up to rounding: no contact force opposes v. Above 0, v proves that no
-            greater margin is possible: the margin is -min(v . w) / sum(v . w - min(v . w)) over the
-            edge wrenches.
+            edge wrench w, up to rounding: no contact force opposes v. For a closed set, v proves
+            that no greater margin is possible. The margin is -min(v . w) / sum(v . w - min(v . w))
+            over the edge wrenches. If only the rank is too low, the wrenches are smallest along v.
         task_load: the load t (b, 6) that the contacts resist least, of those of `resist`: force
             [N], then torque [N m] about the contacts' centroid.
         task_margin: the greatest multiple (b,) of t that the contacts resist, without unit; all
