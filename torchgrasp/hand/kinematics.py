@@ -93,15 +93,15 @@ class KinematicTree(Value):
         parents = self.parent.split(self.level_sizes)
         frames = [levels[0]] if root is None else [root[:, :, None]]
         for k in range(1, len(levels)):
-            level = levels[k]
             if root is None and k == 1:  # the root is the identity
-                frames.append(level)
+                frames.append(levels[k])
                 continue
-            above = frames[-1].index_select(2, parents[k])
-            frame = above[:, 0, None] * level[0]
-            frame = torch.addcmul(frame, above[:, 1, None], level[1])
-            frame = torch.addcmul(frame, above[:, 2, None], level[2])
-            frame[:, 3] += above[:, 3]
+            first, second, third = levels[k].unbind()  # rows (4, l, n)
+            x, y, z, origin = frames[-1].index_select(2, parents[k])[:, :, None].unbind(1)
+            frame = x * first
+            frame = torch.addcmul(frame, y, second)
+            frame = torch.addcmul(frame, z, third)
+            frame[:, 3:].add_(origin)
             frames.append(frame)
         return torch.cat(frames, 2).index_select(2, self.places)
 

@@ -350,7 +350,8 @@ def separations(
     They are free of cancellation. With a leading axis, `y` holds the points that each x is compared
     with.
     """
-    d = [x[:, m, None] - y[..., m] for m in range(3)]
+    pairs = zip(x[:, None].unbind(2), y.unbind(-1), strict=True)
+    d = [one - other for one, other in pairs]
     square = d[0] * d[0]
     square.addcmul_(d[1], d[1]).addcmul_(d[2], d[2])
     return d, square.sqrt_()
