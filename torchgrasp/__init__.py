@@ -31,7 +31,7 @@ from torchgrasp.contacts.region import Region
 from torchgrasp.contacts.certify import certify
 from torchgrasp.contacts.closure_probability import closure_probability
 from torchgrasp.contacts.critical import critical_friction
-from torchgrasp.contacts.hold_probability import hold_probability
+from torchgrasp.contacts.hold_probability import CarriedWeight, hold_probability
 from torchgrasp.contacts.plan import plan_contacts
 from torchgrasp.hand.hand import Hand
 from torchgrasp.hand.load import load_hand
@@ -84,6 +84,7 @@ __all__ = [
     "certify",
     "closure_probability",
     "critical_friction",
+    "CarriedWeight",
     "hold_probability",
     "plan_contacts",
     "Hand",

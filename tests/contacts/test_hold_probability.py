@@ -2,16 +2,26 @@
 with an exact test of closure, scipy's distributions, quadrature and finite differences.
 """
 
+import dataclasses
 import math
 
 import numpy as np
 import pytest
 import torch
 from scipy import integrate, stats
+from scipy.optimize import linprog
 
 from tests.contacts.test_forces import tripods
-from tests.make import real
-from torchgrasp import Contacts, Distribution, critical_friction, hold_probability
+from tests.make import contacts_on, near, real
+from torchgrasp import (
+    CarriedWeight,
+    Contacts,
+    ContactSpec,
+    Distribution,
+    closure_probability,
+    critical_friction,
+    hold_probability,
+)
 from torchgrasp.contacts.critical import least_balance
 from torchgrasp.contacts.form_closure import closed_exact
 from torchgrasp.contacts.hold_probability import exceeding, sensitivities
@@ -80,6 +90,85 @@ def test_errors_of_the_pose_move_all_contacts_together(shift, turn, generator):
     assert float((found - share).abs().mean()) <= 0.02
     without = hold_probability(contacts, WIDE)
     assert float((without - share).abs().mean()) > float((found - share).abs().mean())
+
+
+def carried_masses(points, normals, friction, weight, edges=64):
+    """The least and the greatest mass [kg] that forces in friction pyramids carry, by a linear
+    programme; None if there is none. Its pyramids lie inside the cones, and are hardly less.
+    """
+    angle = 2 * math.pi * np.arange(edges) / edges
+    columns = []
+    for point, normal in zip(points, normals, strict=True):
+        one, other = np.linalg.svd(normal[None])[2][1:]
+        around = np.outer(np.cos(angle), one) + np.outer(np.sin(angle), other)
+        force = friction * around - normal
+        moment = np.cross(point - weight.center.numpy(), force) / 0.04
+        columns.append(np.concatenate([force, moment], 1))
+    balance = np.concatenate([np.concatenate(columns).T, [[0], [0], [-9.81], [0], [0], [0]]], 1)
+    pressed = np.append(np.ones(edges * len(points)), 0.0)[None]
+    found = [
+        linprog(
+            np.append(np.zeros(edges * len(points)), sign),
+            A_eq=np.concatenate([balance, pressed]),
+            b_eq=np.append(np.zeros(6), len(points) * weight.press),
+        )
+        for sign in (1, -1)
+    ]
+    return None if found[0].x is None else (found[0].x[-1], found[1].x[-1])
+
+
+@pytest.mark.parametrize("law", ["0.05:0.6", "0.1|0.2:0.8"])
+def test_a_mass_counts_by_the_friction_that_it_needs(law, generator):
+    contacts = Contacts(*tripods(12, 3))
+    mass = Distribution.parse(law)
+    weight = CarriedWeight(mass, torch.tensor([0.01, 0.0, 0.01]), press=4.0)
+    found = hold_probability(contacts, WIDE, weight=weight)
+    masses = mass.sample(10_000, seed=1).numpy()
+    frictions = 16
+    share = torch.zeros(12, dtype=torch.float64)
+    for k in range(frictions):
+        q = (k + torch.rand(1, generator=generator, dtype=torch.float64)) / frictions
+        friction = float(WIDE.quantile(q))
+        for row in range(12):
+            points, normals = contacts.points[row].numpy(), contacts.normals[row].numpy()
+            carried = carried_masses(points, normals, friction, weight)
+            if carried is not None:
+                held = (carried[0] <= masses) & (masses <= carried[1])
+                share[row] += float(held.mean()) / frictions
+    assert float((found - share).abs().mean()) <= 0.02
+    without = hold_probability(contacts, WIDE)
+    assert float((without - share).abs().mean()) > 0.1
+
+
+def test_an_uncertain_centre_of_mass_is_the_mean_over_centres(generator):
+    contacts = Contacts(*tripods(20, 3))
+    up = unit(torch.tensor([1.0, 2.0, 2.0], dtype=torch.float64))
+    weight = CarriedWeight(0.2, torch.zeros(3), 4.0, up, center_std=0.005)
+    found = hold_probability(contacts, WIDE, weight=weight)
+    drawn = 100
+    center = 0.005 * torch.randn(20 * drawn, 3, generator=generator, dtype=torch.float64)
+    one = dataclasses.replace(weight, center=center, center_std=0.0)
+    many = Contacts(*(x.repeat(drawn, 1, 1) for x in (contacts.points, contacts.normals)))
+    share = hold_probability(many, WIDE, weight=one).view(drawn, 20).mean(0)
+    assert float((found - share).abs().mean()) <= 0.02
+
+
+@pytest.mark.parametrize(("fingertips", "friction"), [(3, 0.6), (4, 0.3)])
+def test_drawn_surfaces_close_as_often_as_an_exact_test_says(
+    doubtful, generator, fingertips, friction
+):
+    contacts = contacts_on(doubtful, generator, 6, fingertips)
+    found = hold_probability(contacts, friction, shape=doubtful, draws=400, seed=3)
+    spec = ContactSpec(friction=friction)
+    exact = closure_probability(doubtful, contacts, spec, n=400, seed=3)
+    near(found, exact.probability, 2 / 400)
+    law = Distribution.between(friction / 2, friction)
+    found = hold_probability(contacts, law, shape=doubtful, draws=200)
+    spec = ContactSpec(friction=law)
+    share = closure_probability(doubtful, contacts, spec, n=1000, seed=1).probability
+    assert float((found - share).abs().mean()) <= 0.02
+    with pytest.raises(BadArgument, match="domain"):
+        hold_probability(Contacts(9 * contacts.points, contacts.normals), law, shape=doubtful)
 
 
 def test_friction_alone_is_scipys_survival_of_the_critical_friction():
@@ -165,6 +254,7 @@ def test_each_normal_may_have_its_own_tilt_and_sets_are_independent():
 def test_wrong_arguments_are_refused():
     points, normals = tripods(4, 3)
     contacts = Contacts(points, normals)
+    weight = CarriedWeight(0.1, torch.zeros(3, 3), 5.0)
     wrong = [
         ("contacts.points", (Contacts(points[:, :2], normals[:, :2]), 0.5)),
         ("contacts.normals", (Contacts(points, 2 * normals), 0.5)),
@@ -177,8 +267,16 @@ def test_wrong_arguments_are_refused():
         ("tilt", (contacts, 0.5, 0.0, -0.1)),
         ("tilt", (contacts, 0.5, 0.0, torch.full((4, 3), 4.0))),
         ("tilt", (contacts, 0.5, 0.0, torch.zeros(4, 2))),
+        ("weight.center", (contacts, 0.5, 0.0, 0.0, 0.0, 0.0, weight)),
         ("tilt", (contacts, 0.5, 0.0, real([[math.nan] * 3] * 4))),
     ]
     for argument, arguments in wrong:
         with pytest.raises(BadArgument, match=argument):
             hold_probability(*arguments)
+    for argument, arguments in (
+        ("mass", (Distribution.between(0.0, 0.1), torch.zeros(3), 5.0)),
+        ("press", (0.1, torch.zeros(3), 0.0)),
+        ("up", (0.1, torch.zeros(3), 5.0, torch.ones(3))),
+    ):
+        with pytest.raises(BadArgument, match=argument):
+            CarriedWeight(*arguments)

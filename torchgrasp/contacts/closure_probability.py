@@ -18,7 +18,7 @@ from torchgrasp.contacts.problem import walls_at
 from torchgrasp.foundation.base import Batch, row_numbers
 from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument
-from torchgrasp.foundation.rules import FINITE, Range, Seed
+from torchgrasp.foundation.rules import FINITE, Range, Seed, is_known
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import real
 from torchgrasp.geometry.linalg import dot, norm, unit
@@ -101,7 +101,7 @@ def well_inside(shape: ShapeGP, contacts: Contacts) -> Bool[Tensor, "b"]:
 
 def _normalised_points(shape: ShapeGP, contacts: Contacts) -> Vectors:
     """Return contact points in the normalised units of a shape, on its device."""
-    return shape.normalise(contacts.points.detach().double().to(shape.device))
+    return shape.normalise(contacts.points.double().to(shape.device))
 
 
 def line_posterior(shape: ShapeGP, contacts: Contacts) -> LinePosterior:
@@ -114,8 +114,9 @@ def line_posterior(shape: ShapeGP, contacts: Contacts) -> LinePosterior:
     for name, value in (("points", contacts.points), ("normals", contacts.normals)):
         check_tensor(f"contacts.{name}", value, (len(contacts), f, 3))
     points = _normalised_points(shape, contacts)
-    normals = check_unit(contacts.normals.detach().double().to(shape.device))
-    if not bool(well_inside(shape, contacts).all()):
+    normals = check_unit(contacts.normals.double().to(shape.device))
+    inside = well_inside(shape, contacts)
+    if is_known(inside) and not bool(inside.all()):
         raise BadArgument(
             "contacts.points", "a contact at the edge of the domain", "contacts further inside"
         )
@@ -156,10 +157,12 @@ def _along_lines(
     nodes = deviation[..., None] * torch.tensor(NODES, dtype=torch.float32, device="cpu").to(
         deviation
     )
-    values = 4 * len(NODES) * points.shape[1]
-    covariance = points.new_empty(len(points), values, values)
-    for rows in row_numbers(points).split(LINES):
-        covariance[rows] = node_covariance(shape, points[rows], normals[rows], nodes[rows])
+    covariance = torch.cat(
+        [
+            node_covariance(shape, points[rows], normals[rows], nodes[rows])
+            for rows in row_numbers(points).split(LINES)
+        ]
+    )
     _, slope = shape.mean_and_gradient(_on_lines(points, normals, nodes).reshape(-1, 3))
     t = deviation[..., None] * grid().to(deviation)
     distance = shape.mean(_on_lines(points, normals, t).reshape(-1, 3))
@@ -302,6 +305,20 @@ def closure_probability(
     share = weights.to(shares) @ shares
     middle = (n * share + 1) / (n + 2)
     return ClosureProbability(share, torch.sqrt(middle * (1 - middle) / n))
+
+
+def drawn_contacts(lines: LinePosterior, n: int, seed: int) -> tuple[TouchPoints, TouchPoints]:
+    """Return points (normalised) and outward unit normals at which fingertips touch n random
+    surfaces, drawn with a seed on `lines`.
+
+    Both have the shape (b, n, f, 3), and are NaN where a line meets no surface.
+    """
+    # the draws are the same for all that torch.vmap maps over
+    with torch._C._DisableFuncTorch():
+        generator = torch.Generator("cpu").manual_seed(seed)
+        size = n, lines.root.shape[-1]
+        standard = torch.randn(size, dtype=torch.float64, generator=generator, device="cpu")
+    return first_contact(lines, standard.to(lines.root.device) @ lines.root)
 
 
 def closed_share(lines: LinePosterior, friction: float, n: int, seed: int) -> Float[Tensor, "b"]:

@@ -20,7 +20,7 @@ s, D = (2 J w w^T J - J) / beta maps x to s. Its inverse is beta (2 w w^T - J).
 """
 
 import dataclasses
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -28,10 +28,10 @@ from torch import Tensor
 
 from torchgrasp.contacts.balance import grasp_map
 from torchgrasp.contacts.form_closure import Vectors, scaled_arms
-from torchgrasp.foundation.base import FINGERTIPS, flatnonzero
+from torchgrasp.foundation.base import FINGERTIPS, flatnonzero, row_numbers
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
-from torchgrasp.foundation.rules import ANY
+from torchgrasp.foundation.rules import ANY, is_known
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import degenerate
 from torchgrasp.geometry.linalg import eye_like, matvec, norm
@@ -140,32 +140,94 @@ def critical_friction(
     return friction.to(points).reshape(points.shape[:-2])
 
 
-def least_balance(points: Vectors, normals: Vectors) -> tuple[Int[Tensor, "k"], LeastBalance]:
+def least_balance(
+    points: Vectors, normals: Vectors, load: Float[Tensor, "b 6"] | None = None
+) -> tuple[Int[Tensor, "k"], LeastBalance]:
     """Return the indices of the k contact sets that can balance, and their balances.
 
-    The balances are differentiable in `points` and `normals`. Where several motions of the object
-    prove the friction, its derivative is that of one of them.
+    The balances are differentiable twice in all arguments. Where several motions of the object
+    prove the friction, its derivative is that of one of them. Inside torch.vmap, all sets have an
+    index; the balances of those that cannot balance are NaN.
+
+    Args:
+        points: positions [m] of f contacts.
+        normals: outward unit normals of the object.
+        load: wrench that the contacts balance, in the units of `scaled_arms`, over the mean normal
+            force; None means no load. Few sets fail to converge, most of them under loads far below
+            the normal forces.
     """
-    with torch.no_grad():
-        rows, found = _search(points.detach(), normals.detach())
-        for _ in range(CRITICAL.polishing):
-            found = _Cones.of(points.detach()[rows], normals.detach()[rows]).nearer(found)
-    if is_plain(points, normals):
+    load = points.new_zeros(len(points), 6) if load is None else load
+    good, *parts = _Search.apply(points.detach(), normals.detach(), load.detach())
+    found = LeastBalance(*parts)
+    rows = flatnonzero(good) if is_known(good) else row_numbers(good)
+    found = found.rows(rows)
+    if is_plain(points, normals, load):
         return rows, found
     # Newton's steps at the solution change the derivatives alone: the first step those of first
     # order, the second step those of second order.
-    cones = _Cones.of(points[rows], normals[rows])
+    cones = _Cones.of(points[rows], normals[rows], load[rows])
     for _ in range(2):
         found = cones.nearer(found)
     return rows, found
 
 
-def _search(points: Vectors, normals: Vectors) -> tuple[Int[Tensor, "k"], LeastBalance]:
+class _Search(torch.autograd.Function):
+    """The search for balances, without derivatives.
+
+    Its results are the mask of the contact sets that can balance, and the fields of their
+    `LeastBalance`; those of others are NaN.
+    """
+
+    @staticmethod
+    def forward(
+        points: Vectors, normals: Vectors, load: Float[Tensor, "b 6"]
+    ) -> tuple[Tensor, ...]:
+        """Return the mask and the fields for all contact sets."""
+        rows, found = _search(points, normals, load)
+        for _ in range(CRITICAL.polishing):
+            found = _Cones.of(points[rows], normals[rows], load[rows]).nearer(found)
+        good = torch.zeros_like(load[:, 0], dtype=torch.bool).index_fill(0, rows, True)
+        parts = (x.new_full((len(good), *x.shape[1:]), torch.nan) for x in found)
+        return good, *(x.index_copy(0, rows, y) for x, y in zip(parts, found, strict=True))
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:
+        """Say that no result has a derivative."""
+        ctx.mark_non_differentiable(*output)
+
+    @staticmethod
+    def backward(ctx: Any, *_: Any) -> tuple[None, ...]:
+        """Return no derivatives."""
+        return None, None, None
+
+    @staticmethod
+    def jvp(ctx: Any, *_: Any) -> tuple[None, ...]:
+        """Return no changes of the results."""
+        return (None,) * (1 + len(LeastBalance._fields))
+
+    @staticmethod
+    def vmap(
+        info: Any, in_dims: tuple[int | None, ...], *args: Tensor
+    ) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
+        """Search together for the balances of all entries of the mapped axis."""
+        rows = [
+            x.expand(info.batch_size, *x.shape) if axis is None else x.movedim(axis, 0)
+            for x, axis in zip(args, in_dims, strict=True)
+        ]
+        found = _Search.apply(*(x.flatten(0, 1) for x in rows))
+        size = rows[0].shape[:2]
+        return tuple(x.unflatten(0, size) for x in found), (0,) * len(found)
+
+
+def _search(
+    points: Vectors, normals: Vectors, load: Float[Tensor, "b 6"]
+) -> tuple[Int[Tensor, "k"], LeastBalance]:
     """Return the result of `least_balance`, without derivatives."""
     numbers = CRITICAL
     finite = torch.isfinite(points) & torch.isfinite(normals)
-    left = flatnonzero(finite.flatten(1).all(1) & ~degenerate(points))
-    cones = _Cones.of(points[left], normals[left])
+    finite = finite.flatten(1).all(1) & torch.isfinite(load).all(1)
+    left = flatnonzero(finite & ~degenerate(points))
+    cones = _Cones.of(points[left], normals[left], load[left])
     at = cones.first()
     whole = points.new_ones(len(left))
     shorter = whole.new_tensor(numbers.shorter)
@@ -213,18 +275,19 @@ def _search(points: Vectors, normals: Vectors) -> tuple[Int[Tensor, "k"], LeastB
 
 
 class _Cones(NamedTuple):
-    """The friction cones of b contact sets: the normals, and the rows of G and of the sum of normal
-    forces (b, 7, f, 3).
+    """The friction cones of b contact sets: the normals, the rows of G and of the sum of normal
+    forces (b, 7, f, 3), and the load that the forces balance.
     """
 
     normals: Vectors
     rows: Float[Tensor, "b 7 f 3"]
+    load: Float[Tensor, "b 6"]
 
     @classmethod
-    def of(cls, points: Vectors, normals: Vectors) -> "_Cones":
+    def of(cls, points: Vectors, normals: Vectors, load: Float[Tensor, "b 6"]) -> "_Cones":
         """Return the cones of contacts."""
         balance = grasp_map(scaled_arms(points)).unflatten(2, (-1, 3))
-        return cls(normals, torch.cat([balance, normals[:, None]], 1))
+        return cls(normals, torch.cat([balance, normals[:, None]], 1), load)
 
     def first(self) -> LeastBalance:
         """Return the start: equal pushes, made to balance where they then push everywhere."""
@@ -232,7 +295,7 @@ class _Cones(NamedTuple):
         n = self.normals
         b, f, _ = n.shape
         grasp = self.rows[:, :6].flatten(2)
-        total = -(grasp @ n.flatten(1)[..., None])
+        total = self.load[..., None] - grasp @ n.flatten(1)[..., None]
         needed, _ = torch.linalg.solve_ex(grasp @ grasp.mT, total)
         balanced = -n - (grasp.mT @ needed)[..., 0].view(b, f, 3)
         pushes = (-_dot(balanced, n) > numbers.pushing).all(1)[:, None, None]
@@ -261,8 +324,8 @@ class _Cones(NamedTuple):
         return (at.friction[:, None] * push * at.press + _dot(tangential, at.slide)) / 2
 
     def resultant(self, at: LeastBalance) -> Float[Tensor, "b"]:
-        """Return the length of the total wrench of the forces."""
-        return norm(matvec(self.rows[:, :6].flatten(2), at.forces.flatten(1)))
+        """Return the length of the total wrench of forces and load."""
+        return norm(matvec(self.rows[:, :6].flatten(2), at.forces.flatten(1)) + self.load)
 
     def longest(self, at: LeastBalance, change: LeastBalance) -> Float[Tensor, "b"]:
         """Return the largest share of a change for which all x_i and s_i stay in their cones, to
@@ -345,7 +408,8 @@ class _Cones(NamedTuple):
         free = torch.stack([still, centring], 1)  # (b, 2, f, 3)
         right = free.flatten(2) @ rows.flatten(2).mT  # (b, 2, 8)
         total = torch.einsum("brfi,bfi->br", self.rows, at.forces)
-        total = total + torch.cat([total.new_zeros(6), total.new_full((1,), n.shape[1])])
+        pressed = torch.full_like(self.load[:, :1], n.shape[1])
+        total = total + torch.cat([self.load, pressed], 1)
         weighed = (push * x * inverse_x).sum(1)
         residual = torch.cat([total, torch.ones_like(weighed)[:, None]], 1)
         other = -weighed[:, None] * corner

@@ -9,13 +9,19 @@ contacts that move by u_i and normals that turn by w_i, both along the surface, 
 with the symbols of `torchgrasp.contacts.critical`, of the twist y only the rotation, and the
 root-mean-square radius r of the contacts. An object that is displaced by v, and turned by z about
 the centroid of its contacts p_i, moves all contacts together: u_i is the part of v + z x (p_i - p)
-along the surface, with the centroid p. So Gaussian errors make mu_c Gaussian, with a standard
-deviation s. Then the friction m suffices with the probability Phi((m - mu_c) / s), whose mean for m
-in an interval [a, b] is
+along the surface, with the centroid p. Under a weight w, whose centre of mass is c, a change of the
+mass by the share e and of the centre by d changes mu_c by
+
+    e y . w + (w_f x y / r) . d,    w_f the force of w.
+
+An interval of masses is split into ranges, each of which counts as a Gaussian error. So Gaussian
+errors make mu_c Gaussian, with a standard deviation s. Then the friction m suffices with the
+probability Phi((m - mu_c) / s), whose mean for m in an interval [a, b] is
 
     s (Psi((b - mu_c) / s) - Psi((a - mu_c) / s)) / (b - a),    Psi(x) = x Phi(x) + Phi'(x).
 """
 
+import dataclasses
 import math
 from typing import Annotated
 
@@ -23,28 +29,75 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchgrasp.contacts.certify import check_contacts, check_unit
+from torchgrasp.contacts.certify import UNIT_TOLERANCE, check_contacts, check_unit
+from torchgrasp.contacts.closure_probability import drawn_contacts, line_posterior
 from torchgrasp.contacts.critical import LeastBalance, least_balance
-from torchgrasp.contacts.form_closure import Vectors, centre_and_radius
-from torchgrasp.foundation.base import at_once, in_chunks
+from torchgrasp.contacts.form_closure import Vectors, centre_and_radius, with_torque
+from torchgrasp.foundation.base import Value, at_once, in_chunks
 from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument
-from torchgrasp.foundation.rules import Length, Range
+from torchgrasp.foundation.rules import Force, Length, Range, Seed, is_known
 from torchgrasp.foundation.threads import single_threaded
 from torchgrasp.geometry.frames import real
-from torchgrasp.geometry.linalg import dot
+from torchgrasp.geometry.linalg import dot, eye_like, norm
+from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.values.distribution import Distribution, check_within
 from torchgrasp.values.planning import Contacts
-from torchgrasp.values.specs import FRICTIONS
+from torchgrasp.values.specs import FRICTIONS, MASSES
 
 TILTS = Range(0.0, math.pi)
 """The standard deviations [rad] of a normal that are possible."""
-NARROW = 1e-4
-"""An interval shorter than this, in standard deviations, counts as its middle: the difference of
-Psi would be lost in rounding.
-"""
-PARTS = 2**20
-"""Pairs of a contact set and a part of the distribution that are computed at a time."""
+
+
+@dataclasses.dataclass(frozen=True)
+class HoldProbabilityNumbers:
+    """Parameters of `hold_probability`."""
+
+    narrow: float = 1e-4
+    """An interval shorter than this, in standard deviations, counts as its middle: the difference
+    of Psi would be lost in rounding.
+    """
+    parts: int = 2**20
+    """Pairs of a contact set and a part of the distribution that are computed at a time."""
+    masses: int = 9
+    """Number of ranges of an uncertain mass, in each of which the critical friction is linear."""
+    gravity: float = 9.81
+    """Acceleration [m/s2] of the weight."""
+
+
+HOLD = HoldProbabilityNumbers()
+
+
+@checked
+@dataclasses.dataclass(frozen=True)
+class CarriedWeight(Value):
+    """The weight of an object that contacts carry.
+
+    Args:
+        mass: mass of the object [kg], or its `Distribution`.
+        center: centre of mass [m] in the frame of the contacts, one for all contact sets or one for
+            each.
+        press: mean normal force [N] of the contacts.
+        up: unit vector against gravity in the frame of the contacts; None means z.
+        center_std: standard deviation [m] of the centre of mass along each of three axes.
+
+    Raises `BadArgument` for a number outside its range, or an `up` that is not of length 1.
+
+    >>> weight = CarriedWeight(Distribution.between(0.1, 0.4), torch.zeros(3), press=5.0)
+    """
+
+    mass: Annotated[float, MASSES] | Distribution
+    center: Float[Tensor, "3"] | Float[Tensor, "b 3"]
+    press: Force
+    up: Float[Tensor, "3"] | None = None
+    center_std: Length = 0.0
+
+    def __post_init__(self) -> None:
+        check_within("mass", self.mass, MASSES)
+        if self.up is not None and is_known(self.up):
+            length = float(norm(self.up.detach()))
+            if not abs(length - 1) <= UNIT_TOLERANCE:
+                raise BadArgument("up", f"a length of {length:.4g}", "a unit vector (to 1e-3)")
 
 
 @checked
@@ -56,15 +109,22 @@ def hold_probability(
     tilt: Annotated[float, TILTS] | Float[Tensor, "b f"] = 0.0,
     shift: Length = 0.0,
     turn: Annotated[float, TILTS] = 0.0,
+    weight: CarriedWeight | None = None,
+    shape: ShapeGP | None = None,
+    draws: Annotated[int, Range(1, 10**6)] = 200,
+    seed: Seed = 0,
 ) -> Float[Tensor, "b"]:
     """Return the probability (b,) that each contact set has force closure, for uncertain friction,
     finger placement, normals and object pose.
 
-    If only the friction is uncertain, the result is exact. It then is the probability that the
-    friction exceeds the `critical_friction`, and 0 where that is infinite. The other errors count
-    to first order. So the result is mostly a little too high, since errors also raise the mean of
-    the critical friction. Errors count too little where the critical friction has a kink, as for
-    contacts that are exactly symmetric.
+    With a `weight`, it is the probability that forces with the mean normal force `weight.press`
+    balance the weight. With a `shape`, it is the mean over random surfaces. If only the friction is
+    uncertain, the result is exact. It then is the probability that the friction exceeds the
+    `critical_friction`, and 0 where that is infinite. The other errors count to first order. So the
+    result is mostly a little too high, since errors also raise the mean of the critical friction.
+    Errors count too little where the critical friction has a kink, as for contacts that are exactly
+    symmetric. A set for which the method does not converge counts as 0;
+    most of them carry a load far below the normal forces.
 
     Args:
         contacts: sets of 3 to 5 contacts (b, f, 3) [m] with outward unit normals.
@@ -77,12 +137,20 @@ def hold_probability(
             all contacts together along the surface.
         turn: standard deviation [rad] of the object's rotation about each of three axes through the
             contacts' centroid.
+        weight: the weight that the contacts carry; None means that any load may come, and the
+            fingertips press as much as it needs.
+        shape: the uncertain shape in the frame of the contacts. Random surfaces are drawn from it
+            as in `closure_probability`; the other errors count on each of them. None means that the
+            contacts are where they were planned.
+        draws: number of random surfaces.
+        seed: random seed of the surfaces.
 
     Raises `BadArgument` for:
 
     * sets of other than 3 to 5 contacts;
     * normals that are not of length 1 (to 1e-3);
-    * numbers outside their range.
+    * numbers outside their range;
+    * contacts outside the domain of the `shape`.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> contacts = load_shipped_grasp("jug", "allegro").contacts
@@ -93,18 +161,123 @@ def hold_probability(
     points = check_contacts(contacts).points.double()
     normals = check_unit(contacts.normals.double())
     check_within("friction", friction, FRICTIONS)
-    tilts = _tilts(tilt, points)
-    rows, balance = least_balance(points, normals)
-    moved, turned = sensitivities(points[rows], normals[rows], balance)
-    errors = torch.stack([placement * moved, tilts[rows, :, None] * turned], 1)  # (k, 2, f, 3)
-    arms = points[rows] - points[rows].mean(1, keepdim=True)
-    together = torch.stack(
-        [shift * moved.sum(1), turn * torch.linalg.cross(arms, moved).sum(1)], 1
-    )  # (k, 2, 3)
-    errors = torch.cat([errors.flatten(1), together.flatten(1)], 1)
-    deviation = torch.linalg.vector_norm(errors, dim=1)
-    found = exceeding(Distribution.of(friction), balance.friction, deviation)
-    return points.new_zeros(len(points)).index_put((rows,), found).to(contacts.points)
+    spread = _Errors(placement, _tilts(tilt, points), shift, turn)
+    center = points.new_zeros(len(points), 3)
+    if weight is not None:
+        center = _center(weight, points)
+    count = 1
+    if shape is not None:
+        count = draws
+        touched, slopes = drawn_contacts(line_posterior(shape, contacts), draws, seed)
+        points = shape.metres(touched.flatten(0, 1)).to(points)  # (b n, f, 3)
+        normals = slopes.flatten(0, 1).to(points)
+        tilts = spread.tilt.repeat_interleave(draws, 0)
+        spread = dataclasses.replace(spread, tilt=tilts)
+        center = center.repeat_interleave(draws, 0)
+    law = Distribution.of(friction)
+    if weight is None:
+        found = _held(law, points, normals, spread)
+    else:
+        found = points.new_zeros(len(points))
+        for mass, width, share in _mass_ranges(Distribution.of(weight.mass)):
+            burden = _Burden(_force(weight, mass, points), center, width / mass, weight.center_std)
+            found = found + share * _held(law, points, normals, spread, burden)
+    return found.unflatten(0, (-1, count)).mean(1).to(contacts.points)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Errors:
+    """Standard deviations of placement [m], normals [rad] (b, f), position [m] and rotation [rad]."""
+
+    placement: float
+    tilt: Float[Tensor, "b f"]
+    shift: float
+    turn: float
+
+
+@dataclasses.dataclass(frozen=True)
+class _Burden:
+    """A weight: the force over the mean normal force, the centre of mass [m] of each contact set,
+    the standard deviation of the mass over the mass, and that of the centre [m].
+    """
+
+    force: Float[Tensor, "3"]
+    center: Float[Tensor, "b 3"]
+    of_mass: float
+    of_center: float
+
+    def wrench(self, points: Vectors) -> Float[Tensor, "b 6"]:
+        """Return the load of `least_balance`."""
+        centroid, radius = centre_and_radius(points)
+        arm = self.center - centroid[:, 0]
+        return with_torque(self.force.expand_as(arm), arm / radius[:, 0])
+
+
+def _held(
+    law: Distribution,
+    points: Vectors,
+    normals: Vectors,
+    errors: _Errors,
+    burden: _Burden | None = None,
+) -> Float[Tensor, "b"]:
+    """Return the probability that each contact set balances, with a friction of the distribution
+    `law`, and 0 for those that cannot.
+    """
+    load = None if burden is None else burden.wrench(points)
+    rows, balance = least_balance(points, normals, load)
+    known = points[rows]
+    moved, turned = sensitivities(known, normals[rows], balance)
+    arms = known - known.mean(1, keepdim=True)
+    parts = [
+        (errors.placement * moved).flatten(1),
+        (errors.tilt[rows, :, None] * turned).flatten(1),
+        errors.shift * moved.sum(1),
+        errors.turn * torch.linalg.cross(arms, moved).sum(1),
+    ]
+    if burden is not None and load is not None:
+        _, radius = centre_and_radius(known)
+        push = burden.force.expand_as(balance.twist[:, 3:])
+        by_center = torch.linalg.cross(push, balance.twist[:, 3:]) / radius[:, 0]
+        by_mass = dot(balance.twist, load[rows], keepdim=True)
+        parts += [burden.of_center * by_center, burden.of_mass * by_mass]
+    square = (torch.cat(parts, 1) ** 2).sum(1)
+    # without errors the derivative of the root would be NaN
+    deviation = torch.where(square > 0, square, 1.0).sqrt() * (square > 0)
+    found = exceeding(law, balance.friction, deviation)
+    if not is_known(found):
+        return found.nan_to_num(0.0)
+    return points.new_zeros(len(points)).index_put((rows,), found)
+
+
+def _mass_ranges(law: Distribution) -> list[tuple[float, float, float]]:
+    """Return the masses that stand for a distribution: mass, standard deviation around it [kg], and
+    probability of each.
+    """
+    if len(law.parts) > HOLD.masses:
+        numbers, shares = law.nodes(HOLD.masses)
+        return [(x, 0.0, p) for x, p in zip(numbers.tolist(), shares.tolist(), strict=True)]
+    found = list[tuple[float, float, float]]()
+    for (low, high), share in zip(law.parts, law.shares, strict=True):
+        count = 1 if low == high else max(1, round(HOLD.masses * share))
+        width = (high - low) / count
+        for k in range(count):
+            found.append((low + (k + 0.5) * width, width / math.sqrt(12), share / count))
+    return found
+
+
+def _force(weight: CarriedWeight, mass: float, like: Tensor) -> Float[Tensor, "3"]:
+    """Return the weight of a `mass` [kg] as a force, over the mean normal force."""
+    up = eye_like(3, like)[2] if weight.up is None else weight.up.to(like)
+    return -mass * HOLD.gravity / weight.press * up
+
+
+def _center(weight: CarriedWeight, points: Vectors) -> Float[Tensor, "b 3"]:
+    """Return the centre of mass [m] of each contact set; raise `BadArgument` if there is not one
+    for each.
+    """
+    if weight.center.ndim == 2:
+        check_tensor("weight.center", weight.center, (len(points), 3))
+    return weight.center.to(points).expand(len(points), 3)
 
 
 def _tilts(tilt: float | Tensor, points: Vectors) -> Float[Tensor, "b f"]:
@@ -114,6 +287,8 @@ def _tilts(tilt: float | Tensor, points: Vectors) -> Float[Tensor, "b f"]:
     if not isinstance(tilt, Tensor):
         return torch.full_like(points[..., 0], tilt)
     check_tensor("tilt", tilt, tuple(points.shape[:2]))
+    if not is_known(tilt):
+        return tilt.to(points)
     wrong = tilt[(tilt < TILTS.low) | (tilt > TILTS.high)]
     if len(wrong):
         allowed = f"angles in [{TILTS.low:g}, {TILTS.high:.4g}] rad"
@@ -152,13 +327,17 @@ def exceeding(
         low = (ends[:, 0] - middle) / spread  # (k, parts)
         high = (ends[:, 1] - middle) / spread
         length = high - low
-        within = (_mean_positive(high) - _mean_positive(low)) / length
+        wide = length > HOLD.narrow
+        within = _mean_positive(high) - _mean_positive(low)
+        within = within / torch.where(wide, length, 1.0)
         at_middle = torch.special.ndtr((low + high) / 2)
-        return (torch.where(length > NARROW, within, at_middle) @ shares,)
+        return (torch.where(wide, within, at_middle) @ shares,)
 
-    size = at_once(mean, max(PARTS // len(ends), 1))
-    (uncertain,) = in_chunks(blurred, torch.stack([mean, deviation], 1), size)
-    return torch.where(deviation > 0, uncertain, 1 - law.cdf(mean)).clamp(0, 1)
+    size = at_once(mean, max(HOLD.parts // len(ends), 1))
+    certain = deviation == 0
+    spread = torch.where(certain, 1.0, deviation)
+    (uncertain,) = in_chunks(blurred, torch.stack([mean, spread], 1), size)
+    return torch.where(certain, 1 - law.cdf(mean), uncertain).clamp(0, 1)
 
 
 def _mean_positive(x: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
