@@ -155,3 +155,19 @@ def test_the_next_try_begins_with_what_the_touches_have_left_of_an_uncertain_fri
     assert 0.5 < known.least < 0.6 and known.most == 1.0
     assert left.controller.reference.friction == known
     assert after("0.8").grasps.meta["friction"] == "0.8"
+    assert "mass" not in left.grasps.meta
+
+
+def test_the_next_try_knows_what_a_load_that_is_too_heavy_shows_of_the_mass():
+    attempt = GraspTry(
+        around(0.0, 90.0),
+        lambda grasp: GraspController(
+            on_table(obj_from_hand=grasp.obj_from_hand[0]), holding="grip"
+        ),
+    )
+    list(close_on_block(attempt.controller, 3.0))
+    attempt.controller.hold.most = 9.81  # [N], the weight of 1 kg
+    attempt.controller.hold.status = Status.TOO_HEAVY
+    known = Distribution.parse(attempt.next().grasps.meta["mass"])
+    assert known == attempt.controller.mass
+    assert 0.3 < known.least < 1.0 < known.most

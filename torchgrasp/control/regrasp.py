@@ -204,7 +204,8 @@ class GraspTry:
         best-ranked one.
 
         If the grasps were planned for a distribution of friction, the touches narrow it. The grasps
-        of the next try have what is left in `meta["friction"]`.
+        of the next try have what is left in `meta["friction"]`. If the object was too heavy, they
+        have what the lift has shown of the mass [kg] in `meta["mass"]`, as a `Distribution`.
         """
         if not len(self.others):
             return None
@@ -214,14 +215,18 @@ class GraspTry:
         return GraspTry(grasps, self.start, self.surface, (*self.tried, row), moved)
 
     def _informed(self) -> Grasps:
-        """Return the grasps, with what the touches have left of an uncertain friction."""
-        prior = self.controller.reference.friction
-        left = self.controller.friction
+        """Return the grasps, with what the try has shown of friction and mass."""
+        controller = self.controller
+        meta = dict[str, str]()
+        left = controller.friction
         # a controller accepts no friction of 0
-        if left is None or left.least <= 0.0 or not isinstance(prior, Distribution):
-            return self.grasps
-        meta = self.grasps.meta | {"friction": str(left)}
-        return dataclasses.replace(self.grasps, meta=meta)
+        if left is not None and left.least > 0.0:
+            if isinstance(controller.reference.friction, Distribution):
+                meta["friction"] = str(left)
+        # a hand that loses the object does not feel its whole weight
+        if controller.mass is not None and controller.status is Status.TOO_HEAVY:
+            meta["mass"] = str(controller.mass)
+        return dataclasses.replace(self.grasps, meta=self.grasps.meta | meta)
 
 
 class Withdrawal:
