@@ -9,6 +9,7 @@ from torchgrasp import Status, certify
 from torchgrasp.contacts.feasibility import flatness_constraint
 from torchgrasp.contacts.problem import ContactProblem, triple_jet
 from torchgrasp.contacts.solver import normalise_tensions
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.frames import apply
 from torchgrasp.ik.attempts import assign, solve_contact_first
 from torchgrasp.ik.configuration import Configuration
@@ -36,6 +37,15 @@ def scene(jugs, fingertips):
 @pytest.fixture(scope="module")
 def grasps(jug_grasps, fingertips):
     return jug_grasps(fingertips)
+
+
+def test_guesses_of_another_hand_or_of_other_contact_sets_are_refused(scene):
+    given, seeds, shape, spec = scene
+    fewer_joints = dataclasses.replace(seeds, joints=seeds.joints[:, 1:])
+    beyond = dataclasses.replace(seeds, row=seeds.row + len(given.contacts.points))
+    for wrong, found in ((fewer_joints, "joints"), (beyond, "contact set")):
+        with pytest.raises(BadArgument, match=rf"seeds: expected .*{found}"):
+            solve_joint(given, wrong, shape, spec)
 
 
 def test_jacobian_of_the_joint_problem_against_finite_differences(scene, generator):

@@ -1,5 +1,6 @@
 """The zero level of a sphere's posterior against the sphere."""
 
+import dataclasses
 import math
 from typing import Literal
 
@@ -10,8 +11,8 @@ import trimesh
 
 from tests.make import cup_view, near, real
 from torchgrasp import PointCloud, ShapeGP, fit_shape
-from torchgrasp.foundation.errors import BadArgument
-from torchgrasp.shape.surface import _grid, extract_mesh, extract_surface
+from torchgrasp.foundation.errors import BadArgument, SuspiciousScale
+from torchgrasp.shape.surface import _grid, collision_field, extract_mesh, extract_surface
 
 RADIUS = 0.04
 CENTER = real([0.2, -0.1, 0.3])
@@ -93,3 +94,10 @@ def test_both_walls_of_a_vessel_are_wound_outward():
 def test_a_resolution_out_of_range_is_refused(ball: ShapeGP, resolution: int):
     with pytest.raises(BadArgument, match="resolution"):
         extract_surface(ball, resolution)
+
+
+def test_an_object_far_larger_than_a_hand_is_refused_by_its_size(ball: ShapeGP):
+    mesh = extract_mesh(ball)
+    large = dataclasses.replace(mesh, vertices=1.2 / 0.08 * mesh.vertices)
+    with pytest.raises(SuspiciousScale, match=r"cloud: expected an object of less than .* m, got"):
+        collision_field(ball, large)

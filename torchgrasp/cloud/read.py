@@ -95,13 +95,16 @@ def read_cloud(
     the format:
 
     * `.ply`, ascii or binary: x y z, optionally nx ny nz. Header lines `comment viewpoint x y z`
-      and `comment frustum` with 12 numbers give the camera. `comment table` with 4 numbers gives
-      the table. A mesh gives 2000 surface points, with normals if it is closed.
+      and `comment frustum` give the camera. The 12 numbers of a frustum are the inward unit normals
+      of the four sides of the view, as in `PointCloud`. `comment table` gives the table, by the 3
+      numbers of its unit normal and its offset. A mesh gives 2000 surface points, with normals if
+      it is closed.
     * `.pcd`, ascii, binary or compressed: x y z, optionally normal_x normal_y normal_z. VIEWPOINT
       gives the camera. Its default `0 0 0 1 0 0 0` counts only if a camera there can have seen the
       points.
     * `.npz`: arrays `points` (n, 3), optionally `normals` (n, 3), `viewpoint` (3,), `frustum`
-      (4, 3), `table` (4,). For several views: `viewpoint` (n, 3) and `frustum` (n, 4, 3).
+      (4, 3), `table` (4,), `pose_error` (n,). For several views: `viewpoint` (n, 3) and `frustum`
+      (n, 4, 3).
     * `.npy`: an (n, 3) array, or (n, 6) with normals; colours are left out. Columns 4 to 6 without
       names are normals if they have length 1 and fit the surface of the points.
     * `.xyz`, `.txt`, `.csv`, `.asc`, `.pts`, `.xyzi`, `.xyzn`, `.xyzrgb`: the same as text. A first
@@ -113,9 +116,10 @@ def read_cloud(
 
     Args:
         path: the file.
-        viewpoint: the camera's position (3,) [m] in the cloud's frame; None for the viewpoint in
-            the file.
-        unit: unit of length of the file's points and viewpoint, "m", "cm" or "mm".
+        viewpoint: the camera's position (3,) [m] in the cloud's frame. It replaces viewpoint and
+            frustum of the file. None means those of the file.
+        unit: unit of all lengths in the file, "m", "cm" or "mm". The argument `viewpoint` stays in
+            metres.
 
     Raises:
         CloudFileError: no such file; an unknown suffix; malformed content; more than 512 MB or 5

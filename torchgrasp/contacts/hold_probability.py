@@ -71,12 +71,14 @@ HOLD = HoldProbabilityNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class CarriedWeight(Value):
-    """The weight of an object that contacts carry.
+    """The weight of an object that contacts carry, for `hold_probability`.
+
+    Gravity is 9.81 m/s^2.
 
     Args:
         mass: mass of the object [kg], or its `Distribution`.
-        center: centre of mass [m] in the frame of the contacts, one for all contact sets or one for
-            each.
+        center: centre of mass (3,) [m] in the frame of the contacts, or (b, 3), one for each of b
+            contact sets.
         press: mean normal force [N] of the contacts.
         up: unit vector against gravity in the frame of the contacts; None means z.
         center_std: standard deviation [m] of the centre of mass along each of three axes.

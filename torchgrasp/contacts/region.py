@@ -42,8 +42,8 @@ class Region(Value):
         distance: function of points (n, 3) [m] in float64 that returns their signed distances (n,)
             [m], negative inside.
         name: name of the function in errors.
-        placed: whether the region must be at the object, as a box or a mesh. Planning then compares
-            it with the cloud.
+        placed: whether the region must be at the object, as a box or a mesh. If it is off the
+            cloud, planning raises `BadArgument` for `keep`, and warns `NoEffect` for `avoid`.
 
     >>> from torchgrasp import load_object
     >>> ball = Region(lambda points: points.norm(dim=-1) - 0.05)

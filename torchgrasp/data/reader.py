@@ -126,8 +126,9 @@ class GraspShards:
     def job(self, j: Annotated[int, Range(0, MOST)]) -> ShardJob:
         """Return cloud, grasps and trials of the job with the index `j` in `jobs`.
 
-        Numbers have the precision of the file. Raises `IndexError` for no such job. Raises
-        `ModelFileError` if its file is missing, damaged, or of another campaign.
+        Numbers have the precision of the file. `j` counts from 0. Raises `IndexError` if `jobs` has
+        no such index, and `BadArgument` for a negative one. Raises `ModelFileError` if its file is
+        missing, damaged, or of another campaign.
         """
         j = range(len(self.jobs))[j]
         row, records = self.recent.get(j // self.size, self._read).take(j % self.size)

@@ -190,8 +190,8 @@ class Hand(Value):
     def require_three(self, argument: str, what: str) -> None:
         """Raise `BadArgument` unless the hand has three fingertips, as in the paper.
 
-        `argument` is the name of the argument that the error's text names. `what` is its value,
-        which needs three fingertips.
+        Functions call it for options that need three fingertips. The error's text calls the option
+        `argument`, and its value `what`.
         """
         if len(self.tips) != 3:
             raise BadArgument(
@@ -352,13 +352,13 @@ class Hand(Value):
         negative if links overlap.
 
         A negative value is minus the shortest translation that separates two links. A positive
-        value is a lower bound of the distance, exact where a face is nearest. It is infinite if no
-        pair is tested.
+        value is at most the true distance. It is the true distance if the nearest point of one of
+        the two shapes lies on a face. It is infinite if no pair is tested.
 
         Args:
             joints: positions (*b, h) [rad or m] of the actuated joints.
-            below: separation [m] above which results may be inexact lower bounds. A small value
-                makes the function faster.
+            below: separation [m] that is of interest. Greater results may be any lower bound above
+                it. A small value makes the function faster.
             chunk: number of postures that are computed at a time, which bounds the memory.
         """
         self.actuated.check(joints)

@@ -77,12 +77,15 @@ class KinematicTree(Value):
     def frames(
         self, values: Float[Tensor, "j n"], root: Float[Tensor, "3 4 n"] | None = None
     ) -> Frames:
-        """Return the poses (3, 4, l, n) [m] of the l links in n postures, in the root's frame.
+        """Return the poses (3, 4, l, n) [m] of the l links, in the order of `link_names`, in n
+        postures.
+
+        A pose is the upper three rows of its 4 x 4 matrix; `poses` returns whole matrices.
 
         Args:
             values: positions (j, n) [rad or m] of all movable joints of the URDF.
-            root: poses (3, 4, n) [m] of the root link in another frame, in which the result then
-                is. None means the root's own frame.
+            root: poses (3, 4, n) [m] of the root link in another frame. The result is in the same
+                frame. None means the root's own frame.
         """
         constant, sine, cosine, slide = self.tables.to(values).unbind()
         local = torch.addcmul(constant, sine, values.sin().index_select(0, self.joint))

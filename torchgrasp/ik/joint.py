@@ -38,6 +38,7 @@ from torchgrasp.foundation.base import (
     spread,
 )
 from torchgrasp.foundation.checks import checked
+from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.linalg import dot, eye_like
 from torchgrasp.geometry.optim import LeastSquares, Residuals, levenberg_marquardt
 from torchgrasp.hand.hand import Hand
@@ -286,7 +287,9 @@ def solve_sliding(
 def solve_joint(
     problem: GraspProblem, seeds: IKSeeds, shape: ShapeLike, spec: ContactSpec
 ) -> Grasps:
-    """Return checked grasps, the best of each contact set that has initial guesses, best first.
+    """Return checked grasps, the best of each contact set that has initial guesses.
+
+    Executable grasps are first, then the order is by `score`.
 
     The guesses are tried in their order. If the hand cannot reach the contacts, they slide along
     the surface of the `shape`, and are certified anew. If the moved contacts fail, the grasp has
@@ -298,6 +301,8 @@ def solve_joint(
         shape: the object's shape, from `fit_shape`, in the frame of the contacts.
         spec: constraints under which sliding contacts are certified.
 
+    Raises `BadArgument` for guesses of another hand, or of other contact sets.
+
     >>> from torchgrasp import fit_shape, load_hand, load_object
     >>> from torchgrasp.ik import CollisionWorld, PostureLibrary, nearest_postures
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -308,8 +313,24 @@ def solve_joint(
     >>> solve_joint(problem, seeds, fit_shape(load_object("jug").view), ContactSpec()).status
     tensor([0])
     """
+    _check_seeds(problem, seeds)
     seeds = problem.drop_unreachable(seeds)
     attempts = try_best_seeds(problem, seeds)
     joint_problem = JointProblem(problem.hand, shape, ContactProblem.of(shape, spec), problem.world)
     solve_sliding(joint_problem, problem, seeds, attempts)
     return best_first(best_grasps(attempts)[0])
+
+
+def _check_seeds(problem: GraspProblem, seeds: IKSeeds) -> None:
+    """Raise `BadArgument` for initial guesses of another hand, or of other contact sets."""
+    sets, fingers = problem.contacts.points.shape[:2]
+    found = seeds.joints.shape[1], seeds.permutation.shape[1]
+    own = problem.hand.dof, fingers
+    if found != own:
+        joints, tips = found
+        allowed = f"guesses of {own[0]} joints and {own[1]} fingertips, as the hand has"
+        raise BadArgument("seeds", f"guesses of {joints} joints and {tips} fingertips", allowed)
+    strange = (seeds.row < 0) | (seeds.row >= sets)
+    if bool(strange.any()):
+        row = int(seeds.row[strange][0])
+        raise BadArgument("seeds", f"a guess for contact set {row}", f"sets from 0 to {sets - 1}")

@@ -99,8 +99,9 @@ def plan_grasps(
 
     Args:
         cloud: points that a camera saw [m], in any frame; the grasps are in this frame.
-            One of: a `PointCloud`, a `Scene` with a target, an array or tensor (n, 3), a cloud of
-              Open3D or trimesh, a file for `read_cloud` or `read_scene`, a `GraspObject`.
+            It is a `PointCloud`, a `Scene` with a target, a `GraspObject`, or an array or tensor
+              (n, 3). It may also be a cloud of Open3D or trimesh, or a file for `read_cloud` or
+              `read_scene`.
             Missing normals and viewpoint are estimated; `cloud_from_array` takes them.
             A sequence of clouds gives a list of results. A bad cloud then has no grasps, and
               `meta["refused"]` holds the reason.
@@ -129,7 +130,8 @@ def plan_grasps(
             None means anywhere.
         avoid: where no contact lies, given as `keep`.
         resist: what contacts must resist: "lift", "pour", "push", a tuple of several of them, or
-            `TaskWrenches`. Forces are in the planned friction cones, and of the hand's strength.
+            `TaskWrenches`. Each force must lie in its planned friction cone, and the hand must be
+            strong enough for it.
             `Grasps.certificate` has the proof; grasps that resist less have the status
             `NOT_RESISTED`. None means that nothing is asked for.
         mode: how contacts become grasps. All but "joint" need the hand's learned model, and three
@@ -153,8 +155,10 @@ def plan_grasps(
 
     Raises:
         BadArgument: an argument of the wrong type or range; an object that is not of graspable
-            size; a scene without a target; `shape`, `observer`, `reachable`, `arm` or a region
-            beside several clouds.
+            size; a scene without a target; `keep` off the object; an `arm` that carries another
+            hand; a `promise` for a displaced object; `shape`, `observer`, `reachable`, `arm` or a
+            region beside several clouds. Errors of files and hands, such as `CloudFileError` and
+            `HandFileError`, are kinds of it.
         MissingExtra, NoWorkers: pebble is not installed, or no worker process can start.
 
     The result does not depend on the frame of cloud, camera and table. In a scene the hand keeps
@@ -228,7 +232,8 @@ def stream_grasps(
         fingers, task, promise, reachable, arm, keep, avoid, resist: as in `plan_grasps`.
         mode, ranking, time_budget, shape, observer: as in `plan_grasps`.
 
-    Raises the errors of `plan_grasps`, for a wrong cloud at the first iteration.
+    Raises the errors of `plan_grasps`: at the call for arguments and files, at the first iteration
+    for what the points show, such as a wrong size.
 
     >>> from torchgrasp import load_hand, load_object
     >>> first = next(stream_grasps(load_object("cylinder").view, load_hand("barrett"), starts=40))

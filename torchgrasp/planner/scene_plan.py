@@ -41,8 +41,9 @@ class ThingPlan(Value):
         grasps: executable grasps, best first; None if there are none.
         reason: sentence that says why there are no grasps.
         shape: the estimated shape of the object; None without grasps.
-        status: `OK`, or the reason why the image shows that the object cannot be grasped.
-            `TOO_VAGUE` means that its shape is too uncertain.
+        status: the reason why the image shows that the object cannot be grasped; `OK` if it shows
+            none. `OK` does not mean that there are grasps: see `grasps`. `TOO_VAGUE` means that the
+            shape is too uncertain.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> grasp = load_shipped_grasp("jug", "allegro")

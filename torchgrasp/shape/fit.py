@@ -273,9 +273,9 @@ def condition(
             `Kernel` of normalised distances.
 
     Raises:
-        BadArgument: an unknown kernel; points or `has_normal` inside torch.vmap.
-        IndefiniteCovariance: `psi_scale` is too small for these observations. Inside torch.vmap it
-            is not raised, and the estimate is NaN.
+        BadArgument: an unknown kernel; torch.vmap that maps over points or `has_normal`.
+        IndefiniteCovariance: `psi_scale` is too small, or the kernel too long for the noise. Inside
+            torch.vmap it is not raised, and the estimate is NaN.
 
     >>> x = torch.cat([torch.eye(3), -torch.eye(3)]).double() / 2
     >>> noise = torch.full((6,), 0.01).double()

@@ -144,7 +144,8 @@ class HollowShape(ShapeGP):
         """Return the variance (q,) of the signed distance at q points `x` (q, 3) that `normalise`
         returned.
 
-        It is in squared normalised units: one unit is `scale` [m].
+        It is that of the surface which applies there, as in `estimate`, in squared normalised
+        units: one unit is `scale` [m]. It is not calibrated; `predict(...).std_m` is.
         """
         parts, merge = self._by_wall(x, lambda wall, own: wall.variance(own))
         return merge(*parts)

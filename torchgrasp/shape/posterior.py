@@ -114,7 +114,8 @@ class Posterior(Value):
     def mean(self, x: Queries) -> Float[Tensor, "q"]:
         """Return the mean signed distance (q,) at q points `x` (q, 3) that `normalise` returned.
 
-        It is normalised: one unit is `scale` [m].
+        It is negative inside, and normalised: one unit is `scale` [m]. It is valid within
+        `domain_radius` of the origin; `predict` also covers points outside.
         """
         if not self._is_plain(x):
             return self.distance_rows(x) @ self.weights
@@ -163,8 +164,8 @@ class Posterior(Value):
         """Return the variance (q,) of the signed distance at q points `x` (q, 3) that `normalise`
         returned.
 
-        It is in squared normalised units: one unit is `scale` [m]. It costs a quarter of
-        `estimate`.
+        It is in squared normalised units: one unit is `scale` [m]. It is not calibrated;
+        `predict(...).std_m` is. It takes a quarter of the time of `estimate`.
         """
         prior = self.kernel.profile(self.x.new_zeros(()))
 
@@ -305,8 +306,11 @@ class Posterior(Value):
 
     @property
     def weighted(self) -> Weighted:
-        """The observed points, the kernel, and the posterior weights of each point's distance and
-        normal.
+        """The observed points, the posterior weights of each point's distance and normal, and the
+        kernel.
+
+        It is (x, a, b, kernel): n observed points (n, 3), normalised, the weights (n,) of their
+        distances, and the weights (k, 3) of the k observed normals.
         """
         n = len(self.x)
         normals = self.weights[n:].reshape(3, self.n_oriented).T

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchgrasp.foundation.base import Value, map_tensors
 from torchgrasp.foundation.checks import checked
-from torchgrasp.foundation.errors import BadArgument
+from torchgrasp.foundation.errors import BadArgument, SuspiciousScale
 from torchgrasp.foundation.lazy import ndimage, spatial, trimesh
 from torchgrasp.foundation.rules import Range
 from torchgrasp.foundation.threads import single_threaded
@@ -23,6 +23,7 @@ from torchgrasp.geometry.linalg import Points, limit_norm, number_components, un
 from torchgrasp.geometry.mesh import clip_mesh
 from torchgrasp.geometry.signed_distance import (
     FIELD_SPACING,
+    FIELDS,
     SignedDistanceField,
     field_from_surface,
 )
@@ -150,12 +151,19 @@ def extract_mesh(shape: ShapeGP) -> Mesh:
 def collision_field(shape: ShapeGP, mesh: Mesh) -> SignedDistanceField:
     """Return the signed distance field of the mesh of a shape, for collision checks.
 
-    `mesh` is the result of `extract_mesh`. The nodes are closer for thin bodies.
+    `mesh` is the result of `extract_mesh`. The nodes are closer for thin bodies. Raises
+    `SuspiciousScale` for an object that is much larger than a hand.
     """
     size = mesh.vertices.amax(0) - mesh.vertices.amin(0)
     thick = float(size.min()) > NODES.thick and len(shape.walls) == 1
     spacing = NODES.wide if thick else NODES.close
-    return field_from_surface(mesh.vertices, mesh.faces, spacing)
+    try:
+        return field_from_surface(mesh.vertices, mesh.faces, spacing)
+    except BadArgument as error:
+        # the grid of an object that is much larger than a hand would not fit into memory
+        found = f"a surface of {' x '.join(f'{x:.2g}' for x in size.tolist())} m"
+        side = FIELDS.most_nodes ** (1 / 3) * spacing
+        raise SuspiciousScale("cloud", found, f"an object of less than {side:.1g} m") from error
 
 
 def _trace_walls(

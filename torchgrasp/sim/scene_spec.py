@@ -146,6 +146,8 @@ class SceneSpec:
     def slides(self) -> list["Slide"]:
         """The prismatic joints of the mount that carries the hand, in order from the world to the
         hand.
+
+        Each has its name, its unit axis in the world's frame, its limits [m] and its start [m].
         """
         if self.mount is not None:
             return list(self.mount)

@@ -141,7 +141,8 @@ class ClosureResult(Value):
         object_motion: motion of the object in the hand from the pre-grasp to the end.
         pushed: motion of the object in the world, from the pre-grasp until all fingers touched or
             the closing ended.
-        before_lift: motion of the object in the world from the start to the end of the pressing.
+        before_lift: motion of the object in the world from the start of the trial until the
+            pressing ends.
         rise: height [m] by which the object's centre has risen at the end.
         unbalanced: norm of the sum of the fingertip forces before the lift, over the sum of their
             norms (no unit).
@@ -155,11 +156,11 @@ class ClosureResult(Value):
         stops: number of stops of the approaching hand at a contact.
         attempts: number of closings of the hand.
         seconds: wall time [s] of the trial.
-        friction: what the touches leave of the friction that the grasp was planned for. If they
-            leave nothing of it, what the touches alone show. None if the hand did not hold in the
-            mode "grip".
-        mass: the object's mass [kg] by the load that the hand felt while nothing pushed at the
-            object. None if the mode "grip" felt no steady load.
+        friction: `Distribution` of the coefficient of friction: the planned one, limited to what
+            sticking and sliding fingertips allow. If nothing is left of it, what these touches
+            allow alone. None if the hand did not hold in the mode "grip".
+        mass: `Distribution` of the object's mass [kg], from the load that the hand felt while
+            nothing pushed at the object. None if the mode "grip" felt no steady load.
     """
 
     held: bool

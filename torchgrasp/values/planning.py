@@ -456,10 +456,11 @@ class Grasps(Batch):
         return None if (text := self.meta.get("table", "none")) == "none" else read_plane(text)
 
     def show(self, cloud: Any = None, hand: Any = None) -> Any:
-        """Return a sheet of the best grasps: a table as text and a picture.
+        """Return a sheet of the best grasps: a table of up to five executable ones, and a picture
+        of the first.
 
         A notebook shows both, and `print` shows the table. The attribute `picture` of the sheet
-        holds the picture as PNG.
+        holds the picture as PNG; it is None if no grasp is executable.
 
         Args:
             cloud: the cloud of the object, in any form that `plan_grasps` takes. With it the
