@@ -103,11 +103,9 @@ def plan_grasps(
               (n, 3). It may also be a cloud of Open3D or trimesh, or a file for `read_cloud` or
               `read_scene`.
             Missing normals and viewpoint are estimated; `cloud_from_array` takes them.
-            A sequence of clouds gives a list of results. A bad cloud then has no grasps, and
-              `meta["refused"]` holds the reason.
+            A sequence gives a list of results; `meta["refused"]` says why a bad cloud has none.
         hand: from `load_hand`, or its name or folder; it is moved to the device of the cloud.
-        spec: the constraints on contacts. None means `ContactSpec()`, in mode "paper"
-            `ContactSpec.paper()`.
+        spec: constraints; None means `ContactSpec()`, in mode "paper" `ContactSpec.paper()`.
         starts: number of random initial guesses of the contact planner.
         seed: random seed; on the CPU the same seed gives bitwise the same grasps.
         workers: number of processes for a sequence of clouds; 0 means this process. On a GPU, which
@@ -115,27 +113,22 @@ def plan_grasps(
         fingers: the fingers that grasp, as in `load_hand`; None means the fingers of `hand`. "auto"
             chooses, of the sets that the hand declares, the one with the greatest expected success.
             `hand_of` loads the hand of the result.
-        task: what the grasps must do, for which their success is predicted; None means
-            `GraspTask()`.
+        task: what grasps must do, for which success is predicted; None means `GraspTask()`.
         promise: share of the returned grasps that must hold, in [0.5, 0.99]. Less sure grasps get
             the status `NO_PROMISE`. `meta["promise"]` says which trials chose the bound
             (`torchgrasp.success.promise`). None means no promise.
         reachable: function of hand poses `obj_from_hand` (k, 4, 4) [m] in the frame of the cloud.
-            It returns a mask (k,) of the poses that an arm reaches. None means that all poses are
-            reachable.
+            It returns a mask (k,) of the poses that an arm reaches. None means all of them.
         arm: the arm that carries the hand, from `load_arm`; it must reach each grasp by a straight
             approach, and lift. Without a table z points up. None means no arm.
         keep: where all contacts lie: a `Region`, or a function of points (n, 3) [m] that returns
-            their signed distances (n,) [m], negative inside. Contacts lie on the estimated surface.
-            None means anywhere.
+            their signed distances (n,) [m], negative inside. None means anywhere.
         avoid: where no contact lies, given as `keep`.
         resist: what contacts must resist: "lift", "pour", "push", a tuple of several of them, or
             `TaskWrenches`. Each force must lie in its planned friction cone, and the hand must be
-            strong enough for it.
-            `Grasps.certificate` has the proof; grasps that resist less have the status
-            `NOT_RESISTED`. None means that nothing is asked for.
-        mode: how contacts become grasps. All but "joint" need the hand's learned model, and three
-            fingers.
+            strong enough for it. `Grasps.certificate` has the proof; grasps that resist less have
+            the status `NOT_RESISTED`. None means that nothing is asked for.
+        mode: how contacts become grasps. All but "joint" need a learned model and three fingers.
             "joint": the hand starts from random postures near each contact set. If none succeeds,
               the contacts move along the surface with the hand.
             "contact_first": initial postures of the learned model are refined onto fixed contacts.
@@ -146,12 +139,10 @@ def plan_grasps(
             `meta["starts"]` is the number of planned guesses.
         shape: the object's shape if it is known better than the cloud shows, as after a touch
             (`ShapeGP.update`). None means that it is estimated.
-        observer: function that is called after each stage with the stage's name, a line of text and
-            its result.
+        observer: function that is called after each stage, with its name, a text and its result.
 
     Returns:
-        Grasps: executable grasps (`Status.OK`) first, best first. `explain_empty` explains an empty
-            result.
+        Grasps: executable ones (`Status.OK`) first, best first; if none, see `explain_empty`.
 
     Raises:
         BadArgument: an argument of the wrong type or range; an object that is not of graspable

@@ -197,7 +197,8 @@ def expect_deviation(
     total = len(joint.mean)
     covariance = joint.covariance.reshape(total, 4, total, 4)[:, 0, :, 0]
     slope = torch.linalg.vector_norm(joint.mean[count:, 1:], dim=-1)
-    variance = torch.where(seen, VIEW.noise**2, VIEW.unseen**2).to(covariance)
+    unseen = covariance.new_full(seen.shape, VIEW.unseen**2)
+    variance = unseen.masked_fill(seen, VIEW.noise**2)
     measured = covariance[:count, :count] + torch.diag_embed(variance)  # (v, n, n)
     across = covariance[:count, count:]
     root = torch.linalg.cholesky(measured)
