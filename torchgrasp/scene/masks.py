@@ -258,7 +258,7 @@ def label_image(
         *_removed("mask", int(flying.sum()), seen, "no surface, between near and far ones,"),
     ]
     if notes:
-        notes += _shifted(mask & view.measured, target | (belongs & shown)[objects] & (objects > 0))
+        notes += _shifted(mask & view.measured, target | (shown[objects] & (objects > 0)))
     return torch.where(target, 1, torch.where(rest > 0, rest + 1, 0)), tuple(notes)
 
 
@@ -363,16 +363,13 @@ def _shifted(mask: Bool[Tensor, "h w"], target: Bool[Tensor, "h w"]) -> list[str
 
     A mask from a colour image that is not aligned with the depth lies beside its object.
     """
+    from scipy import signal
+
     reach = math.ceil(MASKS.reach * mask.shape[1])
-    rows, columns = torch.nonzero(mask).unbind(1)
-    padded = torch.from_numpy(np.pad(target.numpy(), reach))
-    shares = torch.stack(
-        [
-            padded[rows + down, columns + right].double().mean()
-            for down in range(2 * reach + 1)
-            for right in range(2 * reach + 1)
-        ]
-    ).reshape(2 * reach + 1, -1)
+    padded = np.pad(target.numpy(), reach).astype(float)
+    # entry (down, right) counts the pixels on the object after such a shift, from -reach on
+    counts = signal.correlate(padded, mask.double().numpy(), mode="valid", method="fft")
+    shares = torch.from_numpy(counts.round()) / int(mask.sum())
     best = int(shares.argmax())
     gained = float(shares.max() - shares[reach, reach])
     if gained < MASKS.gained or float(shares.max()) < MASKS.fitting:

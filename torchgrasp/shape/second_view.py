@@ -86,8 +86,9 @@ class NextView(Value):
         expected to tell.
         """
         x, y, z = self.camera_pose[:3, 3].tolist()
-        known = self.turn == self.turn
-        turn = f", {self.turn:.0f} degrees from where the camera was" if known else ""
+        turn = ""
+        if not math.isnan(self.turn):
+            turn = f", {self.turn:.0f} degrees from where the camera was"
         place = f"({x:.2f}, {y:.2f}, {z:.2f}) m{turn}"
         return f"{place}: std_m falls from {1e3 * self.before:.1f} to {1e3 * self.after:.1f} mm"
 
