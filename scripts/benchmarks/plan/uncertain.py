@@ -1,14 +1,22 @@
-"""Whether contacts planned at several frictions help where the friction is only a distribution."""
+"""Whether contacts planned at several frictions help where the friction is only a distribution.
 
+Every rule plans on the same view of a body, and ranks by the same distribution of the friction. The
+best grasp of each rule is lifted at quantiles of the distribution. Bodies are of families that
+fitted no tree of the success model. Masses and simulators alternate from body to body.
+"""
+
+import dataclasses
+import itertools
 import math
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
 
 import torch
 from train.household import (
     CALIBRATING,
     FAMILIES,
     GOLDEN_ANGLE,
+    HouseholdBody,
     author_household,
     family_of,
 )
@@ -16,31 +24,36 @@ from train.household import (
 from benchmarks.common import Options, Row, bench, mean_over
 from torchgrasp import ContactSpec, Distribution, GraspTask, load_hand, plan_grasps
 from torchgrasp.cloud.camera import look_at, partial_view
+from torchgrasp.evaluation.intervals import Share, contrast_over
 from torchgrasp.evaluation.lift import lift_grasp
 from torchgrasp.evaluation.trial import GraspTrial, Truth
 from torchgrasp.foundation.errors import GraspError, Status
+from torchgrasp.foundation.jobs import run_tasks
+from torchgrasp.geometry.frames import real
 from torchgrasp.hand.hand import Hand
+from torchgrasp.values.planning import Grasps, PointCloud
 from torchgrasp.values.specs import TrialSpec
 
-REGIMES = ("0.15:1.2", "0.18|1", "0.4:1", "0.15:0.4")
+REGIMES = ("0.4:1", "0.15:0.4", "0.15:1.2", "0.18|1")
 """Distributions of friction."""
-MASS = 0.25
+SURE = ("0.4:1", "0.15:1.2")
+"""Regimes whose predictions must be closest."""
+PROMISED = "0.2:0.9"
+PROMISE = 0.9
+"""The friction for which a share of the returned grasps is promised to hold, and this share."""
+SETTINGS = tuple(itertools.product(("mujoco", "sapien"), (0.25, 0.1)))
+"""Simulators and masses [kg], which bodies take in turn."""
 FIRST = 30_000
 """Number of the first body: none of the bodies from here on is in the success model's trials."""
 STARTS = 50
-BODIES = 4
+BODIES = 46
 LIFTS = 4
 """Bodies, and lifts of each best grasp, with the frictions at the quantiles (i + 1/2) / `LIFTS`."""
-
-
-class Outcome(NamedTuple):
-    """What one rule gave for a body under a regime."""
-
-    body: str
-    executable: int
-    predicted: float
-    held: float
-    planned: float
+LOW = 0.05
+"""The quantile of the friction at which the most careful rule plans."""
+LIMIT = 1800.0
+"""Wall time [s] of one body."""
+MEAN, HALF, LOWEST, TURN = "at the mean", "at half of the mean", "at the 5 % quantile", "in turn"
 
 
 class OneFriction(ContactSpec):
@@ -52,67 +65,211 @@ class OneFriction(ContactSpec):
         return (self.planned_friction,)
 
 
+def _low_margin(law: Distribution) -> float:
+    return float(law.quantile(real([LOW]))) / law.mean
+
+
 RULES: dict[str, Callable[[Distribution], ContactSpec]] = {
-    "at the mean": lambda law: OneFriction(law, friction_margin=1.0, table=0.0),
-    "at half of the mean": lambda law: OneFriction(law, table=0.0),
-    "in turn": lambda law: ContactSpec(law, table=0.0),
+    MEAN: lambda law: OneFriction(law, friction_margin=1.0, table=0.0),
+    HALF: lambda law: OneFriction(law, table=0.0),
+    LOWEST: lambda law: OneFriction(law, friction_margin=_low_margin(law), table=0.0),
+    TURN: lambda law: ContactSpec(law, table=0.0),
 }
+
+
+class Outcome(NamedTuple):
+    """What one rule gave for a body under a regime: the share of lifts that held, and what was
+    predicted; NaN without a grasp.
+    """
+
+    body: str
+    regime: str
+    rule: str
+    executable: int
+    predicted: float
+    held: float
+    planned: float
 
 
 @bench("plan/uncertain")
 def uncertain(o: Options) -> list[Row]:
     """Lift the best grasp of each rule at quantiles of the friction; predictions know all of it."""
-    # one body of each family
+    tasks = [(k, o.hands[0], o.seed, setting) for k, setting in choose_bodies(o.times(BODIES))]
+    found = list[Outcome]()
+    for outcomes in run_tasks(try_body, tasks, o.workers, LIMIT):
+        if isinstance(outcomes, Status):
+            raise SystemExit(f"uncertain: a body ended with {outcomes.name}")
+        print(*outcomes, sep="\n", flush=True)
+        found += [Outcome(*outcome) for outcome in outcomes]
+    return describe(found)
+
+
+def choose_bodies(count: int) -> list[tuple[int, tuple[str, float]]]:
+    """Return numbers of bodies, each of another family left out, with simulator and mass [kg]."""
     left_out = [k for k in range(FIRST, FIRST + len(FAMILIES)) if family_of(k) in CALIBRATING]
-    step = max(1, len(left_out) // o.times(BODIES))
-    hand = load_hand(o.hands[0])
-    rows = list[Row]()
-    for regime in REGIMES:
-        law = Distribution.parse(regime)
-        found: dict[str, list[Outcome]] = {name: [] for name in RULES}
-        for k in left_out[::step][: o.times(BODIES)]:
-            for name, rule in RULES.items():
-                outcome = try_rule(k, hand, law, rule(law), o.seed)
-                print(regime, name, *outcome, flush=True)
-                found[name].append(outcome)
-        rows += [describe(regime, name, outcomes) for name, outcomes in found.items()]
-    return rows
+    step = max(1, len(left_out) // count)
+    return list(zip(left_out[::step][:count], itertools.cycle(SETTINGS), strict=False))
 
 
-def try_rule(k: int, hand: Hand, law: Distribution, spec: ContactSpec, seed: int) -> Outcome:
-    """Plan on a view of body `k`, and lift the best grasp at quantiles of the friction."""
+def see_body(k: int) -> tuple[HouseholdBody, PointCloud]:
+    """Return body `k` and a noisy view of it."""
     body = author_household(k)
     eye = look_at(GOLDEN_ANGLE * k % 360, 35.0, target=body.mesh)
-    cloud = partial_view(body.mesh, eye, noise=True, seed=k)
-    none = Outcome(body.name, 0, math.nan, 0.0, math.nan)
+    return body, partial_view(body.mesh, eye, noise=True, seed=k)
+
+
+def try_body(k: int, hand: str, seed: int, setting: tuple[str, float]) -> list[tuple[Any, ...]]:
+    """Return the fields of the outcomes of all rules and regimes for body `k`."""
+    model = load_hand(hand)
+    body, cloud = see_body(k)
+    simulator, mass = setting
+    found = list[tuple[Any, ...]]()
+    for regime, (rule, spec_of) in itertools.product(REGIMES, RULES.items()):
+        law = Distribution.parse(regime)
+        good = plan(cloud, model, spec_of(law), mass, seed)
+        outcome = lift_best(good, model, body, law, simulator, mass, seed)
+        found.append((body.name, regime, rule, *outcome))
+    law = Distribution.parse(PROMISED)
+    good = plan(cloud, model, RULES[TURN](law), mass, seed, PROMISE)
+    outcome = lift_best(good, model, body, law, simulator, mass, seed)
+    found.append((body.name, PROMISED, f"promise {PROMISE}", *outcome))
+    return found
+
+
+def plan(
+    cloud: PointCloud,
+    hand: Hand,
+    spec: ContactSpec,
+    mass: float,
+    seed: int,
+    promise: float | None = None,
+) -> Grasps | None:
+    """Return the executable grasps of a view, best first; None if there are none."""
+    task = GraspTask(mass)
     try:
-        grasps = plan_grasps(cloud, hand, spec, STARTS, seed=seed, task=GraspTask(MASS))
+        grasps = plan_grasps(cloud, hand, spec, STARTS, seed=seed, task=task, promise=promise)
     except GraspError:
-        return none
+        return None
     good = grasps[grasps.status == Status.OK]
-    if not len(good):
-        return none
+    return good if len(good) else None
+
+
+def lift_best(
+    good: Grasps | None,
+    hand: Hand,
+    body: HouseholdBody,
+    law: Distribution,
+    simulator: str,
+    mass: float,
+    seed: int,
+) -> tuple[int, float, float, float]:
+    """Lift the first grasp at quantiles of the friction; return the last fields of an `Outcome`."""
+    if good is None:
+        return 0, math.nan, math.nan, math.nan
     best = good[:1]
     truth = Truth(body.mesh, body.parts)
     held = list[bool]()
     for friction in law.quantile((torch.arange(LIFTS).double() + 0.5) / LIFTS).tolist():
-        trial = TrialSpec(mass=MASS, friction=friction, simulator="mujoco")
+        trial = TrialSpec(mass=mass, friction=friction, simulator=simulator)  # pyright: ignore[reportArgumentType]
         held.append(lift_grasp(GraspTrial(hand, best, truth, seed), trial).held)
     planned = best.certificate.friction
-    at = spec.planned_friction if planned is None else float(planned)
-    predicted = float(torch.sigmoid(best.score))
-    return Outcome(body.name, len(good), predicted, sum(held) / LIFTS, at)
+    at = math.nan if planned is None else float(planned)
+    return len(good), float(torch.sigmoid(best.score)), sum(held) / LIFTS, at
 
 
-def describe(regime: str, rule: str, outcomes: list[Outcome]) -> Row:
-    """Return how often the grasps of a rule held beside what was predicted."""
-    planned = [x for x in outcomes if x.executable]
-    held = mean_over((x.body, x.held) for x in outcomes)
-    error = mean_over((x.body, x.predicted - x.held) for x in planned)
-    count = sum(x.executable for x in outcomes) / len(outcomes)
-    text = (
-        f"held {held.value:.2f}, predicted minus held {error.value:+.2f}, "
-        f"{count:.1f} executable grasps, {len(outcomes) - len(planned)} bodies without"
+def describe(found: list[Outcome]) -> list[Row]:
+    """Return a row for each regime and rule, then the comparisons with targets."""
+    cells = {
+        (regime, rule): [x for x in found if x.regime == regime and x.rule == rule]
+        for regime, rule in itertools.product(REGIMES, RULES)
+    }
+    rows = [describe_cell(regime, rule, cell) for (regime, rule), cell in cells.items()]
+    for regime in REGIMES:
+        single = [mean_held(cells[regime, rule]) for rule in (MEAN, HALF, LOWEST)]
+        error = errors(cells[regime, TURN])
+        bar = 0.05 if regime in SURE else 0.1
+        rows += [
+            Row(
+                f"friction {regime}: held, in turn minus the best single rule",
+                ">= -0.02",
+                f"{mean_held(cells[regime, TURN]) - max(single):+.3f}",
+                mean_held(cells[regime, TURN]) - max(single) >= -0.02,
+            ),
+            Row(
+                f"friction {regime}: predicted minus held, in turn",
+                f"<= {bar}",
+                format_number(error),
+                abs(error.value) <= bar,
+            ),
+        ]
+    every = {rule: [x for r in REGIMES for x in cells[r, rule]] for rule in RULES}
+    for rule in (MEAN, HALF, LOWEST):
+        gain = contrast_over([shares(every[TURN]), shares(every[rule])], [1.0, -1.0])
+        target = (">= +0.03, 0 outside", gain.value >= 0.03 and gain.low > 0)
+        bar, met = target if rule == HALF else ("-", None)
+        rows.append(Row(f"held, in turn minus {rule}", bar, format_number(gain), met))
+    refused = {rule: sum(not x.executable for x in every[rule]) for rule in RULES}
+    text = ", ".join(f"{rule} {n}" for rule, n in refused.items())
+    rows.append(
+        Row(
+            f"plans without a grasp, of {len(every[TURN])}",
+            f"in turn <= {MEAN}",
+            text,
+            refused[TURN] <= refused[MEAN],
+        )
     )
-    numbers = {"outcomes": [x._asdict() for x in outcomes]}
-    return Row(f"friction {regime}, planned {rule}", "-", text, numbers=numbers)
+    promised = [x for x in found if x.regime == PROMISED]
+    kept = mean_over((x.body, x.held) for x in promised)
+    answered = sum(x.executable > 0 for x in promised)
+    rows.append(
+        Row(
+            f"friction {PROMISED}, promise {PROMISE}: held where returned",
+            ">= 0.9",
+            f"{format_number(kept, sign='')}, {answered} of {len(promised)} bodies answered",
+            kept.value >= PROMISE,
+        )
+    )
+    numbers = {"outcomes": [x._asdict() for x in found]}
+    rows[-1] = dataclasses.replace(rows[-1], numbers=numbers)
+    return rows
+
+
+def describe_cell(regime: str, rule: str, cell: list[Outcome]) -> Row:
+    """Return how often the grasps of a rule held beside what was predicted."""
+    held = mean_over(held_of(cell))
+    count = sum(x.executable for x in cell) / len(cell)
+    without = sum(not x.executable for x in cell)
+    text = (
+        f"held {held.value:.3f}, predicted minus held {errors(cell).value:+.3f}, "
+        f"{count:.1f} executable grasps, {without} bodies without"
+    )
+    return Row(f"friction {regime}, planned {rule}", "-", text)
+
+
+def held_of(cell: Iterable[Outcome]) -> list[tuple[str, float]]:
+    """Return the share of lifts that held of each body; 0 without a grasp."""
+    return [(x.body, x.held if x.executable else 0.0) for x in cell]
+
+
+def mean_held(cell: Iterable[Outcome]) -> float:
+    """Return the mean share of lifts that held."""
+    return mean_over(held_of(cell)).value
+
+
+def errors(cell: Iterable[Outcome]) -> Share:
+    """Return predicted minus held of the bodies with a grasp."""
+    return mean_over((x.body, x.predicted - x.held) for x in cell if x.executable)
+
+
+def shares(cell: Iterable[Outcome]) -> dict[str, tuple[float, int]]:
+    """Return the sum of held shares and the number of regimes of each body."""
+    sums: dict[str, tuple[float, int]] = {}
+    for body, held in held_of(cell):
+        before = sums.get(body, (0.0, 0))
+        sums[body] = before[0] + held, before[1] + 1
+    return sums
+
+
+def format_number(share: Share, sign: str = "+") -> str:
+    """Return a number with its interval over bodies as text."""
+    return f"{share.value:{sign}.3f} [{share.low:{sign}.3f}, {share.high:{sign}.3f}]"
