@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from torchgrasp import (
+    CarriedWeight,
     Contacts,
     ContactSpec,
     Distribution,
@@ -24,7 +25,9 @@ from torchgrasp import (
     PointCloud,
     ShapeGP,
     certify,
+    critical_friction,
     encode,
+    hold_probability,
     load_hand,
 )
 from torchgrasp.control import law, squeeze
@@ -95,6 +98,39 @@ def of_contacts(function: Function) -> Make:
         return function, (points.to(dtype), normals.to(dtype))
 
     return make
+
+
+def of_risk(function: Function, extra: Function) -> Make:
+    """Return what makes a function of points, of normals of any length, and of an `extra` argument
+    that is computed from points.
+    """
+
+    def make(dtype: torch.dtype) -> tuple[Function, tuple[Tensor, ...]]:
+        points = 0.05 * draw(3, 3, 3)
+        normals = normalize(
+            points - points.mean(1, keepdim=True) + 0.02 * draw(3, 3, 3, seed=1), dim=-1
+        )
+        inputs = points, normals, extra(points)
+        return (
+            lambda p, n, *x: function(p, normalize(n, dim=-1), *x),
+            tuple(x.to(dtype) for x in inputs if x is not None),
+        )
+
+    return make
+
+
+STRONG = Distribution.between(0.0, 3.0)
+"""A friction that any of these sets may have enough of."""
+
+
+def hold(points: Tensor, normals: Tensor, tilt: Tensor) -> Tensor:
+    contacts = Contacts(points, normals)
+    return hold_probability(contacts, STRONG, 0.002, tilt, shift=0.002, turn=0.05)
+
+
+def carry(points: Tensor, normals: Tensor, center: Tensor) -> Tensor:
+    weight = CarriedWeight(0.3, center, press=5.0, center_std=0.01)
+    return hold_probability(Contacts(points, normals), STRONG, 0.002, weight=weight)
 
 
 def margin(points: Tensor, normals: Tensor) -> Tensor:
@@ -315,6 +351,19 @@ ROWS: dict[str, Row] = {
         of_contacts(margin),
         note="by the dual; a subgradient where it is not unique",
     ),
+    "torchgrasp.contacts.critical.critical_friction": Row(
+        "points, unit normals",
+        TWICE,
+        of_risk(critical_friction, lambda _: None),
+        2,
+        note="that of one motion where several prove the friction",
+    ),
+    "torchgrasp.contacts.hold_probability.hold_probability": Row(
+        "contacts, tilt, centre of mass",
+        TWICE,
+        of_risk(hold, lambda _: 0.05 + 0.01 * draw(3, 3, seed=5).abs()),
+        note="also over drawn surfaces",
+    ),
     "torchgrasp.values.distribution.Distribution.cdf": Row(
         "numbers", TWICE, of_numbers, note="the density; zero between intervals"
     ),
@@ -483,6 +532,9 @@ LAW = {
     ),
 }
 """Functions of `torchgrasp.control.law`, from which a closing law is made; they are not public."""
+LAW["hold_probability, weight"] = Row(
+    "contacts, centre of mass", TWICE, of_risk(carry, lambda points: points.mean(1))
+)
 LAW |= {
     f"predict, {name}": Row("points", TWICE, of_shape(partial(shape_of, name), "predict"), 1)
     for name in KERNELS

@@ -233,14 +233,16 @@ def first_contact(
     nearest, before = far.min(-1, keepdim=True)
     high = distance.gather(-1, before)
     low = distance.gather(-1, before + 1)
-    passed = high / (high - low)
+    # a line that meets no surface adds nothing to derivatives, so it is computed as if it did
+    missed = torch.isinf(nearest)
+    passed = torch.where(missed, 0.0, high / torch.where(missed, 1.0, high - low))
     stop = torch.lerp(t[before], t[before + 1], passed)
-    stop = torch.where(torch.isinf(nearest), torch.nan, stop)
     weights = interpolation(stop, nodes)  # (b, n, f, 1, k)
     slope = lines.slope[:, None] + deviation[..., 1:]
     motion = stop * lines.deviation[:, None, :, None]
     points = lines.points[:, None] + motion * lines.normals[:, None]
-    return points, unit((weights @ slope)[..., 0, :])
+    normals = unit((weights @ slope)[..., 0, :])
+    return torch.where(missed, torch.nan, points), torch.where(missed, torch.nan, normals)
 
 
 @checked

@@ -104,7 +104,7 @@ class LeastBalance(NamedTuple):
         return LeastBalance(*(x[rows] for x in self))
 
 
-@checked
+@checked(gradients=True)
 @single_threaded
 def critical_friction(
     points: Annotated[Float[Tensor, "*b f 3"], ANY],
@@ -136,7 +136,8 @@ def critical_friction(
         raise BadArgument("points", f"{f} contacts a set", "3 to 5 contacts")
     flat = points.reshape(-1, f, 3).double()
     rows, found = least_balance(flat, normals.reshape(-1, f, 3).double())
-    friction = flat.new_full((len(flat),), torch.inf).index_put((rows,), found.friction)
+    needed = torch.where(found.friction.isnan(), torch.inf, found.friction)
+    friction = flat.new_full((len(flat),), torch.inf).index_put((rows,), needed)
     return friction.to(points).reshape(points.shape[:-2])
 
 
@@ -147,7 +148,7 @@ def least_balance(
 
     The balances are differentiable twice in all arguments. Where several motions of the object
     prove the friction, its derivative is that of one of them. Inside torch.vmap, all sets have an
-    index; the balances of those that cannot balance are NaN.
+    index; the friction of those that cannot balance is NaN, and their other fields mean nothing.
 
     Args:
         points: positions [m] of f contacts.
@@ -158,17 +159,40 @@ def least_balance(
     """
     load = points.new_zeros(len(points), 6) if load is None else load
     good, *parts = _Search.apply(points.detach(), normals.detach(), load.detach())
-    found = LeastBalance(*parts)
-    rows = flatnonzero(good) if is_known(good) else row_numbers(good)
-    found = found.rows(rows)
-    if is_plain(points, normals, load):
-        return rows, found
+    if is_known(good):
+        rows = flatnonzero(good)
+        inputs = points[rows], normals[rows], load[rows]
+        found = LeastBalance(*(x[rows] for x in parts))
+    else:
+        # finite numbers stand in for sets that cannot balance, so that their derivatives are 0
+        rows = row_numbers(good)
+        stand = eye_like(max(FINGERTIPS), points)[: points.shape[1], :3]
+        inputs = tuple(
+            _where(good, x, y) for x, y in ((points, stand), (normals, stand), (load, 1.0))
+        )
+        found = LeastBalance(*(_where(good, x, 1.0) for x in parts))
+    if not is_plain(points, normals, load):
+        found = _follow(found, *inputs)
+    if not is_known(good):
+        found = found._replace(friction=_where(good, found.friction, torch.nan))
+    return rows, found
+
+
+def _follow(
+    found: LeastBalance, points: Vectors, normals: Vectors, load: Float[Tensor, "b 6"]
+) -> LeastBalance:
+    """Return the same balances, with their derivatives by points, normals and load."""
     # Newton's steps at the solution change the derivatives alone: the first step those of first
     # order, the second step those of second order.
-    cones = _Cones.of(points[rows], normals[rows], load[rows])
+    cones = _Cones.of(points, normals, load)
     for _ in range(2):
-        found = cones.nearer(found)
-    return rows, found
+        found = cones.refined(found)
+    return found
+
+
+def _where(good: Bool[Tensor, "b"], x: Float[Tensor, "b *d"], other: float | Tensor) -> Tensor:
+    """Return the rows of `x` that are good, and in place of others a number or a row."""
+    return torch.where(good.reshape(-1, *[1] * (x.ndim - 1)), x, other)
 
 
 class _Search(torch.autograd.Function):
@@ -359,6 +383,64 @@ class _Cones(NamedTuple):
         whole = torch.ones_like(at.friction)
         return at.plus(still, whole).plus(centring, CRITICAL.exact * whole)
 
+    def refined(self, at: LeastBalance) -> LeastBalance:
+        """Return the balance after a whole step to the last nu, without elimination of unknowns.
+
+        It is slower than `nearer`. But the matrix stays regular for small nu, so that derivatives
+        of the step are exact.
+        """
+        f = self.normals.shape[1]
+        unknowns = [at.forces, at.press, at.slide, at.friction, at.twist, at.scale]
+        matrix, residual = self.equations(at)
+        step, _ = torch.linalg.solve_ex(matrix, residual)
+        sizes = [3 * f, f, 3 * f, 1, 6, 1]
+        parts = zip(unknowns, step.split(sizes, 1), strict=True)
+        forces, press, slide, friction, twist, scale = (x - d.view(x.shape) for x, d in parts)
+        return LeastBalance(forces, friction, press, slide, twist, scale)
+
+    def equations(self, at: LeastBalance) -> tuple[Float[Tensor, "b q q"], Float[Tensor, "b q"]]:
+        """Return the Jacobian and the residual of the q = 7 f + 8 equations.
+
+        The unknowns are forces, press, slide, friction, twist and scale. The equations are those of
+        balance and sum, of the multipliers by contact, of sum a_i s_i0, and of x_i o s_i: its first
+        number, then the others, by contact.
+        """
+        n = self.normals[..., None]  # (b, f, 3, 1)
+        mu = at.friction[:, None, None, None]
+        push, tangential = (x[..., None] for x in self.split(at.forces))
+        push = push[..., None]  # (b, f, 1, 1)
+        press = at.press[..., None, None]
+        slide = at.slide[..., None]
+        x = mu * push
+        identity = eye_like(3, n)
+        flat = identity - n @ n.mT
+        rows = self.rows.flatten(2)  # (b, 7, 3 f)
+        none = torch.zeros_like
+        # each block by contact: forces, press, slide, friction
+        lacking = none(flat), -mu * n, identity.expand_as(flat), -press * n
+        weighed = -press * n.mT, push, none(n.mT), none(push)
+        along = -mu * press * n.mT + slide.mT @ flat, x, tangential.mT, push * press
+        across = -mu * slide @ n.mT + press * flat, tangential, x * identity, push * slide
+        matrix = [
+            _widened(rows, 4 * n.shape[1] + 8),
+            torch.cat([_by_contact(*lacking), -rows.mT], 2),
+            _widened(_summed(*weighed), 7),
+            _widened(_by_contact(*along), 7),
+            _widened(_by_contact(*across), 7),
+        ]
+        multipliers = torch.cat([at.twist, at.scale[:, None]], 1)[..., None]
+        pressed = torch.full_like(self.load[:, :1], n.shape[1])
+        total = matvec(rows, at.forces.flatten(1)) + torch.cat([self.load, pressed], 1)
+        pull = (slide - mu * press * n).flatten(1)
+        residual = [
+            total,
+            pull - (rows.mT @ multipliers)[..., 0],
+            (push * press).sum(1)[:, :, 0] - 1,
+            (x * press + tangential.mT @ slide).flatten(1) - CRITICAL.exact,
+            (x * slide + press * tangential).flatten(1),
+        ]
+        return torch.cat(matrix, 1), torch.cat(residual, 1)
+
     def directions(
         self, at: LeastBalance, held: Bool[Tensor, "b"] | None = None
     ) -> tuple[LeastBalance, LeastBalance]:
@@ -433,6 +515,28 @@ class _Cones(NamedTuple):
         parts = (forces, friction[..., 0], press, slide, twist, scale[..., 0])
         first, second = (LeastBalance(*(x[:, i] for x in parts)) for i in range(2))
         return first, second
+
+
+def _by_contact(*blocks: Float[Tensor, "b f r _"]) -> Float[Tensor, "b m q"]:
+    """Return the rows of equations that stand for each contact: its blocks for forces, press and
+    slide on the diagonals, then that of the common friction.
+    """
+    *own, common = blocks
+    f = common.shape[1]
+    each = eye_like(f, common)[:, None, :, None]
+    diagonal = [(x[:, :, :, None] * each).flatten(3).flatten(1, 2) for x in own]
+    return torch.cat([*diagonal, common.flatten(1, 2)], 2)
+
+
+def _widened(x: Float[Tensor, "b m k"], columns: int) -> Float[Tensor, "b m q"]:
+    """Return a matrix with further columns of zeros, for unknowns that are not in its equations."""
+    return torch.cat([x, x.new_zeros(*x.shape[:2], columns)], 2)
+
+
+def _summed(*blocks: Float[Tensor, "b f 1 _"]) -> Float[Tensor, "b 1 q"]:
+    """Return the row of an equation that sums over contacts."""
+    *own, common = blocks
+    return torch.cat([*(x.flatten(1)[:, None] for x in own), common.sum(1)], 2)
 
 
 def _dot(a: Float[Tensor, "*b 3"], b: Float[Tensor, "*c 3"]) -> Float[Tensor, "*e"]:

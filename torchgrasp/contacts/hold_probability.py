@@ -102,7 +102,7 @@ class CarriedWeight(Value):
                 raise BadArgument("up", f"a length of {length:.4g}", "a unit vector (to 1e-3)")
 
 
-@checked
+@checked(gradients=True)
 @single_threaded
 def hold_probability(
     contacts: Contacts,
@@ -168,11 +168,17 @@ def hold_probability(
     if weight is not None:
         center = _center(weight, points)
     count = 1
+    missed = None
     if shape is not None:
         count = draws
         touched, slopes = drawn_contacts(line_posterior(shape, contacts), draws, seed)
-        points = shape.metres(touched.flatten(0, 1)).to(points)  # (b n, f, 3)
-        normals = slopes.flatten(0, 1).to(points)
+        touched = shape.metres(touched.flatten(0, 1)).to(points)  # (b n, f, 3)
+        slopes = slopes.flatten(0, 1).to(points)
+        # where a finger meets no surface, the planned contacts stand in, and the result is 0
+        missed = ~torch.isfinite(touched).flatten(1).all(1)
+        each = missed[:, None, None]
+        points = torch.where(each, points.repeat_interleave(draws, 0), touched)
+        normals = torch.where(each, normals.repeat_interleave(draws, 0), slopes)
         tilts = spread.tilt.repeat_interleave(draws, 0)
         spread = dataclasses.replace(spread, tilt=tilts)
         center = center.repeat_interleave(draws, 0)
@@ -184,6 +190,8 @@ def hold_probability(
         for mass, width, share in _mass_ranges(Distribution.of(weight.mass)):
             burden = _Burden(_force(weight, mass, points), center, width / mass, weight.center_std)
             found = found + share * _held(law, points, normals, spread, burden)
+    if missed is not None:
+        found = torch.where(missed, 0.0, found)
     return found.unflatten(0, (-1, count)).mean(1).to(contacts.points)
 
 
@@ -227,6 +235,8 @@ def _held(
     """
     load = None if burden is None else burden.wrench(points)
     rows, balance = least_balance(points, normals, load)
+    balanced = ~balance.friction.isnan()  # inside torch.vmap there are sets that cannot balance
+    balance = balance._replace(friction=torch.where(balanced, balance.friction, 1.0))
     known = points[rows]
     moved, turned = sensitivities(known, normals[rows], balance)
     arms = known - known.mean(1, keepdim=True)
@@ -245,9 +255,7 @@ def _held(
     square = (torch.cat(parts, 1) ** 2).sum(1)
     # without errors the derivative of the root would be NaN
     deviation = torch.where(square > 0, square, 1.0).sqrt() * (square > 0)
-    found = exceeding(law, balance.friction, deviation)
-    if not is_known(found):
-        return found.nan_to_num(0.0)
+    found = torch.where(balanced, exceeding(law, balance.friction, deviation), 0.0)
     return points.new_zeros(len(points)).index_put((rows,), found)
 
 

@@ -348,7 +348,13 @@ def combined_covariance(
     # the sums are whitened: they are fewer than the points
     sums = (weights @ cross).view(b * v, rows)
     whitened = posterior.whiten(sums).view(b, v, rows)
-    apart = torch.linalg.vector_norm(points[:, :, None] - points[:, None], dim=-1)
+    offset = points[:, :, None] - points[:, None]
+    apart = torch.linalg.vector_norm(offset, dim=-1)
+    if not is_plain(points):
+        # the length of a zero vector has no second derivative, and counts as constant here
+        same = (offset == 0).all(-1)
+        apart = torch.linalg.vector_norm(torch.where(same[..., None], 1.0, offset), dim=-1)
+        apart = torch.where(same, 0.0, apart)
     prior = posterior.kernel.profile(apart)  # (b, g p, g p)
     prior = weights @ prior.view(b, g, p, g * p)  # (b, g, m, g p)
     prior = weights @ prior.view(b, v, g, p).permute(0, 2, 3, 1)  # (b, g, m, v)
