@@ -100,6 +100,16 @@ def test_success_is_explained_under_the_distribution(planned):
     assert "the task is 4 kg at a friction of 0.66" in [cost.sentence for cost in heavy], told
 
 
+def test_what_no_trial_supports_is_told(planned):
+    """The trials have masses up to 1 kg: a quarter of 0.7 to 1.1 kg is above."""
+    grasps, shape = planned
+    task = GraspTask(mass=Distribution.parse("0.7:1.1"))
+    told = {x.cause: x for x in explain_success(grasps, load_hand("barrett"), shape, task)}
+    assert told["task"].sentence.endswith("no trial supports 25% of these frictions and masses")
+    known = explain_success(grasps, load_hand("barrett"), shape, GraspTask(mass=MASS))
+    assert not any("no trial" in cost.sentence for cost in known)
+
+
 def test_distributions_of_impossible_numbers_are_refused():
     with pytest.raises(BadArgument, match=r"friction: expected a distribution in \[0, 10\]"):
         ContactSpec(friction=Distribution.between(-0.1, 0.5))

@@ -45,13 +45,17 @@ def covered_share(features: Float[Tensor, "c g k"], conditions: Conditions) -> F
 
     It is 0 if another of the `features` in `DOMAIN` lies outside of the range of the trials.
     """
+    others = [name for name in DOMAIN if name not in ("friction", "mass")]
+    return supported_share(conditions) * is_covered(features[0], others).to(features)
+
+
+def supported_share(conditions: Conditions) -> float:
+    """Return the probability of a friction and a mass that trials support."""
     share = 1.0
-    of = {"friction": conditions.friction, "mass": conditions.mass}
-    for name, distribution in of.items():
+    for name, law in (("friction", conditions.friction), ("mass", conditions.mass)):
         least, most = load_success_model().range[FEATURES.index(name)].tolist()
-        share *= distribution.share(least, most)
-    others = [name for name in DOMAIN if name not in of]
-    return share * is_covered(features[0], others).to(features)
+        share *= law.share(least, most)
+    return share
 
 
 def largest_known() -> float:

@@ -15,6 +15,7 @@ from torchgrasp.shape.gp import ShapeGP
 from torchgrasp.success.body import EstimatedBody
 from torchgrasp.success.features import CAUSES, measure_grasps
 from torchgrasp.success.model import load_success_model
+from torchgrasp.success.order import supported_share
 from torchgrasp.success.task import Conditions, GraspTask
 from torchgrasp.values.distribution import Distribution
 from torchgrasp.values.planning import Grasps
@@ -32,7 +33,11 @@ SENTENCES = {
     "object": "the object is {height} high and {size} in radius",
     "task": "the task is {mass} at a friction of {friction}",
 }
-"""What is said of each cause; the names of features stand for their values."""
+"""What is said of each cause; the names of features stand for their values. "task" is the last."""
+MOST = 3
+"""Most causes that are told."""
+ROUNDING = 1e-9
+"""A probability up to this counts as 0."""
 
 
 class Cost(NamedTuple):
@@ -61,7 +66,8 @@ def explain_success(
 
     Each cause stands for several features of the success model (`CAUSES`). Its `log_odds` is by how
     much the log-odds rise if these features take their median over grasps that held. Causes that do
-    not lower the success are left out.
+    not lower the success are left out. If trials support only a part of the frictions and masses, the
+    sentence of the cause "task" says so, and "task" is not left out.
 
     Args:
         grasps: grasps of `plan_grasps`, of which the first counts.
@@ -85,7 +91,9 @@ def explain_success(
         )
     task = GraspTask() if task is None else task
     features = measure_again(grasps[0], hand, shape, task)
-    weights = conditions_of(grasps, task).weights.to(features)
+    conditions = conditions_of(grasps, task)
+    weights = conditions.weights.to(features)
+    supported = supported_share(conditions)
     model = load_success_model(features.device)
     known = model.mean_log_odds(features, weights)
     first = 0
@@ -101,9 +109,15 @@ def explain_success(
         gain = float(model.mean_log_odds(usual, weights) - known)
         told.append(Cost(cause, gain, SENTENCES[cause].format_map(values)))
         first += len(names)
-    return tuple(
-        cost for cost in sorted(told, key=lambda cost: -cost.log_odds)[:3] if cost.log_odds > 0
-    )
+    lower = [cost for cost in sorted(told, key=lambda cost: -cost.log_odds) if cost.log_odds > 0]
+    if not 0 < supported < 1 - ROUNDING:
+        return tuple(lower[:MOST])
+    given = told[-1]
+    unknown = f"no trial supports {1 - supported:.0%} of these frictions and masses"
+    said = given._replace(sentence=f"{given.sentence}; {unknown}")
+    others = [cost for cost in lower if cost.cause != given.cause]
+    kept = [*others[: MOST - 1], said]
+    return tuple(sorted(kept, key=lambda cost: -cost.log_odds))
 
 
 def conditions_of(grasps: Grasps, task: GraspTask) -> Conditions:
