@@ -9,7 +9,7 @@
 
 * peers: rate: time for a grasp that passes the same checks, beside other planners
 
-* plan: pace, certificates, uncertain: time to grasps, proofs, uncertain friction
+* plan: pace, certificates, uncertain, critical_order: time to grasps, proofs, uncertain friction
 
 * scene: real, rooms: supports and things in depth images
 
