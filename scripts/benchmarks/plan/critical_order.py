@@ -7,8 +7,8 @@ find the least one of a few levels at which each grasp holds.
 import math
 from typing import NamedTuple
 
-import torch
 from scipy.stats import spearmanr
+from train.household import CALIBRATING, FAMILIES, HouseholdBody, family_of
 
 from benchmarks.common import Options, Row, bench, mean_over
 from benchmarks.plan.uncertain import FIRST, plan, see_body
@@ -20,7 +20,6 @@ from torchgrasp.foundation.jobs import run_tasks
 from torchgrasp.hand.hand import Hand
 from torchgrasp.values.planning import Grasps
 from torchgrasp.values.specs import TrialSpec
-from train.household import CALIBRATING, FAMILIES, HouseholdBody, family_of
 
 FRICTION = "0.15:1.2"
 LEVELS = (0.12, 0.17, 0.24, 0.34, 0.48, 0.68, 0.96)
