@@ -446,75 +446,132 @@ class _Cones(NamedTuple):
     ) -> tuple[LeastBalance, LeastBalance]:
         """Return Newton's step to nu = 0, and its change for each unit of nu.
 
-        The friction does not change where `held`.
+        The friction does not change where `held`. Forces and cone multipliers are eliminated: the
+        eight unknowns left are the twist, the scale and the friction.
         """
-        n = self.normals
-        mu = at.friction[:, None]
         push, tangential = self.split(at.forces)
-        x = mu * push
-        # the scaling point w = (ahead, across) and the factor beta
-        size_x = _form(x, tangential).sqrt()
-        size_s = _form(at.press, at.slide).sqrt()
-        both = x / size_x * (at.press / size_s)
-        both = both + _dot(tangential, at.slide) / (size_x * size_s)
-        half = 2 * ((1 + both) / 2).sqrt()
-        ahead = (x / size_x + at.press / size_s) / half
-        across = (tangential / size_x[..., None] - at.slide / size_s[..., None]) / half[..., None]
-        beta = size_x / size_s
-        # in the space of forces: D^-1 becomes beta (2 w w^T + 1 - (1 + 1/mu^2) n n^T)
-        point = across - (ahead / mu)[..., None] * n
-        steep = (1 + 1 / mu**2)[..., None] * n
-        softness = 2 * _outer(point, point) + eye_like(3, n) - _outer(steep, n)
-        softness = beta[..., None, None] * softness  # (b, f, 3, 3)
-
-        def soften(z: Float[Tensor, "b c f 3"]) -> Float[Tensor, "b c f 3"]:
-            return (z.transpose(1, 2) @ softness).transpose(1, 2)
-
-        # how the stationarity of the forces changes with mu: the eighth row
-        stiff = (2 * ahead**2 - 1) / beta
-        by_mu = (at.press - mu * push * stiff)[..., None] * n
-        by_mu = by_mu - (2 * push * ahead / beta)[..., None] * across
-        rows = torch.cat([self.rows, by_mu[:, None]], 1)  # (b, 8, f, 3)
-        softened = soften(rows)
+        x = at.friction[:, None] * push
+        scaling = _Scaling.of(x, tangential, at.press, at.slide)
+        softness = scaling.softness(self.normals, at.friction)
+        stiff = (2 * scaling.ahead**2 - 1) / scaling.beta
+        by_friction = self._by_friction(at, push, stiff, scaling)
+        rows = torch.cat([self.rows, by_friction[:, None]], 1)  # (b, 8, f, 3)
+        softened = _soften(rows, softness)
         matrix = softened.flatten(2) @ rows.flatten(2).mT
+        corner = eye_like(8, self.normals)[7]
         last = (push**2 * stiff).sum(1)
-        corner = eye_like(8, n)[7]
         matrix = matrix - last[:, None, None] * (corner[:, None] * corner)
-        multipliers = torch.cat([at.twist, at.scale[:, None]], 1)
-        pull = at.slide - (mu * at.press)[..., None] * n
-        lacking = pull - torch.einsum("br,brfi->bfi", multipliers, self.rows)
-        inverse_s = 1 / _form(at.press, at.slide)
+        # what the forces would do if the eight unknowns did not change: for both directions
         inverse_x = 1 / _form(x, tangential)
-        still = soften(lacking[:, None])[:, 0] - at.forces
-        centring = -inverse_s[..., None] * (at.slide + (at.press / mu)[..., None] * n)
-        free = torch.stack([still, centring], 1)  # (b, 2, f, 3)
+        still = _soften(self._lacking(at)[:, None], softness)[:, 0] - at.forces
+        free = torch.stack([still, self._centring(at)], 1)  # (b, 2, f, 3)
         right = free.flatten(2) @ rows.flatten(2).mT  # (b, 2, 8)
-        total = torch.einsum("brfi,bfi->br", self.rows, at.forces)
-        pressed = torch.full_like(self.load[:, :1], n.shape[1])
-        total = total + torch.cat([self.load, pressed], 1)
-        weighed = (push * x * inverse_x).sum(1)
-        residual = torch.cat([total, torch.ones_like(weighed)[:, None]], 1)
-        other = -weighed[:, None] * corner
-        right = right + torch.stack([residual, other], 1)
+        right = right + self._residuals(at, (push * x * inverse_x).sum(1))
         if held is not None:
             matrix[held, 7] = corner
             right[held, :, 7] = 0
         solved, _ = torch.linalg.solve_ex(matrix, right.mT)
         solved = solved.mT  # (b, 2, 8)
-        forces = free - (solved @ softened.flatten(2)).unflatten(2, n.shape[1:])
+        forces = free - (solved @ softened.flatten(2)).unflatten(2, self.normals.shape[1:])
         twist, scale, friction = solved.split([6, 1, 1], 2)
-        more = -_dot(forces, n[:, None])
-        sideways = forces + more[..., None] * n[:, None]
-        more = mu[:, None] * more + push[:, None] * friction
-        inner = ahead[:, None] * more - _dot(across[:, None], sideways)
+        # the change of the multipliers follows from that of x: D and the scaling point give it
+        n = self.normals[:, None]
+        more = -_dot(forces, n)
+        sideways = forces + more[..., None] * n
+        more = at.friction[:, None, None] * more + push[:, None] * friction
         press = torch.stack([-at.press, x * inverse_x], 1)
-        press = press - (2 * ahead[:, None] * inner - more) / beta[:, None]
         slide = torch.stack([-at.slide, -tangential * inverse_x[..., None]], 1)
-        bent = 2 * inner[..., None] * across[:, None] - sideways
-        slide = slide + bent / beta[:, None, :, None]
+        ahead, across = scaling.stiffened(more, sideways)
+        press = press - ahead
+        slide = slide + across
         parts = (forces, friction[..., 0], press, slide, twist, scale[..., 0])
         first, second = (LeastBalance(*(x[:, i] for x in parts)) for i in range(2))
         return first, second
+
+    def _by_friction(
+        self,
+        at: LeastBalance,
+        push: Float[Tensor, "b f"],
+        stiff: Float[Tensor, "b f"],
+        scaling: "_Scaling",
+    ) -> Vectors:
+        """Return how the equations of the multipliers, by contact, change with the friction."""
+        ahead = (at.press - at.friction[:, None] * push * stiff)[..., None] * self.normals
+        return ahead - (2 * push * scaling.ahead / scaling.beta)[..., None] * scaling.across
+
+    def _lacking(self, at: LeastBalance) -> Vectors:
+        """Return what M_i^T s_i lacks to G_i^T y + l n_i."""
+        multipliers = torch.cat([at.twist, at.scale[:, None]], 1)
+        pull = at.slide - (at.friction[:, None] * at.press)[..., None] * self.normals
+        return pull - torch.einsum("br,brfi->bfi", multipliers, self.rows)
+
+    def _centring(self, at: LeastBalance) -> Vectors:
+        """Return the change of the forces for each unit of nu: that of the inverses of s_i."""
+        inverse_s = 1 / _form(at.press, at.slide)
+        pull = (at.press / at.friction[:, None])[..., None] * self.normals
+        return -inverse_s[..., None] * (at.slide + pull)
+
+    def _residuals(self, at: LeastBalance, weighed: Float[Tensor, "b"]) -> Float[Tensor, "b 2 8"]:
+        """Return the residuals of balance, sum and sum a_i s_i0, for both directions.
+
+        `weighed` is the change of the last one for each unit of nu.
+        """
+        total = torch.einsum("brfi,bfi->br", self.rows, at.forces)
+        pressed = torch.full_like(self.load[:, :1], self.normals.shape[1])
+        total = total + torch.cat([self.load, pressed], 1)
+        residual = torch.cat([total, torch.ones_like(weighed)[:, None]], 1)
+        other = -weighed[:, None] * eye_like(8, total)[7]
+        return torch.stack([residual, other], 1)
+
+
+class _Scaling(NamedTuple):
+    """The scaling points w = (ahead, across) of x and s by contact, and their factors beta."""
+
+    ahead: Float[Tensor, "b f"]
+    across: Vectors
+    beta: Float[Tensor, "b f"]
+
+    @classmethod
+    def of(
+        cls,
+        x: Float[Tensor, "b f"],
+        tangential: Vectors,
+        press: Float[Tensor, "b f"],
+        slide: Vectors,
+    ) -> "_Scaling":
+        """Return the scaling points of (x, tangential) and (press, slide)."""
+        size_x = _form(x, tangential).sqrt()
+        size_s = _form(press, slide).sqrt()
+        both = x / size_x * (press / size_s)
+        both = both + _dot(tangential, slide) / (size_x * size_s)
+        half = 2 * ((1 + both) / 2).sqrt()
+        ahead = (x / size_x + press / size_s) / half
+        across = (tangential / size_x[..., None] - slide / size_s[..., None]) / half[..., None]
+        return cls(ahead, across, size_x / size_s)
+
+    def softness(self, normals: Vectors, friction: Float[Tensor, "b"]) -> Float[Tensor, "b f 3 3"]:
+        """Return D^-1 in the space of forces: beta (2 w w^T + 1 - (1 + 1/mu^2) n n^T)."""
+        mu = friction[:, None]
+        point = self.across - (self.ahead / mu)[..., None] * normals
+        steep = (1 + 1 / mu**2)[..., None] * normals
+        softness = 2 * _outer(point, point) + eye_like(3, normals) - _outer(steep, normals)
+        return self.beta[..., None, None] * softness
+
+    def stiffened(
+        self, ahead: Float[Tensor, "b c f"], across: Float[Tensor, "b c f 3"]
+    ) -> tuple[Float[Tensor, "b c f"], Float[Tensor, "b c f 3"]]:
+        """Return the two parts of D applied to c vectors for each contact, the second one negated."""
+        inner = self.ahead[:, None] * ahead - _dot(self.across[:, None], across)
+        ahead = (2 * self.ahead[:, None] * inner - ahead) / self.beta[:, None]
+        across = 2 * inner[..., None] * self.across[:, None] - across
+        return ahead, across / self.beta[:, None, :, None]
+
+
+def _soften(
+    z: Float[Tensor, "b c f 3"], softness: Float[Tensor, "b f 3 3"]
+) -> Float[Tensor, "b c f 3"]:
+    """Return the products of vectors by contact with the contact's softness."""
+    return (z.transpose(1, 2) @ softness).transpose(1, 2)
 
 
 def _by_contact(*blocks: Float[Tensor, "b f r _"]) -> Float[Tensor, "b m q"]:
