@@ -75,7 +75,7 @@ class Arm(Value):
         pairs: indices (p, 2) of the two spheres of each pair that must not overlap.
         library: m random postures (m, n) [rad or m], from which inverse kinematics starts.
         features: the tip's pose in each posture of the library as twelve numbers (m, 12) [mm]: its
-            rotation matrix times a length, and its position. Similar poses have near numbers.
+            position, then its rotation matrix times a length. Similar poses have near numbers.
         hand_sha256: hash of the files of the hand.
     """
 
