@@ -195,6 +195,13 @@ def test_a_run_killed_between_a_temporary_file_and_its_name_is_continued(tmp_pat
     ]
 
 
+@pytest.mark.parametrize("sampling", ["uniform", "grasping"])
+def test_a_hand_of_four_fingers_is_refused_before_a_folder_is_made(tmp_path, sampling):
+    with pytest.raises(BadArgument, match="three fingertips"):
+        write_samples(load_hand("allegro", 4), SampleSpec(100, 0, sampling), tmp_path / "four")
+    assert not (tmp_path / "four").exists()
+
+
 @pytest.mark.promise("F7")
 def test_a_folder_in_use_or_of_other_samples_or_files_is_refused(tmp_path, small):
     hand = load_hand("barrett")

@@ -74,8 +74,8 @@ class Arm(Value):
             clear of objects and, unless their links only slide, of the table.
         pairs: indices (p, 2) of the two spheres of each pair that must not overlap.
         library: m random postures (m, n) [rad or m], from which inverse kinematics starts.
-        features: twelve numbers (m, 12) [mm] of the tip's pose in each posture of the library, by
-            which poses are compared.
+        features: the tip's pose in each posture of the library as twelve numbers (m, 12) [mm]: its
+            position, then its rotation matrix times a length. Similar poses have near numbers.
         hand_sha256: hash of the files of the hand.
     """
 

@@ -82,7 +82,7 @@ class CampaignSpec(Value):
 
     @property
     def test(self) -> Protocol:
-        """The `Protocol` of the field `protocol`, also where the field holds its name.
+        """The `Protocol` of the campaign: the field `protocol`, or the one that this field names.
 
         Raises `BadArgument` for an unknown name.
         """

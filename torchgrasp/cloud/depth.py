@@ -94,8 +94,8 @@ def cloud_from_depth(
             frame.
         depth_unit: metres of one count of the depth, such as 0.00025. None means the depth_scale of
             the intrinsics, else the units named under `depth`.
-        up: direction (3,) against gravity, in the object frame. The normal of a table in the image
-            is compared with it. None means z.
+        up: direction (3,) against gravity, in the object frame. With a `mask`, the normal of a
+            table in the image is compared with it. None means z.
 
     A polynomial distortion of a raw image (plumb_bob, rational_polynomial) is removed: each pixel's
     ray is undistorted. `MendedInput` then warns that the distortion was removed.

@@ -110,7 +110,7 @@ def cut_object(
         cloud: points [m] of a scene.
         up: unit vector (3,) that points up.
         point: place (3,) [m] on or near the object. Points more than 0.5 m away (`PARTS.around`)
-            are left out. None means the object with the most points.
+            are left out. None means the object with the most points above the support.
         box: two opposite corners (2, 3) [m] of a box along the axes; points outside are left out
             first. None means no box.
         gap: least distance [m] between two objects, 0.001 to 1.

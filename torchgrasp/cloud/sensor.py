@@ -111,7 +111,8 @@ class SensorNoise(Value):
         lost: share [0 to 1] of all pixels without depth.
         grazing: angles [deg] between ray and normal at which pixels begin to fade, and at which all
             are gone.
-        multipath: excess of the depth in a corner, over the corner's depth behind its surroundings.
+        multipath: error of a time-of-flight camera in a corner (no unit). The measured depth is too
+            great by this factor times the corner's depth behind its surroundings.
 
     >>> float(SENSORS["kinect_v1"].sigma(torch.tensor(2.0))) < 0.007
     True

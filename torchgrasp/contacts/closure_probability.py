@@ -281,9 +281,9 @@ def closure_probability(
 
     Args:
         shape: the uncertain shape, from `fit_shape`.
-        contacts: sets of 3 to 5 contacts (b, f, 3) [m] with outward unit normals, inside the domain
-            of the shape. A random surface that a finger does not meet within 12 standard deviations
-            counts as one without force closure.
+        contacts: sets of 3 to 5 contacts (b, f, 3) [m] with outward unit normals. They lie in the
+            domain of the shape, at least `FOOTPRINT` [m] from its edge. A random surface that a
+            finger does not meet within 12 standard deviations counts as one without force closure.
         spec: its `friction` is used, the coefficient of friction at execution; `planned_friction`
             is not used. For a distribution the result is the mean over 9 frictions. None means
             `ContactSpec()`.
@@ -291,8 +291,8 @@ def closure_probability(
             give force closure, it is computed for the fraction (k + 1) / (n + 2). So it is never 0.
         seed: random seed.
 
-    Raises `BadArgument` for a contact that is not finite or outside the shape's domain, or another
-    wrong argument.
+    Raises `BadArgument` for a contact that is not finite, a contact outside the shape's domain or
+    at its edge, or another wrong argument.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp

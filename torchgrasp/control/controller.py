@@ -171,8 +171,8 @@ class GraspController:
     def mass(self) -> Distribution | None:
         """The mass [kg] of the object that the felt load shows.
 
-        None unless the hand holds in the mode "grip" and its load is steady. A load that is too
-        heavy bounds the mass below only.
+        None unless the hand holds in the mode "grip" and its load is steady. If the load is too
+        heavy for the hand (`status`), only a lower bound of the mass is known.
         """
         return self.hold.mass if isinstance(self.hold, GripHold) else None
 

@@ -388,17 +388,18 @@ class Reopening:
 
 
 class LiftCheck:
-    """Check of a closed hand that rises and holds. `lost` becomes true, and stays so, when the hand
-    loses the object, or surely will.
+    """Check whether a closed hand that rises loses the object; it is called at each tick of the
+    lift.
 
-    That is at the first of two events; the bounds are fields of `LOST` (module `recovery`):
+    `lost` becomes true, and stays so, at the first of two events. Their bounds are fields of `LOST`
+    (module `recovery`):
 
-    * At a height of at least `first` [m], fewer than two fingertips touch. Their load along the
-      table's normal is below `load` [N].
-    * Two fingertips have each slid by more than `slip` [m], up to the height `low` [m].
+    * The hand has risen by at least `first` [m], fewer than two fingertips touch, and all carry
+      together less than `load` [N] along the table's normal.
+    * Two fingertips have each slid by more than `slip` [m] before the hand was `low` [m] high.
 
-    The load does not count for binary sensors, or without a table. Broken sensors count as
-    touching.
+    The load is not asked for with binary sensors, or without a table. Fingertips with broken
+    sensors count as touching.
 
     Args:
         reference: the closing plan of the grasp (`ClosingReference.from_grasp`).

@@ -102,7 +102,7 @@ class ClosingReference(Value):
             kp: stiffness [N m/rad] of every joint's drive; None means the hand's own.
             stability: model that chooses among balanced forces of nearly equal friction, and gives
                 the covariance of the forces (`load_stability`). With None, the standard deviation
-                of a force is a tenth of it.
+                of a normal force is a tenth of it, beside the sensor's error.
 
         Raises `BadArgument` for:
 

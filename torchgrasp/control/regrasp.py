@@ -204,8 +204,9 @@ class GraspTry:
         best-ranked one.
 
         If the grasps were planned for a distribution of friction, the touches narrow it. The grasps
-        of the next try have what is left in `meta["friction"]`. If the object was too heavy, they
-        have what the lift has shown of the mass [kg] in `meta["mass"]`, as a `Distribution`.
+        of the next try have what is left in `meta["friction"]`, unless that includes 0. If the
+        object was too heavy, they have what the lift has shown of the mass [kg] in `meta["mass"]`,
+        as the text of a `Distribution`.
         """
         if not len(self.others):
             return None

@@ -234,7 +234,8 @@ def list_views(
 
     Args:
         objects: the folder of objects, as `write_objects` makes it.
-        whole: give each object the single view "whole", which shows all sides.
+        whole: give each object the single view "whole", which shows all sides. Its file,
+            OBJECT/full_normals.ply, is not among those that `write_objects` writes.
         only: names of the objects; empty means all.
         most: largest number of views of each object; None means all.
 
@@ -264,7 +265,8 @@ def read_view(objects: Path | str, name: str, view: str, camera: bool = True) ->
     Args:
         objects: the folder of objects, as `write_objects` makes it.
         name: name of the object.
-        view: name of the view. "whole" is the view of all sides, with normals and no `viewpoint`.
+        view: name of the view. "whole" is the view of all sides, with normals and no `viewpoint`;
+            it is the file OBJECT/full_normals.ply, which `write_objects` does not write.
         camera: whether the cloud has a `viewpoint`.
 
     Raises `DatasetError` for a bad or missing entry, or an unknown view, and `CloudFileError` for a

@@ -144,7 +144,7 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
     * "failures": numbers of each status by stage: planning, start, closing, pulling or lifting,
       simulation.
     * "causes": why objects were not held, each with "count", "by_group" and the "median" size.
-    * "fingers": numbers of views by the grasping fingers.
+    * "fingers": numbers of views with an executable grasp, by the grasping fingers.
     * "force_n" [N], "overlap_mm" [mm], "plan_cpu_s" [s], "trial_cpu_s" [s]: means, or None.
     * "overlap_mm_max": largest overlap [mm], or None. "cpu_s": total CPU time [s].
     * "slip_mm" [mm], "slip_deg" [deg]: (median, 95 % quantile) over the trials that passed, or
@@ -163,47 +163,61 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
     (1.0, 0.5, 1)
     """
     attempts = [attempt for score in scores for attempt in score.attempts]
-    spent = [*(score.seconds for score in scores), *(a.seconds for a in attempts)]
-    names = sorted({score.object for score in scores})
-    by_object = {name: _shares([s for s in scores if s.object == name]) for name in names}
+    passed = [attempt for attempt in attempts if attempt.passed]
+    overlaps = [1e3 * attempt.overlap for attempt in attempts]  # [mm]
+    spent = [*(score.seconds for score in scores), *(attempt.seconds for attempt in attempts)]
+    objects = sorted({score.object for score in scores})
     groups = sorted({score.group for score in scores if score.group})
-    most = max((attempt.tries for attempt in attempts), default=1)
-    tried = [(score.unit, a) for score in scores for a in score.attempts]
-    known = [(unit, a) for unit, a in tried if not math.isnan(a.predicted)]
-    predicted = torch.tensor([attempt.predicted for _, attempt in known], dtype=torch.float64)
-    passed = torch.tensor([attempt.passed for _, attempt in known], dtype=torch.bool)
-    reasons_of = {"planning": Counter(s.refusal.name for s in scores if s.refusal is not Status.OK)}
-    for stage, reasons in STAGES.items():
-        failed = [a for a in attempts if not a.passed and a.status in reasons]
-        reasons_of[stage] = Counter(a.status.name for a in failed)
     return {
         **_shares(scores),
-        "tries": [sum(a.passed and a.tries == k for a in attempts) for k in range(1, most + 1)],
-        "failures": {
-            stage: dict(counts.most_common()) for stage, counts in reasons_of.items() if counts
-        },
+        "tries": _count_tries(attempts),
+        "failures": _count_failures(scores, attempts),
         "causes": _count_causes(scores),
-        "fingers": dict(
-            Counter(score.fingers for score in scores if score.executable).most_common()
-        ),
-        "force_n": _mean(a.force for a in attempts),
-        "overlap_mm": _mean(1e3 * a.overlap for a in attempts),
-        "overlap_mm_max": max(
-            (1e3 * a.overlap for a in attempts if not math.isnan(a.overlap)), default=None
-        ),
-        "slip_mm": _quantiles(1e3 * a.slip for a in attempts if a.passed),
-        "slip_deg": _quantiles(math.degrees(a.slip_angle) for a in attempts if a.passed),
-        "gap_mm": _quantiles(a.gap_mm for a in attempts),
-        "touch": dict(Counter(a.touch for a in attempts if a.touch).most_common()),
+        "fingers": _count(score.fingers for score in scores if score.executable),
+        "force_n": _mean(attempt.force for attempt in attempts),
+        "overlap_mm": _mean(overlaps),
+        "overlap_mm_max": max(_known(overlaps), default=None),
+        "slip_mm": _quantiles(1e3 * attempt.slip for attempt in passed),
+        "slip_deg": _quantiles(math.degrees(attempt.slip_angle) for attempt in passed),
+        "gap_mm": _quantiles(attempt.gap_mm for attempt in attempts),
+        "touch": _count(attempt.touch for attempt in attempts if attempt.touch),
         "plan_cpu_s": _mean(score.seconds for score in scores),
-        "trial_cpu_s": _mean(a.seconds for a in attempts),
-        "cpu_s": sum(x for x in spent if not math.isnan(x)),
-        "success": judge(predicted, passed, [unit for unit, _ in known]) if known else None,
-        "by_object": by_object,
-        "by_group": {
-            name: _shares([score for score in scores if score.group == name]) for name in groups
-        },
+        "trial_cpu_s": _mean(attempt.seconds for attempt in attempts),
+        "cpu_s": sum(_known(spent)),
+        "success": _judge_predicted(scores),
+        "by_object": {x: _shares([s for s in scores if s.object == x]) for x in objects},
+        "by_group": {x: _shares([s for s in scores if s.group == x]) for x in groups},
     }
+
+
+def _count_tries(attempts: Sequence[ProtocolResult]) -> list[int]:
+    """Return how many trials passed with the first grasp, with the second grasp, and so on."""
+    most = max((attempt.tries for attempt in attempts), default=1)
+    passed = Counter(attempt.tries for attempt in attempts if attempt.passed)
+    return [passed[k] for k in range(1, most + 1)]
+
+
+def _count_failures(
+    scores: Sequence[ViewScore], attempts: Sequence[ProtocolResult]
+) -> dict[str, dict[str, int]]:
+    """Return the numbers of each status by the stage of the failure, without empty stages."""
+    refused = (score.refusal.name for score in scores if score.refusal is not Status.OK)
+    found = {"planning": _count(refused)}
+    for stage, reasons in STAGES.items():
+        failed = (a for a in attempts if not a.passed and a.status in reasons)
+        found[stage] = _count(attempt.status.name for attempt in failed)
+    return {stage: counts for stage, counts in found.items() if counts}
+
+
+def _judge_predicted(scores: Sequence[ViewScore]) -> "dict[str, float | list[Bin]] | None":
+    """Return how well the predictions of success fit the outcomes; None without predictions."""
+    tried = [(score.unit, attempt) for score in scores for attempt in score.attempts]
+    known = [(unit, attempt) for unit, attempt in tried if not math.isnan(attempt.predicted)]
+    if not known:
+        return None
+    predicted = torch.tensor([attempt.predicted for _, attempt in known], dtype=torch.float64)
+    passed = torch.tensor([attempt.passed for _, attempt in known], dtype=torch.bool)
+    return judge(predicted, passed, [unit for unit, _ in known])
 
 
 def _count_causes(scores: Sequence[ViewScore]) -> dict[str, dict[str, Any]]:
@@ -212,11 +226,11 @@ def _count_causes(scores: Sequence[ViewScore]) -> dict[str, dict[str, Any]]:
     """
     lost = [(a.cause, score.group, a.size) for score in scores for a in score.attempts if a.cause]
     found = {}
-    for cause, count in Counter(name for name, _, _ in lost).most_common():
-        groups = Counter(group for name, group, _ in lost if name == cause)
-        sizes = [size for name, _, size in lost if name == cause and not math.isnan(size)]
+    for cause, count in _count(name for name, _, _ in lost).items():
+        groups = _count(group for name, group, _ in lost if name == cause)
+        sizes = _known(size for name, _, size in lost if name == cause)
         middle = statistics.median(sizes) if sizes else math.nan
-        found[cause] = {"count": count, "by_group": dict(groups.most_common()), "median": middle}
+        found[cause] = {"count": count, "by_group": groups, "median": middle}
     return found
 
 
@@ -239,11 +253,21 @@ def _shares(scores: Sequence[ViewScore]) -> dict[str, Share | int]:
     }
 
 
+def _count(values: Iterable[str]) -> dict[str, int]:
+    """Return how often each value occurs, the most frequent first."""
+    return dict(Counter(values).most_common())
+
+
+def _known(values: Iterable[float]) -> list[float]:
+    """Return the values that are not NaN."""
+    return [value for value in values if not math.isnan(value)]
+
+
 def _quantiles(values: Iterable[float]) -> tuple[float, float] | None:
     """Return the median and the 95 % quantile of the values that are not NaN; None if there are
     none.
     """
-    known = torch.tensor([value for value in values if not math.isnan(value)], dtype=torch.float64)
+    known = torch.tensor(_known(values), dtype=torch.float64)
     if not len(known):
         return None
     median, most = known.quantile(torch.tensor(QUANTILES, dtype=torch.float64)).tolist()
@@ -252,7 +276,7 @@ def _quantiles(values: Iterable[float]) -> tuple[float, float] | None:
 
 def _mean(values: Iterable[float]) -> float | None:
     """Return the mean of the values that are not NaN; None if there are none."""
-    known = [value for value in values if not math.isnan(value)]
+    known = _known(values)
     return sum(known) / len(known) if known else None
 
 

@@ -118,8 +118,8 @@ def measure_touch(
             the grasps.
         limit: greatest gap [m] of a fingertip that touches.
 
-    Raises `BadArgument` for joints of another hand. It is also raised for a cloud without normals
-    for which none can be estimated.
+    Raises `BadArgument` for joints of another hand or beyond their limits. It is also raised for a
+    cloud without normals for which none can be estimated.
 
     >>> from torchgrasp import load_hand, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp

@@ -60,7 +60,8 @@ class EvaluationSpec(Value):
         grasps: largest number of grasps to try for each view.
         ranks: "best" tries the best grasps, "spread" tries grasps spread evenly over all ranks.
         starts: number of initial guesses of the contact planner.
-        complete: plan on whole clouds with normals, as if the shape were known.
+        complete: plan on whole clouds with normals, as if the shape were known. They are the views
+            "whole" of `read_view`.
         only: names of the objects to evaluate; empty means all.
         planned: read the grasps that an earlier call saved in `folder`, instead of planning.
         seed: random seed.

@@ -49,9 +49,9 @@ def plan_motion(
 ) -> ArmMotion:
     """Return the motions of arm and hand through executable grasps that were planned with the arm.
 
-    The hand comes straight at 0.1 m/s from 0.1 m, closes and presses. It is lifted by 0.1 m as
-    fast, along the normal of the plan's table. Without a table it is lifted along z. The way to the
-    first posture is not planned.
+    The hand moves straight over the last 0.1 m to its pre-grasp, closes and presses. Then it is
+    lifted by 0.1 m along the normal of the plan's table, or along z without a table. Both motions
+    are at 0.1 m/s. The way to the first posture is not planned.
 
     Args:
         arm: the arm, at the place for which the grasps were planned.

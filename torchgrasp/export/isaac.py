@@ -82,9 +82,9 @@ def format_isaac(
         object_id: name of the object's frame, such as its path in the stage.
         actuated: leave out joints that follow others. By default all joints of the hand are
             written.
-        gripper_link: name of the gripper's frame, or its path in the stage. If its last part is a
-            link of the URDF, poses are of this link. Another name is a name for the root link, or
-            for the flange. None means the root link, or "flange".
+        gripper_link: name of the gripper's frame, or its path in the stage. Without a `flange`,
+            poses are of the link of the URDF that its last part names, else of the root link. With
+            a `flange`, it only names the flange. None means the root link, or "flange".
         isaac_ros: write the names of Isaac ROS, `object_frame` and `gripper_frame`.
 
     Raises:

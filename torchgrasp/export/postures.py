@@ -217,9 +217,9 @@ def format_keyframes(
 ) -> str:
     """Return the hand as MJCF text with four keyframes for each grasp.
 
-    They are `grasp_0_approach`, `grasp_0_pregrasp`, `grasp_0_grasp` and `grasp_0_squeeze`. The
-    approach has the joints of the pre-grasp. The squeeze has the joints of the grasp and targets
-    that press.
+    They are `grasp_0_approach`, `grasp_0_pregrasp`, `grasp_0_grasp` and `grasp_0_squeeze`. In the
+    approach the hand is 0.1 m before its pre-grasp, with the same joints. The squeeze has the
+    joints of the grasp and targets that press.
 
     The world is the object's frame. `qpos` is the free joint, then the joints of the model [rad or
     m]. `ctrl` holds the targets [rad or m] of the actuators. The text elements "qpos" and "ctrl"

@@ -99,11 +99,10 @@ class ActuatedJoints(Value):
 
     @checked(gradients=True)
     def check_limits(self, joints: Tensor, name: str = "joints") -> None:
-        """Raise `BadArgument` unless `joints` (*b, h) [rad or m] pass `check` and are within their
-        limits.
+        """Raise `BadArgument` unless `joints` (*b, h) [rad or m] are within their limits.
 
-        A joint may exceed a limit by the rounding of float32. The error's text calls the argument
-        `name`.
+        A joint may exceed a limit by the rounding of float32. The errors of `check` are raised,
+        too. The error's text calls the argument `name`.
         """
         self.check(joints, name)
         low = self.lower.to(joints) - ROUNDING

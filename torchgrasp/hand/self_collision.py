@@ -133,8 +133,9 @@ class SelfCollision(Value):
         derivative of a separation by a twist of the second shape. Its first three numbers belong to
         translation, the last three [m/rad] to rotation about the origin.
 
-        The last wrench is zero. Pairs whose bounding spheres are at least `below` [m] apart refer
-        to it. Raises `BadArgument` for too few links, and inside `torch.vmap`.
+        The wrench of a pair that is at least `below` [m] apart is zero. The last wrench is zero,
+        too; pairs whose bounding spheres are so far apart refer to it. Raises `BadArgument` for too
+        few links, and inside `torch.vmap`.
         """
         shapes, apart, (pair, row, parts) = self._near(frames, below)
         separation = apart.new_zeros(len(pair))

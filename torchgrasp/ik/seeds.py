@@ -133,6 +133,8 @@ class PostureLibrary(Value):
             count: number of drawn postures. None means `SEEDS.postures`, or `SEEDS.many_postures`
                 for more than three fingers.
             seed: seed of the draws.
+
+        Raises the errors of `sample_configurations`.
         """
         if count is None:
             count = SEEDS.postures if len(hand.tips) == 3 else SEEDS.many_postures

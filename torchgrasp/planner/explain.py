@@ -223,9 +223,8 @@ class Explanation(Value):
         """A sentence for the user on what would help most.
 
         If there is a grasp, the sentence says so. Otherwise it names the best change. If the user
-        cannot make this change, it also names the best change that the user can make. A higher
-        friction is such a change. If no change helps, the sentence names the stage that loses the
-        most.
+        cannot make this change, as a higher friction, it also names the best one that the user can
+        make. If no change helps, the sentence names the stage that loses the most.
         """
         if self.funnel.executable:
             return f"There is a grasp: {self.funnel.executable} of {self.starts} starts ended in an executable one."

@@ -160,7 +160,7 @@ def write_samples(
     The postures are those of `sample_configurations`.
 
     Args:
-        hand: the hand.
+        hand: the hand, with three grasping fingers.
         spec: number of postures, seed and sampling.
         folder: folder that is made, or continued after an interrupted run with the same arguments.
         workers: number of threads that draw at the same time, 1 to 1024.
@@ -168,7 +168,8 @@ def write_samples(
             each new chunk.
 
     Raises:
-        BadArgument: workers outside [1, 1024]; a hand of which almost all postures collide.
+        BadArgument: workers outside [1, 1024]; a hand with another number of fingers, or of which
+            almost no random posture is kept.
         OutputError: the folder holds other samples, another run is writing it, or the disk is full.
 
     >>> import tempfile
@@ -177,6 +178,7 @@ def write_samples(
     >>> len(write_samples(load_hand("barrett"), SampleSpec(100), tempfile.mkdtemp()))
     100
     """
+    hand.require_three("hand", repr(hand.name))
     counts = chunk_sizes(spec.n)
     meta = spec.meta(hand)
     samples = SampleFolder(Path(folder), spec.n, hand.joint_names, meta)

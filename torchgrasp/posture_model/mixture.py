@@ -183,6 +183,8 @@ class GraspMixture(GaussianMixture):
             variance.
         meta: texts that describe hand, samples and fit.
 
+    Raises the errors of `GaussianMixture`, and `BadArgument` for other `names`.
+
     >>> from torchgrasp import encode
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> model, code = load_mixture("barrett"), encode(load_shipped_grasp("jug", "barrett").contacts)

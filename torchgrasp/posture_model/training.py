@@ -173,8 +173,8 @@ def fit_mixture(
         observer: called with the state of the fit after each step.
 
     Raises:
-        BadArgument: too few samples; a joint that does not vary; a number out of range; another
-            fit's checkpoint.
+        BadArgument: too few samples, or codes of another number of fingers than three; a joint that
+            does not vary; a number out of range; another fit's checkpoint.
         ModelFileError: a damaged checkpoint.
         OutputError: a checkpoint that cannot be written.
         IndefiniteCovariance: a component collapses more than three times.

@@ -461,7 +461,7 @@ class Scene(Value):
     def to_upright(self, obj_from_upright: Pose) -> "Scene":
         """Return the scene in an upright frame, in which the table is the plane z = 0.
 
-        Coordinates are rounded, and `others` is empty.
+        Points are rounded to 2^-20 m, and the camera's pose as finely. `others` is empty.
 
         Args:
             obj_from_upright: pose (4, 4) [m] of the upright frame in the frame "obj". Its z axis

@@ -334,8 +334,8 @@ class ShapeGP(Posterior, Normalisation):
         pose.
 
         An error of the pose moves all points of a view together, so more points do not reduce it.
-        At most 300 of the points (`DOMAIN.compared`) are used. All standard deviations grow by one
-        factor: `std_factor` changes.
+        `std_factor` grows by the median of sqrt(std_m^2 + error^2) / std_m over the points, of
+        which at most 300 (`DOMAIN.compared`), drawn at random, are used.
 
         Args:
             points: the view's points (n, 3) [m] in the cloud's frame.

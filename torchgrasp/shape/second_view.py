@@ -64,8 +64,8 @@ VIEW = ViewNumbers()
 class NextView(Value):
     """A camera for a second view, and what it is expected to tell, from `next_view`.
 
-    `before` and `after` are means over the contacts of the best grasps, or over the surface without
-    grasps.
+    `before` and `after` are means over the contacts of the best grasps, weighted by their predicted
+    success. Without grasps they are means over the surface.
 
     Attributes:
         camera_pose: pose `obj_from_camera` (4, 4) [m] in the cloud's frame, as `look_at` returns it
@@ -118,11 +118,12 @@ def next_view(
             means that it counts on all of the surface.
         table: the table's plane, or its height [m] along z; cameras are above it. None means the
             table of the grasps, if they have one.
-        distance: distance [m] of the camera from the middle of the surface; None means the mean
-            distance of earlier cameras, or `VIEW.far` if none is known.
+        distance: distance [m] of the camera from the middle of the surface, at least `VIEW.near`
+            radii of the shape's domain. None means the mean distance of earlier cameras, or
+            `VIEW.far` if none is known; where that is too near, it means the least distance.
 
-    Raises `BadArgument` for a wrong argument, or a distance that is too near to the object. Grasps
-    whose contacts all lie outside the shape's domain raise it, too.
+    Raises `BadArgument` for a wrong argument, or a distance below the least one. Grasps whose
+    contacts all lie outside the shape's domain raise it, too.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> from torchgrasp.shape import next_view

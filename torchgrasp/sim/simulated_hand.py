@@ -73,6 +73,8 @@ class SimulatedHand:
         stray: sums of the impulses (3,) [N s] of these contacts.
         most_stray: largest force (3,) [N] of these contacts, averaged over a tick.
         period: time [s] of a control tick.
+
+    Raises `BadArgument` if the plan's sensor names an unknown finger as dead.
     """
 
     def __init__(

@@ -164,8 +164,8 @@ class ContactSpec(Value):
     def least_separation(self) -> float:
         """The least distance [m] between the centres of two fingertips.
 
-        It is the field `separation`. If that is None, it is `SEPARATION`, plus twice what
-        `fingertip_radius` exceeds `TIP_RADIUS` by.
+        It is the field `separation`. If that is None, it is `SEPARATION` for fingertips of radius
+        `TIP_RADIUS` or less. For larger ones it grows by the difference of the diameters.
         """
         wider = 2 * max(self.fingertip_radius - TIP_RADIUS, 0.0)
         return SEPARATION + wider if self.separation is None else self.separation
@@ -208,11 +208,11 @@ class ContactSpec(Value):
         """Yield weaker constraints for an object without grasps, the strictest first.
 
         The first specs have a smaller `flat_radius`: each of `FLAT_RADII` that is smaller than
-        `below`. With a table, the last specs also allow contacts on the object's upper rim. There a
+        `below`. With a table, three more specs allow contacts on the object's upper rim, where a
         fingertip on the table touches a low object with an inclined normal. The estimated rim is
         rounder than the true one, so its normals are steeper. Therefore the margins of friction and
-        of `tip_radius` are given up step by step. If `flatness` is None, or `flat_radius` is not
-        None, there are no such specs.
+        of `tip_radius` are given up step by step: not at all, by half, wholly. If `flatness` is
+        None, or `flat_radius` is not None, there are no specs.
 
         Args:
             below: radius [m] of the flat areas that were tried before.
@@ -224,17 +224,17 @@ class ContactSpec(Value):
         """
         if self.flatness is None or self.flat_radius is not None:
             return
-        yield from (
-            dataclasses.replace(self, flat_radius=flat) for flat in FLAT_RADII if flat < below
-        )
+        for flat in FLAT_RADII:
+            if flat < below:
+                yield dataclasses.replace(self, flat_radius=flat)
         widest = self.for_fingertips(radius).fingertip_radius
-        for spent in (0.0, 0.5, 1.0) if self.table is not None else ():
-            tips = (
-                widest + spent * (radius - widest)
-                if self.tip_radius is None and radius > 0
-                else self.tip_radius
-            )
+        if self.table is None:
+            return
+        for spent in (0.0, 0.5, 1.0):
             margin = self.friction_margin + spent * (1 - self.friction_margin)
+            tips = self.tip_radius
+            if tips is None and radius > 0:
+                tips = widest + spent * (radius - widest)
             yield dataclasses.replace(
                 self, flat_radius=RIM, tip_radius=tips, friction_margin=margin
             )
