@@ -120,6 +120,9 @@ def critical_friction(
     * contacts that are not finite;
     * the few contacts for which the method does not converge.
 
+    It is differentiable twice. Where several motions prove the friction, the derivative is that of
+    one of them.
+
     Args:
         points: positions (*b, f, 3) [m] of the f contacts of each set, 3 to 5.
         normals: outward unit normals (*b, f, 3) of the object, in the same frame.

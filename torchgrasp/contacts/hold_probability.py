@@ -152,7 +152,10 @@ def hold_probability(
     * sets of other than 3 to 5 contacts;
     * normals that are not of length 1 (to 1e-3);
     * numbers outside their range;
-    * contacts outside the domain of the `shape`.
+    * contacts outside the domain of the `shape`, or at its edge.
+
+    The result is differentiable twice in contacts, `tilt` and `weight.center`. The random surfaces
+    are the same for all contacts.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> contacts = load_shipped_grasp("jug", "allegro").contacts
