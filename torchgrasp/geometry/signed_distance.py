@@ -13,9 +13,9 @@ from torch import Tensor
 from torchgrasp.foundation.base import Value, kept
 from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument
-from torchgrasp.foundation.lazy import spatial, trimesh
+from torchgrasp.foundation.lazy import spatial
 from torchgrasp.foundation.rules import Range
-from torchgrasp.geometry.linalg import norm
+from torchgrasp.geometry.linalg import norm, number_rows
 from torchgrasp.geometry.mesh import closest_on_triangles
 
 FIELD_SPACING = 0.004  # spacing [m] of nodes with an error below that of an estimated surface
@@ -357,8 +357,9 @@ def _pseudonormals(corners: np.ndarray, face: np.ndarray) -> np.ndarray:
     """Return pseudonormals (Baerentzen and Aanaes, 2005) of each triangle's face, 3 sides and 3
     corners, (f, 7, 3), given the unit normals of the faces (f, 3).
     """
-    vertices = corners.reshape(-1, 3)
-    ids = trimesh.grouping.unique_rows(vertices, digits=FIELDS.digits)[1].reshape(-1, 3)
+    # corners at the same place, to some digits, are one vertex
+    places = np.round(corners.reshape(-1, 3) * 10.0**FIELDS.digits)
+    ids = number_rows(torch.from_numpy(places)).numpy().reshape(-1, 3)
     ahead = np.roll(corners, -1, 1) - corners
     back = np.roll(corners, 1, 1) - corners
     lengths = np.linalg.norm(ahead, axis=-1) * np.linalg.norm(back, axis=-1)
