@@ -122,12 +122,13 @@ def test_the_guide_to_a_real_camera_runs_as_it_stands(tmp_path, monkeypatch, cap
     """The commands take the frame that the page renders; planning itself is replaced."""
     from torchgrasp import read_scene
     from torchgrasp.app import cli
+    from torchgrasp.app.cli.grasp import Grasp
 
     guide = (ROOT / "docs" / "real_camera.md").read_text()
     found = []
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(
-        cli.grasp.Grasp, "_grasp_scene", lambda self, path, *_: found.append(read_scene(path)) or 0
+        Grasp, "_grasp_scene", lambda self, path, *_: found.append(read_scene(path)) or 0
     )
     exec(compile(fenced("python", guide)[0], "real_camera.md", "exec"), {})
     for line in "".join(fenced("bash", guide)).splitlines():

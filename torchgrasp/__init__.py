@@ -4,49 +4,52 @@ The names below are the core of the library, in the order of the data flow. Each
 public names.
 """
 
-from torchgrasp.foundation.errors import GraspError, Status
-from torchgrasp.geometry.plane import Plane
-from torchgrasp.values.distribution import Distribution
-from torchgrasp.values.specs import ContactSpec, TrialSpec
-from torchgrasp.values.planning import (
-    Certificate,
-    ContactCode,
-    ContactPlan,
-    Contacts,
-    Grasps,
-    PointCloud,
-    ShapeEstimate,
-)
-from torchgrasp.values.closing import ClosureResult, SensorModel
-from torchgrasp.cloud.read import cloud_from_array, read_cloud
-from torchgrasp.cloud.depth import cloud_from_depth
-from torchgrasp.cloud.prepare import merge_clouds
-from torchgrasp.scene.scene import Scene
-from torchgrasp.scene.file import read_scene, save_scene
-from torchgrasp.data.shards import load_grasps
-from torchgrasp.data.shipped import list_objects, load_object, load_scene
-from torchgrasp.shape.gp import ShapeGP
-from torchgrasp.shape.fit import fit_shape
-from torchgrasp.contacts.region import Region
-from torchgrasp.contacts.certify import certify
-from torchgrasp.contacts.closure_probability import closure_probability
-from torchgrasp.contacts.critical import critical_friction
-from torchgrasp.contacts.hold_probability import CarriedWeight, hold_probability
-from torchgrasp.contacts.plan import plan_contacts
-from torchgrasp.hand.hand import Hand
-from torchgrasp.hand.load import load_hand
-from torchgrasp.posture_model.mixture import GraspMixture, encode, load_mixture
-from torchgrasp.posture_model.training import fit_mixture
-from torchgrasp.posture_model.sample import sample_configurations
-from torchgrasp.ik.solve import solve_ik
-from torchgrasp.success.task import GraspTask
-from torchgrasp.success.reasons import explain_success
-from torchgrasp.planner.explain import explain_empty
-from torchgrasp.planner.grasps import plan_grasps, stream_grasps
-from torchgrasp.planner.scene_plan import plan_scene
-from torchgrasp.control.reference import ClosingReference, closing_gains
-from torchgrasp.control.controller import GraspController
-from torchgrasp.evaluation.lift import close_hand
+from torchgrasp.foundation.garbage import uncollected as _uncollected
+
+with _uncollected():
+    from torchgrasp.foundation.errors import GraspError, Status
+    from torchgrasp.geometry.plane import Plane
+    from torchgrasp.values.distribution import Distribution
+    from torchgrasp.values.specs import ContactSpec, TrialSpec
+    from torchgrasp.values.planning import (
+        Certificate,
+        ContactCode,
+        ContactPlan,
+        Contacts,
+        Grasps,
+        PointCloud,
+        ShapeEstimate,
+    )
+    from torchgrasp.values.closing import ClosureResult, SensorModel
+    from torchgrasp.cloud.read import cloud_from_array, read_cloud
+    from torchgrasp.cloud.depth import cloud_from_depth
+    from torchgrasp.cloud.prepare import merge_clouds
+    from torchgrasp.scene.scene import Scene
+    from torchgrasp.scene.file import read_scene, save_scene
+    from torchgrasp.data.shards import load_grasps
+    from torchgrasp.data.shipped import list_objects, load_object, load_scene
+    from torchgrasp.shape.gp import ShapeGP
+    from torchgrasp.shape.fit import fit_shape
+    from torchgrasp.contacts.region import Region
+    from torchgrasp.contacts.certify import certify
+    from torchgrasp.contacts.closure_probability import closure_probability
+    from torchgrasp.contacts.critical import critical_friction
+    from torchgrasp.contacts.hold_probability import CarriedWeight, hold_probability
+    from torchgrasp.contacts.plan import plan_contacts
+    from torchgrasp.hand.hand import Hand
+    from torchgrasp.hand.load import load_hand
+    from torchgrasp.posture_model.mixture import GraspMixture, encode, load_mixture
+    from torchgrasp.posture_model.training import fit_mixture
+    from torchgrasp.posture_model.sample import sample_configurations
+    from torchgrasp.ik.solve import solve_ik
+    from torchgrasp.success.task import GraspTask
+    from torchgrasp.success.reasons import explain_success
+    from torchgrasp.planner.explain import explain_empty
+    from torchgrasp.planner.grasps import plan_grasps, stream_grasps
+    from torchgrasp.planner.scene_plan import plan_scene
+    from torchgrasp.control.reference import ClosingReference, closing_gains
+    from torchgrasp.control.controller import GraspController
+    from torchgrasp.evaluation.lift import close_hand
 
 __version__ = "0.1.0"
 

@@ -20,6 +20,7 @@ from unittest import mock
 import numpy as np
 
 from torchgrasp.app import cli
+from torchgrasp.app.cli.grasp import Grasp
 from torchgrasp.cloud import realsense
 from torchgrasp.cloud.camera import INTRINSICS
 from torchgrasp.cloud.realsense import LiveCameraNumbers, shoot_depth
@@ -122,7 +123,7 @@ def main(folder, file):
     with connected(Camera(counts)):
         found["good"] = run("--realsense", "--out", f"{folder}/good", "--no-report")
         # the frame alone counts
-        with mock.patch.object(cli.grasp.Grasp, "_grasp_scene", return_value=0):
+        with mock.patch.object(Grasp, "_grasp_scene", return_value=0):
             posed = ("--camera-pose", f"{folder}/pose.npy", "--out", f"{folder}/posed")
             found["posed"] = run("--realsense", *posed)
         found["again"] = shoot_depth("1").camera  # the camera was closed

@@ -112,13 +112,17 @@ def levenberg_marquardt(
         trial_state = problem.move(state, x, rows)
         trial = problem.linearise(trial_state, rows)
         accepted, after = problem.judge(model, trial, x, damping)
-        refused = problem.refuse(model, trial)
         if every > 1:  # problems that have ended, but have not left, stay as they are
             accepted = accepted & going
             after = torch.where(going, after, damping)
-            refused = pick(going, refused, model)
-        state = pick(accepted, trial_state, state)
-        model = pick(accepted, trial, refused)
+        if every == 1 and bool(accepted.all()):  # nothing to choose
+            state, model = trial_state, trial
+        else:
+            refused = problem.refuse(model, trial)
+            if every > 1:
+                refused = pick(going, refused, model)
+            state = pick(accepted, trial_state, state)
+            model = pick(accepted, trial, refused)
         damping = after
     return put(whole, rows, state), costs.index_copy(0, rows, model.cost)
 

@@ -13,9 +13,9 @@ from torch import Tensor
 from torchgrasp.foundation.base import Value, kept
 from torchgrasp.foundation.checks import check_tensor, checked
 from torchgrasp.foundation.errors import BadArgument
-from torchgrasp.foundation.lazy import spatial, trimesh
+from torchgrasp.foundation.lazy import spatial
 from torchgrasp.foundation.rules import Range
-from torchgrasp.geometry.linalg import norm
+from torchgrasp.geometry.linalg import norm, number_rows
 from torchgrasp.geometry.mesh import closest_on_triangles
 
 FIELD_SPACING = 0.004  # spacing [m] of nodes with an error below that of an estimated surface
@@ -128,23 +128,23 @@ class DistanceField(Value, abc.ABC):
         flat = cell[..., 0] * dx + cell[..., 1] * dy + cell[..., 2] + first
         # (2, 2, 2, *b): the corners on x, y and z
         corner = self.nodes[flat + corners].to(points).unflatten(0, (2, 2, 2))
-        low = corner[:, :, 0]
-        high = corner[:, :, 1]
-        z = torch.lerp(low, high, fz)
-        y = torch.lerp(z[:, 0], z[:, 1], fy)
-        slope_z = high - low
-        slope_z = torch.lerp(slope_z[:, 0], slope_z[:, 1], fy)
-        slope_z = torch.lerp(slope_z[0], slope_z[1], fx)
-        slope_y = z[:, 1] - z[:, 0]
-        slope_y = torch.lerp(slope_y[0], slope_y[1], fx)
-        slope = torch.stack([y[1] - y[0], slope_y, slope_z], -1) / spacing
+        low, high = corner.unbind(2)
+        left, right = torch.lerp(low, high, fz).unbind(1)
+        back, front = torch.lerp(left, right, fy).unbind(0)
+        slope_x = front - back
+        across_back, across_front = (right - left).unbind(0)
+        slope_y = torch.lerp(across_back, across_front, fx)
+        slope_left, slope_right = (high - low).unbind(1)
+        up_back, up_front = torch.lerp(slope_left, slope_right, fy).unbind(0)
+        slope_z = torch.lerp(up_back, up_front, fx)
+        slope = torch.stack([slope_x, slope_y, slope_z], -1) / spacing
         beyond = (position - inside) * spacing
         # The norm of a zero vector has no second derivative.
         outside = (beyond != 0).any(-1, keepdim=True)
         length = norm(torch.where(outside, beyond, 1.0), keepdim=True)
         away = torch.where(outside, length, 0.0)[..., 0]
         gradient = torch.where(beyond != 0, 0.0, slope) + beyond / length
-        return torch.lerp(y[0], y[1], fx) + away, gradient
+        return torch.lerp(back, front, fx) + away, gradient
 
 
 @checked
@@ -357,8 +357,9 @@ def _pseudonormals(corners: np.ndarray, face: np.ndarray) -> np.ndarray:
     """Return pseudonormals (Baerentzen and Aanaes, 2005) of each triangle's face, 3 sides and 3
     corners, (f, 7, 3), given the unit normals of the faces (f, 3).
     """
-    vertices = corners.reshape(-1, 3)
-    ids = trimesh.grouping.unique_rows(vertices, digits=FIELDS.digits)[1].reshape(-1, 3)
+    # corners at the same place, to some digits, are one vertex
+    places = np.round(corners.reshape(-1, 3) * 10.0**FIELDS.digits)
+    ids = number_rows(torch.from_numpy(places)).numpy().reshape(-1, 3)
     ahead = np.roll(corners, -1, 1) - corners
     back = np.roll(corners, 1, 1) - corners
     lengths = np.linalg.norm(ahead, axis=-1) * np.linalg.norm(back, axis=-1)

@@ -99,8 +99,9 @@ class SelfCollision(Value):
         with torch.no_grad():  # the spheres show which pairs can be the nearest
             distance = self._distances(shapes[1])
             inscribed = self.half.amin(1) + self.radius
-            limit = (distance - self._sums(inscribed, distance)).amin(0).clamp_max(below)
-            near = distance - self._sums(self._bounding, distance) <= limit
+            touching = inscribed[self.pairs].sum(1, keepdim=True).to(distance)
+            limit = (distance - touching).amin(0).clamp_max(below)
+            near = distance - self._bounding_sums.to(distance) <= limit
             # torch.vmap cannot select entries: all are chosen, by a mask that it does not see
             dense = not torch.compiler.is_compiling() and not is_known(near)
             every = torch.ones(near.shape, dtype=torch.bool, device=near.device) if dense else near
@@ -198,7 +199,7 @@ class SelfCollision(Value):
             )
         shapes = self._place(frames)
         distance = self._distances(shapes[1])
-        apart = distance - self._sums(self._bounding, distance)
+        apart = distance - self._bounding_sums.to(distance)
         return shapes, apart, self._choose(apart < below)
 
     def _distances(self, center: Float[Tensor, "3 s n"]) -> Float[Tensor, "p n"]:
@@ -216,9 +217,10 @@ class SelfCollision(Value):
         """Radius (s,) [m] of the bounding sphere of each collision shape."""
         return torch.linalg.vector_norm(self.half, dim=1) + self.radius
 
-    def _sums(self, radius: Float[Tensor, " s"], like: Tensor) -> Float[Tensor, "p 1"]:
-        """Return the sum of the radii [m] of each pair of shapes, given that of every shape."""
-        return radius[self.pairs].sum(1, keepdim=True).to(like)
+    @kept
+    def _bounding_sums(self) -> Float[Tensor, "p 1"]:
+        """Sum of the radii [m] of the bounding spheres of each pair of shapes."""
+        return self._bounding[self.pairs].sum(1, keepdim=True)
 
     def _choose(self, near: Bool[Tensor, "p n"]) -> Chosen:
         """Return the pairs and postures that the mask `near` marks."""
@@ -340,9 +342,8 @@ class BoxPairs(NamedTuple):
         by_a = t.abs() - half_a - (size * half_b).sum(1)
         by_b = u.abs() - half_b - (size * half_a[:, None]).sum(0)
         # axis i of a cross axis j of b; the other two axes of a box follow by rolling
-        next_t, last_t = (t.roll(k, 0)[:, None] for k in (-1, 1))
+        along = torch.linalg.cross(rotation, t[:, None], dim=0)
         next_a, last_a = (half_a.roll(k, 0)[:, None] for k in (-1, 1))
-        along = last_t * rotation.roll(-1, 0) - next_t * rotation.roll(1, 0)
         reach = next_a * size.roll(1, 0) + last_a * size.roll(-1, 0)
         reach = reach + half_b.roll(-1, 0) * size.roll(1, 1)
         reach = reach + half_b.roll(1, 0) * size.roll(-1, 1)

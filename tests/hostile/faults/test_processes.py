@@ -61,7 +61,8 @@ campaign._plan, campaign._try, campaign.TRIAL_LIMIT = plan, attempt, 5.0
 
 if __name__ == "__main__":
     from torchgrasp.app import cli
-    cli.evaluate.import_simulator = lambda name: None
+    from torchgrasp.app.cli import evaluate
+    evaluate.import_simulator = lambda name: None
     cli.run_and_exit()
 """
 """`evaluate` without planning and simulation; here is what its workers do.

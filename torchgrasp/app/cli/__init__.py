@@ -5,6 +5,8 @@ terminated.
 """
 
 import contextlib
+import gc
+import importlib
 import os
 import re
 import signal
@@ -18,18 +20,6 @@ import tyro
 from tyro.extras import SubcommandApp
 
 from torchgrasp import __version__
-from torchgrasp.app.cli import (
-    agents,
-    clouds,
-    depth_images,
-    doctor,
-    evaluate,
-    export,
-    filming,
-    grasp,
-    hands,
-    look,
-)
 from torchgrasp.app.cli.command import WORDS, Command, execute
 from torchgrasp.foundation.errors import BadArgument, GraspError
 
@@ -38,42 +28,46 @@ __all__ = ["main", "run_and_exit"]
 TERMINATED = 143
 INTERRUPTED = 130
 """Exit codes of a command that a signal ended: 128 and the number of SIGTERM or SIGINT."""
-CHAPTERS: dict[str, dict[str, Callable[..., Command | int]]] = {
+CHAPTERS = {
     "Plan grasps": {
-        "grasp": grasp.Grasp,
-        "view": look.OpenPage,
-        "film": filming.Film,
-        "objects": look.ListObjects,
+        "grasp": "grasp.Grasp",
+        "view": "look.OpenPage",
+        "film": "filming.Film",
+        "objects": "look.ListObjects",
     },
     "Exchange grasps with other programs": {
-        "export": export.Export,
-        "import": export.Import,
-        "mcp": agents.ServeAgents,
+        "export": "export.Export",
+        "import": "export.Import",
+        "mcp": "agents.ServeAgents",
     },
     "Try many grasps in simulation": {
-        "evaluate": evaluate.Evaluate,
-        "campaign": evaluate.RunCampaign,
+        "evaluate": "evaluate.Evaluate",
+        "campaign": "evaluate.RunCampaign",
     },
     "Point clouds and shapes": {
-        "cloud check": clouds.CloudCheck,
-        "cloud cut": clouds.CloudCut,
-        "cloud depth": depth_images.CloudDepth,
-        "cloud scene": depth_images.CloudScene,
-        "cloud thin": clouds.CloudThin,
-        "cloud render": clouds.CloudRender,
-        "cloud views": clouds.CloudViews,
-        "shape surface": clouds.ShapeSurface,
+        "cloud check": "clouds.CloudCheck",
+        "cloud cut": "clouds.CloudCut",
+        "cloud depth": "depth_images.CloudDepth",
+        "cloud scene": "depth_images.CloudScene",
+        "cloud thin": "clouds.CloudThin",
+        "cloud render": "clouds.CloudRender",
+        "cloud views": "clouds.CloudViews",
+        "shape surface": "clouds.ShapeSurface",
     },
     "Hands": {
-        "hand new": hands.HandNew,
-        "hand check": hands.HandCheck,
-        "hand sample": hands.HandSample,
-        "hand train": hands.HandTrain,
+        "hand new": "hands.HandNew",
+        "hand check": "hands.HandCheck",
+        "hand sample": "hands.HandSample",
+        "hand train": "hands.HandTrain",
     },
-    "Installation": {"doctor": doctor.Doctor, "selftest": doctor.Selftest},
+    "Installation": {"doctor": "doctor.Doctor", "selftest": "doctor.Selftest"},
 }
-"""Commands by name, in the chapters of the help."""
-COMMANDS = {name: command for commands in CHAPTERS.values() for name, command in commands.items()}
+"""Modules and classes of the commands by name, in the chapters of the help."""
+Callables = Callable[..., Command | int]
+COMMANDS: dict[str, str | Callables] = {
+    name: place for commands in CHAPTERS.values() for name, place in commands.items()
+}
+"""The places of the commands, or functions, by name; only the module of a used one is imported."""
 GROUPS = {
     "cloud": "Check, cut, thin and make point clouds.",
     "shape": "Write the estimated shape.",
@@ -140,6 +134,8 @@ def run_and_exit() -> NoReturn:
     ]
     for sign in signs:
         signal.signal(sign, end)
+    # what is imported stays: the collector need not look at it again
+    gc.freeze()
     try:
         code = main()
     finally:
@@ -187,7 +183,7 @@ def _run(given: list[str]) -> int:
     plain = contextlib.redirect_stderr(_WithoutMarkup(sys.stderr))  # pyright: ignore[reportArgumentType]
     with warnings.catch_warnings(), plain:
         warnings.showwarning = _show_warning
-        command = _parser().cli(
+        command = _parser(given[0]).cli(
             prog="torchgrasp",
             description="Dexterous fingertip grasps from a partial point cloud.",
             args=[*given, "--help"] if given[0] in GROUPS and len(given) == 1 else given,
@@ -196,18 +192,27 @@ def _run(given: list[str]) -> int:
         return execute(command) if isinstance(command, Command) else command
 
 
-def _parser() -> SubcommandApp:
-    """Return the argument parser of all commands; commands of two words are grouped by the first
-    word.
+def _load(command: str | Callables) -> Callables:
+    """Return a command, given its place or itself."""
+    if not isinstance(command, str):
+        return command
+    module, _, name = command.partition(".")
+    return getattr(importlib.import_module(f"{__name__}.{module}"), name)
+
+
+def _parser(first: str) -> SubcommandApp:
+    """Return the argument parser of the commands that begin with the word `first`, or of all if
+    none does; commands of two words are grouped by the first word.
     """
+    wanted = [name for name in COMMANDS if name.split()[0] == first]
     top = SubcommandApp()
     groups = dict[str, SubcommandApp]()
-    for name, command in COMMANDS.items():
+    for name in wanted or COMMANDS:
         group, _, last = name.rpartition(" ")
         if group and group not in groups:
             groups[group] = SubcommandApp()
             top.command(groups[group], name=group, help=GROUPS[group])
-        (groups[group] if group else top).command(name=last)(command)
+        (groups[group] if group else top).command(name=last)(_load(COMMANDS[name]))
     return top
 
 
@@ -217,7 +222,7 @@ def format_help() -> str:
     for chapter, commands in CHAPTERS.items():
         lines.append(chapter)
         for name, command in commands.items():
-            first = (command.__doc__ or "").split("\n\n")[0].split()
+            first = (_load(command).__doc__ or "").split("\n\n")[0].split()
             lines.append(f"  {name:15}{' '.join(first)}")
         lines.append("")
     lines.append("Options of a command: torchgrasp COMMAND --help. Version: torchgrasp --version.")
