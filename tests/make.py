@@ -351,6 +351,16 @@ def run_python(*arguments: str, given: str = "") -> subprocess.CompletedProcess[
     )
 
 
+HALF = INTRINSICS.clone()
+"""Intrinsics (3, 3) of the default camera whose every second row and column is kept."""
+HALF[:2] /= 2
+
+
+def halved(image: Tensor) -> Tensor:
+    """Return every second row and column of an image (h, w), which `HALF` describes."""
+    return image[::2, ::2].contiguous()
+
+
 @functools.cache
 def see(*boxes: tuple[float, ...], pose: Tensor | None = None) -> Scene:
     """Return the scene of boxes (x, y, width, height) on the table, or (x, y, width, height, foot)."""

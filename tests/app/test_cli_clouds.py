@@ -11,7 +11,7 @@ import torch
 import trimesh
 from PIL import Image
 
-from tests.make import box
+from tests.make import HALF, box, halved
 from torchgrasp import Scene, read_cloud, read_scene
 from torchgrasp.app import cli
 from torchgrasp.app.cli import grasp as grasps
@@ -401,9 +401,9 @@ def test_scene_takes_the_median_of_frames_of_a_still_camera(tmp_path, capsys):
     poses = [look_at(20.0, 45.0, 0.7)] * 3 + [look_at(20.0, 45.0, 0.8)]
     paths = [str(tmp_path / f"{seed}.png") for seed in range(len(poses))]
     for seed, (path, pose) in enumerate(zip(paths, poses, strict=True)):
-        depth = render_depth(meshes, pose, noise="azure", seed=seed)[0]
+        depth = halved(render_depth(meshes, pose, noise="azure", seed=seed)[0])
         Image.fromarray(np.uint16(torch.round(1e3 * depth).numpy())).save(path)
-    words = ["cloud", "scene", paths[0], "--intrinsics", "616", "616", "319.5", "239.5", "--out"]
+    words = ["cloud", "scene", paths[0], "--intrinsics", "308", "308", "159.75", "119.75", "--out"]
     noise = []
     for frames in ([], ["--frames", *paths[1:3]]):
         assert cli.main([*words, str(tmp_path / "scene.npz"), *frames]) == 0
@@ -745,8 +745,8 @@ def test_the_table_that_cut_names_is_that_of_the_next_commands(
 def test_a_cloud_gives_a_scene_as_its_depth_image_does(tmp_path, run_command):
     meshes = [box([0.06, 0.06, 0.1], (0.0, 0.0)), box([0.05, 0.08, 0.06], (0.1, 0.12))]
     pose = look_at(40.0, 45.0, 0.7)
-    depth = render_depth(meshes, pose)[0][::2, ::2].clone()
-    k = torch.diag(torch.tensor([0.5, 0.5, 1])).double() @ INTRINSICS
+    depth = halved(render_depth(meshes, pose)[0])
+    k = HALF
     camera = Scene.from_depth(depth, k)
     rows = torch.where(
         (depth > 0)[..., None], DepthImage(depth, k, torch.eye(4).double()).points(), torch.nan

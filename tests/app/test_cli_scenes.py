@@ -10,6 +10,7 @@ import trimesh
 from PIL import Image
 from scipy.ndimage import binary_dilation
 
+from tests.make import HALF, halved
 from torchgrasp import Scene, Status, load_grasps, read_scene, save_scene
 from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
 from torchgrasp.foundation.errors import BadArgument
@@ -25,15 +26,20 @@ def boxes(lift: float = 0.0) -> list[trimesh.Trimesh]:
     return meshes
 
 
-@pytest.fixture(scope="module")
-def seen():
-    depth, labels = render_depth(boxes(), CAMERA)
+def arrays_of(depth: torch.Tensor, labels: torch.Tensor, intrinsics: torch.Tensor):
+    """Return the arrays of a scene's file."""
     return {
         "depth": np.round(1e3 * depth.numpy()).astype(np.uint16),
-        "intrinsics": INTRINSICS.numpy(),
+        "intrinsics": intrinsics.numpy(),
         "camera_pose": CAMERA.numpy(),
         "labels": labels.numpy(),
     }
+
+
+@pytest.fixture(scope="module")
+def seen():
+    """Arrays of a picture of half the size."""
+    return arrays_of(*map(halved, render_depth(boxes(), CAMERA)), HALF)
 
 
 @pytest.fixture
@@ -170,7 +176,8 @@ def test_objects_that_the_library_found_are_found_again_on_another_table(
     ).sum() > 0.95 * before.sum() and after.sum() > 1.2 * before.sum()  # down to the table
 
 
-def test_beside_a_mask_of_the_user_other_objects_are_found_again(seen, tmp_path, planned, grasp_on):
+def test_beside_a_mask_of_the_user_other_objects_are_found_again(tmp_path, planned, grasp_on):
+    seen = arrays_of(*render_depth(boxes(), CAMERA), INTRINSICS)
     scene = write(tmp_path / "s.npz", seen, 0.03, mask=seen["labels"] == 2)
     words = grasp_on("--table", "0.0")
     assert (
@@ -194,7 +201,7 @@ def test_what_the_user_gave_only_loses_the_pixels_of_another_table(
 ):
     column = int(np.nonzero(seen["labels"] == 2)[1].mean())
     box = seen["labels"] == 2
-    own = binary_dilation(seen["labels"] == 2, iterations=12)
+    own = binary_dilation(seen["labels"] == 2, iterations=6)
     # half of a box: no segmentation finds it
     box[:, :column] = False
     own[:, :column] = False
@@ -216,7 +223,7 @@ def test_what_the_user_gave_only_loses_the_pixels_of_another_table(
 
 
 def test_a_target_that_is_lost_on_another_table_is_told(seen, tmp_path, planned, grasp_on):
-    around = binary_dilation(seen["labels"] > 0, iterations=40).astype(
+    around = binary_dilation(seen["labels"] > 0, iterations=20).astype(
         int
     )  # an older file with boxes and table as one
     np.savez(
@@ -230,7 +237,7 @@ def test_a_target_that_is_lost_on_another_table_is_told(seen, tmp_path, planned,
     )
     grasp_on("--table", "0.0", "--point", *middle(seen["labels"], 1))
     assert [scene.target in (2, 3) for scene in planned] == [True]
-    beside = 2 * (around - binary_dilation(seen["labels"] > 0, iterations=9))  # a part of the table
+    beside = 2 * (around - binary_dilation(seen["labels"] > 0, iterations=5))  # a part of the table
     write(tmp_path / "s.npz", seen, -0.03, labels=beside)
     assert "every object is lost" in grasp_on("--table", "0.0")
     write(tmp_path / "s.npz", seen, -0.03, labels=np.where(seen["labels"] == 1, 1, beside))
@@ -277,7 +284,7 @@ BAD = {
         [],
         "table",
     ),
-    "a target that is the table": (lambda a: a, ["--point", "320", "440"], "--point"),
+    "a target that is the table": (lambda a: a, ["--point", "160", "220"], "--point"),
     "a pixel outside the image": (lambda a: a, ["--point", "900", "20"], "--point"),
     "an unknown label": (lambda a: a, ["--label", "9"], "--label"),
     "an option of clouds": (lambda a: a, ["--no-table"], "scene"),
@@ -307,7 +314,7 @@ def test_a_broken_scene_file_is_refused(tmp_path, refusal, data):
 def test_cloud_scene_tells_a_pose_of_opengl_and_a_wrong_unit(seen, tmp_path, refusal):
     np.save(tmp_path / "d.npy", seen["depth"])
     np.savetxt(tmp_path / "gl.txt", seen["camera_pose"] @ np.diag([1.0, -1.0, -1.0, 1.0]))
-    k = [str(float(INTRINSICS[i, j])) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))]
+    k = [str(float(HALF[i, j])) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))]
     words = ["cloud", "scene", tmp_path / "d.npy", "--intrinsics", *k, "--out", tmp_path / "s.npz"]
     error = refusal(*words, "--camera-pose", tmp_path / "gl.txt")
     assert (
@@ -357,7 +364,7 @@ FORMS = ["rle.json", "list.npz", "alpha.png", "int32.tiff"]
 def scene_words(seen, tmp_path):
     np.save(tmp_path / "d.npy", seen["depth"])
     np.savetxt(tmp_path / "pose.txt", seen["camera_pose"])
-    k = [str(float(INTRINSICS[i, j])) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))]
+    k = [str(float(HALF[i, j])) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))]
     words = [tmp_path / "d.npy", "--intrinsics", *k, "--out", tmp_path / "s.npz"]
     return [*words, "--camera-pose", tmp_path / "pose.txt"]
 
@@ -387,7 +394,7 @@ def test_a_mask_of_one_object_is_the_target_and_the_table_below_is_told(
 ):
     mask = seen["labels"] == 1
     row, column = np.nonzero(mask)
-    mask[row.min() : row.max() + 20, column.min() : column.max() + 1] = (
+    mask[row.min() : row.max() + 10, column.min() : column.max() + 1] = (
         True  # with a strip of the table
     )
     path = save_as(tmp_path / form, mask.astype(int), form)
@@ -404,7 +411,7 @@ def test_a_mask_of_one_object_is_the_target_and_the_table_below_is_told(
 
 BAD_MASKS = {
     "m.json": (b"{", "well-formed .json"),
-    "n.json": (b'{"size": [480, 640], "counts": [1, 2]}', "run lengths"),
+    "n.json": (b'{"size": [240, 320], "counts": [1, 2]}', "run lengths"),
     "o.json": (b'[{"segmentation": [[1, 2, 3, 4]]}]', "shape"),
     "p.json": (b"[" * 9999, "well-formed .json"),
     "q.png": (b"x" * 99, "well-formed .png"),

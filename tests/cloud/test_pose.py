@@ -10,9 +10,9 @@ import pytest
 import torch
 import trimesh
 
-from tests.make import box
+from tests.make import HALF, box, halved
 from torchgrasp import Scene, read_scene, save_scene
-from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
+from torchgrasp.cloud.camera import look_at, render_depth
 from torchgrasp.cloud.depth import cloud_from_depth
 from torchgrasp.cloud.pose import read_camera_pose, read_pose, tell_furniture
 from torchgrasp.cloud.prepare import merge_clouds
@@ -33,13 +33,13 @@ def seen(view="front"):
     """Depth [m] of two boxes on a table, and the camera's pose."""
     pose = look_at(*VIEWS[view], 0.7)
     meshes = [box((0.06, 0.05, 0.1)), box((0.05, 0.05, 0.06), (0.05, 0.14))]
-    return render_depth(meshes, pose)[0], pose
+    return halved(render_depth(meshes, pose)[0]), pose
 
 
 @functools.cache
 def right(view="front"):
     """The scene of the right pose."""
-    return Scene.from_depth(seen(view)[0], INTRINSICS, seen(view)[1])
+    return Scene.from_depth(seen(view)[0], HALF, seen(view)[1])
 
 
 @functools.cache
@@ -48,7 +48,7 @@ def rolled():
     turn = rotation_from_vector(torch.tensor([0.0, 0.0, math.radians(10.0)]).double())
     pose = seen()[1] @ rigid(turn, torch.zeros(3).double())
     meshes = [box((0.06, 0.05, 0.1)), box((0.05, 0.05, 0.06), (0.05, 0.14))]
-    return render_depth(meshes, pose)[0], pose
+    return halved(render_depth(meshes, pose)[0]), pose
 
 
 def scaled(pose, factor):
@@ -85,14 +85,14 @@ def test_a_wrong_pose_is_told_by_what_contradicts_it(name, view):
     depth, pose = seen(view)
     assert len(right(view).things) == 2
     with pytest.raises(BadArgument, match=f"camera_pose: .*({POSES[name][1]})"):
-        Scene.from_depth(depth, INTRINSICS, POSES[name][0](pose))
+        Scene.from_depth(depth, HALF, POSES[name][0](pose))
 
 
 @functools.cache
 def masked():
     """A mask of the near pixels, and their cloud by the right pose."""
     near = (seen()[0] > 0) & (seen()[0] < 0.62)
-    return near, cloud_from_depth(seen()[0], INTRINSICS, near, seen()[1])
+    return near, cloud_from_depth(seen()[0], HALF, near, seen()[1])
 
 
 @pytest.mark.parametrize("name", POSES)
@@ -101,21 +101,21 @@ def test_a_cloud_of_a_mask_is_told_the_same(name):
     near, cloud = masked()
     assert len(cloud) == int(near.sum())
     with pytest.raises(BadArgument, match=f"camera_pose: .*({POSES[name][1]})"):
-        cloud_from_depth(depth, INTRINSICS, near, POSES[name][0](pose))
+        cloud_from_depth(depth, HALF, near, POSES[name][0](pose))
 
 
 @pytest.mark.parametrize("elevation", [75.0, 86.0])
 def test_an_inverse_pose_is_told_by_a_table_a_few_degrees_from_level(elevation):
     pose = look_at(20.0, elevation, 0.7)
-    depth = render_depth([box((0.06, 0.05, 0.1)), box((0.05, 0.05, 0.06), (0.05, 0.14))], pose)[0]
-    assert len(Scene.from_depth(depth, INTRINSICS, pose).things) == 2
+    depth = halved(
+        render_depth([box((0.06, 0.05, 0.1)), box((0.05, 0.05, 0.06), (0.05, 0.14))], pose)[0]
+    )
+    assert len(Scene.from_depth(depth, HALF, pose).things) == 2
     for wrong, said in (POSES[name] for name in ("inverse", "OpenGL's view matrix")):
         with pytest.raises(BadArgument, match=said):
-            Scene.from_depth(depth, INTRINSICS, wrong(pose))
+            Scene.from_depth(depth, HALF, wrong(pose))
     right_up = tuple(
-        Scene.from_depth(
-            depth, INTRINSICS, inverse(pose), table=None, up=_up(pose)
-        ).table.normal.tolist()
+        Scene.from_depth(depth, HALF, inverse(pose), table=None, up=_up(pose)).table.normal.tolist()
     )
     assert right_up[2] > 0.9  # whose user says so is believed
 
@@ -184,16 +184,16 @@ INPUTS = {  # depth in metres and pose to the arguments; what is said
 @pytest.mark.parametrize("name", INPUTS)
 def test_a_wrong_unit_or_image_is_told(name):
     with pytest.raises(BadArgument, match=INPUTS[name][1]):
-        Scene.from_depth(**{"intrinsics": INTRINSICS} | INPUTS[name][0](*seen()))
+        Scene.from_depth(**{"intrinsics": HALF} | INPUTS[name][0](*seen()))
 
 
 def test_a_stated_unit_and_a_mended_pose_are_used(tmp_path):
     depth, pose = seen()
     tenths = np.uint16(np.round(1e4 * depth.numpy()))
     for scene in (
-        Scene.from_depth(tenths, INTRINSICS, pose, depth_unit=1e-4),
-        Scene.from_depth(depth, INTRINSICS, (pose @ GL) @ GL),
-        Scene.from_depth(depth, INTRINSICS, inverse(inverse(pose)), up=(0.0, 0.0, 1.0)),
+        Scene.from_depth(tenths, HALF, pose, depth_unit=1e-4),
+        Scene.from_depth(depth, HALF, (pose @ GL) @ GL),
+        Scene.from_depth(depth, HALF, inverse(inverse(pose)), up=(0.0, 0.0, 1.0)),
         read_scene(save_scene(right(), tmp_path / "s.npz")),
     ):
         assert len(scene.things) == 2 and float(scene.table.normal[2]) > 0.999
@@ -201,8 +201,8 @@ def test_a_stated_unit_and_a_mended_pose_are_used(tmp_path):
         torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])).double() @ pose
     )  # a robot that hangs from the ceiling
     with pytest.raises(BadArgument, match="up"):
-        Scene.from_depth(depth, INTRINSICS, down)
-    hanging = Scene.from_depth(depth, INTRINSICS, down, up=(0.0, 0.0, -1.0))
+        Scene.from_depth(depth, HALF, down)
+    hanging = Scene.from_depth(depth, HALF, down, up=(0.0, 0.0, -1.0))
     assert len(read_scene(save_scene(hanging, tmp_path / "h.npz")).things) == 2
 
 
@@ -212,7 +212,7 @@ def test_right_poses_raise_no_alarm():
     for _ in range(3):
         turn = rotation_from_vector(torch.tensor([0.0, 0.0, rng.uniform(-3, 3)]).double())
         placed = rigid(turn, torch.tensor(rng.uniform(-2, 2, 3))) @ pose
-        assert len(Scene.from_depth(depth, INTRINSICS, placed).things) == 2
+        assert len(Scene.from_depth(depth, HALF, placed).things) == 2
     for tilt in (0.3, math.pi / 4, 1.2):  # a base on a slope
         tilted = (
             rigid(
@@ -221,37 +221,35 @@ def test_right_poses_raise_no_alarm():
             )
             @ pose
         )
-        found = Scene.from_depth(depth, INTRINSICS, tilted)
+        found = Scene.from_depth(depth, HALF, tilted)
         assert len(found.things) == 2
         degrees = math.degrees(math.acos(float((tilted @ inverse(pose))[2, 2])))
         (note,) = found.notes
         assert abs(float(re.findall(r"tilted by (\d+) degrees", note)[0]) - degrees) < 1
     assert not right().notes
-    assert len(Scene.from_depth(depth, INTRINSICS).things) == 2  # the camera's own frame
+    assert len(Scene.from_depth(depth, HALF).things) == 2  # the camera's own frame
     beside = rigid(
         rotation_from_vector(torch.tensor([0.02, 0.0, 0.01]).double()),
         torch.tensor([0.015, 0, 0]).double(),
     )
-    assert (
-        len(Scene.from_depth(depth, INTRINSICS, beside).things) == 2
-    )  # the frame of the colour camera
+    assert len(Scene.from_depth(depth, HALF, beside).things) == 2  # the frame of the colour camera
 
 
 def test_a_high_camera_is_noted_where_no_unit_is_given():
     depth, pose = seen()
-    high = Scene.from_depth(2.2 * depth, INTRINSICS, scaled(pose, 2.2))  # objects of 11 to 22 cm
+    high = Scene.from_depth(2.2 * depth, HALF, scaled(pose, 2.2))  # objects of 11 to 22 cm
     assert (
         len(high.notes) == 1
         and "1.09 m above the table" in high.notes[0]
         and "depth_unit" in high.notes[0]
     )
-    assert Scene.from_depth(2.2 * depth, INTRINSICS, scaled(pose, 2.2), depth_unit=1.0).notes == ()
+    assert Scene.from_depth(2.2 * depth, HALF, scaled(pose, 2.2), depth_unit=1.0).notes == ()
     assert right().notes == ()
 
 
 def test_a_mirrored_image_of_a_level_camera_is_a_right_image_of_another_scene():
     depth, pose = seen()
-    mirrored = Scene.from_depth(depth.flip(1), INTRINSICS, pose)
+    mirrored = Scene.from_depth(depth.flip(1), HALF, pose)
     assert len(mirrored.things) == 2 and abs(mirrored.table.offset) < 0.001
 
 
@@ -317,11 +315,11 @@ def test_slats_before_a_wall_are_a_table_and_furniture_that_stands_on_a_plane_is
     floor = block((3, 3, 0.02), (0, -0.5, -0.5))
     thing = block((0.06, 0.05, 0.1), (0, 0, 0.05))
     pose = look_at(-90.0, 30.0, 0.65)
-    depth = render_depth([*slats, wall, floor, thing], pose, table=None)[0]
-    scene = Scene.from_depth(depth, INTRINSICS)
+    depth = halved(render_depth([*slats, wall, floor, thing], pose, table=None)[0])
+    scene = Scene.from_depth(depth, HALF)
     up = pose[:3, :3].double().T @ torch.tensor([0.0, 0.0, 1.0]).double()
     assert float(scene.table.normal @ up) > 0.999
     bench = torch.rand(500, 3, dtype=torch.float64)
     (note,) = tell_furniture(bench, torch.ones(500, dtype=torch.long))
     assert "as furniture or a wall" in note
-    assert not Scene.from_depth(*seen()[:1], INTRINSICS).notes
+    assert not Scene.from_depth(*seen()[:1], HALF).notes

@@ -3,16 +3,23 @@ import pytest
 import torch
 import trimesh
 
-from tests.make import box
+from tests.make import HALF, box, halved
 from torchgrasp import Scene, read_scene, save_scene
-from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
+from torchgrasp.cloud.camera import INTRINSICS, look_at
+from torchgrasp.cloud.camera import render_depth as render_whole
 from torchgrasp.foundation.errors import BadArgument, NoSupport
 from torchgrasp.geometry.frames import apply, rigid, rotation_from_vector
 from torchgrasp.geometry.plane import Plane
 from torchgrasp.values.planning import PointCloud
 
 POSE = look_at(20.0, 45.0, 0.6)
-K = INTRINSICS
+K = HALF
+
+
+def render_depth(*what, **options):
+    """Depth [m] and labels of half the size, which most tests need not have whole."""
+    depth, labels = render_whole(*what, **options)
+    return halved(depth), halved(labels)
 
 
 def things():
@@ -85,24 +92,24 @@ def test_labels_are_the_same_wherever_the_camera_stands(scene, picture):
 def test_other_types_give_the_same_scene(scene, picture):
     millimetres = (1000 * picture[0]).round().numpy().astype(np.uint16)
     found = Scene.from_depth(
-        millimetres, (616.0, 616.0, 319.5, 239.5), POSE.numpy(), point=middle(picture[1], 1)
+        millimetres, (308.0, 308.0, 159.75, 119.75), POSE.numpy(), point=middle(picture[1], 1)
     )
     assert agreement(found, picture, 1)[0] > 0.95
     missing = torch.where(picture[0] > 0, picture[0], torch.nan)
     assert torch.equal(Scene.from_depth(missing, K, POSE).labels, scene.labels)
 
 
-def test_masks_off_by_three_pixels_lose_table_and_neighbours(picture):
+def test_masks_off_by_three_pixels_lose_table_and_neighbours():
     from scipy.ndimage import binary_dilation, binary_erosion
 
-    depth, labels = picture
+    picture = depth, labels = render_whole(things(), POSE)
     true = (labels == 2).numpy()
     for mask in (
         true,
         binary_dilation(true, iterations=3),
         binary_erosion(true, iterations=3).astype(np.uint8),
     ):
-        scene = Scene.from_depth(depth, K, POSE, mask=mask)
+        scene = Scene.from_depth(depth, INTRINSICS, POSE, mask=mask)
         share, others = agreement(scene, picture, 2)
         assert scene.target == 1 and len(scene.things) == 3
         assert share > (0.95 if mask.sum() >= true.sum() else 0.7) and others < 0.02
@@ -127,7 +134,9 @@ def _image(scene):
     return labels
 
 
-def test_a_cloud_gives_the_scene_of_its_picture(scene, picture):
+def test_a_cloud_gives_the_scene_of_its_picture():
+    picture = render_whole(things(), POSE)
+    scene = Scene.from_depth(picture[0], INTRINSICS, POSE)
     shuffle = torch.randperm(len(scene.points), generator=torch.Generator().manual_seed(0))
     cloud = PointCloud(scene.points[shuffle], None, scene.viewpoint)
     inside = scene.select(middle(picture[1], 1)).cloud().points
@@ -178,29 +187,29 @@ def test_an_object_that_hides_much_of_the_target_is_told(x, height, covers):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"mask": np.zeros((480, 640), bool)}, "mask: expected .*got no pixel inside"),
+        ({"mask": np.zeros((240, 320), bool)}, "mask: expected .*got no pixel inside"),
         ({"mask": np.ones((48, 64), bool)}, "mask: expected"),
         ({"mask": "table"}, "mask: expected .*this target is the table"),
-        ({"point": (5.0, 470.0)}, "point: expected .*got pixel .* on the table"),
-        ({"point": (5.0, 2.0)}, "point: expected .*got nothing measured"),
+        ({"point": (2.0, 235.0)}, "point: expected .*got pixel .* on the table"),
+        ({"point": (2.0, 1.0)}, "point: expected .*got nothing measured"),
         ({"point": (0.0, 0.0, 1.0)}, "point: expected .*got nothing measured"),
         ({"point": (1.0,)}, "point: expected .*got"),
-        ({"labels": np.zeros((480, 640), int)}, "labels: expected .*got none"),
+        ({"labels": np.zeros((240, 320), int)}, "labels: expected .*got none"),
         ({"labels": np.zeros((4, 6), int)}, "labels: expected .*got shape"),
         ({"table": 2.0}, "table: expected .*got the camera .* below it"),
         ({"up": (0.0, 0.0, -1.0)}, "camera_pose: expected .*another `up`.*180 degrees from up"),
         (
-            {"intrinsics": (308.0, 308.0, 159.5, 119.5)},
+            {"intrinsics": (154.0, 154.0, 79.5, 59.5)},
             "intrinsics: expected .*got a principal point",
         ),
-        ({"scale": 1000.0}, "depth: expected a median depth.*got 582 m"),
+        ({"scale": 1000.0}, "depth: expected a median depth.*got 582.4 m"),
     ],
 )
 def test_bad_input_is_one_sentence(picture, given, message):
     depth, labels = picture
     given = dict(given)
     if isinstance(given.get("mask"), str):
-        given["mask"] = (labels == 0) & (torch.arange(480)[:, None] > 400)
+        given["mask"] = (labels == 0) & (torch.arange(240)[:, None] > 200)
     with pytest.raises(BadArgument, match=message) as refused:
         Scene.from_depth(depth * given.pop("scale", 1.0), given.pop("intrinsics", K), POSE, **given)
     assert "\n" not in str(refused.value)
@@ -220,12 +229,12 @@ def test_other_supports_are_told_and_survive_a_file(tmp_path):
     cup = box([0.06, 0.06, 0.08], [0.0, 0.0, 0.04])
     pose = look_at(0.0, 35.0, 1.0)
     depth, _ = render_depth([top, floor, *stools, cup], pose, table=None)
-    scene = Scene.from_depth(depth, INTRINSICS, pose)
+    scene = Scene.from_depth(depth, K, pose)
     assert len(scene.supports) == 2 and len(scene.things) == 1
     assert "another plane" in scene.advice[0]
     again = read_scene(save_scene(scene, tmp_path / "scene.npz"))
     assert again.supports[1].offset == scene.supports[1].offset and again.advice == scene.advice
-    on_floor = Scene.from_depth(depth, INTRINSICS, pose, table=scene.supports[1])
+    on_floor = Scene.from_depth(depth, K, pose, table=scene.supports[1])
     assert (
         on_floor.supports == (scene.supports[1],) and len(on_floor.things) >= 3
     )  # the table, two stools
@@ -237,7 +246,7 @@ def test_a_target_far_above_its_table_is_told(foot, told):
     thing.apply_translation([0.0, 0.0, foot])
     camera = look_at(20.0, 45.0, 0.9, torch.tensor([0.0, 0.0, 0.1]).double())
     depth, labels = render_depth([thing], camera, noise=False)
-    seen = Scene.from_depth(depth, INTRINSICS, camera, mask=labels == 1, table=0.0)
+    seen = Scene.from_depth(depth, K, camera, mask=labels == 1, table=0.0)
     notes = [x for x in seen.notes if "may be a floor or a wall" in x]
     assert len(notes) == told
     if told:
