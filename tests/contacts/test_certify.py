@@ -125,20 +125,6 @@ def test_margin_is_at_most_uniform_and_free_of_units_and_frames(motion):
     torch.testing.assert_close(single.margin, found.margin, atol=1e-6, rtol=1e-4)
 
 
-def test_a_friction_for_each_set_proves_what_specs_with_one_friction_prove():
-    normals = math.cos(0.6) * spokes() + math.sin(0.6) * UP
-    contacts = Contacts(spokes().expand(3, -1, -1), normals.expand(3, -1, -1))
-    frictions = torch.tensor([0.3, 0.6, 0.9], dtype=torch.float64)
-    found = certify(contacts, SPEC, frictions)
-    for k, friction in enumerate(frictions.tolist()):
-        single = certify(contacts[k : k + 1], ContactSpec(friction, friction_margin=1.0))
-        torch.testing.assert_close(found.margin[k], single.margin[0])
-        assert found.closed[k] == single.closed[0]
-    assert torch.equal(found.friction, frictions)
-    with pytest.raises(BadArgument, match=r"friction: expected coefficients from 0, got -0\.1"):
-        certify(contacts, SPEC, torch.tensor([0.3, -0.1, 0.9]))
-
-
 def test_planned_friction_decides():
     tilt = math.radians(35)  # needs more than tan 35 = 0.70
     contacts = Contacts(spokes(), math.cos(tilt) * spokes() + math.sin(tilt) * UP)

@@ -86,7 +86,7 @@ def test_eq13_forces_balance_and_cone_rows_are_their_cosines_and_imply_closure(
     torch.testing.assert_close(rows, cone + CONE_MARGIN - cosine)
     held = (rows <= 0).all(-1)
     assert int(held.sum()) > 10
-    assert bool(closed_exact(points[held], jet.normals[held], problem.round_friction).all())
+    assert bool(closed_exact(points[held], jet.normals[held], problem.friction).all())
 
 
 @FINGERTIPS

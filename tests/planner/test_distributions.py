@@ -12,10 +12,8 @@ from torchgrasp import (
     GraspTask,
     certify,
     critical_friction,
-    fit_shape,
     load_grasps,
     load_object,
-    plan_contacts,
     plan_grasps,
 )
 from torchgrasp.foundation.errors import BadArgument, Status
@@ -119,39 +117,20 @@ def test_distributions_of_impossible_numbers_are_refused():
         ContactSpec(friction="0.3:0.8")  # type: ignore[arg-type]
 
 
-def test_contacts_are_planned_in_turn_and_each_certificate_names_the_friction_it_holds_at(planned):
+def test_contacts_close_at_the_planned_friction_of_the_distribution(planned):
+    """A set that needs more friction would not be closed (`critical_friction` is exact)."""
     grasps, _ = planned
-    frictions = ContactSpec(FRICTION).planned_frictions
-    assert frictions == pytest.approx((0.33125, 0.6625, 0.3 + 0.05 / 0.75 * 0.5))
-    certificate = grasps.certificate
+    spec = ContactSpec(FRICTION)
+    assert spec.planned_friction == pytest.approx(0.33125)
+    assert float(grasps.meta["planned_friction"]) == pytest.approx(0.33125, rel=1e-5)
     good = grasps[grasps.status == Status.OK]
-    at = good.certificate.friction
-    assert {round(x, 6) for x in at.tolist()} <= {round(x, 6) for x in frictions}
-    assert len(at.unique()) >= 2
-    # a contact set that needs more friction would not be closed (`critical_friction` is exact)
     needed = critical_friction(good.contacts.points, good.contacts.normals)
-    assert bool((needed <= at + 1e-6).all())
-    again = certify(grasps.contacts, friction=certificate.friction)
-    assert torch.equal(again.closed, certificate.closed)
-    near(again.margin, certificate.margin, 1e-6)
+    assert len(good) and bool((needed <= spec.planned_friction + 1e-6).all())
+    again = certify(grasps.contacts, spec)
+    assert torch.equal(again.closed, grasps.certificate.closed)
+    near(again.margin, grasps.certificate.margin, 1e-6)
 
 
-def test_guess_i_is_planned_at_friction_i_in_turn():
-    shape = fit_shape(load_object("cylinder").view)
-    spec = ContactSpec(friction=Distribution.between(0.1, 1.3))
-    plan = plan_contacts(shape, spec, starts=8)
-    frictions = spec.planned_frictions
-    assert plan.friction.tolist() == [*frictions, *frictions, *frictions[:2]]
-    first = plan_contacts(shape, dataclasses.replace(spec, friction=0.7), starts=8)
-    assert first.friction is None and first.contacts.points.shape == plan.contacts.points.shape
-    closed = plan.status == Status.OK
-    needed = critical_friction(plan.contacts.points, plan.contacts.normals)
-    assert bool((needed[closed] <= plan.friction[closed] + 1e-6).all())
-
-
-def test_a_certain_distribution_is_planned_as_its_number_and_bad_columns_are_refused(planned):
-    grasps, _ = planned
+def test_a_certain_distribution_is_planned_as_its_number():
     certain = ContactSpec(friction=Distribution.between(0.5, 0.5))
-    assert certain.planned_frictions == ContactSpec(friction=0.5).planned_frictions == (0.25,)
-    with pytest.raises(BadArgument, match="friction"):
-        certify(grasps.contacts, friction=torch.ones(len(grasps) + 1).double())
+    assert certain.planned_friction == ContactSpec(friction=0.5).planned_friction == 0.25

@@ -28,7 +28,7 @@ from torchgrasp.contacts.form_closure import (
     wrenches,
 )
 from torchgrasp.foundation.base import FINGERTIPS, flatnonzero
-from torchgrasp.foundation.checks import check_tensor, checked
+from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import is_known
 from torchgrasp.foundation.threads import single_threaded
@@ -51,9 +51,7 @@ UNIT_TOLERANCE = 1e-3
 
 @checked(gradients=True)
 @single_threaded
-def certify(
-    contacts: Contacts, spec: ContactSpec | None = None, friction: Float[Tensor, "b"] | None = None
-) -> Certificate:
+def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
     """Return whether each of b contact sets has frictional form closure (Eq. 13 of the paper), with
     a proof in float64.
 
@@ -78,14 +76,11 @@ def certify(
             planner.
         spec: its `edges` and `planned_friction` define the friction cones; None means
             `ContactSpec()`.
-        friction: coefficient of friction (b,) of each set, such as `ContactPlan.friction`; None
-            means `spec.planned_friction` for all.
 
     Raises `BadArgument` for:
 
     * contacts of a wrong shape, or sets that do not have three to five contacts;
     * normals that are not of length 1 (to 1e-3);
-    * a `friction` that is not one number from 0 for each set;
     * a second derivative, or a backward derivative of another field than the margin.
 
     >>> corners = torch.tensor([[[1.0, 0, 0], [-0.6, 0.8, 0], [-0.6, -0.8, 0]]])
@@ -95,15 +90,8 @@ def certify(
     spec = ContactSpec() if spec is None else spec
     points = check_contacts(contacts).points.double()
     normals = check_unit(contacts.normals.double())
-    coefficient = spec.planned_friction
-    if friction is not None:
-        check_tensor("friction", friction, (len(points),))
-        if is_known(friction) and bool((friction < 0).any()):
-            raise BadArgument("friction", f"{float(friction.min()):g}", "coefficients from 0")
-        coefficient = friction.to(points)
-    wrench = wrenches(points, normals, coefficient, spec.edges)
-    proof = _Proof.apply(wrench.flatten(1, 2), degenerate(points))
-    return Certificate(*proof[:5], friction=friction)
+    wrench = wrenches(points, normals, spec.planned_friction, spec.edges)
+    return Certificate(*_Proof.apply(wrench.flatten(1, 2), degenerate(points))[:5])
 
 
 class _Proof(torch.autograd.Function):

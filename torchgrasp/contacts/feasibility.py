@@ -171,7 +171,7 @@ def check_feasibility(shape: ShapeLike, problem: ContactProblem, points: Vectors
     jet = triple_jet(shape, points)
     normals = jet.normals
     metres = shape.metres(points)
-    wrench = wrenches(points, normals, problem.friction, spec.edges)
+    wrench = wrenches(points, normals, spec.planned_friction, spec.edges)
     finite = torch.isfinite(wrench).flatten(1).all(1)
     wrench = torch.where(finite[:, None, None, None], wrench, 0.0)
     flat = wrench.flatten(1, 2)
@@ -206,8 +206,7 @@ def check_feasibility(shape: ShapeLike, problem: ContactProblem, points: Vectors
     contacts = Contacts(metres, normals, jet.variance, std_m)
     phi = coefficients.unflatten(1, wrench.shape[1:3])
     quality = norm(points.mean(1)) * scale
-    status = first_violation(good)
-    return ContactPlan(contacts, phi, quality, status, problem.own_friction)
+    return ContactPlan(contacts, phi, quality, first_violation(good))
 
 
 def within(problem: ContactProblem, points: Float[Tensor, "*b 3"]) -> Bool[Tensor, "*b"]:

@@ -25,14 +25,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchgrasp.foundation.base import at_once, flatnonzero, in_chunks, spread
+from torchgrasp.foundation.base import at_once, flatnonzero, in_chunks
 from torchgrasp.geometry.frames import degenerate, subsets
 from torchgrasp.geometry.linalg import dot, eye_like, matvec, norm, unit
 
 Vectors = Float[Tensor, "b f 3"]  # points or normals of the contacts in every row
 Wrenches = Float[Tensor, "b m 6"]  # force, then torque
 Coefficients = Float[Tensor, "b m"]  # of the wrenches
-Friction = float | Float[Tensor, "b"]  # of all contact sets, or of each
 Guess = Coefficients | None  # coefficients of the first wrenches of each cone
 SEAM = 1e-9  # least length of a tangent, as a share of the triangle's: above rounding
 LOOKS_ON_GPU = 16  # pivots on a GPU between two looks at whether any programme goes on
@@ -115,7 +114,7 @@ def _take(vectors: Float[Tensor, "b f k 3"], index: Int[Tensor, "b f 1"]) -> Vec
 
 
 def cone_edges(
-    normals: Float[Tensor, "*b 3"], tangent: Float[Tensor, "*b 3"], friction: Friction, edges: int
+    normals: Float[Tensor, "*b 3"], tangent: Float[Tensor, "*b 3"], friction: float, edges: int
 ) -> Float[Tensor, "*b e 3"]:
     """Return the e edges of linearised friction cones: forces whose normal component is 1.
 
@@ -126,11 +125,11 @@ def cone_edges(
     angle = edge[:, None] * (2 * math.pi / edges)
     other = torch.linalg.cross(normals, tangent)
     lean = angle.cos() * tangent[..., None, :] + angle.sin() * other[..., None, :]
-    return spread(friction, lean) * lean - normals[..., None, :]
+    return friction * lean - normals[..., None, :]
 
 
 def wrenches(
-    points: Vectors, normals: Vectors, friction: Friction, edges: int = 8
+    points: Vectors, normals: Vectors, friction: float, edges: int = 8
 ) -> Float[Tensor, "b f e 6"]:
     """Return the wrench (force, then torque) of each of the e `edges` of all linearised friction
     cones.

@@ -5,13 +5,12 @@ once.
 import time
 from collections.abc import Iterator
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.contacts.feasibility import check_feasibility
 from torchgrasp.contacts.form_closure import Vectors
-from torchgrasp.contacts.problem import ContactProblem, ShapeLike, frictions_in_turn, rows_of
+from torchgrasp.contacts.problem import ContactProblem, ShapeLike, rows_of
 from torchgrasp.contacts.solver import FINISH, Stage, descend, project, start_state
 from torchgrasp.contacts.starts import (
     check_starts,
@@ -56,9 +55,8 @@ def plan_contacts(
 
     A set has `spec.fingertips` contacts. A failed set carries the `Status` of the first constraint
     that it violates. If the solver fails from a feasible initial guess, the guess itself is the
-    result. For a distribution of friction, guesses are planned at the frictions of
-    `spec.planned_frictions` in turn. Without `time_budget` the result is deterministic. The sets
-    from 500 or 1000 initial guesses then are the first sets of a plan from more.
+    result. Without `time_budget` the result is deterministic. The sets from 500 or 1000 initial
+    guesses then are the first sets of a plan from more.
 
     Args:
         shape: a `ShapeGP`, or another implicit surface with the same methods (`ShapeLike`).
@@ -89,14 +87,7 @@ def plan_contacts(
     if time_budget is not None:
         firsts = _within(time_budget, firsts)
     problem = ContactProblem.of(shape, settled.spec)
-    begun = 0
-    plans = list[ContactPlan]()
-    for first in firsts:
-        number = torch.arange(begun, begun + len(first), device=first.device)
-        own = problem.at(frictions_in_turn(settled.spec, number))
-        plans.append(plan_chunk(shape, own, first, stages))
-        begun += len(first)
-    return join(plans)
+    return join([plan_chunk(shape, problem, first, stages) for first in firsts])
 
 
 def stages_for(spec: ContactSpec) -> tuple[Stage, ...]:

@@ -101,19 +101,6 @@ class ShapeLike(Protocol):
 AnyShape = TypeVar("AnyShape", bound=ShapeLike)
 
 
-def frictions_in_turn(spec: ContactSpec, number: Int[Tensor, "b"]) -> Float[Tensor, "b"] | None:
-    """Return the friction coefficients at which initial guesses are planned, the frictions of
-    `spec` in turn; None if there is only one, as for a friction that is certain.
-
-    `number` holds the number of each guess, from 0.
-    """
-    frictions = spec.planned_frictions
-    if len(frictions) == 1:
-        return None
-    found = torch.tensor(frictions, dtype=torch.float64, device=number.device)
-    return found[number % len(found)]
-
-
 def device_of(shape: ShapeLike) -> torch.device:
     """Return the device of a shape; the CPU if the shape has no attribute `device`."""
     return getattr(shape, "device", torch.device("cpu"))
@@ -273,17 +260,17 @@ class ContactProblem:
     """The contact planning problem, Eqs. (10)-(14) of the paper, in normalised units.
 
     The units are those of one shape, or of one shape for each contact set. `spec` holds the
-    constraints in metres; all else is normalised. `friction` is the coefficient of the friction
-    cones, one number, or one for each contact set. `domain_radius` is that of the shape.
-    `separation` is the least distance of two fingertip centres, `tip_radius` the radius of the
-    fingertips, and `ring` the radius within which the surface is flat. The table has the unit
-    normal `up` (None without a table) and the distance `floor` from the origin. `beyond` returns
-    the signed distance (q,) of normalised points (q, 3) from the region where contacts may be,
-    negative inside.
+    constraints in metres; all else is normalised. `friction` is the coefficient of the largest
+    round cone inside the friction cone with flat sides that `certify` uses. `domain_radius` is that
+    of the shape. `separation` is the least distance of two fingertip centres, `tip_radius` the
+    radius of the fingertips, and `ring` the radius within which the surface is flat. The table has
+    the unit normal `up` (None without a table) and the distance `floor` from the origin. `beyond`
+    returns the signed distance (q,) of normalised points (q, 3) from the region where contacts may
+    be, negative inside.
     """
 
     spec: ContactSpec
-    friction: PerRow
+    friction: float
     domain_radius: PerRow
     separation: PerRow
     tip_radius: PerRow
@@ -319,11 +306,12 @@ class ContactProblem:
         else:
             separation = max(separation, LEAST_SIDE)
         ring = (spec.ring_radius if ring_radius is None else ring_radius) / scale
+        friction = spec.planned_friction * math.cos(math.pi / spec.edges)
         region = spec.region
         beyond = None if region is None else lambda x: region(shape.metres(x)) / scale
         return cls(
             spec,
-            spec.planned_friction,
+            friction,
             radius,
             separation,
             spec.fingertip_radius / scale,
@@ -335,27 +323,9 @@ class ContactProblem:
 
     def rows(self, index: Int[Tensor, "k"]) -> "ContactProblem":
         """Return the problem of the k contact sets with the indices `index`."""
-        names = "friction", "domain_radius", "separation", "tip_radius", "ring", "floor"
+        names = "domain_radius", "separation", "tip_radius", "ring", "floor"
         own = {name: x[index] for name in names if isinstance(x := getattr(self, name), Tensor)}
         return dataclasses.replace(self, **own) if own else self
-
-    @property
-    def round_friction(self) -> PerRow:
-        """The coefficient of the largest round cone inside the friction cone with flat sides that
-        `certify` uses.
-        """
-        return self.friction * math.cos(math.pi / self.spec.edges)
-
-    @property
-    def own_friction(self) -> Float[Tensor, "b"] | None:
-        """The friction coefficient of each contact set; None if all have that of the spec."""
-        return self.friction if isinstance(self.friction, Tensor) else None
-
-    def at(self, friction: PerRow | None) -> "ContactProblem":
-        """Return the problem for a friction coefficient, or one for each contact set; None changes
-        nothing.
-        """
-        return self if friction is None else dataclasses.replace(self, friction=friction)
 
     def room(
         self, points: Float[Tensor, "*b 3"], normals: Float[Tensor, "*b 3"]
@@ -480,11 +450,8 @@ class ContactProblem:
         blocks[:, at, at] = by_point - between.sum(2, keepdim=True) * by_force
         along = dot(by_force[:, :, None], sides[:, None])
         by_tension = along * pull_signs(len(at), points.device).to(points)
-        slope = self.round_friction
-        square = 1 + slope**2
-        root = square.sqrt() if isinstance(square, Tensor) else math.sqrt(square)
-        cosine = 1 / root
-        excess = outward[..., 0] + spread(cosine, outward[..., 0]) + CONE_MARGIN
+        cosine = 1 / math.sqrt(1 + self.friction**2)
+        excess = outward[..., 0] + cosine + CONE_MARGIN
         return excess, torch.cat([blocks.flatten(2), by_tension], 2)
 
 

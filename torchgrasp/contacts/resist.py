@@ -56,7 +56,6 @@ def resist_loads(
     strength: Float[Tensor, "b f"],
     loads: Float[Tensor, "b w 6"],
     spec: ContactSpec,
-    friction: Float[Tensor, "b"] | None = None,
 ) -> Resisted:
     """Return the greatest multiple of the worst of w loads that each of b contact sets resists.
 
@@ -68,7 +67,6 @@ def resist_loads(
         strength: greatest normal force [N] of each contact.
         loads: forces [N], then torques [N m] about the origin of the points' frame.
         spec: its `planned_friction` and `edges` define the friction cones.
-        friction: coefficient of friction of each set, in place of `planned_friction`.
     """
     count = loads.shape[1]
     centre, radius = centre_and_radius(points)
@@ -77,8 +75,7 @@ def resist_loads(
     about = torch.cat([force, torque], -1)
     # of wrenches in Eq. (13): (b, 1, 6)
     unit = torch.cat([torch.ones_like(radius), radius], 1).repeat_interleave(3, 1).mT
-    coefficient = spec.planned_friction if friction is None else friction
-    edge = wrenches(points, normals, coefficient, spec.edges)
+    edge = wrenches(points, normals, spec.planned_friction, spec.edges)
     edge = strength[..., None, None] * edge
     edge = torch.cat([edge, torch.zeros_like(edge[:, :, :1])], 2)  # the last is no push
     goal = (-about / unit).flatten(0, 1)

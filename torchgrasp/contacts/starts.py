@@ -16,7 +16,6 @@ from torchgrasp.contacts.feasibility import normal_variation, within
 from torchgrasp.contacts.form_closure import Vectors, closed_exact
 from torchgrasp.contacts.problem import ContactProblem, ShapeLike, device_of, variance_at, walls_of
 from torchgrasp.contacts.solver import project
-from torchgrasp.foundation.base import flatnonzero
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.geometry.linalg import Points, norm, unit
 from torchgrasp.values.specs import FLAT_RADII, ContactSpec
@@ -104,23 +103,12 @@ def drawn_starts(
     if candidates is not None:
         # the rows are drawn after the candidates
         draw(shape, spec, (CANDIDATE_TRIPLES, 3), generator)
-    problem = ContactProblem.of(shape, spec)
-    frictions = spec.planned_frictions
-    begun = 0
     for count in sizes:
         if candidates is None:
             drawn = draw(shape, spec, (count, spec.fingertips), generator)
             yield project(shape, draw_in(shape, drawn), steps=6)
-            continue
-        number = torch.arange(begun, begun + count) % len(frictions)
-        begun += count
-        rows = candidates[0].new_empty(count, spec.fingertips, 3)
-        # each guess closes at the friction at which it is planned (`frictions_in_turn`)
-        for k, friction in enumerate(frictions):
-            own = flatnonzero(number == k)
-            part, _ = candidate_rows(problem.at(friction), *candidates, len(own), generator)
-            rows[own] = part
-        yield rows
+        else:
+            yield candidate_rows(ContactProblem.of(shape, spec), *candidates, count, generator)[0]
 
 
 def settle_flatness(shape: ShapeLike, spec: ContactSpec, seed: int) -> FlatCandidates:
@@ -246,7 +234,7 @@ def candidate_rows(
         choice = choose(DRAWN_PER_START * starts)
         apart = norm(problem.sides(points[choice], normals[choice])).amin(-1)
         choice = choice[apart > problem.separation]
-        closed = closed_exact(points[choice], normals[choice], float(problem.round_friction))
+        closed = closed_exact(points[choice], normals[choice], problem.friction)
         kept = choice[closed][:missing]
         rows.append(points[kept])
         missing -= len(kept)

@@ -276,7 +276,7 @@ def solve_sliding(
         # The solver leaves contacts near the surface, not on it.
         on_surface = project(own.shape, points, SLIDING.projections)
         plan = check_feasibility(own.shape, own.contact_problem, on_surface)
-        certificate = certify(plan.contacts, own.contact_problem.spec, plan.friction)
+        certificate = certify(plan.contacts, own.contact_problem.spec)
         candidates = GraspCandidates(
             configuration, plan.contacts, certificate, kept.permutation, plan.status
         )

@@ -258,13 +258,12 @@ class Objects:
             self.hand, contacts, certificate, world, center, self.reachable, self.descends
         )
 
-    def slide(self, cloud: CloudIndex, friction: Float[Tensor, "b"] | None) -> JointProblem:
+    def slide(self, cloud: CloudIndex) -> JointProblem:
         """Return the problem in which hand and contacts move together, for b contact sets.
 
-        `cloud` is the index of each contact set's object, and `friction` the coefficient of friction
-        at which it was planned; None for that of the constraints.
+        `cloud` is the index of each contact set's object.
         """
-        constraints = self.constraints.rows(cloud).at(friction)
+        constraints = self.constraints.rows(cloud)
         return JointProblem(
             self.hand, rows_of(self.shape, cloud), constraints, self.world.rows(cloud)
         )
@@ -312,7 +311,7 @@ class Objects:
             "units": "metre, radian",
             "unit_m": repr(float(object_.shape.scale)),
             "friction": str(Distribution.of(spec.friction)),
-            "planned_friction": "|".join(f"{x:g}" for x in spec.planned_frictions),
+            "planned_friction": f"{spec.planned_friction:g}",
             "table": "none" if spec.plane is None else spec.plane.describe(),
             "mode": request.mode,
             "ranking": request.order,

@@ -188,7 +188,7 @@ def solve_with_sliding(
     attempts = Attempts(torch.ones_like(certificate.closed), executable)
     attempts.add(rows.best(now), torch.arange(len(now), device=now.device))
     reach = objects.reach(contacts, certificate, rows.cloud[now])
-    solve_sliding(objects.slide(rows.cloud[now], certificate.friction), reach, seeds, attempts)
+    solve_sliding(objects.slide(rows.cloud[now]), reach, seeds, attempts)
     grasps, row = best_grasps(attempts)
     ended = torch.full_like(row, int(Row.ENDED))
     return rows.put(now[row], grasps, ended), now[row]

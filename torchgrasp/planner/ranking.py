@@ -107,8 +107,7 @@ def prove_resistance(objects: Objects, grasps: Grasps, cloud: CloudIndex) -> Gra
     contacts = grasps.contacts
     strength = strength_of(objects.hand, grasps, contacts, objects.strongest)
     loads = objects.loads[cloud]  # (g, w, 6)
-    friction = grasps.certificate.friction
-    proof = resist_loads(contacts.points, contacts.normals, strength, loads, objects.spec, friction)
+    proof = resist_loads(contacts.points, contacts.normals, strength, loads, objects.spec)
     weak = (grasps.status == Status.OK) & ~(proof.margin >= 1)
     status = grasps.status.masked_fill(weak, int(Status.NOT_RESISTED))
     fields = dict(

@@ -108,8 +108,7 @@ class Report:
         if stage == "plan":
             text = f"{len(value)} starts: {describe(count_status(value.status))}"
         elif stage == "certify":
-            frictions = " or ".join(f"{x:g}" for x in self.objects.spec.planned_frictions)
-            text = f"{self.closed} of {self.offered} closed at friction {frictions}"
+            text = f"{self.closed} of {self.offered} closed at friction {self.objects.spec.planned_friction:g}"
         else:
             text = f"{len(value)} seeds for {len(torch.unique(value.row))} of {self.closed} triples"
         self.objects.tell(stage, text, value)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchgrasp.contacts.certify import certify
 from torchgrasp.contacts.plan import plan_chunk, stages_for
-from torchgrasp.contacts.problem import frictions_in_turn, rows_of
+from torchgrasp.contacts.problem import rows_of
 from torchgrasp.contacts.resist import resist_loads
 from torchgrasp.contacts.starts import STARTS_PER_CHUNK
 from torchgrasp.foundation.base import at_once, join, lexical_order, rank_in_group
@@ -211,19 +211,16 @@ def draw(objects: Objects, sizes: Sequence[int]) -> Iterator[tuple[ContactPlan, 
         count = sum(group)
         first = starts[:, begin : begin + count].flatten(0, 1).to(objects.device)
         cloud = torch.arange(clouds, device=objects.device).repeat_interleave(count)
-        number = begin + torch.arange(len(first), device=objects.device) % count
         begin += count
         most = at_once(first, STARTS_PER_CHUNK)
         parts = [
             plan_chunk(
                 rows_of(objects.shape, own),
-                objects.constraints.rows(own).at(frictions_in_turn(objects.spec, turn)),
+                objects.constraints.rows(own),
                 part,
                 stages_for(objects.spec),
             )
-            for part, own, turn in zip(
-                *(x.split(most) for x in (first, cloud, number)), strict=True
-            )
+            for part, own in zip(first.split(most), cloud.split(most), strict=True)
         ]
         plan = join(parts)
         index = torch.arange(clouds * count, device=objects.device).view(clouds, count)
@@ -266,7 +263,7 @@ def find_candidates(
         rows = rows[torch.argsort(variance[rows].sum(1), stable=True)]
     else:
         rows = _spread(plan, cloud, most, len(objects))
-    certificate = certify(plan.contacts[rows], objects.spec, plan[rows].friction)
+    certificate = certify(plan.contacts[rows], objects.spec)
     closed = torch.nonzero(certificate.closed)[:, 0]
     certificate = certificate[closed]
     kept = rows[closed]
@@ -289,8 +286,7 @@ def _drop_weak(
     points = plan.contacts.points[rows]
     normals = plan.contacts.normals[rows]
     full = torch.full_like(points[..., 0], objects.strongest)
-    loads = objects.loads[cloud[rows]]
-    proof = resist_loads(points, normals, full, loads, objects.spec, plan[rows].friction)
+    proof = resist_loads(points, normals, full, objects.loads[cloud[rows]], objects.spec)
     weak = rows[~(proof.margin >= 1)]
     status = plan.status.index_fill(0, weak, int(Status.NOT_RESISTED))
     return dataclasses.replace(plan, status=status), load.index_copy(0, rows, proof.load)
@@ -353,8 +349,7 @@ def with_costs(objects: Objects, found: Candidates) -> Candidates:
         strength = strength_of(objects.hand, seeds, touched, objects.strongest)
         arms = touched.points - touched.points.mean(1, keepdim=True)
         load = found.load[seeds.row, None]
-        friction = found.certificate[seeds.row].friction
-        proof = resist_loads(arms, touched.normals, strength, load, objects.spec, friction)
+        proof = resist_loads(arms, touched.normals, strength, load, objects.spec)
         share = proof.margin.clamp(max=1)
         weak = weak.scatter_reduce(0, seeds.row, share, "amax")
         weak = torch.where(weak < 1, CHOICE.weak * (2 - weak), 0.0)

@@ -215,15 +215,12 @@ class ContactPlan(Batch):
         quality: distance (b,) [m] of the contacts' centroid from the cloud's centre (Eq. 14); less
             is better.
         status: `Status` code (b,) of each set: `OK`, or the first constraint that the set violates.
-        friction: coefficient of friction (b,) of the cones of each set. None if it is
-            `ContactSpec.planned_friction` for all.
     """
 
     contacts: Annotated[Contacts, Rows("b")]
     coefficients: Annotated[Float[Tensor, "b f e"], ANY]
     quality: Annotated[Float[Tensor, "b"], ANY]
     status: Int[Tensor, "b"]
-    friction: Float[Tensor, "b"] | None = None
 
 
 @checked
@@ -258,8 +255,6 @@ class Certificate(Batch):
         task_strength: normal force (b, f) [N] up to which each finger presses in this proof.
         task_twist: proof (b, 6) [1/N, 1/(N m)] that no greater multiple is resisted. It is a twist
             y with y . t = -1: no admissible forces have a greater power along y.
-        friction: coefficient of friction (b,) of the cones of each set. None if it is
-            `ContactSpec.planned_friction` for all.
 
     The `task_` fields are None unless `plan_grasps` was called with `resist`.
     """
@@ -274,7 +269,6 @@ class Certificate(Batch):
     task_twist: Annotated[Float[Tensor, "b 6"], ANY] | None = None
     task_forces: Annotated[Float[Tensor, "b f 3"], ANY] | None = None
     task_strength: Annotated[Float[Tensor, "b f"], ANY] | None = None
-    friction: Float[Tensor, "b"] | None = None
 
 
 @checked

@@ -9,7 +9,6 @@ from torchgrasp.foundation.base import FINGERTIPS, Value
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import BadArgument
 from torchgrasp.foundation.rules import Force, Length, Range
-from torchgrasp.geometry.frames import real
 from torchgrasp.geometry.plane import Plane, as_plane
 from torchgrasp.values.closing import ClosingOptions, ClosureResult, SensorModel, choose_options
 from torchgrasp.values.distribution import Distribution, check_within
@@ -28,8 +27,6 @@ SEPARATION = 0.026
 """Default radius [m] of a fingertip, and least distance [m] between two. Wider links lie behind
 smaller fingertips.
 """
-LOW_QUANTILE = 0.05
-"""Probability of frictions below the least one at which contacts are planned."""
 FLAT_RADII = (0.008, 0.006, 0.004, 0.003)
 """Radii [m] within which the surface at a contact must be flat; the largest that the object allows
 is used.
@@ -53,8 +50,7 @@ class ContactSpec(Value):
         max_variance: largest variance of the signed distance at a contact, S_thresh of Eq. (12), in
             squared normalised units.
         friction_margin: share of the mean friction that is planned with. Contacts are planned and
-            certified with `planned_friction`, which is mean friction times `friction_margin`. For a
-            distribution they are planned at further frictions, too (`planned_frictions`).
+            certified with `planned_friction`, which is mean friction times `friction_margin`.
         separation: least distance [m] between the centres of two fingertips. None means
             `SEPARATION`, or more for wide fingertips (`least_separation`). Contacts on opposite
             sides of a thin object may be closer.
@@ -125,27 +121,9 @@ class ContactSpec(Value):
     def planned_friction(self) -> float:
         """The mean friction times `friction_margin`, a coefficient without unit.
 
-        Contacts are planned and certified with it. For a `Distribution` of friction, contacts are
-        planned at several frictions (`planned_frictions`), of which this is the first.
+        Contacts are planned and certified with it.
         """
         return self.mean_friction * self.friction_margin
-
-    @property
-    def planned_frictions(self) -> tuple[float, ...]:
-        """The coefficients of friction with which contact sets are planned in turn.
-
-        The first one is `planned_friction`. For a `Distribution` of friction, its mean and its 5 %
-        quantile follow. Equal coefficients count once.
-
-        >>> ContactSpec(Distribution.between(0.0, 1.0)).planned_frictions
-        (0.25, 0.5, 0.05)
-        """
-        first = self.planned_friction
-        law = Distribution.of(self.friction)
-        if not isinstance(law.simplest, Distribution):
-            return (first,)
-        low = float(law.quantile(real([LOW_QUANTILE])))
-        return tuple(dict.fromkeys([first, law.mean, low]))
 
     @property
     def fingertip_radius(self) -> float:
