@@ -1,11 +1,12 @@
 """A URDF as values: the checked tree of links, joints and collision shapes.
 
-The gate in `safe_xml` checks a file's bytes and writes each number that is read here. Mesh files are
-not opened.
+The gate in `safe_xml` checks a file's bytes; yourdfpy reads the checked elements alone. Mesh files
+are not opened.
 """
 
 import dataclasses
 import functools
+import io
 import math
 import xml.etree.ElementTree as ET
 from collections import Counter
@@ -18,23 +19,14 @@ import numpy as np
 from torchgrasp.files import read_bounded
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import HandFileError
+from torchgrasp.foundation.lazy import yourdfpy
 from torchgrasp.foundation.limits import HAND_LINKS, HAND_SHAPES, MAX_EXTENT, URDF_BYTES
-from torchgrasp.geometry.frames import rotation_from_rpy
-from torchgrasp.hand.safe_xml import (
-    DEGREES,
-    FULL_TURN,
-    NUMBERS,
-    SIZES,
-    BoundedBuilder,
-    parse_urdf,
-)
+from torchgrasp.hand.safe_xml import DEGREES, FULL_TURN, SIZES, BoundedBuilder, parse_urdf
 
 AXIS_ERROR = 0.001  # largest error of the length of a joint's axis
 DEEPEST = 100  # most links in a line: pytorch-kinematics walks the tree by recursion
 REPAIR = "(torchgrasp hand new writes a clean copy)"
 """The end of an error about a published URDF that the library cannot use as it is."""
-UPPER = np.triu_indices(3)
-"""Where the six numbers of an inertia are in its matrix (3, 3)."""
 Triple = tuple[float, float, float]
 
 
@@ -243,91 +235,90 @@ def _parse(path: Path, data: bytes, visual: bool) -> Urdf:
     """
     # links and joints alone, each with all of its names and with finite numbers
     clean = parse_urdf(path, data, visual)
-    links = tuple(map(_link, clean.findall("link")))
-    joints = tuple(map(_joint, clean.findall("joint")))
-    urdf = Urdf(path, clean.attrib["name"], "", links, joints, data, ET.tostring(clean))
+    xml = ET.tostring(clean)
+    robot = yourdfpy.URDF.load(io.BytesIO(xml), build_scene_graph=False, load_meshes=False).robot
+    links = tuple(_link(*pair) for pair in zip(robot.links, clean.findall("link"), strict=True))
+    joints = tuple(_joint(*pair) for pair in zip(robot.joints, clean.findall("joint"), strict=True))
+    urdf = Urdf(path, robot.name, "", links, joints, data, xml)
     _check_names(urdf)
     _check_shapes(urdf)
     _check_joints(urdf)
     return dataclasses.replace(urdf, root=_check_tree(urdf))
 
 
-def _part(element: ET.Element, tag: str) -> ET.Element:
-    """Return the part of an element that every such element has, as the gate makes sure."""
-    return next(element.iter(tag))
-
-
-def _numbers(element: ET.Element | None, key: str) -> tuple[float, ...]:
-    """Return the numbers of an attribute; none without the element or the attribute."""
-    return () if element is None else tuple(map(float, element.get(key, "").split()))
-
-
-def _number(element: ET.Element | None, key: str, default: float) -> float:
-    """Return the number of an attribute, or the default without it."""
-    return (*_numbers(element, key), default)[0]
-
-
-def _place(element: ET.Element) -> tuple[Triple, Triple]:
-    """Return translation [m] and fixed-axis angles [rad] of the <origin> in an element."""
-    origin = element.find("origin")
-    x, y, z = _numbers(origin, "xyz") or (0.0, 0.0, 0.0)
-    roll, pitch, yaw = _numbers(origin, "rpy") or (0.0, 0.0, 0.0)
+def _place(origin: Any, element: ET.Element | None) -> tuple[Triple, Triple]:
+    """Return translation [m] and fixed-axis angles [rad]; yourdfpy keeps a matrix, so the XML gives
+    the angles.
+    """
+    if origin is None or element is None:
+        return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    x, y, z = origin[:3, 3].tolist()
+    roll, pitch, yaw = map(float, element.attrib["rpy"].split())
     return (x, y, z), (roll, pitch, yaw)
 
 
-def _link(element: ET.Element) -> Link:
+def _link(link: Any, element: ET.Element) -> Link:
     """Return a link; its inertia is rotated into the link's axes."""
-    name = element.attrib["name"]
-    shapes = tuple(map(_shape, element.findall("collision")))
-    body = element.find("inertial")
-    if body is None:
-        return Link(name, 0.0, (0.0, 0.0, 0.0), (0.0,) * 6, shapes)
-    mass = _number(_part(body, "mass"), "value", 0.0)
-    com, rpy = _place(body)
-    inertia = _part(body, "inertia")
-    upper = np.zeros((3, 3))
-    upper[UPPER] = [_number(inertia, key, 0.0) for key in NUMBERS["inertia"]]
-    whole = upper + np.triu(upper, 1).T
-    turn = rotation_from_rpy(rpy).numpy()
-    turned = turn @ whole @ turn.T if any(rpy) else whole
-    return Link(name, mass, com, tuple(turned[UPPER].tolist()), shapes)
+    shapes = tuple(
+        _shape(*pair) for pair in zip(link.collisions, element.findall("collision"), strict=True)
+    )
+    if (body := link.inertial) is None:
+        return Link(link.name, 0.0, (0.0, 0.0, 0.0), (0.0,) * 6, shapes)
+    com, rpy = _place(body.origin, element.find("inertial/origin"))
+    turn = body.origin[:3, :3] if any(rpy) else np.eye(3)
+    inertia = body.inertia
+    return Link(
+        link.name,
+        body.mass,
+        com,
+        tuple((turn @ inertia @ turn.T)[np.triu_indices(3)].tolist()),
+        shapes,
+    )
 
 
-def _shape(element: ET.Element) -> LinkShape:
-    shape = _part(element, "geometry")[0]
-    size = tuple(x for key in SIZES[shape.tag] for x in _numbers(shape, key))
-    return LinkShape(shape.tag, size, *_place(element), shape.get("filename", ""))
+def _shape(collision: Any, element: ET.Element) -> LinkShape:
+    kind, shape = next(
+        (kind, shape) for kind, shape in vars(collision.geometry).items() if shape is not None
+    )
+    size = [float(x) for key in SIZES[kind] for x in np.atleast_1d(getattr(shape, key))]
+    return LinkShape(
+        kind,
+        tuple(size),
+        *_place(collision.origin, element.find("origin")),
+        getattr(shape, "filename", ""),
+    )
 
 
-def _joint(element: ET.Element) -> Joint:
+def _joint(joint: Any, element: ET.Element) -> Joint:
     """Return a joint. Its default axis is x, as in ROS; a continuous joint gets no limits."""
-    name, kind = element.attrib["name"], element.attrib["type"]
-    parent, child = (_part(element, key).attrib["link"] for key in ("parent", "child"))
-    xyz, rpy = _place(element)
-    if kind == "fixed":
-        return Joint(name, kind, parent, child, xyz, rpy)
-    x, y, z = _numbers(element.find("axis"), "xyz") or (1.0, 0.0, 0.0)
+    xyz, rpy = _place(joint.origin, element.find("origin"))
+    if joint.type == "fixed":
+        return Joint(joint.name, joint.type, joint.parent, joint.child, xyz, rpy)
+    x, y, z = joint.axis.tolist()
     length = math.sqrt(x * x + y * y + z * z)
     length = length if _is_unit(length) else 1.0  # refused later
-    limit = element.find("limit")
-    bounded = None if kind == "continuous" else limit
-    follows = element.find("mimic")
-    mimic = None
-    if follows is not None:
-        ratio = _number(follows, "multiplier", 1.0)
-        mimic = Mimic(follows.attrib["joint"], ratio, _number(follows, "offset", 0.0))
+    low, high, effort, velocity = (
+        getattr(joint.limit, key, None) for key in ("lower", "upper", "effort", "velocity")
+    )
+    if joint.type == "continuous":
+        low = high = None
+    mimic = (
+        None
+        if joint.mimic is None
+        else Mimic(joint.mimic.joint, joint.mimic.multiplier, joint.mimic.offset)
+    )
     return Joint(
-        name,
-        kind,
-        parent,
-        child,
+        joint.name,
+        joint.type,
+        joint.parent,
+        joint.child,
         xyz,
         rpy,
         (x / length, y / length, z / length),
-        _number(bounded, "lower", -math.inf),
-        _number(bounded, "upper", math.inf),
-        _number(limit, "effort", 0.0),
-        _number(limit, "velocity", 0.0),
+        -math.inf if low is None else low,
+        math.inf if high is None else high,
+        effort or 0.0,
+        velocity or 0.0,
         mimic,
     )
 
