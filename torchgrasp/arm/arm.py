@@ -142,7 +142,7 @@ class Arm(Value):
 
         `poses` (3, 4, k) [m] are the tip's poses. `motion` (6, n, k) is the derivative of each pose
         by each of the n joints. Rows 0 to 2 are the derivative of the translation [mm per rad or
-        m]. Rows 3 to 5 are the derivative of the rotation vector, times `LEVER` [mm per rad].
+        m]. Rows 3 to 5 are the derivative of the rotation vector, times 100 mm (`LEVER`).
 
         Args:
             joints: positions (n, k) of the joints [rad, or m for sliding joints], a column for each

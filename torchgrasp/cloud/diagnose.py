@@ -117,7 +117,7 @@ def diagnose_cloud(
         stands: True if the object stands on a table; False allows a camera below it.
 
     Of a larger cloud, 50,000 points (`DIAGNOSIS.measured`) are measured. 5000 of them
-    (`DIAGNOSIS.viewed`) serve the advice on camera, vertical, table and bodies.
+    (`DIAGNOSIS.viewed`) serve the advice on camera, vertical, table, and other bodies in the cloud.
 
     Raises the errors of `check_cloud`, and `BadArgument` for a vertical of length zero.
 

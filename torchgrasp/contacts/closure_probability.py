@@ -282,7 +282,7 @@ def closure_probability(
     Args:
         shape: the uncertain shape, from `fit_shape`.
         contacts: sets of 3 to 5 contacts (b, f, 3) [m] with outward unit normals. They lie in the
-            domain of the shape, at least `FOOTPRINT` [m] from its edge. A random surface that a
+            domain of the shape, at least 12 mm (`FOOTPRINT`) from its edge. A random surface that a
             finger does not meet within 12 standard deviations counts as one without force closure.
         spec: its `friction` is used, the coefficient of friction at execution; `planned_friction`
             is not used. For a distribution the result is the mean over 9 frictions. None means

@@ -46,8 +46,8 @@ class GraspController:
     """Controller that closes a hand on an object and holds it. Each `step` maps an `Observation` to
     `Targets`, on the CPU.
 
-    A closing controller brings the fingers to the object, then a hold controller presses. After the
-    time `PRESSING_TIME` [s] of pressing, `closed` becomes true. The hand may then be lifted, but
+    A closing controller brings the fingers to the object, then a hold controller presses. After
+    pressing for 0.5 s (`PRESSING_TIME`), `closed` becomes true. The hand may then be lifted, but
     `step` must still be called.
 
     A plan that includes the table allows another closing, if the grasp seems too weak to lift the
@@ -159,11 +159,11 @@ class GraspController:
 
     @property
     def friction(self) -> Distribution | None:
-        """The coefficients of friction that the touches still allow, of those of the plan.
+        """The plan's coefficients of friction, without those that the touches contradict.
 
-        Fingertips that stick and slide bound the friction. If they leave nothing of the plan's
-        friction, the result is what the touches alone show. None unless the hand holds in the mode
-        "grip".
+        Fingertips that stick and slide bound the friction. If the touches contradict all of the
+        plan's coefficients, the result is what the touches alone show. None unless the hand holds
+        in the mode "grip".
         """
         return self.hold.friction.posterior if isinstance(self.hold, GripHold) else None
 

@@ -391,15 +391,14 @@ class LiftCheck:
     """Check whether a closed hand that rises loses the object; it is called at each tick of the
     lift.
 
-    `lost` becomes true, and stays so, at the first of two events. Their bounds are fields of `LOST`
-    (module `recovery`):
+    `lost` becomes true, and stays so, at the first of two events (`LOST` in the module `recovery`):
 
-    * The hand has risen by at least `first` [m], fewer than two fingertips touch, and all carry
-      together less than `load` [N] along the table's normal.
-    * Two fingertips have each slid by more than `slip` [m] before the hand was `low` [m] high.
+    * The hand has risen by at least 10 mm, fewer than two fingertips touch, and all together carry
+      less than 0.2 N along the table's normal.
+    * Two fingertips have each slid by more than 1.5 mm before the hand was 20 mm high.
 
-    The load is not asked for with binary sensors, or without a table. Fingertips with broken
-    sensors count as touching.
+    The load does not count with binary sensors, or without a table. Fingertips with broken sensors
+    count as touching.
 
     Args:
         reference: the closing plan of the grasp (`ClosingReference.from_grasp`).

@@ -211,8 +211,8 @@ class ClosingReference(Value):
         of the table.
 
         It is in the frame of the planned hand. It is 0 without a table, and if no link is in the
-        table. It is also 0 for a hand that would have to rise by more than `MOTION.most` [m]
-        (`ik.opened_pose`).
+        table. It is also 0 for a hand that would have to rise by more than 30 mm (`MOTION.most`),
+        as in `ik.opened_pose`.
         """
         planned = torch.eye(4, dtype=torch.float64)[None]
         return opened_pose(self.hand, self.pregrasp[None], planned, self.table)[0, :3, 3]

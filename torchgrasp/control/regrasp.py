@@ -97,8 +97,8 @@ class GraspTry:
     """One try to lift an object with one of several grasps; `next` is the robot's next try.
 
     The robot moves its hand to `obj_from_hand`, and steps the `controller` until the hand has
-    closed. In each tick of the lift it asks `fails`. If so, it lowers the hand, sends the targets
-    of `withdraw`, and goes on with `next`.
+    closed. In each tick of the lift it asks `fails`. If the lift fails, it lowers the hand, sends
+    the targets of `withdraw`, and goes on with `next`.
 
     Args:
         grasps: the grasps in the order of preference.
@@ -150,7 +150,7 @@ class GraspTry:
         """The indices (k,) of the grasps that are left to try.
 
         A grasp is left if it differs from each tried grasp. Its approach then differs by more than
-        `REGRASP.turn` [rad], or its contacts by more than `REGRASP.gap` [m].
+        30 degrees (`REGRASP.turn`), or its contacts by more than 15 mm on average (`REGRASP.gap`).
         """
         return list_others(self.grasps, self.tried)
 

@@ -160,8 +160,10 @@ class DriveFeel:
 
 
 class FingertipSensor:
-    """Simulator of the fingertip sensors that a `SensorModel` describes: a call maps true contacts
-    to readings.
+    """Simulator of the fingertip sensors that a `SensorModel` describes.
+
+    A call at each control tick takes the true contacts (`TipContact`), the fingertips' Jacobian
+    (f, 3, j) [m/rad] and the tick's length [s]. It returns the readings (`TactileState`).
 
     Args:
         reference: the closing plan; its `sensor` is the sensor model.

@@ -148,8 +148,8 @@ def measure(
         truth: true contacts in this tick.
         pads: outward unit normals (*b, f, 3) of the surface at the planned contacts. They direct
             the noise of tips that touch nothing.
-        radius: radius (f,) [m] of the tips. 0 means that a tip is not round; then `TACTILE.radius`
-            [m] is assumed.
+        radius: radius (f,) [m] of the tips. 0 means that a tip is not round; then 12 mm
+            (`TACTILE.radius`) is assumed.
         period: length [s] of the tick.
         generator: draws the noise; None means no noise.
         noise: factor (no unit) on the standard deviations of the noise.

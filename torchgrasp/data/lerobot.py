@@ -43,7 +43,7 @@ def write_lerobot(folder: Path | str, episodes: Episodes, hand: Hand) -> Path:
     | `observation.state` | joints [rad or m] by name, then position and quaternion of the hand |
     | `observation.forces` | force [N] of each fingertip on the object, in the hand's frame |
     | `observation.environment_state` | position and quaternion of the object |
-    | `action` | the joints' targets in the next tick, then the hand's pose as above at its end |
+    | `action` | the joints' targets in the next tick, then the hand's pose after this tick |
     | `next.done` | whether the next tick is the last one |
     | `next.success` | whether the next tick is the last one, and the object is held |
 

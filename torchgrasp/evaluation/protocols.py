@@ -88,8 +88,8 @@ class Protocol(Value):
         tries: largest number of grasps to try in a lift (`lift_grasps`).
 
     Raises `BadArgument` for two contradictions. The first is a `noise.rotation` with an object
-    displaced during the approach. The second is `pull` with one of the five settings of lifts,
-    `criterion` to `tries`.
+    displaced during the approach. The second is `pull` with a setting of lifts: `criterion`,
+    `displaced`, `push`, `relook` or `tries`.
     """
 
     name: str

@@ -51,8 +51,8 @@ def lift_grasps(
 
     The hand may feel that the object slides or stays behind (`LiftCheck`), or that it is too heavy.
     Then it goes down, opens and withdraws. The object stays where it then is. The robot expects it
-    at the pose that the touches of the last try show, or looks once more. It tries the grasp of
-    `next_grasp`.
+    at the pose that the touches of the last try show, or looks once more. It tries another grasp,
+    the one that most likely holds (`GraspTry.next`).
 
     Args:
         trial: the hand, grasps in the order of preference, and the true object. `trial.truth.error`

@@ -84,8 +84,10 @@ class ProtocolResult(Value):
 
     @property
     def held(self) -> bool:
-        """Whether the status is `OK`; in a lift, the object is then held as `close_hand` defines
-        it.
+        """Whether the status is `OK`.
+
+        In a lift, the object then rose, two fingers touch it, and it slipped little. `close_hand`
+        gives the bounds.
         """
         return self.status is Status.OK
 

@@ -130,8 +130,8 @@ class PostureLibrary(Value):
 
         Args:
             hand: the hand.
-            count: number of drawn postures. None means `SEEDS.postures`, or `SEEDS.many_postures`
-                for more than three fingers.
+            count: number of drawn postures. None means 5000 (`SEEDS.postures`), or 20,000
+                (`SEEDS.many_postures`) for more than three fingers.
             seed: seed of the draws.
 
         Raises the errors of `sample_configurations`.

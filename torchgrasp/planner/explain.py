@@ -275,11 +275,11 @@ def explain_empty(
     Each is tried by planning with it. The search ends at a change that the user can make and that
     gives grasps which are likely to succeed.
 
-    The work is bounded by the fields of `EXPLAIN`, not by time, so a seed always gives the same
-    explanation. A plan has at most `starts` initial guesses and a library of `postures` postures.
-    Relaxed constraints are tried only where no contact set is found. At most `trials` changes are
-    tried, in the order of the losses that they could prevent; fewer with "auto" fingers. If no
-    change helps, a request of few guesses is tried with `more` times as many.
+    The work is bounded by numbers (`EXPLAIN`), not by time, so a seed always gives the same
+    explanation. A plan has at most 20 initial guesses and a library of 500 postures. Relaxed
+    constraints are tried only where no contact set is found. At most 8 changes are tried, in the
+    order of the losses that they could prevent; fewer with "auto" fingers. If no change helps, a
+    request of few guesses is tried with four times as many.
 
     Args:
         cloud: the cloud or scene, as in `plan_grasps`.

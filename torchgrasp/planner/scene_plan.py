@@ -69,7 +69,7 @@ class ScenePlan(Value):
     Attributes:
         things: one plan for each object; objects without a grasp come last.
         clear: labels of objects to take away, in this order, so that the given target has a grasp.
-            It is empty if the target has one, or if no few objects are in the way.
+            It is empty if the target has one, or if no small set of objects to take away was found.
 
     >>> empty = ThingPlan(1, success=0.0, reason="too flat")
     >>> ScenePlan((empty,)).best is None

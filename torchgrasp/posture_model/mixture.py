@@ -66,8 +66,8 @@ def encode(contacts: Contacts | tuple[Tensor, Tensor]) -> ContactCode:
     to fingers, Eqs. (15)-(18).
 
     A code is three distances [m] of the contacts from their centroid, and three cosines between
-    their normals. No rigid motion changes it. Codes and frames are differentiable in points and
-    normals.
+    their normals. No rigid motion changes it. The result also has the frame that each triple
+    defines. Codes and frames are differentiable in points and normals.
 
     Args:
         contacts: `Contacts` with three contacts in each set, or a pair of points [m] and unit
@@ -236,9 +236,9 @@ class GraspMixture(GaussianMixture):
         surely the hand reaches it.
 
         It is half the squared Mahalanobis distance of the code from the nearest component. The hand
-        probably reaches a code whose energy is below `DEFAULT_ENERGY`, or the paper's
-        `PAPER_ENERGY`. Where two components are equally near, the derivative is the mean of both
-        derivatives.
+        probably reaches a code whose energy is below 6.3 (`DEFAULT_ENERGY`), or the paper's bound
+        of 2 (`PAPER_ENERGY`). Where two components are equally near, the derivative is the mean of
+        both derivatives.
 
         Args:
             code: a `ContactCode`, or codes (*b, 6): three lengths [m], then three cosines. b stands

@@ -98,11 +98,11 @@ def fit_shape(
             `table` becomes a `HollowShape` with two surfaces.
         noise: standard deviation of an observed signed distance, in radii of the object. If
             `support` is "paper", also of a component of a normal.
-        budget: number of observed points. It counts at most 1 inside, 20 outside, and the most
-            informative of the cloud. Points of the outline and of the hidden side do not count.
-            None means 85 for "camera" (`SHAPE.camera`) and 70 for "paper" (`SHAPE.paper`).
-            "sure", the paper's rule, adds points until no point's variance (squared normalised
-            units) exceeds `noise`, but at most 1000 (`SHAPE.budget`).
+        budget: number of observed points. At most 1 of them is inside the object, and at most
+            20 are outside. The others are the most informative of the cloud. Points of the outline
+            and of the hidden side do not count. None means 85 for "camera" (`SHAPE.camera`) and 70
+            for "paper" (`SHAPE.paper`). "sure", the paper's rule, adds points until no point's
+            variance (squared normalised units) exceeds `noise`, but at most 1000 (`SHAPE.budget`).
         psi_scale: ratio of the kernel's length psi to the longest distance between observed points;
             below 1.34 the covariance may be indefinite.
         support: observations in addition to the cloud's points, "camera" or "paper"; see above.

@@ -113,7 +113,8 @@ class ShapeGP(Posterior, Normalisation):
         it.
 
         The domain's radius is the smaller of two lengths. One is half the kernel's `diameter`. The
-        other is `DOMAIN.reach` times the greatest distance of an observed point from the centre.
+        other is 1.25 (`DOMAIN.reach`) times the greatest distance of an observed point from the
+        centre.
 
         Args:
             posterior: observed points, weights and Cholesky factor, all normalised, as another

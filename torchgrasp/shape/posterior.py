@@ -165,7 +165,7 @@ class Posterior(Value):
         returned.
 
         It is in squared normalised units: one unit is `scale` [m]. It is not calibrated;
-        `predict(...).std_m` is. It takes a quarter of the time of `estimate`.
+        `predict(...).std_m` is. It costs less than `estimate`.
         """
         prior = self.kernel.profile(self.x.new_zeros(()))
 

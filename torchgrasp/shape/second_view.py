@@ -118,9 +118,9 @@ def next_view(
             means that it counts on all of the surface.
         table: the table's plane, or its height [m] along z; cameras are above it. None means the
             table of the grasps, if they have one.
-        distance: distance [m] of the camera from the middle of the surface, at least `VIEW.near`
-            radii of the shape's domain. None means the mean distance of earlier cameras, or
-            `VIEW.far` if none is known; where that is too near, it means the least distance.
+        distance: distance [m] of the camera from the middle of the surface, at least 1.5 radii
+            (`VIEW.near`) of the shape's domain. None means the mean distance of earlier cameras, or
+            0.5 m (`VIEW.far`) if none is known; if this is too near, the least distance.
 
     Raises `BadArgument` for a wrong argument, or a distance below the least one. Grasps whose
     contacts all lie outside the shape's domain raise it, too.

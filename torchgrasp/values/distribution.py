@@ -309,9 +309,10 @@ class Distribution(Value):
         """Return n numbers (n,) and their probabilities (n,), with n at most `count` (1 to 10,000).
 
         They stand for the distribution: the mean of a function is about the weighted mean of its
-        values at the numbers. A single number is itself a node. An interval has the middles of
-        equal parts as nodes, about as many as its share. If there are more parts than `count`, the
-        nodes are the quantiles (i + 1/2) / `count`.
+        values at the numbers. A single number is itself a node. An interval is cut into equal
+        pieces, and their middles are the nodes. The greater an interval's probability, the more
+        pieces it has. If the distribution has more `parts` than `count`, the nodes are the
+        quantiles (i + 1/2) / `count`.
         """
         if len(self.parts) > count:
             middles = (torch.arange(count, dtype=torch.float64, device="cpu") + 0.5) / count

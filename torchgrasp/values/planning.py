@@ -122,8 +122,8 @@ class ShapeEstimate(Value):
     """The estimated shape at query points: signed distance and normal with their uncertainty (Eqs.
     7-8 of the paper).
 
-    A `ShapeGP` makes it when it is called with points. All fields share the leading axes `*b` of
-    these points. Normalised units are the paper's: one unit is `shape.scale` metres.
+    `ShapeGP.predict` makes it. All fields share the leading axes `*b` of these points. Normalised
+    units are the paper's: one unit is `shape.scale` metres.
 
     Attributes:
         distance: mean signed distance (*b,), normalised; negative inside the object.

@@ -52,8 +52,8 @@ class ContactSpec(Value):
         friction_margin: share of the mean friction that is planned with. Contacts are planned and
             certified with `planned_friction`, which is mean friction times `friction_margin`.
         separation: least distance [m] between the centres of two fingertips. None means
-            `SEPARATION`, or more for wide fingertips (`least_separation`). Contacts on opposite
-            sides of a thin object may be closer.
+            26 mm (`SEPARATION`), or more for wide fingertips (`least_separation`). Contacts on
+            opposite sides of a thin object may be closer.
         flatness: largest angle [rad] between the normals at a contact and on a ring around it. None
             means that flatness is not checked.
         flat_radius: radius [m] of the ring. None means the largest of `FLAT_RADII` that the object
@@ -127,14 +127,14 @@ class ContactSpec(Value):
 
     @property
     def fingertip_radius(self) -> float:
-        """The radius [m] of the fingertips; `TIP_RADIUS` if the field `tip_radius` is None."""
+        """The radius [m] of the fingertips: `tip_radius`, or 12 mm (`TIP_RADIUS`) if it is None."""
         return TIP_RADIUS if self.tip_radius is None else self.tip_radius
 
     @property
     def ring_radius(self) -> float:
         """The radius [m] around a contact within which the surface must be flat.
 
-        It is the field `flat_radius`, or the largest of `FLAT_RADII` if it is None.
+        It is the field `flat_radius`, or 8 mm, the largest of `FLAT_RADII`, if it is None.
         """
         return FLAT_RADII[0] if self.flat_radius is None else self.flat_radius
 
@@ -142,8 +142,8 @@ class ContactSpec(Value):
     def least_separation(self) -> float:
         """The least distance [m] between the centres of two fingertips.
 
-        It is the field `separation`. If that is None, it is `SEPARATION` for fingertips of radius
-        `TIP_RADIUS` or less. For larger ones it grows by the difference of the diameters.
+        It is the field `separation`. If `separation` is None, it is 26 mm for fingertips of radius
+        12 mm (`TIP_RADIUS`) or less. For larger ones it grows by the difference of the diameters.
         """
         wider = 2 * max(self.fingertip_radius - TIP_RADIUS, 0.0)
         return SEPARATION + wider if self.separation is None else self.separation
@@ -167,8 +167,8 @@ class ContactSpec(Value):
         """Return the spec with the `tip_radius` of a hand whose fingertips have the given `radius`
         [m].
 
-        The new `tip_radius` is at least `TIP_RADIUS`. A spec whose `tip_radius` is not None is
-        returned as it is. Raises `BadArgument` for a radius outside the range of `tip_radius`.
+        The new `tip_radius` is at least 12 mm (`TIP_RADIUS`). A spec whose `tip_radius` is not None
+        is returned as it is. Raises `BadArgument` for a radius outside the range of `tip_radius`.
 
         >>> wide = ContactSpec().for_fingertips(0.015)
         >>> points = ContactSpec(tip_radius=0.0).for_fingertips(0.015)
@@ -188,9 +188,9 @@ class ContactSpec(Value):
         The first specs have a smaller `flat_radius`: each of `FLAT_RADII` that is smaller than
         `below`. With a table, three more specs allow contacts on the object's upper rim, where a
         fingertip on the table touches a low object with an inclined normal. The estimated rim is
-        rounder than the true one, so its normals are steeper. Therefore the margins of friction and
-        of `tip_radius` are given up step by step: not at all, by half, wholly. If `flatness` is
-        None, or `flat_radius` is not None, there are no specs.
+        rounder than the true one, so its normals are steeper. Therefore the three specs reduce the
+        margins of friction and of `tip_radius`: the first keeps them, the second halves them, and
+        the third has none. If `flatness` is None, or `flat_radius` is not None, there are no specs.
 
         Args:
             below: radius [m] of the flat areas that were tried before.
@@ -402,7 +402,7 @@ class TrialSpec(Value):
         """The normal force [N] of the strongest finger in the closing, and in the holding mode
         "force".
 
-        It is the field `force`. If that is None, it is 4 N, or `max_force` if it is less.
+        It is the field `force`. If `force` is None, it is 4 N, but at most `max_force`.
         """
         return min(4.0, self.max_force or 4.0) if self.force is None else self.force
 
