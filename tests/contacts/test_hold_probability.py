@@ -192,6 +192,14 @@ def test_derivatives_over_drawn_surfaces_are_those_of_differences(doubtful):
     slope = torch.func.grad(lambda *x: risk(*x).sum(), argnums=(0, 1))
     gradient = slope(*inputs)
     near(sum(dot(g, w).sum() for g, w in zip(gradient, way, strict=True)), change.sum(), 1e-6)
+    # forward over reverse and reverse over reverse: nodes that coincide add no NaN
+    _, forward = torch.func.jvp(slope, inputs, way)
+    leaves = tuple(x.clone().requires_grad_() for x in inputs)
+    first = torch.autograd.grad(risk(*leaves).sum(), leaves, create_graph=True)
+    along = sum(dot(g, w).sum() for g, w in zip(first, way, strict=True))
+    reverse = torch.autograd.grad(along, leaves)
+    for one, other in zip(forward, reverse, strict=True):
+        near(one, other, 1e-6 * float(one.abs().max()))
 
 
 def test_friction_alone_is_scipys_survival_of_the_critical_friction():
