@@ -58,6 +58,18 @@ def all_figures(_: Inputs) -> Iterator[Inputs]:
         yield points[None], normals[None]
 
 
+def tilted(_: Inputs) -> Iterator[Inputs]:
+    """Yield the same with errors of the normals, and without."""
+    for points, normals in all_figures(()):
+        for tilt in (0.05, 0.0):
+            yield points, normals, torch.full_like(points[..., 0], tilt)
+
+
+def carried(_: Inputs) -> Iterator[Inputs]:
+    """Yield the same with a centre of mass among the contacts."""
+    return ((points, normals, points.mean(1)) for points, normals in all_figures(()))
+
+
 def triples(_: Inputs) -> Iterator[Inputs]:
     return ((points[None], normals[None]) for points, normals in figures(3))
 
@@ -136,6 +148,9 @@ def same(x: Inputs) -> Iterator[Inputs]:
 
 PLACES: dict[str, Places] = {
     "certify": all_figures,
+    "critical_friction": all_figures,
+    "hold_probability": tilted,
+    "hold_probability, weight": carried,
     "encode": triples,
     "squeeze": lambda x: iter([x]),
     "Kernel.derivatives": distances,
@@ -150,8 +165,10 @@ PLACES: dict[str, Places] = {
 
 def places_of(name: str) -> Places:
     """Return what yields the kinks of a row of the table."""
-    if name in LAW:
+    if name in LAW and name not in PLACES:
         return at_points("torchgrasp.shape.gp.ShapeGP.predict") if "predict" in name else same
+    if name in PLACES:
+        return PLACES[name]
     owner, method = name.split(".")[-2:]
     if owner in ("Hand", "ActuatedJoints"):
         return postures

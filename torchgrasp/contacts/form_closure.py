@@ -28,6 +28,7 @@ from torch import Tensor
 from torchgrasp.foundation.base import at_once, flatnonzero, in_chunks
 from torchgrasp.geometry.frames import degenerate, subsets
 from torchgrasp.geometry.linalg import dot, eye_like, matvec, norm, unit
+from torchgrasp.shape.kernel import is_plain
 
 Vectors = Float[Tensor, "b f 3"]  # points or normals of the contacts in every row
 Wrenches = Float[Tensor, "b m 6"]  # force, then torque
@@ -63,9 +64,14 @@ def centre_and_radius(points: Vectors) -> tuple[Float[Tensor, "b 1 3"], Float[Te
     `points` have the shape (b, f, 3). The radius is 1 if it would be 0.
     """
     centre = points.mean(-2, keepdim=True)
-    size = torch.linalg.vector_norm(points - centre, dim=(-2, -1), keepdim=True)
+    arms = points - centre
+    size = torch.linalg.vector_norm(arms, dim=(-2, -1), keepdim=True)
+    none = size == 0
+    if not is_plain(points):
+        # the length of a zero vector has no second derivative
+        size = torch.linalg.vector_norm(torch.where(none, 1.0, arms), dim=(-2, -1), keepdim=True)
     radius = size / math.sqrt(points.shape[-2])
-    return centre, torch.where(radius == 0, 1.0, radius)
+    return centre, torch.where(none, 1.0, radius)
 
 
 def scaled_arms(points: Vectors) -> Vectors:
