@@ -165,10 +165,10 @@ PLACES: dict[str, Places] = {
 
 def places_of(name: str) -> Places:
     """Return what yields the kinks of a row of the table."""
-    if name in LAW and name not in PLACES:
-        return at_points("torchgrasp.shape.gp.ShapeGP.predict") if "predict" in name else same
     if name in PLACES:
         return PLACES[name]
+    if name in LAW:
+        return at_points("torchgrasp.shape.gp.ShapeGP.predict") if "predict" in name else same
     owner, method = name.split(".")[-2:]
     if owner in ("Hand", "ActuatedJoints"):
         return postures

@@ -103,12 +103,13 @@ def drawn_starts(
     if candidates is not None:
         # the rows are drawn after the candidates
         draw(shape, spec, (CANDIDATE_TRIPLES, 3), generator)
+    problem = ContactProblem.of(shape, spec)
     for count in sizes:
         if candidates is None:
             drawn = draw(shape, spec, (count, spec.fingertips), generator)
             yield project(shape, draw_in(shape, drawn), steps=6)
         else:
-            yield candidate_rows(ContactProblem.of(shape, spec), *candidates, count, generator)[0]
+            yield candidate_rows(problem, *candidates, count, generator)[0]
 
 
 def settle_flatness(shape: ShapeLike, spec: ContactSpec, seed: int) -> FlatCandidates:
