@@ -194,7 +194,7 @@ def judge(model: SuccessModel, trials: Trials) -> list[str]:
         **{hand: trials.hand == hand for hand in HANDS},
         **{
             f"friction {a:g} to {b:g}": (columns["friction"] >= a) & (columns["friction"] < b)
-            for a, b in ((0.2, 0.4), (0.4, 0.6), (0.6, 0.8), (0.8, 1.01))
+            for a, b in ((0.12, 0.2), (0.2, 0.4), (0.4, 0.6), (0.6, 0.8), (0.8, 1.21))
         },
         **{
             f"{a:g} to {b:g} kg": (columns["mass"] >= a) & (columns["mass"] < b)

@@ -14,11 +14,11 @@ from torchgrasp.foundation.base import Value
 from torchgrasp.success.task import GraspTask
 from torchgrasp.values.specs import ClosingMode
 
-FRICTION = (0.2, 1.0)
+FRICTION = (0.12, 1.2)
 MASS = (0.02, 1.0)
 FORCE = (2.0, 10.0)
-"""Least and greatest friction, mass [kg] (even in its logarithm) and force [N] of the strongest
-finger.
+"""Least and greatest friction, mass [kg] and force [N] of the strongest finger. Friction and mass
+are even in their logarithm: wet glass to rubber.
 """
 
 ORDINARY_FRICTION = (0.3, 1.0)
@@ -91,6 +91,15 @@ class Task(Value):
         return found.with_trial(**changes, force=self.force, simulator="mujoco")
 
 
+def draw_friction(draw: np.random.Generator) -> float:
+    """Draw a friction, even in its logarithm.
+
+    >>> FRICTION[0] <= draw_friction(np.random.default_rng(0)) <= FRICTION[1]
+    True
+    """
+    return round(math.exp(draw.uniform(*np.log(FRICTION))), 3)
+
+
 def draw_ordinary(draw: np.random.Generator, planned: float) -> Task:
     """Draw the task of a grasp for which a promise is made: at the planned friction, where the
     planner saw the object.
@@ -118,7 +127,8 @@ def draw_task(draw: np.random.Generator, planned: float) -> Task:
         0.5,
         0.75,
     )  # a lift takes three times as long as pulls
-    friction, force = (round(float(draw.uniform(*bounds)), 3) for bounds in (FRICTION, FORCE))
+    friction = draw_friction(draw)
+    force = round(float(draw.uniform(*FORCE)), 3)
     mass = round(math.exp(draw.uniform(*np.log(MASS))), 4)
     closing = "uncertainty" if lift or draw.random() < 0.5 else "open_loop"
     return Task(

@@ -25,6 +25,7 @@ from torchgrasp.campaign.cluster import check_versions, empty_shard, run_on_clus
 from torchgrasp.campaign.folder import README, Campaign, carry_out
 from torchgrasp.cloud.camera import look_at, partial_view
 from torchgrasp.cloud.sensor import SensorName
+from torchgrasp.contacts.region import Region
 from torchgrasp.data.reader import GraspShards
 from torchgrasp.data.shards import JobRow, Records, Shard, pack_shard, short
 from torchgrasp.evaluation.protocols import draw_error, seed_of
@@ -47,7 +48,14 @@ from torchgrasp.success.task import Conditions
 from torchgrasp.values.planning import Grasps, PointCloud
 from torchgrasp.values.specs import ContactSpec
 from train.household import CALIBRATING, FAMILIES, HouseholdBody, author_household, family_of
-from train.tasks import FRICTION, ORDINARY_FRICTION, PULL, Task, draw_ordinary, draw_task
+from train.tasks import (
+    ORDINARY_FRICTION,
+    PULL,
+    Task,
+    draw_friction,
+    draw_ordinary,
+    draw_task,
+)
 
 HANDS = ("allegro", "barrett", "leap", "shadow")
 """Hands of the trials; each body is tried with one of them."""
@@ -62,6 +70,9 @@ SPREAD = 6
 
 TASKS = 3
 """Ordinary tasks of a body, for each of which its best grasp is tried."""
+
+KEPT = 0.2
+"""Share of the bodies whose contacts are planned in one half of their view, as at a handle."""
 
 LIMIT = 1800.0
 """Wall time [s] of one job."""
@@ -201,14 +212,18 @@ def _try_body(
     azimuth = draw.uniform(0.0, 360.0)
     elevation = draw.uniform(15.0, 60.0)
     sensor = SENSORS[draw.integers(len(SENSORS))]
-    friction = round(float(draw.uniform(*(ORDINARY_FRICTION if best else FRICTION))), 3)
+    friction = round(float(draw.uniform(*ORDINARY_FRICTION)), 3) if best else draw_friction(draw)
     camera = look_at(azimuth, elevation, target=body.mesh)
     cloud = partial_view(body.mesh, camera, noise=sensor, seed=seed)
     table = Plane.horizontal(0.0)
     eye = cloud.viewpoint.double()[None]  # pyright: ignore[reportOptionalMemberAccess]
-    found = plan_grasps(cloud, hand, ContactSpec(friction=friction, table=table), STARTS)
+    kept = not best and draw.random() < KEPT
+    region = draw_half(cloud, draw) if kept else None
+    spec = ContactSpec(friction=friction, table=table)
+    found = plan_grasps(cloud, hand, spec, STARTS, keep=region)
     executable = found[found.status == Status.OK]
-    row = row._replace(executable=len(executable), points=len(cloud), meta={"sensor": str(sensor)})
+    seen = {"sensor": str(sensor), "region": "half" if kept else "none"}
+    row = row._replace(executable=len(executable), points=len(cloud), meta=seen)
     if not len(executable):
         row = row._replace(
             status=Status(int(found.status.mode().values)) if len(found) else Status.OUT_OF_REACH
@@ -245,6 +260,23 @@ def _try_body(
     )
     row = row._replace(grasps=len(ranks), passed=int(passed.sum()), meta=meta)
     return Shard((row,), Records(cloud.points.double(), eye, executable[ranks], passed, outcome))
+
+
+def draw_half(cloud: PointCloud, draw: np.random.Generator) -> Region:
+    """Draw one half of a view's bounding box: the upper one, or one end of a horizontal side."""
+    points = cloud.points.double()
+    low = points.amin(0)
+    high = points.amax(0)
+    middle = (low + high) / 2
+    deep = (high - low).max()  # the unseen side is at most as deep as the object is wide
+    low = low - deep
+    high = high + deep
+    axis = int(draw.integers(3))
+    if axis == 2 or draw.random() < 0.5:
+        low[axis] = middle[axis]
+    else:
+        high[axis] = middle[axis]
+    return Region.box(low, high)
 
 
 def best_for(tasks: Sequence[Task], hand: Hand, shape: ShapeGP, grasps: Grasps) -> list[int]:
