@@ -12,7 +12,7 @@ from torchgrasp import Status, TrialSpec
 from torchgrasp.app.report.evaluation_page import format_evaluation, list_causes
 from torchgrasp.evaluation import GraspTrial, Truth
 from torchgrasp.evaluation.causes import CAUSES, find_cause
-from torchgrasp.evaluation.regrasp import LiftTry
+from torchgrasp.evaluation.several_tries import LiftTry
 from torchgrasp.evaluation.summary import ProtocolResult, ViewScore, summarise
 from torchgrasp.geometry.frames import rigid, rotation_from_vector
 from torchgrasp.values.closing import ClosingTrace, ClosureResult, Disturbance, ObjectMotion

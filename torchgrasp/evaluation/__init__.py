@@ -4,7 +4,7 @@ from torchgrasp.values.closing import ClosingTrace, Disturbance, ObjectMotion
 from torchgrasp.evaluation.intervals import Share
 from torchgrasp.evaluation.protocols import PROTOCOLS, PoseNoise, Protocol, PullSpec, find_protocol
 from torchgrasp.evaluation.pull import PullResult, pull_grasp
-from torchgrasp.evaluation.regrasp import LiftTry, lift_grasps
+from torchgrasp.evaluation.several_tries import LiftTry, lift_grasps
 from torchgrasp.evaluation.sweep import evaluate
 from torchgrasp.evaluation.summary import ProtocolResult, ViewScore, summarise
 from torchgrasp.evaluation.touch import Touch, measure_touch

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchgrasp.evaluation.criterion import SLIP_ANGLE, SLIP_DISTANCE
-from torchgrasp.evaluation.regrasp import LiftTry
+from torchgrasp.evaluation.several_tries import LiftTry
 from torchgrasp.evaluation.trial import GraspTrial
 from torchgrasp.foundation.checks import checked
 from torchgrasp.foundation.errors import Status

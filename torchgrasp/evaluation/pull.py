@@ -10,7 +10,7 @@ import torch
 
 from torchgrasp.evaluation.causes import find_cause
 from torchgrasp.evaluation.protocols import Protocol, PullSpec, draw_push, find_protocol, seed_of
-from torchgrasp.evaluation.regrasp import run_lifts
+from torchgrasp.evaluation.several_tries import run_lifts
 from torchgrasp.evaluation.summary import ProtocolResult
 from torchgrasp.evaluation.trial import GraspTrial, TrialDriver, TrialRun, check_truth
 from torchgrasp.foundation.base import Value

@@ -259,7 +259,7 @@ def _support_near(
     )
     near = dataclasses.replace(target, points=target.points - middle)
     for fit in fit_planes(view, generator):
-        surface = _Surface.of(view, fit)
+        surface = _FlatSurface.of(view, fit)
         support = surface.support
         if support is None or not near.stands_on(support):
             continue
@@ -311,7 +311,7 @@ def find_supports(
     # The points are centred so that distant origins cost no digits.
     centre = points.mean(0)
     view = SeenPoints(points - centre, None if eye is None else eye - centre, sky)
-    surfaces = [_Surface.of(view, fit) for fit in fit_planes(view, generator)]
+    surfaces = [_FlatSurface.of(view, fit) for fit in fit_planes(view, generator)]
     found: list[_Candidate] = []
     reasons: list[str] = []
     for surface in surfaces:
@@ -523,7 +523,7 @@ def _refit(view: SeenPoints, fit: PlaneFit) -> PlaneFit:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Surface:
+class _FlatSurface:
     """A plane that was fitted to a view, the points on it, and its region.
 
     `height` [m] is that of each point of the view, `tolerance` [m] the greatest height of a point
@@ -538,7 +538,7 @@ class _Surface:
     bowed: bool
 
     @classmethod
-    def of(cls, view: SeenPoints, fit: PlaneFit) -> "_Surface":
+    def of(cls, view: SeenPoints, fit: PlaneFit) -> "_FlatSurface":
         """Return the surface of a fit, its normal turned to the upper side."""
         bowed = fit.scale >= PLANES.rough
         fit = (_refit(view, fit) if bowed else fit).turned_up(view)
@@ -558,7 +558,7 @@ class _Surface:
         """Mask of the points on the plane."""
         return self.height.abs() < self.tolerance
 
-    def beside(self, other: "_Surface") -> bool:
+    def beside(self, other: "_FlatSurface") -> bool:
         """Return whether this surface is at an angle to another one, as a wall to a table."""
         return abs(float(self.fit.normal @ other.fit.normal)) < SUPPORTS.askew
 
@@ -569,7 +569,7 @@ class _Surface:
 
 
 def _judge(
-    view: SeenPoints, surface: _Surface, surfaces: list[_Surface], least_width: float
+    view: SeenPoints, surface: _FlatSurface, surfaces: list[_FlatSurface], least_width: float
 ) -> _Candidate | str:
     """Return the candidate support on a surface, or as text the reason why it supports nothing.
 
@@ -617,7 +617,7 @@ def _judge(
     return _Candidate(support, score * favour, middle)
 
 
-def _refuse_plane(view: SeenPoints, surface: _Surface) -> str:
+def _refuse_plane(view: SeenPoints, surface: _FlatSurface) -> str:
     """Return the reason why a fit is no plane that may be level; an empty text if it may be."""
     fit = surface.fit
     share = fit.count / len(view.points)
@@ -631,7 +631,7 @@ def _refuse_plane(view: SeenPoints, surface: _Surface) -> str:
     return ""
 
 
-def _bends_away(view: SeenPoints, surface: _Surface, support: SupportPlane, own: int) -> bool:
+def _bends_away(view: SeenPoints, surface: _FlatSurface, support: SupportPlane, own: int) -> bool:
     """Return whether many points around the region of a support are near its plane, but off it.
 
     `own` is the number of points on the support.
@@ -641,7 +641,7 @@ def _bends_away(view: SeenPoints, surface: _Surface, support: SupportPlane, own:
     return int(away.sum()) > SUPPORTS.most_away * own
 
 
-def _count_through(view: SeenPoints, surface: _Surface, support: SupportPlane) -> int:
+def _count_through(view: SeenPoints, surface: _FlatSurface, support: SupportPlane) -> int:
     """Return the number of points that the camera sees through the region of a support."""
     inner = SUPPORTS.edge * support.width
     crossing, behind = cross(support.plane, view.points, view.eye)
@@ -660,7 +660,9 @@ def _number_cells(points: Points, axes: Float[Tensor, "3 2"], side: float) -> In
     return number_rows(torch.floor(points @ axes / side).long())
 
 
-def _furniture(surface: _Surface, surfaces: list[_Surface], width: float) -> Bool[Tensor, "n"]:
+def _furniture(
+    surface: _FlatSurface, surfaces: list[_FlatSurface], width: float
+) -> Bool[Tensor, "n"]:
     """Return a mask of the points on surfaces wider than `width` [m] at an angle to `surface`."""
     found = torch.zeros_like(surface.on)
     for other in surfaces:
@@ -684,7 +686,7 @@ class _Risen:
     def on(
         cls,
         view: SeenPoints,
-        surface: _Surface,
+        surface: _FlatSurface,
         support: SupportPlane,
         furniture: Bool[Tensor, "n"],
     ) -> "_Risen":
@@ -702,7 +704,7 @@ class _Risen:
         return self.over & self.low
 
 
-def _count_pierced(view: SeenPoints, surface: _Surface, risen: _Risen) -> int:
+def _count_pierced(view: SeenPoints, surface: _FlatSurface, risen: _Risen) -> int:
     """Return the number of standing points with many points below the plane under them."""
     depth = -surface.height
     below = (depth > SUPPORTS.sag * surface.tolerance) & (depth < SUPPORTS.low)

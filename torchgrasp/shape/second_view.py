@@ -23,7 +23,7 @@ from torchgrasp.values.planning import Grasps
 
 
 @dataclasses.dataclass(frozen=True)
-class ViewNumbers:
+class SecondViewNumbers:
     """The cameras that are compared, and what each of them sees."""
 
     azimuths: int = 24
@@ -56,7 +56,7 @@ class ViewNumbers:
     """Deviation, normalised, that stands for a point that was not seen."""
 
 
-VIEW = ViewNumbers()
+VIEW = SecondViewNumbers()
 
 
 @checked

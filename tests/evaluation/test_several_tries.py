@@ -25,7 +25,7 @@ from torchgrasp.evaluation.causes import tick_of
 from torchgrasp.evaluation.lift import lift_grasp
 from torchgrasp.evaluation.protocols import apply_error
 from torchgrasp.evaluation.pull import run_protocol
-from torchgrasp.evaluation.regrasp import _left_behind, lift_grasps
+from torchgrasp.evaluation.several_tries import _left_behind, lift_grasps
 from torchgrasp.foundation.errors import BadArgument, Status
 from torchgrasp.geometry.frames import apply, inverse, rigid, rotate, rotation_from_vector
 from torchgrasp.geometry.signed_distance import SignedDistanceField
