@@ -11,7 +11,7 @@
 
 * plan: pace, certificates, uncertain, critical_order: time to grasps, proofs, uncertain friction
 
-* scene: real, rooms: supports and things in depth images
+* scene: real, rooms, target: supports and things in depth images, a given thing among others
 
 * shape: objects, views: the estimated shape against true meshes; what more views bring
 

@@ -21,7 +21,7 @@ def scatter(
     The footprints, convex hulls seen from above, lie within `radius` [m] of the origin and at least
     `gap` [m] apart. Meshes that do not fit raise `BadArgument`.
     """
-    outlines = [_footprint(mesh) for mesh in meshes]
+    outlines = [footprint(mesh) for mesh in meshes]
     largest_first = sorted(
         range(len(meshes)),
         key=lambda i: -float(torch.linalg.vector_norm(outlines[i], dim=-1).max()),
@@ -34,7 +34,7 @@ def scatter(
                 pose = _random_pose(-float(meshes[i].bounds[0, 2]), generator, radius)
                 outline = outlines[i] @ pose[:2, :2].T + pose[:2, 3]
                 inside = float(torch.linalg.vector_norm(outline, dim=-1).max()) <= radius
-                if inside and all(_separation(outline, other) >= gap for other in taken):
+                if inside and all(separation(outline, other) >= gap for other in taken):
                     placed[i] = pose, outline
                     break
             else:
@@ -60,7 +60,7 @@ def _random_pose(height: float, generator: torch.Generator, radius: float) -> Fl
     return rigid(rotation, torch.tensor(position, dtype=torch.float64))
 
 
-def _footprint(mesh: trimesh.Trimesh) -> Float[Tensor, "n 2"]:
+def footprint(mesh: trimesh.Trimesh) -> Float[Tensor, "n 2"]:
     """Return the corners of the convex hull of a mesh, seen from above, in order."""
     from scipy.spatial import ConvexHull
 
@@ -68,7 +68,7 @@ def _footprint(mesh: trimesh.Trimesh) -> Float[Tensor, "n 2"]:
     return torch.from_numpy(flat[ConvexHull(flat).vertices])
 
 
-def _separation(a: Float[Tensor, "n 2"], b: Float[Tensor, "m 2"]) -> float:
+def separation(a: Float[Tensor, "n 2"], b: Float[Tensor, "m 2"]) -> float:
     """Return a lower bound of the distance of two convex polygons: the widest strip along an edge
     between them.
     """

@@ -1,0 +1,338 @@
+"""A given target among neighbours: the things stand close, touch and hide each other, and one of
+them is to be lifted.
+
+The target is given by its true mask, or by a click in its middle. The library finds the table and
+the neighbours in one noisy depth image. The best grasp is tried among the true bodies. Bodies are
+of families that fitted no tree of the success model.
+"""
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+from jaxtyping import Float, Int
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
+from train.household import CALIBRATING, FAMILIES, HouseholdBody, author_household, family_of
+
+from benchmarks.close.campaign import keep
+from benchmarks.common import Options, Row, bench, mean_over
+from benchmarks.scene.scenes import footprint, separation
+from torchgrasp import ContactSpec, GraspTask, Scene, load_hand, plan_scene
+from torchgrasp.cloud.camera import INTRINSICS, look_at, render_depth
+from torchgrasp.evaluation import PROTOCOLS
+from torchgrasp.evaluation.intervals import count_by, format_share, share_over
+from torchgrasp.evaluation.lift import lift_grasp
+from torchgrasp.evaluation.trial import GraspTrial, Truth
+from torchgrasp.foundation.errors import GraspError, Status
+from torchgrasp.foundation.jobs import run_tasks
+from torchgrasp.geometry.frames import rigid, rotation_from_vector
+from torchgrasp.geometry.plane import Plane
+from torchgrasp.planner import ScenePlan
+from torchgrasp.sim.scene_spec import Neighbour
+from torchgrasp.values.specs import TrialSpec
+
+SCENES = 100
+NEIGHBOURS = (2, 6)
+"""Scenes, and least and greatest number of neighbours."""
+FIRST = 40_000
+"""Number of the first body: none of the bodies from here on is in the success model's trials."""
+LARGEST = 0.2
+"""Greatest side [m] of a body: the hands grasp no larger ones."""
+TOUCHING = 0.001
+TOUCH = 0.5
+APART = (0.01, 0.05)
+"""Gap [m] of neighbours that touch, the share that does, and the gaps [m] of the others."""
+COVERED = 0.1
+"""Least share of the target that neighbours hide in every second scene."""
+PIXELS = 300
+"""Fewest pixels of the target in the image."""
+ELEVATION = (30.0, 60.0)
+DISTANCE = (0.5, 0.75)
+"""Of the camera [deg, m]."""
+OUTSIDE = 0.6
+STEP = 0.002
+"""Distance [m] from which a neighbour is moved towards the target, and the step."""
+MOVED = 0.02
+"""Motion [m] of a neighbour's centre that counts."""
+HIDDEN = (0.0, 1 / 3, 2 / 3, 1.0)
+"""Edges of the shares of the target that neighbours hide, by which results are told."""
+WAYS = ("mask", "click")
+BARS = {"mask": 0.96, "click": 0.93}
+LIMIT = 1800.0
+"""Wall time [s] of one scene."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Clutter:
+    """Bodies on the table z = 0, of which the first is the target, and one image of them.
+
+    `hidden` is the share of the target's pixels that neighbours cover.
+    """
+
+    names: tuple[str, ...]
+    family: str
+    meshes: tuple[trimesh.Trimesh, ...]
+    parts: tuple[list[trimesh.Trimesh], ...]
+    depth: Float[Tensor, "h w"]
+    labels: Int[Tensor, "h w"]
+    camera_pose: Float[Tensor, "4 4"]
+    hidden: float
+
+
+@dataclasses.dataclass(frozen=True)
+class TargetTry:
+    """What became of one target that was given in one way.
+
+    `purity` and `share` are of the pixels taken for the target: how many are its own, and how many
+    of its own are taken. Without a grasp, `said` is the reason, and `clear` counts the neighbours
+    to take away first. `moved` [m] is the largest motion of a neighbour.
+    """
+
+    scene: int
+    family: str
+    neighbours: int
+    hidden: float
+    way: str
+    purity: float = math.nan
+    share: float = math.nan
+    executable: int = 0
+    predicted: float = math.nan
+    status: str = "NO_GRASP"
+    moved: float = 0.0
+    said: str = ""
+    clear: int = 0
+
+    @property
+    def held(self) -> bool:
+        """Whether the target was lifted and held."""
+        return self.status == Status.OK.name
+
+    @property
+    def asked(self) -> bool:
+        """Whether the library planned nothing and said why."""
+        return self.status == "NO_GRASP" and bool(self.said)
+
+
+@bench("scene/target")
+def target(o: Options) -> list[Row]:
+    """Lift one given thing of crowded scenes: by its mask, and by a click."""
+    hand = o.hands[0]
+    load_hand(hand)
+    tasks = [(o, k, hand) for k in range(o.times(SCENES))]
+    found = list[TargetTry]()
+    for outcomes in run_tasks(try_scene, tasks, o.workers, LIMIT):
+        if isinstance(outcomes, Status):
+            raise SystemExit(f"target: a scene ended with {outcomes.name}")
+        tries = [TargetTry(**outcome) for outcome in outcomes]
+        print(*tries, sep="\n", flush=True)
+        found += tries
+    return [row for way in WAYS for row in describe(way, [x for x in found if x.way == way])]
+
+
+def try_scene(o: Options, k: int, hand: str) -> list[dict[str, Any]]:
+    """Return the fields of the tries of one scene; kept ones are read."""
+    path = o.out / "target" / f"{hand}_{o.starts}_{o.simulator}_{k:03d}.json"
+    return keep(path, lambda: [dataclasses.asdict(x) for x in _try_scene(o, k, hand)])
+
+
+def _try_scene(o: Options, k: int, hand: str) -> list[TargetTry]:
+    clutter = make_clutter(np.random.default_rng([o.seed, k]), k)
+    return [try_target(clutter, k, way, hand, o) for way in WAYS]
+
+
+def make_clutter(draw: np.random.Generator, k: int) -> Clutter:
+    """Return the k-th scene: bodies pushed together around the target, before a camera that sees
+    it.
+    """
+    while True:
+        bodies = [draw_body(draw, k)]
+        while len(bodies) <= draw.integers(NEIGHBOURS[0], NEIGHBOURS[1] + 1):
+            bodies.append(draw_body(draw))
+        poses = push_together([body.mesh for body in bodies], draw)
+        meshes = tuple(moved(x.mesh, pose) for x, pose in zip(bodies, poses, strict=True))
+        parts = tuple(
+            [moved(part, pose) for part in x.parts] for x, pose in zip(bodies, poses, strict=True)
+        )
+        middle = torch.from_numpy(meshes[0].bounds.mean(0))
+        pose = look_at(
+            draw.uniform(0, 360), draw.uniform(*ELEVATION), draw.uniform(*DISTANCE), middle
+        )
+        depth, labels = render_depth(meshes, pose, seed=k)
+        alone = int((render_depth(meshes[:1], pose, noise=False)[1] == 1).sum())
+        seen = int((labels == 1).sum())
+        hidden = 1 - seen / max(alone, 1)
+        if seen >= PIXELS and hidden >= COVERED * (k % 2):
+            names = tuple(body.name for body in bodies)
+            return Clutter(names, bodies[0].family, meshes, parts, depth, labels, pose, hidden)
+
+
+def draw_body(draw: np.random.Generator, k: int | None = None) -> HouseholdBody:
+    """Return a random body of the families left out; with `k`, of the k-th family of them."""
+    among = sorted(CALIBRATING)
+    family = among[k % len(among)] if k is not None else among[draw.integers(len(among))]
+    place = list(FAMILIES).index(family)
+    while True:
+        number = FIRST - FIRST % len(FAMILIES) + len(FAMILIES) * int(draw.integers(200)) + place
+        assert family_of(number) == family
+        body = author_household(number)
+        if max(body.mesh.extents) <= LARGEST:
+            return body
+
+
+def push_together(
+    meshes: Sequence[trimesh.Trimesh], draw: np.random.Generator
+) -> list[Float[Tensor, "4 4"]]:
+    """Return upright poses: the first mesh above the origin, each other one moved towards it from
+    outside until its gap is reached.
+    """
+    placed = list[Float[Tensor, "k 2"]]()
+    poses = list[Float[Tensor, "4 4"]]()
+    for mesh in meshes:
+        turn = torch.tensor([0.0, 0.0, draw.uniform(0, 2 * math.pi)], dtype=torch.float64)
+        rotation = rotation_from_vector(turn)
+        outline = footprint(mesh) @ rotation[:2, :2].T
+        gap = TOUCHING if draw.random() < TOUCH else draw.uniform(*APART)
+        angle = draw.uniform(0, 2 * math.pi)
+        towards = torch.tensor([math.cos(angle), math.sin(angle)], dtype=torch.float64)
+        distance = OUTSIDE if placed else 0.0
+        while placed and distance > 0:
+            nearer = outline + (distance - STEP) * towards
+            if any(separation(nearer, other) < gap for other in placed):
+                break
+            distance -= STEP
+        shift = distance * towards
+        placed.append(outline + shift)
+        poses.append(rigid(rotation, torch.cat([shift, shift.new_zeros(1)])))
+    return poses
+
+
+def moved(mesh: trimesh.Trimesh, pose: Float[Tensor, "4 4"]) -> trimesh.Trimesh:
+    """Return a mesh at another pose."""
+    return mesh.copy().apply_transform(pose.numpy())
+
+
+def try_target(clutter: Clutter, k: int, way: str, hand: str, o: Options) -> TargetTry:
+    """Plan for the target of a scene, and lift it with its best grasp."""
+    trial = PROTOCOLS["table-lift"].with_trial(simulator=o.simulator).trial
+    told = TargetTry(k, clutter.family, len(clutter.names) - 1, clutter.hidden, way)
+    own = clutter.labels == 1
+    given: dict[str, Any] = {"mask": own} if way == "mask" else {"point": middle_of(own)}
+    model = load_hand(hand)
+    spec = ContactSpec(friction=trial.friction)
+    try:
+        scene = Scene.from_depth(
+            clutter.depth, INTRINSICS, clutter.camera_pose, up=(0.0, 0.0, 1.0), **given
+        )
+        task = GraspTask(mass=trial.mass, lift=True)
+        plan = plan_scene(scene, model, spec, o.starts, o.seed, target=scene.target, task=task)
+    except GraspError as error:
+        return dataclasses.replace(told, said=str(error))
+    taken = scene.pixel_labels == scene.target
+    both = int((taken & own).sum())
+    told = dataclasses.replace(
+        told, purity=both / max(int(taken.sum()), 1), share=both / int(own.sum())
+    )
+    return lift_target(clutter, plan, told, hand, trial, k)
+
+
+def middle_of(mask: Tensor) -> tuple[int, int]:
+    """Return the pixel (u, v) that is farthest from the rim of a mask."""
+    depth = distance_transform_edt(mask.numpy())
+    row, column = np.unravel_index(int(np.argmax(depth)), mask.shape)
+    return int(column), int(row)
+
+
+def lift_target(
+    clutter: Clutter, plan: ScenePlan, told: TargetTry, hand: str, trial: TrialSpec, seed: int
+) -> TargetTry:
+    """Return the try with the lift of the plan's best grasp."""
+    best = plan.best
+    if best is None or best.grasps is None:
+        reasons = "; ".join(dict.fromkeys(x.reason for x in plan.things if x.reason))
+        return dataclasses.replace(told, said=reasons, clear=len(plan.clear))
+    around = [
+        Neighbour(mesh, parts)
+        for mesh, parts in zip(clutter.meshes[1:], clutter.parts[1:], strict=True)
+    ]
+    truth = Truth(
+        clutter.meshes[0], clutter.parts[0], table=Plane.horizontal(0.0), neighbours=around
+    )
+    closed = lift_grasp(GraspTrial(load_hand(hand), best.grasps[0], truth, seed), trial)
+    assert closed.disturbance is not None
+    return dataclasses.replace(
+        told,
+        executable=int((best.grasps.status == Status.OK).sum()),
+        predicted=best.success,
+        status=closed.status.name,
+        moved=largest_motion(clutter.meshes[1:], closed.disturbance.neighbour_pose[-1]),
+        said=best.reason,
+    )
+
+
+def largest_motion(meshes: Iterable[trimesh.Trimesh], motion: Float[Tensor, "n 4 4"]) -> float:
+    """Return the largest motion [m] of the middle of a mesh."""
+    middle = torch.stack([torch.from_numpy(mesh.bounds.mean(0)) for mesh in meshes])
+    motion = motion.double()
+    after = (motion[:, :3, :3] @ middle[..., None])[..., 0] + motion[:, :3, 3]
+    return float(torch.linalg.vector_norm(after - middle, dim=-1).max())
+
+
+def describe(way: str, tries: Sequence[TargetTry]) -> list[Row]:
+    """Return the rows of all scenes whose target was given in one way."""
+    planned = [x for x in tries if x.status != "NO_GRASP"]
+    held = share_over(count_by((x.family, x.held) for x in tries))
+    good = share_over(count_by((x.family, x.held or x.asked) for x in tries))
+    of_planned = share_over(count_by((x.family, x.held) for x in planned))
+    pushed = share_over(count_by((x.family, x.moved > MOVED) for x in planned))
+    error = mean_over((x.family, x.predicted - x.held) for x in planned)
+    by_hidden = "; ".join(
+        f"{low:.2f} to {high:.2f}: {describe_group([x for x in tries if low <= x.hidden < high])}"
+        for low, high in itertools.pairwise(HIDDEN)
+    )
+    bar = BARS[way]
+    asking = way == "click"
+    first = good if asking else held
+    words = f"held {format_share(held, 'scenes')}; held or asked {format_share(good, 'scenes')}"
+    few = sum(x.purity < 0.9 for x in tries)
+    return [
+        Row(
+            f"target by {way}",
+            f">= {bar:.0%} held" + (" or asked" if asking else ""),
+            f"{words}; held of planned {format_share(of_planned, 'scenes')}",
+            first.value >= bar,
+            {"tries": [dataclasses.asdict(x) for x in tries]},
+        ),
+        Row(
+            f"a neighbour moved by more than 2 cm, {way}",
+            "<= 4 %",
+            format_share(pushed, "scenes"),
+            pushed.value <= 0.04,
+        ),
+        Row(
+            f"predicted minus held, {way}",
+            "<= 0.05",
+            f"{error.value:+.3f} [{error.low:+.3f}, {error.high:+.3f}]",
+            abs(error.value) <= 0.05,
+        ),
+        Row(f"by the share hidden, {way}", "-", by_hidden),
+        Row(
+            f"pixels taken for the target of which less than 0.9 are its own, {way}", "-", f"{few}"
+        ),
+    ]
+
+
+def describe_group(tries: Sequence[TargetTry]) -> str:
+    """Return counts of a group of tries."""
+    planned = [x for x in tries if x.status != "NO_GRASP"]
+    if not tries:
+        return "none"
+    words = f"{sum(x.held for x in tries)} held, {len(tries) - len(planned)} without a grasp of {len(tries)}"
+    if planned:
+        words += f", predicted {np.mean([x.predicted for x in planned]):.2f}"
+    return words
