@@ -60,6 +60,8 @@ STEP = 0.002
 """Distance [m] from which a neighbour is moved towards the target, and the step."""
 MOVED = 0.02
 """Motion [m] of a neighbour's centre that counts."""
+KEPT = 0.95
+"""Share of measured pixels that a good mask keeps."""
 HIDDEN = (0.0, 1 / 3, 2 / 3, 1.0)
 """Edges of the shares of the target that neighbours hide, by which results are told."""
 WAYS = ("mask", "click")
@@ -89,8 +91,8 @@ class Clutter:
 class TargetTry:
     """What became of one target that was given in one way.
 
-    `purity` and `share` are of the pixels taken for the target: how many are its own, and how many
-    of its own are taken. Without a grasp, `said` is the reason, and `clear` counts the neighbours
+    `purity` is the share of the pixels taken for the target that are its own, and `share` the share
+    of its own measured pixels that are taken. Without a grasp, `said` is the reason, and `clear` counts the neighbours
     to take away first. `moved` [m] is the largest motion of a neighbour.
     """
 
@@ -236,7 +238,9 @@ def try_target(clutter: Clutter, k: int, way: str, hand: str, o: Options) -> Tar
     taken = scene.pixel_labels == scene.target
     both = int((taken & own).sum())
     told = dataclasses.replace(
-        told, purity=both / max(int(taken.sum()), 1), share=both / int(own.sum())
+        told,
+        purity=both / max(int(taken.sum()), 1),
+        share=both / int((own & (clutter.depth > 0)).sum()),
     )
     return lift_target(clutter, plan, told, hand, trial, k)
 
@@ -299,7 +303,10 @@ def describe(way: str, tries: Sequence[TargetTry]) -> list[Row]:
     asking = way == "click"
     first = good if asking else held
     words = f"held {format_share(held, 'scenes')}; held or asked {format_share(good, 'scenes')}"
-    few = sum(x.purity < 0.9 for x in tries)
+    whole = sum(x.share >= KEPT for x in tries)
+    pure = sum(x.purity >= KEPT for x in tries)
+    kept = f"{whole} of {len(tries)} keep {KEPT:.0%} of the target's measured pixels; "
+    kept += f"{pure} hold {KEPT:.0%} of the target's own"
     return [
         Row(
             f"target by {way}",
