@@ -92,8 +92,8 @@ class TargetTry:
     """What became of one target that was given in one way.
 
     `purity` is the share of the pixels taken for the target that are its own, and `share` the share
-    of its own measured pixels that are taken. Without a grasp, `said` is the reason, and `clear` counts the neighbours
-    to take away first. `moved` [m] is the largest motion of a neighbour.
+    of its own measured pixels that are taken. Without a grasp, `said` is the reason, and `clear`
+    counts the neighbours to take away first. `moved` [m] is the largest motion of a neighbour.
     """
 
     scene: int
@@ -328,9 +328,7 @@ def describe(way: str, tries: Sequence[TargetTry]) -> list[Row]:
             abs(error.value) <= 0.05,
         ),
         Row(f"by the share hidden, {way}", "-", by_hidden),
-        Row(
-            f"pixels taken for the target of which less than 0.9 are its own, {way}", "-", f"{few}"
-        ),
+        Row(f"pixels taken for the target, {way}", "-", kept),
     ]
 
 
