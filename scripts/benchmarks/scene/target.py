@@ -93,7 +93,8 @@ class TargetTry:
 
     `purity` is the share of the pixels taken for the target that are its own, and `share` the share
     of its own measured pixels that are taken. Without a grasp, `said` is the reason, and `clear`
-    counts the neighbours to take away first. `moved` [m] is the largest motion of a neighbour.
+    counts the neighbours to take away first. A refused target has pixels and prediction 0.
+    `moved` [m] is the largest motion of a neighbour.
     """
 
     scene: int
@@ -101,10 +102,10 @@ class TargetTry:
     neighbours: int
     hidden: float
     way: str
-    purity: float = math.nan
-    share: float = math.nan
+    purity: float = 0.0
+    share: float = 0.0
     executable: int = 0
-    predicted: float = math.nan
+    predicted: float = 0.0
     status: str = "NO_GRASP"
     moved: float = 0.0
     said: str = ""
