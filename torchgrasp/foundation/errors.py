@@ -147,7 +147,9 @@ class DegenerateContacts(GraspError, ValueError):
 
 
 class BrokenLaw(GraspError, AssertionError):
-    """The kinematics of a hand break a law that `check_hand` checks; `law` is the law's name.
+    """The kinematics of a hand break a law, a property of all hands that `check_hand` tests.
+
+    The attribute `law` is the name of the law.
 
     >>> error = BrokenLaw("order", "2 nan", "finite numbers")
     >>> error.law, str(error)
