@@ -89,8 +89,9 @@ class ProtocolResult(Value):
     def held(self) -> bool:
         """Whether `status` is `OK`: the object withstood all pulls, or a lift held it.
 
-        A lift holds an object if it rose with the hand, two fingers touch it, and it slipped
-        little; `close_hand` gives the bounds.
+        A lift holds an object if three conditions are met (`close_hand`). Its centre rose by at
+        least half of the lift's height. At least two fingers touch it at the end. It slipped by
+        less than 20 mm and 30 degrees in the closed hand.
         """
         return self.status is Status.OK
 

@@ -92,9 +92,9 @@ class Obstacles(Value):
     ) -> Float[Tensor, "*b"]:
         """Return the probability (*b,) with which each set of s spheres touches something occupied.
 
-        The spheres touch the region of a level L, but not that of the next level M. The result is
-        then (L + M) / 2. It is 0 if no region is touched; after the last level M is 1. b stands for
-        any batch axes.
+        The region of a level L is where the probability of occupancy is at least L. If the spheres
+        touch this region, but not that of the next level M, the result is (L + M) / 2. After the
+        last level, M is 1. The result is 0 if no region is touched. b stands for any batch axes.
 
         Args:
             centres: centres (*b, s, 3) [m] of the spheres, in the frame of `field`.

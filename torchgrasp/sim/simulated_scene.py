@@ -55,10 +55,9 @@ class SimulatedScene(abc.ABC):
         root: the simulator's handle of the hand's root link.
         tips: the simulator's handles of the links of the f fingertips.
         neighbours: the simulator's handles of the other bodies.
-
-    A simulator's subclass sets `joint_names` and the handles, then calls `_map_contacts`.
     """
 
+    # The class of a simulator sets these, then calls `_map_contacts`.
     joint_names: tuple[str, ...]
     body: Any
     root: Any

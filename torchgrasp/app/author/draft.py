@@ -74,7 +74,8 @@ DRAFT = DraftNumbers()
 
 
 class Draft(NamedTuple):
-    """A first hand.toml for a URDF, and the repaired URDF; `new_hand` returns it.
+    """A first hand.toml, the file that describes a hand (docs/hands.md), with a repaired URDF;
+    `new_hand` returns it.
 
     Attributes:
         toml: text of the hand.toml.
@@ -105,10 +106,10 @@ class Wish(NamedTuple):
             it are left out.
         meshes: folder in which all mesh files lie; None means the folder of the URDF.
         visual: whether links without <collision> take their <visual> as collision shapes.
-        tip_offset: lengths [m] by which tactile sensors extend the fingertips. () means no sensors,
-            one number is for all fingertips, and several are for each of `tips`; 0 adds no sensor.
-            A sensor points away from the axis of the finger's last joint, to the fingertip's end.
-            The contact point of the fingertip's pad moves by this length; its normal stays.
+        tip_offset: lengths [m] by which tactile sensors extend the fingertips. () means no sensors.
+            One number counts for all fingertips, several for each of `tips`; 0 adds no sensor. A
+            sensor points away from the axis of the finger's last joint, to the fingertip's end. The
+            contact point of the fingertip's pad moves by this length; its normal stays.
         tip_radius: radii [m] of the balls in which the sensors end, counted like `tip_offset`. ()
             means the radii of the fingertips' own balls.
     """
