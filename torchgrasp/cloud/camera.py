@@ -55,8 +55,8 @@ def look_at(
 ) -> Transform:
     """Return the pose `obj_from_camera` (4, 4) [m] of an upright camera that looks at a target.
 
-    The camera's frame has x right, y down and z forward. The object frame has z up; in it are the
-    pose and the target. The pose is in float64.
+    The camera's frame has x right, y down and z forward. Pose and target are in the object frame,
+    whose z axis points up. The pose has the dtype float64.
 
     Args:
         azimuth: angle [deg] about z of the direction from the target to the camera: 0 along x, 90

@@ -112,8 +112,8 @@ def voxel_downsample(cloud: PointCloud, voxel: Annotated[float, Range(1e-5, 1.0)
 def remove_outliers(cloud: PointCloud) -> PointCloud:
     """Return the cloud without duplicate points and without outliers, such as flying pixels.
 
-    Each point has a mean distance to its 8 nearest neighbours. For an outlier it is more than 2.5
-    times (`NEAR.outlier`) its median over all points.
+    Each point has a mean distance to its 8 nearest neighbours. That of an outlier is more than 2.5
+    times (`NEAR.outlier`) the median of these distances.
 
     Raises the errors of `check_cloud`.
 

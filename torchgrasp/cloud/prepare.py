@@ -261,9 +261,9 @@ def merge_clouds(
 ) -> PointCloud:
     """Return one cloud of several views in a common frame, with each point's normal and camera.
 
-    Views without normals get those of `estimate_normals`. The result has a `viewpoint` only if
-    every view has one, or gets one with its normals. Points are denser where views overlap;
-    `voxel_downsample` evens the density.
+    Views without normals get those of `estimate_normals`. The result has a `viewpoint`, unless a
+    view has normals but no viewpoint. Points are denser where views overlap; `voxel_downsample`
+    evens the density.
 
     Overlapping views are compared. If they are farther apart than noise explains, `MendedInput`
     warns. Their distance becomes the result's `pose_error` [m], which widens the standard

@@ -102,8 +102,8 @@ def read_cloud(
     * `.pcd`, ascii, binary or compressed: x y z, optionally normal_x normal_y normal_z. VIEWPOINT
       gives the camera. Its default `0 0 0 1 0 0 0` counts only if a camera there can have seen the
       points.
-    * `.npz`: arrays `points` (n, 3), optionally `normals` (n, 3), `viewpoint` (3,), `frustum` (4,
-      3), `table` (4,), `pose_error` (n,). For several views: `viewpoint` (n, 3) and `frustum` (n,
+    * `.npz`: arrays `points` (n, 3), optionally `normals` (n, 3), `viewpoint` (3,), `table` (4,),
+      `frustum` (4, 3), `pose_error` (n,). For several views: `viewpoint` (n, 3) and `frustum` (n,
       4, 3).
     * `.npy`: an array (n, 3), or (n, 6) with normals or colours. Columns 4 to 6 without names are
       normals if they have length 1 and fit the surface of the points. Otherwise they are left out.

@@ -48,8 +48,8 @@ def evaluate(
     for each view.
 
     The planner sees only the clouds; only the simulator uses the true meshes. An object with bad
-    files or a bad entry gives a score with a `refusal`. Nothing runs before the first score is
-    asked for.
+    files or a bad entry gives a score with a `refusal`. Nothing is planned before the first score
+    is asked for.
 
     Args:
         objects: folder of objects with its manifest, as `write_objects` makes it.

@@ -70,7 +70,7 @@ def format_moveit(
     * `pre_grasp_posture` has the joints of the opened hand.
     * `grasp_posture` has the joints at the contacts, then targets with which the fingers press,
       with their torques [N m] as effort.
-    * `grasp_quality` is the predicted success.
+    * `grasp_quality` is the predicted success, .nan where it is unknown.
     * `post_grasp_retreat` is along the normal of the plan's table, or along z without a table.
 
     Args:
