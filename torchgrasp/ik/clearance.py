@@ -62,8 +62,9 @@ class Obstacles(Value):
     def of(
         cls, occupancy: Occupancy, full: Annotated[float, Range(0.01, 1.0)] = 0.3, hard: bool = True
     ) -> "Obstacles | None":
-        """Return the obstacles of an occupancy grid; None if no voxel is occupied with a
-        probability of 0.1 or more.
+        """Return the obstacles of an occupancy grid; None if all its voxels are probably free.
+
+        A voxel is probably free if its probability of occupancy is below 0.1, and below `full`.
 
         Args:
             occupancy: the grid, from `estimate_occupancy`.

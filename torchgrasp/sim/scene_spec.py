@@ -190,8 +190,8 @@ class SceneSpec:
         """The vertices (v, 3) [m] of all convex parts: a list for the object, then one for each
         neighbour.
 
-        Vertices within 0.3 mm of the table are moved onto it. Otherwise a scanned round body would
-        roll away on its facets before it is touched.
+        Vertices less than 0.3 mm above the table, or below it, are moved onto it. Otherwise a
+        scanned round body would roll away on its facets before it is touched.
         """
         lowest = self.table_height + SIMULATION.near if self.table else -math.inf
         found = []
