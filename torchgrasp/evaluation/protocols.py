@@ -136,10 +136,8 @@ class Protocol(Value):
     def with_trial(self, **changes: Any) -> "Protocol":
         """Return the protocol with some fields of its `trial` changed.
 
-        Args:
-            changes: new values of fields of `TrialSpec`, by name.
-
-        Raises `BadArgument` for a wrong value, and `TypeError` for an unknown field.
+        `changes` are new values of fields of `TrialSpec`, by name. Raises `BadArgument` for a wrong
+        value, and `TypeError` for an unknown field.
 
         >>> find_protocol("tabletop").with_trial(closing="fixed").trial.closing
         'fixed'
