@@ -361,8 +361,9 @@ class Hand(Value):
 
         Args:
             joints: positions (*b, h) [rad or m] of the actuated joints.
-            below: separation [m] up to which results are needed. A greater result may be any number
-                between `below` and the separation. A small `below` saves time.
+            below: separation [m] up to which results are needed. Where the separation is greater,
+                the result is any number of at least `below`, or infinity. A small `below` saves
+                time.
             chunk: number of postures that are computed at a time, which bounds the memory.
         """
         self.actuated.check(joints)

@@ -65,8 +65,8 @@ def load_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
     """Load a hand from its hand.toml and URDF, with the chosen grasping fingers.
 
     Args:
-        name_or_path: name of a shipped hand ("allegro", "barrett", "leap" or "shadow"), or the
-            folder or hand.toml of another hand.
+        name_or_path: name of a shipped hand, such as "allegro", "barrett", "leap" or "shadow". Or
+            the folder or hand.toml of another hand.
         fingers: the grasping fingers, in one of these forms:
             - the name of an option of hand.toml, which lists fingers: "default", or for the Allegro
               hand "four" (all) or "paper_literal" (index, middle and ring);

@@ -92,8 +92,8 @@ class SelfCollision(Value):
 
         Args:
             frames: poses (3, 4, l, n) [m] of the links.
-            below: separation [m] up to which results are needed; greater results may be lower
-                bounds.
+            below: separation [m] up to which results are needed. Where the least separation is
+                greater, the result is any number of at least `below`, or infinity.
 
         Raises `BadArgument` for too few links.
         """
