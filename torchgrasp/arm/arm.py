@@ -52,14 +52,16 @@ TipPoses = Float[Tensor, "3 4 k"]  # poses [m] of the tip in k postures, in the 
 
 @dataclasses.dataclass(frozen=True)
 class Arm(Value):
-    """A robot arm that carries a hand, from `load_arm`. `plan_grasps` keeps grasps that it reaches.
+    """A robot arm that carries a hand; `load_arm` makes it. `plan_grasps(arm=)` keeps the grasps
+    that the arm reaches.
 
     n counts the arm's joints, from the base to the tip. The tip is the link that carries the hand.
-    A posture holds one position of each joint [rad, or m for sliding joints].
+    A posture holds one position of each joint [rad, or m for sliding joints]. Tensors are in
+    float64 on the CPU.
 
     Attributes:
         urdf: the chain of links from base to tip.
-        tree: its kinematic tree.
+        tree: forward kinematics of this chain.
         lower: lower limits (n,) of the joints [rad or m].
         upper: upper limits (n,) of the joints [rad or m].
         speed: greatest speed (n,) of each joint [rad/s or m/s].
@@ -67,16 +69,19 @@ class Arm(Value):
             cloud.
         tip_from_hand: pose (4, 4) [m] of the hand's root link in the frame of the tip.
         link: index (s,) in `urdf.links` of the link of each of s collision spheres. First come the
-            spheres of the links, then the spheres of the hand's palm, which count as the tip's.
+            spheres of the links, then the spheres of the hand's palm, which belong to the tip.
         center: centre (s, 3) [m] of each sphere in the frame of its link.
         radius: radius (s,) [m] of each sphere.
-        moving: indices (w,) of the spheres of links that joints move, without the palm. They keep
-            clear of objects and, unless their links only slide, of the table.
-        pairs: indices (p, 2) of the two spheres of each pair that must not overlap.
+        moving: indices (w,) of the spheres of links that joints move, without the palm. These
+            spheres must not touch objects. They must not touch the table either, unless their links
+            only slide.
+        pairs: indices (p, 2) of the spheres of each pair that must not overlap. Pairs of adjacent
+            links, and pairs that overlap by construction, are left out.
         library: m random postures (m, n) [rad or m], from which inverse kinematics starts.
         features: the tip's pose in each posture of the library as twelve numbers (m, 12) [mm]: its
-            position, then its rotation matrix times a length. Similar poses have near numbers.
-        hand_sha256: hash of the files of the hand.
+            position, then the entries of its rotation matrix times 71 mm. The Euclidean distance of
+            two rows is a distance of two poses.
+        hand_sha256: SHA-256 of the files of the hand, by which `plan_grasps` knows it.
     """
 
     urdf: Urdf = dataclasses.field(repr=False)
@@ -97,40 +102,41 @@ class Arm(Value):
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the n joints, from the base to the tip."""
+        """The names of the n joints, from the base to the tip."""
         return self.tree.joint_names
 
     @checked
     def moved(self, b_from_a: Pose) -> "Arm":
-        """Return the arm with its base given in frame b, a new frame of the object and its cloud.
-
-        The arm itself stays in its place: only `obj_from_base` changes.
+        """Return the arm for another object frame: only `obj_from_base` changes, and the arm stays
+        in place.
 
         Args:
-            b_from_a: rigid transform (4, 4) [m] from the present frame of the object, a, to frame
+            b_from_a: rigid transform (4, 4) [m] from the present object frame, a, to the new one,
                 b.
+
+        Raises `BadArgument` for a transform that is not rigid.
         """
         return dataclasses.replace(self, obj_from_base=b_from_a.to(self.lower) @ self.obj_from_base)
 
     @checked
     def hand_poses(self, joints: Float[Tensor, "k n"]) -> Float[Tensor, "k 4 4"]:
-        """Return the pose `obj_from_hand` (k, 4, 4) [m] of the hand in each of k postures of the
-        arm.
+        """Return the pose `obj_from_hand` (k, 4, 4) [m] of the hand's root link in each of k
+        postures.
 
         Args:
-            joints: positions (k, n) of the n joints [rad, or m for sliding joints], a row for each
-                posture.
+            joints: positions (k, n) of the arm's joints [rad, or m for sliding joints].
         """
         return self.obj_from_base @ self.tree.poses(joints)[:, -1] @ self.tip_from_hand
 
     @checked
     def tip_poses(self, obj_from_hand: Float[Tensor, "k 4 4"]) -> TipPoses:
-        """Return the poses (3, 4, k) [m] of the tip that put the hand at k given poses.
+        """Return the poses (3, 4, k) [m] of the tip at which the hand has k given poses.
 
-        The result is in the frame of the base.
+        They are in the frame of the base, without the last row (0, 0, 0, 1). The joints that reach
+        them are not computed.
 
         Args:
-            obj_from_hand: poses (k, 4, 4) [m] of the hand in the object's frame.
+            obj_from_hand: poses (k, 4, 4) [m] of the hand's root link in the object's frame.
         """
         base_from_hand = inverse(self.obj_from_base) @ obj_from_hand.to(self.lower)
         base_from_tip = base_from_hand @ inverse(self.tip_from_hand)
@@ -138,15 +144,16 @@ class Arm(Value):
 
     @checked
     def tip_motion(self, joints: Float[Tensor, "n k"]) -> tuple[TipPoses, Float[Tensor, "6 n k"]]:
-        """Return (poses, motion) of the tip in k postures, in the base's frame.
+        """Return (poses, motion): the tip's pose and its Jacobian in k postures, in the base's
+        frame.
 
-        `poses` (3, 4, k) [m] are the tip's poses. `motion` (6, n, k) is the derivative of each pose
-        by each of the n joints. Rows 0 to 2 are the derivative of the translation [mm per rad or
-        m]. Rows 3 to 5 are the derivative of the rotation vector, times 100 mm (`LEVER`).
+        `poses` (3, 4, k) [m] are without the last row (0, 0, 0, 1). `motion` (6, n, k) is the
+        derivative by each of the n joints. Its rows 0 to 2 are that of the position [mm per rad or
+        m]. Rows 3 to 5 are that of the rotation vector [rad per rad or m], times a hand's depth of
+        100 mm (`LEVER`). So all rows are in mm.
 
         Args:
-            joints: positions (n, k) of the joints [rad, or m for sliding joints], a column for each
-                posture.
+            joints: positions (n, k) of the arm's joints [rad, or m for sliding joints].
         """
         frames = self.tree.frames(joints)
         tip = frames[:, :, -1]
@@ -164,8 +171,7 @@ class Arm(Value):
         object's frame.
 
         Args:
-            joints: positions (n, k) of the joints [rad, or m for sliding joints], a column for each
-                posture.
+            joints: positions (n, k) of the arm's joints [rad, or m for sliding joints].
         """
         frames = self.tree.frames(joints.contiguous()).index_select(2, self.link)
         pose = self.obj_from_base
@@ -206,25 +212,26 @@ def load_arm(
     tip_from_hand: Pose | None = None,
     seed: Seed = 0,
 ) -> Arm:
-    """Return the robot arm that carries a hand, read from the arm's URDF, for `plan_grasps`.
+    """Read the robot arm that carries a hand from the arm's URDF, for `plan_grasps(arm=)`.
 
     Args:
-        urdf: path of the file; a joint without limits gets [-2 pi, 2 pi] rad.
-        hand: the hand on the arm, or its name or folder.
-        tip: name of the link that carries the hand; None means the link that most joints move, the
-            last of equals.
-        obj_from_base: pose (4, 4) [m] of the arm's root link in the frame of the cloud; None means
-            the identity.
+        urdf: path of the file. Joint limits are cut to [-2 pi, 2 pi] rad; a joint without limits
+            gets this range.
+        hand: the hand on the arm, or its name, or its folder.
+        tip: name of the link that carries the hand. None means the link that is moved by the most
+            joints; of several such links it is the last in the file.
+        obj_from_base: pose (4, 4) [m] of the arm's root link in the frame of the cloud that is
+            planned on; None means the identity.
         tip_from_hand: pose (4, 4) [m] of the hand's root link in the frame of the tip; None means
             the identity.
         seed: seed of the random postures from which inverse kinematics starts.
 
     Raises:
-        HandFileError: a URDF that is missing or malformed.
-        HandFileError: a mesh on a link up to the tip (`torchgrasp.app.author.clean_arm` replaces
-            it).
-        HandFileError: a joint up to the tip that follows another joint.
-        BadArgument: no link named `tip`, or fewer than six joints that move it.
+        HandFileError: a URDF or a hand that is missing or malformed.
+        HandFileError: a collision mesh on a link between root and tip;
+            `torchgrasp.app.author.clean_arm` replaces meshes.
+        HandFileError: a joint between root and tip that mimics another joint.
+        BadArgument: no link is named `tip`, fewer than six joints move it, or a pose is not rigid.
 
     >>> from torchgrasp import load_hand
     >>> load_arm(load_hand("allegro").urdf_path, "allegro", "thumb_tip")

@@ -38,22 +38,24 @@ LONGEST_LICENCE = 100  # letters of a licence's name; those of the SPDX list hav
 @checked
 @dataclasses.dataclass(frozen=True)
 class CampaignSpec(Value):
-    """Options of a campaign (`run_campaign`): protocol, trials, licence and size of the files.
+    """Options of `run_campaign`: test protocol, views and grasps to try, licence, and size of the
+    files.
 
     Args:
-        protocol: test protocol of each grasp, or its name in `torchgrasp.evaluation.PROTOCOLS`.
-        trials: which views are planned on, and how many of their grasps are tried, with the hand's
-            own fingers.
+        protocol: the protocol by which each grasp is tried in simulation, or its name in
+            `torchgrasp.evaluation.PROTOCOLS`.
+        trials: which views are planned on, and how many of their grasps are tried.
         licence: licence of the data set, preferably an SPDX identifier such as "CC-BY-4.0".
         jobs_in_shard: number of jobs in one file. A job is one view of one object.
-        device: "cpu", or "cuda" to plan on all views of a file at once. "cuda" needs workers of a
-            Dask cluster with the resource "GPU". A GPU's rounding may change grasps.
+        device: "cpu", or "cuda" to plan on all views of a file at once. "cuda" needs a Dask cluster
+            whose workers have the resource "GPU". Grasps may differ from those of a CPU by
+            rounding.
 
     Raises `BadArgument` for:
 
-    * `trials` of whole clouds (`complete`), of grasps that were planned before (`planned`), or with
-      other `fingers` than the hand's;
-    * a `licence` that is empty, too long, or not one printable line;
+    * `trials` with `complete`, `planned` or `fingers`: a campaign plans on partial views, with the
+      fingers of its hand;
+    * a `licence` that is not one printable line of 1 to 100 characters;
     * a number outside its range.
 
     >>> CampaignSpec("dexgraspbench").test.trial.friction
@@ -82,7 +84,7 @@ class CampaignSpec(Value):
 
     @property
     def test(self) -> Protocol:
-        """The `Protocol` of the campaign: the field `protocol`, or the one that this field names.
+        """The `Protocol` of the campaign, also if `protocol` holds only its name.
 
         Raises `BadArgument` for an unknown name.
         """
@@ -101,26 +103,29 @@ def run_campaign(
     """Plan grasps on every view of a folder of objects, try them in simulation, and return the data
     set.
 
-    The data set is written to `folder` (`read_shards` reads it). A job is one view of one object.
-    It gives a `JobRow` and its grasps, or the reason why there are none. A finished job is on disk
-    at once. The same call continues an interrupted run, and retries failed jobs (`WORKER_DIED`,
-    `TIMED_OUT`, `BROKEN`). Equal results give equal bytes, whatever the workers, their order and
-    the interruptions (docs/promises.md, N10).
+    The data set is written to `folder`; `read_shards` reads it again. A job is one view of one
+    object. Each job gives a `JobRow` and its grasps; without grasps the row says why. A finished
+    job is on disk at once.
+
+    The same call continues an interrupted run. It also repeats the jobs that ended with
+    `WORKER_DIED`, `TIMED_OUT` or `BROKEN`. The files do not depend on the number and order of
+    workers, nor on interruptions (docs/promises.md, N10).
 
     Args:
-        objects: a folder of objects with its manifest, as `write_objects` makes it. On a cluster it
+        objects: folder of objects with its manifest, as `write_objects` makes it. On a cluster it
             has the same path on every machine.
         hand: from `load_hand`, with the fingers that grasp.
-        folder: folder of the data set; no other run may write to it at the same time.
+        folder: folder of the data set. No other run may write to it at the same time.
         spec: options of the campaign; None means `CampaignSpec()`.
         workers: number of processes on this machine; 0 means this process. Or the address of a Dask
             scheduler, such as "tcp://10.0.0.1:8786", whose workers have one thread each.
         observer: function that is called with the `JobRow` of each finished job.
 
     Raises:
-        BadArgument: no objects, no scheduler at the address or for "cuda", or a machine with other
-            versions or another hand.
-        OutputError: the folder holds another campaign or other files, another run holds it, or it
+        DatasetError: no manifest, or none of the objects is in it.
+        BadArgument: an unknown protocol, no Dask scheduler at the address, or "cuda" without one.
+        BadArgument: a machine of the cluster has other versions or another hand.
+        OutputError: the folder holds another campaign or other files, another run uses it, or it
             cannot be written.
         MissingExtra: the simulator, pebble for workers, or Dask for a cluster is not installed.
 

@@ -49,12 +49,13 @@ ADVICE = AdviceNumbers()
 
 @dataclasses.dataclass(frozen=True)
 class Advice(Value):
-    """A fault of a point cloud, and how to fix it, from `diagnose_cloud`. `str(advice)` joins both.
+    """A fault of a point cloud, and how to fix it; `diagnose_cloud` makes it.
 
     Attributes:
         found: the fault in words.
         fix: what to do, such as the option of a command.
-        refused: True if no grasp is planned on such a cloud; False if planning goes on.
+        refused: whether the command `torchgrasp grasp` refuses such a cloud; otherwise it plans and
+            only prints the advice.
 
     >>> print(Advice("the cloud is empty", "look again", refused=True))
     the cloud is empty: look again

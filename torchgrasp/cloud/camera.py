@@ -55,18 +55,19 @@ def look_at(
 ) -> Transform:
     """Return the pose `obj_from_camera` (4, 4) [m] of an upright camera that looks at a target.
 
-    The camera's frame has x right, y down and z forward. The vertical is the z axis of the target's
-    frame, in which the pose is.
+    The camera's frame has x right, y down and z forward. Pose and target are in the object frame,
+    whose z axis points up. The pose has the dtype float64.
 
     Args:
-        azimuth: direction [deg] in which the camera stands, seen from the target, from x towards y.
+        azimuth: angle [deg] about z of the direction from the target to the camera: 0 along x, 90
+            along y.
         elevation: angle [deg] of the camera above the horizontal, in [-89.9, 89.9].
         distance: distance [m] of the camera from the target, in [0.01, 10].
-        target: point (3,) [m] in the middle of the image; or a mesh, for the centre of its box; or
-            None for the origin.
+        target: point (3,) [m] that is in the middle of the image. A mesh means the centre of its
+            bounding box, and None the origin.
 
-    Raises `BadArgument` for an angle or a distance outside its range, and `MeshError` for a mesh
-    without faces.
+    Raises `BadArgument` for an elevation or a distance outside its range, and `MeshError` for a
+    mesh without faces.
 
     >>> look_at(0.0, 0.0, 0.5)[:3, 3]
     tensor([0.5000, 0.0000, 0.0000], dtype=torch.float64)
@@ -96,28 +97,29 @@ def partial_view(
     noise: bool | SensorName | SensorNoise = True,
     seed: Seed = 0,
 ) -> PointCloud:
-    """Return the points of a mesh that a simulated depth camera sees, as a `PointCloud` of n
-    points.
+    """Return the points of a mesh that a simulated depth camera sees, at most `n`, in float64.
 
     Points and `viewpoint` [m] are in the frame of the mesh. There are no normals. The camera has
     640 x 480 pixels.
 
-    By default the noise is that of an active stereo camera. It has noise and steps of the
-    disparity, a smooth bias, and flying and missing pixels at rims. Surfaces fade out at grazing
-    angles.
+    By default the noise is that of an active stereo camera: noisy and rounded disparities, a smooth
+    bias, and flying and missing pixels at rims. Pixels are missing at grazing angles, too.
 
     Args:
-        mesh: surface of the object, in the object frame [m].
-        camera_pose: pose `obj_from_camera` (4, 4) [m] of the camera, as `look_at` returns it.
-        n: number of pixels drawn at random, at least 4; if the camera sees fewer, all are returned.
-        noise: True for the default noise; False for exact depths; the camera "realsense",
-            "kinect_v1", "azure" or "zivid"; or a `SensorNoise`.
+        mesh: surface of the object [m].
+        camera_pose: pose `obj_from_camera` (4, 4) [m] of the camera in the frame of the mesh, as
+            `look_at` returns it.
+        n: number of points, at least 4, drawn at random from the measured pixels. If there are
+            fewer pixels, all are returned.
+        noise: True for the default noise, False for exact depths, a camera's name ("realsense",
+            "kinect_v1", "azure" or "zivid"), or a `SensorNoise`.
         seed: seed of the noise and of the choice of points.
 
     Raises:
-        BadArgument: fewer than 4 points; a pose that is not rigid.
+        BadArgument: `n` is below 4, or the pose is not rigid.
         MeshError: a mesh without faces.
         TooFewPoints: the camera sees fewer than 4 points of the mesh.
+        SuspiciousScale: the points extend over less than 5 mm or more than 2 m.
 
     >>> import trimesh
     >>> box = trimesh.creation.box([0.06, 0.06, 0.1])

@@ -53,7 +53,8 @@ def check_cloud(cloud: PointCloud) -> PointCloud:
 
     Raises:
         TooFewPoints: fewer than 4 distinct points.
-        SuspiciousScale: an extent outside [5 mm, 2 m], as of points in mm.
+        SuspiciousScale: the longest side of the bounding box is outside [5 mm, 2 m], as of points
+            in mm.
         BadArgument: points that all coincide or lie on one line; a normal of length zero.
 
     >>> check_cloud(PointCloud(torch.rand(50, 3))).viewpoint is None
@@ -79,14 +80,15 @@ def remove_duplicates(cloud: PointCloud) -> PointCloud:
 
 @checked
 def voxel_downsample(cloud: PointCloud, voxel: Annotated[float, Range(1e-5, 1.0)]) -> PointCloud:
-    """Return a thinned cloud: of each voxel the one point nearest to the voxel's centre.
+    """Return a thinned cloud: from each voxel the one point that is nearest to the voxel's centre.
 
-    The points keep their order. Points are not averaged, since a mean may lie inside a thin wall.
+    The points keep their order, and their normals and cameras. They are not averaged, since a mean
+    may lie inside a thin wall.
 
     Args:
         cloud: the points [m].
-        voxel: side [m] of the voxels, 0.00001 to 1. Their grid starts at the lowest corner of the
-            cloud.
+        voxel: side [m] of the voxels, 0.00001 to 1. Their grid starts at the cloud's least x, y and
+            z.
 
     Raises the errors of `check_cloud`, and `TooFewPoints` if fewer than 4 voxels hold points.
 
@@ -110,8 +112,8 @@ def voxel_downsample(cloud: PointCloud, voxel: Annotated[float, Range(1e-5, 1.0)
 def remove_outliers(cloud: PointCloud) -> PointCloud:
     """Return the cloud without duplicate points and without outliers, such as flying pixels.
 
-    An outlier's mean distance to its 8 nearest neighbours is above 2.5 times (`NEAR.outlier`) the
-    median of all points.
+    Each point has a mean distance to its 8 nearest neighbours. That of an outlier is more than 2.5
+    times (`NEAR.outlier`) the median of these distances.
 
     Raises the errors of `check_cloud`.
 

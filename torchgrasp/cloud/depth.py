@@ -70,13 +70,12 @@ def cloud_from_depth(
 ) -> PointCloud:
     """Return the points [m] that a pinhole camera's depth image shows, in the object frame.
 
-    `camera_pose` leads to the object frame; without it, points are in the camera's frame (x right,
-    y down, z forward). The result's `viewpoint` is the camera, and its `frustum` the sides of the
-    image. It has the dtype of a depth tensor of floats, else float64.
+    In the camera's frame x points right, y down and z forward. A pixel with depth z in column u and
+    row v shows the point z ((u - cx) / fx, (v - cy) / fy, 1). u and v count from 0. Pixels with
+    depth 0, NaN, 65535 counts or more than 50 m were not measured, and are left out.
 
-    A pixel with depth z in column u and row v shows the camera's point z ((u - cx) / fx, (v - cy) /
-    fy, 1). Columns and rows count from 0. Pixels with depth 0, NaN, 65535 counts or more than 50 m
-    were not measured, and are left out.
+    The result's `viewpoint` is the camera, and its `frustum` are the sides of the image. Its dtype
+    is that of a depth tensor of floats, else float64.
 
     Args:
         depth: image (h, w) or (h, w, 1) of distances along the optical axis: floats in metres, or
@@ -85,17 +84,17 @@ def cloud_from_depth(
             - a matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels, or its 9 numbers;
             - a 3 x 4 projection matrix;
             - (fx, fy, cx, cy) [pixels];
-            - (fx, fy, cx, cy, width, height) with the size of the image, which may be a crop;
+            - (fx, fy, cx, cy, width, height) with the size of the image;
             - the dict or object of ROS (CameraInfo), Open3D, RealSense, Zivid, Azure Kinect or BOP,
               with its depth_scale and distortion.
-        mask: image (h, w) of bool or uint8, not 0 at the object's pixels; None for all measured
-            pixels.
-        camera_pose: rigid pose `obj_from_camera` (4, 4) [m]; None for results in the camera's
-            frame.
+        mask: image (h, w) of bool or uint8 that is not 0 at the object's pixels; None for all
+            measured pixels.
+        camera_pose: rigid pose `obj_from_camera` (4, 4) [m] of the camera. None means that the
+            object frame is the camera's frame.
         depth_unit: metres of one count of the depth, such as 0.00025. None means the depth_scale of
-            the intrinsics, else the units named under `depth`.
-        up: direction (3,) against gravity, in the object frame. With a `mask`, the normal of a
-            table in the image is compared with it. None means z.
+            the intrinsics; without it, the units named under `depth`.
+        up: direction (3,) against gravity, in the object frame; None means z. It serves to find a
+            wrong pose: with a `mask`, a table in the image must face up.
 
     A polynomial distortion of a raw image (plumb_bob, rational_polynomial) is removed: each pixel's
     ray is undistorted. `MendedInput` then warns that the distortion was removed.

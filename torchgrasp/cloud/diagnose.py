@@ -60,21 +60,21 @@ DIAGNOSIS = DiagnosisNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class CloudReport(Value):
-    """The measured properties of a point cloud, with advice on how to improve it, from
-    `diagnose_cloud`.
+    """The measured properties of a point cloud, with advice on how to improve it; `diagnose_cloud`
+    makes it.
 
     Attributes:
         points: number of all points.
         measured: number of the points at which spacing, density, noise and outliers are measured.
-        size: sides (x, y, z) [m] of the cloud's box along the axes.
-        spacing: median distance [m] of a point to the nearest other point.
-        density: median density of the points [1/m2].
-        noise: median rms distance [m] of the points from planes fitted around them.
-        copies: number of coincident points beyond the first.
+        size: sides (x, y, z) [m] of the cloud's bounding box along the axes.
+        spacing: median distance [m] from a point to its nearest neighbour.
+        density: median number of points on a square metre of surface [1/m2].
+        noise: median rms distance [m] of neighbouring points from the plane that is fitted to them.
+        copies: number of points that coincide with an earlier point.
         outliers: estimated number of points far from their neighbours.
         normals: agreement of the given normals among neighbours; None without normals.
-        viewpoint: position (3,) [m] of the camera, or (points, 3) of each point's camera; None for
-            a whole surface.
+        viewpoint: position (3,) [m] of the camera. For a cloud of several cameras it is (v, 3), the
+            camera of each of v measured points. None for a surface that is seen from all sides.
         viewpoint_given: True if the viewpoint was given; False if it is estimated.
         facing: share [0 to 1] of the normals that face the viewpoint; 0 without one.
         advice: faults and their fixes; refusals come first.
@@ -109,17 +109,19 @@ def diagnose_cloud(
 ) -> CloudReport:
     """Return the measured properties of a cloud, with advice on what would improve it.
 
+    At most 50,000 points (`DIAGNOSIS.measured`) are measured. At most 5000 of them
+    (`DIAGNOSIS.viewed`) show whether camera, vertical and table are right, and whether there is a
+    second body.
+
     Args:
         cloud: the points [m].
-        up: vector (3,) of any length that points up; None means z, unless the cloud seems to be in
+        up: vector (3,) of any length that points up. None means z, unless the cloud seems to be in
             its camera's frame.
         table: the plane under the object; None means a level plane at the lowest point.
-        stands: True if the object stands on a table; False allows a camera below it.
+        stands: whether the object stands on a table. False means an object in the air, whose camera
+            may be below it.
 
-    Of a larger cloud, 50,000 points (`DIAGNOSIS.measured`) are measured. 5000 of them
-    (`DIAGNOSIS.viewed`) serve the advice on camera, vertical, table, and other bodies in the cloud.
-
-    Raises the errors of `check_cloud`, and `BadArgument` for a vertical of length zero.
+    Raises the errors of `check_cloud`, and `BadArgument` for a vector `up` of length zero.
 
     >>> cloud = PointCloud(0.1 * torch.rand(500, 3), viewpoint=torch.tensor([0.0, 0.0, 1.0]))
     >>> diagnose_cloud(cloud).copies
@@ -197,7 +199,7 @@ def _guess_camera(
 
 @checked
 def format_report(report: CloudReport) -> str:
-    """Return a report of `diagnose_cloud` as text of several lines for a terminal.
+    """Return the report of `diagnose_cloud` as a text of several lines, for a terminal.
 
     >>> print(format_report(diagnose_cloud(PointCloud(0.1 * torch.rand(500, 3)))).splitlines()[0])
     points      500

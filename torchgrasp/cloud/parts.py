@@ -104,19 +104,20 @@ def cut_object(
 ) -> tuple[PointCloud, Plane | None]:
     """Return (object, support): the points of one object of a scene, and the plane it stands on.
 
-    The plane is None if no support was found. Points of the support are left out.
+    The plane is a `Plane` in the frame of the cloud; None if no plane was found. Points on the
+    plane or below it are left out.
 
     Args:
         cloud: points [m] of a scene.
         up: unit vector (3,) that points up.
         point: place (3,) [m] on or near the object. Points more than 0.5 m away (`PARTS.around`)
-            are left out. None means the object with the most points above the support.
+            are left out first. None means the object with the most points above the plane.
         box: two opposite corners (2, 3) [m] of a box along the axes; points outside are left out
             first. None means no box.
-        gap: least distance [m] between two objects, 0.001 to 1.
+        gap: distance [m] beyond which points belong to different objects, 0.001 to 1.
 
-    Raises `TooFewPoints` for fewer than 4 points in the box, near the point, above the plane, or of
-    the object.
+    Raises `TooFewPoints` if fewer than 4 points are in the box, near `point`, above the plane, or
+    on the object.
 
     >>> from torchgrasp import load_scene
     >>> seen = PointCloud(load_scene().points.double())

@@ -67,14 +67,14 @@ NORMALS = NormalNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class NormalCheck(Value):
-    """How well the given normals of n points agree with the normals of neighbouring points.
+    """How well the normals of a cloud agree with the normals of neighbouring points.
 
-    `diagnose_cloud` makes it (`CloudReport.normals`).
+    `diagnose_cloud` makes it (`CloudReport.normals`) for n points of the cloud, all or drawn ones.
 
     Attributes:
         flipped: mask (n,) of the normals that oppose most of their neighbours' normals.
-        opposed: share [0 to 1] of opposite normals among pairs of neighbours.
-        oriented: False if the signs look random: the normals are then ignored.
+        opposed: share [0 to 1] of pairs of neighbours with opposite normals.
+        oriented: False if the signs of the normals look random. The normals are then ignored.
         scaled: number of normals that are not of unit length.
     """
 
@@ -169,11 +169,11 @@ def _seen_by_pixels(points: Points, normals: Points | None, up: Vector | None) -
 
 @checked
 def estimate_normals(cloud: PointCloud) -> PointCloud:
-    """Return the cloud without duplicate points, with outward unit normals of a fitted surface.
+    """Return the cloud without duplicate points, and with fitted outward unit normals.
 
-    The surface is a quadric fitted around each point. Given normals are replaced. Outward is the
-    side of the viewpoint. Without a viewpoint, outward is the side of the given normals. Without
-    both, the viewpoint is estimated, and the result has it.
+    Each normal is that of a quadric surface fitted around the point. It replaces a given normal. It
+    points to the viewpoint. Without a viewpoint it points to the side of the given normal. Without
+    both, the viewpoint is estimated, and the result has this viewpoint.
 
     Raises the errors of `check_cloud`.
 
@@ -261,18 +261,19 @@ def merge_clouds(
 ) -> PointCloud:
     """Return one cloud of several views in a common frame, with each point's normal and camera.
 
-    Points are denser where views overlap; `voxel_downsample` evens the density. A view without
-    normals gets normals by `estimate_normals`. If a view has normals but no viewpoint, the result
-    has no viewpoint.
+    Views without normals get those of `estimate_normals`. The result has a `viewpoint`, unless a
+    view has normals but no viewpoint. Points are denser where views overlap; `voxel_downsample`
+    evens the density.
+
+    Overlapping views are compared. If they are farther apart than noise explains, `MendedInput`
+    warns. Their distance becomes the result's `pose_error` [m], which widens the standard
+    deviations of a shape.
 
     Args:
         clouds: k views of one object [m], each in a frame of its own.
         poses: rigid pose `obj_from_cloud` (4, 4) [m] of each view's frame in the common frame.
         align: whether views are moved onto the first, by at most 50 mm and 20 degrees.
             `MendedInput` then warns.
-
-    Views are compared. If noise does not explain their distance, `MendedInput` warns. The distance
-    becomes the result's `pose_error` [m], which widens the standard deviations of a shape.
 
     Raises:
         BadArgument: no cloud, another number of poses, or a pose that is not rigid.

@@ -63,12 +63,12 @@ READ = ReadNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class CloudFile(Value):
-    """A cloud with what else was found in its file, from `read_cloud_file`.
+    """The content of a cloud's file; `read_cloud_file` returns it.
 
     Attributes:
         cloud: the points [m], in float64.
         notes: a sentence for each kind of data in the file that was left out.
-        table: the table that the file holds, as `save_cloud` writes it; None without one.
+        table: plane of the table that the file holds, as `save_cloud` writes it; None without one.
 
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp(), "cloud.npy")
@@ -91,8 +91,8 @@ def read_cloud(
 ) -> PointCloud:
     """Read the point cloud [m] of one object, in float64.
 
-    `read_cloud_file` also reports what was left out, and the table in the file. The suffix tells
-    the format:
+    `read_cloud_file` also returns the table in the file, and says what was left out. The suffix
+    tells the format:
 
     * `.ply`, ascii or binary: x y z, optionally nx ny nz. Header lines `comment viewpoint x y z`
       and `comment frustum` give the camera. The 12 numbers of a frustum are the inward unit normals
@@ -102,24 +102,24 @@ def read_cloud(
     * `.pcd`, ascii, binary or compressed: x y z, optionally normal_x normal_y normal_z. VIEWPOINT
       gives the camera. Its default `0 0 0 1 0 0 0` counts only if a camera there can have seen the
       points.
-    * `.npz`: arrays `points` (n, 3), optionally `normals` (n, 3), `viewpoint` (3,), `frustum`
-      (4, 3), `table` (4,), `pose_error` (n,). For several views: `viewpoint` (n, 3) and `frustum`
-      (n, 4, 3).
-    * `.npy`: an (n, 3) array, or (n, 6) with normals; colours are left out. Columns 4 to 6 without
-      names are normals if they have length 1 and fit the surface of the points.
-    * `.xyz`, `.txt`, `.csv`, `.asc`, `.pts`, `.xyzi`, `.xyzn`, `.xyzrgb`: the same as text. A first
-      line may name the columns (x y z nx ny nz), or hold the number of points.
+    * `.npz`: arrays `points` (n, 3), optionally `normals` (n, 3), `viewpoint` (3,), `table` (4,),
+      `frustum` (4, 3), `pose_error` (n,). For several views: `viewpoint` (n, 3) and `frustum` (n,
+      4, 3).
+    * `.npy`: an array (n, 3), or (n, 6) with normals or colours. Columns 4 to 6 without names are
+      normals if they have length 1 and fit the surface of the points. Otherwise they are left out.
+    * `.xyz`, `.txt`, `.csv`, `.asc`, `.pts`, `.xyzi`, `.xyzn`, `.xyzrgb`: the columns of `.npy` as
+      text. A first line may name the columns (x y z nx ny nz), or hold the number of points.
 
-    Images (h, w, 3) of points are accepted. Points with NaN or infinity are left out. Points at
-    (0, 0, 0) are left out if there are several. Points whose normal is NaN or zero are left out; if
-    most are so, all normals are left out instead.
+    Arrays may also be images (h, w, 3) of points. Points with NaN or infinity are left out. Points
+    at (0, 0, 0) are left out if there are several. Points whose normal is NaN or zero are left out.
+    If most normals are NaN or zero, all normals are left out instead.
 
     Args:
         path: the file.
-        viewpoint: the camera's position (3,) [m] in the cloud's frame. It replaces viewpoint and
-            frustum of the file. None means those of the file.
-        unit: unit of all lengths in the file, "m", "cm" or "mm". The argument `viewpoint` stays in
-            metres.
+        viewpoint: the camera's position (3,) [m] in the cloud's frame. It replaces the file's
+            viewpoint and frustum. None keeps those of the file.
+        unit: unit of all lengths in the file, "m", "cm" or "mm". The argument `viewpoint` is always
+            in metres.
 
     Raises:
         CloudFileError: no such file; an unknown suffix; malformed content; more than 512 MB or 5
@@ -142,8 +142,8 @@ def read_cloud_file(
     viewpoint: Sequence[float | int] | Tensor | None = None,
     unit: Literal["m", "cm", "mm"] = "m",
 ) -> CloudFile:
-    """Read a cloud of any size, such as a whole scene. Also return the file's table, and what was
-    left out.
+    """Read a cloud of any extent, such as a whole scene, with its table and notes on what was left
+    out.
 
     Formats and arguments are those of `read_cloud`.
 
@@ -196,16 +196,17 @@ def cloud_from_array(
     normals: np.ndarray | None = None,
     viewpoint: np.ndarray | Sequence[float | int] | None = None,
 ) -> PointCloud:
-    """Return a cloud made of NumPy arrays [m], in float64. Points that were not measured are left
-    out.
+    """Return a cloud made of NumPy arrays [m], in float64, without the points that were not
+    measured.
 
     Not measured are points with NaN or infinity, and points at (0, 0, 0) if there are several.
-    Points whose normal is NaN or zero are left out, too; if most are so, all normals are left out
-    instead.
+    Points whose normal is NaN or zero are left out, too. If most normals are NaN or zero, all
+    normals are left out instead.
 
     Args:
-        points: (n, 3), or (h, w, 3) for an image of points. Without `normals` they may have six
-            columns; the last three are then normals, or colours, which are left out.
+        points: (n, 3), or (h, w, 3) for an image of points. Without `normals` there may be six
+            columns. The last three are normals if they have length 1 and fit the surface. Otherwise
+            they are taken for colours and left out.
         normals: outward normals in the shape of `points`; None without normals.
         viewpoint: position (3,) [m] of the camera, or (n, 3) of each point's camera; None if it is
             unknown.
@@ -228,12 +229,12 @@ def save_cloud(cloud: PointCloud, path: Path | str, table: Plane | None = None) 
     """Write a cloud as `.npz` (exact) or binary `.ply` (float32), atomically; return the path.
 
     Args:
-        cloud: the points [m], with all that belongs to them.
+        cloud: the points [m], with their normals, cameras and errors.
         path: a file ending in `.npz` or `.ply`.
-        table: plane that is written, too; None without one.
+        table: plane of the table, which is written, too; None without one.
 
-    Raises `OutputError` if the file cannot be written, and `BadArgument` for another suffix. A
-    `.ply` file has one viewpoint, so several views for `.ply` raise `BadArgument`, too.
+    Raises `OutputError` if the file cannot be written, and `BadArgument` for another suffix.
+    `BadArgument` is also raised for a `.ply` of several views, or of a cloud with `pose_error`.
 
     >>> save_cloud(PointCloud(torch.rand(9, 3)), "cloud.txt")
     Traceback (most recent call last):

@@ -88,29 +88,32 @@ STILL = StillNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class SensorNoise(Value):
-    """A model of a depth camera's noise: random noise, depth steps, a smooth bias, and faults.
+    """A model of a depth camera's noise, for `partial_view`: random noise, rounding, bias and
+    faults.
 
-    `partial_view` draws such noise. Faults are flying and missing pixels at rims, at grazing angles
-    and in corners.
+    The faults are flying and missing pixels at rims, missing pixels at grazing angles, and errors
+    in corners. A stereo camera measures the disparity f b / depth [px], with focal length f [px]
+    and baseline b [m].
 
     Args:
-        base: focal length times baseline [px m] of a stereo camera; 0 means time of flight.
+        base: f b [px m] of a stereo camera; 0 means a time-of-flight camera.
         disparity: standard deviation of the disparity [px]; only with a `base`.
-        step: difference [px] of two neighbouring values of the disparity; 0 means no steps. Only
+        step: resolution of the disparity [px], to which it is rounded; 0 means no rounding. Only
             with a `base`.
         floor: standard deviation [m] at any distance; `partial_view` draws it only without a
             `base`.
         growth: standard deviation over the squared distance [1/m]; only without a `base`.
-        grain: width [px] of patches of similar noise; 0 means that each pixel has its own.
-        bias: standard deviation [m] of the smooth bias.
-        bias_width: width [px] of the patches of the bias.
-        shadow: whether a second eye misses surfaces beside nearer ones.
-        flying: share [0 to 1] of flying pixels at rims.
+        grain: standard deviation [px] of the Gaussian blur that makes neighbouring pixels have
+            similar noise; 0 means independent pixels.
+        bias: standard deviation [m] of the smooth bias of the depth.
+        bias_width: standard deviation [px] of the Gaussian blur that makes the bias smooth.
+        shadow: whether pixels are missing that the stereo camera's second lens does not see.
+        flying: share [0 to 1] of flying pixels at rims, whose depth is too great.
         flight: mean distance [m] of flying pixels behind the rim.
-        lost_rim: share [0 to 1] of rim pixels without depth.
+        lost_rim: share [0 to 1] of the pixels at rims without depth.
         lost: share [0 to 1] of all pixels without depth.
-        grazing: angles [deg] between ray and normal at which pixels begin to fade, and at which all
-            are gone.
+        grazing: angles [deg] between ray and surface normal at which pixels begin to be missing,
+            and at which all are missing.
         multipath: error of a time-of-flight camera in a corner (no unit). The measured depth is too
             great by this factor times the corner's depth behind its surroundings.
 
@@ -138,7 +141,7 @@ class SensorNoise(Value):
     def sigma(self, depth: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
         """Return the standard deviation (*b,) [m] of the random noise at each depth (*b,) [m].
 
-        Bias and steps do not count. b stands for any batch axes.
+        It contains neither the bias nor the rounding of the disparity. b stands for any batch axes.
         """
         growth = self.disparity / self.base if self.base else self.growth
         return torch.sqrt(self.floor**2 + (growth * depth * depth) ** 2)
@@ -292,17 +295,17 @@ def _deviation(error: Float[Tensor, "n"]) -> Float[Tensor, ""]:
 def median_depth(frames: Sequence[Tensor | np.ndarray]) -> Tensor:
     """Return one depth image (h, w): the median of each pixel over several depth images.
 
-    It has the unit and dtype of the frames. Pixels that were not measured (0, NaN or infinity) in
-    half of the frames or more are 0.
+    It has the unit and the dtype of the frames. A pixel is 0 if half of the frames or more did not
+    measure it (0, NaN or infinity).
 
     Args:
-        frames: images (h, w) of one size, one unit and one dtype, while camera and scene stand
-            still.
+        frames: images (h, w) of one size, one unit and one dtype, taken while camera and scene
+            stand still.
 
     Raises:
-        BadArgument: no frame; frames of several sizes or dtypes.
-        BadArgument: camera or scene have moved in a frame. Then more than 5 % of its pixels, or 1 %
-            of its patches, differ from the median (`STILL`).
+        BadArgument: no frame, or frames of several sizes or dtypes.
+        BadArgument: camera or scene have moved: a frame differs from the median in more than 5 % of
+            its pixels, or 1 % of its patches (`STILL`).
 
     >>> frames = [[[0.0, 0.7]], [[0.0, 0.701]], [[0.5, 0.702]]]
     >>> median_depth([torch.tensor(frame) for frame in frames])

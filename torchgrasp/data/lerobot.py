@@ -33,19 +33,21 @@ RATE_DECIMALS = 6  # to which rates [Hz] are rounded before they are compared
 
 @checked
 def write_lerobot(folder: Path | str, episodes: Episodes, hand: Hand) -> Path:
-    """Write closings as a LeRobot data set (v3.0), to train policies on; return the folder.
+    """Write simulated closings as a LeRobot data set (v3.0), to train policies on; return the
+    folder.
 
-    `LeRobotDataset(name, root=folder)` reads it. A frame is a control tick. Positions [m] and
-    quaternions (x, y, z, w) are in the frame of the grasp. There are no images and no rewards.
+    `LeRobotDataset(name, root=folder)` reads it. Each closing is an episode. Each control tick is a
+    frame, except the last one. Positions [m] and quaternions (x, y, z, w) are in the frame of the
+    grasp. There are no images and no rewards.
 
     | feature | contents |
     | --- | --- |
-    | `observation.state` | joints [rad or m] by name, then position and quaternion of the hand |
-    | `observation.forces` | force [N] of each fingertip on the object, in the hand's frame |
+    | `observation.state` | all joints [rad or m] of the URDF, then position and quaternion of the hand |
+    | `observation.forces` | force (x, y, z) [N] of each fingertip on the object, in the hand's frame |
     | `observation.environment_state` | position and quaternion of the object |
-    | `action` | the joints' targets in the next tick, then the hand's pose after this tick |
-    | `next.done` | whether the next tick is the last one |
-    | `next.success` | whether the next tick is the last one, and the object is held |
+    | `action` | the next tick's joint targets [rad or m], then the hand's pose after that tick |
+    | `next.done` | whether this frame is the last one of the episode |
+    | `next.success` | whether this frame is the last one, and the object was held |
 
     Args:
         folder: the folder to write.
@@ -53,8 +55,8 @@ def write_lerobot(folder: Path | str, episodes: Episodes, hand: Hand) -> Path:
         hand: the hand of all closings.
 
     Raises:
-        BadArgument: there is no closing, or a closing has a single tick. A closing is of another
-            hand, or at another control rate than the first.
+        BadArgument: there is no closing, or a closing has a single tick.
+        BadArgument: a closing is of another hand, or has another control rate than the first one.
         OutputError: the folder holds other files, or cannot be written.
         MissingExtra: pyarrow is not installed.
 

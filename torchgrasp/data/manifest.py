@@ -133,18 +133,19 @@ def _parse_entry(name: str, field: Field) -> ObjectEntry:
 def write_objects(
     meshes: Path | str, out: Path | str, views: Count = 3, seed: Seed = 0
 ) -> list[str]:
-    """Make a folder of objects from a folder of mesh files; return the objects' names.
+    """Make a folder of objects from a folder of mesh files; return the names of the objects.
 
-    The names are the names of the files without suffix. Each mesh is moved: its lowest point is
-    then at z = 0, and the middle of its box above the origin. Each view is rendered by the depth
-    camera of `partial_view` from a random side. The manifest is written last, so that a folder with
-    a manifest is complete.
+    Each object is named after its file, without the suffix. Each mesh is translated: its lowest
+    point is then at z = 0, and the centre of its bounding box above the origin. Each view is a
+    noisy cloud of at most 1000 points, rendered from a random direction (`partial_view`). The
+    manifest, `manifest.json`, names all objects and views. It is written last, so a folder with a
+    manifest is complete.
 
     Args:
         meshes: folder of closed meshes (.ply, .stl, .obj, .off), in metres, with z up.
         out: the folder to write.
         views: number of views of each object.
-        seed: random seed of the camera positions and of the noise.
+        seed: seed of the camera directions and of the noise.
 
     Warns of a mesh that is too large for a hand (`CloudWarning`), and of bodies that lie apart
     (`TwoBodies`).
@@ -230,16 +231,16 @@ def _check_name(field: Field, name: str) -> None:
 def list_views(
     objects: Path | str, whole: bool = False, only: Sequence[str] = (), most: Count | None = None
 ) -> list[tuple[str, str]]:
-    """Return the pairs (object, view) of names in a folder of objects, sorted.
+    """Return the names (object, view) of all views in a folder of objects, sorted.
 
     Args:
         objects: the folder of objects, as `write_objects` makes it.
-        whole: give each object the single view "whole", which shows all sides. Its file,
-            OBJECT/full_normals.ply, is not among those that `write_objects` writes.
-        only: names of the objects; empty means all.
+        whole: whether each object has only the view "whole" instead, a cloud of all its sides. Its
+            file, OBJECT/full_normals.ply, is not among those that `write_objects` writes.
+        only: names of the objects to list; unknown names are ignored. Empty means all objects.
         most: largest number of views of each object; None means all.
 
-    Raises `DatasetError` if there is no manifest, if none of the objects is in it, or for a bad
+    Raises `DatasetError` if there is no manifest, if it has none of the objects, or for a bad
     entry.
 
     >>> import tempfile, trimesh
@@ -260,13 +261,15 @@ def list_views(
 def read_view(objects: Path | str, name: str, view: str, camera: bool = True) -> PointCloud:
     """Return the noisy point cloud [m] of a view, with the camera's position as `viewpoint`.
 
-    The cloud is in the frame of the object, which rests at z = 0. It has no normals.
+    The cloud is in the frame of the object's mesh, multiplied by the object's scale in the manifest
+    (1 by default). It has no normals.
 
     Args:
         objects: the folder of objects, as `write_objects` makes it.
         name: name of the object.
-        view: name of the view. "whole" is the view of all sides, with normals and no `viewpoint`;
-            it is the file OBJECT/full_normals.ply, which `write_objects` does not write.
+        view: name of the view, from `list_views`. "whole" means all sides, with normals and no
+            `viewpoint`. Its file, OBJECT/full_normals.ply, is not among those that `write_objects`
+            writes.
         camera: whether the cloud has a `viewpoint`.
 
     Raises `DatasetError` for a bad or missing entry, or an unknown view, and `CloudFileError` for a
@@ -293,9 +296,12 @@ def read_view(objects: Path | str, name: str, view: str, camera: bool = True) ->
 
 @checked
 def read_object_mesh(objects: Path | str, name: str) -> "trimesh.Trimesh":
-    """Return the true, closed mesh [m] of an object in a folder of objects.
+    """Return the true, closed mesh [m] of an object, in the frame of the object's views.
 
-    It is in the frame of the object's views. `objects` is the folder, and `name` the object's name.
+    Args:
+        objects: the folder of objects, as `write_objects` makes it.
+        name: name of the object.
+
     Raises `DatasetError` for a bad or missing entry, and `MeshError` for a bad mesh.
 
     >>> import tempfile, trimesh

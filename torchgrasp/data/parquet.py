@@ -30,12 +30,12 @@ OBJECT = ("object", "view", "family", "group")
 
 @checked
 def write_parquet(data: GraspShards, folder: Path | str) -> Path:
-    """Write a data set as Parquet files with cards in Markdown and Croissant; return the folder.
+    """Write a data set as Parquet files, with cards in Markdown and Croissant; return the folder.
 
-    With the package `datasets`, `load_dataset(folder)` reads a line for each grasp. A line has the
-    numbers of an item of `GraspShards`. It also names object, view, hand, friction and seed, and
-    the status of each try. `load_dataset(folder, "views")` reads a line for each job: its cloud and
-    counts. The joints' names are in the cards, and in the metadata of each file's schema.
+    The package `datasets` reads it. `load_dataset(folder)` has a row for each grasp. A row holds
+    the tensors of `data[i]` without the cloud, and the status of each simulated trial. It also
+    names object, view, hand, friction and seed. `load_dataset(folder, "views")` has a row for each
+    job: its cloud, its status and its counts. The cards name the joints.
 
     Args:
         data: the data set, as `read_shards` opens it.

@@ -26,16 +26,16 @@ CARD_BYTES = 256 * 1024**2  # largest card
 
 
 class ShardJob(NamedTuple):
-    """One job of a data set: a view of an object, and the g grasps that were tried on it.
+    """One job of a data set: one view of one object, with the g grasps that were planned on it.
 
-    `GraspShards.job` makes it. d counts the simulated trials of each grasp.
+    `GraspShards.job` returns it. Each grasp was tried d times in simulation.
 
     Attributes:
-        row: the outcome of the job.
+        row: names, status and counts of the job.
         cloud: the cloud [m] of the view; None if no view was read.
         grasps: the grasps, in the frame of the cloud.
-        passed: whether each trial of each grasp passed (g, d).
-        outcome: the `Status` of each of these trials (g, d), as integers.
+        passed: whether each trial of each grasp passed, a mask (g, d).
+        outcome: the `Status` of each trial of each grasp, integers (g, d).
     """
 
     row: JobRow
@@ -49,28 +49,29 @@ class ShardJob(NamedTuple):
 class GraspShards:
     """A data set of grasps on disk, for `torch.utils.data.DataLoader`; `read_shards` opens it.
 
-    `len` counts the grasps. Item i is a dict of tensors for grasp i. They are float32 and in the
-    object's frame, for n points, h actuated joints and f fingertips:
+    `len(data)` is the number of grasps. `data[i]` is a dict of tensors for grasp i. Numbers are
+    float32, in the object's frame. n counts points, h actuated joints, and f fingertips:
 
     * `points` (n, 3) [m] and `viewpoint` (3,) [m] of the cloud; the viewpoint is 0 if unknown.
     * `joints` (h,) and `pregrasp` (h,) [rad or m].
-    * `approach` (3,), a unit vector, and the pose `obj_from_hand` (4, 4) [m].
-    * `contacts` (f, 3) [m], their outward unit `normals` (f, 3), and their `std_m` (f,) [m].
+    * `approach` (3,), the unit direction of the approach, and the pose `obj_from_hand` (4, 4) [m].
+    * `contacts` (f, 3) [m], with the outward unit `normals` (f, 3) and the standard deviation
+      `std_m` (f,) [m] of the surface there.
     * `margin` and `witness` (6,) of the `Certificate`.
     * `clearance` [m].
     * `predicted`, the predicted success in [0, 1].
     * `simulated`, the share of simulated trials that passed.
-    * `closed`, a bool: whether the contacts have frictional form closure.
-    * `job`, an integer: the index in `jobs`.
+    * `closed`, a boolean: whether the contacts have frictional form closure.
+    * `job`, an integer: the index in `jobs` of the grasp's view.
 
     Attributes:
         folder: folder of the data set.
         card: content of `card.json`.
-        jobs: the outcome for each object and view, with or without grasps.
-        size: number of jobs in a shard.
+        jobs: the outcome of each view of each object, with or without grasps.
+        size: number of jobs in a shard, a file of the data set.
         points: number of points of each item's cloud. None means all points, so that clouds may
             differ in size.
-        recent: the shards that were read last, kept in memory.
+        recent: the cache of the shards that were read last.
     """
 
     folder: Path
@@ -84,7 +85,10 @@ class GraspShards:
 
     @functools.cached_property
     def starts(self) -> list[int]:
-        """The index of the first grasp of each job in the data set, then the number of grasps."""
+        """For each job the index of its first grasp in the data set; then the number of all grasps.
+
+        The grasps of job j are `data[starts[j]]` to `data[starts[j + 1] - 1]`.
+        """
         return list(itertools.accumulate((row.grasps for row in self.jobs), initial=0))
 
     def __len__(self) -> int:
@@ -124,11 +128,16 @@ class GraspShards:
 
     @checked
     def job(self, j: Annotated[int, Range(0, MOST)]) -> ShardJob:
-        """Return cloud, grasps and trials of the job with the index `j` in `jobs`.
+        """Return the cloud, the grasps and the trials of a job, in the dtype in which they are
+        stored.
 
-        Numbers have the precision of the file. `j` counts from 0. Raises `IndexError` if `jobs` has
-        no such index, and `BadArgument` for a negative one. Raises `ModelFileError` if its file is
-        missing, damaged, or of another campaign.
+        Args:
+            j: index of the job in `jobs`, from 0.
+
+        Raises:
+            IndexError: `jobs` has no such index.
+            BadArgument: a negative index.
+            ModelFileError: the job's file is missing, damaged, or of another campaign.
         """
         j = range(len(self.jobs))[j]
         row, records = self.recent.get(j // self.size, self._read).take(j % self.size)
@@ -156,12 +165,12 @@ def shard_path(folder: Path, k: int) -> Path:
 
 @checked
 def read_shards(folder: Path | str, points: Count | None = None) -> GraspShards:
-    """Open a data set that a campaign has written, for learning; its shards are read on demand.
+    """Open a data set that `run_campaign` wrote; its files are read on demand.
 
     Args:
         folder: the folder that `run_campaign` wrote.
-        points: number of points that are drawn from each cloud, the same ones in every call. A
-            smaller cloud repeats points. None means all points.
+        points: number of points that are drawn from each cloud, the same ones each time. A cloud
+            with fewer points repeats some. None means all points.
 
     Raises `ModelFileError` if the campaign is not finished, or its card is damaged.
 

@@ -33,16 +33,17 @@ class JobRow(NamedTuple):
     Attributes:
         object: name of the object.
         view: name of the view; "" if the object could not be read, or has no view.
-        status: `OK`, or the reason why there is no grasp: the most frequent failure, a bad object,
+        status: `OK` if there is a grasp. Else the most frequent failure of the plan, `BAD_OBJECT`,
             or how the process ended.
         note: details of the status, or "".
-        family: family of similar objects, or "".
+        family: name of a family of similar objects, or "".
         group: group of objects, such as "solid", or "".
         executable: number of executable grasps that were planned.
         points: number of points of the cloud.
-        grasps: number of grasps that were kept and tried.
-        passed: number of simulated trials that passed.
-        meta: `Grasps.meta` of the plan. It is empty without a plan, and in `GraspShards.jobs`.
+        grasps: number of the executable grasps that were tried in simulation and kept.
+        passed: number of simulated trials that passed, over all these grasps.
+        meta: `Grasps.meta` of the plan. It is empty without a plan, and in the rows of
+            `GraspShards.jobs`.
 
     >>> JobRow("mug", "view0", Status.NOT_CLOSED, points=1000).as_json()["status"]
     'NOT_CLOSED'
@@ -61,7 +62,7 @@ class JobRow(NamedTuple):
     meta: dict[str, str] = {}  # noqa: RUF012
 
     def as_json(self) -> dict[str, Any]:
-        """Return the fields by name as a dict for JSON; the status is its name."""
+        """Return a dict of all fields by name, for `json.dumps`; `status` becomes its name."""
         return {**self._asdict(), "status": self.status.name}
 
 
@@ -179,8 +180,8 @@ def short(text: str) -> str:
 def load_grasps(path: Path | str) -> Grasps:
     """Return the grasps in a file that `Grasps.save` wrote.
 
-    Raises `ModelFileError` if the file is missing or malformed. It is also raised if a pose, a
-    status or the number of contacts is not valid.
+    Raises `ModelFileError` if the file is missing or malformed, or holds an invalid pose, status or
+    number of contacts.
 
     >>> import tempfile
     >>> from torchgrasp.data.shipped import load_shipped_grasp

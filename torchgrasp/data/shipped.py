@@ -26,13 +26,13 @@ GRASPED = {(name, hand) for name in ("cylinder", "jug") for hand in ("allegro", 
 @checked
 @dataclasses.dataclass(frozen=True, eq=False)
 class GraspObject:
-    """An object to grasp, which rests at z = 0 with z up; `load_object` makes it.
+    """An object to grasp, which stands on the plane z = 0 with z up; `load_object` makes it.
 
     Attributes:
         name: name of the object.
-        mesh: its true, closed surface [m].
-        parts: convex meshes [m] whose union is the object, for the simulation.
-        view: a noisy point cloud [m] from one side, with its viewpoint.
+        mesh: the true, closed surface [m].
+        parts: convex meshes [m] whose union approximates the object, for simulators.
+        view: a noisy point cloud [m] of one side, with its `viewpoint`.
         mass: mass [kg].
 
     >>> jug = load_object("jug")
@@ -48,7 +48,7 @@ class GraspObject:
 
 
 def list_objects() -> tuple[str, ...]:
-    """Return the names of the shipped objects, for `load_object`.
+    """Return the names of the shipped objects, which `load_object` takes.
 
     >>> list_objects()
     ('cylinder', 'jug', 'rabbit', 'spray')
@@ -76,9 +76,12 @@ def find_view(path: Path, name: str = "cloud") -> Path:
 
 @checked
 def load_object(name: str) -> GraspObject:
-    """Return a shipped object by its name: mesh, convex parts, mass and a noisy view.
+    """Return a shipped object: mesh, convex parts, mass and a noisy view.
 
-    `list_objects` has the names. Raises `BadArgument` for an unknown name.
+    Args:
+        name: name of the object, one of `list_objects()`.
+
+    Raises `BadArgument` for an unknown name.
 
     >>> jug = load_object("jug")
     >>> jug.mesh.is_watertight, len(jug.view)
@@ -95,7 +98,7 @@ def load_object(name: str) -> GraspObject:
 
 @checked
 def load_shipped_grasp(name: str, hand: str) -> Grasps:
-    """Return a shipped grasp of a shipped object, to close or draw at once.
+    """Return one planned grasp of a shipped object, without planning; for examples.
 
     Args:
         name: name of the object: "cylinder" or "jug".
@@ -114,10 +117,10 @@ def load_shipped_grasp(name: str, hand: str) -> Grasps:
 
 
 def load_scene() -> Scene:
-    """Return a scene of the shipped objects on a table: a rendered, noisy depth image with true
-    labels.
+    """Return a scene of the four shipped objects on a table: a rendered, noisy depth image with
+    true labels.
 
-    Its frame has z up, and lengths are in metres.
+    Its frame has z up, in metres.
 
     >>> load_scene().things
     (1, 2, 3, 4)

@@ -34,17 +34,17 @@ object). For a mean: (sum, number) of the values.
 
 
 class Share(NamedTuple):
-    """A success rate, mean or difference, with its 95 % interval; `summarise` makes it.
+    """A success rate (or a mean, or a difference) with its 95 % interval; `summarise` makes it.
 
-    The interval is found by resampling units, such as families of objects. With a single unit, the
-    ends of the interval are NaN. Without trials, value and interval are NaN.
+    The interval is found by resampling units, such as families of objects. With a single unit its
+    ends are NaN. Without trials the value is NaN, too.
 
     Attributes:
-        value: a share in [0, 1], or a mean or difference in its own unit.
+        value: the rate in [0, 1]; a mean or a difference has its own unit.
         low: lower end of the interval.
         high: upper end of the interval.
         total: number of trials.
-        units: number of resampled units.
+        units: number of different units that were resampled.
     """
 
     value: float

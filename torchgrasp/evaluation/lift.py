@@ -81,9 +81,11 @@ def close_hand(
     """Close a hand on the true object, lift it and hold it, in simulation; return the record.
 
     The opened hand moves straight to its pre-grasp, closes and presses (`GraspController`), rises
-    and holds. The object is **held** if three conditions are met. Its centre rose by half the lift.
-    Two fingers touch it at the end. It slipped by less than 20 mm and 30 degrees in the closed
-    hand.
+    and holds. The object is **held** if three conditions are met:
+
+    * its centre rose by at least half of the lift's height;
+    * at least two fingers touch it at the end;
+    * it slipped by less than 20 mm and 30 degrees in the closed hand.
 
     `status` says why an object was not held. Equal arguments give bitwise equal results.
 
@@ -93,10 +95,10 @@ def close_hand(
         mesh: the true object [m], closed, in the frame of the grasp: a trimesh, a file, or a
             `GraspObject`.
         spec: parameters of the trial; None means `TrialSpec()`.
-        seed: random seed of the tactile sensors' noise. Friction and mass are drawn by it if the
-            `spec` has distributions.
-        error: rigid transform (4, 4) [m] from the hand's planned pose to its true pose. It is in
-            the frame of the planned hand. The controller does not know it. None means no error.
+        seed: seed of the sensors' noise, and of friction and mass if the `spec` has distributions
+            of them.
+        error: pose (4, 4) [m] of the true hand in the frame of the planned hand; None means no
+            error. The controller does not know it.
         parts: convex parts [m] of the mesh. None means the parts of a `GraspObject`, or those that
             `convex_parts` computes.
         table: the true table below the object, in the frame of the grasp. None means a level table
@@ -104,18 +106,18 @@ def close_hand(
         neighbours: other bodies on the table, which the hand may push.
         told: the table that the controller knows, in the frame of the grasp. None means the table
             of the plan (`Grasps.table`).
-        surface: estimated surface of the object (`surface_field`), in the frame of the grasp. By
-            it, touches show the object's pose. None means the tangent planes of the planned
-            contacts.
+        surface: estimated surface of the object (`surface_field`), in the frame of the grasp. The
+            controller compares touches with it to estimate the object's pose. None means the
+            tangent planes of the planned contacts.
         slide: displacement (3,) [m] of the object along the table, in the frame of the grasp. It
             happens halfway through the approach, and the controller does not know it. None means no
             displacement.
 
     Raises:
-        BadArgument: there is not exactly one grasp. Joints are of another hand, or a pre-grasp is
-            outside the joint limits. The approach is no unit vector. Contacts are off the mesh. The
-            mesh does not stand on the `table`. The holding "law" is asked for with a closing that
-            does not follow it (Eq. 25).
+        BadArgument: there is not exactly one grasp, or its approach is no unit vector.
+        BadArgument: joints are of another hand, or a pre-grasp is outside the joint limits.
+        BadArgument: contacts are off the mesh, or the mesh does not stand on the `table`.
+        BadArgument: the holding "law" after a closing that does not follow it (Eq. 25).
         MeshError: the mesh is missing, open or without volume.
         MissingExtra: the simulator is not installed.
 

@@ -31,15 +31,15 @@ LEAST_MASS = 1e-3  # least mass [kg] of a task, so that no load is zero
 @checked
 @dataclasses.dataclass(frozen=True)
 class PoseNoise(Value):
-    """The bounds of random pose errors in the trials of a `Protocol`.
+    """The bounds of random pose errors in the trials of a `Protocol`, drawn uniformly.
 
-    In pulls, the hand's pose errs, in the frame of the planned hand. In lifts, the object is
-    displaced along the table.
+    In pulls, the true pose of the hand differs from the planned one, in the frame of the planned
+    hand. In lifts, the object is displaced along the table and turned about the vertical.
 
     Args:
         translation: greatest error [m] along each axis.
-        rotation: greatest error [rad] about each axis; in lifts about the vertical.
-        draws: number of random errors that `evaluate` tries for each grasp.
+        rotation: greatest error [rad] about each axis; in lifts about the vertical only.
+        draws: number of trials with different errors that `evaluate` runs for each grasp.
     """
 
     translation: Length = 0.0
@@ -50,14 +50,14 @@ class PoseNoise(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class PullSpec(Value):
-    """The settings of pulls at a grasped object, and the motion that passes.
+    """The settings of pulls at a grasped object, and the motion at which a pull fails.
 
     Args:
-        acceleration: force of each pull over the object's mass [m/s^2].
+        acceleration: force of each pull, divided by the object's mass [m/s^2].
         seconds: duration [s] of each pull.
-        distance: motion [m] of the object's centre of mass at which a pull fails. It is measured
-            from the start of the trial, so it includes the closing.
-        angle: rotation [rad] of the object, since the start of the trial, at which a pull fails.
+        distance: motion [m] of the object's centre of mass at which a pull fails. It counts from
+            the start of the trial, so it includes the closing.
+        angle: rotation [rad] of the object, counted likewise, at which a pull fails.
     """
 
     acceleration: Annotated[float, Range(0.0, 1000.0)]
@@ -69,23 +69,25 @@ class PullSpec(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class Protocol(Value):
-    """The settings of the simulated trials that test a grasp: pulls at the object, or a lift.
+    """The settings of the simulated trials that test a grasp: pulls at a floating object, or a lift
+    off a table.
 
-    `PROTOCOLS` holds published ones by name.
+    `PROTOCOLS` holds ready protocols by name, published ones among them.
 
     Args:
         name: the protocol's name.
         trial: parameters of the simulated trials.
         pull: the pulls; None means a lift.
-        noise: bounds of random errors: of the hand's pose in pulls, of the object's place in lifts.
-        criterion: when a lift passes: the object is "held" (`close_hand`), or has "risen" by half
-            of the lift at the end.
+        noise: bounds of random errors: of the hand's pose in pulls, of the object's pose in lifts.
+        criterion: when a lift passes. "held": as `close_hand` defines it. "risen": the object's
+            centre is higher by half of the lift's height at the end.
         displaced: when `noise` displaces the object of a lift: "before" the approach, or halfway
             through the "approach".
         push: size [N] of a force in a random direction at the lifted object; 0 means no push.
         relook: whether the camera looks at the object of a lift once more, from the same place,
             before the approach.
-        tries: largest number of grasps to try in a lift (`lift_grasps`).
+        tries: largest number of grasps of a view to try, one after the other, in one lift
+            (`lift_grasps`).
 
     Raises `BadArgument` for two contradictions. The first is a `noise.rotation` with an object
     displaced during the approach. The second is `pull` with a setting of lifts: `criterion`,
@@ -114,7 +116,7 @@ class Protocol(Value):
 
     @property
     def task(self) -> GraspTask:
-        """The task that `plan_grasps` takes, so that it predicts success under this protocol.
+        """The task of the protocol's trials, for `plan_grasps`, which predicts the success in it.
 
         >>> find_protocol("dexgraspbench").task.describe()
         'pulls of 0.1 kg with 7 N'
@@ -132,10 +134,10 @@ class Protocol(Value):
 
     @checked
     def with_trial(self, **changes: Any) -> "Protocol":
-        """Return the protocol with some fields of its `trial` replaced.
+        """Return the protocol with some fields of its `trial` changed.
 
-        `changes` are fields of `TrialSpec` by name. Raises `BadArgument` for a wrong value, and
-        `TypeError` for an unknown field.
+        `changes` are new values of fields of `TrialSpec`, by name. Raises `BadArgument` for a wrong
+        value, and `TypeError` for an unknown field.
 
         >>> find_protocol("tabletop").with_trial(closing="fixed").trial.closing
         'fixed'
@@ -205,7 +207,7 @@ PROTOCOLS = {
 
 @checked
 def find_protocol(protocol: Protocol | str) -> Protocol:
-    """Return a protocol, given its name in `PROTOCOLS` or the protocol itself.
+    """Return the protocol of `PROTOCOLS` with a given name; a `Protocol` is returned as it is.
 
     Raises `BadArgument` for an unknown name.
 

@@ -29,15 +29,16 @@ INTERVAL = 0.2  # interval [s] at which the pulled object's motion is checked
 @checked
 @dataclasses.dataclass(frozen=True)
 class PullResult(Value):
-    """The result of a pull trial: whether the object stayed in the hand; `pull_grasp` makes it.
+    """The result of a pull trial: whether the object stayed in the hand; `pull_grasp` returns it.
 
     Attributes:
         passed: whether the object stayed in the hand in all six pulls.
-        status: how the last pull ended, or the closing if no pull was tried.
+        status: how the last pull ended. If no pull was tried, it says how the closing failed.
         directions: number of pulls that were tried, up to 6; 0 if the closing failed.
-        moved: largest motion [m] of the object's centre of mass in the world. It is infinite if the
-            simulation did not stay finite, and 0 if the closing did not start.
-        turned: largest rotation [rad] of the object in the world; infinite or 0 as `moved`.
+        moved: largest motion [m] of the object's centre of mass in the world, from the start of the
+            trial. It is infinite if the simulation did not stay finite, and 0 if the closing did
+            not start.
+        turned: largest rotation [rad] of the object in the world; infinite or 0 in the same cases.
         force: mean normal force [N] of the fingers before the first pull; NaN if the closing did
             not start.
         seconds: CPU time [s] of the trial.
@@ -58,16 +59,17 @@ def pull_grasp(trial: GraspTrial, protocol: Protocol | str = "dexgraspbench") ->
     """Close a hand on the true object, pull at the object, and return whether it stayed in the
     hand.
 
-    The pulls are along -x, +x, -y, +y, -z and +z of the world, until one fails. Every pull begins
-    from the same grasp. The object's motion is measured from the start of the trial, so it includes
-    the closing.
+    The pulls are along -x, +x, -y, +y, -z and +z of the grasp's frame, until one fails. With a
+    `truth.table` the axes are those of a frame on this table: z up, x along the hand's x axis.
+    Every pull starts from the same closed grasp. The object's motion counts from the start of the
+    trial, so it includes the closing.
 
     Args:
         trial: the hand, a single grasp and the true object.
         protocol: a protocol with pulls, or its name in `PROTOCOLS`.
 
-    Raises the errors of `close_hand`. Raises `BadArgument` for an unknown protocol, or a protocol
-    that lifts.
+    Raises the errors of `close_hand`. Raises `BadArgument` for an unknown protocol, or one without
+    pulls.
 
     >>> from torchgrasp import load_hand, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp

@@ -30,11 +30,11 @@ from torchgrasp.values.specs import TrialSpec
 
 
 class LiftTry(NamedTuple):
-    """One try of `lift_grasps`.
+    """One try of `lift_grasps`: a grasp and the record of its lift.
 
     Attributes:
-        row: index of the grasp that was tried, in the trial's grasps.
-        result: record of its lift.
+        row: index of the grasp in `trial.grasp`.
+        result: record of the lift, as `close_hand` returns it.
     """
 
     row: int
@@ -46,19 +46,19 @@ class LiftTry(NamedTuple):
 def lift_grasps(
     trial: GraspTrial, spec: TrialSpec | None = None, tries: Count = 3
 ) -> tuple[LiftTry, ...]:
-    """Lift an object with the first of several grasps, and with others where a lift fails; return
-    all tries.
+    """Lift an object with the first of several grasps, and with further ones while lifts fail;
+    return all tries.
 
-    The hand may feel that the object slides or stays behind (`LiftCheck`), or that it is too heavy.
-    Then it goes down, opens and withdraws. The object stays where it then is. The robot expects it
-    at the pose that the touches of the last try show, or looks once more. It tries another grasp,
-    the one that most likely holds (`GraspTry.next`).
+    The robot may feel that the object slides or stays behind (`LiftCheck`), or that it is too
+    heavy. Then the hand goes down, opens and withdraws; the object stays where it is. The robot
+    estimates the object's new pose from the touches, or looks again. Of the remaining grasps it
+    tries the one that most likely holds there (`GraspTry.next`).
 
     Args:
         trial: the hand, grasps in the order of preference, and the true object. `trial.truth.error`
             is the pose error of the first grasp.
         spec: parameters of the trial; None means `TrialSpec()`.
-        tries: largest number of tries. With 1 the trial is the same as in `close_hand`.
+        tries: largest number of tries. With 1 the trial is that of `close_hand`.
 
     Raises the errors of `close_hand`.
 

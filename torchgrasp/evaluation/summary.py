@@ -41,22 +41,25 @@ class ProtocolResult(Value):
 
     Attributes:
         rank: rank of the grasp among the executable grasps of its view; 0 is the best.
-        draw: number of the random pose error, from 0.
+        draw: index of the random pose error of the trial, from 0.
         passed: whether the trial passed under its protocol.
-        status: how the trial ended.
+        status: how the trial ended: `OK`, or why it failed.
         moved: motion [m] of the object's centre: in pulls in the world, in a lift relative to the
             hand.
         turned: rotation [rad] of the object: in pulls in the world, in a lift relative to the hand.
-        force: mean normal force [N] of the fingers: before the first pull, or at the end of a lift.
+        force: mean normal force [N] of the fingers, before the first pull or at the end of a lift.
         overlap: depth [m] by which the hand at the planned grasp penetrates the object.
         seconds: CPU time [s] of the trial.
-        slip: motion [m] of the object's centre in the closed hand, in a lift.
-        slip_angle: rotation [rad] of the object in the closed hand, in a lift.
+        slip: motion [m] of the object's centre in the hand from the end of pressing, in a lift.
+        slip_angle: rotation [rad] of the object in the hand from the end of pressing, in a lift.
         predicted: predicted probability of success of the grasp.
         tries: number of grasps that were tried. `rank`, `predicted`, `overlap`, `gap_mm`,
-            `deepest_mm` and `touch` belong to the first one. All else belongs to the last one.
-        cause: why the object of a lift was not held, such as "slid"; "" if there is none.
-        size: size of the cause, in the cause's own unit.
+            `deepest_mm` and `touch` are those of the first grasp, all other numbers those of the
+            last.
+        cause: why a lift did not hold the object, such as "slid"; "" if it was held, if the
+            simulation diverged, or in pulls.
+        size: size of the cause in the cause's unit: [mm] of "slid", [deg] of "turned", [N] of "too
+            weak".
         gap_mm: largest gap [mm] between a fingertip and the object at the planned posture. It is
             measured before any force and without a pose error.
         deepest_mm: smallest such gap [mm]; negative if the fingertip penetrates the object.
@@ -84,10 +87,11 @@ class ProtocolResult(Value):
 
     @property
     def held(self) -> bool:
-        """Whether the status is `OK`.
+        """Whether `status` is `OK`: the object withstood all pulls, or a lift held it.
 
-        In a lift, the object then rose, two fingers touch it, and it slipped little. `close_hand`
-        gives the bounds.
+        A lift holds an object if three conditions are met (`close_hand`). Its centre rose by at
+        least half of the lift's height. At least two fingers touch it at the end. It slipped by
+        less than 20 mm and 30 degrees in the closed hand.
         """
         return self.status is Status.OK
 
@@ -95,18 +99,18 @@ class ProtocolResult(Value):
 @checked
 @dataclasses.dataclass(frozen=True)
 class ViewScore(Value):
-    """The outcome of one view of an object: planning, and the trials of its grasps; `evaluate`
+    """The outcome of one view of an object: its planning, and the trials of its grasps; `evaluate`
     makes it.
 
     Attributes:
         object: name of the object.
         view: name of the view; "" if the object could not be read.
-        executable: number of executable grasps.
+        executable: number of executable grasps that were planned.
         seconds: CPU time [s] of planning; NaN if it was not measured.
         attempts: results of the trials, one for each tried grasp and pose error.
-        refusal: most frequent failure if no grasp is executable; else `OK`.
+        refusal: `OK` if a grasp is executable; else the most frequent failure of the plan.
         note: details of the refusal, or "".
-        family: family of similar objects, or "".
+        family: name of a family of similar objects, or "".
         group: group of the object, such as "solid", or "".
         fingers: names of the grasping fingers, joined by commas.
     """
@@ -124,9 +128,9 @@ class ViewScore(Value):
 
     @property
     def unit(self) -> str:
-        """The name of the unit that confidence intervals resample.
+        """The family of the object, or the object's name if it has no family.
 
-        It is the family of the object, or the object if it has no family.
+        Confidence intervals resample these units.
         """
         return self.family or self.object
 
@@ -138,25 +142,28 @@ def summarise(scores: Sequence[ViewScore]) -> dict[str, Any]:
     Success rates are `Share` values. Their 95 % intervals resample families of objects.
 
     * "gsr": grasp success rate, the share of trials that passed.
-    * "top1": share of best-ranked grasps that passed; a view without grasps counts as failed.
-    * "objects": share of objects with a success. "refused": number of views without a trial.
+    * "top1": share of trials of best-ranked grasps that passed; a view without grasps counts as
+      failed.
+    * "objects": share of objects with at least one trial that passed.
+    * "refused": number of views without a trial.
     * "executable": number of executable grasps.
-    * "by_object", "by_group": these five figures for each object and each group.
-    * "tries": numbers of trials that passed with the first grasp, with the second grasp, and so on.
-    * "failures": numbers of each status by stage: planning, start, closing, pulling or lifting,
+    * "by_object", "by_group": dicts of the five figures above for each object and each group.
+    * "tries": list of the numbers of trials that passed with the first grasp, with the second
+      grasp, and so on.
+    * "failures": the number of each status by stage: planning, start, closing, pulling or lifting,
       simulation.
-    * "causes": why objects were not held, each with "count", "by_group" and the "median" size.
+    * "causes": for each cause why a lift did not hold: its "count", "by_group" and "median" size.
     * "fingers": numbers of views with an executable grasp, by the grasping fingers.
     * "force_n" [N], "overlap_mm" [mm], "plan_cpu_s" [s], "trial_cpu_s" [s]: means, or None.
     * "overlap_mm_max": largest overlap [mm], or None. "cpu_s": total CPU time [s].
     * "slip_mm" [mm], "slip_deg" [deg]: (median, 95 % quantile) over the trials that passed, or
       None.
-    * "gap_mm" [mm]: (median, 95 % quantile) of the largest gaps before any force, or None.
-    * "touch": numbers of the verdicts on these gaps (`measure_touch`).
-    * "success": how well predicted success fits the outcomes, or None without predictions. "brier"
-      is the mean squared error. "skill" is 1 for perfect predictions, and 0 for always the
-      mean. "auc" is the area under the ROC curve. "error" is the expected calibration error over
-      the "bins".
+    * "gap_mm" [mm]: (median, 95 % quantile) of each trial's largest gap before any force, or None.
+    * "touch": number of each verdict on these gaps (`measure_touch`).
+    * "success": how well predicted success fits the outcomes, or None without predictions.
+      "predicted" and "passed" are means. "brier" is the mean squared error. "skill" is 1 for
+      perfect predictions, and 0 for always the mean. "auc" is the area under the ROC curve. "error"
+      is the expected calibration error over the "bins".
 
     >>> held = ProtocolResult(0, 0, True, Status.OK, predicted=0.9)
     >>> lost = ViewScore("pen", "view0", 0, 3.0, refusal=Status.OUT_OF_REACH)

@@ -44,21 +44,23 @@ def evaluate(
     folder: Path | None = None,
     workers: Annotated[int, Range(0, 1024)] = 0,
 ) -> Generator[ViewScore, None, None]:
-    """Yield the score of every view of a folder of objects: grasps are planned, then tried in
-    simulation.
+    """Plan grasps on every view of a folder of objects, and try them in simulation; yield a score
+    for each view.
 
-    Only the simulator uses the true mesh. An object with bad files or a bad entry gets a score with
-    a refusal.
+    The planner sees only the clouds; only the simulator uses the true meshes. An object with bad
+    files or a bad entry gives a score with a `refusal`. Nothing is planned before the first score
+    is asked for.
 
     Args:
-        objects: a folder of objects with its manifest, as `write_objects` makes it.
+        objects: folder of objects with its manifest, as `write_objects` makes it.
         hand: the hand that grasps.
         protocol: a protocol, or its name in `PROTOCOLS`.
         spec: which views and grasps are tried; None means `EvaluationSpec()`.
-        folder: folder for the executable grasps of each view, in OBJECT/VIEW.safetensors. None
-            means a temporary folder. No other run may write to it at the same time.
-        workers: number of worker processes; 0 means this process, without limits of time. The
-            scores do not depend on it.
+        folder: folder in which the executable grasps of each view are saved, as
+            OBJECT/VIEW.safetensors. None means a temporary folder. No other run may write to it at
+            the same time.
+        workers: number of worker processes. 0 means this process, without time limits. The scores
+            do not depend on it.
 
     Raises:
         BadArgument: the protocol is unknown.

@@ -47,13 +47,13 @@ TOUCH = TouchNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class Touch(Value):
-    """The gaps between the f fingertips of g grasps and the object; `measure_touch` makes it.
+    """The gaps between the f fingertips of g grasps and the object; `measure_touch` returns it.
 
     Attributes:
-        gaps: signed distances (g, f) [m] of the pads from the surface, at the planned postures.
-            They are negative where a pad penetrates the object, and NaN where a cloud does not show
-            the surface.
-        limit: greatest distance [m] of a fingertip that touches.
+        gaps: signed distances (g, f) [m] of the fingertips from the surface, at the planned
+            postures. They are negative where a fingertip penetrates the object, and NaN where a
+            cloud does not show the surface.
+        limit: largest size [m] of a gap of either sign at which a fingertip counts as touching.
     """
 
     gaps: Annotated[Float[Tensor, "g f"], ANY]
@@ -61,23 +61,23 @@ class Touch(Value):
 
     @property
     def largest(self) -> Float[Tensor, "g"]:
-        """Largest gap (g,) [m] of each grasp; NaN if none is known."""
+        """The largest gap (g,) [m] of each grasp; NaN if no gap of the grasp is known."""
         return _known(self.gaps.nan_to_num(-torch.inf).amax(-1))
 
     @property
     def deepest(self) -> Float[Tensor, "g"]:
-        """Smallest gap (g,) [m] of each grasp, negative if a pad penetrates the object; NaN if none
+        """The smallest gap (g,) [m] of each grasp, negative if a fingertip penetrates; NaN if none
         is known.
         """
         return _known(self.gaps.nan_to_num(torch.inf).amin(-1))
 
     @property
     def verdicts(self) -> list[Verdict]:
-        """The verdict on each of the g grasps.
+        """The verdict on each of the g grasps, the first that applies.
 
         * "apart": a fingertip is farther than `limit` from the surface.
-        * "penetrates": none is apart, but one is deeper in the object than `limit`.
-        * "unseen": the cloud does not show the surface at a fingertip; all others touch.
+        * "penetrates": a fingertip is deeper in the object than `limit`.
+        * "unseen": the cloud does not show the surface at a fingertip.
         * "touches": each fingertip is within `limit` of the surface.
         """
         verdicts = list[Verdict]()
@@ -107,19 +107,19 @@ def measure_touch(
 ) -> Touch:
     """Return the gaps between fingertips and an object at the planned posture of each grasp.
 
-    A gap is the signed distance from the surface to the sphere of a pad. For a pad without a sphere
-    it is the distance to its contact point. Forces, and errors of the pose, are not considered. In
-    a cloud with a viewpoint, the surface behind the seen one is unknown.
+    A gap is the signed distance from the object's surface to the sphere of a fingertip's pad. A pad
+    that is no sphere has only its contact point. No forces and no pose errors are taken into
+    account. The space behind the points of a cloud with a viewpoint counts as unseen.
 
     Args:
         hand: the hand of the grasps.
         grasps: g grasps; only `joints` and `obj_from_hand` are used.
         surface: the object's mesh [m] with faces turned outward, or its cloud [m], in the frame of
             the grasps.
-        limit: greatest gap [m] of a fingertip that touches.
+        limit: largest gap [m] of a fingertip that counts as touching.
 
-    Raises `BadArgument` for joints of another hand or beyond their limits. It is also raised for a
-    cloud without normals for which none can be estimated.
+    Raises `BadArgument` for joints of another hand or beyond their limits, and for a cloud whose
+    normals cannot be estimated.
 
     >>> from torchgrasp import load_hand, load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp

@@ -67,18 +67,18 @@ TRIALS = TrialNumbers()
 class Truth:
     """The true world of a trial, which only the simulator knows.
 
-    All is in the frame of the grasp, and lengths are in metres.
+    Everything is in the frame of the grasp, in metres.
 
     Args:
         mesh: closed mesh of the object [m], or its file.
         parts: convex parts of the mesh [m]; None means those that `convex_parts` computes.
-        error: rigid transform (4, 4) [m] from the hand's planned pose to its true pose. It is in
-            the frame of the planned hand. None means no error.
+        error: pose (4, 4) [m] of the true hand in the frame of the planned hand; None means no
+            error.
         table: the true table below the object. None means a level table at the mesh's lowest point.
-        neighbours: other bodies on the table.
+        neighbours: other bodies on the table, which the hand may push.
         slide: displacement (3,) [m] of the object halfway through the approach; None means none.
-        camera: pose (4, 4) [m] of a depth camera that looks at the object once more before the
-            approach. None means no second look.
+        camera: pose (4, 4) [m] of a depth camera (x right, y down, z forward) with which the robot
+            looks again before the approach. None means no second look.
     """
 
     mesh: "trimesh.Trimesh | Path | str"
@@ -93,7 +93,7 @@ class Truth:
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspTrial:
-    """The input of a trial: the truth, and what the robot knows.
+    """The input of a trial: the true world, and what the robot knows.
 
     `pull_grasp` and `lift_grasps` take it.
 
@@ -101,12 +101,12 @@ class GraspTrial:
         hand: the hand.
         grasp: one grasp of the hand, or for `lift_grasps` several in the order of preference.
         truth: the true world, which only the simulator knows.
-        seed: random seed of the noise. Friction and mass are drawn by it if they are distributions.
+        seed: seed of the sensors' noise, and of friction and mass if they are distributions.
         told: the table that the controller knows, in the frame of the grasp. None means the table
             of the plan (`Grasps.table`).
-        surface: estimated surface of the object (`surface_field`), in the frame of the grasp, by
-            which touches show the object's pose. None means the tangent planes of the planned
-            contacts.
+        surface: estimated surface of the object (`surface_field`), in the frame of the grasp. The
+            controller compares touches with it to estimate the object's pose. None means the
+            tangent planes of the planned contacts.
     """
 
     hand: Hand

@@ -58,13 +58,15 @@ class EvaluationSpec(Value):
 
     Args:
         grasps: largest number of grasps to try for each view.
-        ranks: "best" tries the best grasps, "spread" tries grasps spread evenly over all ranks.
+        ranks: "best" tries the best-ranked grasps, "spread" tries grasps spread evenly over all
+            ranks.
         starts: number of initial guesses of the contact planner.
-        complete: plan on whole clouds with normals, as if the shape were known. They are the views
-            "whole" of `read_view`.
+        complete: whether to plan on clouds of all sides with normals, as if the shape were known.
+            They are the views "whole" of `read_view`.
         only: names of the objects to evaluate; empty means all.
-        planned: read the grasps that an earlier call saved in `folder`, instead of planning.
-        seed: random seed.
+        planned: whether to read the grasps that an earlier call of `evaluate` saved in its
+            `folder`, instead of planning.
+        seed: seed of the planner, of the pose errors and of the trials.
         views: largest number of views of each object; None means all views.
         fingers: the fingers that grasp (`load_hand`); None means the hand's own. "auto" takes for
             each view the fingers most likely to succeed.
@@ -84,7 +86,7 @@ class EvaluationSpec(Value):
 
     @property
     def tried(self) -> str:
-        """Text that says which grasps are tried, such as "the 20 best of each view"."""
+        """Text that says which grasps of a view are tried, such as "the 20 best of each view"."""
         if self.ranks == "spread":
             return f"up to {self.grasps} of each view, spread over all ranks"
         return (

@@ -31,10 +31,10 @@ class ArmMotion(Value):
     Attributes:
         joint_names: names of the j joints: first the arm's, then all movable joints of the hand.
         times: times (t,) [s] from the start, beginning at 0.
-        positions: positions (g, t, j) [rad, or m for sliding joints] of these joints.
-        phases: index into `times` by name. "above": the hand is above its pre-grasp. "pregrasp" and
-            "grasp": it is there. "squeeze": it presses, and its joints are targets. "lift": it has
-            lifted the object.
+        positions: targets (g, t, j) [rad, or m for sliding joints] of these joints.
+        phases: index into `times` of each named moment. At "above" the opened hand is before its
+            pre-grasp, and at "pregrasp" it has arrived. At "grasp" the fingers are on the contacts,
+            and at "squeeze" their targets press. At "lift" the hand has lifted the object.
     """
 
     joint_names: tuple[str, ...]
@@ -49,19 +49,19 @@ def plan_motion(
 ) -> ArmMotion:
     """Return the motions of arm and hand through executable grasps that were planned with the arm.
 
-    The hand moves straight over the last 0.1 m to its pre-grasp, closes and presses. Then it is
-    lifted by 0.1 m along the normal of the plan's table, or along z without a table. Both motions
-    are at 0.1 m/s. The way to the first posture is not planned.
+    The opened hand moves straight over the last 0.1 m to its pre-grasp, closes and presses. Then it
+    is lifted by 0.1 m along the normal of the plan's table, or along z without a table. Approach
+    and lift take a second each. How the arm gets to the start of the approach is not planned.
 
     Args:
-        arm: the arm, at the place for which the grasps were planned.
+        arm: the arm, with the `obj_from_base` for which the grasps were planned.
         hand: the hand on the arm.
         grasps: executable grasps of `plan_grasps(..., arm=arm)`.
-        force: normal force [N] of the strongest finger in the squeeze.
+        force: normal force [N] of the strongest finger at the "squeeze".
         kp: stiffness [N m/rad] of the robot's position control; None means the hand's own.
 
-    Raises `BadArgument` for grasps without postures of this arm at its place, and for joints of
-    another hand.
+    Raises `BadArgument` for grasps that were planned without this arm or with it at another place,
+    and for joints of another hand.
 
     >>> grasps = plan_grasps(cloud, hand, spec, arm=arm)  # doctest: +SKIP
     >>> motion = plan_motion(arm, hand, grasps[:1])  # doctest: +SKIP

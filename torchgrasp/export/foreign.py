@@ -59,8 +59,8 @@ Quaternion = Literal["wxyz", "xyzw"]
 
 
 class ForeignGrasps(NamedTuple):
-    """The g grasps of a file of another program, for a hand with h actuated joints; `read_foreign`
-    makes it.
+    """The g grasps of another program's file, for a hand with h actuated joints; `read_foreign`
+    returns it.
 
     Attributes:
         joints: positions (g, h) [rad or m] of the actuated joints, in the order of
@@ -86,7 +86,8 @@ def read_foreign(
     unit_m: Positive = 1.0,
     root: str | Pose = "",
 ) -> ForeignGrasps:
-    """Return joints and poses of grasps from the file of another program, or from our own JSON.
+    """Return joints and poses of grasps from another program's file, or from the JSON of
+    `format_grasps`.
 
     `grasps_from_joints` makes `Grasps` of them.
 
@@ -97,9 +98,9 @@ def read_foreign(
     | `.npz` with `grasp_qpos` (DexGraspBench) | lines of pose and joints; `pregrasp_qpos`, if any |
     | `.yaml` of `isaac_grasp` 1.0 | pose, joints by name, pre-grasp if any |
 
-    With `obj_pose` in the file, poses are in the world, and are moved to the object's frame. A
-    wrist that moves from pre-grasp to grasp stays at the grasp here. The fingers of the pre-grasp
-    take up its motion, so that their tips are where the file has them.
+    If the file has an `obj_pose`, its poses are in the world, and are moved to the object's frame.
+    DexGraspBench's hand may move from pre-grasp to grasp. Here it stays at the grasp. The joints of
+    the pre-grasp are changed, so that its fingertips are where the file has them.
 
     Coupled and parked joints of the file may differ from the hand's, unless a fingertip moves by
     over 0.1 mm. A `GraspFileWarning` names values that are not kept, and joints that bend backward.
@@ -108,19 +109,20 @@ def read_foreign(
         path: the file. Its angles are in radians.
         hand: the grasping hand. For the Allegro hand DexGraspBench's frame and joint order are
             known.
-        order: names (as in the hand's URDF) of the joints in the file. `JOINT:FACTOR` or
-            `JOINT:FACTOR:OFFSET` convert a number of another sign, unit or zero [rad]. Values under
-            other names are not read.
+        order: names (as in the hand's URDF) of the numbers in a posture of the file, in their
+            order. `JOINT:FACTOR` or `JOINT:FACTOR:OFFSET` convert a number of another sign, unit or
+            zero [rad]. Numbers under names that the hand does not have are not read.
         quaternion: order of the four numbers after the position in a pose.
         unit_m: length [m] of one unit of the positions in the file.
-        root: the frame of the hand whose poses the file has. It is a link of our URDF, or the pose
-            (4, 4) [m] of our root link in that frame. "" means the link that the file names
-            (`root_link`, `base_link`, or the end of Isaac's `gripper_frame_link`). If none is
-            named, "" means DexGraspBench's frame of the Allegro hand, or our root link.
+        root: the hand's frame whose poses the file has: a link of the hand's URDF, or the pose (4,
+            4) [m] of its root link in that frame. "" means the link that the file names
+            (`root_link`, `base_link`, or the end of Isaac's `gripper_frame_link`). If it names
+            none, "" means the hand's root link, or DexGraspBench's frame of the Allegro hand.
 
     Raises:
-        ModelFileError: the file is missing or malformed, or its root link is none of ours. Joints
-            fit with another sign only, or do not follow as the hand's joints do.
+        ModelFileError: the file is missing or malformed, or names a root link that the hand does
+            not have.
+        ModelFileError: joints fit only with another sign, or do not follow as the hand's joints do.
         BadArgument: the `order` misses a joint.
 
     >>> import tempfile
@@ -382,12 +384,12 @@ def grasps_from_joints(
 ) -> Grasps:
     """Return imported joints and poses as `Grasps`, for `certify`, `close_hand` and the exporters.
 
-    Each contact is at the middle of a pad, with a normal opposite to the pad's normal. Certificates
-    are for these contacts. A grasp without frictional form closure gets `Status.NOT_CLOSED`.
-    Replace contacts and certificate if you know the surface.
+    No object is known. So each contact is in the middle of a fingertip's pad, and its normal is
+    opposite to the pad's normal. Certificates are for these contacts. A grasp without frictional
+    form closure gets `Status.NOT_CLOSED`. Replace contacts and certificate if you know the surface.
 
-    `clearance` is only the clearance between links, and success is unknown, because no object is
-    known. `approach` is the approach axis of the hand.
+    `clearance` is only that between links, and the success is unknown (NaN). `approach` is the
+    hand's approach axis.
 
     Args:
         hand: the hand.
@@ -396,8 +398,8 @@ def grasps_from_joints(
         obj_from_hand: poses (g, 4, 4) [m] of the hand's root link in the object's frame.
         pregrasp: positions (g, h) [rad or m] of the opened hand's joints. None means that each tip
             moves 20 mm off its contact, or as far as limits allow.
-        table: the table under the object, in the object's frame, above which an opened hand stays.
-            None means no table, or an unknown one.
+        table: the table under the object, in the object's frame; the opened hand stays above it.
+            None means that there is no table, or that it is unknown.
         spec: friction and number of cone edges of the certificate; None means `ContactSpec()`.
         std_m: standard deviation [m] of the surface at each contact, for closing modes that use it.
             None means unknown.

@@ -62,35 +62,40 @@ def format_isaac(
     gripper_link: str | None = None,
     isaac_ros: bool = False,
 ) -> str:
-    """Return grasps as the YAML text of an `isaac_grasp` file of version 1.0, in metres, radians.
+    """Return grasps as the YAML text of an `isaac_grasp` file of version 1.0, in metres and
+    radians.
 
-    * `position` and `orientation` (w, x, y, z) are the pose of the gripper's frame in
-      the object's frame. The object's frame is the frame of the planned cloud.
+    * `position` and `orientation` (w, x, y, z) are the pose of the gripper's frame in the object's
+      frame. The object's frame is that of the planned cloud.
     * `cspace_position` has the joints at the contacts, by name.
     * `pregrasp_cspace_position` has the joints of the opened hand.
-    * `squeeze_cspace_position`, a key of ours, has the targets that press.
+    * `squeeze_cspace_position`, a key of torchgrasp, has joint targets with which the fingers
+      press.
     * `confidence` is the predicted success, 0 where it is unknown.
 
     Args:
         hand: the hand.
         grasps: grasps planned for this hand, best first.
-        force: normal force [N] of the strongest finger in the squeeze.
+        force: normal force [N] of the strongest finger when the fingers press.
         kp: stiffness [N m/rad] of the robot's position control; None means the hand's own.
         rename: the robot's names of joints, by their names in the URDF; None keeps all names.
-        flange: pose (4, 4) [m] of the robot's flange in the frame of the root link. With it, poses
-            are the flange's. None means poses of `gripper_link`.
+        flange: pose (4, 4) [m] of the robot's flange in the frame of the hand's root link. With it,
+            the gripper's frame is the flange. None means the frame of `gripper_link`.
         object_id: name of the object's frame, such as its path in the stage.
-        actuated: leave out joints that follow others. By default all joints of the hand are
-            written.
-        gripper_link: name of the gripper's frame, or its path in the stage. Without a `flange`,
-            poses are of the link of the URDF that its last part names, else of the root link. With
-            a `flange`, it only names the flange. None means the root link, or "flange".
-        isaac_ros: write the names of Isaac ROS, `object_frame` and `gripper_frame`.
+        actuated: whether to leave out coupled joints, which follow others.
+        gripper_link: name of the gripper's frame, or its path in the stage. Without a `flange`, its
+            last part names the link of the URDF whose poses are written; an unknown name means the
+            root link. With a `flange`, it only names the flange. None means the root link, or
+            "flange".
+        isaac_ros: whether to write the frames under the keys of Isaac ROS, `object_frame` and
+            `gripper_frame`.
 
     Raises:
-        BadArgument: joints are of another hand. The `force` is outside 0.01 to 100 N, or `kp` is
-            not positive. Names are unknown, empty or equal. A hand goes down while it closes,
-            which a file with one pose cannot express.
+        BadArgument: joints are of another hand.
+        BadArgument: the `force` is outside 0.01 to 100 N, or `kp` is not positive.
+        BadArgument: names are unknown, empty or equal.
+        BadArgument: a hand must go down while it closes, because its opened fingers would be in the
+            table. A file with one pose for each grasp cannot express this.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp

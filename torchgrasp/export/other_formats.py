@@ -47,13 +47,13 @@ def save_dexgraspbench(
     force: Force = 4.0,
     kp: Positive = 5.0,
 ) -> list[Path]:
-    """Write each grasp as a file of DexGraspBench's evaluator; return the paths of the files.
+    """Write each grasp as a file for DexGraspBench's evaluator; return the paths of the files.
 
     The files are `folder/0.npy`, `folder/1.npy` and so on. A file is a pickled dictionary, because
     the evaluator accepts nothing else. It holds only arrays, numbers and a text: `obj_path`,
     `obj_scale` (1), `obj_pose` (identity), `pregrasp_qpos`, `grasp_qpos` and `squeeze_qpos`. Each
     `qpos` has 23 numbers: position [m] and quaternion (w, x, y, z) of the hand, then 16 joints
-    [rad].
+    [rad]. Those of the squeeze are targets with which the fingers press.
 
     Args:
         hand: the Allegro hand, whose model DexGraspBench has.
@@ -65,7 +65,7 @@ def save_dexgraspbench(
         kp: stiffness [N m/rad] of DexGraspBench's drives.
 
     Raises:
-        BadArgument: DexGraspBench does not have the hand, or joints are of another hand.
+        BadArgument: the hand is not the Allegro hand, or joints are of another hand.
         OutputError: a file cannot be written.
 
     >>> import tempfile
@@ -103,8 +103,8 @@ def format_graspgen(grasps: Grasps, object_path: str) -> str:
     """Return grasps as the JSON text of a GraspGen data set.
 
     `transforms` [m] are poses of the hand's root link in the object's frame. `object_in_gripper`
-    says which grasps are executable. The fields `success` (predicted probability), `joints` [rad or
-    m] and `joint_names` are our additions.
+    says which grasps are executable. The fields `success` (predicted probability, null if unknown),
+    `joints` [rad or m] and `joint_names` are additions of torchgrasp.
 
     Args:
         grasps: grasps, executable or not.
@@ -142,10 +142,11 @@ def bench_frame(hand: Hand) -> tuple[Float[Tensor, "4 4"], tuple[str, ...]]:
 
 @checked
 def save_surface(surface: Surface, path: Path | str) -> Path:
-    """Write a surface, with its uncertainty as colours, to a .ply or .glb file; return the path.
+    """Write an estimated surface, coloured by its uncertainty, as a .ply or .glb file; return the
+    path.
 
-    Violet marks a standard deviation of 0, yellow one of `largest_std` or more. A .ply file also
-    has `std_m` [m] of each vertex.
+    Violet marks a standard deviation of 0, yellow one of `largest_std(surface)` or more. A .ply
+    file also has `std_m` [m] of each vertex.
 
     Args:
         surface: the surface, as `extract_surface` returns it.
@@ -181,9 +182,9 @@ def save_surface(surface: Surface, path: Path | str) -> Path:
 
 @checked
 def largest_std(surface: Surface) -> float:
-    """Return the upper end [m] of the colour scale of `save_surface`.
+    """Return the standard deviation [m] at the upper end of the colours of `save_surface`.
 
-    It is the 99 % quantile of the vertices' standard deviations, at least 1e-6 m.
+    It is the 99 % quantile over the vertices of the surface, at least 1e-6 m.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> from torchgrasp.shape import extract_surface
@@ -196,7 +197,7 @@ def largest_std(surface: Surface) -> float:
 
 @checked
 def check_surface_path(path: Path | str) -> Path:
-    """Return the path if `save_surface` can write a file with its suffix; otherwise raise
+    """Return the path if it ends in .ply or .glb, as `save_surface` needs; else raise
     `BadArgument`.
 
     >>> check_surface_path("a.glb").suffix

@@ -92,19 +92,20 @@ def save_play(
     *,
     parts: "Sequence[trimesh.Trimesh] | None" = None,
 ) -> Path:
-    """Write a folder in which `python play.py 0` plays the first grasp in a simulator; return the
-    folder.
+    """Write a folder with a script that plays the grasps in a simulator; return the folder.
 
-    The script needs only the simulator and NumPy. The hand comes along its approach, closes in open
-    loop, presses, lifts and holds. The script prints one line of JSON: how far the object rose [m],
-    and whether this is at least half of the lift. `play.json` has the motion, drives, contacts and
-    the object; its text "frames" explains the numbers.
+    `python play.py 0` in the folder plays the first grasp. The script needs only the simulator and
+    NumPy. The hand moves along its approach, closes without sensors, presses, lifts and holds. Then
+    a line of JSON says how far the object rose [m], and whether this is at least half of the lift.
+    `play.json` has the motion, the drives, the contacts and the object; its text "frames" explains
+    the numbers.
 
     Args:
         hand: the hand.
         grasps: one or more grasps of the hand.
         folder: the folder to write.
-        player: the simulator, or "usd" for a scene.
+        player: the simulator: "mujoco", "maniskill", "newton" or "isaaclab". "usd" means a USD
+            scene, whose script writes the grasp's motion as a USD file and does not play it.
         mesh: closed mesh of the object [m] in the frame of the grasps. It may be the estimated
             `Surface`, whose points below the table are moved up to it.
         spec: mass, friction, force, stiffness, heights, times and timestep; None means

@@ -45,20 +45,23 @@ def format_grasps(
     rename: Mapping[str, str] | None = None,
     flange: Pose | None = None,
 ) -> str:
-    """Return grasps as JSON text, with postures by joint name and an explanation of all numbers.
+    """Return grasps as JSON text, with three postures by joint name and an explanation of all
+    numbers.
 
-    In its "pregrasp" posture, the hand moves along "approach" to its "pose", raised by "rise". It
-    closes to "grasp" in the given time. In the same time again it presses towards "squeeze". All
-    joints move at constant speeds. Poses are in the object's frame.
+    A robot plays a grasp in three steps. In the posture "pregrasp" the hand moves along "approach"
+    to its "pose", displaced by "rise". Then it moves to "pose" and closes to "grasp". At last it
+    moves towards "squeeze", targets with which the fingers press. The times are in "time"; joints
+    move at constant speeds. Poses are in the object's frame, which is the frame of the planned
+    cloud.
 
     Args:
         hand: the hand.
         grasps: grasps planned for this hand, best first.
-        force: normal force [N] of the strongest finger in the squeeze.
+        force: normal force [N] of the strongest finger at the squeeze.
         kp: stiffness [N m/rad] of the robot's position control; None means the hand's own.
         rename: the robot's names of joints, by their names in the URDF; None keeps all names.
-        flange: pose (4, 4) [m] of the robot's flange in the frame of the root link. With it, the
-            flange's pose is added as "flange".
+        flange: pose (4, 4) [m] of the robot's flange in the frame of the hand's root link. With it,
+            the flange's pose is added as "flange".
 
     Raises `BadArgument` for joints of another hand, and for names that are unknown, empty or equal.
     It is also raised for a `force` outside 0.01 to 100 N, or a `kp` that is not positive.
@@ -215,20 +218,20 @@ def quaternion(a_from_b: Tensor | np.ndarray) -> list[float]:
 def format_keyframes(
     hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None = None
 ) -> str:
-    """Return the hand as MJCF text with four keyframes for each grasp.
+    """Return the hand as MJCF text (of MuJoCo) with four keyframes for each grasp.
 
-    They are `grasp_0_approach`, `grasp_0_pregrasp`, `grasp_0_grasp` and `grasp_0_squeeze`. In the
-    approach the hand is 0.1 m before its pre-grasp, with the same joints. The squeeze has the
-    joints of the grasp and targets that press.
+    Those of the first grasp are `grasp_0_approach`, `grasp_0_pregrasp`, `grasp_0_grasp` and
+    `grasp_0_squeeze`. At the approach the opened hand is 0.1 m before its pre-grasp. The squeeze
+    has the joints of the grasp, and targets with which the fingers press.
 
-    The world is the object's frame. `qpos` is the free joint, then the joints of the model [rad or
-    m]. `ctrl` holds the targets [rad or m] of the actuators. The text elements "qpos" and "ctrl"
-    name their order.
+    The world is the object's frame. `qpos` is the pose of the hand's free joint, then the joints of
+    the model [rad or m]. `ctrl` holds the targets [rad or m] of the actuators. The text elements
+    "qpos" and "ctrl" of the model name their order.
 
     Args:
         hand: the hand.
         grasps: grasps planned for this hand, best first.
-        force: normal force [N] of the strongest finger in the squeeze.
+        force: normal force [N] of the strongest finger at the squeeze.
         kp: stiffness [N m/rad] of every drive; None means the hand's own.
 
     Raises `BadArgument` for joints of another hand. It is also raised for a `force` outside 0.01 to

@@ -63,32 +63,35 @@ def format_moveit(
     object_id: str = OBJECT_FRAME,
     actuated: bool = False,
 ) -> str:
-    """Return grasps as a YAML list of moveit_msgs/Grasp, in metres and radians.
+    """Return grasps as a YAML list of moveit_msgs/Grasp, in metres, radians and seconds.
 
-    `grasp_pose` is the pose of the hand's root link, or of the robot's flange, in the frame
-    "object". Publish a transform of this name: it is the frame of the planned cloud.
-    `pre_grasp_posture` has the joints of the opened hand. `grasp_posture` has the joints at the
-    contacts, then targets that press, with torques [N m] as effort. `time_from_start` is in
-    seconds. `grasp_quality` is the predicted success. The retreat is along the normal of the plan's
-    table, or along z without a table.
+    * `grasp_pose` is the pose of the hand's root link, or of the robot's flange, in the frame
+      "object". This is the frame of the planned cloud; publish a transform of this name.
+    * `pre_grasp_posture` has the joints of the opened hand.
+    * `grasp_posture` has the joints at the contacts, then targets with which the fingers press,
+      with their torques [N m] as effort.
+    * `grasp_quality` is the predicted success, .nan where it is unknown.
+    * `post_grasp_retreat` is along the normal of the plan's table, or along z without a table.
 
     Args:
         hand: the hand.
         grasps: grasps planned for this hand, best first.
-        force: normal force [N] of the strongest finger in the squeeze.
+        force: normal force [N] of the strongest finger when the fingers press.
         kp: stiffness [N m/rad] of the robot's position control; None means the hand's own.
         rename: the robot's names of joints, by their names in the URDF. These joints come first, in
             this order. None keeps all names.
-        flange: pose (4, 4) [m] of the robot's flange in the frame of the root link. With it, poses
-            are the flange's. None means poses of the root link.
+        flange: pose (4, 4) [m] of the robot's flange in the frame of the hand's root link. With it,
+            poses are the flange's. None means poses of the root link.
         object_id: id of the object in the planning scene, which the hand may touch.
-        actuated: leave out efforts, and joints that follow others. Controllers of ros2_control
-            refuse both.
+        actuated: whether to leave out efforts and coupled joints, which follow others. Controllers
+            of ros2_control refuse both.
 
     Raises:
-        BadArgument: joints are of another hand. The `force` is outside 0.01 to 100 N, or `kp` is
-            not positive. Names are unknown, empty or equal. A hand goes down while it closes,
-            which a message with one pose cannot express.
+        BadArgument: joints are of another hand.
+        BadArgument: the `force` is outside 0.01 to 100 N, or `kp` is not positive.
+        BadArgument: names are unknown, empty or equal.
+        BadArgument: a hand must go down while it closes, because its opened fingers would be in the
+            table. A message with one pose cannot express this.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -134,22 +137,22 @@ def format_trajectories(
     rename: Mapping[str, str] | None = None,
     actuated: bool = False,
 ) -> str:
-    """Return a YAML document of trajectory_msgs/JointTrajectory for each grasp.
+    """Return a text with a YAML document of trajectory_msgs/JointTrajectory for each grasp.
 
-    Each trajectory has three points: pre-grasp, grasp and squeeze, with `time_from_start` in
-    seconds. The hand must already be at its pose, which `format_moveit` and `format_grasps` give.
-    The points have no efforts, which controllers of positions refuse. `format_grasps` has the
-    torques.
+    Each trajectory of the hand's joints has three points: pre-grasp, grasp, and squeeze, where
+    targets press. `time_from_start` is in seconds. The hand must already be at its pose, which
+    `format_moveit` and `format_grasps` give. The points have no efforts, which position controllers
+    refuse; `format_grasps` has the torques.
 
     Args:
         hand: the hand.
         grasps: grasps planned for this hand, best first.
-        force: normal force [N] of the strongest finger in the squeeze.
+        force: normal force [N] of the strongest finger at the squeeze.
         kp: stiffness [N m/rad] of the robot's position control; None means the hand's own.
         rename: the robot's names of joints, by their names in the URDF. These joints come first, in
             this order. None keeps all names.
-        actuated: leave out joints that follow others. Controllers of ros2_control refuse their
-            names.
+        actuated: whether to leave out coupled joints, which follow others. Controllers of
+            ros2_control refuse their names.
 
     Raises `BadArgument` for joints of another hand, and for names that are unknown, empty or equal.
     It is also raised for a `force` outside 0.01 to 100 N, or a `kp` that is not positive.
@@ -169,14 +172,15 @@ def format_trajectories(
 
 @checked
 def format_motion(hand: Hand, motion: ArmMotion, actuated: bool = False) -> str:
-    """Return a YAML document of trajectory_msgs/JointTrajectory for each grasp, of arm and hand.
+    """Return a text with a YAML document of trajectory_msgs/JointTrajectory for each grasp, of arm
+    and hand.
 
     Positions are in [rad], or [m] for sliding joints; `time_from_start` is in seconds.
 
     Args:
         hand: the hand on the arm.
         motion: the motions, from `plan_motion`.
-        actuated: leave out joints of the hand that follow others.
+        actuated: whether to leave out coupled joints of the hand, which follow others.
 
     >>> import torch
     >>> from torchgrasp import load_hand

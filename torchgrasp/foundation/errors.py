@@ -147,7 +147,9 @@ class DegenerateContacts(GraspError, ValueError):
 
 
 class BrokenLaw(GraspError, AssertionError):
-    """The kinematics of a hand break a law that `check_hand` checks; `law` is the law's name.
+    """The kinematics of a hand break a law, a property of all hands that `check_hand` tests.
+
+    The attribute `law` is the name of the law.
 
     >>> error = BrokenLaw("order", "2 nan", "finite numbers")
     >>> error.law, str(error)
@@ -204,10 +206,11 @@ class GraspFileWarning(UserWarning):
 
 
 class Status(enum.IntEnum):
-    """The outcome of one row of a batch, such as one grasp.
+    """The outcome of one row of a batch, such as one grasp: success, or the reason of a failure.
 
-    It is an integer: 0 (`OK`) means success, and other values are failures. `name` is its name, and
-    `sentence` explains it. `Status(code)` makes one from an entry of a `status` tensor.
+    A status is an integer: 0 (`OK`) means success, other values are failures. Its `name`, such as
+    "NOT_CLOSED", is short, and its `sentence` explains it. `Status(code)` turns an entry of a
+    `status` tensor into one.
 
     >>> Status.NOT_CLOSED.sentence
     'the contacts do not resist every wrench at the planned friction (no frictional form closure)'

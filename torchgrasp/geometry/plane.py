@@ -37,15 +37,15 @@ MOST_ABOVE = 0.01
 @checked
 @dataclasses.dataclass(frozen=True)
 class Plane(Value):
-    """A table plane: the points p [m] with normal . p = offset. Objects stand on the side of the
-    normal.
+    """The plane of a table: the points p [m] with normal . p = offset. The normal points up, to the
+    objects.
 
     Args:
-        normal: unit normal (3,), which points up.
+        normal: unit normal (3,).
         offset: distance [m] of the plane from the origin along the normal; negative if the plane is
             below the origin.
 
-    Raises `BadArgument` if the normal is not of unit length, or if a number is not finite.
+    Raises `BadArgument` if the normal is not of unit length, or a number is not finite.
 
     >>> plane = Plane.horizontal(0.1)
     >>> plane.describe(), plane.height(torch.tensor([0.0, 0.0, 0.3]))
@@ -63,7 +63,7 @@ class Plane(Value):
     @classmethod
     @checked
     def horizontal(cls, height: float) -> "Plane":
-        """Return the plane z = `height` [m]."""
+        """Return the plane z = `height` [m], with the normal (0, 0, 1) in float64."""
         return cls(real([0.0, 0.0, 1.0]), float(height))
 
     @checked(gradients=True)
@@ -76,14 +76,15 @@ class Plane(Value):
 
     @checked
     def moved(self, b_from_a: Pose) -> "Plane":
-        """Return the plane in frame b, given the rigid transform `b_from_a` (4, 4) [m] from its own
-        frame a.
+        """Return the same plane in another frame b, in float64.
+
+        `b_from_a` is the rigid transform (4, 4) [m] from the plane's present frame a to b.
         """
         normal = b_from_a[:3, :3].double() @ self.normal.double()
         return Plane(unit(normal), self.offset + float(normal @ b_from_a[:3, 3].double()))
 
     def describe(self) -> str:
-        """Return normal and offset [m] as text, for example "normal 0 0 1, offset 0.1"."""
+        """Return the normal and the offset [m] as text, such as "normal 0 0 1, offset 0.1"."""
         x, y, z = self.normal.tolist()
         return f"normal {x:.9g} {y:.9g} {z:.9g}, offset {self.offset:.9g}"
 

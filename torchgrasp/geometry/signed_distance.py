@@ -93,8 +93,8 @@ class DistanceField(Value, abc.ABC):
     def nearest_node(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
         """Return the signed distance (*b,) [m] at the grid node nearest to each point (*b, 3) [m].
 
-        For a point outside the grid it is a node at the border. b stands for any batch axes.
-        `query` is slower and interpolates.
+        For a point outside the grid this is a node at the border of the grid. b stands for any
+        batch axes. `query` is slower, and interpolates.
         """
         grid = self._grid(points)
         spacing = grid.spacing[..., 0] if isinstance(grid.spacing, Tensor) else grid.spacing
@@ -150,15 +150,17 @@ class DistanceField(Value, abc.ABC):
 @checked
 @dataclasses.dataclass(frozen=True)
 class SignedDistanceField(DistanceField):
-    """Signed distances [m] of one object on a grid, negative inside.
+    """Signed distances [m] of one object at the nodes of a regular grid, negative inside the
+    object.
 
-    `surface_field` makes it of a shape.
+    `surface_field` makes it of an estimated shape. The grid is along the axes of the object's
+    frame.
 
     Args:
         origin: position (3,) [m] of node (0, 0, 0).
         spacing: distance [m] of neighbouring nodes.
-        values: signed distances (x, y, z) [m]; `values[i, j, k]` is at the point `origin` +
-            (i, j, k) * `spacing`.
+        values: signed distances (x, y, z) [m]; `values[i, j, k]` is at the point `origin` + (i, j,
+            k) * `spacing`.
 
     >>> nodes = torch.cartesian_prod(*[torch.linspace(-0.1, 0.1, 41)] * 3)
     >>> ball = nodes.norm(dim=1).reshape(41, 41, 41) - 0.05
@@ -181,8 +183,9 @@ class SignedDistanceField(DistanceField):
 
     @checked
     def rows(self, index: Int[Tensor, "k"]) -> "SignedDistanceField":
-        """Return this field unchanged: the field of one object is the same for every entry of
-        `index` (k,).
+        """Return this field unchanged, whatever the `index` (k,).
+
+        Other distance fields hold one object for each entry of a batch, and return some of them.
         """
         return self
 

@@ -38,15 +38,16 @@ ABILITY = AbilityNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class FingerAbility:
-    """What the tip of one finger can do; `hand_abilities` makes it.
+    """What one fingertip can do; `hand_abilities` makes it.
 
     Attributes:
         name: name of the finger.
         tip_link: name of the link of its tip.
         joints: number of the actuated joints that move the tip.
-        force: normal force [N] with which the tip presses in the median free posture. NaN if no
-            joint moves the contact point along its normal: the structure then carries the load.
-        sure_force: normal force [N] that nine of ten free postures reach. NaN as for `force`.
+        force: greatest normal force [N] of the tip in the median free posture. NaN if no joint
+            moves the contact point along its normal: then the structure carries the load.
+        sure_force: greatest normal force [N] that is reached in 90 % of the free postures. NaN as
+            for `force`.
 
     Both forces act at the contact point of the pad, along the pad's normal. No other finger
     presses, and each actuated joint exerts at most its effort. A posture is free if no links of the
@@ -66,19 +67,19 @@ class PairAbility:
     """What two fingertips can do together; `hand_abilities` makes it.
 
     Attributes:
-        fingers: names of both fingers, in grasp order.
+        fingers: names of both fingers.
         least_span: least distance [m] between the contact points of the two pads, over the free
             postures.
         greatest_span: greatest distance [m] between these contact points.
-        least_width: least thickness [m] of a plate that the tips hold between them. NaN if no free
-            posture holds a plate.
-        greatest_width: greatest thickness [m] of a plate that the tips hold. NaN as for
-            `least_width`.
+        least_width: least thickness [m] of a plate that the two tips hold between them. NaN if they
+            hold none in any free posture.
+        greatest_width: greatest thickness [m] of such a plate. NaN as for `least_width`.
         opposed: share [0 to 1] of the free postures in which the tips hold a plate.
 
-    A posture is free if no links of the hand overlap. Tips hold a plate if the line between the
-    centres of their spheres lies in the cones of both pads. `Fingertips.cone` is the half angle of
-    these cones. The plate is as thick as the gap of the tips on this line.
+    A posture is free if no links of the hand overlap. Two tips hold a plate if they face each
+    other: the line between the centres of their spheres lies in the cones of both pads.
+    `Fingertips.cone` is the half angle of these cones. The plate is as thick as the gap between the
+    tips on this line.
     """
 
     fingers: tuple[str, str]
@@ -92,16 +93,16 @@ class PairAbility:
 @checked
 @dataclasses.dataclass(frozen=True)
 class HandAbilities:
-    """What a hand can do with one choice of grasping fingers; `hand_abilities` makes it.
+    """What a hand can do with its grasping fingers; `hand_abilities` returns it.
 
     Attributes:
         hand: name of the hand.
-        option: option of hand.toml by which the fingers were chosen, or their names.
+        option: name of the option of hand.toml that lists the fingers; or the names of the fingers.
         joints: number of actuated joints.
         postures: number of random postures that were drawn.
         seed: seed of these postures.
         free: share [0 to 1] of the postures in which no links of the hand overlap.
-        fingers: a `FingerAbility` for each grasping finger, in grasp order.
+        fingers: a `FingerAbility` for each grasping finger.
         pairs: a `PairAbility` for each pair of grasping fingers.
     """
 
@@ -116,19 +117,20 @@ class HandAbilities:
 
     @property
     def least_width(self) -> float:
-        """Least thickness [m] of a plate that any two tips hold; NaN if no two tips hold one."""
+        """The least thickness [m] of a plate that two tips hold; NaN if no tips hold one."""
         return min(_known(pair.least_width for pair in self.pairs), default=math.nan)
 
     @property
     def greatest_width(self) -> float:
-        """Greatest thickness [m] of a plate that any two tips hold; NaN if no two tips hold one."""
+        """The greatest thickness [m] of a plate that two tips hold; NaN if no tips hold one."""
         return max(_known(pair.greatest_width for pair in self.pairs), default=math.nan)
 
     @checked
     def content(self) -> dict[str, Any]:
         """Return the abilities as a dict for JSON.
 
-        Keys end with the unit, as `force_n`. Numbers have six significant digits. NaN becomes None.
+        Keys of numbers with a unit end with it, as `force_n`. Numbers have six significant digits.
+        NaN becomes None.
         """
         fingers = [
             {
@@ -167,9 +169,9 @@ def hand_abilities(hand: Hand, postures: Count = 5000, seed: Seed = 0) -> HandAb
     """Return what a hand can do with its grasping fingers, measured in random postures.
 
     Args:
-        hand: the hand, with its grasping fingers. It caches the result.
-        postures: number of random postures, uniform within the joint limits. Extremes are over
-            these postures: more postures approach the hand's own extremes.
+        hand: the hand, with its grasping fingers. The result is cached in `hand.derived`.
+        postures: number of random postures, uniform within the joint limits. With more postures,
+            the least and greatest values come nearer to those of the hand.
         seed: seed of the random postures.
 
     Raises `BadArgument` if links of the hand overlap in every drawn posture.

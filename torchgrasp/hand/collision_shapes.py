@@ -66,9 +66,10 @@ class CollisionSpheres(Value):
         link_index: index (s,) of the link of each sphere, in `Hand.tree.link_names`.
         center: centre (s, 3) [m] of each sphere, in the frame of its link.
         radius: radius (s,) [m] of each sphere.
-        finger: index (s,) of the grasping finger of each sphere, in grasp order. It is -1 for the
+        finger: index (s,) in `Hand.finger_names` of the finger of each sphere. It is -1 for the
             palm, and -2 for a finger that does not grasp.
-        touching: mask (s,) of the spheres of the grasping fingers' tip links.
+        touching: mask (s,) of the spheres on the links of the grasping fingertips, which may touch
+            objects.
 
     >>> from torchgrasp import load_hand
     >>> load_hand("barrett").collision_spheres.center.shape

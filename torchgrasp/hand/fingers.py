@@ -38,15 +38,16 @@ touch.
 class ActuatedJoints(Value):
     """The h actuated joints of the grasping fingers; a `Hand` holds them as `actuated`.
 
-    All j movable joints of the URDF follow the actuated joints. Their positions are `coupling @
+    The actuated joints determine all j movable joints of the URDF. Their positions are `coupling @
     joints + offset`.
 
     Attributes:
         names: names of the h actuated joints, in the order of every tensor of joints.
         lower: lower limits (h,) [rad, or m for a sliding joint].
         upper: upper limits (h,) [rad or m].
-        coupling: motion of each movable joint for each actuated joint (j, h).
-        offset: positions (j,) [rad or m] of the movable joints with all actuated joints at 0.
+        coupling: matrix (j, h): the motion of each movable joint for a unit motion of each actuated
+            joint.
+        offset: positions (j,) [rad or m] of the movable joints if all actuated joints are at 0.
 
     >>> from torchgrasp import load_hand
     >>> actuated = load_hand("barrett").actuated
@@ -64,30 +65,38 @@ class ActuatedJoints(Value):
     def expand(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b j"]:
         """Return the positions (*b, j) [rad or m] of all j movable joints of the URDF.
 
-        `joints` (*b, h) are positions [rad or m] of the h actuated joints. Raises `BadArgument` for
-        joints of a wrong count, dtype or device, and for NaN or infinity. Limits are not checked.
+        b stands for any batch axes. Limits are not checked.
+
+        Args:
+            joints: positions (*b, h) [rad or m] of the h actuated joints.
+
+        Raises `BadArgument` for joints of a wrong count, dtype or device, and for NaN or infinity.
         """
         self.check(joints)
         return self.couple(joints)
 
     @checked(gradients=True)
     def couple(self, joints: Annotated[Float[Tensor, "*b h"], ANY]) -> Float[Tensor, "*b j"]:
-        """Return the positions (*b, j) [rad or m] of all movable joints of the URDF; NaN and
-        infinity pass.
+        """Return what `expand` returns, without a check for NaN and infinity, which pass.
 
-        `joints` (*b, h) are positions [rad or m] of the h actuated joints. Unlike in `expand`,
-        their numbers are not checked, because a check would wait for the GPU. Raises `BadArgument`
-        for a wrong count of joints.
+        On a GPU such a check would wait for the numbers.
+
+        Args:
+            joints: positions (*b, h) [rad or m] of the h actuated joints.
+
+        Raises `BadArgument` for a wrong count of joints.
         """
         return joints @ self.coupling.to(joints).T + self.offset.to(joints)
 
     @checked(gradients=True)
     def check(self, joints: Tensor, name: str = "joints") -> None:
-        """Raise `BadArgument` unless `joints` (*b, h) are finite positions [rad or m] of the h
-        actuated joints.
+        """Raise `BadArgument` unless `joints` are finite positions of the h actuated joints.
 
-        The error is raised for joints of a wrong count, dtype or device, for NaN and for infinity.
-        Its text calls the argument `name`. Limits are not checked.
+        A wrong count, dtype or device is refused, too. Limits are not checked.
+
+        Args:
+            joints: positions (*b, h) [rad or m] of the actuated joints.
+            name: name of the argument in the text of the error.
         """
         if joints.ndim < 1 or joints.shape[-1] != len(self.names):
             allowed = f"{len(self.names)} joints in the last axis: {self.names}"
@@ -99,10 +108,13 @@ class ActuatedJoints(Value):
 
     @checked(gradients=True)
     def check_limits(self, joints: Tensor, name: str = "joints") -> None:
-        """Raise `BadArgument` unless `joints` (*b, h) [rad or m] are within their limits.
+        """Raise `BadArgument` unless all `joints` are within their limits.
 
-        A joint may exceed a limit by the rounding of float32. The errors of `check` are raised,
-        too. The error's text calls the argument `name`.
+        A limit may be exceeded by the rounding of float32. What `check` refuses is refused, too.
+
+        Args:
+            joints: positions (*b, h) [rad or m] of the actuated joints.
+            name: name of the argument in the text of the error.
         """
         self.check(joints, name)
         low = self.lower.to(joints) - ROUNDING
@@ -161,22 +173,25 @@ def joints_from_files(spec: HandSpec, urdf: Urdf) -> ActuatedJoints:
 
 @dataclasses.dataclass(frozen=True)
 class Fingertips(Value):
-    """The f grasping fingertips of a hand, in grasp order; a `Hand` holds them as `tips`.
+    """The f grasping fingertips of a hand, in the order of `names`; a `Hand` holds them as `tips`.
 
-    A tip touches with its pad. Each tip is rigidly attached to a carrier: the last link that a
-    joint moves.
+    A fingertip touches objects with its pad: a sphere, or a single point. The carrier of a
+    fingertip is the last link that a joint moves; the tip's link is fixed to it.
 
     Attributes:
         names: names of the fingers.
         links: names of the tips' links.
         index: index (f,) of each tip's link in `Hand.tree.link_names`.
         contact: contact point (f, 3) [m] of each pad, in the frame of the tip's link.
-        normal: outward unit normal (f, 3) of each pad, in the frame of the tip's link.
-        center: centre (f, 3) [m] of each pad's sphere, in the frame of the tip's link.
-        radius: radius (f,) [m] of each pad's sphere; 0 for a pad without a sphere.
+        normal: outward unit normal (f, 3) of each pad at its contact point, in the frame of the
+            tip's link.
+        center: centre (f, 3) [m] of each pad's sphere, in the frame of the tip's link. A pad that
+            is a point has its contact point here.
+        radius: radius (f,) [m] of each pad's sphere; 0 for a point.
         chains: the part of the kinematic tree that leads to the carriers.
         carrier: index (f,) of each carrier in `chains.link_names`.
-        carrier_from_tip: pose (3, 4, f, 1) [m] of each tip's link in its carrier.
+        carrier_from_tip: pose (3, 4, f, 1) [m] of each tip's link in its carrier, without the last
+            row of the 4 x 4 matrix.
 
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("allegro")
@@ -200,7 +215,9 @@ class Fingertips(Value):
 
     @kept
     def cone(self) -> Float[Tensor, "f"]:
-        """Half angle (f,) [rad] of the cone about each pad's normal in which the tip may touch."""
+        """Half angle (f,) [rad] of the cone about each pad's normal in which the pad may touch a
+        surface.
+        """
         # float32, as when results were published
         angles = self.radius.new_tensor([ROUND_PAD, FLAT_PAD], dtype=torch.float32)
         return torch.where(self.radius > 0, *angles).to(self.radius)
@@ -211,7 +228,7 @@ class Fingertips(Value):
     ) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"], Float[Tensor, "f 3"]]:
         """Contact points [m], unit normals and sphere centres [m] of the pads, each (f, 3).
 
-        They are in the frames of the tips' carriers.
+        Each is in the frame of the tip's carrier.
         """
         pose = self.carrier_from_tip
         contact = map_points(pose, self.contact)[..., 0].T
@@ -221,11 +238,16 @@ class Fingertips(Value):
 
     @checked(gradients=True)
     def frames(self, values: Float[Tensor, "j n"]) -> tuple[Frames, Float[Tensor, "3 4 f n"]]:
-        """Return the poses [m] of the m links of `chains`, then the poses [m] of the f carriers.
+        """Return the poses [m] of the m links of `chains`, then those of the f carriers, in n
+        postures.
 
-        The shapes are (3, 4, m, n) and (3, 4, f, n), in n postures. `values` (j, n) [rad or m] are
-        the positions of all j movable joints of the URDF. The poses are in the palm's frame. Raises
-        `BadArgument` for a wrong number of joints.
+        The shapes are (3, 4, m, n) and (3, 4, f, n), without the last rows of the 4 x 4 matrices.
+        The poses are in the palm's frame.
+
+        Args:
+            values: positions (j, n) [rad or m] of all j movable joints of the URDF.
+
+        Raises `BadArgument` for a wrong number of joints.
         """
         if len(values) != (every := len(self.chains.joint_names)):
             raise BadArgument("values", f"{len(values)} joints", f"all {every} joints of the URDF")

@@ -29,15 +29,15 @@ from torchgrasp.hand.self_collision import SelfCollision
 
 
 class Actuator(NamedTuple):
-    """The drive of one joint: greatest effort and velocity, stiffness and damping.
+    """The drive of one joint; `Hand.actuators` has that of each movable joint.
 
     A sliding joint has [N] and [m] in place of [N m] and [rad].
 
     Attributes:
         effort: greatest torque [N m].
         velocity: greatest speed [rad/s].
-        kp: stiffness [N m/rad].
-        kd: damping [N m s/rad].
+        kp: stiffness of the position control [N m/rad].
+        kd: damping of the position control [N m s/rad].
 
     >>> from torchgrasp import load_hand
     >>> load_hand("barrett").actuators["f1_flex"].effort
@@ -51,13 +51,14 @@ class Actuator(NamedTuple):
 
 
 class HandSource(NamedTuple):
-    """The files of a hand, and the option by which its fingers were chosen.
+    """The files of a hand, and how its grasping fingers were chosen.
 
     Attributes:
-        option: option of hand.toml, or the names of the fingers.
+        option: name of the option, an entry of hand.toml that lists the grasping fingers. If they
+            were chosen by name, it is their names with commas between.
         urdf_path: path of the URDF.
-        sha256: one hash of both files, hand.toml and the URDF.
-        options: all options of hand.toml.
+        sha256: one SHA-256 of both files, hand.toml and the URDF.
+        options: names of all options of hand.toml.
 
     >>> from torchgrasp import load_hand
     >>> load_hand("allegro").source.options
@@ -72,29 +73,29 @@ class HandSource(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Hand(Value):
-    """A robot hand with three to five grasping fingers; `load_hand` loads it.
+    """A robot hand with three to five grasping fingers; `load_hand` returns it.
 
-    Positions [m] are in the palm's frame, the frame of the URDF's root link. Fingers are in grasp
-    order.
+    Positions [m] are in the palm's frame, the frame of the URDF's root link. Grasping fingers are
+    always in the order of `finger_names`: finger i touches contact i of a grasp.
 
     In the methods, `joints` (*b, h) are positions of the h actuated joints, in the order of
     `joint_names`. Their unit is [rad], or [m] for sliding joints. f counts the fingertips, j all
-    movable joints of the URDF, l its links, s the collision spheres. Methods raise `BadArgument`
-    for joints of a wrong count or dtype, and for NaN or infinity.
+    movable joints of the URDF, l its links, and s the collision spheres; *b stands for any batch
+    axes. Methods raise `BadArgument` for joints of a wrong count or dtype, and for NaN or infinity.
 
     Attributes:
         name: name of the hand.
-        source: the files of the hand, and the chosen option.
+        source: the files of the hand, and how its grasping fingers were chosen.
         actuated: names, limits and coupling of the actuated joints.
         chain: the model as a chain of pytorch-kinematics, in which every movable joint is
             independent. `tree` and `tips` are compiled from its tensors, so do not change it in
             place.
         tree: the kinematic tree: names of links and joints, and forward kinematics.
         tips: the fingertips and their pads.
-        approach: unit vector (3,) out of the palm.
+        approach: unit vector (3,) out of the palm, along which the hand approaches objects.
         actuators: the drive of every movable joint of the URDF, by the joint's name.
         collision_spheres: spheres that cover the links.
-        self_collision: shapes of the links, and the pairs of them that must not collide.
+        self_collision: shapes of the links, and the pairs of shapes that must not collide.
 
     >>> from torchgrasp import load_hand
     >>> hand = load_hand("barrett")
@@ -120,13 +121,13 @@ class Hand(Value):
 
     @property
     def urdf_path(self) -> Path:
-        """Path of the hand's URDF."""
+        """The path of the hand's URDF."""
         return self.source.urdf_path
 
     def to(self, *args: Any, **kwargs: Any) -> "Hand":
         """Return the hand on another device or in another floating dtype.
 
-        It takes the arguments of `torch.Tensor.to`. A hand that is already there is returned
+        The arguments are those of `torch.Tensor.to`. A hand that is already there is returned
         itself. Raises `BadArgument` if the device does not exist, or the dtype is neither float32
         nor float64.
         """
@@ -139,10 +140,10 @@ class Hand(Value):
 
     @kept
     def motion(self) -> FreeMotion:
-        """Tables (`FreeMotion`) of how the links move with the hand's pose and its joints.
+        """Tables of how collision spheres, fingertips and pad normals move with the hand's pose and
+        joints.
 
-        Its markers are the centres of collision spheres, the centres of tips, and the normals of
-        pads. `solve_ik` uses them.
+        They serve `solve_ik`.
         """
         spheres = self.collision_spheres
         tips = self.tips
@@ -158,40 +159,43 @@ class Hand(Value):
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the h actuated joints, in the order of `joints`."""
+        """The names of the h actuated joints, in the order of every tensor of joints."""
         return self.actuated.names
 
     @property
     def finger_names(self) -> tuple[str, ...]:
-        """Names of the f grasping fingers, in grasp order."""
+        """The names of the f grasping fingers; finger i touches contact i of a grasp."""
         return self.tips.names
 
     @property
     def tip_radius(self) -> Float[Tensor, "f"]:
-        """Radii (f,) [m] of the fingertips; 0 for a flat or pointed tip."""
+        """The radii (f,) [m] of the fingertips' spheres; 0 for a flat or pointed tip."""
         return self.tips.radius
 
     @property
     def dof(self) -> int:
-        """Number h of actuated joints."""
+        """The number h of actuated joints."""
         return len(self.actuated.names)
 
     @property
     def lower(self) -> Float[Tensor, " h"]:
-        """Lower limits (h,) [rad, or m for a sliding joint] of the actuated joints."""
+        """The lower limits (h,) [rad, or m for a sliding joint] of the actuated joints."""
         return self.actuated.lower
 
     @property
     def upper(self) -> Float[Tensor, " h"]:
-        """Upper limits (h,) [rad, or m for a sliding joint] of the actuated joints."""
+        """The upper limits (h,) [rad, or m for a sliding joint] of the actuated joints."""
         return self.actuated.upper
 
     @checked
     def require_three(self, argument: str, what: str) -> None:
-        """Raise `BadArgument` unless the hand has three fingertips, as in the paper.
+        """Raise `BadArgument` unless the hand has exactly three fingertips.
 
-        Functions call it for options that need three fingertips. The error's text calls the option
-        `argument`, and its value `what`.
+        Functions call it for options that exist for three fingertips only.
+
+        Args:
+            argument: name of the option in the text of the error.
+            what: value of the option in the text of the error.
         """
         if len(self.tips) != 3:
             raise BadArgument(
@@ -202,9 +206,9 @@ class Hand(Value):
 
     @checked(gradients=True)
     def check_joints(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b h"]:
-        """Return `joints` (*b, h) [rad or m] if all are within their limits.
+        """Return `joints` (*b, h) [rad or m] unchanged if all are within their limits.
 
-        Otherwise it raises `BadArgument`, whose text names the first joint beyond its limits.
+        Otherwise raise `BadArgument`, which names the first joint beyond its limits.
 
         >>> from torchgrasp import load_hand
         >>> hand = load_hand("barrett")
@@ -219,12 +223,15 @@ class Hand(Value):
 
     @checked(gradients=True)
     def expand(self, joints: Float[Tensor, "*b h"]) -> dict[str, Float[Tensor, "*b"]]:
-        """Return the positions (*b) [rad or m] of all movable joints of the URDF, as a dict by
+        """Return a dict of the positions (*b,) [rad or m] of all movable joints of the URDF, by
         name.
 
-        `joints` (*b, h) [rad or m] are positions of the actuated joints. The dict also has the
-        joints of fingers that do not grasp. Raises `BadArgument` for joints of a wrong count, dtype
-        or device, and for NaN or infinity.
+        It also has the joints of fingers that do not grasp.
+
+        Args:
+            joints: positions (*b, h) [rad or m] of the actuated joints.
+
+        Raises `BadArgument` for joints of a wrong count, dtype or device, and for NaN or infinity.
 
         >>> from torchgrasp import load_hand
         >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -238,7 +245,7 @@ class Hand(Value):
         """Return the positions (*b, j) [rad or m] of all j movable joints of the URDF.
 
         They are in the order of `tree.joint_names`. `joints` (*b, h) [rad or m] are positions of
-        the actuated joints. Errors are the same as in `expand`.
+        the actuated joints. Raises the errors of `expand`.
         """
         return self.actuated.expand(joints)
 
@@ -259,15 +266,14 @@ class Hand(Value):
         joints: Float[Tensor, "*b h"],
         backend: Literal["torchgrasp", "pytorch_kinematics"] = "torchgrasp",
     ) -> tuple[Float[Tensor, "*b f 3"], Float[Tensor, "*b f 3"]]:
-        """Return the contact points (*b, f, 3) [m] of the f pads, then their outward unit normals
-        (*b, f, 3).
+        """Return (points, normals) of the f pads: contact points [m] and outward unit normals.
 
-        Both are in the palm's frame.
+        Both are (*b, f, 3), in the palm's frame.
 
         Args:
             joints: positions (*b, h) [rad or m] of the actuated joints.
-            backend: what computes the poses of the fingertips. "torchgrasp" means the compiled
-                tables of `tips`. "pytorch_kinematics" means the hand's `chain`.
+            backend: what computes the poses of the fingertips: "torchgrasp", the tables of `tips`;
+                or "pytorch_kinematics", the hand's `chain`. The results agree up to rounding.
         """
         if backend == "torchgrasp":
             _, frames = self.tips.frames(self._columns(joints))
@@ -284,10 +290,10 @@ class Hand(Value):
 
     @checked(gradients=True)
     def tip_centres(self, joints: Float[Tensor, "*b h"]) -> Float[Tensor, "*b f 3"]:
-        """Return the centres (*b, f, 3) [m] of the f fingertip spheres in the palm's frame.
+        """Return the centres (*b, f, 3) [m] of the fingertips' spheres in the palm's frame.
 
-        A tip of radius 0 has its contact point there. `joints` (*b, h) [rad or m] are positions of
-        the actuated joints.
+        A tip of radius 0 gives its contact point. `joints` (*b, h) [rad or m] are positions of the
+        actuated joints.
         """
         _, carriers = self.tips.frames(self._columns(joints))
         return _rows(map_points(carriers, self.tips.in_carriers[2]), joints)
@@ -296,10 +302,9 @@ class Hand(Value):
     def jacobian(
         self, joints: Float[Tensor, "*b h"], at: Float[Tensor, "*b f 3"] | None = None
     ) -> Float[Tensor, "*b f 3 h"]:
-        """Return the Jacobian (*b, f, 3, h) [m/rad] of a point on each fingertip by the actuated
-        joints.
+        """Return the Jacobian (*b, f, 3, h) of a point on each fingertip by the actuated joints.
 
-        It is in the palm's frame. Columns of sliding joints have no unit.
+        It is in the palm's frame. Its unit is [m/rad]; columns of sliding joints have none.
 
         Args:
             joints: positions (*b, h) [rad or m] of the actuated joints.
@@ -348,17 +353,17 @@ class Hand(Value):
         below: Annotated[float, Range(-math.inf, math.inf)] = math.inf,
         chunk: Count = 1000,
     ) -> Float[Tensor, "*b"]:
-        """Return the least signed separation (*b) [m] of the pairs of links in `self_pairs`;
-        negative if links overlap.
+        """Return the least signed separation (*b,) [m] of the pairs of links in `self_pairs`.
 
-        A negative value is minus the shortest translation that separates two links. A positive
-        value is at most the true distance. It is the true distance if the nearest point of one of
-        the two shapes lies on a face. It is infinite if no pair is tested.
+        A negative value means overlap: it is minus the shortest translation that separates two
+        links. A positive value is a lower bound of the distance. It is exact if the nearest point
+        of one of the two shapes lies on a face. It is infinite if no pair is tested.
 
         Args:
             joints: positions (*b, h) [rad or m] of the actuated joints.
-            below: separation [m] that is of interest. Greater results may be any lower bound above
-                it. A small value makes the function faster.
+            below: separation [m] up to which results are needed. Where the separation is greater,
+                the result is any number of at least `below`, or infinity. A small `below` saves
+                time.
             chunk: number of postures that are computed at a time, which bounds the memory.
         """
         self.actuated.check(joints)
@@ -369,7 +374,7 @@ class Hand(Value):
 
     @property
     def self_pairs(self) -> tuple[tuple[str, str], ...]:
-        """Names of the two links of each pair that `self_clearance` tests for collision."""
+        """The names of the two links of each pair that `self_clearance` tests for collision."""
         names = self.tree.link_names
         return tuple((names[one], names[two]) for one, two in self.self_collision.link_pairs())
 

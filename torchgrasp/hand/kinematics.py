@@ -29,25 +29,25 @@ Frames = Float[Tensor, "3 4 l n"]  # poses (3 x 4) of l links in n postures
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class KinematicTree(Value):
-    """The kinematic tree of a URDF as tables of l links and j movable joints; a `Hand` holds it as
-    `tree`.
+    """The forward kinematics of a URDF, as tables of l links and j movable joints; a `Hand` holds
+    it as `tree`.
 
-    The root link is the palm. `Fingertips.chains` holds only the part of the tree that leads to the
-    fingertips. In `tables`, `joint` and `parent`, links are sorted by level, the number of joints
-    from the root.
+    The root link of a hand is its palm. `Fingertips.chains` holds only the part of the tree that
+    leads to the fingertips. In `tables`, `joint` and `parent`, links are sorted by level: the
+    number of joints between root and link.
 
     Attributes:
         link_names: names of the l links, in the order of the URDF.
         joint_names: names of the j movable joints, in the order of the URDF.
         child: index (j,) of the link that each joint moves; 0 if that link is outside this part.
         axis: unit axis (j, 3) of each joint, in the frame of the link that it moves.
-        prismatic: 1 for a sliding joint, 0 for others (j,).
-        moves: 1 if joint j moves link l, else 0 (l, j).
+        prismatic: numbers (j,), 1 for a sliding joint and 0 for others.
+        moves: numbers (l, j), 1 if the joint moves the link and 0 if not.
         tables: pose [m] of each link in its parent as four 3 x 4 tables (4, 3, 4, l, 1). The first
-            is the constant part. The others are the factors of sin q, cos q and q, with the joint's
-            position q.
-        joint: index (l,) of the joint that moves each link; 0 for a fixed link.
-        parent: index (l,) of each link's parent in the level above.
+            is the constant part. The others are multiplied by sin q, cos q and q, where q is the
+            position of the link's joint.
+        joint: index (l,) of the joint between each link and its parent; 0 if the link is fixed.
+        parent: index (l,) of each link's parent among the links of the level above.
         level_sizes: number of links in each level.
         places: index (l,) of each of `link_names` among the sorted links.
         slides: whether any joint is prismatic.
@@ -80,12 +80,12 @@ class KinematicTree(Value):
         """Return the poses (3, 4, l, n) [m] of the l links, in the order of `link_names`, in n
         postures.
 
-        A pose is the upper three rows of its 4 x 4 matrix; `poses` returns whole matrices.
+        The last row of each 4 x 4 matrix is left out; `poses` returns whole matrices.
 
         Args:
             values: positions (j, n) [rad or m] of all movable joints of the URDF.
-            root: poses (3, 4, n) [m] of the root link in another frame. The result is in the same
-                frame. None means the root's own frame.
+            root: poses (3, 4, n) [m] of the root link in another frame, in which the result then
+                is. None means the root's own frame.
         """
         constant, sine, cosine, slide = self.tables.to(values).unbind()
         local = torch.addcmul(constant, sine, values.sin().index_select(0, self.joint))
@@ -122,11 +122,13 @@ class KinematicTree(Value):
     def joint_axes(
         self, poses: Float[Tensor, "*b l 4 4"]
     ) -> tuple[Float[Tensor, "*b j 3"], Float[Tensor, "*b j 3"]]:
-        """Return the unit axis of each joint, then the origin [m] of the link that it moves.
+        """Return (axes, origins) of the j movable joints, both (*b, j, 3).
 
-        Both are (*b, j, 3). `poses` (*b, l, 4, 4) [m] are poses of the l links in any one frame, as
-        `poses` returns them. Axes and origins are in the same frame. Each origin lies on the axis
-        of its joint.
+        An axis is a unit vector. An origin [m] is that of the link which the joint moves; it lies
+        on the joint's axis. Both are in the frame of `poses`.
+
+        Args:
+            poses: poses (*b, l, 4, 4) [m] of the l links in any one frame, as `poses` returns them.
         """
         frames = poses.reshape(-1, *poses.shape[-3:])[..., :3, :].permute(2, 3, 1, 0)
         child = frames.index_select(2, self.child)  # (3, 4, j, n)

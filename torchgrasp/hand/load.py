@@ -32,10 +32,11 @@ def hands_folder() -> Path:
 def find_hand(name_or_path: str | Path) -> Path:
     """Return the folder of a hand.
 
-    `name_or_path` is the name of a shipped hand, a folder, or the path of a hand.toml.
+    Args:
+        name_or_path: name of a shipped hand, a folder with a hand.toml, or the path of a hand.toml.
 
-    Raises `HandFileError` if there is no such hand. The name of a shipped hand raises it, too, if
-    the working directory has another hand of this name.
+    Raises `HandFileError` if there is no such hand. It is also raised for a shipped hand's name if
+    a folder of this name here holds another hand. "./NAME" means this folder.
 
     >>> find_hand("allegro").name
     'allegro'
@@ -66,13 +67,15 @@ def load_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
     Args:
         name_or_path: name of a shipped hand, such as "allegro", "barrett", "leap" or "shadow". Or
             the folder or hand.toml of another hand.
-        fingers: the grasping fingers. A text is an option of hand.toml: "default", or for the
-            Allegro "four" (all) or "paper_literal" (index, middle and ring). A number of fingers
-            means the first option with this number. A tuple names three to five fingers in grasp
-            order, and a text may list them: "index,middle,thumb".
+        fingers: the grasping fingers, in one of these forms:
+            - the name of an option of hand.toml, which lists fingers: "default", or for the Allegro
+              hand "four" (all) or "paper_literal" (index, middle and ring);
+            - a number of fingers, for the first option with this number;
+            - a tuple of the names of three to five fingers, or a text with commas:
+              "index,middle,thumb".
 
-    An option may park joints of the other fingers at a position. Other joints that do not grasp
-    stay at zero, or at the limit nearest to zero.
+    An option may park joints of the other fingers at given positions. Other joints that do not
+    grasp stay at zero, or at the limit nearest to zero.
 
     Raises:
         HandFileError: a file is missing or malformed, or the two files contradict each other.
@@ -103,10 +106,15 @@ def load_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
 
 @checked
 def with_fingers(hand: Hand, fingers: Fingers) -> Hand:
-    """Return the same hand, on the same device, with other grasping `fingers`.
+    """Return the same hand, on the same device, with other grasping fingers.
 
-    `fingers` are chosen as in `load_hand`, and the hand's files are read again. Raises the errors
-    of `load_hand`.
+    The hand's files are read again.
+
+    Args:
+        hand: the hand.
+        fingers: the grasping fingers, as in `load_hand`.
+
+    Raises the errors of `load_hand`.
 
     >>> with_fingers(load_hand("allegro"), 4).finger_names
     ('index', 'middle', 'ring', 'thumb')
@@ -117,7 +125,7 @@ def with_fingers(hand: Hand, fingers: Fingers) -> Hand:
 
 @checked
 def hand_of(grasps: Grasps, hand: Hand | str | Path | None = None) -> Hand:
-    """Return the hand, with the fingers for which `grasps` were planned.
+    """Return the hand of given grasps, with the fingers for which they were planned.
 
     Args:
         grasps: grasps of `plan_grasps`, or loaded from a file. Their `meta` names hand and fingers.

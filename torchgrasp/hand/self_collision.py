@@ -54,17 +54,17 @@ class SelfCollision(Value):
 
     Attributes:
         link: index (s,) of the link of each shape, in `Hand.tree.link_names`.
-        rotation: axes of each box in its link's frame, the columns of `rotation[:, :, s]` (3, 3,
-            s).
+        rotation: rotation matrices (3, 3, s). The columns of `rotation[:, :, k]` are the axes of
+            box k in its link's frame.
         center: centre (s, 3) [m] of each shape, in its link's frame.
         half: half sizes (s, 3) [m] of each box; 0 for a sphere.
         radius: radius (s,) [m] of each sphere; 0 for a box.
-        pairs: indices of the two shapes of each pair (p, 2). Box-box pairs come first, then
+        pairs: indices (p, 2) of the two shapes of each pair. Box-box pairs come first, then
             sphere-box pairs, then sphere-sphere pairs.
-        kinds: number of pairs of each of the three kinds.
+        kinds: numbers of box-box, sphere-box and sphere-sphere pairs.
 
-    `frames` (3, 4, l, n) in the methods are poses [m] of the l links in n postures.
-    `Hand.tree.frames` makes them. A negative separation is minus the shortest translation that
+    In the methods, `frames` (3, 4, l, n) are the poses [m] of the l links in n postures, which
+    `Hand.tree.frames` returns. A negative separation is minus the shortest translation that
     separates two shapes. A positive separation is a lower bound of their distance, exact where a
     face is nearest.
 
@@ -86,11 +86,16 @@ class SelfCollision(Value):
 
     @checked(gradients=True)
     def clearance(self, frames: Frames, below: Bound = torch.inf) -> Float[Tensor, " n"]:
-        """Return the least signed separation (n,) [m] of all pairs in each posture; infinite if
-        there are no pairs.
+        """Return the least signed separation (n,) [m] of all pairs in each posture.
 
-        `frames` (3, 4, l, n) are poses [m] of the links. Results above `below` [m] may be inexact
-        lower bounds. Raises `BadArgument` for too few links.
+        It is infinite if there are no pairs.
+
+        Args:
+            frames: poses (3, 4, l, n) [m] of the links.
+            below: separation [m] up to which results are needed. Where the least separation is
+                greater, the result is any number of at least `below`, or infinity.
+
+        Raises `BadArgument` for too few links.
         """
         least = frames.new_full(frames.shape[3:], torch.inf)
         if not len(self.pairs):
@@ -115,9 +120,12 @@ class SelfCollision(Value):
     def separations(self, frames: Frames, below: Bound) -> Float[Tensor, "p n"]:
         """Return the signed separation (p, n) [m] of each pair in each posture.
 
-        `frames` (3, 4, l, n) are poses [m] of the links. Pairs whose bounding spheres are at least
-        `below` [m] apart get the separation of these spheres. Raises `BadArgument` for too few
-        links, and inside `torch.vmap`.
+        Args:
+            frames: poses (3, 4, l, n) [m] of the links.
+            below: separation [m] up to which results are needed. Pairs whose bounding spheres are
+                farther apart get the separation of these spheres, a lower bound.
+
+        Raises `BadArgument` for too few links, and inside `torch.vmap`.
         """
         shapes, apart, chosen = self._near(frames, below)
         return apart.index_put(chosen[:2], self._separations(shapes, chosen))
@@ -126,17 +134,21 @@ class SelfCollision(Value):
     def pushes(
         self, frames: Frames, below: Bound
     ) -> tuple[Float[Tensor, "p n"], Int[Tensor, "p n"], Float[Tensor, "6 k"]]:
-        """Return the signed separations (p, n) [m] of the pairs, and by which wrenches the pairs
-        move apart.
+        """Return (separations, index, wrenches): how far the pairs are apart, and how this changes
+        with motion.
 
-        `frames` (3, 4, l, n) are poses [m] of the links. The second tensor (p, n) is the index of
-        each pair's wrench. The third tensor (6, k) holds the wrenches as columns. A wrench is the
-        derivative of a separation by a twist of the second shape. Its first three numbers belong to
-        translation, the last three [m/rad] to rotation about the origin.
+        * `separations` (p, n) [m] are those of the method `separations`.
+        * `index` (p, n) is the column in `wrenches` of each pair in each posture.
+        * `wrenches` (6, k) are derivatives of a separation by a twist of the pair's second shape:
+          three by its translation, then three [m/rad] by its rotation about the origin.
 
-        The wrench of a pair that is at least `below` [m] apart is zero. The last wrench is zero,
-        too; pairs whose bounding spheres are so far apart refer to it. Raises `BadArgument` for too
-        few links, and inside `torch.vmap`.
+        The wrench of a pair that is at least `below` apart is zero.
+
+        Args:
+            frames: poses (3, 4, l, n) [m] of the links.
+            below: separation [m] up to which pairs have a wrench.
+
+        Raises `BadArgument` for too few links, and inside `torch.vmap`.
         """
         shapes, apart, (pair, row, parts) = self._near(frames, below)
         separation = apart.new_zeros(len(pair))
@@ -159,22 +171,27 @@ class SelfCollision(Value):
 
     @checked(gradients=True)
     def count_near(self, frames: Frames, below: Bound) -> int:
-        """Return how many pairs, summed over all postures, have bounding spheres nearer than
-        `below` [m].
+        """Return the number of pairs whose bounding spheres are nearer than `below` [m], over all
+        postures.
 
-        `frames` (3, 4, l, n) are poses [m] of the links. Raises `BadArgument` for too few links,
-        and inside `torch.vmap`.
+        Args:
+            frames: poses (3, 4, l, n) [m] of the links.
+            below: separation [m] of bounding spheres.
+
+        Raises `BadArgument` for too few links, and inside `torch.vmap`.
         """
         return len(self._near(frames, below)[2].pair)
 
     @checked
     def only(self, kept: Bool[Tensor, " p"]) -> "SelfCollision":
-        """Return the same shapes with only the pairs that the mask `kept` (p,) selects."""
+        """Return the same shapes with fewer pairs: those that the mask `kept` (p,) selects."""
         one, two, three = (int(kind.sum()) for kind in kept.split(self.kinds))
         return dataclasses.replace(self, pairs=self.pairs[kept], kinds=(one, two, three))
 
     def link_pairs(self) -> list[tuple[int, int]]:
-        """Return the two link indices, ascending, of each pair of links that is tested."""
+        """Return the pairs of links that are tested, as pairs of indices in `Hand.tree.link_names`,
+        sorted.
+        """
         links = self.link[self.pairs].sort(1).values
         return [(one, two) for one, two in torch.unique(links, dim=0).tolist()]
 

@@ -68,16 +68,16 @@ class GraspProblem(Value):
 
     Args:
         hand: the hand.
-        contacts: the b contact sets, in the object's frame [m], with `std_m`; the pre-grasp opens
-            by their `std_m`.
+        contacts: the b contact sets [m], in the object's frame, with `std_m`. Where the surface is
+            less certain, the pre-grasp opens farther.
         certificate: the certificate of force closure of each contact set, from `certify`.
         world: the surroundings of the hand, with one object for all contact sets, or one for each.
         center: the object's centre (3,) [m], or one for each contact set (b, 3). Grasps near it
             score higher.
         reachable: function of hand poses (k, 4, 4) [m] that returns a mask (k,) of the poses that
             an arm reaches; None means that every pose is reachable.
-        descends: whether the opened hand may start above its pose where its opened links would be
-            in the table (`opened_pose`).
+        descends: whether the opened hand may start above the pose of the grasp, where its opened
+            fingers would be in the table (`opened_pose`). It then goes down while it closes.
 
     Raises `BadArgument` if the contacts lack `std_m`.
 
@@ -103,7 +103,9 @@ class GraspProblem(Value):
 
     @checked
     def rows(self, index: Int[Tensor, "k"]) -> "GraspProblem":
-        """Return the problem of the k contact sets with the indices `index` (k,), in this order."""
+        """Return the problem of some of the contact sets: those with the indices `index` (k,), in
+        this order.
+        """
         center = self.center if self.center.ndim == 1 else self.center[index]
         contacts = self.contacts[index]
         certificate = self.certificate[index]
@@ -114,11 +116,10 @@ class GraspProblem(Value):
 
     @checked
     def drop_unreachable(self, seeds: IKSeeds) -> IKSeeds:
-        """Return those initial guesses of `seeds` whose hand poses the function `reachable`
-        accepts.
+        """Return the initial guesses in `seeds` whose hand poses an arm reaches (`reachable`).
 
-        All are returned if `reachable` is None. Raises `BadArgument` for a malformed answer of the
-        function.
+        All are returned if `reachable` is None. Raises `BadArgument` if `reachable` does not return
+        a mask of booleans, one for each pose.
         """
         return (
             seeds

@@ -34,16 +34,16 @@ LEVELS = (0.1, 0.5, 0.8)  # probabilities of occupancy whose regions are told ap
 @checked
 @dataclasses.dataclass(frozen=True)
 class Obstacles(Value):
-    """Regions of a scene that are probably occupied, as grids of distances [m]; `Obstacles.of`
-    makes them.
+    """Regions of a scene that are probably occupied, as grids of distances; `Obstacles.of` makes
+    them.
 
     Attributes:
         field: signed distances [m] from the region that counts as occupied, negative inside.
-        distances: distances (k, x, y, z) [m], one grid for each of the k `levels`. They are from
-            the region occupied with at least this probability, and 0 inside it. The nodes are those
-            of `field`.
+        distances: distances (k, x, y, z) [m] at the nodes of `field`, one grid for each of the
+            `levels`: from the region that is occupied with at least this probability, and 0 inside
+            it.
         levels: k probabilities (k,), ascending.
-        hard: whether links must not touch the occupied region; otherwise a collision only lowers
+        hard: whether links must not touch the occupied region. Otherwise a collision only lowers
             the predicted success.
 
     >>> from torchgrasp import load_scene
@@ -62,12 +62,14 @@ class Obstacles(Value):
     def of(
         cls, occupancy: Occupancy, full: Annotated[float, Range(0.01, 1.0)] = 0.3, hard: bool = True
     ) -> "Obstacles | None":
-        """Return the obstacles of an occupancy grid, or None if all its voxels are probably free.
+        """Return the obstacles of an occupancy grid; None if all its voxels are probably free.
+
+        A voxel is probably free if its probability of occupancy is below 0.1, and below `full`.
 
         Args:
             occupancy: the grid, from `estimate_occupancy`.
             full: probability from which a voxel counts as occupied, in [0.01, 1].
-            hard: whether links must not touch occupied voxels; otherwise a collision only lowers
+            hard: whether links must not touch occupied voxels. Otherwise a collision only lowers
                 the predicted success.
         """
         # SciPy's distances
@@ -89,11 +91,11 @@ class Obstacles(Value):
     def likelihood(
         self, centres: Float[Tensor, "*b s 3"], radius: Float[Tensor, "s"]
     ) -> Float[Tensor, "*b"]:
-        """Return the largest occupancy probability (*b,) of the regions that each set of s spheres
-        touches.
+        """Return the probability (*b,) with which each set of s spheres touches something occupied.
 
-        It is the middle between the region's level and the next level, and 0 if none is touched. b
-        stands for any batch axes.
+        The region of a level L is where the probability of occupancy is at least L. If the spheres
+        touch this region, but not that of the next level M, the result is (L + M) / 2. After the
+        last level, M is 1. The result is 0 if no region is touched. b stands for any batch axes.
 
         Args:
             centres: centres (*b, s, 3) [m] of the spheres, in the frame of `field`.
@@ -124,12 +126,12 @@ def distance_to(region: Bool[Tensor, "x y z"], spacing: float) -> Float[Tensor, 
 @checked
 @dataclasses.dataclass(frozen=True)
 class CollisionWorld(Value):
-    """The surroundings that a hand must not touch, in the frame of the object. None means that a
-    part does not exist.
+    """What the links of a hand must not touch, in the frame of the object. None means that a part
+    does not exist.
 
     Args:
-        field: signed distances [m] from the object, negative inside. They are of one object for all
-            hands of a batch, or of one object for each hand. `surface_field` makes one of a shape.
+        field: signed distances [m] from the object, negative inside, as `surface_field` makes them
+            of a shape. It holds one object for all hands of a batch, or one for each hand.
         table: the table's plane, or its height [m] along z.
         obstacles: other bodies of a scene.
 
@@ -156,23 +158,22 @@ class CollisionWorld(Value):
 
     @property
     def fields(self) -> tuple[DistanceField, ...]:
-        """The distance fields of object and obstacles, in this order, without those that do not
-        exist.
-        """
+        """The distance fields that exist: that of the object, then that of the obstacles."""
         return tuple(
             x for x in (self.field, self.obstacles and self.obstacles.field) if x is not None
         )
 
     @property
     def alone(self) -> "CollisionWorld":
-        """The same world without obstacles."""
+        """The same world without its obstacles: only the object and the table."""
         return dataclasses.replace(self, obstacles=None)
 
     @checked
     def rows(self, index: Int[Tensor, "k"]) -> "CollisionWorld":
-        """Return the world of k hands: entry i of the result is the world of hand `index[i]`.
+        """Return the world of some hands of a batch: those with the indices `index` (k,), in this
+        order.
 
-        A world of one object is the same for all hands, and is returned unchanged. `index` is (k,).
+        A world of one object for all hands is returned unchanged.
         """
         if self.field is None or isinstance(self.field, SignedDistanceField):
             return self
@@ -180,7 +181,7 @@ class CollisionWorld(Value):
 
     @property
     def guarded(self) -> bool:
-        """Whether there are obstacles that links must not touch (`Obstacles.hard`)."""
+        """Whether there are obstacles, and links must not touch them (`Obstacles.hard`)."""
         return self.obstacles is not None and self.obstacles.hard
 
 

@@ -287,19 +287,19 @@ def solve_sliding(
 def solve_joint(
     problem: GraspProblem, seeds: IKSeeds, shape: ShapeLike, spec: ContactSpec
 ) -> Grasps:
-    """Return checked grasps, the best of each contact set that has initial guesses.
+    """Return one checked grasp for each contact set that has initial guesses, the best that was
+    found.
 
-    Executable grasps are first, then the order is by `score`.
-
-    The guesses are tried in their order. If the hand cannot reach the contacts, they slide along
-    the surface of the `shape`, and are certified anew. If the moved contacts fail, the grasp has
-    the `Status` of the contact planner.
+    The guesses of a set are tried in their order. If the hand cannot reach the contacts, they slide
+    along the surface of the `shape`, and are certified again. If the moved contacts fail, the grasp
+    has the `Status` of the contact planner. Executable grasps come first, then those of higher
+    `score`.
 
     Args:
         problem: hand, b contact sets and surroundings.
         seeds: initial guesses, from `nearest_postures`.
         shape: the object's shape, from `fit_shape`, in the frame of the contacts.
-        spec: constraints under which sliding contacts are certified.
+        spec: constraints on sliding contacts, such as friction and table.
 
     Raises `BadArgument` for guesses of another hand, or of other contact sets.
 

@@ -90,16 +90,16 @@ def opened_pose(
     obj_from_hand: Float[Tensor, "g 4 4"],
     table: Plane | None,
 ) -> Float[Tensor, "g 4 4"]:
-    """Return the poses (g, 4, 4) [m] of g opened hands at the end of their approach.
+    """Return the poses (g, 4, 4) [m] at which g opened hands end their approach and begin to close.
 
-    They are in the object's frame. Each is the pose of its grasp, raised along the table's normal
-    where an opened link would be in the table. Coupled fingers can move towards the table as they
-    open. A hand that would have to rise by more than 30 mm (`MOTION.most`) is not raised.
+    Such a pose is that of the grasp, raised along the table's normal if an opened link would be in
+    the table. The reason is that coupled fingers can move towards the table as they open. A hand
+    that would have to rise by more than 30 mm (`MOTION.most`) is not raised.
 
     Args:
         hand: the hand.
-        joints: joints (g, h) [rad or m] of the opened hands.
-        obj_from_hand: poses (g, 4, 4) [m] of the grasps.
+        joints: joints (g, h) [rad or m] of the opened hands, such as `Grasps.pregrasp`.
+        obj_from_hand: poses (g, 4, 4) [m] of the grasps in the object's frame.
         table: the table in the object's frame; None means that no hand is raised.
 
     >>> from torchgrasp import load_hand

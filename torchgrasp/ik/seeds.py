@@ -76,20 +76,19 @@ SEEDS = SeedNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class PostureLibrary(Value):
-    """Random postures of a hand, prepared for quick comparison of their fingertips with contact
-    sets.
+    """Random postures of a hand, prepared for a quick comparison with contact sets.
 
     `PostureLibrary.of` makes it, and `nearest_postures` uses it. s counts postures, h actuated
-    joints, f fingertips, and k collision spheres. The fingertips of each posture define a frame
-    ("vf") with the origin at their centroid.
+    joints, f fingertips, and k collision spheres. The fingertips of each posture define a frame,
+    "vf", with the origin at their centroid.
 
     Attributes:
         hand: the hand.
         joints: actuated joints (s, h) [rad or m].
-        vf_from_hand: pose (s, 4, 4) [m] of the hand's root in the frame of its fingertips.
-        centres: centres (s, f, 3) [m] of the fingertips, in the frame of the fingertips.
-        feature: vectors (s, 6 f) without unit that are compared: the fingertips' centres and the
-            axes of their pads, each over its scale.
+        vf_from_hand: pose (s, 4, 4) [m] of the hand's root link in the frame vf.
+        centres: centres (s, f, 3) [m] of the fingertips, in the frame vf.
+        feature: numbers (s, 6 f) without unit by which postures are compared: centres and pad axes
+            of the fingertips in the frame vf, each divided by a scale.
         spheres: centres (s, k, 3) [m] of the collision spheres, in the hand's frame.
 
     Raises `BadArgument` for numbers of joints, tips or spheres that are not the hand's.
@@ -126,7 +125,7 @@ class PostureLibrary(Value):
         """Return random postures of a hand within the joint limits and without self-collision.
 
         Postures whose fingertips are on a line are left out, so there may be fewer than `count`.
-        The hand caches the last library of each count.
+        The result is cached in `hand.derived`.
 
         Args:
             hand: the hand.
@@ -208,15 +207,15 @@ def nearest_postures(
     """Return initial guesses for inverse kinematics: postures of a library, placed on contact sets
     (Eq. 24).
 
-    The guesses (seeds) are in the order of the contact sets. Each set has at most `n_seeds`, best
-    first, and none if its contacts lie on a line. Their `energy` is half the squared distance
-    between the features of posture and contacts.
+    The guesses are in the order of the contact sets. Each set has at most `n_seeds`, best first,
+    and none if its contacts lie on a line. A guess is better if its fingertips are nearer to the
+    contacts, and its links clear of the `world`. Its `energy` is half the squared distance between
+    the features of posture and contacts (`PostureLibrary.feature`).
 
     Args:
         library: random postures of the hand.
         contacts: b contact sets [m], with one contact for each fingertip.
-        world: surroundings in the frame of the contacts. The clearance from them and the distance
-            of features rank the guesses.
+        world: surroundings in the frame of the contacts.
         n_seeds: most guesses of a contact set, 1 to 64.
         reachable: function of hand poses (k, 4, 4) [m] that returns a mask (k,) of the poses that
             an arm reaches. The next posture takes the place of an unreachable one. None means that

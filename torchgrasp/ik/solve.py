@@ -57,21 +57,22 @@ SOLVING = SolveNumbers()
 @checked
 @dataclasses.dataclass(frozen=True)
 class IKSolution(Batch):
-    """The hand configurations that `solve_ik` found for b contact sets, one for each.
+    """The hand configurations that `solve_ik` found, one for each of b contact sets.
 
-    h counts actuated joints, and f fingertips. A contact set without initial guesses has NaN.
+    h counts actuated joints, and f fingertips. A contact set for which nothing could be tried has
+    NaN.
 
     Attributes:
         joints: actuated joints (b, h) [rad or m].
-        obj_from_hand: pose (b, 4, 4) [m] of the hand's root in the frame of the contacts.
-        permutation: index (b, f) of the contact that each finger touches: finger i touches contact
-            `permutation[:, i]`.
+        obj_from_hand: pose (b, 4, 4) [m] of the hand's root link in the frame of the contacts.
+        permutation: indices (b, f): in set k finger i touches contact `permutation[k, i]`.
         tip_error: distance (b, f) [m] of each fingertip from its contact.
         normal_angle: angle (b, f) [rad] between the contact's inward normal and the axis of the
             finger's pad.
-        clearance: least clearance (b,) [m] of the links, negative in a collision.
+        clearance: least clearance (b,) [m] of the links from object, table, hard obstacles and each
+            other; negative where they overlap.
         attempts: number (b,) of initial guesses that were refined.
-        status: `Status` (b,) of the first error out of tolerance, or `Status.OK`.
+        status: `Status` (b,): `OK`, or the first tolerance that is exceeded.
 
     >>> from torchgrasp import load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -102,19 +103,22 @@ def solve_ik(
 ) -> IKSolution:
     """Return for each contact set the best hand configuration whose fingertips touch its contacts.
 
-    Any finger may touch any contact. With `Status.OK` every tip is within 1 mm of its contact.
-    Every contact direction is then inside its pad's cone, and every link is clear.
+    Any finger may touch any contact. `Status.OK` means that no link collides, and every tip is
+    within 1 mm of its contact. Every contact's inward normal is then in the cone of the finger's
+    pad (`Fingertips.cone`).
 
     Args:
         hand: the hand.
         contacts: b contact sets [m], with one contact for each fingertip; `std_m` and `variance`
             are not used.
-        mixture: the hand's learned model; None means that all initial guesses come from `library`.
+        mixture: the hand's learned posture model, which gives initial guesses. None means that all
+            guesses come from `library`.
         world: object, table and obstacles that the links must not touch; None means that only
             self-collision counts.
         method: "levenberg_marquardt", or "cobyla", the paper's method (Sec. 6.3). "cobyla" brings
-            each tip's contact point to its contact and ignores the contact directions.
-        library: the hand's random postures; None means that they are drawn when they are needed.
+            each tip's contact point to its contact and ignores the contact's normal.
+        library: random postures of the hand, which give initial guesses; None means that they are
+            drawn when they are needed.
 
     Hand, mixture, world and library are moved to the contacts' device.
 

@@ -186,15 +186,18 @@ class Trial(Value):
 
 @dataclasses.dataclass(frozen=True)
 class Explanation(Value):
-    """Why there is no grasp: where grasps were lost, and the results of single changes.
+    """Why there is no executable grasp: where planning lost them, and which single change would
+    help.
 
-    `explain_empty` makes it. `str` gives one line for each planning stage, and the `advice`.
+    `explain_empty` returns it. `print(explanation)` shows one line for each planning stage, and the
+    `advice`.
 
     Attributes:
-        starts: number of initial guesses from which grasps were planned with each change.
-        funnel: losses of the planning stages without a change.
-        trials: the results of the changes, the most helpful first.
-        left: number of changes that were not tried, because the work is bounded.
+        starts: number of initial guesses from which grasps were planned, without a change and with
+            each.
+        funnel: how many candidates each planning stage lost, and why, without a change.
+        trials: the result of planning with each change, the most helpful first.
+        left: number of further changes that were not tried, to bound the work.
 
     >>> funnel = Funnel((Losses("grasps", "postures", 40, {Status.TABLE_COLLISION: 40}),))
     >>> words = "if the table were 20 mm lower"
@@ -211,10 +214,10 @@ class Explanation(Value):
 
     @property
     def best(self) -> Trial | None:
-        """The most helpful change; None if no change gives a grasp.
+        """The most helpful change; None if no tried change gives a grasp.
 
         Its `words` describe the change, and `executable` is the number of grasps with it.
-        `expected` is their mean predicted success, in [0, 1].
+        `expected` is the mean predicted success, in [0, 1], of the best of them.
         """
         return next((trial for trial in self.trials if trial.executable), None)
 
@@ -222,9 +225,9 @@ class Explanation(Value):
     def advice(self) -> str:
         """A sentence for the user on what would help most.
 
-        If there is a grasp, the sentence says so. Otherwise it names the best change. If the user
-        cannot make this change, as a higher friction, it also names the best one that the user can
-        make. If no change helps, the sentence names the stage that loses the most.
+        It names the most helpful change. If the user cannot make it, such as a higher friction, the
+        sentence also names the most helpful one that the user can make. If no change helps, it
+        names the stage that loses most and the reason. If there is a grasp after all, it says so.
         """
         if self.funnel.executable:
             return f"There is a grasp: {self.funnel.executable} of {self.starts} starts ended in an executable one."
@@ -268,18 +271,25 @@ def explain_empty(
     shape: ShapeGP | None = None,
     observer: Observer | None = None,
 ) -> Explanation:
-    """Return why `plan_grasps` found no executable grasp, and which single change gives grasps.
+    """Return why `plan_grasps` found no executable grasp, and which single change would give
+    grasps.
 
-    The changes are: no region, other fingers, another shipped hand, wider limits of contacts,
-    higher friction. Further changes are: no table, no neighbours, an arm that reaches everything.
-    Each is tried by planning with it. The search ends at a change that the user can make and that
-    gives grasps which are likely to succeed.
+    Each change is tried by planning with it. The changes are: no `keep`, `avoid` or `resist`; other
+    fingers; another shipped hand; wider limits of contacts; higher friction. Further changes are:
+    no table or another one; no neighbours, or neighbours that may be pushed; an arm that reaches
+    every pose.
+
+    The search ends at a change that the user can make and that gives grasps which are likely to
+    succeed. If a grasp is found without a change, no change is tried.
 
     The work is bounded by numbers (`EXPLAIN`), not by time, so a seed always gives the same
-    explanation. A plan has at most 20 initial guesses and a library of 500 postures. Relaxed
-    constraints are tried only where no contact set is found. At most 8 changes are tried, in the
-    order of the losses that they could prevent; fewer with "auto" fingers. If no change helps, a
-    request of few guesses is tried with four times as many.
+    explanation:
+
+    * A plan has at most 20 initial guesses, and a library of 500 postures.
+    * Relaxed constraints are tried only if no contact set is found.
+    * At most 8 changes are tried, fewer with "auto" fingers. First come those that could prevent
+      the most losses.
+    * If no change helps, a request of at most 80 guesses is tried with four times as many.
 
     Args:
         cloud: the cloud or scene, as in `plan_grasps`.

@@ -89,8 +89,8 @@ def plan_grasps(
     shape: ShapeGP | None = None,
     observer: Observer | None = None,
 ) -> Grasps | list[Grasps]:
-    """Return planned grasps of a hand on the object of a partial point cloud or scene, the best
-    grasp first.
+    """Plan grasps of a hand on the object of a partial point cloud or scene; return them, best
+    first.
 
     >>> from torchgrasp import load_object
     >>> grasps = plan_grasps(load_object("cylinder"), "barrett", ContactSpec(table=0.0), starts=20)
@@ -102,29 +102,30 @@ def plan_grasps(
             It is a `PointCloud`, a `Scene` with a target, a `GraspObject`, or an array or tensor
               (n, 3). It may also be a cloud of Open3D or trimesh, or a file for `read_cloud` or
               `read_scene`.
-            Missing normals and viewpoint are estimated; `cloud_from_array` takes them.
-            A sequence gives a list of results; `meta["refused"]` says why a bad cloud has none.
+            Missing normals and viewpoint are estimated; `cloud_from_array` adds known ones.
+            A sequence of clouds gives a list of `Grasps`. Those of a bad cloud are empty, and their
+              `meta["refused"]` says why.
         hand: from `load_hand`, or its name or folder; it is moved to the device of the cloud.
         spec: constraints; None means `ContactSpec()`, in mode "paper" `ContactSpec.paper()`.
         starts: number of random initial guesses of the contact planner.
         seed: random seed; on the CPU the same seed gives bitwise the same grasps.
-        workers: number of processes for a sequence of clouds; 0 means this process. On a GPU, which
-            plans all clouds at once, they estimate the shapes.
+        workers: number of processes for a sequence of clouds; 0 means this process. If the clouds
+            are on a GPU, it plans them at once, and the processes only estimate the shapes.
         fingers: the fingers that grasp, as in `load_hand`; None means the fingers of `hand`. "auto"
-            chooses, of the sets that the hand declares, the one with the greatest expected success.
+            tries the sets of fingers in the hand's file, and takes the most likely to succeed.
             `hand_of` loads the hand of the result.
-        task: what grasps must do, for which success is predicted; None means `GraspTask()`.
-        promise: share of the returned grasps that must hold, in [0.5, 0.99]. Less sure grasps get
-            the status `NO_PROMISE`. `meta["promise"]` says which trials chose the bound
+        task: what grasps must do; success is predicted for it. None means `GraspTask()`.
+        promise: share of the executable grasps that must hold, in [0.5, 0.99]. Less sure grasps get
+            the status `NO_PROMISE`. `meta["promise"]` says how many trials support the promise
             (`torchgrasp.success.promise`). None means no promise.
         reachable: function of hand poses `obj_from_hand` (k, 4, 4) [m] in the frame of the cloud.
             It returns a mask (k,) of the poses that an arm reaches. None means all of them.
-        arm: the arm that carries the hand, from `load_arm`; it must reach each grasp by a straight
-            approach, and lift. Without a table z points up. None means no arm.
+        arm: the arm that carries the hand, from `load_arm`; it must follow the straight approach
+            and the lift of each grasp. Without a table z points up. None means no arm.
         keep: where all contacts lie: a `Region`, or a function of points (n, 3) [m] that returns
             their signed distances (n,) [m], negative inside. None means anywhere.
         avoid: where no contact lies, given as `keep`.
-        resist: what contacts must resist: "lift", "pour", "push", a tuple of several of them, or
+        resist: loads that contacts must resist: "lift", "pour", "push", a tuple of several, or
             `TaskWrenches`. Each force must lie in its planned friction cone, and the hand must be
             strong enough for it. `Grasps.certificate` has the proof; grasps that resist less have
             the status `NOT_RESISTED`. None means that nothing is asked for.
@@ -135,8 +136,8 @@ def plan_grasps(
             "paper": the paper's method (docs/paper.md).
         ranking: what puts a grasp first: the greatest predicted "success", or the least "variance"
             of the surface at its contacts. None means "success", in mode "paper" "variance".
-        time_budget: wall time [s] after which no batch begins; None means no limit.
-            `meta["starts"]` is the number of planned guesses.
+        time_budget: wall time [s] after which no batch of guesses begins; None means no limit.
+            `meta["starts"]` is the number of guesses that were planned.
         shape: the object's shape if it is known better than the cloud shows, as after a touch
             (`ShapeGP.update`). None means that it is estimated.
         observer: function that is called after each stage, with its name, a text and its result.
@@ -152,10 +153,9 @@ def plan_grasps(
             `HandFileError`, are kinds of it.
         MissingExtra, NoWorkers: pebble is not installed, or no worker process can start.
 
-    The result does not depend on the frame of cloud, camera and table. In a scene the hand keeps
-    clear of the target's neighbours and of space that is probably full. The remaining risk of
-    collision lowers `Grasps.success`. Grasps are planned in batches, each larger than the one
-    before. `stream_grasps` yields each batch when it ends.
+    If cloud, camera and table are moved together, the grasps move with them. In a scene the hand
+    keeps clear of the target's neighbours and of space that is probably full. What risk remains
+    lowers `Grasps.success`. Guesses are planned in batches; `stream_grasps` yields each at once.
     """
     given: dict[str, Any] = dict(
         hand=as_hand(hand, "hand"),
@@ -206,13 +206,13 @@ def stream_grasps(
     shape: ShapeGP | None = None,
     observer: Observer | None = None,
 ) -> Iterator[Grasps]:
-    """Yield the executable grasps of each batch of `plan_grasps` as soon as the batch ends, best
-    first.
+    """Yield the executable grasps of `plan_grasps` in batches, as soon as they are planned.
 
-    Each yielded batch has at least one grasp; a later batch may have a better best grasp. Each
-    grasp has force closure, has passed all checks, and is scored. All batches together, ranked, are
-    the executable grasps of `plan_grasps` with the same arguments. The work stops when the caller
-    stops iterating. In modes other than "joint", and with "auto" fingers, there is one batch.
+    Each batch holds at least one grasp, its best first. Each grasp has force closure, has passed
+    all checks, and is scored. A later batch may hold a better grasp. All batches together, ranked,
+    are the executable grasps of `plan_grasps` with the same arguments. The work stops when the
+    caller stops iterating. In modes other than "joint", and with "auto" fingers, there is one
+    batch.
 
     Args:
         cloud: one cloud or scene, as in `plan_grasps`.
@@ -223,8 +223,8 @@ def stream_grasps(
         fingers, task, promise, reachable, arm, keep, avoid, resist: as in `plan_grasps`.
         mode, ranking, time_budget, shape, observer: as in `plan_grasps`.
 
-    Raises the errors of `plan_grasps`: at the call for arguments and files, at the first iteration
-    for what the points show, such as a wrong size.
+    Raises the errors of `plan_grasps`. Those of arguments and files are raised at the call. Those
+    of what the points show, such as a wrong size, are raised at the first iteration.
 
     >>> from torchgrasp import load_hand, load_object
     >>> first = next(stream_grasps(load_object("cylinder").view, load_hand("barrett"), starts=40))

@@ -36,14 +36,13 @@ class ThingPlan(Value):
 
     Attributes:
         label: label of the object in the scene.
-        success: predicted probability that the best grasp holds: 0 without grasps, NaN if it is
-            unknown.
+        success: predicted probability that the best grasp holds. 0 means no grasps, NaN an unknown
+            success.
         grasps: executable grasps, best first; None if there are none.
-        reason: sentence that says why there are no grasps.
+        reason: sentence that says why there are no grasps; "" if there are.
         shape: the estimated shape of the object; None without grasps.
-        status: the reason why the image shows that the object cannot be grasped; `OK` if it shows
-            none. `OK` does not mean that there are grasps: see `grasps`. `TOO_VAGUE` means that the
-            shape is too uncertain.
+        status: why the object's image or its estimated shape (`TOO_VAGUE`) rules out a grasp. `OK`
+            means that neither does: grasps may still be None.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> grasp = load_shipped_grasp("jug", "allegro")
@@ -68,8 +67,9 @@ class ScenePlan(Value):
 
     Attributes:
         things: one plan for each object; objects without a grasp come last.
-        clear: labels of objects to take away, in this order, so that the given target has a grasp.
-            It is empty if the target has one, or if no small set of objects to take away was found.
+        clear: labels of objects to take away, in this order, so that the `target` of `plan_scene`
+            has a grasp. It is empty if the target has one, if no small number of objects suffices,
+            or without a target.
 
     >>> empty = ThingPlan(1, success=0.0, reason="too flat")
     >>> ScenePlan((empty,)).best is None
@@ -81,7 +81,9 @@ class ScenePlan(Value):
 
     @property
     def best(self) -> ThingPlan | None:
-        """The plan of the object to grasp first; None if no object has a grasp."""
+        """The plan of the object to grasp first, that of the greatest success; None if no object
+        has a grasp.
+        """
         return next((thing for thing in self.things if thing.grasps is not None), None)
 
 
@@ -105,7 +107,7 @@ def plan_scene(
     avoid: Where | None = None,
     resist: Resist | None = None,
 ) -> ScenePlan:
-    """Return grasps of the objects of a scene, the object with the greatest predicted success
+    """Plan grasps of the objects in a scene; return a plan for each, the greatest predicted success
     first.
 
     Nothing is planned for an object if its image shows that it cannot be grasped
@@ -113,8 +115,8 @@ def plan_scene(
     around them are planned first. Objects that are larger than all objects in our trials, or cut
     off by the image border, are planned last.
 
-    With a `target`, this object alone is planned. If it has no grasp, the search goes on without
-    the nearest objects. `ScenePlan.clear` then says which of them to take away first.
+    With a `target`, only this object is planned. If it has no grasp, it is planned again without
+    the nearest objects. `ScenePlan.clear` then says which of them to take away.
 
     Args:
         scene: objects on a table, or a file of `save_scene`.
@@ -123,7 +125,7 @@ def plan_scene(
         starts: number of random initial guesses of the contact planner for each object.
         seed: random seed.
         target: label of the object to grasp; None means any object.
-        enough: predicted success of a grasp, in [0, 1], at which the remaining objects are not
+        enough: predicted success in [0, 1]. Once a grasp has it, the remaining objects are not
             planned.
         fingers: the fingers that grasp, as in `plan_grasps`. "auto" chooses for each object, and
             `hand_of` loads the hand of its grasps.

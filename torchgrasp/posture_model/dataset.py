@@ -48,20 +48,21 @@ Chunk = Annotated[int, Range(0, 1_000_000)]
 
 @dataclasses.dataclass(frozen=True)
 class SampleFolder:
-    """A complete folder of `n` sampled postures in chunk files, which are read on demand.
+    """A complete folder of `n` sampled postures of a hand, which are read on demand.
 
-    `write_samples` makes it, and `load_samples` opens it. h counts the hand's joints.
+    `write_samples` makes it, and `load_samples` opens it. h counts the hand's actuated joints. The
+    postures are in files of 10,000 (`CHUNK_POSTURES`), the chunks.
 
     Iteration yields the chunks as `HandSamples`. By index the folder is a map-style dataset for
-    `torch.utils.data.DataLoader`: item i holds the joints (h,) [rad or m] and the contact code (6,)
-    of posture i. Recent chunks stay in memory.
+    `torch.utils.data.DataLoader`: `folder[i]` is (joints (h,) [rad or m], contact code (6,)) of
+    posture i.
 
     Attributes:
         folder: path of the folder.
         n: number of postures.
         joint_names: names of the h joints, in the order of the hand.
-        meta: hand, seed and sampling, as in `HandSamples`.
-        recent: chunks that were read lately.
+        meta: texts that describe hand, seed and sampling, as in `HandSamples`.
+        recent: the cache of the chunks that were read last.
 
     >>> import tempfile
     >>> from torchgrasp import load_hand
@@ -97,8 +98,9 @@ class SampleFolder:
 
     @checked
     def chunk(self, i: Chunk) -> HandSamples:
-        """Read the postures of chunk i, counted from 0. A chunk has 10,000 postures
-        (`CHUNK_POSTURES`); the last has the rest.
+        """Read the postures of chunk i, counted from 0.
+
+        Each chunk has 10,000 postures (`CHUNK_POSTURES`); the last one has the rest.
 
         Raises `ModelFileError` if its file is missing, damaged, or belongs to other samples. Raises
         `BadArgument` for an index beyond the last chunk.
@@ -121,8 +123,8 @@ class SampleFolder:
     def read(self, n: Count | None = None) -> HandSamples:
         """Read the first `n` postures into memory; None means all.
 
-        Raises `BadArgument` for n outside [1, len], and `ModelFileError` for a missing or damaged
-        chunk.
+        Raises `BadArgument` for n outside [1, len(folder)], and `ModelFileError` for a missing or
+        damaged chunk.
         """
         n = self.n if n is None else n
         check_whole("n", n, 1, self.n)
@@ -135,10 +137,10 @@ class SampleFolder:
 
     @checked
     def holds(self, i: Chunk) -> bool:
-        """Return whether the file of chunk i, counted from 0, exists and is undamaged.
+        """Return whether the file of chunk i, counted from 0, exists, is undamaged, and belongs to
+        these samples.
 
-        It is also False for a chunk of other samples. Raises `BadArgument` for an index beyond the
-        last chunk.
+        Raises `BadArgument` for an index beyond the last chunk.
         """
         try:
             self.chunk(i)
@@ -155,21 +157,23 @@ def write_samples(
     workers: Annotated[int, Range(1, 1024)] = 1,
     observer: Callable[[int], object] = lambda count: None,
 ) -> SampleFolder:
-    """Draw random postures of a hand, write them to a folder in chunks, and return the folder.
+    """Draw random postures of a hand, write them to a folder, and return the folder.
 
-    The postures are those of `sample_configurations`.
+    The postures are those of `sample_configurations`, in files of 10,000 (chunks). A call with the
+    same arguments continues an interrupted run.
 
     Args:
         hand: the hand, with three grasping fingers.
         spec: number of postures, seed and sampling.
-        folder: folder that is made, or continued after an interrupted run with the same arguments.
+        folder: the folder to write.
         workers: number of threads that draw at the same time, 1 to 1024.
-        observer: called at the start with the number of postures on disk, then with the number in
-            each new chunk.
+        observer: function that is called at the start with the number of postures on disk, then
+            with the number in each new chunk.
 
     Raises:
-        BadArgument: workers outside [1, 1024]; a hand with another number of fingers, or of which
-            almost no random posture is kept.
+        BadArgument: workers outside [1, 1024].
+        BadArgument: a hand with another number of fingers, or of which almost no random posture is
+            kept.
         OutputError: the folder holds other samples, another run is writing it, or the disk is full.
 
     >>> import tempfile
@@ -213,7 +217,7 @@ def write_samples(
 
 @checked
 def load_samples(folder: Path | str) -> SampleFolder:
-    """Open a complete folder of sampled postures, as `write_samples` made it.
+    """Open a complete folder of sampled postures that `write_samples` wrote.
 
     No posture is read yet. Raises `ModelFileError` for an unfinished folder or a damaged manifest.
 

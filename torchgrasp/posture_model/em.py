@@ -105,9 +105,10 @@ class DataRows:
 
 @dataclasses.dataclass(frozen=True)
 class Components(Value):
-    """Weights, means and covariances of m Gaussians in d dimensions (Eqs. 19-20).
+    """The m Gaussians of a mixture in d dimensions: weights, means and covariances (Eqs. 19-20).
 
-    A fit reports them in `FitProgress`, in standardised dimensions.
+    `FitProgress` reports them during a fit. The dimensions are then standardised: each has mean 0
+    and variance 1 over the samples.
 
     Attributes:
         weights: shares (m,) of the Gaussians, of sum 1.
@@ -125,15 +126,17 @@ class Components(Value):
 
 @dataclasses.dataclass(frozen=True)
 class FitProgress(Value):
-    """The state of a fit of m Gaussians after t steps, which `fit_mixture` gives to its `observer`.
+    """The state of a fit of m Gaussians after t steps of EM; `fit_mixture` gives it to its
+    `observer`.
 
     Attributes:
-        components: the Gaussians.
-        reseeded: how often (m,) each of them collapsed and was placed anew; the likelihood may fall
-            after that.
+        components: the Gaussians, in standardised dimensions.
+        reseeded: number of times (m,) that each Gaussian collapsed and got a new place. The
+            likelihood may fall after that.
         log_likelihood: mean log-likelihood (t,) [nats] of the standardised data before each step.
-        jumped: whether the last step placed a component anew, or the next step uses other rows.
-        rows: number of rows that the last step used, 0 before the first step.
+        jumped: whether the likelihood may fall: a Gaussian got a new place in the last step, or the
+            next step uses another subset of the samples.
+        rows: number of samples that the last step used; 0 before the first step.
 
     >>> start = Components(torch.ones(1), torch.zeros(1, 2), torch.eye(2)[None])
     >>> FitProgress(start, torch.zeros(1, dtype=torch.int64), torch.zeros(0)).jumped

@@ -59,8 +59,9 @@ class GaussianMixture(Value):
         covariances: covariances (m, d, d) of the components, in products of these units.
         names: names of the d dimensions.
 
-    Raises `BadArgument` for inconsistent shapes, a repeated name, or an indefinite or asymmetric
-    covariance. Weights that are negative or do not sum to 1 raise it, too.
+    Raises `BadArgument` for inconsistent shapes, a repeated name, or a covariance that is not
+    symmetric and positive definite. It is also raised for weights that are negative or do not sum
+    to 1.
 
     >>> mixture = GaussianMixture(torch.ones(1), torch.zeros(1, 2), torch.eye(2)[None], ("a", "b"))
     >>> mixture.condition({"b": 3.0}).means
@@ -104,10 +105,12 @@ class GaussianMixture(Value):
 
     @checked(gradients=True)
     def log_prob(self, x: Float[Tensor, "*b d"]) -> Float[Tensor, "*b"]:
-        """Return the log-density (*b,) [nats] of each point `x` (*b, d), Eq. (19).
+        """Return the log-density (*b,) [nats] at each point, Eq. (19).
 
-        A point has d numbers, in the units of the dimensions. b stands for any batch axes. Raises
-        `BadArgument` for points of another length.
+        Args:
+            x: points (*b, d), in the units of the dimensions. b stands for any batch axes.
+
+        Raises `BadArgument` for points of another length.
         """
         if x.ndim < 1 or x.shape[-1] != len(self.names):
             raise BadArgument("x", f"shape {tuple(x.shape)}", f"rows of {len(self.names)} numbers")
@@ -115,11 +118,13 @@ class GaussianMixture(Value):
 
     @checked(gradients=True)
     def log_joint(self, x: Float[Tensor, "n d"]) -> Float[Tensor, "n m"]:
-        """Return the log joint density (n, m) [nats] of each of n points `x` (n, d) with each
-        component.
+        """Return log(weight) + log N(x | mean, covariance) of each point and each component, (n, m)
+        [nats].
 
-        It is log(weight) + log N(x | mean, covariance). It is -inf for a component of weight 0. m
-        counts the components. The points have d numbers, in the units of the dimensions.
+        It is -inf for a component of weight 0. The log-sum-exp over the m components is `log_prob`.
+
+        Args:
+            x: points (n, d), in the units of the dimensions.
         """
         density = self.whitening.log_scale - 0.5 * self.whitening.squared(x.double())
         weights = self.weights.double()
@@ -130,10 +135,11 @@ class GaussianMixture(Value):
 
     @checked
     def sample(self, n: Annotated[int, Range(0, 10**8)], seed: Seed = 0) -> Float[Tensor, "n d"]:
-        """Draw n random points (n, d) of the mixture, in the units of its dimensions.
+        """Draw n random points (n, d) of the mixture, in the units of its dimensions, in float64.
 
-        The same `seed` gives the same points. Raises `BadArgument` for n or seed out of range, or a
-        parameter that requires a gradient: samples are not differentiable.
+        The same `seed` gives the same points. Samples are not differentiable.
+
+        Raises `BadArgument` for n or seed out of range, or a parameter that requires a gradient.
         """
         for name in PARAMETERS:
             check_dense(name, getattr(self, name), gradients=False)
@@ -155,7 +161,8 @@ class GaussianMixture(Value):
 
     @checked(gradients=True)
     def marginal(self, names: Sequence[str]) -> "GaussianMixture":
-        """Return the marginal mixture of the named dimensions, in the order of `names`, Eq. (22).
+        """Return the marginal mixture over some of the dimensions, in the order of `names`, Eq.
+        (22).
 
         Raises `BadArgument` for an unknown or repeated name.
         """
@@ -166,10 +173,9 @@ class GaussianMixture(Value):
 
     @checked(gradients=True)
     def condition(self, given: dict[str, float]) -> "GaussianMixture":
-        """Return the mixture of the other dimensions, given the values of some of them, Eq. (23) of
-        the paper.
+        """Return the mixture over the other dimensions, given the values of some of them, Eq. (23).
 
-        Components whose weight becomes 0 are left out, except inside torch.vmap.
+        Components whose weight becomes 0 are left out, except inside `torch.vmap`.
 
         Args:
             given: values of some dimensions, by name, in their units.
@@ -200,7 +206,7 @@ class GaussianMixture(Value):
         return GaussianMixture(weights, means, covariances, names)
 
     def mean(self) -> Float[Tensor, "d"]:
-        """Return the expected value (d,) of each of the d dimensions, in its unit."""
+        """Return the mean (d,) of the whole mixture, in the units of the dimensions."""
         return self.weights.double() @ self.means.double()
 
     def covariance(self) -> Float[Tensor, "d d"]:
@@ -215,8 +221,10 @@ class GaussianMixture(Value):
     def whitening(self) -> "Whitening":
         """The components in whitened form, which makes densities quick to evaluate.
 
-        It holds `matrix` (m, d, d), the lower-triangular W with W^T W = covariance^-1, and `means`
-        (m, d), W mean. `log_scale` (m,) [nats] is the log-density of each Gaussian at its mean.
+        * `matrix` (m, d, d) holds the lower-triangular W of each component, with W^T W =
+          covariance^-1.
+        * `means` (m, d) holds W mean.
+        * `log_scale` (m,) [nats] is the log-density of each Gaussian at its mean.
         """
         means = self.means.double()
         d = len(self.names)

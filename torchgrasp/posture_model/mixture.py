@@ -62,12 +62,13 @@ def encode_fingertips(
 
 @checked(gradients=True)
 def encode(contacts: Contacts | tuple[Tensor, Tensor]) -> ContactCode:
-    """Return six contact codes for each of b contact triples, one for each assignment of contacts
-    to fingers, Eqs. (15)-(18).
+    """Return the contact code of each of b contact triples, for all six assignments to fingers,
+    Eqs. (15)-(18).
 
-    A code is three distances [m] of the contacts from their centroid, and three cosines between
-    their normals. No rigid motion changes it. The result also has the frame that each triple
-    defines. Codes and frames are differentiable in points and normals.
+    A code is six numbers that no rigid motion changes. They are the distances [m] of the three
+    contacts from their centroid, and the cosines between their normals. The returned `ContactCode`
+    has the codes `q` (b, 6, 6). It also has the frame of each triple (`obj_from_vf`) and a
+    `status`. Codes and frames are differentiable in points and normals.
 
     Args:
         contacts: `Contacts` with three contacts in each set, or a pair of points [m] and unit
@@ -164,10 +165,11 @@ def _probe_codes(hand: Hand) -> Float[Tensor, "3 q"]:
 @checked
 @dataclasses.dataclass(frozen=True)
 class GraspMixture(GaussianMixture):
-    """The learned mixture over the joints and contact codes of one hand (Eqs. 19-20).
+    """The learned posture model of a hand: a mixture over its joints and contact codes (Eqs.
+    19-20).
 
-    `load_mixture` reads it, and `fit_mixture` fits it. `energy` tells whether the hand reaches a
-    contact code, and `joints` returns its expected joints.
+    `load_mixture` reads it, and `fit_mixture` fits it. `energy` tells whether the hand reaches
+    contacts of a given code, and `joints` returns the joints that it then most likely has.
 
     Its d dimensions are the h joints [rad or m], in the hand's order, then a contact code. A code
     has the distances L1 L2 L3 [m] of three contacts from their centroid. Then come the cosines N1
@@ -179,11 +181,12 @@ class GraspMixture(GaussianMixture):
         means: means (m, d) of the components, in the units of the dimensions.
         covariances: covariances (m, d, d) of the components, in products of these units.
         names: names of the d dimensions; the last six are `CODE_NAMES`.
-        regularisation: variance that was added to every dimension, relative to the samples'
+        regularisation: variance that the fit added to every dimension, relative to the samples'
             variance.
         meta: texts that describe hand, samples and fit.
 
-    Raises the errors of `GaussianMixture`, and `BadArgument` for other `names`.
+    Raises the errors of `GaussianMixture`, and `BadArgument` if the last `names` are not
+    `CODE_NAMES`.
 
     >>> from torchgrasp import encode
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -203,7 +206,7 @@ class GraspMixture(GaussianMixture):
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the h joints, in the order of the hand."""
+        """The names of the h joints, in the order of the hand."""
         return self.names[:-6]
 
     @of_parameters
@@ -232,13 +235,13 @@ class GraspMixture(GaussianMixture):
     def energy(
         self, code: ContactCode | Annotated[Float[Tensor, "*b 6"], ANY]
     ) -> Float[Tensor, "*b"]:
-        """Return the energy (*b,) (no unit) of each contact code, Eq. (21): the less, the more
-        surely the hand reaches it.
+        """Return the energy (*b,) (no unit) of each contact code, Eq. (21); a low one means that
+        the hand reaches it.
 
         It is half the squared Mahalanobis distance of the code from the nearest component. The hand
-        probably reaches a code whose energy is below 6.3 (`DEFAULT_ENERGY`), or the paper's bound
-        of 2 (`PAPER_ENERGY`). Where two components are equally near, the derivative is the mean of
-        both derivatives.
+        probably reaches a code whose energy is below 6.3 (`DEFAULT_ENERGY`). The paper's bound is 2
+        (`PAPER_ENERGY`). Where two components are equally near, the derivative is the mean of both
+        derivatives.
 
         Args:
             code: a `ContactCode`, or codes (*b, 6): three lengths [m], then three cosines. b stands
@@ -253,8 +256,8 @@ class GraspMixture(GaussianMixture):
     def joints(
         self, code: ContactCode | Annotated[Float[Tensor, "*b 6"], ANY]
     ) -> Float[Tensor, "*b h"]:
-        """Return the expected positions (*b, h) [rad or m] of the joints given each contact code,
-        Eq. (23) of the paper.
+        """Return the expected positions (*b, h) [rad or m] of the joints, given each contact code,
+        Eq. (23).
 
         They may exceed the joint limits.
 
@@ -279,12 +282,13 @@ class GraspMixture(GaussianMixture):
     def modes(
         self, q: Annotated[Float[Tensor, "*b 6"], ANY], k: Count
     ) -> tuple[Float[Tensor, "*b k h"], Float[Tensor, "*b k"]]:
-        """Return (joints, responsibilities) of the k components most responsible for each contact
-        code.
+        """Return (joints, responsibilities) of the k components that most likely produced each
+        contact code.
 
         `joints` (*b, k, h) [rad or m] are each component's mean given the code. `responsibilities`
-        (*b, k) are the shares h_i in Eq. (23) of the paper, the largest first. Use them where
-        several postures have the same code: the expected joints may then be none of these postures.
+        (*b, k) are the components' probabilities given the code, h_i in Eq. (23), the largest
+        first. Use `modes` where several postures have the same code: the mean that `joints` returns
+        may then be none of these postures.
 
         Args:
             q: codes (*b, 6): three lengths [m], then three cosines. b stands for any batch axes. A
@@ -311,7 +315,7 @@ class GraspMixture(GaussianMixture):
 
     @checked
     def save(self, path: Path | str) -> Path:
-        """Write the mixture to a safetensors file, atomically, for `load_mixture`. Return its path.
+        """Write the mixture to a safetensors file, atomically, for `load_mixture`; return the path.
 
         Raises `OutputError` if the file cannot be written.
 
@@ -343,11 +347,11 @@ def _map_codes(
 
 @checked
 def load_mixture(name_or_path: Path | str) -> GraspMixture:
-    """Return the learned mixture of a hand, read from a file.
+    """Return the learned posture model of a hand, read from a file.
 
     Args:
-        name_or_path: the hand's name, the hand's folder, or the path of a .safetensors file that
-            `GraspMixture.save` wrote.
+        name_or_path: name of a shipped hand, or folder of another hand, which holds a
+            mixture.safetensors. Or the path of a .safetensors file that `GraspMixture.save` wrote.
 
     Raises `HandFileError` for an unknown hand, and `ModelFileError` for a missing or malformed
     file.

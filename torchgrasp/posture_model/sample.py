@@ -108,12 +108,12 @@ Sampling = Literal["uniform", "grasping"]
 @checked
 @dataclasses.dataclass(frozen=True)
 class HandSamples(Batch):
-    """n sampled postures of one hand, from `sample_configurations` or `SampleFolder.read`.
+    """n sampled postures of one hand; `sample_configurations` and `SampleFolder.read` return them.
 
     Attributes:
         joints: positions (n, h) [rad or m] of the h actuated joints.
-        q: contact codes (n, q) of the fingertips: lengths [m], then cosines. A hand of three
-            fingers has q = 6.
+        q: contact codes (n, q) of the fingertips: lengths [m], then cosines (`encode`). A hand of
+            three fingers has q = 6.
         joint_names: names of the h joints, in the order of the columns of `joints`.
         meta: texts that describe hand, seed and sampling.
 
@@ -129,7 +129,9 @@ class HandSamples(Batch):
     meta: dict[str, str] = dataclasses.field(default_factory=dict[str, str])
 
     def rows(self) -> Float[Tensor, "n d"]:
-        """Return d numbers (n, d) for each posture: joints [rad or m], then the contact code."""
+        """Return the joints [rad or m] and the contact code of each posture, side by side, (n, h +
+        q).
+        """
         return torch.cat([self.joints, self.q], dim=-1)
 
 
@@ -138,14 +140,13 @@ class HandSamples(Batch):
 class SampleSpec(Value):
     """The settings by which `write_samples` draws `n` postures without self-collision.
 
-    A smaller set of samples is the beginning of a larger one. Chunk i of `CHUNK_POSTURES` postures
-    depends only on `seed`, `sampling` and i.
+    With the same seed and sampling, a smaller number of postures is the beginning of a larger one.
 
     Args:
         n: number of postures, 1 to 100,000,000.
         seed: seed of the draws.
         sampling: which postures are taken. "uniform" means all, as in the paper. "grasping" means
-            those whose random contacts can have force closure.
+            those in which contacts at random places on the pads can have force closure.
 
     Raises `BadArgument` for values out of range.
 
@@ -160,8 +161,8 @@ class SampleSpec(Value):
 
     @checked
     def meta(self, hand: Hand) -> dict[str, str]:
-        """Return texts by name that identify the samples: hand, seed and sampling, but not their
-        number.
+        """Return texts by name that identify hand, seed and sampling, but not the number of
+        postures.
         """
         return {**describe_compatibility(hand), "seed": str(self.seed), "sampling": self.sampling}
 
@@ -177,7 +178,8 @@ def sample_configurations(
 ) -> HandSamples:
     """Return `n` random postures within the joint limits and without self-collision (Sec. 6.3).
 
-    A smaller set with the same `seed` is the beginning of a larger one.
+    With the same `seed` and `sampling`, a smaller number of postures is the beginning of a larger
+    one.
 
     Args:
         hand: the hand.
@@ -185,9 +187,10 @@ def sample_configurations(
         seed: seed of the draws.
         workers: number of threads that draw at the same time, 1 to 1024.
         sampling: which postures are taken. "uniform" means all without self-collision. "grasping"
-            means those whose random contacts can have force closure; it needs a hand with three
-            fingers.
-        observer: called after each chunk with the number of its postures.
+            means those in which contacts at random places on the pads can have force closure. It
+            needs a hand with three fingers.
+        observer: function that is called after each chunk of up to 10,000 postures with their
+            number.
 
     Raises:
         BadArgument: an argument out of range; "grasping" with another number of fingers.

@@ -146,35 +146,36 @@ def fit_mixture(
     distributed: bool = False,
     observer: Callable[[FitProgress], None] = lambda progress: None,
 ) -> GraspMixture:
-    """Return the mixture of Eqs. (19)-(20), fitted to sampled postures by expectation-maximisation.
+    """Return the mixture of Eqs. (19)-(20), fitted to sampled postures by expectation-maximisation
+    (EM).
 
-    It starts from k-means. The mixture's `meta` reports iterations, convergence, collapsed
-    components, mean log-likelihood [nats] and the Bayesian information criterion (BIC). Codes are
-    exact functions of the joints, so the BIC keeps falling with more components: use its elbow, not
-    its minimum.
+    The fit starts from k-means. The mixture's `meta` reports iterations, convergence, collapsed
+    components, mean log-likelihood [nats] and the Bayesian information criterion (BIC). Contact
+    codes are exact functions of the joints, so the BIC keeps falling with more components. To
+    choose their number, use the BIC's elbow, not its minimum.
 
     Args:
         samples: n postures of one hand: joints [rad or m] and fingertip codes.
         components: number m of Gaussians.
         seed: seed of k-means, and of the random subsets.
-        iterations: largest number of steps.
+        iterations: largest number of EM steps.
         tolerance: the fit stops when a step raises the mean log-likelihood by less [nats].
         regularisation: variance added to every dimension of a component, relative to the
             dimension's variance over all samples.
-        starts: number of k-means initialisations, with consecutive seeds. After a few steps of
-            each, the fit of the greatest likelihood continues.
-        subset: least number of rows of nested random subsets, each half of the next. EM fits one
-            after the other, and all rows at last. Every start is fitted to the smaller subsets.
-            None means that EM sees all rows in each step.
-        checkpoint: file that stores the fit after every step; None means none. A fit that continues
-            from it gives the same bits.
-        distributed: whether `samples` are only the part of this process under torchrun. All
-            processes must see the same checkpoint.
-        observer: called with the state of the fit after each step.
+        starts: number of k-means initialisations, with consecutive seeds. After a short fit from
+            each, only the fit of the greatest likelihood continues.
+        subset: least number of samples in nested random subsets, each half of the next. EM fits one
+            subset after the other, and all samples at last. The `starts` are compared on small
+            subsets. None means that EM uses all samples in each step.
+        checkpoint: file that stores the fit after every step; None means none. If it exists, the
+            fit continues from it, with the same bits as without a break.
+        distributed: whether this is one of several processes under torchrun, and `samples` are only
+            its part. All processes must see the same checkpoint.
+        observer: function that is called with the state of the fit after each step.
 
     Raises:
-        BadArgument: too few samples, or codes of another number of fingers than three; a joint that
-            does not vary; a number out of range; another fit's checkpoint.
+        BadArgument: too few samples, or codes of another number of fingers than three.
+        BadArgument: a joint that does not vary, a number out of range, or another fit's checkpoint.
         ModelFileError: a damaged checkpoint.
         OutputError: a checkpoint that cannot be written.
         IndefiniteCovariance: a component collapses more than three times.

@@ -34,8 +34,8 @@ _log = logging.getLogger(__name__)
 def convex_parts(
     mesh: "trimesh.Trimesh | Path | str", cache: Path | str | None = None
 ) -> "list[trimesh.Trimesh]":
-    """Return convex parts [m] that together fill a closed mesh; a single part if the mesh is
-    convex.
+    """Return convex parts [m] whose union approximates a closed mesh; a convex mesh gives a single
+    part.
 
     Args:
         mesh: the closed mesh [m], or its file.

@@ -55,8 +55,8 @@ class Neighbour:
     Args:
         mesh: closed mesh [m], in the frame of the grasp.
         parts: convex parts of the mesh [m]; None means those that `convex_parts` computes.
-        mass: mass [kg]. None means the mass by `TrialSpec.mass` or `TrialSpec.density`, as for the
-            object.
+        mass: mass [kg]. None means that `TrialSpec.mass` or `TrialSpec.density` gives it, as for
+            the object.
     """
 
     mesh: "trimesh.Trimesh"
@@ -81,9 +81,10 @@ class Body:
 
 @dataclasses.dataclass(frozen=True)
 class SceneSpec:
-    """Parameters of a simulated scene: a hand on its mount, the object, the table and neighbours.
+    """Parameters of a simulated scene: a hand, the object, the table and neighbours.
 
-    `open_scene` takes it. All is in the world's frame, with z up.
+    `open_scene` takes it. Everything is in the world's frame, with z up. The hand is carried by a
+    mount: a chain of driven prismatic joints in place of an arm.
 
     Args:
         urdf_path: URDF of the hand.
@@ -95,7 +96,7 @@ class SceneSpec:
         parts: convex bodies [m] that make up the object.
         mass: mass [kg] of the object.
         friction: friction coefficient of every contact; `table_friction` may replace it.
-        gravity: gravity [m/s^2], downward.
+        gravity: acceleration [m/s^2] by gravity, downward.
         timestep: timestep [s] of the simulator.
         travel: largest height [m] of a lift.
         approach: displacement (x, y, z) [m] from the hand's start to the pose `world_from_hand`.
@@ -104,10 +105,10 @@ class SceneSpec:
             patch.
         height: height [m] of the table; None means the lowest point of the mesh.
         neighbours: other bodies on the table.
-        self_pairs: pairs of the hand's links that collide with each other.
-        yields: largest displacement [m] of the mount along each axis of the world; 0 if the mount
-            is stiff.
-        start: initial displacement (x, y, z) [m] of the mount, if it yields.
+        self_pairs: names of the two links of each pair of the hand's links that can collide.
+        yields: largest displacement [m] of the mount along each axis of the world, beside approach
+            and lift; 0 allows none.
+        start: initial displacement (x, y, z) [m] of a mount that `yields`.
         table_friction: friction coefficient of objects with the table and with each other; None
             means `friction`.
         mount: all prismatic joints of the mount; None means those that `travel`, `approach` and
@@ -139,15 +140,18 @@ class SceneSpec:
 
     @functools.cached_property
     def urdf(self) -> Urdf:
-        """The parsed URDF of the hand; raises `HandFileError` if the file is not valid."""
+        """The parsed URDF of the hand.
+
+        Raises `HandFileError` if the file is not valid.
+        """
         return read_urdf(self.urdf_path)
 
     @functools.cached_property
     def slides(self) -> list["Slide"]:
-        """The prismatic joints of the mount that carries the hand, in order from the world to the
-        hand.
+        """The prismatic joints of the mount that carries the hand, from the world to the hand.
 
-        Each has its name, its unit axis in the world's frame, its limits [m] and its start [m].
+        Each has its name, its unit axis in the world's frame, its limits [m] and its start position
+        [m].
         """
         if self.mount is not None:
             return list(self.mount)
@@ -178,16 +182,16 @@ class SceneSpec:
 
     @property
     def table_height(self) -> float:
-        """The height [m] of the table."""
+        """The height [m] of the table: `height`, or the lowest point of the object's mesh."""
         return float(self.mesh.bounds[0, 2]) if self.height is None else self.height
 
     @property
     def hulls(self) -> list[list[np.ndarray]]:
-        """The vertices (v, 3) [m] of each convex part: a list for the object, then one for each
+        """The vertices (v, 3) [m] of all convex parts: a list for the object, then one for each
         neighbour.
 
-        Vertices nearly on the table are moved onto it. A scanned round body would otherwise roll
-        away on its facets before it is touched.
+        Vertices less than 0.3 mm above the table, or below it, are moved onto it. Otherwise a
+        scanned round body would roll away on its facets before it is touched.
         """
         lowest = self.table_height + SIMULATION.near if self.table else -math.inf
         found = []

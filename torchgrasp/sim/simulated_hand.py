@@ -50,26 +50,28 @@ def open_scene(spec: SceneSpec, simulator: Simulator = "sapien") -> SimulatedSce
 
 
 class SimulatedHand:
-    """A simulated hand of f fingers, as a controller uses it: `tick` takes targets, and observes.
+    """A simulated hand of f fingers, as a controller sees it: `tick` takes targets and returns
+    measurements.
 
     Args:
         scene: scene at its initial state, from `open_scene`.
         reference: the closing plan.
-        control_rate: rate [Hz] of the control ticks.
+        control_rate: rate [Hz] of the control ticks; a tick is a whole number of the scene's
+            timesteps.
         generator: source of the noise of the fingertips' sensors; None means no noise.
 
     Attributes:
         truth: the true contacts of the last tick, in the hand's frame.
-        force: true normal forces (f,) [N], averaged over the tick.
+        force: true normal forces (f,) [N], averaged over the last tick.
         pushes: full forces (f, 3) [N] of the fingertips on the object, in the world's frame,
-            averaged over the tick.
-        finger: mask (f,) of the fingers that touched the object in the last step.
-        steps: number of steps of the simulator so far.
+            averaged over the last tick.
+        finger: mask (f,) of the fingers that touched the object in the last timestep.
+        steps: number of timesteps so far.
         sent: targets (j,) [rad or m] of the last tick, in the order of `scene.joint_names`.
-        first_touch: number of the step of each fingertip's first contact (f,); infinite before it.
-        first_stray: number of the step of the hand's first other contact (3,); infinite before it.
-            The three are with a neighbour, with the table, and of links that are no fingertip with
-            the object.
+        first_touch: timestep (f,) of each fingertip's first contact with the object; infinite
+            before it.
+        first_stray: timestep (3,) of the hand's first unintended contact: with a neighbour; with
+            the table; of a link that is no fingertip with the object. Infinite before it.
         stray: sums of the impulses (3,) [N s] of these contacts.
         most_stray: largest force (3,) [N] of these contacts, averaged over a tick.
         period: time [s] of a control tick.
@@ -113,11 +115,14 @@ class SimulatedHand:
 
     @checked
     def tick(self, targets: Targets) -> Observation:
-        """Drive joints and palm towards their targets for one control tick; return the observation
-        at its end.
+        """Drive joints and palm towards their targets for one control tick; return what the hand
+        then measures.
 
-        `targets` are the controller's. Raises `BadArgument` unless they hold all joints of the
-        URDF.
+        Args:
+            targets: targets of all movable joints of the URDF and of the palm, as
+                `GraspController.step` returns them.
+
+        Raises `BadArgument` unless the targets have all joints of the URDF.
         """
         if len(targets.joints) != len(self._to_scene):
             allowed = f"all {len(self._to_scene)} of the URDF"
@@ -155,15 +160,15 @@ class SimulatedHand:
 
     @checked
     def rest(self, ticks: Annotated[int, Range(0, 1000000)]) -> None:
-        """Keep the last targets for a number of control ticks, without observations."""
+        """Keep the last targets for a number of control ticks, without measurements."""
         self.scene.skip(ticks * self.substeps)
         self.steps += ticks * self.substeps
 
     def unbalanced(self) -> float:
-        """Return the norm of the sum of all fingertip forces over the sum of their norms, in [0,
-        1].
+        """Return how far the fingertip forces of the last tick are from balance, in [0, 1].
 
-        It is for the last tick, and NaN if there are no forces.
+        It is the norm of the sum of all forces, divided by the sum of their norms; NaN without
+        forces.
         """
         sizes = float(np.linalg.norm(self.pushes, axis=-1).sum())
         return float(np.linalg.norm(self.pushes.sum(0))) / sizes if sizes > 0.0 else math.nan

@@ -40,25 +40,24 @@ class StepContacts:
 
 
 class SimulatedScene(abc.ABC):
-    """A simulated scene of one trial: table, object, neighbours and a hand on a mount; `open_scene`
-    makes it.
+    """A simulated scene of one trial: table, object, neighbours and a hand; `open_scene` makes it.
 
-    Arrays are in the world's frame. The j driven joints are all movable joints of the hand's URDF.
-    f counts the fingertips, in the order of the grasp's contacts.
+    Arrays are in the world's frame. The hand is carried by a mount, a chain of prismatic joints
+    (`SceneSpec.slides`). The j driven joints are all movable joints of the hand's URDF. f counts
+    the fingertips, in the order of the grasp's contacts.
 
     Attributes:
         joint_names: names of the j driven joints, in the order of every array of joints.
         spec: the parameters of the scene.
-        timestep: time [s] of a step.
+        timestep: time [s] of a step of the simulator.
         centre: centre of mass (3,) [m] of the object, in the object's frame.
         body: the simulator's handle of the object.
         root: the simulator's handle of the hand's root link.
         tips: the simulator's handles of the links of the f fingertips.
         neighbours: the simulator's handles of the other bodies.
-
-    A simulator's subclass sets `joint_names` and the handles, then calls `_map_contacts`.
     """
 
+    # The class of a simulator sets these, then calls `_map_contacts`.
     joint_names: tuple[str, ...]
     body: Any
     root: Any
@@ -85,7 +84,7 @@ class SimulatedScene(abc.ABC):
                 self._finger_of.setdefault(carrier, i)
 
     def step(self) -> StepContacts:
-        """Advance by one timestep, and return the hand's contacts during it, summed for each
+        """Advance by one timestep; return the contacts of the hand during it, summed for each
         finger.
         """
         sums = [[0.0] * 10 for _ in self.tips]
@@ -125,7 +124,7 @@ class SimulatedScene(abc.ABC):
 
     @abc.abstractmethod
     def skip(self, steps: int) -> None:
-        """Advance by `steps` timesteps, without reports of contacts."""
+        """Advance by `steps` timesteps, without a report of contacts."""
 
     @abc.abstractmethod
     def _advance(self) -> Iterable[tuple[Any, Any, Any]]:
@@ -144,18 +143,18 @@ class SimulatedScene(abc.ABC):
 
     @abc.abstractmethod
     def keep(self) -> "Callable[[], SimulatedScene]":
-        """Return a function that opens scenes in the present state of this one.
+        """Return a function that returns copies of this scene in its present state.
 
-        Each of them continues bitwise as this one does.
+        Each copy continues bitwise as this scene does.
         """
 
     @abc.abstractmethod
     def drive(self, targets: np.ndarray) -> None:
-        """Set the `targets` (j,) [rad or m] of the j driven joints, until the next call."""
+        """Set the targets (j,) [rad or m] of the j driven joints, until the next call."""
 
     @abc.abstractmethod
     def pull(self, force: np.ndarray, torque: np.ndarray = STILL) -> None:
-        """Apply a `force` (3,) [N] at the object's centre of mass, and a `torque` (3,) [N m].
+        """Apply a force (3,) [N] at the object's centre of mass, and a torque (3,) [N m].
 
         Both are in the world's frame, and act in all later steps until the next call.
         """
@@ -164,7 +163,7 @@ class SimulatedScene(abc.ABC):
     def displace(self, shift: np.ndarray) -> None:
         """Move the object at once by a displacement `shift` (3,) [m] in the world's frame.
 
-        This is as if a person pushed the object while the hand approaches.
+        Trials call it to displace the object while the hand approaches.
         """
 
     @abc.abstractmethod
@@ -173,11 +172,13 @@ class SimulatedScene(abc.ABC):
 
     @abc.abstractmethod
     def jacobian(self, points: np.ndarray) -> np.ndarray:
-        """Return the Jacobian (f, 3, j) [m/rad] of one point on each fingertip by the driven
-        joints.
+        """Return the Jacobian (f, 3, j) of one point on each fingertip by the driven joints.
 
-        The `points` (f, 3) [m] and the result are in the world's frame. Columns of sliding joints
-        have no unit.
+        Points and result are in the world's frame. The unit is [m/rad]; columns of sliding joints
+        have none.
+
+        Args:
+            points: a point (f, 3) [m] on each fingertip.
         """
 
     @abc.abstractmethod
@@ -199,23 +200,28 @@ class SimulatedScene(abc.ABC):
 
     @checked
     def lift(self, height: float, speed: float = 0.0) -> None:
-        """Set the target `height` [m] of the mount above its start, with a `speed` [m/s]."""
+        """Set the target of the lift: the height [m] of the mount above its start, and a speed
+        [m/s].
+
+        Both are along the world's z axis.
+        """
         self._move_mount(LIFT_JOINT, height, speed)
 
     @checked
     def approach(self, left: float, speed: float = 0.0) -> None:
-        """Set the target of the hand's motion along its approach.
-
-        The target is the distance `left` [m] before the end of the approach, with a `speed` [m/s].
-        """
+        """Set the target of the approach: the distance `left` [m] to its end, and a speed [m/s]."""
         self._move_mount(APPROACH_JOINT, -left, speed)
 
     @checked
     def shift(self, displacement: np.ndarray, velocity: np.ndarray = STILL) -> None:
-        """Set the target of the hand's displacement from its path, if the mount yields.
+        """Set the target of the mount's displacement from its path; only for `SceneSpec.yields`
+        above 0.
 
-        The target has a `displacement` (3,) [m] and a `velocity` (3,) [m/s], both in the world's
-        frame. Raises `BadArgument` for arrays of another shape, or without numbers.
+        Args:
+            displacement: displacement (3,) [m] in the world's frame.
+            velocity: velocity (3,) [m/s] in the world's frame.
+
+        Raises `BadArgument` for arrays of another shape, or without numbers.
         """
         for name, vector in (("displacement", displacement), ("velocity", velocity)):
             if vector.shape != (3,) or vector.dtype.kind not in "iuf":
@@ -234,8 +240,9 @@ class SimulatedScene(abc.ABC):
         return self._pose(self.body)
 
     def hand_pose(self) -> np.ndarray:
-        """Return the pose (4, 4) [m] of the hand's root link in the world's frame; valid after the
-        first step.
+        """Return the pose (4, 4) [m] of the hand's root link in the world's frame.
+
+        It is valid after the first step.
         """
         return self._pose(self.root)
 

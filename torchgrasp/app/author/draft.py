@@ -74,16 +74,18 @@ DRAFT = DraftNumbers()
 
 
 class Draft(NamedTuple):
-    """A first hand.toml for a URDF, and the repaired URDF.
+    """A first hand.toml, the file that describes a hand (docs/hands.md), with a repaired URDF;
+    `new_hand` returns it.
 
     Attributes:
         toml: text of the hand.toml.
-        urdf: text of the clean URDF to which it refers; "" if the published URDF is clean.
+        urdf: text of the repaired URDF, which the hand.toml names. It is "" if nothing had to be
+            repaired; the hand.toml then names the published URDF.
         repairs: a sentence for each repair of the URDF.
-        warnings: a sentence for each number of the URDF that no hand has, and for each guess that
-            is likely wrong; `toml` has them, too.
-        meshes: bytes of the files of visual meshes to which `urdf` refers, by their paths beside
-            it. Pictures alone use them.
+        warnings: a sentence for each number of the URDF that is implausible for a hand, and for
+            each guess that is likely wrong. `toml` repeats them as comments.
+        meshes: bytes of each visual mesh file that `urdf` names, by its path relative to the URDF.
+            Only pictures use them.
     """
 
     toml: str
@@ -94,20 +96,22 @@ class Draft(NamedTuple):
 
 
 class Wish(NamedTuple):
-    """The user's choices for a new hand; `draft_hand` decides what is left empty.
+    """The user's choices for a new hand (`new_hand`). What is left empty is guessed.
 
     Attributes:
-        tips: links of the fingertips in grasp order.
-        name: name of the hand, by default the robot's.
-        root: first link of the hand, where the URDF has an arm, too.
-        meshes: folder of all meshes, by default the URDF's.
-        visual: links without <collision> take their <visual> as collision shapes.
-        tip_offset: lengths [m] by which sensor tips reach beyond the fingertips: one for all, or
-            one for each of `tips`. The direction is that from the axis of the finger's last joint
-            to its end, across this axis, and fixed in the frame of the fingertip's link. The pad's
-            contact point moves by exactly this length, its normal not. 0 adds no sensor.
-        tip_radius: radii [m] of the balls in which sensor tips end, likewise; by default those of
-            the fingertips' balls.
+        tips: names of the fingertip links, three to five; the first three grasp by default. ()
+            means the last link of each branch.
+        name: name of the hand; "" means the robot's name in the URDF.
+        root: name of the hand's first link, if the URDF also has an arm. Links that are not below
+            it are left out.
+        meshes: folder in which all mesh files lie; None means the folder of the URDF.
+        visual: whether links without <collision> take their <visual> as collision shapes.
+        tip_offset: lengths [m] by which tactile sensors extend the fingertips. () means no sensors.
+            One number counts for all fingertips, several for each of `tips`; 0 adds no sensor. A
+            sensor points away from the axis of the finger's last joint, to the fingertip's end. The
+            contact point of the fingertip's pad moves by this length; its normal stays.
+        tip_radius: radii [m] of the balls in which the sensors end, counted like `tip_offset`. ()
+            means the radii of the fingertips' own balls.
     """
 
     tips: tuple[str, ...] = ()
@@ -128,14 +132,20 @@ def draft_hand(
 ) -> str:
     """Return the text of a hand.toml for a clean URDF, for the user to review.
 
-    `check_hand` checks it. `tips` are the links of the fingertips in grasp order. They form the
-    hand.toml's sets of fingers: "default" has the first three, "four" the first four, and "five"
-    all five. A set is left out if there are too few tips. By default the tips are the last links of
-    the branches, in the order in which their pads best face each other. The hand has the `name` of
-    the robot by default. `seed` is that of the random postures from which pads are guessed. Raises
-    `HandFileError` for a URDF that is missing or malformed, or needs repair by `new_hand`. Raises
-    `BadArgument` for fewer than three tips, more than five, or a tip without a collision shape or a
-    movable joint.
+    `torchgrasp.testing.check_hand` checks the finished hand. The hand.toml has up to three sets of
+    fingers that grasp: "default" with three tips, "four" and "five".
+
+    Args:
+        path: the URDF. It must need no repair; `new_hand` repairs others.
+        tips: names of three to five fingertip links; each set has the first ones. Empty means the
+            last link of each branch; each set then has the tips whose pads face each other best.
+        name: name of the hand; None means the robot's name in the URDF.
+        seed: seed of the random postures from which the fingertip pads are guessed.
+
+    Raises:
+        HandFileError: a URDF or a mesh that is missing or malformed, or a URDF that needs repair.
+        BadArgument: fewer than three tips, more than five, or a tip without a collision shape or a
+            movable joint.
 
     >>> from torchgrasp.hand.load import find_hand
     >>> text = draft_hand(find_hand("barrett") / "hand.urdf")
@@ -156,16 +166,23 @@ def new_hand(
     seed: Seed = 0,
     file: str = "hand.urdf",
 ) -> Draft:
-    """Repair a published URDF, and draft a hand.toml for the clean copy.
+    """Return a hand.toml for a published URDF or MJCF, with a repaired copy of the URDF.
 
-    An MJCF (.xml, .mjcf) is read by MuJoCo, and becomes a URDF.
+    If hardly any random posture is free of self-collision, the pairs of links that meet most often
+    are no longer tested. A warning names them.
 
-    The user saves the clean copy as `file`, which the hand.toml names. `wish` holds the user's
-    choices; `seed` is that of the random postures from which pads are guessed. Where links meet in
-    nearly all postures, the pairs that cause it are left out of the self-collision, and a warning
-    names them. Raises the errors of `draft_hand`, and `HandFileError` for a mesh that is refused, a
-    URDF without collision shapes, or one that cannot be repaired; `MissingExtra` for an MJCF
-    without MuJoCo.
+    Args:
+        path: the URDF; or an MJCF (.xml, .mjcf), which MuJoCo reads and which becomes a URDF.
+        wish: the user's choices, such as the fingertips.
+        seed: seed of the random postures from which the fingertip pads are guessed.
+        file: name of the file in which the user saves the repaired URDF; the hand.toml names it.
+
+    Raises:
+        HandFileError: a file or a mesh that is missing, malformed or refused; no collision shape;
+            or a fault that cannot be repaired.
+        BadArgument: an unknown root; fewer than three tips or more than five; a tip without a
+            collision shape or a movable joint; or a bad length or radius of a sensor.
+        MissingExtra: an MJCF without MuJoCo.
 
     >>> from torchgrasp import load_hand
     >>> draft = new_hand(load_hand("barrett").urdf_path, Wish(name="mine"))
@@ -375,11 +392,16 @@ def _part_pairs(
 
 @checked
 def clean_arm(path: Path | str, meshes: Path | str | None = None) -> str:
-    """Return the URDF of a published arm with boxes and cylinders instead of meshes, as `load_arm`
-    needs it.
+    """Return the text of an arm's URDF with boxes and cylinders in place of collision meshes.
 
-    The meshes lie below the folder `meshes`, by default that of the URDF. A joint without limits
-    gets half a turn either way. Raises the errors of `new_hand`.
+    `load_arm` needs such a URDF. A revolute joint without limits gets [-pi, pi] rad.
+
+    Args:
+        path: the published URDF of the arm.
+        meshes: folder in which all mesh files lie; None means the folder of the URDF.
+
+    Raises `HandFileError` for a URDF or a mesh that is missing, malformed or refused, and for a
+    sliding joint without limits.
 
     >>> from torchgrasp import load_hand
     >>> clean_arm(load_hand("barrett").urdf_path).splitlines()[0]

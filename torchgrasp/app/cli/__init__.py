@@ -87,10 +87,16 @@ All commands: torchgrasp --help. To read: README.md and docs/ of the repository.
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; return its exit code.
+    """Run the command line in this process; return its exit code.
 
-    `arguments` are the words after `torchgrasp`, by default those of this process. Errors are
-    printed as one sentence on stderr.
+    The code is 0 for success and 2 for bad input. It is 1 if no grasp is executable, or if the
+    object was not held. An interrupted run gives 130. Errors are printed as one sentence on stderr.
+
+    PyTorch uses one thread from then on. Raises `SystemExit` after the help of a command, and for
+    unknown options.
+
+    Args:
+        arguments: the words after `torchgrasp`; None means those of this process.
 
     >>> main(["--version"])
     torchgrasp ...
@@ -109,7 +115,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run_and_exit() -> NoReturn:
-    """Run the command line with the words of this process, and end the process with the exit code.
+    """Run the command line with the arguments of this process, and end the process with its exit
+    code.
 
     The first SIGINT or SIGTERM ends the command cleanly. Later signals are ignored, so that the
     command can clean up.

@@ -31,8 +31,8 @@ def write_evaluation(
     Args:
         path: the file to write.
         title: title of the page.
-        asked: the settings of the evaluation by name, which the page lists.
-        scores: the scores that `evaluate` yielded.
+        asked: settings that the page lists, by name, such as {"hand": "allegro"}.
+        scores: the `ViewScore` of each view, as `evaluate` yields them.
 
     Raises `OutputError` if the file cannot be written.
 

@@ -43,8 +43,9 @@ def write_glb(
     """Write a hand at a single grasp, with the object, as one GLB file, atomically; return the
     path.
 
-    The file is binary glTF 2.0, in metres, with y up. Its nodes are the hand's links by name, in
-    the colours of their fingers, and "object".
+    The file is binary glTF 2.0, in metres, with y up. Up is the normal of the grasp's table;
+    without a table it is the z axis of the grasp's frame. The nodes are "object" and the hand's
+    links by name. Each finger has its own colour.
 
     Args:
         path: the file to write.
@@ -53,8 +54,8 @@ def write_glb(
         body: the object's mesh [m] in the frame of the grasp, or its estimated surface. The surface
             is coloured by its standard deviation.
 
-    Raises `BadArgument` if there is not exactly one grasp, or if it does not touch the mesh. Raises
-    `OutputError` if the file cannot be written.
+    Raises `BadArgument` if there is not exactly one grasp, or if the grasp does not touch the mesh.
+    Raises `OutputError` if the file cannot be written.
 
     >>> import tempfile
     >>> from torchgrasp import load_hand, load_object

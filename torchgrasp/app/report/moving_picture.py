@@ -63,23 +63,22 @@ def write_film(
     rate: Rate = 15,
     observer: Callable[[int, int], Any] | None = None,
 ) -> Path:
-    """Write the closing of a grasp as a moving picture, atomically; return the path.
+    """Write a simulated closing as a moving picture in real time, atomically; return the path.
 
-    It shows the approach, the closing and the lift at the speed of the simulation. One fixed camera
-    takes all pictures, so the lift is visible.
+    It shows the approach, the closing and the lift, from one fixed camera.
 
     Args:
         path: the file to write: .gif or .mp4. An .mp4 needs the extra `film`, or `ffmpeg` on the
             search path.
         hand: the hand of the grasp.
         grasp: a single grasp.
-        closure: its closing in simulation, from `close_hand`.
-        mesh: the object [m] in the frame of the grasp.
-        direction: direction (x, y, z) from the object to the camera, where z is up. None means
-            across the fingers.
-        rate: pictures each second.
-        observer: function that is called with the number of pictures done and the number of all
-            pictures.
+        closure: the simulated closing of this grasp, from `close_hand`.
+        mesh: the object's mesh [m] in the frame of the grasp.
+        direction: direction (x, y, z) from the object to the camera, of any length. z is up, along
+            the normal of the grasp's table. None means a side from which all fingers are seen.
+        rate: pictures in each second, 1 to 50.
+        observer: function that is called after each picture, with the number of pictures done and
+            the number of all pictures.
 
     Raises:
         BadArgument: the file is of another kind, there is not exactly one grasp, or the closing is

@@ -40,10 +40,11 @@ def write_report(path: Path | str, run: Run, view: str = "") -> Path:
     Args:
         path: the file to write.
         run: the inputs and results that the report shows.
-        view: file name of the 3D page that `write_viewer` wrote beside the report, for a link; ""
-            means no link.
+        view: name of the file that `write_viewer` wrote into the same folder; the report links to
+            it. "" means no link.
 
-    Raises `OutputError` if the file cannot be written.
+    Raises `OutputError` if the file cannot be written, and `BadArgument` if the executable grasps
+    do not touch the run's mesh.
 
     >>> import tempfile
     >>> from torchgrasp import ContactSpec, fit_shape, load_hand, load_object

@@ -34,20 +34,28 @@ Index = tuple[str, str, np.ndarray]
 
 @checked
 def write_recording(path: Path | str, run: Run) -> Path:
-    """Write a run as a recording of the viewer Rerun, atomically; return the path.
+    """Write a run as a recording for the viewer Rerun, atomically; return the path.
 
-    `rerun FILE.rrd` opens it. Lengths are in metres. Entities are in the frame of the cloud:
+    `rerun FILE.rrd` opens it. Lengths are in metres. These entities are in the frame of the cloud:
 
-    * `cloud`, `surface` in the colours of its standard deviation, and `contacts` with outward
-      normals.
-    * `plan/hand`, on the timeline `posture`: approach, pre-grasp, grasp and squeeze of the best
-      grasp.
-    * `closing/hand` and `closing/object`, on the timeline `time` [s]: the simulated closing.
-    * `closing/forces`: the forces on the object, 1 cm for each newton; `force/FINGER` [N] are
-      curves.
+    * `cloud`, `surface` coloured by its standard deviation, and `contacts` as arrows along the
+      outward normals.
+    * `plan/hand`: the best grasp on the timeline `posture`: approach, pre-grasp, grasp and squeeze.
+      Squeeze is the target of the finger drives.
+    * `closing/hand` and `closing/object`: the simulated closing, on the timeline `time` [s].
+    * `closing/forces`: the forces on the object as arrows, 1 cm for each newton.
 
-    Raises `MissingExtra` if Rerun (extra `rerun`) is not installed, and `OutputError` if the file
-    cannot be written.
+    `force/FINGER` is the curve of a fingertip's force [N]. A run without a closing or a mesh has no
+    `closing` and no `force`.
+
+    Args:
+        path: the file to write, FILE.rrd.
+        run: the inputs and results that are recorded.
+
+    Raises:
+        MissingExtra: Rerun (extra `rerun`) is not installed.
+        BadArgument: the executable grasps do not touch the run's mesh.
+        OutputError: the file cannot be written.
 
     >>> write_recording("run.rrd", run)  # doctest: +SKIP
     """

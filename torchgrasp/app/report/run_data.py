@@ -38,7 +38,7 @@ CREEP = 0.01  # fingertips that stick slide more slowly than this [m/s]
 @checked
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """The inputs and results of one planning run, which reports show; a user makes it.
+    """The inputs and results of one planning run, for `write_report`, `write_viewer` and others.
 
     Cloud, surface, grasps, mesh and scene are in one frame, in metres.
 
@@ -53,11 +53,13 @@ class Run:
         stages: name, result in words and wall time [s] of each stage.
         plan: the contacts that were planned; None if they are unknown.
         mesh: the true object [m]; None if it is unknown.
-        closure: result of closing on the true object, only with `mesh`; None without a closing.
+        closure: result of `close_hand` for the first executable grasp on `mesh`; None without a
+            closing.
         scene: the scene that the cloud was cut from; None without a scene.
         explanation: why no grasp is executable, and what would help; None if it is not asked for.
-        costs: sentences on what lowers the predicted success of the best grasp most.
-        look: from where a second view would help; None if none is needed.
+        costs: sentences on what lowers the predicted success of the best grasp most, such as those
+            of `explain_success`.
+        look: where a second view would help; None if no second view is needed.
         command: the command line of the run, or "".
         date: date and time of the run as text, or "".
     """
@@ -87,21 +89,23 @@ class Run:
 
     @property
     def title(self) -> str:
-        """The title of the run's pages, which names object and hand."""
+        """The title of the run's pages, which names the object and the hand."""
         return f"Grasps of the {self.object_name} with the {self.hand.name} hand"
 
     @property
     def good(self) -> bool:
-        """Whether the object was held in the closing; without a closing, whether a grasp is
+        """Whether the simulated closing held the object; without a closing, whether any grasp is
         executable.
         """
         return bool(self.closure.held) if self.closure is not None else len(self.executable) > 0
 
     def upright(self) -> "Run":
-        """Return the run in the upright frame of its cloud and table, where z is up.
+        """Return the run in a frame whose z axis points up.
 
-        A table has the height z = 0 there. `spec` stays as it is. Raises `BadArgument` for a mesh
-        that the executable grasps do not touch.
+        z is the normal of the table, and the table has the height z = 0. Without a table, z points
+        to the camera. `spec` is not transformed: its table stays in the frame of the old cloud.
+
+        Raises `BadArgument` if the executable grasps do not touch the mesh.
         """
         obj_from_upright = upright_frame(self.cloud.points, self.cloud.viewpoint, self.spec.plane)
         upright_from_obj = inverse(obj_from_upright)

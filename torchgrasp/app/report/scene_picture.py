@@ -90,9 +90,9 @@ TEXT = SceneText()
 
 @checked
 def draw_scene(scene: Scene, path: Path | str) -> Path:
-    """Write a picture of a scene as a PNG file; return the path.
+    """Write a picture of a scene, as its camera saw it, as a PNG file; return the path.
 
-    It shows the support, numbered objects, obstacles, unmeasured pixels and a legend.
+    It shows the support plane, the numbered objects, obstacles, unmeasured pixels and a legend.
 
     Args:
         scene: the scene.

@@ -77,19 +77,25 @@ POSTURES = ("approach", "pre-grasp", "grasp", "squeeze")
 
 @checked
 def write_viewer(path: Path | str, run: Run) -> Path:
-    """Write a run as a 3D page in one HTML file, atomically; return the path.
+    """Write a run as an interactive 3D page in one HTML file, atomically; return the path.
 
-    The page needs WebGL, but no network. It shows the cloud, the surface by its standard deviation,
-    a shell at k standard deviations, and the contacts. Each of the best 20 grasps has four postures
-    of the hand, and the motion with the lift. The closing of the first grasp is replayed with its
-    forces. The address may name a state, as in `view.html#grasp=3&posture=squeeze&sigma=2` or
+    The page needs WebGL, but no network. It shows:
+
+    * the cloud, and the surface coloured by its standard deviation;
+    * the surface moved by a chosen number of standard deviations;
+    * the best 20 grasps with their contacts, each in four postures: approach, pre-grasp, grasp and
+      squeeze (the target of the finger drives);
+    * a replay of the run's closing with its forces.
+
+    The address may name a state: `view.html#grasp=3&posture=squeeze&sigma=2` or
     `view.html#tick=50`.
 
     Args:
         path: the file to write.
         run: the inputs and results that the page shows.
 
-    Raises `OutputError` if the file cannot be written.
+    Raises `OutputError` if the file cannot be written, and `BadArgument` if the executable grasps
+    do not touch the run's mesh.
 
     >>> import tempfile
     >>> from torchgrasp import ContactSpec, fit_shape, load_hand, load_object
@@ -113,12 +119,13 @@ def show_grasps(
 
     Args:
         cloud: the cloud that was planned on, in any form that `plan_grasps` takes. The surface on
-            the page is estimated anew from it.
+            the page is estimated again from this cloud.
         grasps: grasps that were planned on the cloud.
-        hand: the hand; None means the shipped hand that the grasps name.
-        browser: whether the page is opened; if False it is only written.
+        hand: the hand of the grasps; None means the shipped hand that `grasps.meta` names.
+        browser: whether the page is opened; False only writes it.
 
-    Raises `BadArgument` for a cloud that the grasps do not touch.
+    Raises `BadArgument` for a cloud that the grasps do not touch, and for a hand other than that of
+    the grasps.
 
     >>> from torchgrasp import load_object
     >>> from torchgrasp.data.shipped import load_shipped_grasp
