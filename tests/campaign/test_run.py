@@ -60,6 +60,32 @@ def test_a_loader_makes_batches_of_what_the_job_holds(data: Path):
 
 @pytest.mark.sim
 @pytest.mark.filterwarnings("ignore")
+def test_a_success_that_no_trial_supports_is_no_number_in_a_data_set(data: Path):
+    data = read_shards(data)
+    predicted = [data[i]["predicted"] for i in range(2)]
+    assert predicted == data.job(0).grasps.success.float().tolist()
+    shard = data.recent.get(0, data._read)
+    known = torch.tensor([True, False])
+    grasps = dataclasses.replace(shard.records.grasps, known=known)
+    records = dataclasses.replace(shard.records, grasps=grasps)
+    changed = dataclasses.replace(data, recent=Kept(shard._replace(records=records)))
+    assert changed[0]["predicted"] == predicted[0] and changed[1]["predicted"].isnan()
+    assert type(changed[0]["predicted"]) is torch.Tensor
+
+
+class Kept:
+    """A cache that holds one shard."""
+
+    def __init__(self, shard):
+        self.shard = shard
+
+    def get(self, key, make):
+        """Return the shard."""
+        return self.shard
+
+
+@pytest.mark.sim
+@pytest.mark.filterwarnings("ignore")
 def test_bad_objects_and_errors_of_the_library_have_rows(
     carton: Path, tmp_path: Path, monkeypatch, capsys
 ):

@@ -83,6 +83,8 @@ def test_a_folder_without_a_manifest_or_the_object_is_refused(folder: Path, tmp_
         list_views(tmp_path / "empty")
     with pytest.raises(BadArgument, match="asked for"):
         list_views(folder, only=["jug"])
+    with pytest.raises(BadArgument, match="jug"):  # none of several names is skipped
+        list_views(folder, only=["box", "jug"])
 
 
 def test_a_folder_of_meshes_becomes_objects_with_views_that_see_them(tmp_path: Path):

@@ -237,11 +237,11 @@ def list_views(
         objects: the folder of objects, as `write_objects` makes it.
         whole: whether each object has only the view "whole" instead, a cloud of all its sides. Its
             file, OBJECT/full_normals.ply, is not among those that `write_objects` writes.
-        only: names of the objects to list; unknown names are ignored. Empty means all objects.
+        only: names of the objects to list. Empty means all objects.
         most: largest number of views of each object; None means all.
 
-    Raises `DatasetError` if there is no manifest, if it has none of the objects, or for a bad
-    entry.
+    Raises `DatasetError` if there is no manifest, if it has no objects or lacks one of `only`, or
+    for a bad entry.
 
     >>> import tempfile, trimesh
     >>> folder = Path(tempfile.mkdtemp())
@@ -338,8 +338,9 @@ def _read_fields(objects: Path | str, only: Sequence[str]) -> dict[str, Field]:
     )
     top = read_json(path, refuse, allowed).entries()
     entries = top["objects"].entries() if "objects" in top else {}
-    chosen = {name: entries[name] for name in entries if not only or name in only}
-    if not chosen:
+    missing = sorted(set(only) - set(entries))
+    if missing or not entries:
         found = f"{path} with {sorted(entries)[:SHOWN_NAMES]}"
-        raise refuse(found, "a manifest with the objects asked for")
-    return chosen
+        wanted = "objects" if not only else f"the objects asked for, {missing[:SHOWN_NAMES]} too"
+        raise refuse(found, f"a manifest with {wanted}")
+    return {name: entries[name] for name in entries if not only or name in only}

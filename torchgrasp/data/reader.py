@@ -59,7 +59,7 @@ class GraspShards:
       `std_m` (f,) [m] of the surface there.
     * `margin` and `witness` (6,) of the `Certificate`.
     * `clearance` [m].
-    * `predicted`, the predicted success in [0, 1].
+    * `predicted`, the predicted success in [0, 1]; NaN where no trial supports it.
     * `simulated`, the share of simulated trials that passed.
     * `closed`, a boolean: whether the contacts have frictional form closure.
     * `job`, an integer: the index in `jobs` of the grasp's view.
@@ -118,12 +118,12 @@ class GraspShards:
             "std_m": contacts.require_std()[g],
             "margin": certificate.margin[g],
             "witness": certificate.witness[g],
-            "predicted": torch.sigmoid(grasps.score[g]),
+            "predicted": grasps.success[g],
             "simulated": records.passed[g].double().mean(),
             "points": _choose(records.points, self.points, i),
             "viewpoint": records.viewpoints[0],
         }
-        single = {name: x.float() for name, x in item.items()}
+        single = {name: x.float().as_subclass(Tensor) for name, x in item.items()}
         return {**single, "closed": certificate.closed[g], "job": torch.tensor(j)}
 
     @checked

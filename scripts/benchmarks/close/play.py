@@ -94,7 +94,8 @@ def play(o: Options) -> list[Row]:
     for hand, objects, (k, mass) in itertools.product(
         map(load_hand, o.hands), o.objects, enumerate(MASSES)
     ):
-        names = [name for name, _ in list_views(objects, only=o.names, most=1)][k :: len(MASSES)]
+        listed = [name for name, _ in list_views(objects, most=1)]
+        names = [name for name in listed if not o.names or name in o.names][k :: len(MASSES)]
         shelf = o.out / "play" / f"{hand.name}_{objects.name}_{mass}"
         out = o.out / "play" / "folders"
         for name, changes in TRIALS.items() if names else ():

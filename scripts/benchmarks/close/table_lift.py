@@ -15,6 +15,7 @@ from paper.tables6_7 import format_points
 
 from benchmarks.common import Options, Row, bench
 from torchgrasp.app.report.evaluation_page import list_causes
+from torchgrasp.data.manifest import read_entries
 from torchgrasp.evaluation import (
     PROTOCOLS,
     EvaluationSpec,
@@ -103,11 +104,19 @@ def lift_objects(
     found = []
     for folder in o.objects:
         shelf = o.planned or o.out / "table-lift" / f"{hand.name}_{folder.name}"
+        here = names_in(folder, o.names)
+        if o.names and not here:
+            continue
         spec = EvaluationSpec(
-            grasps, starts=o.starts, only=o.names, seed=o.seed, views=1, planned=_kept(shelf)
+            grasps, starts=o.starts, only=here, seed=o.seed, views=1, planned=_kept(shelf)
         )
         found += evaluate(folder, hand, protocol, spec, folder=shelf, workers=o.workers)
     return found
+
+
+def names_in(folder: Path, names: Sequence[str]) -> tuple[str, ...]:
+    """Return the names that a folder of objects has; other folders have the others."""
+    return tuple(sorted({*names} & {*read_entries(folder)}))
 
 
 def _kept(shelf: Path) -> bool:
