@@ -42,9 +42,9 @@ class Region(Value):
         distance: function of points (n, 3) [m] in float64 that returns their signed distances (n,)
             [m], negative inside.
         name: name of the region in errors.
-        placed: whether the region has a place of its own, as a box or a mesh. If no point of the
-            cloud is near it, planning raises `BadArgument` for `keep`, and warns `NoEffect` for
-            `avoid`.
+        placed: whether the region must be at the object, as a box or a mesh. If it is off the
+            cloud and the space behind the cloud, planning raises `BadArgument` for `keep`, and
+            warns `NoEffect` for `avoid`.
 
     >>> from torchgrasp import load_object
     >>> ball = Region(lambda points: points.norm(dim=-1) - 0.05)

@@ -32,8 +32,8 @@ def read_scene(path: Path | str) -> Scene:
     * `others` (k, 4): such numbers of other planes on which objects could stand.
     * `given`: labels that a user made, as in `Scene.given`. If it is missing, the user made all
       labels, or none in a file with `table` and `labels`.
-    * `bounded`: whether the camera saw nothing beyond the image's border, which is the usual case.
-      It is False for an image made of a cloud.
+    * `bounded`: False for an image made of a cloud, whose border is not that of the camera's view.
+      If it is missing, it is True.
 
     Raises `CloudFileError` for no such file, or for malformed content. Raises `BadArgument` for a
     `target` that is no label of an object, and the errors of `Scene.from_depth`.

@@ -122,8 +122,9 @@ class Scene(Value):
         """Return the scene that a pinhole camera's depth image shows.
 
         The objects are those of `labels`. Without labels they are the connected components above
-        the table. Pixels on the table and flying pixels at rims get the label 0. A `mask` or a
-        `point` chooses the target; without both there is none.
+        the table. Pixels on the table get the label 0, and so do flying pixels, which lie between
+        a near and a far surface. A `mask` or a `point` chooses the target; without both there is
+        none.
 
         Args:
             depth: image (h, w) of depths, as `cloud_from_depth` takes it: floats in metres, or

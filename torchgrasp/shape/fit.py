@@ -96,8 +96,8 @@ def fit_shape(
 
     Args:
         cloud: points [m] of one object from one view or several (`merge_clouds`), or another value
-            that `plan_grasps` takes. Points of a whole surface need outward normals: most of them
-            then do not face one camera, which tells a whole surface from a view.
+            that `plan_grasps` takes. Points from all sides need outward `normals`, or the
+            `viewpoint` of each point.
         noise: standard deviation of an observed signed distance, normalised: one unit is the
             shape's `scale`, about the object's radius. If `support` is "paper", also that of a
             component of a normal.
@@ -262,8 +262,8 @@ def condition(
     std_factor: Positive = 1.0,
     kernel: KernelName | Kernel = "thin_plate",
 ) -> ShapeGP:
-    """Return the shape whose posterior is given exactly these observations, Eqs. (7)-(9) of the
-    paper.
+    """Return the shape as a Gaussian process posterior, given normalised observations, Eqs. (7)-(9)
+    of the paper.
 
     The result is differentiable, to any order, in the observations, in the frame's centre, and in
     tensors of the kernel's profile. The length psi of a kernel by name and the domain's radius are

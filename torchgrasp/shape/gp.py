@@ -67,7 +67,7 @@ class ShapeGP(Posterior, Normalisation):
             component.
         factor: lower Cholesky factor (r, r) of K + noise, the covariance of the observed numbers.
         order: index (r,) in `weights` of each row of `factor`; None if both have the same order.
-        kernel: covariance function of the signed distance, by normalised distance.
+        kernel: the `Kernel`, the covariance of the signed distances at two points.
         center: origin (3,) [m] of the normalised frame, in the cloud's frame.
         scale: length [m] of one normalised unit.
         psi: the kernel's length psi, normalised.
@@ -76,9 +76,10 @@ class ShapeGP(Posterior, Normalisation):
         std_factor: ratio of the surface's true deviations to the posterior's standard deviations,
             calibrated on known objects. `std_m` of `predict` includes this factor.
         cloud: the points [m] that the camera saw, after cleaning.
-        kind: how the hidden side was completed: "ball", "revolution", "mirrored", "vessel", "guess"
-            (from the outline alone, or not at all), "cut off" (by the image border), or "whole" (no
-            hidden side).
+        kind: how the hidden side was completed: as that of a "ball", of a body of "revolution", of
+            a "mirrored" body, or of an open "vessel". "guess" means from the outline alone, or not
+            at all. "cut off" means that the image border cuts the object off, and "whole" that
+            there is no hidden side.
 
     Results at given points are differentiable in the points to any order. At observed points they
     are twice differentiable, and normals of a thin plate once. `update` refuses points that require

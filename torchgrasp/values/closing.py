@@ -272,8 +272,8 @@ class SensorModel(Value):
             "tactile": force, position and sliding of each contact, like a BioTac.
             "torque": only the force, from the torques of the finger's joints.
             "binary": only whether the tip touches.
-        delay: age [s] of the readings, rounded to whole samples of the sensor. It samples at 100
-            Hz, or once a control tick if ticks are longer.
+        delay: age [s] of the readings, rounded to whole samples. The sensor samples at 100 Hz, or
+            once a control tick if ticks are longer.
         noise: factor (no unit) on the usual noise. The usual standard deviation is 0.1 N of a
             tactile normal force, and 0.01 N m of a joint torque.
         dead: names of the fingers whose sensor is known to be broken.

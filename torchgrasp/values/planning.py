@@ -230,14 +230,15 @@ class Certificate(Batch):
     """The verdict whether each of b contact sets has frictional form closure (Eq. 13), with its
     proof.
 
-    `certify` makes it, and `closed` is the answer. f counts the fingertips of a set. The wrenches w
-    of a set are the columns of W: forces along the edges of its friction cones, then their torques.
-    Torques are about the contacts' centroid. They are divided by the contacts' root-mean-square
-    distance from it, so wrenches have no unit.
+    `certify` returns it, and `closed` is the answer. f counts the fingertips of a set. The wrenches
+    w of a set are the columns of W: forces along the edges of its friction cones, then their
+    torques. Torques are about the contacts' centroid. They are divided by the contacts'
+    root-mean-square distance from it, so wrenches have no unit.
 
     Attributes:
-        closed: whether the set has force closure (b,). It needs a margin clearly above 0 and full
-            rank, because coincident or collinear contacts satisfy Eq. (13), too.
+        closed: mask (b,) of the sets that have force closure. Their margin is at least 1e-6 and
+            their `rank_ratio` at least 1e-3: coincident or collinear contacts satisfy Eq. (13),
+            too.
         margin: the largest s (b,) for which coefficients phi >= s have W phi = 0 and sum phi = 1.
             -inf if no coefficients balance; NaN for contacts that are not finite.
         rank_ratio: the smallest singular value of W over its largest one (b,).
@@ -358,8 +359,9 @@ class Grasps(Batch):
 
     Attributes:
         joints: actuated joints (g, h) [rad or m], in the order of `hand.joint_names`.
-        pregrasp: joints (g, h) [rad or m] of the opened hand. It is at the same pose, or above it
-            where its links would be in the table (`ik.opened_pose`).
+        pregrasp: joints (g, h) [rad or m] of the opened hand. The opened hand is at
+            `obj_from_hand`, or above it if its links would be in the table there
+            (`ik.opened_pose`).
         approach: unit direction (g, 3) in which the opened hand moves straight to its pre-grasp.
         obj_from_hand: pose (g, 4, 4) [m] of the hand's root link.
         contacts: contact sets (g rows); finger i touches contact i.
@@ -381,9 +383,9 @@ class Grasps(Batch):
             that held in trials, over families of objects. [0, 1] if the success is unknown, [0, 0]
             for failed grasps. None if there are no bounds.
         arm: joints (g, n) [rad or m] of the arm at the grasp; None without an arm.
-        ease: two numbers (g, 2) of the arm's way (`torchgrasp.arm`): the least joint margin, as a
-            share of half a joint's range, and the least manipulability, sqrt(det(J J^T)) [m^3]. 0
-            for failed grasps; None without an arm.
+        ease: two numbers (g, 2) of the arm's straight way to the grasp (`torchgrasp.arm`). First
+            the least distance of a joint from its limits, over half its range. Then the least
+            manipulability, sqrt(det(J J^T)) [m^3]. 0 for failed grasps; None without an arm.
 
     Each index keeps the batch axis: `grasps[0]` is a batch of one, and `grasps[0].joints[0]` are
     its joints. For all joints of the hand see `Hand.expand`, for a 3D page

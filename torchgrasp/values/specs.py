@@ -62,8 +62,8 @@ class ContactSpec(Value):
             table.
         tip_radius: radius [m] of the fingertips, which may rest on the table; 0 means points. None
             means the radius of the hand's fingertips, but at least 12 mm (`TIP_RADIUS`).
-        start_radius: normalised radius of the sphere around the cloud on which initial guesses are
-            drawn (Sec. 6.2).
+        start_radius: radius, normalised, of the sphere on which initial guesses are drawn, around
+            the centre of the shape's frame (Sec. 6.2).
         fingertips: number of contacts, one for each fingertip: 3, 4 or 5.
         contact_allowed: whether links may touch and push the target's neighbours. Such collisions
             then lower the predicted success, but do not make a grasp fail.
@@ -299,8 +299,8 @@ class TrialSpec(Value):
 
     Args:
         closing: how the hand closes.
-            "uncertainty": Eqs. 25-28 with the surface's calibrated standard deviations, and further
-              components (`ClosingOptions`).
+            "uncertainty": Eqs. 25-28 with the surface's calibrated standard deviations, and with
+              `options`.
             "fixed": the same with equal gains for all contacts.
             "paper": Eqs. 25-28 as written, with forces of the hand's stability model.
             "paper_position": PI position control to the contacts until 0.5 N, the paper's baseline.
@@ -324,7 +324,7 @@ class TrialSpec(Value):
         hold_time: time [s] after the lift.
         shake: amplitude [m] of a vertical sinusoid of 5 Hz during the hold.
         force: normal force [N] of the strongest finger in the closing and in the holding "force".
-            None means 4 N, or `max_force` if it is less.
+            None means 4 N, but at most `max_force`.
         noise: whether the sensors are noisy (`SensorModel.noise` scales the noise).
         timestep: timestep [s] of the simulator.
         control_rate: rate [Hz] of the controller.
@@ -335,7 +335,7 @@ class TrialSpec(Value):
         kp: stiffness [N m/rad] of all joint drives; None means the hand's own.
         overlap: depth [m] by which the hand may penetrate the object or the table at the start. The
             convex parts that stand for the object bulge a little. A deeper overlap ends the trial.
-        table: whether the object stands on a table.
+        table: whether the object stands on a table; without one it falls, unless `gravity` is 0.
         self_collision: whether links of the hand collide with each other, in the pairs that the
             hand names.
         options: options of the closing "uncertainty" or "fixed"; None means `ClosingOptions()`.
