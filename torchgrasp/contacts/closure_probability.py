@@ -254,8 +254,8 @@ class ClosureProbability(Batch):
 
     Attributes:
         probability: share (b,) of random surfaces on which the set has force closure, in [0, 1].
-        standard_error: standard error (b,) of the probability, never 0: it is that of a share
-            (k + 1) / (n + 2), if k of n surfaces give force closure.
+        standard_error: standard error (b,) of the probability. If k of n surfaces give force
+            closure, it is that of a share (k + 1) / (n + 2), and so never 0.
 
     >>> ClosureProbability(torch.tensor([0.97]), torch.tensor([0.01])).probability
     tensor([0.9700])

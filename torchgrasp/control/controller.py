@@ -169,8 +169,8 @@ class GraspController:
         the plan's coefficients are all out of bounds, the bounds alone count. None unless the hand
         holds in the mode "grip".
 
-        For example, a plan with 0.3 to 0.8 gives 0.5 to 0.8 once a fingertip sticks with a
-        tangential force of half its normal force, apart from noise.
+        For example, a plan has a friction of 0.3 to 0.8. A fingertip that sticks with a tangential
+        force of half its normal force leaves 0.5 to 0.8, apart from noise.
         """
         return self.hold.friction.posterior if isinstance(self.hold, GripHold) else None
 
@@ -189,8 +189,8 @@ class GraspController:
         """The share of force control (f,) of each finger at the last tick, from 0 to 1: lambda in
         Eq. (26) of the paper.
 
-        NaN while Eq. (25) does not command the fingers: before the first tick of a closing, in the
-        hold, while the hand opens again, and in closings without this law.
+        NaN while Eq. (25) does not command the fingers, as in closings without this law. In others
+        it is NaN before the first tick, in the hold, and while the hand opens again.
         """
         acts = self.hold is None and self.reopening is None and self.time > 0.0
         if acts and isinstance(self.closing, LawClosing):

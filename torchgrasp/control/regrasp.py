@@ -113,9 +113,9 @@ class GraspTry:
     Attributes:
         row: index of the grasp of this try.
         controller: the controller of this grasp.
-        moved: motion (4, 4) [m] of the object since the grasps were planned, as far as it is known:
-            a rigid transform in the frame of the grasps. The `controller` works in a frame that
-            moves with the object: a cloud for `relook` must be transformed by the inverse.
+        moved: motion (4, 4) [m] of the object since the grasps were planned, as far as it is known.
+            It is a rigid transform in the frame of the grasps. The `controller` works in a frame
+            that moves with the object: transform a cloud for `relook` by the inverse of `moved`.
 
     Raises `BadArgument` if `tried` is empty, or an index in it is none of the grasps.
     """
@@ -152,8 +152,9 @@ class GraspTry:
     def others(self) -> Int[Tensor, "k"]:
         """The indices (k,) of the grasps that are left to try.
 
-        A grasp is left if it differs from each tried grasp: by more than 30 degrees in its approach
-        (`REGRASP.turn`), or by more than 15 mm in its contacts on average (`REGRASP.gap`).
+        A grasp is left if it differs from each tried grasp. Two grasps differ by more than 30
+        degrees in approach (`REGRASP.turn`), or by more than 15 mm in the mean distance of their
+        contacts (`REGRASP.gap`).
         """
         return list_others(self.grasps, self.tried)
 

@@ -315,8 +315,8 @@ class Posterior(Value):
         """The observed points, the weights of their distances and normals in the posterior mean,
         and the kernel.
 
-        A named tuple (x, a, b, kernel): n observed points (n, 3), normalised, the weights (n,) of
-        their distances, the weights (k, 3) of the k observed normals, and the `Kernel`.
+        A named tuple (x, a, b, kernel). `x` (n, 3) are the n observed points, normalised. `a` (n,)
+        are the weights of their distances, and `b` (k, 3) those of the k observed normals.
         """
         n = len(self.x)
         normals = self.weights[n:].reshape(3, self.n_oriented).T

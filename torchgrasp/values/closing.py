@@ -131,9 +131,9 @@ class ClosureResult(Value):
     have [m] in place of [rad].
 
     Attributes:
-        held: whether the object was lifted with the hand and slipped little: its centre rose by
-            half the lift, two fingers touch it at the end, and it slipped by less than 20 mm and 30
-            degrees.
+        held: whether the object was lifted with the hand and slipped little. Its centre then rose
+            by half the lift, and two fingers touch it at the end. It slipped by less than 20 mm and
+            30 degrees.
         status: `OK`, or the reason why the object was not held.
         time: times (t,) [s] at which the control ticks ended.
         forces: normal force (t, f) [N] of each fingertip; 0 without contact.
@@ -158,9 +158,9 @@ class ClosureResult(Value):
             start.
         disturbance: unintended contacts of the hand.
         trace: contacts and estimates at every tick.
-        phases: times (3,) [s] at which three phases ended: the approach; the closing, with all
-            fingers touching or given up; the pressing. The first is 0, and the others are NaN, if
-            the trial ended before.
+        phases: times (3,) [s] at which approach, closing and pressing ended. The closing ends when
+            all fingers touch, or are given up. If the trial ended before, the first time is 0, and
+            the others are NaN.
         stops: number of stops of the approaching hand at a contact.
         attempts: number of closings of the hand.
         seconds: wall time [s] of the trial.
