@@ -53,18 +53,19 @@ def check_hand(name_or_path: str | Path, fingers: Fingers = "default") -> Hand:
     hand.
 
     The rules for the files concern coupling, limits, drives, masses, pads, parked joints and
-    self-collision. The kinematics of the loaded hand must obey three laws:
+    self-collision. The kinematics of the loaded hand must obey three laws, by name:
 
-    * `kinematics`: the poses of all links are the poses of yourdfpy.
-    * `jacobian`: the Jacobian of the fingertips equals central differences.
-    * `batch`: each posture of a batch gives what it gives alone, and an empty batch is empty.
+    * "kinematics": the poses of all links are those that the URDF library yourdfpy computes.
+    * "jacobian": the Jacobian of the fingertips equals central differences.
+    * "batch": each posture of a batch gives what it gives alone, and an empty batch is empty.
 
     Args:
         name_or_path: name of a shipped hand, or the folder or hand.toml of another hand.
         fingers: the grasping fingers, as in `load_hand`.
 
     Raises:
-        HandFileError: a file breaks a rule, is missing or malformed.
+        HandFileError: a file breaks a rule, is missing or malformed. The links of the hand meet in
+            all random postures.
         BrokenLaw: the kinematics break a law; `law` is the name of the first.
         BadArgument: the hand has no such fingers.
 

@@ -134,6 +134,10 @@ def _image(scene):
     return labels
 
 
+def _at_pixels(scene, image):
+    return image[scene.pixels[:, 0], scene.pixels[:, 1]]
+
+
 def test_a_cloud_gives_the_scene_of_its_picture():
     picture = render_whole(things(), POSE)
     scene = Scene.from_depth(picture[0], INTRINSICS, POSE)
@@ -148,8 +152,13 @@ def test_a_cloud_gives_the_scene_of_its_picture():
         assert (mine & (true == 1)).sum() / (true == 1).sum() > 0.93
         assert (mine & (true != 1)).sum() / mine.sum() < 0.02
         # its picture sees what the points are
-        seen = found.image.points()[found.pixels[:, 0], found.pixels[:, 1]]
+        seen = _at_pixels(found, found.image.points())
         assert (seen - found.points).norm(dim=-1).median() < 0.002
+        # a hidden point takes no pixel from the object before it
+        assert bool((_at_pixels(found, found.pixel_labels)[mine] == found.target).all())
+    for one in ({"box": box.numpy()}, {"mask": true == 1}):
+        with pytest.raises(BadArgument, match="beside"):
+            Scene.from_cloud(cloud, **one, point=inside[0])
 
 
 def test_a_target_cut_off_at_the_border_is_told(picture):

@@ -153,15 +153,16 @@ def least_friction_forces(
 ) -> Float[Tensor, "*b f 3"]:
     """Return balanced fingertip forces (*b, f, 3) [N] on the object that need the least friction.
 
-    Forces of three contacts lie in the friction cones whenever any balanced forces do, except for a
-    small error: the search also slightly favours even forces. Forces of four or five contacts may
-    need slightly more friction than the least. All forces of a set are NaN where no balanced forces
-    push at each of its contacts.
+    Their sum and the sum of their torques are zero. The friction that they need is the greatest
+    ratio of tangential to normal force at a contact. It is a little more than the least possible,
+    because even forces are favoured, too. For four or five contacts it may be more by 0.04
+    (`BALANCE.slack`). All forces of a set are NaN if no balanced forces push at each of its
+    contacts.
 
     Args:
         points: positions (*b, f, 3) [m] of the f contacts of each set, 3 to 5.
-        normals: outward unit normals (*b, f, 3) of the object, in the same frame; the forces are in
-            it, too.
+        normals: outward unit normals (*b, f, 3) of the object. Points, normals and forces are in
+            one frame.
         strongest: normal force [N] of the strongest finger.
         preferred: ratios (*b, f) or (f,) of the normal forces to prefer among forces of similar
             friction, without unit. None means equal ones.

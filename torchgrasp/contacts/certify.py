@@ -58,18 +58,22 @@ def certify(contacts: Contacts, spec: ContactSpec | None = None) -> Certificate:
     The answer is `Certificate.closed`. The wrenches w of a set are forces along the edges of its
     friction cones, with their torques; they are the columns of W. Coefficients phi with W phi = 0
     and sum phi = 1 balance them. The margin is the largest s with phi >= s for such a phi, or -inf
-    without one. A set is `closed` if its margin is at least 1e-6 and its wrenches have full rank.
+    without one. A set is `closed` if its margin is at least 1e-6 (`MIN_MARGIN`) and its
+    `rank_ratio` at least 1e-3 (`MIN_RANK_RATIO`).
 
     If a set is not closed, its `witness` is a unit wrench v that no contact force opposes: v . w >=
     0 for every edge wrench w, up to rounding. If only the rank is too low, the wrenches are
     smallest along v. A set with a contact that is not finite is not closed. Its margin and witness
     are NaN.
 
-    The margin has a first derivative by points and normals. Where several phi or v are optimal, the
-    derivative is the one of a single phi and v. Where the margin is greatest, all phi are equal,
-    and the derivative is 0. Where the margin is -inf, the derivative is NaN. A set whose margin a
-    loss masks adds nothing to the loss's derivatives. In forward mode the derivatives of other
-    fields are NaN.
+    The margin has a first derivative by points and normals:
+
+    * At a kink, where several derivatives are possible, it is one of them.
+    * Where the margin is greatest (all phi are equal), it is 0.
+    * Where the margin is -inf, it is NaN. Such a set adds nothing to the gradient of a loss that
+      masks its margin.
+
+    In forward mode the derivatives of other fields are NaN.
 
     Args:
         contacts: sets of three to five contacts (b, f, 3) [m] with outward unit normals, from any

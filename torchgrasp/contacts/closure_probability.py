@@ -250,12 +250,12 @@ def first_contact(
 class ClosureProbability(Batch):
     """The probability that each of b contact sets has force closure on the true surface.
 
-    `closure_probability` makes it.
+    `closure_probability` returns it.
 
     Attributes:
         probability: share (b,) of random surfaces on which the set has force closure, in [0, 1].
-        standard_error: standard error (b,) of the probability, which is estimated from random
-            surfaces.
+        standard_error: standard error (b,) of the probability. If k of n surfaces give force
+            closure, it is that of a share (k + 1) / (n + 2), and so never 0.
 
     >>> ClosureProbability(torch.tensor([0.97]), torch.tensor([0.01])).probability
     tensor([0.9700])
@@ -277,18 +277,19 @@ def closure_probability(
     """Return the probability that each contact set has force closure on the uncertain surface, by
     Monte Carlo.
 
-    All contact sets share the random surfaces, and no result depends on another set.
+    A fingertip moves along the normal of its contact until it meets a random surface of the
+    Gaussian process. If it meets none within 12 standard deviations of the contact, the set has no
+    force closure on this surface. All contact sets share the random surfaces, and no result depends
+    on another set.
 
     Args:
         shape: the uncertain shape, from `fit_shape`.
-        contacts: sets of 3 to 5 contacts (b, f, 3) [m] with outward unit normals. They lie in the
-            domain of the shape, at least 12 mm (`FOOTPRINT`) from its edge. A random surface that a
-            finger does not meet within 12 standard deviations counts as one without force closure.
+        contacts: sets of 3 to 5 contacts (b, f, 3) [m] with outward unit normals. They must lie in
+            the domain of the shape, at least 12 mm (`FOOTPRINT`) from its edge.
         spec: its `friction` is used, the coefficient of friction at execution; `planned_friction`
-            is not used. For a distribution the result is the mean over 9 frictions. None means
-            `ContactSpec()`.
-        n: number of random surfaces. The standard error is at most 1 / (2 sqrt(n)). If k surfaces
-            give force closure, it is computed for the fraction (k + 1) / (n + 2). So it is never 0.
+            is not used. For a distribution the result is the mean over 9 frictions (`FRICTIONS`).
+            None means `ContactSpec()`.
+        n: number of random surfaces. The standard error is at most 1 / (2 sqrt(n)).
         seed: random seed.
 
     Raises `BadArgument` for a contact that is not finite, a contact outside the shape's domain or

@@ -110,18 +110,19 @@ def critical_friction(
     points: Annotated[Float[Tensor, "*b f 3"], ANY],
     normals: Annotated[Float[Tensor, "*b f 3"], ANY],
 ) -> Float[Tensor, "*b"]:
-    """Return the least common friction coefficient (*b,) at which contacts have force closure.
+    """Return the least friction coefficient (*b,) at which contacts have force closure.
 
-    At any greater friction there are balanced forces inside all friction cones, and at any lesser
-    one there are none. The result is infinite for:
+    The coefficient is the same for all contacts of a set. At any greater friction there are
+    balanced forces inside all friction cones, and at any lesser one there are none. The result is
+    infinite for:
 
-    * contacts that cannot balance at a friction up to 10;
+    * contacts that cannot balance at a friction up to 10 (`CRITICAL.most`);
     * contacts on a line;
     * contacts that are not finite;
     * the few contacts for which the method does not converge.
 
-    It is differentiable twice. Where several motions prove the friction, the derivative is that of
-    one of them.
+    The result is differentiable twice. At a kink, where several derivatives are possible, the
+    derivative is one of them.
 
     Args:
         points: positions (*b, f, 3) [m] of the f contacts of each set, 3 to 5.

@@ -73,13 +73,13 @@ HOLD = HoldProbabilityNumbers()
 class CarriedWeight(Value):
     """The weight of an object that contacts carry, for `hold_probability`.
 
-    Gravity is 9.81 m/s^2.
+    The acceleration of gravity is 9.81 m/s^2.
 
     Args:
         mass: mass of the object [kg], or its `Distribution`.
         center: centre of mass (3,) [m] in the frame of the contacts, or (b, 3), one for each of b
             contact sets.
-        press: mean normal force [N] of the contacts.
+        press: mean of the normal forces [N] with which the fingers press at the contacts.
         up: unit vector against gravity in the frame of the contacts; None means z.
         center_std: standard deviation [m] of the centre of mass along each of three axes.
 
@@ -119,14 +119,16 @@ def hold_probability(
     """Return the probability (b,) that each contact set has force closure, for uncertain friction,
     finger placement, normals and object pose.
 
-    With a `weight`, it is the probability that forces with the mean normal force `weight.press`
-    balance the weight. With a `shape`, it is the mean over random surfaces. If only the friction is
-    uncertain, the result is exact. It then is the probability that the friction exceeds the
-    `critical_friction`, and 0 where that is infinite. The other errors count to first order. So the
-    result is mostly a little too high, since errors also raise the mean of the critical friction.
-    Errors count too little where the critical friction has a kink, as for contacts that are exactly
-    symmetric. A set for which the method does not converge counts as 0;
-    most of them carry a load far below the normal forces.
+    With a `weight`, the result is the probability that forces in the friction cones balance the
+    weight, with the mean normal force `weight.press`. With a `shape`, the result is the mean over
+    random surfaces.
+
+    If only the friction is uncertain, the result is exact: the probability that the friction
+    exceeds the `critical_friction`, and 0 where that is infinite. Other errors count to first
+    order. So the result is mostly a little too high, since errors also raise the mean of the
+    critical friction. Errors count too little where the critical friction has a kink, as for
+    contacts that are exactly symmetric. The result is 0 for the few sets for which the method does
+    not converge; most of them carry a load far below the normal forces.
 
     Args:
         contacts: sets of 3 to 5 contacts (b, f, 3) [m] with outward unit normals.
@@ -135,16 +137,16 @@ def hold_probability(
             perpendicular tangents. The normal stays as it is, as on a surface that is flat nearby.
         tilt: standard deviation [rad] of the angle of a normal about each of two perpendicular
             tangents. It is one number for all contacts, or one for each (b, f).
-        shift: standard deviation [m] of the object's position along each of three axes. It moves
-            all contacts together along the surface.
+        shift: standard deviation [m] of the object's position along each of three axes. Such an
+            error moves all contacts together along the surface.
         turn: standard deviation [rad] of the object's rotation about each of three axes through the
             contacts' centroid.
-        weight: the weight that the contacts carry; None means that any load may come, and the
-            fingertips press as much as it needs.
+        weight: the weight that the contacts carry. None means that they must resist any load, and
+            that the fingertips press as much as it needs.
         shape: the uncertain shape in the frame of the contacts. Random surfaces are drawn from it
             as in `closure_probability`; the other errors count on each of them. None means that the
-            contacts are where they were planned.
-        draws: number of random surfaces.
+            planned contacts lie on the true surface.
+        draws: number of random surfaces, if there is a `shape`.
         seed: random seed of the surfaces.
 
     Raises `BadArgument` for:
@@ -152,10 +154,10 @@ def hold_probability(
     * sets of other than 3 to 5 contacts;
     * normals that are not of length 1 (to 1e-3);
     * numbers outside their range;
-    * contacts outside the domain of the `shape`, or at its edge.
+    * contacts outside the domain of the `shape`, or within 12 mm (`FOOTPRINT`) of its edge.
 
-    The result is differentiable twice in contacts, `tilt` and `weight.center`. The random surfaces
-    are the same for all contacts.
+    The result is differentiable twice in contacts, `tilt` and `weight.center`. All contact sets
+    share the random surfaces.
 
     >>> from torchgrasp.data.shipped import load_shipped_grasp
     >>> contacts = load_shipped_grasp("jug", "allegro").contacts

@@ -53,22 +53,23 @@ def plan_contacts(
     """Return planned contact sets (Eqs. 10-14 of the paper), one for each initial guess, in the
     order of the guesses.
 
-    A set has `spec.fingertips` contacts. A failed set carries the `Status` of the first constraint
-    that it violates. If the solver fails from a feasible initial guess, the guess itself is the
-    result. Without `time_budget` the result is deterministic. The sets from 500 or 1000 initial
-    guesses then are the first sets of a plan from more.
+    A set has `spec.fingertips` contacts. `ContactPlan.status` of a failed set is the `Status` of
+    the first constraint that it violates. If the solver fails from a feasible initial guess, the
+    guess itself is the result. Without `time_budget` the result is deterministic. Guesses are drawn
+    in chunks of 500: a plan from 500 or 1000 guesses is the beginning of a plan from more.
 
     Args:
         shape: a `ShapeGP`, or another implicit surface with the same methods (`ShapeLike`).
         spec: the constraints on contacts; None means `ContactSpec()`.
         starts: number of random initial guesses (Sec. 6.2), or b sets of initial contact points (b,
             f, 3) [m].
-        seed: random seed.
-        time_budget: wall time [s] of the call, in which at least 25 guesses are planned. None means
-            that all are planned.
+        seed: random seed of the guesses.
+        time_budget: wall time [s] of the call. The result then holds the first guesses that could
+            be planned in this time, but at least 25 (`LEAST_STARTS`). None means all.
 
-    Raises `BadArgument` for `starts` that are not positive, of a wrong shape, or outside the
-    shape's domain. It is raised, too, for another argument out of its range.
+    Raises `BadArgument` for a number of `starts` that is not positive, and for guesses of a wrong
+    shape or outside the shape's domain. Raises it for a `spec.start_radius` beyond this domain,
+    too.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> plan = plan_contacts(fit_shape(load_object("jug").view), ContactSpec.paper(), starts=8)

@@ -50,7 +50,7 @@ class ShapeLike(Protocol):
     """The interface of a shape with uncertainty: a `ShapeGP`, or another implicit surface.
 
     `plan_contacts` takes any object with these methods. Normalised points are points of the cloud's
-    frame, shifted and divided by `scale` [m].
+    frame, shifted and divided by `scale` [m]. Signed distances are negative inside the object.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> shape = fit_shape(load_object("jug").view)
@@ -60,41 +60,54 @@ class ShapeLike(Protocol):
 
     @property
     def scale(self) -> PerRow:
-        """The length [m] of one normalised unit; a `ShapeBatch` has one for each entry."""
+        """The length [m] of one normalised unit: a number, or for a batch of shapes one for each
+        (b,).
+        """
         ...
 
     @property
     def domain_radius(self) -> PerRow:
-        """The normalised radius about the origin in which the shape is known."""
+        """The radius, normalised, of the ball about the normalised origin in which the shape is
+        known.
+        """
         ...
 
     @property
     def std_factor(self) -> PerRow:
-        """The factor (no unit) that calibrates standard deviations: they are multiplied by it."""
+        """The factor (no unit) by which the posterior's standard deviations are multiplied."""
         ...
 
     def jet(self, x: Float[Tensor, "q 3"]) -> SurfaceJet:
-        """Return the signed distance and its variance at q normalised points `x`, normalised.
+        """Return mean and variance of the signed distance with derivatives, at q points `x` (q, 3).
 
-        The distance is the mean, with its gradient and Hessian; the variance has its gradient.
+        Points and results are normalised. The fields of the `torchgrasp.shape.estimate.SurfaceJet`
+        are `distance` (q,), `gradient` (q, 3), `hessian` (q, 3, 3), `variance` (q,) and
+        `variance_gradient` (q, 3).
         """
         ...
 
     def mean_and_gradient(
         self, x: Float[Tensor, "q 3"]
     ) -> tuple[Float[Tensor, "q"], Float[Tensor, "q 3"]]:
-        """Return the mean signed distance (q,) at q normalised points `x`, and its gradient (q, 3).
+        """Return the mean signed distance (q,) at q normalised points `x` (q, 3), and its gradient
+        (q, 3).
 
         The distance is normalised, and the gradient has no unit.
         """
         ...
 
     def normalise(self, points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-        """Return points (*b, 3) [m] of the cloud's frame as normalised points (*b, 3)."""
+        """Return points (*b, 3) [m] of the cloud's frame as normalised points (*b, 3).
+
+        b stands for any batch axes.
+        """
         ...
 
     def metres(self, x: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-        """Return normalised points `x` (*b, 3) as points (*b, 3) [m] of the cloud's frame."""
+        """Return normalised points `x` (*b, 3) as points (*b, 3) [m] of the cloud's frame.
+
+        b stands for any batch axes.
+        """
         ...
 
 

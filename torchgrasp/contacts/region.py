@@ -35,15 +35,16 @@ Distance = Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n"]]
 class Region(Value):
     """A region of space in the frame of the cloud, as a signed distance.
 
-    `plan_grasps` takes it as `keep` or `avoid`, and a `ContactSpec` as `region`. `box`, `mesh`,
-    `mask` and `rim` make usual regions.
+    `plan_grasps` takes a region as `keep` or `avoid`, and a `ContactSpec` as `region`. `box`,
+    `mesh`, `mask` and `rim` return usual regions. Call a region to get signed distances.
 
     Args:
         distance: function of points (n, 3) [m] in float64 that returns their signed distances (n,)
             [m], negative inside.
-        name: name of the function in errors.
+        name: name of the region in errors.
         placed: whether the region must be at the object, as a box or a mesh. If it is off the
-            cloud, planning raises `BadArgument` for `keep`, and warns `NoEffect` for `avoid`.
+            cloud and the space behind the cloud, planning raises `BadArgument` for `keep`, and
+            warns `NoEffect` for `avoid`.
 
     >>> from torchgrasp import load_object
     >>> ball = Region(lambda points: points.norm(dim=-1) - 0.05)
@@ -132,8 +133,8 @@ class Region(Value):
     def mask(cls, scene: Scene, mask: Bool[Tensor, "h w"]) -> "Region":
         """Return the space that the pixels of a mask (h, w) cover, as the scene's camera sees it.
 
-        The region is in the frame of the scene. It reaches through the object, so contacts on the
-        hidden side count, too. Points outside the image are outside.
+        The region is in the frame of the scene. It reaches through the object, so that it also
+        holds places on the hidden side. Points outside the image are outside.
 
         Args:
             scene: the scene, whose image has h rows and w columns.

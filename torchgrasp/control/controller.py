@@ -48,14 +48,15 @@ class GraspController:
 
     A closing controller brings the fingers to the object, then a hold controller presses. After
     pressing for 0.5 s (`PRESSING_TIME`), `closed` becomes true. The hand may then be lifted, but
-    `step` must still be called.
+    `step` must still be called at each tick.
 
-    A plan that includes the table allows another closing, if the grasp seems too weak to lift the
-    object. Then the hand opens, locates the object from its touches and closes again.
+    If the plan has a table and `options` allow several attempts, the grasp is judged before the
+    lift. If it seems too weak to lift the object, the hand opens, locates the object from its
+    touches and closes again.
 
     With `approach` > 0 the opened hand starts away from its pre-grasp, the pose from which the
-    fingers close. While `approaching`, a robot arm must keep the hand at the distance
-    `Targets.left` from the pre-grasp. A new view of the object (`relook`) moves this path.
+    fingers close. While `approaching`, a robot arm must keep the hand `Targets.left` [m] short of
+    the pre-grasp, along `reference.approach`. A new view of the object (`relook`) moves this path.
 
     Args:
         reference: the closing plan (`ClosingReference.from_grasp`).
@@ -67,17 +68,18 @@ class GraspController:
         approach: remaining length [m] of the approach; 0 means that the hand is at its pre-grasp.
 
     Attributes:
-        reference: the closing plan, at the object as the last view showed it.
-        targets: the present `Targets`.
-        attempts: number of closings so far.
+        reference: the closing plan, moved by `relook` to the object as a new view showed it.
+        targets: the present `Targets`, which the last `step` returned.
+        attempts: number of closings so far, with the present one.
         stops: number of stops of the approach at an unexpected touch.
 
     Raises `BadArgument` for:
 
     * unknown modes;
     * options or the holding "law" for a closing mode that does not allow them;
+    * the closing "paper" with a plan whose `distance_variance` is None;
     * "impedance" for more than three fingertips;
-    * modes that need more than the sensor measures;
+    * modes that need more than the sensor measures, or a sensor that names an unknown finger;
     * an approach whose options allow no stops;
     * an approach whose plan lacks a direction, a table, a surface or tactile fingertips.
     """
@@ -142,7 +144,8 @@ class GraspController:
     def closed(self) -> bool:
         """Whether the hand has closed and pressed long enough, so that it may be lifted.
 
-        With another closing allowed, it also must not seem too weak to lift the object.
+        If another attempt is allowed, the grasp must also seem strong enough to lift the object. In
+        the mode "open_loop" it is true at the end of the motion.
         """
         if not self.closing.feels:
             return self.closing.done
@@ -159,20 +162,25 @@ class GraspController:
 
     @property
     def friction(self) -> Distribution | None:
-        """The plan's coefficients of friction, without those that the touches contradict.
+        """What is known of the coefficient of friction: that of the plan, within bounds that the
+        touches show.
 
-        Fingertips that stick and slide bound the friction. If the touches contradict all of the
-        plan's coefficients, the result is what the touches alone show. None unless the hand holds
-        in the mode "grip".
+        A fingertip that sticks bounds the coefficient below; one that slides bounds it above. If
+        the plan's coefficients are all out of bounds, the bounds alone count. None unless the hand
+        holds in the mode "grip".
+
+        For example, a plan has a friction of 0.3 to 0.8. A fingertip that sticks with a tangential
+        force of half its normal force leaves 0.5 to 0.8, apart from noise.
         """
         return self.hold.friction.posterior if isinstance(self.hold, GripHold) else None
 
     @property
     def mass(self) -> Distribution | None:
-        """The mass [kg] of the object that the felt load shows.
+        """The `Distribution` of the object's mass [kg] that the felt load shows.
 
-        None unless the hand holds in the mode "grip" and its load is steady. If the load is too
-        heavy for the hand (`status`), only a lower bound of the mass is known.
+        None unless the hand holds in the mode "grip" and its load is steady. If the object is too
+        heavy for the hand (`status`), it reaches from the mass that was carried to 10 kg
+        (`WEIGHT.most`).
         """
         return self.hold.mass if isinstance(self.hold, GripHold) else None
 
@@ -181,8 +189,8 @@ class GraspController:
         """The share of force control (f,) of each finger at the last tick, from 0 to 1: lambda in
         Eq. (26) of the paper.
 
-        It is NaN before the first tick, and at ticks at which the control law does not command the
-        fingers.
+        NaN while Eq. (25) does not command the fingers, as in closings without this law. In others
+        it is NaN before the first tick, in the hold, and while the hand opens again.
         """
         acts = self.hold is None and self.reopening is None and self.time > 0.0
         if acts and isinstance(self.closing, LawClosing):
@@ -193,8 +201,9 @@ class GraspController:
     def displacement(self) -> Float[Tensor, "4 4"]:
         """The displacement (4, 4) [m] of the object that the touches show.
 
-        It is a rigid transform in the frame of the planned hand, from the planned to the present
-        object. It is the identity for closing modes without pose estimate.
+        A rigid transform in the frame of the planned hand, from the planned to the present object.
+        It is the identity before any touch, and if the pose is not estimated
+        (`ClosingOptions.pose_estimate`).
         """
         closing = self.closing
         if not isinstance(closing, UncertaintyClosing):
@@ -209,7 +218,7 @@ class GraspController:
         """The motion (4, 4) [m] of the object since the plan, as a view (`relook`) and the touches
         show it.
 
-        It is a rigid transform in the frame of the grasp, from the planned to the present object.
+        A rigid transform in the frame of the grasp, from the planned to the present object.
         """
         straight = torch.eye(3, dtype=torch.float64)
         placed = self.planned.obj_from_hand @ rigid(straight, self.path)
@@ -219,8 +228,9 @@ class GraspController:
     def relook(self, cloud: PointCloud) -> None:
         """Shift the approach so that it ends at the object as a new view shows it.
 
-        `targets.palm` [m] then is the displacement at which the new path begins. The palm does not
-        rotate, so the contacts of a turned object are found by touch.
+        Call it before the first `step`. Then move the hand by `targets.palm` [m], where the shifted
+        approach begins. The palm does not rotate: the contacts of a turned object are found by
+        touch.
 
         `cloud` holds points [m] of the object alone, in the frame of the grasp. Raises
         `BadArgument` if the hand has no approach, or has begun it.
@@ -248,7 +258,7 @@ class GraspController:
 
         Args:
             observation: what the hand measures now (`observe`), on the CPU.
-            period: time [s] until the next tick.
+            period: time [s] until the next tick, 1e-5 to 1.
 
         Raises `BadArgument` for an observation of another hand or on another device, or a period
         out of range.

@@ -106,11 +106,12 @@ def squeeze(hand: Hand, grasps: Grasps, force: Force = 4.0, kp: Positive | None 
     * `torques` (g, h) [N m or N]: efforts of the actuated joints that exert these forces.
 
     The targets solve J^T f = kp (target - q). Here q are the joints of the grasp, f the forces, and
-    J the Jacobian of the contacts. The targets are differentiable in the joints of the grasps. The
+    J the Jacobian of the contacts. If no forces that press at every contact balance, each force is
+    `force` along the inward normal. The targets are differentiable in the joints of the grasps. The
     forces, found by a search, are not differentiable in the contacts.
 
     Args:
-        hand: the hand of the grasps; it follows the grasps to their device.
+        hand: the hand of the grasps, on any device; the results are on that of the grasps.
         grasps: the grasps.
         force: normal force [N] of the strongest finger.
         kp: stiffness [N m/rad] of every joint's drive; None means the hand's own.

@@ -388,17 +388,16 @@ class Reopening:
 
 
 class LiftCheck:
-    """Check whether a closed hand that rises loses the object; it is called at each tick of the
-    lift.
+    """Check whether a closed hand that rises loses the object. Call it at each tick of the lift.
 
-    `lost` becomes true, and stays so, at the first of two events (`LOST` in the module `recovery`):
+    `lost` becomes true, and stays so, at the first of two events (bounds: `LOST`):
 
-    * The hand has risen by at least 10 mm, fewer than two fingertips touch, and all together carry
-      less than 0.2 N along the table's normal.
-    * Two fingertips have each slid by more than 1.5 mm before the hand was 20 mm high.
+    * The hand has risen by at least 10 mm, and fewer than two fingertips touch. All together carry
+      a low-passed load of less than 0.2 N along the table's normal.
+    * Two fingertips have each slid by more than 1.5 mm in all, before the hand was 20 mm high.
 
-    The load does not count with binary sensors, or without a table. Fingertips with broken sensors
-    count as touching.
+    Without a table, or with binary sensors, the load is unknown and counts as 0. Fingertips with
+    broken sensors count as touching.
 
     Args:
         reference: the closing plan of the grasp (`ClosingReference.from_grasp`).
@@ -426,7 +425,7 @@ class LiftCheck:
         Args:
             observation: what the hand measures at the end of the tick (`observe`).
             height: height [m] to which the hand has risen.
-            period: length [s] of the tick.
+            period: length [s] of the tick, 1e-5 to 1.
         """
         tactile = observation.tactile
         if height <= LOST.low:

@@ -35,9 +35,10 @@ from torchgrasp.values.specs import ContactSpec
 class ClosingReference(Value):
     """The plan for closing a hand on one grasp.
 
-    `from_grasp` makes it. f counts fingertips, h actuated joints, and j all joints of the URDF. All
-    is in the frame of the planned hand, its root link, except for `obj_from_hand` and `surface`.
-    Joints that slide have [m] in place of [rad], and their drives [N/m].
+    `from_grasp` makes it. f counts fingertips, h actuated joints, and j all joints of the URDF.
+    Vectors and the table are in the frame of the planned hand: that of its root link at
+    `obj_from_hand`. Only `surface` is in the frame of the grasp. Joints that slide have [m] in
+    place of [rad], and their drives [N/m].
 
     Args:
         hand: the hand, in float64.
@@ -50,7 +51,7 @@ class ClosingReference(Value):
             feedback, from `torchgrasp.control.squeeze`.
         normals: outward unit normals (f, 3) of the planned contacts.
         gains: targets, controller gains and desired forces of the closing "uncertainty"
-            (`ClosingGains`). `as_printed` returns a plan with the gains of Eqs. (26) and (27).
+            (`ClosingGains`). `as_printed` returns a plan with those of the closing "paper".
         approach: unit vector (3,) along which the opened hand moves to its pre-grasp; None means no
             approach.
         table: the table, which no fingertip enters while it searches; None if it is unknown.
@@ -101,8 +102,8 @@ class ClosingReference(Value):
             force: normal force [N] of the strongest finger.
             kp: stiffness [N m/rad] of every joint's drive; None means the hand's own.
             stability: model that chooses among balanced forces of nearly equal friction, and gives
-                the covariance of the forces (`load_stability`). With None, the standard deviation
-                of a normal force is a tenth of it, beside the sensor's error.
+                their covariance (`torchgrasp.control.paper.stability.load_stability`). With None,
+                the standard deviation of a normal force is a tenth of the force.
 
         Raises `BadArgument` for:
 
@@ -173,8 +174,8 @@ class ClosingReference(Value):
     def as_printed(self) -> "ClosingReference":
         """Return the same plan with the gains of the closing "paper".
 
-        The covariance and the position gains are those of Eqs. (26) and (27) as the paper prints
-        them. Raises `BadArgument` if `distance_variance` is None.
+        In `gains`, `covariance` and `position_gain` become those of Eqs. (26) and (27) as the paper
+        prints them. Raises `BadArgument` if `distance_variance` is None.
         """
         if self.distance_variance is None:
             found = "'paper' without f_cov, the variance of the signed distance [m^2]"
@@ -190,18 +191,18 @@ class ClosingReference(Value):
     def expand(self, actuated: Annotated[Float[Tensor, " h"], ANY]) -> Float[Tensor, " j"]:
         """Return the positions (j,) [rad or m] of all joints of the URDF.
 
-        `actuated` (h,) [rad or m] are the actuated joints. The result is in the order of
-        `hand.tree.joint_names`. NaN is passed on, unlike in `ActuatedJoints.expand`. Raises
-        `BadArgument` for another number of joints.
+        `actuated` (h,) [rad or m] are the actuated joints, in the order of `hand.joint_names`. The
+        result is in the order of `hand.tree.joint_names`. A NaN gives NaN, where
+        `ActuatedJoints.expand` raises an error. Raises `BadArgument` for another number of joints.
         """
         return self.hand.actuated.coupling @ actuated + self.hand.actuated.offset
 
     @checked
     def pick(self, joints: Annotated[Float[Tensor, " j"], ANY]) -> Float[Tensor, " h"]:
-        """Return the actuated joints (h,) [rad or m].
+        """Return the actuated joints (h,) [rad or m] among the positions of all joints of the URDF.
 
-        `joints` (j,) [rad or m] are the positions of all joints of the URDF. NaN is passed on.
-        Raises `BadArgument` for another number of joints.
+        `joints` (j,) [rad or m] are in the order of `hand.tree.joint_names`, the result in that of
+        `hand.joint_names`. A NaN gives NaN. Raises `BadArgument` for another number of joints.
         """
         return joints[self._actuated]
 
@@ -210,9 +211,9 @@ class ClosingReference(Value):
         """The displacement (3,) [m] of the opened hand before it closes, which lifts all links out
         of the table.
 
-        It is in the frame of the planned hand. It is 0 without a table, and if no link is in the
-        table. It is also 0 for a hand that would have to rise by more than 30 mm (`MOTION.most`),
-        as in `ik.opened_pose`.
+        The displacement is in the frame of the planned hand. It is 0 without a table, and if no
+        link is in the table. It is also 0 for a hand that would have to rise by more than 30 mm
+        (`MOTION.most`), as in `ik.opened_pose`.
         """
         planned = torch.eye(4, dtype=torch.float64)[None]
         return opened_pose(self.hand, self.pregrasp[None], planned, self.table)[0, :3, 3]
@@ -244,10 +245,11 @@ class ClosingReference(Value):
 
     @checked
     def contact_points(self, tips: Float[Tensor, "f 3"]) -> Float[Tensor, "f 3"]:
-        """Return the points (f, 3) [m] where fingertips would touch the object.
+        """Return the points (f, 3) [m] where fingertips would touch the object first.
 
-        Each is one tip radius from the centre of its fingertip, against the planned normal. `tips`
-        (f, 3) [m] are the centres, in the frame of the planned hand.
+        They are `tips` - r n, with the radius r of each fingertip and the outward normal n of its
+        planned contact (`normals`). `tips` (f, 3) [m] are the centres of the fingertips, in the
+        frame of the planned hand.
         """
         return tips - self.hand.tips.radius[:, None] * self.normals
 
@@ -348,7 +350,7 @@ def closing_gains(
         hand: the hand of the grasp.
         force: normal force [N] of the strongest finger.
         stability: model that chooses among balanced forces of nearly equal friction
-            (`load_stability`); None means no model.
+            (`torchgrasp.control.paper.stability.load_stability`); None means no model.
 
     Raises the errors of `ClosingReference.from_grasp`.
 

@@ -96,24 +96,26 @@ def _chances(
 class GraspTry:
     """One try to lift an object with one of several grasps; `next` is the robot's next try.
 
-    The robot moves its hand to `obj_from_hand`, and steps the `controller` until the hand has
-    closed. In each tick of the lift it asks `fails`. If the lift fails, it lowers the hand, sends
-    the targets of `withdraw`, and goes on with `next`.
+    The robot goes through these steps:
+
+    1. Move the hand to `obj_from_hand`, and call `controller.step` until `controller.closed`.
+    2. Lift the hand. Still call `controller.step`, then `fails`, at each tick.
+    3. If the lift fails, lower the hand, send the targets of `withdraw`, and go on with `next`.
 
     Args:
         grasps: the grasps in the order of preference.
         start: function that returns the `GraspController` of a single grasp.
         surface: estimated surface of the object (`surface_field`) in the frame of the grasps, by
             which the next grasp is chosen; None if it is unknown.
-        tried: indices of the grasps that were tried, with the grasp of this try at the end.
-        moved: motion (4, 4) [m] of the object, as in the attribute; None means no motion.
+        tried: indices of the grasps that were tried. The last one is the grasp of this try.
+        moved: motion (4, 4) [m] of the object since the grasps were planned; None means no motion.
 
     Attributes:
         row: index of the grasp of this try.
         controller: the controller of this grasp.
         moved: motion (4, 4) [m] of the object since the grasps were planned, as far as it is known.
-            It is a rigid transform in the frame of the grasps. Views and surfaces of later tries
-            are in the frame that has moved with the object.
+            It is a rigid transform in the frame of the grasps. The `controller` works in a frame
+            that moves with the object: transform a cloud for `relook` by the inverse of `moved`.
 
     Raises `BadArgument` if `tried` is empty, or an index in it is none of the grasps.
     """
@@ -140,8 +142,9 @@ class GraspTry:
 
     @property
     def obj_from_hand(self) -> Float[Tensor, "4 4"]:
-        """The pose (4, 4) [m] at which the hand closes, in the frame of the grasps, at the moved
-        object.
+        """The pose (4, 4) [m] at which the hand closes, in the frame of the grasps.
+
+        It is the planned pose of the hand, moved with the object (`moved`).
         """
         return self.moved @ self.grasps.obj_from_hand[self.row].to(self.moved)
 
@@ -149,8 +152,9 @@ class GraspTry:
     def others(self) -> Int[Tensor, "k"]:
         """The indices (k,) of the grasps that are left to try.
 
-        A grasp is left if it differs from each tried grasp. Its approach then differs by more than
-        30 degrees (`REGRASP.turn`), or its contacts by more than 15 mm on average (`REGRASP.gap`).
+        A grasp is left if it differs from each tried grasp. Two grasps differ by more than 30
+        degrees in approach (`REGRASP.turn`), or by more than 15 mm in the mean distance of their
+        contacts (`REGRASP.gap`).
         """
         return list_others(self.grasps, self.tried)
 
@@ -168,14 +172,13 @@ class GraspTry:
     def fails(
         self, observation: Observation, height: Annotated[float, Range(-1.0, 10.0)], period: Period
     ) -> bool:
-        """Return whether the lift has `failed`, and must end.
-
-        It is called at the end of each tick of the lift.
+        """Return whether the lift has `failed`, and must end. Call it at the end of each tick of
+        the lift.
 
         Args:
             observation: what the hand measures at the end of the tick (`observe`).
             height: height [m] to which the hand has risen.
-            period: length [s] of the tick.
+            period: length [s] of the tick, 1e-5 to 1.
         """
         self.check(observation, height, period)
         return self.failed
@@ -184,15 +187,16 @@ class GraspTry:
     def withdraw(
         self, observation: Observation, period: Period, length: Annotated[float, Range(0.0, 1.0)]
     ) -> "Withdrawal":
-        """Return the `Targets` of the ticks in which the lowered hand opens and withdraws, to
-        iterate over.
+        """Return an iterable of the `Targets` of each tick in which the lowered hand opens and
+        withdraws.
 
-        Its attribute `speed` [m/s] is how fast `Targets.left` grows at the last target.
+        The attribute `speed` [m/s] of the result is the rate at which `Targets.left` grows at the
+        last target that was drawn.
 
         Args:
             observation: the last observation, which shows where the fingers begin.
-            period: length [s] of a tick.
-            length: distance [m] by which the hand withdraws against its approach.
+            period: length [s] of a tick, 1e-5 to 1.
+            length: distance [m] by which the hand withdraws against its approach, at most 1.
         """
         return Withdrawal(self.controller, observation, period, length)
 
@@ -200,13 +204,13 @@ class GraspTry:
         """Return the next try, at the object where it is now expected; None if no grasp is left.
 
         Its grasp is the one of `others` that most likely holds, given that the tried grasps failed.
-        Without `surface`, or for grasps that are not ranked by success on a known table, it is the
-        best-ranked one.
+        It is the first of `others` without a `surface`, and for grasps that were planned without a
+        table or not ranked by success.
 
-        If the grasps were planned for a distribution of friction, the touches narrow it. The grasps
-        of the next try have what is left in `meta["friction"]`, unless that includes 0. If the
-        object was too heavy, they have what the lift has shown of the mass [kg] in `meta["mass"]`,
-        as the text of a `Distribution`.
+        The `grasps` of the next try have in `meta` what this try has shown, as texts of a
+        `Distribution`. `meta["friction"]` is `controller.friction`, if the grasps were planned for
+        a distribution and it excludes 0. `meta["mass"]` [kg] is `controller.mass`, if the object
+        was too heavy.
         """
         if not len(self.others):
             return None

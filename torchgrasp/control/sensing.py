@@ -45,10 +45,11 @@ ALONG_STD = 3.0
 def feel_flags(tactile: TactileState, touching: Bool[Tensor, "f"]) -> TactileState:
     """Return the tactile state of f fingertips that sense only whether they touch.
 
-    A fingertip that touches reads `WAITING_FORCE` [N], another one 0.
+    The `reading` of a fingertip that touches is 0.3 N (`WAITING_FORCE`), that of another one 0.
+    Contact points and normals are NaN.
 
     Args:
-        tactile: the state at the last tick; `no_contact` makes the first one.
+        tactile: the state at the last tick; `no_contact` returns the first one.
         touching: mask (f,) of the fingertips that touch.
 
     >>> feel_flags(no_contact(), torch.tensor([True, False, False])).reading
@@ -74,12 +75,12 @@ def feel_torques(
     j counts all joints of the URDF. Contact points and normals of the state are NaN.
 
     Args:
-        tactile: the state at the last tick; `no_contact` makes the first one.
+        tactile: the state at the last tick; `no_contact` returns the first one.
         reference: the closing plan; its normals give the direction in which a finger presses.
         jacobian: Jacobian (f, 3, j) [m/rad] of the centres of the fingertips
             (`Observation.jacobian`).
-        torques: torques (j,) [N m] of all joints that contacts cause, without those of weight,
-            friction and acceleration.
+        torques: torques (j,) [N m] by which the joints press on the object, each positive in the
+            direction of its joint. Torques of weight, friction and acceleration are subtracted.
         period: time [s] since the last readings.
 
     Raises `BadArgument` for a Jacobian with the shape of another hand.
@@ -162,7 +163,7 @@ class DriveFeel:
 class FingertipSensor:
     """Simulator of the fingertip sensors that a `SensorModel` describes.
 
-    A call at each control tick takes the true contacts (`TipContact`), the fingertips' Jacobian
+    Call it at each control tick with the true contacts (`TipContact`), the fingertips' Jacobian
     (f, 3, j) [m/rad] and the tick's length [s]. It returns the readings (`TactileState`).
 
     Args:

@@ -55,8 +55,8 @@ TACTILE = TactileNumbers()
 class TipContact(Value):
     """True contacts of f fingertips, averaged over a tick, in the hand's frame.
 
-    A simulator makes it for `measure` or a `FingertipSensor`. All tensors may have the same leading
-    axes `*b`.
+    A simulator makes it for `measure` or a `FingertipSensor`. All tensors may have further leading
+    axes `*b`, the same for all.
 
     Args:
         normal_force: normal force (*b, f) [N] on the object, along the inward normal; 0 without
@@ -79,18 +79,18 @@ class TipContact(Value):
 class TactileState(Value):
     """Readings of f fingertips in the hand's frame, and the state of their filters.
 
-    `no_contact` makes the first one. `measure`, `feel_flags` or `feel_torques` then make one at
-    each tick. All tensors may have the same leading axes `*b`.
+    `no_contact` returns the first one. `measure`, `feel_flags` or `feel_torques` then return one at
+    each tick. All tensors may have further leading axes `*b`, the same for all.
 
     Args:
         reading: normal force (*b, f) [N].
-        forces: full force (*b, f, 3) [N] on the object.
-        contact: whether each fingertip touches (*b, f).
+        forces: full force (*b, f, 3) [N] on the object, friction included.
+        contact: mask (*b, f) of the fingertips that touch.
         points: contact points (*b, f, 3) [m]; NaN without contact.
         normals: outward unit normals (*b, f, 3) of the object; NaN without contact.
         lagged: low-passed values (*b, f, 5): normal force [N] (entry 0), full force [N] (1 to 3),
             sliding speed [m/s] (4).
-        average: low-passed normal force (*b, f) [N] that sets the contact flag.
+        average: low-passed normal force (*b, f) [N], by which `contact` is decided.
         sliding: sliding speed (*b, f) [m/s].
         age: time [s] since the last sample.
     """
@@ -110,10 +110,11 @@ class TactileState(Value):
 def no_contact(*batch: Count, fingers: Annotated[int, Range(*FINGERTIPS)] = 3) -> TactileState:
     """Return the tactile state of fingertips that touch nothing, the first state of a closing.
 
-    The fingertips are sampled at the next tick.
+    Forces are 0, contact points and normals NaN, in float64 on the CPU. The fingertips are sampled
+    at the next tick.
 
     Args:
-        batch: sizes of the leading axes of its tensors; by default none.
+        batch: sizes of further leading axes of all tensors; by default none.
         fingers: number of fingertips, 3 to 5.
 
     >>> no_contact().contact
@@ -141,10 +142,11 @@ def measure(
     """Return the simulated tactile state one tick later, with lag, noise and sampling of the
     sensors.
 
-    All is in the hand's frame, for f fingertips with the same leading axes `*b`.
+    Vectors are in the hand's frame. f counts fingertips, and `*b` stands for leading axes that all
+    tensors share.
 
     Args:
-        tactile: the state at the last tick; `no_contact` makes the first one.
+        tactile: the state at the last tick; `no_contact` returns the first one.
         truth: true contacts in this tick.
         pads: outward unit normals (*b, f, 3) of the surface at the planned contacts. They direct
             the noise of tips that touch nothing.
@@ -237,8 +239,8 @@ class Targets(NamedTuple):
     Attributes:
         joints: targets (j,) [rad or m] of all joints of the URDF, in the order of
             `hand.tree.joint_names`.
-        palm: displacement (3,) [m] of the palm from its planned path, in the hand's frame. The palm
-            does not rotate.
+        palm: displacement (3,) [m] of the palm from its planned path, in the frame of the planned
+            hand. The palm does not rotate.
         left: remaining length [m] of the approach; 0 if the hand is at its pre-grasp.
     """
 
@@ -258,8 +260,8 @@ class Observation(Value):
     Args:
         joints: positions (j,) [rad or m] of all joints, in the order of `hand.tree.joint_names`.
         tips: centres (f, 3) [m] of the fingertips.
-        jacobian: Jacobian (f, 3, j) [m/rad] of these centres by all joints, as if none were
-            coupled.
+        jacobian: Jacobian (f, 3, j) [m/rad] of these centres by all joints. Each joint counts
+            alone, without the joints that are coupled to it.
         tactile: readings of the fingertips.
     """
 

@@ -22,18 +22,21 @@ def read_scene(path: Path | str) -> Scene:
     The file holds these arrays, of which only the first two are needed:
 
     * `depth` (h, w): floats in m, or whole numbers in mm.
-    * `intrinsics`: (3, 3) or (4,) [pixels].
+    * `depth_unit`: metres of one count of the depth, if it is in another unit.
+    * `intrinsics`: matrix (3, 3), or (fx, fy, cx, cy) [pixels].
     * `camera_pose` (4, 4): the pose `obj_from_camera` [m].
-    * `labels` (h, w) of the objects, or `mask` (h, w) of the target.
-    * `target`: the target's label.
-    * `table` (4,): unit normal, and offset [m].
-    * `others` (k, 4): other planes on which objects could stand.
-    * `given`: the labels that the user made. If it is missing, the user made all labels, or none in
-      a file with a table.
-    * `bounded`: whether the border of the image is the camera's.
+    * `labels` (h, w): 1, 2, ... for the pixels of the objects, 0 for all others. Or `mask` (h, w),
+      not 0 at the target's pixels.
+    * `target`: label of the object to be grasped.
+    * `table` (4,): numbers (nx, ny, nz, d) of the plane n . p = d [m], with the unit normal n.
+    * `others` (k, 4): such numbers of other planes on which objects could stand.
+    * `given`: labels that a user made, as in `Scene.given`. If it is missing, the user made all
+      labels, or none in a file with `table` and `labels`.
+    * `bounded`: False for an image made of a cloud, whose border is not that of the camera's view.
+      If it is missing, it is True.
 
-    Raises the errors of `Scene.from_depth`. Raises `CloudFileError` for no such file, or for
-    malformed content.
+    Raises `CloudFileError` for no such file, or for malformed content. Raises `BadArgument` for a
+    `target` that is no label of an object, and the errors of `Scene.from_depth`.
 
     >>> import tempfile
     >>> from torchgrasp import load_scene
@@ -60,7 +63,8 @@ def read_scene(path: Path | str) -> Scene:
 def save_scene(scene: Scene, path: Path | str) -> Path:
     """Write a scene as .npz, atomically, for `read_scene`. Return the path.
 
-    The file holds depth [m] in float32, labels, camera, table and target.
+    The file holds the arrays that `read_scene` lists, with depth [m] in float32. It does not hold
+    `notes`, and of several points in one pixel only the nearest.
 
     Raises `BadArgument` for a path that does not end in .npz, and `OutputError` if the file cannot
     be written.

@@ -68,7 +68,7 @@ fitted.
 @checked
 @dataclasses.dataclass(frozen=True)
 class Occupancy(Value):
-    """The probability that each voxel around a target is full of something else, from
+    """The probability that something else occupies each voxel around a target, from
     `estimate_occupancy`.
 
     Something else is neither the target nor the table. The grid has x by y by z voxels.
@@ -255,17 +255,22 @@ def probability(kind: str, features: Float[Tensor, "n f"]) -> Float[Tensor, "n"]
 
 @checked
 def estimate_occupancy(scene: Scene, target: int) -> Occupancy:
-    """Return the probability that each voxel around the target is full of something else.
+    """Return the probability that something else occupies each voxel around the target.
 
-    The table does not count. Space in front of a measured depth is free. Behind an object, a model
-    estimates the probability. Behind the target and outside the image, it is a rough guess from
-    depth and height. All work is on the CPU.
+    Something else is neither the target nor the table. Space in front of a measured depth is free.
+    Behind another object, a fitted model estimates the probability. Behind the target and where
+    nothing was measured, it is a rough guess.
+
+    The voxels have a side of 5 mm (`OCCUPANCY.spacing`), and extend 0.25 m (`OCCUPANCY.sideways`)
+    around the target. They reach from the table to 0.04 m (`OCCUPANCY.above`) above the highest
+    point there. The probabilities are float64 on the scene's device, but computed on the CPU.
 
     Args:
-        scene: the scene in its upright frame, with z up (`Scene.to_upright`).
+        scene: the scene in a frame with z up, as `Scene.to_upright` returns it. Its table, if it
+            is known, is at z = 0.
         target: label of the target.
 
-    Raises `BadArgument` for a target without points.
+    Raises `BadArgument` for a label without points.
 
     >>> from torchgrasp import load_scene
     >>> found = estimate_occupancy(load_scene(), target=1)

@@ -70,22 +70,23 @@ LOCAL = (
 class Scene(Value):
     """Objects on a table, as one camera saw them. `plan_scene` plans grasps of its target.
 
-    `Scene.from_depth`, `Scene.from_cloud`, `read_scene` and `load_scene` make it. All places are in
-    the frame "obj" to which the camera's pose leads.
+    `Scene.from_depth`, `Scene.from_cloud`, `read_scene` and `load_scene` return scenes. Points and
+    planes are in the frame "obj", in which the camera has the pose `obj_from_camera`.
 
     Attributes:
         points: the n measured points (n, 3) [m].
         labels: label (n,) of each point: 1, 2, ... for the objects, 0 for the table and everything
             else.
-        image: the camera's depth image, which shows free space and hidden space.
+        image: the camera's depth image. Its fields are `depth` (h, w) [m], 0 where nothing was
+            measured, `intrinsics` (3, 3) [pixels] and `obj_from_camera` (4, 4) [m].
         pixels: row and column (n, 2) of each point in the image.
         table: the plane that the objects stand on, or None if it is unknown.
         target: label of the object to be grasped, or None if none is chosen.
         others: other planes that objects could stand on, the more plausible first.
         notes: what was changed or is doubtful, a sentence each: pixels removed from a given mask or
             label, or a table or a camera in an unlikely place.
-        given: labels whose pixels the user gave, as labels or as a mask. The library found the
-            other objects.
+        given: labels of objects whose pixels the user gave, as labels or as a mask. The library
+            found the other objects.
 
     >>> from torchgrasp import load_scene
     >>> target = load_scene().select([394, 312])  # a clicked pixel: column, row
@@ -121,8 +122,9 @@ class Scene(Value):
         """Return the scene that a pinhole camera's depth image shows.
 
         The objects are those of `labels`. Without labels they are the connected components above
-        the table. Pixels on the table and flying pixels at rims get the label 0. A `mask` or a
-        `point` chooses the target; without both there is none.
+        the table. Pixels on the table get the label 0, and so do flying pixels, which lie between
+        a near and a far surface. A `mask` or a `point` chooses the target; without both there is
+        none.
 
         Args:
             depth: image (h, w) of depths, as `cloud_from_depth` takes it: floats in metres, or
@@ -131,24 +133,29 @@ class Scene(Value):
                 `cloud_from_depth` takes, without distortion.
             camera_pose: rigid pose `obj_from_camera` (4, 4) [m]; None for results in the camera's
                 frame.
-            mask: image (h, w), not 0 at the target, accurate to a few pixels; or another form of
-                `labels` with one object.
+            mask: image (h, w), not 0 at the target's pixels; its border may be a few pixels off.
+                Or any form of `labels` that marks one object.
             labels: the objects' pixels, in one of these forms:
                 - an image (h, w) of whole numbers, where 0 means no object;
                 - a picture (h, w, 3 or 4) with a colour for each object, where black and
                   transparent mean no object;
                 - a list of masks, where a smaller mask lies above a larger one;
-                - COCO's run lengths, or a dict with "annotations".
+                - COCO's run lengths {"size": [h, w], "counts": ...}, or COCO's dict with a list of
+                  "annotations".
             point: a place on the target, as a pixel (u, v), column first, or a point (x, y, z) [m].
-            table: a plane, or its height [m] along z; None means that it is fitted.
-            up: direction (3,) against gravity, for the fit; None allows any direction.
-            depth_unit: metres of one count of the depth, as `cloud_from_depth` takes it.
+            table: a plane, or its height [m] along z; None means that it is fitted to the points.
+            up: direction (3,) against gravity; the normal of a fitted table is within 30 degrees
+                of it. None allows any direction, but prefers z if there is a `camera_pose`.
+            depth_unit: metres of one count of the depth. None means metres for floats. For integers
+                it means the depth_scale of the intrinsics, else millimetres.
 
         Raises:
             BadArgument: what `cloud_from_depth` refuses, and an image with distortion.
+            BadArgument: fewer than 30 measured pixels (`IMAGE.least_pixels`).
             BadArgument: mask or labels of another size; a mask beside labels or a point.
-            BadArgument: a target that is the table; a point where nothing was measured.
-            BadArgument: a camera below the table; a pose or a unit that the view contradicts.
+            BadArgument: a mask or labels on the table alone; a point on no object.
+            BadArgument: a camera below a given table, or `up` over 60 degrees from its normal.
+            BadArgument: a pose or a unit that the view contradicts.
             NoSupport: no plane is found on which objects stand.
         """
         if sum(given is not None for given in (mask, labels, point)) > 1 and mask is not None:
@@ -197,25 +204,27 @@ class Scene(Value):
         table: Plane | float | None = None,
         up: Sequence[float | int] | Tensor | np.ndarray | None = None,
     ) -> "Scene":
-        """Return the scene that a cloud of one view shows, projected to a pinhole image at its
-        viewpoint.
+        """Return the scene that a point cloud of one view shows.
 
-        Objects and target are found as in `from_depth`. A `mask`, a `box` or a `point` chooses the
-        target.
+        The points are projected to a depth image of a pinhole camera at the cloud's viewpoint.
+        Objects are found in it as in `from_depth`. A `mask`, a `box` or a `point` chooses the
+        target; without them there is none.
 
         Args:
-            cloud: everything that the camera saw, n points [m], with the camera's viewpoint.
-            labels: whole numbers (n,); 0 means no object.
+            cloud: everything that the camera saw, n points [m], with the camera's viewpoint (3,).
+            labels: whole numbers (n,), one for each point; 0 means no object.
             mask: mask (n,) of bool: the points of the target.
             box: two opposite corners (2, 3) [m] of a box along the axes, which holds the target.
             point: a place on the target, as a point (x, y, z) [m].
-            table: a plane, or its height [m] along z; None means that it is fitted.
-            up: direction (3,) against gravity, for the fit; None allows any direction.
+            table: a plane, or its height [m] along z; None means that it is fitted to the points.
+            up: direction (3,) against gravity; the normal of a fitted table is within 30 degrees
+                of it. None allows any direction.
 
         Raises:
-            BadArgument: no viewpoint or several; labels or a mask of another size.
-            BadArgument: more than one of labels, mask and box; a mask or box without points.
-            BadArgument: the target or the camera as in `from_depth`.
+            BadArgument: no viewpoint or several; points all around the camera.
+            BadArgument: labels or a mask of another size; a mask or box without points.
+            BadArgument: more than one of labels, mask and box; a mask or box beside a point.
+            BadArgument: a target, a table or a direction that `from_depth` refuses.
             NoSupport: no plane is found on which objects stand.
 
         >>> from torchgrasp import PointCloud, load_scene
@@ -225,6 +234,8 @@ class Scene(Value):
         """
         if sum(given is not None for given in (labels, mask, box)) > 1:
             raise BadArgument("mask", "several of mask, labels and box", "one of them")
+        if point is not None and (mask is not None or box is not None):
+            raise BadArgument("point", "a point beside a mask or a box", "one of them")
         if cloud.viewpoint is None or cloud.viewpoint.ndim != 1:
             found = "none" if cloud.viewpoint is None else "one for each point"
             raise BadArgument("viewpoint", found, "the position of the one camera")
@@ -293,9 +304,9 @@ class Scene(Value):
             target: a label of `things`; or a pixel (u, v) of the image, column first; or a point
                 (x, y, z) [m].
 
-        Raises `BadArgument` for no such label, for a place on the table, or for a place where
-        nothing was measured. A place counts as measured within 3 pixels (`SCENE.click`) or 10 mm
-        (`SCENE.touch`).
+        The place is that of the nearest measured point. Raises `BadArgument` if that is farther
+        than 3 pixels (`SCENE.click`) or 10 mm (`SCENE.touch`), or on no object. Raises it for a
+        label that is not in `things`, too.
         """
         if isinstance(target, int) and not isinstance(target, bool):
             if target not in self.things:
@@ -327,8 +338,13 @@ class Scene(Value):
     def advice(self) -> tuple[str, ...]:
         """Problems of the scene with their fixes, a sentence each; empty if there are none.
 
-        They are several supports, objects that touch, and creases in an object. A target may also
-        be cut off at the border of the image, or much hidden by another object.
+        The problems are:
+
+        * Objects could also stand on another plane than `table`.
+        * Two objects touch, so that the border between them is a guess.
+        * An object has a crease: it may be several objects.
+        * The target is cut off at the border of the image.
+        * Another object hides much of the target.
         """
         found = [
             f"objects could also stand on another plane ({plane.describe()}); "
@@ -383,22 +399,25 @@ class Scene(Value):
         """Label (h, w) of each pixel of the image, as in `labels`; also 0 where nothing was
         measured.
         """
-        labels = self.labels.new_zeros(self.image.depth.shape)
-        labels[self.pixels[:, 0], self.pixels[:, 1]] = self.labels
-        return labels
+        height, width = self.image.depth.shape
+        row, column = self.pixels.long().unbind(-1)
+        labels = self.labels.new_zeros(height * width)
+        # points that a nearer one in the same pixel hides have label 0
+        labels.scatter_reduce_(0, row * width + column, self.labels, "amax")
+        return labels.reshape(height, width)
 
     @property
     def supports(self) -> tuple[Plane, ...]:
-        """The planes that objects could stand on: `table`, then `others`. It is empty if no table
-        is known.
+        """The planes that objects could stand on: `table`, then `others`; empty if no table is
+        known.
         """
         return () if self.table is None else (self.table, *self.others)
 
     @property
     def noise(self) -> SensorNoise | None:
-        """The camera's noise, estimated from the table.
+        """The noise of the camera's depths, estimated from the pixels that show the table.
 
-        It is None if no table is known or too few pixels show it.
+        None if no table is known, or if too few pixels show the table.
         """
         if self.table is None:
             return None
@@ -461,11 +480,12 @@ class Scene(Value):
     def to_upright(self, obj_from_upright: Pose) -> "Scene":
         """Return the scene in an upright frame, in which the table is the plane z = 0.
 
-        Points are rounded to 2^-20 m, and the camera's pose as finely. `others` is empty.
+        Coordinates of points are rounded to multiples of 2^-20 m, about a micrometre. Numbers of
+        the camera's pose are rounded to multiples of 2^-30. `others` is empty.
 
         Args:
             obj_from_upright: pose (4, 4) [m] of the upright frame in the frame "obj". Its z axis
-                must be the table's normal, and its origin on the table.
+                must be the table's normal, and its origin on the table. This is not checked.
         """
         obj_from_upright = obj_from_upright.double()
         return dataclasses.replace(

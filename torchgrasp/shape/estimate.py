@@ -48,7 +48,7 @@ class Normalisation(Value):
     ) -> Float[Tensor, "*b 3"]:
         """Return points (*b, 3) [m] of the cloud's frame as normalised points (*b, 3).
 
-        b stands for any batch axes.
+        Those are (points - `center`) / `scale`. b stands for any batch axes.
         """
         return (points - self.center.to(points)) / self.scale
 
@@ -59,7 +59,7 @@ class Normalisation(Value):
     ) -> Float[Tensor, "*b 3"]:
         """Return normalised points `x` (*b, 3) as points (*b, 3) [m] in the cloud's frame.
 
-        b stands for any batch axes. It is the inverse of `normalise`.
+        The inverse of `normalise`. b stands for any batch axes.
         """
         return x * self.scale + self.center.to(x)
 
@@ -74,10 +74,11 @@ class Observations(Batch):
     Args:
         x: observed points (n, 3), normalised.
         distance: signed distance (n,) of each point from the surface, normalised, positive outside.
-        normal: outward unit normals (n, 3); rows without a normal are not used.
+        normal: outward unit normals (n, 3); any finite numbers where `has_normal` is False.
         has_normal: mask (n,) of the points whose normals are observed.
         distance_noise: standard deviation (n,) of each distance, normalised.
-        normal_noise: standard deviation (n,) of each component of a unit normal (no unit).
+        normal_noise: standard deviation (n,) of each component of a unit normal (no unit); any
+            finite numbers where `has_normal` is False.
 
     >>> x, some = torch.eye(3), torch.ones(3)
     >>> len(Observations(x, 0 * some, x, some > 0, 0.01 * some, 0.05 * some).rows()[0])
@@ -95,8 +96,8 @@ class Observations(Batch):
         """Return (values, variances): all r observed numbers (r,), and the variances (r,) of their
         noise.
 
-        Here r is n plus three for each observed normal. The distances (normalised) come first. Then
-        come the normals by component: all x, all y, all z.
+        Here r is n plus three for each observed normal. The n distances (normalised) come first.
+        Then come the observed normals by component: all x, all y, all z.
         """
         y = torch.cat([self.distance, self.normal[self.has_normal].T.reshape(-1)])
         noise = torch.cat([self.distance_noise, self.normal_noise[self.has_normal].repeat(3)])
@@ -104,8 +105,8 @@ class Observations(Batch):
 
     @property
     def least_noise(self) -> float:
-        """The least standard deviation of all observed numbers: of distances (normalised) and of
-        components of normals.
+        """The least of all standard deviations: of distances (normalised), and of components of
+        observed normals (no unit).
         """
         every = torch.cat([self.distance_noise, self.normal_noise[self.has_normal]])
         return float(every.detach().min())

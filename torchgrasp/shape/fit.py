@@ -83,42 +83,49 @@ def fit_shape(
     """Return the shape of an object as a Gaussian process, given a partial cloud, Eqs. (2)-(9) of
     the paper.
 
-    The result is in the frame of the cloud. With `support` "camera" the cloud is cleaned, and
-    signed distances are true to scale. The object's outline and its estimated hidden side are added
-    as noisier observations. The shape is kept out of free space and of the table.
+    The shape is in the frame of the cloud, in float64. An open vessel seen from above on a `table`
+    becomes a `HollowShape` with two surfaces. Walls thinner than the cloud's spacing merge.
 
-    With "paper", as in Sec. 3.1, the cloud's centre is observed at distance -1. 20 random points
-    around it are observed at distance +1.
+    The points of the cloud are observed at signed distance 0. `support` says what is observed in
+    addition. With "camera" the cloud is cleaned, and distances are true to scale. The object's
+    outline and its estimated hidden side are observed with more noise. The shape is kept out of
+    free space and of the table.
+
+    With "paper", as in Sec. 3.1, the cloud's centre is observed at distance -1, normalised. 20
+    random points on a sphere around it are observed at distance +1.
 
     Args:
-        cloud: points [m] of one object from one view or several (`merge_clouds`), as in
-            `plan_grasps`.
-            Normals, if they are given, show whether the points cover the whole surface.
-            Walls thinner than the cloud's spacing merge. An open vessel seen from above on a
-            `table` becomes a `HollowShape` with two surfaces.
-        noise: standard deviation of an observed signed distance, in radii of the object. If
-            `support` is "paper", also of a component of a normal.
-        budget: number of observed points. At most 1 of them is inside the object, and at most
-            20 are outside. The others are the most informative of the cloud. Points of the outline
-            and of the hidden side do not count. None means 85 for "camera" (`SHAPE.camera`) and 70
-            for "paper" (`SHAPE.paper`). "sure", the paper's rule, adds points until no point's
-            variance (squared normalised units) exceeds `noise`, but at most 1000 (`SHAPE.budget`).
-        psi_scale: ratio of the kernel's length psi to the longest distance between observed points;
-            below 1.34 the covariance may be indefinite.
-        support: observations in addition to the cloud's points, "camera" or "paper"; see above.
+        cloud: points [m] of one object from one view or several (`merge_clouds`), or another value
+            that `plan_grasps` takes. Points from all sides need outward `normals`, or the
+            `viewpoint` of each point.
+        noise: standard deviation of an observed signed distance, normalised: one unit is the
+            shape's `scale`, about the object's radius. If `support` is "paper", also that of a
+            component of a normal.
+        budget: number of observed points, 25 to 1000 (`SHAPE.budget`). Up to 20 of them lie on a
+            sphere around the object, and one in its centre if that is inside. The others are the
+            most informative points of the cloud. The outline and the hidden side come in addition.
+            None means 85 for "camera" (`SHAPE.camera`) and 70 for "paper" (`SHAPE.paper`). "sure",
+            the paper's rule, adds points until no point's variance (squared normalised units)
+            exceeds `noise`, but at most 1000.
+        psi_scale: ratio of the kernel's length psi to the longest distance between observed points,
+            1 to 100. Below 1.34 the covariance may be indefinite.
+        support: "camera" or "paper", as above.
         seed: seed of the random draws.
         table: the table's plane, or its height [m] along z; None means no table. Only "camera"
             keeps the shape out of it.
         kernel: "thin_plate", "matern52" or "rbf", whose length follows from psi; or your own
             `Kernel` of normalised distances.
-        criterion: what is greatest at the most informative point: the "variance" of its distance,
-            the "error" |mean distance|, or "both", |error| + 2 sqrt(variance).
+        criterion: the most informative point has the greatest "variance" of its distance, the
+            greatest "error" |mean distance|, or with "both" the greatest |error| +
+            2 sqrt(variance).
 
     Raises:
-        BadArgument: an argument out of range; a table above the object's foot; a cloud that cannot
-            be prepared; a view that is not wholly in front of its camera; for "camera" a whole
-            surface without normals; a kernel whose profile requires a gradient (use `condition`).
+        BadArgument: an argument out of range; a table above the object's foot.
+        BadArgument: a cloud that `check_cloud` refuses; more than 16 cameras; a view that is not
+            wholly in front of its camera; for "camera" a whole surface without normals.
+        BadArgument: a kernel whose profile requires a gradient (use `condition`).
         TooFewPoints: fewer than 4 distinct points, or fewer than 10 of one of several views.
+        SuspiciousScale: an extent outside [5 mm, 2 m].
         IndefiniteCovariance: `psi_scale` is too small, or the kernel too long for the noise.
 
     >>> from torchgrasp.geometry.linalg import unit
@@ -255,20 +262,23 @@ def condition(
     std_factor: Positive = 1.0,
     kernel: KernelName | Kernel = "thin_plate",
 ) -> ShapeGP:
-    """Return the posterior of a shape given normalised observations, Eqs. (7)-(9) of the paper.
+    """Return the shape as a Gaussian process posterior, given normalised observations, Eqs. (7)-(9)
+    of the paper.
 
-    It is differentiable, to any order, in the observations, in the frame's centre, and in tensors
-    of the kernel's profile. The length psi of a kernel by name and the domain's radius are
+    The result is differentiable, to any order, in the observations, in the frame's centre, and in
+    tensors of the kernel's profile. The length psi of a kernel by name and the domain's radius are
     constants.
 
     Args:
         observations: signed distances and normals at n points, with their noise, all normalised.
             torch.vmap may map over distances, normals and noise.
         normalisation: centre and scale [m] of the normalised frame.
-        cloud: the points [m] that the camera saw, in the frame of `normalisation.center`.
+        cloud: the points [m] that the camera saw, in the frame of `normalisation.center`. The
+            result holds them; the posterior does not depend on them.
         psi_scale: ratio of the kernel's length psi to the longest distance between observed points.
-            The paper's value 1 makes the covariance indefinite.
-        std_factor: ratio of the surface's true deviations to the posterior's standard deviations.
+            The paper's value 1 makes the covariance of a thin plate indefinite.
+        std_factor: factor of `std_m` in results of `ShapeGP.predict`: the ratio of the surface's
+            true deviations to the posterior's standard deviations.
         kernel: "thin_plate", "matern52" or "rbf", whose length follows from psi; or your own
             `Kernel` of normalised distances.
 

@@ -53,9 +53,9 @@ DOMAIN = DomainNumbers()
 class ShapeGP(Posterior, Normalisation):
     """An object's shape as a Gaussian process over its signed distance, Eq. (1) of the paper.
 
-    `fit_shape` makes it. `predict` returns distance, normal and uncertainty at points [m] in the
-    cloud's frame. Methods that take "normalised points" take results of `normalise`. One normalised
-    unit of length is `scale` [m].
+    `fit_shape` and `condition` return shapes. `predict` returns distance, normal and uncertainty at
+    points [m] in the cloud's frame. Other methods take normalised points, the results of
+    `normalise`. One normalised unit of length is `scale` [m].
 
     n counts observed points, and r observed numbers: n distances, and three for each observed
     normal.
@@ -67,22 +67,23 @@ class ShapeGP(Posterior, Normalisation):
             component.
         factor: lower Cholesky factor (r, r) of K + noise, the covariance of the observed numbers.
         order: index (r,) in `weights` of each row of `factor`; None if both have the same order.
-        kernel: covariance function of the signed distance, by normalised distance.
+        kernel: the `Kernel`, the covariance of the signed distances at two points.
         center: origin (3,) [m] of the normalised frame, in the cloud's frame.
         scale: length [m] of one normalised unit.
         psi: the kernel's length psi, normalised.
         domain_radius: radius, normalised, of the domain: the ball around `center` in which the
             posterior is valid.
         std_factor: ratio of the surface's true deviations to the posterior's standard deviations,
-            calibrated on known objects.
+            calibrated on known objects. `std_m` of `predict` includes this factor.
         cloud: the points [m] that the camera saw, after cleaning.
-        kind: how the hidden side was completed: "ball", "revolution", "mirrored", "vessel", "guess"
-            (from the outline alone, or not at all), "cut off" (by the image border), or "whole" (no
-            hidden side).
+        kind: how the hidden side was completed: as that of a "ball", of a body of "revolution", of
+            a "mirrored" body, or of an open "vessel". "guess" means from the outline alone, or not
+            at all. "cut off" means that the image border cuts the object off, and "whole" that
+            there is no hidden side.
 
-    Evaluating methods are differentiable in the points to any order. At observed points they are
-    twice differentiable, and normals of a thin plate once. `update` refuses points that require a
-    gradient.
+    Results at given points are differentiable in the points to any order. At observed points they
+    are twice differentiable, and normals of a thin plate once. `update` refuses points that require
+    a gradient.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> view = load_object("jug").view
@@ -109,18 +110,17 @@ class ShapeGP(Posterior, Normalisation):
         psi: Positive,
         std_factor: Positive = 1.0,
     ) -> "ShapeGP":
-        """Return the shape of a given posterior in the given normalised frame; `condition` calls
-        it.
+        """Return the shape with the observations of `posterior` in the normalised frame `frame`.
 
-        The domain's radius is the smaller of two lengths. One is half the kernel's `diameter`. The
-        other is 1.25 (`DOMAIN.reach`) times the greatest distance of an observed point from the
-        centre.
+        Use `condition` to make a shape of observations. The domain's radius is the smaller of two
+        lengths. One is half the kernel's `diameter`. The other is 1.25 (`DOMAIN.reach`) times the
+        greatest distance of an observed point from the centre.
 
         Args:
-            posterior: observed points, weights and Cholesky factor, all normalised, as another
-                shape has them.
+            posterior: another shape, of which the fields `x`, `has_normal`, `weights`, `factor`,
+                `order` and `kernel` are taken.
             frame: the normalised frame.
-            cloud: the seen points [m].
+            cloud: the seen points [m], in the frame of `frame.center`.
             psi: the kernel's length, normalised.
             std_factor: ratio of the surface's true deviations to the posterior's standard
                 deviations.
@@ -134,7 +134,8 @@ class ShapeGP(Posterior, Normalisation):
     def to(self, *args: Any, **kwargs: Any) -> "ShapeGP":
         """Return the shape on another device, given as in `torch.Tensor.to`.
 
-        The dtype stays float64, which the covariance requires; another given dtype is ignored.
+        The dtype stays float64, which the covariance requires, even if float32 is given. Raises
+        `BadArgument` for a device that does not exist, or for any other dtype.
         """
         check_moved(*args, **kwargs)
         device = torch.empty(0, device=self.x.device).to(*args, **kwargs).device
@@ -142,25 +143,24 @@ class ShapeGP(Posterior, Normalisation):
 
     @property
     def device(self) -> torch.device:
-        """The device of the shape's tensors. Planners put their points there."""
+        """The device of the shape's tensors."""
         return self.x.device
 
     @property
     def walls(self) -> "tuple[ShapeGP, ...]":
-        """The surfaces that enclose the material, each as a shape of its own.
+        """The surfaces that enclose the object's material, each as a shape of its own.
 
-        It is (shape,) for an object that is not hollow. A `HollowShape` has an outer and an inner
-        one.
+        They are this shape alone, or for a `HollowShape` (outer, inner).
         """
         return (self,)
 
     @checked(gradients=True)
     def wall_at(self, x: Queries) -> Bool[Tensor, "q walls"]:
-        """Return a mask (q, walls): which surface of `walls` applies at each of q points `x`
-        (q, 3).
+        """Return which surface of `walls` determines the signed distance at each of q normalised
+        points `x` (q, 3).
 
-        The points are those that `normalise` returned. Each row has one True. This shape has one
-        surface, so all are True.
+        The result is a mask (q, walls) with one True in each row. This shape has one surface, so
+        the mask is (q, 1) and all True. `HollowShape.wall_at` has two columns.
         """
         return torch.ones(len(x), 1, dtype=torch.bool, device=x.device)
 
@@ -182,15 +182,15 @@ class ShapeGP(Posterior, Normalisation):
         Eqs. (7)-(8) of the paper.
 
         Distance, variance and covariance are normalised: one unit is `scale` [m]. `std_m` is in
-        metres. The estimate has the dtype of `points`, and is differentiable in the points to any
-        order. b stands for any batch axes.
+        metres. The estimate has the dtype of `points`, and is differentiable in the points. b
+        stands for any batch axes.
 
-        Points outside the domain, up to twice `domain_radius` from the centre, get a guess. There
-        the distance grows outward with slope 1, from the distance at the nearest point of the
-        domain. Covariance and `std_m` are the prior's.
+        Points outside the domain, up to twice `domain_radius` from `center`, get a guess. There the
+        distance grows outward with slope 1, from the distance at the nearest point of the domain.
+        Covariance and `std_m` are the prior's.
 
-        Raises `BadArgument` for numbers that are not finite, and for points farther away. Inside
-        torch.vmap neither is checked.
+        Raises `BadArgument` for numbers that are not finite, and for points farther than twice
+        `domain_radius` from `center`. Inside torch.vmap neither is checked.
 
         >>> from torchgrasp import fit_shape, load_object
         >>> shape = fit_shape(load_object("jug").view)
@@ -209,10 +209,10 @@ class ShapeGP(Posterior, Normalisation):
         """Return the derivatives of the results of `predict` by points (*b, 3) [m] in the cloud's
         frame.
 
-        They are per metre, with the dtype of `points`. b stands for any batch axes.
+        The derivatives are per metre, with the dtype of `points`. b stands for any batch axes.
 
-        Raises `BadArgument` for numbers that are not finite, and for points outside the domain. At
-        its edge the deviation jumps.
+        Raises `BadArgument` for numbers that are not finite, and for points outside the domain,
+        where `predict` gives a guess.
 
         >>> from torchgrasp import fit_shape, load_object
         >>> view = load_object("jug").view
@@ -236,10 +236,11 @@ class ShapeGP(Posterior, Normalisation):
 
     @checked(gradients=True)
     def joint(self, points: Float[Tensor, "k 3"]) -> JointEstimate:
-        """Return the joint posterior of distance and gradient at k points (k, 3) [m] in the cloud's
-        frame.
+        """Return the joint posterior of signed distance and gradient at k points (k, 3) [m] in the
+        cloud's frame.
 
-        The result is normalised: one unit is `scale` [m]. It has the dtype of `points`.
+        It has the covariances of different points, which `predict` leaves out. The result is
+        normalised: one unit is `scale` [m]. It has the dtype of `points`.
 
         Raises `BadArgument` for numbers that are not finite, points outside the domain, or more
         than 1000 points (`DOMAIN.joint`).
@@ -263,8 +264,8 @@ class ShapeGP(Posterior, Normalisation):
         the posterior of `joint`. Distances are normalised: one unit is `scale` [m]. The same `seed`
         gives the same samples.
 
-        Samples of one seed are twice differentiable in the points. Where points coincide, the
-        derivatives assume that these points move together.
+        The result has the dtype of `points`. Samples of one seed are twice differentiable in the
+        points. Where points coincide, the derivatives assume that these points move together.
 
         Raises `BadArgument` for the causes of `joint`, and for n outside 0 to 1,000,000. Raises
         `IndefiniteCovariance` if the covariance of the points is not positive semidefinite.
@@ -291,12 +292,12 @@ class ShapeGP(Posterior, Normalisation):
     ) -> "ShapeGP":
         """Return the shape given m more surface points, such as a finger's touch or a second view.
 
-        The result equals the posterior of all observations at once. Kernel, domain and `cloud` do
-        not change.
+        The result equals the posterior given the earlier and the new observations at once. Kernel,
+        domain and `cloud` do not change.
 
-        At least 20 points (`VIEWS.least`) count as a view, which is compared with `cloud` if
-        `cloud` has normals. If noise does not explain the distance between view and cloud,
-        `MendedInput` warns, and all standard deviations grow.
+        20 or more points (`VIEWS.least`) count as a view, which is compared with `cloud` if `cloud`
+        has normals. The view's pose is in error if noise does not explain its distance from
+        `cloud`. Then `MendedInput` warns, and all standard deviations grow by this error.
 
         Args:
             points: surface points (m, 3) [m] in the cloud's frame.
@@ -305,7 +306,7 @@ class ShapeGP(Posterior, Normalisation):
             normal_noise: standard deviation of the components of a unit normal (no unit).
 
         Raises `BadArgument` for a wrong argument, a normal of length 0, or a point outside the
-        domain. A view that is too far from `cloud` raises it, too (limits: `merge_clouds`).
+        domain. A view that contradicts `cloud` raises it, too, as in `merge_clouds`.
 
         >>> ball = unit(torch.randn(400, 3, generator=torch.Generator().manual_seed(0)))
         >>> from torchgrasp import fit_shape
@@ -335,14 +336,15 @@ class ShapeGP(Posterior, Normalisation):
         pose.
 
         An error of the pose moves all points of a view together, so more points do not reduce it.
-        `std_factor` grows by the median of sqrt(std_m^2 + error^2) / std_m over the points, of
-        which at most 300 (`DOMAIN.compared`), drawn at random, are used.
+        `std_factor` is multiplied by the median of sqrt(std_m^2 + error^2) / std_m over the points.
+        Of more than 300 points (`DOMAIN.compared`), 300 are drawn with a fixed seed.
 
         Args:
             points: the view's points (n, 3) [m] in the cloud's frame.
             error: standard deviation (n,) [m] of each point because of the uncertain pose.
 
-        Raises `BadArgument` for a used point farther than twice `domain_radius` from the centre.
+        Raises `BadArgument` if one of these points is farther than twice `domain_radius` from
+        `center`.
         """
         rows = draw_rows(len(points), DOMAIN.compared).to(points.device)
         std_m = self.predict(points[rows]).std_m
@@ -355,17 +357,19 @@ class ShapeGP(Posterior, Normalisation):
 
     @checked
     def append(self, new: Observations) -> "ShapeGP":
-        """Return the shape given further observations in the normalised frame, in addition to all
+        """Return the shape given further observations in its normalised frame, in addition to all
         earlier ones.
 
-        Kernel, domain and `cloud` do not change. `update` does the same for points [m].
+        Kernel, domain and `cloud` do not change. `update` does the same for points [m]. Raises
+        `IndefiniteCovariance` for observations too far outside the domain.
         """
         return dataclasses.replace(self, **common_fields(append_observations(self, new), Posterior))
 
     @checked
     def moved(self, b_from_a: Pose) -> "ShapeGP":
-        """Return the shape in frame b, given the rigid transform `b_from_a` (4, 4) [m] from its own
-        frame a.
+        """Return the shape in frame b, given the rigid transform `b_from_a` (4, 4) [m].
+
+        Frame a is that of this shape's `cloud`; a point p of frame a is `b_from_a` p in frame b.
         """
         rotation = b_from_a[:3, :3].to(self.x)
         n = len(self.x)

@@ -58,7 +58,8 @@ class HollowShape(ShapeGP):
     At each point one surface applies: the surface with the greater mean signed distance. Distance,
     normal and covariance are those of this surface. The errors of the two surfaces are independent.
 
-    The attributes of `ShapeGP` describe the outer surface, but `cloud` holds the points of both.
+    The attributes of `ShapeGP` describe the outer surface. But `cloud` holds the points of both,
+    and `domain_radius` is the smaller one.
 
     Attributes:
         inner: the inner surface; its signed distance is positive in the cavity and negative around
@@ -78,10 +79,12 @@ class HollowShape(ShapeGP):
     @classmethod
     @checked(gradients=True)
     def join(cls, outer: ShapeGP, inner: ShapeGP, cloud: PointCloud) -> "HollowShape":
-        """Return the vessel with an `outer` and an `inner` surface in the same normalised frame.
+        """Return the vessel of two surfaces with the same `center` and `scale`.
 
-        `cloud` holds the seen points [m] of both surfaces. The domain is the smaller of both
-        domains.
+        Args:
+            outer: the outer surface; its signed distance is positive outside.
+            inner: the inner surface; its signed distance is positive in the cavity.
+            cloud: the seen points [m] of both surfaces.
         """
         fields = common_fields(outer, ShapeGP)
         fields["cloud"] = cloud
@@ -100,10 +103,10 @@ class HollowShape(ShapeGP):
 
     @checked(gradients=True)
     def wall_at(self, x: Queries) -> Bool[Tensor, "q walls"]:
-        """Return a mask (q, 2): which surface, outer or inner, applies at each of q points `x`
-        (q, 3).
+        """Return a mask (q, 2): which surface, outer or inner, applies at each of q normalised
+        points `x` (q, 3).
 
-        The points are those that `normalise` returned. Each row has one True.
+        That is the surface with the greater mean signed distance. Each row has one True.
         """
         inner = self.inner.mean(x) > self.outer.mean(x)
         return torch.stack([~inner, inner], 1)
@@ -112,7 +115,8 @@ class HollowShape(ShapeGP):
     def mean(self, x: Queries) -> Float[Tensor, "q"]:
         """Return the mean signed distance (q,) at q points `x` (q, 3) that `normalise` returned.
 
-        It is normalised: one unit is `scale` [m].
+        The greater of the distances from the two surfaces: positive outside and in the cavity,
+        negative in the wall. It is normalised: one unit is `scale` [m].
         """
         return torch.maximum(self.outer.mean(x), self.inner.mean(x))
 
@@ -130,11 +134,11 @@ class HollowShape(ShapeGP):
 
     @checked(gradients=True)
     def estimate(self, x: Queries) -> Moments:
-        """Return mean (q, 4) and covariance (q, 4, 4) of signed distance and gradient (d, w) at
-        each point.
+        """Return (mean, covariance) of signed distance and gradient (d, w) at each of q points `x`.
 
-        The q points `x` (q, 3) are those that `normalise` returned. The result is normalised: one
-        unit is `scale` [m]. Each point has the result of the surface that applies there.
+        The points `x` (q, 3) are those that `normalise` returned. The mean is (q, 4) and the
+        covariance (q, 4, 4), both normalised: one unit is `scale` [m]. They are those of the
+        surface that applies at each point (`wall_at`).
         """
         parts, merge = self._by_wall(x, lambda wall, own: wall.estimate(own))
         return tuple(map(merge, *parts))  # pyright: ignore[reportReturnType]
@@ -144,8 +148,8 @@ class HollowShape(ShapeGP):
         """Return the variance (q,) of the signed distance at q points `x` (q, 3) that `normalise`
         returned.
 
-        It is that of the surface which applies there, as in `estimate`, in squared normalised
-        units: one unit is `scale` [m]. It is not calibrated; `predict(...).std_m` is.
+        The variance is that of the surface that applies at each point (`wall_at`), in squared
+        normalised units: one unit is `scale` [m]. It is not calibrated; `predict(...).std_m` is.
         """
         parts, merge = self._by_wall(x, lambda wall, own: wall.variance(own))
         return merge(*parts)
@@ -155,7 +159,8 @@ class HollowShape(ShapeGP):
         """Return mean and variance of the signed distance with derivatives, at q points `x` (q, 3).
 
         The points are those that `normalise` returned. The mean has first and second derivatives,
-        the variance the first. All are by normalised coordinates, as in `ShapeGP.jet`.
+        the variance the first. All are by normalised coordinates: `distance` (q,), `gradient`
+        (q, 3), `hessian` (q, 3, 3), `variance` (q,), `variance_gradient` (q, 3).
         """
         parts, merge = self._by_wall(x, lambda wall, own: wall.jet(own))
         return map_tensors(merge, *parts)
@@ -173,11 +178,11 @@ class HollowShape(ShapeGP):
 
     @checked(gradients=True)
     def joint_at(self, x: Float[Tensor, "k 3"]) -> JointEstimate:
-        """Return the joint posterior of distance and gradient (d, w) at k points `x` (k, 3).
+        """Return the joint posterior of signed distance and gradient (d, w) at k points `x` (k, 3).
 
-        The points are those that `normalise` returned, and the result is normalised. Points at
-        which different surfaces apply have covariance 0. It is `joint` without a limit of the
-        number of points and without a check of the domain.
+        The points are those that `normalise` returned. The result is normalised: one unit is
+        `scale` [m]. Points at which different surfaces apply have covariance 0. `joint` does the
+        same for points [m], but limits their number and refuses points outside the domain.
         """
         outer = self.outer.joint_at(x)
         inner = self.inner.joint_at(x)
@@ -194,9 +199,10 @@ class HollowShape(ShapeGP):
 
     @checked
     def append(self, new: Observations) -> "HollowShape":
-        """Return the vessel given further normalised observations.
+        """Return the vessel given further observations in its normalised frame.
 
-        Each observation changes the surface, outer or inner, that applies at its point.
+        Each observation changes the surface, outer or inner, that applies at its point
+        (`wall_at`). Its distance and normal are those from that surface.
         """
         outer, inner = self.wall_at(new.x).T
         new_outer = self.outer.append(new[outer])
@@ -205,8 +211,9 @@ class HollowShape(ShapeGP):
 
     @checked
     def moved(self, b_from_a: Pose) -> "HollowShape":
-        """Return the vessel in frame b, given the rigid transform `b_from_a` (4, 4) [m] from its
-        own frame a.
+        """Return the vessel in frame b, given the rigid transform `b_from_a` (4, 4) [m].
+
+        Frame a is that of this shape's `cloud`; a point p of frame a is `b_from_a` p in frame b.
         """
         outer = self.outer.moved(b_from_a)
         return self.join(outer, self.inner.moved(b_from_a), outer.cloud)

@@ -55,17 +55,18 @@ class Kernel:
     distance r apart.
 
     Use `thin_plate_kernel`, `matern52_kernel` or `rbf_kernel`, or your own profile. `fit_shape` and
-    `condition` take it. Gradients also reach tensors that the profile itself uses, such as a
-    length.
+    `condition` take a kernel. With `condition`, gradients also reach tensors that the profile
+    itself uses, such as a length.
 
     Args:
-        profile: the function k(r), elementwise on a tensor of distances r >= 0.
-        diameter: diameter, normalised, of the ball within which k is a covariance; infinite if it
-            is one everywhere.
+        profile: the function k(r), elementwise on a tensor of distances r >= 0. It must be smooth
+            for r > 0, with k'(0) = 0.
+        diameter: diameter, normalised, of the ball in which k is positive definite; infinite if it
+            is so everywhere.
         remedy: fix that the error suggests if the covariance is not positive definite.
-        closed_form: function of `r` and `count` that returns the results of `derivatives` faster;
-            False means autograd of the profile. Where a gradient is needed, autograd is used in any
-            case.
+        closed_form: function of `r` and `count` that returns the results of `derivatives` faster
+            than autograd of the profile. False means autograd. Where a gradient is needed, autograd
+            is used in any case.
 
     >>> kernel = Kernel(lambda r: (1 + r) * torch.exp(-r))
     >>> [round(float(s), 4) for s in kernel.derivatives(torch.ones(1, dtype=torch.float64), 4)]
@@ -83,13 +84,20 @@ class Kernel:
         r: Float[Tensor, "*s"],
         count: Orders,
     ) -> tuple[Float[Tensor, "*s"], ...]:
-        """Return `count` tensors (1 to 4): k(r), then its first derivatives by r^2 / 2.
+        """Return the first `count` of the tensors k(r), k1(r), k2(r), k3(r): the derivatives of k
+        by r^2 / 2.
 
-        Each derivative is (1/r) d/dr of the one before: k, k'/r, (k'/r)'/r, and so on. They are not
-        k', k'', k'''. `r` holds normalised distances of any shape, and each tensor has this shape.
+        These are k1 = k' / r, k2 = k1' / r and k3 = k2' / r, where ' is d/dr. They are not the
+        derivatives by r. The results are differentiable. At r = 0 infinite values count as 0, and
+        k3 is not reliable.
 
-        The results are differentiable. At r = 0 infinite derivatives count as 0, and the third is
-        not reliable.
+        Args:
+            r: normalised distances of any shape (*s,), which each result has, too.
+            count: number of results, 1 to 4.
+
+        >>> half_square = Kernel(lambda r: r**2 / 2)
+        >>> half_square.derivatives(torch.tensor([2.0]), 3)
+        (tensor([2.]), tensor([1.]), tensor([0.]))
         """
         if self.closed_form and is_plain(r):
             return self.closed_form(r, count)
@@ -179,8 +187,10 @@ def thin_plate_kernel(psi: Positive, closed_form: bool = True) -> Kernel:
     """Return the thin plate kernel k(r) = 2 r^3 - 3 psi r^2 + psi^3, Eq. (6) of the paper.
 
     Args:
-        psi: the kernel's length, normalised. k is a covariance in a ball of diameter 3/4 `psi`.
-        closed_form: whether derivatives are in closed form; False means autograd of the profile.
+        psi: the kernel's length, normalised. k is positive definite only in a ball of diameter
+            3/4 `psi`.
+        closed_form: whether derivatives are in closed form; False means autograd of the profile,
+            which is slower.
 
     >>> kernel = thin_plate_kernel(psi=2.0)
     >>> kernel.diameter
@@ -218,8 +228,8 @@ def matern52_kernel(length: Positive, variance: Positive = 1.0) -> Kernel:
     """Return the Matern 5/2 kernel k(r) = variance (1 + s + s^2 / 3) exp(-s), with s = sqrt(5) r /
     length.
 
-    `length` is normalised. `variance` is the prior variance of the signed distance, in squared
-    normalised units.
+    `length` is a normalised distance. `variance` is the prior variance of the signed distance, in
+    squared normalised units.
 
     >>> float(matern52_kernel(1.0).profile(torch.zeros(())))
     1.0
@@ -247,8 +257,8 @@ def matern52_kernel(length: Positive, variance: Positive = 1.0) -> Kernel:
 def rbf_kernel(length: Positive, variance: Positive = 1.0) -> Kernel:
     """Return the squared exponential kernel k(r) = variance exp(-r^2 / (2 length^2)).
 
-    `length` is normalised. `variance` is the prior variance of the signed distance, in squared
-    normalised units.
+    `length` is a normalised distance. `variance` is the prior variance of the signed distance, in
+    squared normalised units.
 
     >>> float(rbf_kernel(1.0).profile(torch.zeros(())))
     1.0

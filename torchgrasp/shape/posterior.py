@@ -85,9 +85,11 @@ class Posterior(Value):
 
     @kept
     def whiteners(self) -> list[Float[Tensor, "columns width"]]:
-        """The inverse L^-T of the transposed Cholesky factor L, as a list of blocks of its columns.
+        """The matrix L^-T (r, r), where L is the Cholesky factor `factor`, as a list of blocks of
+        its columns.
 
-        A block (rows, width) leaves out the zeros below the diagonal. `whiten` uses it.
+        Each block has all columns of a range, and the rows down to the last of them: the rows below
+        are zero.
         """
         rows = len(self.factor)
         one = torch.eye(rows, dtype=self.x.dtype, device=self.x.device)
@@ -105,8 +107,10 @@ class Posterior(Value):
         self,
         rows: Shaped[Tensor, "rows *c"],
     ) -> Shaped[Tensor, "rows *c"]:
-        """Return `rows` (r, ...) of all r observed numbers, sorted from the order of `weights` into
-        the order of `factor`.
+        """Return `rows` (r, ...), one for each observed number, sorted from the order of `weights`
+        into the order of `factor`.
+
+        In the order of `weights`, the n distances come first, then the normals by component.
         """
         return rows if self.order is None else rows[self.order]
 
@@ -114,7 +118,7 @@ class Posterior(Value):
     def mean(self, x: Queries) -> Float[Tensor, "q"]:
         """Return the mean signed distance (q,) at q points `x` (q, 3) that `normalise` returned.
 
-        It is negative inside, and normalised: one unit is `scale` [m]. It is valid within
+        The distance is negative inside, and normalised: one unit is `scale` [m]. It is valid within
         `domain_radius` of the origin; `predict` also covers points outside.
         """
         if not self._is_plain(x):
@@ -137,12 +141,12 @@ class Posterior(Value):
 
     @checked(gradients=True)
     def estimate(self, x: Queries) -> Moments:
-        """Return mean (q, 4) and covariance (q, 4, 4) of signed distance and gradient (d, w) at
-        each point.
+        """Return (mean, covariance) of signed distance and gradient (d, w) at each of q points `x`,
+        Eqs. (7)-(8) of the paper.
 
-        The q points `x` (q, 3) are those that `normalise` returned. The result is normalised: one
-        unit is `scale` [m]. Eqs. (7)-(8) of the paper. The covariance between different points is
-        left out; `joint_at` has it.
+        The points `x` (q, 3) are those that `normalise` returned. The mean is (q, 4) and the
+        covariance (q, 4, 4), both normalised: one unit is `scale` [m]. The covariance between
+        different points is left out; `joint_at` has it.
         """
         prior = self.prior_block()
         rows = len(self.factor)
@@ -164,7 +168,7 @@ class Posterior(Value):
         """Return the variance (q,) of the signed distance at q points `x` (q, 3) that `normalise`
         returned.
 
-        It is in squared normalised units: one unit is `scale` [m]. It is not calibrated;
+        The variance is in squared normalised units: one unit is `scale` [m]. It is not calibrated;
         `predict(...).std_m` is. It costs less than `estimate`.
         """
         prior = self.kernel.profile(self.x.new_zeros(()))
@@ -199,7 +203,7 @@ class Posterior(Value):
         (q, 3).
 
         The points are those that `normalise` returned. All are by normalised coordinates:
-        `distance` (q,), `gradient` (q, 3) and `hessian` (q, 3, 3). It costs less than `jet`.
+        `distance` (q,), `gradient` (q, 3) and `hessian` (q, 3, 3). The call costs less than `jet`.
         """
         size = at_once(x, CHUNK.jet)
         if not self._is_plain(x):
@@ -208,11 +212,11 @@ class Posterior(Value):
 
     @checked(gradients=True)
     def joint_at(self, x: Float[Tensor, "k 3"]) -> JointEstimate:
-        """Return the joint posterior of distance and gradient at k points `x` (k, 3) that
-        `normalise` returned.
+        """Return the joint posterior of signed distance and gradient at k points `x` (k, 3) that
+        `normalise` returned, Eqs. (7)-(8) of the paper.
 
-        It is normalised, Eqs. (7)-(8) of the paper. It is `joint` without a limit of the number of
-        points and without a check of the domain.
+        The result is normalised: one unit is `scale` [m]. `joint` does the same for points [m], but
+        limits their number and refuses points outside the domain.
         """
         k = len(x)
         cross = self.cross(x)
@@ -224,7 +228,8 @@ class Posterior(Value):
         return JointEstimate(mean, prior - whitened.T @ whitened)
 
     def prior_block(self) -> Float[Tensor, "4 4"]:
-        """Return the prior covariance (4, 4) of signed distance and gradient (d, w), normalised.
+        """Return the prior covariance (4, 4) of signed distance (index 0) and gradient (1 to 3) at
+        a point, normalised.
 
         It is the same at every point.
         """
@@ -233,11 +238,11 @@ class Posterior(Value):
 
     @checked(gradients=True)
     def distance_rows(self, x: Queries) -> CovarianceRows:
-        """Return the prior covariance (q, r) of the distance at q points with all r observed
+        """Return the prior covariance (q, r) of the signed distance at q points with all r observed
         numbers.
 
         The points `x` (q, 3) are those that `normalise` returned. The columns are in the order of
-        `weights`.
+        `weights`: first the n observed distances, then the observed normals by component.
         """
         if not self._is_plain(x):
             d = x[:, None] - self.x
@@ -252,9 +257,10 @@ class Posterior(Value):
     def whiten(self, rows: CovarianceRows) -> CovarianceRows:
         """Return `rows` (q, r) times L^-T, where L is the Cholesky factor `factor`.
 
-        Each of the q rows holds the covariances of one number with all r observed numbers. They are
-        in the order of `weights`. The dot product of two rows of the result (q, r) is the
-        covariance that the observations explain.
+        A row holds the prior covariances of one number with all r observed numbers, as
+        `distance_rows` returns them. The dot product of two rows of the result (q, r) is the
+        covariance of their numbers that the observations explain. Prior minus explained covariance
+        is the posterior covariance.
         """
         rows = rows if self.order is None else rows[:, self.order]
         if not self._is_plain(rows):
@@ -272,12 +278,11 @@ class Posterior(Value):
         self,
         rows: CovarianceRows,
     ) -> tuple[Float[Tensor, "q"], CovarianceRows]:
-        """Return (explained, k A) for each row k of `rows` (q, r): the variance k A k (q,) that the
-        observations explain, and k A (q, r).
+        """Return (explained, solved): k A k^T (q,) and k A (q, r) for each row k of `rows` (q, r).
 
-        A row holds the covariances of one number with all r observed numbers. A is the inverse
-        covariance of the observed numbers. The prior variance minus the explained variance is the
-        posterior variance.
+        A is the inverse covariance of the r observed numbers. A row holds the prior covariances of
+        one number with them, as `distance_rows` returns them. The prior variance of this number
+        minus the explained variance k A k^T is its posterior variance.
         """
         whitened = self.whiten(rows)
         solved = torch.zeros_like(rows)
@@ -296,7 +301,8 @@ class Posterior(Value):
         observed numbers.
 
         The points `x` (q, 3) are those that `normalise` returned. On the first axis, index 0 is the
-        distance, and 1 to 3 are the gradient. The last axis is in the order of `weights`.
+        signed distance, and 1 to 3 are its gradient. The last axis is in the order of `weights`:
+        first the n observed distances, then the observed normals by component.
         """
         return cross_covariance(self.kernel, x, self.x, self.n_oriented)
 
@@ -306,11 +312,11 @@ class Posterior(Value):
 
     @property
     def weighted(self) -> Weighted:
-        """The observed points, the posterior weights of each point's distance and normal, and the
-        kernel.
+        """The observed points, the weights of their distances and normals in the posterior mean,
+        and the kernel.
 
-        It is (x, a, b, kernel): n observed points (n, 3), normalised, the weights (n,) of their
-        distances, and the weights (k, 3) of the k observed normals.
+        A named tuple (x, a, b, kernel). `x` (n, 3) are the n observed points, normalised. `a` (n,)
+        are the weights of their distances, and `b` (k, 3) those of the k observed normals.
         """
         n = len(self.x)
         normals = self.weights[n:].reshape(3, self.n_oriented).T

@@ -70,9 +70,10 @@ class NextView(Value):
     Attributes:
         camera_pose: pose `obj_from_camera` (4, 4) [m] in the cloud's frame, as `look_at` returns it
             (x right, y down, z forward).
-        turn: angle [deg] at the object from the nearest earlier camera; NaN if none is known.
-        before: standard deviation [m] of the surface now.
-        after: standard deviation [m] of the surface that is expected with the second view.
+        turn: angle [deg], seen from the object, between this camera and the nearest earlier one;
+            NaN if no earlier camera is known.
+        before: mean standard deviation [m] of the surface now.
+        after: mean standard deviation [m] of the surface that is expected with the second view.
     """
 
     camera_pose: Pose
@@ -82,8 +83,10 @@ class NextView(Value):
 
     @property
     def sentence(self) -> str:
-        """A sentence in words: where to look from, in the frame of the cloud, and what it is
-        expected to tell.
+        """The camera's position [m] in the frame of the cloud, and the expected gain, in words.
+
+        For example "(0.31, 0.02, 0.40) m, 95 degrees from where the camera was: std_m falls from
+        5.2 to 1.8 mm".
         """
         x, y, z = self.camera_pose[:3, 3].tolist()
         turn = ""
@@ -104,26 +107,26 @@ def next_view(
 ) -> NextView:
     """Return the camera for a second view that would reduce the shape's standard deviation most.
 
-    Candidates are cameras on a sphere around the object. Each is given the points of the estimated
-    surface that it would see. They face it, and no other surface is in the way. The deviation after
-    a view is the deviation of the posterior given these points.
+    Candidates are cameras on a sphere around the object. A camera would see the points of the
+    estimated surface that face it and that no other part of the surface hides. The deviation after
+    a view is that of the posterior given these points.
 
-    A new fit may do better: it also takes the second outline, and completes the rest anew.
-    Neighbours of the object do not hide it here. Whether an arm reaches the camera is not asked.
+    The search knows neither neighbours that hide the object nor an arm that carries the camera. A
+    fit to both views may be better still: it also uses the object's second outline.
 
     Args:
         shape: the shape, from `fit_shape`.
-        grasps: grasps of this shape, in its frame. The deviation counts at the contacts of the best
-            executable ones, weighted by their predicted success. None, or no executable grasp,
-            means that it counts on all of the surface.
+        grasps: grasps of this shape, in its frame. The deviation is then the mean over the contacts
+            of the first 20 executable ones (`VIEW.grasps`), weighted by their predicted success.
+            None, or no executable grasp, means the mean over the surface.
         table: the table's plane, or its height [m] along z; cameras are above it. None means the
-            table of the grasps, if they have one.
+            table of the grasps, if they have one. Without a table, cameras may be below the object.
         distance: distance [m] of the camera from the middle of the surface, at least 1.5 radii
             (`VIEW.near`) of the shape's domain. None means the mean distance of earlier cameras, or
-            0.5 m (`VIEW.far`) if none is known; if this is too near, the least distance.
+            0.5 m (`VIEW.far`) if none is known, but at least the least distance.
 
-    Raises `BadArgument` for a wrong argument, or a distance below the least one. Grasps whose
-    contacts all lie outside the shape's domain raise it, too.
+    Raises `BadArgument` for a distance below the least one, and for grasps whose contacts all lie
+    outside the shape's domain.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> from torchgrasp.shape import next_view

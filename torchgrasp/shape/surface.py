@@ -111,8 +111,9 @@ def extract_surface(
 ) -> Surface:
     """Return the estimated surface as a triangle mesh, Eq. (9) of the paper.
 
-    The mean signed distance is zero there. Marching cubes find it, and Newton steps refine it.
-    Pieces to which less than 2 % of the cloud is nearest (`SURFACE.share`) are left out.
+    It is where the mean signed distance is zero. Marching cubes find it, and Newton steps refine
+    its vertices. A separate piece is left out if it is nearest to less than 2 % of the cloud's
+    points (`SURFACE.share`). A `HollowShape` gives the vertices of both its surfaces.
 
     Args:
         shape: the shape, from `fit_shape`.
@@ -324,13 +325,15 @@ def surface_field(
 ) -> SignedDistanceField:
     """Return the signed distance field [m] of a shape's estimated surface, negative inside.
 
-    It serves to locate the object by touch. Its nodes are in the cloud's frame.
+    `close_hand(surface=)` takes it, to locate the object by touch. Its nodes are in the cloud's
+    frame, and reach to 0.08 m around the surface.
 
     Args:
         shape: the shape, from `fit_shape`.
         spacing: distance [m] of neighbouring nodes, 0.001 to 0.02.
 
-    Raises `BadArgument` for another spacing, or if the mean signed distance is nowhere zero.
+    Raises `BadArgument` for another spacing, and for one that needs more than 2e7 nodes
+    (`FIELDS.most_nodes`). Raises it if the mean signed distance is nowhere zero, too.
 
     >>> from torchgrasp import fit_shape, load_object
     >>> jug = load_object("jug")

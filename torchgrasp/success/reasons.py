@@ -43,10 +43,15 @@ ROUNDING = 1e-9
 class Cost(NamedTuple):
     """A cause that lowers the predicted success of a grasp.
 
-    `explain_success` makes it.
+    `explain_success` returns such causes.
 
     Attributes:
-        cause: name of the cause: "load", "moved", "surface", "object" or "task".
+        cause: name of the cause:
+            "load": the forces that carry the load.
+            "moved": the contacts, if the object is not quite where the camera saw it.
+            "surface": the uncertainty of the surface at the contacts.
+            "object": the size of the object.
+            "task": mass, friction and force of the task.
         log_odds: by how much (no unit) the cause lowers the log-odds of success, compared to grasps
             that held.
         sentence: explanation of the cause, with its numbers.
@@ -64,10 +69,12 @@ def explain_success(
     """Return at most three causes that lower the predicted success of the first grasp most, the
     greatest first.
 
-    Each cause stands for several features of the success model (`CAUSES`). Its `log_odds` is by how
-    much the log-odds rise if these features take their median over grasps that held. Causes that do
-    not lower the success are left out. If trials support only a part of the frictions and masses, the
-    sentence of the cause "task" says so, and "task" is not left out.
+    Each cause stands for several features of the success model. Its `log_odds` is by how much the
+    log-odds rise if these features take their median over grasps that held. Causes that do not
+    lower the success are left out.
+
+    No trial may have tested some of the frictions and masses of the task. Then "task" is always
+    among the causes, and its sentence says for what share of them success is unknown.
 
     Args:
         grasps: grasps of `plan_grasps`, of which the first counts.

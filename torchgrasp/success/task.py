@@ -30,14 +30,14 @@ class GraspTask(Value):
         mass: mass [kg] of the object, or its `Distribution`.
         force: normal force [N] of the strongest finger. None means 4 N in pulls. In a lift it means
             as much as the felt load needs.
-        lift: whether the object is lifted off its table. Otherwise it floats, and is pulled along
-            six directions with a force of 10 m/s^2 times its mass. None means a lift if the planner
-            knows the table and the closing is not "open_loop".
+        lift: True means that the object is lifted off its table. False means pulls: the object
+            floats, and is pulled along six directions with a force of 10 m/s^2 times its mass. None
+            means a lift if the planner knows the table and the closing is not "open_loop".
         closing: how the hand closes.
             "uncertainty": by touch.
             "open_loop": without sensors, from pre-grasp to grasp to squeeze.
-        displaced: whether the object may be elsewhere: up to 30 mm along the table, or 5 mm and 5
-            degrees if it floats.
+        displaced: whether the object may be elsewhere than the camera saw it: up to 30 mm along the
+            table, or 5 mm and 5 degrees in pulls.
 
     Raises `BadArgument` for a number outside its range, or a lift in open loop.
 
@@ -59,7 +59,8 @@ class GraspTask(Value):
     def describe(self) -> str:
         """Return the task as a short text, such as "lift of 0.5 kg".
 
-        It begins with "lift" or "pulls", or with "task" if the field `lift` is None.
+        The text begins with "lift" or "pulls", or with "task" if the field `lift` is None. It names
+        `force` if that is not None, and ends with ", displaced" if `displaced` is True.
         """
         what = "task" if self.lift is None else "lift" if self.lift else "pulls"
         force = "" if self.force is None else f" with {self.force:g} N"
@@ -72,9 +73,9 @@ class GraspTask(Value):
         """Return the task of the next grasp, with the mass narrowed to what a lift has shown
         (`ClosureResult.mass`).
 
-        `result` is what `close_hand` returned. If no mass of the task is among the shown masses,
-        the shown masses replace the task's. The task is returned as it is in two cases: the lift
-        showed no mass, or its status is neither `OK` nor `TOO_HEAVY`.
+        `result` is what `close_hand` returned. Masses outside those that it shows are left out. If
+        none is left, the mass is what it shows. The task is returned as it is in two cases: the
+        lift showed no mass, or its status is neither `OK` nor `TOO_HEAVY`.
         """
         felt = result.mass
         if felt is None or result.status not in (Status.OK, Status.TOO_HEAVY):
@@ -90,9 +91,9 @@ class GraspTask(Value):
     def pressing(self, lifted: bool) -> float:
         """Return the normal force [N] of the strongest finger.
 
-        It is the field `force`. If that is None, it is 4 N in pulls and 0 in a lift. There 0 means
-        that the hand presses as much as the felt load needs. `lifted` says whether the task is a
-        lift (`lifts`).
+        This is the field `force`. If that is None, it is 4 N in pulls and 0 in a lift, where the
+        hand presses as much as the felt load needs. `lifted` says whether the task is a lift, as
+        `lifts` returns it.
         """
         return self.force or (0.0 if lifted else 4.0)
 
@@ -101,8 +102,8 @@ class GraspTask(Value):
         """Return whether the task is a lift, for a planner that knows this `table` (None: no
         table).
 
-        It is the field `lift`. If that is None, the task is a lift with a `table`, unless the
-        closing is "open_loop".
+        The answer is the field `lift`. If that is None, the task is a lift with a `table`, unless
+        the closing is "open_loop".
         """
         return table is not None and self.closing != "open_loop" if self.lift is None else self.lift
 
@@ -157,14 +158,18 @@ class Conditions:
 @checked
 @dataclasses.dataclass(frozen=True)
 class TaskWrenches(Value):
-    """The w loads of an object in a task, for the argument `resist` of `plan_grasps`.
+    """The w loads on an object in a task, for the argument `resist` of `plan_grasps`.
+
+    The contacts must balance each load alone.
 
     Args:
-        wrenches: loads (w, 6) in the cloud's frame: force [N] with the weight included, then torque
-            [N m] about `point`.
+        wrenches: loads (w, 6) on the object in the cloud's frame: first the force [N], in which its
+            weight is included, then the torque [N m] about `point`.
         point: point (3,) [m] in the cloud's frame; None means the estimated centre of the object.
 
     Raises `BadArgument` for no load, or a load that is all zeros.
+
+    A jar of 2.5 N, whose lid is turned with 0.1 N m about the vertical, in both directions:
 
     >>> turn = [0.0, 0.0, -2.5, 0.0, 0.0, 0.1]
     >>> back = [0.0, 0.0, -2.5, 0.0, 0.0, -0.1]

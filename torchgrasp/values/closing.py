@@ -21,16 +21,17 @@ class ClosingGains(Value):
     """Targets and gains of the closing controller for f fingers (Eqs. 26-28 of the paper), in the
     hand's frame.
 
-    `closing_gains` makes them. The hand's frame is the frame of its root link at the planned pose.
+    `closing_gains` returns them. The hand's frame is the frame of its root link at the planned
+    pose.
 
     Attributes:
         target: planned position (f, 3) [m] of each contact.
         covariance: uncertainty (f, 3, 3) [m^2] of each position.
         position_gain: diagonal (f, 3) [1/s] of each finger's position gain matrix.
         force_gain: diagonal (f, 3) [m/(s N)] of each finger's force gain matrix.
-        desired_force: contact force (f, 3) [N] on the object to reach.
-        force_source: "analytic", or "stability" if the stability model chose among the balanced
-            forces.
+        desired_force: force (f, 3) [N] that each finger is to exert on the object.
+        force_source: how `desired_force` was chosen among the balanced forces: "stability" by the
+            hand's learned stability model, else "analytic".
 
     >>> from torchgrasp import closing_gains, load_hand
     >>> from torchgrasp.data.shipped import load_shipped_grasp
@@ -68,15 +69,18 @@ class ObjectMotion(NamedTuple):
 class Disturbance(Value):
     """Unintended contacts of the hand in a simulated trial, of three kinds.
 
-    It is the field `disturbance` of a `ClosureResult`. Entry 0 of each (3,) is for contacts with
-    neighbours, and entry 1 for contacts with the table. Entry 2 is for contacts of other links than
-    fingertips with the object.
+    It is the field `disturbance` of a `ClosureResult`. Each tensor (3,) has one entry for each
+    kind:
+
+    * 0: contacts with neighbours of the object.
+    * 1: contacts with the table.
+    * 2: contacts of other links than fingertips with the object.
 
     Attributes:
         first_touch: time (3,) [s] of the first contact; infinite if there is none.
         impulse: sum (3,) of the normal impulses [N s].
         force: largest normal force (3,) [N], averaged over a control tick.
-        early: whether (3,) the first of these contacts was before a fingertip touched the object.
+        early: whether (3,) the first contact of a kind was before a fingertip touched the object.
         neighbour_pose: rigid transforms (t, m, 4, 4) [m] in the frame of the grasp, for t ticks and
             m neighbours. Each moves a neighbour from its start to its place at the tick.
     """
@@ -127,8 +131,9 @@ class ClosureResult(Value):
     have [m] in place of [rad].
 
     Attributes:
-        held: whether the object was lifted with the hand and slipped little (`close_hand` gives the
-            bounds).
+        held: whether the object was lifted with the hand and slipped little. Its centre then rose
+            by half the lift, and two fingers touch it at the end. It slipped by less than 20 mm and
+            30 degrees.
         status: `OK`, or the reason why the object was not held.
         time: times (t,) [s] at which the control ticks ended.
         forces: normal force (t, f) [N] of each fingertip; 0 without contact.
@@ -138,21 +143,24 @@ class ClosureResult(Value):
         targets: positions (t, j) [rad or m] that were the targets of the drives in the tick.
         joint_names: names of all joints of the URDF.
         contact_order: indices of the fingers that touched, in the order of their first contacts.
-        object_motion: motion of the object in the hand from the pre-grasp to the end.
-        pushed: motion of the object in the world, from the pre-grasp until all fingers touched or
-            the closing ended.
-        before_lift: motion of the object in the world from the start of the trial until the
-            pressing ends.
+        object_motion: motion of the object relative to the hand, from the end of the approach to
+            the end of the trial.
+        pushed: motion of the object in the world, from the end of the approach to the end of the
+            closing (`phases`).
+        before_lift: motion of the object in the world, from the start of the trial to the end of
+            the pressing.
         rise: height [m] by which the object's centre has risen at the end.
         unbalanced: norm of the sum of the fingertip forces before the lift, over the sum of their
             norms (no unit).
-        slip: motion of the object in the hand from the end of pressing to the end.
+        slip: motion of the object relative to the hand, from the end of the pressing to the end of
+            the trial.
         start_overlap: depth [m] by which the opened hand penetrates the object or the table at the
             start.
         disturbance: unintended contacts of the hand.
         trace: contacts and estimates at every tick.
-        phases: times (3,) [s] at which the hand arrived, all fingers touched, and the hand pressed;
-            NaN if never.
+        phases: times (3,) [s] at which approach, closing and pressing ended. The closing ends when
+            all fingers touch, or are given up. If the trial ended before, the first time is 0, and
+            the others are NaN.
         stops: number of stops of the approaching hand at a contact.
         attempts: number of closings of the hand.
         seconds: wall time [s] of the trial.
@@ -205,13 +213,15 @@ class ClosingOptions(Value):
             all contact targets.
         palm_reach: largest displacement [m] of the palm, which follows the estimated object pose. 0
             means that the palm does not move.
-        stops: largest number of stops at an unexpected contact, after which the approaching hand
-            moves sideways; 0 means none.
+        stops: how often the approaching hand may stop at an unexpected contact and move sideways; 0
+            means never.
         attempts: largest number of closings. On a known table the hand closes again if the grasp
             seems too weak to lift.
 
-    Raises `BadArgument` for a number outside its range, and for two contradictions. These are a
-    `palm_reach` or a second attempt without `pose_estimate`, and `stops` with a `palm_reach` of 0.
+    Raises `BadArgument` for a number outside its range, and for options that exclude each other:
+
+    * a `palm_reach` above 0, or more than 1 of `attempts`, without `pose_estimate`;
+    * `stops` above 0 with a `palm_reach` of 0.
 
     >>> ClosingOptions(palm_reach=0.0, stops=0).attempts  # an arm that cannot yield
     5
@@ -262,8 +272,8 @@ class SensorModel(Value):
             "tactile": force, position and sliding of each contact, like a BioTac.
             "torque": only the force, from the torques of the finger's joints.
             "binary": only whether the tip touches.
-        delay: age [s] of the readings, rounded to whole samples of the sensor. It samples at 100
-            Hz, or once a control tick if ticks are longer.
+        delay: age [s] of the readings, rounded to whole samples. The sensor samples at 100 Hz, or
+            once a control tick if ticks are longer.
         noise: factor (no unit) on the usual noise. The usual standard deviation is 0.1 N of a
             tactile normal force, and 0.01 N m of a joint torque.
         dead: names of the fingers whose sensor is known to be broken.

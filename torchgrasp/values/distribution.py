@@ -73,8 +73,9 @@ class Distribution(Value):
     @classmethod
     @checked
     def of(cls, value: "float | Distribution") -> "Distribution":
-        """Return the distribution of a number that is certain. A `Distribution` is returned as it
-        is.
+        """Return the distribution of a number that is certain: its only part is (value, value).
+
+        A `Distribution` is returned as it is.
         """
         return value if isinstance(value, Distribution) else cls(((value, value),))
 
@@ -104,10 +105,11 @@ class Distribution(Value):
         """Return the number or the `Distribution` that a text names, in the form that `parse`
         explains.
 
-        A text of one number gives a float. Raises `BadArgument` for another text.
+        A text of one number gives a float; `parse` gives a `Distribution` in any case. Raises
+        `BadArgument` for another text.
 
-        >>> Distribution.read("0.5")
-        0.5
+        >>> Distribution.read("0.5"), str(Distribution.read("0.3:0.8"))
+        (0.5, '0.3:0.8')
         """
         return cls.parse(text).simplest
 
@@ -153,7 +155,7 @@ class Distribution(Value):
 
     @property
     def simplest(self) -> "float | Distribution":
-        """The number as a float if it is certain, else the `Distribution`."""
+        """The number as a float if only one is possible, else this `Distribution`."""
         return self.least if self.least == self.most else self
 
     @property
@@ -230,9 +232,10 @@ class Distribution(Value):
 
     @checked(gradients=True)
     def cdf(self, x: Annotated[Float[Tensor, "*b"], ANY]) -> Float[Tensor, "*b"]:
-        """Return the probability P(X <= x) of numbers up to each `x` (*b,); NaN for NaN.
+        """Return the probability (*b,) that the number is at most `x` (*b,); NaN for NaN.
 
-        Its derivative is the density between the single numbers.
+        The result is differentiable in `x`. The derivative is the density of the intervals; it does
+        not show the jumps at single numbers.
         """
         return torch.where(x.isnan(), x, self._below(x, reached=True).clamp(0, 1))
 
@@ -247,10 +250,12 @@ class Distribution(Value):
 
     @checked(gradients=True)
     def quantile(self, q: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-        """Return for each probability `q` (*b,) in [0, 1] the least number x with P(X <= x) >= q.
+        """Return for each probability `q` (*b,) in [0, 1] the least number x (*b,) with
+        `cdf`(x) >= q.
 
-        Its derivative is one over the density, and 0 at a single number. Raises `BadArgument` for a
-        `q` outside [0, 1]; torch.vmap and torch.compile leave this check out.
+        The result is differentiable in `q`. The derivative is one over the density, and 0 where x
+        is a single number. Raises `BadArgument` for a `q` outside [0, 1]; torch.vmap and
+        torch.compile leave this check out.
         """
         if is_known(q) and not bool(((q >= 0) & (q <= 1)).all()):
             raise BadArgument("q", "a number outside [0, 1]", "probabilities in [0, 1]")
@@ -306,13 +311,19 @@ class Distribution(Value):
 
     @checked
     def nodes(self, count: Few) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
-        """Return n numbers (n,) and their probabilities (n,), with n at most `count` (1 to 10,000).
+        """Return (numbers, probabilities): n nodes (n,) that stand for the distribution, and their
+        probabilities (n,).
 
-        They stand for the distribution: the mean of a function is about the weighted mean of its
-        values at the numbers. A single number is itself a node. An interval is cut into equal
-        pieces, and their middles are the nodes. The greater an interval's probability, the more
-        pieces it has. If the distribution has more `parts` than `count`, the nodes are the
-        quantiles (i + 1/2) / `count`.
+        The sum of probability times f(number) is about the mean of a function f. Here n is at most
+        `count` (1 to 10,000).
+
+        A part that is a single number is one node. An interval is cut into equal pieces, and their
+        middles are the nodes. The greater an interval's probability, the more pieces it has. If the
+        distribution has more `parts` than `count`, the nodes are the `count` quantiles (i + 1/2) /
+        `count`.
+
+        >>> [node.tolist() for node in Distribution.between(0.0, 1.0).nodes(2)]
+        [[0.25, 0.75], [0.5, 0.5]]
         """
         if len(self.parts) > count:
             middles = (torch.arange(count, dtype=torch.float64, device="cpu") + 0.5) / count

@@ -39,11 +39,11 @@ class PointCloud(Value):
         normals: outward normals (n, 3) of any length; None if they are unknown.
         viewpoint: position of the camera (3,) [m], or of each point's camera (n, 3) [m]; None if it
             is unknown.
-        frustum: inward unit normals (4, 3) of the four sides of the camera's view. Or the normals
-            (n, 4, 3) of each point's camera. An object that reaches a side is cut off there. None
-            if they are unknown.
-        pose_error: standard deviation (n,) [m] of the position of each point's view, which moves
-            its points together. None if the poses are exact.
+        frustum: inward unit normals (4, 3) of the left, right, top and bottom side of the camera's
+            view, or those (n, 4, 3) of each point's camera. An object that reaches a side is cut
+            off there. None if they are unknown.
+        pose_error: standard deviation (n,) [m] of an error of the camera's pose, which moves all
+            points of a view together. None if the poses are exact.
 
     Raises:
         BadArgument: a wrong shape or dtype, or numbers that are not finite.
@@ -70,7 +70,7 @@ class PointCloud(Value):
 
     @checked
     def select(self, rows: Int[Tensor, "m"] | Bool[Tensor, "n"]) -> "PointCloud":
-        """Return a cloud of some of the points, with all that belongs to them.
+        """Return a cloud of some of the points, with their normals, cameras and pose errors.
 
         `rows` is a mask (n,) of the points, or holds m indices of points in the wanted order. Raises
         `BadArgument` for another shape or dtype, and `TooFewPoints` if fewer than 4 points are left.
@@ -122,8 +122,8 @@ class ShapeEstimate(Value):
     """The estimated shape at query points: signed distance and normal with their uncertainty (Eqs.
     7-8 of the paper).
 
-    `ShapeGP.predict` makes it. All fields share the leading axes `*b` of these points. Normalised
-    units are the paper's: one unit is `shape.scale` metres.
+    `ShapeGP.predict` returns it. All fields share the leading axes `*b` of these points. One
+    normalised unit is `ShapeGP.scale` metres.
 
     Attributes:
         distance: mean signed distance (*b,), normalised; negative inside the object.
@@ -131,8 +131,9 @@ class ShapeEstimate(Value):
             distance.
         variance: variance (*b,) of the distance, in squared normalised units.
         covariance: covariance (*b, 4, 4) of distance (index 0) and gradient (1 to 3), normalised.
-        std_m: calibrated standard deviation (*b,) [m] of the surface along its normal. It is the
-            standard deviation of the distance, divided by the slope of the mean.
+        std_m: calibrated standard deviation (*b,) [m] of the surface along its normal. It is
+            `ShapeGP.std_factor` sqrt(variance) / |gradient| times `ShapeGP.scale`; the gradient is
+            that of the mean distance.
     """
 
     distance: Float[Tensor, "*b"]
@@ -147,9 +148,9 @@ class ShapeEstimate(Value):
 class Contacts(Batch):
     """Sets of three to five contacts, one contact for each fingertip.
 
-    b counts contact sets, and f the fingertips of a set. All is in the frame of the cloud, and all
-    tensors have one dtype. `plan_contacts` makes contacts; contacts of another planner are made
-    from `points` and `normals`.
+    b counts contact sets, and f the fingertips of a set. Vectors are in the frame of the cloud, and
+    all tensors have one dtype. `plan_contacts` returns contacts. For contacts of another planner,
+    `points` and `normals` are enough.
 
     Args:
         points: contact points (b, f, 3) [m] on the object.
@@ -229,14 +230,15 @@ class Certificate(Batch):
     """The verdict whether each of b contact sets has frictional form closure (Eq. 13), with its
     proof.
 
-    `certify` makes it, and `closed` is the answer. f counts the fingertips of a set. The wrenches w
-    of a set are the columns of W: forces along the edges of its friction cones, then their torques.
-    Torques are about the contacts' centroid. They are divided by the contacts' root-mean-square
-    distance from it, so wrenches have no unit.
+    `certify` returns it, and `closed` is the answer. f counts the fingertips of a set. The wrenches
+    w of a set are the columns of W: forces along the edges of its friction cones, then their
+    torques. Torques are about the contacts' centroid. They are divided by the contacts'
+    root-mean-square distance from it, so wrenches have no unit.
 
     Attributes:
-        closed: whether the set has force closure (b,). It needs a margin clearly above 0 and full
-            rank, because coincident or collinear contacts satisfy Eq. (13), too.
+        closed: mask (b,) of the sets that have force closure. Their margin is at least 1e-6 and
+            their `rank_ratio` at least 1e-3: coincident or collinear contacts satisfy Eq. (13),
+            too.
         margin: the largest s (b,) for which coefficients phi >= s have W phi = 0 and sum phi = 1.
             -inf if no coefficients balance; NaN for contacts that are not finite.
         rank_ratio: the smallest singular value of W over its largest one (b,).
@@ -246,8 +248,9 @@ class Certificate(Batch):
             edge wrench w, up to rounding: no contact force opposes v. For a closed set, v proves
             that no greater margin is possible. The margin is -min(v . w) / sum(v . w - min(v . w))
             over the edge wrenches. If only the rank is too low, the wrenches are smallest along v.
-        task_load: the load t (b, 6) that the contacts resist least, of those of `resist`: force
-            [N], then torque [N m] about the contacts' centroid.
+        task_load: the load t (b, 6) that the contacts resist least, of the loads in the argument
+            `resist` of `plan_grasps`. It is a force [N], then a torque [N m] about the contacts'
+            centroid, in the frame of the cloud.
         task_margin: the greatest multiple (b,) of t that the contacts resist, without unit; all
             loads are resisted if it is at least 1.
         task_forces: contact forces (b, f, 3) [N] that balance this multiple of t, in the frame of
@@ -256,7 +259,7 @@ class Certificate(Batch):
         task_twist: proof (b, 6) [1/N, 1/(N m)] that no greater multiple is resisted. It is a twist
             y with y . t = -1: no admissible forces have a greater power along y.
 
-    The `task_` fields are None unless `plan_grasps` was called with `resist`.
+    The `task_` fields are None without the argument `resist` of `plan_grasps`.
     """
 
     margin: Annotated[Float[Tensor, "b"], ANY]
@@ -274,9 +277,9 @@ class Certificate(Batch):
 @checked
 @dataclasses.dataclass(frozen=True)
 class ContactCode(Value):
-    """The code q of sets of three contacts (Eq. 18), which is the same in every frame.
+    """The code q of sets of three contacts (Eq. 18), which does not change with the frame.
 
-    `encode` makes it. b counts contact sets. The axis of length 6 counts the assignments of the
+    `encode` returns it. b counts contact sets. The axis of length 6 counts the assignments of the
     three contacts to three fingers.
 
     Attributes:
@@ -284,8 +287,8 @@ class ContactCode(Value):
             their centroid, then 3 cosines between their normals.
         obj_from_vf: pose (b, 6, 4, 4) [m] of the virtual frame that the contacts define, in the
             frame of the contacts.
-        status: `Status` code (b,) of each set. Sets on a line or in a point have another one than
-            `OK`, and NaN in `q` and `obj_from_vf`.
+        status: `Status` code (b,) of each set. If the contacts of a set lie on a line or in a
+            point, it is not `OK`, and `q` and `obj_from_vf` are NaN.
         permutation: indices (6, 3): in assignment k finger i touches contact `permutation[k, i]`.
     """
 
@@ -301,7 +304,7 @@ class IKSeeds(Batch):
     """Initial guesses for inverse kinematics: g postures whose fingertips are placed on contacts
     (Eq. 24 of the paper).
 
-    `nearest_postures` makes it. f counts fingertips, and h actuated joints.
+    `nearest_postures` returns them. f counts fingertips, and h actuated joints.
 
     Attributes:
         joints: actuated joints (g, h) [rad or m], in the order of `hand.joint_names`.
@@ -309,8 +312,9 @@ class IKSeeds(Batch):
         row: index (g,) of the contact set of each guess.
         permutation: indices (g, f): in guess k finger i is placed on contact `permutation[k, i]` of
             its set.
-        energy: misfit (g,) of the posture, without unit; less is better. It is the least f_i of Eq.
-            (21), or half the squared feature distance of a library posture.
+        energy: misfit (g,) of the posture, without unit; less is better. For `nearest_postures` it
+            is half the squared distance between the features of posture and contacts. For a learned
+            model it is the least f_i of Eq. (21).
         tip_error: distance (g, f) [m] of each fingertip from its contact.
     """
 
@@ -349,14 +353,15 @@ class Grasps(Batch):
     """Grasps: hand configurations with their contacts, certificates and checks, the best grasp
     first.
 
-    `plan_grasps` makes them, and `load_grasps` reads them. g counts grasps, f fingertips, h
-    actuated joints of the hand, and n joints of the arm. Positions are in the frame of the cloud.
-    Joints that slide have [m] in place of [rad].
+    `plan_grasps` returns them, and `load_grasps` reads them from a file. g counts grasps, f
+    fingertips, h actuated joints of the hand, and n joints of the arm. Positions are in the frame
+    of the cloud. Joints that slide have [m] in place of [rad].
 
     Attributes:
         joints: actuated joints (g, h) [rad or m], in the order of `hand.joint_names`.
-        pregrasp: joints (g, h) [rad or m] of the opened hand. It is at the same pose, or above it
-            where its links would be in the table (`ik.opened_pose`).
+        pregrasp: joints (g, h) [rad or m] of the opened hand. The opened hand is at
+            `obj_from_hand`, or above it if its links would be in the table there
+            (`ik.opened_pose`).
         approach: unit direction (g, 3) in which the opened hand moves straight to its pre-grasp.
         obj_from_hand: pose (g, 4, 4) [m] of the hand's root link.
         contacts: contact sets (g rows); finger i touches contact i.
@@ -365,20 +370,22 @@ class Grasps(Batch):
         tip_error: distance (g, f) [m] of each fingertip from its contact.
         clearance: least distance (g,) [m] of the links from the estimated surface, from each other
             and from the table; negative where they overlap. Fingertips may touch the surface.
-        normal_angle: angle (g, f) [rad] between pad axis and contact direction.
+        normal_angle: angle (g, f) [rad] between the axis of a fingertip's pad and the inward normal
+            of the object at its contact.
         certificate: proof of force closure (g rows).
-        score: log-odds (g,) of the predicted success, which rank the executable grasps. Failed
-            grasps have a geometric score in its place.
+        score: log-odds (g,) of the predicted success, by which executable grasps are ordered. The
+            score of failed grasps is another number, which says nothing of success.
         status: `Status` code (g,): `OK` for an executable grasp, else the reason why it failed.
         meta: names, units, hashes and the seed of the plan, as text.
-        known: mask (g,) of the grasps whose predicted success trials support; None means all.
-        interval: bounds (g, 2) of the share of such grasps that held in trials (95 % over
-            families). [0, 1] if the success is unknown, [0, 0] for failed grasps. None if there are
-            no bounds.
+        known: mask (g,) of the grasps like those of the trials to which the success model was
+            fitted; the success of others is unknown. None means that all are known.
+        interval: 95 % confidence interval (g, 2) of the share of grasps with this predicted success
+            that held in trials, over families of objects. [0, 1] if the success is unknown, [0, 0]
+            for failed grasps. None if there are no bounds.
         arm: joints (g, n) [rad or m] of the arm at the grasp; None without an arm.
-        ease: two numbers (g, 2) of the arm's way (`torchgrasp.arm`): the least joint margin, as a
-            share of half a joint's range, and the least manipulability, sqrt(det(J J^T)) [m^3]. 0
-            for failed grasps; None without an arm.
+        ease: two numbers (g, 2) of the arm's straight way to the grasp (`torchgrasp.arm`). First
+            the least distance of a joint from its limits, over half its range. Then the least
+            manipulability, sqrt(det(J J^T)) [m^3]. 0 for failed grasps; None without an arm.
 
     Each index keeps the batch axis: `grasps[0]` is a batch of one, and `grasps[0].joints[0]` are
     its joints. For all joints of the hand see `Hand.expand`, for a 3D page
@@ -445,7 +452,7 @@ class Grasps(Batch):
     def table(self) -> Plane | None:
         """The table that the planner was given, in the frame of the grasps.
 
-        None if there was no table, or if it is unknown.
+        None if the grasps were planned without a table, or if `meta` does not say.
         """
         return None if (text := self.meta.get("table", "none")) == "none" else read_plane(text)
 

@@ -56,16 +56,17 @@ class ContactSpec(Value):
             opposite sides of a thin object may be closer.
         flatness: largest angle [rad] between the normals at a contact and on a ring around it. None
             means that flatness is not checked.
-        flat_radius: radius [m] of the ring. None means the largest of `FLAT_RADII` that the object
-            allows.
+        flat_radius: radius [m] of the ring. None means the largest of 8, 6, 4 and 3 mm
+            (`FLAT_RADII`) that the object allows.
         table: the table's `Plane` in the cloud's frame, or its height [m] along z; None means no
             table.
         tip_radius: radius [m] of the fingertips, which may rest on the table; 0 means points. None
-            means the radius of the hand's fingertips.
-        start_radius: normalised radius of the sphere on which initial guesses are drawn (Sec. 6.2).
+            means the radius of the hand's fingertips, but at least 12 mm (`TIP_RADIUS`).
+        start_radius: radius, normalised, of the sphere on which initial guesses are drawn, around
+            the centre of the shape's frame (Sec. 6.2).
         fingertips: number of contacts, one for each fingertip: 3, 4 or 5.
-        contact_allowed: whether links may touch and push the target's neighbours. Collisions then
-            only lower the predicted success.
+        contact_allowed: whether links may touch and push the target's neighbours. Such collisions
+            then lower the predicted success, but do not make a grasp fail.
         region: where contacts may be: a `Region`, or a function of points (n, 3) [m] that returns
             their signed distances (n,) [m], negative there. None means anywhere.
 
@@ -107,11 +108,10 @@ class ContactSpec(Value):
 
     @checked
     def updated(self, result: ClosureResult) -> "ContactSpec":
-        """Return this spec with its `friction` replaced by what a closing has shown
-        (`ClosureResult.friction`).
+        """Return this spec with the `friction` that a closing has shown (`ClosureResult.friction`).
 
-        `result` is what `close_hand` returned. If it has shown nothing of the friction (None), the
-        spec is returned as it is.
+        `result` is what `close_hand` returned. If its `friction` is None, the spec is returned as
+        it is.
         """
         if result.friction is None:
             return self
@@ -127,14 +127,16 @@ class ContactSpec(Value):
 
     @property
     def fingertip_radius(self) -> float:
-        """The radius [m] of the fingertips: `tip_radius`, or 12 mm (`TIP_RADIUS`) if it is None."""
+        """The radius [m] of the fingertips: the field `tip_radius`, or 12 mm (`TIP_RADIUS`) if that
+        is None.
+        """
         return TIP_RADIUS if self.tip_radius is None else self.tip_radius
 
     @property
     def ring_radius(self) -> float:
         """The radius [m] around a contact within which the surface must be flat.
 
-        It is the field `flat_radius`, or 8 mm, the largest of `FLAT_RADII`, if it is None.
+        This is the field `flat_radius`. If that is None, it is 8 mm, the largest of `FLAT_RADII`.
         """
         return FLAT_RADII[0] if self.flat_radius is None else self.flat_radius
 
@@ -142,8 +144,12 @@ class ContactSpec(Value):
     def least_separation(self) -> float:
         """The least distance [m] between the centres of two fingertips.
 
-        It is the field `separation`. If `separation` is None, it is 26 mm for fingertips of radius
-        12 mm (`TIP_RADIUS`) or less. For larger ones it grows by the difference of the diameters.
+        This is the field `separation`. If that is None, it is 26 mm (`SEPARATION`) for fingertips
+        of radius 12 mm (`TIP_RADIUS`) or less. For wider ones it grows by the difference of the
+        diameters.
+
+        >>> f"{1e3 * ContactSpec(tip_radius=0.015).least_separation:.0f} mm"
+        '32 mm'
         """
         wider = 2 * max(self.fingertip_radius - TIP_RADIUS, 0.0)
         return SEPARATION + wider if self.separation is None else self.separation
@@ -152,10 +158,11 @@ class ContactSpec(Value):
     def least_height(self) -> float:
         """The least height [m] of an object that fingertips on the table can grasp.
 
-        With a `flat_radius` they must touch the wall, so it is `fingertip_radius` plus
-        `flat_radius`. Otherwise they may touch the upper rim. A rim of radius q and a fingertip of
-        radius r touch at the height (r + q)(1 - s). Here q is the least of `FLAT_RADII`. s is the
-        largest vertical part of the contact's unit normal that friction allows.
+        Fingertips are balls of radius r, the `fingertip_radius`. With a `flat_radius` they must
+        touch a flat side, and the least height is r + `flat_radius`. With None they may touch the
+        object's rounded upper rim, and the least height is (r + q)(1 - s). Here q is the rim's
+        radius, 3 mm, the least of `FLAT_RADII`. s is the largest vertical part of the contact's
+        unit normal that `mean_friction` allows.
         """
         if self.flat_radius is not None:
             return self.fingertip_radius + self.flat_radius
@@ -164,11 +171,10 @@ class ContactSpec(Value):
 
     @checked
     def for_fingertips(self, radius: float) -> "ContactSpec":
-        """Return the spec with the `tip_radius` of a hand whose fingertips have the given `radius`
-        [m].
+        """Return the spec for a hand whose fingertips have the given `radius` [m].
 
-        The new `tip_radius` is at least 12 mm (`TIP_RADIUS`). A spec whose `tip_radius` is not None
-        is returned as it is. Raises `BadArgument` for a radius outside the range of `tip_radius`.
+        A `tip_radius` of None becomes `radius`, but at least 12 mm (`TIP_RADIUS`). Otherwise the
+        spec is returned as it is. Raises `BadArgument` for a `tip_radius` above 1 m.
 
         >>> wide = ContactSpec().for_fingertips(0.015)
         >>> points = ContactSpec(tip_radius=0.0).for_fingertips(0.015)
@@ -185,16 +191,21 @@ class ContactSpec(Value):
     def relaxed(self, below: Length, radius: Length) -> "Iterator[ContactSpec]":
         """Yield weaker constraints for an object without grasps, the strictest first.
 
-        The first specs have a smaller `flat_radius`: each of `FLAT_RADII` that is smaller than
-        `below`. With a table, three more specs allow contacts on the object's upper rim, where a
-        fingertip on the table touches a low object with an inclined normal. The estimated rim is
-        rounder than the true one, so its normals are steeper. Therefore the three specs reduce the
-        margins of friction and of `tip_radius`: the first keeps them, the second halves them, and
-        the third has none. If `flatness` is None, or `flat_radius` is not None, there are no specs.
+        First come specs with a smaller `flat_radius`: each of 8, 6, 4 and 3 mm (`FLAT_RADII`) that
+        is less than `below`.
+
+        With a table, three specs follow for the upper rim of a low object, with a `flat_radius` of
+        1 mm (`RIM`). There a fingertip on the table touches an inclined surface. The estimated rim
+        is too round, so its normals are too steep. Therefore the second and the third spec give up
+        half and all of two margins. One is that of the friction: `planned_friction` rises to
+        `mean_friction`. The other is that of a `tip_radius` of None: it falls from at least 12 mm
+        (`TIP_RADIUS`) to `radius`.
+
+        There are no specs if `flatness` is None, or if `flat_radius` is not None.
 
         Args:
             below: radius [m] of the flat areas that were tried before.
-            radius: radius [m] of the hand's fingertips.
+            radius: radius [m] of the hand's fingertips; 0 keeps `tip_radius` as it is.
 
         >>> relaxed = ContactSpec(table=0.0).relaxed(0.003, 0.0096)
         >>> [round(spec.planned_friction, 1) for spec in relaxed]
@@ -229,8 +240,9 @@ class ContactSpec(Value):
         """Return the constraints of the paper.
 
         Contacts are planned with the whole friction (`friction_margin` 1). Fingertips are points
-        (`tip_radius` 0). No least separation and no flat surface is asked for. Initial guesses are
-        drawn on the paper's sphere (`start_radius` 0.1).
+        (`tip_radius` 0). They may be at any distance (`separation` 0), and the surface need not be
+        flat (`flatness` None). Initial guesses are drawn on the paper's sphere (`start_radius`
+        0.1).
 
         Args:
             friction: coefficient of friction between fingertip and object, or its `Distribution`.
@@ -287,8 +299,8 @@ class TrialSpec(Value):
 
     Args:
         closing: how the hand closes.
-            "uncertainty": Eqs. 25-28 with the surface's calibrated standard deviations, and further
-              components (`ClosingOptions`).
+            "uncertainty": Eqs. 25-28 with the surface's calibrated standard deviations, and with
+              `options`.
             "fixed": the same with equal gains for all contacts.
             "paper": Eqs. 25-28 as written, with forces of the hand's stability model.
             "paper_position": PI position control to the contacts until 0.5 N, the paper's baseline.
@@ -296,12 +308,12 @@ class TrialSpec(Value):
             "open_loop": joint motion from pre-grasp to grasp to squeeze.
         holding: how the closed hand presses; after "open_loop" the squeeze is kept.
             "grip": the forces that the felt load and a push of 2.5 N need.
-            "force": balanced forces.
+            "force": balanced forces, of which `force` sets the strength.
             "impedance": virtual springs keep the fingertips together and in place.
             "position": joint targets are kept.
             "law": Eq. 25 continues.
             None means "grip", or "force" in three cases: `force` is given, the closing is not
-              "uncertainty" or "fixed", or a fingertip is not tactile.
+              "uncertainty" or "fixed", or a fingertip has no working tactile sensor.
         mass: mass [kg] of the object. From a `Distribution` each trial draws it by its seed.
         friction: coefficient of friction of every contact. From a `Distribution` each trial draws
             it by its seed.
@@ -312,7 +324,7 @@ class TrialSpec(Value):
         hold_time: time [s] after the lift.
         shake: amplitude [m] of a vertical sinusoid of 5 Hz during the hold.
         force: normal force [N] of the strongest finger in the closing and in the holding "force".
-            None means 4 N, or `max_force` if it is less.
+            None means 4 N, but at most `max_force`.
         noise: whether the sensors are noisy (`SensorModel.noise` scales the noise).
         timestep: timestep [s] of the simulator.
         control_rate: rate [Hz] of the controller.
@@ -321,12 +333,12 @@ class TrialSpec(Value):
         patch: radius [m] of the contact patch of a fingertip. Torsional friction is friction x
             force x patch. With 0 the contacts are hard points, as in the paper.
         kp: stiffness [N m/rad] of all joint drives; None means the hand's own.
-        overlap: largest overlap [m] of hand and object at the start. The object's convex parts
-            bulge a little.
-        table: whether the object stands on a table.
+        overlap: depth [m] by which the hand may penetrate the object or the table at the start. The
+            convex parts that stand for the object bulge a little. A deeper overlap ends the trial.
+        table: whether the object stands on a table; without one it falls, unless `gravity` is 0.
         self_collision: whether links of the hand collide with each other, in the pairs that the
             hand names.
-        options: components of the closing "uncertainty" or "fixed"; None means `ClosingOptions()`.
+        options: options of the closing "uncertainty" or "fixed"; None means `ClosingOptions()`.
         sensor: sensors of the fingertips; the controller knows their kind.
         max_force: largest normal force [N] of a fingertip; None means no limit.
         table_friction: coefficient of friction between object and table; None means `friction`.
@@ -390,9 +402,11 @@ class TrialSpec(Value):
 
     @property
     def pressing(self) -> HoldingMode:
-        """The holding mode of the trial, such as "grip" or "force".
+        """The holding mode of the trial, such as "grip".
 
-        It is the field `holding`. If that is None, it is the default that `TrialSpec` states.
+        This is the field `holding`. If that is None, it is "force" in three cases: `force` is
+        given, `closing` is not "uncertainty" or "fixed", or a fingertip has no working tactile
+        sensor. Otherwise it is "grip".
         """
         default = default_holding(self.sensor, self.closing) if self.force is None else "force"
         return self.holding or default
@@ -402,7 +416,7 @@ class TrialSpec(Value):
         """The normal force [N] of the strongest finger in the closing, and in the holding mode
         "force".
 
-        It is the field `force`. If `force` is None, it is 4 N, but at most `max_force`.
+        This is the field `force`. If that is None, it is 4 N, but at most `max_force`.
         """
         return min(4.0, self.max_force or 4.0) if self.force is None else self.force
 
@@ -410,8 +424,12 @@ class TrialSpec(Value):
     def components(self) -> ClosingOptions:
         """The `ClosingOptions` with which the hand closes.
 
-        They are the field `options`, or `ClosingOptions()` if it is None. In a closing mode that
-        takes no options, all are off.
+        For the closing "uncertainty" or "fixed" they are the field `options`, or
+        `ClosingOptions()` if that is None. Other closings have no options: the result then has all
+        of them off.
+
+        >>> TrialSpec(closing="paper").components.wait
+        False
         """
         return choose_options(self.closing, self.options)
 
