@@ -164,6 +164,8 @@ def test_fingertips_come_from_the_hand_unless_they_are_given():
     assert given.for_fingertips(0.02) == given
     assert (given.fingertip_radius, given.least_separation) == (0.005, 0.01)
     assert ContactSpec(tip_radius=0.0).least_separation == 0.026
+    with pytest.raises(BadArgument, match="radius"):
+        spec.for_fingertips(-0.001)
 
 
 def test_paper_spec_has_no_margins():

@@ -96,8 +96,8 @@ def _sizes(
 def tick_of(lift: ClosureResult, phase: int) -> int:
     """Return the index of the tick at which a phase of a lift ended.
 
-    The `phase` is 0 (approach), 1 (closing) or 2 (pressing). A phase that never ended gives the
-    last tick.
+    The `phase` is 0 (approach), 1 (closing) or 2 (pressing). A phase whose end in
+    `ClosureResult.phases` is NaN gives the last tick.
     """
     end = lift.phases[phase]
     return int((lift.time - end).abs().argmin()) if bool(end.isfinite()) else len(lift.time) - 1

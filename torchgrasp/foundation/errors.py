@@ -151,9 +151,9 @@ class BrokenLaw(GraspError, AssertionError):
 
     The attribute `law` is the name of the law.
 
-    >>> error = BrokenLaw("order", "2 nan", "finite numbers")
+    >>> error = BrokenLaw("jacobian", "2 nan", "finite numbers")
     >>> error.law, str(error)
-    ('order', 'order: expected finite numbers, got 2 nan')
+    ('jacobian', 'jacobian: expected finite numbers, got 2 nan')
     """
 
     def __init__(self, law: str, found: str, allowed: str):

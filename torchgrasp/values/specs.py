@@ -170,11 +170,12 @@ class ContactSpec(Value):
         return (self.fingertip_radius + FLAT_RADII[-1]) * (1 - slope)
 
     @checked
-    def for_fingertips(self, radius: float) -> "ContactSpec":
+    def for_fingertips(self, radius: Length) -> "ContactSpec":
         """Return the spec for a hand whose fingertips have the given `radius` [m].
 
         A `tip_radius` of None becomes `radius`, but at least 12 mm (`TIP_RADIUS`). Otherwise the
-        spec is returned as it is. Raises `BadArgument` for a `tip_radius` above 1 m.
+        spec is returned as it is. Raises `BadArgument` for a negative radius, and for a
+        `tip_radius` above 1 m.
 
         >>> wide = ContactSpec().for_fingertips(0.015)
         >>> points = ContactSpec(tip_radius=0.0).for_fingertips(0.015)
