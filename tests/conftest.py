@@ -71,7 +71,7 @@ def pytest_collection_finish() -> None:
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Check annotations of the first calls of the next test, too."""
-    annotations.LEFT.clear()
+    annotations.check_anew()
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from tests.annotations import CALLS, LEFT, jaxtyped
+from tests.annotations import CALLS, check_anew, jaxtyped
 
 
 def test_each_call_of_a_nested_function_is_checked():
@@ -25,7 +25,7 @@ def test_each_call_of_a_nested_function_is_checked():
     two = make(2)
     none = make(0)
     for n in (2, 3):
-        LEFT.clear()
+        check_anew()
         assert (
             one(torch.zeros(n)).sum() == n and two(torch.zeros(n), z=torch.ones(n)).sum() == 2 * n
         )
@@ -35,7 +35,7 @@ def test_each_call_of_a_nested_function_is_checked():
         lambda: two(torch.zeros(2), y=3),
         lambda: none(torch.zeros(2)),
     ):
-        LEFT.clear()
+        check_anew()
         with pytest.raises(TypeError):
             call()
 
@@ -51,7 +51,7 @@ def test_the_first_calls_of_each_test_are_checked():
         with pytest.raises(TypeError):
             checked(torch.zeros(2, 2))
     assert checked(torch.zeros(2, 2)).shape == (2, 2)
-    LEFT.clear()  # as conftest.py does before each test
+    check_anew()  # as conftest.py does before each test
     with pytest.raises(TypeError):
         checked(torch.zeros(2, 2))
 
