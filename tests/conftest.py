@@ -26,6 +26,7 @@ os.environ.pop(
 sys.dont_write_bytecode = False
 
 annotations.install()
+gc.disable()  # until all tests are collected: hardly any of what that makes is garbage
 
 collect_ignore = [
     "app/agent_client.py",
@@ -67,6 +68,7 @@ def pytest_collection_finish() -> None:
     gc.collect()
     gc.freeze()
     gc.set_threshold(*GARBAGE)
+    gc.enable()
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
