@@ -13,9 +13,7 @@ import torch
 from hypothesis import HealthCheck, settings
 from torch import Tensor
 
-from tests import annotations
-from tests.kept import kept as kept
-from tests.kept import kept_plans as kept_plans
+from tests import annotations, kept
 
 if TYPE_CHECKING:
     from torchgrasp.values.planning import PointCloud
@@ -49,6 +47,11 @@ SIMULATED = re.compile(
     r"(close_hand|evaluate|drop|lift_grasp|open_scene|pull_grasp|run_protocol|open)\("
 )
 """What an example calls that opens a simulator."""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Give its fixtures to the examples of the library, which are not below this folder."""
+    config.pluginmanager.register(kept)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
