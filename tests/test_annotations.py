@@ -6,6 +6,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tests.annotations import CALLS, check_anew, jaxtyped
+from torchgrasp.geometry.linalg import limit_norm, solve_least_squares
 
 
 def test_each_call_of_a_nested_function_is_checked():
@@ -65,3 +66,23 @@ def test_the_library_is_checked_in_this_way():
     assert rigid(torch.eye(3), torch.zeros(3)).shape == (4, 4)
     with pytest.raises(TypeError):
         rigid(torch.eye(3)[None], torch.zeros(3))  # torch raises another error
+
+
+ROWS = torch.ones(4, 2, dtype=torch.float64)
+VALUES = torch.ones(4, dtype=torch.float64)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [(VALUES, VALUES), (ROWS, VALUES[:3]), (ROWS.long(), VALUES)],
+    ids=["rank", "letter", "type"],
+)
+def test_tests_check_annotations_of_tensors(arguments):
+    with pytest.raises(TypeError):
+        solve_least_squares(*arguments)
+
+
+def test_tests_check_annotations_and_let_right_arguments_pass():
+    assert solve_least_squares(torch.rand(4, 2).double(), VALUES).shape == (2,)
+    with pytest.raises(TypeError):
+        limit_norm(ROWS, "1")  # pyright: ignore[reportArgumentType]
